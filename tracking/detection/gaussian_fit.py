@@ -66,18 +66,21 @@ _LEAST_VARIANCE = 0.02  # px^2: narrower spots cannot be distinguished from a po
 
 @compiled
 def fit_all(
-    image: Pixels, table: Array, noise: Noise, saturation: float, max_sigma: float, min_gain: float, cells: Array,
-    algebra: Array,
+    image: Pixels, table: Array, noise: Noise, saturation: float, max_sigma: float, min_gain: float, again: bool,
+    cells: Array, algebra: Array,
 ) -> None:  # fmt: skip
     """Fit all candidates of a picture (n, COLUMNS) together, in place, starting from their moments.
 
     Gauss-Newton steps until the centres converge; clipped pixels, pixels outside and hot pixels are excluded, and the
     light of the neighbours is subtracted. A candidate that grows beyond `max_sigma`, px, diverges, or lowers chi-square
-    by less than `min_gain` is rejected: its flux becomes 0.
+    by less than `min_gain` is rejected: its flux becomes 0. again: only those with ACTIVE start from their moments; the
+    others have been fitted and stay as they are.
     """
     n = table.shape[0]
     for i in range(n):
         spot = table[i]
+        if again and not spot[ACTIVE]:
+            continue
         spot[U], spot[V], spot[UU], spot[UV] = spot[MOMENT_U], spot[MOMENT_V], spot[MOMENT_UU], spot[MOMENT_UV]
         spot[VV], spot[LEVEL], spot[ACTIVE] = spot[MOMENT_VV], spot[BACKGROUND], 1.0
         spot[SLOPE_U] = spot[SLOPE_V] = 0.0
@@ -99,8 +102,8 @@ def fit_all(
                 moved = True
             elif moved:
                 spot[ACTIVE] = 1.0
-            if moved:
-                changed = True
+            changed = changed or moved
+            if moved and not again:
                 _reactivate_neighbours(table, i)
         if not changed:
             break
@@ -108,11 +111,12 @@ def fit_all(
 
 @compiled
 def _has_diverged(spot: Array, max_sigma: float) -> bool:
-    """Whether a spot has become too wide or too far from its moments."""
-    if ellipse.axes(spot[UU], spot[UV], spot[VV])[0] > 1.5 * max_sigma:
+    """Whether a spot has become too wide, or too far from its moments for their width and its own."""
+    major = ellipse.axes(spot[UU], spot[UV], spot[VV])[0]
+    if major > 1.5 * max_sigma:
         return True
     away = sqrt((spot[U] - spot[MOMENT_U]) ** 2 + (spot[V] - spot[MOMENT_V]) ** 2)
-    return away > 3.0 + 2.0 * ellipse.axes(spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV])[0]
+    return away > 3.0 + max(2.0 * ellipse.axes(spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV])[0], major)
 
 
 @compiled

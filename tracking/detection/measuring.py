@@ -43,9 +43,10 @@ from tracking.detection.table import (
     V,
 )
 
-AT_U, AT_V, LEVEL, WIDE_PEAK, SCALE = (
+AT_U, AT_V, HEIGHT, LEVEL, WIDE_PEAK, SCALE = (
     candidates.AT_U,
     candidates.AT_V,
+    candidates.HEIGHT,
     candidates.LEVEL,
     candidates.WIDE,
     candidates.SCALE,
@@ -61,6 +62,8 @@ _LEAST_GAIN = 0.7  # decrease of chi-square relative to threshold^2 below which 
 NARROWER = 0.5  # a spot narrower than this share of another spot is not a duplicate of it
 _PART_APART = 2.0  # sigmas: fits that are nearer to each other are parts of one light
 _MERGES = 3  # fits of a picture at most, with parts joined in between
+_LEAST_START = 2.0  # px^2: least variance of that start
+_OUTGROWN = 4.0  # variance of the moments over that of the start above which they have left the light
 _NOTHING = 1e12  # px^2: variance of the start of a candidate that has been joined to another one; the fit leaves it out
 _SAME_SPOT = 1.5  # sigmas of a brighter spot: a second spot nearer to its centre is a duplicate
 
@@ -94,9 +97,11 @@ def measure(
     find_moments(image, table, cells)
     least = _LEAST_GAIN * limits.threshold_sigma**2
     for _ in range(_MERGES):
-        fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, cells, algebra)
+        fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, False, cells, algebra)
         if not _merge_parts(table):
             break
+    if _start_again(peaks, chosen, table):
+        fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, cells, algebra)
     for k in range(chosen.shape[0]):
         spot = table[k]
         spot[ACCEPTED] = (
@@ -105,6 +110,30 @@ def measure(
             else 0.0
         )
     _drop_duplicates(table)
+
+
+@compiled
+def _start_again(peaks: Array, chosen: Ints, table: Array) -> bool:
+    """Give rejected candidates whose moments left their light a start from the peak and its scale; whether there are.
+
+    On a sloping or textured background the window of the moments grows over the light beside a faint spot.
+    """
+    found = False
+    for k in range(table.shape[0]):
+        spot, peak = table[k], peaks[chosen[k]]
+        spot[ACTIVE] = 0.0
+        if spot[FLUX] > 0.0 or spot[MOMENT_UU] >= _NOTHING or peak[WIDE_PEAK]:
+            continue
+        start = max(spot[START], _LEAST_START)
+        away = max(abs(spot[MOMENT_U] - peak[AT_U]), abs(spot[MOMENT_V] - peak[AT_V]))
+        high = ellipse.eigenvalues(spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV])[1]
+        if away * away < start and high < _OUTGROWN * start:
+            continue
+        spot[MOMENT_U], spot[MOMENT_V] = peak[AT_U], peak[AT_V]
+        spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV] = start, 0.0, start
+        spot[FLUX], spot[ACTIVE] = 2 * pi * start * peak[HEIGHT], 1.0
+        found = True
+    return found
 
 
 @compiled

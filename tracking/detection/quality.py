@@ -28,6 +28,9 @@ from tracking.detection.table import (
 
 _CORE = 0.2  # share of the brightest cell's light that limits the core: the peak is searched in the core, with clipped
 # cells but without hot pixels in the wings
+# Sum of the squared shares of the cells above which they are too few for a test of their own: of one narrow spot it
+# would show the grain in some pictures and not in others.
+_CROWDED = 1 / 40
 _LAGS = 2  # cells: largest lag of the autocorrelation of the residuals
 
 
@@ -104,14 +107,19 @@ def _covariance_factor(window: Window, frame: PolynomialFrame, cells: Array, use
         else:
             odd[k] = 0.0
         squares += odd[k] * odd[k]
-    if 0.5 * squares / free <= 1.0 + 3.0 * sqrt(2.0 / free):
-        return 1.0
-    return _odd_misfit_factor(window, frame, cells, odd, 2.0 if whole else 1.0)
+    anywhere = 0.5 * squares / free > 1.0 + 3.0 * sqrt(2.0 / free)
+    return _odd_misfit_factor(window, frame, cells, odd, 2.0 if whole else 1.0, anywhere)
 
 
 @compiled
-def _odd_misfit_factor(window: Window, frame: PolynomialFrame, cells: Array, odd: Array, doubled: float) -> float:
-    """The factor if there is a misfit. odd (cells,): residuals in sigmas, overwritten."""
+def _odd_misfit_factor(
+    window: Window, frame: PolynomialFrame, cells: Array, odd: Array, doubled: float, anywhere: bool
+) -> float:
+    """The factor; 1 without a misfit. odd (cells,): residuals in sigmas, overwritten.
+
+    anywhere: whether there is one in the mean of all cells. Grain of the light is in the core only: there the mean
+    weighted with the sensitivity shows it. Its variance, with noise alone, is 2 sum(share^2), or 4 of mirrored pairs.
+    """
     count = window.columns * window.rows
     share = cells[NEIGHBOUR_LIGHT]  # no longer needed
     a, b, c = ellipse.inverse(frame.S[0], frame.S[1], frame.S[2])
@@ -129,6 +137,8 @@ def _odd_misfit_factor(window: Window, frame: PolynomialFrame, cells: Array, odd
         square += odd[k] * odd[k] * part / doubled
         crowd += part * part
         odd[k] *= sqrt(part)
+    if not anywhere and (crowd > _CROWDED or square <= 1.0 + 3.0 * sqrt(4.0 / doubled * crowd)):
+        return 1.0
     grain = _correlated_cells(window, odd)
     grains = 1.0 / max(crowd * grain, 1e-12)  # number of independent samples in the slopes
     # Four fitted parameters are odd, so the residuals contain less of the odd part than the light.

@@ -10,13 +10,16 @@ from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
 from tracking.detection.candidates import insertion_sort
-from tracking.detection.pixels import Noise, Pixels, pixel, variance
+from tracking.detection.pixels import Noise, Pixels, pixel, texture_variance, variance
 
 _RADII = (0.4, 0.8, 2.4, 2.8, 3.2)  # sigmas of the moments' ellipse: two in the core, three in the ring
 # Error of the centre relative to the ellipse's sigma. On the three saturated laser spots of the real pictures the
 # moments and the middle of the core differ by 0.05 to 0.15.
 CENTRE_SHARE = 0.15
-_THRESHOLD_FACTOR = 1.5  # factor on the detection threshold, because no fit confirms the spot
+_THRESHOLD_FACTOR = 1.5  # factor on the noise in the detection threshold, because no fit confirms the spot
+
+# Share of the texture's sigma in it: the light falls off in all directions, which most grains of texture do not.
+_OF_TEXTURE = 0.7
 
 
 @compiled
@@ -53,6 +56,7 @@ def compact_height(
     insertion_sort(scratch[24:32], 8)
     core, background = 0.5 * (scratch[7] + scratch[8]), 0.5 * (scratch[27] + scratch[28])
     above = core - background
-    if core - highest < 0.5 * above or above <= _THRESHOLD_FACTOR * threshold_sigma * sqrt(variance(noise, background)):
+    sigma2 = _THRESHOLD_FACTOR**2 * variance(noise, background) + _OF_TEXTURE**2 * texture_variance(noise, background)
+    if core - highest < 0.5 * above or above <= threshold_sigma * sqrt(sigma2):
         return 0.0
     return above

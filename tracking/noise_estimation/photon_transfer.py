@@ -17,6 +17,7 @@ import numpy as np
 from geometry.arrays import Array
 from tracking.detection.detect import find_spots
 from tracking.noise import FULL_SCALE_E, NoiseModel, Picture, quantile_variance
+from tracking.noise_estimation.block_steps import block_step
 from tracking.noise_estimation.grey_values import clipped_background, full_scale, grey_step, saturation_level
 from tracking.noise_estimation.levels import LEAST_PIXELS, LEVELS, SIDE, LevelVariances, level_variances
 from tracking.noise_estimation.rounding import banding
@@ -35,6 +36,7 @@ _MOST_SPOTS = 40  # per picture: the brightest
 _LEAST_OF_SPOTS, _MOST_OF_SPOTS = 30, 300  # pixels per brightness class; residuals of one spot are not independent
 _CONTRASTS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)  # contrasts of the light's grain that are tried
 _FEW_STEPS = 20  # grey values of a background below which one step is more than its texture
+_OF_STEP = 0.3  # of a block's step, as its sigma: with the usual threshold a spot must be 1.5 steps high
 _GRAIN_SIGMA = 0.5  # relative uncertainty of the grain's variance
 
 
@@ -79,7 +81,8 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
     lines = _Lines.fit(levels, background, full, rounding) if clipped is None else _Lines.from_point(*clipped, full)
     slope, slope_sigma = lines.slope(rounding)
     first = lines.model(slope, rounding)
-    first = replace(first, texture=texture_of(usable, first), banding_dn=banding(first.floor_dn2, rounding))
+    shared = max(banding(first.floor_dn2, rounding), _OF_STEP * block_step(usable))
+    first = replace(first, texture=texture_of(usable, first), banding_dn=shared)
     if slope_sigma > _SURE:  # no static pixel is bright enough: use the spots' residuals
         found = [find_spots(p, DetectParameters(max_detections=_MOST_SPOTS), first) for p in usable]
         lines.add(residuals_of_spots(usable, found, top))

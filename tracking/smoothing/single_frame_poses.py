@@ -41,8 +41,12 @@ def single_frame_poses(
     calibration_cov: Array,
     ref: Reference,
     limits: SolveLimits,
+    beside: Array,
 ) -> SingleFramePoses:
-    """Each frame's own pose from its labels (T, n), starting at the reference motion."""
+    """Each frame's own pose from its labels (T, n), starting at the reference motion.
+
+    beside (T, 6): a further error, one sigma, of the poses (motion.velocity_jumps.corner_offsets).
+    """
     frames = len(assigned)
     out = SingleFramePoses.unknown(frames)
     for k in range(frames):
@@ -57,7 +61,10 @@ def single_frame_poses(
         out.measured[k] = worst[0] <= limits.max_sigma_m and worst[1] <= limits.max_sigma_rad
         if out.measured[k]:
             out.R[k], out.t[k], out.covariance[k] = R, t, covariance
-            out.excess[k] = frame_information(views, ref.R[k], ref.t[k], use, uv, cov)[2] - chi2
+            at_ref, along, chi2_ref = frame_information(views, ref.R[k], ref.t[k], use, uv, cov)[:3]
+            b = beside[k]
+            out.covariance[k] += np.outer(b, b)
+            out.excess[k] = chi2_ref - chi2 - float(b @ along) ** 2 / (1 + b @ at_ref @ b)
     return out
 
 

@@ -47,7 +47,7 @@ from tracking.smoothing.labels.reassociation import RunObservation, reassociated
 from tracking.smoothing.labels.view_path import PathContext
 from tracking.smoothing.motion.reference import Reference, straight_between
 from tracking.smoothing.motion.run_detections import labelled_points
-from tracking.smoothing.motion.velocity_jumps import jump_sigmas
+from tracking.smoothing.motion.velocity_jumps import corner_offsets, jump_sigmas
 from tracking.smoothing.motion.whole_run import MAX_DISTANCE, SmoothedMotion, WholeRun, estimate
 from tracking.smoothing.place_errors import place_errors
 from tracking.smoothing.recording import TrackedRecording
@@ -147,8 +147,10 @@ class _Smoother:
         self.own = replace(own, measured=self.measured)
 
     def _single_frame_poses(self, assigned: Ints) -> SingleFramePoses:
+        motion, rec = self.motion, self.rec
+        beside = corner_offsets(motion.ref, motion.jumped, rec.exposure_s, rec.dt_s)
         return single_frame_poses(
-            self.views, self.detections, assigned, self.calibration_cov, self.motion.ref, self.limits
+            self.views, self.detections, assigned, self.calibration_cov, motion.ref, self.limits, beside
         )
 
     def _redundant(self, chosen: Bools) -> Bools:

@@ -1,7 +1,7 @@
 """The noise model: from a sensor's data sheet and estimated from pictures."""
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import NormalDist
 
 import cv2
@@ -14,6 +14,7 @@ from geometry.camera import SensorNoise
 from tests.tracking.rendering import Scene, Spot, photograph
 from tracking.detection.detect import find_spots
 from tracking.noise import ROUNDING_DN2, NoiseModel, guess_noise
+from tracking.noise_estimation.block_steps import block_step
 from tracking.noise_estimation.grey_values import saturation_level
 from tracking.noise_estimation.photon_transfer import estimate_noise
 from tracking.noise_estimation.rounding import clipped_normal, unrounded
@@ -239,3 +240,18 @@ def test_the_noise_of_pictures_too_small_for_levels_is_estimated(size):
     model = estimate_noise([photograph(scene, rng, bits=16) for _ in range(2)]).model
     true = 20.0**2 + 200.0 / scene.gain
     assert 1 / 1.6 < float(model.variance(200.0)) / true < 1.6
+
+
+def test_steps_of_compressed_blocks_are_not_spots():
+    """Noise below the quantisation of JPEG: whole blocks of 8x8 pixels are one grey value brighter in some pictures."""
+    lab = Lab(gain=27.0, read_e=7.6, texture=0.0, details=0, background=8.0, speed_px=0.0, spot_peak=0.0, quality=80)
+    pictures = lab.pictures(5)
+    assert block_step(pictures) == 1.0
+    model = estimate_noise(pictures).model
+    assert sum(len(find_spots(p, noise=replace(model, banding_dn=0.0))) for p in pictures) > 5
+    assert sum(len(find_spots(p, noise=model)) for p in pictures) == 0
+
+
+@pytest.mark.parametrize("lab", [Lab(), Lab(gain=160.0, read_e=3.0), Lab(speed_px=0.0), Lab(flicker=0.03)])
+def test_pictures_without_compression_have_no_steps_of_blocks(lab):
+    assert block_step(lab.pictures(3)) == 0.0

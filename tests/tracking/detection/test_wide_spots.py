@@ -66,3 +66,37 @@ def test_a_narrow_spot_on_the_light_of_a_reflection_keeps_its_width():
         spot = np.argmin(np.linalg.norm(found.uv_px - [125.2, 104.4], axis=1))
         assert np.linalg.norm(found.uv_px[spot] - [125.2, 104.4]) < 0.4
         assert found.major_px[spot] < 4.0
+
+
+def test_a_wide_faint_spot_on_the_slope_of_a_reflection_is_found():
+    """Windows that grow with the light run up the slope; the fit starts again from the peak."""
+    found = 0
+    for seed in range(6):
+        rng = np.random.default_rng([seed, 7])
+        bright = 6.0 * light(130.3, 90.6, (10.0, 10.0)) + 20.0 * light(30.0, 170.0, (60.0, 60.0))
+        screen = (16.0 + bright) * grain(rng, 0.03, 3.3)
+        noisy = screen + rng.standard_normal(screen.shape) * np.sqrt(0.22 + 0.0124 * screen)
+        picture = np.rint(noisy).clip(0, 255).astype(np.uint8)
+        found += near(find_spots(picture, noise=NoiseModel(0.22, 0.0124, 0.0, 0.028)), 130.3, 90.6, 5.0)
+    assert found >= 5
+
+
+def test_grains_of_a_textured_screen_are_not_compact_lights():
+    count = 0
+    for seed in range(6):
+        rng = np.random.default_rng([seed, 8])
+        screen = BACKGROUND * grain(rng, 0.09, 0.9) + np.sqrt(FLOOR) * rng.standard_normal((HEIGHT, WIDTH))
+        picture = np.rint(screen).clip(0, 255).astype(np.uint8)
+        count += len(find_spots(picture, noise=NoiseModel(FLOOR, SLOPE, BACKGROUND, 0.066)))
+    assert count <= 1
+
+
+def test_grain_of_the_light_widens_the_sigmas_also_where_it_is_in_a_few_cells_only():
+    """The mean over all cells of the window hardly shows the speckle of a spot's core; the centre moves by it."""
+    errors = []
+    for seed in range(60):
+        found = seen(100.0 * light(120.3, 100.6, (4.0, 4.0)), 0.04, seed, background=6.0)
+        row = int(np.argmin(np.linalg.norm(found.uv_px - [120.3, 100.6], axis=1)))
+        error = found.uv_px[row] - [120.3, 100.6]
+        errors.append(error @ np.linalg.solve(found.cov_px2[row], error) / 2)
+    assert np.mean(errors) < 3.3

@@ -11,7 +11,19 @@ from geometry.pose import Pose
 from lab.simulate.points import PointRun
 from lab.simulate.rigs import RIGS
 from lab.simulate.scenarios import PriorRegion
-from tests.tracking.rigid_runs import Assessment, assess, recording_of, smoothed_frames, tracked, zig_zag
+from tests.tracking.rigid_runs import (
+    RIGID,
+    Assessment,
+    assess,
+    dt_of,
+    found_in,
+    recording_of,
+    smoothed_frames,
+    tracked,
+    zig_zag,
+)
+from tracking.smoothing.recording import TrackedRecording
+from tracking.smoothing.smoother import smooth
 
 NOISE_PX = 0.01
 START = Pose.from_ypr(np.deg2rad([7.0, 0.0, 0.0]), np.zeros(3))
@@ -48,4 +60,26 @@ def test_covariances_near_corners_between_frames_are_right(rate):
     assert 0.7 < np.mean(nees) / 6 < 1.4
     assert np.mean(nees < COVERED) >= 0.9
     assert np.mean(nees[near]) / 6 < 1.6
+    assert np.max(nees) < 60
+
+
+def test_a_corner_within_a_long_exposure_does_not_shift_the_pose_beyond_its_sigma():
+    """A spot's mean over the exposure lies beside the corner, by up to an eighth of the exposure times the jump."""
+    parts, share, rate_hz = 20, 0.7, 100.0
+    nees = []
+    for seed in (1, 2):
+        fine, fine_t, _ = zig_zag(seed, FRAMES * parts, rate_hz * parts, EVERY * parts, HARD, START)
+        middle = np.arange(parts // 2, FRAMES * parts - parts // 2, parts)
+        half = int(share * parts / 2)
+        during = [fine[middle + i].minus(fine[middle]) for i in range(-half, half + 1)]
+        mean = fine[middle].plus(np.mean(during, axis=0))
+        run = recording_of(RIGS["four-skew-beams"](), mean, fine_t[middle], NOISE_PX, seed, prior=PRIOR)
+        recording = TrackedRecording(run.rig, RIGID, exposure_s=share / rate_hz)
+        for k, frame in enumerate(tracked(run)):
+            recording.append(dt_of(run, k), found_in(run, k), frame)
+        result = smooth(recording)
+        assert result.measured.all()
+        error = result.poses.minus(fine[middle])
+        nees.append(np.einsum("ki,kij,kj->k", error, np.linalg.inv(result.covariance), error))
+    assert np.mean(nees) / 6 < 1.2
     assert np.max(nees) < 60

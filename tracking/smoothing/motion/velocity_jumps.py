@@ -16,6 +16,7 @@ P_JUMP_OCCLUDED = 0.05  # probability of a jump in each step at a frame that doe
 P_JUMP_SHARED = 0.3  # least probability of a known jump in each of several steps between which little is observed
 # Log determinant of a frame's information below the run's usual one: sigmas of the pose half as large again.
 WEAK_LOG_DET = 2 * 6 * np.log(1.5)
+SHORT_EXPOSURE = 0.1  # of the step between two frames: with a shorter exposure a corner is hardly ever within one
 SPEED_WINDOW_S = 0.5  # s: the size of a jump follows from the fastest motion within this time of it
 
 
@@ -53,6 +54,22 @@ def new_jumps(shock: Array, jumped: Bools) -> Bools:
     """(T,): steps with a velocity jump that is not known yet (jumped (T,)): local maxima of the shock (T,)."""
     peak = shock >= largest_near(np.where(jumped, 0.0, shock), SHOCK_SEPARATION)
     return np.asarray(peak & (shock > SHOCK_CHI2) & ~jumped)
+
+
+def corner_offsets(ref: Reference, jumped: Bools, exposure_s: float, dt: Array) -> Array:
+    """Largest mean pose over the exposure less that at its middle, (T, 6), where the velocities jump; 0 elsewhere.
+
+    Where they jump at the middle of the exposure, the mean is an eighth of the exposure times the jump beside the
+    corner: for all spots as if the vehicle were there. A jump before frame k (jumped[k]) is in the exposure of that
+    frame or of the one before it. Short exposures hardly ever contain one and get 0. Source: ours.
+    """
+    out = np.zeros((len(ref.t), 6))
+    for k in np.flatnonzero(jumped[1:] & (exposure_s > SHORT_EXPOSURE * dt[1:])) + 1:
+        b = (ref.m[k, :6] - ref.m[k - 1, :6]) * exposure_s / 8
+        for frame in (k - 1, k):
+            if np.linalg.norm(b) > np.linalg.norm(out[frame]):
+                out[frame] = b
+    return out
 
 
 def _weak(information: Array, measured: Bools) -> Bools:

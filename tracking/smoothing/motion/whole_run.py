@@ -20,7 +20,7 @@ from tracking.smoothing.motion.predictive_cost import leave_one_out_log_likeliho
 from tracking.smoothing.motion.process_noise import next_log_density
 from tracking.smoothing.motion.reference import Reference, shifted, speeds
 from tracking.smoothing.motion.run_detections import RunDetections, spot_information
-from tracking.smoothing.motion.velocity_jumps import jump_variances, new_jumps
+from tracking.smoothing.motion.velocity_jumps import corner_offsets, jump_variances, new_jumps
 from tracking.smoothing.motion.windows import largest_near
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD
 
@@ -107,6 +107,7 @@ class _Estimator:
         self.jumped = motion.jumped[core].copy()
         self.jumped[0] = False
         self.dt = np.ascontiguousarray(run.dt[core])
+        self.beside = np.zeros((len(self.dt), 6))  # of corner_offsets, at the reference of the last step
         self.fresh = motion.log_density is None
         self.log_density = self._first_density() if motion.log_density is None else motion.log_density[core].copy()
         self.interpolation_offset = motion.interpolation_offset
@@ -255,11 +256,12 @@ class _Estimator:
     def _information(self, ref: Reference) -> tuple[RunInformation, float]:
         """The frames' information at a reference, with the allowed velocity jumps; and the spots' chi-square."""
         measured, jumped = self.measured, self.jumped
+        self.beside = corner_offsets(ref, jumped, self.run.exposure_s, self.dt)
         L, g, chi2 = self._spot_information(ref)
         if self.run.exposure_s > 0:
-            for k in np.flatnonzero(jumped[1:] & measured[1:] & measured[:-1]):
-                # An exposure in which the velocities jump has its mean beside the corner, by up to an eighth of the
-                # exposure times the jump: the same for all spots, as if the vehicle were there.
+            short = ~np.any(self.beside[:-1] != 0, axis=1)
+            for k in np.flatnonzero(jumped[1:] & measured[1:] & measured[:-1] & short):
+                # As `corner_offsets`, for a short exposure.
                 b = (ref.m[k + 1, :6] - ref.m[k, :6]) * self.run.exposure_s / 8
                 Lb = L[k] @ b
                 share = 1 / (1 + b @ Lb)
@@ -270,7 +272,10 @@ class _Estimator:
         return RunInformation(L, g, self.dt, jump, jump / MANOEUVRE_S**2, first), float(chi2.sum())
 
     def _spot_information(self, ref: Reference) -> tuple[Array, Array, Array]:
-        """Information of the used spots at a reference: normal matrices (T, 6, 6), vectors (T, 6), chi-squares (T,)."""
+        """Information of the used spots at a reference: normal matrices (T, 6, 6), vectors (T, 6), chi-squares (T,).
+
+        An exposure with a corner has a further error, of one sigma along `beside`.
+        """
         run = self.run
         L, g, chi2 = spot_information(
             run.views, run.detections, self.assigned, run.calibration_cov, ref, self.core.start
@@ -280,6 +285,13 @@ class _Estimator:
         # Along a direction that the spots leave open their paths are not straight, with the same sign in every frame.
         for a in (L, g, chi2):
             a[~self.measured] *= PARTIAL_WEIGHT
+        for k in np.flatnonzero(self.beside.any(axis=1)):
+            b = self.beside[k]
+            Lb = L[k] @ b
+            along, share = float(b @ g[k]), 1 / (1 + b @ Lb)
+            g[k] -= Lb * along * share
+            L[k] -= np.outer(Lb, Lb) * share
+            chi2[k] -= along**2 * share
         return L, g, chi2
 
     # -- result -------------------------------------------------------------------------------------------------------
