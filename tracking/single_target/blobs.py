@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from geometry.arrays import Array
 from tracking.detections import Detections
@@ -14,7 +15,7 @@ _MAD_TO_SIGMA = 1.4826  # of a Gaussian
 _EVERY = 4  # every 4th row and column is enough for the noise
 
 
-def find_blobs(picture: Picture, parameters: BlobParameters) -> Detections:
+def find_blobs(picture: Picture | NDArray[np.float32], parameters: BlobParameters) -> Detections:
     """The blobs of a picture (h, w), strongest first.
 
     flux is the sum and peak the maximum of the contrast, DN; the axes are the square roots of the second moments. The
