@@ -28,6 +28,7 @@ from tracking.single_target.parameters import BlobParameters
 
 DETECTORS = ("spots", "darker", "brighter", COLOUR)
 TABLE = "table"  # in place of a detector, for a CSV file
+_COMPLETE_SHARE = 0.98  # of the pictures that a video's header states
 LARGEST_RATE_HZ = 1e6  # a larger rate in a video's header is not one
 
 Progress = Callable[[int, int | None], None]  # pictures done, total number of pictures where known
@@ -86,8 +87,8 @@ def read_recording(
     by_frame: dict[int, Detections | None] = {}
     missing: dict[str, int] = {}
     size: tuple[int, int] | None = None
-    others = 0  # pictures of another size than the first
     total = inputs.count(1) if limit is None else limit
+    done = 0
     for done, (frame, found) in enumerate(pictures, start=1):
         if isinstance(found, MissingPicture):
             by_frame[frame] = None
@@ -95,7 +96,10 @@ def read_recording(
         else:
             own, by_frame[frame] = found
             size = size or own
-            others += own != size
+            if own != size:
+                by_frame[frame] = None  # its pixels are not comparable
+                why = f"another size: {own[0]}x{own[1]} px, the first picture has {size[0]}x{size[1]}"
+                missing[why] = missing.get(why, 0) + 1
         if progress is not None:
             progress(done, total)
         if limit is not None and done >= limit:
@@ -107,8 +111,8 @@ def read_recording(
     for reason, count in missing.items():
         out.missing[reason] = out.missing.get(reason, 0) + count
     out.notes += inputs.notes
-    if others:
-        out.notes.append(f"{others} pictures have another size than the first, {size[0]}x{size[1]} px")
+    if isinstance(inputs, Video) and limit is None and total is not None and done < _COMPLETE_SHARE * total:
+        out.notes.append(f"the video ends after {done} of the {total} pictures that its header states")
     return out
 
 

@@ -6,13 +6,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Array
+from geometry.arrays import Array, Bools, Ints
 from tracking.detections import Detections
 from tracking.noise import Picture
 from tracking.single_target.parameters import BlobParameters
 
 _MAD_TO_SIGMA = 1.4826  # of a Gaussian
 _EVERY = 4  # every 4th row and column is enough for the noise
+# A target larger than the background's square has contrast along its edge only. Such an edge is as bright as the blob
+# on its inner side and as dark as the background on the outer one: both on this share of its surroundings.
+_EDGE_SHARE, _AS_BLOB, _AS_BACKGROUND = 0.2, 0.3, 0.7  # the limits are shares of the peak of the contrast
+_RING_PX = 7  # side of the square that reaches the surroundings
 
 
 def find_blobs(picture: Picture | NDArray[np.float32], parameters: BlobParameters) -> Detections:
@@ -41,6 +45,10 @@ def find_blobs(picture: Picture | NDArray[np.float32], parameters: BlobParameter
     good = (longest >= parameters.min_size_px) & (longest <= parameters.max_size_px)
     good &= (left > 0) & (top > 0) & (left + wide < w) & (top + high < h)
     good[0] = False  # the background
+    large = good & (longest >= parameters.background_px / 2)
+    if large.any():
+        sign = -1 if parameters.polarity == "darker" else 1
+        good &= ~(large & _is_an_edge(sign * grey, contrast, mask, np.asarray(labels, np.int64), count))
     rows = np.flatnonzero(good)
     if not len(rows):
         return Detections.none()
@@ -51,6 +59,35 @@ def find_blobs(picture: Picture | NDArray[np.float32], parameters: BlobParameter
     u, v, of, weight = u[of >= 0], v[of >= 0], of[of >= 0], np.maximum(contrast[v, u][of >= 0].astype(float), 0.0)
     found = _moments(u.astype(float), v.astype(float), of, weight, len(rows), sigma, limit)
     return found[np.argsort(-found.flux, kind="stable")]
+
+
+def _is_an_edge(
+    grey: NDArray[np.float32], contrast: NDArray[np.float32], mask: NDArray[np.uint8], labels: Ints, count: int
+) -> Bools:
+    """Which of the blobs (count,) are parts of the edge of something larger; grey values are larger in a blob.
+
+    Holes of a blob are part of it: an outline that is seen whole has its centroid at the target's centre.
+    """
+    _, outside = cv2.connectedComponents(1 - mask, connectivity=4)
+    border = np.concatenate([outside[0], outside[-1], outside[:, 0], outside[:, -1]])
+    open_parts = np.zeros(int(outside.max()) + 1, dtype=bool)
+    open_parts[border] = True
+    open_parts[0] = False  # the blobs themselves
+    near = cv2.dilate(labels.astype(np.float32), np.ones((_RING_PX, _RING_PX), np.uint8)).astype(np.int64)
+    beside = cv2.dilate(mask, np.ones((3, 3), np.uint8)) > 0
+    ring = np.flatnonzero((near > 0) & ~beside & open_parts[outside])
+    inside = np.flatnonzero(mask)
+    of = labels.ravel()[inside]
+    pixels = np.maximum(np.bincount(of, minlength=count), 1)
+    level = np.bincount(of, grey.ravel()[inside], count) / pixels
+    peak = np.zeros(count)
+    np.maximum.at(peak, of, contrast.ravel()[inside])
+    owner = near.ravel()[ring]
+    below = level[owner] - grey.ravel()[ring]
+    around = np.maximum(np.bincount(owner, minlength=count), 1)
+    alike = np.bincount(owner, below < _AS_BLOB * peak[owner], count) / around
+    background = np.bincount(owner, below > _AS_BACKGROUND * peak[owner], count) / around
+    return np.asarray((alike > _EDGE_SHARE) & (background > _EDGE_SHARE))
 
 
 def _moments(u: Array, v: Array, of: np.ndarray, weight: Array, n: int, sigma: float, limit: float) -> Detections:

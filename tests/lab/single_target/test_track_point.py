@@ -256,3 +256,25 @@ def test_a_target_of_another_colour_is_lost_and_never_reported(tmp_path):
     options = PointOptions("colour", rate_hz=25.0, colour="blue")
     assert track_target(source, tmp_path / "out", options).exit_status == 4
     assert {r["status"] for r in rows_of(tmp_path / "out")} == {"lost"}
+
+
+def test_pictures_of_another_size_than_the_first_are_no_pictures_of_the_recording(tmp_path):
+    source = tmp_path / "disc"
+    source.mkdir()
+    for k in range(12):
+        cv2.imwrite(str(source / f"{k:04d}.png"), picture(k)[: 100 if k in (5, 6) else None])
+    outcome = track_target(source, tmp_path / "out", PointOptions("darker", rate_hz=50.0))
+    assert [k for k, r in enumerate(rows_of(tmp_path / "out")) if r["status"] != "measured"] == [5, 6]
+    assert outcome.recording.missing == {"another size: 160x100 px, the first picture has 160x120": 2}
+
+
+def test_a_video_that_ends_early_is_noted(tmp_path):
+    path = tmp_path / "cut.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (160, 120))
+    for k in range(FRAMES):
+        writer.write(cv2.cvtColor(picture(k), cv2.COLOR_GRAY2BGR))
+    writer.release()
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    outcome = track_target(path, tmp_path / "out", PointOptions("darker"))
+    assert any(f"of the {FRAMES} pictures that its header states" in note for note in outcome.recording.notes)
