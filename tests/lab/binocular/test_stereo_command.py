@@ -107,6 +107,21 @@ def test_unsynchronised_pictures_fail_the_run_and_say_by_how_much(tmp_path):
     assert any(f.code == "BP-W05" for f in outcome.findings)
 
 
+@pytest.mark.parametrize(("shift", "words"), [(4, "frames with markers in both pictures"), (200, "right: 200 to 223")])
+def test_frame_numbers_of_one_camera_that_are_shifted_fail_the_run(drogue, tmp_path, shift, words):
+    """Frames that only one camera has are measured by it alone: without the others they would seem right."""
+    run = changed(drogue, tmp_path / "run")
+    shutil.rmtree(run / "truth")
+    table = rows(run, "detections.csv")
+    with (run / "detections.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, table[0])
+        writer.writeheader()
+        writer.writerows({**r, "frame": int(r["frame"]) + shift * (r["camera"] == "right")} for r in table)
+    outcome = process_stereo_run(run, tmp_path / "out")
+    assert outcome.exit_status == 4
+    assert any(f.code == "BP-W09" and words in f.what for f in outcome.findings)
+
+
 def test_markers_that_are_not_where_run_yaml_says_are_reported(drogue, tmp_path):
     target = yaml.safe_load((drogue / "run.yaml").read_text(encoding="utf-8"))["target"]
     target["markers"]["3"]["position_m"][0] += 0.02
