@@ -83,7 +83,7 @@ def _cameras(results: StereoResults) -> Iterator[Finding]:
 
 
 def _together(results: StereoResults) -> Iterator[Finding]:
-    """Whether the two cameras see the same moments: poses of one camera alone cannot tell."""
+    """Whether the two cameras see the same moments: poses of one camera alone do not show it."""
     if not results.measured:
         return
     sees = [[r for r in results.records if _has_markers(r.candidates[c])] for c in range(2)]

@@ -14,7 +14,7 @@ from tracking.single_target.parameters import BlobParameters
 _MAD_TO_SIGMA = 1.4826  # of a Gaussian
 _EVERY = 4  # every 4th row and column is enough for the noise
 # A target larger than the background's square has contrast along its edge only. Such an edge is as bright as the blob
-# on its inner side and as dark as the background on the outer one: both on this share of its surroundings.
+# on its inner side and as the background on its outer one: both on this share of its surroundings.
 _EDGE_SHARE, _AS_BLOB, _AS_BACKGROUND = 0.2, 0.3, 0.7  # the limits are shares of the peak of the contrast
 _RING_PX = 7  # side of the square that reaches the surroundings
 
