@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array
 from tracking.detections import Detections
 from tracking.noise import Picture
 from tracking.single_target.parameters import BlobParameters
@@ -45,10 +45,11 @@ def find_blobs(picture: Picture | NDArray[np.float32], parameters: BlobParameter
     good = (longest >= parameters.min_size_px) & (longest <= parameters.max_size_px)
     good &= (left > 0) & (top > 0) & (left + wide < w) & (top + high < h)
     good[0] = False  # the background
-    large = good & (longest >= parameters.background_px / 2)
-    if large.any():
-        sign = -1 if parameters.polarity == "darker" else 1
-        good &= ~(large & _is_an_edge(sign * grey, contrast, mask, np.asarray(labels, np.int64), count))
+    for row in np.flatnonzero(good & (longest >= parameters.background_px / 2)).tolist():
+        x0, y0 = max(int(left[row]) - _RING_PX, 0), max(int(top[row]) - _RING_PX, 0)
+        part = slice(y0, int(top[row] + high[row]) + _RING_PX), slice(x0, int(left[row] + wide[row]) + _RING_PX)
+        level = grey[part] if parameters.polarity == "brighter" else -grey[part]
+        good[row] = not _is_an_edge(level, contrast[part], mask[part], np.asarray(labels[part] == row, np.uint8))
     rows = np.flatnonzero(good)
     if not len(rows):
         return Detections.none()
@@ -62,32 +63,23 @@ def find_blobs(picture: Picture | NDArray[np.float32], parameters: BlobParameter
 
 
 def _is_an_edge(
-    grey: NDArray[np.float32], contrast: NDArray[np.float32], mask: NDArray[np.uint8], labels: Ints, count: int
-) -> Bools:
-    """Which of the blobs (count,) are parts of the edge of something larger; grey values are larger in a blob.
+    grey: NDArray[np.float32], contrast: NDArray[np.float32], mask: NDArray[np.uint8], own: NDArray[np.uint8]
+) -> bool:
+    """Whether a blob is a part of the edge of something larger, from the picture around it.
 
-    Holes of a blob are part of it: an outline that is seen whole has its centroid at the target's centre.
+    grey (h, w): larger in a blob than beside it. mask: all blobs, own: this one. Holes of a blob are part of it: an
+    outline that is seen whole has its centroid at the target's centre.
     """
-    _, outside = cv2.connectedComponents(1 - mask, connectivity=4)
-    border = np.concatenate([outside[0], outside[-1], outside[:, 0], outside[:, -1]])
-    open_parts = np.zeros(int(outside.max()) + 1, dtype=bool)
-    open_parts[border] = True
-    open_parts[0] = False  # the blobs themselves
-    near = cv2.dilate(labels.astype(np.float32), np.ones((_RING_PX, _RING_PX), np.uint8)).astype(np.int64)
+    _, parts = cv2.connectedComponents(1 - own, connectivity=4)
+    border = np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]])
+    outside = np.isin(parts, np.unique(border[border > 0]))
     beside = cv2.dilate(mask, np.ones((3, 3), np.uint8)) > 0
-    ring = np.flatnonzero((near > 0) & ~beside & open_parts[outside])
-    inside = np.flatnonzero(mask)
-    of = labels.ravel()[inside]
-    pixels = np.maximum(np.bincount(of, minlength=count), 1)
-    level = np.bincount(of, grey.ravel()[inside], count) / pixels
-    peak = np.zeros(count)
-    np.maximum.at(peak, of, contrast.ravel()[inside])
-    owner = near.ravel()[ring]
-    below = level[owner] - grey.ravel()[ring]
-    around = np.maximum(np.bincount(owner, minlength=count), 1)
-    alike = np.bincount(owner, below < _AS_BLOB * peak[owner], count) / around
-    background = np.bincount(owner, below > _AS_BACKGROUND * peak[owner], count) / around
-    return np.asarray((alike > _EDGE_SHARE) & (background > _EDGE_SHARE))
+    ring = (cv2.dilate(own, np.ones((_RING_PX, _RING_PX), np.uint8)) > 0) & ~beside & outside
+    if not ring.any():
+        return False
+    inside = own > 0
+    below = (float(grey[inside].mean()) - grey[ring]) / float(contrast[inside].max())
+    return bool(np.mean(below < _AS_BLOB) > _EDGE_SHARE and np.mean(below > _AS_BACKGROUND) > _EDGE_SHARE)
 
 
 def _moments(u: Array, v: Array, of: np.ndarray, weight: Array, n: int, sigma: float, limit: float) -> Detections:
