@@ -45,7 +45,7 @@ def find_blobs(picture: Picture | NDArray[np.float32], parameters: BlobParameter
     good = (longest >= parameters.min_size_px) & (longest <= parameters.max_size_px)
     good &= (left > 0) & (top > 0) & (left + wide < w) & (top + high < h)
     good[0] = False  # the background
-    for row in np.flatnonzero(good & (longest >= parameters.background_px / 2)).tolist():
+    for row in np.flatnonzero(good & (longest >= parameters.background_px)).tolist():
         x0, y0 = max(int(left[row]) - _RING_PX, 0), max(int(top[row]) - _RING_PX, 0)
         part = slice(y0, int(top[row] + high[row]) + _RING_PX), slice(x0, int(left[row] + wide[row]) + _RING_PX)
         level = grey[part] if parameters.polarity == "brighter" else -grey[part]
