@@ -2,7 +2,8 @@
 
 Rendered pictures of 640 x 480 with a drogue of 9 to 200 px before backgrounds that no training picture shows. The
 threshold is the one with 0.1 false detections per frame. Beside it: cv2.HoughCircles with its best threshold.
-`--calibrate` fits the logistic curve of the confidence on other pictures, with backgrounds as in training.
+`--calibrate` fits the logistic curve of the confidence on other pictures, with backgrounds as in training. `--weights`
+measures another network, such as the paper's layout, trained by lab/learned_detector/train.py.
 """
 
 from __future__ import annotations
@@ -10,13 +11,14 @@ from __future__ import annotations
 import argparse
 import time
 from itertools import pairwise
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from geometry.arrays import Array, Bools
 from lab.learned_detector.samples import Sample, draw_sample
-from tracking.learned_detector.detector import DrogueCandidate, find_drogues
+from tracking.learned_detector.detector import WEIGHTS, DrogueCandidate, find_drogues
 
 SIZE_PX = (640, 480)
 DIAMETERS_PX = (9.0, 200.0)
@@ -99,6 +101,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=500)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--calibrate", action="store_true")
+    parser.add_argument("--weights", type=Path, default=WEIGHTS, help="a file weights.onnx of the training script")
     a = parser.parse_args()
     cv2.setNumThreads(1)
     rng = np.random.default_rng([a.seed, 77])
@@ -107,7 +110,7 @@ def main() -> None:
         for _ in range(a.frames)
     ]
     start = time.process_time()
-    found = [find_drogues(s.image, DIAMETERS_PX[0], DIAMETERS_PX[1], LEAST_CONFIDENCE) for s in samples]
+    found = [find_drogues(s.image, DIAMETERS_PX[0], DIAMETERS_PX[1], LEAST_CONFIDENCE, a.weights) for s in samples]
     learned_s = time.process_time() - start
     confidence, right, error = scored(samples, found)
     if a.calibrate:

@@ -10,11 +10,13 @@ import numpy as np
 from calibration.findings import Finding, Level
 from lab.binocular.stereo_record import StereoResults
 from lab.number_format import format_number
+from tracking.binocular.marker_model import MarkerImages
 from tracking.binocular.pose_tracker import AMBIGUOUS
 
 LEAST_MEASURED, GOOD_MEASURED = 0.1, 0.95  # shares of the frames, as for runs of laser spots
 GOOD_PICTURES = 0.95  # share of frames with a usable picture, per camera
 LARGEST_NOISE_SCALE, GOOD_NOISE_SCALE = 5.0, 1.5  # residuals over their sigmas
+_ENOUGH, _FEWEST_SEEN = 4, 3  # markers of a picture that determine a pose, and frames with as many in both
 MOVED_SIGMAS, MOVED_PX = 6.0, 0.1  # rotation of the right camera since the calibration
 
 
@@ -23,6 +25,7 @@ def findings_of(results: StereoResults) -> tuple[Finding, ...]:
     found = [
         *_measured(results),
         *_cameras(results),
+        *_together(results),
         *_clock(results),
         *_moved(results),
         *_noise(results),
@@ -77,6 +80,39 @@ def _cameras(results: StereoResults) -> Iterator[Finding]:
                 "Look at its pictures: exposure, focus, colours in run.yaml, view not blocked.",
                 code="BP-W04",
             )
+
+
+def _together(results: StereoResults) -> Iterator[Finding]:
+    """Whether the two cameras see the same moments: poses of one camera alone do not show it."""
+    if not results.measured:
+        return
+    sees = [[r for r in results.records if _has_markers(r.candidates[c])] for c in range(2)]
+    seen = [r for r in sees[0] if _has_markers(r.candidates[1])]
+    if not seen and all(sees):
+        names = [camera.name for camera in results.run.pair.cameras]
+        spans = "; ".join(f"{n}: {own[0].frame} to {own[-1].frame}" for n, own in zip(names, sees, strict=True))
+        yield Finding(
+            Level.FAIL,
+            f"no frame has markers in both cameras ({spans})",
+            "All poses are those of a single camera.",
+            "Give pictures that are taken at the same time the same number.",
+            code="BP-W09",
+        )
+        return
+    joint = sum(1 for r in seen if r.measured)
+    if len(seen) >= _FEWEST_SEEN and joint < LEAST_MEASURED * len(seen):
+        yield Finding(
+            Level.FAIL,
+            f"{joint} of {len(seen)} frames with markers in both pictures have a measured pose; the others are those of"
+            " a single camera",
+            "The two cameras contradict each other.",
+            "Check that pictures of the same time have the same number, which camera is which, and the calibration.",
+            code="BP-W09",
+        )
+
+
+def _has_markers(found: MarkerImages | None) -> bool:
+    return found is not None and len(found) >= _ENOUGH
 
 
 def _clock(results: StereoResults) -> Iterator[Finding]:

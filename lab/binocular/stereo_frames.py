@@ -67,7 +67,7 @@ class _Folder:
 
 class _Video:
     def __init__(self, path: Path, size_px: tuple[int, int]) -> None:
-        self._capture, self._size = open_video(path), size_px
+        self._capture, self._size = open_video(path, colour=True), size_px
         self.first, self.last = 0, None
 
     def at(self, frame: int) -> Content | None:

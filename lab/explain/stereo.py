@@ -49,6 +49,13 @@ STEREO: Explanations = {
         " are `predicted`, with a covariance that covers both attitudes.",
         "Mount some markers in front of the others, or measure from a shorter distance.",
     ),
+    "BP-W09": Explanation(
+        "The two cameras never agree",
+        "Poses are measured with one camera alone, but hardly any where both see the markers, or no frame number has"
+        " markers in both. Pictures of different times have the same number, or the pair is not the one that was"
+        " calibrated.",
+        "Give pictures of the same time the same number; check which camera is which, and the calibration.",
+    ),
 }
 PAIR: Explanations = {
     "BP-Q01": Explanation(

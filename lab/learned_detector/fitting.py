@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 BatchLoss = Callable[[Any, np.random.Generator], Any]  # (model, rng) -> loss of a new batch
-_KEPT = 0.998  # share of the mean weights that a step keeps
+_KEPT, _FORGOTTEN_STEPS = 0.998, 40.0  # largest share of the mean weights that a step keeps; see `_kept`
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ def fit(model: Any, batch_loss: BatchLoss, validate: Callable[[Any], float], pla
     torch.manual_seed(plan.seed)
     torch.set_num_threads(1)
     model = model.to(memory_format=torch.channels_last)
-    mean = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(_KEPT), use_buffers=True)
+    mean = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(_kept(plan.epochs * plan.steps)), use_buffers=True)
     optimiser = torch.optim.AdamW(model.parameters(), lr=plan.rate, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, max_lr=plan.rate, total_steps=plan.epochs * plan.steps, pct_start=0.1
@@ -71,6 +71,11 @@ def fit(model: Any, batch_loss: BatchLoss, validate: Callable[[Any], float], pla
         _keep(parts, plan, out, log, spent)
     mean.eval()
     return mean.module
+
+
+def _kept(steps: int) -> float:
+    """Share of the mean weights that a step keeps: in a short run fewer steps, so that the first ones are forgotten."""
+    return float(np.clip(1 - _FORGOTTEN_STEPS / steps, 0.5, _KEPT))
 
 
 def _keep(parts: dict[str, Any], plan: Plan, out: Path, log: list[dict[str, float]], spent: float) -> None:

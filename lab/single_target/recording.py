@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,14 +18,17 @@ from lab.pictures.opencv import load_cv2
 from lab.pictures.picture_file import DROPPED, MissingPicture
 from lab.runs.frames.frame_sources import open_video
 from lab.runs.frames.sensor_noise import CameraNoise
+from lab.single_target.colour_pictures import COLOUR, colour_pictures, hue_named
 from tracking.detections import Detections
 from tracking.noise import Picture
 from tracking.parameters import DetectParameters
 from tracking.single_target.blobs import find_blobs
+from tracking.single_target.colour import find_coloured, has_colour
 from tracking.single_target.parameters import BlobParameters
 
-DETECTORS = ("spots", "darker", "brighter")
+DETECTORS = ("spots", "darker", "brighter", COLOUR)
 TABLE = "table"  # in place of a detector, for a CSV file
+_COMPLETE_SHARE = 0.98  # of the pictures that a video's header states
 LARGEST_RATE_HZ = 1e6  # a larger rate in a video's header is not one
 
 Progress = Callable[[int, int | None], None]  # pictures done, total number of pictures where known
@@ -63,11 +66,12 @@ def read_recording(
     camera: str | None = None,
     limit: int | None = None,
     progress: Progress | None = None,
+    colour: str | None = None,
 ) -> PointRecording:
     """The detections of a folder of pictures, a video or a CSV file with frame,u_px,v_px.
 
     rate_hz: frames per second; None: that of a video's header or of the table's t_s, where there is one. camera: of a
-    table with several. limit: largest number of pictures.
+    table with several. limit: largest number of pictures. colour: of the detector "colour", a name or #rrggbb.
 
     Raises:
         InputError: the path or an option cannot be used, or no picture can be read.
@@ -79,21 +83,23 @@ def read_recording(
     inputs = open_inputs([path])
     if rate_hz is None and isinstance(inputs, Video):
         rate_hz = _header_rate(path)
-    search = _search_of(detector, inputs, detect, blobs)
+    pictures = _searched(detector, inputs, detect, blobs, colour)
     by_frame: dict[int, Detections | None] = {}
     missing: dict[str, int] = {}
     size: tuple[int, int] | None = None
-    others = 0  # pictures of another size than the first
     total = inputs.count(1) if limit is None else limit
-    for done, (frame, picture) in enumerate(inputs.pictures(1), start=1):
-        if isinstance(picture, MissingPicture):
+    done = 0
+    for done, (frame, found) in enumerate(pictures, start=1):
+        if isinstance(found, MissingPicture):
             by_frame[frame] = None
-            missing[picture.reason] = missing.get(picture.reason, 0) + 1
+            missing[found.reason] = missing.get(found.reason, 0) + 1
         else:
-            own = (picture.shape[1], picture.shape[0])
+            own, by_frame[frame] = found
             size = size or own
-            others += own != size
-            by_frame[frame] = search(picture)
+            if own != size:
+                by_frame[frame] = None  # its pixels are not comparable
+                why = f"another size: {own[0]}x{own[1]} px, the first picture has {size[0]}x{size[1]}"
+                missing[why] = missing.get(why, 0) + 1
         if progress is not None:
             progress(done, total)
         if limit is not None and done >= limit:
@@ -105,19 +111,44 @@ def read_recording(
     for reason, count in missing.items():
         out.missing[reason] = out.missing.get(reason, 0) + count
     out.notes += inputs.notes
-    if others:
-        out.notes.append(f"{others} pictures have another size than the first, {size[0]}x{size[1]} px")
+    if isinstance(inputs, Video) and limit is None and total is not None and done < _COMPLETE_SHARE * total:
+        out.notes.append(f"the video ends after {done} of the {total} pictures that its header states")
     return out
 
 
-def _search_of(
-    detector: str, inputs: PictureFiles | Video, detect: DetectParameters, blobs: BlobParameters
-) -> Callable[[Picture], Detections]:
-    if detector != "spots":
-        return lambda picture: find_blobs(picture, blobs)
-    noise = CameraNoise(inputs.camera)
-    noise.estimate_from([p for p in inputs.noise_pictures() if not isinstance(p, MissingPicture)])
-    return lambda picture: noise.detect(picture, detect)
+_Searched = Iterator[tuple[int, tuple[tuple[int, int], Detections] | MissingPicture]]
+
+
+def _searched(
+    detector: str, inputs: PictureFiles | Video, detect: DetectParameters, blobs: BlobParameters, colour: str | None
+) -> _Searched:
+    """Frame numbers with the width and height of the picture and its detections."""
+    if detector == COLOUR:
+        return _searched_for_colour(inputs, hue_named(colour), blobs)
+    if colour is not None:
+        raise InputError(f"--colour: belongs to --detector {COLOUR}, got --detector {detector}")
+    search: Callable[[Picture], Detections] = lambda picture: find_blobs(picture, blobs)  # noqa: E731
+    if detector == "spots":
+        noise = CameraNoise(inputs.camera)
+        noise.estimate_from([p for p in inputs.noise_pictures() if not isinstance(p, MissingPicture)])
+        search = lambda picture: noise.detect(picture, detect)  # noqa: E731
+    return (
+        (frame, p if isinstance(p, MissingPicture) else ((p.shape[1], p.shape[0]), search(p)))
+        for frame, p in inputs.pictures(1)
+    )
+
+
+def _searched_for_colour(inputs: PictureFiles | Video, hue_deg: float, blobs: BlobParameters) -> _Searched:
+    """As `_searched`. Raises InputError at the end if no picture has colour: then the target cannot be seen."""
+    coloured, shown = False, False
+    for frame, picture in colour_pictures(inputs):
+        if isinstance(picture, MissingPicture):
+            yield frame, picture
+            continue
+        shown, coloured = True, coloured or has_colour(picture)
+        yield frame, ((picture.shape[1], picture.shape[0]), find_coloured(picture, hue_deg, blobs))
+    if shown and not coloured:
+        raise InputError(f"{inputs.camera}: expected colour pictures, got grey ones; use --detector darker or brighter")
 
 
 def _filled(

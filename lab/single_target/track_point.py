@@ -33,7 +33,7 @@ class PointSettings:
 
     track: PointParameters = field(default_factory=PointParameters)
     detect: DetectParameters = field(default_factory=DetectParameters)  # of the detector `spots`
-    blobs: BlobParameters = field(default_factory=BlobParameters)  # of the detectors `darker` and `brighter`
+    blobs: BlobParameters = field(default_factory=BlobParameters)  # of the detectors `darker`, `brighter`, `colour`
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +48,7 @@ class PointOptions:
     min_measured: float = 0.5  # the gate: least share of measured frames
     overlay: bool = False  # also write a video with the track
     overrides: Mapping[str, Any] = field(default_factory=dict)  # of PointSettings
+    colour: str | None = None  # of the detector `colour`: a name or #rrggbb
 
     def settings(self) -> PointSettings:
         """The parameters. Raises InputError: an override is not one of them, or the detector does not exist."""
@@ -74,7 +75,7 @@ def track_target(
     with atomic_folder(out, may_replace=is_a_track) as folder:
         recording = read_recording(
             path, options.detector, settings.detect, settings.blobs, options.rate_hz, options.camera, options.limit,
-            progress,
+            progress, options.colour,
         )  # fmt: skip
         track = track_point(recording.steps, recording.found, settings.track)
         statistics = statistics_of(recording, track)
@@ -128,6 +129,7 @@ def _summary(outcome: PointOutcome, settings: PointSettings, options: PointOptio
         },
         "parameters": {
             **{name: dataclasses.asdict(value) for name, value in used.items()},
+            **({} if options.colour is None else {"colour": options.colour}),
             "min_measured": options.min_measured,
             "limit": options.limit,
         },

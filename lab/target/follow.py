@@ -10,7 +10,7 @@ from pathlib import Path
 
 from geometry.arrays import Array
 from lab.detect.inputs import PictureFiles, Video
-from lab.pictures.picture_file import GreyPicture, MissingPicture
+from lab.pictures.picture_file import GreyPicture
 from lab.target.frame_series import F, FrameSeries, every_frame
 from lab.target.overlay import OverlayVideo, label_of
 from lab.target.results import Progress
@@ -40,12 +40,11 @@ def follow(
     with video as overlay:
         total = inputs.count(1)
         for number, picture in islice(every_frame(inputs), limit):
-            usable = None if isinstance(picture, MissingPicture) else picture
+            usable = series.usable(picture)
             begun = time.process_time()
             frame = step(usable)
             tracking_s += time.process_time() - begun
             series.add(number, frame)
-            series.count(picture)
             if overlay is not None:
                 label = label_of(number, frame.status, frame.cause.value)
                 overlay.add(usable, label, frame.status, circle(frame))

@@ -93,17 +93,15 @@ class FrameSeries(Generic[F]):
             if f.event
         ]
 
-    def count(self, picture: GreyPicture | MissingPicture) -> None:
-        """Count a picture; a note where the sizes differ."""
-        if isinstance(picture, MissingPicture):
-            self.missing[picture.reason] += 1
-            return
+    def usable(self, picture: GreyPicture | MissingPicture) -> GreyPicture | None:
+        """Count a picture, and return it if it is one of this recording: of the size of the first."""
+        checked = of_one_size(picture, self.size_px)
+        if isinstance(checked, MissingPicture):
+            self.missing[checked.reason] += 1
+            return None
         self.pictures += 1
-        size = (picture.shape[1], picture.shape[0])
-        if self.size_px is None:
-            self.size_px = size
-        elif size != self.size_px and not any("different sizes" in note for note in self.notes):
-            self.notes.append("the pictures have different sizes")
+        self.size_px = (checked.shape[1], checked.shape[0])
+        return checked
 
     def require_pictures(self, given: Path, stated: int | None, limit: int | None) -> None:
         """Check that pictures were read; a note where a video ends early.
@@ -126,6 +124,16 @@ class FrameSeries(Generic[F]):
             self.notes.append(
                 f"the video ends after {len(self.numbers)} of the {stated} pictures that its header states"
             )
+
+
+def of_one_size(picture: GreyPicture | MissingPicture, size_px: tuple[int, int] | None) -> GreyPicture | MissingPicture:
+    """The picture, or missing where its (width, height) is not that of the first: pixels would not be comparable."""
+    if isinstance(picture, MissingPicture) or size_px in (None, (picture.shape[1], picture.shape[0])):
+        return picture
+    assert size_px is not None
+    return MissingPicture(
+        f"another size: {picture.shape[1]}x{picture.shape[0]} px, the first picture has {size_px[0]}x{size_px[1]}"
+    )
 
 
 def frame_rate(inputs: PictureFiles | Video, given_hz: float | None) -> tuple[float, list[str]]:

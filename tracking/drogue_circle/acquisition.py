@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import erf
 
 import numpy as np
 
 from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window
 from tracking.drogue_circle.parameters import CircleParameters
-from tracking.drogue_circle.rim import smooth_crop
+from tracking.drogue_circle.rim import SmoothCrop, smooth_crop
 from tracking.drogue_circle.rim_fit import RimFit, fit_rim
 
 _MOST_FITTED = 24  # of the whole picture
@@ -18,6 +19,10 @@ _RIM_SHARE = 0.92  # score of the outermost circle of a target, as a share of th
 _LEAST_POINTS = 12  # independent edge points: texture often gives a short arc of a small circle
 _CORRELATED_PX = 3.5  # length of rim that counts as one point, see `rim_fit`
 _LARGEST_RMS = 0.05, 0.35  # of the rim points: share of the radius, and px
+# Starts of `_best_near`: shift of the centre and change of the radius, as shares of the radius.
+_SHIFT, _SHIFTS, _GROWTH = 0.12, 6, (0.9, 1.0, 1.1)
+_MOST_SHIFT_PX = 3.0
+_ON_RIM = 0.03, 0.3  # of `_clean_share`: share of the radius, and least distance, px
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +71,10 @@ def _fitted(
         tried.append(c)
         half = 1.3 * c.radius_px + 10
         window = Window(c.u_px, c.v_px, half, p.gate_px, p.min_radius_px, 2 * c.radius_px)
-        fit = fit_rim(smooth_crop(picture, window, p.blur_px), c, p.acquire_coverage)
+        crop = smooth_crop(picture, window, p.blur_px)
+        fit = fit_rim(crop, c, p.acquire_coverage)
+        if fit is not None and is_certain(fit):
+            fit = _best_near(crop, fit, p)
         largest = p.max_radius_px or 0.5 * max(picture.shape[:2])
         if (
             fit is not None
@@ -76,6 +84,32 @@ def _fitted(
         ):
             fits.append(fit)
     return fits
+
+
+def _best_near(crop: SmoothCrop, fit: RimFit, p: CircleParameters) -> RimFit:
+    """The best fit from starts around a fit.
+
+    Several rims next to each other, of which each is seen in part, have a local optimum of points of two of them: a
+    mixture. A start next to one of the rims leads to it alone, with smaller residuals.
+    """
+    u, v, radius = fit.circle
+    step = min(_SHIFT * radius, _MOST_SHIFT_PX)
+    angles = 2 * np.pi * np.arange(_SHIFTS) / _SHIFTS
+    shifts = [(0.0, 0.0), *zip((step * np.cos(angles)).tolist(), (step * np.sin(angles)).tolist(), strict=True)]
+    best, share = fit, _clean_share(fit)
+    for du, dv in shifts:
+        for growth in _GROWTH:
+            start = CircleCandidate(u + du, v + dv, growth * radius, 0.0, fit.polarity)
+            other = fit_rim(crop, start, p.acquire_coverage, sure=True)
+            if other is not None and _clean_share(other) > share:
+                best, share = other, _clean_share(other)
+    return best
+
+
+def _clean_share(fit: RimFit) -> float:
+    """Share of the rim with edge points next to the circle, if their residuals are normal."""
+    near = max(_ON_RIM[0] * fit.rim.radius_px, _ON_RIM[1])
+    return fit.coverage * erf(near / (np.sqrt(2) * max(fit.rms_px, 1e-3)))
 
 
 def is_certain(fit: RimFit) -> bool:

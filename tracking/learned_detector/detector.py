@@ -49,13 +49,14 @@ class DrogueCandidate:
 
 
 @cache
-def _network() -> cv2.dnn.Net:
+def _network(weights: Path) -> cv2.dnn.Net:
     try:
-        return cv2.dnn.readNetFromONNX(str(WEIGHTS))
+        return cv2.dnn.readNetFromONNX(str(weights))
     except cv2.error as error:
-        raise ValueError(
-            f"{WEIGHTS}: the weights of the learned detector are damaged: install beampose again"
-        ) from error
+        remedy = (
+            "install beampose again" if weights == WEIGHTS else "expected a file that lab.learned_detector.train made"
+        )
+        raise ValueError(f"{weights}: the weights of the learned detector are damaged: {remedy}") from error
 
 
 def find_drogues(
@@ -63,11 +64,13 @@ def find_drogues(
     smallest_px: float = SMALLEST_PX,
     largest_px: float | None = None,
     min_confidence: float = MIN_CONFIDENCE,
+    weights: Path | None = None,
 ) -> list[DrogueCandidate]:
     """Drogues of a picture (h, w), the most confident first.
 
     smallest_px, largest_px: range of the diameters; None: up to the picture's smaller side. 16-bit pictures are scaled
-    by their largest value.
+    by their largest value. weights: of another network of lab/learned_detector/networks.py, whose confidence
+    is an order and no probability; None: those of the package.
 
     Raises:
         ValueError: the picture is not grey, or the file of the weights is damaged.
@@ -78,29 +81,29 @@ def find_drogues(
     grey = np.asarray(picture, dtype=np.float32) / np.float32(full)
     top = float(min(picture.shape)) if largest_px is None else largest_px
     levels = pyramid(grey, SMALLEST_PX / max(smallest_px, SMALLEST_PX), COARSEST_PX, top)
-    found = np.concatenate([_of_level(level) for level in levels])
+    found = np.concatenate([_of_level(level, weights or WEIGHTS) for level in levels])
     found[:, 0] = 1 / (1 + np.exp(-(CALIBRATION_SLOPE * found[:, 0] + CALIBRATION_OFFSET)))
     found = _distinct(_without_parts(found[found[:, 0] >= min(min_confidence, WHOLE_CONFIDENCE)]))
     return [DrogueCandidate(u, v, diameter, c) for c, u, v, diameter in found.tolist() if c >= min_confidence]
 
 
-def _of_level(level: Level) -> Array:
+def _of_level(level: Level, weights: Path) -> Array:
     """Logit, u, v, diameter (n, 4) of the candidates of a level, in pixels of the picture."""
-    found = _candidates(level.grey)
+    found = _candidates(level.grey, weights)
     scales = np.array([level.scale_u, level.scale_v])
     found[:, 1:3] = (found[:, 1:3] + 0.5) / scales - 0.5
     found[:, 3] /= level.scale
     return found
 
 
-def _candidates(grey: Floats) -> Array:
+def _candidates(grey: Floats, weights: Path) -> Array:
     """Logit, u, v, diameter (n, 4), px, of the candidates in a picture (h, w) of 0 to 1."""
     height, width = grey.shape
     below, beside = -height % _MULTIPLE, -width % _MULTIPLE
     below, beside = max(below, _LEAST_SIDE_PX - height), max(beside, _LEAST_SIDE_PX - width)
     if below or beside:
         grey = np.asarray(cv2.copyMakeBorder(grey, 0, below, 0, beside, cv2.BORDER_REPLICATE), np.float32)
-    network = _network()
+    network = _network(weights)
     network.setInput(np.ascontiguousarray(grey, dtype=np.float32)[None, None])
     cells = network.forward()[0].astype(float)
     logit = cells[0]

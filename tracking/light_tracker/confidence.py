@@ -15,7 +15,7 @@ from geometry.arrays import Array
 RIGHT_SHARE = 0.25  # of the diameter
 FEATURES = ("1", "support", "confirmed", "unconfirmed")
 SIGNS = (0, 1, 1, -1)  # of the coefficients: more of a good sign never lowers the confidence
-COEFFICIENTS = (-0.07, 1.1, 0.88, -0.05)
+COEFFICIENTS = (-0.29, 0.83, 1.62, -1.3)
 ABSENT_LOGIT = -2.0  # of a check without a detection, in the running mean of the checks
 _CAP = 0.995  # of correlations: above it, noise decides
 _MOST_CONFIRMED = 10

@@ -25,8 +25,6 @@ _START_SPEED = 0.3, 5.0  # 1 sigma of the speed at the start: diameters and px p
 # to the initial value: as in tracking/single_target/point_tracker.py.
 _LEARNING_RATE, _MOST_NIS = 0.1, 6.0
 _SIGMA_A_RANGE = 0.1, 10.0
-_MISS_GROWTH, _MOST_GROWTH = 1.1, 10.0  # of the acceleration per frame without a measurement
-_DAMPING = 0.9  # of the rates per frame without a measurement
 WHOLE = 0.9  # visible share of a pattern of which nothing is hidden
 _HIDDEN_FACTOR = 10.0  # of the covariance of a match of which a part is hidden
 _HUBER_SIGMAS = 2.5  # a detection farther away than this has a smaller weight
@@ -63,11 +61,9 @@ class Motion:
     def predicted(self, dt: float, misses: int, p: LightParameters) -> Motion:
         """`dt` frames later. misses: frames in a row without a measurement."""
         start = p.sigma_a_diameters * self.diameter_px + p.sigma_a_px
-        growth = min(_MISS_GROWTH**misses, _MOST_GROWTH)
-        sigma_a = self.sigma_a_px if not misses else max(self.sigma_a_px, start) * growth
+        # A drogue sways: what its acceleration was before it was hidden is not what it is now.
+        sigma_a = self.sigma_a_px if not misses else max(self.sigma_a_px, start)
         x, P = kalman.predict(self.x, self.P, dt, np.asarray(sigma_a))
-        if misses:  # a drogue sways: it does not fly on in a straight line
-            x = np.concatenate([x[:2], _DAMPING**dt * x[2:]])
         drift = np.array([p.offset_drift, p.offset_drift, p.offset_drift]) ** 2 * dt
         return replace(
             self, x=x, P=P, size_variance=self.size_variance + p.sigma_growth**2 * dt,
@@ -101,6 +97,11 @@ class Motion:
         noise = noise * np.maximum(np.abs(innovation) / (_HUBER_SIGMAS * sigma), 1.0) ** 2
         gain = self.offset_variance / (self.offset_variance + noise)
         return replace(self, offset=self.offset + gain * innovation, offset_variance=(1 - gain) * self.offset_variance)
+
+    def moved(self, match: Match, p: LightParameters) -> Motion:
+        """Found at another place after a gap: at rest there, of the same size and offset."""
+        start = Motion.started(match.u_px, match.v_px, match.diameter_px, p)
+        return replace(start, offset=self.offset, offset_variance=self.offset_variance)
 
     def centred(self) -> Motion:
         """With the pattern cut out again at the rim."""

@@ -19,45 +19,18 @@ from geometry.arrays import Array
 from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window
 from tracking.light_tracker.confidence import ABSENT_LOGIT, features, fisher, logit, probability, within
 from tracking.light_tracker.frames import Cause, DrogueFrame, Source, nothing_known
+from tracking.light_tracker.known import is_clear
 from tracking.light_tracker.motion import WHOLE, Motion
 from tracking.light_tracker.parameters import USUAL, LightParameters
 from tracking.light_tracker.pattern import Match, Pattern, unexplained
+from tracking.light_tracker.track import LONGEST_GAP, TRUSTED, Track
 from tracking.statuses import PoseStatus
 
-_SIMILAR = 0.7  # fall of Fisher's z of the correlation below its usual value, of a match that may be the drogue
-_TRUSTED = 4  # detections that confirmed a track
-_GOOD = 1.5  # Fisher's z that is similar in any case: a correlation of 0.905
-_MOSTLY = 0.6  # visible share from which the agreement of this share counts
-_LEAD = 0.3  # of Fisher's z over the next best place of the window, after a gap
-_LONGEST_GAP = 20  # frames
 _NEAR_PX = 20.0  # distance of the first drogue from the place that the user states
 _SUPPORT_RATE = 0.25  # of the running mean of the log odds of the checks
 _USUAL_RATE = 0.1  # of the running mean of the correlation
 _OFF_CENTRE, _OFF_SIZE = 0.12, 0.2  # offset of the pattern, in diameters and as a logarithm, that cuts it out again
 _MORE_PX = 2.0  # radius of a window beyond 3 sigma
-
-
-@dataclass(slots=True)
-class _Track:
-    """What is known of the drogue while it is followed."""
-
-    motion: Motion
-    pattern: Pattern
-    support: float  # running mean of the log odds of the checks
-    usual: float = float("nan")  # running mean of Fisher's z of the matches' correlation
-    confirmed: int = 1  # detections
-    unconfirmed: int = 0  # checks in a row without a detection
-    age: float = 0.0  # frames since the last confirmation
-    since_check: int = 0  # frames since the detector searched
-    lost: bool = False  # reported as lost
-    trusted: float = 1.0  # confidence of the last measured frame
-    misses: int = 0  # frames in a row without a measurement
-    blind: int = 0  # frames in a row without a match that resembles the pattern
-    gap: int = 0  # the same, and falling by one with each match afterwards: how far the drogue can have moved away
-
-    def count_blind(self) -> None:
-        """One more frame without a match."""
-        self.blind, self.gap = self.blind + 1, min(self.gap + 1, _LONGEST_GAP)
 
 
 @dataclass(slots=True)
@@ -67,7 +40,7 @@ class DrogueTracker:
     detector: CircleDetector
     parameters: LightParameters = USUAL
     near_px: tuple[float, float] | None = None  # of the first drogue, if the user knows it
-    _track: _Track | None = None
+    _track: Track | None = None
     _last: Motion | None = None  # of the drogue that was lost
     _ambiguous: bool = False
     trace: list[tuple[Array, Array]] | None = None  # if a list: gets inputs of the confidence, and the centre, px
@@ -91,6 +64,10 @@ class DrogueTracker:
         match = self._matched(track, picture)
         if match is not None:
             track.motion = track.motion.matched(match, self.parameters, track.blind == 0)
+        elif track.before is not None:
+            match = track.before.found(picture, u, v, 3 * track.motion.sigma_px + _MORE_PX)
+            if match is not None:
+                track.take_back(track.before, match, self.parameters)
         track.since_check += 1
         searched, found, source = "", 0, Source.LIGHT
         confidence = self._confidence(track, match)
@@ -109,7 +86,7 @@ class DrogueTracker:
             confidence = self._confidence(track, match)
         if match is None or confidence < p.measured_confidence:
             cause = Cause.NO_MATCH if match is None else Cause.UNCERTAIN
-            if match is not None and self._similar(track, match):
+            if match is not None and track.resembles(match):
                 track.blind, track.gap = 0, max(track.gap - 1, 0)  # it may be the drogue: later frames decide
             else:
                 track.count_blind()
@@ -129,7 +106,7 @@ class DrogueTracker:
             track, PoseStatus.MEASURED, Cause.NONE, source, confidence, match.correlation, searched, found, event
         )
 
-    def _matched(self, track: _Track, picture: Picture) -> Match | None:
+    def _matched(self, track: Track, picture: Picture) -> Match | None:
         """The pattern near the prediction."""
         motion = track.motion
         reach = 3 * motion.sigma_px + _MORE_PX
@@ -138,19 +115,12 @@ class DrogueTracker:
         if match is None or match.correlation < self.parameters.least_correlation:
             return None
         # After a gap, what is in front of the drogue has a weak correlation too, as have many places of a wide window.
-        if track.gap and not (self._similar(track, match) and fisher(match.correlation) > fisher(match.second) + _LEAD):
+        if track.gap and not (track.resembles(match) and is_clear(match)):
             return None
         limit = np.log(self.parameters.size_ratio)
         return match if abs(np.log(match.diameter_px) - motion.log_diameter) < limit else None
 
-    @staticmethod
-    def _similar(track: _Track, match: Match) -> bool:
-        """Whether a match is about as good as the ones before."""
-        z = fisher(match.agreement if match.visible > _MOSTLY else match.correlation)
-        new = bool(np.isnan(track.usual))  # a pattern that has no usual correlation yet
-        return new or track.usual - z < _SIMILAR or z > _GOOD
-
-    def _seen(self, track: _Track, picture: Picture) -> list[CircleCandidate]:
+    def _seen(self, track: Track, picture: Picture) -> list[CircleCandidate]:
         """What the detector finds around the track, of about its size."""
         motion, p = track.motion, self.parameters
         diameter = motion.rim_diameter_px
@@ -164,9 +134,7 @@ class DrogueTracker:
             if c.score >= p.confirm_confidence and low <= c.radius_px <= high
         ]  # fmt: skip
 
-    def _confirming(
-        self, track: _Track, seen: Sequence[CircleCandidate], match: Match | None
-    ) -> CircleCandidate | None:
+    def _confirming(self, track: Track, seen: Sequence[CircleCandidate], match: Match | None) -> CircleCandidate | None:
         """The detection of the tracked drogue: at the match, or, without one, where the drogue can be."""
         motion, p = track.motion, self.parameters
         near = p.agree_diameters * motion.rim_diameter_px + (3 * motion.sigma_px if match is None else 1.0)
@@ -176,7 +144,7 @@ class DrogueTracker:
             own = [c for c in own if c.score >= p.acquire_confidence]
         return max(own, key=lambda c: c.score, default=None)
 
-    def _confirm(self, track: _Track, picture: Picture, seen: CircleCandidate, match: Match | None) -> Match | None:
+    def _confirm(self, track: Track, picture: Picture, seen: CircleCandidate, match: Match | None) -> Match | None:
         """Take a detection into the track. Returns the match, found again at the detection where there was none."""
         p = self.parameters
         if match is None:
@@ -195,19 +163,20 @@ class DrogueTracker:
         track.confirmed, track.unconfirmed, track.age, track.gap = track.confirmed + 1, 0, 0.0, 0
         return match
 
-    def _cut_again(self, track: _Track, picture: Picture, seen: CircleCandidate) -> Match | None:
+    def _cut_again(self, track: Track, picture: Picture, seen: CircleCandidate) -> Match | None:
         """A new pattern at a detection: the drogue does not look as before."""
         diameter = 2 * seen.radius_px
         pattern = Pattern.started(picture, seen.u_px, seen.v_px, diameter)
         match = None if pattern is None else pattern.find(picture, seen.u_px, seen.v_px, diameter, 0.0)
         if pattern is None or match is None:
             return None
+        track.before = track.known
         track.motion = Motion.started(seen.u_px, seen.v_px, diameter, self.parameters)
         track.pattern, track.usual, track.confirmed = pattern, float("nan"), 1
         track.unconfirmed, track.age = 0, 0.0
         return match
 
-    def _learn(self, track: _Track, picture: Picture, match: Match) -> None:
+    def _learn(self, track: Track, picture: Picture, match: Match) -> None:
         """Update the pattern with a good match."""
         z, p = fisher(match.correlation), self.parameters
         whole = match.visible > WHOLE
@@ -222,7 +191,7 @@ class DrogueTracker:
         rate = _USUAL_RATE if whole else _USUAL_RATE / 5
         track.usual = z if np.isnan(track.usual) else track.usual + rate * (z - track.usual)
 
-    def _confidence(self, track: _Track, match: Match | None) -> float:
+    def _confidence(self, track: Track, match: Match | None) -> float:
         if match is None:
             return 0.0
         inputs = features(track.support, track.confirmed, track.unconfirmed)
@@ -245,7 +214,7 @@ class DrogueTracker:
 
     def _start(self, seen: CircleCandidate, pattern: Pattern, searched: str, found: int, event: str) -> DrogueFrame:
         motion = Motion.started(seen.u_px, seen.v_px, 2 * seen.radius_px, self.parameters)
-        self._track = track = _Track(motion, pattern, logit(seen.score), trusted=seen.score)
+        self._track = track = Track(motion, pattern, logit(seen.score), trusted=seen.score)
         return self._frame(
             track, PoseStatus.MEASURED, Cause.NONE, Source.DETECTOR, seen.score, float("nan"), searched, found, event
         )
@@ -267,7 +236,7 @@ class DrogueTracker:
 
     def _missed(
         self,
-        track: _Track,
+        track: Track,
         picture: Picture,
         cause: Cause,
         match: Match | None = None,
@@ -285,24 +254,30 @@ class DrogueTracker:
         correlation = float("nan") if match is None else match.correlation
         return replace(out, correlation=correlation, searched=searched, found=found)
 
-    def _found_elsewhere(self, track: _Track, picture: Picture) -> DrogueFrame | None:
+    def _found_elsewhere(self, track: Track, picture: Picture) -> DrogueFrame | None:
         """One drogue in the whole picture, of about the same size, away from where the track is."""
         motion, p = track.motion, self.parameters
         found = self._in_picture(picture)
         # A track that few detections confirmed may have a wrong size, and be none.
-        limit = p.size_ratio if track.confirmed >= _TRUSTED else np.inf
+        limit = p.size_ratio if track.confirmed >= TRUSTED else np.inf
         alike = [c for c in found if 1 / limit < 2 * c.radius_px / motion.rim_diameter_px < limit]
         best, _ = self._chosen(alike)
-        doubtful = track.lost and (track.confirmed < _TRUSTED or track.misses > _LONGEST_GAP)
+        doubtful = track.lost and (track.confirmed < TRUSTED or track.misses > LONGEST_GAP)
         if best is None or (best.score < p.elsewhere_confidence and not doubtful):
             return None
         u, v = motion.centre_px.tolist()
         if track.misses == 0 and np.hypot(best.u_px - u, best.v_px - v) < motion.rim_diameter_px / 2:
             return None
         pattern = Pattern.started(picture, best.u_px, best.v_px, 2 * best.radius_px)
-        return None if pattern is None else self._start(best, pattern, "both", len(found), "reacquired")
+        if pattern is None:
+            return None
+        known = track.known
+        out = self._start(best, pattern, "both", len(found), "reacquired")
+        assert self._track is not None
+        self._track.before = known
+        return out
 
-    def _unmeasured(self, track: _Track, cause: Cause, share: float = 1.0) -> DrogueFrame:
+    def _unmeasured(self, track: Track, cause: Cause, share: float = 1.0) -> DrogueFrame:
         """A frame without a measurement: predicted, or lost."""
         track.misses += 1
         motion, p = track.motion, self.parameters
@@ -320,7 +295,7 @@ class DrogueTracker:
 
     @staticmethod
     def _frame(
-        track: _Track,
+        track: Track,
         status: PoseStatus,
         cause: Cause,
         source: Source,

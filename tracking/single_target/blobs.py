@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from geometry.arrays import Array
 from tracking.detections import Detections
@@ -12,9 +13,13 @@ from tracking.single_target.parameters import BlobParameters
 
 _MAD_TO_SIGMA = 1.4826  # of a Gaussian
 _EVERY = 4  # every 4th row and column is enough for the noise
+# A target larger than the background's square has contrast along its edge only. Such an edge is as bright as the blob
+# on its inner side and as the background on its outer one: both on this share of its surroundings.
+_EDGE_SHARE, _AS_BLOB, _AS_BACKGROUND = 0.2, 0.3, 0.7  # the limits are shares of the peak of the contrast
+_RING_PX = 7  # side of the square that reaches the surroundings
 
 
-def find_blobs(picture: Picture, parameters: BlobParameters) -> Detections:
+def find_blobs(picture: Picture | NDArray[np.float32], parameters: BlobParameters) -> Detections:
     """The blobs of a picture (h, w), strongest first.
 
     flux is the sum and peak the maximum of the contrast, DN; the axes are the square roots of the second moments. The
@@ -40,6 +45,11 @@ def find_blobs(picture: Picture, parameters: BlobParameters) -> Detections:
     good = (longest >= parameters.min_size_px) & (longest <= parameters.max_size_px)
     good &= (left > 0) & (top > 0) & (left + wide < w) & (top + high < h)
     good[0] = False  # the background
+    for row in np.flatnonzero(good & (longest >= parameters.background_px)).tolist():
+        x0, y0 = max(int(left[row]) - _RING_PX, 0), max(int(top[row]) - _RING_PX, 0)
+        part = slice(y0, int(top[row] + high[row]) + _RING_PX), slice(x0, int(left[row] + wide[row]) + _RING_PX)
+        level = grey[part] if parameters.polarity == "brighter" else -grey[part]
+        good[row] = not _is_an_edge(level, contrast[part], mask[part], np.asarray(labels[part] == row, np.uint8))
     rows = np.flatnonzero(good)
     if not len(rows):
         return Detections.none()
@@ -50,6 +60,26 @@ def find_blobs(picture: Picture, parameters: BlobParameters) -> Detections:
     u, v, of, weight = u[of >= 0], v[of >= 0], of[of >= 0], np.maximum(contrast[v, u][of >= 0].astype(float), 0.0)
     found = _moments(u.astype(float), v.astype(float), of, weight, len(rows), sigma, limit)
     return found[np.argsort(-found.flux, kind="stable")]
+
+
+def _is_an_edge(
+    grey: NDArray[np.float32], contrast: NDArray[np.float32], mask: NDArray[np.uint8], own: NDArray[np.uint8]
+) -> bool:
+    """Whether a blob is a part of the edge of something larger, from the picture around it.
+
+    grey (h, w): larger in a blob than beside it. mask: all blobs, own: this one. Holes of a blob are part of it: an
+    outline that is seen whole has its centroid at the target's centre.
+    """
+    _, parts = cv2.connectedComponents(1 - own, connectivity=4)
+    border = np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]])
+    outside = np.isin(parts, np.unique(border[border > 0]))
+    beside = cv2.dilate(mask, np.ones((3, 3), np.uint8)) > 0
+    ring = (cv2.dilate(own, np.ones((_RING_PX, _RING_PX), np.uint8)) > 0) & ~beside & outside
+    if not ring.any():
+        return False
+    inside = own > 0
+    below = (float(grey[inside].mean()) - grey[ring]) / float(contrast[inside].max())
+    return bool(np.mean(below < _AS_BLOB) > _EDGE_SHARE and np.mean(below > _AS_BACKGROUND) > _EDGE_SHARE)
 
 
 def _moments(u: Array, v: Array, of: np.ndarray, weight: Array, n: int, sigma: float, limit: float) -> Detections:

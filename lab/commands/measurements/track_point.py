@@ -30,9 +30,12 @@ def _place(ctx: click.Context, parameter: click.Parameter, value: str | None) ->
     "--detector",
     default="spots",
     show_default=True,
-    type=click.Choice(["spots", "darker", "brighter"]),
-    help="Points of light, or larger targets, darker or brighter than what is around them. Not used for a table.",
+    type=click.Choice(["spots", "darker", "brighter", "colour"]),
+    help="Points of light, or larger targets: darker or brighter than what is around them, or of a colour. Not used for"
+    " a table.",
 )
+@click.option("--colour", metavar="NAME", help="Of a coloured target: red, orange, yellow, green, cyan, blue, magenta,"
+              " or #rrggbb.")  # fmt: skip
 @click.option("--start", metavar="U,V", callback=_place, help="Where the target is at the start, px; default: the"
               " brightest one.")  # fmt: skip
 @click.option(
@@ -60,6 +63,7 @@ def point(
     source: Path,
     out: Path,
     detector: str,
+    colour: str | None,
     start: tuple[float, float] | None,
     frame_rate: float | None,
     camera: str | None,
@@ -79,7 +83,7 @@ def point(
     """
     from lab.single_target.track_point import PointOptions, track_target
 
-    options = PointOptions(detector, start, frame_rate, camera, limit, min_measured, overlay, settings)
+    options = PointOptions(detector, start, frame_rate, camera, limit, min_measured, overlay, settings, colour)
     with progress_bar("pictures") as progress:
         outcome = track_target(source, out, options, progress)
     conclude(outcome)

@@ -56,7 +56,8 @@ def retrieved(capture: Grabbed, size_px: tuple[int, int] | None) -> GreyPicture 
         return MissingPicture(f"{UNREADABLE}: damaged")
     if picture.ndim == 3:
         cv2 = load_cv2()
-        picture = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if picture.shape[2] == 3 else picture[..., 0]
+        to_grey = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}.get(picture.shape[2])
+        picture = picture[..., 0] if to_grey is None else cv2.cvtColor(picture, to_grey)
     return require_format(picture, size_px)
 
 
@@ -202,8 +203,8 @@ class VideoSource:
         self._capture.release()
 
 
-def open_video(path: Path) -> cv2.VideoCapture:
-    """Open a video.
+def open_video(path: Path, colour: bool = False) -> cv2.VideoCapture:
+    """Open a video. colour: its pictures come as BGR; else grey videos stay as they are, and most others come as grey.
 
     Raises:
         InputError: OpenCV cannot read it.
@@ -215,7 +216,9 @@ def open_video(path: Path) -> cv2.VideoCapture:
         raise InputError(
             f"{path}: expected a video that OpenCV can read; it cannot open this file (damaged, no video?)"
         )
-    capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # keeps grey videos, of 8 or 16 bits, unchanged; others still come as BGR
+    if not colour:
+        # Keeps grey videos, of 8 or 16 bits, unchanged; of YUV videos only the luma comes, of RGB videos all channels.
+        capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
     capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # no rotation: pixels stay in the sensor's order
     return capture
 

@@ -4,6 +4,7 @@ import csv
 import json
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -104,6 +105,21 @@ def test_unsynchronised_pictures_fail_the_run_and_say_by_how_much(tmp_path):
     clock = outcome.results.clock
     assert clock.offset_s == pytest.approx(0.0015, abs=5 * clock.sigma_s)
     assert any(f.code == "BP-W05" for f in outcome.findings)
+
+
+@pytest.mark.parametrize(("shift", "words"), [(4, "frames with markers in both pictures"), (200, "right: 200 to 223")])
+def test_frame_numbers_of_one_camera_that_are_shifted_fail_the_run(drogue, tmp_path, shift, words):
+    """Frames that only one camera has are measured by it alone: without the others they would seem right."""
+    run = changed(drogue, tmp_path / "run")
+    shutil.rmtree(run / "truth")
+    table = rows(run, "detections.csv")
+    with (run / "detections.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, table[0])
+        writer.writeheader()
+        writer.writerows({**r, "frame": int(r["frame"]) + shift * (r["camera"] == "right")} for r in table)
+    outcome = process_stereo_run(run, tmp_path / "out")
+    assert outcome.exit_status == 4
+    assert any(f.code == "BP-W09" and words in f.what for f in outcome.findings)
 
 
 def test_markers_that_are_not_where_run_yaml_says_are_reported(drogue, tmp_path):
@@ -212,3 +228,23 @@ def test_empty_and_grey_and_missing_pictures_are_plain_errors(tmp_path):
     shutil.rmtree(run / "frames" / "left")
     with pytest.raises(InputError, match="found nothing"):
         process_stereo_run(run, tmp_path / "out")
+
+
+def test_colour_videos_give_the_markers_that_their_pictures_show(tmp_path):
+    """Videos of cameras are YUV: their colour must be decoded, not only the brightness."""
+    run = write_stereo_recording(tmp_path / "run", seed=5, frames=1, scale=0.75)
+    content = yaml.safe_load((run / "run.yaml").read_text(encoding="utf-8"))
+    for name, source in content["cameras"].items():
+        files = sorted((run / source["frames"]).iterdir())
+        pictures = [cv2.imread(str(f)) for f in files if f.suffix == ".png"]
+        path = run / f"{name}.avi"
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, pictures[0].shape[1::-1])
+        writer.set(cv2.VIDEOWRITER_PROP_QUALITY, 98)
+        for picture in pictures:
+            writer.write(picture)
+        writer.release()
+        content["cameras"][name] = {"frames": path.name}
+    (run / "run.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+    done = process_stereo_run(run, tmp_path / "out")
+    assert len(rows(done.out, "detections.csv")) >= 10
+    assert np.abs(done.results.errors.range_m).max() < 0.3

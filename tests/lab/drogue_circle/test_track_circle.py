@@ -170,3 +170,13 @@ def test_the_command_offers_the_detectors_and_forms_that_exist():
     options = {p.name: p.type.choices for p in parameters if p.name in ("detector", "form")}
     assert tuple(options["detector"]) == tuple(DETECTORS)
     assert tuple(options["form"]) == FORMS
+
+
+def test_pictures_of_another_size_than_the_first_are_no_pictures_of_the_recording(tmp_path):
+    source = tmp_path / "drogue"
+    source.mkdir()
+    for k in range(12):
+        cv2.imwrite(str(source / f"{k:04d}.png"), picture(k)[: 80 if k in (5, 6) else None])
+    result = typed(source, "--out", tmp_path / "out")
+    assert "another size: 128x80 px, the first picture has 128x96" in result.output
+    assert [k for k, r in enumerate(rows(tmp_path / "out")) if r["cause"] == "no_image"] == [5, 6]

@@ -19,7 +19,7 @@ from lab.errors import InputError
 from lab.files.run.run_file import load_run
 from lab.pictures.picture_file import MissingPicture, decode, read_picture
 from lab.runs.frames import frames
-from lab.runs.frames.frame_sources import list_folder
+from lab.runs.frames.frame_sources import VideoSource, list_folder
 from lab.runs.frames.frames import FrameSet, open_frames, pictures_at
 from tests.lab.run_folders import edit, picture_of, write_run
 
@@ -358,6 +358,23 @@ def test_frame_n_of_a_video_is_its_nth_picture(video_run):
         np.testing.assert_array_equal(s.images["left"], picture_of(s.frame))
         assert isinstance(s.images["right"], MissingPicture) == (s.frame >= 5)
     assert reader.expected_frames == 12
+
+
+@pytest.mark.parametrize("fourcc", ["FFV1", "MJPG"])
+def test_the_grey_of_a_colour_video_is_that_of_all_channels(fourcc, tmp_path):
+    """A green light is grey in a lossless video (all channels come) and in a compressed one (the luma comes) alike."""
+    path = tmp_path / "green.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*fourcc), 25, SIZE, True)
+    if not writer.isOpened():
+        pytest.skip(f"this OpenCV cannot write {fourcc} video")
+    for _ in range(3):
+        writer.write(np.full((SIZE[1], SIZE[0], 3), (10, 200, 10), np.uint8))
+    writer.release()
+    video = VideoSource(path, SIZE)
+    picture = video.next_picture()
+    video.close()
+    assert isinstance(picture, np.ndarray)
+    assert np.median(picture) == pytest.approx(0.587 * 200 + 0.413 * 10, abs=8)
 
 
 def test_frames_after_the_end_of_a_video_are_dropped(video_run):

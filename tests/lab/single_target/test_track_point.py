@@ -193,3 +193,88 @@ def test_the_study_shows_why_a_gate_is_needed():
     nees = "NEES per coordinate, without false detections"
     assert study.value(nees, "as printed") < 0, "the printed covariance has negative variances"
     assert 0.7 < study.value(nees, "beampose") < 1.3
+
+
+def coloured(k, bgr=(40, 40, 190)):
+    """The disc in colour on a grey ground, before a brighter grey one."""
+    v, u = np.mgrid[:120, :160]
+    out = np.full((120, 160, 3), 150.0)
+    for place, ink in ((np.array([120.0, 20.0]), (250, 250, 250)), (path_of(k), bgr)):
+        cover = np.clip(6.5 - np.hypot(u - place[0], v - place[1]), 0, 1)[..., None]
+        out += cover * (np.asarray(ink, float) - out)
+    noise = np.random.default_rng(k).normal(0, 1.5, out.shape)
+    return np.clip(out + noise, 0, 255).round().astype(np.uint8)
+
+
+@pytest.mark.parametrize("kind", ["pictures", "video"])
+@pytest.mark.parametrize("name", ["red", "#be2828"])
+def test_a_coloured_target_is_tracked(kind, name, tmp_path):
+    if kind == "video":
+        source = tmp_path / "ball.avi"
+        writer = cv2.VideoWriter(str(source), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (160, 120))
+        for k in range(FRAMES):
+            writer.write(np.full((120, 160, 3), 150, np.uint8) if k == 15 else coloured(k))
+        writer.release()
+    else:
+        source = tmp_path / "ball"
+        source.mkdir()
+        for k in range(FRAMES):
+            shown = np.full((120, 160, 3), 150, np.uint8) if k == 15 else coloured(k)
+            cv2.imwrite(str(source / f"{k:04d}.png"), shown)
+    arguments = ["track", "point", str(source), "--out", str(tmp_path / "out"), "--detector", "colour", "--colour"]
+    result = CliRunner().invoke(main, [*arguments, name])
+    assert result.exit_code == 0, result.output
+    rows = rows_of(tmp_path / "out")
+    assert [k for k, r in enumerate(rows) if r["status"] != "measured"] == [15]
+    errors = [np.hypot(*(np.array([float(r["u_px"]), float(r["v_px"])]) - path_of(k))) for k, r in enumerate(rows)]
+    assert max(errors) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--detector", "colour"], "expected --colour with red"),
+        (["--detector", "colour", "--colour", "mauve"], "expected red, orange"),
+        (["--detector", "colour", "--colour", "#808080"], "got the grey #808080"),
+        (["--detector", "colour", "--colour", "red"], "got grey ones; use --detector darker"),
+        (["--detector", "darker", "--colour", "red"], "belongs to --detector colour"),
+    ],
+)
+def test_a_colour_that_cannot_be_searched_is_one_plain_line(arguments, words, folder, tmp_path):
+    result = CliRunner().invoke(main, ["track", "point", str(folder), "--out", str(tmp_path / "out"), *arguments])
+    assert result.exit_code == 2
+    assert words in result.output
+    assert len(result.output.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_target_of_another_colour_is_lost_and_never_reported(tmp_path):
+    source = tmp_path / "ball"
+    source.mkdir()
+    for k in range(8):
+        cv2.imwrite(str(source / f"{k:04d}.png"), coloured(k))
+    options = PointOptions("colour", rate_hz=25.0, colour="blue")
+    assert track_target(source, tmp_path / "out", options).exit_status == 4
+    assert {r["status"] for r in rows_of(tmp_path / "out")} == {"lost"}
+
+
+def test_pictures_of_another_size_than_the_first_are_no_pictures_of_the_recording(tmp_path):
+    source = tmp_path / "disc"
+    source.mkdir()
+    for k in range(12):
+        cv2.imwrite(str(source / f"{k:04d}.png"), picture(k)[: 100 if k in (5, 6) else None])
+    outcome = track_target(source, tmp_path / "out", PointOptions("darker", rate_hz=50.0))
+    assert [k for k, r in enumerate(rows_of(tmp_path / "out")) if r["status"] != "measured"] == [5, 6]
+    assert outcome.recording.missing == {"another size: 160x100 px, the first picture has 160x120": 2}
+
+
+def test_a_video_that_ends_early_is_noted(tmp_path):
+    path = tmp_path / "cut.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (160, 120))
+    for k in range(FRAMES):
+        writer.write(cv2.cvtColor(picture(k), cv2.COLOR_GRAY2BGR))
+    writer.release()
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    outcome = track_target(path, tmp_path / "out", PointOptions("darker"))
+    assert any(f"of the {FRAMES} pictures that its header states" in note for note in outcome.recording.notes)

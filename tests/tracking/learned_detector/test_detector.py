@@ -88,7 +88,7 @@ def test_the_coupling_and_a_marker_are_parts_of_their_drogue():
 
 def test_a_drogue_whose_coupling_is_more_confident_is_found_whole(monkeypatch):
     rows = np.array([[1.0, 100, 100, 160], [3.0, 102, 100, 40]])  # logit, centre and diameter
-    monkeypatch.setattr(detector, "_of_level", lambda level: rows)
+    monkeypatch.setattr(detector, "_of_level", lambda level, weights: rows)
     found = find_drogues(np.zeros((240, 320), np.uint8))
     assert [c.diameter_px for c in found] == pytest.approx([160])
 

@@ -113,6 +113,22 @@ def test_while_the_target_is_hidden_nothing_that_resembles_it_a_little_is_follow
         assert gone == (frame.status is not PoseStatus.MEASURED), k
 
 
+def test_a_target_found_again_beside_what_hid_it_is_followed_when_that_has_gone():
+    """The detector sees it once, half hidden, and misses it afterwards: it looks as before the occlusion again."""
+    detector = Detector()
+    tracker = DrogueTracker(detector)
+    for k in range(45):
+        u, v, d = path(k)
+        gone, half = 22 <= k < 30, 30 <= k < 33
+        detector.circles = [path(k)] if k < 22 or k == 30 else []
+        hidden = (u, v, 2 * d) if gone else (u + 0.62 * d, v, 1.6 * d) if half else None
+        frame = tracker.step(picture([path(k)], seed=k, hidden=hidden))
+        if k >= 33:
+            assert frame.correlation > 0.9, k  # nan without a match
+            assert np.hypot(*(frame.centre_px - (u, v))) < 0.1 * d
+            assert k > 33 or frame.status is PoseStatus.MEASURED
+
+
 def test_frames_without_a_picture_are_predicted():
     detector, sigmas = Detector(), []
     tracker = DrogueTracker(detector)

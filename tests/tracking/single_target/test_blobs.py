@@ -60,3 +60,18 @@ def test_the_stated_sigma_is_that_of_the_noise():
     centres = np.array([find_blobs(disc((100.2, 80.4), 9.0, seed=k), BlobParameters()).uv_px[0] for k in range(40)])
     stated = np.sqrt(find_blobs(disc((100.2, 80.4), 9.0), BlobParameters()).cov_px2[0, 0, 0])
     assert stated / 2.5 < centres[:, 0].std() < 1.5 * stated
+
+
+@pytest.mark.parametrize("polarity", ["darker", "brighter"])
+@pytest.mark.parametrize("radius", [95.0, 110.0, 130.0])
+def test_parts_of_the_edge_of_a_target_larger_than_the_picture_are_no_target(polarity, radius):
+    """The disc reaches beyond the upper and the lower edge; beyond it the left and right ends of its rim are seen."""
+    ink = 40.0 if polarity == "darker" else 230.0
+    found = find_blobs(disc((120.0, 90.0), radius, ink=ink), BlobParameters(polarity=polarity))
+    assert np.all(found.major_px < 2.5)  # at most a few pixels of noise; the ends are 150 px long
+
+
+def test_a_target_larger_than_the_square_of_the_background_has_its_centre_if_it_is_seen_whole():
+    found = find_blobs(disc((120.4, 88.7), 60.0), BlobParameters())
+    assert len(found) == 1
+    np.testing.assert_allclose(found.uv_px[0], (120.4, 88.7), atol=1.0)
