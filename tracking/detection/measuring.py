@@ -32,6 +32,8 @@ from tracking.detection.table import (
     PEAK,
     SCRATCH,
     SIGMA_FLUX,
+    SLOPE_U,
+    SLOPE_V,
     START,
     UU,
     UV,
@@ -64,6 +66,7 @@ _PART_APART = 2.0  # sigmas: fits that are nearer to each other are parts of one
 _MERGES = 3  # fits of a picture at most, with parts joined in between
 _LEAST_START = 2.0  # px^2: least variance of that start
 _OUTGROWN = 4.0  # variance of the moments over that of the start above which they have left the light
+_STEEPEST = 0.6065  # exp(-1/2): slope of a Gaussian at one sigma, in heights per sigma
 _NOTHING = 1e12  # px^2: variance of the start of a candidate that has been joined to another one; the fit leaves it out
 _SAME_SPOT = 1.5  # sigmas of a brighter spot: a second spot nearer to its centre is a duplicate
 
@@ -102,6 +105,7 @@ def measure(
             break
     if _start_again(peaks, chosen, table):
         fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, cells, algebra)
+        _drop_background(table)
     for k in range(chosen.shape[0]):
         spot = table[k]
         spot[ACCEPTED] = (
@@ -134,6 +138,25 @@ def _start_again(peaks: Array, chosen: Ints, table: Array) -> bool:
         spot[FLUX], spot[ACTIVE] = 2 * pi * start * peak[HEIGHT], 1.0
         found = True
     return found
+
+
+@compiled
+def _drop_background(table: Array) -> None:
+    """Reject fits that have started again and follow the background: wider than the peak, or no maximum on the slope.
+
+    The curvature of a wide reflection fits a faint wide spot. A spot is brighter than its surroundings on all sides.
+    """
+    for k in range(table.shape[0]):
+        spot = table[k]
+        if spot[FLUX] <= 0.0 or spot[MOMENT_UV] != 0.0 or spot[MOMENT_UU] != spot[MOMENT_VV]:
+            continue
+        det = spot[UU] * spot[VV] - spot[UV] ** 2
+        height = spot[FLUX] / (2 * pi * sqrt(det))
+        a, b = spot[SLOPE_U], spot[SLOPE_V]
+        rise = sqrt(a * a * spot[UU] + 2 * a * b * spot[UV] + b * b * spot[VV])  # of the background over one sigma
+        wide = ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[1] > _OUTGROWN * spot[MOMENT_UU]
+        if wide or height * _STEEPEST < rise:
+            spot[FLUX] = 0.0
 
 
 @compiled
