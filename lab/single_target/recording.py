@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -127,11 +128,11 @@ def _searched(
         return _searched_for_colour(inputs, hue_named(colour), blobs)
     if colour is not None:
         raise InputError(f"--colour: belongs to --detector {COLOUR}, got --detector {detector}")
-    search: Callable[[Picture], Detections] = lambda picture: find_blobs(picture, blobs)  # noqa: E731
+    search: Callable[[Picture], Detections] = partial(find_blobs, parameters=blobs)
     if detector == "spots":
         noise = CameraNoise(inputs.camera)
         noise.estimate_from([p for p in inputs.noise_pictures() if not isinstance(p, MissingPicture)])
-        search = lambda picture: noise.detect(picture, detect)  # noqa: E731
+        search = partial(noise.detect, parameters=detect)
     return (
         (frame, p if isinstance(p, MissingPicture) else ((p.shape[1], p.shape[0]), search(p)))
         for frame, p in inputs.pictures(1)
