@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -33,18 +33,29 @@ class NoiseModel:
     # used for the detection threshold only. Its effect on the positions of spots is estimated in place_errors.py
 
     banding_dn: float = 0.0  # sigma of rounding errors that neighbouring pixels share, because the noise is small
+    correlation: float = 1.0  # variance of means of neighbouring pixels over that with independent pixels: of compressed
+    # pictures above 1. A spot's centre is such a mean, so detection uses `of_means`
 
     def __post_init__(self) -> None:
         if not (self.floor_dn2 > 0 and self.slope_dn >= 0):
             raise ValueError(
                 f"noise model: expected floor_dn2 > 0 and slope_dn >= 0, got {self.floor_dn2} and {self.slope_dn}"
             )
+        if not self.correlation >= 1:
+            raise ValueError(f"noise model: expected correlation >= 1, got {self.correlation}")
 
     @staticmethod
     def of(sensor: SensorNoise) -> NoiseModel:
         """The model of a sensor with known gain, read noise and black level (rig.yaml: cameras.*.noise)."""
         read_dn = sensor.read_noise_e / sensor.gain_e_per_dn
         return NoiseModel(read_dn**2 + ROUNDING_DN2, 1.0 / sensor.gain_e_per_dn, sensor.black_dn)
+
+    @property
+    def of_means(self) -> NoiseModel:
+        """The model of independent pixels whose means have the variance of this one's."""
+        return replace(
+            self, floor_dn2=self.floor_dn2 * self.correlation, slope_dn=self.slope_dn * self.correlation, correlation=1.0
+        )
 
     def variance(self, level_dn: ArrayLike) -> Array:
         """Variance, DN^2, of pixels with the given expected grey values, DN, any shape."""

@@ -54,7 +54,7 @@ class PictureSeries:
         group.pictures += 1
         model = group.noise.model
         assert model is not None  # the search has estimated it
-        self.spots.add(frame, found, matched_snr(found, float(np.sqrt(model.floor_dn2))))
+        self.spots.add(frame, found, matched_snr(found, float(np.sqrt(model.of_means.floor_dn2))))
         return found
 
 

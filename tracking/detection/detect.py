@@ -172,7 +172,7 @@ class _Task(NamedTuple):
 
     @staticmethod
     def of(image: Picture, parameters: DetectParameters, noise: NoiseModel | None) -> _Task:
-        model = noise or guess_noise(image)
+        model = (noise or guess_noise(image)).of_means
         image = image if image.flags.c_contiguous else image.copy()
         saturation = parameters.saturation_dn
         limits = DetectionLimits(

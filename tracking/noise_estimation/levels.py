@@ -36,6 +36,7 @@ class LevelVariances:
     variance: Array  # (k,), DN^2
     sigma: Array  # (k,), DN^2, of the variance
     temporal: bool  # from differences in time
+    correlation: float = 1.0  # variance of means of neighbouring pixels over that of independent pixels
 
     def scaled(self, floor: float) -> LevelVariances:
         """All variances scaled so that the least is `floor`, if `floor` is larger by more than the factor _GRAIN."""
@@ -65,7 +66,7 @@ def level_variances(pictures: Sequence[Picture], top: float, rounding: float) ->
     at = float(np.median(level))
     if between.nearest(at) > 1.5 * max(within.nearest(at), 2 * rounding):
         return within  # the camera or the scene moves
-    return replace(between, variance=between.variance * np.median(grain), sigma=between.sigma * np.median(grain))
+    return replace(between, correlation=float(np.median(grain)))
 
 
 def _pairs(pictures: Sequence[Picture]) -> list[tuple[Picture, Picture]]:

@@ -82,7 +82,8 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
     slope, slope_sigma = lines.slope(rounding)
     first = lines.model(slope, rounding)
     shared = max(banding(first.floor_dn2, rounding), _OF_STEP * block_step(usable))
-    first = replace(first, texture=texture_of(usable, first), banding_dn=shared)
+    first = replace(first, banding_dn=shared, correlation=levels.correlation if clipped is None else 1.0)
+    first = replace(first, texture=texture_of(usable, first))
     if slope_sigma > _SURE:  # no static pixel is bright enough: use the spots' residuals
         found = [find_spots(p, DetectParameters(max_detections=_MOST_SPOTS), first) for p in usable]
         lines.add(residuals_of_spots(usable, found, top))

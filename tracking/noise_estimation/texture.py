@@ -30,5 +30,5 @@ def texture_of(pictures: Sequence[Picture], noise: NoiseModel) -> float:
     if not above.size:
         return 0.0
     variance = quantile_variance(np.abs(above / level))
-    explained = float(np.mean(noise.variance(level) / level**2)) / (_MEAN**2 * len(pictures))
+    explained = float(np.mean(noise.of_means.variance(level) / level**2)) / (_MEAN**2 * len(pictures))
     return float(np.sqrt(max(variance - explained, 0.0)))

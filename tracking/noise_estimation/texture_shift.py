@@ -66,7 +66,7 @@ def texture_shift(pictures: Sequence[Picture], noise: NoiseModel) -> TextureShif
     texture: NDArray[Any] = np.clip((mean - background) / level, -_LARGEST_CONTRAST, _LARGEST_CONTRAST)
     sample = level[::_BLOCK, ::_BLOCK].astype(float)
     cell = 1
-    white = float(np.median(noise.variance(sample) / sample**2)) / len(pictures)
+    white = float(np.median(noise.of_means.variance(sample) / sample**2)) / len(pictures)
     light, around = [], []
     for sigma_px in _WIDTHS_PX:
         if sigma_px > _FEWER_PIXELS * cell:

@@ -104,14 +104,16 @@ class CameraNoise:
         return replace(found, cov_px2=found.cov_px2 + (np.nan_to_num(added) ** 2)[:, None, None] * np.eye(2))
 
     def _update_model(self) -> None:
-        """Stated values take precedence; texture and banding are always estimated, since a data sheet has none."""
+        """Stated values take precedence; texture, banding and correlation are always estimated: a data sheet has none."""
         estimated = None if self.estimate is None else self.estimate.model
         if self.stated is None or self._overruled:
             self.model = estimated
             return
         stated = NoiseModel.of(self.stated)
         if estimated is not None:
-            stated = replace(stated, texture=estimated.texture, banding_dn=estimated.banding_dn)
+            stated = replace(
+                stated, texture=estimated.texture, banding_dn=estimated.banding_dn, correlation=estimated.correlation
+            )
         self.model = stated
 
     def _estimate_again(self, picture: Picture, parameters: DetectParameters) -> Detections:
