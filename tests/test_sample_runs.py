@@ -15,6 +15,7 @@ from lab.runs.process import process_run
 from lab.simulate.scene import compose
 from tests.paths import ROOT
 
+NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 FOLDER = ROOT / "sample_runs"
 if not FOLDER.is_dir():
     pytest.skip("a source distribution has no sample runs", allow_module_level=True)
@@ -48,12 +49,19 @@ def test_every_sample_is_a_run_that_can_be_processed(name):
     assert check(FOLDER / name).exit_status == 0
 
 
-def test_the_calibration_is_reproduced_byte_for_byte(tmp_path):
+def test_the_calibration_is_reproduced(tmp_path):
+    """Byte for byte, except for the last digits of a solved camera: they depend on the processor."""
     made = make.make("calibration", tmp_path / "again")
     kept = sorted(p.relative_to(FOLDER / "calibration") for p in (FOLDER / "calibration").rglob("*.*"))
     assert [p.relative_to(made) for p in sorted(made.rglob("*.*"))] == kept
     for path in kept:
-        assert (made / path).read_bytes() == (FOLDER / "calibration" / path).read_bytes()
+        again, here = (made / path).read_bytes(), (FOLDER / "calibration" / path).read_bytes()
+        if path.suffix == ".yaml" and again != here:
+            assert NUMBER.sub("", again.decode()).split() == NUMBER.sub("", here.decode()).split()
+            new, old = (np.array([float(x) for x in NUMBER.findall(text.decode())]) for text in (again, here))
+            np.testing.assert_allclose(new, old, rtol=1e-8)
+        else:
+            assert again == here
 
 
 @pytest.mark.slow
