@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -25,13 +25,17 @@ class Detections:
     major_px: Array  # (n,) 1-sigma half axes of the fitted Gaussian
     minor_px: Array  # (n,)
     angle_deg: Array  # (n,) angle of the major axis, from +u towards +v, in (-90, 90]
+    # (n,) part of a coordinate's variance that belongs to the place on the screen, so that averaging over a vehicle at
+    # rest does not reduce it; None: not known
+    place_px2: Array | None = field(default=None, kw_only=True)
 
     def __len__(self) -> int:
         return len(self.uv_px)
 
     def __getitem__(self, rows: Ints | Bools | slice) -> Detections:
         """The points of the given rows, in that order."""
-        return Detections(*(getattr(self, name)[rows] for name in Detections.__slots__))
+        known: list[Array] = [getattr(self, name)[rows] for name in Detections.__slots__[:-1]]
+        return Detections(*known, place_px2=None if self.place_px2 is None else self.place_px2[rows])
 
     @staticmethod
     def none() -> Detections:

@@ -33,8 +33,8 @@ class NoiseModel:
     # used for the detection threshold only. Its effect on the positions of spots is estimated in place_errors.py
 
     banding_dn: float = 0.0  # sigma of rounding errors that neighbouring pixels share, because the noise is small
-    correlation: float = 1.0  # variance of means of neighbouring pixels over that with independent pixels: of compressed
-    # pictures above 1. A spot's centre is such a mean, so detection uses `of_means`
+    correlation: float = 1.0  # variance of means of neighbouring pixels over that of independent pixels: above 1 in
+    # compressed pictures. A spot's centre is such a mean, so detection uses `of_means`
 
     def __post_init__(self) -> None:
         if not (self.floor_dn2 > 0 and self.slope_dn >= 0):
@@ -53,9 +53,8 @@ class NoiseModel:
     @property
     def of_means(self) -> NoiseModel:
         """The model of independent pixels whose means have the variance of this one's."""
-        return replace(
-            self, floor_dn2=self.floor_dn2 * self.correlation, slope_dn=self.slope_dn * self.correlation, correlation=1.0
-        )
+        c = self.correlation
+        return replace(self, floor_dn2=c * self.floor_dn2, slope_dn=c * self.slope_dn, correlation=1.0)
 
     def variance(self, level_dn: ArrayLike) -> Array:
         """Variance, DN^2, of pixels with the given expected grey values, DN, any shape."""

@@ -1,7 +1,8 @@
 """The results of a run on pictures compared with the truth: spots, labels, poses, noise model and verdict.
 
-A pair (view, frame) counts if the spot is visible with a matched-filter SNR of at least LEAST_SNR, its centre is in the
-picture, and no other light of the scene lies within the widths of both. It is correct if the reported position is
+A pair (view, frame) counts if the spot is visible with a matched-filter SNR of at least LEAST_SNR, its sigma at rest is
+at most WIDEST_PX (the beams are drawn for the median view; a camera near its screen may see 140 px), its centre is in
+the picture, and no other light of the scene lies within the widths of both. It is correct if the reported position is
 within max(3 px, 5 sigma / SNR) of the truth. Only scenes count that can be solved with the true labels and such points.
 """
 
@@ -28,6 +29,7 @@ from lab.files.run.results import read_result_table, read_spots, read_summary
 from lab.runs.verdict.verdict_reasons import ReasonKind
 
 LEAST_SNR = 8.0
+WIDEST_PX = 24.0
 SAME_SPOT_PX, SAME_SPOT_SIGMAS = 3.0, 5.0
 APART_WIDTHS = 4.0  # sigmas of both lights, within which two lights do not count
 LEAST_RIGHT, MOST_NEES = 0.97, 2.0  # of a good scene; NEES/6
@@ -82,9 +84,9 @@ class PictureJudgement:
 
 
 def visible(renderer: Renderer) -> Bools:
-    """(T, n): visible with LEAST_SNR in an existing picture."""
+    """(T, n): visible with LEAST_SNR in an existing picture, and not wider than WIDEST_PX."""
     scene = renderer.ps.scene
-    return scene.shining & (np.nan_to_num(renderer.snr) >= LEAST_SNR)
+    return scene.shining & (np.nan_to_num(renderer.snr) >= LEAST_SNR) & (renderer.width_px <= WIDEST_PX)
 
 
 def oracle_scene(renderer: Renderer) -> Scene:

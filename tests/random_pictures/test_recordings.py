@@ -13,6 +13,7 @@ import pytest
 from bench.random_pictures.adapter import model_of_pictures, variance_at
 from bench.random_pictures.judge import (
     LEAST_SNR,
+    WIDEST_PX,
     compared,
     counted_pairs,
     judge,
@@ -102,6 +103,17 @@ def test_a_spot_beside_another_light_is_not_asked_for():
     renderer.still[c] = replace(renderer.still[c], bright=np.array([[beside, v, 1.0]]))
     assert not counted_pairs(renderer)[k, view]
     assert counted_pairs(renderer).sum() < pairs.sum()
+
+
+def test_a_spot_wider_than_the_detector_accepts_is_not_asked_for():
+    renderer = Renderer(picture_scene(3, "16-bit", 4, SMALL))
+    for k in range(4):
+        for c in range(len(renderer.still)):
+            renderer.expected(k, c)
+    view = int(np.argwhere(counted_pairs(renderer))[0, 1])
+    renderer.width_px[view] = 1.1 * WIDEST_PX
+    assert not counted_pairs(renderer)[:, view].any()
+    assert not oracle_scene(renderer).shining[:, view].any()
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ import pytest
 from bench.random_scenes.__main__ import main
 from bench.random_scenes.answers import LOST, MEASURED, Answers, Pass, answers_in_memory, answers_through_files
 from bench.random_scenes.drafts import bends_px
+from bench.random_scenes.draw.motions import MOTIONS
 from bench.random_scenes.draw.vehicles import LEAST_SPOTS
 from bench.random_scenes.families import FAMILIES, family_scene
 from bench.random_scenes.judge import figures, independent_poses, judge
@@ -122,6 +123,15 @@ def test_the_draws_are_wide():
     assert any((s.in_view == OUTSIDE).any() for s in drawn)
     assert any(not s.has_image.all() for s in drawn)
     assert any(any((o == CLUTTER).any() for o in s.origin[0]) for s in drawn)
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_no_motion_jumps_within_the_first_exposure(name):
+    """A picture at time 0 is exposed from before it on."""
+    before = np.concatenate([[0.0, 0.01], [-2e-5, -1e-5, 0.0, 1e-5, 2e-5], [1.0]])
+    for seed in range(10):
+        shape = MOTIONS[name](np.random.default_rng(seed), before).shape[2:-1]
+        assert np.abs(np.diff(shape, axis=0)).max() < 0.01
 
 
 def test_the_oracle_finds_its_own_poses_consistent(scenes):

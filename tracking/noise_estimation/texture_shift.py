@@ -18,12 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array
-from tracking.noise import NoiseModel, Picture, quantile_variance
+from tracking.noise import NORMAL_68, NoiseModel, Picture, quantile_variance
 
 _BLOCK = 8  # px: as in texture.py, so that the background is the same
-_WIDTHS_PX = (0.8, 1.6, 3.2)  # of spots; wider ones have the last error: that of a grain finer than the spot
+_WIDTHS_PX = (0.8, 1.6, 3.2, 6.4, 12.8, 25.6)  # of spots
+_COARSE_PX = 4.0  # width from which the smooth part of the background counts: it may be uneven response (vignetting)
 _LARGEST_CONTRAST = 0.3  # more is an edge or an object
 _REACH = 3.0  # sigmas of the kernel to each side
+_BRIGHT = 0.2  # above the background: a light, whose surroundings are left out on the coarse scale
+_FEWEST = 60  # samples of the filters' outputs on the coarse scale; with fewer the last error is used
 _FEWER_PIXELS = 1.6  # pixels per sigma of a spot above which pixels are averaged in pairs
 _SAMPLED = 3  # px: step of the sample of the filters' outputs
 LARGEST_SHARE = 0.1  # of the spot's width: a larger error is not assumed
@@ -56,7 +59,9 @@ class TextureShift:
 def texture_shift(pictures: Sequence[Picture], noise: NoiseModel) -> TextureShift:
     """The errors of spots on the background of pictures (h, w) of one camera, less those by noise.
 
-    As in `texture_of`, the mean of the pictures is used, and the background without its smooth part.
+    As in `texture_of`, the mean of the pictures is used, and the background without its smooth part. For wide spots the
+    smooth part counts, except for a plane over the picture: light that falls from one side does not shift a spot, but
+    a response of lens and screen that varies over the spot does, and both look alike.
     """
     height, width = (n // _BLOCK * _BLOCK for n in pictures[0].shape)
     mean = np.asarray(np.mean([p[:height, :width] for p in pictures], axis=0), dtype=np.float32)
@@ -68,12 +73,17 @@ def texture_shift(pictures: Sequence[Picture], noise: NoiseModel) -> TextureShif
     cell = 1
     white = float(np.median(noise.of_means.variance(sample) / sample**2)) / len(pictures)
     light, around = [], []
-    for sigma_px in _WIDTHS_PX:
+    for sigma_px in (w for w in _WIDTHS_PX if w < _COARSE_PX):
         if sigma_px > _FEWER_PIXELS * cell:
             cell *= 2
             texture = np.asarray(cv2.resize(texture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
         light.append(cell * _shift(texture, sigma_px / cell, 2, white / cell**2))
         around.append(cell * _shift(texture, sigma_px / cell, 1, white / cell**2))
+    for sigma_px in (w for w in _WIDTHS_PX if w > _COARSE_PX):
+        cell *= 2
+        shifts = _coarse_shifts(mean, cell, sigma_px / cell, white / cell**2)
+        light.append(light[-1] if shifts is None else max(cell * shifts[0], light[-1]))
+        around.append(around[-1] if shifts is None else max(cell * shifts[1], around[-1]))
     return TextureShift(_WIDTHS_PX, tuple(light), tuple(around))
 
 
@@ -83,11 +93,59 @@ def _shift(texture: NDArray[Any], sigma_px: float, power: int, white: float) -> 
     inner = reach + 2 * _BLOCK
     if min(texture.shape) < 2 * inner + 4 * _SAMPLED:
         return 0.0
+    kernels = odd, smooth = _kernels(sigma_px, power, reach)
+    middle = slice(inner, -inner, _SAMPLED)
+    outputs = [o[middle, middle].ravel() for o in _filtered(texture, *kernels)]
+    variance = quantile_variance(np.abs(np.concatenate(outputs)))
+    return float(np.sqrt(max(variance - white * np.sum(odd**2) * np.sum(smooth**2), 0.0)))
+
+
+def _kernels(sigma_px: float, power: int, reach: int) -> tuple[Array, Array]:
+    """The factors of a filter, s^2 x G^power / sum(x^2 G^2) and G^power of the other coordinate, (2 reach + 1,)."""
     x = np.arange(-reach, reach + 1)
     G = np.exp(-0.5 * (x / sigma_px) ** 2)
     smooth = G**power
-    odd = sigma_px**2 * x * smooth / (np.sum(x**2 * G**2) * np.sum(G**2))
-    middle = slice(inner, -inner, _SAMPLED)
-    outputs = [cv2.sepFilter2D(texture, cv2.CV_32F, *k)[middle, middle] for k in ((odd, smooth), (smooth, odd))]
-    variance = quantile_variance(np.abs(np.concatenate([o.ravel() for o in outputs])))
-    return float(np.sqrt(max(variance - white * np.sum(odd**2) * np.sum(smooth**2), 0.0)))
+    return sigma_px**2 * x * smooth / (np.sum(x**2 * G**2) * np.sum(G**2)), smooth
+
+
+def _filtered(texture: NDArray[Any], odd: Array, smooth: Array) -> list[NDArray[Any]]:
+    """The shifts in u and in v, both (h, w)."""
+    return [cv2.sepFilter2D(texture, cv2.CV_32F, *k) for k in ((odd, smooth), (smooth, odd))]
+
+
+def _coarse_shifts(mean: NDArray[Any], cell: int, sigma_px: float, white: float) -> tuple[float, float] | None:
+    """Sigmas, cells, by the light's and by the background's texture in cells of a mean picture (h, w); None: no room.
+
+    sigma_px: of a spot, in cells; white: variance of the noise of a cell, relative. Places near a light are left out.
+    """
+    cells = cv2.resize(mean, (mean.shape[1] // cell, mean.shape[0] // cell), interpolation=cv2.INTER_AREA)
+    reach = int(np.ceil(_REACH * sigma_px))
+    if min(cells.shape) < 2 * reach + 2 * _SAMPLED:
+        return None
+    level = np.maximum(cv2.blur(cv2.medianBlur(cells, 5), (2 * reach + 1, 2 * reach + 1)), 1.0)
+    lit = cells - level > _BRIGHT * level
+    near = cv2.dilate(lit.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+    y, x = np.mgrid[: cells.shape[0], : cells.shape[1]]
+    A = np.stack([np.ones_like(x), x - x.mean(), y - y.mean()], axis=-1).astype(float)
+    if np.count_nonzero(~near) < _FEWEST:
+        return None
+    plane = A @ np.linalg.lstsq(A[~near], cells[~near].astype(float), rcond=None)[0]
+    texture = np.clip(cells / np.maximum(plane, 1.0) - 1, -_LARGEST_CONTRAST, _LARGEST_CONTRAST).astype(np.float32)
+    inner = slice(reach, -reach)
+    used = ~near[inner, inner]
+    if np.count_nonzero(used) < _FEWEST:
+        return None
+    out = []
+    for power in (2, 1):
+        odd, smooth = _kernels(sigma_px, power, reach)
+        own = white * np.sum(odd**2) * np.sum(smooth**2)
+        outputs = _filtered(texture, odd, smooth)
+        if power == 1:  # a slope over the spot is the plane of its fit's background
+            flat = np.ones(2 * reach + 1)
+            straight = np.arange(-reach, reach + 1.0)
+            slope = np.sum(odd * straight) * np.sum(smooth) / (np.sum(straight**2) * np.sum(flat))
+            outputs = [o - p for o, p in zip(outputs, _filtered(texture, slope * straight, flat), strict=True)]
+        sizes = np.concatenate([np.abs(o[inner, inner][used]) for o in outputs])
+        variance = (float(np.quantile(sizes, 0.68)) / NORMAL_68) ** 2
+        out.append(float(np.sqrt(max(variance - own, 0.0))))
+    return out[0], out[1]

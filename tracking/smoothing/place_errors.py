@@ -9,11 +9,11 @@ Source: ours.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geometry.arrays import Array
+from geometry.arrays import Array, Bools
 
 USUAL_WIDTH_PX = 2.0  # of spots whose width is not known
 _CHUNK = 256  # consecutive frames that are compared with each other
@@ -44,6 +44,21 @@ class PlaceErrors:
             + self.share * (self.few_places_factor * np.minimum(self.same_error_frames, np.maximum(averaged, 1.0)) - 1)
         )
 
+    def at_least(self, share: float, uv_px: Array, width_px: Array) -> PlaceErrors:
+        """This estimate, or at least a share of the variance that is known to belong to places.
+
+        The residuals of few spots hardly show errors of places, because the poses absorb them; the texture of the
+        background does. uv_px (T, n, 2): the labelled pixels, nan without. width_px (n,): as in `place_errors`.
+        """
+        if share <= self.share:
+            return self
+        reach = usable_widths(width_px)
+        counts = np.stack([_same_error_frames(uv_px[:, i], reach[i]) for i in range(len(reach))], axis=-1)
+        return replace(
+            self, share=min(share, 1.0), same_error_frames=_mean_over_views(counts, np.isfinite(uv_px[..., 0])),
+            reach_px=reach, few_places_factor=1.0,
+        )  # fmt: skip
+
 
 def correlation(distance_px: Array, width_px: Array | float) -> Array:
     """Correlation of the errors in two places at a distance, of a spot with this width (1 sigma).
@@ -63,16 +78,14 @@ def place_errors(residual: Array, uv_px: Array, width_px: Array, averaged: Array
     frames that each pose is a mean of. explained (n,): share of the residuals' variance that is expected from
     calibration errors, which are constant as well.
     """
-    width = np.where(np.isfinite(width_px), np.maximum(width_px, 0.5), USUAL_WIDTH_PX)
+    width = usable_widths(width_px)
     labelled = np.isfinite(residual[..., 0])
     count = float(np.mean(labelled.sum(axis=1)[labelled.any(axis=1)])) if labelled.any() else 0.0
     absorbed = min(3.0 / max(count, 1e-9), _MAX_ABSORBED)
     # Coarse texture and edges of the screen reach farther than a spot is wide: take the most significant length.
     reaches = [r * width for r in _REACHES]
     sums = max((_products(residual, uv_px, reach, explained) for reach in reaches), key=lambda p: p.significance)
-    same_error_frames = np.where(
-        labelled.any(axis=1), (sums.same_error_frames * labelled).sum(axis=1) / np.maximum(labelled.sum(axis=1), 1), 1
-    )
+    same_error_frames = _mean_over_views(sums.same_error_frames, labelled)
     # The poses absorb part of the residuals, which reduces the degrees of freedom.
     if sums.significance * np.sqrt(1 - absorbed) < _SIGNIFICANT:
         return PlaceErrors(0.0, same_error_frames, sums.reach_px)
@@ -83,6 +96,28 @@ def place_errors(residual: Array, uv_px: Array, width_px: Array, averaged: Array
     free = 2 * (1 - absorbed) * float(np.sum(labelled / np.maximum(sums.same_error_frames, 1.0)))
     few_places_factor = min(free / max(free - 2, 1e-9), _MAX_STUDENT)
     return PlaceErrors(place / (place + white), same_error_frames, sums.reach_px, sums.elsewhere, few_places_factor)
+
+
+def usable_widths(width_px: Array) -> Array:
+    """(n,): the widths of the spots, px; a usual one where not known."""
+    return np.where(np.isfinite(width_px), np.maximum(width_px, 0.5), USUAL_WIDTH_PX)
+
+
+def _mean_over_views(counts: Array, labelled: Bools) -> Array:
+    """(T,): mean of the counts (T, n) over the labelled views; 1 without any."""
+    total = np.where(labelled, counts, 0.0).sum(axis=1)
+    return np.asarray(np.where(labelled.any(axis=1), total / np.maximum(labelled.sum(axis=1), 1), 1.0))
+
+
+def _same_error_frames(uv_px: Array, reach_px: float) -> Array:
+    """(T,): number of frames in which one view's spot, at uv_px (T, 2), has the same error; nan without a spot."""
+    out = np.full(len(uv_px), np.nan)
+    rows = np.flatnonzero(np.isfinite(uv_px).all(axis=-1))
+    for start in range(0, len(rows), _CHUNK):
+        some = rows[start : start + _CHUNK]
+        at = uv_px[some]
+        out[some] = correlation(np.linalg.norm(at[:, None] - at[None], axis=-1), reach_px).sum(axis=1)
+    return out
 
 
 @dataclass(frozen=True, slots=True)

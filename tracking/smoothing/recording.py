@@ -51,6 +51,7 @@ class TrackedRecording:
         self._uv: list[Array] = []
         self._cov: list[Array] = []
         self._size: list[Array] = []
+        self._place: list[Array] = []
         self._first: list[Ints] = []
         self._has_image: list[Bools] = []
         self._assigned: list[Ints] = []
@@ -72,6 +73,8 @@ class TrackedRecording:
         self._uv.append(np.concatenate([f.uv_px for f in some]) if some else none2)
         self._cov.append(np.concatenate([f.cov_px2 for f in some]) if some else none4)
         self._size.append(np.concatenate([f.major_px for f in some]) if some else np.zeros(0))
+        places = [np.zeros(len(f)) if f.place_px2 is None else f.place_px2 for f in some]
+        self._place.append(np.concatenate(places) if places else np.zeros(0))
         self._first.append(first)
         self._has_image.append(np.array([f is not None for f in found]))
         self._assigned.append(assigned_in_one_list(tracked, first[self.model.camera_of]))
@@ -124,6 +127,10 @@ class TrackedRecording:
         camera begin (cameras + 1,); which cameras have a picture (cameras,).
         """
         return self._uv[k], self._cov[k], self._size[k], self._first[k], self._has_image[k]
+
+    def place_px2(self) -> Array:
+        """(m,): of the variance of a coordinate of each detection of the run, the part that belongs to its place."""
+        return np.concatenate([np.zeros(0), *self._place])
 
     def run_detections(self) -> RunDetections:
         """All detections of the run."""

@@ -333,18 +333,18 @@ class _Smoother:
         averaged = np.full(len(self.rec), np.nan)
         for k in np.flatnonzero(self.own.measured).tolist():
             averaged[k] = 6 / max(float(np.trace(np.linalg.solve(self.own.covariance[k], pose_P[k]))), 1e-9)
-        usual = float(np.nanmedian(averaged)) if np.isfinite(averaged).any() else 1.0
-        averaged = np.where(np.isfinite(averaged), averaged, usual)
-        shape = (*self.assigned.shape, 2)
-        residual, uv_px = np.full(shape, np.nan), np.full(shape, np.nan)
+        averaged = np.where(np.isfinite(averaged), averaged, np.nanmedian(averaged) if self.own.measured.any() else 1.0)
+        residual, uv_px = np.full((2, *self.assigned.shape, 2), np.nan)
         expected, _ = project_all(self.views, ref.R, ref.t)
-        explained = np.zeros(shape[1])
+        shares: list[float] = []
+        explained, place_px2 = np.zeros(len(self.model)), self.scale**2 * self.rec.place_px2()
         for k in np.flatnonzero(self.own.measured).tolist():
             use, uv, cov = labelled_points(self.detections, k, self.assigned[k], self.calibration_cov)
             use = use & np.isfinite(expected[k]).all(axis=-1)
             size = np.sqrt(0.5 * np.trace(cov[use], axis1=1, axis2=2))
-            residual[k, use] = (uv[use] - expected[k, use]) / size[:, None]
-            uv_px[k, use] = uv[use]
+            residual[k, use], uv_px[k, use] = (uv[use] - expected[k, use]) / size[:, None], uv[use]
             explained[use] = 0.5 * np.trace(self.calibration_cov[use], axis1=1, axis2=2) / size**2
-        found = place_errors(residual, uv_px, self.detections.usual_size_px, averaged, explained)
+            shares.extend(place_px2[self.detections.begin[k] + self.assigned[k, use]] / size**2)
+        width_px, share = self.detections.usual_size_px, float(np.mean(shares or [0.0]))
+        found = place_errors(residual, uv_px, width_px, averaged, explained).at_least(share, uv_px, width_px)
         return found.share, found.factor(averaged)

@@ -113,7 +113,7 @@ def steps(rng: np.random.Generator, t_s: Array) -> Motion:
         for a, b, u, v in zip(times[1::2], times[2::2], levels[1::2], levels[2::2], strict=True):
             now = (t_s >= a) & (t_s < b)
             path[now] = u + (v - u) * smooth_step((t_s[now] - a) / (b - a))
-        for b, a, u in zip([0.0, *times[2::2]], [*times[1::2], np.inf], levels[::2], strict=True):
+        for b, a, u in zip([-np.inf, *times[2::2]], [*times[1::2], np.inf], levels[::2], strict=True):
             path[(t_s >= b) & (t_s < a)] = u
     corners = np.array([c for c in times[1:] if c < t_s[-1]])
     return Motion(path[:, None] * lead, corners, f"turntable steps of {turn:.0f} frames{', abrupt' * abrupt}")

@@ -101,10 +101,11 @@ class CameraNoise:
         level = max(self.estimate.model.black_dn, 1.0)
         width = np.sqrt(found.major_px * found.minor_px)
         added = self.estimate.texture_shift.sigma_px(width, found.peak / level)
-        return replace(found, cov_px2=found.cov_px2 + (np.nan_to_num(added) ** 2)[:, None, None] * np.eye(2))
+        place_px2 = np.nan_to_num(added) ** 2
+        return replace(found, cov_px2=found.cov_px2 + place_px2[:, None, None] * np.eye(2), place_px2=place_px2)
 
     def _update_model(self) -> None:
-        """Stated values take precedence; texture, banding and correlation are always estimated: a data sheet has none."""
+        """Stated values take precedence; texture, banding and correlation are estimated: data sheets lack them."""
         estimated = None if self.estimate is None else self.estimate.model
         if self.stated is None or self._overruled:
             self.model = estimated

@@ -169,8 +169,8 @@ def unseen_finding(unseen: UnseenView, model: SpotModel) -> Finding:
         Level.WARN,
         f"spot {spot} in camera `{camera}` was measured in {unseen.measured} of {unseen.expected} frames in which the"
         " pose puts it well inside the picture",
-        "its laser is off or occluded, or points so far from where the rig file says that its spot is taken for"
-        " clutter; the pose is computed without it",
+        "its laser is off or occluded, or its spot is taken for clutter: it is wider than `max_sigma_px`, or far from"
+        " where the rig file puts it; the pose is computed without it",
         "Check the pictures where that spot should be; then check its laser's mount, or calibrate the beams again.",
         code="BP-M05",
     )

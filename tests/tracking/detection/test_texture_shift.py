@@ -38,7 +38,7 @@ def spots(sigma_px: float, peak: float, seed: int) -> tuple[Array, Array]:
     return centres, peak * np.asarray(light)
 
 
-@pytest.mark.parametrize(("sigma_px", "grain_px"), [(1.5, 1.0), (3.0, 1.5), (6.0, 1.0)])
+@pytest.mark.parametrize(("sigma_px", "grain_px"), [(1.5, 1.0), (3.0, 1.5), (6.0, 1.0), (9.0, 1.0)])
 @pytest.mark.parametrize("peak", [6000.0, 300.0])
 def test_the_background_predicts_the_errors_of_bright_and_of_faint_spots(sigma_px, grain_px, peak):
     errors, expected = [], []
@@ -54,6 +54,19 @@ def test_the_background_predicts_the_errors_of_bright_and_of_faint_spots(sigma_p
         sigma = estimate.texture_shift.sigma_px(np.array([sigma_px]), np.array([peak / BACKGROUND]))
         expected.append(float(sigma[0]))
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.mean(expected), rel=0.4)
+
+
+def test_the_fall_of_the_light_towards_the_corners_shifts_wide_spots():
+    """Vignetting of lens and sensor multiplies the laser's light; a plane of ambient light does not shift a spot."""
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    r2 = ((x - 250) ** 2 + (y - 200) ** 2) / 250**2
+    plane = 1 + 0.3 * (x - 250) / 500
+    width, contrast = np.array([12.0, 20.0]), np.array([20.0, 20.0])
+    level = estimate_noise(pictures(plane, 0.0, 4)).texture_shift.sigma_px(width, contrast)
+    falling = estimate_noise(pictures(1 - 0.2 * r2, 0.0, 4)).texture_shift.sigma_px(width, contrast)
+    usual = width**2 * 2 * 0.2 * 125 / 250**2  # px, at half the distance to the edge
+    assert np.all(level < 0.1 * usual)
+    assert np.all(np.abs(np.log(falling / usual)) < np.log(2))
 
 
 def test_noise_alone_predicts_next_to_nothing():

@@ -13,8 +13,11 @@ from tracking.smoothing.place_errors import PlaceErrors, correlation, place_erro
 WIDTH_PX = 2.0
 
 
-def textured(run: PointRun, place_px: float, white_px: float, seed: int) -> PointRun:
-    """The recording with other errors: white noise, and for each spot a smooth random field over its picture."""
+def textured(run: PointRun, place_px: float, white_px: float, seed: int, known: bool = False) -> PointRun:
+    """The recording with other errors: white noise, and for each spot a smooth random field over its picture.
+
+    known: the points state which part of their variance belongs to the place.
+    """
     rng = np.random.default_rng(seed)
     waves, n = 48, run.uv_px.shape[1]
     k_vectors = rng.normal(0, 1 / np.sqrt(2) / WIDTH_PX, (n, 2, waves, 2))
@@ -32,7 +35,8 @@ def textured(run: PointRun, place_px: float, white_px: float, seed: int) -> Poin
                     uv[i] = at + place_px * field + white_px * rng.standard_normal(2)
             width = np.full(len(uv), WIDTH_PX)
             points = Detections.at(uv, np.tile(sigma2 * np.eye(2), (len(uv), 1, 1)))
-            row.append(replace(points, major_px=width, minor_px=width))
+            place_px2 = np.full(len(uv), place_px**2) if known else None
+            row.append(replace(points, major_px=width, minor_px=width, place_px2=place_px2))
         detections.append(tuple(row))
     return replace(run, detections=tuple(detections))
 
@@ -49,6 +53,29 @@ def test_sigmas_stay_right_where_texture_shifts_the_spots(scenario, least, most)
         shares.append(smoothed.place_share)
     assert least < np.mean(nees) < most
     assert np.min(shares) > 0.5
+
+
+def only_views(run: PointRun, count: int) -> PointRun:
+    """The recording without the points of the views from `count` on: hardly any residuals are left."""
+    detections, origins = [], []
+    for per_camera, origin in zip(run.detections, run.origin, strict=True):
+        kept = [np.flatnonzero(np.asarray(views) < count) for views in origin]
+        detections.append(tuple(found[rows] for found, rows in zip(per_camera, kept, strict=True)))
+        origins.append(tuple(np.asarray(views)[rows] for views, rows in zip(origin, kept, strict=True)))
+    return replace(run, detections=tuple(detections), origin=tuple(origins))
+
+
+def test_few_spots_show_no_errors_of_places_but_the_texture_of_the_screen_does():
+    """With four spots in eight coordinates a pose of six numbers absorbs most of a shift."""
+    nees = {False: [], True: []}
+    for seed in range(4):
+        for known, answers in nees.items():
+            run = simulate_points("static", seed, frames=40, noise_px=0.05, clutter=0.0)
+            run = only_views(textured(run, 0.02, 0.05, seed, known), 4)
+            frames, _ = smoothed_frames(run, tracked(run))
+            answers.append(np.nanmean(assess(run, frames).nees) / 6)
+    assert np.mean(nees[True]) < 1.5
+    assert np.mean(nees[False]) > 1.8 * np.mean(nees[True])
 
 
 def test_white_noise_is_averaged_over_a_vehicle_at_rest():
@@ -84,6 +111,16 @@ def test_a_run_without_labels_has_no_errors_of_places():
     )
     assert nothing.share == 0.0
     assert np.array_equal(nothing.factor(np.ones(5)), np.ones(5))
+
+
+def test_a_known_share_counts_where_the_residuals_show_less():
+    uv, width = np.tile(np.array([[100.0, 50.0]]), (30, 3, 1)), np.full(3, 2.0)
+    none = PlaceErrors(0.0, np.ones(30), width)
+    assert none.at_least(0.4, uv, width).factor(np.full(30, 1e6)) == pytest.approx(1 + 0.4 * 29)
+    moving = uv + 10 * np.arange(30.0)[:, None, None]
+    assert none.at_least(0.4, moving, width).factor(np.full(30, 1e6)) == pytest.approx(1.0)
+    more = PlaceErrors(0.6, np.ones(30), width)
+    assert more.at_least(0.4, uv, width) is more
 
 
 def test_a_pose_of_one_frame_keeps_its_covariance():
