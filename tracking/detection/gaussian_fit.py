@@ -22,6 +22,7 @@ from tracking.detection.table import (
     FLUX,
     GAIN,
     GAPS,
+    HELD,
     LEVEL,
     MOMENT_U,
     MOMENT_UU,
@@ -137,7 +138,7 @@ def _step(
     if _exclude_isolated_cells(window, spot, cells):
         chi2 = accumulate(window, spot, noise, cells, algebra)
     frame = frame_of(window, spot)
-    if not _solve(frame, algebra):
+    if not _solve(frame, spot[HELD] > 0.0, algebra):
         spot[FLUX] = 0.0
         return True
     before_u, before_v = spot[U], spot[V]
@@ -255,15 +256,33 @@ def _exclude_isolated_cells(window: Window, spot: Array, cells: Array) -> bool:
 
 
 @compiled
-def _solve(frame: PolynomialFrame, algebra: Array) -> bool:
-    """Fill the columns of X: the step, and N^-1 times the gradients of the centre's u' and v' and of the flux."""
+def _solve(frame: PolynomialFrame, held: bool, algebra: Array) -> bool:
+    """Fill the columns of X: the step, and N^-1 times the gradients of the centre's u' and v' and of the flux.
+
+    held: the shape's coefficients are not part of the fit.
+    """
     X = algebra[SOLUTION]
+    if held:
+        _hold_shape(algebra)
     for p in range(9):
         X[p, 0] = algebra[VECTORS, RIGHT_SIDE, p]
         X[p, 1] = X[p, 2] = X[p, 3] = 0.0
     X[1, 1], X[2, 2] = 1.0, 1.0
     _flux_direction(frame, X, 3)
+    if held:
+        X[3, 3] = X[4, 3] = X[5, 3] = 0.0
     return solve_normal(algebra[NORMAL], X, 4, algebra[FACTOR])
+
+
+@compiled
+def _hold_shape(algebra: Array) -> None:
+    """Take the coefficients of the shape out of the normal equations."""
+    N, b = algebra[NORMAL], algebra[VECTORS, RIGHT_SIDE]
+    for p in range(3, 6):
+        b[p] = 0.0
+        for q in range(9):
+            N[p, q] = N[q, p] = 0.0
+        N[p, p] = 1.0
 
 
 @compiled

@@ -13,6 +13,7 @@ from tracking.detection import candidates, ellipse
 from tracking.detection.gaussian_fit import fit_all
 from tracking.detection.moments import find_moments, start_variance
 from tracking.detection.pixels import Noise, Pixels, texture_variance
+from tracking.detection.quality import light_beside
 from tracking.detection.regions import in_a_region
 from tracking.detection.saturated_spots import CENTRE_SHARE, compact_height
 from tracking.detection.table import (
@@ -24,6 +25,7 @@ from tracking.detection.table import (
     EXPLAINED,
     FLUX,
     GAIN,
+    HELD,
     MOMENT_U,
     MOMENT_UU,
     MOMENT_UV,
@@ -67,6 +69,13 @@ _MERGES = 3  # fits of a picture at most, with parts joined in between
 _LEAST_START = 2.0  # px^2: least variance of that start
 _OUTGROWN = 4.0  # variance of the moments over that of the start above which they have left the light
 _STEEPEST = 0.6065  # exp(-1/2): slope of a Gaussian at one sigma, in heights per sigma
+_NARROWEST = 0.35  # px: width of a spot that the pixels do not resolve; with the pixel's own it is 0.45
+_UNRESOLVED = 1.0  # px: of a wider fit the centre is known
+_BESIDE = 3.0  # sigmas: least light of such a spot outside its two brightest pixels, which may be hot
+_UNRESOLVED_GAIN = (
+    2.0  # least decrease of its chi-square, relative to threshold^2: noise of a few pixels has longer tails
+)
+_WITHIN_PIXEL = 0.03  # px: error of the centre if the held width is a tenth of a pixel wrong
 _NOTHING = 1e12  # px^2: variance of the start of a candidate that has been joined to another one; the fit leaves it out
 _SAME_SPOT = 1.5  # sigmas of a brighter spot: a second spot nearer to its centre is a duplicate
 
@@ -96,7 +105,7 @@ def measure(
     for k in range(chosen.shape[0]):
         peak, spot = peaks[chosen[k]], table[k]
         spot[MOMENT_U], spot[MOMENT_V], spot[BACKGROUND] = peak[AT_U], peak[AT_V], peak[LEVEL]
-        spot[WIDE], spot[START] = peak[WIDE_PEAK], start_variance(peak[SCALE])
+        spot[WIDE], spot[START], spot[HELD] = peak[WIDE_PEAK], start_variance(peak[SCALE]), 0.0
     find_moments(image, table, cells)
     least = _LEAST_GAIN * limits.threshold_sigma**2
     for _ in range(_MERGES):
@@ -106,6 +115,9 @@ def measure(
     if _start_again(peaks, chosen, table):
         fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, cells, algebra)
         _drop_background(table)
+    if _hold_unresolved(peaks, chosen, table, limits):
+        fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, cells, algebra)
+        _judge_unresolved(image, table, noise, limits)
     for k in range(chosen.shape[0]):
         spot = table[k]
         spot[ACCEPTED] = (
@@ -157,6 +169,43 @@ def _drop_background(table: Array) -> None:
         wide = ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[1] > _OUTGROWN * spot[MOMENT_UU]
         if wide or height * _STEEPEST < rise:
             spot[FLUX] = 0.0
+
+
+@compiled
+def _hold_unresolved(peaks: Array, chosen: Ints, table: Array, limits: DetectionLimits) -> bool:
+    """Give fits that have collapsed a start with a width that is held; whether there are any.
+
+    The width of a spot that is narrower than a pixel follows from the light in the neighbouring pixels alone. Noise, or
+    a top that is flatter than a Gaussian's, makes it zero, and then its place within the pixel is unknown.
+    """
+    found = False
+    for k in range(table.shape[0]):
+        spot, peak = table[k], peaks[chosen[k]]
+        spot[ACTIVE] = 0.0
+        if spot[FLUX] <= 0.0 or peak[WIDE_PEAK]:
+            continue
+        major, minor, _ = ellipse.axes(spot[UU], spot[UV], spot[VV])
+        sigma = sqrt(max(spot[VAR_U], spot[VAR_V], 0.0))
+        if major > _UNRESOLVED or (minor >= limits.min_sigma and sigma < 0.5 * max(major, 0.5)):
+            continue
+        spot[MOMENT_U], spot[MOMENT_V] = peak[AT_U], peak[AT_V]
+        spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV] = _NARROWEST**2, 0.0, _NARROWEST**2
+        spot[FLUX], spot[ACTIVE], spot[HELD] = 9.0 * peak[HEIGHT], 1.0, 1.0
+        found = True
+    return found
+
+
+@compiled
+def _judge_unresolved(image: Pixels, table: Array, noise: Noise, limits: DetectionLimits) -> None:
+    """Reject fits with a held width that are weak or have light in one or two pixels only; widen the others' covariance."""
+    needed = _UNRESOLVED_GAIN * limits.threshold_sigma**2
+    for k in range(table.shape[0]):
+        spot = table[k]
+        if not spot[HELD] or spot[FLUX] <= 0.0:
+            continue
+        spot[VAR_U], spot[VAR_V] = spot[VAR_U] + _WITHIN_PIXEL**2, spot[VAR_V] + _WITHIN_PIXEL**2
+        if spot[GAIN] < needed or light_beside(image, spot, noise, _NARROWEST) < _BESIDE:
+            spot[FLUX] = spot[UU] = spot[UV] = spot[VV] = 0.0
 
 
 @compiled

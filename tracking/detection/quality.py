@@ -2,28 +2,36 @@
 
 from __future__ import annotations
 
-from math import sqrt
+from math import erf, sqrt
+
+import numpy as np
 
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
 from tracking.detection.normal_equations import PolynomialFrame
-from tracking.detection.pixels import OUTSIDE, Window
+from tracking.detection.pixels import OUTSIDE, Noise, Pixels, Window, pixel, variance
 from tracking.detection.table import (
     CHI2,
     COV_UV,
     EXPLAINED,
+    FLUX,
     GAIN,
+    LEVEL,
     LIGHT,
     NEIGHBOUR_LIGHT,
     PEAK,
     RESIDUAL,
     SIGMA_FLUX,
+    SLOPE_U,
+    SLOPE_V,
     STATE,
     VALUES,
     VAR_U,
     VAR_V,
     WEIGHT,
+    U,
+    V,
 )
 
 _CORE = 0.2  # share of the brightest cell's light that limits the core: the peak is searched in the core, with clipped
@@ -76,6 +84,37 @@ def gain_over_plane(N: Array, b: Array, before: float, chi2: float) -> float:
     y2 -= l2 * y0 + l3 * y1
     plane = y0 * y0 / d0 + y1 * y1 / d1 + y2 * y2 / d2
     return max(before + 2 * b[0] + N[0, 0] - plane - chi2, 0.0)
+
+
+@compiled
+def light_beside(image: Pixels, spot: Array, noise: Noise, width: float) -> float:
+    """The light of a fitted narrow spot of sigma `width`, px, outside its two brightest pixels, in its own sigmas.
+
+    A matched filter over 5x5 pixels. Hot pixels, which occur in pairs, have no light beside them.
+    """
+    column, row = int(np.rint(spot[U])), int(np.rint(spot[V]))
+    product, power, first, second = 0.0, 0.0, (-1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)
+    for i in range(max(row - 2, 0), min(row + 3, image.height)):
+        for j in range(max(column - 2, 0), min(column + 3, image.width)):
+            light = spot[FLUX] * _within_pixel(j - spot[U], width) * _within_pixel(i - spot[V], width)
+            plane = spot[LEVEL] + spot[SLOPE_U] * (j - spot[U]) + spot[SLOPE_V] * (i - spot[V])
+            value = pixel(image, j, i)
+            weight = light / variance(noise, plane + light)
+            here = (value, weight * (value - plane), weight * light)
+            product, power = product + here[1], power + here[2]
+            if value > first[0]:
+                first, second = here, first
+            elif value > second[0]:
+                second = here
+    product, power = product - first[1] - second[1], power - first[2] - second[2]
+    return product / sqrt(max(power, 1e-12))
+
+
+@compiled
+def _within_pixel(offset: float, width: float) -> float:
+    """The share of the light of a line spread of sigma `width`, px, that falls on a pixel at this offset, px."""
+    scale = 1.0 / (width * sqrt(2.0))
+    return 0.5 * (erf((offset + 0.5) * scale) - erf((offset - 0.5) * scale))
 
 
 @compiled

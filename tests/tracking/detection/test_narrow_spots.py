@@ -1,0 +1,58 @@
+"""Spots that the pixels hardly resolve: whatever their place within a pixel, they are found, and hot pixels are not."""
+
+import numpy as np
+import pytest
+
+from geometry.camera import SensorNoise
+from tests.tracking.rendering import Scene, Spot, photograph
+from tracking.detection.detect import find_spots
+from tracking.noise import NoiseModel
+
+NOISE = SensorNoise(gain_e_per_dn=30.0, read_noise_e=45.0)
+SIZE = (400, 320)
+
+
+def grid(rng: np.random.Generator) -> np.ndarray:
+    """Places (n, 2) px, far apart and anywhere within a pixel."""
+    u, v = np.meshgrid(np.arange(30.0, 380, 40), np.arange(30.0, 300, 40))
+    return np.stack([u.ravel(), v.ravel()], axis=-1) + rng.uniform(-0.5, 0.5, (u.size, 2))
+
+
+@pytest.mark.parametrize(("sigma", "peak"), [(0.3, 250.0), (0.36, 120.0), (0.45, 60.0)])
+def test_a_spot_as_narrow_as_a_pixel_is_found_anywhere_within_it(sigma, peak):
+    """Noise makes the fitted width of some zero. sigma: of the light, before the pixels integrate it."""
+    found = elsewhere = 0
+    normalised = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        places = grid(rng)
+        scene = Scene([Spot(u, v, peak, sigma, sigma) for u, v in places], SIZE)
+        points = find_spots(photograph(scene, rng), noise=NOISE)
+        gap = np.linalg.norm(points.uv_px[:, None] - places, axis=-1)
+        found += int(np.sum(gap.min(axis=0) < 0.7))
+        elsewhere += int(np.sum(gap.min(axis=1) > 0.7))
+        rows = gap.argmin(axis=0)
+        off = points.uv_px[rows] - places
+        normalised.append(
+            np.einsum("ni,nij,nj->n", off, np.linalg.inv(points.cov_px2[rows]), off)[gap.min(axis=0) < 0.7]
+        )
+    total = 4 * len(places)
+    assert found >= 0.98 * total
+    assert elsewhere == 0
+    assert 0.5 < np.mean(np.concatenate(normalised)) / 2 < 2.0
+
+
+@pytest.mark.parametrize("pair", [False, True])
+@pytest.mark.parametrize("height", [15.0, 30.0, 120.0])
+def test_hot_pixels_and_pairs_of_them_are_not_narrow_spots(height, pair):
+    count = 0
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        picture = photograph(Scene([], SIZE), rng).astype(float)
+        for u, v in np.rint(grid(rng)).astype(int):
+            picture[v, u] += height
+            if pair:
+                picture[v, u + 1] += height * rng.uniform(0.5, 1.0)
+        points = find_spots(np.clip(picture, 0, 255).astype(np.uint8), noise=NoiseModel.of(NOISE))
+        count += len(points)
+    assert count <= (0.08 if pair else 0.0) * 4 * len(grid(np.random.default_rng(0)))
