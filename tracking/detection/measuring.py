@@ -197,7 +197,7 @@ def _hold_unresolved(peaks: Array, chosen: Ints, table: Array, limits: Detection
 
 @compiled
 def _judge_unresolved(image: Pixels, table: Array, noise: Noise, limits: DetectionLimits) -> None:
-    """Reject fits with a held width that are weak or have light in one or two pixels only; widen the others' covariance."""
+    """Reject fits with a held width that are weak or have no light beside two pixels; widen the others' covariance."""
     needed = _UNRESOLVED_GAIN * limits.threshold_sigma**2
     for k in range(table.shape[0]):
         spot = table[k]
