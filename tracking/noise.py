@@ -35,6 +35,7 @@ class NoiseModel:
     banding_dn: float = 0.0  # sigma of rounding errors that neighbouring pixels share, because the noise is small
     correlation: float = 1.0  # variance of means of neighbouring pixels over that of independent pixels: above 1 in
     # compressed pictures. A spot's centre is such a mean, so detection uses `of_means`
+    compression_dn2: float = 0.0  # variance that lossy compression adds to pixels with light, whose details it rounds
 
     def __post_init__(self) -> None:
         if not (self.floor_dn2 > 0 and self.slope_dn >= 0):

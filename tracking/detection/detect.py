@@ -183,6 +183,6 @@ class _Task(NamedTuple):
             float(parameters.min_explained),
         )
         pixels = Pixels(image.view(np.uint8), image.itemsize, image.shape[1], image.shape[0])
-        search = float(model.texture), float(model.banding_dn)
-        known = Noise(float(model.floor_dn2), float(model.slope_dn), float(model.black_dn), *search)
+        others = float(model.texture), float(model.banding_dn), float(model.compression_dn2)
+        known = Noise(float(model.floor_dn2), float(model.slope_dn), float(model.black_dn), *others)
         return _Task(image, pixels, known, limits)

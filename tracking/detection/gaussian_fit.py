@@ -153,7 +153,7 @@ def _step(
     moved = _needs_another_step(du, var_u, spot[UU]) or _needs_another_step(dv, var_v, spot[VV])
     if not moved or last:
         spot[VAR_U], spot[COV_UV], spot[VAR_V], spot[SIGMA_FLUX] = var_u, cov_uv, var_v, sigma_flux
-        assess_fit(window, frame, after, cells, spot)
+        assess_fit(window, frame, after, noise, cells, spot)
         if moved:  # the last step is added to the uncertainty of a centre that has not converged
             spot[VAR_U], spot[COV_UV] = spot[VAR_U] + du * du, spot[COV_UV] + du * dv
             spot[VAR_V] += dv * dv

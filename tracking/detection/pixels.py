@@ -114,6 +114,7 @@ class Noise(NamedTuple):
     black: float
     texture: float
     banding: float
+    compression: float
 
 
 @compiled

@@ -43,11 +43,11 @@ _LAGS = 2  # cells: largest lag of the autocorrelation of the residuals
 
 
 @compiled
-def assess_fit(window: Window, frame: PolynomialFrame, chi2: float, cells: Array, spot: Array) -> None:
+def assess_fit(window: Window, frame: PolynomialFrame, chi2: float, noise: Noise, cells: Array, spot: Array) -> None:
     """Fill PEAK, CHI2 and EXPLAINED of a spot (COLUMNS,), which has its covariances and GAIN.
 
     chi2: after the last step. The covariance is the Cramer-Rao bound of the model on entry; it and the variance of the
-    flux are scaled by `_covariance_factor`.
+    flux are scaled by `_covariance_factor`, the covariance at least by `_compression_factor`.
     """
     count = window.columns * window.rows
     used, most = 0, 0.0
@@ -61,11 +61,12 @@ def assess_fit(window: Window, frame: PolynomialFrame, chi2: float, cells: Array
             peak = max(peak, cells[RESIDUAL, k] + cells[LIGHT, k])
     spot[PEAK], spot[CHI2] = peak, chi2 / free
     # Chi-square scatters by sqrt(2 free): twice that is not counted as misfit, for the sake of faint spots.
-    noise = min(free + 2.0 * sqrt(2.0 * free), chi2)
-    spot[EXPLAINED] = spot[GAIN] / max(chi2 + spot[GAIN] - noise, 1e-9)
+    by_noise = min(free + 2.0 * sqrt(2.0 * free), chi2)
+    spot[EXPLAINED] = spot[GAIN] / max(chi2 + spot[GAIN] - by_noise, 1e-9)
     factor = _covariance_factor(window, frame, cells, used)
-    spot[VAR_U], spot[COV_UV], spot[VAR_V] = spot[VAR_U] * factor, spot[COV_UV] * factor, spot[VAR_V] * factor
     spot[SIGMA_FLUX] *= sqrt(factor)
+    factor = max(factor, _compression_factor(window, noise.compression, cells))
+    spot[VAR_U], spot[COV_UV], spot[VAR_V] = spot[VAR_U] * factor, spot[COV_UV] * factor, spot[VAR_V] * factor
 
 
 @compiled
@@ -154,13 +155,13 @@ def _covariance_factor(window: Window, frame: PolynomialFrame, cells: Array, use
 def _odd_misfit_factor(
     window: Window, frame: PolynomialFrame, cells: Array, odd: Array, doubled: float, anywhere: bool
 ) -> float:
-    """The factor; 1 without a misfit. odd (cells,): residuals in sigmas, overwritten.
+    """The factor; 1 without a misfit. odd (cells,): residuals in sigmas, overwritten. Fills NEIGHBOUR_LIGHT.
 
     anywhere: whether there is one in the mean of all cells. Grain of the light is in the core only: there the mean
     weighted with the sensitivity shows it. Its variance, with noise alone, is 2 sum(share^2), or 4 of mirrored pairs.
     """
     count = window.columns * window.rows
-    share = cells[NEIGHBOUR_LIGHT]  # no longer needed
+    share = cells[NEIGHBOUR_LIGHT]  # no longer needed: the sensitivity of the centre to each cell
     a, b, c = ellipse.inverse(frame.S[0], frame.S[1], frame.S[2])
     total = 0.0
     for k in range(count):
@@ -182,6 +183,19 @@ def _odd_misfit_factor(
     grains = 1.0 / max(crowd * grain, 1e-12)  # number of independent samples in the slopes
     # Four fitted parameters are odd, so the residuals contain less of the odd part than the light.
     return max(square * grain * min(grains / max(grains - 4.0, 1e-9), 3.0), 1.0)
+
+
+@compiled
+def _compression_factor(window: Window, compression: float, cells: Array) -> float:
+    """Factor >= 1 on the covariance of the centre for the variance, DN^2 per pixel, that compression adds to the light.
+
+    Weighted with the sensitivity in NEIGHBOUR_LIGHT.
+    """
+    added, total = 0.0, 0.0
+    for k in range(window.columns * window.rows):
+        share = cells[NEIGHBOUR_LIGHT, k]
+        added, total = added + share * cells[WEIGHT, k], total + share
+    return 1.0 + compression / window.cell**2 * added / max(total, 1e-300)
 
 
 @compiled

@@ -37,6 +37,9 @@ _LEAST_OF_SPOTS, _MOST_OF_SPOTS = 30, 300  # pixels per brightness class; residu
 _CONTRASTS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)  # contrasts of the light's grain that are tried
 _FEW_STEPS = 20  # grey values of a background below which one step is more than its texture
 _OF_STEP = 0.3  # of a block's step, as its sigma: with the usual threshold a spot must be 1.5 steps high
+# Of a block's step squared. JPEG's steps of coarse details are 6 to 8 times that of a block's mean (T.81, annex K), so
+# the error of each of them has a variance of 3 to 5 step^2; a spot has about a third of all of them.
+_OF_LIGHT = 4 / 3
 _GRAIN_SIGMA = 0.5  # relative uncertainty of the grain's variance
 
 
@@ -81,8 +84,12 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
     lines = _Lines.fit(levels, background, full, rounding) if clipped is None else _Lines.from_point(*clipped, full)
     slope, slope_sigma = lines.slope(rounding)
     first = lines.model(slope, rounding)
-    shared = max(banding(first.floor_dn2, rounding), _OF_STEP * block_step(usable))
-    first = replace(first, banding_dn=shared, correlation=levels.correlation if clipped is None else 1.0)
+    step_of_blocks = block_step(usable)
+    shared = max(banding(first.floor_dn2, rounding), _OF_STEP * step_of_blocks)
+    # The steps of blocks make means of their pixels scatter as well; they count once.
+    correlation = levels.correlation if clipped is None and not step_of_blocks else 1.0
+    lossy = _OF_LIGHT * step_of_blocks**2
+    first = replace(first, banding_dn=shared, correlation=correlation, compression_dn2=lossy)
     first = replace(first, texture=texture_of(usable, first))
     if slope_sigma > _SURE:  # no static pixel is bright enough: use the spots' residuals
         found = [find_spots(p, DetectParameters(max_detections=_MOST_SPOTS), first) for p in usable]

@@ -105,7 +105,7 @@ class CameraNoise:
         return replace(found, cov_px2=found.cov_px2 + place_px2[:, None, None] * np.eye(2), place_px2=place_px2)
 
     def _update_model(self) -> None:
-        """Stated values take precedence; texture, banding and correlation are estimated: data sheets lack them."""
+        """Stated values take precedence; the rest is estimated: data sheets lack them."""
         estimated = None if self.estimate is None else self.estimate.model
         if self.stated is None or self._overruled:
             self.model = estimated
@@ -113,8 +113,9 @@ class CameraNoise:
         stated = NoiseModel.of(self.stated)
         if estimated is not None:
             stated = replace(
-                stated, texture=estimated.texture, banding_dn=estimated.banding_dn, correlation=estimated.correlation
-            )
+                stated, texture=estimated.texture, banding_dn=estimated.banding_dn, correlation=estimated.correlation,
+                compression_dn2=estimated.compression_dn2,
+            )  # fmt: skip
         self.model = stated
 
     def _estimate_again(self, picture: Picture, parameters: DetectParameters) -> Detections:
