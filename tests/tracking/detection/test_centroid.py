@@ -43,7 +43,7 @@ from tracking.detection.table import (
 )  # fmt: skip
 
 px = 1.0
-NOISE = Noise(1.5**2 + 1 / 12, 1 / 30, 0.0, 0.0, 0.0)
+NOISE = Noise(1.5**2 + 1 / 12, 1 / 30, 0.0, 0.0, 0.0, 0.0)
 sigmas = st.floats(0.3, 15)
 
 
@@ -177,7 +177,7 @@ def test_without_noise_the_moments_are_close_to_the_truth_and_the_fit_reaches_it
     table = start(spot, 1000.0)
     find_moments(image, table, cells)
     assert np.abs(table[0, [MOMENT_U, MOMENT_V]] - [40.3, 30.8]).max() < 0.1 * px
-    fit_all(image, table, Noise(1.0, 1.0, 1000.0, 0.0, 0.0), 65535.0, 20.0, 0.0, False, cells, algebra)
+    fit_all(image, table, Noise(1.0, 1.0, 1000.0, 0.0, 0.0, 0.0), 65535.0, 20.0, 0.0, False, cells, algebra)
     assert np.abs(table[0, [U, V]] - [40.3, 30.8]).max() < 2e-4 * px
     assert ellipse.axes(*table[0, UU : UU + 3]) == pytest.approx((3.1, 1.7, 25.0), abs=0.01)
     assert table[0, FLUX] == pytest.approx(spot.flux, rel=1e-3)
@@ -248,5 +248,5 @@ def test_centres_are_not_biased_towards_pixel_centres(sigma, lock):
         cells, algebra = workspace()
         table = start(spot, 1000.0)
         find_moments(image, table, cells)
-        fit_all(image, table, Noise(100.0, 0.1, 1000.0, 0.0, 0.0), 65535.0, 20.0, 0.0, False, cells, algebra)
+        fit_all(image, table, Noise(100.0, 0.1, 1000.0, 0.0, 0.0, 0.0), 65535.0, 20.0, 0.0, False, cells, algebra)
         assert np.abs(table[0, [U, V]] - [spot.u, spot.v]).max() < lock * px
