@@ -265,7 +265,9 @@ class _Estimator:
                 # As `corner_offsets`, for a short exposure.
                 b = (ref.m[k + 1, :6] - ref.m[k, :6]) * self.run.exposure_s / 8
                 L[k], g[k], _ = with_error_along(b, L[k], g[k])
-        jump = jump_variances(ref, L, measured, jumped, self.dt)
+        # By the spots alone: the error of a corner grows with the jump, and the jump that is allowed would depend on
+        # the one that was estimated before, so that the passes alternate between two motions without end.
+        jump = jump_variances(ref, self._without_corners(ref)[0], measured, jumped, self.dt)
         first = _first_variance(ref, self.dt, bool(measured[0]))
         return RunInformation(L, g, self.dt, jump, jump / MANOEUVRE_S**2, first), float(chi2.sum())
 
