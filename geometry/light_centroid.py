@@ -9,11 +9,13 @@ of a circle's centre (Heikkila & Silven, CVPR 1997, section 3.1), here for a Gau
 from __future__ import annotations
 
 from functools import lru_cache
+from math import sqrt
 
 import numpy as np
 
 from geometry.arrays import Array, Bools
 from geometry.camera import Camera
+from geometry.compilation.jit import compiled
 from geometry.planes import intersect_plane
 from geometry.rig import Screen
 
@@ -46,35 +48,53 @@ class CentroidOffsets:
         picture. brightness (n,): variance of the shot noise at the peak over that of the background noise; the brighter
         a spot, the more weight its wings have in the fit.
         """
-        n = len(uv_px)
-        if n == 0:
-            return np.zeros((0, 2))
-        T = self._interpolated(uv_px)
-        # L is the Cholesky factor of a shape, g = L^-1 x are coordinates in sigmas of the spot.
-        l11 = np.sqrt(np.maximum(shape_px2[:, 0], 1e-9))
-        l21 = shape_px2[:, 1] / l11
-        l22 = np.sqrt(np.maximum(shape_px2[:, 2] - l21**2, 1e-9))
-        t11 = T[..., 0] * (l11**2)[:, None] + 2 * T[..., 1] * (l11 * l21)[:, None] + T[..., 2] * (l21**2)[:, None]
-        t12 = T[..., 1] * (l11 * l22)[:, None] + T[..., 2] * (l21 * l22)[:, None]
-        t22 = T[..., 2] * (l22**2)[:, None]
-        P1 = np.stack([t11[:, 0], t12[:, 0], t22[:, 0]]) / l11
-        P2 = (np.stack([t11[:, 1], t12[:, 1], t22[:, 1]]) - l21 * P1) / l22
-        # The exponent is -|g + P(g, g)|^2 / 2 = -|g|^2 / 2 - g . (P_11 g1^2 + 2 P_12 g1 g2 + P_22 g2^2) + ...
-        cube1, cube2 = -P1[0], -P2[2]
-        mixed1, mixed2 = -(P1[2] + 2 * P2[1]), -(P2[0] + 2 * P1[1])  # of g1 g2^2 and g1^2 g2
-        a, b = np.array([_centre_shifts(float(r)) for r in brightness]).T
-        g1, g2 = a * cube1 + b * mixed1, a * cube2 + b * mixed2
-        kept = np.minimum(1.0, _MAX_SHARE / np.maximum(np.hypot(g1, g2), 1e-12))
-        return np.asarray(np.stack([l11 * g1, l21 * g1 + l22 * g2], axis=-1) * kept[:, None])
+        shifts = np.array([_centre_shifts(float(r)) for r in brightness]).reshape(-1, 2)
+        return _offsets(self._curvature, self._size, np.ascontiguousarray(uv_px), shape_px2, shifts)
 
-    def _interpolated(self, uv_px: Array) -> Array:
-        """The curvature (n, 2, 3) at pixels (n, 2), bilinear between the nodes."""
-        place = np.clip(uv_px / self._size, 0.0, 1.0) * (_NODES - 1)
-        first = np.minimum(place.astype(np.int64), _NODES - 2)
-        i, j = first.T
-        x, y = (place - first).T[:, :, None, None]
-        C = self._curvature
-        return (1 - x) * ((1 - y) * C[i, j] + y * C[i, j + 1]) + x * ((1 - y) * C[i + 1, j] + y * C[i + 1, j + 1])
+
+@compiled
+def _offsets(curvature: Array, size: Array, uv_px: Array, shape_px2: Array, shifts: Array) -> Array:
+    """`CentroidOffsets.at`; curvature (_NODES, _NODES, 2, 3), size (2,), shifts (n, 2) from `_centre_shifts`."""
+    out = np.zeros((uv_px.shape[0], 2))
+    T = np.empty((2, 3))
+    for k in range(uv_px.shape[0]):
+        _interpolate(curvature, size, uv_px[k], T)
+        # L is the Cholesky factor of a shape, g = L^-1 x are coordinates in sigmas of the spot.
+        l11 = sqrt(max(shape_px2[k, 0], 1e-9))
+        l21 = shape_px2[k, 1] / l11
+        l22 = sqrt(max(shape_px2[k, 2] - l21 * l21, 1e-9))
+        first, second = np.empty(3), np.empty(3)
+        for c in range(2):
+            t11 = T[c, 0] * (l11 * l11) + 2 * T[c, 1] * (l11 * l21) + T[c, 2] * (l21 * l21)
+            t12, t22 = T[c, 1] * (l11 * l22) + T[c, 2] * (l21 * l22), T[c, 2] * (l22 * l22)
+            row = first if c == 0 else second
+            row[0], row[1], row[2] = t11, t12, t22
+        for q in range(3):
+            first[q] /= l11
+            second[q] = (second[q] - l21 * first[q]) / l22
+        # The exponent is -|g + P(g, g)|^2 / 2 = -|g|^2 / 2 - g . (P_11 g1^2 + 2 P_12 g1 g2 + P_22 g2^2) + ...
+        cube1, cube2 = -first[0], -second[2]
+        mixed1 = -(first[2] + 2 * second[1])  # of g1 g2^2
+        mixed2 = -(second[0] + 2 * first[1])  # of g1^2 g2
+        g1, g2 = shifts[k, 0] * cube1 + shifts[k, 1] * mixed1, shifts[k, 0] * cube2 + shifts[k, 1] * mixed2
+        kept = min(1.0, _MAX_SHARE / max(np.hypot(g1, g2), 1e-12))
+        out[k, 0], out[k, 1] = l11 * g1 * kept, (l21 * g1 + l22 * g2) * kept
+    return out
+
+
+@compiled
+def _interpolate(curvature: Array, size: Array, uv: Array, out: Array) -> None:
+    """The curvature (2, 3) at a pixel (2,), bilinear between the nodes, into `out`."""
+    at_u = min(max(uv[0] / size[0], 0.0), 1.0) * (_NODES - 1)
+    at_v = min(max(uv[1] / size[1], 0.0), 1.0) * (_NODES - 1)
+    i = min(int(at_u), _NODES - 2) if at_u >= 0.0 else 0  # for nan the result is nan
+    j = min(int(at_v), _NODES - 2) if at_v >= 0.0 else 0
+    x, y = at_u - i, at_v - j
+    for a in range(2):
+        for b in range(3):
+            low = (1 - y) * curvature[i, j, a, b] + y * curvature[i, j + 1, a, b]
+            high = (1 - y) * curvature[i + 1, j, a, b] + y * curvature[i + 1, j + 1, a, b]
+            out[a, b] = (1 - x) * low + x * high
 
 
 def _curvature(camera: Camera, screen: Screen, uv_px: Array) -> Array:

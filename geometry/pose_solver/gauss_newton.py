@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from geometry.arrays import Array, Ints, symmetric
+from geometry.arrays import Array, Bools, Ints, symmetric
 from geometry.pose import Pose
 from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import RigUncertainty
@@ -256,10 +256,18 @@ def _terms(
 
 def covariance_of(H: Array) -> tuple[Array, bool]:
     """Covariance (6, 6) of a normal matrix (6, 6), and whether that has full rank; if not, all entries are inf."""
+    covariance, full_rank = covariances_of(H[None])
+    return covariance[0], bool(full_rank[0])
+
+
+def covariances_of(H: Array) -> tuple[Array, Bools]:
+    """As `covariance_of`, of normal matrices (n, 6, 6): covariances (n, 6, 6), and which have full rank (n,)."""
     eigenvalues, vectors = np.linalg.eigh(symmetric(H))
-    if eigenvalues[0] <= (RANK_TOLERANCE**2) * eigenvalues[-1]:
-        return np.full((6, 6), np.inf), False
-    return (vectors / eigenvalues) @ vectors.T, True
+    full_rank: Bools = eigenvalues[:, 0] > (RANK_TOLERANCE**2) * eigenvalues[:, -1]
+    out = np.full(H.shape, np.inf)
+    v = vectors[full_rank]
+    out[full_rank] = (v / eigenvalues[full_rank][:, None]) @ np.swapaxes(v, 1, 2)
+    return out, full_rank
 
 
 def is_measurement(fit: PoseFit, limits: SolveLimits) -> bool:

@@ -91,7 +91,7 @@ def _tile(one: _Kept, width: int, height: int) -> Colour:
     h, w = one.picture.shape
     scale = min(width / w, height / h, _LARGEST_ZOOM)
     size = (max(round(w * scale), 1), max(round(h * scale), 1))
-    grey = stretched(one.picture.astype(np.float32), *grey_limits(one.picture.astype(np.float32)))
+    grey = stretched(one.picture, *grey_limits(one.picture))
     # A maximum filter keeps small spots visible in a reduced picture.
     if scale < 0.6:
         reach = max(round(0.7 / scale), 1)

@@ -40,7 +40,7 @@ def status_words(mark: SpotMark) -> str:
 
 def limits_of(picture: GreyPicture) -> Limits:
     """The grey values of a picture that are shown as black and as white."""
-    return grey_limits(picture.astype(float))
+    return grey_limits(picture)
 
 
 def grey_picture(camera: CameraFrame, limits: Limits | None = None) -> Pixels | None:
@@ -48,8 +48,7 @@ def grey_picture(camera: CameraFrame, limits: Limits | None = None) -> Pixels | 
     if camera.picture is None:
         return None
     low, high = limits_of(camera.picture) if limits is None else limits
-    shades = stretched(np.arange(np.iinfo(camera.picture.dtype).max + 1, dtype=float), low, high)
-    return np.asarray(shades[camera.picture], np.uint8)
+    return stretched(camera.picture, low, high)
 
 
 def panel(camera: CameraFrame, grey: Pixels | None, width: int, unit: float, size: float) -> Pixels:

@@ -42,7 +42,7 @@ def write_overlay(recording: PointRecording, track: list[PointEstimate], path: P
                 break
             if isinstance(picture, MissingPicture) or (picture.shape[1], picture.shape[0]) != recording.size_px:
                 continue
-            limits = limits or grey_limits(picture.astype(np.float32))
+            limits = limits or grey_limits(picture)
             k = frame - int(recording.frames[0])
             writer.write(drawn(picture, limits, track, k, size))
     finally:
@@ -54,7 +54,7 @@ def drawn(
 ) -> np.ndarray:
     """The picture of frame k, (h, w, 3), 8 bit, BGR, reduced to `size` (width, height), with the track up to it."""
     scale = np.array(size) / np.array([picture.shape[1], picture.shape[0]])
-    grey = cv2.resize(stretched(picture.astype(np.float32), *limits), size, interpolation=cv2.INTER_AREA)
+    grey = cv2.resize(stretched(picture, *limits), size, interpolation=cv2.INTER_AREA)
     out = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
 
     def place(uv_px: Array) -> tuple[int, int]:

@@ -24,6 +24,7 @@ HOT_SIGMAS = 4.0  # least excess of a hot pixel over its surroundings
 _BESIDE_HOT = 2.0  # sigmas above a hot pixel's neighbours at which other pixels are clipped: hot pixels occur in pairs
 _REACH = 4  # px around a block that its search uses: 2 for maxima, 2 for the means
 _SIDE = BLOCK + 2 * _REACH
+_LINES, _SUMS, _SCRATCH = 1, 4, 7  # in the workspace of a block, see `block_workspace`
 _WEAK = 20.0  # sigmas: a weaker peak must also exceed the background's curvature ...
 _WEAK_SHARE = 0.7  # ... by this share of the threshold
 _WIDE_CLIP = 4.0  # sigmas above the background at which pixels are clipped in the search for wide faint spots
@@ -37,8 +38,8 @@ PEAK_COLUMNS = 6
 
 
 def block_workspace() -> Array:
-    """Workspace for one block: pixels; sums of three in a row; sums of 3x3; scratch values."""
-    return np.zeros((4, _SIDE, _SIDE))
+    """Workspace for one block: pixels; sums of 3, 5 and 7 in a line; of 3x3, 5x5 and 7x7; scratch values."""
+    return np.zeros((_SCRATCH + 1, _SIDE, _SIDE))
 
 
 class PeakSearch(NamedTuple):
@@ -48,6 +49,7 @@ class PeakSearch(NamedTuple):
     noise: Noise
     blocks: Blocks
     workspace: Array  # see `block_workspace`
+    flat: Array  # the same memory, (_SCRATCH + 1, _SIDE^2)
     peaks: Array  # (most, PEAK_COLUMNS), the peaks found
 
 
@@ -69,30 +71,24 @@ def find_peaks(search: PeakSearch, found: Ints, found_count: int, min_sigmas: fl
 def _peaks_of_block(search: PeakSearch, left: int, top: int, level: float, min_sigmas: float, count: int) -> int:
     """Append the significant maxima, among 5x5 neighbours, of the mean of 3x3 pixels in one block."""
     image, noise, peaks, workspace = search.image, search.noise, search.peaks, search.workspace
-    values, lines, sum3, scratch = workspace[0], workspace[1], workspace[2], workspace[3, 0]
+    values, sum3, scratch = workspace[0], workspace[_SUMS], workspace[_SCRATCH, 0]
+    sum5, sum7 = workspace[_SUMS + 1], workspace[_SUMS + 2]
     # Mirrored at the border: with repeated pixels the maximum of a spot at the edge would lie outside the picture.
-    for i in range(_SIDE):
-        v = mirrored(top + i - _REACH, image.height)
-        for j in range(_SIDE):
-            values[i, j] = pixel(image, mirrored(left + j - _REACH, image.width), v)
-    for i in range(_SIDE):
-        for j in range(1, _SIDE - 1):
-            lines[i, j] = values[i, j - 1] + values[i, j] + values[i, j + 1]
-    for i in range(1, _SIDE - 1):
-        for j in range(1, _SIDE - 1):
-            sum3[i, j] = lines[i - 1, j] + lines[i, j] + lines[i + 1, j]
+    _read_block(image, left - _REACH, top - _REACH, values)
+    _sum_squares(search.flat)
     noise2, texture2 = variance(noise, level), texture_variance(noise, level)
     sigma = sqrt(noise2)
-    least3 = min_sigmas * sqrt(noise2 + 9.0 * texture2)
-    least5 = min_sigmas * sqrt(noise2 + 25.0 * texture2)
-    least7 = min_sigmas * sqrt(noise2 + 49.0 * texture2)
+    least3 = 3 * min_sigmas * sqrt(noise2 + 9.0 * texture2)
+    least5 = 5 * min_sigmas * sqrt(noise2 + 25.0 * texture2)
+    least7 = 7 * min_sigmas * sqrt(noise2 + 49.0 * texture2)
+    if not _has_significant(search.flat, 9 * level + least3, 25 * level + least5, 49 * level + least7):
+        return count
     for i in range(_REACH, min(_REACH + BLOCK, image.height - top + _REACH)):
         for j in range(_REACH, min(_REACH + BLOCK, image.width - left + _REACH)):
-            if sum3[i, j] <= 9 * level or not _is_maximum(sum3, i, j):
+            height3, height5, height7 = sum3[i, j] - 9 * level, sum5[i, j] - 25 * level, sum7[i, j] - 49 * level
+            if height3 < least3 and height5 < least5 and height7 < least7:
                 continue
-            height3, height5 = sum3[i, j] - 9 * level, _clipped_sum(values, i, j, 2, np.inf) - 25 * level
-            height7 = _clipped_sum(values, i, j, 3, np.inf) - 49 * level
-            if height3 / 3 < least3 and height5 / 5 < least5 and height7 / 7 < least7:
+            if height3 <= 0 or not _is_maximum(sum3, i, j):
                 continue
             u, v = left + j - _REACH, top + i - _REACH
             limit = _hot_pixel_limit(image, u, v, noise, level + height3 / 9, scratch)
@@ -100,7 +96,7 @@ def _peaks_of_block(search: PeakSearch, left: int, top: int, level: float, min_s
                 height3 = _clipped_sum(values, i, j, 1, limit) - 9 * level
                 height5 = _clipped_sum(values, i, j, 2, limit) - 25 * level
                 height7 = _clipped_sum(values, i, j, 3, limit) - 49 * level
-            if height3 / 3 < least3 and height5 / 5 < least5 and height7 / 7 < least7:
+            if height3 < least3 and height5 < least5 and height7 < least7:
                 continue
             if height3 <= 0 or count >= peaks.shape[0]:
                 continue
@@ -112,6 +108,63 @@ def _peaks_of_block(search: PeakSearch, left: int, top: int, level: float, min_s
             _store_peak(peaks, count, u, v, height3 / 9, level, 0.0)
             count += 1
     return count
+
+
+@compiled
+def _read_block(image: Pixels, left: int, top: int, values: Array) -> None:
+    """The pixels of a square (_SIDE, _SIDE) that begins at (left, top); mirrored at the picture's border."""
+    inside = left >= 0 and top >= 0 and left + _SIDE <= image.width and top + _SIDE <= image.height
+    for i in range(_SIDE):
+        out = values[i]
+        if inside and image.depth == 1:
+            line = image.bytes[top + i, left : left + _SIDE]
+            for j in range(_SIDE):
+                out[j] = line[j]
+            continue
+        v = mirrored(top + i, image.height)
+        for j in range(_SIDE):
+            out[j] = pixel(image, mirrored(left + j, image.width), v)
+
+
+@compiled
+def _sum_squares(flat: Array) -> None:
+    """Sums over squares of pixels, in flat arrays (_SCRATCH + 1, _SIDE^2): the sum of 2 r + 1 lines of 2 r + 1 pixels.
+
+    Flat, since one long loop is vectorised and several short ones are not. Sums that reach over the end of a line are
+    wrong, and not used.
+    """
+    x, three, five, seven = flat[0], flat[_LINES], flat[_LINES + 1], flat[_LINES + 2]
+    sum3, sum5, sum7 = flat[_SUMS], flat[_SUMS + 1], flat[_SUMS + 2]
+    n = _SIDE * _SIDE
+    for k in range(n - 2):
+        three[k] = x[k] + x[k + 1] + x[k + 2]
+    for k in range(n - 4):
+        five[k] = three[k] + x[k + 3] + x[k + 4]
+    for k in range(n - 6):
+        seven[k] = five[k] + x[k + 5] + x[k + 6]
+    for k in range(n - 2 * (_SIDE + 1)):
+        sum3[k + _SIDE + 1] = three[k] + three[k + _SIDE] + three[k + 2 * _SIDE]
+    for k in range(n - 4 * (_SIDE + 1)):
+        total = five[k] + five[k + _SIDE] + five[k + 2 * _SIDE]
+        sum5[k + 2 * (_SIDE + 1)] = total + five[k + 3 * _SIDE] + five[k + 4 * _SIDE]
+    for k in range(n - 6 * (_SIDE + 1)):
+        total = seven[k] + seven[k + _SIDE] + seven[k + 2 * _SIDE] + seven[k + 3 * _SIDE]
+        sum7[k + 3 * (_SIDE + 1)] = total + seven[k + 4 * _SIDE] + seven[k + 5 * _SIDE] + seven[k + 6 * _SIDE]
+
+
+@compiled
+def _has_significant(flat: Array, least3: float, least5: float, least7: float) -> bool:
+    """Whether a sum of 3x3, 5x5 or 7x7 pixels reaches its threshold anywhere in the block, at a maximum or not.
+
+    In most bright blocks none does. This is faster than to look at their maxima.
+    """
+    sum3, sum5, sum7 = flat[_SUMS], flat[_SUMS + 1], flat[_SUMS + 2]
+    found = 0
+    for i in range(BLOCK):
+        for j in range(BLOCK):
+            k = (i + _REACH) * _SIDE + _REACH + j
+            found += 1 if sum3[k] >= least3 or sum5[k] >= least5 or sum7[k] >= least7 else 0
+    return found > 0
 
 
 @compiled
@@ -218,7 +271,7 @@ def _wide_peak(search: PeakSearch, row: int, column: int, min_sigmas: float, cou
     u, v = 4 * bj + 4, 4 * bi + 4
     if u >= image.width or v >= image.height:
         return count
-    scratch = search.workspace[3, 0]
+    scratch = search.workspace[_SCRATCH, 0]
     level = blocks.maps[BACKGROUND, row, column] / 64.0
     sigma2 = variance(noise, level)
     top = level + _WIDE_CLIP * sqrt(sigma2)
@@ -262,6 +315,12 @@ def _background_around(image: Pixels, u: int, v: int, top: float, scratch: Array
 def _mean8(image: Pixels, u: int, v: int, top: float) -> float:
     """The mean of 8x8 pixels, clipped at `top`, starting at (u - 4, v - 4); border pixels are repeated outside."""
     total = 0.0
+    if image.depth == 1 and u >= 4 and v >= 4 and u + 4 <= image.width and v + 4 <= image.height:
+        for i in range(v - 4, v + 4):
+            line = image.bytes[i, u - 4 : u + 4]
+            for j in range(8):
+                total += min(np.float64(line[j]), top)
+        return total / 64.0
     for i in range(v - 4, v + 4):
         for j in range(u - 4, u + 4):
             total += min(pixel(image, clamped(j, image.width), clamped(i, image.height)), top)

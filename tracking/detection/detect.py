@@ -137,7 +137,8 @@ class SpotFinder:
             self._runs[: runs_of(boxes, BORDER_BLOCKS, BORDER_BLOCKS, rows, columns, self._runs)],
             self._blocks.pairs,
         )
-        search = PeakSearch(task.pixels, task.noise, self._blocks, self._workspace, self._peaks)
+        flat = self._workspace.reshape(len(self._workspace), -1)
+        search = PeakSearch(task.pixels, task.noise, self._blocks, self._workspace, flat, self._peaks)
         threshold = task.limits.threshold_sigma
         return find_peaks_in(boxes, search, threshold, self._searched, self._bright_blocks, self._runs, count)
 

@@ -257,10 +257,7 @@ def _exclude_isolated_cells(window: Window, spot: Array, cells: Array) -> bool:
 
 @compiled
 def _solve(frame: PolynomialFrame, held: bool, algebra: Array) -> bool:
-    """Fill the columns of X: the step, and N^-1 times the gradients of the centre's u' and v' and of the flux.
-
-    held: the shape's coefficients are not part of the fit.
-    """
+    """Fill the columns of X: the step, and N^-1 times the gradients of the centre's u' and v' and of the flux."""
     X = algebra[SOLUTION]
     if held:
         _hold_shape(algebra)

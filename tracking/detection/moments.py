@@ -67,7 +67,7 @@ def find_moments(image: Pixels, table: Array, cells: Array) -> None:
                 background = _median_of_border(window, cells[VALUES], cells[STATE], cells[SCRATCH], background)
             _subtract_background(window, table, i, background, cells[VALUES], cells[STATE])
             for _ in range(rounds):
-                spot[FLUX] = cell * cell * _adapt_window(window, cells[VALUES], spot, cells[ROW])
+                spot[FLUX] = cell * cell * _adapt_window(window, cells[VALUES], spot, cells[ROW:])
         largest = limit**2
 
 
@@ -109,8 +109,8 @@ def _subtract_background(window: Window, table: Array, i: int, background: float
 
 
 @compiled
-def _adapt_window(window: Window, light: Array, spot: Array, row: Array) -> float:
-    """One iteration of the adaptive window; returns the flux, DN cells.
+def _adapt_window(window: Window, light: Array, spot: Array, lines: Array) -> float:
+    """One iteration of the adaptive window; returns the flux, DN cells. lines (4, columns) is workspace.
 
     Under a window W a Gaussian S has the covariance (1/S + 1/W)^-1. If both are equal, the measured offset and flux are
     half the true ones, so they are doubled.
@@ -120,20 +120,29 @@ def _adapt_window(window: Window, light: Array, spot: Array, row: Array) -> floa
     narrow = ellipse.inverse(*W)
     middle = 0.5 * (window.cell - 1)
     u0, v0 = window.left + middle - spot[MOMENT_U], window.top + middle - spot[MOMENT_V]
-    row = row[: window.columns]
-    s0 = su = sv = suu = suv = svv = 0.0
+    n = window.columns
+    row, sum0, sum1, sum2 = (
+        lines[0, :n],
+        lines[1, :n],
+        lines[2, :n],
+        lines[3, :n],
+    )  # sums of columns times y^0, y^1, y^2
+    for j in range(n):
+        sum0[j] = sum1[j] = sum2[j] = 0.0
     for r in range(window.rows):
         y = v0 + r * window.cell
         gaussian_row(narrow, u0, y, float(window.cell), row)
-        t0 = t1 = t2 = 0.0
-        for j in range(window.columns):
-            x = u0 + j * window.cell
-            a = row[j] * light[r * window.columns + j]
-            t0 += a
-            t1 += a * x
-            t2 += a * x * x
-        s0, su, sv = s0 + t0, su + t1, sv + y * t0
-        suu, suv, svv = suu + t2, suv + y * t1, svv + y * y * t0
+        line = light[r * n : (r + 1) * n]
+        for j in range(line.shape[0]):
+            a = row[j] * line[j]
+            sum0[j] += a
+            sum1[j] += a * y
+            sum2[j] += a * y * y
+    s0 = su = sv = suu = suv = svv = 0.0
+    for j in range(n):
+        x = u0 + j * window.cell
+        s0, su, sv = s0 + sum0[j], su + x * sum0[j], sv + sum1[j]
+        suu, suv, svv = suu + x * x * sum0[j], suv + x * sum1[j], svv + sum2[j]
     s0 = max(s0, 1e-9)
     mu, mv = su / s0, sv / s0
     seen = ellipse.clip_in_metric((suu / s0 - mu * mu, suv / s0 - mu * mv, svv / s0 - mv * mv), W, 0.15, 0.75)

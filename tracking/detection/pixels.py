@@ -81,6 +81,10 @@ def read_window(image: Pixels, window: Window, saturation: float, values: Array,
     """The cells' values (cells,), DN, and states (cells,): OUTSIDE (at least partly), CLIPPED (any pixel) or VALID."""
     cell = window.cell
     share = 1.0 / (cell * cell)
+    right, bottom = window.left + cell * window.columns, window.top + cell * window.rows
+    if image.depth == 1 and window.left >= 0 and window.top >= 0 and right <= image.width and bottom <= image.height:
+        _read_inner_window(image, window, share, saturation, values, state)
+        return
     for i in range(window.rows):
         top = window.top + i * cell
         for j in range(window.columns):
@@ -100,6 +104,33 @@ def read_window(image: Pixels, window: Window, saturation: float, values: Array,
                         most = max(most, x)
             values[k] = total * share
             state[k] = VALID if most < saturation else CLIPPED
+
+
+@compiled
+def _read_inner_window(
+    image: Pixels, window: Window, share: float, saturation: float, values: Array, state: Array
+) -> None:
+    """`read_window` of an 8 bit picture for a window inside it: the same values, in half the time and less."""
+    cell, n = window.cell, window.columns
+    total, highest = np.empty(n * cell), np.empty(n * cell)  # of the pixels of a column in a row of cells
+    for i in range(window.rows):
+        top = window.top + i * cell
+        line = image.bytes[top, window.left : window.left + n * cell]
+        for j in range(line.shape[0]):
+            total[j] = highest[j] = line[j]
+        for v in range(top + 1, top + cell):
+            line = image.bytes[v, window.left : window.left + n * cell]
+            for j in range(line.shape[0]):
+                x = np.float64(line[j])
+                total[j] += x
+                highest[j] = x if x > highest[j] else highest[j]
+        for j in range(n):
+            light, most = total[cell * j], highest[cell * j]
+            for u in range(cell * j + 1, cell * j + cell):
+                light += total[u]
+                most = max(most, highest[u])
+            values[i * n + j] = light * share
+            state[i * n + j] = VALID if most < saturation else CLIPPED
 
 
 # Share of the threshold that applies to the sigma of the texture, which has far fewer independent places than pixels.

@@ -164,12 +164,13 @@ def _odd_misfit_factor(
     share = cells[NEIGHBOUR_LIGHT]  # no longer needed: the sensitivity of the centre to each cell
     a, b, c = ellipse.inverse(frame.S[0], frame.S[1], frame.S[2])
     total = 0.0
-    for k in range(count):
-        du = frame.u0 + (k % window.columns) * window.cell
-        dv = frame.v0 + (k // window.columns) * window.cell
-        wu, wv = a * du + b * dv, b * du + c * dv
-        share[k] = cells[WEIGHT, k] * cells[LIGHT, k] ** 2 * (wu * wu + wv * wv)
-        total += share[k]
+    for row in range(window.rows):
+        dv = frame.v0 + row * window.cell
+        for column in range(window.columns):
+            du, k = frame.u0 + column * window.cell, row * window.columns + column
+            wu, wv = a * du + b * dv, b * du + c * dv
+            share[k] = cells[WEIGHT, k] * cells[LIGHT, k] ** 2 * (wu * wu + wv * wv)
+            total += share[k]
     total = max(total, 1e-300)
     square, crowd = 0.0, 0.0
     for k in range(count):

@@ -36,7 +36,7 @@ _MOST_SPOTS = 40  # per picture: the brightest
 _LEAST_OF_SPOTS, _MOST_OF_SPOTS = 30, 300  # pixels per brightness class; residuals of one spot are not independent
 _CONTRASTS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)  # contrasts of the light's grain that are tried
 _FEW_STEPS = 20  # grey values of a background below which one step is more than its texture
-_OF_STEP = 0.3  # of a block's step, as its sigma: with the usual threshold a spot must be 1.5 steps high
+_OF_STEP = 0.42  # of a block's step, as its sigma: with the usual threshold a spot must be 2.1 steps high
 # Of a block's step squared. JPEG's steps of coarse details are 6 to 8 times that of a block's mean (T.81, annex K), so
 # the error of each of them has a variance of 3 to 5 step^2; a spot has about a third of all of them.
 _OF_LIGHT = 4 / 3

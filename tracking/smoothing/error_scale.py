@@ -25,7 +25,7 @@ _CLEAR_SCATTER = 2.0  # ratio of the widths' variance to the stated one from whi
 
 def width_covariance(width_px: Array, share: float) -> Array:
     """Covariances (m, 2, 2), px^2, of errors that are this share of the spots' widths (m,), px; 0 where not known."""
-    return ((share * np.nan_to_num(width_px, nan=0.0)) ** 2)[:, None, None] * np.eye(2)
+    return ((share * np.where(np.isnan(width_px), 0.0, width_px)) ** 2)[:, None, None] * np.eye(2)
 
 
 def width_share(

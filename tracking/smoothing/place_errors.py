@@ -9,11 +9,12 @@ Source: ours.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array, Bools, Ints
 
 USUAL_WIDTH_PX = 2.0  # of spots whose width is not known
 _CHUNK = 256  # consecutive frames that are compared with each other
@@ -84,7 +85,7 @@ def place_errors(residual: Array, uv_px: Array, width_px: Array, averaged: Array
     absorbed = min(3.0 / max(count, 1e-9), _MAX_ABSORBED)
     # Coarse texture and edges of the screen reach farther than a spot is wide: take the most significant length.
     reaches = [r * width for r in _REACHES]
-    sums = max((_products(residual, uv_px, reach, explained) for reach in reaches), key=lambda p: p.significance)
+    sums = max(_products(residual, uv_px, reaches, explained), key=lambda p: p.significance)
     same_error_frames = _mean_over_views(sums.same_error_frames, labelled)
     # The poses absorb part of the residuals, which reduces the degrees of freedom.
     if sums.significance * np.sqrt(1 - absorbed) < _SIGNIFICANT:
@@ -136,9 +137,39 @@ class _Products:
         return self.near / np.sqrt(0.5 * self.expected) if self.expected > 0 else 0.0
 
 
-def _products(residual: Array, uv_px: Array, reach_px: Array, explained: Array) -> _Products:
-    same_error_frames = np.ones(residual.shape[:2])
-    near = expected = far = far_pairs = independent = 0.0
+@dataclass(slots=True)
+class _Sums:
+    """Of one assumed correlation length, as in `_Products`."""
+
+    same_error_frames: Array
+    near: float = 0.0
+    expected: float = 0.0
+    far: float = 0.0  # products of pairs in different places
+    far_pairs: float = 0.0
+    independent: float = 0.0  # those of them that are independent of each other
+
+    def add(self, some: Ints, view: int, products: Array, rho: Array, explained: float) -> None:
+        """Add a view's pairs among some frames (m,): products (m, m) and correlations (m, m)."""
+        self.far += float(np.sum(products[rho == 0]))
+        pairs = float(np.count_nonzero(rho == 0))
+        self.far_pairs += pairs
+        np.fill_diagonal(rho, 0.0)
+        self.same_error_frames[some, view] = 1 + rho.sum(axis=1)
+        self.independent += 0.5 * pairs / float(np.mean(self.same_error_frames[some, view])) ** 2
+        # Each pair is counted twice.
+        self.near += 0.5 * float(np.sum(rho * products) - explained * np.sum(rho**2))
+        self.expected += 0.5 * float(np.sum(rho**2))
+
+    def products(self, reach_px: Array) -> _Products:
+        """The complete sums."""
+        # Less one sigma: a spot that hardly moves shows few places that differ, and their errors may agree by chance.
+        elsewhere = self.far / self.far_pairs - np.sqrt(0.5 / self.independent) if self.far_pairs else 0.0
+        return _Products(reach_px, self.same_error_frames, self.near, self.expected, max(elsewhere, 0.0))
+
+
+def _products(residual: Array, uv_px: Array, reaches_px: Sequence[Array], explained: Array) -> list[_Products]:
+    """For each of several assumed correlation lengths (n,)."""
+    sums = [_Sums(np.ones(residual.shape[:2])) for _ in reaches_px]
     for view in range(residual.shape[1]):
         rows = np.flatnonzero(np.isfinite(residual[:, view]).all(axis=-1))
         mean_square = float(np.mean(np.sum(residual[rows, view] ** 2, axis=-1))) if len(rows) > 1 else 0.0
@@ -148,16 +179,7 @@ def _products(residual: Array, uv_px: Array, reach_px: Array, explained: Array) 
             some = rows[start : start + _CHUNK]
             r, at = residual[some, view], uv_px[some, view]
             products = r @ r.T / mean_square
-            rho = correlation(np.linalg.norm(at[:, None] - at[None], axis=-1), reach_px[view])
-            far += float(np.sum(products[rho == 0]))
-            pairs = float(np.count_nonzero(rho == 0))
-            far_pairs += pairs
-            np.fill_diagonal(rho, 0.0)
-            same_error_frames[some, view] = 1 + rho.sum(axis=1)
-            independent += 0.5 * pairs / float(np.mean(same_error_frames[some, view])) ** 2
-            # Each pair is counted twice.
-            near += 0.5 * float(np.sum(rho * products) - explained[view] * np.sum(rho**2))
-            expected += 0.5 * float(np.sum(rho**2))
-    # Less one sigma: a spot that hardly moves shows few places that differ, and their errors may agree by chance.
-    elsewhere = far / far_pairs - np.sqrt(0.5 / independent) if far_pairs else 0.0
-    return _Products(reach_px, same_error_frames, near, expected, max(elsewhere, 0.0))
+            distance = np.linalg.norm(at[:, None] - at[None], axis=-1)
+            for one, reach_px in zip(sums, reaches_px, strict=True):
+                one.add(some, view, products, correlation(distance, reach_px[view]), explained[view])
+    return [one.products(reach_px) for one, reach_px in zip(sums, reaches_px, strict=True)]

@@ -8,10 +8,9 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.compiled_projection import Views, project_all
-from geometry.pose_solver.gauss_newton import SolveLimits, covariance_of
-from tracking.rigid_body.models.information import frame_information, single_frame_pose
+from geometry.pose_solver.gauss_newton import SolveLimits, covariances_of
 from tracking.smoothing.motion.reference import Reference
-from tracking.smoothing.motion.run_detections import RunDetections, labelled_points
+from tracking.smoothing.motion.run_detections import RunDetections, fit_frames, labelled_points
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,24 +46,20 @@ def single_frame_poses(
 
     beside (T, 6): a further error, one sigma, of the poses (motion.velocity_jumps.corner_offsets).
     """
-    frames = len(assigned)
-    out = SingleFramePoses.unknown(frames)
-    for k in range(frames):
-        use, uv, cov = labelled_points(detections, k, assigned[k], calibration_cov)
-        if np.count_nonzero(use) < 3:
-            continue
-        R, t, L, chi2, count = single_frame_pose(views, ref.R[k], ref.t[k], use, uv, cov)
-        covariance, full_rank = covariance_of(L)
-        if not full_rank or count < 3:
-            continue
-        worst = [np.sqrt(np.linalg.eigvalsh(covariance[i, i])[-1]) for i in (slice(0, 3), slice(3, 6))]
-        out.measured[k] = worst[0] <= limits.max_sigma_m and worst[1] <= limits.max_sigma_rad
-        if out.measured[k]:
-            out.R[k], out.t[k], out.covariance[k] = R, t, covariance
-            at_ref, along, chi2_ref = frame_information(views, ref.R[k], ref.t[k], use, uv, cov)[:3]
-            b = beside[k]
-            out.covariance[k] += np.outer(b, b)
-            out.excess[k] = chi2_ref - chi2 - float(b @ along) ** 2 / (1 + b @ at_ref @ b)
+    out = SingleFramePoses.unknown(len(assigned))
+    fits = fit_frames(views, detections, assigned, calibration_cov, ref)
+    rows = np.flatnonzero(fits.spots >= 3)
+    covariance, full_rank = covariances_of(fits.information[rows])
+    rows, covariance = rows[full_rank], covariance[full_rank]
+    worst = [np.sqrt(np.linalg.eigvalsh(covariance[:, i, i])[:, -1]) for i in (slice(0, 3), slice(3, 6))]
+    good = (worst[0] <= limits.max_sigma_m) & (worst[1] <= limits.max_sigma_rad)
+    rows, b = rows[good], beside[rows[good]]
+    out.measured[rows] = True
+    out.R[rows], out.t[rows] = fits.R[rows], fits.t[rows]
+    out.covariance[rows] = covariance[good] + b[:, :, None] * b[:, None]
+    inside = np.einsum("ki,kij,kj->k", b, fits.at_ref[rows], b)
+    less = np.einsum("ki,ki->k", b, fits.along[rows]) ** 2 / (1 + inside)
+    out.excess[rows] = fits.chi2_ref[rows] - fits.chi2[rows] - less
     return out
 
 

@@ -67,16 +67,17 @@ class Smoothed:
         uv_px, cov_px2 = uv[0], J[0] @ covariance @ np.swapaxes(J[0], -1, -2) + self.calibration_cov
         exists: Bools = ~np.isnan(uv_px[:, 0])
         point = np.where(labelled, assigned % BLENDED - self.first[k][model.camera_of], UNMATCHED)
-        for v in np.flatnonzero(labelled):
-            points = found[int(model.camera_of[v])]
+        for camera, points in enumerate(found):
+            views = np.flatnonzero(labelled & (model.camera_of == camera))
+            if not len(views):
+                continue
             assert points is not None
-            uv_px[v] = points.uv_px[point[v]] - self.exposure_px[k, v]
-            row = point[v : v + 1]
-            stated = (points.cov_px2[row] + width_covariance(points.major_px[row], self.width_share))[0]
-            cov_px2[v] = stated * self.noise_scale**2
-            cov_px2[v] += self.parameters.sigma_model_px**2 * np.eye(2)
-            if assigned[v] >= BLENDED:
-                cov_px2[v] += (self.parameters.blend_px / 2) ** 2 * np.eye(2)
+            row = point[views]
+            uv_px[views] = points.uv_px[row] - self.exposure_px[k, views]
+            stated = points.cov_px2[row] + width_covariance(points.major_px[row], self.width_share)
+            blended = np.where(assigned[views] >= BLENDED, self.parameters.blend_px / 2, 0.0)
+            own = stated * self.noise_scale**2 + self.parameters.sigma_model_px**2 * np.eye(2)
+            cov_px2[views] = own + (blended**2)[:, None, None] * np.eye(2)
         turned = np.array([s is SpotStatus.TURNED for s in causal.status]) & (point == causal.point)
         has_image = np.array([f is not None for f in found])[model.camera_of]
         status = view_statuses(labelled, turned, exists, model.in_picture(uv_px), has_image, known)

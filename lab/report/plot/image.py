@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TypeAlias
 
 import cv2
@@ -12,20 +13,37 @@ from geometry.arrays import Array
 from lab.report.plot.svg import picture_uri
 
 Bytes: TypeAlias = NDArray[np.uint8]
+GreyValues: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16] | Array  # whole numbers are faster
 _JPEG_QUALITY = 72
 
 
-def grey_limits(picture: Array) -> tuple[float, float]:
+def grey_limits(picture: GreyValues) -> tuple[float, float]:
     """The grey values shown as black and as white; white saturates in 3 of 10,000 pixels.
 
     They differ by at least eight times the spread of the background, so that an unlit image does not show as noise.
     """
-    low, usual, high = np.percentile(picture, [1.0, 50.0, 99.97])
-    return float(low), float(max(high, low + 8.0 * (usual - low), low + 8.0))
+    low, usual, high = _percentiles(picture, (1.0, 50.0, 99.97))
+    return low, max(high, low + 8.0 * (usual - low), low + 8.0)
 
 
-def stretched(picture: Array, low: float, high: float) -> Bytes:
+def _percentiles(picture: GreyValues, percent: Sequence[float]) -> list[float]:
+    """As np.percentile; of whole numbers from their counts, which takes a tenth of the time."""
+    if picture.dtype.kind != "u":
+        return [float(p) for p in np.percentile(picture, percent)]
+    up_to = np.cumsum(np.bincount(picture.ravel()))
+    out = []
+    for p in percent:
+        at = p / 100 * (picture.size - 1)
+        below, above = np.searchsorted(up_to, (np.floor(at), np.ceil(at)), side="right").tolist()
+        out.append(below + (above - below) * (at - np.floor(at)))
+    return out
+
+
+def stretched(picture: GreyValues, low: float, high: float) -> Bytes:
     """Eight bits on a square-root scale: the background is just visible and not all spots saturate."""
+    if picture.dtype.kind == "u":
+        shades: Bytes = stretched(np.arange(256.0**picture.itemsize), low, high)
+        return shades[picture]
     shares = np.clip((picture - low) / max(high - low, 1.0), 0.0, 1.0)
     return (255 * np.sqrt(shares)).astype(np.uint8)
 

@@ -59,7 +59,7 @@ def pictures(m: ReportData, results: Path, selection: list[ShownEvent]) -> list[
             if isinstance(picture, MissingPicture):
                 read[camera, frame] = picture.reason
             elif not isinstance(picture, Detections):
-                read[camera, frame] = picture  # in their own type: eight pictures as floats would take 80 MB
+                read[camera, frame] = picture
     drawings = []
     for event in selection:
         views = [j for j, (c, _) in enumerate(m.spots.views) if c == event.camera]
@@ -67,9 +67,7 @@ def pictures(m: ReportData, results: Path, selection: list[ShownEvent]) -> list[
         shot = _Shot(m, event, views, m.picture_sizes[event.camera], points.get((frame, event.camera)))
         found_or_reason = read.get((event.camera, frame))
         if found_or_reason is not None:
-            drawings.append(
-                _drawing(shot, found_or_reason if isinstance(found_or_reason, str) else found_or_reason.astype(float))
-            )
+            drawings.append(_drawing(shot, found_or_reason))
     return drawings
 
 
@@ -87,7 +85,7 @@ def _detections(path: Path, frames: set[int]) -> dict[tuple[int, str], Array]:
     return out
 
 
-def _drawing(shot: _Shot, picture: Array | str) -> str:
+def _drawing(shot: _Shot, picture: GreyPicture | str) -> str:
     """picture: grey values (h, w), or the reason why there is none."""
     m, event = shot.m, shot.event
     w, h = shot.size_px
@@ -221,7 +219,7 @@ def _arrow(uv: Array, size_px: tuple[int, int], unit: float) -> tuple[float, flo
     return float(name_at[0]), float(name_at[1]) + 4 * unit, d
 
 
-def _zoom(shot: _Shot, picture: Array, focus: Array) -> str:
+def _zoom(shot: _Shot, picture: GreyPicture, focus: Array) -> str:
     """The part of the picture around one place, enlarged without interpolation."""
     h, w = picture.shape
     side = min(_ZOOM_PX, w, h)

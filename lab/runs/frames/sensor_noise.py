@@ -101,7 +101,7 @@ class CameraNoise:
         level = max(self.estimate.model.black_dn, 1.0)
         width = np.sqrt(found.major_px * found.minor_px)
         added = self.estimate.texture_shift.sigma_px(width, found.peak / level)
-        place_px2 = np.nan_to_num(added) ** 2
+        place_px2 = np.where(np.isnan(added), 0.0, added) ** 2
         return replace(found, cov_px2=found.cov_px2 + place_px2[:, None, None] * np.eye(2), place_px2=place_px2)
 
     def _update_model(self) -> None:

@@ -319,6 +319,15 @@ def test_a_faint_spot_in_a_black_picture_is_shown_bright_and_the_background_stay
     assert np.median(stretched(black, *grey_limits(black))) < 128
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_whole_grey_values_are_shown_like_the_same_values_with_a_fraction(kind):
+    picture = np.random.default_rng(2).poisson(20.0, (97, 83)).astype(kind)
+    picture[40:44, 50:53] = np.iinfo(kind).max
+    limits = grey_limits(picture.astype(float))
+    np.testing.assert_allclose(grey_limits(picture), limits, rtol=1e-12)
+    np.testing.assert_array_equal(stretched(picture, *limits), stretched(picture.astype(float), *limits))
+
+
 def test_a_spot_far_outside_gets_an_arrow_at_the_border_and_a_name_inside():
     x, y, d = _arrow(np.array([1500.0, 300.0]), (1280, 1024), 2.0)
     tip = [float(v) for v in d[1:].split("L")[0].split()]

@@ -10,7 +10,7 @@ from lab.simulate.rigs import RIGS
 from tests.tracking.rigid_runs import RIGID, dt_of, found_in, recording_of, tracked
 from tracking.smoothing.motion.reference import straight_between
 from tracking.smoothing.motion.run_detections import spot_information
-from tracking.smoothing.motion.whole_run import SmoothedMotion, WholeRun, estimate
+from tracking.smoothing.motion.whole_run import MAX_PASSES, SmoothedMotion, WholeRun, _Estimator, estimate
 from tracking.smoothing.recording import TrackedRecording
 
 AT_REST = Pose.from_ypr(np.deg2rad([7.0, 0.0, 0.0]), np.zeros(3))
@@ -47,3 +47,26 @@ def test_a_step_of_a_vehicle_at_rest_is_fitted_after_an_estimate_without_its_fra
     labels = (assigned >= 0).sum(axis=1)
     assert chi2.sum() / (2 * labels.sum()) < 1.2
     assert np.max(chi2 / np.maximum(2 * labels, 1)) < 4
+
+
+@pytest.mark.parametrize("rate_rad_s", np.geomspace(0.3, 3.0, 12))
+def test_the_passes_end_where_the_corner_of_an_exposure_hides_how_the_vehicle_is_turned(rate_rad_s, monkeypatch):
+    """The error of such an exposure grows with the jump of the rate. It must not decide in which steps a jump is
+    allowed: the jump would then be in one step in every second pass, and in two steps in the others.
+    """
+    t_s, corner_s, exposure_s = np.arange(FRAMES) / 100, 0.25, 5e-4
+    angle = -rate_rad_s * np.abs(t_s - corner_s)
+    poses = AT_REST.plus(np.stack([0 * t_s] * 4 + [angle, 0 * t_s], axis=-1))
+    run = recording_of(RIGS["four-skew-beams"](), poses, t_s, 0.02, 3)
+    recording = TrackedRecording(run.rig, RIGID)
+    for k, frame in enumerate(tracked(run)):
+        recording.append(dt_of(run, k), found_in(run, k), frame)
+    detections, assigned, n = recording.run_detections(), recording.assigned, len(run.model)
+    whole = WholeRun(run.model.numbers, detections, np.zeros((n, 2, 2)), recording.dt_s, exposure_s, True)
+    every = np.ones(FRAMES, dtype=bool)
+    straight = np.concatenate([poses.rotation, poses.translation[:, None]], axis=1)
+    passes = []
+    monkeypatch.setattr(_Estimator, "_step", lambda *a, step=_Estimator._step: passes.append(1) or step(*a))
+    motion = SmoothedMotion.begin(straight_between(straight, every, t_s), recording.jumped.copy(), None)
+    motion = estimate(whole, assigned, every, motion, 0, every)
+    assert len(passes) < MAX_PASSES

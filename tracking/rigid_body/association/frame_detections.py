@@ -71,4 +71,6 @@ class Observation(NamedTuple):
 
 def distinct_spots(chosen: Bools, spot: Ints) -> Ints:
     """Number (...) of different spots among the chosen views (..., n); spot (n,): the spot of each view."""
+    if chosen.ndim == 1:  # a frame's: ten times as fast
+        return np.asarray(len(set(spot[chosen].tolist())))
     return np.count_nonzero(np.stack([chosen[..., spot == s].any(axis=-1) for s in np.unique(spot)], axis=-1), axis=-1)

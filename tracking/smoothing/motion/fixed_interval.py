@@ -18,7 +18,6 @@ from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from geometry.compiled_linalg import (
     apply,
-    cholesky,
     copy_into,
     copy_matrix_into,
     multiply,
@@ -30,9 +29,12 @@ from geometry.compiled_linalg import (
     transposed_multiply,
 )
 from tracking.rigid_body.models.motion import STATE, predicted, process_noise, propagated, transition
+from tracking.smoothing.motion.axis_noise import noise_root, subtract_noise
 from tracking.smoothing.motion.reference import Reference
 
-CHUNK = 512  # frames whose covariances are in memory at once; the forward filter runs twice instead
+# Frames whose covariances are in memory at once, 2.7 kB each. The forward filter runs once more over the chunks before
+# the last one.
+CHUNK = 2048
 
 
 class RunInformation(NamedTuple):
@@ -126,63 +128,12 @@ def log_likelihood(ref: Reference, info: RunInformation, jerk: Array) -> float:
 
 
 @compiled
-def noise_root(dt: float, jerk: float, velocity_jump: float, acceleration_jump: float) -> Array:
-    """Lower triangular root (3, 3) of one axis' process noise."""
-    Q = np.empty((3, 3))
-    Q[0, 0], Q[0, 1], Q[0, 2], Q[1, 1], Q[1, 2], Q[2, 2] = process_noise(dt, jerk, velocity_jump, acceleration_jump)
-    Q[1, 0], Q[2, 0], Q[2, 1] = Q[0, 1], Q[0, 2], Q[1, 2]
-    return cholesky(Q)
-
-
-@compiled
-def _subtract_noise(Y: Array, y: Array, axis: int, root: Array) -> None:
-    """Information about x - w from that about x, in place: (Y^-1 + Q)^-1, Q = root root^T of one axis of noise w."""
-    n = Y.shape[0]
-    Z, A, b = np.zeros((n, 3)), np.zeros((3, 3)), np.zeros((3, 1))
-    for a in range(3):
-        row = axis + 6 * a
-        for c in range(a + 1):
-            q = root[a, c]
-            if q != 0.0:
-                b[c, 0] += q * y[row]
-                for i in range(n):
-                    Z[i, c] += Y[i, row] * q
-    for a in range(3):
-        row = axis + 6 * a
-        for c in range(a + 1):
-            for e in range(3):
-                A[c, e] += root[a, c] * Z[row, e]
-    for c in range(3):
-        A[c, c] += 1.0
-        for e in range(c):
-            A[c, e] = 0.5 * (A[c, e] + A[e, c])
-            A[e, c] = A[c, e]
-    # With W W^T = A, subtract Z W^-T (Z W^-T)^T.
-    W = cholesky(A)
-    for c in range(3):
-        for e in range(c):
-            w = W[c, e]
-            for i in range(n):
-                Z[i, c] -= Z[i, e] * w
-            b[c, 0] -= b[e, 0] * w
-        for i in range(n):
-            Z[i, c] /= W[c, c]
-        b[c, 0] /= W[c, c]
-    for i in range(n):
-        z0, z1, z2 = Z[i, 0], Z[i, 1], Z[i, 2]
-        y[i] -= z0 * b[0, 0] + z1 * b[1, 0] + z2 * b[2, 0]
-        for j in range(i + 1):
-            Y[i, j] -= z0 * Z[j, 0] + z1 * Z[j, 1] + z2 * Z[j, 2]
-            Y[j, i] = Y[i, j]
-
-
-@compiled
 def _predict_backward(
     ref: Reference, info: RunInformation, jerk: Array, k: int, Y: Array, y: Array
 ) -> tuple[Array, Array]:
     """Information about frame k - 1 from all frames from k on, given that about frame k; overwrites Y and y."""
     for axis in range(6):
-        _subtract_noise(
+        subtract_noise(
             Y,
             y,
             axis,
@@ -215,19 +166,14 @@ def smoothed(ref: Reference, info: RunInformation, jerk: Array) -> Interval:
     frames = info.dt.shape[0]
     out = _empty_interval(frames)
     chunks = (frames + CHUNK - 1) // CHUNK
-    start_x, start_P = _filter_checkpoints(ref, info, jerk, CHUNK)
     room = min(CHUNK, frames)
     xs, Ps = np.empty((room, STATE)), np.empty((room, STATE, STATE))
+    start_x, start_P = _filter_checkpoints(ref, info, jerk, CHUNK, xs, Ps)
     Y, y = np.zeros((STATE, STATE)), np.zeros(STATE)  # information about a frame from the frames after it
     for chunk in range(chunks - 1, -1, -1):
         begin, end = chunk * CHUNK, min((chunk + 1) * CHUNK, frames)
-        x, P = start_x[chunk].copy(), start_P[chunk].copy()
-        for k in range(begin, end):
-            if k > begin:
-                x, P = _predict(ref, info, jerk, k, x, P)
-            x, P, _ = _update(info, k, x, P)
-            copy_into(xs[k - begin], x)
-            copy_matrix_into(Ps[k - begin], P)
+        if chunk < chunks - 1:
+            _filter_chunk(ref, info, jerk, begin, end, start_x[chunk], start_P[chunk], xs, Ps)
         for k in range(end - 1, begin - 1, -1):
             P = _combine(out, k, xs[k - begin], Ps[k - begin], Y, y)
             if k == 0:
@@ -255,19 +201,41 @@ def _empty_interval(frames: int) -> Interval:
 
 
 @compiled
-def _filter_checkpoints(ref: Reference, info: RunInformation, jerk: Array, chunk: int) -> tuple[Array, Array]:
-    """Forward filter: predicted deviations (c, 18) and covariances (c, 18, 18) at the start of each chunk of frames."""
+def _filter_chunk(
+    ref: Reference, info: RunInformation, jerk: Array, begin: int, end: int, x: Array, P: Array, xs: Array, Ps: Array
+) -> tuple[Array, Array]:
+    """Filter the frames from `begin` to before `end`, given the prediction x (18,), P (18, 18) of the first of them.
+
+    Writes the filtered states into xs (end - begin, 18) and Ps (end - begin, 18, 18); returns the last one.
+    """
+    for k in range(begin, end):
+        if k > begin:
+            x, P = _predict(ref, info, jerk, k, x, P)
+        x, P, _ = _update(info, k, x, P)
+        copy_into(xs[k - begin], x)
+        copy_matrix_into(Ps[k - begin], P)
+    return x, P
+
+
+@compiled
+def _filter_checkpoints(
+    ref: Reference, info: RunInformation, jerk: Array, chunk: int, xs: Array, Ps: Array
+) -> tuple[Array, Array]:
+    """Forward filter: predicted deviations (c, 18) and covariances (c, 18, 18) at the start of each chunk of frames.
+
+    xs and Ps, as in `_filter_chunk`, are those of the last chunk in the end.
+    """
     frames = info.dt.shape[0]
     chunks = (frames + chunk - 1) // chunk
     start_x, start_P = np.zeros((chunks, STATE)), np.zeros((chunks, STATE, STATE))
     x, P = _first_prior(info)
-    for k in range(frames):
-        if k > 0:
-            x, P = _predict(ref, info, jerk, k, x, P)
-        if k % chunk == 0:
-            copy_into(start_x[k // chunk], x)
-            copy_matrix_into(start_P[k // chunk], P)
-        x, P, _ = _update(info, k, x, P)
+    for i in range(chunks):
+        begin, end = i * chunk, min((i + 1) * chunk, frames)
+        if i > 0:
+            x, P = _predict(ref, info, jerk, begin, x, P)
+        copy_into(start_x[i], x)
+        copy_matrix_into(start_P[i], P)
+        x, P = _filter_chunk(ref, info, jerk, begin, end, x, P, xs, Ps)
     return start_x, start_P
 
 

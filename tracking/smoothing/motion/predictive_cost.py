@@ -8,7 +8,8 @@ from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from geometry.compiled_linalg import apply, block, column, hstack, multiply, pose_minus, solve
 from tracking.rigid_body.models.motion import propagated, transition
-from tracking.smoothing.motion.fixed_interval import RunInformation, noise_root
+from tracking.smoothing.motion.axis_noise import noise_root
+from tracking.smoothing.motion.fixed_interval import RunInformation
 from tracking.smoothing.motion.reference import Reference
 
 

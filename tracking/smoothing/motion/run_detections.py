@@ -11,7 +11,7 @@ from geometry.compilation.jit import compiled
 from geometry.compiled_linalg import copy_into, copy_matrix_into
 from geometry.compiled_projection import Views
 from tracking.rigid_body.association.frame_detections import BLENDED
-from tracking.rigid_body.models.information import frame_information
+from tracking.rigid_body.models.information import frame_information, single_frame_pose
 from tracking.smoothing.motion.reference import Reference
 
 
@@ -66,3 +66,42 @@ def spot_information(
         copy_matrix_into(L[k], L_k)
         copy_into(g[k], g_k)
     return L, g, chi2
+
+
+class FrameFits(NamedTuple):
+    """The pose of each of T frames by itself, from a reference motion on."""
+
+    R: Array  # (T, 3, 3)
+    t: Array  # (T, 3), m
+    information: Array  # (T, 6, 6) normal matrices there
+    chi2: Array  # (T,)
+    spots: Ints  # (T,) used; 0 where fewer than three are labelled, and the other fields are not filled
+    at_ref: Array  # (T, 6, 6) normal matrices at the reference,
+    along: Array  # (T, 6) J^T C^-1 (measured - expected) there,
+    chi2_ref: Array  # (T,) and chi-squares
+
+
+@compiled
+def fit_frames(
+    views: Views, detections: RunDetections, assigned: Ints, calibration_cov: Array, ref: Reference
+) -> FrameFits:
+    """Fit the pose of each frame to its labelled spots (T, n), starting at the reference motion."""
+    frames = assigned.shape[0]
+    R, t, L, chi2 = np.empty((frames, 3, 3)), np.empty((frames, 3)), np.empty((frames, 6, 6)), np.empty(frames)
+    spots = np.zeros(frames, np.int64)
+    at_ref, along, chi2_ref = np.empty((frames, 6, 6)), np.empty((frames, 6)), np.empty(frames)
+    for k in range(frames):
+        use, uv, cov = labelled_points(detections, k, assigned[k], calibration_cov)
+        labelled = 0
+        for i in range(use.shape[0]):
+            labelled += 1 if use[i] else 0
+        if labelled < 3:
+            continue
+        R_k, t_k, L_k, chi2[k], spots[k] = single_frame_pose(views, ref.R[k], ref.t[k], use, uv, cov)
+        at_ref_k, along_k, chi2_ref[k], _, _ = frame_information(views, ref.R[k], ref.t[k], use, uv, cov)
+        copy_matrix_into(R[k], R_k)
+        copy_into(t[k], t_k)
+        copy_matrix_into(L[k], L_k)
+        copy_matrix_into(at_ref[k], at_ref_k)
+        copy_into(along[k], along_k)
+    return FrameFits(R, t, L, chi2, spots, at_ref, along, chi2_ref)

@@ -72,6 +72,15 @@ def corner_offsets(ref: Reference, jumped: Bools, exposure_s: float, dt: Array) 
     return out
 
 
+def with_error_along(b: Array, information: Array, vector: Array) -> tuple[Array, Array, float]:
+    """Information (6, 6) and vector (6,) of spots with a further common error, of one sigma b (6,); and by how much
+    their chi-square falls. Source: the Sherman-Morrison formula.
+    """
+    Lb = information @ b
+    along, share = float(b @ vector), float(1 / (1 + b @ Lb))
+    return information - np.outer(Lb, Lb) * share, vector - Lb * along * share, along**2 * share
+
+
 def _weak(information: Array, measured: Bools) -> Bools:
     """(T,): frames with much less information about the pose than is usual in the run."""
     sign, log_det = np.linalg.slogdet(information)

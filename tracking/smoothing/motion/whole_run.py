@@ -20,7 +20,7 @@ from tracking.smoothing.motion.predictive_cost import leave_one_out_log_likeliho
 from tracking.smoothing.motion.process_noise import next_log_density
 from tracking.smoothing.motion.reference import Reference, shifted, speeds
 from tracking.smoothing.motion.run_detections import RunDetections, spot_information
-from tracking.smoothing.motion.velocity_jumps import corner_offsets, jump_variances, new_jumps
+from tracking.smoothing.motion.velocity_jumps import corner_offsets, jump_variances, new_jumps, with_error_along
 from tracking.smoothing.motion.windows import largest_near
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD
 
@@ -108,6 +108,7 @@ class _Estimator:
         self.jumped[0] = False
         self.dt = np.ascontiguousarray(run.dt[core])
         self.beside = np.zeros((len(self.dt), 6))  # of corner_offsets, at the reference of the last step
+        self.kept: tuple[Reference, tuple[Array, Array, Array]] | None = None  # of the last `_without_corners`
         self.fresh = motion.log_density is None
         self.log_density = self._first_density() if motion.log_density is None else motion.log_density[core].copy()
         self.interpolation_offset = motion.interpolation_offset
@@ -263,11 +264,10 @@ class _Estimator:
             for k in np.flatnonzero(jumped[1:] & measured[1:] & measured[:-1] & short):
                 # As `corner_offsets`, for a short exposure.
                 b = (ref.m[k + 1, :6] - ref.m[k, :6]) * self.run.exposure_s / 8
-                Lb = L[k] @ b
-                share = 1 / (1 + b @ Lb)
-                g[k] -= Lb * (b @ g[k]) * share
-                L[k] -= np.outer(Lb, Lb) * share
-        jump = jump_variances(ref, L, measured, jumped, self.dt)
+                L[k], g[k], _ = with_error_along(b, L[k], g[k])
+        # By the spots alone: the error of a corner grows with the jump, and the jump that is allowed would depend on
+        # the one that was estimated before, so that the passes alternate between two motions without end.
+        jump = jump_variances(ref, self._without_corners(ref)[0], measured, jumped, self.dt)
         first = _first_variance(ref, self.dt, bool(measured[0]))
         return RunInformation(L, g, self.dt, jump, jump / MANOEUVRE_S**2, first), float(chi2.sum())
 
@@ -276,6 +276,16 @@ class _Estimator:
 
         An exposure with a corner has a further error, of one sigma along `beside`.
         """
+        L, g, chi2 = (a.copy() for a in self._without_corners(ref))
+        for k in np.flatnonzero(self.beside.any(axis=1)):
+            L[k], g[k], less = with_error_along(self.beside[k], L[k], g[k])
+            chi2[k] -= less
+        return L, g, chi2
+
+    def _without_corners(self, ref: Reference) -> tuple[Array, Array, Array]:
+        """As `_spot_information`, without the errors of corners. The last reference's is kept."""
+        if self.kept is not None and self.kept[0] is ref:
+            return self.kept[1]
         run = self.run
         L, g, chi2 = spot_information(
             run.views, run.detections, self.assigned, run.calibration_cov, ref, self.core.start
@@ -285,13 +295,7 @@ class _Estimator:
         # Along a direction that the spots leave open their paths are not straight, with the same sign in every frame.
         for a in (L, g, chi2):
             a[~self.measured] *= PARTIAL_WEIGHT
-        for k in np.flatnonzero(self.beside.any(axis=1)):
-            b = self.beside[k]
-            Lb = L[k] @ b
-            along, share = float(b @ g[k]), 1 / (1 + b @ Lb)
-            g[k] -= Lb * along * share
-            L[k] -= np.outer(Lb, Lb) * share
-            chi2[k] -= along**2 * share
+        self.kept = ref, (L, g, chi2)
         return L, g, chi2
 
     # -- result -------------------------------------------------------------------------------------------------------
