@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array
 from tracking.noise import NORMAL_68, NoiseModel, Picture, quantile_variance
+from tracking.noise_estimation.black_level import level_over_light
 
 _BLOCK = 8  # px: as in texture.py, so that the background is the same
 _WIDTHS_PX = (0.8, 1.6, 3.2, 6.4, 12.8, 25.6)  # of spots
@@ -29,7 +30,7 @@ _BRIGHT = 0.2  # above the background: a light, whose surroundings are left out 
 _FEWEST = 60  # samples of the filters' outputs on the coarse scale; with fewer the last error is used
 _FEWER_PIXELS = 1.6  # pixels per sigma of a spot above which pixels are averaged in pairs
 _SAMPLED = 3  # px: step of the sample of the filters' outputs
-LARGEST_SHARE = 0.1  # of the spot's width: a larger error is not assumed
+LARGEST_SHARE = 0.25  # of the spot's width: a larger error is not assumed; faint spots on texture have half of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +57,8 @@ class TextureShift:
         return np.minimum(light + background / np.maximum(contrast, 1e-3), LARGEST_SHARE * np.asarray(width_px))
 
 
-def texture_shift(pictures: Sequence[Picture], noise: NoiseModel) -> TextureShift:
-    """The errors of spots on the background of pictures (h, w) of one camera, less those by noise.
+def texture_shift(pictures: Sequence[Picture], noise: NoiseModel, full_dn: float) -> TextureShift:
+    """The errors of spots on the background of pictures (h, w) of one camera, less those by noise. full_dn: full scale.
 
     As in `texture_of`, the mean of the pictures is used, and the background without its smooth part. For wide spots the
     smooth part counts, except for a plane over the picture: light that falls from one side does not shift a spot, but
@@ -71,7 +72,10 @@ def texture_shift(pictures: Sequence[Picture], noise: NoiseModel) -> TextureShif
     texture: NDArray[Any] = np.clip((mean - background) / level, -_LARGEST_CONTRAST, _LARGEST_CONTRAST)
     sample = level[::_BLOCK, ::_BLOCK].astype(float)
     cell = 1
-    white = float(np.median(noise.of_means.variance(sample) / sample**2)) / len(pictures)
+    variance = noise.of_means.variance(sample) / len(pictures)
+    white = float(np.median(variance / sample**2))
+    # Contrasts are relative to the level; those of the light are larger.
+    more = level_over_light(mean - background, level, float(np.median(variance)), full_dn)
     light, around = [], []
     for sigma_px in (w for w in _WIDTHS_PX if w < _COARSE_PX):
         if sigma_px > _FEWER_PIXELS * cell:
@@ -84,7 +88,7 @@ def texture_shift(pictures: Sequence[Picture], noise: NoiseModel) -> TextureShif
         shifts = _coarse_shifts(mean, cell, sigma_px / cell, white / cell**2)
         light.append(light[-1] if shifts is None else max(cell * shifts[0], light[-1]))
         around.append(around[-1] if shifts is None else max(cell * shifts[1], around[-1]))
-    return TextureShift(_WIDTHS_PX, tuple(light), tuple(around))
+    return TextureShift(_WIDTHS_PX, tuple(more * x for x in light), tuple(around))
 
 
 def _shift(texture: NDArray[Any], sigma_px: float, power: int, white: float) -> float:
