@@ -156,7 +156,8 @@ def main() -> None:
     find_spots(np.zeros(SIZE[::-1], np.uint8), regions=np.array([[9.0, 9.0, HALF_PX]]))  # loads the compiled code
     print(f"seed {seed}; 1280x1024, 8 bit; ms are process time of one core; 'read' is cv2.imread of the same PNG")
     print(
-        "set        frames    spots   recall   rms px    worst rms/crlb err/crlb  err/sig  FP/frame      ms   x read x thresh   roi ms"
+        "set        frames    spots   recall   rms px    worst rms/crlb err/crlb  err/sig  FP/frame"
+        "      ms   x read x thresh   roi ms"
     )
     for kind in sys.argv[3:] or SETS:
         print(measured(kind, frames, seed).line(), flush=True)
