@@ -20,6 +20,7 @@ from tracking.detection.detect import find_spots
 
 SETS = ("main", "faint", "saturated", "near", "edge", "streak", "wide", "small", "speckle", "blank")
 SIZE = (1280, 1024)
+HALF_PX = 12.0  # of a region of interest: three sigmas of a spot and of its prediction
 
 
 def scene_of(kind: str, rng: np.random.Generator) -> Scene:
@@ -76,13 +77,15 @@ class Row:
     false_per_frame: float
     time_ms: float
     read_ms: float
+    regions_ms: float  # detection in boxes of half size HALF_PX about the spots only
+    threshold_ms: float  # cv2.threshold of the picture into an array that exists
 
     def line(self) -> str:
         return (
             f"{self.kind:10} {self.frames:6} {self.spots:8} {self.recall:8.4f} {self.rms_px:8.4f} {self.worst_px:8.3f}"
             f" {self.rms_px / self.bound_px:8.3f} {self.of_bound:8.3f} {self.of_sigma:8.3f}"
             f" {self.false_per_frame:9.3f} {self.time_ms:8.2f}"
-            f" {self.time_ms / self.read_ms:8.2f}"
+            f" {self.time_ms / self.read_ms:8.2f} {self.time_ms / self.threshold_ms:8.1f} {self.regions_ms:8.2f}"
         )
 
 
@@ -90,7 +93,8 @@ def measured(kind: str, frames: int, seed: int) -> Row:
     """One line of the table."""
     rng = np.random.default_rng([seed, SETS.index(kind)])
     errors, crlb, claimed, missed, false, total = [], [], [], 0, 0, 0
-    spent, reading = 0.0, 0.0
+    spent, reading, in_regions, threshold = 0.0, 0.0, 0.0, 0.0
+    other = np.empty(SIZE[::-1], np.uint8)
     folder = Path(tempfile.mkdtemp())
     for _ in range(frames):
         scene = scene_of(kind, rng)
@@ -100,9 +104,17 @@ def measured(kind: str, frames: int, seed: int) -> Row:
         start = time.process_time()
         image = cv2.imread(str(folder / "frame.png"), cv2.IMREAD_UNCHANGED)
         middle = time.process_time()
-        found = find_spots(image, noise=SensorNoise(scene.gain, scene.read * scene.gain))
-        spent += time.process_time() - middle
+        noise = SensorNoise(scene.gain, scene.read * scene.gain)
+        found = find_spots(image, noise=noise)
+        after = time.process_time()
+        spent += after - middle
         reading += middle - start
+        boxes = np.array([[s.u, s.v, HALF_PX] for s in scene.spots]).reshape(-1, 3)
+        find_spots(image, noise=noise, regions=boxes)
+        later = time.process_time()
+        in_regions += later - after
+        cv2.threshold(image, 100, 255, cv2.THRESH_BINARY, other)
+        threshold += time.process_time() - later
         taken: set[int] = set()
         total += len(scene.spots)
         for spot in scene.spots:
@@ -132,6 +144,8 @@ def measured(kind: str, frames: int, seed: int) -> Row:
             false / frames,
             spent / frames * 1e3,
             reading / frames * 1e3,
+            in_regions / frames * 1e3,
+            threshold / frames * 1e3,
         )
 
 
@@ -139,8 +153,12 @@ def main() -> None:
     frames = int(sys.argv[1]) if len(sys.argv) > 1 else 60
     seed = int(sys.argv[2]) if len(sys.argv) > 2 else int(time.time())
     cv2.setNumThreads(1)
+    find_spots(np.zeros(SIZE[::-1], np.uint8), regions=np.array([[9.0, 9.0, HALF_PX]]))  # loads the compiled code
     print(f"seed {seed}; 1280x1024, 8 bit; ms are process time of one core; 'read' is cv2.imread of the same PNG")
-    print("set        frames    spots   recall   rms px    worst rms/crlb err/crlb  err/sig  FP/frame      ms   x read")
+    print(
+        "set        frames    spots   recall   rms px    worst rms/crlb err/crlb  err/sig  FP/frame"
+        "      ms   x read x thresh   roi ms"
+    )
     for kind in sys.argv[3:] or SETS:
         print(measured(kind, frames, seed).line(), flush=True)
 

@@ -25,6 +25,15 @@ def speeds(m: Array) -> Array:
     return np.stack([np.linalg.norm(m[..., :3], axis=-1), np.linalg.norm(m[..., 3:6], axis=-1)], axis=-1)
 
 
+def first_variance(ref: Reference, dt: Array, measured: bool) -> Array:
+    """Variances (18,) of the first frame's deviation: wide compared with the run's motion."""
+    speed = np.abs(ref.m[:, :6]).reshape(-1, 2, 3).max(axis=(0, 2), initial=0.0)
+    change = np.abs(np.diff(ref.m[:, :6], axis=0)) / np.maximum(dt[1:, None], 1e-9)
+    acceleration = change.reshape(-1, 2, 3).max(axis=(0, 2), initial=0.0)
+    pose = [0.1, 0.1] if measured else [1.0, 1.0]
+    return np.asarray(np.repeat([*pose, *(2 * speed + 0.1), *(2 * acceleration + 1.0)], 3) ** 2)
+
+
 @compiled
 def shifted(ref: Reference, x: Array) -> Reference:
     """The reference moved by deviations (T, 18)."""

@@ -20,11 +20,11 @@ SHORT_EXPOSURE = 0.1  # of the step between two frames: with a shorter exposure 
 SPEED_WINDOW_S = 0.5  # s: the size of a jump follows from the fastest motion within this time of it
 
 
-def jump_variances(ref: Reference, information: Array, measured: Bools, jumped: Bools, dt: Array) -> Array:
+def jump_variances(ref: Reference, weak: Bools, measured: Bools, jumped: Bools, dt: Array) -> Array:
     """Variances (T, 2) of the velocities' jump in each step, (m/s)^2 and (rad/s)^2, weighted with its probability.
 
-    information (T, 6, 6): of the spots; measured (T,): frames whose spots determine the pose; jumped (T,): steps with a
-    known jump; dt (T,), s.
+    measured (T,): frames whose spots determine the pose; weak (T,): those that do so much worse than usual; jumped
+    (T,): steps with a known jump; dt (T,), s.
     """
     usual = float(np.median(dt[dt > 0])) if np.any(dt > 0) else SPEED_WINDOW_S
     window = max(1, min(round(SPEED_WINDOW_S / usual), len(dt)))
@@ -36,7 +36,7 @@ def jump_variances(ref: Reference, information: Array, measured: Bools, jumped: 
     unobserved[2:] |= ~measured[:-2]
     probability = np.where(unobserved, P_JUMP_OCCLUDED, 0.0)
     jumps = np.flatnonzero(jumped)
-    weak = ~measured | _weak(information, measured) if len(jumps) else measured
+    weak = ~measured | weak
     for k in jumps:
         first, last = k, k
         while first > 1 and weak[first - 1]:
@@ -81,8 +81,8 @@ def with_error_along(b: Array, information: Array, vector: Array) -> tuple[Array
     return information - np.outer(Lb, Lb) * share, vector - Lb * along * share, along**2 * share
 
 
-def _weak(information: Array, measured: Bools) -> Bools:
-    """(T,): frames with much less information about the pose than is usual in the run."""
+def weak_frames(information: Array, measured: Bools) -> Bools:
+    """(T,): frames with much less information (T, 6, 6) about the pose than is usual in the run."""
     sign, log_det = np.linalg.slogdet(information)
     log_det = np.where(sign > 0, log_det, -np.inf)
     usual = float(np.median(log_det[measured])) if measured.any() else 0.0

@@ -18,9 +18,15 @@ from tracking.rigid_body.models.motion import STATE, predicted
 from tracking.smoothing.motion.fixed_interval import Interval, RunInformation, log_likelihood, smoothed
 from tracking.smoothing.motion.predictive_cost import leave_one_out_log_likelihood, motion_cost
 from tracking.smoothing.motion.process_noise import next_log_density
-from tracking.smoothing.motion.reference import Reference, shifted, speeds
+from tracking.smoothing.motion.reference import Reference, first_variance, shifted, speeds
 from tracking.smoothing.motion.run_detections import RunDetections, spot_information
-from tracking.smoothing.motion.velocity_jumps import corner_offsets, jump_variances, new_jumps, with_error_along
+from tracking.smoothing.motion.velocity_jumps import (
+    corner_offsets,
+    jump_variances,
+    new_jumps,
+    weak_frames,
+    with_error_along,
+)
 from tracking.smoothing.motion.windows import largest_near
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD
 
@@ -108,6 +114,7 @@ class _Estimator:
         self.jumped[0] = False
         self.dt = np.ascontiguousarray(run.dt[core])
         self.beside = np.zeros((len(self.dt), 6))  # of corner_offsets, at the reference of the last step
+        self.weak = np.zeros(len(self.dt), dtype=bool)  # (T,) see `jump_variances`
         self.kept: tuple[Reference, tuple[Array, Array, Array]] | None = None  # of the last `_without_corners`
         self.fresh = motion.log_density is None
         self.log_density = self._first_density() if motion.log_density is None else motion.log_density[core].copy()
@@ -265,10 +272,12 @@ class _Estimator:
                 # As `corner_offsets`, for a short exposure.
                 b = (ref.m[k + 1, :6] - ref.m[k, :6]) * self.run.exposure_s / 8
                 L[k], g[k], _ = with_error_along(b, L[k], g[k])
-        # By the spots alone: the error of a corner grows with the jump, and the jump that is allowed would depend on
-        # the one that was estimated before, so that the passes alternate between two motions without end.
-        jump = jump_variances(ref, self._without_corners(ref)[0], measured, jumped, self.dt)
-        first = _first_variance(ref, self.dt, bool(measured[0]))
+        if jumped.any():
+            # For the rest of the passes: the information changes with the motion. A frame near the limit would be weak
+            # in every second pass, which allows the jump in other steps, and the passes would never end.
+            self.weak |= weak_frames(L, measured)
+        jump = jump_variances(ref, self.weak, measured, jumped, self.dt)
+        first = first_variance(ref, self.dt, bool(measured[0]))
         return RunInformation(L, g, self.dt, jump, jump / MANOEUVRE_S**2, first), float(chi2.sum())
 
     def _spot_information(self, ref: Reference) -> tuple[Array, Array, Array]:
@@ -339,12 +348,3 @@ class _Estimator:
 def _damped(info: RunInformation, damping: float) -> RunInformation:
     """Levenberg's damping: as if each frame's pose had been measured at the reference, with this sigma (m and rad)."""
     return info._replace(information=info.information + np.eye(6) / damping**2)
-
-
-def _first_variance(ref: Reference, dt: Array, measured: bool) -> Array:
-    """Variances (18,) of the first frame's deviation: wide compared with the run's motion."""
-    speed = np.abs(ref.m[:, :6]).reshape(-1, 2, 3).max(axis=(0, 2), initial=0.0)
-    change = np.abs(np.diff(ref.m[:, :6], axis=0)) / np.maximum(dt[1:, None], 1e-9)
-    acceleration = change.reshape(-1, 2, 3).max(axis=(0, 2), initial=0.0)
-    pose = [0.1, 0.1] if measured else [1.0, 1.0]
-    return np.asarray(np.repeat([*pose, *(2 * speed + 0.1), *(2 * acceleration + 1.0)], 3) ** 2)
