@@ -1,7 +1,7 @@
 """Candidate positions of spots: the peaks in bright blocks.
 
-A candidate is a maximum of the mean of 3x3 pixels. Its significance is tested with the means of 3x3, 5x5 and 7x7
-pixels, which approximate the matched filters of spots of 1 to 3 px sigma with a loss of an eighth of the
+A candidate is a maximum of the mean of 3x3 pixels. Its significance is tested with the means of 2x2, 3x3, 5x5 and 7x7
+pixels, which approximate the matched filters of spots of 0.5 to 3 px sigma with a loss of an eighth of the
 signal-to-noise ratio. Wide faint spots that only a mean of 8x8 pixels detects are found by `_wide_peak`.
 """
 
@@ -11,12 +11,20 @@ from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled
 from tracking.detection.block_search import BACKGROUND, BLOCK, HIGHEST8, Blocks
-from tracking.detection.pixels import Noise, Pixels, clamped, mirrored, pixel, texture_variance, variance
+from tracking.detection.pixels import (
+    Noise,
+    Pixels,
+    clamped,
+    insertion_sort,
+    mirrored,
+    pixel,
+    texture_variance,
+    variance,
+)
 
 # Mean light of the four neighbours relative to the pixel's: 0.15 for the sharpest spot (1 px wide), 0 for a hot pixel.
 HOT_SHARE = 0.08
@@ -24,7 +32,7 @@ HOT_SIGMAS = 4.0  # least excess of a hot pixel over its surroundings
 _BESIDE_HOT = 2.0  # sigmas above a hot pixel's neighbours at which other pixels are clipped: hot pixels occur in pairs
 _REACH = 4  # px around a block that its search uses: 2 for maxima, 2 for the means
 _SIDE = BLOCK + 2 * _REACH
-_LINES, _SUMS, _SCRATCH = 1, 4, 7  # in the workspace of a block, see `block_workspace`
+_LINES, _SUMS, _PAIRS, _SCRATCH = 1, 4, 7, 9  # in the workspace of a block, see `block_workspace`
 _WEAK = 20.0  # sigmas: a weaker peak must also exceed the background's curvature ...
 _WEAK_SHARE = 0.7  # ... by this share of the threshold
 _WIDE_CLIP = 4.0  # sigmas above the background at which pixels are clipped in the search for wide faint spots
@@ -38,7 +46,9 @@ PEAK_COLUMNS = 6
 
 
 def block_workspace() -> Array:
-    """Workspace for one block: pixels; sums of 3, 5 and 7 in a line; of 3x3, 5x5 and 7x7; scratch values."""
+    """Workspace for one block: pixels; sums of 3, 5 and 7 in a line; of 3x3, 5x5 and 7x7; of 2x2 to the right and
+    below, and the highest of the four that contain a pixel; scratch values.
+    """
     return np.zeros((_SCRATCH + 1, _SIDE, _SIDE))
 
 
@@ -72,37 +82,46 @@ def _peaks_of_block(search: PeakSearch, left: int, top: int, level: float, min_s
     """Append the significant maxima, among 5x5 neighbours, of the mean of 3x3 pixels in one block."""
     image, noise, peaks, workspace = search.image, search.noise, search.peaks, search.workspace
     values, sum3, scratch = workspace[0], workspace[_SUMS], workspace[_SCRATCH, 0]
-    sum5, sum7 = workspace[_SUMS + 1], workspace[_SUMS + 2]
+    sum5, sum7, sum2 = workspace[_SUMS + 1], workspace[_SUMS + 2], workspace[_PAIRS + 1]
     # Mirrored at the border: with repeated pixels the maximum of a spot at the edge would lie outside the picture.
     _read_block(image, left - _REACH, top - _REACH, values)
     _sum_squares(search.flat)
     noise2, texture2 = variance(noise, level), texture_variance(noise, level)
     sigma = sqrt(noise2)
+    least2 = 2 * min_sigmas * sqrt(noise2 + 4.0 * texture2)
     least3 = 3 * min_sigmas * sqrt(noise2 + 9.0 * texture2)
     least5 = 5 * min_sigmas * sqrt(noise2 + 25.0 * texture2)
     least7 = 7 * min_sigmas * sqrt(noise2 + 49.0 * texture2)
-    if not _has_significant(search.flat, 9 * level + least3, 25 * level + least5, 49 * level + least7):
+    if not _has_significant(
+        search.flat, 4 * level + least2, 9 * level + least3, 25 * level + least5, 49 * level + least7
+    ):
         return count
     for i in range(_REACH, min(_REACH + BLOCK, image.height - top + _REACH)):
         for j in range(_REACH, min(_REACH + BLOCK, image.width - left + _REACH)):
             height3, height5, height7 = sum3[i, j] - 9 * level, sum5[i, j] - 25 * level, sum7[i, j] - 49 * level
-            if height3 < least3 and height5 < least5 and height7 < least7:
+            height2 = sum2[i, j] - 4 * level
+            if height2 < least2 and height3 < least3 and height5 < least5 and height7 < least7:
                 continue
             if height3 <= 0 or not _is_maximum(sum3, i, j):
                 continue
             u, v = left + j - _REACH, top + i - _REACH
             limit = _hot_pixel_limit(image, u, v, noise, level + height3 / 9, scratch)
             if limit < np.inf:
+                height2 = _clipped_pairs(values, i, j, limit) - 4 * level
                 height3 = _clipped_sum(values, i, j, 1, limit) - 9 * level
                 height5 = _clipped_sum(values, i, j, 2, limit) - 25 * level
                 height7 = _clipped_sum(values, i, j, 3, limit) - 49 * level
-            if height3 < least3 and height5 < least5 and height7 < least7:
+            if height2 < least2 and height3 < least3 and height5 < least5 and height7 < least7:
                 continue
             if height3 <= 0 or count >= peaks.shape[0]:
                 continue
-            if max(height3 / 3, height5 / 5, height7 / 7) < _WEAK * sigma:  # may be the top of a diffuse reflection
+            if (
+                max(height2 / 2, height3 / 3, height5 / 5, height7 / 7) < _WEAK * sigma
+            ):  # may be the top of a diffuse reflection
                 more = _background_around(image, u, v, level + _WIDE_CLIP * sigma, scratch) - level
-                higher = max(height3 / 3 - 3 * more, height5 / 5 - 5 * more, height7 / 7 - 7 * more)
+                higher = max(
+                    height2 / 2 - 2 * more, height3 / 3 - 3 * more, height5 / 5 - 5 * more, height7 / 7 - 7 * more
+                )
                 if higher < _WEAK_SHARE * min_sigmas * sigma:
                     continue
             _store_peak(peaks, count, u, v, height3 / 9, level, 0.0)
@@ -150,20 +169,28 @@ def _sum_squares(flat: Array) -> None:
     for k in range(n - 6 * (_SIDE + 1)):
         total = seven[k] + seven[k + _SIDE] + seven[k + 2 * _SIDE] + seven[k + 3 * _SIDE]
         sum7[k + 3 * (_SIDE + 1)] = total + seven[k + 4 * _SIDE] + seven[k + 5 * _SIDE] + seven[k + 6 * _SIDE]
+    below, highest = flat[_PAIRS], flat[_PAIRS + 1]
+    for k in range(n - _SIDE - 1):
+        below[k] = (x[k] + x[k + 1]) + (x[k + _SIDE] + x[k + _SIDE + 1])
+    for k in range(n - 2 * (_SIDE + 1)):
+        a, b, c, d = below[k], below[k + 1], below[k + _SIDE], below[k + _SIDE + 1]
+        a, b = (a if a > b else b), (c if c > d else d)
+        highest[k + _SIDE + 1] = a if a > b else b
 
 
 @compiled
-def _has_significant(flat: Array, least3: float, least5: float, least7: float) -> bool:
-    """Whether a sum of 3x3, 5x5 or 7x7 pixels reaches its threshold anywhere in the block, at a maximum or not.
+def _has_significant(flat: Array, least2: float, least3: float, least5: float, least7: float) -> bool:
+    """Whether a sum of 2x2, 3x3, 5x5 or 7x7 pixels reaches its threshold anywhere in the block, at a maximum or not.
 
     In most bright blocks none does. This is faster than to look at their maxima.
     """
-    sum3, sum5, sum7 = flat[_SUMS], flat[_SUMS + 1], flat[_SUMS + 2]
+    sum2, sum3, sum5, sum7 = flat[_PAIRS + 1], flat[_SUMS], flat[_SUMS + 1], flat[_SUMS + 2]
     found = 0
     for i in range(BLOCK):
         for j in range(BLOCK):
             k = (i + _REACH) * _SIDE + _REACH + j
-            found += 1 if sum3[k] >= least3 or sum5[k] >= least5 or sum7[k] >= least7 else 0
+            few, many = sum2[k] >= least2 or sum3[k] >= least3, sum5[k] >= least5 or sum7[k] >= least7
+            found += 1 if few or many else 0
     return found > 0
 
 
@@ -186,6 +213,17 @@ def _clipped_sum(values: Array, i: int, j: int, reach: int, limit: float) -> flo
         for b in range(j - reach, j + reach + 1):
             total += min(values[a, b], limit)
     return total
+
+
+@compiled
+def _clipped_pairs(values: Array, i: int, j: int, limit: float) -> float:
+    """The highest sum of 2x2 values that contain one, each clipped at the limit."""
+    best = -np.inf
+    for a in range(i - 1, i + 1):
+        for b in range(j - 1, j + 1):
+            above = min(values[a, b], limit) + min(values[a, b + 1], limit)
+            best = max(best, above + min(values[a + 1, b], limit) + min(values[a + 1, b + 1], limit))
+    return best
 
 
 @compiled
@@ -216,30 +254,6 @@ def _hot_pixel_limit(image: Pixels, u: int, v: int, noise: Noise, level: float, 
     if cross - ring < HOT_SHARE * above and above > HOT_SIGMAS * sqrt(variance(noise, level)):
         return cross + _BESIDE_HOT * sqrt(variance(noise, cross))
     return np.inf
-
-
-@compiled
-def insertion_sort(values: Array, n: int) -> None:
-    """Sort the first n values in place; for small n."""
-    for i in range(1, n):
-        x, j = values[i], i
-        while j > 0 and values[j - 1] > x:
-            values[j] = values[j - 1]
-            j -= 1
-        values[j] = x
-
-
-@compiled
-def insert_nearest(near: NDArray, gaps: Array, filled: int, most: int, gap: float, row: int) -> int:
-    """Enter a row into the at most `most` nearest ones, sorted by gap; returns their new number."""
-    if filled == most and gap >= gaps[most - 1]:
-        return filled
-    k = min(filled, most - 1)
-    while k > 0 and gaps[k - 1] > gap:
-        gaps[k], near[k] = gaps[k - 1], near[k - 1]
-        k -= 1
-    gaps[k], near[k] = gap, row
-    return min(filled + 1, most)
 
 
 @compiled

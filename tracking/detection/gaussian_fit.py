@@ -9,9 +9,8 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
-from tracking.detection.candidates import insert_nearest
 from tracking.detection.normal_equations import PolynomialFrame, accumulate, add_light, frame_of, solve_normal
-from tracking.detection.pixels import VALID, Noise, Pixels, Window, read_window, window_around
+from tracking.detection.pixels import VALID, Noise, Pixels, Window, insert_nearest, read_window, window_around
 from tracking.detection.quality import assess_fit, gain_over_plane
 from tracking.detection.table import (
     ACTIVE,

@@ -7,9 +7,8 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
-from tracking.detection.candidates import insertion_sort
 from tracking.detection.ellipse import gaussian_row
-from tracking.detection.pixels import OUTSIDE, Pixels, Window, read_window, window_around
+from tracking.detection.pixels import OUTSIDE, Pixels, Window, insertion_sort, read_window, window_around
 from tracking.detection.table import (
     BACKGROUND,
     CELL_SIZE,

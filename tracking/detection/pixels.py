@@ -1,4 +1,4 @@
-"""Single pixels and small windows of a picture, and the noise of pixels, for compiled code.
+"""Single pixels and small windows of a picture, the noise of pixels, and the order of few values, for compiled code.
 
 A picture is viewed as bytes, so that 8 and 16 bits share the compiled code of all steps but the first pass.
 """
@@ -158,3 +158,27 @@ def variance(noise: Noise, level: float) -> float:
 def texture_variance(noise: Noise, level: float) -> float:
     """Variance, DN^2, of the mean of a few background pixels due to fixed structure and rounding."""
     return TEXTURE_SHARE**2 * ((noise.texture * level) ** 2 + noise.banding**2)
+
+
+@compiled
+def insertion_sort(values: Array, n: int) -> None:
+    """Sort the first n values in place; for small n."""
+    for i in range(1, n):
+        x, j = values[i], i
+        while j > 0 and values[j - 1] > x:
+            values[j] = values[j - 1]
+            j -= 1
+        values[j] = x
+
+
+@compiled
+def insert_nearest(near: NDArray, gaps: Array, filled: int, most: int, gap: float, row: int) -> int:
+    """Enter a row into the at most `most` nearest ones, sorted by gap; returns their new number."""
+    if filled == most and gap >= gaps[most - 1]:
+        return filled
+    k = min(filled, most - 1)
+    while k > 0 and gaps[k - 1] > gap:
+        gaps[k], near[k] = gaps[k - 1], near[k - 1]
+        k -= 1
+    gaps[k], near[k] = gap, row
+    return min(filled + 1, most)

@@ -9,8 +9,7 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
-from tracking.detection.candidates import insertion_sort
-from tracking.detection.pixels import Noise, Pixels, pixel, texture_variance, variance
+from tracking.detection.pixels import Noise, Pixels, insertion_sort, pixel, texture_variance, variance
 
 _RADII = (0.4, 0.8, 2.4, 2.8, 3.2)  # sigmas of the moments' ellipse: two in the core, three in the ring
 # Error of the centre relative to the ellipse's sigma. On the three saturated laser spots of the real pictures the

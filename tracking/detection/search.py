@@ -29,10 +29,8 @@ from tracking.detection.candidates import (
     WIDE,
     PeakSearch,
     find_peaks,
-    insert_nearest,
-    insertion_sort,
 )
-from tracking.detection.pixels import Noise, Pixels, clamped, mean3, pixel, variance
+from tracking.detection.pixels import Noise, Pixels, clamped, insert_nearest, insertion_sort, mean3, pixel, variance
 
 BORDER_BLOCKS = 2  # blocks around a box that its search needs
 RADIUS = 48  # px: peaks farther apart than this are never parts of one spot of the largest size
