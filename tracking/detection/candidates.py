@@ -21,6 +21,7 @@ from tracking.detection.pixels import (
     clamped,
     insertion_sort,
     mirrored,
+    pair_variance,
     pixel,
     texture_variance,
     variance,
@@ -88,7 +89,7 @@ def _peaks_of_block(search: PeakSearch, left: int, top: int, level: float, min_s
     _sum_squares(search.flat)
     noise2, texture2 = variance(noise, level), texture_variance(noise, level)
     sigma = sqrt(noise2)
-    least2 = 2 * min_sigmas * sqrt(noise2 + 4.0 * texture2)
+    least2 = 2 * min_sigmas * sqrt(noise2 + 4.0 * pair_variance(noise, level))
     least3 = 3 * min_sigmas * sqrt(noise2 + 9.0 * texture2)
     least5 = 5 * min_sigmas * sqrt(noise2 + 25.0 * texture2)
     least7 = 7 * min_sigmas * sqrt(noise2 + 49.0 * texture2)

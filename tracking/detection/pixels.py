@@ -135,6 +135,7 @@ def _read_inner_window(
 
 # Share of the threshold that applies to the sigma of the texture, which has far fewer independent places than pixels.
 TEXTURE_SHARE = 5.0 / 6.0
+_FINER = 9.0 / 4.0  # ratio of the variances of means of 2x2 and 3x3 pixels of a texture finer than a pixel
 
 
 class Noise(NamedTuple):
@@ -158,6 +159,17 @@ def variance(noise: Noise, level: float) -> float:
 def texture_variance(noise: Noise, level: float) -> float:
     """Variance, DN^2, of the mean of a few background pixels due to fixed structure and rounding."""
     return TEXTURE_SHARE**2 * ((noise.texture * level) ** 2 + noise.banding**2)
+
+
+@compiled
+def pair_variance(noise: Noise, level: float) -> float:
+    """As `texture_variance`, of the mean of 2x2 pixels: that of fine texture is larger than of 3x3.
+
+    Infinite for compressed pictures: their smallest details are errors of the compression.
+    """
+    if noise.compression > 0.0:
+        return np.inf
+    return TEXTURE_SHARE**2 * (_FINER * (noise.texture * level) ** 2 + noise.banding**2)
 
 
 @compiled

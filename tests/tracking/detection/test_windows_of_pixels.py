@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.lib.stride_tricks import sliding_window_view
 
 from geometry.arrays import Array
 from tracking.detection.block_search import BLOCK
@@ -41,17 +42,22 @@ def test_the_cells_of_a_window_are_the_means_of_their_pixels(cell, left, top):
                 assert state[9 * i + j] == (OUTSIDE if not inside else CLIPPED if block.max() >= 250 else VALID)
 
 
-@pytest.mark.parametrize("square", [3, 5, 7])
+@pytest.mark.parametrize("square", [2, 3, 5, 7])
 @pytest.mark.parametrize(("left", "top"), [(0, 0), (16, 24), (WIDTH - 12, HEIGHT - 12), (WIDTH // 8 * 8, 8)])
 def test_a_block_is_significant_where_the_sum_of_a_square_about_one_of_its_pixels_is(square, left, top):
-    grey, workspace, reach = picture(2), block_workspace(), square // 2
+    grey, workspace = picture(2), block_workspace()
     flat = workspace.reshape(len(workspace), -1)
-    padded, side = np.pad(grey.astype(int), 20, mode="reflect"), np.arange(-reach, reach + 1) + 20
-    places = [(u, v) for v in range(top, top + BLOCK) for u in range(left, left + BLOCK)]
-    sums = np.array([padded[np.ix_(v + side, u + side)].sum() for u, v in places])
+    padded = np.pad(grey.astype(int), 20, mode="reflect")[20 - 3 + top :, 20 - 3 + left :][: BLOCK + 6, : BLOCK + 6]
+    sums = sliding_window_view(padded, (square, square)).sum(axis=(2, 3))
+    # Those about the pixels of the block; of 2x2 pixels those that contain one.
+    sums = (
+        sums[2 : BLOCK + 3, 2 : BLOCK + 3]
+        if square == 2
+        else sums[3 - square // 2 :, 3 - square // 2 :][:BLOCK, :BLOCK]
+    )
     for image in (grey, grey.astype(np.uint16)):
         _read_block(pixels_of(image), left - 4, top - 4, workspace[0])
         _sum_squares(flat)
         for more, expected in ((0.0, True), (0.5, False)):
-            least = [sums.max() + more if s == square else np.inf for s in (3, 5, 7)]
+            least = [sums.max() + more if s == square else np.inf for s in (2, 3, 5, 7)]
             assert _has_significant(flat, *least) == expected
