@@ -15,7 +15,7 @@ from geometry.arrays import Array
 
 _TILE = 32  # px: side of the squares in which the texture is measured
 _LARGEST_SHARE = 0.05  # of full scale: usual black levels are between 0 and this
-_LEAST_LIGHT = 0.1  # of the level
+_LEAST_LIGHT = 0.35  # of the level
 _UNEVEN = 0.25  # relative scatter of a tile's variance: texture is not the same everywhere
 _INDEPENDENT = 40  # tiles: neighbours share what is uneven
 _OUTLIER = 9.0  # squared sigmas

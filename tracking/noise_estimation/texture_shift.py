@@ -10,7 +10,7 @@ Source: ours.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -45,6 +45,16 @@ class TextureShift:
     def none() -> TextureShift:
         """No texture."""
         return TextureShift((1.0,), (0.0,), (0.0,))
+
+    @property
+    def known(self) -> bool:
+        """The pictures could show it: neither too small nor too coarsely rounded."""
+        return len(self.widths_px) > 1
+
+    @property
+    def of_light(self) -> TextureShift:
+        """That of the spot's own light alone."""
+        return replace(self, background_px=tuple(0.0 for _ in self.widths_px))
 
     def sigma_px(self, width_px: Array, contrast: Array) -> Array:
         """Sigmas (n,), px, of spots with these widths (n,), px, and peaks (n,) relative to the background.

@@ -149,7 +149,23 @@ def camera_noises(run: Run, reader: FrameReader) -> dict[str, CameraNoise]:
             wanted = list(VIDEO_PICTURES)
         shown = pictures_at(run, name, wanted)
         out[name].estimate_from([p for _, p in sorted(shown.items()) if isinstance(p, np.ndarray)])
+    share_texture(list(out.values()))
     return out
+
+
+def share_texture(cameras: Sequence[CameraNoise]) -> None:
+    """Give cameras whose background is too faint to show the texture of its screen the finest of the others'.
+
+    The screens of a laboratory are alike; without this the errors of such a camera would be taken for noise.
+    """
+    estimates = [c.estimate for c in cameras if c.estimate is not None]
+    shifts = [e.texture_shift for e in estimates if e.texture_shift.known]
+    if not shifts:
+        return
+    finest = min(shifts, key=lambda s: max(s.light_px)).of_light
+    for camera in cameras:
+        if camera.estimate is not None and not camera.estimate.texture_shift.known:
+            camera.estimate = replace(camera.estimate, texture_shift=finest)
 
 
 def noise_estimation_frames(pictures: int) -> list[int]:

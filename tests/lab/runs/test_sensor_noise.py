@@ -1,10 +1,11 @@
 """The noise model of a camera, and its correction where nothing is detected."""
 
+import cv2
 import numpy as np
 import pytest
 
 from geometry.camera import SensorNoise
-from lab.runs.frames.sensor_noise import CameraNoise, noise_estimation_frames
+from lab.runs.frames.sensor_noise import CameraNoise, noise_estimation_frames, share_texture
 from tests.tracking.rendering import Scene, Spot, photograph
 from tracking.parameters import DetectParameters
 
@@ -87,3 +88,25 @@ def test_a_colour_mosaic_is_found_whether_or_not_the_noise_is_stated(stated):
     assert noise.mosaic > 0.1
     noise.estimate_from(pictures(2))
     assert noise.mosaic == 0.0
+
+
+def test_a_camera_with_a_background_too_faint_for_texture_takes_that_of_another_camera():
+    rng = np.random.default_rng(4)
+    grain = cv2.GaussianBlur(rng.standard_normal((320, 400)), (0, 0), 1.0)
+    screen = 1 + 0.04 * grain / grain.std()
+
+    def seen(name: str, level: float, noise_dn: float) -> CameraNoise:
+        camera = CameraNoise(name)
+        expected = level * screen
+        camera.estimate_from(
+            [np.rint(expected + noise_dn * rng.standard_normal(expected.shape)).astype(np.uint8) for _ in range(4)]
+        )
+        return camera
+
+    bright, faint, alone = seen("bright", 60.0, 1.0), seen("faint", 4.0, 0.1), seen("alone", 4.0, 0.1)
+    assert not faint.estimate.texture_shift.known
+    share_texture([bright, faint])
+    assert faint.estimate.texture_shift == bright.estimate.texture_shift.of_light
+    assert max(faint.estimate.texture_shift.light_px) > 0.02
+    share_texture([alone])
+    assert not alone.estimate.texture_shift.known
