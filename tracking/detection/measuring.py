@@ -9,7 +9,9 @@ import numpy as np
 
 from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled, compiled_for_threads
-from tracking.detection import candidates, ellipse
+from tracking.detection import ellipse
+from tracking.detection.candidates import AT_U, AT_V, HEIGHT, LEVEL, SCALE
+from tracking.detection.candidates import WIDE as WIDE_PEAK
 from tracking.detection.gaussian_fit import fit_all
 from tracking.detection.moments import find_moments, start_variance
 from tracking.detection.pixels import Noise, Pixels, texture_variance
@@ -23,6 +25,7 @@ from tracking.detection.table import (
     CHI2,
     COV_UV,
     EXPLAINED,
+    EXPLAINED_HERE,
     FLUX,
     GAIN,
     HELD,
@@ -47,14 +50,6 @@ from tracking.detection.table import (
     V,
 )
 
-AT_U, AT_V, HEIGHT, LEVEL, WIDE_PEAK, SCALE = (
-    candidates.AT_U,
-    candidates.AT_V,
-    candidates.HEIGHT,
-    candidates.LEVEL,
-    candidates.WIDE,
-    candidates.SCALE,
-)
 # Least decrease of chi-square by a spot, relative to threshold^2. The maximum of noise over positions and shapes is
 # higher than at one position: with 1.0 a picture of 1280x1024 has 0.04 false points, with 1.1 fewer than 0.01.
 _SPOT_GAIN = 1.1
@@ -62,6 +57,7 @@ _CHI2 = 1.3  # chi-square per degree of freedom above which the noise is larger 
 _SPOT_FLUX = (
     0.5  # least flux in its own sigmas, relative to the threshold; lower, because flux and shape are correlated
 )
+_ABOVE_GRAINS, _CLEAR_GAIN = 1.5, 2.0  # relative to what is needed of any spot
 _LEAST_GAIN = 0.7  # decrease of chi-square relative to threshold^2 below which the fit stops early
 NARROWER = 0.5  # a spot narrower than this share of another spot is not a duplicate of it
 _PART_APART = 2.0  # sigmas: fits that are nearer to each other are parts of one light
@@ -250,14 +246,18 @@ def _is_spot(image: Pixels, spot: Array, noise: Noise, limits: DetectionLimits) 
     major, minor, _ = ellipse.axes(spot[UU], spot[UV], spot[VV])
     sigma_u, sigma_v = sqrt(max(spot[VAR_U], 0.0)), sqrt(max(spot[VAR_V], 0.0))
     amplitude = spot[FLUX] / (2 * pi * (major * minor + 1 / 12))
+    structure = limits.threshold_sigma * sqrt(texture_variance(noise, spot[BACKGROUND]))
+    needed = _SPOT_GAIN * limits.threshold_sigma**2 * max(spot[CHI2] / _CHI2, 1.0)
+    # Texture around a faint spot is not a misfit of the spot if that is clearly higher than the grains.
+    clear = amplitude > _ABOVE_GRAINS * structure and spot[GAIN] > _CLEAR_GAIN * needed
     return (
-        amplitude > limits.threshold_sigma * sqrt(texture_variance(noise, spot[BACKGROUND]))
-        and spot[GAIN] > _SPOT_GAIN * limits.threshold_sigma**2 * max(spot[CHI2] / _CHI2, 1.0)
+        amplitude > structure
+        and spot[GAIN] > needed
         and spot[FLUX] > _SPOT_FLUX * limits.threshold_sigma * spot[SIGMA_FLUX]
         and spot[PEAK] > 0.0
         and major <= limits.max_sigma
         and minor >= limits.min_sigma
-        and spot[EXPLAINED] >= limits.min_explained
+        and (spot[EXPLAINED] >= limits.min_explained or (clear and spot[EXPLAINED_HERE] >= limits.min_explained))
         and max(sigma_u, sigma_v) < 0.5 * max(major, 0.5)
         and spot[U] > -0.5 - 3 * sigma_u
         and spot[V] > -0.5 - 3 * sigma_v

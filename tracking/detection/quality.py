@@ -15,6 +15,7 @@ from tracking.detection.table import (
     CHI2,
     COV_UV,
     EXPLAINED,
+    EXPLAINED_HERE,
     FLUX,
     GAIN,
     LEVEL,
@@ -39,12 +40,13 @@ _CORE = 0.2  # share of the brightest cell's light that limits the core: the pea
 # Sum of the squared shares of the cells above which they are too few for a test of their own: of one narrow spot it
 # would show the grain in some pictures and not in others.
 _CROWDED = 1 / 40
+_BESIDE, _FEWEST_BESIDE = 0.02, 30  # share of the brightest cell's light below which a cell is beside the spot; cells
 _LAGS = 2  # cells: largest lag of the autocorrelation of the residuals
 
 
 @compiled
 def assess_fit(window: Window, frame: PolynomialFrame, chi2: float, noise: Noise, cells: Array, spot: Array) -> None:
-    """Fill PEAK, CHI2 and EXPLAINED of a spot (COLUMNS,), which has its covariances and GAIN.
+    """Fill PEAK, CHI2 and both EXPLAINED of a spot (COLUMNS,), which has its covariances and GAIN.
 
     chi2: after the last step. The covariance is the Cramer-Rao bound of the model on entry; it and the variance of the
     flux are scaled by `_covariance_factor`, the covariance at least by `_compression_factor`.
@@ -61,12 +63,25 @@ def assess_fit(window: Window, frame: PolynomialFrame, chi2: float, noise: Noise
             peak = max(peak, cells[RESIDUAL, k] + cells[LIGHT, k])
     spot[PEAK], spot[CHI2] = peak, chi2 / free
     # Chi-square scatters by sqrt(2 free): twice that is not counted as misfit, for the sake of faint spots.
-    by_noise = min(free + 2.0 * sqrt(2.0 * free), chi2)
-    spot[EXPLAINED] = spot[GAIN] / max(chi2 + spot[GAIN] - by_noise, 1e-9)
+    by_noise = free + 2.0 * sqrt(2.0 * free)
+    spot[EXPLAINED] = spot[GAIN] / (max(chi2 - by_noise, 0.0) + max(spot[GAIN], 1e-9))
+    by_structure = by_noise * max(_chi2_beside(count, most, cells), 1.0)
+    spot[EXPLAINED_HERE] = spot[GAIN] / (max(chi2 - by_structure, 0.0) + max(spot[GAIN], 1e-9))
     factor = _covariance_factor(window, frame, cells, used)
     spot[SIGMA_FLUX] *= sqrt(factor)
     factor = max(factor, _compression_factor(window, noise.compression, cells))
     spot[VAR_U], spot[COV_UV], spot[VAR_V] = spot[VAR_U] * factor, spot[COV_UV] * factor, spot[VAR_V] * factor
+
+
+@compiled
+def _chi2_beside(count: int, most: float, cells: Array) -> float:
+    """Mean square of the residuals, in sigmas, of the cells with hardly any light of the spot; 0 with few of them."""
+    squares, n = 0.0, 0
+    for k in range(count):
+        if cells[WEIGHT, k] > 0 and cells[LIGHT, k] < _BESIDE * most:
+            squares += cells[RESIDUAL, k] * cells[RESIDUAL, k] * cells[WEIGHT, k]
+            n += 1
+    return squares / n if n >= _FEWEST_BESIDE else 0.0
 
 
 @compiled

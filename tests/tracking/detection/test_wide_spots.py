@@ -100,3 +100,16 @@ def test_grain_of_the_light_widens_the_sigmas_also_where_it_is_in_a_few_cells_on
         error = found.uv_px[row] - [120.3, 100.6]
         errors.append(error @ np.linalg.solve(found.cov_px2[row], error) / 2)
     assert np.mean(errors) < 3.3
+
+
+def test_a_faint_spot_far_above_the_grains_of_its_screen_is_found():
+    """Fine texture has more light in its window than the spot; beside the spot it is the same."""
+    found = 0
+    for seed in range(20):
+        rng = np.random.default_rng([seed, 9])
+        spot = 2.6 * light(130.3, 100.6, (1.5, 1.5))
+        screen = (7.0 + spot) * (1 + 0.06 * rng.standard_normal((HEIGHT, WIDTH)))
+        picture = np.rint(screen + 0.2 * rng.standard_normal((HEIGHT, WIDTH))).clip(0, 255).astype(np.uint8)
+        points = find_spots(picture, noise=NoiseModel(0.12, 0.005, 7.0, 0.02))
+        found += bool(len(points)) and float(np.linalg.norm(points.uv_px - [130.3, 100.6], axis=1).min()) < 1.5
+    assert found >= 19
