@@ -106,7 +106,7 @@ class SpotFinder:
         """Measure the peaks in the regions and all other peaks that affect them."""
         workspace = np.zeros((max(len(regions), 64), 4), np.int64)
         boxes, count = workspace[: boxes_of(regions, self.width, self.height, workspace)], 0
-        reach = np.zeros(0)
+        reach, chosen = np.zeros(0), None
         while True:
             count = self._search(task, boxes, count)
             reach = np.concatenate([reach, np.full(count - len(reach), INITIAL_REACH)])
@@ -117,7 +117,7 @@ class SpotFinder:
             if more:
                 boxes = workspace[:more]
                 continue
-            chosen = self._measure(task, count, relevant)
+            chosen = self._measure(task, count, relevant, chosen)
             needed = np.array([reach_of(int(cell)) for cell in self._table[: len(chosen), CELL_SIZE]])
             far = needed + MARGIN > reach[chosen]
             far &= needed > reach_of(1)
@@ -142,15 +142,20 @@ class SpotFinder:
         threshold = task.limits.threshold_sigma
         return find_peaks_in(boxes, search, threshold, self._searched, self._bright_blocks, self._runs, count)
 
-    def _measure(self, task: _Task, count: int, relevant: Ints | None = None) -> Ints:
-        """Measure the separate spots among the first `count` peaks, as far as relevant; the rows of their peaks."""
+    def _measure(self, task: _Task, count: int, relevant: Ints | None = None, measured: Ints | None = None) -> Ints:
+        """Measure the separate spots among the first `count` peaks, as far as relevant; the rows of their peaks.
+
+        measured: the rows that the last call, for the same picture, has measured; the same rows are not measured again.
+        """
         peaks = self._peaks[:count]
         order = np.lexsort((peaks[:, AT_U], peaks[:, AT_V], -peaks[:, HEIGHT]))[: len(self._separate)]
         n = find_separate_peaks(task.pixels, peaks, order, task.noise, self._separate, self._near, self._gaps)
         chosen = self._separate[:n]
         if relevant is not None:
             chosen = chosen[relevant[chosen] > 0]
-        chosen = chosen[: self.most]
+        chosen = chosen[: self.most].copy()
+        if measured is not None and np.array_equal(chosen, measured):
+            return chosen
         self._count = len(chosen)
         table = self._table[: self._count]
         measure(task.pixels, peaks, chosen, task.noise, task.limits, table, self._cells, self._algebra)

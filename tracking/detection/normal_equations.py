@@ -45,7 +45,7 @@ from tracking.detection.table import (
 EXACT_PX2 = 0.9**2  # px^2: narrower spots are integrated over the pixels numerically
 _POWERS_U, _POWERS_V = (0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)
 _FOUR_NODES_PX2 = 0.5**2  # px^2: narrower spots need eight instead of four nodes in each direction
-_DARK = 8.5  # sigmas from the centre at which the light is 2e-16 of its peak
+_NEGLIGIBLE = 8.5  # sigmas from the centre at which the light is 2e-16 of its peak
 _EDGEWORTH = 0.4  # cell^2 / variance above which the pixels' fourth cumulant is significant
 
 # Gauss-Legendre nodes and weights on [-1/2, 1/2] for 4 and 8 points: accurate to 1e-4 of the peak for sigmas of at
@@ -257,13 +257,13 @@ def _moments_of_row(
 ) -> None:  # fmt: skip
     """Pixel means of the light times 1, x, y, x^2, x y, y^2 along a row of pixels, into cells[NODES:].
 
-    Beyond _DARK sigmas from the centre they are below the rounding of the sums, and 0.
+    Beyond _NEGLIGIBLE sigmas from the centre they are below the rounding of the sums, and 0.
     """
     row, line = cells[ROW, :columns], cells[LINE : LINE + 3, :columns]
     for p in range(NODES, NODES + 6):
         for j in range(columns):
             cells[p, j] = 0.0
-    if abs(dv) - 0.5 > _DARK * frame.sv:
+    if abs(dv) - 0.5 > _NEGLIGIBLE * frame.sv:
         return
     narrow = 1.0 / frame.su
     for k in range(nodes.shape[0]):
