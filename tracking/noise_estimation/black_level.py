@@ -28,7 +28,7 @@ def level_over_light(texture_dn: NDArray[Any], level_dn: NDArray[Any], white_dn2
 
     texture_dn (h, w): a mean picture less its smooth background; level_dn (h, w): that background; white_dn2: variance
     of the noise in texture_dn; full_dn: full scale. A black level between 0 and 5 % of full scale is assumed, as far as
-    the picture does not tell.
+    the texture does not show it.
     """
     rows, columns = (n // _TILE for n in texture_dn.shape)
     if rows * columns < 4:

@@ -99,7 +99,7 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
     floor_sigma = float(np.interp(slope, lines.slopes, lines.floor_sigma)) / model.floor_dn2
     # With hardly any noise on a background of few grey values their steps look like texture.
     stepped = banding(model.floor_dn2, rounding) > _STEPS_SEEN * background
-    shift = TextureShift.none() if stepped else texture_shift(usable, model, full)
+    shift = TextureShift.usual(usable[0]) if stepped else texture_shift(usable, model, full)
     return NoiseEstimate(model, floor_sigma, slope_sigma, saturation, step, len(usable), levels.temporal, shift)
 
 

@@ -26,6 +26,7 @@ _WIDTHS_PX = (0.8, 1.6, 3.2, 6.4, 12.8, 25.6)  # of spots
 _COARSE_PX = 4.0  # width from which the smooth part of the background counts: it may be uneven response (vignetting)
 _LARGEST_CONTRAST = 0.3  # more is an edge or an object
 _REACH = 3.0  # sigmas of the kernel to each side
+_USUAL_FALL = 0.2  # share of the light lost in the corners by usual lenses
 _BRIGHT = 0.2  # above the background: a light, whose surroundings are left out on the coarse scale
 _FEWEST = 60  # samples of the filters' outputs on the coarse scale; with fewer the last error is used
 _FEWER_PIXELS = 1.6  # pixels per sigma of a spot above which pixels are averaged in pairs
@@ -40,16 +41,22 @@ class TextureShift:
     widths_px: tuple[float, ...]
     light_px: tuple[float, ...]  # by the texture in the spot's own light
     background_px: tuple[float, ...]  # by the texture in the background, for a spot as bright as the background
+    known: bool = True  # the pictures could show it: neither too small nor too coarsely rounded
 
     @staticmethod
     def none() -> TextureShift:
         """No texture."""
-        return TextureShift((1.0,), (0.0,), (0.0,))
+        return TextureShift((1.0,), (0.0,), (0.0,), known=False)
 
-    @property
-    def known(self) -> bool:
-        """The pictures could show it: neither too small nor too coarsely rounded."""
-        return len(self.widths_px) > 1
+    @staticmethod
+    def usual(picture: Picture) -> TextureShift:
+        """For pictures (h, w) that cannot show it: no texture, but a lens that transmits less light to the corners.
+
+        Half way to the corner a light of sigma s is shifted by s^2 times the fall of the light over its distance.
+        """
+        half_diagonal = 0.5 * float(np.hypot(*picture.shape))
+        light = tuple(_USUAL_FALL * w**2 / half_diagonal for w in _WIDTHS_PX)
+        return TextureShift(_WIDTHS_PX, light, tuple(0.0 for _ in _WIDTHS_PX), known=False)
 
     @property
     def of_light(self) -> TextureShift:

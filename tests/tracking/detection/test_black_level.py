@@ -1,4 +1,4 @@
-"""The light of a background told from the black level of the sensor by its texture, over an unevenly lit picture."""
+"""The black level of a sensor, from the texture of an unevenly lit background."""
 
 import cv2
 import numpy as np
