@@ -115,7 +115,7 @@ def test_a_spot_that_is_hardly_ever_measured_where_it_should_be_is_reported():
     (finding,) = check_model(run.rig, dataclasses.replace(recording, seen=seen)).findings
     assert finding.level == Level.WARN
     assert finding.what.startswith("spot 7 in camera `right` was measured in 40 of 300 frames")
-    assert "points so far from where the rig file says" in finding.why
+    assert "far from where the rig file puts it" in finding.why
     seen[40:200, 6] = recording.seen[40:200, 6]  # occluded for the last 100 frames
     assert check_model(run.rig, dataclasses.replace(recording, seen=seen)).findings == ()
 
