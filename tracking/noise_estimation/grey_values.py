@@ -11,6 +11,7 @@ from tracking.noise import Picture
 from tracking.noise_estimation.rounding import clipped_normal
 
 _FEWEST_VALUES = 8  # distinct grey values needed to take their common divisor as the step
+_UNLIT = 0.25  # share of the blocks that is taken to be without light
 _CLIPPED = 0.02  # share of pixels at zero above which the background counts as clipped
 
 
@@ -50,10 +51,10 @@ def full_scale(pictures: Sequence[Picture], step_dn: float) -> float:
 
 def clipped_background(pictures: Sequence[Picture], step: float) -> tuple[float, float] | None:
     """Mean, DN, and variance, DN^2, before clipping of a background partly clipped at zero; None: not clipped."""
-    # Only the darker half of the blocks, which contains no light.
+    # Only the darkest blocks: reflections may light more than half of the picture.
     blocks = np.concatenate([_blocks(p) for p in pictures])
     mean = blocks.mean(axis=1, dtype=np.float64)
-    sample = blocks[mean <= np.median(mean)].ravel()
+    sample = blocks[mean <= np.quantile(mean, _UNLIT)].ravel()
     if np.mean(sample == 0) < _CLIPPED:
         return None
     mean, sigma = clipped_normal(sample.astype(float) / step)

@@ -15,7 +15,8 @@ def clipped_normal(values: Array) -> tuple[float, float]:
     """Mean and sigma, in steps, of values (m,) that were rounded to whole steps and clipped at 0.
 
     The share of values of at least k steps is 1 - Phi((k - 1/2 - mean) / sigma): a straight line through the normal
-    quantiles of these shares (probit regression) gives both. With one usable share the mean is assumed to be zero.
+    quantiles of these shares (probit regression) gives both. With one usable share the mean is assumed to be zero, unless
+    then more values would be a step higher than there are.
     Source: ours.
     """
     thresholds = np.unique(np.quantile(values, np.linspace(0.02, 0.995, 25)).round())
@@ -28,7 +29,9 @@ def clipped_normal(values: Array) -> tuple[float, float]:
     z = np.array([-NormalDist().inv_cdf(float(s)) for s in shares[good]])
     edge = thresholds[good] - 0.5
     if len(z) == 1 or np.ptp(z) < 1e-3:
-        return 0.0, float(edge[0] / max(z[0], 0.2))
+        rarest = -NormalDist().inv_cdf(_LEAST_SHARE)
+        sigma = min(edge[0] / max(z[0], 0.2), 1.0 / max(rarest - z[0], 0.2))
+        return float(max(edge[0] - sigma * z[0], 0.0)), float(sigma)
     sigma, mean = np.polyfit(z, edge, 1)
     return float(mean), float(max(sigma, 0.0))
 
