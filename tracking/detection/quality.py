@@ -23,6 +23,7 @@ from tracking.detection.table import (
     NEIGHBOUR_LIGHT,
     PEAK,
     RESIDUAL,
+    SCRATCH,
     SIGMA_FLUX,
     SLOPE_U,
     SLOPE_V,
@@ -150,20 +151,38 @@ def _covariance_factor(window: Window, frame: PolynomialFrame, cells: Array, use
     whole = 0.5 * both < 0.3 * used
     free = max(used - 9.0, 1.0) if whole else max(0.5 * both - 4.0, 1.0)  # u, v and two slopes are odd
     squares = 0.0
-    odd = cells[VALUES]  # no longer needed
+    z, odd = cells[VALUES], cells[SCRATCH]  # no longer needed
+    for k in range(count):
+        z[k] = cells[RESIDUAL, k] * sqrt(cells[WEIGHT, k])
+    # Mirrored cells are at w + d and -w + d from the centre: an even residual differs there by 2 d times its slope.
+    du = frame.u0 / window.cell + 0.5 * (window.columns - 1)
+    dv = frame.v0 / window.cell + 0.5 * (window.rows - 1)
+    share = 1.0 / sqrt(2.0 + du * du + dv * dv)
     for k in range(count):
         mirror = count - 1 - k
-        here = cells[RESIDUAL, k] * sqrt(cells[WEIGHT, k])
-        there = cells[RESIDUAL, mirror] * sqrt(cells[WEIGHT, mirror])
         if whole:
-            odd[k] = here * sqrt(2.0)
+            odd[k] = z[k] * sqrt(2.0)
         elif cells[WEIGHT, k] > 0 and cells[WEIGHT, mirror] > 0:
-            odd[k] = (here - there) * sqrt(0.5)
+            slope = _slope_along(window, cells, z, k, du, dv) - _slope_along(window, cells, z, mirror, du, dv)
+            odd[k] = (z[k] - z[mirror] - slope) * share
         else:
             odd[k] = 0.0
         squares += odd[k] * odd[k]
     anywhere = 0.5 * squares / free > 1.0 + 3.0 * sqrt(2.0 / free)
     return _odd_misfit_factor(window, frame, cells, odd, 2.0 if whole else 1.0, anywhere)
+
+
+@compiled
+def _slope_along(window: Window, cells: Array, z: Array, k: int, du: float, dv: float) -> float:
+    """The change of values (cells,) over a distance in cells, from a cell's neighbours; 0 where one is missing."""
+    n = window.columns
+    row, column = k // n, k % n
+    total = 0.0
+    if 0 < column < n - 1 and cells[WEIGHT, k - 1] > 0 and cells[WEIGHT, k + 1] > 0:
+        total += 0.5 * du * (z[k + 1] - z[k - 1])
+    if 0 < row < window.rows - 1 and cells[WEIGHT, k - n] > 0 and cells[WEIGHT, k + n] > 0:
+        total += 0.5 * dv * (z[k + n] - z[k - n])
+    return total
 
 
 @compiled

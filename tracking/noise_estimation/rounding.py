@@ -15,9 +15,8 @@ def clipped_normal(values: Array) -> tuple[float, float]:
     """Mean and sigma, in steps, of values (m,) that were rounded to whole steps and clipped at 0.
 
     The share of values of at least k steps is 1 - Phi((k - 1/2 - mean) / sigma): a straight line through the normal
-    quantiles of these shares (probit regression) gives both. With one usable share the mean is assumed to be zero, unless
-    then more values would be a step higher than there are.
-    Source: ours.
+    quantiles of these shares (probit regression) gives both. With one usable share the mean is assumed to be zero,
+    unless then more values would be a step higher than there are. Source: ours.
     """
     thresholds = np.unique(np.quantile(values, np.linspace(0.02, 0.995, 25)).round())
     thresholds = np.unique(np.append(thresholds, [1.0, 2.0, 3.0]))

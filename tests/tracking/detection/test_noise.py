@@ -152,6 +152,25 @@ def test_mean_and_sigma_of_clipped_values_are_recovered(mean, sigma):
     assert got == pytest.approx((mean, sigma), abs=0.15 * sigma)
 
 
+@pytest.mark.parametrize("mean", [0.0, 0.2, 0.45, 0.55, 0.8])
+@pytest.mark.parametrize("sigma", [0.15, 0.3, 0.5, 1.0])
+def test_a_quiet_background_near_black_is_not_taken_for_a_noisy_one(mean, sigma):
+    """It has two grey values only, of which one share follows. A variance of 77 times the true one hid the spots."""
+    values = np.clip(np.rint(np.random.default_rng(3).normal(mean, sigma, 20_000)), 0, None)
+    found = clipped_normal(values)[1] ** 2 + ROUNDING_DN2
+    assert 0.7 < found / (sigma**2 + ROUNDING_DN2) < 3.5
+
+
+def test_reflections_over_half_of_a_black_picture_are_not_noise():
+    rng = np.random.default_rng(4)
+    light = np.zeros((400, 520))
+    light[:, 180:] = np.linspace(0, 25, 340)
+    pictures = [
+        np.rint(0.4 + light + 0.3 * rng.standard_normal(light.shape)).clip(0).astype(np.uint8) for _ in range(4)
+    ]
+    assert float(estimate_noise(pictures).model.floor_dn2) < 2.5 * (0.3**2 + ROUNDING_DN2)
+
+
 @pytest.mark.parametrize("sigma", [0.1, 0.25, 0.4, 0.7, 2.0])
 def test_the_rounding_error_that_is_constant_in_time_is_added(sigma):
     rng = np.random.default_rng(7)
