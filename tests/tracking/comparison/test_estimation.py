@@ -133,7 +133,7 @@ def test_a_stationary_stand_determines_neither_clock_nor_axes():
     assert len(e.determined.world_axes) == 3
     assert len(e.determined.lever_axes) == 3
     assert e.sigmas[0] == 0.0
-    assert e.alignment.offset_s == 0.0
+    assert e.alignment.offset_s == pytest.approx(0.0, abs=1e-12)  # the last digits depend on the processor
     assert 0.7 < e.scale < 1.3  # the differences are still those of the noise
 
 
