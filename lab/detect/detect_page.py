@@ -155,12 +155,13 @@ def _noise(series: PictureSeries, groups: list[SizeGroup]) -> Section:
             [
                 g.text(), e.pictures, "in time" if e.temporal else "within pictures", m.black_dn,
                 _with_sigma(math.sqrt(m.floor_dn2), e.floor_sigma / 2), _with_sigma(1 / m.slope_dn, e.slope_sigma),
-                m.correlation, 100 * m.texture, "not seen" if e.saturation_dn is None else e.saturation_dn, e.step_dn,
+                m.correlation, math.sqrt(m.compression_dn2), 100 * m.texture,
+                "not seen" if e.saturation_dn is None else e.saturation_dn, e.step_dn,
             ]
         )  # fmt: skip
     heads = (
         "pictures", "estimated from", "differences", "background (DN)", "noise there (DN)", "electrons per DN",
-        "noise of means over independent", "texture (%)", "clips at (DN)", "grey step (DN)",
+        "correlation of pixels", "by compression (DN)", "texture (%)", "clips at (DN)", "grey step (DN)",
     )  # fmt: skip
     drawings = []
     for g in groups[:_MOST_KINDS]:
