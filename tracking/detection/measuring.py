@@ -68,9 +68,7 @@ _STEEPEST = 0.6065  # exp(-1/2): slope of a Gaussian at one sigma, in heights pe
 _NARROWEST = 0.35  # px: width of a spot that the pixels do not resolve; with the pixel's own it is 0.45
 _UNRESOLVED = 1.0  # px: of a wider fit the centre is known
 _BESIDE = 3.0  # sigmas: least light of such a spot outside its two brightest pixels, which may be hot
-_UNRESOLVED_GAIN = (
-    2.0  # least decrease of its chi-square, relative to threshold^2: noise of a few pixels has longer tails
-)
+_UNRESOLVED_GAIN = 2.0  # least decrease of its chi-square, relative to threshold^2: few pixels have longer tails
 _WITHIN_PIXEL = 0.03  # px: error of the centre if the held width is a tenth of a pixel wrong
 _NOTHING = 1e12  # px^2: variance of the start of a candidate that has been joined to another one; the fit leaves it out
 _SAME_SPOT = 1.5  # sigmas of a brighter spot: a second spot nearer to its centre is a duplicate
