@@ -30,8 +30,7 @@ class NoiseModel:
     slope_dn: float  # DN^2 per DN: 1 / (electrons per DN)
     black_dn: float = 0.0  # grey value at which the variance is the floor
     texture: float = 0.0  # contrast of the background's fixed structure over a few pixels, as a fraction of its level;
-    # used for the detection threshold only. Its effect on the positions of spots is estimated in place_errors.py
-
+    # used for the detection threshold only. Its effect on the positions of spots: noise_estimation/texture_shift.py
     banding_dn: float = 0.0  # sigma of rounding errors that neighbouring pixels share, because the noise is small
     correlation: float = 1.0  # variance of means of neighbouring pixels over that of independent pixels: above 1 in
     # compressed pictures. A spot's centre is such a mean, so detection uses `of_means`

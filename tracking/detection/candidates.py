@@ -116,9 +116,8 @@ def _peaks_of_block(search: PeakSearch, left: int, top: int, level: float, min_s
                 continue
             if height3 <= 0 or count >= peaks.shape[0]:
                 continue
-            if (
-                max(height2 / 2, height3 / 3, height5 / 5, height7 / 7) < _WEAK * sigma
-            ):  # may be the top of a diffuse reflection
+            # A weak one may be the top of a diffuse reflection.
+            if max(height2 / 2, height3 / 3, height5 / 5, height7 / 7) < _WEAK * sigma:
                 more = _background_around(image, u, v, level + _WIDE_CLIP * sigma, scratch) - level
                 higher = max(
                     height2 / 2 - 2 * more, height3 / 3 - 3 * more, height5 / 5 - 5 * more, height7 / 7 - 7 * more

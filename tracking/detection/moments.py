@@ -120,12 +120,8 @@ def _adapt_window(window: Window, light: Array, spot: Array, lines: Array) -> fl
     middle = 0.5 * (window.cell - 1)
     u0, v0 = window.left + middle - spot[MOMENT_U], window.top + middle - spot[MOMENT_V]
     n = window.columns
-    row, sum0, sum1, sum2 = (
-        lines[0, :n],
-        lines[1, :n],
-        lines[2, :n],
-        lines[3, :n],
-    )  # sums of columns times y^0, y^1, y^2
+    # Sums of the columns times y^0, y^1, y^2.
+    row, sum0, sum1, sum2 = lines[0, :n], lines[1, :n], lines[2, :n], lines[3, :n]
     for j in range(n):
         sum0[j] = sum1[j] = sum2[j] = 0.0
     for r in range(window.rows):

@@ -22,7 +22,7 @@ from tracking.noise_estimation.grey_values import clipped_background, full_scale
 from tracking.noise_estimation.levels import LEAST_PIXELS, LEVELS, SIDE, LevelVariances, level_variances
 from tracking.noise_estimation.rounding import banding
 from tracking.noise_estimation.spot_residuals import SpotResiduals, residuals_of_spots
-from tracking.noise_estimation.texture import texture_of
+from tracking.noise_estimation.texture import MeanPicture, texture_of
 from tracking.noise_estimation.texture_shift import TextureShift, texture_shift
 from tracking.parameters import DetectParameters
 
@@ -90,7 +90,8 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
     correlation = levels.correlation if clipped is None and not step_of_blocks else 1.0
     lossy = _OF_LIGHT * step_of_blocks**2
     first = replace(first, banding_dn=shared, correlation=correlation, compression_dn2=lossy)
-    first = replace(first, texture=texture_of(usable, first))
+    seen = MeanPicture.of(usable)
+    first = replace(first, texture=texture_of(seen, first))
     if slope_sigma > _SURE:  # no static pixel is bright enough: use the spots' residuals
         found = [find_spots(p, DetectParameters(max_detections=_MOST_SPOTS), first) for p in usable]
         lines.add(residuals_of_spots(usable, found, top))
@@ -99,7 +100,7 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
     floor_sigma = float(np.interp(slope, lines.slopes, lines.floor_sigma)) / model.floor_dn2
     # With hardly any noise on a background of few grey values their steps look like texture.
     stepped = banding(model.floor_dn2, rounding) > _STEPS_SEEN * background
-    shift = TextureShift.usual(usable[0]) if stepped else texture_shift(usable, model, full)
+    shift = TextureShift.usual(usable[0]) if stepped else texture_shift(seen, model, full)
     return NoiseEstimate(model, floor_sigma, slope_sigma, saturation, step, len(usable), levels.temporal, shift)
 
 

@@ -9,7 +9,6 @@ Source: ours.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,8 +19,8 @@ from numpy.typing import NDArray
 from geometry.arrays import Array
 from tracking.noise import NORMAL_68, NoiseModel, Picture, quantile_variance
 from tracking.noise_estimation.black_level import level_over_light
+from tracking.noise_estimation.texture import BLOCK, MeanPicture
 
-_BLOCK = 8  # px: as in texture.py, so that the background is the same
 _WIDTHS_PX = (0.8, 1.6, 3.2, 6.4, 12.8, 25.6)  # of spots
 _COARSE_PX = 4.0  # width from which the smooth part of the background counts: it may be uneven response (vignetting)
 _LARGEST_CONTRAST = 0.3  # more is an edge or an object
@@ -74,22 +73,19 @@ class TextureShift:
         return np.minimum(light + background / np.maximum(contrast, 1e-3), LARGEST_SHARE * np.asarray(width_px))
 
 
-def texture_shift(pictures: Sequence[Picture], noise: NoiseModel, full_dn: float) -> TextureShift:
-    """The errors of spots on the background of pictures (h, w) of one camera, less those by noise. full_dn: full scale.
+def texture_shift(seen: MeanPicture, noise: NoiseModel, full_dn: float) -> TextureShift:
+    """The errors of spots on the background of one camera's pictures, less those by noise. full_dn: full scale.
 
-    As in `texture_of`, the mean of the pictures is used, and the background without its smooth part. For wide spots the
-    smooth part counts, except for a plane over the picture: light that falls from one side does not shift a spot, but
-    a response of lens and screen that varies over the spot does, and both look alike.
+    As in `texture_of`, the background counts without its smooth part. For wide spots the smooth part counts, except for
+    a plane over the picture: light that falls from one side does not shift a spot, but a response of lens and screen
+    that varies over the spot does, and both look alike.
     """
-    height, width = (n // _BLOCK * _BLOCK for n in pictures[0].shape)
-    mean = np.asarray(np.mean([p[:height, :width] for p in pictures], axis=0), dtype=np.float32)
-    coarse = cv2.resize(mean, (width // _BLOCK, height // _BLOCK), interpolation=cv2.INTER_AREA)
-    background = cv2.resize(cv2.medianBlur(coarse, 5), (width, height), interpolation=cv2.INTER_LINEAR)
+    mean, background, pictures = seen
     level = np.maximum(background, 1.0)
     texture: NDArray[Any] = np.clip((mean - background) / level, -_LARGEST_CONTRAST, _LARGEST_CONTRAST)
-    sample = level[::_BLOCK, ::_BLOCK].astype(float)
+    sample = level[::BLOCK, ::BLOCK].astype(float)
     cell = 1
-    variance = noise.of_means.variance(sample) / len(pictures)
+    variance = noise.of_means.variance(sample) / pictures
     white = float(np.median(variance / sample**2))
     # Contrasts are relative to the level; those of the light are larger.
     more = level_over_light(mean - background, level, float(np.median(variance)), full_dn)
@@ -111,7 +107,7 @@ def texture_shift(pictures: Sequence[Picture], noise: NoiseModel, full_dn: float
 def _shift(texture: NDArray[Any], sigma_px: float, power: int, white: float) -> float:
     """Sigma, px, of the filter with G^power of a texture (h, w), less the part of white noise of this variance."""
     reach = int(np.ceil(_REACH * sigma_px / np.sqrt(power)))
-    inner = reach + 2 * _BLOCK
+    inner = reach + 2 * BLOCK
     if min(texture.shape) < 2 * inner + 4 * _SAMPLED:
         return 0.0
     kernels = odd, smooth = _kernels(sigma_px, power, reach)
