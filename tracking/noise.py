@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -13,6 +13,7 @@ from geometry.camera import SensorNoise
 
 Picture: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
+BLOCK = 8  # px: side of the blocks of detection
 ROUNDING_DN2 = 1.0 / 12.0  # variance of rounding to whole DN
 
 # Electrons at full scale, for sensors with unknown gain: typical of small industrial sensors (5 000 to 60 000). With
@@ -35,6 +36,8 @@ class NoiseModel:
     correlation: float = 1.0  # variance of means of neighbouring pixels over that of independent pixels: above 1 in
     # compressed pictures. A spot's centre is such a mean, so detection uses `of_means`
     compression_dn2: float = 0.0  # variance that lossy compression adds to pixels with light, whose details it rounds
+    # (n, m): texture of each block of BLOCK x BLOCK pixels, at most `texture`; None: that everywhere
+    local_texture: NDArray[np.float32] | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         if not (self.floor_dn2 > 0 and self.slope_dn >= 0):
@@ -55,6 +58,11 @@ class NoiseModel:
         """The model of independent pixels whose means have the variance of this one's."""
         c = self.correlation
         return replace(self, floor_dn2=c * self.floor_dn2, slope_dn=c * self.slope_dn, correlation=1.0)
+
+    def texture_of_blocks(self, rows: int, columns: int) -> NDArray[np.float32] | float:
+        """The texture of each block of a picture of so many blocks; the same for all if it is not known for each."""
+        local = self.local_texture
+        return self.texture if local is None or local.shape != (rows, columns) else local
 
     def variance(self, level_dn: ArrayLike) -> Array:
         """Variance, DN^2, of pixels with the given expected grey values, DN, any shape."""

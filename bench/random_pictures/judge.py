@@ -226,7 +226,8 @@ def wrong_diagnoses(renderer: Renderer, summary: Mapping[str, Any]) -> tuple[str
             c = list(scene.rig.cameras).index(camera)
             mine = np.asarray(seen[:, scene.camera_of == c].any(axis=1))
             pictures = scene.has_image[:, c]
-            false |= kind == ReasonKind.NOTHING_DETECTED and float(mine[pictures].mean()) > SEEN
+            last = item["numbers"].get("empty_at_end", 0) if "in its last" in item["what"] else 0
+            false |= kind == ReasonKind.NOTHING_DETECTED and float(mine[pictures][-last:].mean()) > SEEN
             false |= kind == ReasonKind.NO_PICTURES and bool(pictures.any())
             false |= kind in (ReasonKind.CAMERA_LATE, ReasonKind.CAMERA_STOPPED, ReasonKind.MISSING_PICTURES) and bool(
                 pictures.all()

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from geometry.arrays import Ints
 from geometry.compilation.jit import compiled, compiled_for_threads
 from tracking.detection.pixels import TEXTURE_SHARE, Noise
+from tracking.noise import BLOCK
 
-BLOCK = 8  # px
 BACKGROUND_REACH = 2  # blocks on each side that contribute to the median for the background
 
 Sums = NDArray[np.float32]
 
 
-SUMS, HIGHEST2, HIGHEST4, HIGHEST8, ROW_MEDIAN, BACKGROUND = range(6)
+SUMS, HIGHEST2, HIGHEST4, HIGHEST8, ROW_MEDIAN, BACKGROUND, TEXTURE = range(7)
 
 
 class Blocks(NamedTuple):
@@ -32,9 +32,10 @@ class Blocks(NamedTuple):
 
     pairs: Sums  # (4n, 4m) of 2x2 pixels
     quads: Sums  # (2n, 2m) of 4x4 pixels
-    # (6, n, m). SUMS: sums of 8x8 pixels. HIGHEST2: the largest sum of 2x2 pixels in the block. HIGHEST4, HIGHEST8: the
+    # (7, n, m). SUMS: sums of 8x8 pixels. HIGHEST2: the largest sum of 2x2 pixels in the block. HIGHEST4, HIGHEST8: the
     # largest sum of 4x4 and 8x8 pixels that begin in the block, at every second and fourth pixel. ROW_MEDIAN: median of
-    # SUMS over five blocks of a row. BACKGROUND: median of ROW_MEDIAN over five rows
+    # SUMS over five blocks of a row. BACKGROUND: median of ROW_MEDIAN over five rows. TEXTURE: its contrast (see
+    # tracking.noise.NoiseModel), which does not depend on the picture
     maps: Sums
     lines: Sums  # (2, 4m) workspace
 
@@ -42,7 +43,7 @@ class Blocks(NamedTuple):
     def of(width: int, height: int) -> Blocks:
         """Arrays for a picture of that size, px."""
         n, m = -(-height // BLOCK), -(-width // BLOCK)
-        shapes = [(4 * n, 4 * m), (2 * n, 2 * m), (6, n, m), (2, 4 * m)]
+        shapes = [(4 * n, 4 * m), (2 * n, 2 * m), (7, n, m), (2, 4 * m)]
         return Blocks(*(np.zeros(shape, np.float32) for shape in shapes))
 
 
@@ -204,21 +205,21 @@ def find_bright_blocks(
     the sum of 8x8 pixels is above its threshold. Returns the number of blocks found.
     """
     floor, slope, black = noise.floor, noise.slope, noise.black
-    texture, banding = TEXTURE_SHARE * noise.texture, TEXTURE_SHARE * noise.banding
     count = 0
-    fine, wide, texture2 = 16.0 * min_sigmas**2, 64.0 * min_sigmas_wide**2, texture**2
-    banding2 = banding**2
+    fine, wide = 16.0 * min_sigmas**2, 64.0 * min_sigmas_wide**2
+    share2, banding2 = np.float64(TEXTURE_SHARE**2), (TEXTURE_SHARE * noise.banding) ** 2
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], runs[k, 1], runs[k, 2]
         background, highest2 = blocks.maps[BACKGROUND, row, first:last], blocks.maps[HIGHEST2, row, first:last]
         highest4, highest8 = blocks.maps[HIGHEST4, row, first:last], blocks.maps[HIGHEST8, row, first:last]
         excess, excess8 = blocks.lines[0, : last - first], blocks.lines[1, : last - first]
+        texture = blocks.maps[TEXTURE, row, first:last]
         for j in range(background.shape[0]):  # squared excess relative to the squared threshold
             level = background[j] / 64.0
             above_black = level - black
             variance, structure = (
                 floor + slope * (above_black if above_black > 0.0 else 0.0),
-                texture2 * level * level + banding2,
+                share2 * (texture[j] * level) ** 2 + banding2,
             )
             a, b, c = 2.0 * (highest2[j] - 4.0 * level), highest4[j] - 16.0 * level, highest8[j] - 64.0 * level
             a, b, c = (a if a > 0.0 else 0.0), (b if b > 0.0 else 0.0), (c if c > 0.0 else 0.0)

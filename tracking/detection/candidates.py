@@ -14,7 +14,7 @@ import numpy as np
 
 from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled
-from tracking.detection.block_search import BACKGROUND, BLOCK, HIGHEST8, Blocks
+from tracking.detection.block_search import BACKGROUND, BLOCK, HIGHEST8, TEXTURE, Blocks
 from tracking.detection.pixels import (
     Noise,
     Pixels,
@@ -25,6 +25,7 @@ from tracking.detection.pixels import (
     pixel,
     texture_variance,
     variance,
+    with_texture,
 )
 
 # Mean light of the four neighbours relative to the pixel's: 0.15 for the sharpest spot (1 px wide), 0 for a hot pixel.
@@ -41,9 +42,9 @@ _WIDE_CLIP = 4.0  # sigmas above the background at which pixels are clipped in t
 
 # Columns of peaks (most, PEAK_COLUMNS): position, px; mean of 3x3 pixels above the background, and the background, DN;
 # 1 if only the mean of 8x8 pixels detects the peak; half side, px, of the square that the light around it fills, 1 for
-# a narrow spot (found by search.find_separate_peaks).
-AT_U, AT_V, HEIGHT, LEVEL, WIDE, SCALE = range(6)
-PEAK_COLUMNS = 6
+# a narrow spot (found by search.find_separate_peaks); contrast of the texture there.
+AT_U, AT_V, HEIGHT, LEVEL, WIDE, SCALE, CONTRAST = range(7)
+PEAK_COLUMNS = 7
 
 
 def block_workspace() -> Array:
@@ -71,17 +72,18 @@ def find_peaks(search: PeakSearch, found: Ints, found_count: int, min_sigmas: fl
     for k in range(found_count):
         row, column = found[k, 0], found[k, 1]
         if not found[k, 2]:
-            level = blocks.maps[BACKGROUND, row, column] / 64.0
-            count = _peaks_of_block(search, BLOCK * column, BLOCK * row, level, min_sigmas, count)
+            count = _peaks_of_block(search, row, column, min_sigmas, count)
         elif _is_highest_block(blocks, row, column):
             count = _wide_peak(search, row, column, min_sigmas, count)
     return count
 
 
 @compiled
-def _peaks_of_block(search: PeakSearch, left: int, top: int, level: float, min_sigmas: float, count: int) -> int:
+def _peaks_of_block(search: PeakSearch, row: int, column: int, min_sigmas: float, count: int) -> int:
     """Append the significant maxima, among 5x5 neighbours, of the mean of 3x3 pixels in one block."""
-    image, noise, peaks, workspace = search.image, search.noise, search.peaks, search.workspace
+    image, peaks, workspace = search.image, search.peaks, search.workspace
+    left, top, level = BLOCK * column, BLOCK * row, search.blocks.maps[BACKGROUND, row, column] / 64.0
+    noise = with_texture(search.noise, search.blocks.maps[TEXTURE, row, column])
     values, sum3, scratch = workspace[0], workspace[_SUMS], workspace[_SCRATCH, 0]
     sum5, sum7, sum2 = workspace[_SUMS + 1], workspace[_SUMS + 2], workspace[_PAIRS + 1]
     # Mirrored at the border: with repeated pixels the maximum of a spot at the edge would lie outside the picture.
@@ -124,7 +126,7 @@ def _peaks_of_block(search: PeakSearch, left: int, top: int, level: float, min_s
                 )
                 if higher < _WEAK_SHARE * min_sigmas * sigma:
                     continue
-            _store_peak(peaks, count, u, v, height3 / 9, level, 0.0)
+            _store_peak(peaks, count, u, v, height3 / 9, level, 0.0, noise.texture)
             count += 1
     return count
 
@@ -274,7 +276,8 @@ def _wide_peak(search: PeakSearch, row: int, column: int, min_sigmas: float, cou
 
     Bright pixels are clipped, so that a hot pixel does not become a wide spot.
     """
-    image, noise, blocks, peaks = search.image, search.noise, search.blocks, search.peaks
+    image, blocks, peaks = search.image, search.blocks, search.peaks
+    noise = with_texture(search.noise, blocks.maps[TEXTURE, row, column])
     rows, columns = blocks.quads.shape
     bi, bj, best = 2 * row, 2 * column, -1.0
     for i in range(2 * row, min(2 * row + 2, rows - 1)):
@@ -295,14 +298,17 @@ def _wide_peak(search: PeakSearch, row: int, column: int, min_sigmas: float, cou
     scatter = sqrt((sigma2 / 64.0 + texture_variance(noise, level)) * (1 + 1.4 / 8 * 17.0 / 9.0))
     if height < min_sigmas * scatter or count >= peaks.shape[0]:
         return count
-    _store_peak(peaks, count, u, v, height, level, 1.0)
+    _store_peak(peaks, count, u, v, height, level, 1.0, noise.texture)
     return count + 1
 
 
 @compiled
-def _store_peak(peaks: Array, row: int, u: int, v: int, height: float, level: float, wide: float) -> None:
+def _store_peak(
+    peaks: Array, row: int, u: int, v: int, height: float, level: float, wide: float, contrast: float
+) -> None:
     peak = peaks[row]
     peak[AT_U], peak[AT_V], peak[HEIGHT], peak[LEVEL], peak[WIDE], peak[SCALE] = u, v, height, level, wide, 1.0
+    peak[CONTRAST] = contrast
 
 
 @compiled

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from geometry.arrays import Array, Ints
 from geometry.camera import SensorNoise
-from tracking.detection.block_search import Blocks, bin_pixels, runs_of
+from tracking.detection.block_search import TEXTURE, Blocks, bin_pixels, runs_of
 from tracking.detection.candidates import (
     AT_U,
     AT_V,
@@ -92,6 +92,7 @@ class SpotFinder:
         """As `find_spots`, for a picture of this size."""
         task = _Task.of(image, parameters, NoiseModel.of(noise) if isinstance(noise, SensorNoise) else noise)
         self._searched[:] = 0
+        self._blocks.maps[TEXTURE] = task.model.texture_of_blocks(*self._blocks.maps.shape[1:])
         if regions is None:
             self._measure(task, self._search(task, self._whole, 0))
             return self._detections(_EVERYWHERE)
@@ -173,6 +174,7 @@ class _Task(NamedTuple):
 
     image: Picture
     pixels: Pixels
+    model: NoiseModel
     noise: Noise
     limits: DetectionLimits
 
@@ -191,4 +193,4 @@ class _Task(NamedTuple):
         pixels = Pixels(image.view(np.uint8), image.itemsize, image.shape[1], image.shape[0])
         others = float(model.texture), float(model.banding_dn), float(model.compression_dn2)
         known = Noise(float(model.floor_dn2), float(model.slope_dn), float(model.black_dn), *others)
-        return _Task(image, pixels, known, limits)
+        return _Task(image, pixels, model, known, limits)

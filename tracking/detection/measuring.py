@@ -10,11 +10,11 @@ import numpy as np
 from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled, compiled_for_threads
 from tracking.detection import ellipse
-from tracking.detection.candidates import AT_U, AT_V, HEIGHT, LEVEL, SCALE
+from tracking.detection.candidates import AT_U, AT_V, CONTRAST, HEIGHT, LEVEL, SCALE
 from tracking.detection.candidates import WIDE as WIDE_PEAK
 from tracking.detection.gaussian_fit import fit_all
 from tracking.detection.moments import find_moments, start_variance
-from tracking.detection.pixels import Noise, Pixels, texture_variance
+from tracking.detection.pixels import Noise, Pixels, texture_variance, with_texture
 from tracking.detection.quality import light_beside
 from tracking.detection.regions import in_a_region
 from tracking.detection.saturated_spots import CENTRE_SHARE, compact_height
@@ -40,6 +40,7 @@ from tracking.detection.table import (
     SLOPE_U,
     SLOPE_V,
     START,
+    TEXTURE,
     UU,
     UV,
     VAR_U,
@@ -100,6 +101,7 @@ def measure(
         peak, spot = peaks[chosen[k]], table[k]
         spot[MOMENT_U], spot[MOMENT_V], spot[BACKGROUND] = peak[AT_U], peak[AT_V], peak[LEVEL]
         spot[WIDE], spot[START], spot[HELD] = peak[WIDE_PEAK], start_variance(peak[SCALE]), 0.0
+        spot[TEXTURE] = peak[CONTRAST]
     find_moments(image, table, cells)
     least = _LEAST_GAIN * limits.threshold_sigma**2
     for _ in range(_MERGES):
@@ -114,11 +116,9 @@ def measure(
         _judge_unresolved(image, table, noise, limits)
     for k in range(chosen.shape[0]):
         spot = table[k]
-        spot[ACCEPTED] = (
-            1.0
-            if _is_spot(image, spot, noise, limits) or _is_compact(image, spot, noise, limits, cells[SCRATCH])
-            else 0.0
-        )
+        here = with_texture(noise, spot[TEXTURE])
+        accepted = _is_spot(image, spot, here, limits) or _is_compact(image, spot, here, limits, cells[SCRATCH])
+        spot[ACCEPTED] = 1.0 if accepted else 0.0
     _drop_duplicates(table)
 
 

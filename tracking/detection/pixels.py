@@ -162,6 +162,12 @@ def texture_variance(noise: Noise, level: float) -> float:
 
 
 @compiled
+def with_texture(noise: Noise, texture: float) -> Noise:
+    """The noise at a place with this contrast of the texture."""
+    return Noise(noise.floor, noise.slope, noise.black, texture, noise.banding, noise.compression)
+
+
+@compiled
 def pair_variance(noise: Noise, level: float) -> float:
     """As `texture_variance`, of the mean of 2x2 pixels: that of fine texture is larger than of 3x3.
 

@@ -22,7 +22,7 @@ from tracking.noise_estimation.grey_values import clipped_background, full_scale
 from tracking.noise_estimation.levels import LEAST_PIXELS, LEVELS, SIDE, LevelVariances, level_variances
 from tracking.noise_estimation.rounding import banding
 from tracking.noise_estimation.spot_residuals import SpotResiduals, residuals_of_spots
-from tracking.noise_estimation.texture import MeanPicture, texture_of
+from tracking.noise_estimation.texture import MeanPicture, local_texture, texture_of
 from tracking.noise_estimation.texture_shift import TextureShift, texture_shift
 from tracking.parameters import DetectParameters
 
@@ -92,6 +92,7 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
     first = replace(first, banding_dn=shared, correlation=correlation, compression_dn2=lossy)
     seen = MeanPicture.of(usable)
     first = replace(first, texture=texture_of(seen, first))
+    first = replace(first, local_texture=local_texture(seen, first, usable[0].shape[::-1]))
     if slope_sigma > _SURE:  # no static pixel is bright enough: use the spots' residuals
         found = [find_spots(p, DetectParameters(max_detections=_MOST_SPOTS), first) for p in usable]
         lines.add(residuals_of_spots(usable, found, top))

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking.noise import NoiseModel, Picture, quantile_variance
+from tracking.noise import BLOCK, NoiseModel, Picture, quantile_variance
 
-BLOCK = 8  # px: as in tracking/detection/block_search.py, so that the background is the same
 _MEAN = 3  # px: side of the means compared with the background
+_BY_NOISE = 2.5  # times its expectation: most of the variance of a block's few means that noise alone causes
 
 
 class MeanPicture(NamedTuple):
@@ -46,3 +46,23 @@ def texture_of(seen: MeanPicture, noise: NoiseModel) -> float:
     variance = quantile_variance(np.abs(above / level))
     explained = float(np.mean(noise.of_means.variance(level) / level**2)) / (_MEAN**2 * seen.pictures)
     return float(np.sqrt(max(variance - explained, 0.0)))
+
+
+def local_texture(seen: MeanPicture, noise: NoiseModel, size_px: tuple[int, int]) -> NDArray[np.float32]:
+    """The texture of each block of a picture (width, height) and its neighbours, at most noise.texture.
+
+    The edge of a screen, a cable or a frame raises `texture_of` of a whole picture, in which most places are plain. A
+    spot that stays in its place counts as texture here, so the texture of the whole picture is the upper limit.
+    Source: ours.
+    """
+    level = np.maximum(seen.background, 1.0)
+    relative = (cv2.blur(seen.mean, (_MEAN, _MEAN)) - seen.background) / level
+    size = seen.mean.shape[1] // BLOCK, seen.mean.shape[0] // BLOCK
+    variance = cv2.resize(relative * relative, size, interpolation=cv2.INTER_AREA)
+    levels = cv2.resize(level, size, interpolation=cv2.INTER_AREA)
+    explained = noise.of_means.variance(levels) / (levels * levels) / (_MEAN**2 * seen.pictures)
+    beyond = np.maximum(variance - _BY_NOISE * explained, 0.0)
+    contrast = np.minimum(np.sqrt(cv2.dilate(beyond, np.ones((3, 3)))), noise.texture)
+    rows, columns = -(-size_px[1] // BLOCK), -(-size_px[0] // BLOCK)
+    missing = (0, rows - contrast.shape[0]), (0, columns - contrast.shape[1])
+    return np.asarray(np.pad(contrast, missing, mode="edge"), np.float32)

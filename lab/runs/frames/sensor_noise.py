@@ -79,13 +79,14 @@ class CameraNoise:
 
     def as_mapping(self) -> dict[str, Any]:
         """For summary.json."""
-        out: dict[str, Any] = {} if self.model is None else asdict(self.model)
+        out: dict[str, Any] = {}
         if self.model is not None:
+            out = _scalars(self.model)
             out["source"] = "pictures" if self.stated is None or self._overruled else "rig"
         if self.estimate is not None:
-            seen = asdict(self.estimate)
-            model = seen.pop("model")
-            out["estimated"] = {**model, **seen}
+            seen = asdict(replace(self.estimate, model=replace(self.estimate.model, local_texture=None)))
+            del seen["model"]
+            out["estimated"] = {**_scalars(self.estimate.model), **seen}
         return out
 
     def _search(self, picture: Picture, parameters: DetectParameters, model: NoiseModel | None) -> Detections:
@@ -114,7 +115,7 @@ class CameraNoise:
         if estimated is not None:
             stated = replace(
                 stated, texture=estimated.texture, banding_dn=estimated.banding_dn, correlation=estimated.correlation,
-                compression_dn2=estimated.compression_dn2,
+                compression_dn2=estimated.compression_dn2, local_texture=estimated.local_texture,
             )  # fmt: skip
         self.model = stated
 
@@ -133,6 +134,13 @@ class CameraNoise:
                 )
             self._update_model()
         return found
+
+
+def _scalars(model: NoiseModel) -> dict[str, Any]:
+    """A noise model without its map of the texture."""
+    out = asdict(replace(model, local_texture=None))
+    del out["local_texture"]
+    return out
 
 
 def camera_noises(run: Run, reader: FrameReader) -> dict[str, CameraNoise]:
