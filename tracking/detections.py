@@ -28,14 +28,17 @@ class Detections:
     # (n,) part of a coordinate's variance that belongs to the place on the screen, so that averaging over a vehicle at
     # rest does not reduce it; None: not known
     place_px2: Array | None = field(default=None, kw_only=True)
+    # (n,) share of the covariance due to misfits of the Gaussian (speckle, texture, a skewed spot); None: not known
+    misfit: Array | None = field(default=None, kw_only=True)
 
     def __len__(self) -> int:
         return len(self.uv_px)
 
     def __getitem__(self, rows: Ints | Bools | slice) -> Detections:
         """The points of the given rows, in that order."""
-        known: list[Array] = [getattr(self, name)[rows] for name in Detections.__slots__[:-1]]
-        return Detections(*known, place_px2=None if self.place_px2 is None else self.place_px2[rows])
+        known: list[Array] = [getattr(self, name)[rows] for name in Detections.__slots__[:-2]]
+        place, misfit = (None if x is None else x[rows] for x in (self.place_px2, self.misfit))
+        return Detections(*known, place_px2=place, misfit=misfit)
 
     @staticmethod
     def none() -> Detections:

@@ -80,7 +80,7 @@ class SpotFinder:
             np.zeros(MAX_COMPARED),
         )
         self._cells, self._algebra = np.zeros((CELL_ROWS, MOST_CELLS)), np.zeros((ALGEBRA, 9, 10))
-        self._table, self._count, self._out = np.zeros((most, COLUMNS)), 0, np.zeros((most, 10))
+        self._table, self._count, self._out = np.zeros((most, COLUMNS)), 0, np.zeros((most, 11))
 
     def find(
         self,
@@ -166,7 +166,9 @@ class SpotFinder:
         """The spots, among the candidates measured last, that lie in one of the regions."""
         rows = self._out[: write_detections(self._table[: self._count], regions, self._out)]
         cov = rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
-        return Detections(rows[:, :2].copy(), cov, *(rows[:, k].copy() for k in range(5, 10)))
+        return Detections(
+            rows[:, :2].copy(), cov, *(rows[:, k].copy() for k in range(5, 10)), misfit=rows[:, 10].copy()
+        )
 
 
 class _Task(NamedTuple):

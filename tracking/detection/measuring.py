@@ -29,6 +29,7 @@ from tracking.detection.table import (
     FLUX,
     GAIN,
     HELD,
+    MISFIT,
     MOMENT_U,
     MOMENT_UU,
     MOMENT_UV,
@@ -101,7 +102,7 @@ def measure(
         peak, spot = peaks[chosen[k]], table[k]
         spot[MOMENT_U], spot[MOMENT_V], spot[BACKGROUND] = peak[AT_U], peak[AT_V], peak[LEVEL]
         spot[WIDE], spot[START], spot[HELD] = peak[WIDE_PEAK], start_variance(peak[SCALE]), 0.0
-        spot[TEXTURE] = peak[CONTRAST]
+        spot[TEXTURE], spot[MISFIT] = peak[CONTRAST], 0.0
     find_moments(image, table, cells)
     least = _LEAST_GAIN * limits.threshold_sigma**2
     for _ in range(_MERGES):
@@ -283,7 +284,7 @@ def _is_compact(image: Pixels, spot: Array, noise: Noise, limits: DetectionLimit
     spot[FLUX] = 2 * pi * sqrt(max(uu * vv - uv * uv, 0.0)) * height
     share = CENTRE_SHARE**2
     spot[VAR_U], spot[COV_UV], spot[VAR_V] = share * uu + 0.01, share * uv, share * vv + 0.01
-    spot[PEAK], spot[SIGMA_FLUX] = height, np.nan
+    spot[PEAK], spot[SIGMA_FLUX], spot[MISFIT] = height, np.nan, 1.0
     return True
 
 
@@ -326,7 +327,7 @@ def _drop_duplicates(table: Array) -> None:
 def write_detections(table: Array, regions: Array, out: Array) -> int:
     """Write the spots that lie in a region (n, 3) into `out`, largest flux first; returns their number.
 
-    Columns of out (most, 10): u, v; cov uu, uv, vv; flux, peak, major, minor, angle.
+    Columns of out (most, 11): u, v; cov uu, uv, vv; flux, peak, major, minor, angle; share of the covariance by misfit.
     """
     for k in range(table.shape[0]):
         found = table[k, ACCEPTED] and in_a_region(regions, table[k, U], table[k, V], 0.0)
@@ -339,6 +340,7 @@ def write_detections(table: Array, regions: Array, out: Array) -> int:
         row[0], row[1], row[2], row[3] = spot[U], spot[V], spot[VAR_U], spot[COV_UV]
         row[4], row[5], row[6] = spot[VAR_V], spot[FLUX], spot[PEAK]
         row[7], row[8], row[9] = ellipse.axes(spot[UU], spot[UV], spot[VV])
+        row[10] = spot[MISFIT]
         count += 1
         i = _brightest(table)
     return count

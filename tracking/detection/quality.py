@@ -20,6 +20,7 @@ from tracking.detection.table import (
     GAIN,
     LEVEL,
     LIGHT,
+    MISFIT,
     NEIGHBOUR_LIGHT,
     PEAK,
     RESIDUAL,
@@ -47,7 +48,7 @@ _LAGS = 2  # cells: largest lag of the autocorrelation of the residuals
 
 @compiled
 def assess_fit(window: Window, frame: PolynomialFrame, chi2: float, noise: Noise, cells: Array, spot: Array) -> None:
-    """Fill PEAK, CHI2 and both EXPLAINED of a spot (COLUMNS,), which has its covariances and GAIN.
+    """Fill PEAK, CHI2, MISFIT and both EXPLAINED of a spot (COLUMNS,), which has its covariances and GAIN.
 
     chi2: after the last step. The covariance is the Cramer-Rao bound of the model on entry; it and the variance of the
     flux are scaled by `_covariance_factor`, the covariance at least by `_compression_factor`.
@@ -70,7 +71,9 @@ def assess_fit(window: Window, frame: PolynomialFrame, chi2: float, noise: Noise
     spot[EXPLAINED_HERE] = spot[GAIN] / (max(chi2 - by_structure, 0.0) + max(spot[GAIN], 1e-9))
     factor = _covariance_factor(window, frame, cells, used)
     spot[SIGMA_FLUX] *= sqrt(factor)
-    factor = max(factor, _compression_factor(window, noise.compression, cells))
+    known = _compression_factor(window, noise.compression, cells)
+    factor = max(factor, known)
+    spot[MISFIT] = 1.0 - known / factor
     spot[VAR_U], spot[COV_UV], spot[VAR_V] = spot[VAR_U] * factor, spot[COV_UV] * factor, spot[VAR_V] * factor
 
 

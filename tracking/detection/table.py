@@ -15,10 +15,10 @@ VAR_U, COV_UV, VAR_V, SIGMA_FLUX, PEAK, CHI2, EXPLAINED, GAIN = range(9, 17)
 # Moments; then the background from the search, DN; 1 if only a mean of 8x8 pixels detects the candidate; size of the
 # largest cells used, px; 1 if it is to be fitted (again); 1 if it is a spot; variance of the first window, px^2; 1 if
 # its shape is held in the fit; share of the signal beyond noise and the structure beside the spot that is explained;
-# contrast of the texture there.
+# contrast of the texture there; share of the centre's variance due to misfits of the Gaussian.
 MOMENT_U, MOMENT_V, MOMENT_UU, MOMENT_UV, MOMENT_VV, BACKGROUND, WIDE, CELL_SIZE = range(17, 25)
-ACTIVE, ACCEPTED, START, HELD, EXPLAINED_HERE, TEXTURE = range(25, 31)
-COLUMNS = 31
+ACTIVE, ACCEPTED, START, HELD, EXPLAINED_HERE, TEXTURE, MISFIT = range(25, 32)
+COLUMNS = 32
 
 # Rows of `cells` (CELL_ROWS, most), of one window: grey values, DN; pixels.OUTSIDE, CLIPPED or VALID; light of the
 # neighbours, DN; light of the spot, DN; weight, 1/DN^2, 0 for excluded cells; residual, DN; 0 for cells excluded as hot

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array
+from tracking.detections import Detections
 from tracking.noise import NORMAL_68, NoiseModel, Picture, quantile_variance
 from tracking.noise_estimation.black_level import level_over_light
 from tracking.noise_estimation.texture import BLOCK, MeanPicture
@@ -29,6 +30,7 @@ _USUAL_FALL = 0.2  # share of the light lost in the corners by usual lenses
 _BRIGHT = 0.2  # above the background: a light, whose surroundings are left out on the coarse scale
 _FEWEST = 60  # samples of the filters' outputs on the coarse scale; with fewer the last error is used
 _FEWER_PIXELS = 1.6  # pixels per sigma of a spot above which pixels are averaged in pairs
+_NARROWEST_PX = 0.5  # half axis, with the pixel's own width
 _SAMPLED = 3  # px: step of the sample of the filters' outputs
 LARGEST_SHARE = 0.25  # of the spot's width: a larger error is not assumed; faint spots on texture have half of it
 
@@ -71,6 +73,29 @@ class TextureShift:
         light = np.interp(at, widths, self.light_px)
         background = np.interp(at, widths, self.background_px)
         return np.minimum(light + background / np.maximum(contrast, 1e-3), LARGEST_SHARE * np.asarray(width_px))
+
+    def added_to(self, found: Detections, level_dn: float) -> Detections:
+        """Points whose covariances include these errors, on a background of this level.
+
+        The kernels above of an elliptical Gaussian give variances along its axes in proportion to its half axes. The
+        fits' misfits show these errors as well, with others such as speckle: the larger of both counts, and belongs
+        to the place.
+        """
+        misfit = np.zeros(len(found)) if found.misfit is None else found.misfit
+        seen = misfit[:, None, None] * found.cov_px2
+        major, minor = np.maximum(found.major_px, _NARROWEST_PX), np.maximum(found.minor_px, _NARROWEST_PX)
+        sigma = self.sigma_px(np.sqrt(found.major_px * found.minor_px), found.peak / max(level_dn, 1.0))
+        expected_px2 = np.where(np.isnan(sigma), 0.0, sigma) ** 2
+        angle = np.radians(found.angle_deg)
+        along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        outer = along[:, :, None] * along[:, None, :]
+        ratio = (major / minor)[:, None, None]
+        shape = np.where(np.isnan(ratio * outer), np.eye(2), ratio * outer + (np.eye(2) - outer) / ratio)
+        expected = expected_px2[:, None, None] * shape
+        larger = np.trace(expected, axis1=1, axis2=2) > np.trace(seen, axis1=1, axis2=2)
+        place = np.where(larger[:, None, None], expected, seen)
+        place_px2 = 0.5 * np.trace(place, axis1=1, axis2=2)
+        return replace(found, cov_px2=found.cov_px2 - seen + place, place_px2=place_px2)
 
 
 def texture_shift(seen: MeanPicture, noise: NoiseModel, full_dn: float) -> TextureShift:

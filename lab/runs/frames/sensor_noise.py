@@ -99,11 +99,7 @@ class CameraNoise:
         """The points with covariances that include the errors due to the screen's texture."""
         if self.estimate is None or not len(found):
             return found
-        level = max(self.estimate.model.black_dn, 1.0)
-        width = np.sqrt(found.major_px * found.minor_px)
-        added = self.estimate.texture_shift.sigma_px(width, found.peak / level)
-        place_px2 = np.where(np.isnan(added), 0.0, added) ** 2
-        return replace(found, cov_px2=found.cov_px2 + place_px2[:, None, None] * np.eye(2), place_px2=place_px2)
+        return self.estimate.texture_shift.added_to(found, self.estimate.model.black_dn)
 
     def _update_model(self) -> None:
         """Stated values take precedence; the rest is estimated: data sheets lack them."""

@@ -56,6 +56,36 @@ def test_the_background_predicts_the_errors_of_bright_and_of_faint_spots(sigma_p
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.mean(expected), rel=0.4)
 
 
+@pytest.mark.parametrize("angle_deg", [0.0, 35.0, 90.0])
+def test_elongated_spots_have_larger_errors_along_their_major_axis(angle_deg):
+    """Variances along the axes are in proportion to the half axes."""
+    major, minor, peak = 4.5, 1.8, 4000.0
+    p, q = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    shape = np.array([[p, -q], [q, p]]) @ np.diag([major**-2, minor**-2]) @ np.array([[p, q], [-q, p]])
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    errors, claimed = [], []
+    for seed in range(4):
+        reflectance = screen(0.05, 1.0, seed)
+        estimate = estimate_noise(pictures(reflectance, 0.0, 4))
+        centres, _ = spots(1.0, 1.0, seed)
+        light = sum(
+            np.exp(
+                -0.5 * (shape[0, 0] * (x - a) ** 2 + 2 * shape[0, 1] * (x - a) * (y - b) + shape[1, 1] * (y - b) ** 2)
+            )
+            for a, b in centres
+        )
+        picture = pictures(reflectance, peak * np.asarray(light), 1)[0]
+        found = estimate.texture_shift.added_to(find_spots(picture, noise=estimate.model), BACKGROUND)
+        for centre in centres:
+            nearest = int(np.argmin(np.hypot(*(found.uv_px - centre).T)))
+            errors.append((found.uv_px[nearest] - centre) @ np.array([[p, -q], [q, p]]))
+            rotated = np.array([[p, q], [-q, p]]) @ found.cov_px2[nearest] @ np.array([[p, -q], [q, p]])
+            claimed.append(np.diag(rotated))
+    rms, sigma = np.sqrt(np.mean(np.square(errors), axis=0)), np.sqrt(np.mean(claimed, axis=0))
+    assert rms[0] > 1.3 * rms[1]
+    assert rms == pytest.approx(sigma, rel=0.35)
+
+
 def test_the_fall_of_the_light_towards_the_corners_shifts_wide_spots():
     """Vignetting of lens and sensor multiplies the laser's light; a plane of ambient light does not shift a spot."""
     y, x = np.mgrid[: SIZE[0], : SIZE[1]]
