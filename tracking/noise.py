@@ -13,7 +13,7 @@ from geometry.camera import SensorNoise
 
 Picture: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
-BLOCK = 8  # px: side of the blocks of detection
+BLOCK = 8  # px: side of the blocks in which pictures are searched
 ROUNDING_DN2 = 1.0 / 12.0  # variance of rounding to whole DN
 
 # Electrons at full scale, for sensors with unknown gain: typical of small industrial sensors (5 000 to 60 000). With

@@ -14,7 +14,7 @@ import numpy as np
 
 from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled
-from tracking.detection.block_search import BACKGROUND, BLOCK, HIGHEST8, TEXTURE, Blocks
+from tracking.detection.block_search import BACKGROUND, HIGHEST8, TEXTURE, Blocks
 from tracking.detection.pixels import (
     Noise,
     Pixels,
@@ -27,6 +27,7 @@ from tracking.detection.pixels import (
     variance,
     with_texture,
 )
+from tracking.noise import BLOCK
 
 # Mean light of the four neighbours relative to the pixel's: 0.15 for the sharpest spot (1 px wide), 0 for a hot pixel.
 HOT_SHARE = 0.08

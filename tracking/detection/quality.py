@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import erf, sqrt
+from math import cos, erf, exp, log, pi, sin, sqrt
 
 import numpy as np
 
@@ -43,15 +43,22 @@ _CORE = 0.2  # share of the brightest cell's light that limits the core: the pea
 # would show the grain in some pictures and not in others.
 _CROWDED = 1 / 40
 _BESIDE, _FEWEST_BESIDE = 0.02, 30  # share of the brightest cell's light below which a cell is beside the spot; cells
-_LAGS = 2  # cells: largest lag of the autocorrelation of the residuals
+# The grain of the light, of speckle or texture, moves the centre by its coarse part, which the fit follows and the
+# residuals do not contain. If its correlation, exp(-d^2 / (4 g^2)), is fitted to that of the residuals at a distance
+# d of 0.35 sigmas, then the variance of the centre over that of independent residuals of the same size is
+# exp(24 (g - 0.18)) sigma^2 with g in sigmas. Source: ours, a Monte Carlo with spots of 1.5 to 6 px and grains of 0.15
+# to 1 sigma; coarser grains look like a spot of another shape.
+_AWAY, _GRAIN_RISE, _GRAIN_OF_ONE = 0.35, 24.0, 0.18
+_LEAST_RHO, _COARSEST, _MOST_TAKEN = 0.01, 0.29, 3.0
+_LARGEST_SHIFT = 0.3  # widths: speckle of contrast 0.3 moves the centre by 0.14 widths, that of a streak by 0.28
 
 
 @compiled
 def assess_fit(window: Window, frame: PolynomialFrame, chi2: float, noise: Noise, cells: Array, spot: Array) -> None:
     """Fill PEAK, CHI2, MISFIT and both EXPLAINED of a spot (COLUMNS,), which has its covariances and GAIN.
 
-    chi2: after the last step. The covariance is the Cramer-Rao bound of the model on entry; it and the variance of the
-    flux are scaled by `_covariance_factor`, the covariance at least by `_compression_factor`.
+    chi2: after the last step. The covariance is the Cramer-Rao bound of the model on entry; it is scaled by the factors
+    of `_misfit`, as is the variance of the flux.
     """
     count = window.columns * window.rows
     used, most = 0, 0.0
@@ -69,11 +76,13 @@ def assess_fit(window: Window, frame: PolynomialFrame, chi2: float, noise: Noise
     spot[EXPLAINED] = spot[GAIN] / (max(chi2 - by_noise, 0.0) + max(spot[GAIN], 1e-9))
     by_structure = by_noise * max(_chi2_beside(count, most, cells), 1.0)
     spot[EXPLAINED_HERE] = spot[GAIN] / (max(chi2 - by_structure, 0.0) + max(spot[GAIN], 1e-9))
-    factor = _covariance_factor(window, frame, cells, used)
-    spot[SIGMA_FLUX] *= sqrt(factor)
-    known = _compression_factor(window, noise.compression, cells)
-    factor = max(factor, known)
-    spot[MISFIT] = 1.0 - known / factor
+    width2 = sqrt(max(frame.S[0] * frame.S[2] - frame.S[1] ** 2, 0.0))
+    largest = _LARGEST_SHIFT**2 * width2 / max(0.5 * (spot[VAR_U] + spot[VAR_V]), 1e-300)
+    by_compression, by_grain, of_flux = _misfit(window, frame, noise.compression, cells, used)
+    spot[SIGMA_FLUX] *= sqrt(1.0 + of_flux)
+    # Errors of compression are those of the picture's content: a spot at rest has the same in every picture.
+    factor = 1.0 + by_compression + min(by_grain, largest)
+    spot[MISFIT] = 1.0 - 1.0 / factor
     spot[VAR_U], spot[COV_UV], spot[VAR_V] = spot[VAR_U] * factor, spot[COV_UV] * factor, spot[VAR_V] * factor
 
 
@@ -138,14 +147,17 @@ def _within_pixel(offset: float, width: float) -> float:
 
 
 @compiled
-def _covariance_factor(window: Window, frame: PolynomialFrame, cells: Array, used: int) -> float:
-    """Factor >= 1 on the covariance of the centre, for errors of the Gaussian model.
+def _misfit(
+    window: Window, frame: PolynomialFrame, compression: float, cells: Array, used: int
+) -> tuple[float, float, float]:
+    """Additions to a factor of 1 on the covariance of the centre: by compression, and by errors of the Gaussian model.
 
     Only the part of the residuals that is odd about the centre can shift it: a spot with a flat top, a ring or a streak
-    is not Gaussian, but its centre is correct. If the odd part is significantly larger than noise, the factor is its
-    mean square, weighted by the sensitivity of the centre (the slopes), times the number of correlated cells. Spots at
-    the border, with few cells in mirrored pairs, use all residuals. Source: ours, after the sandwich covariance of
-    misspecified models; measured in bench/detection.py (sets streak, speckle).
+    is not Gaussian, but its centre is correct. If the odd part is significantly larger than noise and compression, the
+    addition is its mean square, weighted by the sensitivity of the centre (the slopes), times the number of cells that
+    one grain of the light has. Spots at the border, with few cells in mirrored pairs, use all residuals. The third
+    value is that for the flux, on which the fit's freedom has less effect. Source: ours, after the sandwich covariance
+    of misspecified models; measured in bench/detection.py (sets streak, speckle).
     """
     count = window.columns * window.rows
     both = 0
@@ -172,7 +184,7 @@ def _covariance_factor(window: Window, frame: PolynomialFrame, cells: Array, use
             odd[k] = 0.0
         squares += odd[k] * odd[k]
     anywhere = 0.5 * squares / free > 1.0 + 3.0 * sqrt(2.0 / free)
-    return _odd_misfit_factor(window, frame, cells, odd, 2.0 if whole else 1.0, anywhere)
+    return _odd_misfit(window, frame, compression, cells, odd, 2.0 if whole else 1.0, anywhere)
 
 
 @compiled
@@ -189,10 +201,10 @@ def _slope_along(window: Window, cells: Array, z: Array, k: int, du: float, dv: 
 
 
 @compiled
-def _odd_misfit_factor(
-    window: Window, frame: PolynomialFrame, cells: Array, odd: Array, doubled: float, anywhere: bool
-) -> float:
-    """The factor; 1 without a misfit. odd (cells,): residuals in sigmas, overwritten. Fills NEIGHBOUR_LIGHT.
+def _odd_misfit(
+    window: Window, frame: PolynomialFrame, compression: float, cells: Array, odd: Array, doubled: float, anywhere: bool
+) -> tuple[float, float, float]:
+    """As `_misfit`. odd (cells,): residuals in sigmas. Overwrites NEIGHBOUR_LIGHT.
 
     anywhere: whether there is one in the mean of all cells. Grain of the light is in the core only: there the mean
     weighted with the sensitivity shows it. Its variance, with noise alone, is 2 sum(share^2), or 4 of mirrored pairs.
@@ -209,47 +221,56 @@ def _odd_misfit_factor(
             share[k] = cells[WEIGHT, k] * cells[LIGHT, k] ** 2 * (wu * wu + wv * wv)
             total += share[k]
     total = max(total, 1e-300)
-    square, crowd = 0.0, 0.0
+    square, crowd, added = 0.0, 0.0, 0.0
     for k in range(count):
+        added += share[k] * cells[WEIGHT, k] * compression / (total * window.cell**2)
         part = share[k] / total if odd[k] != 0.0 else 0.0
         square += odd[k] * odd[k] * part / doubled
         crowd += part * part
-        odd[k] *= sqrt(part)
-    if not anywhere and (crowd > _CROWDED or square <= 1.0 + 3.0 * sqrt(4.0 / doubled * crowd)):
-        return 1.0
-    grain = _correlated_cells(window, odd)
-    grains = 1.0 / max(crowd * grain, 1e-12)  # number of independent samples in the slopes
-    # Four fitted parameters are odd, so the residuals contain less of the odd part than the light.
-    return max(square * grain * min(grains / max(grains - 4.0, 1e-9), 3.0), 1.0)
+        share[k] = sqrt(part)
+    scatter = sqrt(4.0 / doubled * crowd)  # of the mean square by noise
+    beyond = square - (1.0 + added)
+    if beyond <= 0.0 or (not anywhere and (crowd > _CROWDED or beyond <= 3.0 * scatter * (1.0 + added))):
+        return added, 0.0, 0.0
+    width2 = sqrt(max(frame.S[0] * frame.S[2] - frame.S[1] ** 2, 0.0)) / window.cell**2
+    rho, away2 = _correlation_within(window, frame, odd, share)
+    rho = min(max(rho / (doubled * beyond), _LEAST_RHO), 0.99)
+    grain = min(sqrt(away2 / (-4.0 * log(rho))), _COARSEST)
+    # Four fitted parameters are odd: of a narrow spot they take a large part of the odd residuals.
+    odd_cells = 0.5 * doubled / max(crowd, 1e-12)
+    taken = min(odd_cells / max(odd_cells - 4.0, 1e-9), _MOST_TAKEN)
+    cells_of_one = taken * exp(_GRAIN_RISE * (grain - _GRAIN_OF_ONE)) * width2
+    # A misfit that is barely significant has no reliable correlation.
+    reliable = max(1.0 - scatter * (1.0 + added) / beyond, 0.0)
+    visible = 4.0 * pi * grain * grain * width2
+    return added, beyond * max(cells_of_one * reliable, 1.0), beyond * max(visible * reliable, 1.0)
 
 
 @compiled
-def _compression_factor(window: Window, compression: float, cells: Array) -> float:
-    """Factor >= 1 on the covariance of the centre for the variance, DN^2 per pixel, that compression adds to the light.
+def _correlation_within(window: Window, frame: PolynomialFrame, z: Array, weight: Array) -> tuple[float, float]:
+    """Mean product of two of the values (cells,) that are about _AWAY sigmas of the spot apart, weighted.
 
-    Weighted with the sensitivity in NEIGHBOUR_LIGHT.
+    The mean of four directions, evenly spaced where the spot's ellipse is a circle; and their mean squared distance,
+    sigma^2.
     """
-    added, total = 0.0, 0.0
-    for k in range(window.columns * window.rows):
-        share = cells[NEIGHBOUR_LIGHT, k]
-        added, total = added + share * cells[WEIGHT, k], total + share
-    return 1.0 + compression / window.cell**2 * added / max(total, 1e-300)
-
-
-@compiled
-def _correlated_cells(window: Window, z: Array) -> float:
-    """Number of cells over which residuals (cells,) are correlated: the fit has fewer independent cells by this factor.
-
-    Speckle is smooth, so chi2 alone underestimates its effect on the centre. The number is the sum of the residuals'
-    autocorrelation over lags of up to two cells.
-    """
-    power, other = 0.0, 0.0
-    for r in range(window.rows):
-        for c in range(window.columns):
-            here = z[r * window.columns + c]
-            power += here * here
-            for i in range(min(_LAGS + 1, window.rows - r)):
-                for j in range(-_LAGS if i > 0 else 1, _LAGS + 1):
-                    if c + j >= 0 and c + j < window.columns:
-                        other += here * z[(r + i) * window.columns + c + j]
-    return max(1.0 + 2.0 * other / max(power, 1e-12), 1.0)
+    n, total, weights, away2 = window.columns, 0.0, 0.0, 0.0
+    a = sqrt(max(frame.S[0], 1e-9))
+    b = frame.S[1] / a
+    c = sqrt(max(frame.S[2] - b * b, 1e-9))
+    for direction in range(4):
+        p, q = cos(direction * pi / 4), sin(direction * pi / 4)
+        right = int(np.rint(_AWAY * a * p / window.cell))
+        down = int(np.rint(_AWAY * (b * p + c * q) / window.cell))
+        if down < 0:
+            right, down = -right, -down
+        if right == 0 and down == 0:
+            right, down = (0, 1) if direction == 2 else (1, 0)
+        x = right * window.cell / a
+        y = (down * window.cell - b * x) / c
+        away2 += 0.25 * (x * x + y * y)
+        for row in range(window.rows - down):
+            for column in range(max(-right, 0), min(n - right, n)):
+                k = row * n + column
+                both = weight[k] * weight[k + down * n + right]
+                total, weights = total + both * z[k] * z[k + down * n + right], weights + both
+    return total / max(weights, 1e-300), away2

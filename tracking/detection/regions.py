@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled
-from tracking.detection.block_search import BLOCK
 from tracking.detection.candidates import AT_U, AT_V
 from tracking.detection.search import RADIUS
+from tracking.noise import BLOCK
 
 MARGIN = 16  # px: largest distance of a peak from its spot's centre
 

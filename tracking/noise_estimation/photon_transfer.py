@@ -102,6 +102,7 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
     # With hardly any noise on a background of few grey values their steps look like texture.
     stepped = banding(model.floor_dn2, rounding) > _STEPS_SEEN * background
     shift = TextureShift.usual(usable[0]) if stepped else texture_shift(seen, model, full)
+    shift = shift.with_lights([find_spots(p, DetectParameters(max_detections=_MOST_SPOTS), model) for p in usable])
     return NoiseEstimate(model, floor_sigma, slope_sigma, saturation, step, len(usable), levels.temporal, shift)
 
 

@@ -9,6 +9,7 @@ Source: ours.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,9 +19,9 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array
 from tracking.detections import Detections
-from tracking.noise import NORMAL_68, NoiseModel, Picture, quantile_variance
+from tracking.noise import BLOCK, NORMAL_68, NoiseModel, Picture, quantile_variance
 from tracking.noise_estimation.black_level import level_over_light
-from tracking.noise_estimation.texture import BLOCK, MeanPicture
+from tracking.noise_estimation.texture import MeanPicture
 
 _WIDTHS_PX = (0.8, 1.6, 3.2, 6.4, 12.8, 25.6)  # of spots
 _COARSE_PX = 4.0  # width from which the smooth part of the background counts: it may be uneven response (vignetting)
@@ -31,6 +32,10 @@ _BRIGHT = 0.2  # above the background: a light, whose surroundings are left out 
 _FEWEST = 60  # samples of the filters' outputs on the coarse scale; with fewer the last error is used
 _FEWER_PIXELS = 1.6  # pixels per sigma of a spot above which pixels are averaged in pairs
 _NARROWEST_PX = 0.5  # half axis, with the pixel's own width
+_USUAL = 0.3  # quantile of the lights' misfits: of reflections and other clutter many have larger ones than spots
+_RESOLVED_PX, _CLEAR = 1.8, 0.02  # width from which a misfit shows; noise of the centre, in widths, of clear lights
+_FEWEST_LIGHTS = 6
+_CLEARLY_MORE = 6.0  # ratio of the variance that a fit shows to that expected: of one spot it has a factor of two
 _SAMPLED = 3  # px: step of the sample of the filters' outputs
 LARGEST_SHARE = 0.25  # of the spot's width: a larger error is not assumed; faint spots on texture have half of it
 
@@ -43,6 +48,9 @@ class TextureShift:
     light_px: tuple[float, ...]  # by the texture in the spot's own light
     background_px: tuple[float, ...]  # by the texture in the background, for a spot as bright as the background
     known: bool = True  # the pictures could show it: neither too small nor too coarsely rounded
+    # Usual error of the lights in the pictures by misfits of their fits, as a share of their widths; nan: too few
+    # lights that are wide enough to show it
+    misfit_share: float = float("nan")
 
     @staticmethod
     def none() -> TextureShift:
@@ -58,6 +66,17 @@ class TextureShift:
         half_diagonal = 0.5 * float(np.hypot(*picture.shape))
         light = tuple(_USUAL_FALL * w**2 / half_diagonal for w in _WIDTHS_PX)
         return TextureShift(_WIDTHS_PX, light, tuple(0.0 for _ in _WIDTHS_PX), known=False)
+
+    def with_lights(self, found: Sequence[Detections]) -> TextureShift:
+        """These errors with `misfit_share` from the lights found in pictures."""
+        shares = []
+        for points in found:
+            width = np.sqrt(points.major_px * points.minor_px)
+            variance = 0.5 * np.trace(points.cov_px2, axis1=1, axis2=2)
+            misfit = np.zeros(len(points)) if points.misfit is None else points.misfit
+            clear = (width > _RESOLVED_PX) & (variance * (1 - misfit) < (_CLEAR * width) ** 2)
+            shares.extend(np.sqrt(misfit * variance)[clear] / width[clear])
+        return replace(self, misfit_share=float(np.quantile(shares, _USUAL))) if len(shares) >= _FEWEST_LIGHTS else self
 
     @property
     def of_light(self) -> TextureShift:
@@ -78,8 +97,8 @@ class TextureShift:
         """Points whose covariances include these errors, on a background of this level.
 
         The kernels above of an elliptical Gaussian give variances along its axes in proportion to its half axes. The
-        fits' misfits show these errors as well, with others such as speckle: the larger of both counts, and belongs
-        to the place.
+        fits' misfits show these errors as well, less precisely; if they are clearly larger, they count instead: they
+        contain other errors, such as speckle. Both belong to the place.
         """
         misfit = np.zeros(len(found)) if found.misfit is None else found.misfit
         seen = misfit[:, None, None] * found.cov_px2
@@ -92,8 +111,13 @@ class TextureShift:
         ratio = (major / minor)[:, None, None]
         shape = np.where(np.isnan(ratio * outer), np.eye(2), ratio * outer + (np.eye(2) - outer) / ratio)
         expected = expected_px2[:, None, None] * shape
-        larger = np.trace(expected, axis1=1, axis2=2) > np.trace(seen, axis1=1, axis2=2)
-        place = np.where(larger[:, None, None], expected, seen)
+        other = np.trace(seen, axis1=1, axis2=2) > _CLEARLY_MORE * np.trace(expected, axis1=1, axis2=2)
+        place = np.where(other[:, None, None], seen, expected)
+        # The grain of the light is the same for all spots of a camera, but does not show in each: then it is at least
+        # usual.
+        usual = np.nan_to_num(self.misfit_share) ** 2 * major * minor
+        below = 0.5 * np.trace(place, axis1=1, axis2=2) < usual
+        place = np.where(below[:, None, None], usual[:, None, None] * shape, place)
         place_px2 = 0.5 * np.trace(place, axis1=1, axis2=2)
         return replace(found, cov_px2=found.cov_px2 - seen + place, place_px2=place_px2)
 

@@ -15,17 +15,26 @@ from tracking.smoothing.motion.reference import Reference
 from tracking.smoothing.motion.run_detections import RunDetections, labelled_points
 
 # Largest shift of a spot's centre by texture, speckle and its shape, as a share of its width (1 sigma): 4 % texture
-# makes 0.04, speckle of contrast 0.3 makes 0.1.
-LARGEST_WIDTH_SHARE = 0.1
+# makes 0.04, speckle of contrast 0.3 up to 0.16.
+LARGEST_WIDTH_SHARE = 0.16
 _FRAMES = 300  # from which the width share is estimated
-_LEAST_CHANGES = 20  # changes of a width from which its scatter is estimated
+_LEAST_CHANGES = 20  # changes of the widths in a camera from which their scatter is estimated
+_LEAST_OF_VIEW = 6  # changes from which a view counts
 _MEDIAN_CHI2 = 0.4549364  # median of chi-square with one degree of freedom
 _CLEAR_SCATTER = 2.0  # ratio of the widths' variance to the stated one from which it is used
 
 
-def width_covariance(width_px: Array, share: float) -> Array:
-    """Covariances (m, 2, 2), px^2, of errors that are this share of the spots' widths (m,), px; 0 where not known."""
+def width_covariance(width_px: Array, share: Array | float) -> Array:
+    """Covariances (m, 2, 2), px^2, of errors that are shares of the spots' widths (m,), px; 0 where not known."""
     return ((share * np.where(np.isnan(width_px), 0.0, width_px)) ** 2)[:, None, None] * np.eye(2)
+
+
+def widened(detections: RunDetections, share: Array | float) -> RunDetections:
+    """The detections with covariances that include errors of these shares (cameras,) of the spots' widths."""
+    cameras = detections.has_image.shape[1]
+    camera = np.repeat(np.tile(np.arange(cameras), len(detections.first)), np.diff(detections.first, axis=1).ravel())
+    own = np.broadcast_to(share, (cameras,))[camera]
+    return detections._replace(cov=detections.cov + width_covariance(detections.size_px, own))
 
 
 def width_share(
@@ -41,16 +50,17 @@ def width_share(
     frames = _evenly_spread(np.flatnonzero(measured), _FRAMES)
 
     def variance_factor(share: float) -> float:
-        wider = detections._replace(cov=detections.cov + width_covariance(detections.size_px, share))
-        return _mean_variance_factor(views, wider, assigned, calibration_cov, ref, frames)
+        return _mean_variance_factor(views, widened(detections, share), assigned, calibration_cov, ref, frames)
 
     if variance_factor(0.0) <= DEADBAND:
         return 0.0
     return _share_with(variance_factor)
 
 
-def scattered_width_share(detections: RunDetections, assigned: Ints) -> float:
-    """Errors beyond the stated ones as a share of the spots' widths, from the scatter of the widths; 0 if none show.
+def scattered_width_share(detections: RunDetections, assigned: Ints, camera_of: Ints) -> Array:
+    """Errors beyond the stated ones of each camera (cameras,) as a share of the spots' widths, from their scatter.
+
+    0 if none show. camera_of (n,): of the views.
 
     Whatever changes the light from place to place (noise, texture, speckle) shifts a fitted Gaussian and changes its
     width by the same amount: the derivatives with respect to both have the same norm once that of the amplitude is
@@ -65,19 +75,27 @@ def scattered_width_share(detections: RunDetections, assigned: Ints) -> float:
         np.where(labelled, detections.size_px[row], np.nan) if len(detections.size_px) else np.full(row.shape, np.nan)
     )
     change = size[2:] - 2 * size[1:-1] + size[:-2]
+    square, width2 = change**2 / 6, size[1:-1] ** 2
     known = np.isfinite(change)
-    if np.count_nonzero(known) < _LEAST_CHANGES:
-        return 0.0
-    square = change[known] ** 2 / 6
-    stated = np.linalg.eigvalsh(detections.cov[row[1:-1][known]])[:, 1]
-    width2 = size[1:-1][known] ** 2
+    stated = np.full(change.shape, np.nan)
+    stated[known] = np.linalg.eigvalsh(detections.cov[row[1:-1][known]])[:, 1]
+    out = np.zeros(detections.has_image.shape[1])
+    for camera in range(len(out)):
+        some: list[int] = [
+            int(i) for i in np.flatnonzero(camera_of == camera) if np.count_nonzero(known[:, i]) >= _LEAST_OF_VIEW
+        ]
+        if np.count_nonzero(known[:, some]) < _LEAST_CHANGES:
+            continue
 
-    def ratio(share: float) -> float:
-        return float(np.median(square / (stated + share**2 * width2))) / _MEDIAN_CHI2
+        # The mean over the views: speckle may show in the sigmas of wide spots and not in those of narrow ones.
+        def ratio(share: float, some: list[int] = some) -> float:
+            return float(np.mean(np.nanmedian(square[:, some] / (stated + share**2 * width2)[:, some], axis=0))) / (
+                _MEDIAN_CHI2
+            )
 
-    if ratio(0.0) <= _CLEAR_SCATTER:
-        return 0.0
-    return _share_with(ratio)
+        if ratio(0.0) > _CLEAR_SCATTER:
+            out[camera] = _share_with(ratio)
+    return out
 
 
 def _share_with(variance_factor: Callable[[float], float]) -> float:

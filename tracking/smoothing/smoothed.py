@@ -41,7 +41,7 @@ class Smoothed:
     jerk: Array  # (2,) m/s^3 and rad/s^3 per sqrt(Hz), of translation and rotation
     iterations: int  # rounds of motion and labels
     relabelled: int  # labels that differ from the causal ones
-    width_share: float  # errors beyond the stated ones, as a share of the spots' widths (1 sigma)
+    width_share: Array  # (cameras,) errors beyond the stated ones, as a share of the spots' widths (1 sigma)
     noise_scale: float  # ratio of the spots' errors to their stated sigmas
     calibration_cov: Array  # (n, 2, 2) px^2: covariance of the expected pixels due to calibration errors
 
@@ -74,7 +74,7 @@ class Smoothed:
             assert points is not None
             row = point[views]
             uv_px[views] = points.uv_px[row] - self.exposure_px[k, views]
-            stated = points.cov_px2[row] + width_covariance(points.major_px[row], self.width_share)
+            stated = points.cov_px2[row] + width_covariance(points.major_px[row], self.width_share[camera])
             blended = np.where(assigned[views] >= BLENDED, self.parameters.blend_px / 2, 0.0)
             own = stated * self.noise_scale**2 + self.parameters.sigma_model_px**2 * np.eye(2)
             cov_px2[views] = own + (blended**2)[:, None, None] * np.eye(2)

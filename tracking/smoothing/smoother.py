@@ -35,7 +35,7 @@ from tracking.smoothing.error_scale import (
     noise_scale,
     scattered_width_share,
     usual_sizes,
-    width_covariance,
+    widened,
     width_share,
 )
 from tracking.smoothing.exposure import exposure_offsets, pose_shift
@@ -112,11 +112,10 @@ class _Smoother:
         ref = straight_between(rec.poses, self.measured, np.cumsum(rec.dt_s))
         every = rec.run_detections()
         self.calibration_cov, self.systematic, self.noise_share = calibration_errors(rec, every, self.assigned, ref)
-        self.width_share = max(
-            width_share(self.views, every, self.assigned, self.calibration_cov, ref, self.measured),
-            scattered_width_share(every, self.assigned),
-        )
-        every = every._replace(cov=every.cov + width_covariance(every.size_px, self.width_share))
+        seen = scattered_width_share(every, self.assigned, self.model.camera_of)
+        every = widened(every, seen)
+        more = width_share(self.views, every, self.assigned, self.calibration_cov, ref, self.measured)
+        every, self.width_share = widened(every, more), np.hypot(seen, more)
         self.scale = noise_scale(self.views, every, self.assigned, self.calibration_cov, ref, self.measured)
         self.detections = every._replace(
             cov=every.cov * self.scale**2 + parameters.sigma_model_px**2 * np.eye(2),

@@ -158,18 +158,25 @@ def camera_noises(run: Run, reader: FrameReader) -> dict[str, CameraNoise]:
 
 
 def share_texture(cameras: Sequence[CameraNoise]) -> None:
-    """Give cameras whose background is too faint to show the texture of its screen the finest of the others'.
+    """Give cameras whose pictures cannot show the texture of the screen or the grain of the light that of the others.
 
-    The screens of a laboratory are alike; without this the errors of such a camera would be taken for noise.
+    A background may be too faint, spots may be too narrow. The screens and lasers of a laboratory are alike; without
+    this such errors would be taken for noise. Of several textures the finest is taken, of several grains the coarsest.
     """
     estimates = [c.estimate for c in cameras if c.estimate is not None]
+    grains = [e.texture_shift.misfit_share for e in estimates if np.isfinite(e.texture_shift.misfit_share)]
+    for camera in cameras:
+        if camera.estimate is not None and grains and not np.isfinite(camera.estimate.texture_shift.misfit_share):
+            shift = replace(camera.estimate.texture_shift, misfit_share=max(grains))
+            camera.estimate = replace(camera.estimate, texture_shift=shift)
     shifts = [e.texture_shift for e in estimates if e.texture_shift.known]
     if not shifts:
         return
     finest = min(shifts, key=lambda s: max(s.light_px)).of_light
     for camera in cameras:
         if camera.estimate is not None and not camera.estimate.texture_shift.known:
-            camera.estimate = replace(camera.estimate, texture_shift=finest)
+            share = camera.estimate.texture_shift.misfit_share
+            camera.estimate = replace(camera.estimate, texture_shift=replace(finest, misfit_share=share))
 
 
 def noise_estimation_frames(pictures: int) -> list[int]:

@@ -7,9 +7,9 @@ import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 
 from geometry.arrays import Array
-from tracking.detection.block_search import BLOCK
 from tracking.detection.candidates import _has_significant, _read_block, _sum_squares, block_workspace
 from tracking.detection.pixels import CLIPPED, OUTSIDE, VALID, Pixels, Window, read_window
+from tracking.noise import BLOCK
 
 WIDTH, HEIGHT = 90, 70
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tracking.rigid_body.association.frame_detections import BLENDED
-from tracking.smoothing.error_scale import scattered_width_share
+from tracking.smoothing.error_scale import scattered_width_share, widened
 from tracking.smoothing.motion.run_detections import RunDetections
 
 FRAMES, VIEWS, WIDTH = 60, 3, 2.0
@@ -17,7 +17,7 @@ def detections(sizes: np.ndarray, sigma_px: float) -> RunDetections:
     count = sizes.size
     return RunDetections(
         uv=np.zeros((count, 2)), cov=np.tile(sigma_px**2 * np.eye(2), (count, 1, 1)), blend_px=np.zeros(count),
-        begin=np.arange(len(sizes) + 1) * sizes.shape[1], first=np.zeros((len(sizes), 2), dtype=np.int64),
+        begin=np.arange(len(sizes) + 1) * sizes.shape[1], first=np.tile([0, sizes.shape[1]], (len(sizes), 1)),
         has_image=np.ones((len(sizes), 1), dtype=bool), log_static=np.full(count, -np.inf), size_px=sizes.ravel(),
         usual_size_px=np.full(sizes.shape[1], np.nan),
     )  # fmt: skip
@@ -30,21 +30,46 @@ def sizes(error_px: float) -> np.ndarray:
 
 
 LABELS = np.tile(np.arange(VIEWS), (FRAMES, 1))
+CAMERAS = np.zeros(VIEWS, dtype=np.int64)
 
 
 def test_widths_that_scatter_as_their_stated_sigmas_say_add_nothing():
-    assert scattered_width_share(detections(sizes(0.02), 0.02), LABELS) == 0.0
+    assert scattered_width_share(detections(sizes(0.02), 0.02), LABELS, CAMERAS) == [0.0]
 
 
 def test_widths_that_scatter_more_show_errors_of_this_share_of_the_width():
     errors = 0.06 * sizes(0.0)
     rng = np.random.default_rng(2)
-    share = scattered_width_share(detections(sizes(0.0) + errors * rng.normal(size=errors.shape), 0.02), LABELS)
-    assert share == pytest.approx(0.06, rel=0.2)
+    share = scattered_width_share(
+        detections(sizes(0.0) + errors * rng.normal(size=errors.shape), 0.02), LABELS, CAMERAS
+    )
+    assert share == pytest.approx([0.06], rel=0.2)
 
 
 def test_unlabelled_and_blended_points_and_unknown_widths_do_not_count():
     wild = detections(sizes(0.5), 0.02)
-    assert scattered_width_share(wild, np.full_like(LABELS, -1)) == 0.0
-    assert scattered_width_share(wild, LABELS + BLENDED) == 0.0
-    assert scattered_width_share(wild._replace(size_px=np.full(LABELS.size, np.nan)), LABELS) == 0.0
+    assert scattered_width_share(wild, np.full_like(LABELS, -1), CAMERAS) == [0.0]
+    assert scattered_width_share(wild, LABELS + BLENDED, CAMERAS) == [0.0]
+    assert scattered_width_share(wild._replace(size_px=np.full(LABELS.size, np.nan)), LABELS, CAMERAS) == [0.0]
+
+
+def test_errors_that_only_narrow_spots_hide_add_to_their_camera_alone():
+    """One of two cameras, and in it one of three views whose sigmas contain the errors."""
+    rng = np.random.default_rng(3)
+    scattered = sizes(0.0) * (1 + 0.08 * rng.normal(size=(FRAMES, VIEWS)))
+    both = np.concatenate([scattered, sizes(0.02)], axis=1)
+    found = detections(both, 0.02)
+    cov = found.cov.reshape(FRAMES, 2 * VIEWS, 2, 2).copy()
+    cov[:, 0] += (0.08 * WIDTH) ** 2 * np.eye(2)
+    found = found._replace(
+        cov=cov.reshape(-1, 2, 2),
+        first=np.tile([0, VIEWS, 2 * VIEWS], (FRAMES, 1)),
+        has_image=np.ones((FRAMES, 2), bool),
+    )
+    labels, camera_of = np.tile(np.arange(2 * VIEWS), (FRAMES, 1)), np.repeat([0, 1], VIEWS)
+    share = scattered_width_share(found, labels, camera_of)
+    assert share[0] == pytest.approx(0.07, rel=0.25)
+    assert share[1] == 0.0
+    added = np.trace(widened(found, share).cov - found.cov, axis1=1, axis2=2).reshape(FRAMES, 2 * VIEWS)
+    assert np.all(added[:, :VIEWS] > 0)
+    assert np.all(added[:, VIEWS:] == 0)
