@@ -179,21 +179,21 @@ class _Smoother:
             run, self.assigned, ref, self.motion.pose_P, self.motion.weight, self._log_clutter(known),
             jump_sigmas(ref, self.rec.dt_s),
         )  # fmt: skip
-        before = self.assigned
-        new = np.where((probability >= self.parameters.min_label_probability) & known[:, None], found, -1)
-        self.assigned = new
+        before, likely = self.assigned, probability >= self.parameters.min_label_probability
+        self.assigned = new = np.where(likely & known[:, None], found, -1)
         new[self._brief(new >= 0) & (probability < BRIEF_PROBABILITY)] = -1
         self.measured = self._single_frame_poses(new).measured
         # Where the other frames do not check a label, those of its frame must, or a tracker that was sure of it.
         vague = sigma_px > MAX_CHECKING_SIGMA_PX
         controlled, uncontrolled_labels = self._controlled(ref)
         confirmed = self.sure | controlled | self._redundant((new >= 0) & (probability >= SURE_PROBABILITY))
-        new[(vague[:, None] & (uncontrolled_labels | ~confirmed[:, None])) & (new != self.tracker_labels)] = -1
+        left_open = vague[:, None] & (uncontrolled_labels | ~confirmed[:, None]) & (new != self.tracker_labels)
+        new[left_open] = -1
         unchecked = vague & ~connected(self.measured & self.tracker_measured, confirmed)
         count = distinct_spots(new >= 0, self.model.spot_of)
         dropped = isolated(count)
         # In a long occlusion so few false points fit a pose once by chance; spots would be there in the next frame too.
-        measured = self._single_frame_poses(new).measured
+        measured = self._single_frame_poses(new).measured if left_open.any() else self.measured
         dropped |= vague & measured & (count <= MIN_REDUNDANT_SPOTS) & ~next_to(measured)
         new[dropped] = -1
         self.probability = np.where((found >= 0) & ~dropped[:, None], probability, np.nan)
