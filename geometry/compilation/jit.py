@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
-from numba.core import event
+from numba.core import codegen, event
 from numba.core.caching import FunctionCache
 from numba.core.types import unliteral
 
@@ -38,10 +38,44 @@ def compiled_for_threads(function: Function) -> Function:
     return _compiled(function, release_gil=True)
 
 
+class _Library(codegen.JITCodeLibrary):
+    """numba's holder of machine code; for code from disk, LLVM's bitcode is parsed only when it is needed.
+
+    It is needed to compile a caller, which may inline this code. numba parses it in every process: half of the time
+    of loading (docs/decisions/compile-cache.md).
+    """
+
+    _unparsed: bytes | None = None  # bitcode of code from disk
+
+    @classmethod
+    def _unserialize(cls, generator: Any, state: Any) -> _Library:
+        name, _, (machine_code, bitcode) = state
+        library: Any = cls(generator, name)
+        library._unparsed = bitcode
+        library.enable_object_caching()
+        library._set_compiled_object(machine_code)
+        library._finalize_final_module()
+        out: _Library = library
+        return out
+
+    def _get_module_for_linking(self) -> Any:
+        if self._unparsed is not None:
+            self._shared_module = codegen.ll.parse_bitcode(self._unparsed)  # type: ignore[attr-defined]
+            self._unparsed = None
+        return super()._get_module_for_linking()  # type: ignore[no-untyped-call]
+
+    def get_pointer_to_function(self, name: str) -> int:
+        if self._disable_inspection:  # code from disk: numba knows its symbols only from the bitcode
+            address: int = self._codegen._engine.get_function_address(name)
+            return address
+        return int(super().get_pointer_to_function(name))  # type: ignore[no-untyped-call]
+
+
 class _Cache(FunctionCache):
     """numba's cache of one function, for which an unreadable or unwritable file is a missing one."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
+        target_context.codegen()._library_class = _Library
         try:
             return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         except Exception:  # unpickling a truncated file raises almost anything

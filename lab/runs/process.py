@@ -141,20 +141,20 @@ def _write_results(
     statistics, model_check, verdict = write_tables(
         pipeline, passes, work, causal=causal, on_frame=lambda record, _: tally.add(record)
     )
-    from lab.runs.score.score import score
+    from lab.runs.score.score import against_truth, read_tables
 
-    errors, added = score(work, run.folder), more()
-    results = RunResults(tally, statistics, model_check, verdict, passes.smoothing, errors)
+    tables, added = against_truth(read_tables(work), run.folder), more()
+    results = RunResults(tally, statistics, model_check, verdict, passes.smoothing, tables.errors)
     content = summary_of(pipeline, results, time.perf_counter() - started)
     write_json({**content, **added}, work / "summary.json")
     from lab.report.run.page import write_report  # imports the template engine, which only the report needs
 
     log.info("stage: report")
-    write_report(work, run.folder)
+    write_report(work, run.folder, run, tables)
     seconds = time.perf_counter() - started
     log.conclude(verdict, content, seconds)
     log.write(work)
-    return RunOutcome(run.name, out, verdict, statistics.frames, statistics.measured, seconds, errors)
+    return RunOutcome(run.name, out, verdict, statistics.frames, statistics.measured, seconds, tables.errors)
 
 
 def write_tables(

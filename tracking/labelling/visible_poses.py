@@ -124,7 +124,7 @@ def _weights(
 ) -> Array:
     """The volume that each of k poses represents, times the number of sets; 0 for poses from other than good sets."""
     area = np.prod(model.image_size_px, axis=-1)[views].prod(axis=1)
-    ways = np.array([np.prod([len(views_of[s]) for s in triples[i]]) for i in which], dtype=float)
+    ways = np.array([np.prod([len(views_of[s]) for s in spots]) for spots in triples], dtype=float)[which]
     met = sum(np.prod(shown[:, list(triples[i])], axis=1) for i in good)
     with np.errstate(divide="ignore", invalid="ignore"):
         weight = area * ways / (np.prod(singular, axis=1) * met)

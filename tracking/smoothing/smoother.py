@@ -178,21 +178,21 @@ class _Smoother:
             run, self.assigned, ref, self.motion.pose_P, self.motion.weight, self._log_clutter(known),
             jump_sigmas(ref, self.rec.dt_s),
         )  # fmt: skip
-        before = self.assigned
-        new = np.where((probability >= self.parameters.min_label_probability) & known[:, None], found, -1)
-        self.assigned = new
+        before, likely = self.assigned, probability >= self.parameters.min_label_probability
+        self.assigned = new = np.where(likely & known[:, None], found, -1)
         new[self._brief(new >= 0) & (probability < BRIEF_PROBABILITY)] = -1
         self.measured = self._single_frame_poses(new).measured
         # Where the other frames do not check a label, those of its frame must, or a tracker that was sure of it.
         vague = sigma_px > MAX_CHECKING_SIGMA_PX
         controlled, uncontrolled_labels = self._controlled(ref)
         confirmed = self.sure | controlled | self._redundant((new >= 0) & (probability >= SURE_PROBABILITY))
-        new[(vague[:, None] & (uncontrolled_labels | ~confirmed[:, None])) & (new != self.tracker_labels)] = -1
+        left_open = vague[:, None] & (uncontrolled_labels | ~confirmed[:, None]) & (new != self.tracker_labels)
+        new[left_open] = -1
         unchecked = vague & ~connected(self.measured & self.tracker_measured, confirmed)
         count = distinct_spots(new >= 0, self.model.spot_of)
         dropped = isolated(count)
         # In a long occlusion so few false points fit a pose once by chance; spots would be there in the next frame too.
-        measured = self._single_frame_poses(new).measured
+        measured = self._single_frame_poses(new).measured if left_open.any() else self.measured
         dropped |= vague & measured & (count <= MIN_REDUNDANT_SPOTS) & ~next_to(measured)
         new[dropped] = -1
         self.probability = np.where((found >= 0) & ~dropped[:, None], probability, np.nan)
@@ -329,21 +329,21 @@ class _Smoother:
 
     def _place_errors(self, ref: Reference, pose_P: Array) -> tuple[float, Array]:
         """Share of the errors that belong to places, and the factor (T,) of the poses' covariances for it."""
-        averaged = np.full(len(self.rec), np.nan)
-        for k in np.flatnonzero(self.own.measured).tolist():
-            averaged[k] = 6 / max(float(np.trace(np.linalg.solve(self.own.covariance[k], pose_P[k]))), 1e-9)
-        averaged = np.where(np.isfinite(averaged), averaged, np.nanmedian(averaged) if self.own.measured.any() else 1.0)
-        residual, uv_px = np.full((2, *self.assigned.shape, 2), np.nan)
-        expected, _ = project_all(self.views, ref.R, ref.t)
-        shares: list[float] = []
-        explained, place_px2 = np.zeros(len(self.model)), self.scale**2 * self.rec.place_px2()
-        for k in np.flatnonzero(self.own.measured).tolist():
-            use, uv, cov = labelled_points(self.detections, k, self.assigned[k], self.calibration_cov)
-            use = use & np.isfinite(expected[k]).all(axis=-1)
-            size = np.sqrt(0.5 * np.trace(cov[use], axis1=1, axis2=2))
-            residual[k, use], uv_px[k, use] = (uv[use] - expected[k, use]) / size[:, None], uv[use]
-            explained[use] = 0.5 * np.trace(self.calibration_cov[use], axis1=1, axis2=2) / size**2
-            shares.extend(place_px2[self.detections.begin[k] + self.assigned[k, use]] / size**2)
-        width_px, share = self.detections.usual_size_px, float(np.mean(shares or [0.0]))
+        frames, detections = np.flatnonzero(self.own.measured), self.detections
+        averaged, (residual, uv_px) = np.full(len(self.rec), np.nan), np.full((2, *self.assigned.shape, 2), np.nan)
+        ratio = np.trace(np.linalg.solve(self.own.covariance[frames], pose_P[frames]), axis1=1, axis2=2)
+        averaged[frames] = 6 / np.maximum(ratio, 1e-9)
+        averaged = np.where(np.isfinite(averaged), averaged, np.nanmedian(averaged) if len(frames) else 1.0)
+        expected, assigned = project_all(self.views, ref.R[frames], ref.t[frames])[0], self.assigned[frames]
+        use = (assigned >= 0) & (assigned < BLENDED) & np.isfinite(expected).all(axis=-1)
+        k, view = np.nonzero(use)
+        rows = detections.begin[frames[k]] + assigned[use]
+        size = np.sqrt(0.5 * np.trace(detections.cov[rows] + self.calibration_cov[view], axis1=1, axis2=2))
+        residual[frames[k], view] = (detections.uv[rows] - expected[use]) / size[:, None]
+        uv_px[frames[k], view] = detections.uv[rows]
+        explained = np.zeros(len(self.model))
+        explained[view] = 0.5 * np.trace(self.calibration_cov[view], axis1=1, axis2=2) / size**2  # in the last frame
+        shares = self.scale**2 * self.rec.place_px2()[rows] / size**2
+        width_px, share = self.detections.usual_size_px, float(np.mean(shares)) if len(shares) else 0.0
         found = place_errors(residual, uv_px, width_px, averaged, explained).at_least(share, uv_px, width_px)
         return found.share, found.factor(averaged)

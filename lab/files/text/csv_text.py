@@ -1,9 +1,8 @@
 """Reads and writes CSV files: every table that the program reads passes through this module.
 
-`read_table` reads the named columns of any CSV file into a `Table`. The csv module reads small and irregular files;
-pandas reads large regular ones. Measured: spots.csv of 600 frames takes 14 ms by the csv module and 5 ms by pandas,
-whose import takes 400 ms; of 50,000 frames 2.3 s and 0.4 s. All errors name the line of
-the file (`Table.error`). See docs/decisions/csv-layer.md.
+`read_table` reads the named columns of any CSV file into a `Table`. A regular file (each line as many commas as the
+header, no quotes, no blank line) is split at its commas, or read by pandas if it is large; the csv module reads all
+others. All errors name the line of the file (`Table.error`). See docs/decisions/csv-layer.md.
 """
 
 from __future__ import annotations
@@ -11,14 +10,14 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from geometry.arrays import Array, Ints
+from geometry.arrays import Array
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.csv_table import Categorical, Table
@@ -26,8 +25,8 @@ from lab.files.text.error_text import is_formula, printable_line, suggest_name
 
 # The columns that hold words; every other column holds numbers.
 WORD_COLUMNS = ("camera", "spot", "beam", "status", "point", "screen", "date", "verdict")
-LARGE_BYTES = 4_000_000  # pandas reads files of this size and larger
-_ROWS_AT_ONCE = 1_500  # bounds the memory of the text (1 MB): a long table is read in pieces
+LARGE_BYTES = 4_000_000  # pandas reads regular files of this size and larger
+_ROWS_AT_ONCE, _BYTES_AT_ONCE = 1_500, 200_000  # bound the memory of the text (1 MB): a table is read in pieces
 _MAX_TEXTS = 1000  # kept per column, of fields that are not numbers
 
 
@@ -48,9 +47,10 @@ def read_table(path: Path, required: Iterable[str], optional: Iterable[str] = ()
     data = _content(path, required, damaged)
     header = _checked_header(path, data, required)
     wanted = tuple(dict.fromkeys((*required, *optional)))
-    table = _read_regular(path, data, header, wanted) if len(data) >= LARGE_BYTES else None
+    regular = _is_regular(data, header)
+    table = _read_large(path, data, header, wanted) if regular and len(data) >= LARGE_BYTES else None
     if table is None:
-        table = _read_any(path, data, header, wanted)
+        table = (_read_regular if regular else _read_any)(path, data, header, wanted)
     for name in wanted:
         if name not in header and name not in WORD_COLUMNS:
             table.numbers[name] = np.full(len(table), np.nan)
@@ -110,11 +110,14 @@ def _checked_header(path: Path, data: bytes, required: Sequence[str]) -> tuple[s
     return tuple(header)
 
 
-def _read_regular(path: Path, data: bytes, header: tuple[str, ...], wanted: Sequence[str]) -> Table | None:
-    """By pandas; None where a field is not a number or the lines are not regular: row i must stand in line i + 2."""
+def _is_regular(data: bytes, header: tuple[str, ...]) -> bool:
+    """Whether row i of a table stands in line i + 2, with each field between two commas."""
     first = data[: data.find(b"\n") + 1].decode("utf-8", errors="replace")
-    if tuple(first.strip().split(",")) != header or not _all_lines_are_equal(data, len(header)):
-        return None
+    return tuple(first.strip().split(",")) == header and _all_lines_are_equal(data, len(header))
+
+
+def _read_large(path: Path, data: bytes, header: tuple[str, ...], wanted: Sequence[str]) -> Table | None:
+    """A regular file by pandas; None where a field is not a number."""
     import pandas as pd
 
     # Exact to the last bit; pandas does so by default since 3.1, where the option is deprecated.
@@ -155,6 +158,55 @@ def _all_lines_are_equal(data: bytes, columns: int) -> bool:
     return columns > 1 and bool(np.all(commas == columns - 1))
 
 
+class _Columns:
+    """The wanted columns of a file as they are read, in pieces."""
+
+    def __init__(self, header: tuple[str, ...], wanted: Sequence[str]) -> None:
+        self.place = {name: header.index(name) for name in wanted if name in header}
+        self._header = header
+        self._lines = [np.zeros(0, dtype=np.int64)]
+        self._numbers = {name: [np.zeros(0)] for name in self.place if name not in WORD_COLUMNS}
+        self._codes = {name: [np.zeros(0, dtype=np.int64)] for name in self.place if name in WORD_COLUMNS}
+        self._known: dict[str, dict[str, int]] = {name: {} for name in self._codes}
+        self._texts: dict[str, dict[int, str]] = {name: {} for name in self._numbers}
+
+    def add(self, fields: Mapping[str, list[str]], lines: Sequence[int]) -> None:
+        """Add some rows: the fields of each wanted column, and the line of each row."""
+        self._lines.append(np.array(lines, dtype=np.int64))
+        for name, pieces in self._numbers.items():
+            pieces.append(_as_numbers(fields[name], lines, self._texts[name]))
+        for name, known in self._known.items():
+            code = {field: known.setdefault(field.strip(), len(known)) for field in dict.fromkeys(fields[name])}
+            self._codes[name].append(np.array([code[field] for field in fields[name]], dtype=np.int64))
+
+    def table(self, path: Path, long_lines: Sequence[int] = (), short_lines: Sequence[int] = ()) -> Table:
+        """The rows so far."""
+        return Table(
+            path,
+            self._header,
+            {name: np.concatenate(pieces) for name, pieces in self._numbers.items()},
+            {n: Categorical(np.concatenate(pieces), tuple(self._known[n])) for n, pieces in self._codes.items()},
+            np.concatenate(self._lines),
+            {name: found for name, found in self._texts.items() if found},
+            tuple(long_lines),
+            tuple(short_lines),
+        )
+
+
+def _read_regular(path: Path, data: bytes, header: tuple[str, ...], wanted: Sequence[str]) -> Table:
+    """A regular file, split at its commas."""
+    columns, line = _Columns(header, wanted), 2
+    begin = data.find(b"\n") + 1
+    while begin < len(data):
+        end = data.find(b"\n", begin + _BYTES_AT_ONCE) + 1 or len(data)
+        text = data[begin:end].decode("utf-8", errors="replace").replace("\r\n", "\n")
+        fields = text.replace("\n", ",").split(",")[:-1]
+        rows = len(fields) // len(header)
+        columns.add({name: fields[i :: len(header)] for name, i in columns.place.items()}, range(line, line + rows))
+        begin, line = end, line + rows
+    return columns.table(path)
+
+
 def _records(path: Path, data: bytes) -> Iterator[tuple[int, list[str]]]:
     """Line number and fields of each line that is not blank. Raises InputError."""
     reader = csv.reader(
@@ -172,12 +224,7 @@ def _records(path: Path, data: bytes) -> Iterator[tuple[int, list[str]]]:
 
 def _read_any(path: Path, data: bytes, header: tuple[str, ...], wanted: Sequence[str]) -> Table:
     """By the csv module. Raises InputError."""
-    place = {name: header.index(name) for name in wanted if name in header}
-    numbers: dict[str, list[Array]] = {n: [] for n in place if n not in WORD_COLUMNS}
-    codes: dict[str, list[Ints]] = {n: [] for n in place if n in WORD_COLUMNS}
-    known: dict[str, dict[str, int]] = {n: {} for n in codes}
-    lines: list[Ints] = []
-    texts: dict[str, dict[int, str]] = {}
+    columns = _Columns(header, wanted)
     long_lines, short_lines = [], []
     records = _records(path, data)
     next(records)  # the header
@@ -192,39 +239,21 @@ def _read_any(path: Path, data: bytes, header: tuple[str, ...], wanted: Sequence
                 short_lines.append(line)
                 fields = [*fields, *[""] * -extra]
             kept.append((line, fields))
-        if not kept:
-            continue
         at = [line for line, _ in kept]
-        lines.append(np.array(at, dtype=np.int64))
-        for name, pieces in numbers.items():
-            column = [fields[place[name]] for _, fields in kept]
-            pieces.append(_as_numbers(column, at, texts.setdefault(name, {})))
-        for name, code_pieces in codes.items():
-            of = known[name]
-            column = [fields[place[name]].strip() for _, fields in kept]
-            code_pieces.append(np.array([of.setdefault(word, len(of)) for word in column], dtype=np.int64))
-    no_codes = np.zeros(0, dtype=np.int64)
-    return Table(
-        path,
-        header,
-        {n: np.concatenate([np.zeros(0), *pieces]) for n, pieces in numbers.items()},
-        {n: Categorical(np.concatenate([no_codes, *pieces]), tuple(known[n])) for n, pieces in codes.items()},
-        np.concatenate([no_codes, *lines]),
-        {name: found for name, found in texts.items() if found},
-        tuple(long_lines),
-        tuple(short_lines),
-    )
+        columns.add({name: [fields[i] for _, fields in kept] for name, i in columns.place.items()}, at)
+    return columns.table(path, long_lines, short_lines)
 
 
-def _as_numbers(fields: list[str], lines: list[int], texts: dict[int, str]) -> Array:
+def _as_numbers(fields: list[str], lines: Sequence[int], texts: dict[int, str]) -> Array:
     """Numbers (n,), nan where a field is empty or not a number; `texts` gets the latter by line."""
+    empty = fields.count("")
     try:
-        values = np.array([float(field or "nan") for field in fields])
-        suspicious = np.isnan(values).any() or any("_" in field for field in fields)
+        numbers = map(float, fields) if not empty else (float(field or "nan") for field in fields)
+        values = np.fromiter(numbers, float, len(fields))
+        if np.count_nonzero(np.isnan(values)) == empty and "_" not in "".join(fields):
+            return values
     except ValueError:
-        values, suspicious = np.full(len(fields), np.nan), True
-    if not suspicious:
-        return values
+        values = np.full(len(fields), np.nan)
     for i, field in enumerate(fields):
         text = field.strip()
         try:

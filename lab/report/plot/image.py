@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TypeAlias
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array
+from lab.pictures.opencv import load_cv2
 from lab.report.plot.svg import picture_uri
 
 Bytes: TypeAlias = NDArray[np.uint8]
@@ -54,6 +54,7 @@ def image_uri(picture: Bytes, kind: str) -> str:
     Raises:
         ValueError: OpenCV cannot encode pixels of this shape.
     """
+    cv2 = load_cv2()
     options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if kind == "jpeg" else [cv2.IMWRITE_PNG_COMPRESSION, 9]
     done, data = cv2.imencode(f".{kind}", picture, options)
     if not done:

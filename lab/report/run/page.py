@@ -9,6 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from lab.errors import InputError
+from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_text
 from lab.report.failure import Failure, files_beside, write_failure_report
 from lab.report.html import environment
@@ -20,24 +21,27 @@ from lab.report.run.events import ShownEvent, events, selected
 from lab.report.run.pictures import pictures
 from lab.report.run.report_data import ReportData, read_report_data
 from lab.report.run.tracks import POSE_COLOURS, SPOT_COLOURS, timeline_figure, tracks_figure, zoom_data
+from lab.runs.score.score import ResultTables
 from tracking.statuses import PoseStatus, SpotStatus
 
 FILE_NAME = "report.html"
 _MOST_EVENTS = 200
 
 
-def write_report(results: Path, run_folder: Path | None = None) -> Path:
+def write_report(
+    results: Path, run_folder: Path | None = None, run: Run | None = None, result_tables: ResultTables | None = None
+) -> Path:
     """Write report.html into a results folder, from its tables alone; returns its path.
 
     Where the run folder can be read (the one given, or the one that summary.json names), pictures, residuals and
-    errors against truth are added.
+    errors against truth are added. run, result_tables: those of the folders, where they are known already.
 
     Raises:
         InputError: the tables cannot be read; report.html then says so.
     """
     path = results / FILE_NAME
     try:
-        data = read_report_data(results, run_folder)
+        data = read_report_data(results, run_folder, run, result_tables)
     except InputError as error:
         if results.is_dir():
             folder = "" if run_folder is None else str(run_folder)

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from geometry.arrays import Array
 from lab.errors import BeamposeError
 from lab.files.run.results import SPOT_STATUSES, read_result_table
 from lab.files.run.run_file import DetectionsTable, LiveDevice
+from lab.pictures.opencv import load_cv2
 from lab.pictures.picture_file import GreyPicture, MissingPicture
 from lab.report.plot import svg
 from lab.report.plot.image import grey_limits, image_uri, stretched
@@ -103,6 +103,7 @@ def _drawing(shot: _Shot, picture: GreyPicture | str) -> str:
     else:
         shown = stretched(picture, *grey_limits(picture))
         if w > 2 * _SHOWN_WIDTH:
+            cv2 = load_cv2()
             shown = np.asarray(cv2.resize(shown, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
         out.append(
             f'<image x="-0.5" y="-0.5" width="{w}" height="{h}" preserveAspectRatio="none"'

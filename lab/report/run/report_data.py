@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,12 +11,12 @@ import numpy as np
 from geometry.arrays import Array, Bools
 from geometry.forward_model import SpotModel
 from lab.errors import BeamposeError
-from lab.files.run.results import PoseTrack, SpotGrid, has_causal, read_poses, read_spots, read_summary
+from lab.files.run.results import PoseTrack, SpotGrid, read_summary
 from lab.files.run.run_file import Run, load_run
 from lab.files.text.error_text import name_of_path
 from lab.report.run.summary import RunSummary, summary_of
 from lab.report.run.truth_errors import TruthErrors, errors_of
-from lab.runs.score.score import TruthArrays, pose_errors, read_truth, score_against
+from lab.runs.score.score import ResultTables, TruthArrays, against_truth, pose_errors, read_tables
 from tracking.statuses import PoseStatus
 
 _FRAMES_AT_ONCE = 2000  # bounds the memory of projecting all poses with their Jacobians
@@ -62,32 +63,28 @@ class ReportData:
         return self.poses.t_s if self.time_name != "frame" else self.poses.frames.astype(float)
 
 
-def read_report_data(results: Path, run_folder: Path | None) -> ReportData:
+def read_report_data(
+    results: Path, run_folder: Path | None, run: Run | None = None, tables: ResultTables | None = None
+) -> ReportData:
     """Read a results folder, and what is there of its run folder.
 
     run_folder: None: the folder that summary.json names. If it is missing or damaged, only the data from it are left
-    out.
+    out. run, tables (with truth): those of the folders, where they are known already.
 
     Raises:
         InputError: the results cannot be read.
     """
     summary = summary_of(read_summary(results))
-    spots, poses = read_spots(results), read_poses(results)
-    causal = read_poses(results, causal=True) if has_causal(results) else None
-    if causal is not None and not np.array_equal(causal.frames, poses.frames):
-        causal = None
     folder = _reachable(results, run_folder, summary)
-    run = truth = None
-    if folder is not None:
-        try:
+    if tables is None:
+        tables = read_tables(results)
+        if folder is not None:
+            with suppress(BeamposeError):
+                tables = against_truth(tables, folder)
+    if run is None and folder is not None:
+        with suppress(BeamposeError):
             run = load_run(folder)
-        except BeamposeError:
-            run = None
-        try:
-            truth = read_truth(folder, spots, poses)
-        except BeamposeError:
-            truth = None
-    score = score_against(spots, poses, truth, causal) if truth is not None else summary.errors
+    spots, poses = tables.spots, tables.poses
     times_known = bool(len(spots.t_s)) and bool(np.isfinite([*spots.t_s, *poses.t_s]).all())
     residual_px, residual_share = (None, None) if run is None else _residuals(spots, poses, run)
     return ReportData(
@@ -95,13 +92,13 @@ def read_report_data(results: Path, run_folder: Path | None) -> ReportData:
         summary=summary,
         spots=spots,
         poses=poses,
-        causal=causal,
+        causal=tables.causal,
         t_s=spots.t_s if times_known else spots.frames.astype(float),
         time_name="time (s)" if times_known else "frame",
         run=run,
         run_folder=folder,
-        truth=truth,
-        errors=errors_of(score),
+        truth=tables.truth,
+        errors=errors_of(summary.errors if tables.truth is None else tables.errors),
         residual_px=residual_px,
         residual_share=residual_share,
     )

@@ -108,5 +108,5 @@ class TruthErrors:
 
 
 def errors_of(score: Mapping[str, Any] | None) -> TruthErrors | None:
-    """The typed form of what lab.runs.score.score returns; None where there is no score."""
+    """The typed form of what `score_against` of lab/runs/score/score.py returns; None where there is no score."""
     return valid(TruthErrors, score)

@@ -5,21 +5,22 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from geometry.light_centroid import CentroidOffsets
 from geometry.pose_prior import PosePrior
-from lab.files.run.run_file import Run
+from lab.files.run.run_file import DetectionsTable, Run
 from lab.pictures.picture_file import GreyPicture, MissingPicture
 from lab.runs.frames.frames import FrameSet, open_frames
-from lab.runs.frames.sensor_noise import CameraNoise, camera_noises
-from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import Detections
 from tracking.noise import NoiseModel
 from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.tracked_frame import TrackedFrame
+
+if TYPE_CHECKING:
+    from lab.runs.frames.sensor_noise import CameraNoise
 
 
 class Tracker(Protocol):
@@ -66,6 +67,8 @@ def tracker_of(run: Run) -> Tracker:
     """A new tracker of the run's method; without a prior it starts from all poses that show the spots."""
     prior = PosePrior.everywhere(run.rig) if run.prior is None else run.prior
     if run.tracker.method == "spots":
+        from tracking.curve_switching.spot_tracker import SpotTracker  # few runs need it
+
         return SpotTracker(run.rig, run.tracker, prior, run.covariance)
     return RigidTracker(run.rig, run.tracker, prior, run.covariance)
 
@@ -100,7 +103,12 @@ class Pipeline:
             InputError: its pictures cannot be found.
         """
         reader = open_frames(run)
-        return Pipeline(run, reader, tracker_of(run), camera_noises(run, reader))
+        noise: dict[str, CameraNoise] = {}
+        if not all(isinstance(source, DetectionsTable) for source in run.cameras.values()):
+            from lab.runs.frames.sensor_noise import camera_noises  # with the detection and OpenCV, 50 ms
+
+            noise = camera_noises(run, reader)
+        return Pipeline(run, reader, tracker_of(run), noise)
 
     @property
     def notes(self) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -72,23 +72,42 @@ def read_truth(run_folder: Path, spots: SpotGrid, poses: PoseTrack) -> TruthArra
     return TruthArrays(uv, in_view, world_from_body)
 
 
-def score(results: Path, run_folder: Path) -> dict[str, Any] | None:
-    """Errors of a results folder against its run's truth, as plain JSON values; None where the run has no truth.
+@dataclass(frozen=True, slots=True)
+class ResultTables:
+    """The tables of a results folder, with the truth of its run where it has one."""
 
-    Units are in the names; values without any row are None.
-    """
-    if not (run_folder / "truth").is_dir():
-        return None
+    spots: SpotGrid
+    poses: PoseTrack
+    causal: PoseTrack | None  # of the causal pass, where `poses` are smoothed; of the same frames
+    truth: TruthArrays | None = None
+    errors: dict[str, Any] | None = None  # against the truth, as `score_against` gives them
+
+
+def read_tables(results: Path) -> ResultTables:
+    """The tables of a results folder, without truth. Raises InputError."""
     spots, poses = read_spots(results), read_poses(results)
-    truth = read_truth(run_folder, spots, poses)
     causal = read_poses(results, causal=True) if has_causal(results) else None
-    return None if truth is None else score_against(spots, poses, truth, causal)
+    if causal is not None and not np.array_equal(causal.frames, poses.frames):
+        causal = None
+    return ResultTables(spots, poses, causal)
+
+
+def against_truth(tables: ResultTables, run_folder: Path) -> ResultTables:
+    """The tables with the truth of their run, if it has one, and the errors against it. Raises InputError."""
+    truth = read_truth(run_folder, tables.spots, tables.poses)
+    if truth is None:
+        return tables
+    return replace(tables, truth=truth, errors=score_against(tables.spots, tables.poses, truth, tables.causal))
 
 
 def score_against(
     spots: SpotGrid, poses: PoseTrack, truth: TruthArrays, causal: PoseTrack | None = None
 ) -> dict[str, Any]:
-    """`score` from tables that are already read. causal: poses of the causal pass, where `poses` are smoothed."""
+    """Errors of results against their truth, as plain JSON values.
+
+    causal: poses of the causal pass, where `poses` are smoothed. Units are in the names; values without any row are
+    None.
+    """
     blocks = ("spots", "pose", "pose_causal", "motion_vs_differences", "motion_causal_vs_differences")
     out: dict[str, Any] = dict.fromkeys(blocks)
     if truth.uv_px is not None and truth.in_view is not None:
@@ -96,7 +115,7 @@ def score_against(
     if truth.world_from_body is not None:
         true = truth.world_from_body
         out["pose"], out["motion_vs_differences"] = _pose_scores(poses, true), motion_scores(poses, true)
-        if causal is not None and np.array_equal(causal.frames, poses.frames):
+        if causal is not None:
             out["pose_causal"] = _pose_scores(causal, true)
             out["motion_causal_vs_differences"] = motion_scores(causal, true)
     return out

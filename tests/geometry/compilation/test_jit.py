@@ -150,6 +150,17 @@ def test_code_of_an_edited_source_is_never_run(program, first_two, tmp_path):
         folders.add(after["folder"])
 
 
+def test_code_from_disk_is_inlined_into_a_caller_that_is_compiled_again(program, first_two, tmp_path):
+    """Its bitcode is parsed only then; if numba's loader changed, `grown` would be compiled again as well."""
+    copy = tmp_path / "program"
+    shutil.copytree(program, copy)
+    assert found(started(copy))["value"] == 20.0
+    outer = copy / "floor" / "outer.py"
+    outer.write_text(outer.read_text().replace("x + count", "x + 2 * count"))
+    again = found(started(copy))
+    assert (again["value"], again["compiled"]) == (40.0, ["twice_grown"])
+
+
 def test_a_truncated_cache_file_is_discarded_and_compiled_again(program, first_two, tmp_path):
     copy = tmp_path / "program"
     shutil.copytree(program, copy)

@@ -1,4 +1,4 @@
-"""The CSV layer: both readers give the same table, and every error names the line of the file."""
+"""The CSV layer: all readers give the same table, and every error names the line of the file."""
 
 from __future__ import annotations
 
@@ -22,38 +22,54 @@ from tests.lab.run_folders import RIG
 COLUMNS = ("frame", "a", "b", "camera")
 
 
-def both_ways(path, monkeypatch, required=COLUMNS, optional=()):
-    small = read_table(path, required, optional)
-    monkeypatch.setattr(csv_text, "LARGE_BYTES", 0)
-    used = []
-    real = csv_text._read_regular
-    monkeypatch.setattr(csv_text, "_read_regular", lambda *a: used.append(real(*a)) or used[-1])
-    return small, read_table(path, required, optional), used[0] is not None
+def by_each_reader(path, monkeypatch, required=COLUMNS, optional=()):
+    """The table as a small file, as a large one and by the csv module; whether pandas has read the second."""
+    tables = [read_table(path, required, optional)]
+    used, real = [], csv_text._read_large
+    with monkeypatch.context() as patched:
+        patched.setattr(csv_text, "LARGE_BYTES", 0)
+        patched.setattr(csv_text, "_read_large", lambda *a: used.append(real(*a)) or used[-1])
+        tables.append(read_table(path, required, optional))
+        patched.setattr(csv_text, "_is_regular", lambda *_: False)
+        tables.append(read_table(path, required, optional))
+    return tables, any(table is not None for table in used)
 
 
-def test_numbers_words_lines_and_empty_fields_are_the_same_by_both_readers(tmp_path, monkeypatch):
+def assert_equal(one, two):
+    assert (one.numbers.keys(), one.words.keys()) == (two.numbers.keys(), two.words.keys())
+    for name, values in one.numbers.items():
+        np.testing.assert_array_equal(values, two.numbers[name], strict=True)
+    for name, column in one.words.items():
+        assert column.words == two.words[name].words
+        np.testing.assert_array_equal(column.codes, two.words[name].codes, strict=True)
+    np.testing.assert_array_equal(one.lines, two.lines, strict=True)
+    assert (one.texts, one.long_lines, one.short_lines) == (two.texts, two.long_lines, two.short_lines)
+
+
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+def test_numbers_words_lines_and_empty_fields_are_the_same_by_all_readers(newline, tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
     values = np.concatenate([10 ** rng.uniform(-300, 300, 50_000), rng.normal(size=500), [0.1 + 0.2, 5e-324, 1e308]])
     rows = [
         f"{k},{v!r},{'' if k % 3 else 'inf'},{'NA' if k % 2 else 'x y '},more" for k, v in enumerate(values.tolist())
     ]
     path = tmp_path / "t.csv"
-    path.write_text("\n".join(["frame,a,b,camera,other", *rows]) + "\n")
-    one, two, fast = both_ways(path, monkeypatch)
+    path.write_text(newline.join(["frame,a,b,camera,other", *rows, ""]), newline="")
+    (one, two, three), fast = by_each_reader(path, monkeypatch)
     assert fast
-    for name in ("frame", "a", "b"):
-        np.testing.assert_array_equal(one.numbers[name], two.numbers[name])
-    assert one.words["camera"].words == two.words["camera"].words == ("x y", "NA")
-    np.testing.assert_array_equal(one.words["camera"].codes, two.words["camera"].codes)
-    np.testing.assert_array_equal(one.lines, two.lines)
+    np.testing.assert_array_equal(one.numbers["a"], values)
+    assert one.words["camera"].words == ("x y", "NA")
+    assert one.lines.tolist() == list(range(2, len(values) + 2))
+    assert_equal(one, two)
+    assert_equal(one, three)
 
 
-def test_an_absent_optional_column_is_nan_by_both_readers(tmp_path, monkeypatch):
+def test_an_absent_optional_column_is_nan_by_all_readers(tmp_path, monkeypatch):
     path = tmp_path / "t.csv"
     path.write_text("frame,a,camera\n1,2,x\n2,3,x\n")
-    one, two, fast = both_ways(path, monkeypatch, ("frame", "a", "camera"), ("b", "spot"))
+    tables, fast = by_each_reader(path, monkeypatch, ("frame", "a", "camera"), ("b", "spot"))
     assert fast
-    for table in (one, two):
+    for table in tables:
         assert np.isnan(table.numbers["b"]).all()
         assert "b" not in table
         assert "spot" not in table.words
@@ -66,23 +82,20 @@ def test_an_absent_optional_column_is_nan_by_both_readers(tmp_path, monkeypatch)
         "frame,a,b,camera\n1,2,3,x\n4,5\n4,5,6,x,8,9\n",  # one line too short, one too long: as many commas as usual
         "frame,a,b,camera\n1,2,3,x\n\n4,5,6,x\n",
         "frame,a,b,camera\n1,2,five,x\n",
-        "frame,a,b,camera\n1,2,nan,x\n",
+        "frame,a,b,camera\n1,2,nan,x\n2, 3,1_0,y\n3,,  ,x \n",
         'frame,a,b,camera\n1,2,3,"x, y"\n',
         "frame,a,b,camera\n1,2,3,x",
         "\nframe,a,b,camera\n1,2,3,x\n",
         "frame,a,b,camera\r1,2,3,x\r4,5,6,y\r",
     ],
 )
-def test_an_irregular_large_table_is_read_as_a_small_one(text, tmp_path, monkeypatch):
+def test_an_irregular_table_is_the_same_by_all_readers(text, tmp_path, monkeypatch):
     path = tmp_path / "t.csv"
     path.write_bytes(text.encode())
-    one, two, fast = both_ways(path, monkeypatch)
+    (one, two, three), fast = by_each_reader(path, monkeypatch)
     assert not fast
-    for name in ("frame", "a", "b"):
-        np.testing.assert_array_equal(one.numbers[name], two.numbers[name])
-    assert one.words["camera"].tolist() == two.words["camera"].tolist()
-    np.testing.assert_array_equal(one.lines, two.lines)
-    assert (one.texts, one.long_lines, one.short_lines) == (two.texts, two.long_lines, two.short_lines)
+    assert_equal(one, two)
+    assert_equal(one, three)
 
 
 @pytest.mark.parametrize("newline", ["\n", "\r\n"])

@@ -20,7 +20,7 @@ from lab.files.run.results import POSE_STATUSES, read_poses, read_spots
 from lab.files.run.run_file import load_run
 from lab.files.text import columns
 from lab.files.text.json_text import plain_value
-from lab.runs import process
+from lab.runs import process, smoothing_pass
 from lab.runs.batch.batch import process_batch
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.process import are_results, process_run
@@ -396,7 +396,10 @@ def test_a_wrong_smoothed_pose_is_reported_as_predicted_with_sigmas_that_cover_t
     assert np.all(nees[20:30] < 25)
 
 
-def test_the_same_run_gives_the_same_tables(tmp_path, run_folder, results):
+@pytest.mark.parametrize("in_memory", [smoothing_pass.IN_MEMORY, 5, 0])
+def test_the_same_run_gives_the_same_tables(tmp_path, run_folder, results, monkeypatch, in_memory):
+    """Also if most frames are stored on disk between the passes."""
+    monkeypatch.setattr(smoothing_pass, "IN_MEMORY", in_memory)
     process_run(run_folder, tmp_path / "again")
     for name in HEADERS:
         assert (tmp_path / "again" / name).read_bytes() == (results / name).read_bytes()
@@ -536,8 +539,9 @@ def test_the_method_chooses_the_tracker(tmp_path):
     assert run.tracker.method == "rigid"  # unless the run says otherwise
 
 
-def test_frames_are_stored_on_disk_between_the_passes(tmp_path):
-    """Between the passes no record of the causal pass is in memory."""
+def test_frames_are_stored_on_disk_between_the_passes(tmp_path, monkeypatch):
+    """Between the passes only the first records of the causal pass are in memory."""
+    monkeypatch.setattr(smoothing_pass, "IN_MEMORY", 5)
     pipeline = Pipeline.of(load_run(points_run(tmp_path / "run", frames=40)))
     alive = []
 
@@ -563,7 +567,7 @@ def test_frames_are_stored_on_disk_between_the_passes(tmp_path):
 
     assert sum(1 for _ in passes.records()) == 40
     assert len(alive) == 40
-    assert max(left) <= 1  # the one that the loop still holds
+    assert max(left) <= 5 + 1  # and the one that the loop still holds
     assert names(tmp_path) == ["run"]  # no file is left
 
 

@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,16 @@ from geometry.pose import Pose
 from lab.errors import InputError
 from lab.files.run.results import ABSENT, SPOT_STATUSES, SpotGrid, read_poses, read_spots
 from lab.runs.score.motion_score import differenced
-from lab.runs.score.score import TruthArrays, _returns, normalised_squares, read_truth, right_spot, score, score_against
+from lab.runs.score.score import (
+    TruthArrays,
+    _returns,
+    against_truth,
+    normalised_squares,
+    read_tables,
+    read_truth,
+    right_spot,
+    score_against,
+)
 from tests.lab.fake_results import MOTION_SIGMA, NOISE_PX, Fake, make, without_added_columns
 from tracking.statuses import PoseStatus, SpotStatus
 
@@ -30,6 +40,10 @@ def quiet(tmp_path_factory: pytest.TempPathFactory) -> Fake:
 @pytest.fixture(scope="module")
 def eventful(tmp_path_factory: pytest.TempPathFactory) -> Fake:
     return make(tmp_path_factory.mktemp("eventful"), 600)
+
+
+def score(results: Path, run_folder: Path) -> dict[str, Any] | None:
+    return against_truth(read_tables(results), run_folder).errors
 
 
 def rewritten(source: Fake, folder: Path, change: Callable[[dict[str, str]], dict[str, str] | None]) -> Path:
