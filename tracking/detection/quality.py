@@ -230,7 +230,7 @@ def _odd_misfit(
         share[k] = sqrt(part)
     scatter = sqrt(4.0 / doubled * crowd)  # of the mean square by noise
     beyond = square - (1.0 + added)
-    if beyond <= 0.0 or (not anywhere and (crowd > _CROWDED or beyond <= 3.0 * scatter * (1.0 + added))):
+    if beyond <= 0.0 or (not anywhere and (crowd > _CROWDED or square <= 1.0 + 3.0 * scatter)):
         return added, 0.0, 0.0
     width2 = sqrt(max(frame.S[0] * frame.S[2] - frame.S[1] ** 2, 0.0)) / window.cell**2
     rho, away2 = _correlation_within(window, frame, odd, share)

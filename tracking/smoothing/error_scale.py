@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.compiled_projection import Views
+from geometry.forward_model import SpotModel
 from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.rigid_body.models.information import single_frame_pose
 from tracking.rigid_body.variance_factor import DEADBAND
@@ -19,9 +21,90 @@ from tracking.smoothing.motion.run_detections import RunDetections, labelled_poi
 LARGEST_WIDTH_SHARE = 0.16
 _FRAMES = 300  # from which the width share is estimated
 _LEAST_CHANGES = 20  # changes of the widths in a camera from which their scatter is estimated
+_RESOLVED_PX = 1.8  # width of a spot from which its fit shows misfits
 _LEAST_OF_VIEW = 6  # changes from which a view counts
 _MEDIAN_CHI2 = 0.4549364  # median of chi-square with one degree of freedom
 _CLEAR_SCATTER = 2.0  # ratio of the widths' variance to the stated one from which it is used
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorScale:
+    """Corrections of the stated covariances of the spots, from a whole run."""
+
+    misfit_share: Array  # (cameras,) least error by misfits of the fits (speckle, texture), as a share of the widths
+    width_share: Array  # (cameras,) errors beyond the stated ones, as a share of the spots' widths (1 sigma)
+    noise_scale: float  # ratio of the errors to the stated sigmas beyond these
+
+    @staticmethod
+    def of(
+        model: SpotModel, run: RunDetections, place_px2: Array, assigned: Ints, calibration_cov: Array, ref: Reference,
+        measured: Bools,
+    ) -> ErrorScale:  # fmt: skip
+        """The corrections from the labelled spots of T frames, with their single-frame poses near a reference motion.
+
+        place_px2 (m,): variances of the detections that belong to their places; calibration_cov (n, 2, 2).
+        """
+        views, camera = model.numbers, model.camera_of
+        misfit = usual_misfit(run, place_px2, assigned, camera)
+        own = _cameras_of(run)
+        even = run._replace(cov=_with_least(run.cov, run.size_px, place_px2, misfit[own]))
+        seen = scattered_width_share(even, assigned, camera)
+        wider = widened(even, seen)
+        more = width_share(views, wider, assigned, calibration_cov, ref, measured)
+        scale = noise_scale(views, widened(wider, more), assigned, calibration_cov, ref, measured)
+        return ErrorScale(misfit, np.hypot(seen, more), scale)
+
+    def covariance(self, stated: Array, width_px: Array, place_px2: Array, camera: Ints | int) -> Array:
+        """Covariances (m, 2, 2), px^2, of spots with these widths (m,), px, and stated covariances (m, 2, 2).
+
+        place_px2 (m,): part of the stated variances that belongs to the place. Unknown widths (nan) add nothing.
+        """
+        least = _with_least(stated, width_px, place_px2, self.misfit_share[camera])
+        return (least + width_covariance(width_px, self.width_share[camera])) * self.noise_scale**2
+
+    def place_px2(self, run: RunDetections, stated_px2: Array) -> Array:
+        """(m,): variances of a run's detections that belong to their places."""
+        width = np.where(np.isnan(run.size_px), 0.0, run.size_px)
+        least = (self.misfit_share[_cameras_of(run)] * width) ** 2
+        return np.maximum(stated_px2, least) * self.noise_scale**2
+
+    def of_run(self, run: RunDetections, place_px2: Array) -> Array:
+        """Covariances (m, 2, 2) of all detections of a run."""
+        return self.covariance(run.cov, run.size_px, place_px2, _cameras_of(run))
+
+
+def _cameras_of(run: RunDetections) -> Ints:
+    """(m,): the camera of each detection."""
+    cameras = run.has_image.shape[1]
+    return np.repeat(np.tile(np.arange(cameras), len(run.first)), np.diff(run.first, axis=1).ravel())
+
+
+def _with_least(cov: Array, width_px: Array, place_px2: Array, share: Array | float) -> Array:
+    """Covariances (m, 2, 2) with a part that belongs to the place of at least a share of the width, squared."""
+    missing = np.maximum((share * np.where(np.isnan(width_px), 0.0, width_px)) ** 2 - place_px2, 0.0)
+    return np.asarray(cov + missing[:, None, None] * np.eye(2))
+
+
+def usual_misfit(run: RunDetections, place_px2: Array, assigned: Ints, camera_of: Ints) -> Array:
+    """Errors (cameras,) of the labelled spots that belong to their places, as a share of the widths.
+
+    The grain of the light is the same for all spots of a camera, but does not show in each fit: each spot has at least
+    half of their mean variance. A camera whose spots are too narrow to show it takes that of the others.
+    """
+    share2, size = np.full(assigned.shape, np.nan), np.full(assigned.shape, np.nan)
+    labelled = (assigned >= 0) & (assigned < BLENDED)
+    rows = (run.begin[: len(assigned), None] + assigned)[labelled]
+    size[labelled] = run.size_px[rows]
+    share2[labelled] = place_px2[rows] / run.size_px[rows] ** 2
+    out = np.full(run.has_image.shape[1], np.nan)
+    for camera in range(len(out)):
+        some, wide = share2[:, camera_of == camera], size[:, camera_of == camera] > _RESOLVED_PX
+        shares = np.sort(some[wide & np.isfinite(some)])
+        if len(shares) >= _LEAST_CHANGES:
+            cut = len(shares) // 10
+            out[camera] = np.sqrt(0.5 * np.mean(shares[cut : len(shares) - cut]))
+    usual = float(np.nanmax(out)) if np.isfinite(out).any() else 0.0
+    return np.where(np.isnan(out), usual, out)
 
 
 def width_covariance(width_px: Array, share: Array | float) -> Array:
@@ -31,9 +114,7 @@ def width_covariance(width_px: Array, share: Array | float) -> Array:
 
 def widened(detections: RunDetections, share: Array | float) -> RunDetections:
     """The detections with covariances that include errors of these shares (cameras,) of the spots' widths."""
-    cameras = detections.has_image.shape[1]
-    camera = np.repeat(np.tile(np.arange(cameras), len(detections.first)), np.diff(detections.first, axis=1).ravel())
-    own = np.broadcast_to(share, (cameras,))[camera]
+    own = np.broadcast_to(share, (detections.has_image.shape[1],))[_cameras_of(detections)]
     return detections._replace(cov=detections.cov + width_covariance(detections.size_px, own))
 
 

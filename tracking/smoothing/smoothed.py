@@ -14,7 +14,7 @@ from geometry.pose import Pose
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.association.frame_detections import BLENDED
-from tracking.smoothing.error_scale import width_covariance
+from tracking.smoothing.error_scale import ErrorScale
 from tracking.statuses import PoseStatus, SpotStatus, view_statuses
 from tracking.tracked_frame import Event, MotionEstimate, TrackedFrame
 
@@ -41,8 +41,7 @@ class Smoothed:
     jerk: Array  # (2,) m/s^3 and rad/s^3 per sqrt(Hz), of translation and rotation
     iterations: int  # rounds of motion and labels
     relabelled: int  # labels that differ from the causal ones
-    width_share: Array  # (cameras,) errors beyond the stated ones, as a share of the spots' widths (1 sigma)
-    noise_scale: float  # ratio of the spots' errors to their stated sigmas
+    errors: ErrorScale  # corrections of the spots' stated covariances
     calibration_cov: Array  # (n, 2, 2) px^2: covariance of the expected pixels due to calibration errors
 
     @property
@@ -74,10 +73,11 @@ class Smoothed:
             assert points is not None
             row = point[views]
             uv_px[views] = points.uv_px[row] - self.exposure_px[k, views]
-            stated = points.cov_px2[row] + width_covariance(points.major_px[row], self.width_share[camera])
+            place = np.zeros(len(row)) if points.place_px2 is None else points.place_px2[row]
+            own = self.errors.covariance(points.cov_px2[row], points.major_px[row], place, camera)
             blended = np.where(assigned[views] >= BLENDED, self.parameters.blend_px / 2, 0.0)
-            own = stated * self.noise_scale**2 + self.parameters.sigma_model_px**2 * np.eye(2)
-            cov_px2[views] = own + (blended**2)[:, None, None] * np.eye(2)
+            more = blended**2 + self.parameters.sigma_model_px**2
+            cov_px2[views] = own + more[:, None, None] * np.eye(2)
         turned = np.array([s is SpotStatus.TURNED for s in causal.status]) & (point == causal.point)
         has_image = np.array([f is not None for f in found])[model.camera_of]
         status = view_statuses(labelled, turned, exists, model.in_picture(uv_px), has_image, known)

@@ -31,13 +31,7 @@ from tracking.rigid_body.hypotheses.prediction_checks import (
 from tracking.rigid_body.models.information import well_controlled
 from tracking.smoothing.backward import merged, track_backward
 from tracking.smoothing.calibration_errors import calibration_errors
-from tracking.smoothing.error_scale import (
-    noise_scale,
-    scattered_width_share,
-    usual_sizes,
-    widened,
-    width_share,
-)
+from tracking.smoothing.error_scale import ErrorScale, usual_sizes
 from tracking.smoothing.exposure import exposure_offsets, pose_shift
 from tracking.smoothing.labels.clutter import run_log_clutter, run_log_static
 from tracking.smoothing.labels.continuity import continued
@@ -112,13 +106,10 @@ class _Smoother:
         ref = straight_between(rec.poses, self.measured, np.cumsum(rec.dt_s))
         every = rec.run_detections()
         self.calibration_cov, self.systematic, self.noise_share = calibration_errors(rec, every, self.assigned, ref)
-        seen = scattered_width_share(every, self.assigned, self.model.camera_of)
-        every = widened(every, seen)
-        more = width_share(self.views, every, self.assigned, self.calibration_cov, ref, self.measured)
-        every, self.width_share = widened(every, more), np.hypot(seen, more)
-        self.scale = noise_scale(self.views, every, self.assigned, self.calibration_cov, ref, self.measured)
+        place_px2 = rec.place_px2()
+        self.errors = ErrorScale.of(model, every, place_px2, self.assigned, self.calibration_cov, ref, self.measured)
         self.detections = every._replace(
-            cov=every.cov * self.scale**2 + parameters.sigma_model_px**2 * np.eye(2),
+            cov=self.errors.of_run(every, place_px2) + parameters.sigma_model_px**2 * np.eye(2),
             usual_size_px=usual_sizes(every, self.assigned),
         )
         log_density: Array | None = None
@@ -306,8 +297,7 @@ class _Smoother:
             jerk=jerk,
             iterations=rounds,
             relabelled=int(np.count_nonzero(differ)),
-            noise_scale=self.scale,
-            width_share=self.width_share,
+            errors=self.errors,
             calibration_cov=self.calibration_cov,
         )
 
@@ -343,7 +333,7 @@ class _Smoother:
         uv_px[frames[k], view] = detections.uv[rows]
         explained = np.zeros(len(self.model))
         explained[view] = 0.5 * np.trace(self.calibration_cov[view], axis1=1, axis2=2) / size**2  # in the last frame
-        shares = self.scale**2 * self.rec.place_px2()[rows] / size**2
+        shares = self.errors.place_px2(detections, self.rec.place_px2())[rows] / size**2
         width_px, share = self.detections.usual_size_px, float(np.mean(shares)) if len(shares) else 0.0
         found = place_errors(residual, uv_px, width_px, averaged, explained).at_least(share, uv_px, width_px)
         return found.share, found.factor(averaged)
