@@ -49,7 +49,7 @@ _FIRST_SURROUNDINGS = 40  # px: distance of the background from a peak; of a wid
 _SURROUNDINGS = 4  # ... this many half sides, 3.3 sigmas
 _LEVEL_HALF_SIDE = 4  # px: half side of the squares of the background
 _NARROW = 2.5  # half side, px, below which means of 3x3 pixels are compared
-BLOCK_SHARE, PEAK_SHARE = 0.55, 0.75  # shares of the threshold above which a block is searched and a peak is measured
+BLOCK_SHARE, PEAK_SHARE = 0.63, 0.75  # shares of the threshold above which a block is searched and a peak is measured
 
 
 @compiled_for_threads
