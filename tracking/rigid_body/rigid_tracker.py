@@ -195,7 +195,7 @@ class RigidTracker:
         first = self._last_pose is None
         prior = self._acquisition.search_prior(
             self._last_pose, self._last_pose_age_s, self.process_noise.fastest, self._schedule.just_found,
-            self._schedule.doubted,
+            self._schedule.doubted or self._schedule.astray,
         )  # fmt: skip
         static_too = self._schedule.searches % STATIC_SEARCH_INTERVAL == 0
         candidates = self._acquisition.labellings(obs.frame, found, prior, first, static_too, events)

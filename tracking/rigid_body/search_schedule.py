@@ -23,6 +23,7 @@ from tracking.rigid_body.pose_candidates import predicted_hypothesis
 
 LONG_UNMEASURED = 10  # frames without a measured pose, after which two missing spots are enough to contradict
 SEARCH_AT = (2, 4, 8, 14)  # frames in a row that contradict the best hypothesis, at which a search is made
+ASTRAY = 15  # frames without a measured pose, after which a contradicted vehicle is searched anywhere
 MISSING_TO_DOUBT = 2  # spots of one camera; an answer must explain so many more than the doubted track
 CONTRADICTED_INTERVAL = 20  # frames: and after that at each multiple of it
 FEW_SPOTS_INTERVAL = 50  # frames in a row with few, uncontradicted labels between two searches
@@ -73,6 +74,11 @@ class SearchSchedule:
     def doubted(self) -> bool:
         """Whether the last measured pose may be wrong."""
         return self._doubted > 0
+
+    @property
+    def astray(self) -> bool:
+        """Whether the vehicle is probably not near the place where it is followed: it moved faster than ever before."""
+        return self._contradicted > 0 and self._unmeasured >= ASTRAY
 
     def next_frame(self) -> None:
         """Count a frame."""
@@ -133,12 +139,23 @@ class SearchSchedule:
         return False
 
     def _contradicts(self, best: Ints, found: Sequence[Detections | None]) -> bool:
-        """Whether a camera has enough points, but none where several spots are expected; counts such frames."""
-        missed = best == MISSED
-        least = MIN_CONFIRMING_SPOTS if self._unmeasured < LONG_UNMEASURED else 2
+        """Whether a camera has enough points, but none where several spots are expected; counts such frames.
+
+        After some frames without a measured pose the spots of all cameras count together: one or two labels agree with
+        almost any pose.
+        """
+        missed, labelled = best == MISSED, best >= 0
+        long = self._unmeasured >= LONG_UNMEASURED
+        least, elsewhere = 2 if long else MIN_CONFIRMING_SPOTS, 0
         contradicts = False
         for c, f in enumerate(found):
-            missing = int(np.count_nonzero(missed & (self._model.camera_of == c))) if f is not None else 0
-            contradicts |= missing >= least and f is not None and len(f) >= missing
+            if f is None:
+                continue
+            mine = self._model.camera_of == c
+            missing = int(np.count_nonzero(missed & mine))
+            spare = len(f) - int(np.count_nonzero(labelled & mine))
+            contradicts |= missing >= least and len(f) >= missing
+            elsewhere += min(missing, max(spare, 0))
+        contradicts |= long and elsewhere >= MISSING_TO_DOUBT
         self._contradicted = self._contradicted + 1 if contradicts else 0
         return contradicts

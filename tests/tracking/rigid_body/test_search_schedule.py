@@ -8,7 +8,7 @@ from geometry.forward_model import SpotModel
 from lab.simulate.rigs import RIGS
 from tracking.detections import Detections
 from tracking.rigid_body.models.occlusion import MISSED
-from tracking.rigid_body.search_schedule import SEARCH_AT, SearchSchedule
+from tracking.rigid_body.search_schedule import ASTRAY, LONG_UNMEASURED, SEARCH_AT, SearchSchedule
 
 MODEL = SpotModel.of(RIGS["fan"]())
 N = len(MODEL)
@@ -87,3 +87,41 @@ def test_labels_that_leave_most_spots_of_a_camera_missing_among_as_many_points_a
     two_of_it[np.flatnonzero(MODEL.camera_of == 0)[-1]] = MISSED
     assert searched(schedule, two_of_it, False, 45) == []
     assert not schedule.doubted
+
+
+def test_after_long_without_a_measured_pose_missing_spots_of_all_cameras_count_together():
+    """One or two labels agree with almost any pose: a vehicle that moved away is searched, in the end anywhere."""
+    one_missing_in_each = FOUND_ALL.copy()
+    for camera in range(2):
+        one_missing_in_each[np.flatnonzero(camera == MODEL.camera_of)[0]] = MISSED
+    labels = [int(np.count_nonzero((one_missing_in_each >= 0) & (camera == MODEL.camera_of))) for camera in range(2)]
+    spare = tuple(n + 1 for n in labels)
+    few = np.where(np.arange(N) < N - 3, one_missing_in_each, -2)
+    few[MODEL.camera_of == 1] = -2
+    few[np.flatnonzero(MODEL.camera_of == 1)[0]] = MISSED
+    schedule = tracking()
+    for frame in range(60):
+        schedule.measured(False, 2)
+        due = schedule.due(few, points(*spare), lambda: False)
+        assert not (due and frame < LONG_UNMEASURED - 1)
+        if due:
+            break
+    assert frame <= LONG_UNMEASURED + SEARCH_AT[0]
+    assert not schedule.astray
+    for _ in range(ASTRAY):
+        schedule.measured(False, 2)
+        schedule.due(few, points(*spare), lambda: False)
+    assert schedule.astray
+    schedule.measured(True, 4)
+    assert not schedule.astray
+
+
+def test_missing_spots_without_points_in_their_place_are_occluded():
+    missing = FOUND_ALL.copy()
+    missing[:] = -2
+    missing[[0, N - 1]] = MISSED
+    schedule = tracking()
+    for _ in range(45):
+        schedule.measured(False, 2)
+        assert not schedule.due(missing, points(0, MIN_SPOTS), lambda: False)
+        assert not schedule.astray
