@@ -35,7 +35,8 @@ _SURE = 0.25  # sigma of the slope's logarithm up to which photon transfer alone
 _MOST_SPOTS = 40  # per picture: the brightest
 _LEAST_OF_SPOTS, _MOST_OF_SPOTS = 30, 300  # pixels per brightness class; residuals of one spot are not independent
 _CONTRASTS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)  # contrasts of the light's grain that are tried
-_STEPS_SEEN = 0.003  # of a background: rounding errors above this look like texture
+_STEPS_SEEN = 0.003  # of a background: rounding errors above this look like texture ...
+_TEXTURE_SEEN = 0.5  # ... unless they are smaller than this share of it
 _OF_STEP = 0.42  # of a block's step, as its sigma: with the usual threshold a spot must be 2.1 steps high
 # Of a block's step squared. JPEG's steps of coarse details are 6 to 8 times that of a block's mean (T.81, annex K), so
 # the error of each of them has a variance of 3 to 5 step^2; a spot has about a third of all of them.
@@ -99,8 +100,9 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
         slope, slope_sigma = lines.slope(rounding)
     model = replace(first, slope_dn=slope, floor_dn2=lines.model(slope, rounding).floor_dn2)
     floor_sigma = float(np.interp(slope, lines.slopes, lines.floor_sigma)) / model.floor_dn2
-    # With hardly any noise on a background of few grey values their steps look like texture.
-    stepped = banding(model.floor_dn2, rounding) > _STEPS_SEEN * background
+    # With hardly any noise on a background of few grey values their steps look like texture, unless it is larger.
+    steps = banding(model.floor_dn2, rounding)
+    stepped = steps > max(_STEPS_SEEN, _TEXTURE_SEEN * model.texture) * background
     shift = TextureShift.usual(usable[0]) if stepped else texture_shift(seen, model, full)
     shift = shift.with_lights([find_spots(p, DetectParameters(max_detections=_MOST_SPOTS), model) for p in usable])
     return NoiseEstimate(model, floor_sigma, slope_sigma, saturation, step, len(usable), levels.temporal, shift)

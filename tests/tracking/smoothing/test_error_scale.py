@@ -33,24 +33,27 @@ LABELS = np.tile(np.arange(VIEWS), (FRAMES, 1))
 CAMERAS = np.zeros(VIEWS, dtype=np.int64)
 
 
+def share_of(found: RunDetections, labels: np.ndarray) -> np.ndarray:
+    """The share of one camera with round spots."""
+    return scattered_width_share(found, found.size_px, labels, CAMERAS)
+
+
 def test_widths_that_scatter_as_their_stated_sigmas_say_add_nothing():
-    assert scattered_width_share(detections(sizes(0.02), 0.02), LABELS, CAMERAS) == [0.0]
+    assert share_of(detections(sizes(0.02), 0.02), LABELS) == [0.0]
 
 
 def test_widths_that_scatter_more_show_errors_of_this_share_of_the_width():
     errors = 0.06 * sizes(0.0)
     rng = np.random.default_rng(2)
-    share = scattered_width_share(
-        detections(sizes(0.0) + errors * rng.normal(size=errors.shape), 0.02), LABELS, CAMERAS
-    )
+    share = share_of(detections(sizes(0.0) + errors * rng.normal(size=errors.shape), 0.02), LABELS)
     assert share == pytest.approx([0.06], rel=0.2)
 
 
 def test_unlabelled_and_blended_points_and_unknown_widths_do_not_count():
     wild = detections(sizes(0.5), 0.02)
-    assert scattered_width_share(wild, np.full_like(LABELS, -1), CAMERAS) == [0.0]
-    assert scattered_width_share(wild, LABELS + BLENDED, CAMERAS) == [0.0]
-    assert scattered_width_share(wild._replace(size_px=np.full(LABELS.size, np.nan)), LABELS, CAMERAS) == [0.0]
+    assert share_of(wild, np.full_like(LABELS, -1)) == [0.0]
+    assert share_of(wild, LABELS + BLENDED) == [0.0]
+    assert share_of(wild._replace(size_px=np.full(LABELS.size, np.nan)), LABELS) == [0.0]
 
 
 def test_errors_that_only_narrow_spots_hide_add_to_their_camera_alone():
@@ -67,7 +70,7 @@ def test_errors_that_only_narrow_spots_hide_add_to_their_camera_alone():
         has_image=np.ones((FRAMES, 2), bool),
     )
     labels, camera_of = np.tile(np.arange(2 * VIEWS), (FRAMES, 1)), np.repeat([0, 1], VIEWS)
-    share = scattered_width_share(found, labels, camera_of)
+    share = scattered_width_share(found, found.size_px, labels, camera_of)
     assert share[0] == pytest.approx(0.07, rel=0.25)
     assert share[1] == 0.0
     added = np.trace(widened(found, share).cov - found.cov, axis1=1, axis2=2).reshape(FRAMES, 2 * VIEWS)
