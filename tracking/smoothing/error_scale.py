@@ -42,8 +42,8 @@ class ErrorScale:
     ) -> ErrorScale:  # fmt: skip
         """The corrections from the labelled spots of T frames, with their single-frame poses near a reference motion.
 
-        width_px (m,): geometric means of the detections' half axes; place_px2 (m,): their variances that belong to their
-        places; calibration_cov (n, 2, 2).
+        width_px (m,): geometric means of the detections' half axes; place_px2 (m,): their variances that belong to
+        their places; calibration_cov (n, 2, 2).
         """
         views, camera = model.numbers, model.camera_of
         misfit = usual_misfit(run, place_px2, assigned, camera)

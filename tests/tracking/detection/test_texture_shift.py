@@ -86,16 +86,14 @@ def test_elongated_spots_have_larger_errors_along_their_major_axis(angle_deg):
     assert rms == pytest.approx(sigma, rel=0.35)
 
 
-@pytest.mark.parametrize(("contrast", "known"), [(0.04, True), (0.0, False)])
-def test_texture_above_the_steps_of_a_quiet_sensor_counts(contrast, known):
-    """Nearly without noise, rounding makes plateaus of grey values; texture of half a grey value is not hidden by it."""
+@pytest.mark.parametrize(("contrast", "least", "most"), [(0.04, 0.05, 0.3), (0.0, 0.0, 0.02)])
+def test_texture_above_the_steps_of_a_quiet_sensor_counts(contrast, least, most):
+    """Nearly without noise, rounding makes plateaus of grey values; it does not hide texture of half a grey value."""
     rng = np.random.default_rng(4)
     expected = 16.0 * screen(contrast, 3.0, 1) if contrast else np.full(SIZE, 16.3)
     quiet = [np.rint(expected + 0.25 * rng.standard_normal(SIZE)).astype(np.uint8) for _ in range(6)]
-    shift = estimate_noise(quiet).texture_shift
-    assert shift.known == known
-    if known:
-        assert shift.sigma_px(np.array([2.5]), np.array([1.0]))[0] > 0.05
+    sigma = estimate_noise(quiet).texture_shift.sigma_px(np.array([2.5]), np.array([1.0]))[0]
+    assert least <= sigma <= most
 
 
 def test_the_fall_of_the_light_towards_the_corners_shifts_wide_spots():
