@@ -84,7 +84,8 @@ class LinearisedFrames:
         """(I - H_SS)^-1, (K, 2v, 2v), of a group of v views; nan where the other views do not check the group."""
         A = self.A[:, views].reshape(len(self.frames), -1, 6)
         own = np.eye(A.shape[1]) - A @ self.normal_inverse @ np.swapaxes(A, -1, -2)
-        known = self.used[:, views].any(axis=1) & (np.linalg.eigvalsh(own) > _LEAST_REDUNDANCY).all(axis=1)
+        smallest = np.linalg.eigvalsh(own).min(axis=1, initial=np.inf)
+        known: Bools = self.used[:, views].any(axis=1) & (smallest > _LEAST_REDUNDANCY)
         inverse = np.linalg.inv(np.where(known[:, None, None], own, np.eye(A.shape[1])))
         return np.where(known[:, None, None], inverse, np.nan)
 

@@ -148,7 +148,8 @@ def test_a_beam_and_a_camera_without_spots_do_not_change_the_result():
     more = Rig(screens, cameras, {**rig.beams, "spare": rig.beams["A"]}, rig.spots)
     stated = RigCovariance(("screens.right.x_m",), np.array([[4e-6]]))
     usual, result = (evaluate_model(r, recording, stated) for r in (rig, more))
-    assert usual.diagnosis is not None and result.diagnosis is not None
+    assert usual.diagnosis is not None
+    assert result.diagnosis is not None
     assert result.diagnosis.p_before == pytest.approx(usual.diagnosis.p_before)
     assert result.statistics is not None
     assert {g.name: g.frames for g in result.statistics.beams}["spare"] == 0
