@@ -10,6 +10,7 @@ with the whitened Jacobian A, H = A (A^T A)^-1 A^T and the fit's residual e = (I
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import prod
 
 import numpy as np
 
@@ -83,21 +84,22 @@ class LinearisedFrames:
         """(I - H_SS)^-1, (K, 2v, 2v), of a group of v views; nan where the other views do not check the group."""
         A = self.A[:, views].reshape(len(self.frames), -1, 6)
         own = np.eye(A.shape[1]) - A @ self.normal_inverse @ np.swapaxes(A, -1, -2)
-        known = self.used[:, views].any(axis=1) & (np.linalg.eigvalsh(own)[:, 0] > _LEAST_REDUNDANCY)
+        smallest = np.linalg.eigvalsh(own).min(axis=1, initial=np.inf)
+        known: Bools = self.used[:, views].any(axis=1) & (smallest > _LEAST_REDUNDANCY)
         inverse = np.linalg.inv(np.where(known[:, None, None], own, np.eye(A.shape[1])))
         return np.where(known[:, None, None], inverse, np.nan)
 
     def leave_group_out(self, views: Ints, rows: Array) -> tuple[Array, Array]:
-        """Residuals of a group of v views against the pose of all other views.
+        """Residuals of a group of v views against the pose of all other views; v may be 0 (a beam without spots).
 
         rows: (K, n, 2, ...), whitened pixel shifts. Returns residuals (K, v, 2, ...), px, and their covariances
         (K, v, 2, 2), px^2; nan for unused views and where the other views do not determine the pose.
         """
-        K, v = len(self.frames), len(views)
+        K, v, columns = len(self.frames), len(views), prod(rows.shape[3:])
         inverse = self.inverse_group_redundancy(views)
         used = self.used[:, views]
         back = np.linalg.inv(np.where(used[..., None, None], self.W[:, views], np.eye(2)))
-        off = (inverse @ self.residual_part(rows)[:, views].reshape(K, 2 * v, -1)).reshape(K, v, 2, -1)
+        off = (inverse @ self.residual_part(rows)[:, views].reshape(K, 2 * v, columns)).reshape(K, v, 2, columns)
         off = np.where(used[..., None, None], back @ off, np.nan).reshape(K, v, 2, *rows.shape[3:])
         blocks = inverse.reshape(K, v, 2, v, 2)[:, np.arange(v), :, np.arange(v)].swapaxes(0, 1)
         covariance = back @ blocks @ np.swapaxes(back, -1, -2)

@@ -107,6 +107,12 @@ VERDICT: Explanations = {
         "Convert the pictures to colour or grey before the run (demosaicing), or let the camera do so; a camera"
         " without colour filters is more accurate.",
     ),
+    "BP-V19": Explanation(
+        "A camera has moved during the recording",
+        "From some frame on, all spots of one camera are displaced by the same shift from where the pose of the other"
+        " cameras puts them. They keep their labels, but the poses of these frames are computed without them.",
+        "Check the mounts of this camera and its screen, and calibrate again.",
+    ),
 }
 
 MODEL_CHECK: Explanations = {

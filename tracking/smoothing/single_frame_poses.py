@@ -44,7 +44,8 @@ def single_frame_poses(
 ) -> SingleFramePoses:
     """Each frame's own pose from its labels (T, n), starting at the reference motion.
 
-    beside (T, 6): a further error, one sigma, of the poses (motion.velocity_jumps.corner_offsets).
+    beside (T, 6): a further error of the poses, one sigma, independent for each of the six components
+    (motion.velocity_jumps.corner_offsets).
     """
     out = SingleFramePoses.unknown(len(assigned))
     fits = fit_frames(views, detections, assigned, calibration_cov, ref)
@@ -56,9 +57,10 @@ def single_frame_poses(
     rows, b = rows[good], beside[rows[good]]
     out.measured[rows] = True
     out.R[rows], out.t[rows] = fits.R[rows], fits.t[rows]
-    out.covariance[rows] = covariance[good] + b[:, :, None] * b[:, None]
-    inside = np.einsum("ki,kij,kj->k", b, fits.at_ref[rows], b)
-    less = np.einsum("ki,ki->k", b, fits.along[rows]) ** 2 / (1 + inside)
+    out.covariance[rows] = covariance[good] + np.eye(6) * (b**2)[:, None]
+    along = b * fits.along[rows]
+    inside = np.eye(6) + b[:, :, None] * fits.at_ref[rows] * b[:, None]
+    less = np.einsum("ki,ki->k", along, np.linalg.solve(inside, along[..., None])[..., 0])
     out.excess[rows] = fits.chi2_ref[rows] - fits.chi2[rows] - less
     return out
 

@@ -7,7 +7,8 @@
    poses belong together.
 4. Compare each pose with that of the frame's own spots. Where they contradict each other a velocity jump is assumed and
    the motion estimated again; if the contradiction remains, the frame's own spots decide.
-5. Add labels by continuity where the pose is uncertain (labels/continuity.py).
+5. Add labels by continuity where the pose is uncertain (labels/continuity.py), and those of a camera that was knocked
+   (labels/displaced_camera.py).
 
 lab/runs/verdict/frame_checks.py tests the result once more, against the spots and the causal pose. Source: ours.
 """
@@ -35,6 +36,7 @@ from tracking.smoothing.error_scale import ErrorScale, usual_sizes
 from tracking.smoothing.exposure import exposure_offsets, pose_shift
 from tracking.smoothing.labels.clutter import run_log_clutter, run_log_static
 from tracking.smoothing.labels.continuity import continued
+from tracking.smoothing.labels.displaced_camera import displaced
 from tracking.smoothing.labels.neighbouring_frames import brief, connected, isolated, next_to
 from tracking.smoothing.labels.path_pairs import transfers_between_cameras
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated
@@ -251,7 +253,7 @@ class _Smoother:
         )  # fmt: skip
 
     def continue_paths(self) -> None:
-        """Label spots by the continuity of their paths where the pose does not predict them well."""
+        """Label spots by the continuity of their paths where the pose is uncertain, and those of a displaced camera."""
         motion = self.motion
         uv, J = project_all(self.views, motion.ref.R, motion.ref.t)
         cov = J @ motion.pose_P[:, None] @ np.swapaxes(J, -1, -2) + self.calibration_cov
@@ -264,6 +266,10 @@ class _Smoother:
         self.assigned, probability = continued(self.detections, self.assigned, context, transfers)
         unsure = self._brief(self.assigned >= 0) & (probability < BRIEF_PROBABILITY)
         self.assigned[unsure], probability[unsure] = -1, np.nan
+        visible = self.model.in_picture(uv) & sure & ~vague
+        with_displaced = displaced(self.detections, self.assigned, self.view_table.camera, uv, visible)
+        probability[with_displaced != self.assigned] = SURE_PROBABILITY
+        self.assigned = with_displaced
         self.probability = np.where(np.isnan(probability), self.probability, probability)
 
     def result(self, rounds: int) -> Smoothed:

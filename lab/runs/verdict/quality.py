@@ -34,6 +34,7 @@ FEW_SHOWN = 0.1  # share of the frames with enough points, below which too few p
 LONG_EMPTY = (
     0.05  # duration, as a share of the run, of an empty end of a camera's recording, above which it is reported
 )
+LEAST_DISPLACED = 5  # frames in which none of a camera's spots fits the others' pose, from which on it is reported
 _FEW_FOUND = 0.2  # measured share of the expected spots, below which a mostly empty camera is reported
 
 
@@ -198,6 +199,13 @@ def _cameras(statistics: RunStatistics) -> list[VerdictReason]:
     out = []
     for name, camera in statistics.cameras.items():
         out += _pictures(name, camera, statistics)
+        if len(camera.displaced) >= LEAST_DISPLACED:
+            what = (
+                f"camera {name}: in {_frames(len(camera.displaced))} ({camera.displaced.as_text()}) none of its spots"
+                " is where the other cameras put it: the camera or its screen has moved during the recording"
+            )
+            numbers = {"camera": name, **camera.as_mapping()}
+            out.append(VerdictReason(ReasonKind.CAMERA_MOVED, False, what, REMEDIES[ReasonKind.CAMERA_MOVED], numbers))
         if not camera.pictures:
             continue
         empty = camera.empty / camera.pictures

@@ -65,6 +65,8 @@ class CameraStatistics:
     empty_at_end: int = 0  # pictures since the last one that has a point of light
     expected_at_end: int = 0  # spots that the pose puts inside those
     missing: FrameRanges = field(default_factory=FrameRanges)  # frames without a usable picture
+    # Measured frames in which this camera's spots have labels and none of them fits the pose of the other cameras.
+    displaced: FrameRanges = field(default_factory=FrameRanges)
 
     def as_mapping(self) -> dict[str, Any]:
         """For summary.json."""
@@ -76,6 +78,7 @@ class CameraStatistics:
             "spots_found": self.found,
             "empty_at_end": self.empty_at_end,
             "missing": [list(r) for r in self.missing.ranges],
+            "displaced": [list(r) for r in self.displaced.ranges],
         }
 
 
@@ -137,7 +140,7 @@ class RunStatistics:
                 self.tie_text = self.tie_text or event.text
 
     def _add_cameras(self, record: FrameRecord) -> None:
-        status = record.tracked.status
+        status, used = record.tracked.status, record.tracked.used_in_pose
         for c, (camera, found) in enumerate(zip(self.cameras.values(), record.detections, strict=True)):
             if found is None:
                 camera.missing.add(record.frame)
@@ -155,6 +158,10 @@ class RunStatistics:
                 expected = sum(s.measured or s is SpotStatus.OCCLUDED for s in own)
                 camera.expected += expected
                 camera.expected_at_end += expected if camera.empty_at_end else 0
+                labelled = [v for v, index in enumerate(self.camera_of) if index == c and status[v].measured]
+                measured = record.tracked.pose_status is PoseStatus.MEASURED
+                if labelled and measured and used is not None and not used[labelled].any():
+                    camera.displaced.add(record.frame)
 
     def _cause(self, record: FrameRecord) -> Cause:
         tracked = record.tracked

@@ -31,6 +31,7 @@ class ReasonKind(StrEnum):
     NOISE_SCALE = "noise_scale"
     MODEL = "model"  # a finding of the model check
     COLOUR_MOSAIC = "colour_mosaic"
+    CAMERA_MOVED = "camera_moved"  # during the recording
 
 
 # For `beampose explain`; stable: new kinds get new codes.
@@ -53,6 +54,7 @@ CODES = {
     ReasonKind.NOISE_SCALE: "BP-V16",
     ReasonKind.MODEL: "BP-V17",
     ReasonKind.COLOUR_MOSAIC: "BP-V18",
+    ReasonKind.CAMERA_MOVED: "BP-V19",
 }
 REMEDIES = {
     ReasonKind.NO_FRAMES: "Check the folders of pictures, or the detections, that run.yaml names (`beampose check`).",
@@ -77,6 +79,8 @@ REMEDIES = {
     ReasonKind.INTERNAL: "These values are omitted. Please report this run as an error of the program.",
     ReasonKind.COLOUR_MOSAIC: "Convert the pictures to colour or grey before the run (demosaicing), or let the camera"
     " do so; a camera without colour filters is more accurate.",
+    ReasonKind.CAMERA_MOVED: "Check the mounts of this camera and its screen, and calibrate again. The poses of these"
+    " frames are computed without this camera.",
     ReasonKind.NOISE_SCALE: "Check the calibration (`beampose calibrate check`) and the light (speckle).",
 }
 REMEDIES_BY_CAUSE = {

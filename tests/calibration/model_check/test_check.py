@@ -13,6 +13,7 @@ from calibration.model_check.noise_scales import is_noisy
 from calibration.model_check.recording import ModelCheckRecording
 from geometry.forward_model import SpotModel
 from geometry.pose_solver.gauss_newton import fit_pose
+from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
 from tests.calibration.model_check.model_scenes import NOISE_PX, SCENES, changed, one_camera, recorded, turned
 
@@ -137,6 +138,22 @@ def test_the_calibrations_sigma_of_a_mean_residual_is_the_shift_that_a_calibrati
     views = [evaluate_model(run.rig, r, stated).statistics.views for r in (right, wrong)]
     for a, b in zip(*views, strict=True):
         np.testing.assert_allclose(np.abs(b.mean_px - a.mean_px), a.calibration_px, rtol=0.05, atol=2e-3)
+
+
+def test_a_beam_and_a_camera_without_spots_do_not_change_the_result():
+    run, recording = recorded("smooth", 5, frames=100)
+    rig = run.rig
+    screens = {**rig.screens, "spare": rig.screens["right"]}
+    cameras = {**rig.cameras, "spare": dataclasses.replace(rig.cameras["right"], name="spare", screen="spare")}
+    more = Rig(screens, cameras, {**rig.beams, "spare": rig.beams["A"]}, rig.spots)
+    stated = RigCovariance(("screens.right.x_m",), np.array([[4e-6]]))
+    usual, result = (evaluate_model(r, recording, stated) for r in (rig, more))
+    assert usual.diagnosis is not None
+    assert result.diagnosis is not None
+    assert result.diagnosis.p_before == pytest.approx(usual.diagnosis.p_before)
+    assert result.statistics is not None
+    assert {g.name: g.frames for g in result.statistics.beams}["spare"] == 0
+    assert {g.name: g.frames for g in result.statistics.cameras}["spare"] == 0
 
 
 def test_a_displacement_of_a_screen_in_its_own_plane_raises_no_alarm():

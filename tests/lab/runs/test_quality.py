@@ -8,7 +8,14 @@ import pytest
 
 from calibration.findings import Finding, Level
 from lab.runs.verdict.frame_ranges import FrameRanges
-from lab.runs.verdict.quality import GOOD_MEASURED, LEAST_MEASURED, LEAST_MEASURED_OF_SHOWN, Verdict, judge
+from lab.runs.verdict.quality import (
+    GOOD_MEASURED,
+    LEAST_DISPLACED,
+    LEAST_MEASURED,
+    LEAST_MEASURED_OF_SHOWN,
+    Verdict,
+    judge,
+)
 from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, Cause, RunStatistics
 from lab.runs.verdict.verdict_reasons import REMEDIES, REMEDIES_BY_CAUSE, ReasonKind
 
@@ -278,3 +285,13 @@ def test_raw_pictures_of_a_colour_camera_are_a_point_to_check():
     assert "camera left" in verdict.texts[0]
     assert "20%" in verdict.texts[0]
     assert verdict.exit_status == 0
+
+
+@pytest.mark.parametrize(("frames", "status"), [(LEAST_DISPLACED - 1, "pass"), (LEAST_DISPLACED, "check")])
+def test_a_camera_that_moved_during_the_recording_is_a_point_to_check(frames, status):
+    cameras = {"left": a_camera(displaced=ranges((500, 499 + frames))), "right": a_camera()}
+    verdict = judge(statistics_of(cameras=cameras))
+    assert verdict.status == status
+    if status == "check":
+        assert kinds(verdict) == [ReasonKind.CAMERA_MOVED]
+        assert "camera left: in 5 frames (500 to 504)" in verdict.texts[0]

@@ -139,3 +139,14 @@ def test_frame_ranges_count_their_frames_and_list_the_first_ranges():
     assert ranges.as_text() == "3 to 5, 9, 11 to 12 and 2 more ranges"
     assert ranges.as_text(4) == "3 to 5, 9, 11 to 12, 20 and 1 more range"
     assert ranges.as_text(9) == "3 to 5, 9, 11 to 12, 20, 30"
+
+
+def test_frames_in_which_no_spot_of_a_camera_fits_the_pose_are_those_of_a_displaced_camera():
+    used = np.array([False] * 3 + [True] * 3)
+    records = [a_record(k) for k in range(4)]
+    for k in (1, 2):
+        records[k] = replace(records[k], tracked=replace(records[k].tracked, used_in_pose=used))
+    cameras = statistics_of(*records).cameras
+    assert cameras["left"].displaced.ranges == [[1, 2]]
+    assert cameras["right"].displaced.ranges == []
+    assert cameras["left"].as_mapping()["displaced"] == [[1, 2]]

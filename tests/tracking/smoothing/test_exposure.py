@@ -8,6 +8,7 @@ from geometry.pose import Pose
 from lab.simulate.points import simulate_points
 from tracking.smoothing.exposure import exposure_offsets, pose_shift
 from tracking.smoothing.motion.reference import Reference
+from tracking.smoothing.motion.velocity_jumps import with_error_along, with_errors_along_axes
 
 EXPOSURE_S = 0.02
 
@@ -61,3 +62,28 @@ def test_frames_with_a_velocity_jump_and_runs_without_an_exposure_time_have_no_o
     assert offsets[steady].any()
     assert not exposure_offsets(model.numbers, motion, 0.0, steady).any()
     assert not pose_shift(model.numbers, motion, offsets)[~steady].any()
+
+
+def test_components_that_turn_at_different_moments_of_an_exposure_are_both_within_their_sigmas():
+    """One of them turns at the middle of the exposure, the other just after its end: only the first has an error."""
+    b = np.array([1e-3, 0.0, 0.0, 0.0, 0.0, 5e-4])  # corner_offsets: 1 mm and 0.5 mrad
+    sigma = np.array([2e-5] * 3 + [1e-5] * 3)
+    information = np.diag(sigma**-2)
+    for error in (b * [1, 0, 0, 0, 0, 0], b * [0, 0, 0, 0, 0, 1], b):
+        L, g, less = with_errors_along_axes(b, information, information @ error)
+        nees = error @ L @ error / np.count_nonzero(b)
+        assert 0.4 < nees < 1.1
+        np.testing.assert_allclose(np.linalg.inv(L), np.diag(sigma**2 + b**2), rtol=1e-9, atol=1e-18)
+        np.testing.assert_allclose(np.linalg.solve(L, g), error, atol=1e-9)
+        assert less == pytest.approx(error @ information @ error - error @ L @ error)
+
+
+def test_a_corner_outside_the_exposure_does_not_hide_one_inside_it():
+    """A common error along b, as one impact causes, does not cover an error of one component alone."""
+    b = np.array([1e-3, 0.0, 0.0, 0.0, 0.0, 5e-4])
+    information = np.diag(np.array([2e-5] * 3 + [1e-5] * 3) ** -2.0)
+    error = b * [0, 0, 0, 0, 0, 1]
+    along, _, _ = with_error_along(b, information, information @ error)
+    axes, _, _ = with_errors_along_axes(b, information, information @ error)
+    assert error @ along @ error / 6 > 50
+    assert error @ axes @ error / 6 < 1

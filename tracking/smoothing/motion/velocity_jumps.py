@@ -81,6 +81,20 @@ def with_error_along(b: Array, information: Array, vector: Array) -> tuple[Array
     return information - np.outer(Lb, Lb) * share, vector - Lb * along * share, along**2 * share
 
 
+def with_errors_along_axes(b: Array, information: Array, vector: Array) -> tuple[Array, Array, float]:
+    """As `with_error_along`, with an independent error of one sigma b_i of each pose component.
+
+    Two components that turn within one frame do so at different moments, and the error is not a multiple of b.
+    """
+    total = 0.0
+    for i in np.flatnonzero(b):
+        one = np.zeros(6)
+        one[i] = b[i]
+        information, vector, less = with_error_along(one, information, vector)
+        total += less
+    return information, vector, total
+
+
 def weak_frames(information: Array, measured: Bools) -> Bools:
     """(T,): frames with much less information (T, 6, 6) about the pose than is usual in the run."""
     sign, log_det = np.linalg.slogdet(information)

@@ -26,6 +26,7 @@ from tracking.smoothing.motion.velocity_jumps import (
     new_jumps,
     weak_frames,
     with_error_along,
+    with_errors_along_axes,
 )
 from tracking.smoothing.motion.windows import largest_near
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD
@@ -283,11 +284,11 @@ class _Estimator:
     def _spot_information(self, ref: Reference) -> tuple[Array, Array, Array]:
         """Information of the used spots at a reference: normal matrices (T, 6, 6), vectors (T, 6), chi-squares (T,).
 
-        An exposure with a corner has a further error, of one sigma along `beside`.
+        An exposure with a corner has a further error: the components of `beside`, one sigma, independent of each other.
         """
         L, g, chi2 = (a.copy() for a in self._without_corners(ref))
         for k in np.flatnonzero(self.beside.any(axis=1)):
-            L[k], g[k], less = with_error_along(self.beside[k], L[k], g[k])
+            L[k], g[k], less = with_errors_along_axes(self.beside[k], L[k], g[k])
             chi2[k] -= less
         return L, g, chi2
 
