@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import sqrt
+from math import cos, pi, sin, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,10 @@ _OUTLIER, _LEAST_BESIDE = 4.0, 0.2
 _FIRST_SURROUNDINGS = 40  # px: distance of the background from a peak; of a wide one ...
 _SURROUNDINGS = 4  # ... this many half sides, 3.3 sigmas
 _LEVEL_HALF_SIDE = 4  # px: half side of the squares of the background
+# Radii, px, of the circles on which the light of a line continues, and the numbers of points on them.
+_CIRCLES, _RING = (4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0), (12, 20, 28, 36, 52, 72, 108)
+_LEAST_ON_RING = 3
+_ON_RING = 1.0  # sigmas of a pixel: three of the means
 _NARROW = 2.5  # half side, px, below which means of 3x3 pixels are compared
 BLOCK_SHARE, PEAK_SHARE = 0.63, 0.75  # shares of the threshold above which a block is searched and a peak is measured
 
@@ -93,7 +97,7 @@ def find_separate_peaks(
     means of squares as large as the light around the peak must fall as well. A wide faint peak must have no other peak
     within 16 px. Fills SCALE of the separate peaks. `near`, `gaps` (MAX_COMPARED,) are workspace. Source: ours.
     """
-    count, border = 0, np.zeros(8)
+    count, border, ring = 0, np.zeros(8), np.zeros(_RING[-1])
     for place in range(order.shape[0]):
         i = order[place]
         if peaks[i, WIDE]:
@@ -105,6 +109,7 @@ def find_separate_peaks(
                 lowest = _lowest_between(image, peaks, i, near[k], 1) - peaks[i, LEVEL]
                 least = max(needed, HALO_SHARE * peaks[near[k], HEIGHT])
                 alone = alone and peaks[i, HEIGHT] - lowest >= least
+            alone = alone and not _is_on_a_line(image, peaks[i], sqrt(variance(noise, peaks[i, LEVEL])), ring)
             if alone:
                 level = _find_scale(image, peaks[i], border)
                 for k in range(_nearest(peaks, i, separate, count, near, gaps)):
@@ -123,6 +128,31 @@ def find_separate_peaks(
             separate[count] = i
             count += 1
     return count
+
+
+@compiled
+def _is_on_a_line(image: Pixels, peak: Array, sigma: float, ring: Array) -> bool:
+    """Whether a peak is a part of an edge, a cable or another long line: on each circle around it some light continues.
+
+    A spot, also a streak, is brighter than all light on a circle that is large enough. Fits of candidates on lines
+    would grow over large windows and take most of the time. ring (_RING[-1],) is workspace. Source: ours.
+    """
+    here, column, row = peak[HEIGHT] + peak[LEVEL], int(peak[AT_U]), int(peak[AT_V])
+    for k in range(len(_CIRCLES)):
+        n = 0  # points inside the picture
+        for i in range(_RING[k]):
+            angle = 2 * pi * i / _RING[k]
+            u, v = column + int(np.rint(_CIRCLES[k] * cos(angle))), row + int(np.rint(_CIRCLES[k] * sin(angle)))
+            if 0 < u < image.width - 1 and 0 < v < image.height - 1:
+                ring[n] = mean3(image, u, v)
+                n += 1
+        if n < _LEAST_ON_RING:
+            return False
+        insertion_sort(ring, n)
+        around, highest = ring[n // 2], ring[n - 1]
+        if highest - around < 0.5 * (here - around) + _ON_RING * sigma:
+            return False
+    return True
 
 
 @compiled
