@@ -20,8 +20,11 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSI
 FILES = 8
 # Replaces the results again and again; each time all files have the same content.
 WRITER = f"""
-import sys
+import signal, sys
 sys.path.insert(0, {str(ROOT)!r})
+for name in ("SIGTERM", "SIGHUP", "SIGINT"):  # the tests may have been started with `nohup`, and commands respect that
+    if hasattr(signal, name):
+        signal.signal(getattr(signal, name), signal.default_int_handler if name == "SIGINT" else signal.SIG_DFL)
 from pathlib import Path
 from lab.commands.stop_signals import stopped_by_signals
 from lab.files.output import part_folder
