@@ -37,19 +37,18 @@ class ErrorScale:
 
     @staticmethod
     def of(
-        model: SpotModel, run: RunDetections, width_px: Array, place_px2: Array, assigned: Ints, calibration_cov: Array,
-        ref: Reference, measured: Bools,
+        model: SpotModel, run: RunDetections, place_px2: Array, assigned: Ints, calibration_cov: Array, ref: Reference,
+        measured: Bools,
     ) -> ErrorScale:  # fmt: skip
         """The corrections from the labelled spots of T frames, with their single-frame poses near a reference motion.
 
-        width_px (m,): geometric means of the detections' half axes; place_px2 (m,): their variances that belong to
-        their places; calibration_cov (n, 2, 2).
+        place_px2 (m,): variances of the detections that belong to their places; calibration_cov (n, 2, 2).
         """
         views, camera = model.numbers, model.camera_of
         misfit = usual_misfit(run, place_px2, assigned, camera)
         own = _cameras_of(run)
         even = run._replace(cov=_with_least(run.cov, run.size_px, place_px2, misfit[own]))
-        seen = scattered_width_share(even, width_px, assigned, camera)
+        seen = scattered_width_share(even, assigned, camera)
         wider = widened(even, seen)
         more = width_share(views, wider, assigned, calibration_cov, ref, measured)
         scale = noise_scale(views, widened(wider, more), assigned, calibration_cov, ref, measured)
@@ -139,11 +138,11 @@ def width_share(
     return _share_with(variance_factor)
 
 
-def scattered_width_share(run: RunDetections, width_px: Array, assigned: Ints, camera_of: Ints) -> Array:
+def scattered_width_share(run: RunDetections, assigned: Ints, camera_of: Ints) -> Array:
     """Errors beyond the stated ones of each camera (cameras,) as a share of the spots' widths, from their scatter.
 
-    0 if none show. width_px (m,): geometric means of the detections' half axes: the length of a streak, which changes
-    with the speed, counts for half. camera_of (n,): of the views.
+    0 if none show. The widths are the larger half axes: the length of a streak changes with the speed, which adds to
+    the scatter; its centre is less certain, too. camera_of (n,): of the views.
 
     Whatever changes the light from place to place (noise, texture, speckle) shifts a fitted Gaussian and changes its
     width by the same amount: the derivatives with respect to both have the same norm once that of the amplitude is
@@ -154,12 +153,12 @@ def scattered_width_share(run: RunDetections, width_px: Array, assigned: Ints, c
     """
     labelled = (assigned >= 0) & (assigned < BLENDED)
     row = np.where(labelled, run.begin[: len(assigned), None] + assigned, 0)
-    size = np.where(labelled, width_px[row], np.nan) if len(width_px) else np.full(row.shape, np.nan)
+    size = np.where(labelled, run.size_px[row], np.nan) if len(run.size_px) else np.full(row.shape, np.nan)
     change = size[2:] - 2 * size[1:-1] + size[:-2]
     square, width2 = change**2 / 6, size[1:-1] ** 2
     known = np.isfinite(change)
     stated = np.full(change.shape, np.nan)
-    stated[known] = np.sqrt(np.linalg.det(run.cov[row[1:-1][known]]))
+    stated[known] = np.linalg.eigvalsh(run.cov[row[1:-1][known]])[:, 1]
     out = np.zeros(run.has_image.shape[1])
     for camera in range(len(out)):
         some: list[int] = [

@@ -52,7 +52,6 @@ class TrackedRecording:
         self._cov: list[Array] = []
         self._size: list[Array] = []
         self._place: list[Array] = []
-        self._width: list[Array] = []
         self._first: list[Ints] = []
         self._has_image: list[Bools] = []
         self._assigned: list[Ints] = []
@@ -76,7 +75,6 @@ class TrackedRecording:
         self._size.append(np.concatenate([f.major_px for f in some]) if some else np.zeros(0))
         places = [np.zeros(len(f)) if f.place_px2 is None else f.place_px2 for f in some]
         self._place.append(np.concatenate(places) if places else np.zeros(0))
-        self._width.append(np.concatenate([np.sqrt(f.major_px * f.minor_px) for f in some]) if some else np.zeros(0))
         self._first.append(first)
         self._has_image.append(np.array([f is not None for f in found]))
         self._assigned.append(assigned_in_one_list(tracked, first[self.model.camera_of]))
@@ -133,10 +131,6 @@ class TrackedRecording:
     def place_px2(self) -> Array:
         """(m,): of the variance of a coordinate of each detection of the run, the part that belongs to its place."""
         return np.concatenate([np.zeros(0), *self._place])
-
-    def width_px(self) -> Array:
-        """(m,): geometric means of the half axes of the run's detections, px; nan where not known."""
-        return np.concatenate([np.zeros(0), *self._width])
 
     def run_detections(self) -> RunDetections:
         """All detections of the run."""

@@ -109,9 +109,7 @@ class _Smoother:
         every = rec.run_detections()
         self.calibration_cov, self.systematic, self.noise_share = calibration_errors(rec, every, self.assigned, ref)
         place_px2 = rec.place_px2()
-        self.errors = ErrorScale.of(
-            model, every, rec.width_px(), place_px2, self.assigned, self.calibration_cov, ref, self.measured
-        )
+        self.errors = ErrorScale.of(model, every, place_px2, self.assigned, self.calibration_cov, ref, self.measured)
         self.detections = every._replace(
             cov=self.errors.of_run(every, place_px2) + parameters.sigma_model_px**2 * np.eye(2),
             usual_size_px=usual_sizes(every, self.assigned),

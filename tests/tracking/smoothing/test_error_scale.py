@@ -35,7 +35,7 @@ CAMERAS = np.zeros(VIEWS, dtype=np.int64)
 
 def share_of(found: RunDetections, labels: np.ndarray) -> np.ndarray:
     """The share of one camera with round spots."""
-    return scattered_width_share(found, found.size_px, labels, CAMERAS)
+    return scattered_width_share(found, labels, CAMERAS)
 
 
 def test_widths_that_scatter_as_their_stated_sigmas_say_add_nothing():
@@ -70,7 +70,7 @@ def test_errors_that_only_narrow_spots_hide_add_to_their_camera_alone():
         has_image=np.ones((FRAMES, 2), bool),
     )
     labels, camera_of = np.tile(np.arange(2 * VIEWS), (FRAMES, 1)), np.repeat([0, 1], VIEWS)
-    share = scattered_width_share(found, found.size_px, labels, camera_of)
+    share = scattered_width_share(found, labels, camera_of)
     assert share[0] == pytest.approx(0.07, rel=0.25)
     assert share[1] == 0.0
     added = np.trace(widened(found, share).cov - found.cov, axis1=1, axis2=2).reshape(FRAMES, 2 * VIEWS)
