@@ -274,8 +274,7 @@ class _Estimator:
                 b = (ref.m[k + 1, :6] - ref.m[k, :6]) * self.run.exposure_s / 8
                 L[k], g[k], _ = with_error_along(b, L[k], g[k])
         if jumped.any():
-            # For the rest of the passes: the information changes with the motion. A frame near the limit would be weak
-            # in every second pass, which allows the jump in other steps, and the passes would never end.
+            # For all later passes: a frame near the limit would be weak in every second one, and they would never end.
             self.weak |= weak_frames(L, measured)
         jump = jump_variances(ref, self.weak, measured, jumped, self.dt)
         first = first_variance(ref, self.dt, bool(measured[0]))
