@@ -45,6 +45,7 @@ class _Library(codegen.JITCodeLibrary):
     of loading (docs/decisions/compile-cache.md).
     """
 
+    # mypy is silenced in calls of numba's own methods: numba has no types for them.
     _unparsed: bytes | None = None  # bitcode of code from disk
 
     @classmethod

@@ -64,8 +64,7 @@ class ErrorScale:
 
     def place_px2(self, run: RunDetections, stated_px2: Array) -> Array:
         """(m,): variances of a run's detections that belong to their places."""
-        width = np.where(np.isnan(run.size_px), 0.0, run.size_px)
-        least = (self.misfit_share[_cameras_of(run)] * width) ** 2
+        least = _variance_of_share(run.size_px, self.misfit_share[_cameras_of(run)])
         return np.maximum(stated_px2, least) * self.noise_scale**2
 
     def of_run(self, run: RunDetections, place_px2: Array) -> Array:
@@ -79,9 +78,14 @@ def _cameras_of(run: RunDetections) -> Ints:
     return np.repeat(np.tile(np.arange(cameras), len(run.first)), np.diff(run.first, axis=1).ravel())
 
 
+def _variance_of_share(width_px: Array, share: Array | float) -> Array:
+    """(m,): variances, px^2, of errors that are shares of the widths (m,), px; 0 where a width is not known."""
+    return np.asarray((share * np.where(np.isnan(width_px), 0.0, width_px)) ** 2)
+
+
 def _with_least(cov: Array, width_px: Array, place_px2: Array, share: Array | float) -> Array:
     """Covariances (m, 2, 2) with a part that belongs to the place of at least a share of the width, squared."""
-    missing = np.maximum((share * np.where(np.isnan(width_px), 0.0, width_px)) ** 2 - place_px2, 0.0)
+    missing = np.maximum(_variance_of_share(width_px, share) - place_px2, 0.0)
     return np.asarray(cov + missing[:, None, None] * np.eye(2))
 
 
@@ -109,7 +113,7 @@ def usual_misfit(run: RunDetections, place_px2: Array, assigned: Ints, camera_of
 
 def width_covariance(width_px: Array, share: Array | float) -> Array:
     """Covariances (m, 2, 2), px^2, of errors that are shares of the spots' widths (m,), px; 0 where not known."""
-    return ((share * np.where(np.isnan(width_px), 0.0, width_px)) ** 2)[:, None, None] * np.eye(2)
+    return _variance_of_share(width_px, share)[:, None, None] * np.eye(2)
 
 
 def widened(detections: RunDetections, share: Array | float) -> RunDetections:
