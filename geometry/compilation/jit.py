@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import numba
 from numba.core import codegen, event
 from numba.core.caching import FunctionCache
+from numba.core.runtime.nrt import rtsys
 from numba.core.types import unliteral
 
 from geometry.compilation.compile_cache import cache_folder, is_empty
@@ -77,8 +78,11 @@ class _Cache(FunctionCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         target_context.codegen()._library_class = _Library
+        rtsys.initialize(target_context)  # what machine code needs of numba: the memory of arrays
         try:
-            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+            # Not FunctionCache.load_overload: it first imports what numba needs to compile, as numba does again there.
+            with self._guard_against_spurious_io_errors():  # type: ignore[no-untyped-call]
+                return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         except Exception:  # unpickling a truncated file raises almost anything
             with suppress(OSError):
                 self.flush()  # type: ignore[no-untyped-call]

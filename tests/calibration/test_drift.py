@@ -13,11 +13,10 @@ from calibration.drift import (
     TURNED_ZOOMED,
     WRONG_POINT,
     ZOOMED,
-    ChangeCandidate,
-    ExcessResidual,
     camera_columns,
     find_changes,
 )
+from calibration.excess_residual import ChangeCandidate, ExcessResidual
 from geometry.camera import pinhole_numbers, project_points_full
 from geometry.lens import padded
 from geometry.rotations import exp

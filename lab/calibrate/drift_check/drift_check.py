@@ -17,13 +17,13 @@ import numpy as np
 from calibration.drift import (
     CAMERA_KINDS,
     TURNED_ZOOMED,
-    Change,
     FoundChanges,
     PriorSizes,
     expected_rms,
     find_changes,
     rms_length,
 )
+from calibration.excess_residual import Change
 from calibration.findings import Finding, Level, verdict
 from geometry.arrays import Array
 from geometry.camera import Camera

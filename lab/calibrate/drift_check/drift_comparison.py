@@ -12,11 +12,10 @@ from calibration.drift import (
     LASER_MOVED,
     WRONG_POINT,
     CameraColumns,
-    ChangeCandidate,
-    ExcessResidual,
     PriorSizes,
     camera_columns,
 )
+from calibration.excess_residual import ChangeCandidate, ExcessResidual
 from geometry.arrays import Array, Ints, skew
 from geometry.camera import FISHEYE, Camera, Projected, pinhole_numbers, project_points_full
 from geometry.forward_model import SpotDerivatives, SpotModel

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.drift import Change
+from calibration.excess_residual import Change
 from calibration.findings import Finding, Level
 from geometry.arrays import Array
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import secrets
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -48,7 +47,7 @@ def atomic_write_bytes(content: bytes, path: Path) -> None:
 
 def _written(content: bytes, path: Path) -> bool:
     """Write a file under another name, locked while it is incomplete, and rename it. Raises OSError."""
-    part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
+    part = path.with_name(f".{path.name}.{os.urandom(8).hex()}.part")
     with removed_at_the_end(part):
         with part.open("xb") as file:
             try:
