@@ -205,15 +205,15 @@ def posterior(P: Array, information: Array) -> tuple[Array, float]:
     """
     n, k = P.shape[0], information.shape[0]
     S = cholesky(P)
-    half = np.zeros((k, n))  # Y S
+    half = np.zeros((k, k))  # Y S
     for i in range(k):
         for j in range(k):
             y = information[i, j]
             if y != 0.0:
                 for c in range(j + 1):  # S is lower triangular
                     half[i, c] += y * S[j, c]
-    M = np.zeros((n, n))
-    for i in range(n):
+    M = np.zeros((k, k))  # of I + S^T Y S; the rest of it is that of I, and so is that of its factor
+    for i in range(k):
         for a in range(i, k):
             s = S[a, i]
             if s != 0.0:
@@ -224,13 +224,14 @@ def posterior(P: Array, information: Array) -> tuple[Array, float]:
         M[i, i] += 1.0
     W = cholesky(M)
     log_det = 0.0
-    for i in range(n):
+    for i in range(k):
         log_det += 2 * np.log(W[i, i])
     # Z = W^-1 S^T
     Z = np.zeros((n, n))
     for i in range(n):
         for c in range(n):
             Z[i, c] = S[c, i]
+    for i in range(k):
         for a in range(i):
             w = W[i, a]
             if w != 0.0:
@@ -342,7 +343,6 @@ def pose_plus(R: Array, t: Array, d: Array) -> tuple[Array, Array]:
 @compiled
 def pose_minus(R: Array, t: Array, R0: Array, t0: Array) -> Array:
     """The delta (6,) from the pose (R0, t0) to the pose (R, t), as `Pose.minus`."""
-
     out = np.empty(6)
     turn = log(transposed_multiply(R0, R))
     for i in range(3):

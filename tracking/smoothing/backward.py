@@ -17,7 +17,7 @@ from tracking.rigid_body.association.frame_detections import distinct_spots
 from tracking.rigid_body.hypotheses.prediction_checks import MIN_REDUNDANT_SPOTS
 from tracking.rigid_body.models.motion import STATE
 from tracking.rigid_body.rigid_tracker import RigidTracker
-from tracking.smoothing.motion.whole_run import SmoothedMotion
+from tracking.smoothing.motion.smoothed_motion import SmoothedMotion
 from tracking.smoothing.recording import TrackedRecording, assigned_in_one_list
 from tracking.statuses import PoseStatus
 

@@ -43,8 +43,9 @@ from tracking.smoothing.labels.reassociation import RunObservation, reassociated
 from tracking.smoothing.labels.view_path import PathContext
 from tracking.smoothing.motion.reference import Reference, straight_between
 from tracking.smoothing.motion.run_detections import labelled_points
+from tracking.smoothing.motion.smoothed_motion import SmoothedMotion, WholeRun
 from tracking.smoothing.motion.velocity_jumps import corner_offsets, jump_sigmas
-from tracking.smoothing.motion.whole_run import MAX_DISTANCE, SmoothedMotion, WholeRun, estimate
+from tracking.smoothing.motion.whole_run import MAX_DISTANCE, estimate
 from tracking.smoothing.place_errors import place_errors
 from tracking.smoothing.recording import TrackedRecording
 from tracking.smoothing.single_frame_poses import SingleFramePoses, rms_residuals, single_frame_poses

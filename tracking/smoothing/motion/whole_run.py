@@ -7,19 +7,19 @@ Source: ours.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from geometry.compiled_projection import Views
 from tracking.rigid_body.adaptive_process_noise import MANOEUVRE_S, jump_variance
 from tracking.rigid_body.models.motion import STATE, predicted
 from tracking.smoothing.motion.fixed_interval import Interval, RunInformation, log_likelihood, smoothed
 from tracking.smoothing.motion.predictive_cost import leave_one_out_log_likelihood, motion_cost
 from tracking.smoothing.motion.process_noise import next_log_density
 from tracking.smoothing.motion.reference import Reference, first_variance, shifted, speeds
-from tracking.smoothing.motion.run_detections import RunDetections, spot_information
+from tracking.smoothing.motion.run_detections import spot_information
+from tracking.smoothing.motion.smoothed_motion import SmoothedMotion, WholeRun
 from tracking.smoothing.motion.velocity_jumps import (
     corner_offsets,
     jump_variances,
@@ -44,40 +44,6 @@ PARTIAL_WEIGHT = 0.25  # of the spots of a frame that does not determine the pos
 P_JUMP_OUTSIDE = 0.15  # probability of a velocity jump in each frame that is extrapolated
 MAX_DISTANCE = 12  # frames: spots farther from any measured frame are not used
 INTERPOLATION_OFFSETS = (-2.0, -4.0, -6.0)  # of log q: tried for the interpolation between frames
-
-
-@dataclass(frozen=True, slots=True)
-class WholeRun:
-    """What stays the same while the motion is estimated: T frames, n views."""
-
-    views: Views
-    detections: RunDetections
-    calibration_cov: Array  # (n, 2, 2) px^2: covariance of the expected pixels due to calibration errors
-    dt: Array  # (T,) s
-    exposure_s: float
-    adapt_jerk: bool  # estimate the strength of the jerk; else it is kept
-
-
-@dataclass(frozen=True, slots=True)
-class SmoothedMotion:
-    """The estimate, T frames."""
-
-    ref: Reference
-    log_density: Array | None  # (T, 6) logarithms of the jerk's spectral densities; None: not estimated yet
-    interpolation_offset: float  # to be added to them for the interpolation between frames
-    jumped: Bools  # (T,) the velocities jumped in the step before
-    pose_P: Array  # (T, 6, 6)
-    motion_P: Array  # (T, 6, 6) of the velocities
-    known: Bools  # (T,) the pose is not lost
-    weight: Array  # (T,) of the information of each frame's spots in the motion; 0: not used
-
-    @staticmethod
-    def begin(ref: Reference, jumped: Bools, log_density: Array | None) -> SmoothedMotion:
-        """The motion before the first estimate."""
-        frames = len(ref.t)
-        zero = np.zeros((frames, 6, 6))
-        known = np.zeros(frames, dtype=bool)
-        return SmoothedMotion(ref, log_density, 0.0, jumped, zero, zero, known, np.zeros(frames))
 
 
 def estimate(
@@ -117,6 +83,7 @@ class _Estimator:
         self.beside = np.zeros((len(self.dt), 6))  # of corner_offsets, at the reference of the last step
         self.weak = np.zeros(len(self.dt), dtype=bool)  # (T,) see `jump_variances`
         self.kept: tuple[Reference, tuple[Array, Array, Array]] | None = None  # of the last `_without_corners`
+        self.tried: tuple[RunInformation, Array, Interval] | None = None  # of `_best_interpolation_offset`: the best
         self.fresh = motion.log_density is None
         self.log_density = self._first_density() if motion.log_density is None else motion.log_density[core].copy()
         self.interpolation_offset = motion.interpolation_offset
@@ -202,22 +169,34 @@ class _Estimator:
         interior = self._interior(out)
         if not interior.any():
             return 0.0
-        best, value = 0.0, self._leave_one_out(info, 0.0, interior)
+        best = 0.0
+        value, self.tried = self._leave_one_out(info, 0.0, interior)
         for offset in INTERPOLATION_OFFSETS:
-            likelihood = self._leave_one_out(info, offset, interior)
+            likelihood, tried = self._leave_one_out(info, offset, interior)
             if likelihood < value:
                 break
-            best, value = offset, likelihood
+            best, value, self.tried = offset, likelihood, tried
         for offset in (best - 1.0, best + 1.0):
-            likelihood = self._leave_one_out(info, offset, interior) if offset < 0 else -np.inf
-            if likelihood > value:
-                best, value = offset, likelihood
+            if offset < 0:
+                likelihood, tried = self._leave_one_out(info, offset, interior)
+                if likelihood > value:
+                    best, value, self.tried = offset, likelihood, tried
         return best
 
-    def _leave_one_out(self, info: RunInformation, offset: float, interior: Bools) -> float:
-        out = smoothed(self.ref, info, np.exp(self.log_density + offset * interior[:, None]))
+    def _leave_one_out(
+        self, info: RunInformation, offset: float, interior: Bools
+    ) -> tuple[float, tuple[RunInformation, Array, Interval]]:
+        density = np.exp(self.log_density + offset * interior[:, None])
+        out = smoothed(self.ref, info, density)
         value = float(leave_one_out_log_likelihood(out.x, out.pose_P, info))
-        return value if np.isfinite(value) else -np.inf
+        return value if np.isfinite(value) else -np.inf, (info, density, out)
+
+    def _smoothed(self, info: RunInformation, density: Array) -> Interval:
+        """The smoother at the reference; as `_best_interpolation_offset` left it if that has just tried the same."""
+        tried, self.tried = self.tried, None
+        if tried is not None and all(map(np.array_equal, (*info, density), (*tried[0], tried[1]))):
+            return tried[2]
+        return smoothed(self.ref, info, density)
 
     # -- Gauss-Newton -------------------------------------------------------------------------------------------------
 
@@ -230,7 +209,7 @@ class _Estimator:
         cost = 0.5 * chi2 + motion_cost(self.ref, info, density)
         # Damping is against steps that leave the linear region; rounding alone makes some nats.
         limit = cost + ROUNDING_NATS * (1 + 1e-3 * abs(cost))
-        out = smoothed(self.ref, info, density)
+        out = self._smoothed(info, density)
         for damping in DAMPING:
             x = out.x if np.isinf(damping) else smoothed(self.ref, _damped(info, damping), density).x
             moved = self._corrected(x, info, damping, density, limit)
