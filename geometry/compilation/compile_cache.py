@@ -30,7 +30,7 @@ _IMPORT = re.compile(r"^[ \t]*import[ \t]+(.+)$", re.M)
 
 def cache_folder(folder: Path) -> Path | None:
     """Cache folder for the functions of a source folder as they are now; None if no folder can be written safely."""
-    return _private_folder(_sources(folder))
+    return private_folder(_sources(folder))
 
 
 def is_empty(folder: Path) -> bool:
@@ -86,8 +86,11 @@ def _exists(module: str) -> bool:
 
 
 @cache
-def _private_folder(sources: tuple[Path, ...]) -> Path | None:
-    """A writable folder for these sources only: beside this module, else the user's cache, else the temporary one."""
+def private_folder(sources: tuple[Path, ...]) -> Path | None:
+    """A writable folder for code compiled from these files: beside this module, or in the user's or a temporary cache.
+
+    None where no such folder is safe: what is in it is executed.
+    """
     digest = hashlib.sha256(f"{sys.version_info[:2]} {numba.__version__}".encode())
     for source in sources:
         digest.update(source.read_bytes())

@@ -81,7 +81,7 @@ class _Cache(FunctionCache):
         rtsys.initialize(target_context)  # what machine code needs of numba: the memory of arrays
         try:
             # Not FunctionCache.load_overload: it first imports what numba needs to compile, as numba does again there.
-            with self._guard_against_spurious_io_errors():  # type: ignore[no-untyped-call]
+            with self._guard_against_spurious_io_errors():
                 return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         except Exception:  # unpickling a truncated file raises almost anything
             with suppress(OSError):

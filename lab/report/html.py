@@ -10,13 +10,17 @@ import jinja2
 from markupsafe import Markup, escape
 
 from lab.report.content_policy import content_policy
+from lab.report.template_cache import template_cache
+
+TEMPLATES = Path(__file__).parent / "templates"
 
 
 @cache
 def environment() -> jinja2.Environment:
     """The templates in lab/report/templates/; text that is not marked as HTML is escaped."""
     made = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        bytecode_cache=template_cache((Path(__file__), *sorted(TEMPLATES.iterdir()))),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

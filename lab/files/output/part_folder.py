@@ -14,6 +14,7 @@ import ctypes
 import errno
 import os
 import re
+import secrets
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,7 +28,7 @@ _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
 @contextmanager
 def part_folder(target: Path) -> Iterator[Path]:
     """Yields a new empty folder beside `target`, removed when the block ends unless it was renamed. Raises OSError."""
-    work = target.parent / f".{target.name}.part-{os.urandom(8).hex()}"
+    work = target.parent / f".{target.name}.part-{secrets.token_hex(8)}"
     with removed_at_the_end(work):
         work.mkdir()
         yield work
@@ -42,7 +43,7 @@ def replace_folder(work: Path, target: Path) -> None:
     if not target.exists():
         work.rename(target)
     elif not exchange(work, target):
-        old = target.parent / f".{target.name}.old-{os.urandom(8).hex()}"
+        old = target.parent / f".{target.name}.old-{secrets.token_hex(8)}"
         try:
             target.rename(old)
             work.rename(target)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import secrets
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -47,7 +48,7 @@ def atomic_write_bytes(content: bytes, path: Path) -> None:
 
 def _written(content: bytes, path: Path) -> bool:
     """Write a file under another name, locked while it is incomplete, and rename it. Raises OSError."""
-    part = path.with_name(f".{path.name}.{os.urandom(8).hex()}.part")
+    part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
     with removed_at_the_end(part):
         with part.open("xb") as file:
             try:

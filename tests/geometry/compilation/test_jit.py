@@ -262,7 +262,7 @@ def private_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "cache"))
     monkeypatch.setattr(compile_cache, "__file__", "/dev/null/compile_cache.py")
     sources = compile_cache._sources(Path(str(compiled_projection.__file__)).parent)
-    return lambda: compile_cache._private_folder.__wrapped__(sources)  # without its memory of earlier results
+    return lambda: compile_cache.private_folder.__wrapped__(sources)  # without its memory of earlier results
 
 
 @owners
