@@ -38,6 +38,13 @@ except SystemExit as done:
 print("FIRST", *sorted(first))
 print("LOADED", *sorted(sys.modules))
 """
+# What an exit handler finds that runs after those of the program.
+AT_EXIT = """
+import atexit, gc
+atexit.register(lambda: print("LOADED", gc.get_freeze_count() > 1000, gc.get_threshold()[0] > 100_000))
+from cli import main
+main({arguments!r})
+"""
 SLOW_SCIPY = {
     "scipy.stats", "scipy.optimize", "scipy.special", "scipy.ndimage", "scipy.spatial", "scipy.sparse", "scipy.linalg",
 }  # fmt: skip
@@ -93,3 +100,7 @@ def test_a_short_run_never_loads_pandas_or_the_slow_parts_of_scipy_or_the_compil
     after = loaded(WATCHED, "run", str(points_run), "--out", str(tmp_path / "out"))
     assert {"jinja2", "lab.report.run.page"} <= after
     assert after & (SLOW_SCIPY | COMPILER | {"pandas", "cv2", "unittest"}) == set()
+
+
+def test_python_does_not_search_for_cycles_while_the_program_ends():
+    assert loaded(AT_EXIT, "--version") == {"True"}

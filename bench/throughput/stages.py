@@ -19,6 +19,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from lab.cycle_search import search_rarely
+
 STAGES = (
     ("decode", "lab.runs.frames.frame_sources", "read_picture"),
     ("decode", "lab.runs.frames.frame_sources", "VideoSource._next"),
@@ -80,6 +82,7 @@ def _run(folder: Path, out: Path) -> Counter[str]:
     from lab.runs import process
     from lab.runs.frames import frames
 
+    search_rarely()  # as the command does
     clock = Clock()
     watch(clock)  # also imports the report and the model check, which a run imports at its end
     started: list[float] = []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import gc
 import logging
 import math
 import os
@@ -15,15 +14,13 @@ from typing import Any, TextIO
 import click
 
 from lab.commands.stop_signals import StoppedBySignal, stopped_by_signals, stops_are_no_errors
+from lab.cycle_search import search_rarely
 from lab.errors import BeamposeError
 from lab.files.text.error_text import printable
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
 ANY_PATH = click.Path(path_type=Path)
 _ANY_LENGTH = 10_000  # of a first sentence
-# New objects after which Python searches for unused cycles. The libraries make 250,000 that all stay in use; with
-# Python's 700 the searches take 0.14 s of a run of 300 frames (CPU time, least of six). Memory grows by 1 to 6 MB.
-_OBJECTS_BETWEEN_SEARCHES = 300_000
 PIPE_CLOSED = 141  # 128 + SIGPIPE: the status that a shell reports for a program whose reader has gone
 
 
@@ -104,7 +101,7 @@ class Commands(click.Group):
     """A group whose errors (the lab's own, click's and unforeseen ones) end as plain lines and an exit status."""
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
-        gc.set_threshold(_OBJECTS_BETWEEN_SEARCHES)
+        search_rarely()
         _open_standard_streams()
         _show_log_on_a_terminal()
         with _quiet_when_the_reader_has_gone(), _stop_is_a_line(), stopped_by_signals(), _errors_are_lines():

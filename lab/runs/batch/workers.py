@@ -16,6 +16,8 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection
 from typing import Any, TypeVar
 
+from lab.cycle_search import search_rarely
+
 T = TypeVar("T")
 R = TypeVar("R")
 # Threads per process of the libraries below; they are read when the library is loaded.
@@ -117,6 +119,7 @@ def _prepare(threads: int) -> None:
     """Prepares a new worker process."""
     from lab.runs.frames import frames
 
+    search_rarely()
     frames.THREADS = min(frames.THREADS, threads)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent decides
     signal.signal(signal.SIGTERM, _end)
