@@ -21,7 +21,7 @@ from pathlib import Path
 import numba
 
 MAX_FOLDERS = 40  # cache folders kept in one place; a version of beampose uses about ten
-_MARK = "@compiled"
+_MARK = b"@compiled"
 _PREFIX = "beampose-compiled-"
 _NAMES = r"\w+(?:[ \t]+as[ \t]+\w+)?"
 _FROM = re.compile(rf"^[ \t]*from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|{_NAMES}(?:[ \t]*,[ \t]*{_NAMES})*)", re.M)
@@ -46,7 +46,7 @@ def _sources(folder: Path) -> tuple[Path, ...]:
     Modules without compiled functions count too: numba compiles their constants into the machine code.
     """
     found: set[Path] = set()
-    waiting = [f for f in folder.glob("*.py") if _MARK in f.read_text("utf-8")]
+    waiting = [f for f in folder.glob("*.py") if _MARK in _content(f)]
     while waiting:
         source = waiting.pop()
         if source not in found:
@@ -65,7 +65,7 @@ def _imported(source: Path) -> frozenset[Path]:
     package = root = os.path.dirname(source)
     while os.path.isfile(f"{root}/__init__.py"):
         root = os.path.dirname(root)
-    text = re.sub(r"#.*", "", source.read_text("utf-8")).replace("\\\n", " ")
+    text = re.sub(r"#.*", "", _content(source).decode("utf-8")).replace("\\\n", " ")
     modules = {item.split()[0] for line in _IMPORT.findall(text) for item in line.split(",")}
     for module, names in _FROM.findall(text):
         modules |= {module, *(f"{module.rstrip('.')}.{name}" for name in re.findall(r"\w+", names))}
@@ -75,14 +75,30 @@ def _imported(source: Path) -> frozenset[Path]:
         base = root if name == module else os.path.normpath(f"{package}/{'../' * (len(module) - len(name) - 1)}")
         path = f"{base}/{name.replace('.', '/')}"
         if _exists(f"{base}/{name.split('.')[0]}"):
-            found |= {f for f in (f"{path}.py", f"{path}/__init__.py") if os.path.isfile(f)}
+            found |= {f for f in (f"{path}.py", f"{path}/__init__.py") if _is_in_folder(f)}
     return frozenset(map(Path, found))
+
+
+@cache
+def _content(source: Path) -> bytes:
+    return source.read_bytes()
 
 
 @cache
 def _exists(module: str) -> bool:
     """Whether a path without suffix is a package or a module; saves the search for names of other programs."""
-    return os.path.isdir(module) or os.path.isfile(f"{module}.py")
+    return os.path.isdir(module) or _is_in_folder(f"{module}.py")
+
+
+def _is_in_folder(path: str) -> bool:
+    """Whether a path exists: most of those that are asked for do not, and each folder is read once."""
+    folder, name = os.path.split(path)
+    return name in _names(folder)
+
+
+@cache
+def _names(folder: str) -> frozenset[str]:
+    return frozenset(os.listdir(folder)) if os.path.isdir(folder) else frozenset()
 
 
 @cache
@@ -93,7 +109,7 @@ def private_folder(sources: tuple[Path, ...]) -> Path | None:
     """
     digest = hashlib.sha256(f"{sys.version_info[:2]} {numba.__version__}".encode())
     for source in sources:
-        digest.update(source.read_bytes())
+        digest.update(_content(source))
     homes = [Path(__file__).parent / "__pycache__", Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()]
     for home in (*homes, Path(tempfile.gettempdir())):
         folder = home / f"{_PREFIX}{digest.hexdigest()[:16]}"

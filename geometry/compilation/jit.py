@@ -10,13 +10,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
 from numba.core import codegen, event
 from numba.core.caching import FunctionCache
-from numba.core.runtime.nrt import rtsys
+from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]
 from numba.core.types import unliteral
 
 from geometry.compilation.compile_cache import cache_folder, is_empty
@@ -74,11 +75,28 @@ class _Library(codegen.JITCodeLibrary):
 
 
 class _Cache(FunctionCache):
-    """numba's cache of one function, for which an unreadable or unwritable file is a missing one."""
+    """numba's cache of one function, for which an unreadable or unwritable file is a missing one.
+
+    It is opened by the first call of the function: a run calls a quarter of all functions.
+    """
+
+    def __init__(self, function: Callable, folder: Path) -> None:
+        self._function, self._folder, self._is_open = function, folder, False
+
+    def _open(self) -> None:
+        settings: Any = numba.config
+        before, settings.CACHE_DIR = settings.CACHE_DIR, str(self._folder)
+        try:
+            super().__init__(self._function)  # type: ignore[no-untyped-call]
+        finally:
+            settings.CACHE_DIR = before
+        self._is_open = True
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
+        if not self._is_open:
+            self._open()
         target_context.codegen()._library_class = _Library
-        rtsys.initialize(target_context)  # what machine code needs of numba: the memory of arrays
+        _name_functions_of_numba()
         try:
             # Not FunctionCache.load_overload: it first imports what numba needs to compile, as numba does again there.
             with self._guard_against_spurious_io_errors():
@@ -93,6 +111,17 @@ class _Cache(FunctionCache):
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
 
 
+@cache
+def _name_functions_of_numba() -> None:
+    """Tells the linker where the functions are that machine code calls for the memory of arrays.
+
+    The first half of what numba does before it compiles; the other half compiles functions that machine code from disk
+    contains.
+    """
+    for name, address in _nrt_python.c_helpers.items():
+        codegen.ll.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)  # type: ignore[attr-defined]
+
+
 def _compiled(function: Function, release_gil: bool) -> Function:
     settings: Any = numba.config
     dispatcher = numba.njit(function, error_model="numpy", nogil=release_gil)
@@ -102,11 +131,7 @@ def _compiled(function: Function, release_gil: bool) -> Function:
     _folders.add(folder)
     cached = cache_folder(folder)
     if cached is not None:
-        before, settings.CACHE_DIR = settings.CACHE_DIR, str(cached)
-        try:
-            dispatcher._cache = _Cache(function)  # type: ignore[no-untyped-call]
-        finally:
-            settings.CACHE_DIR = before
+        dispatcher._cache = _Cache(function, cached)
     _treat_literals_as_numbers(dispatcher)
     return dispatcher
 
