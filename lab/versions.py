@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import platform
+from functools import cache
 from importlib import metadata
 
 PACKAGES = (
@@ -14,6 +15,11 @@ ONE_OF = ("open3d-cpu", "open3d")  # the name depends on the platform; some have
 
 def versions() -> dict[str, str]:
     """Versions by name of package."""
+    return dict(_versions())
+
+
+@cache
+def _versions() -> dict[str, str]:
     out = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
