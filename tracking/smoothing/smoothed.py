@@ -15,8 +15,45 @@ from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.smoothing.error_scale import ErrorScale
+from tracking.smoothing.motion.run_detections import RunDetections
 from tracking.statuses import PoseStatus, SpotStatus, view_statuses
 from tracking.tracked_frame import Event, MotionEstimate, TrackedFrame
+
+
+@dataclass(frozen=True, slots=True)
+class ReportedSpots:
+    """All views' spots in T frames: measured where they have a label, elsewhere as the pose gives them."""
+
+    uv_px: Array  # (T, n, 2) at mid-exposure; nan where the pose does not project the spot
+    cov_px2: Array  # (T, n, 2, 2)
+    exists: Bools  # (T, n): the pose projects the spot
+    inside: Bools  # (T, n): the spot is in the picture
+
+    @staticmethod
+    def of(
+        model: SpotModel, parameters: TrackerParameters, poses: Pose, covariance: Array, calibration_cov: Array,
+        measured: tuple[RunDetections, Array], labels: tuple[Ints, ErrorScale], exposure_px: Array,
+    ) -> ReportedSpots:  # fmt: skip
+        """The spots of T frames from their poses, with covariances (T, 6, 6), and the labelled detections.
+
+        calibration_cov (n, 2, 2), px^2: covariance of the expected pixels due to calibration errors. measured: the
+        detections as stated, and the part (m,), px^2, of their variances that belongs to the place. labels: (T, n), as
+        `Smoothed.assigned`, and the corrections of the stated covariances. exposure_px (T, n, 2): mean pixel of a spot
+        over the exposure less that at its middle.
+        """
+        (detections, place_px2), (assigned, errors) = measured, labels
+        uv_px, J = project_all(model.numbers, poses.rotation, poses.translation)
+        cov_px2 = J @ covariance[:, None] @ np.swapaxes(J, -1, -2) + calibration_cov
+        exists = ~np.isnan(uv_px[..., 0])
+        k, view = np.nonzero(assigned >= 0)
+        chosen = assigned[k, view]
+        rows = detections.begin[k] + chosen % BLENDED
+        uv_px[k, view] = detections.uv[rows] - exposure_px[k, view]
+        own = errors.covariance(detections.cov[rows], detections.size_px[rows], place_px2[rows], model.camera_of[view])
+        blended = np.where(chosen >= BLENDED, parameters.blend_px / 2, 0.0)
+        more = blended**2 + parameters.sigma_model_px**2
+        cov_px2[k, view] = own + more[:, None, None] * np.eye(2)
+        return ReportedSpots(uv_px, cov_px2, exists, model.in_picture(uv_px))
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +63,7 @@ class Smoothed:
     model: SpotModel
     parameters: TrackerParameters
     poses: Pose  # (T,) at mid-exposure
-    exposure_px: Array  # (T, n, 2) mean pixel of a spot over the exposure less that at its middle
+    spots: ReportedSpots
     velocities: Array  # (T, 6): m/s in world, rad/s in body
     covariance: Array  # (T, 6, 6) of the poses, from noise and from errors that belong to places
     place_share: float  # share of the spots' error variance that belongs to places (place_errors.py)
@@ -42,7 +79,6 @@ class Smoothed:
     iterations: int  # rounds of motion and labels
     relabelled: int  # labels that differ from the causal ones
     errors: ErrorScale  # corrections of the spots' stated covariances
-    calibration_cov: Array  # (n, 2, 2) px^2: covariance of the expected pixels due to calibration errors
 
     @property
     def frames(self) -> int:
@@ -62,25 +98,11 @@ class Smoothed:
         pose = self.poses[k]
         systematic = self.systematic[min(k, len(self.systematic) - 1)]
         covariance = self.covariance[k] + systematic
-        uv, J = project_all(model.numbers, pose.rotation[None], pose.translation[None])
-        uv_px, cov_px2 = uv[0], J[0] @ covariance @ np.swapaxes(J[0], -1, -2) + self.calibration_cov
-        exists: Bools = ~np.isnan(uv_px[:, 0])
+        uv_px, cov_px2 = self.spots.uv_px[k].copy(), self.spots.cov_px2[k].copy()
         point = np.where(labelled, assigned % BLENDED - self.first[k][model.camera_of], UNMATCHED)
-        for camera, points in enumerate(found):
-            views = np.flatnonzero(labelled & (model.camera_of == camera))
-            if not len(views):
-                continue
-            assert points is not None
-            row = point[views]
-            uv_px[views] = points.uv_px[row] - self.exposure_px[k, views]
-            place = np.zeros(len(row)) if points.place_px2 is None else points.place_px2[row]
-            own = self.errors.covariance(points.cov_px2[row], points.major_px[row], place, camera)
-            blended = np.where(assigned[views] >= BLENDED, self.parameters.blend_px / 2, 0.0)
-            more = blended**2 + self.parameters.sigma_model_px**2
-            cov_px2[views] = own + more[:, None, None] * np.eye(2)
         turned = np.array([s is SpotStatus.TURNED for s in causal.status]) & (point == causal.point)
         has_image = np.array([f is not None for f in found])[model.camera_of]
-        status = view_statuses(labelled, turned, exists, model.in_picture(uv_px), has_image, known)
+        status = view_statuses(labelled, turned, self.spots.exists[k], self.spots.inside[k], has_image, known)
         nowhere = [s in (SpotStatus.LOST, SpotStatus.OFF_SCREEN) for s in status]
         uv_px[nowhere], cov_px2[nowhere] = np.nan, np.nan
         measured = bool(self.measured[k])

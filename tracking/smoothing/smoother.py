@@ -49,7 +49,7 @@ from tracking.smoothing.motion.whole_run import MAX_DISTANCE, estimate
 from tracking.smoothing.place_errors import place_errors
 from tracking.smoothing.recording import TrackedRecording
 from tracking.smoothing.single_frame_poses import SingleFramePoses, rms_residuals, single_frame_poses
-from tracking.smoothing.smoothed import Smoothed
+from tracking.smoothing.smoothed import ReportedSpots, Smoothed
 
 MAX_ROUNDS = 4  # of motion and labels
 BRIEF_PROBABILITY = 0.9999  # least one of a label of a spot that is occluded before and after
@@ -277,7 +277,7 @@ class _Smoother:
         self.own = replace(self.own, measured=self.own.measured & self.trusted)
         final, pose_P, motion_P = self._with_own_poses()
         differ = (assigned % BLENDED != causal % BLENDED) & ~((assigned < 0) & (causal < 0))
-        place_share, place_factor = self._place_errors(final, pose_P)
+        place_share, covariance = self._place_errors(final, pose_P)
         # Measured is the mean over the exposure; reported is the pose at its middle.
         jumps = motion.jumped | np.append(motion.jumped[1:], False)
         offsets = exposure_offsets(self.views, final, self.rec.exposure_s, motion.known & ~jumps)
@@ -285,13 +285,18 @@ class _Smoother:
         if motion.log_density is not None:
             half = 0.5 * np.median(motion.log_density, axis=0)
             jerk = np.exp([half[:3].mean(), half[3:].mean()])
+        poses = Pose(final.R, final.t).plus(-pose_shift(self.views, final, offsets))
+        spots = ReportedSpots.of(
+            self.model, self.parameters, poses, covariance + self.systematic, self.calibration_cov,
+            (self.rec.run_detections(), self.rec.place_px2()), (assigned, self.errors), offsets,
+        )  # fmt: skip
         return Smoothed(
             model=self.model,
             parameters=self.parameters,
-            poses=Pose(final.R, final.t).plus(-pose_shift(self.views, final, offsets)),
-            exposure_px=offsets,
+            poses=poses,
+            spots=spots,
             velocities=final.m[:, :6],
-            covariance=pose_P * (place_factor * self.noise_share)[:, None, None],
+            covariance=covariance,
             place_share=place_share,
             systematic=self.systematic,
             motion_covariance=motion_P,
@@ -305,7 +310,6 @@ class _Smoother:
             iterations=rounds,
             relabelled=int(np.count_nonzero(differ)),
             errors=self.errors,
-            calibration_cov=self.calibration_cov,
         )
 
     def _with_own_poses(self) -> tuple[Reference, Array, Array]:
@@ -325,7 +329,7 @@ class _Smoother:
         return Reference(R, t, ref.m), pose_P, motion_P
 
     def _place_errors(self, ref: Reference, pose_P: Array) -> tuple[float, Array]:
-        """Share of the errors that belong to places, and the factor (T,) of the poses' covariances for it."""
+        """Share of the errors that belong to places, and the covariances (T, 6, 6) of the poses with it."""
         frames, detections = np.flatnonzero(self.own.measured), self.detections
         averaged, (residual, uv_px) = np.full(len(self.rec), np.nan), np.full((2, *self.assigned.shape, 2), np.nan)
         ratio = np.trace(np.linalg.solve(self.own.covariance[frames], pose_P[frames]), axis1=1, axis2=2)
@@ -343,4 +347,4 @@ class _Smoother:
         shares = self.errors.place_px2(detections, self.rec.place_px2())[rows] / size**2
         width_px, share = self.detections.usual_size_px, float(np.mean(shares)) if len(shares) else 0.0
         found = place_errors(residual, uv_px, width_px, averaged, explained).at_least(share, uv_px, width_px)
-        return found.share, found.factor(averaged)
+        return found.share, pose_P * (found.factor(averaged) * self.noise_share)[:, None, None]

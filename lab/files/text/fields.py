@@ -199,7 +199,7 @@ Lines = Annotated[list[str], _plain(lines_of_text)]
 class Block(pydantic.BaseModel):
     """A mapping in a file. Unknown keys are mistakes, as are known keys without a value."""
 
-    model_config = pydantic.ConfigDict(frozen=True, arbitrary_types_allowed=True)
+    model_config = pydantic.ConfigDict(frozen=True, arbitrary_types_allowed=True, defer_build=True)
 
     @pydantic.model_validator(mode="before")
     @classmethod
