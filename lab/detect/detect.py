@@ -125,7 +125,7 @@ def _search_all(
                 series.unreadable.setdefault(picture.reason, []).append(frame)
             else:
                 found = series.search(frame, picture)
-                file.writelines(detection_rows(frame, camera, found))
+                file.writelines(detection_rows([(frame, camera, found)]))
                 sheet.offer(done - 1, frame, picture, found)
             if progress is not None:
                 progress(done, total)

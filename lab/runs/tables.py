@@ -101,13 +101,13 @@ class TableWriter:
             self._poses(causal, CAUSAL)
 
     def _detections(self, records: Sequence[FrameRecord]) -> None:
-        rows = []
-        for record in records:
-            for camera, found in zip(self._cameras, record.detections, strict=True):
-                if found is None or not len(found):
-                    continue
-                rows += detection_rows(record.frame, camera, found)
-        self._open["detections.csv"].writelines(rows)
+        pictures = [
+            (record.frame, camera, found)
+            for record in records
+            for camera, found in zip(self._cameras, record.detections, strict=True)
+            if found is not None and len(found)
+        ]
+        self._open["detections.csv"].writelines(detection_rows(pictures))
 
     def _spots(self, records: Sequence[FrameRecord]) -> None:
         tracked = [record.tracked for record in records]
@@ -161,13 +161,20 @@ class TableWriter:
         self._open["beams.csv"].writelines(rows)
 
 
-def detection_rows(frame: int, camera: str, found: Detections) -> list[str]:
-    """The lines of detections.csv for one picture. camera: as a CSV field (`csv_word`)."""
-    cov = found.cov_px2
-    sigma = _sigmas(np.stack([cov[:, 0, 0], cov[:, 1, 1]], axis=-1), [frame])
-    shape = (found.flux, found.peak, found.major_px, found.minor_px, found.angle_deg, cov[:, 0, 1])
-    numbers = np.column_stack([found.uv_px, sigma, *shape])
-    return [f"{frame},{camera},{_joined(row)}\n" for row in numbers.tolist()]
+def detection_rows(pictures: Sequence[tuple[int, str, Detections]]) -> list[str]:
+    """The lines of detections.csv for some pictures: frame, camera as a CSV field (`csv_word`), and its detections."""
+    if not pictures:
+        return []
+    every = [found for _, _, found in pictures]
+    cov = np.concatenate([f.cov_px2 for f in every])
+    heads = [f"{frame},{camera}" for frame, camera, found in pictures for _ in range(len(found))]
+    frames = [frame for frame, _, found in pictures for _ in range(len(found))]
+    sigma = _sigmas(np.stack([cov[:, 0, 0], cov[:, 1, 1]], axis=-1), frames)
+    shape = [np.stack([f.flux, f.peak, f.major_px, f.minor_px, f.angle_deg], axis=-1) for f in every]
+    numbers = np.concatenate(
+        [np.concatenate([f.uv_px for f in every]), sigma, np.concatenate(shape), cov[:, :1, 1]], axis=-1
+    )
+    return [f"{head},{_joined(row)}\n" for head, row in zip(heads, numbers.tolist(), strict=True)]
 
 
 def attitude_rows(records: Sequence[FrameRecord]) -> list[str]:

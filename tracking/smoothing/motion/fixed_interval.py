@@ -31,9 +31,9 @@ from tracking.rigid_body.models.motion import STATE, predicted, process_noise, p
 from tracking.smoothing.motion.axis_noise import noise_root, subtract_noise
 from tracking.smoothing.motion.reference import Reference
 
-# Frames whose covariances are in memory at once, 2.7 kB each. The forward filter runs once more over the chunks before
-# the last one.
-CHUNK = 2048
+# Frames whose covariances are in memory at once, 2.7 kB each. The forward filter, a fifth of a pass, runs once more
+# over the chunks before the last one.
+CHUNK = 8192
 
 
 class RunInformation(NamedTuple):
