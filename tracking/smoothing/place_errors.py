@@ -110,6 +110,12 @@ def _mean_over_views(counts: Array, labelled: Bools) -> Array:
     return np.asarray(np.where(labelled.any(axis=1), total / np.maximum(labelled.sum(axis=1), 1), 1.0))
 
 
+def _distances(uv_px: Array) -> Array:
+    """(m, m): between all pairs of pixels (m, 2)."""
+    du, dv = uv_px[:, None, 0] - uv_px[None, :, 0], uv_px[:, None, 1] - uv_px[None, :, 1]
+    return np.asarray(np.sqrt(du * du + dv * dv))
+
+
 def _same_error_frames(uv_px: Array, reach_px: float) -> Array:
     """(T,): number of frames in which one view's spot, at uv_px (T, 2), has the same error; nan without a spot."""
     out = np.full(len(uv_px), np.nan)
@@ -117,7 +123,7 @@ def _same_error_frames(uv_px: Array, reach_px: float) -> Array:
     for start in range(0, len(rows), _CHUNK):
         some = rows[start : start + _CHUNK]
         at = uv_px[some]
-        out[some] = correlation(np.linalg.norm(at[:, None] - at[None], axis=-1), reach_px).sum(axis=1)
+        out[some] = correlation(_distances(at), reach_px).sum(axis=1)
     return out
 
 
@@ -179,7 +185,7 @@ def _products(residual: Array, uv_px: Array, reaches_px: Sequence[Array], explai
             some = rows[start : start + _CHUNK]
             r, at = residual[some, view], uv_px[some, view]
             products = r @ r.T / mean_square
-            distance = np.linalg.norm(at[:, None] - at[None], axis=-1)
+            distance = _distances(at)
             for one, reach_px in zip(sums, reaches_px, strict=True):
                 one.add(some, view, products, correlation(distance, reach_px[view]), explained[view])
     return [one.products(reach_px) for one, reach_px in zip(sums, reaches_px, strict=True)]

@@ -9,8 +9,9 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.compiled_projection import Views, project_all
 from geometry.pose_solver.gauss_newton import SolveLimits, covariances_of
+from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.smoothing.motion.reference import Reference
-from tracking.smoothing.motion.run_detections import RunDetections, fit_frames, labelled_points
+from tracking.smoothing.motion.run_detections import RunDetections, fit_frames
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,10 +69,13 @@ def single_frame_poses(
 def rms_residuals(views: Views, detections: RunDetections, assigned: Ints, ref: Reference) -> Array:
     """Root mean square residual (T,) per axis, px, of the spots labelled in each frame at the poses of a motion."""
     out = np.full(len(ref.t), np.nan)
-    none = np.zeros((assigned.shape[1], 2, 2))
     expected, _ = project_all(views, ref.R, ref.t)
-    for k in range(len(out)):
-        use, uv, _ = labelled_points(detections, k, assigned[k], none)
-        if use.any() and np.isfinite(expected[k][use]).any():
-            out[k] = np.sqrt(np.nanmean((uv - expected[k])[use] ** 2))
+    used = (assigned >= 0) & (assigned < BLENDED)
+    square = np.full((*used.shape, 2), np.nan)
+    square[used] = (detections.uv[(detections.begin[:-1, None] + assigned)[used]] - expected[used]) ** 2
+    count = used.sum(axis=1)
+    for spots in np.unique(count[count > 0]).tolist():
+        frames = np.flatnonzero((count == spots) & np.isfinite(square).any(axis=(1, 2)))
+        of_each = square[frames][used[frames]].reshape(len(frames), 2 * spots)
+        out[frames] = np.sqrt(np.nanmean(of_each, axis=1))
     return out
