@@ -29,7 +29,6 @@ from tracking.rigid_body.hypotheses.prediction_checks import (
     MIN_REDUNDANT_SPOTS,
     SURE_PROBABILITY,
 )
-from tracking.rigid_body.models.information import well_controlled
 from tracking.smoothing.backward import merged, track_backward
 from tracking.smoothing.calibration_errors import calibration_errors
 from tracking.smoothing.error_scale import ErrorScale, usual_sizes
@@ -42,7 +41,7 @@ from tracking.smoothing.labels.path_pairs import transfers_between_cameras
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated
 from tracking.smoothing.labels.view_path import PathContext
 from tracking.smoothing.motion.reference import Reference, straight_between
-from tracking.smoothing.motion.run_detections import labelled_points
+from tracking.smoothing.motion.run_detections import controlled_labels
 from tracking.smoothing.motion.smoothed_motion import SmoothedMotion, WholeRun
 from tracking.smoothing.motion.velocity_jumps import corner_offsets, jump_sigmas
 from tracking.smoothing.motion.whole_run import MAX_DISTANCE, estimate
@@ -152,11 +151,7 @@ class _Smoother:
 
     def _controlled(self, ref: Reference) -> tuple[Bools, Bools]:
         """Frames (T,) whose labels control each other, all or enough for a pose; and their other labels (T, n)."""
-        labelled = np.zeros(self.assigned.shape, dtype=bool)
-        checked = labelled.copy()
-        for k in range(len(self.rec)):
-            labelled[k], _, cov = labelled_points(self.detections, k, self.assigned[k], self.calibration_cov)
-            checked[k] = well_controlled(self.views, ref.R[k], ref.t[k], labelled[k], cov)
+        labelled, checked = controlled_labels(self.views, self.detections, self.assigned, self.calibration_cov, ref)
         count = distinct_spots(checked, self.model.spot_of)
         frames = (count >= MIN_REDUNDANT_SPOTS) | ((count > 0) & ~np.any(labelled & ~checked, axis=1))
         return frames, labelled & ~checked & frames[:, None]

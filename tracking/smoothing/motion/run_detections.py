@@ -11,7 +11,7 @@ from geometry.compilation.jit import compiled
 from geometry.compiled_linalg import copy_into, copy_matrix_into
 from geometry.compiled_projection import Views
 from tracking.rigid_body.association.frame_detections import BLENDED
-from tracking.rigid_body.models.information import frame_information, single_frame_pose
+from tracking.rigid_body.models.information import frame_information, single_frame_pose, well_controlled
 from tracking.smoothing.motion.reference import Reference
 
 
@@ -105,3 +105,17 @@ def fit_frames(
         copy_matrix_into(at_ref[k], at_ref_k)
         copy_into(along[k], along_k)
     return FrameFits(R, t, L, chi2, spots, at_ref, along, chi2_ref)
+
+
+@compiled
+def controlled_labels(
+    views: Views, detections: RunDetections, assigned: Ints, calibration_cov: Array, ref: Reference
+) -> tuple[Bools, Bools]:
+    """Labels (T, n) that are used in the poses, and those of them that the other labels of their frame control."""
+    labelled, controlled = np.zeros(assigned.shape, np.bool_), np.zeros(assigned.shape, np.bool_)
+    for k in range(assigned.shape[0]):
+        use, _, cov = labelled_points(detections, k, assigned[k], calibration_cov)
+        by_others = well_controlled(views, ref.R[k], ref.t[k], use, cov)
+        for i in range(use.shape[0]):
+            labelled[k, i], controlled[k, i] = use[i], by_others[i]
+    return labelled, controlled
