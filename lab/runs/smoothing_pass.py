@@ -19,7 +19,7 @@ from tracking.smoothing.smoothed import Smoothed
 from tracking.smoothing.smoother import smooth
 
 Progress = Callable[[int, int | None, str], None]  # frames done, total number of frames where known, stage
-IN_MEMORY = 4000  # frames, of 11 kB each; writing and reading one takes 0.12 ms
+IN_MEMORY = 1000  # frames, of 11 kB each; writing and reading one takes 0.12 ms
 _PROTOCOL = 4  # of pickle: reads arrays in half the time of protocol 5
 TRACKING, SMOOTHING, WRITING = "tracking", "smoothing", "writing"  # the stages
 
