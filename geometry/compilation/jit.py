@@ -113,7 +113,7 @@ class _Cache(FunctionCache):
 
 @cache
 def _name_functions_of_numba() -> None:
-    """Tells the linker where the functions are that machine code calls for the memory of arrays.
+    """Gives the linker the addresses of the functions that machine code calls for the memory of arrays.
 
     The first half of what numba does before it compiles; the other half compiles functions that machine code from disk
     contains.
