@@ -53,6 +53,14 @@ class _Candidates(NamedTuple):
     choice: Ints  # (b,) the decision: a row, that plus BLENDED, MISSED or NOT_SEARCHED
 
 
+class _Predictions(NamedTuple):
+    """Of one view by b partial assignments: pixel, Jacobian and covariance (uu, uv, vv) as from `predicted_pixel`."""
+
+    uv: Array  # (b, 2)
+    J: Array  # (b, 2, 6)
+    cov: Array  # (b, 3)
+
+
 @compiled
 def associate(
     obs: Observation, R: Array, t: Array, P: Array, p_unoccluded: Array
@@ -66,6 +74,7 @@ def associate(
     n = obs.view_table.camera.shape[0]
     width = _beam_width(obs, R, t, P)
     beam, next_beam = _empty_beam(width, n), _empty_beam(width, n)
+    predictions = _Predictions(np.empty((width, 2)), np.empty((width, 2, 6)), np.empty((width, 3)))
     candidates = _Candidates(np.empty(width), np.empty(width), np.empty(width, np.int64), np.empty(width, np.int64))
     beam.score[0] = beam.counted[0] = 0.0
     for i in range(n):
@@ -83,8 +92,8 @@ def associate(
         found = 0
         worst = -np.inf
         for node in range(count):
-            found, worst = _extend(obs, beam, node, view, p_unoccluded[view], candidates, found, worst)
-        count = _select(obs, beam, view, candidates, found, next_beam)
+            found, worst = _extend(obs, beam, node, view, p_unoccluded[view], predictions, candidates, found, worst)
+        count = _select(obs, beam, view, predictions, candidates, found, next_beam)
         beam, next_beam = next_beam, beam
     return beam.assigned[:count], beam.score[:count], beam.counted[:count], beam.R[:count], beam.t[:count], count
 
@@ -156,15 +165,20 @@ def _extend(
     node: int,
     view: int,
     p_unoccluded: float,
+    predictions: _Predictions,
     candidates: _Candidates,
     count: int,
     worst: float,
 ) -> tuple[int, float]:
-    """Add all decisions on one view that extend one partial assignment to the candidates; see `_insert`."""
+    """Add all decisions on one view that extend one partial assignment to the candidates; see `_insert`.
+
+    Writes the prediction of the view into row `node` of `predictions`.
+    """
     frame, calibration_cov = obs.frame, obs.calibration_cov
-    uv, J = np.empty(2), np.empty((2, 6))
+    uv, J = predictions.uv[node], predictions.J[node]
     score, counted = beam.score[node], beam.counted[node]
     projected, a, b, c = predicted_pixel(obs.views, view, beam.R[node], beam.t[node], beam.P[node], uv, J)
+    predictions.cov[node, 0], predictions.cov[node, 1], predictions.cov[node, 2] = a, b, c
     p_in = 0.0
     if projected:
         curvature = ((a + c) / LINEARISATION_PX) ** 2 if a + c > 1.0 else 0.0
@@ -244,7 +258,15 @@ def _insert(
 
 
 @compiled
-def _select(obs: Observation, beam: _Beam, view: int, candidates: _Candidates, found: int, next_beam: _Beam) -> int:
+def _select(
+    obs: Observation,
+    beam: _Beam,
+    view: int,
+    predictions: _Predictions,
+    candidates: _Candidates,
+    found: int,
+    next_beam: _Beam,
+) -> int:
     """Turn the best candidates into the next beam, best first, each with its pose updated; returns their number."""
     order = best_first(candidates.score[:found])
     kept = 0
@@ -257,18 +279,23 @@ def _select(obs: Observation, beam: _Beam, view: int, candidates: _Candidates, f
         next_beam.assigned[kept, view] = choice
         _copy_pose(next_beam, kept, beam.R[node], beam.t[node], beam.P[node])
         if 0 <= choice < BLENDED:
-            _update_pose(obs, view, choice, next_beam.R[kept], next_beam.t[kept], next_beam.P[kept])
+            _update_pose(obs, view, choice, predictions, node, next_beam.R[kept], next_beam.t[kept], next_beam.P[kept])
         next_beam.score[kept], next_beam.counted[kept] = candidates.score[k], candidates.counted[k]
         kept += 1
     return kept
 
 
 @compiled
-def _update_pose(obs: Observation, view: int, d: int, R: Array, t: Array, P: Array) -> None:
-    """Kalman update of a pose and its covariance by detection d of a view, in place."""
+def _update_pose(
+    obs: Observation, view: int, d: int, predictions: _Predictions, node: int, R: Array, t: Array, P: Array
+) -> None:
+    """Kalman update of a pose and its covariance by detection d of a view, in place.
+
+    The pose is that of a partial assignment, `node`, which predicts the view as in that row of `predictions`.
+    """
     frame, calibration_cov = obs.frame, obs.calibration_cov
-    uv, J = np.empty(2), np.empty((2, 6))
-    _, a, b, c = predicted_pixel(obs.views, view, R, t, P, uv, J)
+    uv, J = predictions.uv[node], predictions.J[node]
+    a, b, c = predictions.cov[node, 0], predictions.cov[node, 1], predictions.cov[node, 2]
     curvature = ((a + c) / LINEARISATION_PX) ** 2 if a + c > 1.0 else 0.0
     a, b, c = a + frame.cov[d, 0, 0] + curvature, b + frame.cov[d, 0, 1], c + frame.cov[d, 1, 1] + curvature
     a, b, c = a + calibration_cov[view, 0, 0], b + calibration_cov[view, 0, 1], c + calibration_cov[view, 1, 1]
