@@ -54,7 +54,7 @@ class PlaceErrors:
         if share <= self.share:
             return self
         reach = usable_widths(width_px)
-        counts = np.stack([_same_error_frames(uv_px[:, i], reach[i]) for i in range(len(reach))], axis=-1)
+        counts = np.stack([frames_with_same_error(uv_px[:, i], reach[i]) for i in range(len(reach))], axis=-1)
         return replace(
             self, share=min(share, 1.0), same_error_frames=_mean_over_views(counts, np.isfinite(uv_px[..., 0])),
             reach_px=reach, few_places_factor=1.0,
@@ -110,7 +110,7 @@ def _mean_over_views(counts: Array, labelled: Bools) -> Array:
     return np.asarray(np.where(labelled.any(axis=1), total / np.maximum(labelled.sum(axis=1), 1), 1.0))
 
 
-def _same_error_frames(uv_px: Array, reach_px: float) -> Array:
+def frames_with_same_error(uv_px: Array, reach_px: float) -> Array:
     """(T,): number of frames in which one view's spot, at uv_px (T, 2), has the same error; nan without a spot."""
     out = np.full(len(uv_px), np.nan)
     rows = np.flatnonzero(np.isfinite(uv_px).all(axis=-1))

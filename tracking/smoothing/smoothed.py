@@ -27,6 +27,7 @@ class Smoothed:
     parameters: TrackerParameters
     poses: Pose  # (T,) at mid-exposure
     exposure_px: Array  # (T, n, 2) mean pixel of a spot over the exposure less that at its middle
+    exposure_sigma: Array  # (T, 6), m and rad: of the mean pose over the exposure less that at its middle, unknown part
     velocities: Array  # (T, 6): m/s in world, rad/s in body
     covariance: Array  # (T, 6, 6) of the poses, from noise and from errors that belong to places
     place_share: float  # share of the spots' error variance that belongs to places (place_errors.py)
@@ -77,7 +78,8 @@ class Smoothed:
             own = self.errors.covariance(points.cov_px2[row], points.major_px[row], place, camera)
             blended = np.where(assigned[views] >= BLENDED, self.parameters.blend_px / 2, 0.0)
             more = blended**2 + self.parameters.sigma_model_px**2
-            cov_px2[views] = own + more[:, None, None] * np.eye(2)
+            within = J[0, views] * self.exposure_sigma[k]
+            cov_px2[views] = own + more[:, None, None] * np.eye(2) + within @ np.swapaxes(within, -1, -2)
         turned = np.array([s is SpotStatus.TURNED for s in causal.status]) & (point == causal.point)
         has_image = np.array([f is not None for f in found])[model.camera_of]
         status = view_statuses(labelled, turned, exists, model.in_picture(uv_px), has_image, known)

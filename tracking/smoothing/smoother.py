@@ -33,7 +33,7 @@ from tracking.rigid_body.models.information import well_controlled
 from tracking.smoothing.backward import merged, track_backward
 from tracking.smoothing.calibration_errors import calibration_errors
 from tracking.smoothing.error_scale import ErrorScale, usual_sizes
-from tracking.smoothing.exposure import exposure_offsets, pose_shift
+from tracking.smoothing.exposure import exposure_offsets, exposure_sigmas, pose_shift
 from tracking.smoothing.labels.clutter import run_log_clutter, run_log_static
 from tracking.smoothing.labels.continuity import continued
 from tracking.smoothing.labels.displaced_camera import displaced
@@ -280,6 +280,8 @@ class _Smoother:
         # Measured is the mean over the exposure; reported is the pose at its middle.
         jumps = motion.jumped | np.append(motion.jumped[1:], False)
         offsets = exposure_offsets(self.views, final, self.rec.exposure_s, motion.known & ~jumps)
+        of_spots, of_poses = exposure_sigmas(final, motion.jumped, self.rec.exposure_s, self.rec.dt_s)
+        pose_P = pose_P * (place_factor * self.noise_share)[:, None, None] + of_poses[:, :, None] ** 2 * np.eye(6)
         jerk = np.full(2, np.nan)
         if motion.log_density is not None:
             half = 0.5 * np.median(motion.log_density, axis=0)
@@ -289,8 +291,9 @@ class _Smoother:
             parameters=self.parameters,
             poses=Pose(final.R, final.t).plus(-pose_shift(self.views, final, offsets)),
             exposure_px=offsets,
+            exposure_sigma=of_spots,
             velocities=final.m[:, :6],
-            covariance=pose_P * (place_factor * self.noise_share)[:, None, None],
+            covariance=pose_P,
             place_share=place_share,
             systematic=self.systematic,
             motion_covariance=motion_P,

@@ -13,16 +13,18 @@ from tracking.smoothing.place_errors import PlaceErrors, correlation, place_erro
 WIDTH_PX = 2.0
 
 
-def textured(run: PointRun, place_px: float, white_px: float, seed: int, known: bool = False) -> PointRun:
+def textured(
+    run: PointRun, place_px: float, white_px: float, seed: int, known: bool = False, stated: float = 1.0
+) -> PointRun:
     """The recording with other errors: white noise, and for each spot a smooth random field over its picture.
 
-    known: the points state which part of their variance belongs to the place.
+    known: the points state which part of their variance belongs to the place, with sigmas `stated` times too large.
     """
     rng = np.random.default_rng(seed)
     waves, n = 48, run.uv_px.shape[1]
     k_vectors = rng.normal(0, 1 / np.sqrt(2) / WIDTH_PX, (n, 2, waves, 2))
     phases = rng.uniform(0, 2 * np.pi, (n, 2, waves))
-    sigma2 = place_px**2 + white_px**2
+    sigma2 = (stated * place_px) ** 2 + white_px**2
     detections = []
     for k, per_camera in enumerate(run.detections):
         row = []
@@ -35,7 +37,7 @@ def textured(run: PointRun, place_px: float, white_px: float, seed: int, known: 
                     uv[i] = at + place_px * field + white_px * rng.standard_normal(2)
             width = np.full(len(uv), WIDTH_PX)
             points = Detections.at(uv, np.tile(sigma2 * np.eye(2), (len(uv), 1, 1)))
-            place_px2 = np.full(len(uv), place_px**2) if known else None
+            place_px2 = np.full(len(uv), (stated * place_px) ** 2) if known else None
             row.append(replace(points, major_px=width, minor_px=width, place_px2=place_px2))
         detections.append(tuple(row))
     return replace(run, detections=tuple(detections))
@@ -76,6 +78,33 @@ def test_few_spots_show_no_errors_of_places_but_the_texture_of_the_screen_does()
             answers.append(np.nanmean(assess(run, frames).nees) / 6)
     assert np.mean(nees[True]) < 1.5
     assert np.mean(nees[False]) > 1.8 * np.mean(nees[True])
+
+
+def test_stated_errors_of_places_are_reduced_to_what_the_residuals_allow():
+    """Clipped spots and backgrounds other than the screen predict ten times too much."""
+    nees = {1.0: [], 10.0: []}
+    for seed in range(2):
+        for stated, answers in nees.items():
+            run = simulate_points("huo2015", seed, frames=120, noise_px=0.05, clutter=0.0)
+            run = textured(run, 0.02, 0.01, seed, True, stated)
+            frames, smoothed = smoothed_frames(run, tracked(run))
+            answers.append(np.nanmean(assess(run, frames).nees) / 6)
+            assert np.all(smoothed.errors.place_scale >= (0.8 if stated == 1 else 0.01))
+            assert np.all(smoothed.errors.place_scale <= (1.0 if stated == 1 else 0.025))
+    assert 0.5 < np.mean(nees[1.0]) < 1.5
+    assert 0.4 < np.mean(nees[10.0]) < 1.5
+
+
+@pytest.mark.parametrize("count", [4, 5, 6])
+def test_a_vehicle_at_rest_does_not_show_that_its_errors_of_places_are_small(count):
+    """Few residuals, which agree in all frames, are small by chance."""
+    nees = []
+    for seed in range(6):
+        run = simulate_points("static", seed, frames=40, noise_px=0.05, clutter=0.0)
+        run = only_views(textured(run, 0.03, 0.005, seed, True), count)
+        frames, _ = smoothed_frames(run, tracked(run))
+        nees.append(np.nanmean(assess(run, frames).nees) / 6)
+    assert np.mean(nees) < 1.5
 
 
 def test_white_noise_is_averaged_over_a_vehicle_at_rest():

@@ -1,0 +1,73 @@
+"""Upper bound of the errors that belong to places, from the residuals of single-frame poses.
+
+The texture of the background and the misfit of the fits predict these errors before any pose is known. They may be
+many times too large: clipped spots with rings, a background that is not the screen. The residuals of a run with
+redundant spots contain the true errors, which therefore cannot be larger than the residuals. Noise is in the residuals
+as well, which makes the bound higher, never too low. Source: ours.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.compiled_projection import Views, project_all
+from tracking.rigid_body.association.frame_detections import BLENDED
+from tracking.smoothing.motion.reference import Reference
+from tracking.smoothing.motion.run_detections import RunDetections, fit_frames
+from tracking.smoothing.place_errors import frames_with_same_error, usable_widths
+
+_REACH = 2.0  # widths of the spot: assumed correlation length of the errors
+_QUANTILE = 1.645  # sigmas below the mean: 5 % of normal deviates
+_LEAST_FREEDOM = 4.0  # independent residuals from which the bound is used
+
+
+def place_scale(
+    views: Views, run: RunDetections, assigned: Ints, camera_of: Ints, place_px2: Array, ref: Reference,
+    measured: Bools, widths_px: Array,
+) -> Array:  # fmt: skip
+    """Factors (cameras,), at most 1, of the variances of the errors that belong to places.
+
+    run: m detections of T frames; assigned (T, n): their labels; camera_of (n,): of the views; place_px2 (m,): part of
+    their variances that belongs to places; ref (T,): motion near which the pose of each frame is found; widths_px (n,):
+    usual widths of the views' spots, nan where not known.
+
+    The factor makes those errors as large as all residuals, with the residuals at the lower 5 % of their distribution.
+    Errors in one place count once: a vehicle at rest has few independent residuals.
+    """
+    out = np.ones(run.has_image.shape[1])
+    if not np.any(place_px2 > 0):
+        return out
+    fits = fit_frames(views, run, assigned, np.zeros((len(camera_of), 2, 2)), ref)
+    frames = np.flatnonzero(measured & (fits.spots > 3))
+    labelled = np.zeros(assigned.shape, bool)
+    labelled[frames] = (assigned[frames] >= 0) & (assigned[frames] < BLENDED)
+    row = np.where(labelled, run.begin[: len(assigned), None] + assigned, 0)
+    uv, J = project_all(views, fits.R[frames], fits.t[frames])
+    P = np.linalg.pinv(fits.information[frames], hermitian=True)
+    cov = run.cov[row[frames]]
+    free = 1 - 0.5 * np.einsum("knia,kab,knjb,knji->kn", J, P, J, np.linalg.inv(cov))  # share not taken by the pose
+    usable = labelled[frames] & np.isfinite(uv).all(axis=-1) & (free > 0)
+    size2 = 0.5 * np.trace(cov, axis1=2, axis2=3)
+    square = 0.5 * np.sum((run.uv[row[frames]] - uv) ** 2, axis=-1)
+    share = np.minimum(place_px2[row[frames]] / size2, 1.0)
+    places = np.full(assigned.shape, np.nan)
+    at = np.where(labelled[..., None], run.uv[row], np.nan)
+    for i, width in enumerate(usable_widths(widths_px)):
+        places[:, i] = frames_with_same_error(at[:, i], _REACH * width)
+    for camera in range(len(out)):
+        of_camera = usable & (camera_of == camera)
+        weight = free[of_camera]
+        freedom = 2 * float(np.sum(weight / places[frames][of_camera]))
+        if freedom < _LEAST_FREEDOM:
+            continue
+        residual = float(np.sum((square / size2)[of_camera])) / float(np.sum(weight))
+        place = float(np.sum(share[of_camera] * weight)) / float(np.sum(weight))
+        out[camera] = min(residual / (_lower_quantile(freedom) * max(place, 1e-12)), 1.0)
+    return out
+
+
+def _lower_quantile(freedom: float) -> float:
+    """5 % quantile of chi-square over its degrees of freedom. Source: Wilson & Hilferty 1931."""
+    a = 2 / (9 * freedom)
+    return max(1 - a - _QUANTILE * float(np.sqrt(a)), 0.1) ** 3
