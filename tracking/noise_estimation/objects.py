@@ -1,7 +1,7 @@
 """Places of the background that do not belong to its texture: lights, and lines such as edges, seams and cables.
 
 A line has gradients of one direction over a long way, texture of all directions. The eigenvalues a >= b of the mean of
-the gradients' products over a window tell them apart: white noise adds the same to both. Source: ours; the matrix is
+the gradients' products over a window distinguish them: white noise adds the same to both. Source: ours; the matrix is
 the structure tensor of Bigun & Granlund 1987.
 """
 

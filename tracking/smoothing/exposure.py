@@ -49,7 +49,8 @@ def exposure_sigmas(motion: Reference, jumped: Bools, exposure_s: float, dt: Arr
         pose = Pose(motion.R, motion.t)
         velocity = pose[1:].minus(pose[:-1]) / dt[1:, None]
         acceleration = (velocity[1:] - velocity[:-1]) / (0.5 * (dt[2:] + dt[1:-1]))[:, None]
-        other[1:-1] = np.abs(acceleration - motion.m[1:-1, 6:]) * exposure_s**2 / 24
+        acceleration = acceleration[np.r_[0, 0 : len(dt) - 2, len(dt) - 3]]  # at the ends that of the nearest frames
+        other = np.abs(acceleration - motion.m[:, 6:]) * exposure_s**2 / 24
         other[corners.any(axis=1)] = 0.0
     return np.abs(corners) + other, other
 

@@ -1,12 +1,14 @@
-"""Upper bound of the errors that belong to places, from the residuals of single-frame poses.
+"""Upper bounds of the spots' variances, from the residuals of single-frame poses.
 
-The texture of the background and the misfit of the fits predict these errors before any pose is known. They may be
-many times too large: clipped spots with rings, a background that is not the screen. The residuals of a run with
-redundant spots contain the true errors, which therefore cannot be larger than the residuals. Noise is in the residuals
-as well, which makes the bound higher, never too low. Source: ours.
+Noise is estimated, and the texture of the background and the misfit of the fits predict errors that belong to places,
+before any pose is known. All of them may be too large: too much light taken for noise, clipped spots with rings, a
+background that is not the screen. The residuals of a run with redundant spots contain the true errors, which therefore
+cannot be larger than the residuals. Source: ours.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,25 +21,34 @@ from tracking.smoothing.place_errors import frames_with_same_error, usable_width
 
 _REACH = 2.0  # widths of the spot: assumed correlation length of the errors
 _QUANTILE = 1.645  # sigmas below the mean: 5 % of normal deviates
+_MOVING = 0.5  # share of the residuals that are independent in spite of errors of places, if the spots move
 _LEAST_FREEDOM = 4.0  # independent residuals from which the bound is used
 
 
-def place_scale(
+class VarianceFactors(NamedTuple):
+    """Factors (cameras,), at most 1, of the two parts of the spots' variances."""
+
+    noise: Array
+    place: Array  # of the part that belongs to places
+
+
+def residual_bounds(
     views: Views, run: RunDetections, assigned: Ints, camera_of: Ints, place_px2: Array, ref: Reference,
     measured: Bools, widths_px: Array,
-) -> Array:  # fmt: skip
-    """Factors (cameras,), at most 1, of the variances of the errors that belong to places.
+) -> VarianceFactors:  # fmt: skip
+    """Factors with which each part of the variances alone is as large as the residuals allow.
 
     run: m detections of T frames; assigned (T, n): their labels; camera_of (n,): of the views; place_px2 (m,): part of
     their variances that belongs to places; ref (T,): motion near which the pose of each frame is found; widths_px (n,):
     usual widths of the views' spots, nan where not known.
 
-    The factor makes those errors as large as all residuals, with the residuals at the lower 5 % of their distribution.
-    Errors in one place count once: a vehicle at rest has few independent residuals.
+    The residuals are taken to be at the lower 5 % of their distribution. Noise differs in every frame, errors of one
+    place count once: a vehicle at rest has few residuals that are independent of each other. Where the spots move on
+    between the frames both parts have the same effect, and one factor.
     """
-    out = np.ones(run.has_image.shape[1])
-    if not np.any(place_px2 > 0):
-        return out
+    noise, place = np.ones(run.has_image.shape[1]), np.ones(run.has_image.shape[1])
+    if not measured.any():
+        return VarianceFactors(noise, place)
     fits = fit_frames(views, run, assigned, np.zeros((len(camera_of), 2, 2)), ref)
     frames = np.flatnonzero(measured & (fits.spots > 3))
     labelled = np.zeros(assigned.shape, bool)
@@ -51,20 +62,26 @@ def place_scale(
     size2 = 0.5 * np.trace(cov, axis1=2, axis2=3)
     square = 0.5 * np.sum((run.uv[row[frames]] - uv) ** 2, axis=-1)
     share = np.minimum(place_px2[row[frames]] / size2, 1.0)
-    places = np.full(assigned.shape, np.nan)
+    same = np.full(assigned.shape, np.nan)  # frames with the same error of a place
     at = np.where(labelled[..., None], run.uv[row], np.nan)
     for i, width in enumerate(usable_widths(widths_px)):
-        places[:, i] = frames_with_same_error(at[:, i], _REACH * width)
-    for camera in range(len(out)):
+        same[:, i] = frames_with_same_error(at[:, i], _REACH * width)
+    for camera in range(len(noise)):
         of_camera = usable & (camera_of == camera)
         weight = free[of_camera]
-        freedom = 2 * float(np.sum(weight / places[frames][of_camera]))
+        freedom, places = 2 * float(np.sum(weight)), 2 * float(np.sum(weight / same[frames][of_camera]))
         if freedom < _LEAST_FREEDOM:
             continue
         residual = float(np.sum((square / size2)[of_camera])) / float(np.sum(weight))
-        place = float(np.sum(share[of_camera] * weight)) / float(np.sum(weight))
-        out[camera] = min(residual / (_lower_quantile(freedom) * max(place, 1e-12)), 1.0)
-    return out
+        of_place = float(np.sum(share[of_camera] * weight)) / float(np.sum(weight))
+        most = residual / _lower_quantile(freedom)
+        if places > _MOVING * freedom:
+            noise[camera] = place[camera] = min(most, 1.0)
+            continue
+        noise[camera] = min(most / max(1 - of_place, 1e-12), 1.0)
+        if places >= _LEAST_FREEDOM:
+            place[camera] = min(residual / (_lower_quantile(places) * max(of_place, 1e-12)), 1.0)
+    return VarianceFactors(noise, place)
 
 
 def _lower_quantile(freedom: float) -> float:
