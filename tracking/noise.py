@@ -83,7 +83,7 @@ def guess_noise(image: Picture) -> NoiseModel:
     level = float(np.median(sample[:, ::4])) if sample.size else 0.0
     floor = quantile_variance(jump / np.sqrt(2.0)) if jump.size else 0.0
     if sample.size and np.mean(sample == 0) > CLIPPED_SHARE:
-        floor = max(floor, clipped_normal(sample.ravel())[1] ** 2 + ROUNDING_DN2)
+        floor = max(floor, clipped_normal(sample.ravel().astype(float))[1] ** 2 + ROUNDING_DN2)
     return NoiseModel(max(floor, ROUNDING_DN2), usual_slope(image.dtype), level)
 
 

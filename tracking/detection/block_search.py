@@ -24,7 +24,7 @@ BACKGROUND_REACH = 2  # blocks on each side that contribute to the median for th
 Sums = NDArray[np.float32]
 
 
-SUMS, HIGHEST2, BETWEEN2, HIGHEST4, HIGHEST8, ROW_MEDIAN, BACKGROUND, TEXTURE = range(8)
+SUMS, HIGHEST2, HIGHEST4, HIGHEST8, ROW_MEDIAN, BACKGROUND, TEXTURE, BETWEEN2 = range(8)
 
 
 class Blocks(NamedTuple):
@@ -148,7 +148,7 @@ def find_highest_pairs(blocks: Blocks, runs: Ints) -> None:
             if inner < own.shape[0]:
                 own[inner] = max(own[inner], x[inner])
         for line in range(2):
-            x, out = blocks.lines[line], blocks.maps[HIGHEST2 + line, row, runs[k, 1] : runs[k, 2]]
+            x, out = blocks.lines[line], blocks.maps[HIGHEST2 if line == 0 else HIGHEST4, row, runs[k, 1] : runs[k, 2]]
             for j in range(out.shape[0]):
                 a, b, c, d = x[4 * j], x[4 * j + 1], x[4 * j + 2], x[4 * j + 3]
                 a, b = (a if a > b else b), (c if c > d else d)

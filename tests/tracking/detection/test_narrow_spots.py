@@ -48,13 +48,13 @@ def test_a_spot_as_narrow_as_a_pixel_is_found_anywhere_within_it(sigma, peak):
 def test_a_faint_narrow_spot_is_found_anywhere_among_the_sums_of_the_search(phase):
     """They are sums of 2x2 pixels. The steps of a quiet sensor, 3 grey values below, hide it in wider sums."""
     noise = NoiseModel(0.17, 0.004, 8.0, texture=0.02, banding_dn=0.14)
-    u, v = (np.arange(30.0, end, 40) + shift for end, shift in zip((380, 300), phase, strict=True))
+    u, v = np.arange(30.0, 380, 40) + phase[0], np.arange(30.0, 300, 40) + phase[1]
     places = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    rows, columns = _shares(SIZE[1], v), _shares(SIZE[0], u)
+    light = 8.6 + 11.0 * np.outer(rows.sum(axis=1), columns.sum(axis=1))
     found = elsewhere = 0
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        rows, columns = (_shares(n, at) for n, at in ((SIZE[1], v), (SIZE[0], u)))
-        light = 8.6 + 11.0 * rows @ columns.T
         points = find_spots(np.rint(light + 0.3 * rng.standard_normal(light.shape)).astype(np.uint8), noise=noise)
         gap = np.linalg.norm(points.uv_px[:, None] - places, axis=-1)
         found += int(np.sum(gap.min(axis=0) < 0.8))
