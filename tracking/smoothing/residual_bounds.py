@@ -22,6 +22,7 @@ from tracking.smoothing.place_errors import frames_with_same_error, usable_width
 _REACH = 2.0  # widths of the spot: assumed correlation length of the errors
 _QUANTILE = 1.645  # sigmas below the mean: 5 % of normal deviates
 _MOVING = 0.5  # share of the residuals that are independent in spite of errors of places, if the spots move
+_FRAMES = 2000  # at most so many, evenly spaced
 _LEAST_FREEDOM = 4.0  # independent residuals from which the bound is used
 
 
@@ -47,32 +48,35 @@ def residual_bounds(
     between the frames both parts have the same effect, and one factor.
     """
     noise, place = np.ones(run.has_image.shape[1]), np.ones(run.has_image.shape[1])
-    if not measured.any():
+    labelled = (assigned >= 0) & (assigned < BLENDED)
+    frames = np.flatnonzero(measured & (labelled.sum(axis=1) > 3))
+    if len(frames) > _FRAMES:
+        frames = frames[np.linspace(0, len(frames) - 1, _FRAMES).astype(np.int64)]
+    if not len(frames):
         return VarianceFactors(noise, place)
-    fits = fit_frames(views, run, assigned, np.zeros((len(camera_of), 2, 2)), ref)
-    frames = np.flatnonzero(measured & (fits.spots > 3))
-    labelled = np.zeros(assigned.shape, bool)
-    labelled[frames] = (assigned[frames] >= 0) & (assigned[frames] < BLENDED)
-    row = np.where(labelled, run.begin[: len(assigned), None] + assigned, 0)
-    uv, J = project_all(views, fits.R[frames], fits.t[frames])
-    P = np.linalg.pinv(fits.information[frames], hermitian=True)
-    cov = run.cov[row[frames]]
+    some, assigned, labelled = run._replace(begin=run.begin[frames]), assigned[frames], labelled[frames]
+    row = np.where(labelled, some.begin[:, None] + assigned, 0)
+    near = Reference(ref.R[frames], ref.t[frames], ref.m[frames])
+    fits = fit_frames(views, some, assigned, np.zeros((len(camera_of), 2, 2)), near)
+    uv, J = project_all(views, fits.R, fits.t)
+    P = np.linalg.pinv(fits.information, hermitian=True)
+    cov = run.cov[row]
     free = 1 - 0.5 * np.einsum("knia,kab,knjb,knji->kn", J, P, J, np.linalg.inv(cov))  # share not taken by the pose
-    usable = labelled[frames] & np.isfinite(uv).all(axis=-1) & (free > 0)
+    usable = labelled & np.isfinite(uv).all(axis=-1) & (free > 0)
     size2 = 0.5 * np.trace(cov, axis1=2, axis2=3)
-    square = 0.5 * np.sum((run.uv[row[frames]] - uv) ** 2, axis=-1)
-    share = np.minimum(place_px2[row[frames]] / size2, 1.0)
+    square = 0.5 * np.sum((run.uv[row] - uv) ** 2, axis=-1) / size2
+    share = np.minimum(place_px2[row] / size2, 1.0)
     same = np.full(assigned.shape, np.nan)  # frames with the same error of a place
-    at = np.where(labelled[..., None], run.uv[row], np.nan)
+    measured_px = np.where(labelled[..., None], run.uv[row], np.nan)
     for i, width in enumerate(usable_widths(widths_px)):
-        same[:, i] = frames_with_same_error(at[:, i], _REACH * width)
+        same[:, i] = frames_with_same_error(measured_px[:, i], _REACH * width)
     for camera in range(len(noise)):
         of_camera = usable & (camera_of == camera)
         weight = free[of_camera]
-        freedom, places = 2 * float(np.sum(weight)), 2 * float(np.sum(weight / same[frames][of_camera]))
+        freedom, places = 2 * float(np.sum(weight)), 2 * float(np.sum(weight / same[of_camera]))
         if freedom < _LEAST_FREEDOM:
             continue
-        residual = float(np.sum((square / size2)[of_camera])) / float(np.sum(weight))
+        residual = float(np.sum(square[of_camera])) / float(np.sum(weight))
         of_place = float(np.sum(share[of_camera] * weight)) / float(np.sum(weight))
         most = residual / _lower_quantile(freedom)
         if places > _MOVING * freedom:
