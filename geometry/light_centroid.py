@@ -22,6 +22,7 @@ from geometry.rig import Screen
 _WINDOW = 3.7  # half width of a fit's window in sigmas: 3.2 along the major axis, more across it
 _STEP_PX = 4.0  # step of the differences that give the curvature of the map
 _NODES = 33  # points along each side of the picture at which the curvature is computed; it varies slowly
+_CLIP_STEPS = 6  # per octave, of the height at which the top of a spot is clipped
 _MAX_SHARE = 0.25  # largest offset in sigmas of the spot: a larger one means that the second order does not suffice
 
 # In steps: the centre, the two neighbours along each axis, and the four diagonal ones.
@@ -41,14 +42,16 @@ class CentroidOffsets:
         nodes = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1)
         self._curvature = _curvature(camera, screen, nodes)  # (_NODES, _NODES, 2, 3)
 
-    def at(self, uv_px: Array, shape_px2: Array, brightness: Array) -> Array:
+    def at(self, uv_px: Array, shape_px2: Array, brightness: Array, clip: Array) -> Array:
         """Fitted centres minus the images of the beams' axes (n, 2), px; 0 where the ray misses the screen.
 
         uv_px (n, 2): centres of the light, distorted pixels. shape_px2 (n, 3): uu, uv, vv of the Gaussians in the
         picture. brightness (n,): variance of the shot noise at the peak over that of the background noise; the brighter
-        a spot, the more weight its wings have in the fit.
+        a spot, the more weight its wings have in the fit. clip (n,): height at which the sensor clips over that of the
+        Gaussian, 1 and more for whole spots; the fit leaves out what is clipped, and the wings are shifted farther.
         """
-        shifts = np.array([_centre_shifts(float(r)) for r in brightness]).reshape(-1, 2)
+        shifts = np.array([_centre_shifts(float(r), float(c)) for r, c in zip(brightness, clip, strict=True)])
+        shifts = shifts.reshape(-1, 2)
         return _offsets(self._curvature, self._size, np.ascontiguousarray(uv_px), shape_px2, shifts)
 
 
@@ -114,20 +117,25 @@ def _curvature(camera: Camera, screen: Screen, uv_px: Array) -> Array:
     return np.asarray(np.linalg.solve(np.where(good, J, np.eye(2)).astype(float), curvature))
 
 
-def _centre_shifts(brightness: float) -> tuple[float, float]:
+def _centre_shifts(brightness: float, clip: float) -> tuple[float, float]:
     """Shifts, in sigmas, of the fitted centre of a unit Gaussian G to which g1^3 G, or g1 g2^2 G, is added."""
     steps = 0 if not np.isfinite(brightness) or brightness <= 0 else round(2 * np.log2(1 + brightness))
-    return _fitted_shifts(min(max(steps, 0), 24))
+    clipped = 0 if not 0 < clip < 1 else round(-_CLIP_STEPS * np.log2(clip))
+    return _fitted_shifts(min(max(steps, 0), 24), min(clipped, 4 * _CLIP_STEPS))
 
 
-@lru_cache(maxsize=32)
-def _fitted_shifts(half_octaves: int) -> tuple[float, float]:
-    """As `_centre_shifts`, for the brightness 2^(half_octaves / 2) - 1; the slope of the background is fitted too."""
+@lru_cache(maxsize=512)
+def _fitted_shifts(half_octaves: int, clip_steps: int) -> tuple[float, float]:
+    """As `_centre_shifts`, for the brightness 2^(half_octaves / 2) - 1; the slope of the background is fitted too.
 
+    The Gaussian is clipped at 2^(-clip_steps / _CLIP_STEPS) of its height.
+    """
     g = np.linspace(-_WINDOW, _WINDOW, 81)
     g1, g2 = (x.ravel() for x in np.meshgrid(g, g))
     light = np.exp(-0.5 * (g1**2 + g2**2))
     weight = 1 / (1 + (2.0 ** (half_octaves / 2) - 1) * light)
+    if clip_steps:
+        weight *= light < 2.0 ** (-clip_steps / _CLIP_STEPS)
     A = np.stack([g1 * light, g1])  # the derivatives with respect to the centre and to the background's slope
     normal = (A * weight) @ A.T
     shifts = np.linalg.solve(normal, (A * weight) @ np.stack([g1**3 * light, g1 * g2**2 * light], axis=-1))[0]

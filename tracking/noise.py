@@ -10,9 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from geometry.arrays import Array
 from geometry.camera import SensorNoise
+from tracking.noise_estimation.rounding import clipped_normal
 
 Picture: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
+CLIPPED_SHARE = 0.02  # share of pixels at zero above which the background counts as clipped
 BLOCK = 8  # px: side of the blocks in which pictures are searched
 ROUNDING_DN2 = 1.0 / 12.0  # variance of rounding to whole DN
 
@@ -74,12 +76,14 @@ def guess_noise(image: Picture) -> NoiseModel:
 
     The floor comes from differences of neighbouring pixels in a sparse sample, so the screen's texture counts as noise.
     The larger estimate of the 68 % and the 95 % quantile is taken, because most differences are zero in a picture that
-    is clipped at black.
+    is clipped at black; there the normal distribution that was clipped counts if it is wider.
     """
     sample = image[2:-2:17, ::2].astype(np.float32) if min(image.shape) > 40 else image.astype(np.float32)
     jump = np.abs(sample[:, 1::4][:, : sample[:, ::4].shape[1]] - sample[:, ::4][:, : sample[:, 1::4].shape[1]])
     level = float(np.median(sample[:, ::4])) if sample.size else 0.0
     floor = quantile_variance(jump / np.sqrt(2.0)) if jump.size else 0.0
+    if sample.size and np.mean(sample == 0) > CLIPPED_SHARE:
+        floor = max(floor, clipped_normal(sample.ravel().astype(float))[1] ** 2 + ROUNDING_DN2)
     return NoiseModel(max(floor, ROUNDING_DN2), usual_slope(image.dtype), level)
 
 

@@ -24,11 +24,12 @@ import numpy as np
 from calibration.model_check.effect import Effect, EffectContext, effect_of
 from calibration.model_check.fault_identification import FaultDiagnosis
 from calibration.model_check.faults import FaultParameters, possible_faults
-from calibration.model_check.linearised_frames import linearise
+from calibration.model_check.linearised_frames import LinearisedFrames, linearise
 from calibration.model_check.noise_scales import WeightedDiagnosis, diagnose_with_noise_of_cameras
 from calibration.model_check.recording import ModelCheckRecording, evenly_spaced
 from calibration.model_check.statistics import Statistics, calibration_sigmas_px, statistics
 from calibration.model_check.unseen import UnseenView, unseen_views
+from geometry.arrays import Ints
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_parameters import RigCovariance
@@ -37,6 +38,7 @@ MOST_FRAMES = 2000  # for the statistics: four times as many would only halve th
 MOST_FRAMES_FOR_DIAGNOSIS = 400  # for the normal equations; enough to find 0.02 deg of a camera
 _LARGEST_ARRAY = 12_000_000  # numbers in one array of derivatives, 96 MB: large rigs use fewer frames ...
 FEWEST_FRAMES = 30  # ... but at least this many; a shorter recording is not tested
+_EVENTS = 0.2  # share of the frames that may show something else than the rest
 FEWEST_SPOTS = 3  # per frame: with fewer the pose absorbs all residuals
 
 
@@ -95,6 +97,14 @@ def evaluate_model(
     if lin.dof <= 0:
         return ModelCheckResult(*counts, NotTested.NO_REDUNDANCY, statistics=groups, unseen=unseen)
     weighted = diagnose_with_noise_of_cameras(parameters, recording, lin, jacobian, possible_faults(rig, parameters))
+    if weighted.diagnosis.unexplained:
+        usual = _usual_frames(lin)
+        few = linearise(model, recording, usual)
+        without = diagnose_with_noise_of_cameras(
+            parameters, recording, few, parameters.jacobian(recording, few), possible_faults(rig, parameters)
+        )
+        if not without.diagnosis.suspected_faults and not without.diagnosis.unexplained:
+            weighted, counts = without, (len(all_frames.frames), len(usual))
     return ModelCheckResult(
         *counts,
         statistics=groups,
@@ -105,6 +115,17 @@ def evaluate_model(
         stated_residual_scale=weighted.stated_residual_scale,
         frame_interval_s=float(np.median(np.diff(recording.t_s))),
     )
+
+
+def _usual_frames(lin: LinearisedFrames) -> Ints:
+    """The frames without the fifth that has the largest residuals for its degrees of freedom.
+
+    What no fault explains, and what is not in these frames, is an event: a person in front of a spot, a reflection.
+    """
+    chi2 = np.sum(lin.residual_part(lin.residual) ** 2, axis=(1, 2))
+    dof = np.maximum(2 * lin.used.sum(axis=1) - lin.rank, 1)
+    kept = np.argsort(chi2 / dof, kind="stable")[: len(chi2) - int(_EVENTS * len(chi2))]
+    return np.asarray(np.sort(lin.frames[kept]))
 
 
 def _effects(

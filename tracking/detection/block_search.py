@@ -24,7 +24,7 @@ BACKGROUND_REACH = 2  # blocks on each side that contribute to the median for th
 Sums = NDArray[np.float32]
 
 
-SUMS, HIGHEST2, HIGHEST4, HIGHEST8, ROW_MEDIAN, BACKGROUND, TEXTURE = range(7)
+SUMS, HIGHEST2, HIGHEST4, HIGHEST8, ROW_MEDIAN, BACKGROUND, TEXTURE, BETWEEN2 = range(8)
 
 
 class Blocks(NamedTuple):
@@ -32,10 +32,11 @@ class Blocks(NamedTuple):
 
     pairs: Sums  # (4n, 4m) of 2x2 pixels
     quads: Sums  # (2n, 2m) of 4x4 pixels
-    # (7, n, m). SUMS: sums of 8x8 pixels. HIGHEST2: the largest sum of 2x2 pixels in the block. HIGHEST4, HIGHEST8: the
-    # largest sum of 4x4 and 8x8 pixels that begin in the block, at every second and fourth pixel. ROW_MEDIAN: median of
-    # SUMS over five blocks of a row. BACKGROUND: median of ROW_MEDIAN over five rows. TEXTURE: its contrast (see
-    # tracking.noise.NoiseModel), which does not depend on the picture
+    # (8, n, m). SUMS: sums of 8x8 pixels. HIGHEST2: the largest sum of 2x2 pixels in the block; BETWEEN2: of 2x2 pixels
+    # around the corners of those, also at the block's edges: a spot narrower than a pixel may lie on a corner.
+    # HIGHEST4, HIGHEST8: the largest sum of 4x4 and 8x8 pixels that begin in the block, at every second and fourth
+    # pixel. ROW_MEDIAN: median of SUMS over five blocks of a row. BACKGROUND: median of ROW_MEDIAN over five rows.
+    # TEXTURE: its contrast (see tracking.noise.NoiseModel), which does not depend on the picture
     maps: Sums
     lines: Sums  # (2, 4m) workspace
 
@@ -43,7 +44,7 @@ class Blocks(NamedTuple):
     def of(width: int, height: int) -> Blocks:
         """Arrays for a picture of that size, px."""
         n, m = -(-height // BLOCK), -(-width // BLOCK)
-        shapes = [(4 * n, 4 * m), (2 * n, 2 * m), (7, n, m), (2, 4 * m)]
+        shapes = [(4 * n, 4 * m), (2 * n, 2 * m), (8, n, m), (2, 4 * m)]
         return Blocks(*(np.zeros(shape, np.float32) for shape in shapes))
 
 
@@ -81,6 +82,40 @@ def bin_pixels(image: NDArray, runs: Ints, pairs: Sums) -> None:
                 )
 
 
+@compiled_for_threads
+def find_highest_between(image: NDArray, runs: Ints, maps: Sums, line: Sums) -> None:
+    """Compute BETWEEN2 of a picture (h, w), uint8 or uint16; line (4m,) is workspace."""
+    height, width = image.shape
+    for k in range(runs.shape[0]):
+        row, first, last = runs[k, 0], runs[k, 1], runs[k, 2]
+        begin, left = BLOCK * first + 1, np.float32(0.0)
+        own = line[: 4 * (last - first)]
+        for j in range(own.shape[0]):
+            own[j] = 0.0
+        inner = min(own.shape[0], max((width - begin) // 2, 0))
+        for i in range(max(4 * row - 1, 0), min(4 * row + 4, (height - 1) // 2)):
+            above, below = image[2 * i + 1], image[2 * i + 2]
+            x, y = above[begin : begin + 2 * inner], below[begin : begin + 2 * inner]
+            for j in range(inner):
+                a = (np.float32(x[2 * j]) + np.float32(x[2 * j + 1])) + (
+                    np.float32(y[2 * j]) + np.float32(y[2 * j + 1])
+                )
+                b = own[j]
+                own[j] = a if a > b else b
+            if first > 0:
+                a = (np.float32(above[begin - 2]) + np.float32(above[begin - 1])) + (
+                    np.float32(below[begin - 2]) + np.float32(below[begin - 1])
+                )
+                left = a if a > left else left
+        out = maps[BETWEEN2, row, first:last]
+        for j in range(out.shape[0]):
+            a, b, c, d = own[4 * j], own[4 * j + 1], own[4 * j + 2], own[4 * j + 3]
+            e = own[4 * j - 1] if j > 0 else left
+            a, b = (a if a > b else b), (c if c > d else d)
+            a = a if a > b else b
+            out[j] = a if a > e else e
+
+
 @compiled
 def sum_2x2(fine: Sums, runs: Ints, size: int, coarse: Sums) -> None:
     """Sums of 2x2 entries of `fine`; `size` is the number of entries of `coarse` along a block's side."""
@@ -113,7 +148,7 @@ def find_highest_pairs(blocks: Blocks, runs: Ints) -> None:
             if inner < own.shape[0]:
                 own[inner] = max(own[inner], x[inner])
         for line in range(2):
-            x, out = blocks.lines[line], blocks.maps[HIGHEST2 + line, row, runs[k, 1] : runs[k, 2]]
+            x, out = blocks.lines[line], blocks.maps[HIGHEST2 if line == 0 else HIGHEST4, row, runs[k, 1] : runs[k, 2]]
             for j in range(out.shape[0]):
                 a, b, c, d = x[4 * j], x[4 * j + 1], x[4 * j + 2], x[4 * j + 3]
                 a, b = (a if a > b else b), (c if c > d else d)
@@ -211,6 +246,7 @@ def find_bright_blocks(
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], runs[k, 1], runs[k, 2]
         background, highest2 = blocks.maps[BACKGROUND, row, first:last], blocks.maps[HIGHEST2, row, first:last]
+        between2 = blocks.maps[BETWEEN2, row, first:last]
         highest4, highest8 = blocks.maps[HIGHEST4, row, first:last], blocks.maps[HIGHEST8, row, first:last]
         excess, excess8 = blocks.lines[0, : last - first], blocks.lines[1, : last - first]
         texture = blocks.maps[TEXTURE, row, first:last]
@@ -221,7 +257,8 @@ def find_bright_blocks(
                 floor + slope * (above_black if above_black > 0.0 else 0.0),
                 share2 * (texture[j] * level) ** 2 + banding2,
             )
-            a, b, c = 2.0 * (highest2[j] - 4.0 * level), highest4[j] - 16.0 * level, highest8[j] - 64.0 * level
+            pair = highest2[j] if highest2[j] > between2[j] else between2[j]
+            a, b, c = 2.0 * (pair - 4.0 * level), highest4[j] - 16.0 * level, highest8[j] - 64.0 * level
             a, b, c = (a if a > 0.0 else 0.0), (b if b > 0.0 else 0.0), (c if c > 0.0 else 0.0)
             a, b = a * a / (fine * (variance + 4.0 * structure)), b * b / (fine * (variance + 16.0 * structure))
             excess[j] = a if a > b else b

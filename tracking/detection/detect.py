@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from geometry.arrays import Array, Ints
 from geometry.camera import SensorNoise
-from tracking.detection.block_search import TEXTURE, Blocks, bin_pixels, runs_of
+from tracking.detection.block_search import TEXTURE, Blocks, bin_pixels, find_highest_between, runs_of
 from tracking.detection.candidates import (
     AT_U,
     AT_V,
@@ -138,6 +138,8 @@ class SpotFinder:
             self._runs[: runs_of(boxes, BORDER_BLOCKS, BORDER_BLOCKS, rows, columns, self._runs)],
             self._blocks.pairs,
         )
+        inner = self._runs[: runs_of(boxes, 0, 0, rows, columns, self._runs)]
+        find_highest_between(task.image, inner, self._blocks.maps, self._blocks.lines[0])
         flat = self._workspace.reshape(len(self._workspace), -1)
         search = PeakSearch(task.pixels, task.noise, self._blocks, self._workspace, flat, self._peaks)
         threshold = task.limits.threshold_sigma

@@ -7,12 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking.noise import Picture
+from tracking.noise import CLIPPED_SHARE, Picture
 from tracking.noise_estimation.rounding import clipped_normal
 
 _FEWEST_VALUES = 8  # distinct grey values needed to take their common divisor as the step
 _UNLIT = 0.25  # share of the blocks that is taken to be without light
-_CLIPPED = 0.02  # share of pixels at zero above which the background counts as clipped
 
 
 def grey_step(pictures: Sequence[Picture]) -> float:
@@ -55,7 +54,7 @@ def clipped_background(pictures: Sequence[Picture], step: float) -> tuple[float,
     blocks = np.concatenate([_blocks(p) for p in pictures])
     mean = blocks.mean(axis=1, dtype=np.float64)
     sample = blocks[mean <= np.quantile(mean, _UNLIT)].ravel()
-    if np.mean(sample == 0) < _CLIPPED:
+    if np.mean(sample == 0) < CLIPPED_SHARE:
         return None
     mean, sigma = clipped_normal(sample.astype(float) / step)
     return mean * step, (sigma * step) ** 2 + step**2 / 12

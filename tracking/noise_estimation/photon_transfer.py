@@ -103,8 +103,9 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
     # With hardly any noise on a background of few grey values their steps look like texture, unless it is larger.
     steps = banding(model.floor_dn2, rounding)
     stepped = steps > max(_STEPS_SEEN, _TEXTURE_SEEN * model.texture) * background
-    shift = TextureShift.usual(usable[0]) if stepped else texture_shift(seen, model, full)
-    shift = shift.with_lights([find_spots(p, DetectParameters(max_detections=_MOST_SPOTS), model) for p in usable])
+    found = [find_spots(p, DetectParameters(max_detections=_MOST_SPOTS), model) for p in usable]
+    shift = TextureShift.usual(usable[0]) if stepped else texture_shift(seen, model, full, found)
+    shift = shift.with_lights(found)
     return NoiseEstimate(model, floor_sigma, slope_sigma, saturation, step, len(usable), levels.temporal, shift)
 
 

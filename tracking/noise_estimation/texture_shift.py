@@ -21,6 +21,7 @@ from geometry.arrays import Array
 from tracking.detections import Detections
 from tracking.noise import BLOCK, NORMAL_68, NoiseModel, Picture, quantile_variance
 from tracking.noise_estimation.black_level import level_over_light
+from tracking.noise_estimation.objects import lights_and_lines
 from tracking.noise_estimation.texture import MeanPicture
 
 _WIDTHS_PX = (0.8, 1.6, 3.2, 6.4, 12.8, 25.6)  # of spots
@@ -28,6 +29,7 @@ _COARSE_PX = 4.0  # width from which the smooth part of the background counts: i
 _LARGEST_CONTRAST = 0.3  # more is an edge or an object
 _REACH = 3.0  # sigmas of the kernel to each side
 _USUAL_FALL = 0.2  # share of the light lost in the corners by usual lenses
+_PLANE_FITS = 4
 _BRIGHT = 0.2  # above the background: a light, whose surroundings are left out on the coarse scale
 _FEWEST = 60  # samples of the filters' outputs on the coarse scale; with fewer the last error is used
 _FEWER_PIXELS = 1.6  # pixels per sigma of a spot above which pixels are averaged in pairs
@@ -36,6 +38,7 @@ _USUAL = 0.3  # quantile of the lights' misfits: of reflections and other clutte
 _RESOLVED_PX, _CLEAR = 1.8, 0.02  # width from which a misfit shows; noise of the centre, in widths, of clear lights
 _FEWEST_LIGHTS = 6
 _CLEARLY_MORE = 6.0  # ratio of the variance that a fit shows to that expected: of one spot it has a factor of two
+_FEWEST_PLACES = 500  # samples of the filters' outputs without lights and lines; with fewer all are used
 _SAMPLED = 3  # px: step of the sample of the filters' outputs
 LARGEST_SHARE = 0.25  # of the spot's width: a larger error is not assumed; faint spots on texture have half of it
 
@@ -122,8 +125,12 @@ class TextureShift:
         return replace(found, cov_px2=found.cov_px2 - seen + place, place_px2=place_px2)
 
 
-def texture_shift(seen: MeanPicture, noise: NoiseModel, full_dn: float) -> TextureShift:
+def texture_shift(
+    seen: MeanPicture, noise: NoiseModel, full_dn: float, found: Sequence[Detections] = ()
+) -> TextureShift:
     """The errors of spots on the background of one camera's pictures, less those by noise. full_dn: full scale.
+
+    The lights found in the pictures and lines, such as edges and seams, are not texture.
 
     As in `texture_of`, the background counts without its smooth part. For wide spots the smooth part counts, except for
     a plane over the picture: light that falls from one side does not shift a spot, but a response of lens and screen
@@ -133,6 +140,8 @@ def texture_shift(seen: MeanPicture, noise: NoiseModel, full_dn: float) -> Textu
     level = np.maximum(background, 1.0)
     texture: NDArray[Any] = np.clip((mean - background) / level, -_LARGEST_CONTRAST, _LARGEST_CONTRAST)
     sample = level[::BLOCK, ::BLOCK].astype(float)
+    objects = lights_and_lines(texture, found)
+    own = _without_rows_and_columns(texture, objects)
     cell = 1
     variance = noise.of_means.variance(sample) / pictures
     white = float(np.median(variance / sample**2))
@@ -142,26 +151,41 @@ def texture_shift(seen: MeanPicture, noise: NoiseModel, full_dn: float) -> Textu
     for sigma_px in (w for w in _WIDTHS_PX if w < _COARSE_PX):
         if sigma_px > _FEWER_PIXELS * cell:
             cell *= 2
-            texture = np.asarray(cv2.resize(texture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
-        light.append(cell * _shift(texture, sigma_px / cell, 2, white / cell**2))
-        around.append(cell * _shift(texture, sigma_px / cell, 1, white / cell**2))
+            texture, own = (cv2.resize(t, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for t in (texture, own))
+        some = np.asarray(cv2.resize(objects, texture.shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
+        light.append(cell * _shift(own, some, sigma_px / cell, 2, white / cell**2))
+        around.append(cell * _shift(texture, some, sigma_px / cell, 1, white / cell**2))
     for sigma_px in (w for w in _WIDTHS_PX if w > _COARSE_PX):
         cell *= 2
-        shifts = _coarse_shifts(mean, cell, sigma_px / cell, white / cell**2)
+        shifts = _coarse_shifts(mean, objects, cell, sigma_px / cell, white / cell**2)
         light.append(light[-1] if shifts is None else max(cell * shifts[0], light[-1]))
         around.append(around[-1] if shifts is None else max(cell * shifts[1], around[-1]))
     return TextureShift(_WIDTHS_PX, tuple(more * x for x in light), tuple(around))
 
 
-def _shift(texture: NDArray[Any], sigma_px: float, power: int, white: float) -> float:
-    """Sigma, px, of the filter with G^power of a texture (h, w), less the part of white noise of this variance."""
+def _without_rows_and_columns(texture: NDArray[Any], objects: NDArray[np.uint8]) -> NDArray[Any]:
+    """A texture (h, w) less the means of its rows and columns: these are offsets of the sensor, not of the screen."""
+    weight = (objects == 0).astype(np.float32)
+    rows = np.sum(weight * texture, axis=1, keepdims=True) / np.maximum(weight.sum(axis=1, keepdims=True), 1)
+    columns = np.sum(weight * texture, axis=0) / np.maximum(weight.sum(axis=0), 1)
+    return np.asarray(texture - rows - columns)
+
+
+def _shift(texture: NDArray[Any], objects: NDArray[np.uint8], sigma_px: float, power: int, white: float) -> float:
+    """Sigma, px, of the filter with G^power of a texture (h, w), less the part of white noise of this variance.
+
+    objects (h, w): 1 where something else than texture is seen; the filter does not reach these places.
+    """
     reach = int(np.ceil(_REACH * sigma_px / np.sqrt(power)))
     inner = reach + 2 * BLOCK
     if min(texture.shape) < 2 * inner + 4 * _SAMPLED:
         return 0.0
     kernels = odd, smooth = _kernels(sigma_px, power, reach)
     middle = slice(inner, -inner, _SAMPLED)
-    outputs = [o[middle, middle].ravel() for o in _filtered(texture, *kernels)]
+    free = cv2.dilate(objects, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))[middle, middle] == 0
+    if np.count_nonzero(free) < _FEWEST_PLACES:
+        free[:] = True
+    outputs = [o[middle, middle][free] for o in _filtered(texture, *kernels)]
     variance = quantile_variance(np.abs(np.concatenate(outputs)))
     return float(np.sqrt(max(variance - white * np.sum(odd**2) * np.sum(smooth**2), 0.0)))
 
@@ -179,10 +203,13 @@ def _filtered(texture: NDArray[Any], odd: Array, smooth: Array) -> list[NDArray[
     return [cv2.sepFilter2D(texture, cv2.CV_32F, *k) for k in ((odd, smooth), (smooth, odd))]
 
 
-def _coarse_shifts(mean: NDArray[Any], cell: int, sigma_px: float, white: float) -> tuple[float, float] | None:
+def _coarse_shifts(
+    mean: NDArray[Any], objects: NDArray[np.uint8], cell: int, sigma_px: float, white: float
+) -> tuple[float, float] | None:
     """Sigmas, cells, by the light's and by the background's texture in cells of a mean picture (h, w); None: no room.
 
-    sigma_px: of a spot, in cells; white: variance of the noise of a cell, relative. Places near a light are left out.
+    objects (h, w): as in `_shift`; sigma_px: of a spot, in cells; white: variance of the noise of a cell, relative.
+    Places near a light are left out.
     """
     cells = cv2.resize(mean, (mean.shape[1] // cell, mean.shape[0] // cell), interpolation=cv2.INTER_AREA)
     reach = int(np.ceil(_REACH * sigma_px))
@@ -190,12 +217,17 @@ def _coarse_shifts(mean: NDArray[Any], cell: int, sigma_px: float, white: float)
         return None
     level = np.maximum(cv2.blur(cv2.medianBlur(cells, 5), (2 * reach + 1, 2 * reach + 1)), 1.0)
     lit = cells - level > _BRIGHT * level
+    lit |= cv2.resize(objects, cells.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
     near = cv2.dilate(lit.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
     y, x = np.mgrid[: cells.shape[0], : cells.shape[1]]
     A = np.stack([np.ones_like(x), x - x.mean(), y - y.mean()], axis=-1).astype(float)
     if np.count_nonzero(~near) < _FEWEST:
         return None
-    plane = A @ np.linalg.lstsq(A[~near], cells[~near].astype(float), rcond=None)[0]
+    used, plane = ~near, level.astype(float)
+    for _ in range(_PLANE_FITS):  # of the screen: what is far from the plane is something else
+        plane = A @ np.linalg.lstsq(A[used], cells[used].astype(float), rcond=None)[0]
+        closer = ~near & (np.abs(cells / np.maximum(plane, 1.0) - 1) < _LARGEST_CONTRAST)
+        used = closer if np.count_nonzero(closer) >= _FEWEST else used
     texture = np.clip(cells / np.maximum(plane, 1.0) - 1, -_LARGEST_CONTRAST, _LARGEST_CONTRAST).astype(np.float32)
     inner = slice(reach, -reach)
     used = ~near[inner, inner]

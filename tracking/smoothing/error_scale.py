@@ -15,6 +15,7 @@ from tracking.rigid_body.models.information import single_frame_pose
 from tracking.rigid_body.variance_factor import DEADBAND
 from tracking.smoothing.motion.reference import Reference
 from tracking.smoothing.motion.run_detections import RunDetections, labelled_points
+from tracking.smoothing.residual_bounds import VarianceFactors, residual_bounds
 
 # Largest shift of a spot's centre by texture, speckle and its shape, as a share of its width (1 sigma): 4 % texture
 # makes 0.04, speckle of contrast 0.3 up to 0.16.
@@ -34,6 +35,7 @@ class ErrorScale:
     misfit_share: Array  # (cameras,) least error by misfits of the fits (speckle, texture), as a share of the widths
     width_share: Array  # (cameras,) errors beyond the stated ones, as a share of the spots' widths (1 sigma)
     noise_scale: float  # ratio of the errors to the stated sigmas beyond these
+    bounds: VarianceFactors  # what the residuals allow of the stated variances
 
     @staticmethod
     def of(
@@ -48,11 +50,20 @@ class ErrorScale:
         misfit = usual_misfit(run, place_px2, assigned, camera)
         own = _cameras_of(run)
         even = run._replace(cov=_with_least(run.cov, run.size_px, place_px2, misfit[own]))
+        place = np.maximum(place_px2, _variance_of_share(run.size_px, misfit[own]))
+
+        def bounds_of(some: RunDetections) -> VarianceFactors:
+            return residual_bounds(views, some, assigned, camera, place, ref, measured, usual_sizes(run, assigned))
+
         seen = scattered_width_share(even, assigned, camera)
+        if seen.any():
+            seen = _less(seen, bounds_of(widened(even, seen)).noise, widened(even, seen), even)
+        bounds = bounds_of(widened(even, seen))
+        even = even._replace(cov=_within(bounds, even.cov, place, own))
         wider = widened(even, seen)
         more = width_share(views, wider, assigned, calibration_cov, ref, measured)
         scale = noise_scale(views, widened(wider, more), assigned, calibration_cov, ref, measured)
-        return ErrorScale(misfit, np.hypot(seen, more), scale)
+        return ErrorScale(misfit, np.hypot(seen, more), scale, bounds)
 
     def covariance(self, stated: Array, width_px: Array, place_px2: Array, camera: Ints | int) -> Array:
         """Covariances (m, 2, 2), px^2, of spots with these widths (m,), px, and stated covariances (m, 2, 2).
@@ -60,12 +71,15 @@ class ErrorScale:
         place_px2 (m,): part of the stated variances that belongs to the place. Unknown widths (nan) add nothing.
         """
         least = _with_least(stated, width_px, place_px2, self.misfit_share[camera])
+        place = np.maximum(place_px2, _variance_of_share(width_px, self.misfit_share[camera]))
+        least = _within(self.bounds, least, place, camera)
         return (least + width_covariance(width_px, self.width_share[camera])) * self.noise_scale**2
 
     def place_px2(self, run: RunDetections, stated_px2: Array) -> Array:
         """(m,): variances of a run's detections that belong to their places."""
-        least = _variance_of_share(run.size_px, self.misfit_share[_cameras_of(run)])
-        return np.maximum(stated_px2, least) * self.noise_scale**2
+        camera = _cameras_of(run)
+        least = _variance_of_share(run.size_px, self.misfit_share[camera])
+        return np.maximum(stated_px2, least) * self.bounds.place[camera] * self.noise_scale**2
 
     def of_run(self, run: RunDetections, place_px2: Array) -> Array:
         """Covariances (m, 2, 2) of all detections of a run."""
@@ -87,6 +101,27 @@ def _with_least(cov: Array, width_px: Array, place_px2: Array, share: Array | fl
     """Covariances (m, 2, 2) with a part that belongs to the place of at least a share of the width, squared."""
     missing = np.maximum(_variance_of_share(width_px, share) - place_px2, 0.0)
     return np.asarray(cov + missing[:, None, None] * np.eye(2))
+
+
+def _within(bounds: VarianceFactors, cov: Array, place_px2: Array, camera: Ints | int) -> Array:
+    """Covariances (m, 2, 2) with both parts multiplied by their factors; their shape is kept.
+
+    place_px2 (m,): the part that belongs to places.
+    """
+    share = np.minimum(place_px2 / np.maximum(0.5 * np.trace(cov, axis1=1, axis2=2), 1e-300), 1.0)
+    factor = (1 - share) * bounds.noise[camera] + share * bounds.place[camera]
+    return np.asarray(cov * factor[:, None, None])
+
+
+def _less(share: Array, factor: Array, wider: RunDetections, stated: RunDetections) -> Array:
+    """The shares (cameras,) of the widths that widened the stated covariances, less what exceeds factors (cameras,)."""
+    total, before = (0.5 * np.trace(run.cov, axis1=1, axis2=2) for run in (wider, stated))
+    out, own = share.copy(), _cameras_of(stated)
+    for camera in np.flatnonzero((share > 0) & (factor < 1)):
+        all_of_it = float(np.sum(total[own == camera]))
+        added = all_of_it - float(np.sum(before[own == camera]))
+        out[camera] *= np.sqrt(max(1 - (1 - factor[camera]) * all_of_it / max(added, 1e-300), 0.0))
+    return out
 
 
 def usual_misfit(run: RunDetections, place_px2: Array, assigned: Ints, camera_of: Ints) -> Array:

@@ -8,6 +8,7 @@ from geometry.arrays import Array, Bools
 from geometry.compiled_projection import Views, project_all
 from geometry.pose import Pose
 from tracking.smoothing.motion.reference import Reference
+from tracking.smoothing.motion.velocity_jumps import SHORT_EXPOSURE, corner_offsets
 
 
 def exposure_offsets(views: Views, motion: Reference, exposure_s: float, steady: Bools) -> Array:
@@ -32,6 +33,26 @@ def exposure_offsets(views: Views, motion: Reference, exposure_s: float, steady:
     valid = np.isfinite(offset).all(axis=-1) & steady[:, None]
     out[valid] = offset[valid]
     return out
+
+
+def exposure_sigmas(motion: Reference, jumped: Bools, exposure_s: float, dt: Array) -> tuple[Array, Array]:
+    """Sigmas (T, 6), m and rad, of the pose's mean over the exposure less that at its middle, beyond the offsets above.
+
+    Where the velocities jump (`corner_offsets`), and where the acceleration of the motion is not that of its poses,
+    such as beside strong accelerations that are taken for jumps: their difference times T^2 / 24. The first value is
+    for both, the second without the jumps, which the covariances of the motion contain. Short exposures get 0.
+    Source: ours.
+    """
+    corners = corner_offsets(motion, jumped, exposure_s, dt)
+    other = np.zeros_like(corners)
+    if len(dt) > 2 and exposure_s > SHORT_EXPOSURE * float(np.median(dt[1:])):
+        pose = Pose(motion.R, motion.t)
+        velocity = pose[1:].minus(pose[:-1]) / dt[1:, None]
+        acceleration = (velocity[1:] - velocity[:-1]) / (0.5 * (dt[2:] + dt[1:-1]))[:, None]
+        acceleration = acceleration[np.r_[0, 0 : len(dt) - 2, len(dt) - 3]]  # at the ends that of the nearest frames
+        other = np.abs(acceleration - motion.m[:, 6:]) * exposure_s**2 / 24
+        other[corners.any(axis=1)] = 0.0
+    return np.abs(corners) + other, other
 
 
 def pose_shift(views: Views, motion: Reference, offsets: Array) -> Array:

@@ -21,6 +21,7 @@ _CHUNK = 256  # consecutive frames that are compared with each other
 _MIN_CORRELATION = 0.05  # below it two places count as different
 _REACHES = (1.0, 2.0, 4.0, 8.0)  # tried correlation lengths, in widths of the spot
 _SIGNIFICANT = 3.0  # sigmas of the statistic under noise alone, above which errors of places are assumed
+_UPPER = 3.0  # sigmas of the statistic above it: upper limit
 _MAX_STUDENT = 3.0  # largest variance factor of Student's distribution: that of three degrees of freedom
 _MAX_ABSORBED = 0.8  # largest share of the errors that is assumed to be absorbed by the poses
 
@@ -34,6 +35,7 @@ class PlaceErrors:
     reach_px: Array  # (n,) correlation length: the sigma of a spot whose mean over white texture would make it
     elsewhere: float = 0.0  # share of the variance that is the same in all places: errors of the rig, not of a place
     few_places_factor: float = 1.0  # factor of their variance, because it is estimated from few places
+    most: float = 1.0  # upper limit of `share`: the residuals would show more
 
     def factor(self, averaged: Array) -> Array:
         """Factors (T,) of covariances that were computed as if the errors of all frames were independent.
@@ -51,10 +53,11 @@ class PlaceErrors:
         The residuals of few spots hardly show errors of places, because the poses absorb them; the texture of the
         background does. uv_px (T, n, 2): the labelled pixels, nan without. width_px (n,): as in `place_errors`.
         """
+        share = min(share, self.most)
         if share <= self.share:
             return self
         reach = usable_widths(width_px)
-        counts = np.stack([_same_error_frames(uv_px[:, i], reach[i]) for i in range(len(reach))], axis=-1)
+        counts = np.stack([frames_with_same_error(uv_px[:, i], reach[i]) for i in range(len(reach))], axis=-1)
         return replace(
             self, share=min(share, 1.0), same_error_frames=_mean_over_views(counts, np.isfinite(uv_px[..., 0])),
             reach_px=reach, few_places_factor=1.0,
@@ -88,15 +91,21 @@ def place_errors(residual: Array, uv_px: Array, width_px: Array, averaged: Array
     sums = max(_products(residual, uv_px, reaches, explained), key=lambda p: p.significance)
     same_error_frames = _mean_over_views(sums.same_error_frames, labelled)
     # The poses absorb part of the residuals, which reduces the degrees of freedom.
+    free_of_white = 1 - absorbed / float(np.median(np.maximum(averaged, 1.0)))
+
+    def share_of(seen: float) -> float:
+        place, white = min(seen, 1.0) / (1 - absorbed), max(1 - seen, 0.0) / free_of_white
+        return place / (place + white)
+
+    seen = sums.near / sums.expected if sums.expected > 0 else 0.0
+    scatter = np.sqrt(0.5 / sums.expected / (1 - absorbed)) if sums.expected > 0 else np.inf
+    most = share_of(max(seen, 0.0) + _UPPER * scatter)
     if sums.significance * np.sqrt(1 - absorbed) < _SIGNIFICANT:
-        return PlaceErrors(0.0, same_error_frames, sums.reach_px)
-    seen = sums.near / sums.expected
-    place = min(seen, 1.0) / (1 - absorbed)
-    white = max(1 - seen, 0.0) / (1 - absorbed / float(np.median(np.maximum(averaged, 1.0))))
+        return PlaceErrors(0.0, same_error_frames, sums.reach_px, most=most)
     # A variance estimated from few places is uncertain: Student's distribution is wider by this factor in variance.
     free = 2 * (1 - absorbed) * float(np.sum(labelled / np.maximum(sums.same_error_frames, 1.0)))
     few_places_factor = min(free / max(free - 2, 1e-9), _MAX_STUDENT)
-    return PlaceErrors(place / (place + white), same_error_frames, sums.reach_px, sums.elsewhere, few_places_factor)
+    return PlaceErrors(share_of(seen), same_error_frames, sums.reach_px, sums.elsewhere, few_places_factor, most)
 
 
 def usable_widths(width_px: Array) -> Array:
@@ -116,7 +125,7 @@ def _distances(uv_px: Array) -> Array:
     return np.asarray(np.sqrt(du * du + dv * dv))
 
 
-def _same_error_frames(uv_px: Array, reach_px: float) -> Array:
+def frames_with_same_error(uv_px: Array, reach_px: float) -> Array:
     """(T,): number of frames in which one view's spot, at uv_px (T, 2), has the same error; nan without a spot."""
     out = np.full(len(uv_px), np.nan)
     rows = np.flatnonzero(np.isfinite(uv_px).all(axis=-1))

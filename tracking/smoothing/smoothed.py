@@ -32,16 +32,16 @@ class ReportedSpots:
     @staticmethod
     def of(
         model: SpotModel, parameters: TrackerParameters, poses: Pose, covariance: Array, calibration_cov: Array,
-        measured: tuple[RunDetections, Array], labels: tuple[Ints, ErrorScale], exposure_px: Array,
+        measured: tuple[RunDetections, Array], labels: tuple[Ints, ErrorScale], exposure: tuple[Array, Array],
     ) -> ReportedSpots:  # fmt: skip
         """The spots of T frames from their poses, with covariances (T, 6, 6), and the labelled detections.
 
         calibration_cov (n, 2, 2), px^2: covariance of the expected pixels due to calibration errors. measured: the
         detections as stated, and the part (m,), px^2, of their variances that belongs to the place. labels: (T, n), as
-        `Smoothed.assigned`, and the corrections of the stated covariances. exposure_px (T, n, 2): mean pixel of a spot
-        over the exposure less that at its middle.
+        `Smoothed.assigned`, and the corrections of the stated covariances. exposure: mean pixel (T, n, 2) of a spot
+        over the exposure less that at its middle, and the sigma (T, 6), m and rad, of the unknown part of the pose's.
         """
-        (detections, place_px2), (assigned, errors) = measured, labels
+        (detections, place_px2), (assigned, errors), (exposure_px, exposure_sigma) = measured, labels, exposure
         uv_px, J = project_all(model.numbers, poses.rotation, poses.translation)
         cov_px2 = J @ covariance[:, None] @ np.swapaxes(J, -1, -2) + calibration_cov
         exists = ~np.isnan(uv_px[..., 0])
@@ -52,7 +52,8 @@ class ReportedSpots:
         own = errors.covariance(detections.cov[rows], detections.size_px[rows], place_px2[rows], model.camera_of[view])
         blended = np.where(chosen >= BLENDED, parameters.blend_px / 2, 0.0)
         more = blended**2 + parameters.sigma_model_px**2
-        cov_px2[k, view] = own + more[:, None, None] * np.eye(2)
+        within = J[k, view] * exposure_sigma[k][:, None]
+        cov_px2[k, view] = own + more[:, None, None] * np.eye(2) + within @ np.swapaxes(within, -1, -2)
         return ReportedSpots(uv_px, cov_px2, exists, model.in_picture(uv_px))
 
 

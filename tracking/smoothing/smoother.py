@@ -32,7 +32,7 @@ from tracking.rigid_body.hypotheses.prediction_checks import (
 from tracking.smoothing.backward import merged, track_backward
 from tracking.smoothing.calibration_errors import calibration_errors
 from tracking.smoothing.error_scale import ErrorScale, usual_sizes
-from tracking.smoothing.exposure import exposure_offsets, pose_shift
+from tracking.smoothing.exposure import exposure_offsets, exposure_sigmas, pose_shift
 from tracking.smoothing.labels.clutter import run_log_clutter, run_log_static
 from tracking.smoothing.labels.continuity import continued
 from tracking.smoothing.labels.displaced_camera import displaced
@@ -276,6 +276,8 @@ class _Smoother:
         # Measured is the mean over the exposure; reported is the pose at its middle.
         jumps = motion.jumped | np.append(motion.jumped[1:], False)
         offsets = exposure_offsets(self.views, final, self.rec.exposure_s, motion.known & ~jumps)
+        of_spots, of_poses = exposure_sigmas(final, motion.jumped, self.rec.exposure_s, self.rec.dt_s)
+        covariance = covariance + of_poses[:, :, None] ** 2 * np.eye(6)
         jerk = np.full(2, np.nan)
         if motion.log_density is not None:
             half = 0.5 * np.median(motion.log_density, axis=0)
@@ -283,7 +285,7 @@ class _Smoother:
         poses = Pose(final.R, final.t).plus(-pose_shift(self.views, final, offsets))
         spots = ReportedSpots.of(
             self.model, self.parameters, poses, covariance + self.systematic, self.calibration_cov,
-            (self.rec.run_detections(), self.rec.place_px2()), (assigned, self.errors), offsets,
+            (self.rec.run_detections(), self.rec.place_px2()), (assigned, self.errors), (offsets, of_spots),
         )  # fmt: skip
         return Smoothed(
             model=self.model,

@@ -83,6 +83,9 @@ class Timings:
     smoothing: float = 0.0
 
 
+_CLIPPED = 0.85  # of the range above the background: a spot whose peak is higher is taken to be clipped
+
+
 @dataclass(slots=True)
 class Pipeline:
     """Processes one run. Iterate over `records()` once; `notes`, `noise` and `timings` are complete afterwards."""
@@ -143,7 +146,8 @@ class Pipeline:
         """The points in one picture of a camera. Not thread-safe for the same camera."""
         noise = self.noise[camera]
         points = noise.detect(picture, self.run.tracker.detect)
-        return on_beam_axes(points, self._offsets_of(camera), noise.model)
+        top = noise.saturation_dn(picture, self.run.tracker.detect)
+        return on_beam_axes(points, self._offsets_of(camera), noise.model, top)
 
     def _offsets_of(self, camera: str) -> CentroidOffsets:
         if camera not in self._offsets:
@@ -172,12 +176,20 @@ class Pipeline:
         return tuple(found), tuple(missing)
 
 
-def on_beam_axes(found: Detections, offsets: CentroidOffsets, noise: NoiseModel | None) -> Detections:
-    """Detections (n) with positions shifted from the light's centroid to the image of the beam's axis."""
+def on_beam_axes(
+    found: Detections, offsets: CentroidOffsets, noise: NoiseModel | None, saturation_dn: float
+) -> Detections:
+    """Detections (n) with positions shifted from the light's centroid to the image of the beam's axis.
+
+    saturation_dn: grey value at which the sensor clips.
+    """
     if not len(found) or noise is None:
         return found
     c, s = np.cos(np.radians(found.angle_deg)), np.sin(np.radians(found.angle_deg))
     major2, minor2 = found.major_px**2, found.minor_px**2
     shape = np.stack([major2 * c**2 + minor2 * s**2, (major2 - minor2) * c * s, major2 * s**2 + minor2 * c**2], axis=-1)
-    brightness = noise.slope_dn * found.peak / noise.floor_dn2
-    return replace(found, uv_px=found.uv_px - offsets.at(found.uv_px, shape, brightness))
+    clipped = found.peak > _CLIPPED * (saturation_dn - noise.black_dn)
+    height = np.where(clipped, found.flux / (2 * np.pi * found.major_px * found.minor_px), found.peak)
+    brightness = noise.slope_dn * height / noise.floor_dn2
+    clip = np.where(clipped, found.peak / np.maximum(height, 1e-9), 1.0)
+    return replace(found, uv_px=found.uv_px - offsets.at(found.uv_px, shape, brightness, clip))

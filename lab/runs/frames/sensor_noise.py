@@ -89,11 +89,14 @@ class CameraNoise:
             out["estimated"] = {**_scalars(self.estimate.model), **seen}
         return out
 
+    def saturation_dn(self, picture: Picture, parameters: DetectParameters) -> float:
+        """The grey value at which the sensor clips: stated, seen in the pictures, or the largest of their type."""
+        seen = None if self.estimate is None else self.estimate.saturation_dn
+        known = seen if parameters.saturation_dn is None else parameters.saturation_dn
+        return float(np.iinfo(picture.dtype).max) if known is None else known
+
     def _search(self, picture: Picture, parameters: DetectParameters, model: NoiseModel | None) -> Detections:
-        known = parameters.saturation_dn
-        if known is None and self.estimate is not None:
-            parameters = replace(parameters, saturation_dn=self.estimate.saturation_dn)
-        return find_spots(picture, parameters, model)
+        return find_spots(picture, replace(parameters, saturation_dn=self.saturation_dn(picture, parameters)), model)
 
     def _with_texture(self, found: Detections) -> Detections:
         """The points with covariances that include the errors due to the screen's texture."""

@@ -175,6 +175,22 @@ def test_wrong_labels_in_a_few_frames_are_outliers_and_no_fault():
     assert shares["left/1"] == 0
 
 
+@pytest.mark.parametrize("scene", SCENES)
+def test_a_person_who_hides_parts_of_a_spot_is_no_fault_of_the_rig(scene):
+    """With four spots no single one of them can be named as the outlier of a frame."""
+    run, recording = recorded(scene, 5, frames=80)
+    rng = np.random.default_rng(5)
+    four = np.flatnonzero(recording.seen.sum(axis=0) > 60)[[0, 1, -2, -1]]
+    seen, uv = np.zeros_like(recording.seen), recording.uv_px.copy()
+    seen[:, four] = recording.seen[:, four]
+    partly = rng.choice(80, 9, replace=False)
+    uv[partly, four[-1], 0] += rng.uniform(4, 14, 9) * NOISE_PX
+    result = evaluate_model(run.rig, dataclasses.replace(recording, seen=seen, uv_px=uv))
+    assert result.diagnosis is not None
+    assert suspects(result) == []
+    assert not result.diagnosis.unexplained
+
+
 def test_wrong_labels_are_outliers_in_a_wrong_set_up_too():
     """The camera's rotation shifts its spots by 60 sigma; a wrong label differs from them, not from 0."""
     run, recording = recorded("two-cameras-per-screen", 5, frames=300, really=turned("right-a", 0.3, 1))

@@ -1,5 +1,7 @@
 """Spots that the pixels hardly resolve: whatever their place within a pixel, they are found, and hot pixels are not."""
 
+from statistics import NormalDist
+
 import numpy as np
 import pytest
 
@@ -40,6 +42,31 @@ def test_a_spot_as_narrow_as_a_pixel_is_found_anywhere_within_it(sigma, peak):
     assert found >= 0.98 * total
     assert elsewhere == 0
     assert 0.5 < np.mean(np.concatenate(normalised)) / 2 < 2.0
+
+
+@pytest.mark.parametrize("phase", [(0.0, 0.0), (0.5, 0.5), (1.5, 1.5), (1.5, 0.5), (1.0, 1.0), (0.0, 1.5)])
+def test_a_faint_narrow_spot_is_found_anywhere_among_the_sums_of_the_search(phase):
+    """They are sums of 2x2 pixels. The steps of a quiet sensor, 3 grey values below, hide it in wider sums."""
+    noise = NoiseModel(0.17, 0.004, 8.0, texture=0.02, banding_dn=0.14)
+    u, v = np.arange(30.0, 380, 40) + phase[0], np.arange(30.0, 300, 40) + phase[1]
+    places = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    rows, columns = _shares(SIZE[1], v), _shares(SIZE[0], u)
+    light = 8.6 + 11.0 * np.outer(rows.sum(axis=1), columns.sum(axis=1))
+    found = elsewhere = 0
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        points = find_spots(np.rint(light + 0.3 * rng.standard_normal(light.shape)).astype(np.uint8), noise=noise)
+        gap = np.linalg.norm(points.uv_px[:, None] - places, axis=-1)
+        found += int(np.sum(gap.min(axis=0) < 0.8))
+        elsewhere += int(np.sum(gap.min(axis=1) > 0.8))
+    assert found >= 0.93 * 3 * len(places)
+    assert elsewhere == 0
+
+
+def _shares(pixels: int, centres: np.ndarray) -> np.ndarray:
+    """The shares (pixels, n) of the light of lines with sigma 0.5 px that fall on the pixels."""
+    edges = (np.arange(pixels + 1)[:, None] - 0.5 - centres) / 0.5
+    return np.diff(np.vectorize(NormalDist().cdf)(edges), axis=0)
 
 
 @pytest.mark.parametrize("pair", [False, True])

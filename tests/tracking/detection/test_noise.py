@@ -222,6 +222,16 @@ def test_the_quick_model_has_the_noise_of_the_background(bits):
     assert model.variance(20 * scale) == pytest.approx((2.0 * scale) ** 2, rel=0.25)
 
 
+@pytest.mark.parametrize("background", [-1.0, 0.0, 1.0])
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 4.0])
+def test_the_quick_model_sees_the_noise_that_is_clipped_at_black(background, sigma):
+    """Otherwise the longer tail of the pixels above zero looks like spots."""
+    rng = np.random.default_rng(4)
+    image = np.clip(np.rint(rng.normal(background, sigma, (600, 800))), 0, 255).astype(np.uint8)
+    assert guess_noise(image).floor_dn2 == pytest.approx(sigma**2, rel=0.35)
+    assert len(find_spots(image)) == 0
+
+
 def test_black_pictures_with_spots_give_a_model_without_warnings():
     """Only the pixels of the spots are above zero, as behind a filter."""
     pictures = [np.zeros((300, 400), np.uint8) for _ in range(4)]

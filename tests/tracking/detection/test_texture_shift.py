@@ -96,6 +96,57 @@ def test_texture_above_the_steps_of_a_quiet_sensor_counts(contrast, least, most)
     assert least <= sigma <= most
 
 
+def seams(contrast: float) -> Array:
+    """The reflectance (h, w) of a plain screen with two seams, a cable and its lower edge."""
+    light = np.ones(SIZE, np.float32)
+    lines = (((0, 90), (499, 160), 2, -0.4), ((120, 0), (60, 399), 4, contrast), ((300, 399), (499, 210), 3, contrast))
+    for begin, end, width, change in lines:
+        drawn = cv2.line(np.zeros(SIZE, np.float32), begin, end, 1.0, width, cv2.LINE_AA)
+        light *= 1 + change * drawn
+    light[340:] *= 0.3
+    return np.asarray(light, float)
+
+
+@pytest.mark.parametrize("contrast", [0.1, 0.3, 1.0])
+def test_seams_and_the_edge_of_a_screen_are_not_texture(contrast):
+    shift = estimate_noise(pictures(seams(contrast), 0.0, 4)).texture_shift
+    errors = shift.sigma_px(np.array([1.5, 3.0, 5.0]), np.full(3, 10.0))
+    assert np.all(errors < 0.004 * np.array([1.5, 3.0, 5.0]))
+
+
+def test_texture_beside_seams_counts_as_without_them():
+    at = np.array([1.5, 3.0, 5.0]), np.full(3, 10.0)
+    alone = estimate_noise(pictures(screen(0.05, 1.0, 3), 0.0, 4)).texture_shift.sigma_px(*at)
+    both = estimate_noise(pictures(screen(0.05, 1.0, 3) * seams(0.3), 0.0, 4)).texture_shift.sigma_px(*at)
+    np.testing.assert_allclose(both, alone, rtol=0.2)
+
+
+def test_a_brushed_screen_has_texture_though_it_consists_of_lines():
+    rng = np.random.default_rng(5)
+    brushed = 1 + 0.05 * np.tile(cv2.GaussianBlur(rng.standard_normal((SIZE[0], 1)), (0, 0), 1.0), (1, SIZE[1]))
+    turned = cv2.warpAffine(
+        brushed, cv2.getRotationMatrix2D((250, 200), 20, 1.5), SIZE[::-1], borderMode=cv2.BORDER_REFLECT
+    )
+    errors = estimate_noise(pictures(turned, 0.0, 4)).texture_shift.sigma_px(np.array([3.0]), np.array([10.0]))
+    assert errors[0] > 0.02
+
+
+def test_lights_that_move_over_the_screen_are_not_texture():
+    moving = [pictures(np.ones(SIZE), spots(4.0, 3000.0, seed)[1], 1)[0] for seed in range(6)]
+    errors = estimate_noise(moving).texture_shift.sigma_px(np.array([1.5, 3.0]), np.array([5.0, 5.0]))
+    assert np.all(errors < 0.01)
+
+
+def test_offsets_of_the_sensors_columns_do_not_multiply_the_light():
+    """They shift faint spots, as any structure of the background does, and not bright ones."""
+    offsets = np.tile(6.0 * np.random.default_rng(6).standard_normal(SIZE[1]), (SIZE[0], 1))
+    seen = [np.clip(p + np.rint(offsets), 0, None).astype(np.uint16) for p in pictures(np.ones(SIZE), 0.0, 4)]
+    shift = estimate_noise(seen).texture_shift
+    bright, faint = (shift.sigma_px(np.array([2.0]), np.array([c]))[0] for c in (100.0, 0.5))
+    assert bright < 0.003
+    assert faint > 0.03
+
+
 def test_the_fall_of_the_light_towards_the_corners_shifts_wide_spots():
     """Vignetting of lens and sensor multiplies the laser's light; a plane of ambient light does not shift a spot."""
     y, x = np.mgrid[: SIZE[0], : SIZE[1]]

@@ -83,3 +83,27 @@ def test_a_corner_within_a_long_exposure_does_not_shift_the_pose_beyond_its_sigm
         nees.append(np.einsum("ki,kij,kj->k", error, np.linalg.inv(result.covariance), error))
     assert np.mean(nees) / 6 < 1.2
     assert np.max(nees) < 60
+
+
+def test_strong_accelerations_within_a_long_exposure_are_in_the_covariances():
+    """A step of the vehicle within six frames: beside its start and end the acceleration is not that of any jump."""
+    parts, share, rate_hz, frames = 20, 0.56, 100.0, 60
+    nees = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        moment, step = np.arange(frames * parts) / parts, rng.normal(0, [0.03] * 3 + [0.04] * 3, (2, 6))
+        way = np.clip((moment[:, None] - rng.uniform([18, 38], [19, 39])) / 6, 0, 1)
+        fine = START.plus((3 * way**2 - 2 * way**3) @ step)
+        middle = np.arange(parts // 2, frames * parts - parts // 2, parts)
+        half = int(share * parts / 2)
+        during = [fine[middle + i].minus(fine[middle]) for i in range(-half, half + 1)]
+        mean = fine[middle].plus(np.mean(during, axis=0))
+        run = recording_of(RIGS["four-skew-beams"](), mean, moment[middle] / rate_hz, NOISE_PX, seed, prior=PRIOR)
+        recording = TrackedRecording(run.rig, RIGID, exposure_s=share / rate_hz)
+        for k, frame in enumerate(tracked(run)):
+            recording.append(dt_of(run, k), found_in(run, k), frame)
+        result = smooth(recording)
+        error = result.poses.minus(fine[middle])
+        nees.append(np.einsum("ki,kij,kj->k", error, np.linalg.inv(result.covariance), error))
+    assert np.mean(nees) / 6 < 1.2
+    assert np.max(nees) < 60

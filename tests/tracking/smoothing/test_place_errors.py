@@ -5,24 +5,29 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from geometry.pose import Pose
 from lab.simulate.points import CLUTTER, PointRun, simulate_points
-from tests.tracking.rigid_runs import assess, smoothed_frames, tracked
+from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import PriorRegion
+from tests.tracking.rigid_runs import assess, recording_of, smoothed_frames, tracked, zig_zag
 from tracking.detections import Detections
 from tracking.smoothing.place_errors import PlaceErrors, correlation, place_errors
 
 WIDTH_PX = 2.0
 
 
-def textured(run: PointRun, place_px: float, white_px: float, seed: int, known: bool = False) -> PointRun:
+def textured(
+    run: PointRun, place_px: float, white_px: float, seed: int, known: bool = False, stated: float = 1.0
+) -> PointRun:
     """The recording with other errors: white noise, and for each spot a smooth random field over its picture.
 
-    known: the points state which part of their variance belongs to the place.
+    known: the points state which part of their variance belongs to the place, with sigmas `stated` times too large.
     """
     rng = np.random.default_rng(seed)
     waves, n = 48, run.uv_px.shape[1]
     k_vectors = rng.normal(0, 1 / np.sqrt(2) / WIDTH_PX, (n, 2, waves, 2))
     phases = rng.uniform(0, 2 * np.pi, (n, 2, waves))
-    sigma2 = place_px**2 + white_px**2
+    sigma2 = (stated * place_px) ** 2 + white_px**2
     detections = []
     for k, per_camera in enumerate(run.detections):
         row = []
@@ -35,7 +40,7 @@ def textured(run: PointRun, place_px: float, white_px: float, seed: int, known: 
                     uv[i] = at + place_px * field + white_px * rng.standard_normal(2)
             width = np.full(len(uv), WIDTH_PX)
             points = Detections.at(uv, np.tile(sigma2 * np.eye(2), (len(uv), 1, 1)))
-            place_px2 = np.full(len(uv), place_px**2) if known else None
+            place_px2 = np.full(len(uv), (stated * place_px) ** 2) if known else None
             row.append(replace(points, major_px=width, minor_px=width, place_px2=place_px2))
         detections.append(tuple(row))
     return replace(run, detections=tuple(detections))
@@ -76,6 +81,71 @@ def test_few_spots_show_no_errors_of_places_but_the_texture_of_the_screen_does()
             answers.append(np.nanmean(assess(run, frames).nees) / 6)
     assert np.mean(nees[True]) < 1.5
     assert np.mean(nees[False]) > 1.8 * np.mean(nees[True])
+
+
+def test_stated_errors_of_places_are_reduced_to_what_the_residuals_allow():
+    """Clipped spots and backgrounds other than the screen predict ten times too much."""
+    nees = {1.0: [], 10.0: []}
+    for seed in range(2):
+        for stated, answers in nees.items():
+            run = simulate_points("huo2015", seed, frames=120, noise_px=0.05, clutter=0.0)
+            run = textured(run, 0.02, 0.01, seed, True, stated)
+            frames, smoothed = smoothed_frames(run, tracked(run))
+            answers.append(np.nanmean(assess(run, frames).nees) / 6)
+            assert np.all(smoothed.errors.bounds.place >= (0.8 if stated == 1 else 0.01))
+            assert np.all(smoothed.errors.bounds.place <= (1.0 if stated == 1 else 0.025))
+    assert 0.5 < np.mean(nees[1.0]) < 1.5
+    assert 0.4 < np.mean(nees[10.0]) < 1.5
+
+
+def fast(seed: int, noise_px: float) -> PointRun:
+    """A recording whose spots move by several widths from frame to frame."""
+    start = Pose.from_ypr(np.deg2rad([7.0, 0.0, 0.0]), np.zeros(3))
+    poses, t_s, turned = zig_zag(seed, 120, 100.0, 40, 1.0, start)
+    prior = PriorRegion((0.0, 0.0, 0.0), (7.0, 0.0, 0.0), 0.3, 15.0)
+    return recording_of(RIGS["four-skew-beams"](), poses, t_s, noise_px, seed, turned, prior=prior)
+
+
+@pytest.mark.parametrize("moves", [False, True], ids=["slow", "fast"])
+@pytest.mark.parametrize(("stated", "least", "most"), [(1.0, 0.9, 1.0), (2.0, 0.22, 0.33)])
+def test_stated_noise_is_reduced_to_what_the_residuals_allow(stated, least, most, moves):
+    nees = []
+    for seed in range(2):
+        run = fast(seed, 0.05) if moves else simulate_points("huo2015", seed, frames=120, noise_px=0.05, clutter=0.0)
+        wider = tuple(
+            tuple(replace(found, cov_px2=stated**2 * found.cov_px2) for found in frame) for frame in run.detections
+        )
+        run = replace(run, detections=wider)
+        frames, smoothed = smoothed_frames(run, tracked(run))
+        nees.append(np.nanmean(assess(run, frames).nees) / 6)
+        assert np.all(smoothed.errors.bounds.noise >= least)
+        assert np.all(smoothed.errors.bounds.noise <= most)
+    assert 0.6 < np.mean(nees) < 1.4
+
+
+def test_spots_that_are_wider_in_other_places_have_no_larger_errors():
+    """At a low frame rate a width changes from frame to frame because the spot is elsewhere."""
+    run = fast(3, 0.02)
+    changing = []
+    for frame in run.detections:
+        widths = [WIDTH_PX * (1 + 0.15 * np.sin(found.uv_px[:, 0] / 7.0)) for found in frame]
+        changing.append(tuple(replace(f, major_px=w, minor_px=w) for f, w in zip(frame, widths, strict=True)))
+    run = replace(run, detections=tuple(changing))
+    frames, smoothed = smoothed_frames(run, tracked(run))
+    assert np.all(smoothed.errors.width_share * WIDTH_PX < 0.02)
+    assert 0.5 < np.nanmean(assess(run, frames).nees) / 6 < 1.5
+
+
+@pytest.mark.parametrize("count", [4, 5, 6])
+def test_a_vehicle_at_rest_does_not_show_that_its_errors_of_places_are_small(count):
+    """Few residuals, which agree in all frames, are small by chance."""
+    nees = []
+    for seed in range(6):
+        run = simulate_points("static", seed, frames=40, noise_px=0.05, clutter=0.0)
+        run = only_views(textured(run, 0.03, 0.005, seed, True), count)
+        frames, _ = smoothed_frames(run, tracked(run))
+        nees.append(np.nanmean(assess(run, frames).nees) / 6)
+    assert np.mean(nees) < 1.5
 
 
 def test_white_noise_is_averaged_over_a_vehicle_at_rest():
@@ -121,6 +191,20 @@ def test_a_known_share_counts_where_the_residuals_show_less():
     assert none.at_least(0.4, moving, width).factor(np.full(30, 1e6)) == pytest.approx(1.0)
     more = PlaceErrors(0.6, np.ones(30), width)
     assert more.at_least(0.4, uv, width) is more
+
+
+def test_a_known_share_is_limited_where_the_residuals_would_show_it():
+    """White residuals of a vehicle at rest: those of many spots show that the places have little share in them."""
+    rng = np.random.default_rng(8)
+    limits = []
+    for count in (4, 12):
+        uv, width = np.tile(rng.uniform(0, 500, (1, count, 2)), (60, 1, 1)), np.full(count, 2.0)
+        white = place_errors(rng.standard_normal((60, count, 2)), uv, width, np.full(60, 60.0), np.zeros(count))
+        limits.append(white.most)
+        assert white.at_least(0.9, uv, width).share == pytest.approx(white.most)
+        same = np.tile(rng.standard_normal((1, count, 2)), (60, 1, 1))
+        assert place_errors(same, uv, width, np.full(60, 60.0), np.zeros(count)).most == 1.0
+    assert limits[1] < 0.5 * limits[0] < 0.2
 
 
 def test_a_pose_of_one_frame_keeps_its_covariance():

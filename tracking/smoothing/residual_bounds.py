@@ -1,0 +1,94 @@
+"""Upper bounds of the spots' variances, from the residuals of single-frame poses.
+
+Noise is estimated, and the texture of the background and the misfit of the fits predict errors that belong to places,
+before any pose is known. All of them may be too large: too much light taken for noise, clipped spots with rings, a
+background that is not the screen. The residuals of a run with redundant spots contain the true errors, which therefore
+cannot be larger than the residuals. Source: ours.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.compiled_projection import Views, project_all
+from tracking.rigid_body.association.frame_detections import BLENDED
+from tracking.smoothing.motion.reference import Reference
+from tracking.smoothing.motion.run_detections import RunDetections, fit_frames
+from tracking.smoothing.place_errors import frames_with_same_error, usable_widths
+
+_REACH = 2.0  # widths of the spot: assumed correlation length of the errors
+_QUANTILE = 1.645  # sigmas below the mean: 5 % of normal deviates
+_MOVING = 0.5  # share of the residuals that are independent in spite of errors of places, if the spots move
+_FRAMES = 2000  # at most so many, evenly spaced
+_LEAST_FREEDOM = 4.0  # independent residuals from which the bound is used
+
+
+class VarianceFactors(NamedTuple):
+    """Factors (cameras,), at most 1, of the two parts of the spots' variances."""
+
+    noise: Array
+    place: Array  # of the part that belongs to places
+
+
+def residual_bounds(
+    views: Views, run: RunDetections, assigned: Ints, camera_of: Ints, place_px2: Array, ref: Reference,
+    measured: Bools, widths_px: Array,
+) -> VarianceFactors:  # fmt: skip
+    """Factors with which each part of the variances alone is as large as the residuals allow.
+
+    run: m detections of T frames; assigned (T, n): their labels; camera_of (n,): of the views; place_px2 (m,): part of
+    their variances that belongs to places; ref (T,): motion near which the pose of each frame is found; widths_px (n,):
+    usual widths of the views' spots, nan where not known.
+
+    The residuals are taken to be at the lower 5 % of their distribution. Noise differs in every frame, errors of one
+    place count once: a vehicle at rest has few residuals that are independent of each other. Where the spots move on
+    between the frames both parts have the same effect, and one factor.
+    """
+    noise, place = np.ones(run.has_image.shape[1]), np.ones(run.has_image.shape[1])
+    labelled = (assigned >= 0) & (assigned < BLENDED)
+    frames = np.flatnonzero(measured & (labelled.sum(axis=1) > 3))
+    if len(frames) > _FRAMES:
+        frames = frames[np.linspace(0, len(frames) - 1, _FRAMES).astype(np.int64)]
+    if not len(frames):
+        return VarianceFactors(noise, place)
+    some, assigned, labelled = run._replace(begin=run.begin[frames]), assigned[frames], labelled[frames]
+    row = np.where(labelled, some.begin[:, None] + assigned, 0)
+    near = Reference(ref.R[frames], ref.t[frames], ref.m[frames])
+    fits = fit_frames(views, some, assigned, np.zeros((len(camera_of), 2, 2)), near)
+    uv, J = project_all(views, fits.R, fits.t)
+    P = np.linalg.pinv(fits.information, hermitian=True)
+    cov = run.cov[row]
+    free = 1 - 0.5 * np.einsum("knia,kab,knjb,knji->kn", J, P, J, np.linalg.inv(cov))  # share not taken by the pose
+    usable = labelled & np.isfinite(uv).all(axis=-1) & (free > 0)
+    size2 = 0.5 * np.trace(cov, axis1=2, axis2=3)
+    square = 0.5 * np.sum((run.uv[row] - uv) ** 2, axis=-1) / size2
+    share = np.minimum(place_px2[row] / size2, 1.0)
+    same = np.full(assigned.shape, np.nan)  # frames with the same error of a place
+    measured_px = np.where(labelled[..., None], run.uv[row], np.nan)
+    for i, width in enumerate(usable_widths(widths_px)):
+        same[:, i] = frames_with_same_error(measured_px[:, i], _REACH * width)
+    for camera in range(len(noise)):
+        of_camera = usable & (camera_of == camera)
+        weight = free[of_camera]
+        freedom, places = 2 * float(np.sum(weight)), 2 * float(np.sum(weight / same[of_camera]))
+        if freedom < _LEAST_FREEDOM:
+            continue
+        residual = float(np.sum(square[of_camera])) / float(np.sum(weight))
+        of_place = float(np.sum(share[of_camera] * weight)) / float(np.sum(weight))
+        most = residual / _lower_quantile(freedom)
+        if places > _MOVING * freedom:
+            noise[camera] = place[camera] = min(most, 1.0)
+            continue
+        noise[camera] = min(most / max(1 - of_place, 1e-12), 1.0)
+        if places >= _LEAST_FREEDOM:
+            place[camera] = min(residual / (_lower_quantile(places) * max(of_place, 1e-12)), 1.0)
+    return VarianceFactors(noise, place)
+
+
+def _lower_quantile(freedom: float) -> float:
+    """5 % quantile of chi-square over its degrees of freedom. Source: Wilson & Hilferty 1931."""
+    a = 2 / (9 * freedom)
+    return max(1 - a - _QUANTILE * float(np.sqrt(a)), 0.1) ** 3
