@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geometry.arrays import Array
 from geometry.camera import SensorNoise
-from tracking.noise_estimation.rounding import clipped_normal
+from tracking.rounding import clipped_normal
 
 Picture: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking.noise import CLIPPED_SHARE, Picture
-from tracking.noise_estimation.rounding import clipped_normal
+from tracking.rounding import clipped_normal
 
 _FEWEST_VALUES = 8  # distinct grey values needed to take their common divisor as the step
 _UNLIT = 0.25  # share of the blocks that is taken to be without light

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools
 from tracking.noise import Picture, guess_noise, quantile_variance
-from tracking.noise_estimation.rounding import rounding_ripple, unrounded
+from tracking.rounding import rounding_ripple, unrounded
 
 Floats: TypeAlias = NDArray[Any]
 

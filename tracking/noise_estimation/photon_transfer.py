@@ -20,11 +20,11 @@ from tracking.noise import FULL_SCALE_E, NoiseModel, Picture, quantile_variance
 from tracking.noise_estimation.block_steps import block_step
 from tracking.noise_estimation.grey_values import clipped_background, full_scale, grey_step, saturation_level
 from tracking.noise_estimation.levels import LEAST_PIXELS, LEVELS, SIDE, LevelVariances, level_variances
-from tracking.noise_estimation.rounding import banding
 from tracking.noise_estimation.spot_residuals import SpotResiduals, residuals_of_spots
 from tracking.noise_estimation.texture import MeanPicture, local_texture, texture_of
 from tracking.noise_estimation.texture_shift import TextureShift, texture_shift
 from tracking.parameters import DetectParameters
+from tracking.rounding import banding
 
 _WELL_E = (1_000.0, 200_000.0)  # electrons at full scale: range from the smallest to the largest sensors
 _WELL_SPREAD = 1.2  # prior sigma of the logarithm about FULL_SCALE_E: a decade is two sigmas

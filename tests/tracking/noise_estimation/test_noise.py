@@ -17,7 +17,7 @@ from tracking.noise import ROUNDING_DN2, NoiseModel, guess_noise
 from tracking.noise_estimation.block_steps import block_step
 from tracking.noise_estimation.grey_values import saturation_level
 from tracking.noise_estimation.photon_transfer import estimate_noise
-from tracking.noise_estimation.rounding import clipped_normal, unrounded
+from tracking.rounding import clipped_normal, unrounded
 
 SPOTS = [
     Spot(60 + 70 * i, 60 + 60 * j, 40.0 + 35 * ((i + j) % 5), 2.4, 1.9, 30.0 * i) for i in range(5) for j in range(4)
