@@ -17,13 +17,11 @@ import re
 import secrets
 import sys
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
 from lab.files.output.unfinished import remove, removed_at_the_end
 
-_FILES_AT_ONCE = 8  # to be written to the disk
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
 
 
@@ -59,24 +57,20 @@ def replace_folder(work: Path, target: Path) -> None:
 def _to_disk(folder: Path) -> None:
     """Wait until all files below a folder are on the disk, and the folders' lists of them. Raises OSError.
 
-    Several files at once: for the ten of a run 6 ms instead of 23 to 55.
+    One after another: with threads it takes 6 ms instead of 23 to 55 for the ten files of a run, but a stop signal that
+    arrives while a thread ends is reported as an ignored exception.
     """
-    every = [folder, *folder.rglob("*")]
-    paths = [p for p in every if not p.is_symlink() and (p.is_file() or (p.is_dir() and os.name == "posix"))]
-    with ThreadPoolExecutor(_FILES_AT_ONCE) as pool:
-        for _ in pool.map(_wait_for, paths):
-            pass
-
-
-def _wait_for(path: Path) -> None:
-    file = os.open(path, os.O_RDONLY if os.name == "posix" else os.O_RDWR)  # Windows: only what can be written
-    try:
-        os.fsync(file)
-    except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # file systems without it
-            raise
-    finally:
-        os.close(file)
+    for path in [folder, *folder.rglob("*")]:
+        if path.is_symlink() or not (path.is_file() or (path.is_dir() and os.name == "posix")):
+            continue
+        file = os.open(path, os.O_RDONLY if os.name == "posix" else os.O_RDWR)  # Windows: only what can be written
+        try:
+            os.fsync(file)
+        except OSError as error:
+            if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # file systems without it
+                raise
+        finally:
+            os.close(file)
 
 
 def exchange(one: Path, other: Path) -> bool:
