@@ -96,13 +96,13 @@ def evaluate_model(
     counts = len(all_frames.frames), len(lin.frames)
     if lin.dof <= 0:
         return ModelCheckResult(*counts, NotTested.NO_REDUNDANCY, statistics=groups, unseen=unseen)
-    weighted = diagnose_with_noise_of_cameras(parameters, recording, lin, jacobian, possible_faults(rig, parameters))
+    faults = possible_faults(rig, parameters)
+    weighted = diagnose_with_noise_of_cameras(parameters, recording, lin, jacobian, faults)
     if weighted.diagnosis.unexplained:
         usual = _usual_frames(lin)
         few = linearise(model, recording, usual)
-        without = diagnose_with_noise_of_cameras(
-            parameters, recording, few, parameters.jacobian(recording, few), possible_faults(rig, parameters)
-        )
+        of_few = parameters.jacobian(recording, few)
+        without = diagnose_with_noise_of_cameras(parameters, recording, few, of_few, faults)
         if not without.diagnosis.suspected_faults and not without.diagnosis.unexplained:
             weighted, counts = without, (len(all_frames.frames), len(usual))
     return ModelCheckResult(

@@ -15,7 +15,7 @@ from tracking.rigid_body.models.information import single_frame_pose
 from tracking.rigid_body.variance_factor import DEADBAND
 from tracking.smoothing.motion.reference import Reference
 from tracking.smoothing.motion.run_detections import RunDetections, labelled_points
-from tracking.smoothing.residual_bounds import VarianceFactors, residual_bounds
+from tracking.smoothing.residual_bounds import VarianceFactors, evenly_spread, residual_bounds
 
 # Largest shift of a spot's centre by texture, speckle and its shape, as a share of its width (1 sigma): 4 % texture
 # makes 0.04, speckle of contrast 0.3 up to 0.16.
@@ -49,16 +49,18 @@ class ErrorScale:
         views, camera = model.numbers, model.camera_of
         misfit = usual_misfit(run, place_px2, assigned, camera)
         own = _cameras_of(run)
-        even = run._replace(cov=_with_least(run.cov, run.size_px, place_px2, misfit[own]))
-        place = np.maximum(place_px2, _variance_of_share(run.size_px, misfit[own]))
+        place = _place_variance(place_px2, run.size_px, misfit[own])
+        even = run._replace(cov=_with_more(run.cov, place - place_px2))
 
         def bounds_of(some: RunDetections) -> VarianceFactors:
-            return residual_bounds(views, some, assigned, camera, place, ref, measured, usual_sizes(run, assigned))
+            return residual_bounds(views, some, assigned, camera, place, ref, measured)
 
         seen = scattered_width_share(even, assigned, camera)
+        wider = widened(even, seen)
+        bounds = bounds_of(wider)
         if seen.any():
-            seen = _less(seen, bounds_of(widened(even, seen)).noise, widened(even, seen), even)
-        bounds = bounds_of(widened(even, seen))
+            seen = _less(seen, bounds.noise, wider, even)
+            bounds = bounds_of(widened(even, seen))
         even = even._replace(cov=_within(bounds, even.cov, place, own))
         wider = widened(even, seen)
         more = width_share(views, wider, assigned, calibration_cov, ref, measured)
@@ -70,16 +72,15 @@ class ErrorScale:
 
         place_px2 (m,): part of the stated variances that belongs to the place. Unknown widths (nan) add nothing.
         """
-        least = _with_least(stated, width_px, place_px2, self.misfit_share[camera])
-        place = np.maximum(place_px2, _variance_of_share(width_px, self.misfit_share[camera]))
-        least = _within(self.bounds, least, place, camera)
-        return (least + width_covariance(width_px, self.width_share[camera])) * self.noise_scale**2
+        place = _place_variance(place_px2, width_px, self.misfit_share[camera])
+        within = _within(self.bounds, _with_more(stated, place - place_px2), place, camera)
+        return (within + width_covariance(width_px, self.width_share[camera])) * self.noise_scale**2
 
     def place_px2(self, run: RunDetections, stated_px2: Array) -> Array:
         """(m,): variances of a run's detections that belong to their places."""
         camera = _cameras_of(run)
-        least = _variance_of_share(run.size_px, self.misfit_share[camera])
-        return np.maximum(stated_px2, least) * self.bounds.place[camera] * self.noise_scale**2
+        place = _place_variance(stated_px2, run.size_px, self.misfit_share[camera])
+        return place * self.bounds.place[camera] * self.noise_scale**2
 
     def of_run(self, run: RunDetections, place_px2: Array) -> Array:
         """Covariances (m, 2, 2) of all detections of a run."""
@@ -97,10 +98,14 @@ def _variance_of_share(width_px: Array, share: Array | float) -> Array:
     return np.asarray((share * np.where(np.isnan(width_px), 0.0, width_px)) ** 2)
 
 
-def _with_least(cov: Array, width_px: Array, place_px2: Array, share: Array | float) -> Array:
-    """Covariances (m, 2, 2) with a part that belongs to the place of at least a share of the width, squared."""
-    missing = np.maximum(_variance_of_share(width_px, share) - place_px2, 0.0)
-    return np.asarray(cov + missing[:, None, None] * np.eye(2))
+def _place_variance(stated_px2: Array, width_px: Array, share: Array | float) -> Array:
+    """(m,): variances, px^2, that belong to places: as stated, and at least those of a share of the widths (m,), px."""
+    return np.asarray(np.maximum(stated_px2, _variance_of_share(width_px, share)))
+
+
+def _with_more(cov: Array, variance_px2: Array) -> Array:
+    """Covariances (m, 2, 2) with further variances (m,), the same in all directions."""
+    return np.asarray(cov + variance_px2[:, None, None] * np.eye(2))
 
 
 def _within(bounds: VarianceFactors, cov: Array, place_px2: Array, camera: Ints | int) -> Array:
@@ -167,7 +172,7 @@ def width_share(
     """
     if not np.isfinite(detections.size_px).any():
         return 0.0
-    frames = _evenly_spread(np.flatnonzero(measured), _FRAMES)
+    frames = evenly_spread(np.flatnonzero(measured), _FRAMES)
 
     def variance_factor(share: float) -> float:
         return _mean_variance_factor(views, widened(detections, share), assigned, calibration_cov, ref, frames)
@@ -226,11 +231,6 @@ def _share_with(variance_factor: Callable[[float], float]) -> float:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if variance_factor(middle) > 1.0 else (low, middle)
     return 0.5 * (low + high)
-
-
-def _evenly_spread(rows: Ints, most: int) -> Ints:
-    """At most so many of the rows, evenly spaced."""
-    return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(np.int64)]
 
 
 def noise_scale(

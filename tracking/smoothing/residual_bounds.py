@@ -14,13 +14,14 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.compiled_projection import Views, project_all
+from geometry.uncertainty.chi_square import gamma_quantile
 from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.smoothing.motion.reference import Reference
 from tracking.smoothing.motion.run_detections import RunDetections, fit_frames
 from tracking.smoothing.place_errors import frames_with_same_error, usable_widths
 
 _REACH = 2.0  # widths of the spot: assumed correlation length of the errors
-_QUANTILE = 1.645  # sigmas below the mean: 5 % of normal deviates
+_BELOW = 0.05  # share of the distribution of the residuals that is taken to be below them
 _MOVING = 0.5  # share of the residuals that are independent in spite of errors of places, if the spots move
 _FRAMES = 2000  # at most so many, evenly spaced
 _LEAST_FREEDOM = 4.0  # independent residuals from which the bound is used
@@ -35,13 +36,12 @@ class VarianceFactors(NamedTuple):
 
 def residual_bounds(
     views: Views, run: RunDetections, assigned: Ints, camera_of: Ints, place_px2: Array, ref: Reference,
-    measured: Bools, widths_px: Array,
+    measured: Bools,
 ) -> VarianceFactors:  # fmt: skip
     """Factors with which each part of the variances alone is as large as the residuals allow.
 
     run: m detections of T frames; assigned (T, n): their labels; camera_of (n,): of the views; place_px2 (m,): part of
-    their variances that belongs to places; ref (T,): motion near which the pose of each frame is found; widths_px (n,):
-    usual widths of the views' spots, nan where not known.
+    their variances that belongs to places; ref (T,): motion near which the pose of each frame is found.
 
     The residuals are taken to be at the lower 5 % of their distribution. Noise differs in every frame, errors of one
     place count once: a vehicle at rest has few residuals that are independent of each other. Where the spots move on
@@ -49,9 +49,7 @@ def residual_bounds(
     """
     noise, place = np.ones(run.has_image.shape[1]), np.ones(run.has_image.shape[1])
     labelled = (assigned >= 0) & (assigned < BLENDED)
-    frames = np.flatnonzero(measured & (labelled.sum(axis=1) > 3))
-    if len(frames) > _FRAMES:
-        frames = frames[np.linspace(0, len(frames) - 1, _FRAMES).astype(np.int64)]
+    frames = evenly_spread(np.flatnonzero(measured & (labelled.sum(axis=1) > 3)), _FRAMES)
     if not len(frames):
         return VarianceFactors(noise, place)
     some, assigned, labelled = run._replace(begin=run.begin[frames]), assigned[frames], labelled[frames]
@@ -68,7 +66,7 @@ def residual_bounds(
     share = np.minimum(place_px2[row] / size2, 1.0)
     same = np.full(assigned.shape, np.nan)  # frames with the same error of a place
     measured_px = np.where(labelled[..., None], run.uv[row], np.nan)
-    for i, width in enumerate(usable_widths(widths_px)):
+    for i, width in enumerate(usable_widths(run.usual_size_px)):
         same[:, i] = frames_with_same_error(measured_px[:, i], _REACH * width)
     for camera in range(len(noise)):
         of_camera = usable & (camera_of == camera)
@@ -89,6 +87,10 @@ def residual_bounds(
 
 
 def _lower_quantile(freedom: float) -> float:
-    """5 % quantile of chi-square over its degrees of freedom. Source: Wilson & Hilferty 1931."""
-    a = 2 / (9 * freedom)
-    return max(1 - a - _QUANTILE * float(np.sqrt(a)), 0.1) ** 3
+    """Quantile of chi-square over its degrees of freedom, which need not be whole."""
+    return 2 * gamma_quantile(1 - _BELOW, freedom / 2) / freedom
+
+
+def evenly_spread(rows: Ints, most: int) -> Ints:
+    """At most so many of the rows, evenly spaced."""
+    return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(np.int64)]

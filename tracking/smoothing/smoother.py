@@ -107,12 +107,12 @@ class _Smoother:
         self.probability = np.where(self.causal >= 0, 1.0, np.nan)
         ref = straight_between(rec.poses, self.measured, np.cumsum(rec.dt_s))
         every = rec.run_detections()
+        every = every._replace(usual_size_px=usual_sizes(every, self.assigned))
         self.calibration_cov, self.systematic, self.noise_share = calibration_errors(rec, every, self.assigned, ref)
         place_px2 = rec.place_px2()
         self.errors = ErrorScale.of(model, every, place_px2, self.assigned, self.calibration_cov, ref, self.measured)
         self.detections = every._replace(
-            cov=self.errors.of_run(every, place_px2) + parameters.sigma_model_px**2 * np.eye(2),
-            usual_size_px=usual_sizes(every, self.assigned),
+            cov=self.errors.of_run(every, place_px2) + parameters.sigma_model_px**2 * np.eye(2)
         )
         log_density: Array | None = None
         if not parameters.learn_jerk:
