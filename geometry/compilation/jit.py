@@ -17,13 +17,14 @@ from typing import Any, TypeVar
 import numba
 from numba.core import codegen, event
 from numba.core.caching import FunctionCache
-from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]
+from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]  # written in C, without types
 from numba.core.types import unliteral
 
 from geometry.compilation.compile_cache import cache_folder, is_empty
 
 Function = TypeVar("Function", bound=Callable)
 
+_llvm: Any = codegen.ll  # type: ignore[attr-defined]  # llvmlite.binding, as numba imports it; numba has no types
 _folders: set[Path] = set()  # source folders that have compiled functions
 
 
@@ -47,7 +48,6 @@ class _Library(codegen.JITCodeLibrary):
     of loading (docs/decisions/compile-cache.md).
     """
 
-    # mypy is silenced in calls of numba's own methods: numba has no types for them.
     _unparsed: bytes | None = None  # bitcode of code from disk
 
     @classmethod
@@ -63,15 +63,15 @@ class _Library(codegen.JITCodeLibrary):
 
     def _get_module_for_linking(self) -> Any:
         if self._unparsed is not None:
-            self._shared_module = codegen.ll.parse_bitcode(self._unparsed)  # type: ignore[attr-defined]
+            self._shared_module = _llvm.parse_bitcode(self._unparsed)
             self._unparsed = None
-        return super()._get_module_for_linking()  # type: ignore[no-untyped-call]
+        return super()._get_module_for_linking()  # type: ignore[no-untyped-call]  # numba has no types
 
     def get_pointer_to_function(self, name: str) -> int:
         if self._disable_inspection:  # code from disk: numba knows its symbols only from the bitcode
             address: int = self._codegen._engine.get_function_address(name)
             return address
-        return int(super().get_pointer_to_function(name))  # type: ignore[no-untyped-call]
+        return int(super().get_pointer_to_function(name))  # type: ignore[no-untyped-call]  # numba has no types
 
 
 class _Cache(FunctionCache):
@@ -87,7 +87,7 @@ class _Cache(FunctionCache):
         settings: Any = numba.config
         before, settings.CACHE_DIR = settings.CACHE_DIR, str(self._folder)
         try:
-            super().__init__(self._function)  # type: ignore[no-untyped-call]
+            super().__init__(self._function)  # type: ignore[no-untyped-call]  # numba has no types
         finally:
             settings.CACHE_DIR = before
         self._is_open = True
@@ -100,15 +100,15 @@ class _Cache(FunctionCache):
         try:
             # Not FunctionCache.load_overload: it first imports what numba needs to compile, as numba does again there.
             with self._guard_against_spurious_io_errors():
-                return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+                return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]  # numba has no types
         except Exception:  # unpickling a truncated file raises almost anything
             with suppress(OSError):
-                self.flush()  # type: ignore[no-untyped-call]
+                self.flush()  # type: ignore[no-untyped-call]  # numba has no types
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         with suppress(OSError):  # for instance a full disk: the code is compiled, only not kept
-            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]  # numba has no types
 
 
 @cache
@@ -119,7 +119,7 @@ def _name_functions_of_numba() -> None:
     contains.
     """
     for name, address in _nrt_python.c_helpers.items():
-        codegen.ll.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)  # type: ignore[attr-defined]
+        _llvm.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
 
 
 def _compiled(function: Function, release_gil: bool) -> Function:
