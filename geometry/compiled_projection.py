@@ -61,6 +61,30 @@ def project_all(v: Views, R: Array, t: Array) -> tuple[Array, Array]:
 
 
 @compiled
+def project_with_covariances(v: Views, R: Array, t: Array, P: Array) -> tuple[Array, Array]:
+    """Pixels (m, n, 2) of n views for poses R (m, 3, 3), t (m, 3), m, and their covariances (m, n, 2, 2), px^2.
+
+    P (m, 6, 6): the poses' covariances. nan and 0 where a view has no projection.
+    """
+    m, n = R.shape[0], v.shape[0]
+    uv, cov = np.empty((m, n, 2)), np.empty((m, n, 2, 2))
+    J, JP = np.empty((2, 6)), np.empty((2, 6))
+    for k in range(m):
+        for i in range(n):
+            project_view(v, i, R[k], t[k], uv[k, i], J)
+            for a in range(2):
+                for c in range(6):
+                    JP[a, c] = 0.0
+                    for b in range(6):
+                        JP[a, c] += J[a, b] * P[k, b, c]
+                for b in range(2):
+                    cov[k, i, a, b] = 0.0
+                    for c in range(6):
+                        cov[k, i, a, b] += JP[a, c] * J[b, c]
+    return uv, cov
+
+
+@compiled
 def project_view(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> bool:
     """Writes the pixel of view i to uv (2,) and its Jacobian to J (2, 6); False, nan and 0 if there is no projection.
 

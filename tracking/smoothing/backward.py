@@ -60,7 +60,7 @@ def _track_stretch(rec: TrackedRecording, motion: SmoothedMotion, first: int, la
     poses, causal = rec.poses, rec.measured
     for k in range(last, first - 1, -1):
         tracked = tracker.step(float(dt[k + 1]), rec.found(k))
-        out.assigned[k] = assigned_in_one_list(tracked, rec.detections(k)[3][rec.model.camera_of])
+        out.assigned[k] = assigned_in_one_list(tracked, rec.first(k)[rec.model.camera_of])
         out.measured[k] = tracked.pose_status is PoseStatus.MEASURED
         if out.measured[k] and tracked.pose is not None:
             out.R[k], out.t[k] = tracked.pose.rotation, tracked.pose.translation

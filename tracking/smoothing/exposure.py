@@ -57,9 +57,10 @@ def exposure_sigmas(motion: Reference, jumped: Bools, exposure_s: float, dt: Arr
 
 def pose_shift(views: Views, motion: Reference, offsets: Array) -> Array:
     """Pose errors (T, 6) that pixel offsets (T, n, 2) cause: their least-squares fit."""
-    _, J = project_all(views, motion.R, motion.t)
     out = np.zeros((len(motion.t), 6))
-    for k in np.flatnonzero(np.any(offsets != 0, axis=(1, 2))).tolist():
-        rows = np.flatnonzero(np.any(offsets[k] != 0, axis=-1) & np.isfinite(J[k]).all(axis=(1, 2)))
-        out[k] = np.linalg.lstsq(J[k, rows].reshape(-1, 6), offsets[k, rows].ravel(), rcond=1e-6)[0]
+    frames = np.flatnonzero(np.any(offsets != 0, axis=(1, 2)))
+    _, J = project_all(views, motion.R[frames], motion.t[frames])
+    for k, J_k in zip(frames.tolist(), J, strict=True):
+        rows = np.flatnonzero(np.any(offsets[k] != 0, axis=-1) & np.isfinite(J_k).all(axis=(1, 2)))
+        out[k] = np.linalg.lstsq(J_k[rows].reshape(-1, 6), offsets[k, rows].ravel(), rcond=1e-6)[0]
     return out

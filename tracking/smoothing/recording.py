@@ -19,6 +19,8 @@ from tracking.smoothing.motion.run_detections import RunDetections
 from tracking.statuses import PoseStatus, SpotStatus
 from tracking.tracked_frame import TrackedFrame
 
+_FIRST_VALUES = 1024  # that a column has room for at the start
+
 
 def assigned_in_one_list(tracked: TrackedFrame, start: Ints) -> Ints:
     """A frame's labels as an assignment (n,): rows in the list of all cameras' detections, plus BLENDED; -1 without.
@@ -31,8 +33,38 @@ def assigned_in_one_list(tracked: TrackedFrame, start: Ints) -> Ints:
     return assigned
 
 
+class _Column:
+    """Values that are appended; the storage doubles when it is full."""
+
+    def __init__(self, shape: tuple[int, ...] = (), dtype: type = float) -> None:
+        """shape: of one value."""
+        self._storage: np.ndarray = np.empty((_FIRST_VALUES, *shape), dtype)
+        self._count = 0
+
+    def append(self, value: object) -> None:
+        """Add one value."""
+        self._more(1)[0] = value
+
+    def extend(self, values: np.ndarray) -> None:
+        """Add the values (m, ...)."""
+        self._more(len(values))[:] = values
+
+    def _more(self, count: int) -> np.ndarray:
+        begin, self._count = self._count, self._count + count
+        if self._count > len(self._storage):
+            larger = np.empty((2 * self._count, *self._storage.shape[1:]), self._storage.dtype)
+            larger[:begin] = self._storage[:begin]
+            self._storage = larger
+        return self._storage[begin : self._count]
+
+    @property
+    def values(self) -> np.ndarray:
+        """(m, ...): all values so far; not a copy."""
+        return self._storage[: self._count]
+
+
 class TrackedRecording:
-    """Collects each frame and the causal tracker's answer; keeps about 1 kB per frame."""
+    """Collects each frame and the causal tracker's answer; keeps about 1 kB per frame. T frames, n views."""
 
     def __init__(
         self,
@@ -47,36 +79,31 @@ class TrackedRecording:
         self.parameters = parameters
         self.calibration = None if covariance is None else RigUncertainty(rig, self.model, covariance)
         self.exposure_s = exposure_s
-        self._dt: list[float] = []
-        self._uv: list[Array] = []
-        self._cov: list[Array] = []
-        self._size: list[Array] = []
-        self._place: list[Array] = []
-        self._first: list[Ints] = []
-        self._has_image: list[Bools] = []
-        self._assigned: list[Ints] = []
-        self._jumped: list[bool] = []
-        self._measured: list[bool] = []
-        self._pose: list[Array] = []
+        cameras = len(self.model.camera_names)
+        self._dt, self._jumped, self._measured = _Column(), _Column(dtype=bool), _Column(dtype=bool)
+        self._pose, self._assigned = _Column((4, 3)), _Column((len(self.model),), np.int64)
+        self._uv, self._cov, self._size, self._place = _Column((2,)), _Column((2, 2)), _Column(), _Column()
+        self._first, self._has_image = _Column((cameras + 1,), np.int64), _Column((cameras,), bool)
+        self._begin = _Column(dtype=np.int64)  # (T + 1,) where the detections of each frame begin
+        self._begin.append(0)
 
     def __len__(self) -> int:
-        return len(self._dt)
+        return len(self.dt_s)
 
     def append(self, dt_s: float, found: Sequence[Detections | None], tracked: TrackedFrame) -> None:
         """Add a frame; dt_s: time since the one before (0 for the first)."""
-        counts = [0 if f is None else len(f) for f in found]
         first = np.zeros(len(found) + 1, dtype=np.int64)
-        np.cumsum(counts, out=first[1:])
-        some = [f for f in found if f is not None and len(f)]
-        none2, none4 = np.zeros((0, 2)), np.zeros((0, 2, 2))
-        self._dt.append(dt_s)
-        self._uv.append(np.concatenate([f.uv_px for f in some]) if some else none2)
-        self._cov.append(np.concatenate([f.cov_px2 for f in some]) if some else none4)
-        self._size.append(np.concatenate([f.major_px for f in some]) if some else np.zeros(0))
-        places = [np.zeros(len(f)) if f.place_px2 is None else f.place_px2 for f in some]
-        self._place.append(np.concatenate(places) if places else np.zeros(0))
+        np.cumsum([0 if f is None else len(f) for f in found], out=first[1:])
+        for f in found:
+            if f is not None and len(f):
+                self._uv.extend(f.uv_px)
+                self._cov.extend(f.cov_px2)
+                self._size.extend(f.major_px)
+                self._place.extend(np.zeros(len(f)) if f.place_px2 is None else f.place_px2)
+        self._begin.append(self._begin.values[-1] + first[-1])
         self._first.append(first)
-        self._has_image.append(np.array([f is not None for f in found]))
+        self._has_image.append([f is not None for f in found])
+        self._dt.append(dt_s)
         self._assigned.append(assigned_in_one_list(tracked, first[self.model.camera_of]))
         self._jumped.append(SpotStatus.TURNED in tracked.status)
         self._measured.append(tracked.pose_status is PoseStatus.MEASURED)
@@ -88,63 +115,57 @@ class TrackedRecording:
     @property
     def dt_s(self) -> Array:
         """(T,) time since the frame before."""
-        return np.array(self._dt)
+        return self._dt.values
 
     @property
     def poses(self) -> Array:
         """(T, 4, 3): rotation and, below it, translation of the causal poses; nan where lost."""
-        return np.array(self._pose).reshape(-1, 4, 3)
+        return self._pose.values
 
     @property
     def measured(self) -> Bools:
         """(T,): frames whose pose was measured."""
-        return np.array(self._measured, dtype=bool)
+        return self._measured.values
 
     @property
     def jumped(self) -> Bools:
         """(T,): frames in which the tracker found that the velocities had jumped in the step before."""
-        return np.array(self._jumped, dtype=bool)
+        return self._jumped.values
 
     @property
     def assigned(self) -> Ints:
         """(T, n): row in the list of all cameras' detections of the frame, plus BLENDED; -1 without."""
-        return np.array(self._assigned, dtype=np.int64).reshape(len(self), len(self.model))
+        return self._assigned.values
 
     def found(self, k: int) -> list[Detections | None]:
         """Frame k's detections by camera as a tracker's input, None without a picture; without brightness."""
-        uv, cov, size, first, has_image = self.detections(k)
+        begin, first = int(self._begin.values[k]), self.first(k)
         out: list[Detections | None] = []
-        for c, there in enumerate(has_image):
-            rows = slice(int(first[c]), int(first[c + 1]))
-            points = Detections.at(uv[rows], cov[rows])
-            out.append(replace(points, major_px=size[rows], minor_px=size[rows]) if there else None)
+        for c, there in enumerate(self._has_image.values[k]):
+            rows = slice(begin + int(first[c]), begin + int(first[c + 1]))
+            points = Detections.at(self._uv.values[rows], self._cov.values[rows])
+            size = self._size.values[rows]
+            out.append(replace(points, major_px=size, minor_px=size) if there else None)
         return out
 
-    def detections(self, k: int) -> tuple[Array, Array, Array, Ints, Bools]:
-        """Frame k's m detections, sorted by camera.
-
-        Pixels (m, 2), covariances (m, 2, 2), larger half axes (m,), px, nan where not known; where the rows of each
-        camera begin (cameras + 1,); which cameras have a picture (cameras,).
-        """
-        return self._uv[k], self._cov[k], self._size[k], self._first[k], self._has_image[k]
+    def first(self, k: int) -> Ints:
+        """(cameras + 1,): where the rows of each camera begin in the list of all cameras' detections of frame k."""
+        return np.asarray(self._first.values[k])
 
     def place_px2(self) -> Array:
         """(m,): of the variance of a coordinate of each detection of the run, the part that belongs to its place."""
-        return np.concatenate([np.zeros(0), *self._place])
+        return self._place.values
 
     def run_detections(self) -> RunDetections:
-        """All detections of the run."""
-        frames = [self.detections(k) for k in range(len(self))]
-        counts = [len(f[0]) for f in frames]
-        cameras = len(self.model.camera_names)
-        size = np.concatenate([np.zeros(0), *[f[2] for f in frames]])
+        """All detections of the run; their arrays are the recording's own."""
+        size = self._size.values
         return RunDetections(
-            uv=np.concatenate([np.zeros((0, 2)), *[f[0] for f in frames]]),
-            cov=np.concatenate([np.zeros((0, 2, 2)), *[f[1] for f in frames]]),
+            uv=self._uv.values,
+            cov=self._cov.values,
             blend_px=np.where(np.isnan(size), 0.0, self.parameters.blend_px),
-            begin=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-            first=np.array([f[3] for f in frames], dtype=np.int64).reshape(-1, cameras + 1),
-            has_image=np.array([f[4] for f in frames], dtype=bool).reshape(-1, cameras),
+            begin=self._begin.values,
+            first=self._first.values,
+            has_image=self._has_image.values,
             log_static=np.full(len(size), -np.inf),
             size_px=size,
             usual_size_px=np.full(len(self.model), np.nan),

@@ -13,6 +13,8 @@ from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.smoothing.motion.reference import Reference
 from tracking.smoothing.motion.run_detections import RunDetections, fit_frames
 
+_BLOCK = 4096  # frames whose fits are in memory at once
+
 
 @dataclass(frozen=True, slots=True)
 class SingleFramePoses:
@@ -49,20 +51,25 @@ def single_frame_poses(
     (motion.velocity_jumps.corner_offsets).
     """
     out = SingleFramePoses.unknown(len(assigned))
-    fits = fit_frames(views, detections, assigned, calibration_cov, ref)
-    rows = np.flatnonzero(fits.spots >= 3)
-    covariance, full_rank = covariances_of(fits.information[rows])
-    rows, covariance = rows[full_rank], covariance[full_rank]
-    worst = [np.sqrt(np.linalg.eigvalsh(covariance[:, i, i])[:, -1]) for i in (slice(0, 3), slice(3, 6))]
-    good = (worst[0] <= limits.max_sigma_m) & (worst[1] <= limits.max_sigma_rad)
-    rows, b = rows[good], beside[rows[good]]
-    out.measured[rows] = True
-    out.R[rows], out.t[rows] = fits.R[rows], fits.t[rows]
-    out.covariance[rows] = covariance[good] + np.eye(6) * (b**2)[:, None]
-    along = b * fits.along[rows]
-    inside = np.eye(6) + b[:, :, None] * fits.at_ref[rows] * b[:, None]
-    less = np.einsum("ki,ki->k", along, np.linalg.solve(inside, along[..., None])[..., 0])
-    out.excess[rows] = fits.chi2_ref[rows] - fits.chi2[rows] - less
+    for start in range(0, len(assigned), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        some = detections._replace(begin=detections.begin[start:])
+        near = Reference(ref.R[block], ref.t[block], ref.m[block])
+        fits = fit_frames(views, some, assigned[block], calibration_cov, near)
+        rows = np.flatnonzero(fits.spots >= 3)
+        covariance, full_rank = covariances_of(fits.information[rows])
+        rows, covariance = rows[full_rank], covariance[full_rank]
+        worst = [np.sqrt(np.linalg.eigvalsh(covariance[:, i, i])[:, -1]) for i in (slice(0, 3), slice(3, 6))]
+        good = (worst[0] <= limits.max_sigma_m) & (worst[1] <= limits.max_sigma_rad)
+        rows, covariance = rows[good], covariance[good]
+        at, b = start + rows, beside[start + rows]
+        out.measured[at] = True
+        out.R[at], out.t[at] = fits.R[rows], fits.t[rows]
+        out.covariance[at] = covariance + np.eye(6) * (b**2)[:, None]
+        along = b * fits.along[rows]
+        inside = np.eye(6) + b[:, :, None] * fits.at_ref[rows] * b[:, None]
+        less = np.einsum("ki,ki->k", along, np.linalg.solve(inside, along[..., None])[..., 0])
+        out.excess[at] = fits.chi2_ref[rows] - fits.chi2[rows] - less
     return out
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from geometry.compiled_projection import project_all
+from geometry.compiled_projection import project_with_covariances
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from tracking.detections import UNMATCHED, Detections
@@ -18,6 +18,8 @@ from tracking.smoothing.error_scale import ErrorScale
 from tracking.smoothing.motion.run_detections import RunDetections
 from tracking.statuses import PoseStatus, SpotStatus, view_statuses
 from tracking.tracked_frame import Event, MotionEstimate, TrackedFrame
+
+_BLOCK = 4096  # frames whose measured spots are in memory twice
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,18 +44,26 @@ class ReportedSpots:
         over the exposure less that at its middle, and the sigma (T, 6), m and rad, of the unknown part of the pose's.
         """
         (detections, place_px2), (assigned, errors), (exposure_px, exposure_sigma) = measured, labels, exposure
-        uv_px, J = project_all(model.numbers, poses.rotation, poses.translation)
-        cov_px2 = J @ covariance[:, None] @ np.swapaxes(J, -1, -2) + calibration_cov
+        R, t, views = poses.rotation, poses.translation, model.numbers
+        uv_px, cov_px2 = project_with_covariances(views, R, t, covariance)
+        cov_px2 += calibration_cov
         exists = ~np.isnan(uv_px[..., 0])
-        k, view = np.nonzero(assigned >= 0)
-        chosen = assigned[k, view]
-        rows = detections.begin[k] + chosen % BLENDED
-        uv_px[k, view] = detections.uv[rows] - exposure_px[k, view]
-        own = errors.covariance(detections.cov[rows], detections.size_px[rows], place_px2[rows], model.camera_of[view])
-        blended = np.where(chosen >= BLENDED, parameters.blend_px / 2, 0.0)
-        more = blended**2 + parameters.sigma_model_px**2
-        within = J[k, view] * exposure_sigma[k][:, None]
-        cov_px2[k, view] = own + more[:, None, None] * np.eye(2) + within @ np.swapaxes(within, -1, -2)
+        of_exposure = np.zeros((0, *cov_px2.shape[1:]))
+        if exposure_sigma.any():
+            _, of_exposure = project_with_covariances(views, R, t, exposure_sigma[:, :, None] ** 2 * np.eye(6))
+        for start in range(0, len(assigned), _BLOCK):
+            k, view = np.nonzero(assigned[start : start + _BLOCK] >= 0)
+            k += start
+            chosen = assigned[k, view]
+            rows = detections.begin[k] + chosen % BLENDED
+            uv_px[k, view] = detections.uv[rows] - exposure_px[k, view]
+            blended = np.where(chosen >= BLENDED, parameters.blend_px / 2, 0.0)
+            more = blended**2 + parameters.sigma_model_px**2
+            cov_px2[k, view] = more[:, None, None] * np.eye(2) + errors.covariance(
+                detections.cov[rows], detections.size_px[rows], place_px2[rows], model.camera_of[view]
+            )
+            if len(of_exposure):
+                cov_px2[k, view] += of_exposure[k, view]
         return ReportedSpots(uv_px, cov_px2, exists, model.in_picture(uv_px))
 
 

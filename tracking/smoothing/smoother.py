@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from geometry.compiled_projection import project_all
+from geometry.compiled_projection import project_all, project_with_covariances
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import SolveLimits
 from tracking.rigid_body.association.frame_detections import BLENDED, DetectionModel, ViewTable, distinct_spots
@@ -125,11 +125,13 @@ class _Smoother:
         self.trusted = connected(self.measured, self.sure | self._controlled(ref)[0])  # (T,) labels that may be used
         self.motion = SmoothedMotion.begin(ref, rec.jumped.copy(), log_density)
         self.conflicting = np.zeros(len(rec), dtype=bool)  # (T,) forward and backward poses differ
-        self.own = SingleFramePoses.unknown(len(rec))
+        self.own = SingleFramePoses.unknown(0)  # at the last estimate
 
     def estimate(self, max_distance: int) -> None:
         """Estimate the motion given the labels."""
         rec = self.rec
+        # A long run's memory is largest here.
+        self.motion, self.own = self.motion.without_covariances(), SingleFramePoses.unknown(0)
         run = WholeRun(
             self.views, self.detections, self.calibration_cov, rec.dt_s, rec.exposure_s, self.parameters.learn_jerk
         )
@@ -249,8 +251,8 @@ class _Smoother:
     def continue_paths(self) -> None:
         """Label spots by the continuity of their paths where the pose is uncertain, and those of a displaced camera."""
         motion = self.motion
-        uv, J = project_all(self.views, motion.ref.R, motion.ref.t)
-        cov = J @ motion.pose_P[:, None] @ np.swapaxes(J, -1, -2) + self.calibration_cov
+        uv, cov = project_with_covariances(self.views, motion.ref.R, motion.ref.t, motion.pose_P)
+        cov += self.calibration_cov
         log_clutter = self._log_clutter(self.own.measured)
         known, sure = motion.known[:, None], (self.own.measured & self.trusted)[:, None]
         vague = np.trace(cov, axis1=2, axis2=3) > VAGUE_SIGMA_PX**2
@@ -316,8 +318,8 @@ class _Smoother:
         that covers the contradiction.
         """
         motion, own = self.motion, self.own
-        ref, pose_P, motion_P = motion.ref, motion.pose_P.copy(), motion.motion_P.copy()
-        R, t = ref.R.copy(), ref.t.copy()
+        ref = motion.ref
+        R, t, pose_P, motion_P = (a.copy() for a in (ref.R, ref.t, motion.pose_P, motion.motion_P))
         for k in np.flatnonzero(own.measured & (own.excess > CONTRADICTION_CHI2) & motion.known):
             R[k], t[k], pose_P[k] = own.R[k], own.t[k], own.covariance[k]
             d = Pose(own.R[k], own.t[k]).minus(Pose(ref.R[k], ref.t[k]))

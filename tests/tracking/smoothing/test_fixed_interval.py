@@ -231,15 +231,17 @@ def test_the_last_frame_agrees_with_the_filter():
 def test_the_size_of_the_chunks_does_not_change_the_result(chunk, monkeypatch):
     run = drawn(7, 24, without_spots=slice(5, 8))
     compiled = smoothed(run.ref, run.info, run.jerk)  # all in one chunk
+    monkeypatch.setattr(fixed_interval, "MOST_FRAMES_AT_ONCE", 12)
     monkeypatch.setattr(fixed_interval, "CHUNK", chunk)
     for a, b in zip(smoothed.py_func(run.ref, run.info, run.jerk), compiled, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-18)
 
 
 def test_a_run_of_several_chunks_has_no_error_where_they_meet():
-    run = drawn(8, fixed_interval.CHUNK + 40)
+    run = drawn(8, fixed_interval.MOST_FRAMES_AT_ONCE + 40)
     x, pose_P, *_ = smoothed(run.ref, run.info, run.jerk)
-    meet = fixed_interval.CHUNK
+    meet = 8 * fixed_interval.CHUNK
+    assert len(x) >= meet + 40
     # The frames near the seam by themselves: frames 70 frames away change less than a thousandth of a sigma.
     part = slice(meet - 100, meet + 40)
     info = RunInformation(*(a[part] for a in run.info[:5]), run.info.first_variance)

@@ -93,20 +93,3 @@ def test_the_passes_end_where_a_frame_is_at_the_limit_of_weak_ones(monkeypatch):
     monkeypatch.setattr(whole_run, "weak_frames", alternating)
     assert passes_over_a_corner(1.0, monkeypatch) < MAX_PASSES
     assert len(calls) > 2
-
-
-def test_the_smoother_never_runs_twice_on_the_same_numbers(monkeypatch):
-    """The step after the choice of the interpolation's strength uses the pass that tried it."""
-    inputs, tried = [], []
-
-    def kept(ref, info, jerk):
-        inputs.append(b"".join(np.ascontiguousarray(a).tobytes() for a in (*ref, *info, jerk)))
-        return smoothed(ref, info, jerk)
-
-    smoothed, leave_one_out = whole_run.smoothed, _Estimator._leave_one_out
-    monkeypatch.setattr(whole_run, "smoothed", kept)
-    monkeypatch.setattr(_Estimator, "_interior", lambda self, _: np.arange(len(self.dt)) < 15)  # far from the corner
-    monkeypatch.setattr(_Estimator, "_leave_one_out", lambda *a: tried.append(1) or leave_one_out(*a))
-    steps = passes_over_a_corner(0.3, monkeypatch)
-    assert len(tried) > 1
-    assert len(inputs) == len(set(inputs)) >= steps + len(tried) - 1

@@ -31,9 +31,9 @@ from tracking.rigid_body.models.motion import STATE, predicted, process_noise, p
 from tracking.smoothing.motion.axis_noise import noise_root, subtract_noise
 from tracking.smoothing.motion.reference import Reference
 
-# Frames whose covariances are in memory at once, 2.7 kB each. The forward filter, a fifth of a pass, runs once more
-# over the chunks before the last one.
-CHUNK = 8192
+# Frames whose covariances are in memory at once, 2.7 kB each: the whole of a shorter run, else a chunk. With chunks the
+# forward filter, a fifth of a pass, runs once more over those before the last one.
+MOST_FRAMES_AT_ONCE, CHUNK = 8192, 1024
 
 
 class RunInformation(NamedTuple):
@@ -165,13 +165,13 @@ def smoothed(ref: Reference, info: RunInformation, jerk: Array) -> Interval:
     """
     frames = info.dt.shape[0]
     out = _empty_interval(frames)
-    chunks = (frames + CHUNK - 1) // CHUNK
-    room = min(CHUNK, frames)
-    xs, Ps = np.empty((room, STATE)), np.empty((room, STATE, STATE))
-    start_x, start_P = _filter_checkpoints(ref, info, jerk, CHUNK, xs, Ps)
+    size = frames if frames <= MOST_FRAMES_AT_ONCE else CHUNK
+    chunks = (frames + size - 1) // size
+    xs, Ps = np.empty((size, STATE)), np.empty((size, STATE, STATE))
+    start_x, start_P = _filter_checkpoints(ref, info, jerk, size, xs, Ps)
     Y, y = np.zeros((STATE, STATE)), np.zeros(STATE)  # information about a frame from the frames after it
     for chunk in range(chunks - 1, -1, -1):
-        begin, end = chunk * CHUNK, min((chunk + 1) * CHUNK, frames)
+        begin, end = chunk * size, min((chunk + 1) * size, frames)
         if chunk < chunks - 1:
             _filter_chunk(ref, info, jerk, begin, end, start_x[chunk], start_P[chunk], xs, Ps)
         for k in range(end - 1, begin - 1, -1):

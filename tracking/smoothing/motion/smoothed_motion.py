@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,3 +44,8 @@ class SmoothedMotion:
         zero = np.zeros((frames, 6, 6))
         known = np.zeros(frames, dtype=bool)
         return SmoothedMotion(ref, log_density, 0.0, jumped, zero, zero, known, np.zeros(frames))
+
+    def without_covariances(self) -> SmoothedMotion:
+        """What the next estimate starts from: less memory."""
+        zero = np.zeros_like(self.pose_P)
+        return replace(self, pose_P=zero, motion_P=zero)

@@ -83,7 +83,6 @@ class _Estimator:
         self.beside = np.zeros((len(self.dt), 6))  # of corner_offsets, at the reference of the last step
         self.weak = np.zeros(len(self.dt), dtype=bool)  # (T,) see `jump_variances`
         self.kept: tuple[Reference, tuple[Array, Array, Array]] | None = None  # of the last `_without_corners`
-        self.tried: tuple[RunInformation, Array, Interval] | None = None  # of `_best_interpolation_offset`: the best
         self.fresh = motion.log_density is None
         self.log_density = self._first_density() if motion.log_density is None else motion.log_density[core].copy()
         self.interpolation_offset = motion.interpolation_offset
@@ -169,34 +168,23 @@ class _Estimator:
         interior = self._interior(out)
         if not interior.any():
             return 0.0
-        best = 0.0
-        value, self.tried = self._leave_one_out(info, 0.0, interior)
+        best, value = 0.0, self._leave_one_out(info, 0.0, interior)
         for offset in INTERPOLATION_OFFSETS:
-            likelihood, tried = self._leave_one_out(info, offset, interior)
+            likelihood = self._leave_one_out(info, offset, interior)
             if likelihood < value:
                 break
-            best, value, self.tried = offset, likelihood, tried
+            best, value = offset, likelihood
         for offset in (best - 1.0, best + 1.0):
             if offset < 0:
-                likelihood, tried = self._leave_one_out(info, offset, interior)
+                likelihood = self._leave_one_out(info, offset, interior)
                 if likelihood > value:
-                    best, value, self.tried = offset, likelihood, tried
+                    best, value = offset, likelihood
         return best
 
-    def _leave_one_out(
-        self, info: RunInformation, offset: float, interior: Bools
-    ) -> tuple[float, tuple[RunInformation, Array, Interval]]:
-        density = np.exp(self.log_density + offset * interior[:, None])
-        out = smoothed(self.ref, info, density)
+    def _leave_one_out(self, info: RunInformation, offset: float, interior: Bools) -> float:
+        out = smoothed(self.ref, info, np.exp(self.log_density + offset * interior[:, None]))
         value = float(leave_one_out_log_likelihood(out.x, out.pose_P, info))
-        return value if np.isfinite(value) else -np.inf, (info, density, out)
-
-    def _smoothed(self, info: RunInformation, density: Array) -> Interval:
-        """The smoother at the reference; as `_best_interpolation_offset` left it if that has just tried the same."""
-        tried, self.tried = self.tried, None
-        if tried is not None and all(map(np.array_equal, (*info, density), (*tried[0], tried[1]))):
-            return tried[2]
-        return smoothed(self.ref, info, density)
+        return value if np.isfinite(value) else -np.inf
 
     # -- Gauss-Newton -------------------------------------------------------------------------------------------------
 
@@ -209,7 +197,7 @@ class _Estimator:
         cost = 0.5 * chi2 + motion_cost(self.ref, info, density)
         # Damping is against steps that leave the linear region; rounding alone makes some nats.
         limit = cost + ROUNDING_NATS * (1 + 1e-3 * abs(cost))
-        out = self._smoothed(info, density)
+        out = smoothed(self.ref, info, density)
         for damping in DAMPING:
             x = out.x if np.isinf(damping) else smoothed(self.ref, _damped(info, damping), density).x
             moved = self._corrected(x, info, damping, density, limit)
@@ -248,7 +236,10 @@ class _Estimator:
         L, g, chi2 = self._spot_information(ref)
         if self.run.exposure_s > 0:
             short = ~np.any(self.beside[:-1] != 0, axis=1)
-            for k in np.flatnonzero(jumped[1:] & measured[1:] & measured[:-1] & short):
+            corners = np.flatnonzero(jumped[1:] & measured[1:] & measured[:-1] & short)
+            if len(corners):
+                L, g = L.copy(), g.copy()
+            for k in corners:
                 # As `corner_offsets`, for a short exposure.
                 b = (ref.m[k + 1, :6] - ref.m[k, :6]) * self.run.exposure_s / 8
                 L[k], g[k], _ = with_error_along(b, L[k], g[k])
@@ -264,8 +255,11 @@ class _Estimator:
 
         An exposure with a corner has a further error: the components of `beside`, one sigma, independent of each other.
         """
-        L, g, chi2 = (a.copy() for a in self._without_corners(ref))
-        for k in np.flatnonzero(self.beside.any(axis=1)):
+        L, g, chi2 = self._without_corners(ref)
+        corners = np.flatnonzero(self.beside.any(axis=1))
+        if len(corners):
+            L, g, chi2 = L.copy(), g.copy(), chi2.copy()
+        for k in corners:
             L[k], g[k], less = with_errors_along_axes(self.beside[k], L[k], g[k])
             chi2[k] -= less
         return L, g, chi2
