@@ -28,7 +28,7 @@ from lab.simulate.rigs import RIGS
 from tests.calibration.beams.bench import ARCSEC, exact, unknown_place
 from tests.calibration.beams.test_beams import bench_case, tally
 from tests.calibration.lens.lens_scenes import TRUTH, Scene, photographs
-from tests.calibration.lens.random_lenses import corners_of, judged, random_lens
+from tests.calibration.lens.random_lenses import corners_of, lens_error, random_lens
 from tests.calibration.lens.rendered_circles import LENS as CIRCLE_LENS
 from tests.calibration.lens.rendered_circles import CircleScene, table_of
 from tests.calibration.lens.test_intrinsics import FIVE, bowed, coverage_and_nees
@@ -78,13 +78,13 @@ def random_lenses(seeds: range) -> Iterator[tuple[str, str, str]]:
         except IntrinsicsError as error:
             grave.append(f"{seed} {error}")
             continue
-        j = judged(true, c)
-        ratio = j.error_px / j.claimed_px
+        j = lens_error(true, c)
+        ratio = j.error_px / j.stated_px
         ratios.append(ratio)
         silent += ratio > 1.3 and c.verdict == Level.PASS
         print(
             f"  {seed} {true.kind} {true.fov_deg:.0f} deg -> {c.model.title}: error {j.error_px:.3f} px, stated"
-            f" {j.claimed_px:.3f}, ratio {ratio:.2f}, {c.verdict.name}",
+            f" {j.stated_px:.3f}, ratio {ratio:.2f}, {c.verdict.name}",
             flush=True,
         )
     good = int(np.sum(np.array(ratios) <= 1.3))
