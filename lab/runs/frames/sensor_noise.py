@@ -17,9 +17,11 @@ from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.noise_estimation.colour_mosaic import mosaic_contrast
 from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
+from tracking.noise_estimation.static_background import PICTURES, StaticBackground, is_limited_by_texture
 from tracking.parameters import DetectParameters
 
 VIDEO_PICTURES = (0, 1, 8, 9, 16, 17)  # used for the estimate: the end of a video cannot be read without all of it
+VIDEO_FRAMES = 60  # at the start of a video from which its static background is made
 _BLANK = 3  # consecutive pictures without any point after which the noise model is checked
 _BLANK_AGAIN = 50  # it is checked again after this many more
 _CONTRADICTION = 2.0  # ratio of the stated to the estimated background variance from which a note is made
@@ -37,6 +39,7 @@ class CameraNoise:
     model: NoiseModel | None = field(
         default=None, init=False
     )  # in use; None before the first estimate if none is stated
+    background: StaticBackground | None = field(default=None, init=False)  # for faint spots; None: not used
     _overruled: bool = field(default=False, init=False)  # the stated noise misses visible spots
     _blank: int = field(default=0, init=False)  # consecutive pictures without any point
     _recent: deque[Picture] = field(default_factory=lambda: deque(maxlen=2), init=False)
@@ -62,11 +65,24 @@ class CameraNoise:
                     " leave it out"
                 )
 
+    def look_for_faint_spots(self, pictures: Sequence[Picture]) -> None:
+        """Make the static background of pictures spread over the recording, if that shows spots in them."""
+        if self.model is None:
+            return
+        background = StaticBackground.of(pictures, self.model)
+        if background is not None and background.is_useful(pictures, self.model):
+            self.background = background
+
     def detect(self, picture: Picture, parameters: DetectParameters) -> Detections:
         """The points of one picture. After pictures without any point the noise is estimated again."""
         if self.model is None:
             self.estimate_from([picture])
         found = self._search(picture, parameters, self.model)
+        if self.background is not None and self.estimate is not None:
+            shift = self.estimate.texture_shift
+            found = self.background.improved(self._with_texture(found), picture, parameters, shift)
+            if len(found):
+                return found
         if len(found):
             self._blank = 0
             self._recent.clear()
@@ -83,6 +99,7 @@ class CameraNoise:
         if self.model is not None:
             out = _scalars(self.model)
             out["source"] = "pictures" if self.stated is None or self._overruled else "rig"
+            out["background_pictures"] = 0 if self.background is None else self.background.pictures
         if self.estimate is not None:
             seen = asdict(replace(self.estimate, model=replace(self.estimate.model, local_texture=None)))
             del seen["model"]
@@ -156,6 +173,14 @@ def camera_noises(run: Run, reader: FrameReader) -> dict[str, CameraNoise]:
             wanted = list(VIDEO_PICTURES)
         shown = pictures_at(run, name, wanted)
         out[name].estimate_from([p for _, p in sorted(shown.items()) if isinstance(p, np.ndarray)])
+        model = out[name].model
+        if model is not None and is_limited_by_texture(model):
+            if isinstance(run.cameras[name], FramesFolder):
+                wanted = [int(numbers[i]) for i in background_frames(len(numbers))]
+            else:
+                wanted = list(range(0, VIDEO_FRAMES, VIDEO_FRAMES // PICTURES))
+            shown = pictures_at(run, name, wanted)
+            out[name].look_for_faint_spots([p for _, p in sorted(shown.items()) if isinstance(p, np.ndarray)])
     share_texture(list(out.values()))
     return out
 
@@ -180,6 +205,11 @@ def share_texture(cameras: Sequence[CameraNoise]) -> None:
         if camera.estimate is not None and not camera.estimate.texture_shift.known:
             share = camera.estimate.texture_shift.misfit_share
             camera.estimate = replace(camera.estimate, texture_shift=replace(finest, misfit_share=share))
+
+
+def background_frames(pictures: int) -> list[int]:
+    """Indices of pictures for the static background, spread over a recording."""
+    return sorted({int(i) for i in np.linspace(0, pictures - 1, min(PICTURES, pictures))})
 
 
 def noise_estimation_frames(pictures: int) -> list[int]:

@@ -1,0 +1,226 @@
+"""Faint spots on a textured screen: found after the fixed structure of the background has been subtracted.
+
+The cameras and screens of a recording do not move, so texture, seams and the offsets of pixels are the same in all of
+its pictures. They limit the detection in a single picture to spots well above the texture; in the difference from the
+fixed picture only the noise is left. That picture cannot tell a light at rest from a reflection, therefore the places
+of its lights are left to the search in the whole picture (detection/detect.py), whose spots stay as they are. Source:
+ours; the subtraction of a background is usual in particle image velocimetry, e.g. Raffel et al. (2018), "Particle Image
+Velocimetry", section 3.7.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.arrays import Bools
+from tracking.detection.detect import find_spots
+from tracking.detections import Detections
+from tracking.noise import BLOCK, NoiseModel, Picture
+from tracking.noise_estimation.texture_shift import TextureShift
+from tracking.parameters import DetectParameters
+
+PICTURES = 15  # from which a background is made, spread over the recording
+_LEAST_PICTURES = 9
+_MOST_BYTES = 120_000_000  # of these pictures
+_CUT = 0.25  # share of the lowest and of the highest grey values of a pixel that is left out: moving lights
+_MEAN_VARIANCE = 1.2  # variance of such a mean of normal deviates times their number
+_LIMITING = 1.0  # variance of the texture over that of the noise, for means of 3x3 pixels, from which it matters
+_SMOOTH_BLOCKS = 6.0  # blocks: sigma of the smooth part of the background, which is not subtracted
+_STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
+_LEAST_FOUND = 0.2  # further spots per picture from which the subtraction is used
+_SAMPLE = (7, 8)  # rows and columns: every such pixel shows how much of the structure is in a picture
+_SAME_LIGHT = 0.03  # the light has not changed by more than this share: the structure is not scaled
+_LEAST_LIGHT, _MOST_LIGHT = 0.5, 2.0  # changes of the light beyond which a picture is searched without subtraction
+_LARGEST_MISFIT = 1.3  # sigma of what is left over that of the noise; above it the camera or the light has moved
+_CLEARLY_BETTER = 0.5  # ratio of the variances of two measurements of a spot
+_AROUND_LIGHT, _AROUND_SPOT = (3.0, 3.0), (3.0, 2.0)  # widths, and px: kept clear of lights at rest; of other spots
+
+
+def is_limited_by_texture(model: NoiseModel) -> bool:
+    """Whether the texture of a camera's background hides spots that its noise would show."""
+    contrast = model.texture if model.local_texture is None else float(np.median(model.local_texture))
+    noise = float(model.of_means.variance(model.black_dn)) / 9
+    return (contrast * model.black_dn) ** 2 > _LIMITING * noise
+
+
+@dataclass(frozen=True, slots=True)
+class StaticBackground:
+    """The fixed structure of the pictures (h, w) of one camera."""
+
+    pictures: int  # from which it is made
+    structure: NDArray[np.float32]  # (h, w), DN: the fixed picture without its smooth part
+    smooth: NDArray[np.float32]  # (h, w), DN, on the pixels of _SAMPLE
+    lights: Bools  # (h, w): near lights that do not move
+    steps: int  # grey values per DN of the difference
+    offset_dn: float  # added to it
+    subtracted: NDArray[np.uint16]  # (h, w): what is added to a picture in these steps
+    model: NoiseModel  # of the difference, in its steps
+    noise_dn: float  # sigma of a pixel of the background
+
+    @staticmethod
+    def of(pictures: Sequence[Picture], model: NoiseModel) -> StaticBackground | None:
+        """The background of pictures spread over a recording; None: too few, or of different sizes or types.
+
+        model: of the camera's noise and texture.
+        """
+        some = pictures[: max(_MOST_BYTES // max(pictures[0].nbytes, 1), 1)] if pictures else []
+        if len(some) < _LEAST_PICTURES or any(p.shape != some[0].shape or p.dtype != some[0].dtype for p in some):
+            return None
+        if min(some[0].shape) < 4 * BLOCK:
+            return None
+        mean, share = _trimmed_mean(some), _MEAN_VARIANCE / len(some)
+        smooth = _smooth_part(mean)
+        structure = mean - smooth
+        top = float(np.iinfo(some[0].dtype).max if some[0].dtype == np.uint8 else max(int(p.max()) for p in some))
+        offset = float(np.ceil(max(structure.max(), 0.0)))
+        steps = _STEPS
+        while steps > 1 and (top + 2 * offset) * steps > np.iinfo(np.uint16).max:
+            steps //= 2
+        floor, slope = model.floor_dn2 * steps**2, model.slope_dn * steps
+        fixed = replace(
+            model, floor_dn2=floor * share, slope_dn=slope * share, black_dn=model.black_dn * steps,
+            banding_dn=0.0, compression_dn2=0.0,
+        )  # fmt: skip
+        lights = find_spots(_in_steps(mean, steps), DetectParameters(), fixed)
+        of_difference = replace(
+            model, floor_dn2=floor * (1 + share), slope_dn=slope, black_dn=(model.black_dn + offset) * steps,
+            texture=0.0, local_texture=None, banding_dn=model.banding_dn * steps,
+            compression_dn2=model.compression_dn2 * steps**2,
+        )  # fmt: skip
+        rows, columns = _SAMPLE
+        return StaticBackground(
+            len(some), structure, smooth[::rows, ::columns].copy(), _places_of(lights, mean.shape), steps, offset,
+            _in_steps(offset - structure, steps), of_difference, float(np.sqrt(model.floor_dn2)),
+        )  # fmt: skip
+
+    def is_useful(self, pictures: Sequence[Picture], model: NoiseModel) -> bool:
+        """Whether the search of the differences finds spots in such pictures that the other one misses."""
+        usual, more = DetectParameters(), 0
+        for picture in pictures:
+            found = find_spots(picture, usual, model)
+            more += int(np.count_nonzero(~_near(self.spots_in(picture, usual, TextureShift.none()), found).any(axis=1)))
+        return more >= max(_LEAST_FOUND * len(pictures), 2)
+
+    def improved(
+        self, found: Detections, picture: Picture, parameters: DetectParameters, shift: TextureShift
+    ) -> Detections:
+        """The points found in a picture and those found in its difference from the background, brightest first.
+
+        Of two measurements of one spot that in the picture is kept, unless the other one is clearly more precise: then
+        the texture under the spot is its largest error.
+        """
+        spots = self.spots_in(picture, parameters, shift)
+        if not len(spots):
+            return found
+        near = _near(spots, found)
+        size2, usual2 = (np.trace(d.cov_px2, axis1=1, axis2=2) for d in (spots, found))
+        replaces = near & (size2[:, None] < _CLEARLY_BETTER * usual2)
+        kept = ~np.any(near & ~replaces, axis=1)
+        return _joined(found[~replaces[kept].any(axis=0)], spots[kept], parameters.max_detections)
+
+    def spots_in(self, picture: Picture, parameters: DetectParameters, shift: TextureShift) -> Detections:
+        """The spots in the difference of a picture (h, w) from the background, apart from those near lights at rest.
+
+        shift: errors of spots by the texture; the part that the background causes is subtracted with it.
+        """
+        light = self._light_in(picture)
+        if light is None:
+            return Detections.none()
+        added = self.subtracted
+        if abs(light - 1) > _SAME_LIGHT:
+            added = _in_steps(self.offset_dn - light * self.structure, self.steps)
+        raised: NDArray[np.uint16] = np.multiply(picture, np.uint16(self.steps), dtype=np.uint16)
+        difference = np.asarray(cv2.add(raised, added), np.uint16)
+        spots = find_spots(difference, replace(parameters, saturation_dn=None), self.model)
+        row, column = (_nearest(spots.uv_px[:, i], picture.shape[1 - i]) for i in (1, 0))
+        spots = spots[~self.lights[row, column]]
+        if not len(spots):
+            return spots
+        spots = replace(spots, flux=spots.flux / self.steps, peak=spots.peak / self.steps)
+        # The background's own noise is the same in all pictures.
+        own = _MEAN_VARIANCE / self.pictures
+        fixed = own / (1 + own) * 0.5 * np.trace(spots.cov_px2, axis1=1, axis2=2)
+        of_light = replace(shift, background_px=(0.0,) * len(shift.background_px))
+        spots = of_light.added_to(spots, self.model.black_dn / self.steps - self.offset_dn)
+        place = np.zeros(len(spots)) if spots.place_px2 is None else spots.place_px2
+        return replace(spots, place_px2=place + fixed)
+
+    def _light_in(self, picture: Picture) -> float | None:
+        """How much of the structure a picture shows, relative to the background; None: the two do not fit."""
+        if picture.shape != self.structure.shape:
+            return None
+        rows, columns = _SAMPLE
+        structure = self.structure[::rows, ::columns]
+        level = float(np.median(self.smooth))
+        above = picture[::rows, ::columns].astype(np.float32) - self.smooth
+        above -= np.median(above)
+        clear = ~self.lights[::rows, ::columns] & (np.abs(above) < 6 * self.noise_dn + 4 * np.abs(structure))
+        s, a = structure[clear], above[clear]
+        light = float(s @ a) / max(float(s @ s), 1e-12)
+        if not _LEAST_LIGHT < light < _MOST_LIGHT or level <= 0:
+            return None
+        left = a - light * s
+        scatter = 1.4826 * float(np.median(np.abs(left)))
+        expected = float(np.sqrt(self.model.floor_dn2 / self.steps**2 * max(light, 1.0)))
+        return light if scatter < _LARGEST_MISFIT * expected else None
+
+
+def _joined(found: Detections, more: Detections, most: int) -> Detections:
+    """The points of both lists, brightest first, at most so many."""
+    if not len(more):
+        return found
+    values: dict[str, Any] = {}
+    for name in Detections.__slots__:
+        parts = [getattr(d, name) for d in (found, more)]
+        known = [np.zeros(len(d)) if p is None else p for p, d in zip(parts, (found, more), strict=True)]
+        values[name] = np.concatenate(known)
+    return Detections(**values)[np.argsort(-values["flux"], kind="stable")[:most]]
+
+
+def _trimmed_mean(pictures: Sequence[Picture]) -> NDArray[np.float32]:
+    """The mean (h, w) of the middle half of each pixel's grey values."""
+    out, cut = np.empty(pictures[0].shape, np.float32), int(_CUT * len(pictures))
+    strip = 16 * BLOCK
+    for top in range(0, len(out), strip):
+        values = np.sort([p[top : top + strip] for p in pictures], axis=0)
+        out[top : top + strip] = values[cut : len(values) - cut].mean(axis=0, dtype=np.float32)
+    return out
+
+
+def _smooth_part(mean: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What of a picture (h, w) varies over many blocks, without small lights."""
+    height, width = mean.shape
+    whole = height // BLOCK * BLOCK, width // BLOCK * BLOCK
+    blocks = cv2.resize(mean[: whole[0], : whole[1]], (width // BLOCK, height // BLOCK), interpolation=cv2.INTER_AREA)
+    blurred = cv2.GaussianBlur(cv2.medianBlur(blocks, 5), (0, 0), _SMOOTH_BLOCKS)
+    return np.asarray(cv2.resize(blurred, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+
+
+def _in_steps(values: NDArray[np.float32], steps: int) -> NDArray[np.uint16]:
+    return np.clip(np.rint(values * steps), 0, np.iinfo(np.uint16).max).astype(np.uint16)
+
+
+def _nearest(at: NDArray[np.float64], size: int) -> NDArray[np.int64]:
+    return np.clip(np.rint(at), 0, size - 1).astype(np.int64)
+
+
+def _places_of(lights: Detections, shape: tuple[int, ...]) -> Bools:
+    """(h, w): pixels near the lights."""
+    out = np.zeros(shape, np.uint8)
+    widths, more = _AROUND_LIGHT
+    for (u, v), width in zip(lights.uv_px, lights.major_px, strict=True):
+        cv2.circle(out, (round(u), round(v)), round(widths * width + more), 1, cv2.FILLED)
+    return out > 0
+
+
+def _near(spots: Detections, found: Detections) -> Bools:
+    """(n, m): spots that are parts of others, or the same."""
+    widths, more = _AROUND_SPOT
+    gap = np.linalg.norm(spots.uv_px[:, None] - found.uv_px, axis=-1)
+    return np.asarray(gap < widths * found.major_px + more)
