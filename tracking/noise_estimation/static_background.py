@@ -28,6 +28,8 @@ from tracking.parameters import DetectParameters
 PICTURES = 15  # from which a background is made, spread over the recording
 _LEAST_PICTURES = 9
 _MOST_BYTES = 120_000_000  # of these pictures
+_HIGHEST = 30.0  # sigmas of noise and texture
+_LEAST_CLEAR = 5  # of these pictures without a light at a pixel
 _CUT = 0.25  # share of the lowest and of the highest grey values of a pixel that is left out: moving lights
 _MEAN_VARIANCE = 1.2  # variance of such a mean of normal deviates times their number
 _LIMITING = 1.0  # variance of the texture over that of the noise, for means of 3x3 pixels, from which it matters
@@ -35,8 +37,12 @@ _SMOOTH_BLOCKS = 6.0  # blocks: sigma of the smooth part of the background, whic
 _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
 _LEAST_FOUND = 0.2  # further spots per picture from which the subtraction is used
 _SAMPLE = (7, 8)  # rows and columns: every such pixel shows how much of the structure is in a picture
+_SMOOTH_SAMPLE = (13, 13)  # of these pixels: what varies over them is not structure
+_AROUND_SAMPLE = (15, 15)  # of these pixels: 100 px: a part of the picture that shows the structure or does not
+_LOCAL_LIGHT = 0.4  # largest difference of the light there from that of the whole picture, as a share
+_CLEAR_SIGMAS = 4.0  # ... and in sigmas
 _SAME_LIGHT = 0.03  # the light has not changed by more than this share: the structure is not scaled
-_LEAST_LIGHT, _MOST_LIGHT = 0.5, 2.0  # changes of the light beyond which a picture is searched without subtraction
+_LEAST_LIGHT, _MOST_LIGHT = 0.3, 3.0  # changes of the light beyond which a picture is searched without subtraction
 _LARGEST_MISFIT = 1.3  # sigma of what is left over that of the noise; above it the camera or the light has moved
 _CLEARLY_BETTER = 0.5  # ratio of the variances of two measurements of a spot
 _AROUND_LIGHT, _AROUND_SPOT = (3.0, 3.0), (3.0, 2.0)  # widths, and px: kept clear of lights at rest; of other spots
@@ -56,17 +62,18 @@ class StaticBackground:
     pictures: int  # from which it is made
     structure: NDArray[np.float32]  # (h, w), DN: the fixed picture without its smooth part
     smooth: NDArray[np.float32]  # (h, w), DN, on the pixels of _SAMPLE
-    lights: Bools  # (h, w): near lights that do not move
+    near_lights: Bools  # (h, w): near lights that do not move
     steps: int  # grey values per DN of the difference
     offset_dn: float  # added to it
     subtracted: NDArray[np.uint16]  # (h, w): what is added to a picture in these steps
     model: NoiseModel  # of the difference, in its steps
-    noise_dn: float  # sigma of a pixel of the background
+    noise: NoiseModel  # of the pictures
 
     @staticmethod
     def of(pictures: Sequence[Picture], model: NoiseModel) -> StaticBackground | None:
-        """The background of pictures spread over a recording; None: too few, or of different sizes or types.
+        """The background of pictures spread over a recording.
 
+        None: too few, or of different sizes or types, or the differences from it show no further spots in them.
         model: of the camera's noise and texture.
         """
         some = pictures[: max(_MOST_BYTES // max(pictures[0].nbytes, 1), 1)] if pictures else []
@@ -74,12 +81,52 @@ class StaticBackground:
             return None
         if min(some[0].shape) < 4 * BLOCK:
             return None
-        mean, share = _trimmed_mean(some), _MEAN_VARIANCE / len(some)
+        mean = _trimmed_mean(some)
+        background = StaticBackground._of_mean(mean, some, model)
+        shown = [(p, fit[0]) for p in some if (fit := background._light_in(p)) is not None]
+        some, lights = [p for p, _ in shown], [light for _, light in shown]
+        if len(some) < _LEAST_PICTURES:
+            return None
+        equal: Sequence[NDArray[Any]] = some
+        if max(lights) - min(lights) > 2 * _SAME_LIGHT:
+            smooth = mean - background.structure
+            equal = [smooth + (p - _smooth_part(p.astype(np.float32))) / light for p, light in shown]
+            mean = _trimmed_mean(equal)
+            background = StaticBackground._of_mean(mean, some, model)
+        found, further = background._found_in(some)
+        if further < max(_LEAST_FOUND * len(some), 2):
+            return None
+        # A light that moves slowly is in the mean of many pictures, unless it is left out of each.
+        there = np.array([_places_of(spots, mean.shape) for spots in found])
+        row, column = np.nonzero(there.any(axis=0))
+        clear = ~there[:, row, column]
+        count = np.count_nonzero(clear, axis=0)
+        values = np.array([p[row, column] for p in equal], np.float32)
+        enough = count >= _LEAST_CLEAR
+        mean[row[enough], column[enough]] = ((values * clear).sum(axis=0) / np.maximum(count, 1))[enough]
+        background = StaticBackground._of_mean(mean, some, model)
+        background.near_lights[row[~enough], column[~enough]] = True
+        return background
+
+    def _found_in(self, pictures: Sequence[Picture]) -> tuple[list[Detections], int]:
+        """The spots found in each picture or in its difference from the background, and how many of them only there."""
+        usual, found, further = DetectParameters(), [], 0
+        for picture in pictures:
+            spots = find_spots(picture, usual, self.noise)
+            more = self.spots_in(picture, usual, TextureShift.none())
+            more = more[~np.any(_near(more, spots), axis=1)]
+            found.append(_joined(spots, more, len(spots) + len(more)))
+            further += len(more)
+        return found, further
+
+    @staticmethod
+    def _of_mean(mean: NDArray[np.float32], pictures: Sequence[Picture], model: NoiseModel) -> StaticBackground:
+        share = _MEAN_VARIANCE / len(pictures)
         smooth = _smooth_part(mean)
-        structure = mean - smooth
-        top = float(np.iinfo(some[0].dtype).max if some[0].dtype == np.uint8 else max(int(p.max()) for p in some))
-        offset = float(np.ceil(max(structure.max(), 0.0)))
-        steps = _STEPS
+        sigma = float(np.hypot(np.sqrt(model.floor_dn2), model.texture * model.black_dn))
+        structure = np.minimum(mean - smooth, _HIGHEST * sigma)  # what is higher is a light, or a hot pixel
+        offset, steps = float(np.ceil(max(structure.max(), 0.0))), _STEPS
+        top = max(int(p.max()) for p in pictures)
         while steps > 1 and (top + 2 * offset) * steps > np.iinfo(np.uint16).max:
             steps //= 2
         floor, slope = model.floor_dn2 * steps**2, model.slope_dn * steps
@@ -94,18 +141,11 @@ class StaticBackground:
             compression_dn2=model.compression_dn2 * steps**2,
         )  # fmt: skip
         rows, columns = _SAMPLE
+        near = _places_of(lights, mean.shape) | (cv2.dilate((mean - smooth) - structure, np.ones((3, 3))) > 0)
         return StaticBackground(
-            len(some), structure, smooth[::rows, ::columns].copy(), _places_of(lights, mean.shape), steps, offset,
-            _in_steps(offset - structure, steps), of_difference, float(np.sqrt(model.floor_dn2)),
+            len(pictures), structure, smooth[::rows, ::columns].copy(), near, steps, offset,
+            _in_steps(offset - structure, steps), of_difference, model,
         )  # fmt: skip
-
-    def is_useful(self, pictures: Sequence[Picture], model: NoiseModel) -> bool:
-        """Whether the search of the differences finds spots in such pictures that the other one misses."""
-        usual, more = DetectParameters(), 0
-        for picture in pictures:
-            found = find_spots(picture, usual, model)
-            more += int(np.count_nonzero(~_near(self.spots_in(picture, usual, TextureShift.none()), found).any(axis=1)))
-        return more >= max(_LEAST_FOUND * len(pictures), 2)
 
     def improved(
         self, found: Detections, picture: Picture, parameters: DetectParameters, shift: TextureShift
@@ -129,9 +169,10 @@ class StaticBackground:
 
         shift: errors of spots by the texture; the part that the background causes is subtracted with it.
         """
-        light = self._light_in(picture)
-        if light is None:
+        fit = self._light_in(picture)
+        if fit is None:
             return Detections.none()
+        light, fits = fit
         added = self.subtracted
         if abs(light - 1) > _SAME_LIGHT:
             added = _in_steps(self.offset_dn - light * self.structure, self.steps)
@@ -139,7 +180,8 @@ class StaticBackground:
         difference = np.asarray(cv2.add(raised, added), np.uint16)
         spots = find_spots(difference, replace(parameters, saturation_dn=None), self.model)
         row, column = (_nearest(spots.uv_px[:, i], picture.shape[1 - i]) for i in (1, 0))
-        spots = spots[~self.lights[row, column]]
+        sampled = np.minimum(row // _SAMPLE[0], len(fits) - 1), np.minimum(column // _SAMPLE[1], fits.shape[1] - 1)
+        spots = spots[~self.near_lights[row, column] & fits[sampled]]
         if not len(spots):
             return spots
         spots = replace(spots, flux=spots.flux / self.steps, peak=spots.peak / self.steps)
@@ -151,24 +193,46 @@ class StaticBackground:
         place = np.zeros(len(spots)) if spots.place_px2 is None else spots.place_px2
         return replace(spots, place_px2=place + fixed)
 
-    def _light_in(self, picture: Picture) -> float | None:
-        """How much of the structure a picture shows, relative to the background; None: the two do not fit."""
+    def _light_in(self, picture: Picture) -> tuple[float, Bools] | None:
+        """How much of the structure a picture shows, relative to the background, and where it does.
+
+        Places: on the pixels of _SAMPLE. None: the picture and the background do not fit.
+        """
         if picture.shape != self.structure.shape:
             return None
         rows, columns = _SAMPLE
-        structure = self.structure[::rows, ::columns]
-        level = float(np.median(self.smooth))
+        plain = ~self.near_lights[::rows, ::columns]
+        structure = _without_smooth_part(self.structure[::rows, ::columns], plain)
         above = picture[::rows, ::columns].astype(np.float32) - self.smooth
-        above -= np.median(above)
-        clear = ~self.lights[::rows, ::columns] & (np.abs(above) < 6 * self.noise_dn + 4 * np.abs(structure))
-        s, a = structure[clear], above[clear]
-        light = float(s @ a) / max(float(s @ s), 1e-12)
-        if not _LEAST_LIGHT < light < _MOST_LIGHT or level <= 0:
+        more = float(np.median(above))
+        above = _without_smooth_part(above, plain)
+        variance = self.noise.variance(self.smooth + more).astype(np.float32)
+        clear = plain & (np.abs(above) < 6 * np.sqrt(variance) + 4 * np.abs(structure))
+        seen = np.where(clear, structure, 0.0)
+        light = float(np.vdot(seen, above)) / max(float(np.vdot(seen, seen)), 1e-12)
+        if not _LEAST_LIGHT < light < _MOST_LIGHT:
             return None
-        left = a - light * s
-        scatter = 1.4826 * float(np.median(np.abs(left)))
-        expected = float(np.sqrt(self.model.floor_dn2 / self.steps**2 * max(light, 1.0)))
-        return light if scatter < _LARGEST_MISFIT * expected else None
+        left = np.where(clear, (above - light * structure) / np.sqrt(variance), 0.0)
+        if 1.4826 * float(np.median(np.abs(left[clear]))) > _LARGEST_MISFIT:
+            return None
+        # Where somebody stands in front of the screen the picture has another structure.
+        power = np.maximum(_around(seen * seen), 1e-12)
+        off = np.abs(_around(seen * above) / power - light)
+        sigma = np.sqrt(_around(variance) / power / _around(np.ones_like(power)))
+        others = _around(left * left) > _LARGEST_MISFIT**2 * _around(clear.astype(np.float32))
+        return light, (off < np.maximum(_LOCAL_LIGHT * light, _CLEAR_SIGMAS * sigma)) & ~others
+
+
+def _without_smooth_part(values: NDArray[np.float32], plain: Bools) -> NDArray[np.float32]:
+    """Values on the pixels of _SAMPLE less the means of plain ones around them."""
+    weight = plain.astype(np.float32)
+    mean = cv2.blur(values * weight, _SMOOTH_SAMPLE) / np.maximum(cv2.blur(weight, _SMOOTH_SAMPLE), 1e-3)
+    return np.asarray(values - mean, np.float32)
+
+
+def _around(values: NDArray[Any]) -> NDArray[Any]:
+    """Sums over the surroundings of each pixel of _SAMPLE."""
+    return np.asarray(cv2.boxFilter(values, -1, _AROUND_SAMPLE, normalize=False))
 
 
 def _joined(found: Detections, more: Detections, most: int) -> Detections:
