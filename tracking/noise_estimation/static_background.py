@@ -29,7 +29,7 @@ PICTURES = 15  # from which a background is made, spread over the recording
 _LEAST_PICTURES = 9
 _MOST_BYTES = 120_000_000  # of these pictures
 _HIGHEST = 30.0  # sigmas of noise and texture
-_LEAST_CLEAR = 5  # of these pictures without a light at a pixel
+_LEAST_CLEAR = 3  # of these pictures without a light at a pixel
 _CUT = 0.25  # share of the lowest and of the highest grey values of a pixel that is left out: moving lights
 _MEAN_VARIANCE = 1.2  # variance of such a mean of normal deviates times their number
 _LIMITING = 1.0  # variance of the texture over that of the noise, for means of 3x3 pixels, from which it matters
@@ -93,13 +93,16 @@ class StaticBackground:
             equal = [smooth + (p - _smooth_part(p.astype(np.float32))) / light for p, light in shown]
             mean = _trimmed_mean(equal)
             background = StaticBackground._of_mean(mean, some, model)
-        found, further = background._found_in(some)
+        found, holes, further = background._found_in(some)
         if further < max(_LEAST_FOUND * len(some), 2):
             return None
-        # A light that moves slowly is in the mean of many pictures, unless it is left out of each.
-        there = np.array([_places_of(spots, mean.shape) for spots in found])
-        row, column = np.nonzero(there.any(axis=0))
+        # A light that moves slowly, or rests for a part of the recording, is in the mean of the pictures. Where it was
+        # in some of them the others count; where its absence leaves a hole, those with the hole.
+        there, absent = (np.array([_places_of(spots, mean.shape) for spots in all_]) for all_ in (found, holes))
+        row, column = np.nonzero(there.any(axis=0) | absent.any(axis=0))
         clear = ~there[:, row, column]
+        hole = absent[:, row, column]
+        clear &= hole | ~hole.any(axis=0)
         count = np.count_nonzero(clear, axis=0)
         values = np.array([p[row, column] for p in equal], np.float32)
         enough = count >= _LEAST_CLEAR
@@ -108,16 +111,20 @@ class StaticBackground:
         background.near_lights[row[~enough], column[~enough]] = True
         return background
 
-    def _found_in(self, pictures: Sequence[Picture]) -> tuple[list[Detections], int]:
-        """The spots found in each picture or in its difference from the background, and how many of them only there."""
-        usual, found, further = DetectParameters(), [], 0
+    def _found_in(self, pictures: Sequence[Picture]) -> tuple[list[Detections], list[Detections], int]:
+        """The spots found in each picture or in its difference from the background, how many of them only there.
+
+        In between: the holes in the differences, where the background contains a light that the picture does not.
+        """
+        usual, none, further = DetectParameters(), TextureShift.none(), 0
+        found, holes = [], []
         for picture in pictures:
-            spots = find_spots(picture, usual, self.noise)
-            more = self.spots_in(picture, usual, TextureShift.none())
+            spots, more = find_spots(picture, usual, self.noise), self.spots_in(picture, usual, none)
             more = more[~np.any(_near(more, spots), axis=1)]
             found.append(_joined(spots, more, len(spots) + len(more)))
+            holes.append(self.spots_in(picture, usual, none, inverted=True))
             further += len(more)
-        return found, further
+        return found, holes, further
 
     @staticmethod
     def _of_mean(mean: NDArray[np.float32], pictures: Sequence[Picture], model: NoiseModel) -> StaticBackground:
@@ -164,10 +171,13 @@ class StaticBackground:
         kept = ~np.any(near & ~replaces, axis=1)
         return _joined(found[~replaces[kept].any(axis=0)], spots[kept], parameters.max_detections)
 
-    def spots_in(self, picture: Picture, parameters: DetectParameters, shift: TextureShift) -> Detections:
+    def spots_in(
+        self, picture: Picture, parameters: DetectParameters, shift: TextureShift, inverted: bool = False
+    ) -> Detections:
         """The spots in the difference of a picture (h, w) from the background, apart from those near lights at rest.
 
-        shift: errors of spots by the texture; the part that the background causes is subtracted with it.
+        shift: errors of spots by the texture; the part that the background causes is subtracted with it. inverted: the
+        holes of the difference instead.
         """
         fit = self._light_in(picture)
         if fit is None:
@@ -178,6 +188,8 @@ class StaticBackground:
             added = _in_steps(self.offset_dn - light * self.structure, self.steps)
         raised: NDArray[np.uint16] = np.multiply(picture, np.uint16(self.steps), dtype=np.uint16)
         difference = np.asarray(cv2.add(raised, added), np.uint16)
+        if inverted:
+            difference = np.asarray(cv2.subtract(np.full_like(difference, 2 * self.model.black_dn), difference))
         spots = find_spots(difference, replace(parameters, saturation_dn=None), self.model)
         row, column = (_nearest(spots.uv_px[:, i], picture.shape[1 - i]) for i in (1, 0))
         sampled = np.minimum(row // _SAMPLE[0], len(fits) - 1), np.minimum(column // _SAMPLE[1], fits.shape[1] - 1)
