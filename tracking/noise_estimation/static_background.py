@@ -4,8 +4,8 @@ The cameras and screens of a recording do not move, so texture, seams and the of
 its pictures. They limit the detection in a single picture to spots well above the texture; in the difference from the
 fixed picture only the noise is left. That picture cannot tell a light at rest from a reflection, therefore the places
 of its lights are left to the search in the whole picture (detection/detect.py), whose spots stay as they are. Source:
-ours; the subtraction of a background is usual in particle image velocimetry, e.g. Raffel et al. (2018), "Particle Image
-Velocimetry", section 3.7.
+ours; the subtraction of a mean background is usual in particle image velocimetry, e.g. Raffel et al. (2018), "Particle
+Image Velocimetry".
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ _MEAN_VARIANCE = 1.2  # variance of such a mean of normal deviates times their n
 _LIMITING = 1.0  # variance of the texture over that of the noise, for means of 3x3 pixels, from which it matters
 _SMOOTH_BLOCKS = 6.0  # blocks: sigma of the smooth part of the background, which is not subtracted
 _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
+_TRIED = 3  # every such picture shows whether there are further spots
 _LEAST_FOUND = 0.2  # further spots per picture from which the subtraction is used
 _SAMPLE = (7, 8)  # rows and columns: every such pixel shows how much of the structure is in a picture
 _SMOOTH_SAMPLE = (13, 13)  # of these pixels: what varies over them is not structure
@@ -93,9 +94,10 @@ class StaticBackground:
             equal = [smooth + (p - _smooth_part(p.astype(np.float32))) / light for p, light in shown]
             mean = _trimmed_mean(equal)
             background = StaticBackground._of_mean(mean, some, model)
-        found, holes, further = background._found_in(some)
-        if further < max(_LEAST_FOUND * len(some), 2):
+        tried = some[::_TRIED]
+        if background._found_in(tried)[2] < max(_LEAST_FOUND * len(tried), 2):
             return None
+        found, holes, _ = background._found_in(some)
         # A light that moves slowly, or rests for a part of the recording, is in the mean of the pictures. Where it was
         # in some of them the others count; where its absence leaves a hole, those with the hole.
         there, absent = (np.array([_places_of(spots, mean.shape) for spots in all_]) for all_ in (found, holes))
