@@ -35,6 +35,7 @@ _MEAN_VARIANCE = 1.2  # variance of such a mean of normal deviates times their n
 _LIMITING = 1.0  # variance of the texture over that of the noise, for means of 3x3 pixels, from which it matters
 _SMOOTH_BLOCKS = 6.0  # blocks: sigma of the smooth part of the background, which is not subtracted
 _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
+_REFINEMENTS = 2  # of a background that contains slow lights
 _TRIED = 3  # every such picture shows whether there are further spots
 _LEAST_FOUND = 0.2  # further spots per picture from which the subtraction is used
 _SAMPLE = (7, 8)  # rows and columns: every such pixel shows how much of the structure is in a picture
@@ -97,21 +98,30 @@ class StaticBackground:
         tried = some[::_TRIED]
         if background._found_in(tried)[2] < max(_LEAST_FOUND * len(tried), 2):
             return None
-        found, holes, _ = background._found_in(some)
-        # A light that moves slowly, or rests for a part of the recording, is in the mean of the pictures. Where it was
-        # in some of them the others count; where its absence leaves a hole, those with the hole.
+        for _ in range(_REFINEMENTS):
+            background = background._without_slow_lights(mean, some, equal, model)
+        return background
+
+    def _without_slow_lights(
+        self, mean: NDArray[np.float32], pictures: Sequence[Picture], equal: Sequence[NDArray[Any]], model: NoiseModel
+    ) -> StaticBackground:
+        """A better background, of these pictures (in equal light), with its mean (h, w), which changes.
+
+        A light that moves slowly, or rests for a part of the recording, is in the mean of the pictures. Where it is in
+        some of them the others count; where its absence leaves a hole, those with the hole.
+        """
+        found, holes, _ = self._found_in(pictures)
         there, absent = (np.array([_places_of(spots, mean.shape) for spots in all_]) for all_ in (found, holes))
         row, column = np.nonzero(there.any(axis=0) | absent.any(axis=0))
-        clear = ~there[:, row, column]
-        hole = absent[:, row, column]
+        clear, hole = ~there[:, row, column], absent[:, row, column]
         clear &= hole | ~hole.any(axis=0)
         count = np.count_nonzero(clear, axis=0)
         values = np.array([p[row, column] for p in equal], np.float32)
         enough = count >= _LEAST_CLEAR
         mean[row[enough], column[enough]] = ((values * clear).sum(axis=0) / np.maximum(count, 1))[enough]
-        background = StaticBackground._of_mean(mean, some, model)
-        background.near_lights[row[~enough], column[~enough]] = True
-        return background
+        better = StaticBackground._of_mean(mean, pictures, model)
+        better.near_lights[row[~enough], column[~enough]] = True
+        return better
 
     def _found_in(self, pictures: Sequence[Picture]) -> tuple[list[Detections], list[Detections], int]:
         """The spots found in each picture or in its difference from the background, how many of them only there.
@@ -223,14 +233,16 @@ class StaticBackground:
         variance = self.noise.variance(self.smooth + more).astype(np.float32)
         clear = plain & (np.abs(above) < 6 * np.sqrt(variance) + 4 * np.abs(structure))
         seen = np.where(clear, structure, 0.0)
-        light = float(np.vdot(seen, above)) / max(float(np.vdot(seen, seen)), 1e-12)
+        # A part of what is seen is the background's own noise, which the picture does not show.
+        own = np.where(clear, _MEAN_VARIANCE / self.pictures * variance, 0.0)
+        light = float(np.vdot(seen, above)) / max(float(np.sum(seen * seen - own)), 1e-12)
         if not _LEAST_LIGHT < light < _MOST_LIGHT:
             return None
         left = np.where(clear, (above - light * structure) / np.sqrt(variance), 0.0)
         if 1.4826 * float(np.median(np.abs(left[clear]))) > _LARGEST_MISFIT:
             return None
         # Where somebody stands in front of the screen the picture has another structure.
-        power = np.maximum(_around(seen * seen), 1e-12)
+        power = np.maximum(_around(seen * seen - own), 1e-12)
         off = np.abs(_around(seen * above) / power - light)
         sigma = np.sqrt(_around(variance) / power / _around(np.ones_like(power)))
         others = _around(left * left) > _LARGEST_MISFIT**2 * _around(clear.astype(np.float32))

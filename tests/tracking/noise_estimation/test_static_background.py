@@ -1,0 +1,212 @@
+"""Faint spots on a textured screen are found where only the noise limits them, and nothing else is taken for a spot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+
+from geometry.arrays import Array
+from tracking.detection.detect import find_spots
+from tracking.detections import Detections
+from tracking.noise import NoiseModel, Picture
+from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
+from tracking.noise_estimation.static_background import PICTURES, StaticBackground, is_limited_by_texture
+from tracking.noise_estimation.texture_shift import TextureShift
+from tracking.parameters import DetectParameters
+
+SIZE = (360, 480)
+LEVEL, NOISE, TEXTURE = 20.0, 0.8, 0.04  # DN, DN, share of the level
+USUAL = DetectParameters()
+
+
+def reflectance(seed: int, texture: float) -> Array:
+    smooth = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal(SIZE), (0, 0), 0.6)
+    return np.asarray(1 + texture * smooth / smooth.std())
+
+
+def light_of(centres: Array, peak: float, sigma_px: float = 1.2) -> Array:
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    out = np.zeros(SIZE)
+    for a, b in centres:
+        out += peak * np.exp(-0.5 * ((x - a) ** 2 + (y - b) ** 2) / sigma_px**2)
+    return out
+
+
+def path(pictures: int, spots: int, speed_px: float, seed: int) -> Array:
+    """Centres (pictures, spots, 2) of spots that move straight on, far from each other and inside the picture."""
+    rng = np.random.default_rng(seed)
+    start = np.stack([np.linspace(60, 400, spots), rng.uniform(60, 120, spots)], axis=-1)
+    direction = np.stack([rng.uniform(-0.15, 0.15, spots), np.ones(spots)], axis=-1)
+    return np.asarray(start + speed_px * np.arange(pictures)[:, None, None] * direction)
+
+
+@dataclass
+class Recording:
+    pictures: list[Picture]
+    centres: Array  # (pictures, spots, 2)
+    estimate: NoiseEstimate
+
+    @property
+    def model(self) -> NoiseModel:
+        return self.estimate.model
+
+    @staticmethod
+    def of(
+        centres: Array, peak: float, seed: int = 3, scale: float = 1.0, light: Array | None = None,
+        texture: float = TEXTURE,
+    ) -> Recording:  # fmt: skip
+        """scale: grey values per DN of an 8-bit picture; light (pictures,): of the background, relative to LEVEL."""
+        rng, screen = np.random.default_rng(seed + 1000), reflectance(seed, texture)
+        light = np.ones(len(centres)) if light is None else light
+        kind = np.uint8 if scale == 1 else np.uint16
+        pictures = []
+        for at, share in zip(centres, light, strict=True):
+            expected = screen * (LEVEL * share + light_of(at, peak))
+            noisy = scale * (expected + NOISE * np.sqrt(share) * rng.standard_normal(SIZE))
+            pictures.append(np.clip(np.rint(noisy), 0, np.iinfo(kind).max).astype(kind))
+        return Recording(pictures, centres, estimate_noise(pictures[:2] + pictures[-2:]))
+
+    def background(self) -> StaticBackground | None:
+        return StaticBackground.of(self.pictures[:: max(len(self.pictures) // PICTURES, 1)][:PICTURES], self.model)
+
+    def found_in(self, background: StaticBackground, k: int) -> Detections:
+        return background.improved(self.usual(k), self.pictures[k], USUAL, self.estimate.texture_shift)
+
+    def usual(self, k: int) -> Detections:
+        """What the picture alone shows."""
+        found = find_spots(self.pictures[k], USUAL, self.model)
+        return self.estimate.texture_shift.added_to(found, self.model.black_dn)
+
+
+def judged(recording: Recording, background: StaticBackground, frames: range) -> tuple[float, float, float]:
+    """Recall of the spots in these frames, points per picture in the difference that are none, rms error in sigmas."""
+    hits, false, square = [], 0, []
+    for k in frames:
+        truth = recording.centres[k]
+        found = recording.found_in(background, k)
+        further = background.spots_in(recording.pictures[k], USUAL, TextureShift.none())
+        false += sum(float(np.min(np.hypot(*(truth - p).T))) > 4 for p in further.uv_px)
+        for centre in truth:
+            gap = found.uv_px - centre
+            i = int(np.argmin(np.hypot(*gap.T)))
+            hits.append(np.hypot(*gap[i]) < 1.5)
+            if hits[-1]:
+                square.append(gap[i] @ np.linalg.solve(found.cov_px2[i], gap[i]) / 2)
+    return float(np.mean(hits)), false / len(frames), float(np.sqrt(np.mean(square)))
+
+
+@pytest.mark.parametrize("scale", [1, 16, 200])
+def test_spots_that_the_texture_hides_are_found(scale):
+    recording = Recording.of(path(45, 6, 4.0, 1), 4.5, scale=scale)
+    assert is_limited_by_texture(recording.model)
+    background = recording.background()
+    assert background is not None
+    recall, false, error = judged(recording, background, range(45))
+    plain = [find_spots(p, USUAL, recording.model).uv_px for p in recording.pictures]
+    alone = np.mean([
+        np.min(np.hypot(*(found - c).T), initial=9) < 1.5
+        for found, at in zip(plain, recording.centres, strict=True) for c in at
+    ])  # fmt: skip
+    assert alone < 0.7
+    assert recall > 0.97
+    assert false < 0.1
+    assert 0.85 < error < 1.3
+
+
+def test_the_light_of_the_room_may_change():
+    light = np.linspace(0.6, 1.8, 45)
+    recording = Recording.of(path(45, 6, 4.0, 2), 6.0, light=light, texture=0.1)
+    background = recording.background()
+    assert background is not None
+    recall, false, _ = judged(recording, background, range(45))
+    assert recall > 0.9
+    assert false < 0.3
+
+
+def test_a_camera_that_was_knocked_shows_no_further_spots():
+    recording = Recording.of(path(45, 6, 4.0, 3), 4.5)
+    background = recording.background()
+    assert background is not None
+    knocked = np.roll(recording.pictures[20], (3, -4), axis=(0, 1))
+    assert not len(background.spots_in(knocked, USUAL, TextureShift.none()))
+
+
+def test_somebody_in_front_of_the_screen_adds_no_points():
+    recording = Recording.of(path(45, 6, 4.0, 4), 6.0, texture=0.12)
+    background = recording.background()
+    assert background is not None
+    other = recording.pictures[22].copy()
+    rng = np.random.default_rng(5)
+    other[:, 150:330] = np.rint(14 + NOISE * rng.standard_normal((SIZE[0], 180))).astype(np.uint8)
+    found = background.spots_in(other, USUAL, TextureShift.none())
+    inside = (found.uv_px[:, 0] > 150) & (found.uv_px[:, 0] < 330)
+    assert not inside.any()
+
+
+def test_spots_that_rest_for_a_part_of_the_recording_are_found_there_and_not_shifted_when_they_leave():
+    centres = path(45, 6, 0.0, 6)
+    centres[20:, :, 1] += 3.0 * np.arange(1, 26)[:, None]
+    recording = Recording.of(centres, 4.0)
+    background = recording.background()
+    assert background is not None
+    recall, false, _ = judged(recording, background, range(20))
+    assert recall > 0.9
+    assert false < 0.1
+    gaps = []
+    for k in range(20, 26):
+        found = recording.found_in(background, k)
+        for centre in recording.centres[k]:
+            gap = found.uv_px - centre
+            gaps += list(gap[np.hypot(*gap.T) < 2.5])
+    assert len(gaps) > 20
+    assert abs(np.mean([g[1] for g in gaps])) < 0.1
+
+
+def test_bright_spots_need_no_background():
+    assert Recording.of(path(45, 6, 4.0, 7), 60.0).background() is None
+
+
+def test_lights_that_do_not_move_stay_as_the_picture_shows_them():
+    centres = path(45, 6, 4.0, 8)
+    still = np.broadcast_to(np.array([[240.0, 300.0], [100.0, 250.0]]), (45, 2, 2))
+    recording = Recording.of(centres, 4.5)
+    lit = light_of(still[0], 40.0)
+    flicker = np.random.default_rng(9).uniform(0.8, 1.2, 45)
+    pictures = [np.rint(p + f * lit).astype(np.uint8) for p, f in zip(recording.pictures, flicker, strict=True)]
+    recording = Recording(pictures, centres, recording.estimate)
+    background = recording.background()
+    assert background is not None
+    brightest = int(np.argmax(flicker))
+    usual, found = recording.usual(brightest), recording.found_in(background, brightest)
+    further = background.spots_in(pictures[brightest], USUAL, TextureShift.none())
+    for at in still[0]:
+        assert np.min(np.hypot(*(further.uv_px - at).T), initial=99) > 5
+        rows = [d.uv_px[np.hypot(*(d.uv_px - at).T) < 2] for d in (usual, found)]
+        assert len(rows[0]) == 1
+        np.testing.assert_array_equal(rows[0], rows[1])
+
+
+def test_few_pictures_or_different_ones_make_no_background():
+    recording = Recording.of(path(45, 6, 4.0, 9), 4.5)
+    assert StaticBackground.of(recording.pictures[:8], recording.model) is None
+    assert StaticBackground.of([], recording.model) is None
+    assert StaticBackground.of([*recording.pictures[:14], recording.pictures[14][:-8]], recording.model) is None
+    background = recording.background()
+    assert background is not None
+    smaller = recording.pictures[0][:-8]
+    usual = find_spots(smaller, USUAL, recording.model)
+    assert background.improved(usual, smaller, USUAL, TextureShift.none()) is usual
+
+
+def test_the_points_stay_sorted_and_limited():
+    recording = Recording.of(path(45, 6, 4.0, 10), 4.5)
+    background = recording.background()
+    assert background is not None
+    few = DetectParameters(max_detections=4)
+    usual = find_spots(recording.pictures[5], few, recording.model)
+    found = background.improved(usual, recording.pictures[5], few, TextureShift.none())
+    assert len(found) == 4
+    assert np.all(np.diff(found.flux) <= 0)
