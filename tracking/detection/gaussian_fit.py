@@ -11,7 +11,7 @@ from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
 from tracking.detection.normal_equations import PolynomialFrame, accumulate, add_light, frame_of, solve_normal
 from tracking.detection.pixels import VALID, Noise, Pixels, Window, insert_nearest, read_window, window_around
-from tracking.detection.quality import assess_fit, gain_over_plane
+from tracking.detection.quality import assess_fit, exclude_isolated_cells, gain_over_plane
 from tracking.detection.table import (
     ACTIVE,
     BACKGROUND,
@@ -31,7 +31,6 @@ from tracking.detection.table import (
     NEAR,
     NEIGHBOUR_LIGHT,
     NORMAL,
-    RESIDUAL,
     RIGHT_SIDE,
     ROW,
     SIGMA_FLUX,
@@ -47,7 +46,6 @@ from tracking.detection.table import (
     VAR_V,
     VECTORS,
     VV,
-    WEIGHT,
     U,
     V,
 )
@@ -59,8 +57,6 @@ _WINDOW = 3.7  # sigmas from centre to side of the window: with 3.2 (2.5) the pl
 _WINDOW_WIDE, _WIDE_PX = 3.2, 4.5  # ... of spots wider than this, whose background is not a plane over more
 _LEAST_HALF = 7  # cells from the centre to the side of the window
 _MOST_NEIGHBOURS = 6  # neighbours whose light is subtracted
-_OUTLIER = 6.0  # sigmas: least residual of a hot or dead pixel ...
-_ISOLATED = 2.5  # ... and its least ratio to the residuals of the neighbouring pixels
 _LEAST_VARIANCE = 0.02  # px^2: narrower spots cannot be distinguished from a point
 
 
@@ -134,7 +130,7 @@ def _step(
     for k in range(_neighbours(table, i, window, near, gaps)):
         add_light(window, table[int(near[k])], cells[ROW], cells[NEIGHBOUR_LIGHT])
     chi2 = accumulate(window, spot, noise, cells, algebra)
-    if _exclude_isolated_cells(window, spot, cells):
+    if exclude_isolated_cells(window, spot, cells):
         chi2 = accumulate(window, spot, noise, cells, algebra)
     frame = frame_of(window, spot)
     if not _solve(frame, spot[HELD] > 0.0, algebra):
@@ -225,33 +221,6 @@ def _reactivate_neighbours(table: Array, i: int) -> None:
         spot = table[j]
         if j != i and not spot[ACTIVE] and spot[FLUX] > 0.0 and _gap(spot, table[i], window_of(spot)) < 0:
             spot[ACTIVE] = 1.0
-
-
-@compiled
-def _exclude_isolated_cells(window: Window, spot: Array, cells: Array) -> bool:
-    """Exclude cells with a large residual that all eight neighbours lack: hot or dead pixels, never part of a spot."""
-    found = False
-    narrow_spot = min(spot[UU], spot[VV]) < 0.8**2
-    residual, weight = cells[RESIDUAL], cells[WEIGHT]
-    middle = 0.5 * (window.cell - 1)
-    for k in range(window.rows * window.columns):
-        size = residual[k] * residual[k] * weight[k]
-        if size <= _OUTLIER**2:
-            continue
-        r, c = k // window.columns, k % window.columns
-        u = window.left + middle + c * window.cell - spot[U]
-        v = window.top + middle + r * window.cell - spot[V]
-        if narrow_spot and u * u + v * v < 1.8**2:  # the middle of a spot about one pixel wide is always isolated
-            continue
-        around = 0.0
-        for i in range(max(r - 1, 0), min(r + 2, window.rows)):
-            for j in range(max(c - 1, 0), min(c + 2, window.columns)):
-                other = i * window.columns + j
-                if other != k:
-                    around = max(around, residual[other] * residual[other] * weight[other])
-        if size > _ISOLATED**2 * around:
-            cells[USE, k], found = 0.0, True
-    return found
 
 
 @compiled

@@ -200,3 +200,45 @@ def insert_nearest(near: NDArray, gaps: Array, filled: int, most: int, gap: floa
         k -= 1
     gaps[k], near[k] = gap, row
     return min(filled + 1, most)
+
+
+@compiled
+def total_of(values: Array) -> float:
+    """The sum of an array, as four sums: an addition does not wait for the one before, and they are vectorised."""
+    a = b = c = d = 0.0
+    n = values.shape[0] // 4
+    for k in range(n):
+        a += values[4 * k]
+        b += values[4 * k + 1]
+        c += values[4 * k + 2]
+        d += values[4 * k + 3]
+    for k in range(4 * n, values.shape[0]):
+        a += values[k]
+    return (a + b) + (c + d)
+
+
+@compiled
+def total_of_products(x: Array, y: Array) -> float:
+    """The sum of the products of two arrays of one length, as four sums."""
+    a = b = c = d = 0.0
+    n = x.shape[0] // 4
+    for k in range(n):
+        a += x[4 * k] * y[4 * k]
+        b += x[4 * k + 1] * y[4 * k + 1]
+        c += x[4 * k + 2] * y[4 * k + 2]
+        d += x[4 * k + 3] * y[4 * k + 3]
+    for k in range(4 * n, x.shape[0]):
+        a += x[k] * y[k]
+    return (a + b) + (c + d)
+
+
+@compiled
+def maximum_of(values: Array) -> float:
+    """The largest of values of at least 0."""
+    a = b = 0.0
+    for k in range(values.shape[0] // 2):
+        x, y = values[2 * k], values[2 * k + 1]
+        a, b = (x if x > a else a), (y if y > b else b)
+    if values.shape[0] % 2:
+        a = max(a, values[-1])
+    return max(a, b)
