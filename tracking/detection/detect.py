@@ -73,7 +73,8 @@ class SpotFinder:
         self._runs = np.zeros((rows + 4, 3), np.int64)
         self._searched = np.zeros((rows, columns), np.uint8)
         self._bright_blocks = np.zeros((rows * columns, 3), np.int64)
-        self._workspace, self._peaks = block_workspace(), np.zeros((4 * rows * columns, PEAK_COLUMNS))
+        self._workspace, self._scratch = block_workspace(), np.zeros(16)
+        self._peaks = np.zeros((4 * rows * columns, PEAK_COLUMNS))
         self._separate, self._near, self._gaps = (
             np.zeros(4 * most, np.int64),
             np.zeros(MAX_COMPARED, np.int64),
@@ -140,8 +141,7 @@ class SpotFinder:
         )
         inner = self._runs[: runs_of(boxes, 0, 0, rows, columns, self._runs)]
         find_highest_between(task.image, inner, self._blocks.maps, self._blocks.lines[0])
-        flat = self._workspace.reshape(len(self._workspace), -1)
-        search = PeakSearch(task.pixels, task.noise, self._blocks, self._workspace, flat, self._peaks)
+        search = PeakSearch(task.pixels, task.noise, self._blocks, self._workspace, self._scratch, self._peaks)
         threshold = task.limits.threshold_sigma
         return find_peaks_in(boxes, search, threshold, self._searched, self._bright_blocks, self._runs, count)
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from math import ceil, sqrt
+from math import ceil, pi, sqrt
 
 import numpy as np
 
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
-from tracking.detection.normal_equations import PolynomialFrame, accumulate, add_light, frame_of, solve_normal
+from tracking.detection.ellipse import gaussian_window
+from tracking.detection.normal_equations import PolynomialFrame, accumulate, frame_of, solve_normal
 from tracking.detection.pixels import VALID, Noise, Pixels, Window, insert_nearest, read_window, window_around
 from tracking.detection.quality import assess_fit, exclude_isolated_cells, gain_over_plane
 from tracking.detection.table import (
@@ -128,7 +129,7 @@ def _step(
         cells[USE, k] = 1.0 if cells[STATE, k] == VALID else 0.0
     near, gaps = algebra[VECTORS, NEAR], algebra[VECTORS, GAPS]
     for k in range(_neighbours(table, i, window, near, gaps)):
-        add_light(window, table[int(near[k])], cells[ROW], cells[NEIGHBOUR_LIGHT])
+        _add_light(window, table[int(near[k])], cells[ROW], cells[NEIGHBOUR_LIGHT])
     chi2 = accumulate(window, spot, noise, cells, algebra)
     if exclude_isolated_cells(window, spot, cells):
         chi2 = accumulate(window, spot, noise, cells, algebra)
@@ -153,6 +154,21 @@ def _step(
             spot[VAR_U], spot[COV_UV] = spot[VAR_U] + du * du, spot[COV_UV] + du * dv
             spot[VAR_V] += dv * dv
     return moved and not last
+
+
+@compiled
+def _add_light(window: Window, spot: Array, lights: Array, out: Array) -> None:
+    """Add the light of another spot (9,), DN, to the cells (cells,) of a window. lights (cells,) is workspace."""
+    pixel = window.cell**2 / 12.0
+    S = (spot[UU] + pixel, spot[UV], spot[VV] + pixel)
+    inverse = ellipse.inverse(S[0], S[1], S[2])
+    scale = spot[FLUX] / (2 * pi * sqrt(S[0] * S[2] - S[1] ** 2))
+    middle = 0.5 * (window.cell - 1)
+    u0, v0 = window.left + middle - spot[U], window.top + middle - spot[V]
+    light = lights[: window.rows * window.columns]
+    gaussian_window(inverse, u0, v0, float(window.cell), window.columns, light)
+    for k in range(light.shape[0]):
+        out[k] += scale * light[k]
 
 
 @compiled

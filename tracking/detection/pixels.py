@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array
-from geometry.compilation.jit import compiled
+from geometry.compilation.jit import compiled, compiled_for_sums
 
 OUTSIDE, CLIPPED, VALID = 0.0, 1.0, 2.0
 
@@ -56,6 +56,22 @@ def mean3(image: Pixels, u: int, v: int) -> float:
         for j in range(u - 1, u + 2):
             total += pixel(image, clamped(j, image.width), clamped(i, image.height))
     return total / 9.0
+
+
+@compiled
+def mean8(image: Pixels, u: int, v: int, top: float) -> float:
+    """The mean of 8x8 pixels, clipped at `top`, starting at (u - 4, v - 4); border pixels are repeated outside."""
+    total = 0.0
+    if image.depth == 1 and u >= 4 and v >= 4 and u + 4 <= image.width and v + 4 <= image.height:
+        for i in range(v - 4, v + 4):
+            line = image.bytes[i, u - 4 : u + 4]
+            for j in range(8):
+                total += min(np.float64(line[j]), top)
+        return total / 64.0
+    for i in range(v - 4, v + 4):
+        for j in range(u - 4, u + 4):
+            total += min(pixel(image, clamped(j, image.width), clamped(i, image.height)), top)
+    return total / 64.0
 
 
 class Window(NamedTuple):
@@ -202,34 +218,22 @@ def insert_nearest(near: NDArray, gaps: Array, filled: int, most: int, gap: floa
     return min(filled + 1, most)
 
 
-@compiled
+@compiled_for_sums
 def total_of(values: Array) -> float:
-    """The sum of an array, as four sums: an addition does not wait for the one before, and they are vectorised."""
-    a = b = c = d = 0.0
-    n = values.shape[0] // 4
-    for k in range(n):
-        a += values[4 * k]
-        b += values[4 * k + 1]
-        c += values[4 * k + 2]
-        d += values[4 * k + 3]
-    for k in range(4 * n, values.shape[0]):
-        a += values[k]
-    return (a + b) + (c + d)
+    """The sum of an array."""
+    total = 0.0
+    for k in range(values.shape[0]):
+        total += values[k]
+    return total
 
 
-@compiled
+@compiled_for_sums
 def total_of_products(x: Array, y: Array) -> float:
-    """The sum of the products of two arrays of one length, as four sums."""
-    a = b = c = d = 0.0
-    n = x.shape[0] // 4
-    for k in range(n):
-        a += x[4 * k] * y[4 * k]
-        b += x[4 * k + 1] * y[4 * k + 1]
-        c += x[4 * k + 2] * y[4 * k + 2]
-        d += x[4 * k + 3] * y[4 * k + 3]
-    for k in range(4 * n, x.shape[0]):
-        a += x[k] * y[k]
-    return (a + b) + (c + d)
+    """The sum of the products of two arrays of one length."""
+    total = 0.0
+    for k in range(x.shape[0]):
+        total += x[k] * y[k]
+    return total
 
 
 @compiled
