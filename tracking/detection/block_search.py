@@ -93,20 +93,20 @@ def find_highest_between(image: NDArray, runs: Ints, maps: Sums, line: Sums) -> 
         for j in range(own.shape[0]):
             own[j] = 0.0
         inner = min(own.shape[0], max((width - begin) // 2, 0))
-        for i in range(max(4 * row - 1, 0), min(4 * row + 4, (height - 1) // 2)):
-            above, below = image[2 * i + 1], image[2 * i + 2]
-            x, y = above[begin : begin + 2 * inner], below[begin : begin + 2 * inner]
+        begin_rows, end_rows = max(4 * row - 1, 0), min(4 * row + 4, (height - 1) // 2)
+        for i in range(begin_rows, end_rows):
+            x, y = image[2 * i + 1, begin : begin + 2 * inner], image[2 * i + 2, begin : begin + 2 * inner]
             for j in range(inner):
                 a = (np.float32(x[2 * j]) + np.float32(x[2 * j + 1])) + (
                     np.float32(y[2 * j]) + np.float32(y[2 * j + 1])
                 )
                 b = own[j]
                 own[j] = a if a > b else b
-            if first > 0:
-                a = (np.float32(above[begin - 2]) + np.float32(above[begin - 1])) + (
-                    np.float32(below[begin - 2]) + np.float32(below[begin - 1])
-                )
-                left = a if a > left else left
+        for i in range(2 * begin_rows + 1, 2 * end_rows + 1 if first > 0 else 0, 2):
+            a = (np.float32(image[i, begin - 2]) + np.float32(image[i, begin - 1])) + (
+                np.float32(image[i + 1, begin - 2]) + np.float32(image[i + 1, begin - 1])
+            )
+            left = a if a > left else left
         out = maps[BETWEEN2, row, first:last]
         for j in range(out.shape[0]):
             a, b, c, d = own[4 * j], own[4 * j + 1], own[4 * j + 2], own[4 * j + 3]
