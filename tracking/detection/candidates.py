@@ -100,7 +100,7 @@ def _peaks_of_block(search: PeakSearch, row: int, column: int, min_sigmas: float
     for i in range(_REACH, min(_REACH + BLOCK, image.height - top + _REACH)):
         for j in range(_REACH, min(_REACH + BLOCK, image.width - left + _REACH)):
             k = i * _SIDE + j
-            if marks[k] == 0.0 or sum3[k] < sum3[k + 1] or sum3[k] < sum3[k - 1]:
+            if marks[k] == 0.0 or sum3[k] < max(sum3[k - 1], sum3[k + 1], sum3[k - _SIDE], sum3[k + _SIDE]):
                 continue
             height3 = sum3[k] - 9 * level
             if height3 <= 0 or not _is_maximum(sum3, k):
@@ -208,13 +208,12 @@ def _mark_significant(flat: Sums, least2: float, least3: float, least5: float, l
 @compiled
 def _is_maximum(values: Sums, k: int) -> bool:
     """Whether no value among the 5x5 neighbours is larger, and no earlier one is equal."""
-    here = values[k]
+    here, higher = values[k], 0
     for a in range(-2, 3):
         for b in range(-2, 3):
             other = values[k + a * _SIDE + b]
-            if other > here or (other == here and (a < 0 or (a == 0 and b < 0))):
-                return False
-    return True
+            higher += 1 if other > here or (other == here and (a < 0 or (a == 0 and b < 0))) else 0
+    return higher == 0
 
 
 @compiled

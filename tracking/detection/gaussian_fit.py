@@ -222,7 +222,8 @@ def _neighbours(table: Array, i: int, window: Window, near: Array, gaps: Array) 
     """The spots whose light reaches farthest into a window, into `near`; returns their number."""
     filled = 0
     for j in range(table.shape[0]):
-        if j == i or table[j, FLUX] <= 0.0:
+        far = max(abs(table[j, U] - table[i, U]), abs(table[j, V] - table[i, V])) >= reach_of(window.cell)
+        if j == i or far or table[j, FLUX] <= 0.0:
             continue
         gap = _gap(table[i], table[j], window)
         if gap < 0:
@@ -234,9 +235,11 @@ def _neighbours(table: Array, i: int, window: Window, near: Array, gaps: Array) 
 def _reactivate_neighbours(table: Array, i: int) -> None:
     """Mark the spots into whose windows spot i shines to be fitted again, because it has moved."""
     for j in range(table.shape[0]):
-        spot = table[j]
-        if j != i and not spot[ACTIVE] and spot[FLUX] > 0.0 and _gap(spot, table[i], window_of(spot)) < 0:
-            spot[ACTIVE] = 1.0
+        far = max(abs(table[j, U] - table[i, U]), abs(table[j, V] - table[i, V])) >= reach_of(4)
+        if j == i or far or table[j, ACTIVE] or table[j, FLUX] <= 0.0:
+            continue
+        if _gap(table[j], table[i], window_of(table[j])) < 0:
+            table[j, ACTIVE] = 1.0
 
 
 @compiled

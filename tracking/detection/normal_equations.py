@@ -265,44 +265,41 @@ def _moments_of_row(
 
     Beyond _NEGLIGIBLE sigmas from the centre they are below the rounding of the sums, and 0.
     """
-    line, count, dv = cells[LINE : LINE + 3, :columns], nodes.shape[0], frame.v0 + r
+    count, dv = nodes.shape[0], frame.v0 + r
     out = cells[NODES : NODES + 6, r * columns : (r + 1) * columns]
     for p in range(6):
         for j in range(columns):
             out[p, j] = 0.0
     if abs(dv) - 0.5 > _NEGLIGIBLE * frame.sv:
         return
-    values = cells[ROW, : count * count * columns]
+    # First the sums over the nodes in v, of the light times 1, y and y^2, at all nodes in u of all pixels.
+    u, light = cells[ROW, : count * columns], cells[LINE, : count * columns]
+    light_y, light_yy = cells[LINE + 1, : count * columns], cells[LINE + 2, : count * columns]
+    for m in range(count):
+        for j in range(columns):
+            u[m * columns + j] = frame.u0 + nodes[m] + j
+    for i in range(light.shape[0]):
+        light[i] = light_y[i] = light_yy[i] = 0.0
     for k in range(count):
-        v = dv + nodes[k]
-        for m in range(count):
-            u0 = frame.u0 + nodes[m]
-            row = values[(k * count + m) * columns : (k * count + m + 1) * columns]
-            for j in range(row.shape[0]):
-                u = u0 + j
-                row[j] = -0.5 * (inverse[0] * u * u + 2.0 * inverse[1] * u * v + inverse[2] * v * v)
-    for i in range(values.shape[0]):
-        values[i] = exponential(values[i])
+        v, y, share = dv + nodes[k], (dv + nodes[k]) / frame.sv, scale * weights[k]
+        for i in range(light.shape[0]):
+            g = share * exponential(
+                -0.5 * (inverse[0] * u[i] * u[i] + 2.0 * inverse[1] * u[i] * v + inverse[2] * v * v)
+            )
+            light[i] += g
+            light_y[i] += g * y
+            light_yy[i] += g * y * y
     narrow = 1.0 / frame.su
-    for k in range(count):
-        y = (dv + nodes[k]) / frame.sv
+    for m in range(count):
         for j in range(columns):
-            line[0, j] = line[1, j] = line[2, j] = 0.0
-        for m in range(count):
-            u0, share = frame.u0 + nodes[m], scale * weights[k] * weights[m]
-            row = values[(k * count + m) * columns : (k * count + m + 1) * columns]
-            for j in range(row.shape[0]):
-                x, g = (u0 + j) * narrow, share * row[j]
-                line[0, j] += g
-                line[1, j] += g * x
-                line[2, j] += g * x * x
-        for j in range(columns):
-            out[0, j] += line[0, j]
-            out[1, j] += line[1, j]
-            out[2, j] += line[0, j] * y
-            out[3, j] += line[2, j]
-            out[4, j] += line[1, j] * y
-            out[5, j] += line[0, j] * y * y
+            i = m * columns + j
+            x, one, with_y = u[i] * narrow, weights[m] * light[i], weights[m] * light_y[i]
+            out[0, j] += one
+            out[1, j] += one * x
+            out[2, j] += with_y
+            out[3, j] += one * x * x
+            out[4, j] += with_y * x
+            out[5, j] += weights[m] * light_yy[i]
 
 
 @compiled

@@ -117,32 +117,33 @@ def _chi2_beside(count: int, most: float, cells: Array) -> float:
 @compiled
 def exclude_isolated_cells(window: Window, spot: Array, cells: Array) -> bool:
     """Exclude cells with a large residual that all eight neighbours lack: hot or dead pixels, never part of a spot."""
-    outlying, count = 0, window.rows * window.columns
-    residual, weight = cells[RESIDUAL, :count], cells[WEIGHT, :count]
-    for k in range(residual.shape[0]):  # mostly there are none
-        outlying += 1 if residual[k] * residual[k] * weight[k] > _OUTLIER**2 else 0
+    outlying, n, count, found = 0, window.columns, window.rows * window.columns, False
+    residual, weight, size = cells[RESIDUAL, :count], cells[WEIGHT, :count], cells[SCRATCH, :count]
+    for k in range(size.shape[0]):
+        size[k] = residual[k] * residual[k] * weight[k]
+        outlying += 1 if size[k] > _OUTLIER**2 else 0
     if outlying == 0:
         return False
-    found = False
-    narrow_spot = min(spot[UU], spot[VV]) < 0.8**2
-    middle = 0.5 * (window.cell - 1)
-    for k in range(count):
-        size = residual[k] * residual[k] * weight[k]
-        if size <= _OUTLIER**2:
-            continue
-        r, c = k // window.columns, k % window.columns
-        u = window.left + middle + c * window.cell - spot[U]
-        v = window.top + middle + r * window.cell - spot[V]
-        if narrow_spot and u * u + v * v < 1.8**2:  # the middle of a spot about one pixel wide is always isolated
-            continue
-        around = 0.0
-        for i in range(max(r - 1, 0), min(r + 2, window.rows)):
-            for j in range(max(c - 1, 0), min(c + 2, window.columns)):
-                other = i * window.columns + j
-                if other != k:
-                    around = max(around, residual[other] * residual[other] * weight[other])
-        if size > _ISOLATED**2 * around:
-            cells[USE, k], found = 0.0, True
+    narrow_spot, middle = min(spot[UU], spot[VV]) < 0.8**2, 0.5 * (window.cell - 1)
+    for r in range(window.rows):
+        for c in range(n):
+            k = r * n + c
+            if size[k] <= _OUTLIER**2:
+                continue
+            most = size[k] / _ISOLATED**2  # of a neighbour; in most cases that in the row exceeds it
+            if (c > 0 and size[k - 1] >= most) or (c < n - 1 and size[k + 1] >= most):
+                continue
+            u = window.left + middle + c * window.cell - spot[U]
+            v = window.top + middle + r * window.cell - spot[V]
+            if narrow_spot and u * u + v * v < 1.8**2:  # the middle of a spot about one pixel wide is always isolated
+                continue
+            around = 0.0
+            for i in range(max(r - 1, 0), min(r + 2, window.rows)):
+                for j in range(max(c - 1, 0), min(c + 2, n)):
+                    if i != r or j != c:
+                        around = max(around, size[i * n + j])
+            if around < most:
+                cells[USE, k], found = 0.0, True
     return found
 
 
