@@ -19,7 +19,7 @@ from tracking.detection.candidates import (
     PeakSearch,
     block_workspace,
 )
-from tracking.detection.gaussian_fit import reach_of
+from tracking.detection.gaussian_fit import REACHES
 from tracking.detection.measuring import DetectionLimits, measure, write_detections
 from tracking.detection.pixels import Noise, Pixels
 from tracking.detection.regions import INITIAL_REACH, MARGIN, boxes_of, find_relevant
@@ -110,7 +110,8 @@ class SpotFinder:
         boxes, count = workspace[: boxes_of(regions, self.width, self.height, workspace)], 0
         reach, chosen = np.zeros(0), None
         while True:
-            count = self._search(task, boxes, count)
+            if len(boxes):
+                count = self._search(task, boxes, count)
             reach = np.concatenate([reach, np.full(count - len(reach), INITIAL_REACH)])
             relevant = np.zeros(count, np.int64)
             more = find_relevant(
@@ -120,9 +121,9 @@ class SpotFinder:
                 boxes = workspace[:more]
                 continue
             chosen = self._measure(task, count, relevant, chosen)
-            needed = np.array([reach_of(int(cell)) for cell in self._table[: len(chosen), CELL_SIZE]])
+            needed = np.array(REACHES)[self._table[: len(chosen), CELL_SIZE].astype(int)]
             far = needed + MARGIN > reach[chosen]
-            far &= needed > reach_of(1)
+            far &= needed > REACHES[1]
             if not far.any():
                 return
             reach[chosen[far]] = needed[far] + MARGIN

@@ -57,6 +57,7 @@ _CURVED = 0.02  # the next step is about step^2 / (2 width); it may be a hundred
 _WINDOW = 3.7  # sigmas from centre to side of the window: with 3.2 (2.5) the plane costs 3 % (8 %) of the accuracy
 _WINDOW_WIDE, _WIDE_PX = 3.2, 4.5  # ... of spots wider than this, whose background is not a plane over more
 _LEAST_HALF = 7  # cells from the centre to the side of the window
+REACHES = (150.0, 40.0, 80.0, 150.0, 150.0)  # px, see `reach_of`
 _MOST_NEIGHBOURS = 6  # neighbours whose light is subtracted
 _LEAST_VARIANCE = 0.02  # px^2: narrower spots cannot be distinguished from a point
 
@@ -203,7 +204,7 @@ def window_of(spot: Array) -> Window:
 @compiled
 def reach_of(cell: int) -> float:
     """The largest distance, px, of another spot that affects the measurement of a spot with this cell size."""
-    return 40.0 if cell == 1 else (80.0 if cell == 2 else 150.0)
+    return REACHES[cell]
 
 
 @compiled

@@ -321,20 +321,20 @@ def solve_normal(N: Array, X: Array, right_sides: int, L: Array) -> bool:
             if i == j:
                 if not total > 0.0:
                     return False
-                L[i, i] = sqrt(total)
+                L[i, i] = 1.0 / sqrt(total)  # its inverse: divisions take most of the time
             else:
-                L[i, j] = total / L[j, j]
+                L[i, j] = total * L[j, j]
     for c in range(right_sides):
         for i in range(n):
             total = X[i, c] * scale[i]
             for m in range(i):
                 total -= L[i, m] * X[m, c]
-            X[i, c] = total / L[i, i]
+            X[i, c] = total * L[i, i]
         for i in range(n - 1, -1, -1):
             total = X[i, c]
             for m in range(i + 1, n):
                 total -= L[m, i] * X[m, c]
-            X[i, c] = total / L[i, i]
+            X[i, c] = total * L[i, i]
         for i in range(n):
             X[i, c] *= scale[i]
     return True
