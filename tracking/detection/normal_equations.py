@@ -272,12 +272,15 @@ def _moments_of_row(
             out[p, j] = 0.0
     if abs(dv) - 0.5 > _NEGLIGIBLE * frame.sv:
         return
-    # First the sums over the nodes in v, of the light times 1, y and y^2, at all nodes in u of all pixels.
-    u, light = cells[ROW, : count * columns], cells[LINE, : count * columns]
-    light_y, light_yy = cells[LINE + 1, : count * columns], cells[LINE + 2, : count * columns]
+    reach = _NEGLIGIBLE * frame.su + 0.5
+    first, last = max(int(-reach - frame.u0), 0), min(int(reach - frame.u0) + 1, columns)
+    n = max(last - first, 0)
+    # First the sums over the nodes in v, of the light times 1, y and y^2, at all nodes in u of these pixels.
+    u, light = cells[ROW, : count * n], cells[LINE, : count * n]
+    light_y, light_yy = cells[LINE + 1, : count * n], cells[LINE + 2, : count * n]
     for m in range(count):
-        for j in range(columns):
-            u[m * columns + j] = frame.u0 + nodes[m] + j
+        for j in range(n):
+            u[m * n + j] = frame.u0 + nodes[m] + (first + j)
     for i in range(light.shape[0]):
         light[i] = light_y[i] = light_yy[i] = 0.0
     for k in range(count):
@@ -289,10 +292,10 @@ def _moments_of_row(
             light[i] += g
             light_y[i] += g * y
             light_yy[i] += g * y * y
-    narrow = 1.0 / frame.su
+    narrow, out = 1.0 / frame.su, out[:, first:]
     for m in range(count):
-        for j in range(columns):
-            i = m * columns + j
+        for j in range(n):
+            i = m * n + j
             x, one, with_y = u[i] * narrow, weights[m] * light[i], weights[m] * light_y[i]
             out[0, j] += one
             out[1, j] += one * x
