@@ -54,7 +54,8 @@ def mean3(image: Pixels, u: int, v: int) -> float:
     total = 0.0
     if image.depth == 1 and 0 < u < image.width - 1 and 0 < v < image.height - 1:
         for i in range(v - 1, v + 2):
-            total += image.bytes[i, u - 1] + image.bytes[i, u] + image.bytes[i, u + 1]
+            for j in range(u - 1, u + 2):
+                total += image.bytes[i, j]
         return total / 9.0
     for i in range(v - 1, v + 2):
         for j in range(u - 1, u + 2):
@@ -139,7 +140,7 @@ def _read_cells(
                     higher[j] = line[j]
             else:
                 for j in range(width):
-                    higher[j] = line[2 * j] + 256 * line[2 * j + 1]
+                    higher[j] = np.int32(line[2 * j]) + 256 * np.int32(line[2 * j + 1])
             for j in range(width):
                 total[j] += higher[j]
                 highest[j] = higher[j] if higher[j] > highest[j] else highest[j]
