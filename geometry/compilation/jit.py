@@ -41,6 +41,14 @@ def compiled_for_threads(function: Function) -> Function:
     return _compiled(function, release_gil=True)
 
 
+def compiled_for_sums(function: Function) -> Function:
+    """As `compiled`, but the terms of its sums are added in any order, since loops with sums are vectorised only so.
+
+    The last digits of the sums depend on the processor.
+    """
+    return _compiled(function, release_gil=False, fastmath={"reassoc"})
+
+
 class _Library(codegen.JITCodeLibrary):
     """numba's holder of machine code; for code from disk, LLVM's bitcode is parsed only when it is needed.
 
@@ -122,9 +130,9 @@ def _name_functions_of_numba() -> None:
         _llvm.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
 
 
-def _compiled(function: Function, release_gil: bool) -> Function:
+def _compiled(function: Function, release_gil: bool, fastmath: Any = False) -> Function:
     settings: Any = numba.config
-    dispatcher = numba.njit(function, error_model="numpy", nogil=release_gil)
+    dispatcher = numba.njit(function, error_model="numpy", nogil=release_gil, fastmath=fastmath)
     if settings.DISABLE_JIT:
         return dispatcher
     folder = Path(function.__code__.co_filename).parent

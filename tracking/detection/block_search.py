@@ -93,20 +93,20 @@ def find_highest_between(image: NDArray, runs: Ints, maps: Sums, line: Sums) -> 
         for j in range(own.shape[0]):
             own[j] = 0.0
         inner = min(own.shape[0], max((width - begin) // 2, 0))
-        for i in range(max(4 * row - 1, 0), min(4 * row + 4, (height - 1) // 2)):
-            above, below = image[2 * i + 1], image[2 * i + 2]
-            x, y = above[begin : begin + 2 * inner], below[begin : begin + 2 * inner]
+        begin_rows, end_rows = max(4 * row - 1, 0), min(4 * row + 4, (height - 1) // 2)
+        for i in range(begin_rows, end_rows):
+            x, y = image[2 * i + 1, begin : begin + 2 * inner], image[2 * i + 2, begin : begin + 2 * inner]
             for j in range(inner):
                 a = (np.float32(x[2 * j]) + np.float32(x[2 * j + 1])) + (
                     np.float32(y[2 * j]) + np.float32(y[2 * j + 1])
                 )
                 b = own[j]
                 own[j] = a if a > b else b
-            if first > 0:
-                a = (np.float32(above[begin - 2]) + np.float32(above[begin - 1])) + (
-                    np.float32(below[begin - 2]) + np.float32(below[begin - 1])
-                )
-                left = a if a > left else left
+        for i in range(2 * begin_rows + 1, 2 * end_rows + 1 if first > 0 else 0, 2):
+            a = (np.float32(image[i, begin - 2]) + np.float32(image[i, begin - 1])) + (
+                np.float32(image[i + 1, begin - 2]) + np.float32(image[i + 1, begin - 1])
+            )
+            left = a if a > left else left
         out = maps[BETWEEN2, row, first:last]
         for j in range(out.shape[0]):
             a, b, c, d = own[4 * j], own[4 * j + 1], own[4 * j + 2], own[4 * j + 3]
@@ -187,16 +187,23 @@ def median5(a: float, b: float, c: float, d: float, e: float) -> float:
 
 
 @compiled
+def _median_at_border(x: Sums, j: int) -> float:
+    """The median of the five values about one of them, where the outermost ones are repeated."""
+    last = x.shape[0] - 1
+    return median5(x[max(j - 2, 0)], x[max(j - 1, 0)], x[j], x[min(j + 1, last)], x[min(j + 2, last)])
+
+
+@compiled
 def find_row_medians(blocks: Blocks, runs: Ints) -> None:
     """Compute ROW_MEDIAN, over each block and two on each side; the outermost blocks are repeated at the border."""
     columns = blocks.maps.shape[2]
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], runs[k, 1], runs[k, 2]
         x, out = blocks.maps[SUMS, row], blocks.maps[ROW_MEDIAN, row]
-        for j in range(first, last):
-            if j < BACKGROUND_REACH or j >= columns - BACKGROUND_REACH:
-                left, right = max(j - 1, 0), min(j + 1, columns - 1)
-                out[j] = median5(x[max(j - 2, 0)], x[left], x[j], x[right], x[min(j + 2, columns - 1)])
+        for j in range(first, min(last, BACKGROUND_REACH)):
+            out[j] = _median_at_border(x, j)
+        for j in range(max(first, BACKGROUND_REACH, columns - BACKGROUND_REACH), last):
+            out[j] = _median_at_border(x, j)
         begin = max(first, BACKGROUND_REACH)
         inner = out[begin : max(min(last, columns - BACKGROUND_REACH), begin)]
         x = x[begin - BACKGROUND_REACH :]
@@ -250,7 +257,7 @@ def find_bright_blocks(
         highest4, highest8 = blocks.maps[HIGHEST4, row, first:last], blocks.maps[HIGHEST8, row, first:last]
         excess, excess8 = blocks.lines[0, : last - first], blocks.lines[1, : last - first]
         texture = blocks.maps[TEXTURE, row, first:last]
-        for j in range(background.shape[0]):  # squared excess relative to the squared threshold
+        for j in range(background.shape[0]):
             level = background[j] / 64.0
             above_black = level - black
             variance, structure = (
@@ -260,15 +267,13 @@ def find_bright_blocks(
             pair = highest2[j] if highest2[j] > between2[j] else between2[j]
             a, b, c = 2.0 * (pair - 4.0 * level), highest4[j] - 16.0 * level, highest8[j] - 64.0 * level
             a, b, c = (a if a > 0.0 else 0.0), (b if b > 0.0 else 0.0), (c if c > 0.0 else 0.0)
-            a, b = a * a / (fine * (variance + 4.0 * structure)), b * b / (fine * (variance + 16.0 * structure))
-            excess[j] = a if a > b else b
-            excess8[j] = c * c / (wide * (variance + 64.0 * structure))
+            few = (a * a > fine * (variance + 4.0 * structure)) | (b * b > fine * (variance + 16.0 * structure))
+            excess[j] = 1.0 if few else 0.0
+            excess8[j] = 1.0 if few | (c * c > wide * (variance + 64.0 * structure)) else 0.0
         for j in range(background.shape[0]):
-            if searched[row, first + j]:
-                continue
-            searched[row, first + j] = 1
-            if excess[j] > 1.0 or excess8[j] > 1.0:
+            if excess8[j] > 0.0 and not searched[row, first + j]:
                 found[count, 0], found[count, 1] = row, first + j
-                found[count, 2] = 0 if excess[j] > 1.0 else 1
+                found[count, 2] = 0 if excess[j] > 0.0 else 1
                 count += 1
+        searched[row, first:last] = 1
     return count

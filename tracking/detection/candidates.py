@@ -14,12 +14,12 @@ import numpy as np
 
 from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled
-from tracking.detection.block_search import BACKGROUND, HIGHEST8, TEXTURE, Blocks
+from tracking.detection.block_search import BACKGROUND, HIGHEST8, TEXTURE, Blocks, Sums
 from tracking.detection.pixels import (
     Noise,
     Pixels,
-    clamped,
     insertion_sort,
+    mean8,
     mirrored,
     pair_variance,
     pixel,
@@ -35,7 +35,7 @@ HOT_SIGMAS = 4.0  # least excess of a hot pixel over its surroundings
 _BESIDE_HOT = 2.0  # sigmas above a hot pixel's neighbours at which other pixels are clipped: hot pixels occur in pairs
 _REACH = 4  # px around a block that its search uses: 2 for maxima, 2 for the means
 _SIDE = BLOCK + 2 * _REACH
-_LINES, _SUMS, _PAIRS, _SCRATCH = 1, 4, 7, 9  # in the workspace of a block, see `block_workspace`
+_LINES, _SUMS, _PAIRS, _MARKS = 1, 4, 7, 9  # in the workspace of a block, see `block_workspace`
 _WEAK = 20.0  # sigmas: a weaker peak must also exceed the background's curvature ...
 _WEAK_SHARE = 0.7  # ... by this share of the threshold
 _WIDE_CLIP = 4.0  # sigmas above the background at which pixels are clipped in the search for wide faint spots
@@ -48,11 +48,11 @@ AT_U, AT_V, HEIGHT, LEVEL, WIDE, SCALE, CONTRAST = range(7)
 PEAK_COLUMNS = 7
 
 
-def block_workspace() -> Array:
-    """Workspace for one block: pixels; sums of 3, 5 and 7 in a line; of 3x3, 5x5 and 7x7; of 2x2 to the right and
-    below, and the highest of the four that contain a pixel; scratch values.
+def block_workspace() -> Sums:
+    """Workspace for one block, (_MARKS + 1, _SIDE^2): pixels; sums of 3, 5 and 7 in a line; of 3x3, 5x5 and 7x7; of 2x2
+    to the right and below, and the highest of the four that contain a pixel; marks. All are integers below 2^24.
     """
-    return np.zeros((_SCRATCH + 1, _SIDE, _SIDE))
+    return np.zeros((_MARKS + 1, _SIDE * _SIDE), np.float32)
 
 
 class PeakSearch(NamedTuple):
@@ -61,8 +61,8 @@ class PeakSearch(NamedTuple):
     image: Pixels
     noise: Noise
     blocks: Blocks
-    workspace: Array  # see `block_workspace`
-    flat: Array  # the same memory, (_SCRATCH + 1, _SIDE^2)
+    workspace: Sums  # see `block_workspace`
+    scratch: Array  # (16,)
     peaks: Array  # (most, PEAK_COLUMNS), the peaks found
 
 
@@ -82,39 +82,38 @@ def find_peaks(search: PeakSearch, found: Ints, found_count: int, min_sigmas: fl
 @compiled
 def _peaks_of_block(search: PeakSearch, row: int, column: int, min_sigmas: float, count: int) -> int:
     """Append the significant maxima, among 5x5 neighbours, of the mean of 3x3 pixels in one block."""
-    image, peaks, workspace = search.image, search.peaks, search.workspace
+    image, peaks, flat, scratch = search.image, search.peaks, search.workspace, search.scratch
     left, top, level = BLOCK * column, BLOCK * row, search.blocks.maps[BACKGROUND, row, column] / 64.0
     noise = with_texture(search.noise, search.blocks.maps[TEXTURE, row, column])
-    values, sum3, scratch = workspace[0], workspace[_SUMS], workspace[_SCRATCH, 0]
-    sum5, sum7, sum2 = workspace[_SUMS + 1], workspace[_SUMS + 2], workspace[_PAIRS + 1]
     # Mirrored at the border: with repeated pixels the maximum of a spot at the edge would lie outside the picture.
-    _read_block(image, left - _REACH, top - _REACH, values)
-    _sum_squares(search.flat)
+    _read_block(image, left - _REACH, top - _REACH, flat)
+    _sum_squares(flat)
     noise2, texture2 = variance(noise, level), texture_variance(noise, level)
     sigma = sqrt(noise2)
     least2 = 2 * min_sigmas * sqrt(noise2 + 4.0 * pair_variance(noise, level))
     least3 = 3 * min_sigmas * sqrt(noise2 + 9.0 * texture2)
     least5 = 5 * min_sigmas * sqrt(noise2 + 25.0 * texture2)
     least7 = 7 * min_sigmas * sqrt(noise2 + 49.0 * texture2)
-    if not _has_significant(
-        search.flat, 4 * level + least2, 9 * level + least3, 25 * level + least5, 49 * level + least7
-    ):
+    if not _mark_significant(flat, 4 * level + least2, 9 * level + least3, 25 * level + least5, 49 * level + least7):
         return count
+    values, sum3, marks = flat[0], flat[_SUMS], flat[_MARKS]
     for i in range(_REACH, min(_REACH + BLOCK, image.height - top + _REACH)):
         for j in range(_REACH, min(_REACH + BLOCK, image.width - left + _REACH)):
-            height3, height5, height7 = sum3[i, j] - 9 * level, sum5[i, j] - 25 * level, sum7[i, j] - 49 * level
-            height2 = sum2[i, j] - 4 * level
-            if height2 < least2 and height3 < least3 and height5 < least5 and height7 < least7:
+            k = i * _SIDE + j
+            if marks[k] == 0.0 or sum3[k] < max(sum3[k - 1], sum3[k + 1], sum3[k - _SIDE], sum3[k + _SIDE]):
                 continue
-            if height3 <= 0 or not _is_maximum(sum3, i, j):
+            height3 = sum3[k] - 9 * level
+            if height3 <= 0 or not _is_maximum(sum3, k):
                 continue
+            height2 = flat[_PAIRS + 1, k] - 4 * level
+            height5, height7 = flat[_SUMS + 1, k] - 25 * level, flat[_SUMS + 2, k] - 49 * level
             u, v = left + j - _REACH, top + i - _REACH
             limit = _hot_pixel_limit(image, u, v, noise, level + height3 / 9, scratch)
             if limit < np.inf:
-                height2 = _clipped_pairs(values, i, j, limit) - 4 * level
-                height3 = _clipped_sum(values, i, j, 1, limit) - 9 * level
-                height5 = _clipped_sum(values, i, j, 2, limit) - 25 * level
-                height7 = _clipped_sum(values, i, j, 3, limit) - 49 * level
+                height2 = _clipped_pairs(values, k, limit) - 4 * level
+                height3 = _clipped_sum(values, k, 1, limit) - 9 * level
+                height5 = _clipped_sum(values, k, 2, limit) - 25 * level
+                height7 = _clipped_sum(values, k, 3, limit) - 49 * level
             if height2 < least2 and height3 < least3 and height5 < least5 and height7 < least7:
                 continue
             if height3 <= 0 or count >= peaks.shape[0]:
@@ -133,15 +132,20 @@ def _peaks_of_block(search: PeakSearch, row: int, column: int, min_sigmas: float
 
 
 @compiled
-def _read_block(image: Pixels, left: int, top: int, values: Array) -> None:
+def _read_block(image: Pixels, left: int, top: int, flat: Sums) -> None:
     """The pixels of a square (_SIDE, _SIDE) that begins at (left, top); mirrored at the picture's border."""
     inside = left >= 0 and top >= 0 and left + _SIDE <= image.width and top + _SIDE <= image.height
     for i in range(_SIDE):
-        out = values[i]
+        out = flat[0, i * _SIDE : (i + 1) * _SIDE]
         if inside and image.depth == 1:
             line = image.bytes[top + i, left : left + _SIDE]
             for j in range(_SIDE):
                 out[j] = line[j]
+            continue
+        if inside:
+            line = image.bytes[top + i, 2 * left : 2 * (left + _SIDE)]
+            for j in range(_SIDE):
+                out[j] = np.float32(line[2 * j]) + np.float32(256.0) * np.float32(line[2 * j + 1])
             continue
         v = mirrored(top + i, image.height)
         for j in range(_SIDE):
@@ -149,8 +153,8 @@ def _read_block(image: Pixels, left: int, top: int, values: Array) -> None:
 
 
 @compiled
-def _sum_squares(flat: Array) -> None:
-    """Sums over squares of pixels, in flat arrays (_SCRATCH + 1, _SIDE^2): the sum of 2 r + 1 lines of 2 r + 1 pixels.
+def _sum_squares(flat: Sums) -> None:
+    """Sums over squares of pixels, in flat arrays (_MARKS + 1, _SIDE^2): the sum of 2 r + 1 lines of 2 r + 1 pixels.
 
     Flat, since one long loop is vectorised and several short ones are not. Sums that reach over the end of a line are
     wrong, and not used.
@@ -182,50 +186,55 @@ def _sum_squares(flat: Array) -> None:
 
 
 @compiled
-def _has_significant(flat: Array, least2: float, least3: float, least5: float, least7: float) -> bool:
-    """Whether a sum of 2x2, 3x3, 5x5 or 7x7 pixels reaches its threshold anywhere in the block, at a maximum or not.
+def _mark_significant(flat: Sums, least2: float, least3: float, least5: float, least7: float) -> bool:
+    """Mark the pixels where a sum of 2x2, 3x3, 5x5 or 7x7 pixels reaches its threshold; whether there may be any.
 
-    In most bright blocks none does. This is faster than to look at their maxima.
+    In most bright blocks there is none. Marks between the block's lines, where the sums are wrong, are not used.
     """
-    sum2, sum3, sum5, sum7 = flat[_PAIRS + 1], flat[_SUMS], flat[_SUMS + 1], flat[_SUMS + 2]
-    found = 0
-    for i in range(BLOCK):
-        for j in range(BLOCK):
-            k = (i + _REACH) * _SIDE + _REACH + j
-            few, many = sum2[k] >= least2 or sum3[k] >= least3, sum5[k] >= least5 or sum7[k] >= least7
-            found += 1 if few or many else 0
+    first, n = _REACH * _SIDE + _REACH, (BLOCK - 1) * _SIDE + BLOCK
+    sum2, sum3 = flat[_PAIRS + 1, first : first + n], flat[_SUMS, first : first + n]
+    sum5, sum7 = flat[_SUMS + 1, first : first + n], flat[_SUMS + 2, first : first + n]
+    marks, found = flat[_MARKS, first : first + n], 0
+    # The sums are integers, for which the comparison with the next integer is the same; it is exact in float32.
+    low2, low3 = np.float32(np.ceil(least2)), np.float32(np.ceil(least3))
+    low5, low7 = np.float32(np.ceil(least5)), np.float32(np.ceil(least7))
+    for k in range(n):
+        mark = ((sum2[k] >= low2) | (sum3[k] >= low3)) | ((sum5[k] >= low5) | (sum7[k] >= low7))
+        marks[k] = np.float32(1.0) if mark else np.float32(0.0)
+        found += 1 if mark else 0
     return found > 0
 
 
 @compiled
-def _is_maximum(values: Array, i: int, j: int) -> bool:
+def _is_maximum(values: Sums, k: int) -> bool:
     """Whether no value among the 5x5 neighbours is larger, and no earlier one is equal."""
-    here = values[i, j]
-    for a in range(i - 2, i + 3):
-        for b in range(j - 2, j + 3):
-            if values[a, b] > here or (values[a, b] == here and (a < i or (a == i and b < j))):
-                return False
-    return True
+    here, higher = values[k], 0
+    for a in range(-2, 3):
+        for b in range(-2, 3):
+            other = values[k + a * _SIDE + b]
+            higher += 1 if other > here or (other == here and (a < 0 or (a == 0 and b < 0))) else 0
+    return higher == 0
 
 
 @compiled
-def _clipped_sum(values: Array, i: int, j: int, reach: int, limit: float) -> float:
+def _clipped_sum(values: Sums, k: int, reach: int, limit: float) -> float:
     """The sum of the values within `reach` of one, each clipped at the limit."""
     total = 0.0
-    for a in range(i - reach, i + reach + 1):
-        for b in range(j - reach, j + reach + 1):
-            total += min(values[a, b], limit)
+    for a in range(-reach, reach + 1):
+        for b in range(-reach, reach + 1):
+            total += min(values[k + a * _SIDE + b], limit)
     return total
 
 
 @compiled
-def _clipped_pairs(values: Array, i: int, j: int, limit: float) -> float:
+def _clipped_pairs(values: Sums, k: int, limit: float) -> float:
     """The highest sum of 2x2 values that contain one, each clipped at the limit."""
     best = -np.inf
-    for a in range(i - 1, i + 1):
-        for b in range(j - 1, j + 1):
-            above = min(values[a, b], limit) + min(values[a, b + 1], limit)
-            best = max(best, above + min(values[a + 1, b], limit) + min(values[a + 1, b + 1], limit))
+    for a in range(-1, 1):
+        for b in range(-1, 1):
+            m = k + a * _SIDE + b
+            above = min(values[m], limit) + min(values[m + 1], limit)
+            best = max(best, above + min(values[m + _SIDE], limit) + min(values[m + _SIDE + 1], limit))
     return best
 
 
@@ -289,11 +298,11 @@ def _wide_peak(search: PeakSearch, row: int, column: int, min_sigmas: float, cou
     u, v = 4 * bj + 4, 4 * bi + 4
     if u >= image.width or v >= image.height:
         return count
-    scratch = search.workspace[_SCRATCH, 0]
+    scratch = search.scratch
     level = blocks.maps[BACKGROUND, row, column] / 64.0
     sigma2 = variance(noise, level)
     top = level + _WIDE_CLIP * sqrt(sigma2)
-    here = _mean8(image, u, v, top)
+    here = mean8(image, u, v, top)
     height = here - _background_around(image, u, v, top, scratch)
     # A median of eight has 1.4 times the variance of their mean.
     scatter = sqrt((sigma2 / 64.0 + texture_variance(noise, level)) * (1 + 1.4 / 8 * 17.0 / 9.0))
@@ -325,24 +334,8 @@ def _background_around(image: Pixels, u: int, v: int, top: float, scratch: Array
         for i in range(-1, 2):
             for j in range(-1, 2):
                 if i != 0 or j != 0:
-                    scratch[n] = _mean8(image, u + j * away, v + i * away, top)
+                    scratch[n] = mean8(image, u + j * away, v + i * away, top)
                     n += 1
         insertion_sort(scratch, 8)
         level += (4.0 / 3.0 if k == 0 else -1.0 / 3.0) * 0.5 * (scratch[3] + scratch[4])
     return level
-
-
-@compiled
-def _mean8(image: Pixels, u: int, v: int, top: float) -> float:
-    """The mean of 8x8 pixels, clipped at `top`, starting at (u - 4, v - 4); border pixels are repeated outside."""
-    total = 0.0
-    if image.depth == 1 and u >= 4 and v >= 4 and u + 4 <= image.width and v + 4 <= image.height:
-        for i in range(v - 4, v + 4):
-            line = image.bytes[i, u - 4 : u + 4]
-            for j in range(8):
-                total += min(np.float64(line[j]), top)
-        return total / 64.0
-    for i in range(v - 4, v + 4):
-        for j in range(u - 4, u + 4):
-            total += min(pixel(image, clamped(j, image.width), clamped(i, image.height)), top)
-    return total / 64.0

@@ -19,7 +19,7 @@ from tracking.detection.candidates import (
     PeakSearch,
     block_workspace,
 )
-from tracking.detection.gaussian_fit import reach_of
+from tracking.detection.gaussian_fit import REACHES
 from tracking.detection.measuring import DetectionLimits, measure, write_detections
 from tracking.detection.pixels import Noise, Pixels
 from tracking.detection.regions import INITIAL_REACH, MARGIN, boxes_of, find_relevant
@@ -73,7 +73,8 @@ class SpotFinder:
         self._runs = np.zeros((rows + 4, 3), np.int64)
         self._searched = np.zeros((rows, columns), np.uint8)
         self._bright_blocks = np.zeros((rows * columns, 3), np.int64)
-        self._workspace, self._peaks = block_workspace(), np.zeros((4 * rows * columns, PEAK_COLUMNS))
+        self._workspace, self._scratch = block_workspace(), np.zeros(16)
+        self._peaks = np.zeros((4 * rows * columns, PEAK_COLUMNS))
         self._separate, self._near, self._gaps = (
             np.zeros(4 * most, np.int64),
             np.zeros(MAX_COMPARED, np.int64),
@@ -109,7 +110,8 @@ class SpotFinder:
         boxes, count = workspace[: boxes_of(regions, self.width, self.height, workspace)], 0
         reach, chosen = np.zeros(0), None
         while True:
-            count = self._search(task, boxes, count)
+            if len(boxes):
+                count = self._search(task, boxes, count)
             reach = np.concatenate([reach, np.full(count - len(reach), INITIAL_REACH)])
             relevant = np.zeros(count, np.int64)
             more = find_relevant(
@@ -119,9 +121,9 @@ class SpotFinder:
                 boxes = workspace[:more]
                 continue
             chosen = self._measure(task, count, relevant, chosen)
-            needed = np.array([reach_of(int(cell)) for cell in self._table[: len(chosen), CELL_SIZE]])
+            needed = np.array(REACHES)[self._table[: len(chosen), CELL_SIZE].astype(int)]
             far = needed + MARGIN > reach[chosen]
-            far &= needed > reach_of(1)
+            far &= needed > REACHES[1]
             if not far.any():
                 return
             reach[chosen[far]] = needed[far] + MARGIN
@@ -140,8 +142,7 @@ class SpotFinder:
         )
         inner = self._runs[: runs_of(boxes, 0, 0, rows, columns, self._runs)]
         find_highest_between(task.image, inner, self._blocks.maps, self._blocks.lines[0])
-        flat = self._workspace.reshape(len(self._workspace), -1)
-        search = PeakSearch(task.pixels, task.noise, self._blocks, self._workspace, flat, self._peaks)
+        search = PeakSearch(task.pixels, task.noise, self._blocks, self._workspace, self._scratch, self._peaks)
         threshold = task.limits.threshold_sigma
         return find_peaks_in(boxes, search, threshold, self._searched, self._bright_blocks, self._runs, count)
 

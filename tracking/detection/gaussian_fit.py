@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from math import ceil, sqrt
+from math import ceil, pi, sqrt
 
 import numpy as np
 
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
-from tracking.detection.normal_equations import PolynomialFrame, accumulate, add_light, frame_of, solve_normal
+from tracking.detection.ellipse import gaussian_window
+from tracking.detection.normal_equations import PolynomialFrame, accumulate, frame_of, solve_normal
 from tracking.detection.pixels import VALID, Noise, Pixels, Window, insert_nearest, read_window, window_around
-from tracking.detection.quality import assess_fit, gain_over_plane
+from tracking.detection.quality import assess_fit, exclude_isolated_cells, gain_over_plane
 from tracking.detection.table import (
     ACTIVE,
     BACKGROUND,
@@ -31,7 +32,6 @@ from tracking.detection.table import (
     NEAR,
     NEIGHBOUR_LIGHT,
     NORMAL,
-    RESIDUAL,
     RIGHT_SIDE,
     ROW,
     SIGMA_FLUX,
@@ -47,7 +47,6 @@ from tracking.detection.table import (
     VAR_V,
     VECTORS,
     VV,
-    WEIGHT,
     U,
     V,
 )
@@ -58,9 +57,8 @@ _CURVED = 0.02  # the next step is about step^2 / (2 width); it may be a hundred
 _WINDOW = 3.7  # sigmas from centre to side of the window: with 3.2 (2.5) the plane costs 3 % (8 %) of the accuracy
 _WINDOW_WIDE, _WIDE_PX = 3.2, 4.5  # ... of spots wider than this, whose background is not a plane over more
 _LEAST_HALF = 7  # cells from the centre to the side of the window
+REACHES = (150.0, 40.0, 80.0, 150.0, 150.0)  # px, see `reach_of`
 _MOST_NEIGHBOURS = 6  # neighbours whose light is subtracted
-_OUTLIER = 6.0  # sigmas: least residual of a hot or dead pixel ...
-_ISOLATED = 2.5  # ... and its least ratio to the residuals of the neighbouring pixels
 _LEAST_VARIANCE = 0.02  # px^2: narrower spots cannot be distinguished from a point
 
 
@@ -132,9 +130,9 @@ def _step(
         cells[USE, k] = 1.0 if cells[STATE, k] == VALID else 0.0
     near, gaps = algebra[VECTORS, NEAR], algebra[VECTORS, GAPS]
     for k in range(_neighbours(table, i, window, near, gaps)):
-        add_light(window, table[int(near[k])], cells[ROW], cells[NEIGHBOUR_LIGHT])
+        _add_light(window, table[int(near[k])], cells[ROW], cells[NEIGHBOUR_LIGHT])
     chi2 = accumulate(window, spot, noise, cells, algebra)
-    if _exclude_isolated_cells(window, spot, cells):
+    if exclude_isolated_cells(window, spot, cells):
         chi2 = accumulate(window, spot, noise, cells, algebra)
     frame = frame_of(window, spot)
     if not _solve(frame, spot[HELD] > 0.0, algebra):
@@ -157,6 +155,21 @@ def _step(
             spot[VAR_U], spot[COV_UV] = spot[VAR_U] + du * du, spot[COV_UV] + du * dv
             spot[VAR_V] += dv * dv
     return moved and not last
+
+
+@compiled
+def _add_light(window: Window, spot: Array, lights: Array, out: Array) -> None:
+    """Add the light of another spot (9,), DN, to the cells (cells,) of a window. lights (cells,) is workspace."""
+    pixel = window.cell**2 / 12.0
+    S = (spot[UU] + pixel, spot[UV], spot[VV] + pixel)
+    inverse = ellipse.inverse(S[0], S[1], S[2])
+    scale = spot[FLUX] / (2 * pi * sqrt(S[0] * S[2] - S[1] ** 2))
+    middle = 0.5 * (window.cell - 1)
+    u0, v0 = window.left + middle - spot[U], window.top + middle - spot[V]
+    light = lights[: window.rows * window.columns]
+    gaussian_window(inverse, u0, v0, float(window.cell), window.columns, light)
+    for k in range(light.shape[0]):
+        out[k] += scale * light[k]
 
 
 @compiled
@@ -191,7 +204,7 @@ def window_of(spot: Array) -> Window:
 @compiled
 def reach_of(cell: int) -> float:
     """The largest distance, px, of another spot that affects the measurement of a spot with this cell size."""
-    return 40.0 if cell == 1 else (80.0 if cell == 2 else 150.0)
+    return REACHES[cell]
 
 
 @compiled
@@ -210,7 +223,8 @@ def _neighbours(table: Array, i: int, window: Window, near: Array, gaps: Array) 
     """The spots whose light reaches farthest into a window, into `near`; returns their number."""
     filled = 0
     for j in range(table.shape[0]):
-        if j == i or table[j, FLUX] <= 0.0:
+        far = max(abs(table[j, U] - table[i, U]), abs(table[j, V] - table[i, V])) >= reach_of(window.cell)
+        if j == i or far or table[j, FLUX] <= 0.0:
             continue
         gap = _gap(table[i], table[j], window)
         if gap < 0:
@@ -222,36 +236,11 @@ def _neighbours(table: Array, i: int, window: Window, near: Array, gaps: Array) 
 def _reactivate_neighbours(table: Array, i: int) -> None:
     """Mark the spots into whose windows spot i shines to be fitted again, because it has moved."""
     for j in range(table.shape[0]):
-        spot = table[j]
-        if j != i and not spot[ACTIVE] and spot[FLUX] > 0.0 and _gap(spot, table[i], window_of(spot)) < 0:
-            spot[ACTIVE] = 1.0
-
-
-@compiled
-def _exclude_isolated_cells(window: Window, spot: Array, cells: Array) -> bool:
-    """Exclude cells with a large residual that all eight neighbours lack: hot or dead pixels, never part of a spot."""
-    found = False
-    narrow_spot = min(spot[UU], spot[VV]) < 0.8**2
-    residual, weight = cells[RESIDUAL], cells[WEIGHT]
-    middle = 0.5 * (window.cell - 1)
-    for k in range(window.rows * window.columns):
-        size = residual[k] * residual[k] * weight[k]
-        if size <= _OUTLIER**2:
+        far = max(abs(table[j, U] - table[i, U]), abs(table[j, V] - table[i, V])) >= reach_of(4)
+        if j == i or far or table[j, ACTIVE] or table[j, FLUX] <= 0.0:
             continue
-        r, c = k // window.columns, k % window.columns
-        u = window.left + middle + c * window.cell - spot[U]
-        v = window.top + middle + r * window.cell - spot[V]
-        if narrow_spot and u * u + v * v < 1.8**2:  # the middle of a spot about one pixel wide is always isolated
-            continue
-        around = 0.0
-        for i in range(max(r - 1, 0), min(r + 2, window.rows)):
-            for j in range(max(c - 1, 0), min(c + 2, window.columns)):
-                other = i * window.columns + j
-                if other != k:
-                    around = max(around, residual[other] * residual[other] * weight[other])
-        if size > _ISOLATED**2 * around:
-            cells[USE, k], found = 0.0, True
-    return found
+        if _gap(table[j], table[i], window_of(table[j])) < 0:
+            table[j, ACTIVE] = 1.0
 
 
 @compiled

@@ -7,7 +7,7 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
-from tracking.detection.ellipse import gaussian_row
+from tracking.detection.ellipse import gaussian_window
 from tracking.detection.pixels import OUTSIDE, Pixels, Window, insertion_sort, read_window, window_around
 from tracking.detection.table import (
     BACKGROUND,
@@ -109,7 +109,7 @@ def _subtract_background(window: Window, table: Array, i: int, background: float
 
 @compiled
 def _adapt_window(window: Window, light: Array, spot: Array, lines: Array) -> float:
-    """One iteration of the adaptive window; returns the flux, DN cells. lines (4, columns) is workspace.
+    """One iteration of the adaptive window; returns the flux, DN cells. lines (4, cells) is workspace.
 
     Under a window W a Gaussian S has the covariance (1/S + 1/W)^-1. If both are equal, the measured offset and flux are
     half the true ones, so they are doubled.
@@ -121,13 +121,13 @@ def _adapt_window(window: Window, light: Array, spot: Array, lines: Array) -> fl
     u0, v0 = window.left + middle - spot[MOMENT_U], window.top + middle - spot[MOMENT_V]
     n = window.columns
     # Sums of the columns times y^0, y^1, y^2.
-    row, sum0, sum1, sum2 = lines[0, :n], lines[1, :n], lines[2, :n], lines[3, :n]
+    weights, sum0, sum1, sum2 = lines[0, : n * window.rows], lines[1, :n], lines[2, :n], lines[3, :n]
+    gaussian_window(narrow, u0, v0, float(window.cell), n, weights)
     for j in range(n):
         sum0[j] = sum1[j] = sum2[j] = 0.0
     for r in range(window.rows):
         y = v0 + r * window.cell
-        gaussian_row(narrow, u0, y, float(window.cell), row)
-        line = light[r * n : (r + 1) * n]
+        row, line = weights[r * n : (r + 1) * n], light[r * n : (r + 1) * n]
         for j in range(line.shape[0]):
             a = row[j] * line[j]
             sum0[j] += a

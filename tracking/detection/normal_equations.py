@@ -2,8 +2,7 @@
 
 The linearised model is a Gaussian times a polynomial of second degree in the position (which spans the derivatives with
 respect to centre, shape and flux) plus a plane. The normal matrix therefore consists of moments of weight, weight times
-light and weight times squared light, up to the fourth degree. They are summed row by row, because v is constant within
-a row. This takes 18 products per cell; nine columns of derivatives would take 54. Source: ours.
+light and weight times squared light, up to the fourth degree. Source: ours.
 """
 
 from __future__ import annotations
@@ -14,11 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array
-from geometry.compilation.jit import compiled
+from geometry.compilation.jit import compiled, compiled_for_sums
 from tracking.detection import ellipse
-from tracking.detection.ellipse import gaussian_row
-from tracking.detection.pixels import Noise, Window
+from tracking.detection.ellipse import exponential, gaussian_window
+from tracking.detection.pixels import Noise, Window, total_of_products
 from tracking.detection.table import (
+    AT_X,
+    AT_Y,
     FLUX,
     LEVEL,
     LIGHT,
@@ -29,6 +30,7 @@ from tracking.detection.table import (
     RESIDUAL,
     RIGHT_SIDE,
     ROW,
+    SCRATCH,
     SLOPE_U,
     SLOPE_V,
     USE,
@@ -45,6 +47,17 @@ from tracking.detection.table import (
 EXACT_PX2 = 0.9**2  # px^2: narrower spots are integrated over the pixels numerically
 _POWERS_U, _POWERS_V = (0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)
 _FOUR_NODES_PX2 = 0.5**2  # px^2: narrower spots need eight instead of four nodes in each direction
+_COLUMNS = (
+    NODES,
+    NODES + 1,
+    NODES + 2,
+    NODES + 3,
+    NODES + 4,
+    NODES + 5,
+    USE,
+    AT_X,
+    AT_Y,
+)  # of the exact model, in cells
 _NEGLIGIBLE = 8.5  # sigmas from the centre at which the light is 2e-16 of its peak
 _EDGEWORTH = 0.4  # cell^2 / variance above which the pixels' fourth cumulant is significant
 
@@ -89,111 +102,107 @@ def accumulate(window: Window, spot: Array, noise: Noise, cells: Array, algebra:
     frame = frame_of(window, spot)
     if frame.exact:
         return _accumulate_exact(window, frame, spot, noise, cells, algebra[NORMAL], algebra[VECTORS, RIGHT_SIDE])
-    A = np.zeros((3, 5, 5))  # moments of weight light^0, ^1 and ^2, by powers of x and y
-    R = np.zeros((2, 3, 3))  # of weight residual light^0 and ^1
-    sums = np.zeros(18)
     inverse = ellipse.inverse(frame.S[0], frame.S[1], frame.S[2])
-    cell = float(window.cell)
     scale = spot[FLUX] / (2 * np.pi * sqrt(frame.S[0] * frame.S[2] - frame.S[1] ** 2))
-    narrow = max(inverse[0], inverse[2]) * cell * cell > _EDGEWORTH
-    row = cells[ROW, : window.columns]
-    for r in range(window.rows):
-        dv = frame.v0 + r * cell
-        gaussian_row(inverse, frame.u0, dv, cell, row)
-        if narrow:
-            _integrate_row(inverse, frame.u0, dv, cell, row)
-        for j in range(row.shape[0]):
-            row[j] *= scale
-        _weigh(window, r, frame, spot, noise, row, cells)
-        _sum_row(window, r, frame, cells, sums)
-        y = dv / frame.sv
-        power = 1.0
-        for q in range(5):
-            for p in range(5):
-                A[2, p, q] += power * sums[p]
-            for p in range(4):
-                A[1, p, q] += power * sums[5 + p]
-            if q < 3:
-                for p in range(3):
-                    A[0, p, q] += power * sums[9 + p]
-                    R[1, p, q] += power * sums[12 + p]
-                R[0, 0, q] += power * sums[15]
-                R[0, 1, q] += power * sums[16]
-            power *= y
-    _fill(A, R, algebra[NORMAL], algebra[VECTORS, RIGHT_SIDE])
-    return _chi_square(window, cells)
+    cell, count = float(window.cell), window.rows * window.columns
+    light, weight, residual = cells[LIGHT, :count], cells[WEIGHT, :count], cells[RESIDUAL, :count]
+    x, y, product = cells[AT_X, :count], cells[AT_Y, :count], cells[NODES, :count]
+    _fill_coordinates(window, frame, x, y)
+    gaussian_window(inverse, frame.u0, frame.v0, cell, window.columns, light)
+    if max(inverse[0], inverse[2]) * cell * cell > _EDGEWORTH:
+        _integrate(inverse, frame, cell, x, y, light)
+    _weigh(frame, cell, spot, noise, scale, x, y, cells)
+    # Moments, by powers of x and y, of weight light^0, ^1 and ^2, and of weight residual light^0 and ^1.
+    A = np.zeros((5, 5, 5))
+    for k in range(product.shape[0]):
+        product[k] = weight[k] * light[k]
+    _moments_to_4(product, light, x, y, A[2])
+    _moments_to_4(weight, light, x, y, A[1])
+    _moments_to_2(weight, cells[USE, :count], x, y, A[0])  # the use is 1 wherever the weight is not 0
+    _moments_to_2(weight, residual, x, y, A[3])
+    _moments_to_2(product, residual, x, y, A[4])
+    _fill(A, algebra[NORMAL], algebra[VECTORS, RIGHT_SIDE])
+    return _chi_square(weight, residual)
 
 
 @compiled
-def _weigh(window: Window, r: int, frame: PolynomialFrame, spot: Array, noise: Noise, row: Array, cells: Array) -> None:
-    """Light (given in `row`), residual and weight of a row of cells. Without branches, so that it is vectorised."""
-    first, last = r * window.columns, (r + 1) * window.columns
-    cell = float(window.cell)
-    floor, slope, black = noise.floor, noise.slope, noise.black
-    base = spot[LEVEL] + spot[SLOPE_V] * (frame.v0 + r * cell) + spot[SLOPE_U] * frame.u0
-    tilt = spot[SLOPE_U] * cell
-    others, values, use = cells[NEIGHBOUR_LIGHT, first:last], cells[VALUES, first:last], cells[USE, first:last]
-    light, residual, weight = cells[LIGHT, first:last], cells[RESIDUAL, first:last], cells[WEIGHT, first:last]
-    for j in range(row.shape[0]):
-        level = row[j] + base + tilt * j + others[j]
-        above_black = level - black
-        light[j] = row[j]
-        residual[j] = values[j] - level
-        weight[j] = use[j] * (cell * cell) / (floor + slope * (above_black if above_black > 0.0 else 0.0))
-
-
-@compiled
-def _sum_row(window: Window, r: int, frame: PolynomialFrame, cells: Array, sums: Array) -> None:
-    """Moments in x along a row: w l^2 (5), w l (4), w (3), w l r (3), w r (2); w weight, l light, r residual."""
-    first, last = r * window.columns, (r + 1) * window.columns
-    light, residual, weight = cells[LIGHT, first:last], cells[RESIDUAL, first:last], cells[WEIGHT, first:last]
+def _fill_coordinates(window: Window, frame: PolynomialFrame, x: Array, y: Array) -> None:
+    """The places of the cells (cells,) in the spot's frame."""
     x0, dx = frame.u0 / frame.su, window.cell / frame.su
-    a0 = a1 = a2 = a3 = a4 = b0 = b1 = b2 = b3 = c0 = c1 = c2 = d0 = d1 = d2 = e0 = e1 = 0.0
-    for j in range(light.shape[0]):
-        x = x0 + j * dx
-        w, l = weight[j], light[j]
-        wr, wl = w * residual[j], w * l
-        wll, wlr = wl * l, wr * l
-        a0 += wll
-        b0 += wl
-        c0 += w
-        d0 += wlr
-        e0 += wr
-        wll, wl, w, wlr = wll * x, wl * x, w * x, wlr * x
-        a1 += wll
-        b1 += wl
-        c1 += w
-        d1 += wlr
-        e1 += wr * x
-        wll, wl = wll * x, wl * x
-        a2 += wll
-        b2 += wl
-        c2 += w * x
-        d2 += wlr * x
-        wll = wll * x
-        a3 += wll
-        b3 += wl * x
-        a4 += wll * x
-    sums[0], sums[1], sums[2], sums[3], sums[4] = a0, a1, a2, a3, a4
-    sums[5], sums[6], sums[7], sums[8] = b0, b1, b2, b3
-    sums[9], sums[10], sums[11] = c0, c1, c2
-    sums[12], sums[13], sums[14], sums[15], sums[16] = d0, d1, d2, e0, e1
+    for r in range(window.rows):
+        first, here = r * window.columns, (frame.v0 + r * window.cell) / frame.sv
+        line, other = x[first : first + window.columns], y[first : first + window.columns]
+        for j in range(line.shape[0]):
+            line[j] = x0 + j * dx
+            other[j] = here
 
 
 @compiled
-def _chi_square(window: Window, cells: Array) -> float:
+def _weigh(
+    frame: PolynomialFrame, cell: float, spot: Array, noise: Noise, scale: float, x: Array, y: Array, cells: Array
+) -> None:
+    """Light, residual and weight of the cells, from LIGHT / scale. Without branches and with few arrays in each loop,
+    so that they are vectorised.
+    """
+    count = x.shape[0]
+    level, floor, slope, black = spot[LEVEL], noise.floor, noise.slope, noise.black
+    tilt_x, tilt_y, pixels = spot[SLOPE_U] * frame.su, spot[SLOPE_V] * frame.sv, cell * cell
+    light, residual, weight = cells[LIGHT, :count], cells[RESIDUAL, :count], cells[WEIGHT, :count]
+    others, values, use = cells[NEIGHBOUR_LIGHT, :count], cells[VALUES, :count], cells[USE, :count]
+    for k in range(light.shape[0]):
+        lit = scale * light[k]
+        light[k] = lit
+        residual[k] = lit + (level + tilt_x * x[k] + tilt_y * y[k])
+    for k in range(weight.shape[0]):
+        expected = residual[k] + others[k]
+        above_black = expected - black
+        residual[k] = values[k] - expected
+        weight[k] = use[k] * pixels / (floor + slope * (above_black if above_black > 0.0 else 0.0))
+
+
+@compiled_for_sums
+def _moments_to_4(a: Array, b: Array, x: Array, y: Array, out: Array) -> None:
+    """Sums of a b x^p y^q with p + q <= 4 into out (5, 5), over all cells (cells,)."""
+    s00 = s10 = s01 = s20 = s11 = s02 = s30 = s21 = s12 = s03 = s40 = s31 = s22 = s13 = s04 = 0.0
+    for k in range(a.shape[0]):
+        u, v, t = x[k], y[k], a[k] * b[k]
+        tu, tv = t * u, t * v
+        tuu, tuv, tvv = tu * u, tu * v, tv * v
+        tuuu, tuuv, tuvv, tvvv = tuu * u, tuu * v, tuv * v, tvv * v
+        s00, s10, s01, s20, s11, s02 = s00 + t, s10 + tu, s01 + tv, s20 + tuu, s11 + tuv, s02 + tvv
+        s30, s21, s12, s03 = s30 + tuuu, s21 + tuuv, s12 + tuvv, s03 + tvvv
+        s40, s31, s22 = s40 + tuuu * u, s31 + tuuu * v, s22 + tuuv * v
+        s13, s04 = s13 + tuvv * v, s04 + tvvv * v
+    out[0, 0], out[1, 0], out[0, 1], out[2, 0], out[1, 1], out[0, 2] = s00, s10, s01, s20, s11, s02
+    out[3, 0], out[2, 1], out[1, 2], out[0, 3] = s30, s21, s12, s03
+    out[4, 0], out[3, 1], out[2, 2], out[1, 3], out[0, 4] = s40, s31, s22, s13, s04
+
+
+@compiled_for_sums
+def _moments_to_2(a: Array, b: Array, x: Array, y: Array, out: Array) -> None:
+    """As `_moments_to_4`, with p + q <= 2."""
+    s00 = s10 = s01 = s20 = s11 = s02 = 0.0
+    for k in range(a.shape[0]):
+        u, v, t = x[k], y[k], a[k] * b[k]
+        tu, tv = t * u, t * v
+        s00, s10, s01, s20, s11, s02 = s00 + t, s10 + tu, s01 + tv, s20 + tu * u, s11 + tu * v, s02 + tv * v
+    out[0, 0], out[1, 0], out[0, 1], out[2, 0], out[1, 1], out[0, 2] = s00, s10, s01, s20, s11, s02
+
+
+@compiled_for_sums
+def _chi_square(weight: Array, residual: Array) -> float:
     total = 0.0
-    for k in range(window.columns * window.rows):
-        total += cells[WEIGHT, k] * cells[RESIDUAL, k] * cells[RESIDUAL, k]
+    for k in range(weight.shape[0]):
+        total += weight[k] * residual[k] * residual[k]
     return total
 
 
 @compiled
-def _fill(A: Array, R: Array, N: Array, b: Array) -> None:
+def _fill(A: Array, N: Array, b: Array) -> None:
     for p in range(9):
         light_p = 1 if p < 6 else 0
         i, j = _POWERS_U[p if p < 6 else p - 6], _POWERS_V[p if p < 6 else p - 6]
-        b[p] = R[light_p, i, j]
+        b[p] = A[3 + light_p, i, j]
         for q in range(9):
             light_q = 1 if q < 6 else 0
             m, n = _POWERS_U[q if q < 6 else q - 6], _POWERS_V[q if q < 6 else q - 6]
@@ -201,18 +210,22 @@ def _fill(A: Array, R: Array, N: Array, b: Array) -> None:
 
 
 @compiled
-def _integrate_row(a: tuple[float, float, float], u0: float, v: float, cell: float, row: Array) -> None:
+def _integrate(
+    a: tuple[float, float, float], frame: PolynomialFrame, cell: float, x: Array, y: Array, light: Array
+) -> None:
     """Convert the point values of a Gaussian, whose covariance includes the pixels' variance, into pixel means.
 
     The fourth cumulant of a square pixel, -cell^4/120, enters as an Edgeworth term. Against the exact integral the
     error is below 0.05 % of the peak for sigmas of at least 0.8 px (tested).
     """
-    share = cell**4 / 2880.0
-    for j in range(row.shape[0]):
-        du = u0 + j * cell
-        wu, wv = a[0] * du + a[1] * v, a[1] * du + a[2] * v
-        fourth = wu**4 - 6 * a[0] * wu * wu + 3 * a[0] * a[0] + wv**4 - 6 * a[2] * wv * wv + 3 * a[2] * a[2]
-        row[j] *= max(1.0 - share * fourth, 0.0)
+    share, su, sv = cell**4 / 2880.0, frame.su, frame.sv
+    for k in range(light.shape[0]):
+        du, dv = x[k] * su, y[k] * sv
+        wu, wv = a[0] * du + a[1] * dv, a[1] * du + a[2] * dv
+        uu, vv = wu * wu, wv * wv
+        fourth = uu * uu - 6 * a[0] * uu + 3 * a[0] * a[0] + vv * vv - 6 * a[2] * vv + 3 * a[2] * a[2]
+        mean = 1.0 - share * fourth
+        light[k] *= mean if mean > 0.0 else 0.0
 
 
 @compiled
@@ -224,85 +237,72 @@ def _accumulate_exact(
     nodes, weights = (_NODES4, _WEIGHTS4) if low > _FOUR_NODES_PX2 else (_NODES8, _WEIGHTS8)
     inverse = ellipse.inverse(frame.S[0], frame.S[1], frame.S[2])
     scale = spot[FLUX] / (2 * np.pi * sqrt(frame.S[0] * frame.S[2] - frame.S[1] ** 2))
-    J = np.ones(9)
-    for p in range(9):
-        b[p] = 0.0
-        for q in range(9):
-            N[p, q] = 0.0
+    count = window.rows * window.columns
+    x, y, light, product = cells[AT_X, :count], cells[AT_Y, :count], cells[LIGHT, :count], cells[SCRATCH, :count]
+    _fill_coordinates(window, frame, x, y)
     for r in range(window.rows):
-        dv = frame.v0 + r
-        _moments_of_row(frame, inverse, dv, nodes, weights, scale, window.columns, cells)
-        _weigh(window, r, frame, spot, noise, cells[NODES, : window.columns], cells)
-        J[8] = dv / frame.sv
-        for j in range(window.columns):
-            for p in range(6):
-                J[p] = cells[NODES + p, j]
-            J[7] = (frame.u0 + j) / frame.su
-            w, residual = cells[WEIGHT, r * window.columns + j], cells[RESIDUAL, r * window.columns + j]
-            for p in range(9):
-                wp = w * J[p]
-                b[p] += wp * residual
-                for q in range(p + 1):
-                    N[p, q] += wp * J[q]
+        _moments_of_row(frame, inverse, r, nodes, weights, scale, window.columns, cells)
+    for k in range(light.shape[0]):
+        light[k] = cells[NODES, k]
+    _weigh(frame, 1.0, spot, noise, 1.0, x, y, cells)
+    weight, residual = cells[WEIGHT, :count], cells[RESIDUAL, :count]
     for p in range(9):
-        for q in range(p):
-            N[q, p] = N[p, q]
-    return _chi_square(window, cells)
+        column = cells[_COLUMNS[p], :count]
+        for k in range(product.shape[0]):
+            product[k] = weight[k] * column[k]
+        b[p] = total_of_products(product, residual)
+        for q in range(p + 1):
+            N[p, q] = N[q, p] = total_of_products(product, cells[_COLUMNS[q], :count])
+    return _chi_square(weight, residual)
 
 
 @compiled
 def _moments_of_row(
-    frame: PolynomialFrame, inverse: tuple[float, float, float], dv: float, nodes: Array, weights: Array, scale: float,
+    frame: PolynomialFrame, inverse: tuple[float, float, float], r: int, nodes: Array, weights: Array, scale: float,
     columns: int, cells: Array,
 ) -> None:  # fmt: skip
-    """Pixel means of the light times 1, x, y, x^2, x y, y^2 along a row of pixels, into cells[NODES:].
+    """Pixel means of the light times 1, x, y, x^2, x y, y^2 along row r of the pixels, into cells[NODES:].
 
     Beyond _NEGLIGIBLE sigmas from the centre they are below the rounding of the sums, and 0.
     """
-    row, line = cells[ROW, :columns], cells[LINE : LINE + 3, :columns]
-    for p in range(NODES, NODES + 6):
+    count, dv = nodes.shape[0], frame.v0 + r
+    out = cells[NODES : NODES + 6, r * columns : (r + 1) * columns]
+    for p in range(6):
         for j in range(columns):
-            cells[p, j] = 0.0
+            out[p, j] = 0.0
     if abs(dv) - 0.5 > _NEGLIGIBLE * frame.sv:
         return
-    narrow = 1.0 / frame.su
-    for k in range(nodes.shape[0]):
-        v = dv + nodes[k]
-        y = v / frame.sv
-        for j in range(columns):
-            line[0, j] = line[1, j] = line[2, j] = 0.0
-        for m in range(nodes.shape[0]):
-            u = frame.u0 + nodes[m]
-            gaussian_row(inverse, u, v, 1.0, row)
-            share = scale * weights[k] * weights[m]
-            for j in range(columns):
-                x, g = (u + j) * narrow, share * row[j]
-                line[0, j] += g
-                line[1, j] += g * x
-                line[2, j] += g * x * x
-        for j in range(columns):
-            cells[NODES, j] += line[0, j]
-            cells[NODES + 1, j] += line[1, j]
-            cells[NODES + 2, j] += line[0, j] * y
-            cells[NODES + 3, j] += line[2, j]
-            cells[NODES + 4, j] += line[1, j] * y
-            cells[NODES + 5, j] += line[0, j] * y * y
-
-
-@compiled
-def add_light(window: Window, spot: Array, row: Array, out: Array) -> None:
-    """Add the light of another spot (9,), DN, to the cells (cells,) of a window."""
-    pixel = window.cell**2 / 12.0
-    S = (spot[UU] + pixel, spot[UV], spot[VV] + pixel)
-    inverse = ellipse.inverse(S[0], S[1], S[2])
-    scale = spot[FLUX] / (2 * np.pi * sqrt(S[0] * S[2] - S[1] ** 2))
-    middle = 0.5 * (window.cell - 1)
-    u0, v0 = window.left + middle - spot[U], window.top + middle - spot[V]
-    line = row[: window.columns]
-    for r in range(window.rows):
-        gaussian_row(inverse, u0, v0 + r * window.cell, float(window.cell), line)
-        for j in range(window.columns):
-            out[r * window.columns + j] += scale * line[j]
+    reach = _NEGLIGIBLE * frame.su + 0.5
+    first, last = max(int(-reach - frame.u0), 0), min(int(reach - frame.u0) + 1, columns)
+    n = max(last - first, 0)
+    # First the sums over the nodes in v, of the light times 1, y and y^2, at all nodes in u of these pixels.
+    u, light = cells[ROW, : count * n], cells[LINE, : count * n]
+    light_y, light_yy = cells[LINE + 1, : count * n], cells[LINE + 2, : count * n]
+    for m in range(count):
+        for j in range(n):
+            u[m * n + j] = frame.u0 + nodes[m] + (first + j)
+    for i in range(light.shape[0]):
+        light[i] = light_y[i] = light_yy[i] = 0.0
+    for k in range(count):
+        v, y, share = dv + nodes[k], (dv + nodes[k]) / frame.sv, scale * weights[k]
+        for i in range(light.shape[0]):
+            g = share * exponential(
+                -0.5 * (inverse[0] * u[i] * u[i] + 2.0 * inverse[1] * u[i] * v + inverse[2] * v * v)
+            )
+            light[i] += g
+            light_y[i] += g * y
+            light_yy[i] += g * y * y
+    narrow, out = 1.0 / frame.su, out[:, first:]
+    for m in range(count):
+        for j in range(n):
+            i = m * n + j
+            x, one, with_y = u[i] * narrow, weights[m] * light[i], weights[m] * light_y[i]
+            out[0, j] += one
+            out[1, j] += one * x
+            out[2, j] += with_y
+            out[3, j] += one * x * x
+            out[4, j] += with_y * x
+            out[5, j] += weights[m] * light_yy[i]
 
 
 @compiled
@@ -324,20 +324,20 @@ def solve_normal(N: Array, X: Array, right_sides: int, L: Array) -> bool:
             if i == j:
                 if not total > 0.0:
                     return False
-                L[i, i] = sqrt(total)
+                L[i, i] = 1.0 / sqrt(total)  # its inverse: divisions take most of the time
             else:
-                L[i, j] = total / L[j, j]
+                L[i, j] = total * L[j, j]
     for c in range(right_sides):
         for i in range(n):
             total = X[i, c] * scale[i]
             for m in range(i):
                 total -= L[i, m] * X[m, c]
-            X[i, c] = total / L[i, i]
+            X[i, c] = total * L[i, i]
         for i in range(n - 1, -1, -1):
             total = X[i, c]
             for m in range(i + 1, n):
                 total -= L[m, i] * X[m, c]
-            X[i, c] = total / L[i, i]
+            X[i, c] = total * L[i, i]
         for i in range(n):
             X[i, c] *= scale[i]
     return True

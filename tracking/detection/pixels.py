@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array
-from geometry.compilation.jit import compiled
+from geometry.compilation.jit import compiled, compiled_for_sums
 
 OUTSIDE, CLIPPED, VALID = 0.0, 1.0, 2.0
 
@@ -52,10 +52,31 @@ def clamped(i: int, size: int) -> int:
 def mean3(image: Pixels, u: int, v: int) -> float:
     """The mean of the 3x3 pixels around a pixel; border pixels are repeated outside the picture."""
     total = 0.0
+    if image.depth == 1 and 0 < u < image.width - 1 and 0 < v < image.height - 1:
+        for i in range(v - 1, v + 2):
+            for j in range(u - 1, u + 2):
+                total += image.bytes[i, j]
+        return total / 9.0
     for i in range(v - 1, v + 2):
         for j in range(u - 1, u + 2):
             total += pixel(image, clamped(j, image.width), clamped(i, image.height))
     return total / 9.0
+
+
+@compiled
+def mean8(image: Pixels, u: int, v: int, top: float) -> float:
+    """The mean of 8x8 pixels, clipped at `top`, starting at (u - 4, v - 4); border pixels are repeated outside."""
+    total = 0.0
+    if image.depth == 1 and u >= 4 and v >= 4 and u + 4 <= image.width and v + 4 <= image.height:
+        for i in range(v - 4, v + 4):
+            line = image.bytes[i, u - 4 : u + 4]
+            for j in range(8):
+                total += min(np.float64(line[j]), top)
+        return total / 64.0
+    for i in range(v - 4, v + 4):
+        for j in range(u - 4, u + 4):
+            total += min(pixel(image, clamped(j, image.width), clamped(i, image.height)), top)
+    return total / 64.0
 
 
 class Window(NamedTuple):
@@ -79,58 +100,62 @@ def window_around(u: float, v: float, half_columns: int, half_rows: int, cell: i
 @compiled
 def read_window(image: Pixels, window: Window, saturation: float, values: Array, state: Array) -> None:
     """The cells' values (cells,), DN, and states (cells,): OUTSIDE (at least partly), CLIPPED (any pixel) or VALID."""
-    cell = window.cell
-    share = 1.0 / (cell * cell)
-    right, bottom = window.left + cell * window.columns, window.top + cell * window.rows
-    if image.depth == 1 and window.left >= 0 and window.top >= 0 and right <= image.width and bottom <= image.height:
-        _read_inner_window(image, window, share, saturation, values, state)
-        return
-    for i in range(window.rows):
-        top = window.top + i * cell
-        for j in range(window.columns):
-            left = window.left + j * cell
-            k = i * window.columns + j
+    cell, columns = window.cell, window.columns
+    first = min(max(-window.left + cell - 1, 0) // cell, columns)  # the first column of cells inside the picture
+    n = max(min(max(image.width - window.left, 0) // cell, columns) - first, 0)
+    left = window.left + first * cell
+    if n < columns or window.top < 0 or window.top + cell * window.rows > image.height:
+        for k in range(columns * window.rows):
             values[k], state[k] = 0.0, OUTSIDE
-            if left < 0 or top < 0 or left + cell > image.width or top + cell > image.height:
-                continue
-            if cell == 1:
-                total = most = pixel(image, left, top)
-            else:
-                total = most = 0.0
-                for v in range(top, top + cell):
-                    for u in range(left, left + cell):
-                        x = pixel(image, u, v)
-                        total += x
-                        most = max(most, x)
-            values[k] = total * share
-            state[k] = VALID if most < saturation else CLIPPED
+    begin, end = max(-(window.top // cell), 0), min((image.height - window.top) // cell, window.rows)  # rows inside
+    if cell > 1 or image.depth > 1:
+        _read_cells(image, window, first, n, begin, end, saturation, values, state)
+        return
+    for i in range(begin, end):
+        line = image.bytes[window.top + i, left : left + n]
+        cells, states = values[i * columns + first :], state[i * columns + first :]
+        for j in range(n):
+            cells[j] = line[j]
+            states[j] = VALID if line[j] < saturation else CLIPPED
 
 
 @compiled
-def _read_inner_window(
-    image: Pixels, window: Window, share: float, saturation: float, values: Array, state: Array
-) -> None:
-    """`read_window` of an 8 bit picture for a window inside it: the same values, in half the time and less."""
-    cell, n = window.cell, window.columns
-    total, highest = np.empty(n * cell), np.empty(n * cell)  # of the pixels of a column in a row of cells
-    for i in range(window.rows):
-        top = window.top + i * cell
-        line = image.bytes[top, window.left : window.left + n * cell]
-        for j in range(line.shape[0]):
-            total[j] = highest[j] = line[j]
-        for v in range(top + 1, top + cell):
-            line = image.bytes[v, window.left : window.left + n * cell]
-            for j in range(line.shape[0]):
-                x = np.float64(line[j])
-                total[j] += x
-                highest[j] = x if x > highest[j] else highest[j]
+def _read_cells(
+    image: Pixels, window: Window, first: int, n: int, begin: int, end: int, saturation: float, values: Array,
+    state: Array,
+) -> None:  # fmt: skip
+    """`read_window` for the n columns of cells from `first` on, of the rows from `begin` to `end`."""
+    cell, left = window.cell, window.left + first * window.cell
+    width, share = n * cell, 1.0 / (cell * cell)
+    # Sums and highest values of the pixels of a column in a row of cells, then of two and four columns; workspace.
+    total, highest = np.empty(width, np.int32), np.empty(width, np.int32)
+    more, higher = np.empty(width, np.int32), np.empty(width, np.int32)
+    for i in range(begin, end):
+        for j in range(width):
+            total[j] = highest[j] = 0
+        for v in range(window.top + i * cell, window.top + (i + 1) * cell):
+            line = image.bytes[v, image.depth * left : image.depth * (left + width)]
+            if image.depth == 1:
+                for j in range(width):
+                    higher[j] = line[j]
+            else:
+                for j in range(width):
+                    higher[j] = np.int32(line[2 * j]) + 256 * np.int32(line[2 * j + 1])
+            for j in range(width):
+                total[j] += higher[j]
+                highest[j] = higher[j] if higher[j] > highest[j] else highest[j]
+        added = width
+        while added > n:
+            added //= 2
+            for j in range(added):
+                more[j] = total[2 * j] + total[2 * j + 1]
+                higher[j] = highest[2 * j] if highest[2 * j] > highest[2 * j + 1] else highest[2 * j + 1]
+            for j in range(added):
+                total[j], highest[j] = more[j], higher[j]
+        cells, states = values[i * window.columns + first :], state[i * window.columns + first :]
         for j in range(n):
-            light, most = total[cell * j], highest[cell * j]
-            for u in range(cell * j + 1, cell * j + cell):
-                light += total[u]
-                most = max(most, highest[u])
-            values[i * n + j] = light * share
-            state[i * n + j] = VALID if most < saturation else CLIPPED
+            cells[j] = total[j] * share
+            states[j] = VALID if highest[j] < saturation else CLIPPED
 
 
 # Share of the threshold that applies to the sigma of the texture, which has far fewer independent places than pixels.
@@ -200,3 +225,33 @@ def insert_nearest(near: NDArray, gaps: Array, filled: int, most: int, gap: floa
         k -= 1
     gaps[k], near[k] = gap, row
     return min(filled + 1, most)
+
+
+@compiled_for_sums
+def total_of(values: Array) -> float:
+    """The sum of an array."""
+    total = 0.0
+    for k in range(values.shape[0]):
+        total += values[k]
+    return total
+
+
+@compiled_for_sums
+def total_of_products(x: Array, y: Array) -> float:
+    """The sum of the products of two arrays of one length."""
+    total = 0.0
+    for k in range(x.shape[0]):
+        total += x[k] * y[k]
+    return total
+
+
+@compiled
+def maximum_of(values: Array) -> float:
+    """The largest of values of at least 0."""
+    a = b = 0.0
+    for k in range(values.shape[0] // 2):
+        x, y = values[2 * k], values[2 * k + 1]
+        a, b = (x if x > a else a), (y if y > b else b)
+    if values.shape[0] % 2:
+        a = max(a, values[-1])
+    return max(a, b)

@@ -1,4 +1,4 @@
-"""Quality of a finished fit: peak, chi-square, explained share, and the covariance's correction for model errors."""
+"""Quality of a fit: hot pixels, peak, chi-square, explained share, the covariance's correction for model errors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,17 @@ from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
 from tracking.detection.normal_equations import PolynomialFrame
-from tracking.detection.pixels import OUTSIDE, Noise, Pixels, Window, pixel, variance
+from tracking.detection.pixels import (
+    OUTSIDE,
+    Noise,
+    Pixels,
+    Window,
+    maximum_of,
+    pixel,
+    total_of,
+    total_of_products,
+    variance,
+)
 from tracking.detection.table import (
     CHI2,
     COV_UV,
@@ -29,14 +39,19 @@ from tracking.detection.table import (
     SLOPE_U,
     SLOPE_V,
     STATE,
+    USE,
+    UU,
     VALUES,
     VAR_U,
     VAR_V,
+    VV,
     WEIGHT,
     U,
     V,
 )
 
+_OUTLIER = 6.0  # sigmas: least residual of a hot or dead pixel ...
+_ISOLATED = 2.5  # ... and its least ratio to the residuals of the neighbouring pixels
 _CORE = 0.2  # share of the brightest cell's light that limits the core: the peak is searched in the core, with clipped
 # cells but without hot pixels in the wings
 # Sum of the squared shares of the cells above which they are too few for a test of their own: of one narrow spot it
@@ -61,15 +76,15 @@ def assess_fit(window: Window, frame: PolynomialFrame, chi2: float, noise: Noise
     of `_misfit`, as is the variance of the flux.
     """
     count = window.columns * window.rows
-    used, most = 0, 0.0
-    for k in range(count):
-        used += 1 if cells[WEIGHT, k] > 0 else 0
-        most = max(most, cells[LIGHT, k])
+    weight, light = cells[WEIGHT, :count], cells[LIGHT, :count]
+    used, most = 0, maximum_of(light)
+    for k in range(weight.shape[0]):
+        used += 1 if weight[k] > 0.0 else 0
     free = max(used - 9, 1)
     peak = 0.0
     for k in range(count):
-        if cells[STATE, k] != OUTSIDE and cells[LIGHT, k] > _CORE * most:
-            peak = max(peak, cells[RESIDUAL, k] + cells[LIGHT, k])
+        if light[k] > _CORE * most and cells[STATE, k] != OUTSIDE:
+            peak = max(peak, cells[RESIDUAL, k] + light[k])
     spot[PEAK], spot[CHI2] = peak, chi2 / free
     # Chi-square scatters by sqrt(2 free): twice that is not counted as misfit, for the sake of faint spots.
     by_noise = free + 2.0 * sqrt(2.0 * free)
@@ -89,12 +104,47 @@ def assess_fit(window: Window, frame: PolynomialFrame, chi2: float, noise: Noise
 @compiled
 def _chi2_beside(count: int, most: float, cells: Array) -> float:
     """Mean square of the residuals, in sigmas, of the cells with hardly any light of the spot; 0 with few of them."""
-    squares, n = 0.0, 0
-    for k in range(count):
-        if cells[WEIGHT, k] > 0 and cells[LIGHT, k] < _BESIDE * most:
-            squares += cells[RESIDUAL, k] * cells[RESIDUAL, k] * cells[WEIGHT, k]
-            n += 1
+    weight, light, residual = cells[WEIGHT, :count], cells[LIGHT, :count], cells[RESIDUAL, :count]
+    square, n = cells[SCRATCH, :count], 0
+    for k in range(square.shape[0]):
+        beside = light[k] < _BESIDE * most
+        square[k] = residual[k] * residual[k] * weight[k] if beside else 0.0
+        n += 1 if beside and weight[k] > 0.0 else 0
+    squares = total_of(square)
     return squares / n if n >= _FEWEST_BESIDE else 0.0
+
+
+@compiled
+def exclude_isolated_cells(window: Window, spot: Array, cells: Array) -> bool:
+    """Exclude cells with a large residual that all eight neighbours lack: hot or dead pixels, never part of a spot."""
+    outlying, n, count, found = 0, window.columns, window.rows * window.columns, False
+    residual, weight, size = cells[RESIDUAL, :count], cells[WEIGHT, :count], cells[SCRATCH, :count]
+    for k in range(size.shape[0]):
+        size[k] = residual[k] * residual[k] * weight[k]
+        outlying += 1 if size[k] > _OUTLIER**2 else 0
+    if outlying == 0:
+        return False
+    narrow_spot, middle = min(spot[UU], spot[VV]) < 0.8**2, 0.5 * (window.cell - 1)
+    for r in range(window.rows):
+        for c in range(n):
+            k = r * n + c
+            if size[k] <= _OUTLIER**2:
+                continue
+            most = size[k] / _ISOLATED**2  # of a neighbour; in most cases that in the row exceeds it
+            if (c > 0 and size[k - 1] >= most) or (c < n - 1 and size[k + 1] >= most):
+                continue
+            u = window.left + middle + c * window.cell - spot[U]
+            v = window.top + middle + r * window.cell - spot[V]
+            if narrow_spot and u * u + v * v < 1.8**2:  # the middle of a spot about one pixel wide is always isolated
+                continue
+            around = 0.0
+            for i in range(max(r - 1, 0), min(r + 2, window.rows)):
+                for j in range(max(c - 1, 0), min(c + 2, n)):
+                    if i != r or j != c:
+                        around = max(around, size[i * n + j])
+            if around < most:
+                cells[USE, k], found = 0.0, True
+    return found
 
 
 @compiled
@@ -159,45 +209,54 @@ def _misfit(
     value is that for the flux, on which the fit's freedom has less effect. Source: ours, after the sandwich covariance
     of misspecified models; measured in bench/detection.py (sets streak, speckle).
     """
-    count = window.columns * window.rows
-    both = 0
-    for k in range(count):
-        both += 1 if cells[WEIGHT, k] > 0 and cells[WEIGHT, count - 1 - k] > 0 else 0
+    count, n = window.columns * window.rows, window.columns
+    weight, residual = cells[WEIGHT, :count], cells[RESIDUAL, :count]
+    z, odd, known = cells[VALUES, :count], cells[SCRATCH, :count], cells[USE, :count]  # no longer needed
+    for k in range(z.shape[0]):
+        z[k] = residual[k] * sqrt(weight[k])
+        known[k] = 1.0 if weight[k] > 0.0 else 0.0
+    both, half = 0.0, (count + 1) // 2
+    for k in range(half):
+        both += known[k] * known[count - 1 - k]
+    both = 2.0 * both - known[half - 1]  # the middle is its own mirror image
     whole = 0.5 * both < 0.3 * used
     free = max(used - 9.0, 1.0) if whole else max(0.5 * both - 4.0, 1.0)  # u, v and two slopes are odd
-    squares = 0.0
-    z, odd = cells[VALUES], cells[SCRATCH]  # no longer needed
-    for k in range(count):
-        z[k] = cells[RESIDUAL, k] * sqrt(cells[WEIGHT, k])
-    # Mirrored cells are at w + d and -w + d from the centre: an even residual differs there by 2 d times its slope.
-    du = frame.u0 / window.cell + 0.5 * (window.columns - 1)
-    dv = frame.v0 / window.cell + 0.5 * (window.rows - 1)
-    share = 1.0 / sqrt(2.0 + du * du + dv * dv)
-    for k in range(count):
-        mirror = count - 1 - k
-        if whole:
+    if whole:
+        for k in range(z.shape[0]):
             odd[k] = z[k] * sqrt(2.0)
-        elif cells[WEIGHT, k] > 0 and cells[WEIGHT, mirror] > 0:
-            slope = _slope_along(window, cells, z, k, du, dv) - _slope_along(window, cells, z, mirror, du, dv)
-            odd[k] = (z[k] - z[mirror] - slope) * share
-        else:
-            odd[k] = 0.0
-        squares += odd[k] * odd[k]
-    anywhere = 0.5 * squares / free > 1.0 + 3.0 * sqrt(2.0 / free)
+    else:
+        # Mirrored cells are at w + d and -w + d from the centre: an even residual differs there by 2 d times its slope.
+        du = frame.u0 / window.cell + 0.5 * (n - 1)
+        dv = frame.v0 / window.cell + 0.5 * (window.rows - 1)
+        _subtract_slope(window, z, known, du, dv, odd)
+        share = 1.0 / sqrt(2.0 + du * du + dv * dv)
+        for k in range(half):
+            mirror = count - 1 - k
+            difference = (odd[k] - odd[mirror]) * (known[k] * known[mirror] * share)
+            odd[k], odd[mirror] = difference, -difference
+    anywhere = 0.5 * total_of_products(odd, odd) / free > 1.0 + 3.0 * sqrt(2.0 / free)
     return _odd_misfit(window, frame, compression, cells, odd, 2.0 if whole else 1.0, anywhere)
 
 
 @compiled
-def _slope_along(window: Window, cells: Array, z: Array, k: int, du: float, dv: float) -> float:
-    """The change of values (cells,) over a distance in cells, from a cell's neighbours; 0 where one is missing."""
-    n = window.columns
-    row, column = k // n, k % n
-    total = 0.0
-    if 0 < column < n - 1 and cells[WEIGHT, k - 1] > 0 and cells[WEIGHT, k + 1] > 0:
-        total += 0.5 * du * (z[k + 1] - z[k - 1])
-    if 0 < row < window.rows - 1 and cells[WEIGHT, k - n] > 0 and cells[WEIGHT, k + n] > 0:
-        total += 0.5 * dv * (z[k + n] - z[k - n])
-    return total
+def _subtract_slope(window: Window, z: Array, known: Array, du: float, dv: float, out: Array) -> None:
+    """Values (cells,) less their change over a distance in cells, which follows from a cell's neighbours.
+
+    A direction in which one of them is missing does not count. Loops over the whole window are faster than over rows.
+    """
+    n, count, half_u, half_v = window.columns, z.shape[0], 0.5 * du, 0.5 * dv
+    before, after, both = z[: count - 2], z[2:], out[1 : count - 1]
+    known_before, known_after = known[: count - 2], known[2:]
+    for k in range(both.shape[0]):
+        both[k] = half_u * (after[k] - before[k]) * (known_before[k] * known_after[k])
+    for row in range(window.rows):
+        out[row * n] = out[row * n + n - 1] = 0.0
+    above, below, both = z[: count - 2 * n], z[2 * n :], out[n : count - n]
+    known_above, known_below = known[: count - 2 * n], known[2 * n :]
+    for k in range(both.shape[0]):
+        both[k] += half_v * (below[k] - above[k]) * (known_above[k] * known_below[k])
+    for k in range(count):
+        out[k] = z[k] - out[k]
 
 
 @compiled
@@ -210,27 +269,31 @@ def _odd_misfit(
     weighted with the sensitivity shows it. Its variance, with noise alone, is 2 sum(share^2), or 4 of mirrored pairs.
     """
     count = window.columns * window.rows
-    share = cells[NEIGHBOUR_LIGHT]  # no longer needed: the sensitivity of the centre to each cell
+    weight, light = cells[WEIGHT, :count], cells[LIGHT, :count]
+    share = cells[NEIGHBOUR_LIGHT, :count]  # no longer needed: the sensitivity of the centre to each cell
     a, b, c = ellipse.inverse(frame.S[0], frame.S[1], frame.S[2])
-    total = 0.0
     for row in range(window.rows):
-        dv = frame.v0 + row * window.cell
-        for column in range(window.columns):
-            du, k = frame.u0 + column * window.cell, row * window.columns + column
+        dv, first = frame.v0 + row * window.cell, row * window.columns
+        w, l, out = weight[first : first + window.columns], light[first : first + window.columns], share[first:]
+        for j in range(w.shape[0]):
+            du = frame.u0 + j * window.cell
             wu, wv = a * du + b * dv, b * du + c * dv
-            share[k] = cells[WEIGHT, k] * cells[LIGHT, k] ** 2 * (wu * wu + wv * wv)
-            total += share[k]
-    total = max(total, 1e-300)
-    square, crowd, added = 0.0, 0.0, 0.0
-    for k in range(count):
-        added += share[k] * cells[WEIGHT, k] * compression / (total * window.cell**2)
-        part = share[k] / total if odd[k] != 0.0 else 0.0
-        square += odd[k] * odd[k] * part / doubled
-        crowd += part * part
-        share[k] = sqrt(part)
+            out[j] = w[j] * (l[j] * l[j]) * (wu * wu + wv * wv)
+    total = max(total_of(share), 1e-300)
+    added = 0.0
+    if compression > 0.0:
+        added = total_of_products(share, weight) * compression / (total * window.cell**2)
+    for k in range(share.shape[0]):
+        share[k] = share[k] / total if odd[k] != 0.0 else 0.0
+    crowd = total_of_products(share, share)
+    square = cells[VALUES, :count]
+    for k in range(share.shape[0]):
+        square[k] = odd[k] * odd[k] * share[k]
+        share[k] = sqrt(share[k])
+    mean_square = total_of(square) / doubled
     scatter = sqrt(4.0 / doubled * crowd)  # of the mean square by noise
-    beyond = square - (1.0 + added)
-    if beyond <= 0.0 or (not anywhere and (crowd > _CROWDED or square <= 1.0 + 3.0 * scatter)):
+    beyond = mean_square - (1.0 + added)
+    if beyond <= 0.0 or (not anywhere and (crowd > _CROWDED or mean_square <= 1.0 + 3.0 * scatter)):
         return added, 0.0, 0.0
     width2 = sqrt(max(frame.S[0] * frame.S[2] - frame.S[1] ** 2, 0.0)) / window.cell**2
     rho, away2 = _correlation_within(window, frame, odd, share)

@@ -232,7 +232,13 @@ def _mean_of_square(image: Pixels, u: float, v: float, half: int) -> float:
     """
     total, n = 0.0, 0
     column, row, step = int(np.rint(u)), int(np.rint(v)), max(half // 4, 1)
+    inside = half <= column < image.width - half and half <= row < image.height - half
     for i in range(row - half, row + half + 1, step):
+        if inside and image.depth == 1:
+            for j in range(column - half, column + half + 1, step):
+                total += image.bytes[i, j]
+                n += 1
+            continue
         for j in range(column - half, column + half + 1, step):
             total += pixel(image, clamped(j, image.width), clamped(i, image.height))
             n += 1

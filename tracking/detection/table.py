@@ -22,12 +22,13 @@ COLUMNS = 32
 
 # Rows of `cells` (CELL_ROWS, most), of one window: grey values, DN; pixels.OUTSIDE, CLIPPED or VALID; light of the
 # neighbours, DN; light of the spot, DN; weight, 1/DN^2, 0 for excluded cells; residual, DN; 0 for cells excluded as hot
-# or dead pixels, else 1; the Gaussian of a row; the six moments of the quadrature along a row, and three of one line of
-# nodes; scratch values.
+# or dead pixels, else 1; workspace for Gaussians; six moments of the light over each pixel, and three rows of workspace
+# for them; scratch values; places of the cells in the spot's frame.
 VALUES, STATE, NEIGHBOUR_LIGHT, LIGHT, WEIGHT, RESIDUAL, USE, ROW, NODES = range(9)
 LINE = NODES + 6
 SCRATCH = LINE + 3
-CELL_ROWS = SCRATCH + 1
+AT_X, AT_Y = SCRATCH + 1, SCRATCH + 2
+CELL_ROWS = AT_Y + 1
 MOST_COLUMNS = 73
 MOST_CELLS = MOST_COLUMNS**2
 

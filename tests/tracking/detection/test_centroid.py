@@ -8,7 +8,7 @@ from scipy.special import erf
 
 from tests.tracking.rendering import Scene, Spot, bound, expected, expose
 from tracking.detection import ellipse
-from tracking.detection.ellipse import gaussian_row
+from tracking.detection.ellipse import exponential, gaussian_window
 from tracking.detection.gaussian_fit import fit_all
 from tracking.detection.moments import find_moments
 from tracking.detection.normal_equations import accumulate, solve_normal
@@ -96,12 +96,19 @@ def test_closed_forms_agree_with_numpy(a, b, turn, c, d, other):
 
 
 @given(sigmas, sigmas, st.floats(-90, 90), st.floats(-30, 30), st.floats(-30, 30), st.sampled_from([1.0, 2.0, 4.0]))
-def test_a_row_of_a_gaussian_is_the_exponential_at_each_point(a, b, turn, u0, v, step):
+def test_a_window_of_a_gaussian_is_the_exponential_at_each_point(a, b, turn, u0, v0, step):
     A = np.linalg.inv(matrix(shape_of(a, b, turn)))
-    row = np.zeros(40)
-    gaussian_row((A[0, 0], A[0, 1], A[1, 1]), u0, v, step, row)
-    d = np.stack([u0 + step * np.arange(40), np.full(40, v)])
-    np.testing.assert_allclose(row, np.exp(-0.5 * np.einsum("ik,ij,jk->k", d, A, d)), rtol=1e-9, atol=1e-100)
+    window = np.zeros(3 * 40)
+    gaussian_window((A[0, 0], A[0, 1], A[1, 1]), u0, v0, step, 40, window)
+    v, u = np.meshgrid(v0 + step * np.arange(3), u0 + step * np.arange(40), indexing="ij")
+    d = np.stack([u.ravel(), v.ravel()])
+    np.testing.assert_allclose(window, np.exp(-0.5 * np.einsum("ik,ij,jk->k", d, A, d)), rtol=1e-9, atol=1e-100)
+
+
+def test_the_exponential_has_the_precision_of_floating_point_numbers():
+    x = np.concatenate([np.linspace(-699, 699, 20_001), [0.0, -1e-300, 1e-9]])
+    np.testing.assert_allclose([exponential(float(a)) for a in x], np.exp(x), rtol=5e-16)
+    assert exponential(-1e9) == exponential(-700.0) < 1e-300
 
 
 @pytest.mark.parametrize(
