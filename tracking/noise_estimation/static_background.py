@@ -30,12 +30,11 @@ _LEAST_PICTURES = 9
 _MOST_BYTES = 120_000_000  # of these pictures
 _HIGHEST = 30.0  # sigmas of noise and texture
 _LEAST_CLEAR = 3  # of these pictures without a light at a pixel
-_CUT = 0.25  # share of the lowest and of the highest grey values of a pixel that is left out: moving lights
+_CUT = 0.25  # share of the lowest and of the highest grey values of a pixel that is left out
 _MEAN_VARIANCE = 1.2  # variance of such a mean of normal deviates times their number
 _LIMITING = 1.0  # variance of the texture over that of the noise, for means of 3x3 pixels, from which it matters
 _SMOOTH_BLOCKS = 6.0  # blocks: sigma of the smooth part of the background, which is not subtracted
 _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
-_REFINEMENTS = 2  # of a background that contains slow lights
 _TRIED = 3  # every such picture shows whether there are further spots
 _LEAST_FOUND = 0.2  # further spots per picture from which the subtraction is used
 _SAMPLE = (7, 8)  # rows and columns: every such pixel shows how much of the structure is in a picture
@@ -83,29 +82,27 @@ class StaticBackground:
             return None
         if min(some[0].shape) < 4 * BLOCK:
             return None
-        mean = _trimmed_mean(some)
-        background = StaticBackground._of_mean(mean, some, model)
+        lower, mean = _means(some)
+        background = StaticBackground._of_mean(lower, some, model)
         shown = [(p, fit[0]) for p in some if (fit := background._light_in(p)) is not None]
         some, lights = [p for p, _ in shown], [light for _, light in shown]
         if len(some) < _LEAST_PICTURES:
             return None
         equal: Sequence[NDArray[Any]] = some
         if max(lights) - min(lights) > 2 * _SAME_LIGHT:
-            smooth = mean - background.structure
+            smooth = lower - background.structure
             equal = [smooth + (p - _smooth_part(p.astype(np.float32))) / light for p, light in shown]
-            mean = _trimmed_mean(equal)
-            background = StaticBackground._of_mean(mean, some, model)
+            lower, mean = _means(equal)
+            background = StaticBackground._of_mean(lower, some, model)
         tried = some[::_TRIED]
         if background._found_in(tried)[2] < max(_LEAST_FOUND * len(tried), 2):
             return None
-        for _ in range(_REFINEMENTS):
-            background = background._without_slow_lights(mean, some, equal, model)
-        return background
+        return background._without_slow_lights(mean, some, equal, model)
 
     def _without_slow_lights(
         self, mean: NDArray[np.float32], pictures: Sequence[Picture], equal: Sequence[NDArray[Any]], model: NoiseModel
     ) -> StaticBackground:
-        """A better background, of these pictures (in equal light), with its mean (h, w), which changes.
+        """The background from the mean (h, w) of these pictures (in equal light), given the one from the lower half.
 
         A light that moves slowly, or rests for a part of the recording, is in the mean of the pictures. Where it is in
         some of them the others count; where its absence leaves a hole, those with the hole.
@@ -273,14 +270,19 @@ def _joined(found: Detections, more: Detections, most: int) -> Detections:
     return Detections(**values)[np.argsort(-values["flux"], kind="stable")[:most]]
 
 
-def _trimmed_mean(pictures: Sequence[Picture]) -> NDArray[np.float32]:
-    """The mean (h, w) of the middle half of each pixel's grey values."""
-    out, cut = np.empty(pictures[0].shape, np.float32), int(_CUT * len(pictures))
-    strip = 16 * BLOCK
-    for top in range(0, len(out), strip):
+def _means(pictures: Sequence[NDArray[Any]]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The means (h, w) of the lower half of each pixel's grey values, without the lowest, and of the middle half.
+
+    The lower half does not contain lights that were elsewhere in half of the pictures; its noise is larger.
+    """
+    lower, middle = np.empty((2, *pictures[0].shape), np.float32)
+    count = len(pictures)
+    cut, strip = int(_CUT * count), 16 * BLOCK
+    for top in range(0, len(lower), strip):
         values = np.sort([p[top : top + strip] for p in pictures], axis=0)
-        out[top : top + strip] = values[cut : len(values) - cut].mean(axis=0, dtype=np.float32)
-    return out
+        lower[top : top + strip] = values[1 : count // 2].mean(axis=0, dtype=np.float32)
+        middle[top : top + strip] = values[cut : count - cut].mean(axis=0, dtype=np.float32)
+    return lower, middle
 
 
 def _smooth_part(mean: NDArray[np.float32]) -> NDArray[np.float32]:
