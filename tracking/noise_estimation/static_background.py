@@ -232,18 +232,17 @@ class StaticBackground:
         seen = np.where(clear, structure, 0.0)
         # A part of what is seen is the background's own noise, which the picture does not show.
         own = np.where(clear, _MEAN_VARIANCE / self.pictures * variance, 0.0)
-        light = float(np.vdot(seen, above)) / max(float(np.sum(seen * seen - own)), 1e-12)
+        # Where somebody stands in front of the screen the picture has another structure.
+        power = np.maximum(_around(seen * seen - own), 1e-12)
+        here, sigma = _around(seen * above) / power, np.sqrt(_around(variance) / power / _around(np.ones_like(power)))
+        light = float(np.median(here[sigma <= np.median(sigma)]))
         if not _LEAST_LIGHT < light < _MOST_LIGHT:
             return None
         left = np.where(clear, (above - light * structure) / np.sqrt(variance), 0.0)
         if 1.4826 * float(np.median(np.abs(left[clear]))) > _LARGEST_MISFIT:
             return None
-        # Where somebody stands in front of the screen the picture has another structure.
-        power = np.maximum(_around(seen * seen - own), 1e-12)
-        off = np.abs(_around(seen * above) / power - light)
-        sigma = np.sqrt(_around(variance) / power / _around(np.ones_like(power)))
         others = _around(left * left) > _LARGEST_MISFIT**2 * _around(clear.astype(np.float32))
-        return light, (off < np.maximum(_LOCAL_LIGHT * light, _CLEAR_SIGMAS * sigma)) & ~others
+        return light, (np.abs(here - light) < np.maximum(_LOCAL_LIGHT * light, _CLEAR_SIGMAS * sigma)) & ~others
 
 
 def _without_smooth_part(values: NDArray[np.float32], plain: Bools) -> NDArray[np.float32]:

@@ -140,10 +140,13 @@ def test_somebody_in_front_of_the_screen_adds_no_points():
     assert background is not None
     other = recording.pictures[22].copy()
     rng = np.random.default_rng(5)
-    other[:, 150:330] = np.rint(14 + NOISE * rng.standard_normal((SIZE[0], 180))).astype(np.uint8)
-    found = background.spots_in(other, USUAL, TextureShift.none())
-    inside = (found.uv_px[:, 0] > 150) & (found.uv_px[:, 0] < 330)
-    assert not inside.any()
+    other[60:200, 200:290] = np.rint(14 + NOISE * rng.standard_normal((140, 90))).astype(np.uint8)
+    found = background.spots_in(other, USUAL, TextureShift.none()).uv_px
+    covered = np.all((found > [195, 55]) & (found < [295, 205]), axis=1)
+    assert not covered.any()
+    visible = [c for c in recording.centres[22] if abs(c[0] - 245) > 110]  # farther than the surroundings reach
+    assert len(visible) >= 3
+    assert all(np.min(np.hypot(*(found - c).T), initial=9) < 1.5 for c in visible)
 
 
 def test_spots_that_rest_for_a_part_of_the_recording_are_found_there_and_not_shifted_when_they_leave():
