@@ -29,9 +29,9 @@ PICTURES = 15  # from which a background is made, spread over the recording
 _LEAST_PICTURES = 9
 _MOST_BYTES = 120_000_000  # of these pictures
 _HIGHEST = 30.0  # sigmas of noise and texture
-_LEAST_CLEAR = 3  # of these pictures without a light at a pixel
+_LEAST_CLEAR = 5  # of these pictures without a light at a pixel
 _CUT = 0.25  # share of the lowest and of the highest grey values of a pixel that is left out
-_MEAN_VARIANCE = 1.2  # variance of such a mean of normal deviates times their number
+_MEAN_VARIANCE = 1.4  # variance of these means of normal deviates times their number: 1.4 lower half, 1.2 middle
 _LIMITING = 1.0  # variance of the texture over that of the noise, for means of 3x3 pixels, from which it matters
 _SMOOTH_BLOCKS = 6.0  # blocks: sigma of the smooth part of the background, which is not subtracted
 _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
@@ -43,10 +43,11 @@ _AROUND_SAMPLE = (15, 15)  # of these pixels: 100 px: a part of the picture that
 _LOCAL_LIGHT = 0.4  # largest difference of the light there from that of the whole picture, as a share
 _CLEAR_SIGMAS = 4.0  # ... and in sigmas
 _SAME_LIGHT = 0.03  # the light has not changed by more than this share: the structure is not scaled
-_LEAST_LIGHT, _MOST_LIGHT = 0.3, 3.0  # changes of the light beyond which a picture is searched without subtraction
+_LEAST_LIGHT, _MOST_LIGHT = 0.2, 5.0  # changes of the light beyond which a picture is searched without subtraction
 _LARGEST_MISFIT = 1.3  # sigma of what is left over that of the noise; above it the camera or the light has moved
 _CLEARLY_BETTER = 0.5  # ratio of the variances of two measurements of a spot
-_AROUND_LIGHT, _AROUND_SPOT = (3.0, 3.0), (3.0, 2.0)  # widths, and px: kept clear of lights at rest; of other spots
+# Widths, and px: kept clear of lights at rest; of other spots; a light itself.
+_AROUND_LIGHT, _AROUND_SPOT, _ON_LIGHT = (3.0, 3.0), (3.0, 2.0), (2.5, 1.5)
 
 
 def is_limited_by_texture(model: NoiseModel) -> bool:
@@ -108,7 +109,7 @@ class StaticBackground:
         some of them the others count; where its absence leaves a hole, those with the hole.
         """
         found, holes, _ = self._found_in(pictures)
-        there, absent = (np.array([_places_of(spots, mean.shape) for spots in all_]) for all_ in (found, holes))
+        there, absent = (np.array([_places_of(d, mean.shape, _ON_LIGHT) for d in all_]) for all_ in (found, holes))
         row, column = np.nonzero(there.any(axis=0) | absent.any(axis=0))
         clear, hole = ~there[:, row, column], absent[:, row, column]
         clear &= hole | ~hole.any(axis=0)
@@ -157,7 +158,9 @@ class StaticBackground:
             compression_dn2=model.compression_dn2 * steps**2,
         )  # fmt: skip
         rows, columns = _SAMPLE
-        near = _places_of(lights, mean.shape) | (cv2.dilate((mean - smooth) - structure, np.ones((3, 3))) > 0)
+        near = _places_of(lights, mean.shape, _AROUND_LIGHT) | (
+            cv2.dilate((mean - smooth) - structure, np.ones((3, 3))) > 0
+        )
         return StaticBackground(
             len(pictures), structure, smooth[::rows, ::columns].copy(), near, steps, offset,
             _in_steps(offset - structure, steps), of_difference, model,
@@ -238,7 +241,8 @@ class StaticBackground:
         light = float(np.median(here[sigma <= np.median(sigma)]))
         if not _LEAST_LIGHT < light < _MOST_LIGHT:
             return None
-        left = np.where(clear, (above - light * structure) / np.sqrt(variance), 0.0)
+        both = variance + light**2 * _MEAN_VARIANCE / self.pictures * self.noise.variance(self.smooth)
+        left = np.where(clear, (above - light * structure) / np.sqrt(both), 0.0).astype(np.float32)
         if 1.4826 * float(np.median(np.abs(left[clear]))) > _LARGEST_MISFIT:
             return None
         others = _around(left * left) > _LARGEST_MISFIT**2 * _around(clear.astype(np.float32))
@@ -301,10 +305,10 @@ def _nearest(at: NDArray[np.float64], size: int) -> NDArray[np.int64]:
     return np.clip(np.rint(at), 0, size - 1).astype(np.int64)
 
 
-def _places_of(lights: Detections, shape: tuple[int, ...]) -> Bools:
-    """(h, w): pixels near the lights."""
+def _places_of(lights: Detections, shape: tuple[int, ...], size: tuple[float, float]) -> Bools:
+    """(h, w): pixels near the lights. size: widths, and px."""
     out = np.zeros(shape, np.uint8)
-    widths, more = _AROUND_LIGHT
+    widths, more = size
     for (u, v), width in zip(lights.uv_px, lights.major_px, strict=True):
         cv2.circle(out, (round(u), round(v)), round(widths * width + more), 1, cv2.FILLED)
     return out > 0
