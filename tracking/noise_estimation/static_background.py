@@ -195,14 +195,16 @@ class StaticBackground:
         if fit is None:
             return Detections.none()
         light, fits = fit
-        added = self.subtracted
+        added, model = self.subtracted, self.model
         if abs(light - 1) > _SAME_LIGHT:
             added = _in_steps(self.offset_dn - light * self.structure, self.steps)
+            own = _MEAN_VARIANCE / self.pictures
+            model = replace(model, floor_dn2=model.floor_dn2 * (1 + light**2 * own) / (1 + own))
         raised: NDArray[np.uint16] = np.multiply(picture, np.uint16(self.steps), dtype=np.uint16)
         difference = np.asarray(cv2.add(raised, added), np.uint16)
         if inverted:
             difference = np.asarray(cv2.subtract(np.full_like(difference, 2 * self.model.black_dn), difference))
-        spots = find_spots(difference, replace(parameters, saturation_dn=None), self.model)
+        spots = find_spots(difference, replace(parameters, saturation_dn=None), model)
         row, column = (_nearest(spots.uv_px[:, i], picture.shape[1 - i]) for i in (1, 0))
         sampled = np.minimum(row // _SAMPLE[0], len(fits) - 1), np.minimum(column // _SAMPLE[1], fits.shape[1] - 1)
         spots = spots[~self.near_lights[row, column] & fits[sampled]]
@@ -234,15 +236,14 @@ class StaticBackground:
         clear = plain & (np.abs(above) < 6 * np.sqrt(variance) + 4 * np.abs(structure))
         seen = np.where(clear, structure, 0.0)
         # A part of what is seen is the background's own noise, which the picture does not show.
-        own = np.where(clear, _MEAN_VARIANCE / self.pictures * variance, 0.0)
+        own = _MEAN_VARIANCE / self.pictures * self.noise.variance(self.smooth).astype(np.float32)
         # Where somebody stands in front of the screen the picture has another structure.
-        power = np.maximum(_around(seen * seen - own), 1e-12)
+        power = np.maximum(_around(seen * seen - np.where(clear, own, 0.0)), 1e-12)
         here, sigma = _around(seen * above) / power, np.sqrt(_around(variance) / power / _around(np.ones_like(power)))
         light = float(np.median(here[sigma <= np.median(sigma)]))
         if not _LEAST_LIGHT < light < _MOST_LIGHT:
             return None
-        both = variance + light**2 * _MEAN_VARIANCE / self.pictures * self.noise.variance(self.smooth)
-        left = np.where(clear, (above - light * structure) / np.sqrt(both), 0.0).astype(np.float32)
+        left = np.where(clear, (above - light * structure) / np.sqrt(variance + light**2 * own), 0.0)
         if 1.4826 * float(np.median(np.abs(left[clear]))) > _LARGEST_MISFIT:
             return None
         others = _around(left * left) > _LARGEST_MISFIT**2 * _around(clear.astype(np.float32))
