@@ -144,6 +144,10 @@ def _clutter(rng: np.random.Generator, look: Look) -> Look:
 FAMILIES: dict[str, Callable[[np.random.Generator, Look], Look]] = {
     "issue": _issue,
     "faint": lambda r, k: replace(k, peak_snr=_log(r, 4, 9), sigma_px=_log(r, 1.0, 3.0)),
+    "faint-on-texture": lambda r, k: replace(
+        k, peak_snr=_log(r, 2.5, 5), sigma_px=_log(r, 1.2, 2.5), texture=float(r.uniform(0.03, 0.06)),
+        texture_grain_px=_log(r, 0.5, 1.5), background=float(r.uniform(0.06, 0.15)), motion="sines",
+    ),
     "saturated": lambda r, k: replace(k, peak_snr=1e4, most_peak=float(r.uniform(1.2, 4.0)), sigma_px=_log(r, 0.9, 6)),
     "still": lambda r, k: replace(k, motion="rest", texture=0.04, texture_grain_px=_log(r, 0.7, 4)),
     "streaks": lambda r, k: replace(

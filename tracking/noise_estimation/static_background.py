@@ -36,7 +36,7 @@ _LIMITING = 1.0  # variance of the texture over that of the noise, for means of 
 _SMOOTH_BLOCKS = 6.0  # blocks: sigma of the smooth part of the background, which is not subtracted
 _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
 _TRIED = 3  # every such picture shows whether there are further spots
-_LEAST_FOUND = 0.2  # further spots per picture from which the subtraction is used
+_LEAST_FOUND = 0.2  # further or better spots per picture from which the subtraction is used
 _SAMPLE = (7, 8)  # rows and columns: every such pixel shows how much of the structure is in a picture
 _SMOOTH_SAMPLE = (13, 13)  # of these pixels: what varies over them is not structure
 _AROUND_SAMPLE = (15, 15)  # of these pixels: 100 px: a part of the picture that shows the structure or does not
@@ -72,11 +72,11 @@ class StaticBackground:
     noise: NoiseModel  # of the pictures
 
     @staticmethod
-    def of(pictures: Sequence[Picture], model: NoiseModel) -> StaticBackground | None:
+    def of(pictures: Sequence[Picture], model: NoiseModel, shift: TextureShift) -> StaticBackground | None:
         """The background of pictures spread over a recording.
 
-        None: too few, or of different sizes or types, or the differences from it show no further spots in them.
-        model: of the camera's noise and texture.
+        None: too few, or of different sizes or types, or the differences from it show the spots in them no better.
+        model: of the camera's noise and texture; shift: errors of its spots by the texture.
         """
         some = pictures[: max(_MOST_BYTES // max(pictures[0].nbytes, 1), 1)] if pictures else []
         if len(some) < _LEAST_PICTURES or any(p.shape != some[0].shape or p.dtype != some[0].dtype for p in some):
@@ -96,19 +96,19 @@ class StaticBackground:
             lower, mean = _means(equal)
             background = StaticBackground._of_mean(lower, some, model)
         tried = some[::_TRIED]
-        if background._found_in(tried)[2] < max(_LEAST_FOUND * len(tried), 2):
+        if background._found_in(tried, shift)[2] < max(_LEAST_FOUND * len(tried), 2):
             return None
-        return background._without_slow_lights(mean, some, equal, model)
+        return background._without_slow_lights(mean, some, equal, shift)
 
     def _without_slow_lights(
-        self, mean: NDArray[np.float32], pictures: Sequence[Picture], equal: Sequence[NDArray[Any]], model: NoiseModel
+        self, mean: NDArray[np.float32], pictures: Sequence[Picture], equal: Sequence[NDArray[Any]], shift: TextureShift
     ) -> StaticBackground:
         """The background from the mean (h, w) of these pictures (in equal light), given the one from the lower half.
 
         A light that moves slowly, or rests for a part of the recording, is in the mean of the pictures. Where it is in
         some of them the others count; where its absence leaves a hole, those with the hole.
         """
-        found, holes, _ = self._found_in(pictures)
+        found, holes, _ = self._found_in(pictures, shift)
         there, absent = (np.array([_places_of(d, mean.shape, _ON_LIGHT) for d in all_]) for all_ in (found, holes))
         row, column = np.nonzero(there.any(axis=0) | absent.any(axis=0))
         clear, hole = ~there[:, row, column], absent[:, row, column]
@@ -117,24 +117,27 @@ class StaticBackground:
         values = np.array([p[row, column] for p in equal], np.float32)
         enough = count >= _LEAST_CLEAR
         mean[row[enough], column[enough]] = ((values * clear).sum(axis=0) / np.maximum(count, 1))[enough]
-        better = StaticBackground._of_mean(mean, pictures, model)
+        better = StaticBackground._of_mean(mean, pictures, self.noise)
         better.near_lights[row[~enough], column[~enough]] = True
         return better
 
-    def _found_in(self, pictures: Sequence[Picture]) -> tuple[list[Detections], list[Detections], int]:
-        """The spots found in each picture or in its difference from the background, how many of them only there.
+    def _found_in(
+        self, pictures: Sequence[Picture], shift: TextureShift
+    ) -> tuple[list[Detections], list[Detections], int]:
+        """The spots found in each picture or in its difference, and how many of them the difference shows better.
 
         In between: the holes in the differences, where the background contains a light that the picture does not.
         """
-        usual, none, further = DetectParameters(), TextureShift.none(), 0
+        usual, better = DetectParameters(), 0
         found, holes = [], []
         for picture in pictures:
-            spots, more = find_spots(picture, usual, self.noise), self.spots_in(picture, usual, none)
-            more = more[~np.any(_near(more, spots), axis=1)]
-            found.append(_joined(spots, more, len(spots) + len(more)))
-            holes.append(self.spots_in(picture, usual, none, inverted=True))
-            further += len(more)
-        return found, holes, further
+            in_picture = shift.added_to(find_spots(picture, usual, self.noise), self.noise.black_dn)
+            spots = self.spots_in(picture, usual, shift)
+            kept, replaced = _compared(spots, in_picture)
+            found.append(_joined(in_picture[~replaced], spots[kept], len(in_picture) + len(spots)))
+            holes.append(self.spots_in(picture, usual, shift, inverted=True))
+            better += int(np.count_nonzero(kept))
+        return found, holes, better
 
     @staticmethod
     def _of_mean(mean: NDArray[np.float32], pictures: Sequence[Picture], model: NoiseModel) -> StaticBackground:
@@ -175,13 +178,8 @@ class StaticBackground:
         the texture under the spot is its largest error.
         """
         spots = self.spots_in(picture, parameters, shift)
-        if not len(spots):
-            return found
-        near = _near(spots, found)
-        size2, usual2 = (np.trace(d.cov_px2, axis1=1, axis2=2) for d in (spots, found))
-        replaces = near & (size2[:, None] < _CLEARLY_BETTER * usual2)
-        kept = ~np.any(near & ~replaces, axis=1)
-        return _joined(found[~replaces[kept].any(axis=0)], spots[kept], parameters.max_detections)
+        kept, replaced = _compared(spots, found)
+        return _joined(found[~replaced], spots[kept], parameters.max_detections) if kept.any() else found
 
     def spots_in(
         self, picture: Picture, parameters: DetectParameters, shift: TextureShift, inverted: bool = False
@@ -313,6 +311,15 @@ def _places_of(lights: Detections, shape: tuple[int, ...], size: tuple[float, fl
     for (u, v), width in zip(lights.uv_px, lights.major_px, strict=True):
         cv2.circle(out, (round(u), round(v)), round(widths * width + more), 1, cv2.FILLED)
     return out > 0
+
+
+def _compared(spots: Detections, found: Detections) -> tuple[Bools, Bools]:
+    """Which spots of a difference (n,) are kept, and which of those found in the picture (m,) they replace."""
+    near = _near(spots, found)
+    size2, usual2 = (np.trace(d.cov_px2, axis1=1, axis2=2) for d in (spots, found))
+    replaces = near & (size2[:, None] < _CLEARLY_BETTER * usual2)
+    kept = ~np.any(near & ~replaces, axis=1)
+    return kept, np.asarray(replaces[kept].any(axis=0))
 
 
 def _near(spots: Detections, found: Detections) -> Bools:

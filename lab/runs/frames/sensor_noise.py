@@ -67,8 +67,8 @@ class CameraNoise:
 
     def look_for_faint_spots(self, pictures: Sequence[Picture]) -> None:
         """Make the static background of pictures spread over the recording, if that shows spots in them."""
-        if self.model is not None:
-            self.background = StaticBackground.of(pictures, self.model)
+        if self.model is not None and self.estimate is not None:
+            self.background = StaticBackground.of(pictures, self.model, self.estimate.texture_shift)
 
     def detect(self, picture: Picture, parameters: DetectParameters) -> Detections:
         """The points of one picture. After pictures without any point the noise is estimated again."""

@@ -70,7 +70,9 @@ class Recording:
         return Recording(pictures, centres, estimate_noise(pictures[:2] + pictures[-2:]))
 
     def background(self) -> StaticBackground | None:
-        return StaticBackground.of(self.pictures[:: max(len(self.pictures) // PICTURES, 1)][:PICTURES], self.model)
+        return StaticBackground.of(
+            self.pictures[:: max(len(self.pictures) // PICTURES, 1)][:PICTURES], self.model, self.estimate.texture_shift
+        )
 
     def found_in(self, background: StaticBackground, k: int) -> Detections:
         return background.improved(self.usual(k), self.pictures[k], USUAL, self.estimate.texture_shift)
@@ -169,7 +171,7 @@ def test_spots_that_rest_for_a_part_of_the_recording_are_found_there_and_not_shi
 
 
 def test_bright_spots_need_no_background():
-    assert Recording.of(path(45, 6, 4.0, 7), 60.0).background() is None
+    assert Recording.of(path(45, 6, 4.0, 7), 180.0).background() is None
 
 
 def test_lights_that_do_not_move_stay_as_the_picture_shows_them():
@@ -194,9 +196,10 @@ def test_lights_that_do_not_move_stay_as_the_picture_shows_them():
 
 def test_few_pictures_or_different_ones_make_no_background():
     recording = Recording.of(path(45, 6, 4.0, 9), 4.5)
-    assert StaticBackground.of(recording.pictures[:8], recording.model) is None
-    assert StaticBackground.of([], recording.model) is None
-    assert StaticBackground.of([*recording.pictures[:14], recording.pictures[14][:-8]], recording.model) is None
+    p, model, shift = recording.pictures, recording.model, recording.estimate.texture_shift
+    assert StaticBackground.of(p[:8], model, shift) is None
+    assert StaticBackground.of([], model, shift) is None
+    assert StaticBackground.of([*p[:14], p[14][:-8]], model, shift) is None
     background = recording.background()
     assert background is not None
     smaller = recording.pictures[0][:-8]
