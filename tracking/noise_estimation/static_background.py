@@ -27,7 +27,7 @@ from tracking.parameters import DetectParameters
 
 PICTURES = 15  # from which a background is made, spread over the recording
 _LEAST_PICTURES = 9
-_MOST_BYTES = 120_000_000  # of these pictures
+_MOST_BYTES = 150_000_000  # of these pictures
 _HIGHEST = 30.0  # sigmas of noise and texture
 _LEAST_CLEAR = 7  # of these pictures without a light at a pixel
 _CUT = 0.25  # share of the lowest and of the highest grey values of a pixel that is left out
@@ -78,10 +78,8 @@ class StaticBackground:
         None: too few, or of different sizes or types, or the differences from it show the spots in them no better.
         model: of the camera's noise and texture; shift: errors of its spots by the texture.
         """
-        some = pictures[: max(_MOST_BYTES // max(pictures[0].nbytes, 1), 1)] if pictures else []
-        if len(some) < _LEAST_PICTURES or any(p.shape != some[0].shape or p.dtype != some[0].dtype for p in some):
-            return None
-        if min(some[0].shape) < 4 * BLOCK:
+        some = _usable(pictures)
+        if len(some) < _LEAST_PICTURES:
             return None
         lower, mean = _means(some)
         background = StaticBackground._of_mean(lower, some, model)
@@ -91,6 +89,8 @@ class StaticBackground:
             return None
         equal: Sequence[NDArray[Any]] = some
         if max(lights) - min(lights) > 2 * _SAME_LIGHT:
+            if 4 * some[0].size * len(some) > _MOST_BYTES:
+                return None
             smooth = lower - background.structure
             equal = [smooth + (p - _smooth_part(p.astype(np.float32))) / light for p, light in shown]
             lower, mean = _means(equal)
@@ -270,6 +270,16 @@ def _joined(found: Detections, more: Detections, most: int) -> Detections:
         known = [np.zeros(len(d)) if p is None else p for p, d in zip(parts, (found, more), strict=True)]
         values[name] = np.concatenate(known)
     return Detections(**values)[np.argsort(-values["flux"], kind="stable")[:most]]
+
+
+def _usable(pictures: Sequence[Picture]) -> list[Picture]:
+    """As many of the pictures as may be in memory, evenly spaced; none if they are too small or not alike."""
+    if not pictures or min(pictures[0].shape) < 4 * BLOCK:
+        return []
+    if any(p.shape != pictures[0].shape or p.dtype != pictures[0].dtype for p in pictures):
+        return []
+    count = min(len(pictures), _MOST_BYTES // pictures[0].nbytes)
+    return [pictures[i] for i in np.linspace(0, len(pictures) - 1, count).astype(int)]
 
 
 def _means(pictures: Sequence[NDArray[Any]]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -147,9 +147,12 @@ class LensError:
 
 
 def lens_error(true: TrueLens, c: Intrinsics) -> LensError:
-    """Error of the true projection of the calibrated rays of grid pixels, after the best-fitting rotation."""
+    """Error of the true projection of the calibrated rays of grid pixels, after the best-fitting rotation.
+
+    Pixels that the calibrated lens does not map (it states no error for them) do not count.
+    """
     grid = c.map.pixels.reshape(-1, 2)
-    near = within_boards(c, grid)
+    near = within_boards(c, grid) & np.isfinite(c.map_covariance_px2).all(axis=(-2, -1)).ravel()
     flat = undistorted(grid[near], c.fit.lens, c.model.fisheye)
     rays = np.column_stack([flat, np.ones(len(flat))])
 

@@ -12,6 +12,7 @@ from geometry.arrays import Array
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
+from tracking.noise_estimation import static_background
 from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
 from tracking.noise_estimation.static_background import PICTURES, StaticBackground, is_limited_by_texture
 from tracking.noise_estimation.texture_shift import TextureShift
@@ -205,6 +206,14 @@ def test_few_pictures_or_different_ones_make_no_background():
     smaller = recording.pictures[0][:-8]
     usual = find_spots(smaller, USUAL, recording.model)
     assert background.improved(usual, smaller, USUAL, TextureShift.none()) is usual
+
+
+def test_of_large_pictures_as_many_are_used_as_may_be_in_memory(monkeypatch):
+    pictures = [np.full((64, 64), k, np.uint16) for k in range(15)]
+    monkeypatch.setattr(static_background, "_MOST_BYTES", 10 * pictures[0].nbytes)
+    used = [int(p[0, 0]) for p in static_background._usable(pictures)]
+    assert len(used) == len(set(used)) == 10
+    assert (used[0], used[-1]) == (0, 14)
 
 
 def test_the_points_stay_sorted_and_limited():
