@@ -2,8 +2,8 @@
 
 The cameras and screens of a recording do not move, so texture, seams and the offsets of pixels are the same in all of
 its pictures. They limit the detection in a single picture to spots well above the texture; in the difference from the
-fixed picture only the noise is left. That picture cannot tell a light at rest from a reflection, therefore the places
-of its lights are left to the search in the whole picture (detection/detect.py), whose spots stay as they are. Source:
+fixed picture only the noise is left. A light at rest and a reflection look the same in that picture, so the places of
+its lights are left to the search in the whole picture (detection/detect.py), whose spots stay as they are. Source:
 ours; the subtraction of a mean background is usual in particle image velocimetry, e.g. Raffel et al. (2018), "Particle
 Image Velocimetry".
 """
