@@ -6,6 +6,7 @@ import pytest
 
 from geometry.camera import SensorNoise
 from lab.runs.frames.sensor_noise import CameraNoise, noise_estimation_frames, share_texture
+from tests.tracking.noise_estimation.test_static_background import Recording, path
 from tests.tracking.rendering import Scene, Spot, photograph
 from tracking.parameters import DetectParameters
 
@@ -110,3 +111,21 @@ def test_a_camera_with_a_background_too_faint_for_texture_takes_that_of_another_
     assert max(faint.estimate.texture_shift.light_px) > 0.02
     share_texture([alone])
     assert not alone.estimate.texture_shift.known
+
+
+def test_faint_spots_on_texture_are_detected_once_the_pictures_have_shown_their_background():
+    recording = Recording.of(path(45, 6, 4.0, 1), 4.5)
+    noise = CameraNoise("left")
+    noise.estimate_from(recording.pictures[:2] + recording.pictures[-2:])
+
+    def found() -> int:
+        hits = 0
+        for picture, centres in zip(recording.pictures, recording.centres, strict=True):
+            points = noise.detect(picture, DetectParameters())
+            hits += sum(np.min(np.hypot(*(points.uv_px - c).T), initial=9) < 1.5 for c in centres)
+        return hits
+
+    before = found()
+    noise.look_for_faint_spots(recording.pictures[::3])
+    assert noise.as_mapping()["background_pictures"] == 15
+    assert found() > 0.97 * recording.centres[..., 0].size > 1.3 * before
