@@ -19,6 +19,11 @@ def normalised(vectors: Array) -> Array:
     return vectors / np.where(length > 0, length, 1.0)
 
 
+def evenly_spread(rows: Ints, most: int) -> Ints:
+    """At most so many of the rows, evenly spaced."""
+    return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(np.int64)]
+
+
 def skew(v: Array) -> Array:
     """The matrices (..., 3, 3) with skew(v) @ w = v x w, of vectors (..., 3)."""
     out = np.zeros((*v.shape[:-1], 3, 3))

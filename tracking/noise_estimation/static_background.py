@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Bools
+from geometry.arrays import Bools, evenly_spread
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import BLOCK, NoiseModel, Picture
@@ -96,7 +96,7 @@ class StaticBackground:
             lower, mean = _means(equal)
             background = StaticBackground._of_mean(lower, some, model)
         tried = some[::_TRIED]
-        if background._found_in(tried, shift)[2] < max(_LEAST_FOUND * len(tried), 2):
+        if sum(background._found_in(p, shift)[1] for p in tried) < max(_LEAST_FOUND * len(tried), 2):
             return None
         return background._without_slow_lights(mean, some, equal, shift)
 
@@ -108,7 +108,8 @@ class StaticBackground:
         A light that moves slowly, or rests for a part of the recording, is in the mean of the pictures. Where it is in
         some of them the others count; where its absence leaves a hole, those with the hole.
         """
-        found, holes, _ = self._found_in(pictures, shift)
+        found = [self._found_in(p, shift)[0] for p in pictures]
+        holes = [self.spots_in(p, DetectParameters(), shift, inverted=True) for p in pictures]
         there, absent = (np.array([_places_of(d, mean.shape, _ON_LIGHT) for d in all_]) for all_ in (found, holes))
         row, column = np.nonzero(there.any(axis=0) | absent.any(axis=0))
         clear, hole = ~there[:, row, column], absent[:, row, column]
@@ -121,23 +122,19 @@ class StaticBackground:
         better.near_lights[row[~enough], column[~enough]] = True
         return better
 
-    def _found_in(
-        self, pictures: Sequence[Picture], shift: TextureShift
-    ) -> tuple[list[Detections], list[Detections], int]:
-        """The spots found in each picture or in its difference, and how many of them the difference shows better.
+    def _found_in(self, picture: Picture, shift: TextureShift) -> tuple[Detections, int]:
+        """The spots found in a picture or in its difference, and how many of them the difference shows better."""
+        usual = DetectParameters()
+        in_picture = shift.added_to(find_spots(picture, usual, self.noise), self.noise.black_dn)
+        spots = self.spots_in(picture, usual, shift)
+        kept, replaced = _compared(spots, in_picture)
+        found = _joined(in_picture[~replaced], spots[kept], len(in_picture) + len(spots))
+        return found, int(np.count_nonzero(kept))
 
-        In between: the holes in the differences, where the background contains a light that the picture does not.
-        """
-        usual, better = DetectParameters(), 0
-        found, holes = [], []
-        for picture in pictures:
-            in_picture = shift.added_to(find_spots(picture, usual, self.noise), self.noise.black_dn)
-            spots = self.spots_in(picture, usual, shift)
-            kept, replaced = _compared(spots, in_picture)
-            found.append(_joined(in_picture[~replaced], spots[kept], len(in_picture) + len(spots)))
-            holes.append(self.spots_in(picture, usual, shift, inverted=True))
-            better += int(np.count_nonzero(kept))
-        return found, holes, better
+    @property
+    def _noise_share(self) -> float:
+        """Variance of the background's own noise over that of a picture."""
+        return _MEAN_VARIANCE / self.pictures
 
     @staticmethod
     def _of_mean(mean: NDArray[np.float32], pictures: Sequence[Picture], model: NoiseModel) -> StaticBackground:
@@ -196,7 +193,7 @@ class StaticBackground:
         added, model = self.subtracted, self.model
         if abs(light - 1) > _SAME_LIGHT:
             added = _in_steps(self.offset_dn - light * self.structure, self.steps)
-            own = _MEAN_VARIANCE / self.pictures
+            own = self._noise_share
             model = replace(model, floor_dn2=model.floor_dn2 * (1 + light**2 * own) / (1 + own))
         raised: NDArray[np.uint16] = np.multiply(picture, np.uint16(self.steps), dtype=np.uint16)
         difference = np.asarray(cv2.add(raised, added), np.uint16)
@@ -210,8 +207,7 @@ class StaticBackground:
             return spots
         spots = replace(spots, flux=spots.flux / self.steps, peak=spots.peak / self.steps)
         # The background's own noise is the same in all pictures.
-        own = _MEAN_VARIANCE / self.pictures
-        fixed = own / (1 + own) * 0.5 * np.trace(spots.cov_px2, axis1=1, axis2=2)
+        fixed = self._noise_share / (1 + self._noise_share) * 0.5 * np.trace(spots.cov_px2, axis1=1, axis2=2)
         of_light = replace(shift, background_px=(0.0,) * len(shift.background_px))
         spots = of_light.added_to(spots, self.model.black_dn / self.steps - self.offset_dn)
         place = np.zeros(len(spots)) if spots.place_px2 is None else spots.place_px2
@@ -234,7 +230,7 @@ class StaticBackground:
         clear = plain & (np.abs(above) < 6 * np.sqrt(variance) + 4 * np.abs(structure))
         seen = np.where(clear, structure, 0.0)
         # A part of what is seen is the background's own noise, which the picture does not show.
-        own = _MEAN_VARIANCE / self.pictures * self.noise.variance(self.smooth).astype(np.float32)
+        own = self._noise_share * self.noise.variance(self.smooth).astype(np.float32)
         # Where somebody stands in front of the screen the picture has another structure.
         power = np.maximum(_around(seen * seen - np.where(clear, own, 0.0)), 1e-12)
         here, sigma = _around(seen * above) / power, np.sqrt(_around(variance) / power / _around(np.ones_like(power)))
@@ -278,8 +274,7 @@ def _usable(pictures: Sequence[Picture]) -> list[Picture]:
         return []
     if any(p.shape != pictures[0].shape or p.dtype != pictures[0].dtype for p in pictures):
         return []
-    count = min(len(pictures), _MOST_BYTES // pictures[0].nbytes)
-    return [pictures[i] for i in np.linspace(0, len(pictures) - 1, count).astype(int)]
+    return [pictures[i] for i in evenly_spread(np.arange(len(pictures)), _MOST_BYTES // pictures[0].nbytes)]
 
 
 def _means(pictures: Sequence[NDArray[Any]]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

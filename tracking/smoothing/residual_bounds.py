@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, evenly_spread
 from geometry.compiled_projection import Views, project_all
 from geometry.uncertainty.chi_square import gamma_quantile
 from tracking.rigid_body.association.frame_detections import BLENDED
@@ -89,8 +89,3 @@ def residual_bounds(
 def _lower_quantile(freedom: float) -> float:
     """Quantile of chi-square over its degrees of freedom, which need not be whole."""
     return 2 * gamma_quantile(1 - _BELOW, freedom / 2) / freedom
-
-
-def evenly_spread(rows: Ints, most: int) -> Ints:
-    """At most so many of the rows, evenly spaced."""
-    return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(np.int64)]

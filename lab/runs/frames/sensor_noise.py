@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from geometry.arrays import evenly_spread
 from geometry.camera import SensorNoise
 from lab.files.run.run_file import DetectionsTable, FramesFolder, Run
 from lab.runs.frames.frames import FrameReader, pictures_at
@@ -173,7 +174,7 @@ def camera_noises(run: Run, reader: FrameReader) -> dict[str, CameraNoise]:
         model = out[name].model
         if model is not None and is_limited_by_texture(model):
             if isinstance(run.cameras[name], FramesFolder):
-                wanted = [int(numbers[i]) for i in background_frames(len(numbers))]
+                wanted = evenly_spread(numbers, PICTURES).tolist()
             else:
                 wanted = list(range(0, VIDEO_FRAMES, VIDEO_FRAMES // PICTURES))
             shown = pictures_at(run, name, wanted)
@@ -202,11 +203,6 @@ def share_texture(cameras: Sequence[CameraNoise]) -> None:
         if camera.estimate is not None and not camera.estimate.texture_shift.known:
             share = camera.estimate.texture_shift.misfit_share
             camera.estimate = replace(camera.estimate, texture_shift=replace(finest, misfit_share=share))
-
-
-def background_frames(pictures: int) -> list[int]:
-    """Indices of pictures for the static background, spread over a recording."""
-    return sorted({int(i) for i in np.linspace(0, pictures - 1, min(PICTURES, pictures))})
 
 
 def noise_estimation_frames(pictures: int) -> list[int]:
