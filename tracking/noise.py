@@ -15,6 +15,7 @@ from tracking.rounding import clipped_normal
 Picture: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
 CLIPPED_SHARE = 0.02  # share of pixels at zero above which the background counts as clipped
+_NEAR_BLACK = 4.0  # sigmas: a background that is clipped has a median below this
 BLOCK = 8  # px: side of the blocks in which pictures are searched
 ROUNDING_DN2 = 1.0 / 12.0  # variance of rounding to whole DN
 
@@ -22,6 +23,8 @@ ROUNDING_DN2 = 1.0 / 12.0  # variance of rounding to whole DN
 # 8 bits this is 59 electrons per DN.
 FULL_SCALE_E = 15_000.0
 
+_KEPT = 3.5  # sigmas: larger differences are outliers ...
+_KEPT_VARIANCE = 0.99389  # ... and this is the variance of standard normal deviates truncated there
 NORMAL_68, NORMAL_95 = 0.994457883, 1.959963985  # quantiles 0.68 and 0.95 of |standard normal|
 
 
@@ -74,17 +77,28 @@ class NoiseModel:
 def guess_noise(image: Picture) -> NoiseModel:
     """A quick model from one picture's background (0.3 ms at 1280x1024), with the slope of a typical sensor.
 
-    The floor comes from differences of neighbouring pixels in a sparse sample, so the screen's texture counts as noise.
-    The larger estimate of the 68 % and the 95 % quantile is taken, because most differences are zero in a picture that
-    is clipped at black; there the normal distribution that was clipped counts if it is wider.
+    The floor comes from differences of neighbouring pixels in a sparse sample. Texture that is everywhere counts as
+    noise; edges and objects, which are in few of the differences, do not. In a picture that is clipped at black the
+    normal distribution that was clipped counts if it is wider; dark objects on a brighter background do not matter.
     """
     sample = image[2:-2:17, ::2].astype(np.float32) if min(image.shape) > 40 else image.astype(np.float32)
     jump = np.abs(sample[:, 1::4][:, : sample[:, ::4].shape[1]] - sample[:, ::4][:, : sample[:, 1::4].shape[1]])
     level = float(np.median(sample[:, ::4])) if sample.size else 0.0
-    floor = quantile_variance(jump / np.sqrt(2.0)) if jump.size else 0.0
-    if sample.size and np.mean(sample == 0) > CLIPPED_SHARE:
+    floor = trimmed_variance(jump / np.float32(np.sqrt(2.0)))
+    if sample.size and np.mean(sample == 0) > CLIPPED_SHARE and level <= _NEAR_BLACK * np.sqrt(floor) + 1.0:
         floor = max(floor, clipped_normal(sample.ravel().astype(float))[1] ** 2 + ROUNDING_DN2)
     return NoiseModel(max(floor, ROUNDING_DN2), usual_slope(image.dtype), level)
+
+
+def trimmed_variance(deviates: NDArray[np.floating]) -> float:
+    """Variance of normal deviates, which may be rounded, with up to 20 % of outliers."""
+    size = np.abs(deviates)
+    variance = (float(np.quantile(size, 0.68)) / NORMAL_68) ** 2 if size.size else 0.0
+    for _ in range(3):
+        # With little noise, rounded differences are mostly 0 and sometimes one step.
+        kept = size[size <= _KEPT * max(np.sqrt(variance), 0.3)]
+        variance = float(np.mean(kept.astype(float) ** 2)) / _KEPT_VARIANCE if kept.size else 0.0
+    return variance
 
 
 def quantile_variance(scatter: NDArray[np.floating]) -> float:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Ints
 from geometry.compilation.jit import compiled, compiled_for_threads
-from tracking.detection.pixels import TEXTURE_SHARE, Noise
+from tracking.detection.pixels import SEARCHED_TEXTURE, TEXTURE_SHARE, Noise
 from tracking.noise import BLOCK
 
 BACKGROUND_REACH = 2  # blocks on each side that contribute to the median for the background
@@ -249,6 +249,7 @@ def find_bright_blocks(
     floor, slope, black = noise.floor, noise.slope, noise.black
     count = 0
     fine, wide = 16.0 * min_sigmas**2, 64.0 * min_sigmas_wide**2
+    most = np.float32(SEARCHED_TEXTURE)
     share2, banding2 = np.float64(TEXTURE_SHARE**2), (TEXTURE_SHARE * noise.banding) ** 2
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], runs[k, 1], runs[k, 2]
@@ -262,7 +263,7 @@ def find_bright_blocks(
             above_black = level - black
             variance, structure = (
                 floor + slope * (above_black if above_black > 0.0 else 0.0),
-                share2 * (texture[j] * level) ** 2 + banding2,
+                share2 * ((texture[j] if texture[j] < most else most) * level) ** 2 + banding2,
             )
             pair = highest2[j] if highest2[j] > between2[j] else between2[j]
             a, b, c = 2.0 * (pair - 4.0 * level), highest4[j] - 16.0 * level, highest8[j] - 64.0 * level

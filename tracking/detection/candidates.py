@@ -16,6 +16,7 @@ from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled
 from tracking.detection.block_search import BACKGROUND, HIGHEST8, TEXTURE, Blocks, Sums
 from tracking.detection.pixels import (
+    SEARCHED_TEXTURE,
     Noise,
     Pixels,
     insertion_sort,
@@ -84,7 +85,8 @@ def _peaks_of_block(search: PeakSearch, row: int, column: int, min_sigmas: float
     """Append the significant maxima, among 5x5 neighbours, of the mean of 3x3 pixels in one block."""
     image, peaks, flat, scratch = search.image, search.peaks, search.workspace, search.scratch
     left, top, level = BLOCK * column, BLOCK * row, search.blocks.maps[BACKGROUND, row, column] / 64.0
-    noise = with_texture(search.noise, search.blocks.maps[TEXTURE, row, column])
+    contrast = np.float64(search.blocks.maps[TEXTURE, row, column])
+    noise = with_texture(search.noise, min(contrast, SEARCHED_TEXTURE))
     # Mirrored at the border: with repeated pixels the maximum of a spot at the edge would lie outside the picture.
     _read_block(image, left - _REACH, top - _REACH, flat)
     _sum_squares(flat)
@@ -126,7 +128,7 @@ def _peaks_of_block(search: PeakSearch, row: int, column: int, min_sigmas: float
                 )
                 if higher < _WEAK_SHARE * min_sigmas * sigma:
                     continue
-            _store_peak(peaks, count, u, v, height3 / 9, level, 0.0, noise.texture)
+            _store_peak(peaks, count, u, v, height3 / 9, level, 0.0, contrast)
             count += 1
     return count
 

@@ -153,7 +153,8 @@ class SpotFinder:
         """
         peaks = self._peaks[:count]
         order = np.lexsort((peaks[:, AT_U], peaks[:, AT_V], -peaks[:, HEIGHT]))[: len(self._separate)]
-        n = find_separate_peaks(task.pixels, peaks, order, task.noise, self._separate, self._near, self._gaps)
+        near, threshold = (self._near, self._gaps), task.limits.threshold_sigma
+        n = find_separate_peaks(task.pixels, peaks, order, task.noise, threshold, self._separate, *near)
         chosen = self._separate[:n]
         if relevant is not None:
             chosen = chosen[relevant[chosen] > 0]

@@ -23,6 +23,7 @@ from tracking.detection.block_search import (
 from tracking.detection.candidates import (
     AT_U,
     AT_V,
+    CONTRAST,
     HEIGHT,
     LEVEL,
     SCALE,
@@ -30,7 +31,18 @@ from tracking.detection.candidates import (
     PeakSearch,
     find_peaks,
 )
-from tracking.detection.pixels import Noise, Pixels, clamped, insert_nearest, insertion_sort, mean3, pixel, variance
+from tracking.detection.pixels import (
+    Noise,
+    Pixels,
+    clamped,
+    insert_nearest,
+    insertion_sort,
+    mean3,
+    pixel,
+    texture_variance,
+    variance,
+    with_texture,
+)
 
 BORDER_BLOCKS = 2  # blocks around a box that its search needs
 RADIUS = 48  # px: peaks farther apart than this are never parts of one spot of the largest size
@@ -50,6 +62,9 @@ _SURROUNDINGS = 4  # ... this many half sides, 3.3 sigmas
 _LEVEL_HALF_SIDE = 4  # px: half side of the squares of the background
 # Radii, px, of the circles on which the light of a line continues, and the numbers of points on them.
 _CIRCLES, _RING = (4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0), (12, 20, 28, 36, 52, 72, 108)
+_HIGHEST = (1.6, 1.9, 2.0, 2.1, 2.2, 2.4, 2.5)  # expected highest of as many normal deviates, in sigmas
+# Of the texture around: an even place among objects has less than this on a circle, homogeneous texture never.
+_EVEN = 1 / 3
 _LEAST_ON_RING = 3
 _ON_RING = 1.0  # sigmas of a pixel: three of the means
 _NARROW = 2.5  # half side, px, below which means of 3x3 pixels are compared
@@ -88,8 +103,9 @@ def find_peaks_in(
 
 @compiled
 def find_separate_peaks(
-    image: Pixels, peaks: Array, order: Ints, noise: Noise, separate: Ints, near: Ints, gaps: Array
-) -> int:
+    image: Pixels, peaks: Array, order: Ints, noise: Noise, threshold_sigma: float, separate: Ints, near: Ints,
+    gaps: Array,
+) -> int:  # fmt: skip
     """The rows of separate spots among the peaks, into `separate`; returns their number. order: brightest peak first.
 
     Between a peak and each of the nearest brighter ones the light must fall by `DIP` of the fainter peak, and by four
@@ -109,7 +125,7 @@ def find_separate_peaks(
                 lowest = _lowest_between(image, peaks, i, near[k], 1) - peaks[i, LEVEL]
                 least = max(needed, HALO_SHARE * peaks[near[k], HEIGHT])
                 alone = alone and peaks[i, HEIGHT] - lowest >= least
-            alone = alone and not _is_on_a_line(image, peaks[i], sqrt(variance(noise, peaks[i, LEVEL])), ring)
+            alone = alone and _stands_out(image, peaks[i], noise, threshold_sigma, ring)
             if alone:
                 level = _find_scale(image, peaks[i], border)
                 for k in range(_nearest(peaks, i, separate, count, near, gaps)):
@@ -131,13 +147,16 @@ def find_separate_peaks(
 
 
 @compiled
-def _is_on_a_line(image: Pixels, peak: Array, sigma: float, ring: Array) -> bool:
-    """Whether a peak is a part of an edge, a cable or another long line: on each circle around it some light continues.
+def _stands_out(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float, ring: Array) -> bool:
+    """Whether a peak is far higher than the light on a circle around it; lowers CONTRAST in an even place.
 
-    A spot, also a streak, is brighter than all light on a circle that is large enough. Fits of candidates on lines
-    would grow over large windows and take most of the time. ring (_RING[-1],) is workspace. Source: ours.
+    On each circle around a part of an edge, a cable or another long line some light continues; fits of candidates on
+    lines would grow over large windows and take most of the time. A spot, also a streak, is brighter than all light on
+    a circle that is large enough. The structure of the background at a place is that on the second most even of such circles:
+    what stands farther away does not matter. ring (_RING[-1],) is workspace. Source: ours.
     """
     here, column, row = peak[HEIGHT] + peak[LEVEL], int(peak[AT_U]), int(peak[AT_V])
+    sigma, alone, lowest, second = sqrt(variance(noise, peak[LEVEL])), False, np.inf, np.inf
     for k in range(len(_CIRCLES)):
         n = 0  # points inside the picture
         for i in range(_RING[k]):
@@ -147,12 +166,17 @@ def _is_on_a_line(image: Pixels, peak: Array, sigma: float, ring: Array) -> bool
                 ring[n] = mean3(image, u, v)
                 n += 1
         if n < _LEAST_ON_RING:
-            return False
+            alone = True
+            break
         insertion_sort(ring, n)
         around, highest = ring[n // 2], ring[n - 1]
         if highest - around < 0.5 * (here - around) + _ON_RING * sigma:
-            return False
-    return True
+            alone, scatter = True, (highest - around) / _HIGHEST[k]
+            lowest, second = min(lowest, scatter), min(second, max(lowest, scatter))
+    if second < _EVEN * peak[CONTRAST] * peak[LEVEL]:
+        peak[CONTRAST] = second / max(peak[LEVEL], 1.0)
+    structure = sqrt(texture_variance(with_texture(noise, peak[CONTRAST]), peak[LEVEL]))
+    return alone and peak[HEIGHT] >= PEAK_SHARE * threshold_sigma * structure
 
 
 @compiled

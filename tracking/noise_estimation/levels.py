@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools
-from tracking.noise import Picture, guess_noise, quantile_variance
+from tracking.noise import Picture, guess_noise, quantile_variance, trimmed_variance
 from tracking.rounding import rounding_ripple, unrounded
 
 Floats: TypeAlias = NDArray[Any]
@@ -21,8 +21,6 @@ SIDE = 15  # px: side of the local mean that removes smooth changes of the light
 LEAST_PIXELS = 200  # per level
 LEVELS = 12  # largest number of levels
 _STRIPE = 64  # rows per stripe of the sample
-_KEPT = 3.5  # sigmas: larger differences are outliers ...
-_KEPT_VARIANCE = 0.99389  # ... and this is the variance of standard normal deviates truncated there
 _LEAST_WHITE = 0.01  # DN^2: a smaller variance in time comes from single steps of a few pixels
 _GRAIN = 1.25  # ratio of the variance of means to that of white noise up to which the noise counts as white
 _FOURTH_DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # zero for anything cubic; nearly so for a smooth spot
@@ -38,9 +36,9 @@ class LevelVariances:
     temporal: bool  # from differences in time
     correlation: float = 1.0  # variance of means of neighbouring pixels over that of independent pixels
 
-    def scaled(self, floor: float) -> LevelVariances:
-        """All variances scaled so that the least is `floor`, if `floor` is larger by more than the factor _GRAIN."""
-        factor = floor / max(float(self.variance.min()), 1e-12) if len(self.variance) else 1.0
+    def scaled(self, floor: float, level_dn: float) -> LevelVariances:
+        """All variances scaled so that the one at a level is `floor`, if that is larger by more than _GRAIN."""
+        factor = floor / max(self.nearest(level_dn), 1e-12) if len(self.variance) else 1.0
         return replace(self, variance=self.variance * factor, sigma=self.sigma * factor) if factor > _GRAIN else self
 
     def nearest(self, level_dn: float) -> float:
@@ -55,7 +53,8 @@ def level_variances(pictures: Sequence[Picture], top: float, rounding: float) ->
     """
     within = _binned(*_within(pictures[0], top), rounding)
     # Noise correlated between pixels (JPEG, demosaicing) is underestimated by differences of neighbouring pixels.
-    within = replace(within, temporal=False).scaled(guess_noise(pictures[0]).floor_dn2)
+    guess = guess_noise(pictures[0])
+    within = replace(within, temporal=False).scaled(guess.floor_dn2, guess.black_dn)
     samples = [_between(a, b, top) for a, b in _pairs(pictures)]
     if not samples:
         return within
@@ -128,17 +127,6 @@ def _sample(level: Floats) -> Bools:
     chosen[:3] = chosen[-3:] = False
     chosen[:, :3] = chosen[:, -3:] = False
     return chosen
-
-
-def trimmed_variance(deviates: Floats) -> float:
-    """Variance of normal deviates, which may be rounded, with up to 10 % of outliers."""
-    size = np.abs(deviates)
-    variance = quantile_variance(size) if size.size else 0.0
-    for _ in range(3):
-        # With little noise, rounded differences are mostly 0 and sometimes one step.
-        kept = size[size <= _KEPT * max(np.sqrt(variance), 0.3)]
-        variance = float(np.mean(kept.astype(float) ** 2)) / _KEPT_VARIANCE if kept.size else 0.0
-    return variance
 
 
 def _binned(level: Floats, deviates: Floats, rounding: float) -> LevelVariances:

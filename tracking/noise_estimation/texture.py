@@ -8,10 +8,12 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import percentile_filter
 
 from tracking.noise import BLOCK, NoiseModel, Picture, quantile_variance
 
 _MEAN = 3  # px: side of the means compared with the background
+_AROUND, _QUANTILE = 9, 75  # blocks along a side; per cent: an edge through the surroundings is in fewer of them
 _BY_NOISE = 2.5  # times its expectation: most of the variance of a block's few means that noise alone causes
 
 
@@ -49,11 +51,11 @@ def texture_of(seen: MeanPicture, noise: NoiseModel) -> float:
 
 
 def local_texture(seen: MeanPicture, noise: NoiseModel, size_px: tuple[int, int]) -> NDArray[np.float32]:
-    """The texture of each block of a picture (width, height) and its neighbours, at most noise.texture.
+    """The texture of each block of a picture (width, height), as a fraction of its level.
 
-    The edge of a screen, a cable or a frame raises `texture_of` of a whole picture, in which most places are plain. A
-    spot that stays in its place counts as texture here, so the texture of the whole picture is the upper limit.
-    Source: ours.
+    The lower of two: that of the block and its neighbours, and a quantile of that of the blocks around it. A spot that
+    stays in its place is in the first, but in few of the blocks around it; so is the edge of a screen or a cable. What
+    stands elsewhere in the picture does not count. Source: ours.
     """
     level = np.maximum(seen.background, 1.0)
     relative = (cv2.blur(seen.mean, (_MEAN, _MEAN)) - seen.background) / level
@@ -61,8 +63,9 @@ def local_texture(seen: MeanPicture, noise: NoiseModel, size_px: tuple[int, int]
     variance = cv2.resize(relative * relative, size, interpolation=cv2.INTER_AREA)
     levels = cv2.resize(level, size, interpolation=cv2.INTER_AREA)
     explained = noise.of_means.variance(levels) / (levels * levels) / (_MEAN**2 * seen.pictures)
-    beyond = np.maximum(variance - _BY_NOISE * explained, 0.0)
-    contrast = np.minimum(np.sqrt(cv2.dilate(beyond, np.ones((3, 3)))), noise.texture)
+    beyond = np.maximum(variance - _BY_NOISE * explained, 0.0).astype(np.float32)
+    around = percentile_filter(beyond, _QUANTILE, size=_AROUND, mode="reflect")
+    contrast = np.sqrt(np.minimum(cv2.dilate(beyond, np.ones((3, 3))), around))
     rows, columns = -(-size_px[1] // BLOCK), -(-size_px[0] // BLOCK)
     missing = (0, rows - contrast.shape[0]), (0, columns - contrast.shape[1])
     return np.asarray(np.pad(contrast, missing, mode="edge"), np.float32)
