@@ -223,24 +223,27 @@ def search(folder: Path) -> list[Detections]:
     return [series.search(frame, picture) for frame, picture in inputs.pictures(1)]
 
 
-def main() -> None:
-    """Draw, search and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--pictures", type=int, default=1000)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--keep", type=Path)
-    given = parser.parse_args()
-    random, lights = np.random.default_rng(given.seed), Lights(given.data)
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What was found, by kind of light, background and file."""
+
+    found: dict[str, list[tuple[bool, float]]]  # whether a spot of 8 local sigmas was found, and its error in sigmas
+    others: dict[str, list[float]]  # other points per megapixel of each picture
+    faint: tuple[int, int]  # fainter spots: found, drawn
+
+
+def measured(data: Path, pictures: int, seed: int, keep: Path | None = None) -> Outcome:
+    """Draw pictures and search them. keep: folder for the pictures in which a spot was missed or misplaced."""
+    random, lights = np.random.default_rng(seed), Lights(data)
     backgrounds = {
-        name: [b for p in patterns for f in sorted(given.data.glob(p)) if (b := _read(f)) is not None]
+        name: [b for p in patterns for f in sorted(data.glob(p)) if (b := _read(f)) is not None]
         for name, patterns in GROUPS.items()
     }
-    found: dict[str, list[tuple[bool, float]]] = defaultdict(list)  # hits by kind, with the error in sigmas
-    false: dict[str, list[float]] = defaultdict(list)
+    found: dict[str, list[tuple[bool, float]]] = defaultdict(list)
+    others: dict[str, list[float]] = defaultdict(list)
     faint: Counter[bool] = Counter()
     done = 0
-    while done < given.pictures:
+    while done < pictures:
         group = str(random.choice(list(GROUPS)))
         drawn = draw_pictures(backgrounds[group], lights, random)
         with tempfile.TemporaryDirectory() as name:
@@ -252,7 +255,7 @@ def main() -> None:
             away = answer.uv_px - np.asarray(one.uv)
             near = np.hypot(*away.T)
             hit = bool(len(near)) and float(near.min()) < max(FOUND, 1.5 * one.light.width)
-            false[group].append((len(near) - hit) / (one.image.shape[0] * one.image.shape[1] / 1e6))
+            others[group].append((len(near) - hit) / (one.image.shape[0] * one.image.shape[1] / 1e6))
             if height < 8.0:
                 faint[hit] += 1
                 continue
@@ -260,18 +263,30 @@ def main() -> None:
             error = float(np.sqrt(away[k] @ np.linalg.solve(answer.cov_px2[k], away[k]) / 2)) if hit else np.nan
             for kind in ("all", one.light.kind, f"on {group}", file, "series" if len(drawn) > 1 else "single"):
                 found[kind].append((hit, error))
-            if given.keep is not None and (not hit or error > 3.0):
-                given.keep.mkdir(parents=True, exist_ok=True)
-                what = f"off-{error:.1f}" if hit else "missed"
-                stem = f"{what}-{one.light.kind}-{group}-{height:.0f}-{one.uv[0]:.1f}-{one.uv[1]:.1f}-{done}"
-                cv2.imwrite(str(given.keep / f"{stem.replace(' ', '').replace('close-up', 'close')}.png"), one.image)
-    print(f"{done} pictures; spots of 8 local sigmas and more; fainter ones: {faint[True]} of {faint.total()} found")
+            if keep is not None and (not hit or error > 3.0):
+                keep.mkdir(parents=True, exist_ok=True)
+                what = f"off {error:.1f}" if hit else "missed"
+                name = f"{done} {what} {one.light.kind} on {group} {height:.0f} at {one.uv[0]:.1f} {one.uv[1]:.1f}.png"
+                cv2.imwrite(str(keep / name), one.image)
+    return Outcome(found, others, (faint[True], faint.total()))
+
+
+def main() -> None:
+    """Draw, search and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--pictures", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--keep", type=Path)
+    given = parser.parse_args()
+    outcome = measured(given.data, given.pictures, given.seed, given.keep)
+    print("spots of 8 local sigmas and more; of {1} fainter ones {0} were found".format(*outcome.faint))
     print(f"{'':16}{'number':>8}{'recall':>8}{'within 3 sigma':>16}{'median sigmas':>15}")
-    for kind, rows in sorted(found.items()):
+    for kind, rows in sorted(outcome.found.items()):
         errors = np.array([e for hit, e in rows if hit])
         hits = np.mean([hit for hit, _ in rows])
         print(f"{kind:16}{len(rows):8}{hits:8.3f}{np.mean(errors < 3.0):16.3f}{np.median(errors):15.2f}")
-    for group, counts in sorted(false.items()):
+    for group, counts in sorted(outcome.others.items()):
         print(f"other points per megapixel on {group}: mean {np.mean(counts):.1f}, median {np.median(counts):.1f}")
 
 

@@ -40,6 +40,16 @@ class Detections:
         place, misfit = (None if x is None else x[rows] for x in (self.place_px2, self.misfit))
         return Detections(*known, place_px2=place, misfit=misfit)
 
+    def joined(self, more: Detections, most: int) -> Detections:
+        """These and more points of the same picture, brightest first, at most so many; what is unknown becomes 0."""
+        if not len(more):
+            return self
+        values: dict[str, Array] = {}
+        for name in Detections.__slots__:
+            parts = [(getattr(points, name), len(points)) for points in (self, more)]
+            values[name] = np.concatenate([np.zeros(n) if known is None else known for known, n in parts])
+        return Detections(**values)[np.argsort(-values["flux"], kind="stable")[:most]]
+
     @staticmethod
     def none() -> Detections:
         """No points."""

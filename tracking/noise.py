@@ -15,7 +15,7 @@ from tracking.rounding import clipped_normal
 Picture: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
 CLIPPED_SHARE = 0.02  # share of pixels at zero above which the background counts as clipped
-_NEAR_BLACK = 4.0  # sigmas: a background that is clipped has a median below this
+_LEAST_JUMP = 0.15  # of the sigma: least median change between neighbours of which one is not zero
 BLOCK = 8  # px: side of the blocks in which pictures are searched
 ROUNDING_DN2 = 1.0 / 12.0  # variance of rounding to whole DN
 
@@ -82,12 +82,23 @@ def guess_noise(image: Picture) -> NoiseModel:
     normal distribution that was clipped counts if it is wider; dark objects on a brighter background do not matter.
     """
     sample = image[2:-2:17, ::2].astype(np.float32) if min(image.shape) > 40 else image.astype(np.float32)
-    jump = np.abs(sample[:, 1::4][:, : sample[:, ::4].shape[1]] - sample[:, ::4][:, : sample[:, 1::4].shape[1]])
+    first, second = sample[:, ::4][:, : sample[:, 1::4].shape[1]], sample[:, 1::4][:, : sample[:, ::4].shape[1]]
     level = float(np.median(sample[:, ::4])) if sample.size else 0.0
-    floor = trimmed_variance(jump / np.float32(np.sqrt(2.0)))
-    if sample.size and np.mean(sample == 0) > CLIPPED_SHARE and level <= _NEAR_BLACK * np.sqrt(floor) + 1.0:
-        floor = max(floor, clipped_normal(sample.ravel().astype(float))[1] ** 2 + ROUNDING_DN2)
+    floor = trimmed_variance((second - first) / np.float32(np.sqrt(2.0)))
+    if sample.size and np.mean(sample == 0) > CLIPPED_SHARE:
+        sigma = clipped_normal(sample.ravel().astype(float))[1]
+        if is_clipped_noise(first, second, sigma):
+            floor = max(floor, sigma**2 + ROUNDING_DN2)
     return NoiseModel(max(floor, ROUNDING_DN2), usual_slope(image.dtype), level)
+
+
+def is_clipped_noise(first: NDArray[np.generic], second: NDArray[np.generic], sigma: float) -> bool:
+    """Whether neighbouring pixels (any equal shape), many of them zero, differ like noise of this sigma, DN.
+
+    Black objects beside brighter ones have as wide a distribution of grey values, but nearly equal neighbours.
+    """
+    lit = np.maximum(first, second) > 0
+    return not lit.any() or bool(np.median(np.abs(second[lit].astype(float) - first[lit])) >= _LEAST_JUMP * sigma)
 
 
 def trimmed_variance(deviates: NDArray[np.floating]) -> float:

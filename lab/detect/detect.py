@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -150,6 +151,15 @@ def _add_notes(series: PictureSeries) -> None:
         kinds = "; ".join(f"{_counted(g.pictures)} of {g.text()}" for g in most[:6])
         more = f"; and {len(most) - 6} further kinds" if len(most) > 6 else ""
         series.notes.append(f"pictures of different sizes or depths, each kind with its own noise model: {kinds}{more}")
+    if series.overlooked:
+        widest = max(series.overlooked, key=lambda light: light.sigma_px)
+        value = 10 * math.ceil(1.3 * widest.sigma_px / 10)
+        series.notes.append(
+            f"{_counted(len(series.overlooked))} with a bright light wider than detect.max_sigma_px ="
+            f" {series.parameters.max_sigma_px:g}, which is not reported: the widest has a sigma of"
+            f" {widest.sigma_px:.0f} px, in frame {widest.frame} at ({widest.u_px:.0f}, {widest.v_px:.0f}) px;"
+            f" --set detect.max_sigma_px={value} reports it"
+        )
     series.notes += list(dict.fromkeys(note for g in series.groups.values() for note in g.noise.notes))
 
 

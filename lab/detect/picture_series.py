@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from lab.detect.findings import SizeGroup, SpotCollection, matched_snr
 from lab.pictures.picture_file import GreyPicture
 from lab.runs.frames.sensor_noise import CameraNoise
+from tracking.detection.wide_lights import overlooked_lights
 from tracking.detections import Detections
 from tracking.parameters import DetectParameters
+
+
+class WideLight(NamedTuple):
+    """The brightest light of a picture that max_sigma_px excludes."""
+
+    frame: int
+    u_px: float
+    v_px: float
+    sigma_px: float
 
 
 @dataclass(slots=True)
@@ -26,6 +37,7 @@ class PictureSeries:
     )  # the noise's source
     spots: SpotCollection = field(default_factory=SpotCollection)
     unreadable: dict[str, list[int]] = field(default_factory=dict)  # frames by reason
+    overlooked: list[WideLight] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -54,6 +66,10 @@ class PictureSeries:
         group.pictures += 1
         model = group.noise.model
         assert model is not None  # the search has estimated it
+        wide = overlooked_lights(picture, self.parameters, model, found)
+        if len(wide):
+            i = int(np.argmax(wide.peak))
+            self.overlooked.append(WideLight(frame, *wide.uv_px[i].tolist(), float(wide.major_px[i])))
         self.spots.add(frame, found, matched_snr(found, float(np.sqrt(model.of_means.floor_dn2))))
         return found
 

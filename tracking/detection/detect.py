@@ -14,14 +14,16 @@ from tracking.detection.block_search import TEXTURE, Blocks, bin_pixels, find_hi
 from tracking.detection.candidates import (
     AT_U,
     AT_V,
+    CONTRAST,
     HEIGHT,
+    LEVEL,
     PEAK_COLUMNS,
     PeakSearch,
     block_workspace,
 )
 from tracking.detection.gaussian_fit import REACHES
 from tracking.detection.measuring import DetectionLimits, measure, write_detections
-from tracking.detection.pixels import Noise, Pixels
+from tracking.detection.pixels import TEXTURE_SHARE, Noise, Pixels
 from tracking.detection.regions import INITIAL_REACH, MARGIN, boxes_of, find_relevant
 from tracking.detection.search import BORDER_BLOCKS, MAX_COMPARED, find_peaks_in, find_separate_peaks
 from tracking.detection.table import ALGEBRA, CELL_ROWS, CELL_SIZE, COLUMNS, MOST_CELLS
@@ -152,7 +154,10 @@ class SpotFinder:
         measured: the rows that the last call, for the same picture, has measured; the same rows are not measured again.
         """
         peaks = self._peaks[:count]
-        order = np.lexsort((peaks[:, AT_U], peaks[:, AT_V], -peaks[:, HEIGHT]))[: len(self._separate)]
+        order = np.lexsort((peaks[:, AT_U], peaks[:, AT_V], -peaks[:, HEIGHT]))
+        if count > len(self._separate):  # bright objects have many peaks, which must not displace spots in even places
+            first = np.argsort(_insignificance(peaks[order], task.model), kind="stable")[: len(self._separate)]
+            order = order[np.sort(first)]
         near, threshold = (self._near, self._gaps), task.limits.threshold_sigma
         n = find_separate_peaks(task.pixels, peaks, order, task.noise, threshold, self._separate, *near)
         chosen = self._separate[:n]
@@ -173,6 +178,12 @@ class SpotFinder:
         return Detections(
             rows[:, :2].copy(), cov, *(rows[:, k].copy() for k in range(5, 10)), misfit=rows[:, 10].copy()
         )
+
+
+def _insignificance(peaks: Array, model: NoiseModel) -> Array:
+    """(n,): the noise and structure at each peak relative to its height."""
+    structure = TEXTURE_SHARE * peaks[:, CONTRAST] * peaks[:, LEVEL]
+    return np.asarray((model.variance(peaks[:, LEVEL]) / 9.0 + structure**2) / peaks[:, HEIGHT] ** 2)
 
 
 class _Task(NamedTuple):

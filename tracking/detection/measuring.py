@@ -109,7 +109,7 @@ def measure(
         fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, False, cells, algebra)
         if not _merge_parts(table):
             break
-    if _start_again(peaks, chosen, table):
+    if _start_again(peaks, chosen, table, limits):
         fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, cells, algebra)
         _drop_background(table)
     if _hold_unresolved(peaks, chosen, table, limits):
@@ -124,21 +124,24 @@ def measure(
 
 
 @compiled
-def _start_again(peaks: Array, chosen: Ints, table: Array) -> bool:
-    """Give rejected candidates whose moments left their light a start from the peak and its scale; whether there are.
+def _start_again(peaks: Array, chosen: Ints, table: Array, limits: DetectionLimits) -> bool:
+    """Give candidates whose moments or fits left their light a start from the peak and its scale; whether there are.
 
-    On a sloping or textured background the window of the moments grows over the light beside a faint spot.
+    On a sloping or textured background the window of the moments grows over the light beside a faint spot, or the fit
+    over that beside a saturated one; then it explains little.
     """
     found = False
     for k in range(table.shape[0]):
         spot, peak = table[k], peaks[chosen[k]]
         spot[ACTIVE] = 0.0
-        if spot[FLUX] > 0.0 or spot[MOMENT_UU] >= _NOTHING or peak[WIDE_PEAK]:
-            continue
         start = max(spot[START], _LEAST_START)
+        poor = spot[EXPLAINED] < limits.min_explained
+        poor = poor and ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[1] > _OUTGROWN**2 * start
+        if (spot[FLUX] > 0.0 and not poor) or spot[MOMENT_UU] >= _NOTHING or peak[WIDE_PEAK]:
+            continue
         away = max(abs(spot[MOMENT_U] - peak[AT_U]), abs(spot[MOMENT_V] - peak[AT_V]))
         high = ellipse.eigenvalues(spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV])[1]
-        if away * away < start and high < _OUTGROWN * start:
+        if not poor and away * away < start and high < _OUTGROWN * start:
             continue
         spot[MOMENT_U], spot[MOMENT_V] = peak[AT_U], peak[AT_V]
         spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV] = start, 0.0, start

@@ -162,7 +162,7 @@ def _read_cells(
 TEXTURE_SHARE = 5.0 / 6.0
 # Largest contrast of the texture in the search: an even place may lie between objects that have more. The peaks found
 # are then compared with the light on circles around them (search._stands_out).
-SEARCHED_TEXTURE = 0.06
+SEARCHED_TEXTURE = 0.045
 _FINER = 9.0 / 4.0  # ratio of the variances of means of 2x2 and 3x3 pixels of a texture finer than a pixel
 
 

@@ -7,12 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking.noise import CLIPPED_SHARE, Picture
+from tracking.noise import CLIPPED_SHARE, Picture, is_clipped_noise
 from tracking.rounding import clipped_normal
 
 _FEWEST_VALUES = 8  # distinct grey values needed to take their common divisor as the step
 _UNLIT = 0.25  # share of the blocks that is taken to be without light
-_LEAST_JUMP = 0.15  # of the noise's sigma: least median change between neighbours in a background clipped at zero
 
 
 def grey_step(pictures: Sequence[Picture]) -> float:
@@ -58,16 +57,10 @@ def clipped_background(pictures: Sequence[Picture], step: float) -> tuple[float,
     if np.mean(sample == 0) < CLIPPED_SHARE:
         return None
     mean, sigma = clipped_normal(sample.astype(float) / step)
-    if _median_jump(sample) < _LEAST_JUMP * sigma * step:  # black objects beside brighter ones, each nearly even
+    rows = sample.reshape(-1, 16)
+    if not is_clipped_noise(rows[:, :-1], rows[:, 1:], sigma * step):
         return None
     return mean * step, (sigma * step) ** 2 + step**2 / 12
-
-
-def _median_jump(sample: NDArray[np.generic]) -> float:
-    """Median change, DN, between neighbours in the rows of blocks (n, 256), where one of the two is not zero."""
-    rows = sample.reshape(-1, 16).astype(np.float32)
-    lit = np.maximum(rows[:, 1:], rows[:, :-1]) > 0
-    return float(np.median(np.abs(np.diff(rows, axis=1))[lit])) if lit.any() else np.inf
 
 
 def _blocks(picture: Picture) -> NDArray[np.generic]:

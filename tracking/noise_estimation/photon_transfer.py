@@ -132,6 +132,8 @@ class _Lines:
         if not len(levels.level):
             unknown = np.full(_SLOPES, rounding)
             return _Lines(slopes, unknown, unknown.copy(), background, full, np.zeros(_SLOPES))
+        if not levels.temporal:  # structure, and the gamma curve of photographs, bend the line: only its start counts
+            return _Lines.from_point(background, max(levels.nearest(background), rounding), full)
         lift = levels.level - background
         rise = slopes[:, None] * lift
         weight = np.ones_like(rise) / levels.sigma**2
@@ -143,14 +145,12 @@ class _Lines:
             robust = weight / np.maximum(misfit / _LARGEST_MISFIT, 1.0)
             floor = np.maximum(np.sum(robust * (levels.variance - rise), axis=1) / np.sum(robust, axis=1), rounding)
         sigma = 1 / np.sqrt(np.sum(robust, axis=1))
-        log_likelihood = (
-            -0.5 * np.minimum(misfit, _LARGEST_MISFIT).sum(axis=1) if levels.temporal else np.zeros(_SLOPES)
-        )
+        log_likelihood = -0.5 * np.minimum(misfit, _LARGEST_MISFIT).sum(axis=1)
         return _Lines(slopes, floor, sigma, background, full, log_likelihood)
 
     @staticmethod
     def from_point(background: float, variance: float, full: float) -> _Lines:
-        """The lines through one point: the background, if it is clipped at zero."""
+        """The lines through one point: the background, if it is clipped at zero or known from one picture only."""
         slopes = np.geomspace(full / _WELL_E[1], full / _WELL_E[0], _SLOPES)
         floor = np.full(_SLOPES, variance)
         return _Lines(slopes, floor, 0.2 * floor, background, full, np.zeros(_SLOPES))

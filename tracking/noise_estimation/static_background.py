@@ -128,7 +128,7 @@ class StaticBackground:
         in_picture = shift.added_to(find_spots(picture, usual, self.noise), self.noise.black_dn)
         spots = self.spots_in(picture, usual, shift)
         kept, replaced = _compared(spots, in_picture)
-        found = _joined(in_picture[~replaced], spots[kept], len(in_picture) + len(spots))
+        found = in_picture[~replaced].joined(spots[kept], len(in_picture) + len(spots))
         return found, int(np.count_nonzero(kept))
 
     @property
@@ -176,7 +176,7 @@ class StaticBackground:
         """
         spots = self.spots_in(picture, parameters, shift)
         kept, replaced = _compared(spots, found)
-        return _joined(found[~replaced], spots[kept], parameters.max_detections) if kept.any() else found
+        return found[~replaced].joined(spots[kept], parameters.max_detections) if kept.any() else found
 
     def spots_in(
         self, picture: Picture, parameters: DetectParameters, shift: TextureShift, inverted: bool = False
@@ -254,18 +254,6 @@ def _without_smooth_part(values: NDArray[np.float32], plain: Bools) -> NDArray[n
 def _around(values: NDArray[Any]) -> NDArray[Any]:
     """Sums over the surroundings of each pixel of _SAMPLE."""
     return np.asarray(cv2.boxFilter(values, -1, _AROUND_SAMPLE, normalize=False))
-
-
-def _joined(found: Detections, more: Detections, most: int) -> Detections:
-    """The points of both lists, brightest first, at most so many."""
-    if not len(more):
-        return found
-    values: dict[str, Any] = {}
-    for name in Detections.__slots__:
-        parts = [getattr(d, name) for d in (found, more)]
-        known = [np.zeros(len(d)) if p is None else p for p, d in zip(parts, (found, more), strict=True)]
-        values[name] = np.concatenate(known)
-    return Detections(**values)[np.argsort(-values["flux"], kind="stable")[:most]]
 
 
 def _usable(pictures: Sequence[Picture]) -> list[Picture]:

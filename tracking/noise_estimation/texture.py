@@ -53,9 +53,9 @@ def texture_of(seen: MeanPicture, noise: NoiseModel) -> float:
 def local_texture(seen: MeanPicture, noise: NoiseModel, size_px: tuple[int, int]) -> NDArray[np.float32]:
     """The texture of each block of a picture (width, height), as a fraction of its level.
 
-    The lower of two: that of the block and its neighbours, and a quantile of that of the blocks around it. A spot that
-    stays in its place is in the first, but in few of the blocks around it; so is the edge of a screen or a cable. What
-    stands elsewhere in the picture does not count. Source: ours.
+    The lowest of three: that of the block and its neighbours, a quantile of that of the blocks around it, and that of
+    the whole picture. A spot that stays in its place is in the first, but in few of the blocks around it; so is the
+    edge of a screen or a cable. A wide one is in all of those, but not in the whole picture. Source: ours.
     """
     level = np.maximum(seen.background, 1.0)
     relative = (cv2.blur(seen.mean, (_MEAN, _MEAN)) - seen.background) / level
@@ -65,7 +65,7 @@ def local_texture(seen: MeanPicture, noise: NoiseModel, size_px: tuple[int, int]
     explained = noise.of_means.variance(levels) / (levels * levels) / (_MEAN**2 * seen.pictures)
     beyond = np.maximum(variance - _BY_NOISE * explained, 0.0).astype(np.float32)
     around = percentile_filter(beyond, _QUANTILE, size=_AROUND, mode="reflect")
-    contrast = np.sqrt(np.minimum(cv2.dilate(beyond, np.ones((3, 3))), around))
+    contrast = np.minimum(np.sqrt(np.minimum(cv2.dilate(beyond, np.ones((3, 3))), around)), noise.texture)
     rows, columns = -(-size_px[1] // BLOCK), -(-size_px[0] // BLOCK)
     missing = (0, rows - contrast.shape[0]), (0, columns - contrast.shape[1])
     return np.asarray(np.pad(contrast, missing, mode="edge"), np.float32)

@@ -13,7 +13,7 @@ from geometry.arrays import evenly_spread
 from geometry.camera import SensorNoise
 from lab.files.run.run_file import DetectionsTable, FramesFolder, Run
 from lab.runs.frames.frames import FrameReader, pictures_at
-from tracking.detection.detect import find_spots
+from tracking.detection.wide_lights import find_all_sizes
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.noise_estimation.colour_mosaic import mosaic_contrast
@@ -111,7 +111,9 @@ class CameraNoise:
         return float(np.iinfo(picture.dtype).max) if known is None else known
 
     def _search(self, picture: Picture, parameters: DetectParameters, model: NoiseModel | None) -> Detections:
-        return find_spots(picture, replace(parameters, saturation_dn=self.saturation_dn(picture, parameters)), model)
+        return find_all_sizes(
+            picture, replace(parameters, saturation_dn=self.saturation_dn(picture, parameters)), model
+        )
 
     def _with_texture(self, found: Detections) -> Detections:
         """The points with covariances that include the errors due to the screen's texture."""

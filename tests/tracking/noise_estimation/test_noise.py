@@ -123,9 +123,8 @@ def test_the_structure_of_a_scene_does_not_count_as_noise(lab):
 def test_without_light_between_background_and_spots_the_prior_bounds_the_slope():
     """Texture of 8 % in 16 bits is 500 times the shot noise of a spot: its residuals do not determine the slope."""
     lab = Lab(bits=16, gain=0.4, read_e=3.0, background=20.0, black=500.0, details=0, texture=0.08, spot_peak=30_000.0)
-    estimate = estimate_noise(lab.pictures(4))
-    assert 0.1 < estimate.model.slope_dn * lab.gain < 10
-    assert estimate.slope_sigma > 0.2
+    for seed in range(2, 6):
+        assert 0.1 < estimate_noise(lab.pictures(seed)).model.slope_dn * lab.gain < 10
 
 
 @pytest.mark.parametrize("quality", [70, 95])
