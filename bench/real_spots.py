@@ -34,7 +34,8 @@ ROOM = {"4": (1434, 1146, 26), "5": (1635, 731, 16), "6": (837, 746, 26), "7": (
 STREETS = ("chessboard_webcam_c920/*.jpg", "circles_stills/*", "charuco_aruco_stills/*.jpg")
 BOARDS = ("chessboard_stereo_opencv/*.jpg", "chessboard_lowquality_400x300/*.png")
 GROUPS = {
-    "room": ("laser_spot_room/*.jpg",), "board": BOARDS, "bright field": ("rings_brightfield/*.png",), "street": STREETS,
+    "room": ("laser_spot_room/*.jpg",), "board": BOARDS, "bright field": ("rings_brightfield/*.png",),
+    "street": STREETS,
     "outdoors": ("star_fields/tree.jpg", "moving_target_spider/*.mp4"),
 }  # fmt: skip
 SIZE = (400, 320)  # px, of the pictures

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -101,7 +101,7 @@ def is_clipped_noise(first: NDArray[np.generic], second: NDArray[np.generic], si
     return not lit.any() or bool(np.median(np.abs(second[lit].astype(float) - first[lit])) >= _LEAST_JUMP * sigma)
 
 
-def trimmed_variance(deviates: NDArray[np.floating]) -> float:
+def trimmed_variance(deviates: NDArray[Any]) -> float:
     """Variance of normal deviates, which may be rounded, with up to 20 % of outliers."""
     size = np.abs(deviates)
     variance = (float(np.quantile(size, 0.68)) / NORMAL_68) ** 2 if size.size else 0.0

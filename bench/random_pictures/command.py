@@ -18,6 +18,7 @@ from bench.random_pictures.looks import FAMILIES
 from bench.random_pictures.render import Renderer
 from bench.random_pictures.report import crashed, details, summary, write_rows
 from bench.random_pictures.scene import picture_scene
+from bench.random_pictures.surroundings import photographs
 from bench.random_pictures.write_folder import write_pictures
 from lab.errors import BeamposeError
 from lab.runs.process import process_run
@@ -66,7 +67,9 @@ def picture_jobs(
     seeds: range, family: str | None, frames: int | None, keep: Path | None, state_noise: bool
 ) -> list[PictureJob]:
     """One scene per seed; family `all`: one of each family per seed."""
-    names = [None] if family is None else list(FAMILIES) if family == "all" else [family]
+    names = [None] if family is None else [family]
+    if family == "all":  # without the photographs where they are not at hand
+        names = [name for name in FAMILIES if name != "photographs" or photographs()]
     return [PictureJob(s, n, frames, keep, state_noise) for s in seeds for n in names]
 
 

@@ -44,6 +44,7 @@ class Look:
     motion: str = ""  # of bench.random_scenes.draw.motions; empty: any
     hidden: bool = True  # with occlusions and missing pictures
     plain_rig: bool = False  # the rig of the paper at 1280 x 1024
+    photograph: float = 0.0  # share of the laser light that the darkest place of a photograph takes; 0: no photograph
 
     @property
     def text(self) -> str:
@@ -63,6 +64,7 @@ class Look:
         for count, what in ((self.reflections, "reflections"), (self.details, "details"), (self.hot_pixels, "hot px")):
             parts += [f"{count} {what}"] if count else []
         parts += ["screen edge"] if self.screen_edge else []
+        parts += ["in front of a photograph"] if self.photograph else []
         parts += [f"{self.clutter} moving clutter"] if self.clutter else []
         parts += [f"exposure {self.exposure_share:.2g} of a frame"]
         return f"{self.sensor.text}; {', '.join(parts)}"
@@ -176,6 +178,11 @@ FAMILIES: dict[str, Callable[[np.random.Generator, Look], Look]] = {
     "quiet-sensor": lambda r, k: replace(
         k, sensor=replace(draw_sensor(r, "8"), full_well_e=float(r.uniform(3e4, 6e4)), read_e=1.0, row_e=0.0),
         background=float(r.uniform(0, 0.03)), texture=0.0, flicker=0.0,
+    ),
+    "photographs": lambda r, k: replace(
+        k, photograph=0.6, background=40 / 255, gradient=0.0, vignetting=0.0, texture=0.0, flicker=0.0,
+        sensor=replace(k.sensor, full_well_e=float(r.uniform(8e3, 15e3)), read_e=4.0), peak_snr=_log(r, 40, 150),
+        hot_pixels=0, motion="sines",
     ),
     "row-noise": lambda r, k: replace(k, sensor=replace(k.sensor, row_e=float(r.uniform(0.5, 1.0) * k.sensor.read_e))),
 }  # fmt: skip

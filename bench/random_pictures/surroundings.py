@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,6 +18,12 @@ from geometry.camera import Camera
 from geometry.rig import Screen
 
 _NODE_PX = 16  # spacing of the pixels at which the position on the screen is computed; cubic interpolation between them
+_PHOTOGRAPHS = (
+    "laser_spot_room/*.jpg",
+    "chessboard_webcam_c920/*.jpg",
+    "circles_stills/*",
+    "charuco_aruco_stills/*.jpg",
+)
 _TILE = 1024  # samples of the periodic texture
 
 
@@ -40,6 +47,10 @@ def draw_surroundings(rng: np.random.Generator, look: Look, camera: Camera, scre
     response *= _surface(rng, look, camera, screen, x, y)
     ambient = np.full((height, width), look.background * full, dtype=np.float32)
     ambient *= _gradient(rng, look, width, height)
+    if look.photograph:
+        albedo = draw_photograph(rng, camera.image_size_px)
+        ambient *= albedo
+        response *= 1 - np.float32(look.photograph) * (1 - np.clip(albedo / np.quantile(albedo, 0.99), 0, 1))
     if look.screen_edge:
         ambient *= _beyond_edge(rng, screen, x, y)
     for _ in range(look.reflections):
@@ -58,6 +69,28 @@ def draw_surroundings(rng: np.random.Generator, look: Look, camera: Camera, scre
         else:
             steady[row, column] += charge
     return Surroundings(ambient, steady, response, tuple(blinking), np.array(bright).reshape(-1, 3))
+
+
+def photographs() -> list[Path]:
+    """Photographs of rooms, boards and tables beside the project; empty where they are not at hand."""
+    data = Path(__file__).resolve().parents[3] / "shared" / "data"
+    return sorted(f for pattern in _PHOTOGRAPHS for f in data.glob(pattern))
+
+
+def draw_photograph(rng: np.random.Generator, size_px: tuple[int, int]) -> Light:
+    """A random photograph, random part and side, scaled to a camera's size (width, height); mean 1."""
+    files = photographs()
+    if not files:
+        raise SystemExit("photographs: expected photographs in ../shared/data beside the project, found none")
+    grey = np.asarray(cv2.imread(str(files[int(rng.integers(len(files)))]), cv2.IMREAD_GRAYSCALE))
+    width, height = size_px
+    part = float(rng.uniform(0.5, 1.0)) * min(grey.shape[1] / width, grey.shape[0] / height)
+    w, h = int(part * width), int(part * height)
+    left, top = int(rng.integers(grey.shape[1] - w + 1)), int(rng.integers(grey.shape[0] - h + 1))
+    cut = grey[top : top + h, left : left + w][:, :: int(rng.choice([-1, 1]))]
+    way = cv2.INTER_AREA if part > 1 else cv2.INTER_CUBIC
+    scaled = np.clip(cv2.resize(cut, size_px, interpolation=way).astype(np.float32), 2.0, 255.0)
+    return np.asarray(scaled / scaled.mean(), np.float32)
 
 
 def gaussian_patch(u: float, v: float, sigma: float, size_px: tuple[int, int]) -> Patch | None:

@@ -157,7 +157,7 @@ def _add_notes(series: PictureSeries) -> None:
         series.notes.append(
             f"{_counted(len(series.overlooked))} with a bright light wider than detect.max_sigma_px ="
             f" {series.parameters.max_sigma_px:g}, which is not reported: the widest has a sigma of"
-            f" {widest.sigma_px:.0f} px, in frame {widest.frame} at ({widest.u_px:.0f}, {widest.v_px:.0f}) px;"
+            f" {widest.sigma_px:.0f} px, in frame {widest.frame} at ({widest.uv_px[0]:.0f}, {widest.uv_px[1]:.0f}) px;"
             f" --set detect.max_sigma_px={value} reports it"
         )
     series.notes += list(dict.fromkeys(note for g in series.groups.values() for note in g.noise.notes))

@@ -19,8 +19,7 @@ class WideLight(NamedTuple):
     """The brightest light of a picture that max_sigma_px excludes."""
 
     frame: int
-    u_px: float
-    v_px: float
+    uv_px: tuple[float, float]
     sigma_px: float
 
 
@@ -69,7 +68,7 @@ class PictureSeries:
         wide = overlooked_lights(picture, self.parameters, model, found)
         if len(wide):
             i = int(np.argmax(wide.peak))
-            self.overlooked.append(WideLight(frame, *wide.uv_px[i].tolist(), float(wide.major_px[i])))
+            self.overlooked.append(WideLight(frame, (wide.uv_px[i, 0], wide.uv_px[i, 1]), float(wide.major_px[i])))
         self.spots.add(frame, found, matched_snr(found, float(np.sqrt(model.of_means.floor_dn2))))
         return found
 

@@ -152,8 +152,8 @@ def _stands_out(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float
 
     On each circle around a part of an edge, a cable or another long line some light continues; fits of candidates on
     lines would grow over large windows and take most of the time. A spot, also a streak, is brighter than all light on
-    a circle that is large enough. The structure of the background at a place is that on the second most even of such circles:
-    what stands farther away does not matter. ring (_RING[-1],) is workspace. Source: ours.
+    a circle that is large enough. The structure of the background at a place is that on the second most even of such
+    circles: what stands farther away does not matter. ring (_RING[-1],) is workspace. Source: ours.
     """
     here, column, row = peak[HEIGHT] + peak[LEVEL], int(peak[AT_U]), int(peak[AT_V])
     sigma, alone, lowest, second = sqrt(variance(noise, peak[LEVEL])), False, np.inf, np.inf
