@@ -32,7 +32,8 @@ from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.parameters import DetectParameters
 
 _EVERYWHERE = np.array([[0.0, 0.0, 1e9]])
-_thread_local = threading.local()  # .finder: the last finder of each thread
+_thread_local = threading.local()  # .finders: the last finders of each thread, by width, height, most points
+_MOST_FINDERS = 4
 
 
 def find_spots(
@@ -57,9 +58,12 @@ def find_spots(
         raise ValueError(f"picture: expected grey (h, w) of uint8 or uint16, got shape {image.shape} of {image.dtype}")
     if not image.size:
         return Detections.none()
-    finder: SpotFinder | None = getattr(_thread_local, "finder", None)
-    if finder is None or (finder.height, finder.width, finder.most) != (*image.shape, parameters.max_detections):
-        finder = _thread_local.finder = SpotFinder(image.shape[1], image.shape[0], parameters.max_detections)
+    finders: dict[tuple[int, ...], SpotFinder] = _thread_local.__dict__.setdefault("finders", {})
+    key = (image.shape[1], image.shape[0], parameters.max_detections)
+    finder = finders.pop(key, None) or SpotFinder(*key)
+    finders[key] = finder  # last: the one used longest ago is the first
+    if len(finders) > _MOST_FINDERS:
+        del finders[next(iter(finders))]
     return finder.find(image, parameters, noise, regions)
 
 

@@ -20,8 +20,10 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Bools, evenly_spread
 from tracking.detection.detect import find_spots
+from tracking.detection.pixels import TEXTURE_SHARE
 from tracking.detections import Detections
 from tracking.noise import BLOCK, NoiseModel, Picture
+from tracking.noise_estimation.resting_lights import RestingLights
 from tracking.noise_estimation.texture_shift import TextureShift
 from tracking.parameters import DetectParameters
 
@@ -32,16 +34,19 @@ _HIGHEST = 30.0  # sigmas of noise and texture
 _LEAST_CLEAR = 7  # of these pictures without a light at a pixel
 _CUT = 0.25  # share of the lowest and of the highest grey values of a pixel that is left out
 _MEAN_VARIANCE = 1.4  # variance of these means of normal deviates times their number: 1.4 lower half, 1.2 middle
-_LIMITING = 1.0  # variance of the texture over that of the noise, for means of 3x3 pixels, from which it matters
+_LIMITING = 1.0  # variance of the texture over that of the noise, for means of 3x3 pixels, from which it matters ...
+_LIMITED_SHARE = 0.01  # ... in this share of the picture
 _SMOOTH_BLOCKS = 6.0  # blocks: sigma of the smooth part of the background, which is not subtracted
+_DARK = 0.25  # quantile of the background whose noise the difference is taken to have; brighter places count as uneven
 _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
 _TRIED = 3  # every such picture shows whether there are further spots
+_MANY_LIGHTS = 4  # at rest, from which the subtraction is used in any case: it spares their fits
 _LEAST_FOUND = 0.2  # further or better spots per picture from which the subtraction is used
+_CUT_STEP, _CUT_MARGIN = 64, 40  # px: sides of the parts of a picture that are searched again; light around a box
 _SAMPLE = (7, 8)  # rows and columns: every such pixel shows how much of the structure is in a picture
 _SMOOTH_SAMPLE = (13, 13)  # of these pixels: what varies over them is not structure
 _AROUND_SAMPLE = (15, 15)  # of these pixels: 100 px: a part of the picture that shows the structure or does not
-_LOCAL_LIGHT = 0.4  # largest difference of the light there from that of the whole picture, as a share
-_CLEAR_SIGMAS = 4.0  # ... and in sigmas
+_CLEAR_SIGMAS = 4.0  # more than this counts as much: somebody in front of the screen is in many pixels
 _SAME_LIGHT = 0.03  # the light has not changed by more than this share: the structure is not scaled
 _LEAST_LIGHT, _MOST_LIGHT = 0.2, 5.0  # changes of the light beyond which a picture is searched without subtraction
 _LARGEST_MISFIT = 1.3  # sigma of what is left over that of the noise; above it the camera or the light has moved
@@ -51,10 +56,10 @@ _AROUND_LIGHT, _AROUND_SPOT, _ON_LIGHT = (3.0, 3.0), (3.0, 2.0), (2.5, 1.5)
 
 
 def is_limited_by_texture(model: NoiseModel) -> bool:
-    """Whether the texture of a camera's background hides spots that its noise would show."""
-    contrast = model.texture if model.local_texture is None else float(np.median(model.local_texture))
+    """Whether texture or objects in a part of a camera's background hide spots that its noise would show."""
+    contrast = np.asarray(model.texture if model.local_texture is None else model.local_texture)
     noise = float(model.of_means.variance(model.black_dn)) / 9
-    return (contrast * model.black_dn) ** 2 > _LIMITING * noise
+    return bool(np.mean((contrast * model.black_dn) ** 2 > _LIMITING * noise) > _LIMITED_SHARE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,24 +70,31 @@ class StaticBackground:
     structure: NDArray[np.float32]  # (h, w), DN: the fixed picture without its smooth part
     smooth: NDArray[np.float32]  # (h, w), DN, on the pixels of _SAMPLE
     near_lights: Bools  # (h, w): near lights that do not move
+    lights: RestingLights
+    unknown: NDArray[np.float64]  # (m, 3): u, v and half side, px, of places that are searched in the pictures
+    parameters: DetectParameters
     steps: int  # grey values per DN of the difference
-    offset_dn: float  # added to it
+    level_dn: float  # of the difference
+    dark_dn: float  # level of the pictures whose noise `model` has at that level
     subtracted: NDArray[np.uint16]  # (h, w): what is added to a picture in these steps
     model: NoiseModel  # of the difference, in its steps
     noise: NoiseModel  # of the pictures
 
     @staticmethod
-    def of(pictures: Sequence[Picture], model: NoiseModel, shift: TextureShift) -> StaticBackground | None:
+    def of(
+        pictures: Sequence[Picture], model: NoiseModel, shift: TextureShift, parameters: DetectParameters
+    ) -> StaticBackground | None:
         """The background of pictures spread over a recording.
 
-        None: too few, or of different sizes or types, or the differences from it show the spots in them no better.
-        model: of the camera's noise and texture; shift: errors of its spots by the texture.
+        None: too few, or of different sizes or types, or with few lights at rest, while the differences from it show
+        the spots in them no better. model: of the camera's noise and texture; shift: errors of its spots by the
+        texture; parameters: with the grey value at which the sensor clips.
         """
         some = _usable(pictures)
         if len(some) < _LEAST_PICTURES:
             return None
         lower, mean = _means(some)
-        background = StaticBackground._of_mean(lower, some, model)
+        background = StaticBackground._of_mean(lower, some, model, parameters)
         shown = [(p, fit[0]) for p in some if (fit := background._light_in(p)) is not None]
         some, lights = [p for p, _ in shown], [light for _, light in shown]
         if len(some) < _LEAST_PICTURES:
@@ -94,9 +106,10 @@ class StaticBackground:
             smooth = lower - background.structure
             equal = [smooth + (p - _smooth_part(p.astype(np.float32))) / light for p, light in shown]
             lower, mean = _means(equal)
-            background = StaticBackground._of_mean(lower, some, model)
+            background = StaticBackground._of_mean(lower, some, model, parameters)
         tried = some[::_TRIED]
-        if sum(background._found_in(p, shift)[1] for p in tried) < max(_LEAST_FOUND * len(tried), 2):
+        few = len(background.lights.found) < _MANY_LIGHTS
+        if few and sum(background._better_in(p, shift) for p in tried) < max(_LEAST_FOUND * len(tried), 2):
             return None
         return background._without_slow_lights(mean, some, equal, shift)
 
@@ -108,8 +121,8 @@ class StaticBackground:
         A light that moves slowly, or rests for a part of the recording, is in the mean of the pictures. Where it is in
         some of them the others count; where its absence leaves a hole, those with the hole.
         """
-        found = [self._found_in(p, shift)[0] for p in pictures]
-        holes = [self.spots_in(p, DetectParameters(), shift, inverted=True) for p in pictures]
+        found = [self._searched(p, self.parameters, shift) for p in pictures]
+        holes = [self.spots_in(p, self.parameters, shift, inverted=True) for p in pictures]
         there, absent = (np.array([_places_of(d, mean.shape, _ON_LIGHT) for d in all_]) for all_ in (found, holes))
         row, column = np.nonzero(there.any(axis=0) | absent.any(axis=0))
         clear, hole = ~there[:, row, column], absent[:, row, column]
@@ -118,18 +131,27 @@ class StaticBackground:
         values = np.array([p[row, column] for p in equal], np.float32)
         enough = count >= _LEAST_CLEAR
         mean[row[enough], column[enough]] = ((values * clear).sum(axis=0) / np.maximum(count, 1))[enough]
-        better = StaticBackground._of_mean(mean, pictures, self.noise)
-        better.near_lights[row[~enough], column[~enough]] = True
-        return better
+        better = StaticBackground._of_mean(mean, pictures, self.noise, self.parameters)
+        unknown = np.zeros(mean.shape, np.uint8)
+        unknown[row[~enough], column[~enough]] = 1
+        better.near_lights[unknown > 0] = True
+        _, _, places, _ = cv2.connectedComponentsWithStats(unknown)
+        left, top, width, height = places[1:, : cv2.CC_STAT_AREA].T.astype(float)
+        half = 0.5 * np.maximum(width, height) + _AROUND_SPOT[1]
+        boxes = np.column_stack([left + 0.5 * (width - 1), top + 0.5 * (height - 1), half])
+        return replace(better, unknown=boxes)
 
-    def _found_in(self, picture: Picture, shift: TextureShift) -> tuple[Detections, int]:
-        """The spots found in a picture or in its difference, and how many of them the difference shows better."""
-        usual = DetectParameters()
-        in_picture = shift.added_to(find_spots(picture, usual, self.noise), self.noise.black_dn)
-        spots = self.spots_in(picture, usual, shift)
-        kept, replaced = _compared(spots, in_picture)
-        found = in_picture[~replaced].joined(spots[kept], len(in_picture) + len(spots))
-        return found, int(np.count_nonzero(kept))
+    def _better_in(self, picture: Picture, shift: TextureShift) -> int:
+        """How many spots the difference of a picture shows that the picture does not, or clearly more precisely."""
+        in_picture = shift.added_to(find_spots(picture, self.parameters, self.noise), self.noise.black_dn)
+        return _better(self.spots_in(picture, self.parameters, shift), in_picture)
+
+    def _searched(self, picture: Picture, parameters: DetectParameters, shift: TextureShift) -> Detections:
+        """The points of a picture, also of one that does not fit."""
+        found = self.found_in(picture, parameters, shift)
+        if found is None:
+            return shift.added_to(find_spots(picture, parameters, self.noise), self.noise.black_dn)
+        return found
 
     @property
     def _noise_share(self) -> float:
@@ -137,46 +159,89 @@ class StaticBackground:
         return _MEAN_VARIANCE / self.pictures
 
     @staticmethod
-    def _of_mean(mean: NDArray[np.float32], pictures: Sequence[Picture], model: NoiseModel) -> StaticBackground:
+    def _of_mean(
+        mean: NDArray[np.float32], pictures: Sequence[Picture], model: NoiseModel, parameters: DetectParameters
+    ) -> StaticBackground:
         share = _MEAN_VARIANCE / len(pictures)
         smooth = _smooth_part(mean)
         sigma = float(np.hypot(np.sqrt(model.floor_dn2), model.texture * model.black_dn))
-        structure = np.minimum(mean - smooth, _HIGHEST * sigma)  # what is higher is a light, or a hot pixel
-        offset, steps = float(np.ceil(max(structure.max(), 0.0))), _STEPS
-        top = max(int(p.max()) for p in pictures)
-        while steps > 1 and (top + 2 * offset) * steps > np.iinfo(np.uint16).max:
+        # In 16 bits there is no room for what is higher: a light, or a hot pixel.
+        structure = mean - smooth if pictures[0].dtype == np.uint8 else np.minimum(mean - smooth, _HIGHEST * sigma)
+        plain, most = smooth + structure, float(np.iinfo(np.uint16).max)
+        level, steps = float(np.ceil(plain.max())), _STEPS
+        while steps > 1 and (max(int(p.max()) for p in pictures) + level) * steps > most:
             steps //= 2
+        level = min(level, 0.5 * most / steps)
         floor, slope = model.floor_dn2 * steps**2, model.slope_dn * steps
-        fixed = replace(
-            model, floor_dn2=floor * share, slope_dn=slope * share, black_dn=model.black_dn * steps,
-            banding_dn=0.0, compression_dn2=0.0,
+        once = replace(
+            model, floor_dn2=floor, slope_dn=slope, black_dn=model.black_dn * steps,
+            banding_dn=model.banding_dn * steps, compression_dn2=model.compression_dn2 * steps**2,
         )  # fmt: skip
-        lights = find_spots(_in_steps(mean, steps), DetectParameters(), fixed)
+        clips = _saturation(parameters, pictures[0])
+        at_rest = find_spots(_in_steps(mean, steps), replace(parameters, saturation_dn=(clips - 0.5) * steps), once)
+        at_rest = replace(at_rest, flux=at_rest.flux / steps, peak=at_rest.peak / steps)
+        # The difference has one level everywhere, and the noise of the picture.
+        dark = float(np.quantile(plain[::8, ::8], _DARK))
+        brighter = model.slope_dn * np.maximum(_of_blocks(plain) - max(dark, model.black_dn), 0.0)
+        uneven = np.asarray(np.sqrt(brighter / 9.0) / (TEXTURE_SHARE * level), np.float32)
+        black = level - max(dark - model.black_dn, 0.0)
         of_difference = replace(
-            model, floor_dn2=floor * (1 + share), slope_dn=slope, black_dn=(model.black_dn + offset) * steps,
-            texture=0.0, local_texture=None, banding_dn=model.banding_dn * steps,
-            compression_dn2=model.compression_dn2 * steps**2,
+            model, floor_dn2=floor * (1 + share), slope_dn=slope, black_dn=black * steps, texture=0.0,
+            local_texture=uneven, banding_dn=model.banding_dn * steps, compression_dn2=model.compression_dn2 * steps**2,
         )  # fmt: skip
         rows, columns = _SAMPLE
-        near = _places_of(lights, mean.shape, _AROUND_LIGHT) | (
-            cv2.dilate((mean - smooth) - structure, np.ones((3, 3))) > 0
+        near = _places_of(at_rest, mean.shape, _AROUND_LIGHT) | (
+            cv2.dilate(mean - np.minimum(plain, level), np.ones((3, 3))) > 1 / steps
         )
         return StaticBackground(
-            len(pictures), structure, smooth[::rows, ::columns].copy(), near, steps, offset,
-            _in_steps(offset - structure, steps), of_difference, model,
+            len(pictures), structure, smooth[::rows, ::columns].copy(), near,
+            RestingLights.of(mean, at_rest, model, clips - 0.5), np.zeros((0, 3)), parameters, steps, level, dark,
+            _in_steps(level - plain, steps), of_difference, model,
         )  # fmt: skip
 
-    def improved(
-        self, found: Detections, picture: Picture, parameters: DetectParameters, shift: TextureShift
-    ) -> Detections:
-        """The points found in a picture and those found in its difference from the background, brightest first.
+    def found_in(self, picture: Picture, parameters: DetectParameters, shift: TextureShift) -> Detections | None:
+        """The points of a picture, brightest first, with the errors by texture: what moves, and the lights at rest.
 
-        Of two measurements of one spot that in the picture is kept, unless the other one is clearly more precise: then
-        the texture under the spot is its largest error.
+        What moves is searched in the difference from the background; the lights at rest are measured by one step, and
+        searched where they have changed. None: the picture and the background do not fit.
         """
-        spots = self.spots_in(picture, parameters, shift)
-        kept, replaced = _compared(spots, found)
-        return found[~replaced].joined(spots[kept], parameters.max_detections) if kept.any() else found
+        fit = self._light_in(picture)
+        if fit is None:
+            return None
+        spots = self._moving(picture, parameters, shift, fit)
+        lights, changed = self.lights.in_picture(picture)
+        boxes = np.column_stack([self.lights.found.uv_px, self.lights.half_px])[changed]
+        boxes = np.concatenate([self.unknown, boxes])
+        more = lights[~changed & ~_inside(boxes, lights)]
+        # The error of the mean picture's fit is the same in all pictures.
+        fixed = 0.5 * self._noise_share * np.trace(more.cov_px2, axis1=1, axis2=2)
+        more = shift.added_to(more, self.noise.black_dn)
+        place = np.zeros(len(more)) if more.place_px2 is None else more.place_px2
+        more = replace(more, cov_px2=(1 + self._noise_share) * more.cov_px2, place_px2=place + fixed)
+        found = spots[~_inside(boxes, spots)].joined(more, parameters.max_detections)
+        if not len(boxes):
+            return found
+        again = shift.added_to(self._found_again(picture, parameters, boxes), self.noise.black_dn)
+        return found.joined(again, parameters.max_detections)
+
+    def _found_again(self, picture: Picture, parameters: DetectParameters, boxes: NDArray[np.float64]) -> Detections:
+        """The points of a picture in boxes (m, 3): u, v and half side, px, each found once."""
+        found, height, width = Detections.none(), *picture.shape
+        for k, (u, v, half) in enumerate(boxes):
+            side = _CUT_STEP * int(np.ceil((2 * half + 2 * _CUT_MARGIN) / _CUT_STEP))
+            left, top = (
+                int(np.clip(at - side / 2, 0, max(size - side, 0))) // BLOCK * BLOCK
+                for at, size in ((u, width), (v, height))
+            )
+            local = self.noise.local_texture
+            if local is not None:
+                rows, columns = (np.s_[at // BLOCK : -(-(at + side) // BLOCK)] for at in (top, left))
+                local = local[rows, columns]
+            model = replace(self.noise, local_texture=local)
+            own = find_spots(picture[top : top + side, left : left + side], parameters, model)
+            own = replace(own, uv_px=own.uv_px + np.array([left, top]))
+            found = found.joined(own[_inside(boxes[k : k + 1], own) & ~_inside(boxes[:k], own)], len(found) + len(own))
+        return found
 
     def spots_in(
         self, picture: Picture, parameters: DetectParameters, shift: TextureShift, inverted: bool = False
@@ -187,29 +252,46 @@ class StaticBackground:
         holes of the difference instead.
         """
         fit = self._light_in(picture)
-        if fit is None:
-            return Detections.none()
+        return Detections.none() if fit is None else self._moving(picture, parameters, shift, fit, inverted)
+
+    def _moving(
+        self, picture: Picture, parameters: DetectParameters, shift: TextureShift, fit: tuple[float, Bools],
+        inverted: bool = False,
+    ) -> Detections:  # fmt: skip
+        """`spots_in`, with the result of `_light_in`."""
         light, fits = fit
         added, model = self.subtracted, self.model
         if abs(light - 1) > _SAME_LIGHT:
-            added = _in_steps(self.offset_dn - light * self.structure, self.steps)
+            change = (np.float32(1 - light) * self.structure * self.steps).astype(np.int32)
+            added = np.clip(self.subtracted + change, 0, np.iinfo(np.uint16).max).astype(np.uint16)
             own = self._noise_share
             model = replace(model, floor_dn2=model.floor_dn2 * (1 + light**2 * own) / (1 + own))
         raised: NDArray[np.uint16] = np.multiply(picture, np.uint16(self.steps), dtype=np.uint16)
         difference = np.asarray(cv2.add(raised, added), np.uint16)
+        clips = _saturation(parameters, picture)
+        top = min(int((clips + self.level_dn) * self.steps), np.iinfo(np.uint16).max)
+        if not inverted and picture.max() >= clips:
+            difference[picture >= clips] = top
         if inverted:
-            difference = np.asarray(cv2.subtract(np.full_like(difference, 2 * self.model.black_dn), difference))
-        spots = find_spots(difference, replace(parameters, saturation_dn=None), model)
+            difference = np.asarray(
+                cv2.subtract(np.full_like(difference, 2 * int(self.level_dn * self.steps)), difference)
+            )
+        spots = find_spots(difference, replace(parameters, saturation_dn=float(top)), model)
         row, column = (_nearest(spots.uv_px[:, i], picture.shape[1 - i]) for i in (1, 0))
         sampled = np.minimum(row // _SAMPLE[0], len(fits) - 1), np.minimum(column // _SAMPLE[1], fits.shape[1] - 1)
-        spots = spots[~self.near_lights[row, column] & fits[sampled]]
+        kept = ~self.near_lights[row, column] & fits[sampled]
+        spots, row, column, sampled = spots[kept], row[kept], column[kept], (sampled[0][kept], sampled[1][kept])
         if not len(spots):
             return spots
         spots = replace(spots, flux=spots.flux / self.steps, peak=spots.peak / self.steps)
+        bright = self.smooth[sampled] + self.structure[row, column]
+        light_of_spot = 0.5 * self.noise.slope_dn * spots.peak
+        here, used = (self.noise.variance(at) + light_of_spot for at in (bright, np.full(len(spots), self.dark_dn)))
+        spots = replace(spots, cov_px2=spots.cov_px2 * (here / used)[:, None, None])
         # The background's own noise is the same in all pictures.
         fixed = self._noise_share / (1 + self._noise_share) * 0.5 * np.trace(spots.cov_px2, axis1=1, axis2=2)
         of_light = replace(shift, background_px=(0.0,) * len(shift.background_px))
-        spots = of_light.added_to(spots, self.model.black_dn / self.steps - self.offset_dn)
+        spots = of_light.added_to(spots, self.noise.black_dn)
         place = np.zeros(len(spots)) if spots.place_px2 is None else spots.place_px2
         return replace(spots, place_px2=place + fixed)
 
@@ -222,16 +304,16 @@ class StaticBackground:
             return None
         rows, columns = _SAMPLE
         plain = ~self.near_lights[::rows, ::columns]
-        structure = _without_smooth_part(self.structure[::rows, ::columns], plain)
+        own_light = self.structure[::rows, ::columns]
+        structure = _without_smooth_part(own_light, plain)
         above = picture[::rows, ::columns].astype(np.float32) - self.smooth
         more = float(np.median(above))
         above = _without_smooth_part(above, plain)
-        variance = self.noise.variance(self.smooth + more).astype(np.float32)
+        variance = self.noise.variance(self.smooth + own_light + more).astype(np.float32)
         clear = plain & (np.abs(above) < 6 * np.sqrt(variance) + 4 * np.abs(structure))
         seen = np.where(clear, structure, 0.0)
         # A part of what is seen is the background's own noise, which the picture does not show.
-        own = self._noise_share * self.noise.variance(self.smooth).astype(np.float32)
-        # Where somebody stands in front of the screen the picture has another structure.
+        own = self._noise_share * variance
         power = np.maximum(_around(seen * seen - np.where(clear, own, 0.0)), 1e-12)
         here, sigma = _around(seen * above) / power, np.sqrt(_around(variance) / power / _around(np.ones_like(power)))
         light = float(np.median(here[sigma <= np.median(sigma)]))
@@ -240,8 +322,11 @@ class StaticBackground:
         left = np.where(clear, (above - light * structure) / np.sqrt(variance + light**2 * own), 0.0)
         if 1.4826 * float(np.median(np.abs(left[clear]))) > _LARGEST_MISFIT:
             return None
-        others = _around(left * left) > _LARGEST_MISFIT**2 * _around(clear.astype(np.float32))
-        return light, (np.abs(here - light) < np.maximum(_LOCAL_LIGHT * light, _CLEAR_SIGMAS * sigma)) & ~others
+        # Somebody in front of the screen; a moving light is in few of the pixels.
+        others = _around(np.minimum(left * left, _CLEAR_SIGMAS**2)) > _LARGEST_MISFIT**2 * _around(
+            clear.astype(np.float32)
+        )
+        return light, ~others
 
 
 def _without_smooth_part(values: NDArray[np.float32], plain: Bools) -> NDArray[np.float32]:
@@ -289,6 +374,14 @@ def _smooth_part(mean: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.resize(blurred, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
+def _of_blocks(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The highest mean of each block of BLOCK x BLOCK pixels and its neighbours."""
+    rows, columns = (-(-n // BLOCK) for n in values.shape)
+    missing = (0, rows * BLOCK - values.shape[0]), (0, columns * BLOCK - values.shape[1])
+    blocks = cv2.resize(np.pad(values, missing, mode="edge"), (columns, rows), interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.dilate(blocks, np.ones((3, 3))), np.float32)
+
+
 def _in_steps(values: NDArray[np.float32], steps: int) -> NDArray[np.uint16]:
     return np.clip(np.rint(values * steps), 0, np.iinfo(np.uint16).max).astype(np.uint16)
 
@@ -306,13 +399,24 @@ def _places_of(lights: Detections, shape: tuple[int, ...], size: tuple[float, fl
     return out > 0
 
 
-def _compared(spots: Detections, found: Detections) -> tuple[Bools, Bools]:
-    """Which spots of a difference (n,) are kept, and which of those found in the picture (m,) they replace."""
+def _saturation(parameters: DetectParameters, picture: Picture) -> float:
+    """The grey value at which the sensor clips."""
+    clips = parameters.saturation_dn
+    return float(np.iinfo(picture.dtype).max) if clips is None else clips
+
+
+def _better(spots: Detections, found: Detections) -> int:
+    """How many spots of a difference (n,) are not among those found in the picture (m,), or clearly more precise."""
     near = _near(spots, found)
     size2, usual2 = (np.trace(d.cov_px2, axis1=1, axis2=2) for d in (spots, found))
     replaces = near & (size2[:, None] < _CLEARLY_BETTER * usual2)
-    kept = ~np.any(near & ~replaces, axis=1)
-    return kept, np.asarray(replaces[kept].any(axis=0))
+    return int(np.count_nonzero(~np.any(near & ~replaces, axis=1)))
+
+
+def _inside(boxes: NDArray[np.float64], found: Detections) -> Bools:
+    """Which of the points (n,) lie in one of the boxes (m, 3): u, v and half side, px."""
+    away = np.abs(found.uv_px[:, None] - boxes[None, :, :2]).max(axis=2)
+    return np.asarray((away <= boxes[None, :, 2]).any(axis=1))
 
 
 def _near(spots: Detections, found: Detections) -> Bools:

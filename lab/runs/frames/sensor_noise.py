@@ -13,7 +13,7 @@ from geometry.arrays import evenly_spread
 from geometry.camera import SensorNoise
 from lab.files.run.run_file import DetectionsTable, FramesFolder, Run
 from lab.runs.frames.frames import FrameReader, pictures_at
-from tracking.detection.wide_lights import find_all_sizes
+from tracking.detection.wide_lights import WIDE_PX, find_all_sizes
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.noise_estimation.colour_mosaic import mosaic_contrast
@@ -66,21 +66,22 @@ class CameraNoise:
                     " leave it out"
                 )
 
-    def look_for_faint_spots(self, pictures: Sequence[Picture]) -> None:
-        """Make the static background of pictures spread over the recording, if that shows spots in them."""
-        if self.model is not None and self.estimate is not None:
-            self.background = StaticBackground.of(pictures, self.model, self.estimate.texture_shift)
+    def make_background(self, pictures: Sequence[Picture], parameters: DetectParameters) -> None:
+        """Make the static background of pictures spread over the recording, if that shows more or spares fits."""
+        if pictures and self.model is not None and self.estimate is not None:
+            usual = replace(parameters, saturation_dn=self.saturation_dn(pictures[0], parameters))
+            self.background = StaticBackground.of(pictures, self.model, self.estimate.texture_shift, usual)
 
     def detect(self, picture: Picture, parameters: DetectParameters) -> Detections:
         """The points of one picture. After pictures without any point the noise is estimated again."""
         if self.model is None:
             self.estimate_from([picture])
+        if self.background is not None and self.estimate is not None and parameters.max_sigma_px <= WIDE_PX:
+            usual = replace(parameters, saturation_dn=self.saturation_dn(picture, parameters))
+            seen = self.background.found_in(picture, usual, self.estimate.texture_shift)
+            if seen is not None and len(seen):
+                return seen
         found = self._search(picture, parameters, self.model)
-        if self.background is not None and self.estimate is not None:
-            shift = self.estimate.texture_shift
-            found = self.background.improved(self._with_texture(found), picture, parameters, shift)
-            if len(found):
-                return found
         if len(found):
             self._blank = 0
             self._recent.clear()
@@ -180,7 +181,9 @@ def camera_noises(run: Run, reader: FrameReader) -> dict[str, CameraNoise]:
             else:
                 wanted = list(range(0, VIDEO_FRAMES, VIDEO_FRAMES // PICTURES))
             shown = pictures_at(run, name, wanted)
-            out[name].look_for_faint_spots([p for _, p in sorted(shown.items()) if isinstance(p, np.ndarray)])
+            out[name].make_background(
+                [p for _, p in sorted(shown.items()) if isinstance(p, np.ndarray)], run.tracker.detect
+            )
     share_texture(list(out.values()))
     return out
 

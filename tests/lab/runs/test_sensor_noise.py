@@ -126,6 +126,6 @@ def test_faint_spots_on_texture_are_detected_once_the_pictures_have_shown_their_
         return hits
 
     before = found()
-    noise.look_for_faint_spots(recording.pictures[::3])
+    noise.make_background(recording.pictures[::3], DetectParameters())
     assert noise.as_mapping()["background_pictures"] == 15
     assert found() > 0.97 * recording.centres[..., 0].size > 1.3 * before

@@ -1,0 +1,115 @@
+"""Lights that do not move: fitted once, then measured by one linear step in each picture in which they are unchanged.
+
+A recording's lamps, reflections and bright objects, and the spots of a vehicle at rest, are the same in picture after
+picture. The Gauss-Newton step from the mean picture to a single one (ours; the model of detection/gaussian_fit.py) has
+the covariance of a whole fit at a hundredth of its cost. Where the residuals or the step show that something else is
+there, the place is searched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.arrays import Array, Bools, Ints
+from tracking.detections import Detections
+from tracking.noise import NoiseModel, Picture
+
+_WINDOW = (3.0, 4.0)  # widths, and px: half side of a window
+_SAMPLES = 13  # largest number of pixels from the centre of a window to its side: of wide lights every n-th counts
+_LARGEST_STEP = 0.25  # widths: a longer step of the centre is not linear
+_LARGEST_CHANGE = 0.3  # of the flux, as a share
+_MISFIT, _MISFIT_SIGMAS = 1.4, 5.0  # chi-square per degree of freedom of an unchanged light: factor, and its sigmas
+_PARAMETERS = 9
+
+
+@dataclass(frozen=True, slots=True)
+class RestingLights:
+    """n lights of the mean of some pictures (h, w) with N pixels in their windows, one window after the other."""
+
+    found: Detections  # (n,), in the mean picture
+    half_px: Array  # (n,), half sides of the windows
+    pixels: Ints  # (N,), places in a flat picture
+    mean: NDArray[np.float32]  # (N,), DN
+    weight: NDArray[np.float32]  # (N,), 1/DN^2; 0: clipped
+    slopes: NDArray[np.float32]  # (9, N), DN: by centre, flux, shape and background
+    starts: Ints  # (n,), of the windows
+    free: Array  # (n,), degrees of freedom
+    inverse: Array  # (n, 9, 9), of the normal matrices
+    flux_of: Array  # (n, 9): relative flux by the parameters
+
+    @staticmethod
+    def of(mean: NDArray[Any], found: Detections, noise: NoiseModel, saturation_dn: float) -> RestingLights:
+        """The lights found in a mean picture (h, w), with covariances as of a single one. noise: of its pixels."""
+        half = np.maximum(_WINDOW[0] * found.major_px + 1, 0) + _WINDOW[1]
+        windows = [_Window.of(mean.shape, found, i, half[i]) for i in range(len(found))]
+        counts = np.array([len(w.pixels) for w in windows], dtype=np.int64)
+        starts = np.concatenate([[0], np.cumsum(counts)])[:-1].astype(np.int64)
+        pixels = np.concatenate([np.zeros(0, np.int64), *(w.pixels for w in windows)])
+        slopes = np.concatenate([np.zeros((_PARAMETERS, 0)), *(w.slopes for w in windows)], axis=1)
+        light = mean.ravel()[pixels].astype(float)
+        weight = np.where(light < saturation_dn, 1.0 / noise.of_means.variance(light), 0.0)
+        inverse = np.zeros((len(found), _PARAMETERS, _PARAMETERS))
+        for i, (start, count) in enumerate(zip(starts, counts, strict=True)):
+            own = np.s_[start : start + count]
+            normal = (slopes[:, own] * weight[own]) @ slopes[:, own].T
+            inverse[i] = np.linalg.pinv(normal, hermitian=True)
+        used = np.add.reduceat(weight > 0, starts) if len(found) else np.zeros(0)
+        flux_of = np.array([w.flux_of for w in windows]).reshape(-1, _PARAMETERS)
+        return RestingLights(
+            found, half, pixels, light.astype(np.float32), weight.astype(np.float32), slopes.astype(np.float32), starts,
+            np.maximum(used - _PARAMETERS, 1.0), inverse, flux_of,
+        )  # fmt: skip
+
+    def in_picture(self, picture: Picture) -> tuple[Detections, Bools]:
+        """The lights (n,) in a picture (h, w), and which of them have changed: those are not measured correctly."""
+        if not len(self.found):
+            return self.found, np.zeros(0, dtype=bool)
+        residual = picture.ravel()[self.pixels].astype(np.float32) - self.mean
+        weighted = residual * self.weight
+        right = np.add.reduceat(self.slopes * weighted, self.starts, axis=1).T
+        step = np.einsum("nij,nj->ni", self.inverse, right)
+        chi2 = np.add.reduceat(residual * weighted, self.starts) - np.einsum("ni,ni->n", step, right)
+        more = np.einsum("ni,ni->n", self.flux_of, step)
+        allowed = _MISFIT * (1.0 + _MISFIT_SIGMAS * np.sqrt(2.0 / self.free))
+        changed = (chi2 > allowed * self.free) | (np.abs(more) > _LARGEST_CHANGE)
+        changed |= np.linalg.norm(step[:, :2], axis=1) > _LARGEST_STEP * self.found.minor_px
+        found = replace(self.found, uv_px=self.found.uv_px + step[:, :2], flux=self.found.flux * (1.0 + more))
+        return found, np.asarray(changed)
+
+
+@dataclass(frozen=True, slots=True)
+class _Window:
+    pixels: Ints  # (m,)
+    slopes: Array  # (9, m)
+    flux_of: Array  # (9,)
+
+    @staticmethod
+    def of(shape: tuple[int, ...], found: Detections, i: int, half: float) -> _Window:
+        """The window of a light, and the slopes of a Gaussian with its size."""
+        (u0, v0), apart = found.uv_px[i], max(int(half) // _SAMPLES, 1)
+        reach = int(half) // apart * apart
+        columns = np.arange(round(u0) - reach, round(u0) + reach + 1, apart)
+        rows = np.arange(round(v0) - reach, round(v0) + reach + 1, apart)
+        columns, rows = columns[(columns >= 0) & (columns < shape[1])], rows[(rows >= 0) & (rows < shape[0])]
+        v, u = (x.ravel() for x in np.meshgrid(rows, columns, indexing="ij"))
+        turn = np.deg2rad(found.angle_deg[i])
+        axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        size2 = np.array([found.major_px[i], found.minor_px[i]]) ** 2 + 1 / 12
+        inverse = axes / size2 @ axes.T
+        d = np.array([u - u0, v - v0])
+        p, q = inverse @ d
+        shape_of = np.exp(-0.5 * (p * d[0] + q * d[1]))
+        light = found.flux[i] / (2 * np.pi * np.sqrt(size2.prod())) * shape_of
+        scale = size2.prod() ** 0.25
+        slopes = np.array([
+            light * p, light * q, light, light * (p * scale) ** 2, light * p * q * scale**2, light * (q * scale) ** 2,
+            np.ones_like(p), d[0] / scale, d[1] / scale,
+        ])  # fmt: skip
+        flux_of = np.zeros(_PARAMETERS)
+        flux_of[2] = 1.0
+        flux_of[3:6] = scale**2 * np.array([inverse[0, 0], inverse[0, 1], inverse[1, 1]])
+        return _Window(np.asarray(v * shape[1] + u, np.int64), slopes, flux_of)
