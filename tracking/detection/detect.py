@@ -20,9 +20,9 @@ from tracking.detection.candidates import (
     block_workspace,
 )
 from tracking.detection.gaussian_fit import REACHES
-from tracking.detection.measuring import DetectionLimits, measure, write_detections
+from tracking.detection.measuring import DetectionLimits, measure
 from tracking.detection.pixels import Noise, Pixels
-from tracking.detection.regions import INITIAL_REACH, MARGIN, boxes_of, find_relevant
+from tracking.detection.regions import INITIAL_REACH, MARGIN, boxes_of, find_relevant, write_detections
 from tracking.detection.search import BORDER_BLOCKS, MAX_COMPARED, find_peaks_in, find_separate_peaks
 from tracking.detection.table import ALGEBRA, CELL_ROWS, CELL_SIZE, COLUMNS, MOST_CELLS
 from tracking.detections import Detections
@@ -81,7 +81,7 @@ class SpotFinder:
             np.zeros(MAX_COMPARED),
         )
         self._cells, self._algebra = np.zeros((CELL_ROWS, MOST_CELLS)), np.zeros((ALGEBRA, 9, 10))
-        self._table, self._count, self._out = np.zeros((most, COLUMNS)), 0, np.zeros((most, 11))
+        self._table, self._count, self._out = np.zeros((most, COLUMNS)), 0, np.zeros((most, 12))
 
     def find(
         self,
@@ -170,7 +170,11 @@ class SpotFinder:
         rows = self._out[: write_detections(self._table[: self._count], regions, self._out)]
         cov = rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
         return Detections(
-            rows[:, :2].copy(), cov, *(rows[:, k].copy() for k in range(5, 10)), misfit=rows[:, 10].copy()
+            rows[:, :2].copy(),
+            cov,
+            *(rows[:, k].copy() for k in range(5, 10)),
+            misfit=rows[:, 10].copy(),
+            chi2=rows[:, 11].copy(),
         )
 
 
@@ -194,6 +198,10 @@ class _Task(NamedTuple):
             float(parameters.min_sigma_px),
             float(parameters.max_sigma_px),
             float(parameters.min_explained),
+            float(model.profile.near),
+            float(model.profile.near_px) ** 2,
+            float(model.profile.far),
+            float(model.profile.uneven) ** 2,
         )
         pixels = Pixels(image.view(np.uint8), image.itemsize, image.shape[1], image.shape[0])
         others = float(model.texture), float(model.banding_dn), float(model.compression_dn2)

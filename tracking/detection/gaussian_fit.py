@@ -10,7 +10,7 @@ from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
 from tracking.detection.ellipse import gaussian_window
-from tracking.detection.normal_equations import PolynomialFrame, accumulate, frame_of, solve_normal
+from tracking.detection.normal_equations import PolynomialFrame, accumulate, frame_of, solve_normal, variance_of_wings
 from tracking.detection.pixels import VALID, Noise, Pixels, Window, insert_nearest, read_window, window_around
 from tracking.detection.quality import assess_fit, exclude_isolated_cells, gain_over_plane
 from tracking.detection.table import (
@@ -173,6 +173,12 @@ def _add_light(window: Window, spot: Array, lights: Array, out: Array) -> None:
 
 
 @compiled
+def least_variance(spot: Array) -> float:
+    """The least variance, px^2, of a spot in any direction: that of its wings is part of it."""
+    return _LEAST_VARIANCE + variance_of_wings(spot)
+
+
+@compiled
 def _needs_another_step(step: float, variance: float, width2: float) -> bool:
     """Whether another Gauss-Newton step is needed after this one; the error falls with the square of the step."""
     sigma = sqrt(variance)
@@ -327,7 +333,7 @@ def _advance(frame: PolynomialFrame, spot: Array, X: Array) -> None:
     )
     short = 1.0 / max(ellipse.mahalanobis(du, dv, base[0], base[1], base[2]), 1.0)
     du, dv = short * du, short * dv
-    spot[UU], spot[UV], spot[VV] = ellipse.clip_eigenvalues(uu - pixel, uv, vv - pixel, _LEAST_VARIANCE, np.inf)
+    spot[UU], spot[UV], spot[VV] = ellipse.clip_eigenvalues(uu - pixel, uv, vv - pixel, least_variance(spot), np.inf)
     spot[SLOPE_U] += X[7, 0] / su
     spot[SLOPE_V] += X[8, 0] / sv
     spot[LEVEL] += X[6, 0] + spot[SLOPE_U] * du + spot[SLOPE_V] * dv

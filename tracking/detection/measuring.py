@@ -12,20 +12,23 @@ from geometry.compilation.jit import compiled, compiled_for_threads
 from tracking.detection import ellipse
 from tracking.detection.candidates import AT_U, AT_V, CONTRAST, HEIGHT, LEVEL, SCALE
 from tracking.detection.candidates import WIDE as WIDE_PEAK
-from tracking.detection.gaussian_fit import fit_all
+from tracking.detection.gaussian_fit import fit_all, least_variance
 from tracking.detection.moments import find_moments, start_variance
 from tracking.detection.pixels import Noise, Pixels, texture_variance, with_texture
 from tracking.detection.quality import light_beside
-from tracking.detection.regions import in_a_region
+from tracking.detection.regions import brightest
 from tracking.detection.saturated_spots import CENTRE_SHARE, compact_height
 from tracking.detection.table import (
     ACCEPTED,
     ACTIVE,
     BACKGROUND,
+    CELL_SIZE,
     CHI2,
+    COLUMNS,
     COV_UV,
     EXPLAINED,
     EXPLAINED_HERE,
+    FAR_WING,
     FLUX,
     GAIN,
     HELD,
@@ -35,6 +38,8 @@ from tracking.detection.table import (
     MOMENT_UV,
     MOMENT_V,
     MOMENT_VV,
+    NEAR_VARIANCE,
+    NEAR_WING,
     PEAK,
     SCRATCH,
     SIGMA_FLUX,
@@ -42,6 +47,7 @@ from tracking.detection.table import (
     SLOPE_V,
     START,
     TEXTURE,
+    UNEVEN,
     UU,
     UV,
     VAR_U,
@@ -73,6 +79,8 @@ _BESIDE = 3.0  # sigmas: least light of such a spot outside its two brightest pi
 _UNRESOLVED_GAIN = 2.0  # least decrease of its chi-square, relative to threshold^2: few pixels have longer tails
 _WITHIN_PIXEL = 0.03  # px: error of the centre if the held width is a tenth of a pixel wrong
 _NOTHING = 1e12  # px^2: variance of the start of a candidate that has been joined to another one; the fit leaves it out
+NARROW_PX = 1.0  # sigma: in wider spots the centre of a Gaussian does not depend on the place within a pixel
+_FARTHEST = 0.5  # px: from the Gaussian's centre to that of the fit with wings
 _SAME_SPOT = 1.5  # sigmas of a brighter spot: a second spot nearer to its centre is a duplicate
 
 
@@ -84,6 +92,10 @@ class DetectionLimits(NamedTuple):
     min_sigma: float  # px
     max_sigma: float  # px
     min_explained: float
+    near_wing: float  # of narrow spots, see tracking.noise.SpotProfile
+    near_variance: float  # px^2
+    far_wing: float
+    uneven: float  # variance
 
 
 @compiled_for_threads
@@ -103,6 +115,7 @@ def measure(
         spot[MOMENT_U], spot[MOMENT_V], spot[BACKGROUND] = peak[AT_U], peak[AT_V], peak[LEVEL]
         spot[WIDE], spot[START], spot[HELD] = peak[WIDE_PEAK], start_variance(peak[SCALE]), 0.0
         spot[TEXTURE], spot[MISFIT] = peak[CONTRAST], 0.0
+        spot[NEAR_WING] = spot[NEAR_VARIANCE] = spot[FAR_WING] = spot[UNEVEN] = 0.0
     find_moments(image, table, cells)
     least = _LEAST_GAIN * limits.threshold_sigma**2
     for _ in range(_MERGES):
@@ -121,6 +134,42 @@ def measure(
         accepted = _is_spot(image, spot, here, limits) or _is_compact(image, spot, here, limits, cells[SCRATCH])
         spot[ACCEPTED] = 1.0 if accepted else 0.0
     _drop_duplicates(table)
+    if limits.near_wing + limits.far_wing > 0.0:
+        _fit_wings(image, table, noise, limits, cells, algebra)
+
+
+@compiled
+def _fit_wings(
+    image: Pixels, table: Array, noise: Noise, limits: DetectionLimits, cells: Array, algebra: Array
+) -> None:
+    """Fit the narrow spots again with the wings that they have in this camera; a Gaussian stays where that fails."""
+    gaussian = table.copy()
+    for k in range(table.shape[0]):
+        spot = table[k]
+        spot[ACTIVE] = 0.0
+        det = spot[UU] * spot[VV] - spot[UV] ** 2
+        if not spot[ACCEPTED] or np.isnan(spot[SIGMA_FLUX]) or spot[CELL_SIZE] > 1.0 or det > NARROW_PX**4:
+            continue
+        spot[NEAR_WING], spot[NEAR_VARIANCE] = limits.near_wing, limits.near_variance
+        spot[FAR_WING], spot[UNEVEN] = limits.far_wing, limits.uneven
+        spot[MOMENT_U], spot[MOMENT_V], spot[HELD], spot[ACTIVE] = spot[U], spot[V], 0.0, 1.0
+        spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV] = ellipse.clip_eigenvalues(
+            spot[UU], spot[UV], spot[VV], 2.0 * least_variance(spot), np.inf
+        )
+    fit_all(image, table, noise, limits.saturation, limits.max_sigma, 0.0, True, cells, algebra)
+    for k in range(table.shape[0]):
+        spot = table[k]
+        if spot[NEAR_WING] + spot[FAR_WING] <= 0.0:
+            continue
+        away = max(abs(spot[U] - gaussian[k, U]), abs(spot[V] - gaussian[k, V]))
+        unsure = max(spot[VAR_U], spot[VAR_V]) > _FARTHEST**2
+        if not spot[FLUX] > 0.0 or not spot[PEAK] > 0.0 or unsure or away > _FARTHEST:
+            for column in range(COLUMNS):
+                spot[column] = gaussian[k, column]
+        elif spot[UNEVEN] > 0.0:
+            # What the shape leaves belongs to the place within the pixel, and is no noise.
+            noise_share = (1.0 - gaussian[k, MISFIT]) * (gaussian[k, VAR_U] + gaussian[k, VAR_V])
+            spot[MISFIT] = max(spot[MISFIT], 1.0 - noise_share / (spot[VAR_U] + spot[VAR_V]))
 
 
 @compiled
@@ -289,16 +338,6 @@ def _is_compact(image: Pixels, spot: Array, noise: Noise, limits: DetectionLimit
 
 
 @compiled
-def _brightest(table: Array) -> int:
-    """The row with the largest flux among the ACTIVE ones; -1 if there is none."""
-    best = -1
-    for k in range(table.shape[0]):
-        if table[k, ACTIVE] and (best < 0 or table[k, FLUX] > table[best, FLUX]):
-            best = k
-    return best
-
-
-@compiled
 def _drop_duplicates(table: Array) -> None:
     """Drop spots near the centre of a brighter spot of about the same width: one light detected twice.
 
@@ -306,7 +345,7 @@ def _drop_duplicates(table: Array) -> None:
     """
     for k in range(table.shape[0]):
         table[k, ACTIVE] = table[k, ACCEPTED]
-    i = _brightest(table)
+    i = brightest(table)
     while i >= 0:
         spot = table[i]
         spot[ACTIVE] = 0.0
@@ -320,27 +359,4 @@ def _drop_duplicates(table: Array) -> None:
                 own = (other[UU] + 1 / 12) * (other[VV] + 1 / 12) - other[UV] ** 2
                 if inside and own > NARROWER**4 * area:
                     other[ACCEPTED] = other[ACTIVE] = 0.0
-        i = _brightest(table)
-
-
-@compiled
-def write_detections(table: Array, regions: Array, out: Array) -> int:
-    """Write the spots that lie in a region (n, 3) into `out`, largest flux first; returns their number.
-
-    Columns of out (most, 11): u, v; cov uu, uv, vv; flux, peak, major, minor, angle; share of the covariance by misfit.
-    """
-    for k in range(table.shape[0]):
-        found = table[k, ACCEPTED] and in_a_region(regions, table[k, U], table[k, V], 0.0)
-        table[k, ACTIVE] = 1.0 if found else 0.0
-    count = 0
-    i = _brightest(table)
-    while i >= 0:
-        spot, row = table[i], out[count]
-        spot[ACTIVE] = 0.0
-        row[0], row[1], row[2], row[3] = spot[U], spot[V], spot[VAR_U], spot[COV_UV]
-        row[4], row[5], row[6] = spot[VAR_V], spot[FLUX], spot[PEAK]
-        row[7], row[8], row[9] = ellipse.axes(spot[UU], spot[UV], spot[VV])
-        row[10] = spot[MISFIT]
-        count += 1
-        i = _brightest(table)
-    return count
+        i = brightest(table)

@@ -15,24 +15,29 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled, compiled_for_sums
 from tracking.detection import ellipse
-from tracking.detection.ellipse import exponential, gaussian_window
+from tracking.detection.ellipse import gaussian_window
 from tracking.detection.pixels import Noise, Window, total_of_products
 from tracking.detection.table import (
     AT_X,
     AT_Y,
+    FAR_WING,
     FLUX,
     LEVEL,
     LIGHT,
     LINE,
+    NEAR_VARIANCE,
+    NEAR_WING,
     NEIGHBOUR_LIGHT,
     NODES,
     NORMAL,
+    PART,
     RESIDUAL,
     RIGHT_SIDE,
     ROW,
     SCRATCH,
     SLOPE_U,
     SLOPE_V,
+    UNEVEN,
     USE,
     UU,
     UV,
@@ -44,9 +49,9 @@ from tracking.detection.table import (
     V,
 )
 
+FAR_PX2 = 2.0**2  # px^2: what the far wing adds: its light reaches the border of the window
 EXACT_PX2 = 0.9**2  # px^2: narrower spots are integrated over the pixels numerically
 _POWERS_U, _POWERS_V = (0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)
-_FOUR_NODES_PX2 = 0.5**2  # px^2: narrower spots need eight instead of four nodes in each direction
 _COLUMNS = (
     NODES,
     NODES + 1,
@@ -58,14 +63,7 @@ _COLUMNS = (
     AT_X,
     AT_Y,
 )  # of the exact model, in cells
-_NEGLIGIBLE = 8.5  # sigmas from the centre at which the light is 2e-16 of its peak
 _EDGEWORTH = 0.4  # cell^2 / variance above which the pixels' fourth cumulant is significant
-
-# Gauss-Legendre nodes and weights on [-1/2, 1/2] for 4 and 8 points: accurate to 1e-4 of the peak for sigmas of at
-# least 0.5 and 0.2 px.
-_FOUR = np.polynomial.legendre.leggauss(4)
-_EIGHT = np.polynomial.legendre.leggauss(8)
-_NODES4, _WEIGHTS4, _NODES8, _WEIGHTS8 = _FOUR[0] / 2, _FOUR[1] / 2, _EIGHT[0] / 2, _EIGHT[1] / 2
 
 
 class PolynomialFrame(NamedTuple):
@@ -83,7 +81,8 @@ class PolynomialFrame(NamedTuple):
 def frame_of(window: Window, spot: Array) -> PolynomialFrame:
     """The frame of a spot (9,) in a window."""
     middle, pixel = 0.5 * (window.cell - 1), window.cell**2 / 12.0
-    exact = window.cell == 1 and ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[0] < EXACT_PX2
+    narrow = ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[0] < EXACT_PX2
+    exact = window.cell == 1 and (narrow or variance_of_wings(spot) > 0.0)
     if exact:
         pixel = 0.0
     S = (spot[UU] + pixel, spot[UV], spot[VV] + pixel)
@@ -233,19 +232,16 @@ def _accumulate_exact(
     window: Window, frame: PolynomialFrame, spot: Array, noise: Noise, cells: Array, N: Array, b: Array
 ) -> float:
     """`accumulate` for a narrow spot, with light and derivatives integrated over each pixel by quadrature."""
-    low = ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[0]
-    nodes, weights = (_NODES4, _WEIGHTS4) if low > _FOUR_NODES_PX2 else (_NODES8, _WEIGHTS8)
-    inverse = ellipse.inverse(frame.S[0], frame.S[1], frame.S[2])
-    scale = spot[FLUX] / (2 * np.pi * sqrt(frame.S[0] * frame.S[2] - frame.S[1] ** 2))
     count = window.rows * window.columns
     x, y, light, product = cells[AT_X, :count], cells[AT_Y, :count], cells[LIGHT, :count], cells[SCRATCH, :count]
     _fill_coordinates(window, frame, x, y)
-    for r in range(window.rows):
-        _moments_of_row(frame, inverse, r, nodes, weights, scale, window.columns, cells)
+    _exact_light(window, frame, spot, cells)
     for k in range(light.shape[0]):
         light[k] = cells[NODES, k]
     _weigh(frame, 1.0, spot, noise, 1.0, x, y, cells)
-    weight, residual = cells[WEIGHT, :count], cells[RESIDUAL, :count]
+    weight, residual, uneven = cells[WEIGHT, :count], cells[RESIDUAL, :count], spot[UNEVEN]
+    for k in range(weight.shape[0]):
+        weight[k] /= 1.0 + weight[k] * uneven * light[k] * light[k]
     for p in range(9):
         column = cells[_COLUMNS[p], :count]
         for k in range(product.shape[0]):
@@ -257,52 +253,65 @@ def _accumulate_exact(
 
 
 @compiled
-def _moments_of_row(
-    frame: PolynomialFrame, inverse: tuple[float, float, float], r: int, nodes: Array, weights: Array, scale: float,
-    columns: int, cells: Array,
-) -> None:  # fmt: skip
-    """Pixel means of the light times 1, x, y, x^2, x y, y^2 along row r of the pixels, into cells[NODES:].
+def variance_of_wings(spot: Array) -> float:
+    """What the wings add to the variance of a spot's core, px^2."""
+    return spot[NEAR_WING] * spot[NEAR_VARIANCE] + spot[FAR_WING] * FAR_PX2
 
-    Beyond _NEGLIGIBLE sigmas from the centre they are below the rounding of the sums, and 0.
-    """
-    count, dv = nodes.shape[0], frame.v0 + r
-    out = cells[NODES : NODES + 6, r * columns : (r + 1) * columns]
-    for p in range(6):
-        for j in range(columns):
-            out[p, j] = 0.0
-    if abs(dv) - 0.5 > _NEGLIGIBLE * frame.sv:
+
+@compiled
+def _exact_light(window: Window, frame: PolynomialFrame, spot: Array, cells: Array) -> None:
+    """The light of a spot and its derivatives, the means of each pixel, into cells[NODES:]."""
+    S, more = frame.S, variance_of_wings(spot)
+    if more <= 0.0:
+        _pixel_moments(window, frame, S, spot[FLUX], cells, NODES)
         return
-    reach = _NEGLIGIBLE * frame.su + 0.5
-    first, last = max(int(-reach - frame.u0), 0), min(int(reach - frame.u0) + 1, columns)
-    n = max(last - first, 0)
-    # First the sums over the nodes in v, of the light times 1, y and y^2, at all nodes in u of these pixels.
-    u, light = cells[ROW, : count * n], cells[LINE, : count * n]
-    light_y, light_yy = cells[LINE + 1, : count * n], cells[LINE + 2, : count * n]
-    for m in range(count):
-        for j in range(n):
-            u[m * n + j] = frame.u0 + nodes[m] + (first + j)
-    for i in range(light.shape[0]):
-        light[i] = light_y[i] = light_yy[i] = 0.0
-    for k in range(count):
-        v, y, share = dv + nodes[k], (dv + nodes[k]) / frame.sv, scale * weights[k]
-        for i in range(light.shape[0]):
-            g = share * exponential(
-                -0.5 * (inverse[0] * u[i] * u[i] + 2.0 * inverse[1] * u[i] * v + inverse[2] * v * v)
-            )
-            light[i] += g
-            light_y[i] += g * y
-            light_yy[i] += g * y * y
-    narrow, out = 1.0 / frame.su, out[:, first:]
-    for m in range(count):
-        for j in range(n):
-            i = m * n + j
-            x, one, with_y = u[i] * narrow, weights[m] * light[i], weights[m] * light_y[i]
-            out[0, j] += one
-            out[1, j] += one * x
-            out[2, j] += with_y
-            out[3, j] += one * x * x
-            out[4, j] += with_y * x
-            out[5, j] += weights[m] * light_yy[i]
+    near, far = spot[NEAR_WING], spot[FAR_WING]
+    out, count = cells[NODES : NODES + 6], window.rows * window.columns
+    for p in range(6):
+        for k in range(count):
+            out[p, k] = 0.0
+    for share, added in ((1.0 - near - far, 0.0), (near, spot[NEAR_VARIANCE]), (far, FAR_PX2)):
+        part = (S[0] - more + added, S[1], S[2] - more + added)
+        _pixel_moments(window, frame, part, share * spot[FLUX], cells, PART)
+        M = _derivatives(frame, part)
+        for p in range(6):
+            for q in range(6):
+                if M[p, q] != 0.0:
+                    for k in range(count):
+                        out[p, k] += M[p, q] * cells[PART + q, k]
+
+
+@compiled
+def _pixel_moments(
+    window: Window, frame: PolynomialFrame, S: tuple[float, float, float], flux: float, cells: Array, first: int
+) -> None:
+    """Pixel means of a Gaussian of covariance S, px^2, times 1, x, y, x^2, x y, y^2 into cells[first:]."""
+    scale = flux / (2 * np.pi * sqrt(S[0] * S[2] - S[1] ** 2))
+    for r in range(window.rows):
+        out = cells[first : first + 6, r * window.columns : (r + 1) * window.columns]
+        ellipse.pixel_moments(S, frame.u0, frame.v0 + r, frame.su, frame.sv, scale, cells[ROW : LINE + 3], out)
+
+
+@compiled
+def _derivatives(frame: PolynomialFrame, part: tuple[float, float, float]) -> Array:
+    """(6, 6): the columns of the fit as sums of the moments of a Gaussian that is a part of the light.
+
+    The parameters keep their meaning: x and y are the step S (x / su, y / sv) of the centre, and the second degree
+    Q is the change 2 S Q S of the shape with a flux that is larger by tr(Q S). For a single Gaussian this is 1.
+    """
+    S, su, sv = frame.S, frame.su, frame.sv
+    P = ellipse.inverse(part[0], part[1], part[2])
+    out = np.zeros((6, 6))
+    out[0, 0] = 1.0
+    for p, a, b in ((1, S[0] / su, S[1] / su), (2, S[1] / sv, S[2] / sv)):
+        out[p, 1], out[p, 2] = (P[0] * a + P[1] * b) * su, (P[1] * a + P[2] * b) * sv
+    Q = ((3, 1.0 / su**2, 0.0, 0.0), (4, 0.0, 0.5 / (su * sv), 0.0), (5, 0.0, 0.0, 1.0 / sv**2))
+    for p, a, b, c in Q:
+        T = ellipse.between((S[0], S[1], S[2]), (a, b, c))
+        B = ellipse.between(P, T)
+        out[p, 0] = a * S[0] + 2 * b * S[1] + c * S[2] - (P[0] * T[0] + 2 * P[1] * T[1] + P[2] * T[2])
+        out[p, 3], out[p, 4], out[p, 5] = B[0] * su**2, 2 * B[1] * su * sv, B[2] * sv**2
+    return out
 
 
 @compiled

@@ -12,8 +12,25 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled
+from tracking.detection import ellipse
 from tracking.detection.candidates import AT_U, AT_V
 from tracking.detection.search import RADIUS
+from tracking.detection.table import (
+    ACCEPTED,
+    ACTIVE,
+    CHI2,
+    COV_UV,
+    FLUX,
+    MISFIT,
+    PEAK,
+    UU,
+    UV,
+    VAR_U,
+    VAR_V,
+    VV,
+    U,
+    V,
+)  # fmt: skip
 from tracking.noise import BLOCK
 
 MARGIN = 16  # px: largest distance of a peak from its spot's centre
@@ -93,3 +110,37 @@ def _is_searched(searched: NDArray[np.uint8], box: Ints) -> bool:
 
 
 INITIAL_REACH = float(RADIUS)  # px: reach of a peak before its size is known
+
+
+@compiled
+def brightest(table: Array) -> int:
+    """The row with the largest flux among the ACTIVE ones; -1 if there is none."""
+    best = -1
+    for k in range(table.shape[0]):
+        if table[k, ACTIVE] and (best < 0 or table[k, FLUX] > table[best, FLUX]):
+            best = k
+    return best
+
+
+@compiled
+def write_detections(table: Array, regions: Array, out: Array) -> int:
+    """Write the spots that lie in a region (n, 3) into `out`, largest flux first; returns their number.
+
+    Columns of out (most, 12): u, v; cov uu, uv, vv; flux, peak, major, minor, angle; share of the covariance by misfit;
+    chi-square.
+    """
+    for k in range(table.shape[0]):
+        found = table[k, ACCEPTED] and in_a_region(regions, table[k, U], table[k, V], 0.0)
+        table[k, ACTIVE] = 1.0 if found else 0.0
+    count = 0
+    i = brightest(table)
+    while i >= 0:
+        spot, row = table[i], out[count]
+        spot[ACTIVE] = 0.0
+        row[0], row[1], row[2], row[3] = spot[U], spot[V], spot[VAR_U], spot[COV_UV]
+        row[4], row[5], row[6] = spot[VAR_V], spot[FLUX], spot[PEAK]
+        row[7], row[8], row[9] = ellipse.axes(spot[UU], spot[UV], spot[VV])
+        row[10], row[11] = spot[MISFIT], spot[CHI2]
+        count += 1
+        i = brightest(table)
+    return count

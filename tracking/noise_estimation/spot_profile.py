@@ -1,0 +1,156 @@
+"""The shape that narrow spots share in one camera, estimated from its pictures.
+
+A lens gives a point of light a sharp core with wings. In a spot of about one pixel a Gaussian that is fitted to both is
+too wide, and its centre is pulled towards the centre of the brightest pixel, by up to a tenth of a pixel. So the spots
+are fitted with a sum of Gaussians of one centre (detection/normal_equations.py) whose shares are those of the camera.
+Each spot keeps its own covariance, since the sharpness of a lens varies over the picture.
+
+Pixels alone do not determine the shape within a pixel: with any function of the place within the pixel added to all
+centres, another shape fits as well. This is also true of an effective point spread function on a grid (Anderson & King
+2000, PASP 112:1360), which needs pictures shifted by known amounts. Here two things decide: the sum of Gaussians is
+smooth, and among the shapes that fit equally well the one is taken that distributes the centres evenly over the pixel.
+It is used if spots that had no part in the choice fit better with it. What it leaves is a share of each pixel's light,
+which counts as noise. Source: ours; measured by bench/star_fields.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geometry.arrays import Array
+from tracking.detection.detect import find_spots
+from tracking.detection.measuring import NARROW_PX
+from tracking.detections import Detections
+from tracking.noise import NoiseModel, Picture, SpotProfile
+from tracking.parameters import DetectParameters
+
+_MOST = 100  # spots of each picture: the brightest
+_CLEAR = 0.1  # sigma of the centre over the width of the spot: of a fainter one the pixels do not show the shape, and
+# it is found more easily in the middle of a pixel
+_FEWEST = 24  # narrow and clear spots ...
+_PLACES, _PLACE_PX = 16, 0.2  # ... at so many places: of a spot at rest all pictures show the same
+_FIRST = SpotProfile(0.5, 0.65, 0.05, 0.1)
+_FAR, _NEAR, _NEAR_PX = (0.0, 0.1, 0.15), (0.3, 0.5, 0.7), (0.5, 0.65, 0.8)
+_SIGMAS = 3.0  # of the number of spots that fit better
+_UNEVEN = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25)
+_BRIGHT = 1 / 8  # share of the spots, whose fits show what is left ...
+_CUT = 0.5  # ... and their largest misfits: two stars, or a hot pixel
+
+
+def spot_profile(
+    pictures: Sequence[Picture], found: Sequence[Detections], noise: NoiseModel, saturation_dn: float | None
+) -> SpotProfile:
+    """The profile of narrow spots in pictures (h, w); without wings if these do not fit better.
+
+    found: the brightest spots of each picture. noise: without a profile.
+    """
+    if sum(map(len, map(_narrow_and_clear, found))) < _FEWEST:
+        return SpotProfile()
+    spots = _NarrowSpots.of(pictures, noise, saturation_dn)
+    if spots.places < _PLACES:
+        return SpotProfile()
+    tried = {_FIRST: spots.fits(_FIRST)}
+
+    def best(rows: slice = slice(None)) -> SpotProfile:
+        return min(tried, key=lambda p: float(tried[p].misfits[rows].sum()))
+
+    def compare(profiles: Sequence[SpotProfile]) -> None:
+        tried.update({p: spots.fits(p) for p in profiles if p not in tried})
+
+    gaussian = spots.fits(SpotProfile()).misfits
+    if _better(gaussian, tried[_FIRST].misfits) < _SIGMAS:
+        return SpotProfile()
+    compare([replace(_FIRST, far=far) for far in _FAR])
+    compare([SpotProfile(near, px, best().far, _FIRST.uneven) for near in _NEAR for px in _NEAR_PX])
+    even, odd = slice(0, None, 2), slice(1, None, 2)
+    held_out = [spots.fits(replace(best(half), uneven=0.0)).misfits[other] for half, other in ((even, odd), (odd, even))]
+    if _better(np.concatenate([gaussian[odd], gaussian[even]]), np.concatenate(held_out)) < _SIGMAS:
+        return SpotProfile()
+    fittest = tried[best()].misfits
+
+    def improbability(profile: SpotProfile) -> float:
+        """In units of log-likelihood; sums of misfits have their observed scatter, because they are not noise."""
+        worse = tried[profile].misfits - fittest
+        return 0.5 * float(worse.sum() ** 2 / np.sum(worse**2 + 1e-12)) + spots.places * tried[profile].concentration
+
+    return spots.with_uneven(min(tried, key=improbability))
+
+
+def _better(before: Array, after: Array) -> float:
+    """By how many sigmas more than half of the misfits (n,) have become smaller."""
+    return float(np.sum(np.sign(before - after)) / np.sqrt(len(before)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Fits:
+    """Fits of n spots with one profile."""
+
+    misfits: Array  # (n,) logarithms of chi-square per degree of freedom
+    concentration: float  # sum over u and v of squared mean cosines of the phase in a pixel: 0 if it is even
+
+
+@dataclass(frozen=True, slots=True)
+class _NarrowSpots:
+    """The narrow and clear spots of some pictures, fitted with Gaussians."""
+
+    pictures: tuple[Picture, ...]
+    spots: tuple[Detections, ...]
+    noise: NoiseModel
+    parameters: DetectParameters
+    places: int  # different ones
+
+    @staticmethod
+    def of(pictures: Sequence[Picture], noise: NoiseModel, saturation_dn: float | None) -> _NarrowSpots:
+        parameters = DetectParameters(max_detections=_MOST, saturation_dn=saturation_dn)
+        spots = tuple(_narrow_and_clear(find_spots(p, parameters, noise)) for p in pictures)
+        places = np.unique(np.rint(np.concatenate([d.uv_px for d in spots]) / _PLACE_PX), axis=0)
+        return _NarrowSpots(tuple(pictures), spots, noise, parameters, len(places))
+
+    @property
+    def count(self) -> int:
+        """n."""
+        return sum(map(len, self.spots))
+
+    def fits(self, profile: SpotProfile) -> _Fits:
+        """A spot that is not found again keeps its Gaussian."""
+        misfits, centres, model = [], [], replace(self.noise, profile=profile)
+        for picture, spots in zip(self.pictures, self.spots, strict=True):
+            boxes = np.column_stack([spots.uv_px, np.full(len(spots), NARROW_PX)])
+            again = find_spots(picture, self.parameters, model, boxes)
+            away = np.linalg.norm(spots.uv_px[:, None] - again.uv_px, axis=-1)
+            there = away.min(axis=1, initial=np.inf) < NARROW_PX
+            nearest = away[there].argmin(axis=1) if len(again) else np.zeros(0, int)
+            misfit, centre = _log_chi2(spots), spots.uv_px.copy()
+            misfit[there], centre[there] = _log_chi2(again)[nearest], again.uv_px[nearest]
+            misfits.append(misfit)
+            centres.append(centre)
+        cosines = np.cos(2 * np.pi * np.concatenate(centres)).mean(axis=0)
+        return _Fits(np.concatenate(misfits), float(cosines @ cosines))
+
+    def with_uneven(self, profile: SpotProfile) -> SpotProfile:
+        """The profile with what it leaves of the light: with that, chi-square of the brightest spots is 1."""
+        bright = np.argsort(-np.concatenate([d.flux for d in self.spots]))[: int(np.ceil(_BRIGHT * self.count))]
+        before, last = 0.0, 0.0
+        for uneven in _UNEVEN:
+            misfit = float(np.clip(self.fits(replace(profile, uneven=uneven)).misfits[bright], -_CUT, _CUT).mean())
+            if misfit <= 0.0:
+                uneven -= (uneven - last) * misfit / min(misfit - before, -1e-12)
+                break
+            before, last = misfit, uneven
+        return replace(profile, uneven=uneven)
+
+
+def _narrow_and_clear(found: Detections) -> Detections:
+    """Those whose shape the pixels show."""
+    width = np.sqrt(found.major_px * found.minor_px)
+    sigma = np.sqrt(0.5 * np.trace(found.cov_px2, axis1=1, axis2=2))
+    return found[(width < NARROW_PX) & (sigma < _CLEAR * width)]
+
+
+def _log_chi2(found: Detections) -> Array:
+    """(n,) logarithms of chi-square per degree of freedom."""
+    assert found.chi2 is not None  # of all detections in pictures
+    return np.log(np.maximum(found.chi2, 1e-300))
