@@ -32,8 +32,8 @@ _CLEAR = 0.1  # sigma of the centre over the width of the spot: of a fainter one
 # it is found more easily in the middle of a pixel
 _FEWEST = 24  # narrow and clear spots ...
 _PLACES, _PLACE_PX = 16, 0.2  # ... at so many places: of a spot at rest all pictures show the same
-_FIRST = SpotProfile(0.5, 0.65, 0.05, 0.1)
-_FAR, _NEAR, _NEAR_PX = (0.0, 0.1, 0.15), (0.3, 0.5, 0.7), (0.5, 0.65, 0.8)
+_FIRST = SpotProfile(0.5, 0.6, 0.05, 0.1)
+_FAR, _NEAR, _NEAR_PX = (0.0, 0.1, 0.15), (0.2, 0.4, 0.6, 0.8), (0.5, 0.6, 0.7, 0.85)
 _SIGMAS = 3.0  # of the number of spots that fit better
 _UNEVEN = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25)
 _BRIGHT = 1 / 8  # share of the spots, whose fits show what is left ...
@@ -66,17 +66,20 @@ def spot_profile(
     compare([replace(_FIRST, far=far) for far in _FAR])
     compare([SpotProfile(near, px, best().far, _FIRST.uneven) for near in _NEAR for px in _NEAR_PX])
     even, odd = slice(0, None, 2), slice(1, None, 2)
-    held_out = [spots.fits(replace(best(half), uneven=0.0)).misfits[other] for half, other in ((even, odd), (odd, even))]
+    held_out = [
+        spots.fits(replace(best(half), uneven=0.0)).misfits[other] for half, other in ((even, odd), (odd, even))
+    ]
     if _better(np.concatenate([gaussian[odd], gaussian[even]]), np.concatenate(held_out)) < _SIGMAS:
         return SpotProfile()
     fittest = tried[best()].misfits
-
-    def improbability(profile: SpotProfile) -> float:
-        """In units of log-likelihood; sums of misfits have their observed scatter, because they are not noise."""
-        worse = tried[profile].misfits - fittest
-        return 0.5 * float(worse.sum() ** 2 / np.sum(worse**2 + 1e-12)) + spots.places * tried[profile].concentration
-
-    return spots.with_uneven(min(tried, key=improbability))
+    weights = []
+    for fits in tried.values():
+        worse = fits.misfits - fittest
+        # In units of log-likelihood. Sums of misfits have their observed scatter, because they are not only noise.
+        improbable = 0.5 * worse.sum() ** 2 / np.sum(worse**2 + 1e-12) + spots.places * fits.concentration
+        weights.append(np.exp(-improbable))
+    shapes = [[p.near, p.near_px, p.far] for p in tried]
+    return spots.with_uneven(SpotProfile(*map(float, np.average(shapes, axis=0, weights=weights))))
 
 
 def _better(before: Array, after: Array) -> float:
