@@ -134,15 +134,13 @@ def gaussian_window(a: Entries, u0: float, v0: float, step: float, columns: int,
 def pixel_moments(
     S: Entries, u0: float, dv: float, su: float, sv: float, scale: float, work: Array, out: Array
 ) -> None:
-    """Means, over each pixel of a row (n,), of a Gaussian of covariance S, px^2, times 1, x, y, x^2, x y, y^2: out (6, n).
+    """Means over each pixel of a row (n,) of a Gaussian of covariance S, px^2, times 1, x, y, x^2, x y, y^2: out (6, n).
 
-    u0, dv: px, the first pixel relative to the centre; x and y are such distances over su and sv. scale: of the Gaussian
-    at its centre. Beyond _NEGLIGIBLE sigmas from the centre they are below the rounding of the sums, and 0. work (4, at
-    least 8 n).
+    u0, dv: px, the first pixel relative to the centre; x and y are such distances over su and sv. scale: its value at
+    the centre. Beyond _NEGLIGIBLE sigmas the means are below the rounding of the sums, and 0. work: (4, 8 n) or larger.
     """
-    nodes, weights = (
-        (_NODES4, _WEIGHTS4) if eigenvalues(S[0], S[1], S[2])[0] > _FOUR_NODES_PX2 else (_NODES8, _WEIGHTS8)
-    )
+    wide = eigenvalues(S[0], S[1], S[2])[0] > _FOUR_NODES_PX2
+    nodes, weights = (_NODES4, _WEIGHTS4) if wide else (_NODES8, _WEIGHTS8)
     a = inverse(S[0], S[1], S[2])
     count, columns = nodes.shape[0], out.shape[1]
     for p in range(6):

@@ -16,7 +16,7 @@ from tracking.detection.gaussian_fit import fit_all, least_variance
 from tracking.detection.moments import find_moments, start_variance
 from tracking.detection.pixels import Noise, Pixels, texture_variance, with_texture
 from tracking.detection.quality import light_beside
-from tracking.detection.regions import brightest
+from tracking.detection.regions import NARROWER, drop_duplicates
 from tracking.detection.saturated_spots import CENTRE_SHARE, compact_height
 from tracking.detection.table import (
     ACCEPTED,
@@ -67,7 +67,6 @@ _SPOT_FLUX = (
 )
 _ABOVE_GRAINS, _CLEAR_GAIN = 1.5, 2.0  # relative to what is needed of any spot
 _LEAST_GAIN = 0.7  # decrease of chi-square relative to threshold^2 below which the fit stops early
-NARROWER = 0.5  # a spot narrower than this share of another spot is not a duplicate of it
 _PART_APART = 2.0  # sigmas: fits that are nearer to each other are parts of one light
 _MERGES = 3  # fits of a picture at most, with parts joined in between
 _LEAST_START = 2.0  # px^2: least variance of that start
@@ -81,7 +80,6 @@ _WITHIN_PIXEL = 0.03  # px: error of the centre if the held width is a tenth of 
 _NOTHING = 1e12  # px^2: variance of the start of a candidate that has been joined to another one; the fit leaves it out
 NARROW_PX = 1.0  # sigma: in wider spots the centre of a Gaussian does not depend on the place within a pixel
 _FARTHEST = 0.5  # px: from the Gaussian's centre to that of the fit with wings
-_SAME_SPOT = 1.5  # sigmas of a brighter spot: a second spot nearer to its centre is a duplicate
 
 
 class DetectionLimits(NamedTuple):
@@ -133,7 +131,7 @@ def measure(
         here = with_texture(noise, spot[TEXTURE])
         accepted = _is_spot(image, spot, here, limits) or _is_compact(image, spot, here, limits, cells[SCRATCH])
         spot[ACCEPTED] = 1.0 if accepted else 0.0
-    _drop_duplicates(table)
+    drop_duplicates(table)
     if limits.near_wing + limits.far_wing > 0.0:
         _fit_wings(image, table, noise, limits, cells, algebra)
 
@@ -335,28 +333,3 @@ def _is_compact(image: Pixels, spot: Array, noise: Noise, limits: DetectionLimit
     spot[VAR_U], spot[COV_UV], spot[VAR_V] = share * uu + 0.01, share * uv, share * vv + 0.01
     spot[PEAK], spot[SIGMA_FLUX], spot[MISFIT] = height, np.nan, 1.0
     return True
-
-
-@compiled
-def _drop_duplicates(table: Array) -> None:
-    """Drop spots near the centre of a brighter spot of about the same width: one light detected twice.
-
-    A much narrower spot is kept: a laser spot on a wide diffuse reflection has less flux, but is not part of it.
-    """
-    for k in range(table.shape[0]):
-        table[k, ACTIVE] = table[k, ACCEPTED]
-    i = brightest(table)
-    while i >= 0:
-        spot = table[i]
-        spot[ACTIVE] = 0.0
-        uu, uv, vv = spot[UU] + 1 / 12, spot[UV], spot[VV] + 1 / 12
-        area = uu * vv - uv * uv  # sigma^4, px^4
-        for k in range(table.shape[0]):
-            other = table[k]
-            if other[ACTIVE]:
-                du, dv = other[U] - spot[U], other[V] - spot[V]
-                inside = vv * du * du - 2 * uv * du * dv + uu * dv * dv < _SAME_SPOT**2 * area
-                own = (other[UU] + 1 / 12) * (other[VV] + 1 / 12) - other[UV] ** 2
-                if inside and own > NARROWER**4 * area:
-                    other[ACCEPTED] = other[ACTIVE] = 0.0
-        i = brightest(table)

@@ -266,10 +266,8 @@ def _exact_light(window: Window, frame: PolynomialFrame, spot: Array, cells: Arr
         _pixel_moments(window, frame, S, spot[FLUX], cells, NODES)
         return
     near, far = spot[NEAR_WING], spot[FAR_WING]
-    out, count = cells[NODES : NODES + 6], window.rows * window.columns
-    for p in range(6):
-        for k in range(count):
-            out[p, k] = 0.0
+    out = cells[NODES : NODES + 6, : window.rows * window.columns]
+    out[:] = 0.0
     for share, added in ((1.0 - near - far, 0.0), (near, spot[NEAR_VARIANCE]), (far, FAR_PX2)):
         part = (S[0] - more + added, S[1], S[2] - more + added)
         _pixel_moments(window, frame, part, share * spot[FLUX], cells, PART)
@@ -277,7 +275,7 @@ def _exact_light(window: Window, frame: PolynomialFrame, spot: Array, cells: Arr
         for p in range(6):
             for q in range(6):
                 if M[p, q] != 0.0:
-                    for k in range(count):
+                    for k in range(out.shape[1]):
                         out[p, k] += M[p, q] * cells[PART + q, k]
 
 

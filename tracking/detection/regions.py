@@ -1,4 +1,4 @@
-"""Search in parts of a picture, with the same results as from the whole picture.
+"""Search in parts of a picture, with the same results as from the whole picture; and the spots that are returned.
 
 The measurement of a spot depends on its neighbours: separate peaks are decided with the brighter peaks within
 search.RADIUS, and the light of other spots within gaussian_fit.reach_of is subtracted. The search is therefore
@@ -33,6 +33,8 @@ from tracking.detection.table import (
 )  # fmt: skip
 from tracking.noise import BLOCK
 
+NARROWER = 0.5  # a spot narrower than this share of another spot is not a duplicate of it
+_SAME_SPOT = 1.5  # sigmas of a brighter spot: a second spot nearer to its centre is a duplicate
 MARGIN = 16  # px: largest distance of a peak from its spot's centre
 
 
@@ -120,6 +122,31 @@ def brightest(table: Array) -> int:
         if table[k, ACTIVE] and (best < 0 or table[k, FLUX] > table[best, FLUX]):
             best = k
     return best
+
+
+@compiled
+def drop_duplicates(table: Array) -> None:
+    """Drop spots near the centre of a brighter spot of about the same width: one light detected twice.
+
+    A much narrower spot is kept: a laser spot on a wide diffuse reflection has less flux, but is not part of it.
+    """
+    for k in range(table.shape[0]):
+        table[k, ACTIVE] = table[k, ACCEPTED]
+    i = brightest(table)
+    while i >= 0:
+        spot = table[i]
+        spot[ACTIVE] = 0.0
+        uu, uv, vv = spot[UU] + 1 / 12, spot[UV], spot[VV] + 1 / 12
+        area = uu * vv - uv * uv  # sigma^4, px^4
+        for k in range(table.shape[0]):
+            other = table[k]
+            if other[ACTIVE]:
+                du, dv = other[U] - spot[U], other[V] - spot[V]
+                inside = vv * du * du - 2 * uv * du * dv + uu * dv * dv < _SAME_SPOT**2 * area
+                own = (other[UU] + 1 / 12) * (other[VV] + 1 / 12) - other[UV] ** 2
+                if inside and own > NARROWER**4 * area:
+                    other[ACCEPTED] = other[ACTIVE] = 0.0
+        i = brightest(table)
 
 
 @compiled

@@ -15,7 +15,7 @@ VAR_U, COV_UV, VAR_V, SIGMA_FLUX, PEAK, CHI2, EXPLAINED, GAIN = range(9, 17)
 # Moments; then the background from the search, DN; 1 if only a mean of 8x8 pixels detects the candidate; size of the
 # largest cells used, px; 1 if it is to be fitted (again); 1 if it is a spot; variance of the first window, px^2; 1 if
 # its shape is held in the fit; share of the signal beyond noise and the structure beside the spot that is explained;
-# contrast of the texture there; share of the centre's variance due to misfits of the Gaussian; share of its light in the
+# contrast of the texture there; share of the centre's variance due to misfits of the shape; share of the light in the
 # near wing, variance that this adds to the core, px^2, share in the far wing, and relative variance of the light in
 # each pixel beyond these (tracking.noise.SpotProfile).
 MOMENT_U, MOMENT_V, MOMENT_UU, MOMENT_UV, MOMENT_VV, BACKGROUND, WIDE, CELL_SIZE = range(17, 25)
