@@ -33,6 +33,8 @@ class SpotProfile:
     near_px: float = 0.0  # by which its sigma is larger than the core's, in quadrature
     far: float = 0.0  # share of the light in a far wing
     uneven: float = 0.0  # of each pixel's light: 1-sigma deviations from this shape
+    shape_px2: tuple[float, float, float] = (0.0, 0.0, 0.0)  # uu, uv, vv: usual covariance of a spot with its wings
+    shape_sigma_px2: float = 0.0  # of a spot's covariance about the usual one; 0: that is not known
 
 
 @dataclass(frozen=True, slots=True)

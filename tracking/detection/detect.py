@@ -191,17 +191,14 @@ class _Task(NamedTuple):
     def of(image: Picture, parameters: DetectParameters, noise: NoiseModel | None) -> _Task:
         model = (noise or guess_noise(image)).of_means
         image = image if image.flags.c_contiguous else image.copy()
-        saturation = parameters.saturation_dn
+        saturation, p = parameters.saturation_dn, model.profile
         limits = DetectionLimits(
             float(parameters.threshold_sigma),
             float(np.iinfo(image.dtype).max if saturation is None else saturation),
             float(parameters.min_sigma_px),
             float(parameters.max_sigma_px),
             float(parameters.min_explained),
-            float(model.profile.near),
-            float(model.profile.near_px) ** 2,
-            float(model.profile.far),
-            float(model.profile.uneven) ** 2,
+            np.array([p.near, p.near_px**2, p.far, p.uneven**2, *p.shape_px2, p.shape_sigma_px2**2], dtype=float),
         )
         pixels = Pixels(image.view(np.uint8), image.itemsize, image.shape[1], image.shape[0])
         others = float(model.texture), float(model.banding_dn), float(model.compression_dn2)

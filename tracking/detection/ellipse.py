@@ -14,14 +14,6 @@ Entries = tuple[float, float, float]
 _LOG2_E, _LOG_2, _LOG_2_REST = 1.4426950408889634, 0.693147180369123816, 1.90821492927058770e-10  # log(2) in two parts
 _SHIFT = 1.5 * 2.0**52  # a number added to it is rounded to an integer, in the lowest bits
 _EXPONENT_OF_1 = 1023  # in the bits of a floating-point number
-_FOUR_NODES_PX2 = 0.5**2  # px^2: narrower spots need eight instead of four nodes in each direction
-_NEGLIGIBLE = 8.5  # sigmas from the centre at which the light is 2e-16 of its peak
-
-# Gauss-Legendre nodes and weights on [-1/2, 1/2] for 4 and 8 points: accurate to 1e-4 of the peak for sigmas of at
-# least 0.5 and 0.2 px.
-_FOUR = np.polynomial.legendre.leggauss(4)
-_EIGHT = np.polynomial.legendre.leggauss(8)
-_NODES4, _WEIGHTS4, _NODES8, _WEIGHTS8 = _FOUR[0] / 2, _FOUR[1] / 2, _EIGHT[0] / 2, _EIGHT[1] / 2
 
 
 @compiled
@@ -128,52 +120,3 @@ def gaussian_window(a: Entries, u0: float, v0: float, step: float, columns: int,
             line[j] = -0.5 * (a[0] * u * u + 2.0 * a[1] * u * v + a[2] * v * v)
     for k in range(out.shape[0]):
         out[k] = exponential(out[k])
-
-
-@compiled
-def pixel_moments(
-    S: Entries, u0: float, dv: float, su: float, sv: float, scale: float, work: Array, out: Array
-) -> None:
-    """Means over each pixel of a row (n,) of a Gaussian of covariance S, px^2, times 1, x, y, x^2, x y, y^2: out (6, n).
-
-    u0, dv: px, the first pixel relative to the centre; x and y are such distances over su and sv. scale: its value at
-    the centre. Beyond _NEGLIGIBLE sigmas the means are below the rounding of the sums, and 0. work: (4, 8 n) or larger.
-    """
-    wide = eigenvalues(S[0], S[1], S[2])[0] > _FOUR_NODES_PX2
-    nodes, weights = (_NODES4, _WEIGHTS4) if wide else (_NODES8, _WEIGHTS8)
-    a = inverse(S[0], S[1], S[2])
-    count, columns = nodes.shape[0], out.shape[1]
-    for p in range(6):
-        for j in range(columns):
-            out[p, j] = 0.0
-    if abs(dv) - 0.5 > _NEGLIGIBLE * sqrt(S[2]):
-        return
-    reach = _NEGLIGIBLE * sqrt(S[0]) + 0.5
-    first, last = max(int(-reach - u0), 0), min(int(reach - u0) + 1, columns)
-    n = max(last - first, 0)
-    # First the sums over the nodes in v, of the light times 1, y and y^2, at all nodes in u of these pixels.
-    u, light = work[0, : count * n], work[1, : count * n]
-    light_y, light_yy = work[2, : count * n], work[3, : count * n]
-    for m in range(count):
-        for j in range(n):
-            u[m * n + j] = u0 + nodes[m] + (first + j)
-    for i in range(light.shape[0]):
-        light[i] = light_y[i] = light_yy[i] = 0.0
-    for k in range(count):
-        v, y, share = dv + nodes[k], (dv + nodes[k]) / sv, scale * weights[k]
-        for i in range(light.shape[0]):
-            g = share * exponential(-0.5 * (a[0] * u[i] * u[i] + 2.0 * a[1] * u[i] * v + a[2] * v * v))
-            light[i] += g
-            light_y[i] += g * y
-            light_yy[i] += g * y * y
-    narrow, out = 1.0 / su, out[:, first:]
-    for m in range(count):
-        for j in range(n):
-            i = m * n + j
-            x, one, with_y = u[i] * narrow, weights[m] * light[i], weights[m] * light_y[i]
-            out[0, j] += one
-            out[1, j] += one * x
-            out[2, j] += with_y
-            out[3, j] += one * x * x
-            out[4, j] += with_y * x
-            out[5, j] += weights[m] * light_yy[i]

@@ -10,7 +10,8 @@ from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
 from tracking.detection.ellipse import gaussian_window
-from tracking.detection.normal_equations import PolynomialFrame, accumulate, frame_of, solve_normal, variance_of_wings
+from tracking.detection.narrow_light import PolynomialFrame, frame_of, variance_of_wings
+from tracking.detection.normal_equations import accumulate, solve_normal
 from tracking.detection.pixels import VALID, Noise, Pixels, Window, insert_nearest, read_window, window_around
 from tracking.detection.quality import assess_fit, exclude_isolated_cells, gain_over_plane
 from tracking.detection.table import (

@@ -13,11 +13,10 @@ from tracking.detection import ellipse
 from tracking.detection.candidates import AT_U, AT_V, CONTRAST, HEIGHT, LEVEL, SCALE
 from tracking.detection.candidates import WIDE as WIDE_PEAK
 from tracking.detection.gaussian_fit import fit_all, least_variance
-from tracking.detection.moments import find_moments, start_variance
+from tracking.detection.moments import CENTRE_SHARE, compact_height, find_moments, start_variance
 from tracking.detection.pixels import Noise, Pixels, texture_variance, with_texture
 from tracking.detection.quality import light_beside
 from tracking.detection.regions import NARROWER, drop_duplicates
-from tracking.detection.saturated_spots import CENTRE_SHARE, compact_height
 from tracking.detection.table import (
     ACCEPTED,
     ACTIVE,
@@ -38,7 +37,6 @@ from tracking.detection.table import (
     MOMENT_UV,
     MOMENT_V,
     MOMENT_VV,
-    NEAR_VARIANCE,
     NEAR_WING,
     PEAK,
     SCRATCH,
@@ -90,10 +88,7 @@ class DetectionLimits(NamedTuple):
     min_sigma: float  # px
     max_sigma: float  # px
     min_explained: float
-    near_wing: float  # of narrow spots, see tracking.noise.SpotProfile
-    near_variance: float  # px^2
-    far_wing: float
-    uneven: float  # variance
+    profile: Array  # (n,) of narrow spots: columns NEAR_WING to USUAL_VARIANCE of the table
 
 
 @compiled_for_threads
@@ -113,7 +108,8 @@ def measure(
         spot[MOMENT_U], spot[MOMENT_V], spot[BACKGROUND] = peak[AT_U], peak[AT_V], peak[LEVEL]
         spot[WIDE], spot[START], spot[HELD] = peak[WIDE_PEAK], start_variance(peak[SCALE]), 0.0
         spot[TEXTURE], spot[MISFIT] = peak[CONTRAST], 0.0
-        spot[NEAR_WING] = spot[NEAR_VARIANCE] = spot[FAR_WING] = spot[UNEVEN] = 0.0
+        for p in range(limits.profile.shape[0]):
+            spot[NEAR_WING + p] = 0.0
     find_moments(image, table, cells)
     least = _LEAST_GAIN * limits.threshold_sigma**2
     for _ in range(_MERGES):
@@ -132,7 +128,7 @@ def measure(
         accepted = _is_spot(image, spot, here, limits) or _is_compact(image, spot, here, limits, cells[SCRATCH])
         spot[ACCEPTED] = 1.0 if accepted else 0.0
     drop_duplicates(table)
-    if limits.near_wing + limits.far_wing > 0.0:
+    if limits.profile[0] > 0.0 or limits.profile[FAR_WING - NEAR_WING] > 0.0:
         _fit_wings(image, table, noise, limits, cells, algebra)
 
 
@@ -148,8 +144,8 @@ def _fit_wings(
         det = spot[UU] * spot[VV] - spot[UV] ** 2
         if not spot[ACCEPTED] or np.isnan(spot[SIGMA_FLUX]) or spot[CELL_SIZE] > 1.0 or det > NARROW_PX**4:
             continue
-        spot[NEAR_WING], spot[NEAR_VARIANCE] = limits.near_wing, limits.near_variance
-        spot[FAR_WING], spot[UNEVEN] = limits.far_wing, limits.uneven
+        for p in range(limits.profile.shape[0]):
+            spot[NEAR_WING + p] = limits.profile[p]
         spot[MOMENT_U], spot[MOMENT_V], spot[HELD], spot[ACTIVE] = spot[U], spot[V], 0.0, 1.0
         spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV] = ellipse.clip_eigenvalues(
             spot[UU], spot[UV], spot[VV], 2.0 * least_variance(spot), np.inf

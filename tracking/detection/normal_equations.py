@@ -8,7 +8,6 @@ light and weight times squared light, up to the fourth degree. Source: ours.
 from __future__ import annotations
 
 from math import sqrt
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,41 +15,29 @@ from geometry.arrays import Array
 from geometry.compilation.jit import compiled, compiled_for_sums
 from tracking.detection import ellipse
 from tracking.detection.ellipse import gaussian_window
+from tracking.detection.narrow_light import PolynomialFrame, add_usual_shape, exact_light, frame_of
 from tracking.detection.pixels import Noise, Window, total_of_products
 from tracking.detection.table import (
     AT_X,
     AT_Y,
-    FAR_WING,
     FLUX,
     LEVEL,
     LIGHT,
-    LINE,
-    NEAR_VARIANCE,
-    NEAR_WING,
     NEIGHBOUR_LIGHT,
     NODES,
     NORMAL,
-    PART,
     RESIDUAL,
     RIGHT_SIDE,
-    ROW,
     SCRATCH,
     SLOPE_U,
     SLOPE_V,
     UNEVEN,
     USE,
-    UU,
-    UV,
     VALUES,
     VECTORS,
-    VV,
     WEIGHT,
-    U,
-    V,
 )
 
-FAR_PX2 = 2.0**2  # px^2: what the far wing adds: its light reaches the border of the window
-EXACT_PX2 = 0.9**2  # px^2: narrower spots are integrated over the pixels numerically
 _POWERS_U, _POWERS_V = (0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)
 _COLUMNS = (
     NODES,
@@ -64,31 +51,6 @@ _COLUMNS = (
     AT_Y,
 )  # of the exact model, in cells
 _EDGEWORTH = 0.4  # cell^2 / variance above which the pixels' fourth cumulant is significant
-
-
-class PolynomialFrame(NamedTuple):
-    """The coordinates of the polynomial: relative to the spot's centre, in units of its widths."""
-
-    u0: float  # px, centre of the first cell relative to the spot's centre
-    v0: float
-    su: float  # px, the spot's sigma in u and v
-    sv: float
-    S: tuple[float, float, float]  # px^2: covariance of the light after integration over the cells
-    exact: bool  # the light is integrated over each pixel numerically
-
-
-@compiled
-def frame_of(window: Window, spot: Array) -> PolynomialFrame:
-    """The frame of a spot (9,) in a window."""
-    middle, pixel = 0.5 * (window.cell - 1), window.cell**2 / 12.0
-    narrow = ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[0] < EXACT_PX2
-    exact = window.cell == 1 and (narrow or variance_of_wings(spot) > 0.0)
-    if exact:
-        pixel = 0.0
-    S = (spot[UU] + pixel, spot[UV], spot[VV] + pixel)
-    return PolynomialFrame(
-        window.left + middle - spot[U], window.top + middle - spot[V], sqrt(S[0]), sqrt(S[2]), S, exact
-    )
 
 
 @compiled
@@ -235,7 +197,7 @@ def _accumulate_exact(
     count = window.rows * window.columns
     x, y, light, product = cells[AT_X, :count], cells[AT_Y, :count], cells[LIGHT, :count], cells[SCRATCH, :count]
     _fill_coordinates(window, frame, x, y)
-    _exact_light(window, frame, spot, cells)
+    exact_light(window, frame, spot, cells)
     for k in range(light.shape[0]):
         light[k] = cells[NODES, k]
     _weigh(frame, 1.0, spot, noise, 1.0, x, y, cells)
@@ -249,67 +211,8 @@ def _accumulate_exact(
         b[p] = total_of_products(product, residual)
         for q in range(p + 1):
             N[p, q] = N[q, p] = total_of_products(product, cells[_COLUMNS[q], :count])
+    add_usual_shape(frame, spot, N, b)
     return _chi_square(weight, residual)
-
-
-@compiled
-def variance_of_wings(spot: Array) -> float:
-    """What the wings add to the variance of a spot's core, px^2."""
-    return spot[NEAR_WING] * spot[NEAR_VARIANCE] + spot[FAR_WING] * FAR_PX2
-
-
-@compiled
-def _exact_light(window: Window, frame: PolynomialFrame, spot: Array, cells: Array) -> None:
-    """The light of a spot and its derivatives, the means of each pixel, into cells[NODES:]."""
-    S, more = frame.S, variance_of_wings(spot)
-    if more <= 0.0:
-        _pixel_moments(window, frame, S, spot[FLUX], cells, NODES)
-        return
-    near, far = spot[NEAR_WING], spot[FAR_WING]
-    out = cells[NODES : NODES + 6, : window.rows * window.columns]
-    out[:] = 0.0
-    for share, added in ((1.0 - near - far, 0.0), (near, spot[NEAR_VARIANCE]), (far, FAR_PX2)):
-        part = (S[0] - more + added, S[1], S[2] - more + added)
-        _pixel_moments(window, frame, part, share * spot[FLUX], cells, PART)
-        M = _derivatives(frame, part)
-        for p in range(6):
-            for q in range(6):
-                if M[p, q] != 0.0:
-                    for k in range(out.shape[1]):
-                        out[p, k] += M[p, q] * cells[PART + q, k]
-
-
-@compiled
-def _pixel_moments(
-    window: Window, frame: PolynomialFrame, S: tuple[float, float, float], flux: float, cells: Array, first: int
-) -> None:
-    """Pixel means of a Gaussian of covariance S, px^2, times 1, x, y, x^2, x y, y^2 into cells[first:]."""
-    scale = flux / (2 * np.pi * sqrt(S[0] * S[2] - S[1] ** 2))
-    for r in range(window.rows):
-        out = cells[first : first + 6, r * window.columns : (r + 1) * window.columns]
-        ellipse.pixel_moments(S, frame.u0, frame.v0 + r, frame.su, frame.sv, scale, cells[ROW : LINE + 3], out)
-
-
-@compiled
-def _derivatives(frame: PolynomialFrame, part: tuple[float, float, float]) -> Array:
-    """(6, 6): the columns of the fit as sums of the moments of a Gaussian that is a part of the light.
-
-    The parameters keep their meaning: x and y are the step S (x / su, y / sv) of the centre, and the second degree
-    Q is the change 2 S Q S of the shape with a flux that is larger by tr(Q S). For a single Gaussian this is 1.
-    """
-    S, su, sv = frame.S, frame.su, frame.sv
-    P = ellipse.inverse(part[0], part[1], part[2])
-    out = np.zeros((6, 6))
-    out[0, 0] = 1.0
-    for p, a, b in ((1, S[0] / su, S[1] / su), (2, S[1] / sv, S[2] / sv)):
-        out[p, 1], out[p, 2] = (P[0] * a + P[1] * b) * su, (P[1] * a + P[2] * b) * sv
-    Q = ((3, 1.0 / su**2, 0.0, 0.0), (4, 0.0, 0.5 / (su * sv), 0.0), (5, 0.0, 0.0, 1.0 / sv**2))
-    for p, a, b, c in Q:
-        T = ellipse.between((S[0], S[1], S[2]), (a, b, c))
-        B = ellipse.between(P, T)
-        out[p, 0] = a * S[0] + 2 * b * S[1] + c * S[2] - (P[0] * T[0] + 2 * P[1] * T[1] + P[2] * T[2])
-        out[p, 3], out[p, 4], out[p, 5] = B[0] * su**2, 2 * B[1] * su * sv, B[2] * sv**2
-    return out
 
 
 @compiled

@@ -24,7 +24,7 @@ from geometry.arrays import Array
 from tracking.detection.detect import find_spots
 from tracking.detection.measuring import NARROW_PX
 from tracking.detections import Detections
-from tracking.noise import NoiseModel, Picture, SpotProfile
+from tracking.noise import NORMAL_68, NoiseModel, Picture, SpotProfile
 from tracking.parameters import DetectParameters
 
 _MOST = 100  # spots of each picture: the brightest
@@ -79,7 +79,8 @@ def spot_profile(
         improbable = 0.5 * worse.sum() ** 2 / np.sum(worse**2 + 1e-12) + spots.places * fits.concentration
         weights.append(np.exp(-improbable))
     shapes = [[p.near, p.near_px, p.far] for p in tried]
-    return spots.with_uneven(SpotProfile(*map(float, np.average(shapes, axis=0, weights=weights))))
+    mean = SpotProfile(*map(float, np.average(shapes, axis=0, weights=weights)), _FIRST.uneven)
+    return spots.with_uneven(spots.with_shape(mean))
 
 
 def _better(before: Array, after: Array) -> float:
@@ -92,6 +93,7 @@ class _Fits:
     """Fits of n spots with one profile."""
 
     misfits: Array  # (n,) logarithms of chi-square per degree of freedom
+    shapes: Array  # (n, 3) px^2: covariances uu, uv, vv
     concentration: float  # sum over u and v of squared mean cosines of the phase in a pixel: 0 if it is even
 
 
@@ -119,19 +121,30 @@ class _NarrowSpots:
 
     def fits(self, profile: SpotProfile) -> _Fits:
         """A spot that is not found again keeps its Gaussian."""
-        misfits, centres, model = [], [], replace(self.noise, profile=profile)
+        misfits, centres, shapes, model = [], [], [], replace(self.noise, profile=profile)
         for picture, spots in zip(self.pictures, self.spots, strict=True):
             boxes = np.column_stack([spots.uv_px, np.full(len(spots), NARROW_PX)])
             again = find_spots(picture, self.parameters, model, boxes)
             away = np.linalg.norm(spots.uv_px[:, None] - again.uv_px, axis=-1)
             there = away.min(axis=1, initial=np.inf) < NARROW_PX
             nearest = away[there].argmin(axis=1) if len(again) else np.zeros(0, int)
-            misfit, centre = _log_chi2(spots), spots.uv_px.copy()
+            misfit, centre, shape = _log_chi2(spots), spots.uv_px.copy(), _shapes(spots)
             misfit[there], centre[there] = _log_chi2(again)[nearest], again.uv_px[nearest]
+            shape[there] = _shapes(again)[nearest]
             misfits.append(misfit)
             centres.append(centre)
+            shapes.append(shape)
         cosines = np.cos(2 * np.pi * np.concatenate(centres)).mean(axis=0)
-        return _Fits(np.concatenate(misfits), float(cosines @ cosines))
+        return _Fits(np.concatenate(misfits), np.concatenate(shapes), float(cosines @ cosines))
+
+    def with_shape(self, profile: SpotProfile) -> SpotProfile:
+        """The profile with the usual shape of the brighter half and its scatter."""
+        bright = np.argsort(-np.concatenate([d.flux for d in self.spots]))[: (self.count + 1) // 2]
+        shapes = self.fits(profile).shapes[bright]
+        usual = np.median(shapes, axis=0)
+        sigma = float(np.quantile(np.abs(shapes - usual), 0.68)) / NORMAL_68
+        uu, uv, vv = map(float, usual)
+        return replace(profile, shape_px2=(uu, uv, vv), shape_sigma_px2=sigma)
 
     def with_uneven(self, profile: SpotProfile) -> SpotProfile:
         """The profile with what it leaves of the light: with that, chi-square of the brightest spots is 1."""
@@ -151,6 +164,13 @@ def _narrow_and_clear(found: Detections) -> Detections:
     width = np.sqrt(found.major_px * found.minor_px)
     sigma = np.sqrt(0.5 * np.trace(found.cov_px2, axis1=1, axis2=2))
     return found[(width < NARROW_PX) & (sigma < _CLEAR * width)]
+
+
+def _shapes(found: Detections) -> Array:
+    """(n, 3) px^2: covariances uu, uv, vv."""
+    major, minor, angle = found.major_px**2, found.minor_px**2, np.radians(found.angle_deg)
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([major * c**2 + minor * s**2, (major - minor) * c * s, major * s**2 + minor * c**2], axis=-1)
 
 
 def _log_chi2(found: Detections) -> Array:
