@@ -54,6 +54,7 @@ from tracking.detection.table import (
 
 _STEPS = 12  # Gauss-Newton converges in three or four; a clipped spot, whose top is extrapolated, needs up to ten
 _CONVERGED, _CONVERGED_MOST = 0.1, 0.4  # of the centre's own sigma: a smaller step is the last one
+_SETTLED = 0.02  # largest last step of the coefficients of the shape, half the relative change of the variance
 _CURVED = 0.02  # the next step is about step^2 / (2 width); it may be a hundredth of the sigma
 _WINDOW = 3.7  # sigmas from centre to side of the window: with 3.2 (2.5) the plane costs 3 % (8 %) of the accuracy
 _WINDOW_WIDE, _WIDE_PX = 3.2, 4.5  # ... of spots wider than this, whose background is not a plane over more
@@ -149,6 +150,8 @@ def _step(
     _advance(frame, spot, X)
     du, dv = spot[U] - before_u, spot[V] - before_v
     moved = _needs_another_step(du, var_u, spot[UU]) or _needs_another_step(dv, var_v, spot[VV])
+    if variance_of_wings(spot) > 0.0:  # their start is far from the shape
+        moved = moved or max(abs(X[3, 0]), abs(X[4, 0]), abs(X[5, 0])) > _SETTLED
     if not moved or last:
         spot[VAR_U], spot[COV_UV], spot[VAR_V], spot[SIGMA_FLUX] = var_u, cov_uv, var_v, sigma_flux
         assess_fit(window, frame, after, noise, cells, spot)

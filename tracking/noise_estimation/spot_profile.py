@@ -35,6 +35,7 @@ _PLACES, _PLACE_PX = 16, 0.2  # ... at so many places: of a spot at rest all pic
 _FIRST = SpotProfile(0.5, 0.6, 0.05, 0.1)
 _FAR, _NEAR, _NEAR_PX = (0.0, 0.1, 0.15), (0.2, 0.4, 0.6, 0.8), (0.5, 0.6, 0.7, 0.85)
 _SIGMAS = 3.0  # of the number of spots that fit better
+_SHAPE_NOISE, _LEAST_SCATTER = 3.0, 0.3  # of the shapes: factor for noise; share of their scatter that is not noise
 _UNEVEN = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25)
 _BRIGHT = 1 / 8  # share of the spots, whose fits show what is left ...
 _CUT = 0.5  # ... and their largest misfits: two stars, or a hot pixel
@@ -94,6 +95,7 @@ class _Fits:
 
     misfits: Array  # (n,) logarithms of chi-square per degree of freedom
     shapes: Array  # (n, 3) px^2: covariances uu, uv, vv
+    variances: Array  # (n,) px^2, of the centres
     concentration: float  # sum over u and v of squared mean cosines of the phase in a pixel: 0 if it is even
 
 
@@ -121,29 +123,35 @@ class _NarrowSpots:
 
     def fits(self, profile: SpotProfile) -> _Fits:
         """A spot that is not found again keeps its Gaussian."""
-        misfits, centres, shapes, model = [], [], [], replace(self.noise, profile=profile)
+        misfits, centres, shapes, variances, model = [], [], [], [], replace(self.noise, profile=profile)
         for picture, spots in zip(self.pictures, self.spots, strict=True):
             boxes = np.column_stack([spots.uv_px, np.full(len(spots), NARROW_PX)])
             again = find_spots(picture, self.parameters, model, boxes)
             away = np.linalg.norm(spots.uv_px[:, None] - again.uv_px, axis=-1)
             there = away.min(axis=1, initial=np.inf) < NARROW_PX
             nearest = away[there].argmin(axis=1) if len(again) else np.zeros(0, int)
-            misfit, centre, shape = _log_chi2(spots), spots.uv_px.copy(), _shapes(spots)
+            misfit, centre, shape, variance = _log_chi2(spots), spots.uv_px.copy(), _shapes(spots), _variances(spots)
             misfit[there], centre[there] = _log_chi2(again)[nearest], again.uv_px[nearest]
-            shape[there] = _shapes(again)[nearest]
+            shape[there], variance[there] = _shapes(again)[nearest], _variances(again)[nearest]
             misfits.append(misfit)
             centres.append(centre)
             shapes.append(shape)
+            variances.append(variance)
         cosines = np.cos(2 * np.pi * np.concatenate(centres)).mean(axis=0)
-        return _Fits(np.concatenate(misfits), np.concatenate(shapes), float(cosines @ cosines))
+        return _Fits(*map(np.concatenate, (misfits, shapes, variances)), float(cosines @ cosines))
 
     def with_shape(self, profile: SpotProfile) -> SpotProfile:
-        """The profile with the usual shape of the brighter half and its scatter."""
+        """The profile with the usual shape of the brighter half and its scatter.
+
+        The variance of an element of a shape S by noise is 2 S to 4 S times that of the centre.
+        """
         bright = np.argsort(-np.concatenate([d.flux for d in self.spots]))[: (self.count + 1) // 2]
-        shapes = self.fits(profile).shapes[bright]
-        usual = np.median(shapes, axis=0)
-        sigma = float(np.quantile(np.abs(shapes - usual), 0.68)) / NORMAL_68
+        fits = self.fits(profile)
+        usual = np.median(fits.shapes[bright], axis=0)
+        scatter = float(np.quantile(np.abs(fits.shapes[bright] - usual), 0.68)) / NORMAL_68
         uu, uv, vv = map(float, usual)
+        by_noise = _SHAPE_NOISE * 0.5 * (uu + vv) * float(np.median(fits.variances[bright]))
+        sigma = float(np.sqrt(max(scatter**2 - by_noise, (_LEAST_SCATTER * scatter) ** 2)))
         return replace(profile, shape_px2=(uu, uv, vv), shape_sigma_px2=sigma)
 
     def with_uneven(self, profile: SpotProfile) -> SpotProfile:
@@ -162,8 +170,12 @@ class _NarrowSpots:
 def _narrow_and_clear(found: Detections) -> Detections:
     """Those whose shape the pixels show."""
     width = np.sqrt(found.major_px * found.minor_px)
-    sigma = np.sqrt(0.5 * np.trace(found.cov_px2, axis1=1, axis2=2))
-    return found[(width < NARROW_PX) & (sigma < _CLEAR * width)]
+    return found[(width < NARROW_PX) & (np.sqrt(_variances(found)) < _CLEAR * width)]
+
+
+def _variances(found: Detections) -> Array:
+    """(n,) px^2, of a coordinate of the centre."""
+    return np.asarray(0.5 * np.trace(found.cov_px2, axis1=1, axis2=2))
 
 
 def _shapes(found: Detections) -> Array:
