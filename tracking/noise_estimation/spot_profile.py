@@ -27,7 +27,7 @@ from tracking.detections import Detections
 from tracking.noise import NORMAL_68, NoiseModel, Picture, SpotProfile
 from tracking.parameters import DetectParameters
 
-_MOST = 100  # spots of each picture: the brightest
+_MOST = 400  # spots of all pictures: the brightest
 _CLEAR = 0.1  # sigma of the centre over the width of the spot: of a fainter one the pixels do not show the shape, and
 # it is found more easily in the middle of a pixel
 _FEWEST = 24  # narrow and clear spots ...
@@ -38,6 +38,7 @@ _SIGMAS = 3.0  # of the number of spots that fit better
 _SHAPE_NOISE, _LEAST_SCATTER = 3.0, 0.3  # of the shapes: factor for noise; share of their scatter that is not noise
 _UNEVEN = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25)
 _BRIGHT = 1 / 8  # share of the spots, whose fits show what is left ...
+_FAINT = 0.25  # of their flux: much fainter
 _CUT = 0.5  # ... and their largest misfits: two stars, or a hot pixel
 
 
@@ -111,7 +112,7 @@ class _NarrowSpots:
 
     @staticmethod
     def of(pictures: Sequence[Picture], noise: NoiseModel, saturation_dn: float | None) -> _NarrowSpots:
-        parameters = DetectParameters(max_detections=_MOST, saturation_dn=saturation_dn)
+        parameters = DetectParameters(max_detections=-(-_MOST // len(pictures)), saturation_dn=saturation_dn)
         spots = tuple(_narrow_and_clear(find_spots(p, parameters, noise)) for p in pictures)
         places = np.unique(np.rint(np.concatenate([d.uv_px for d in spots]) / _PLACE_PX), axis=0)
         return _NarrowSpots(tuple(pictures), spots, noise, parameters, len(places))
@@ -155,15 +156,23 @@ class _NarrowSpots:
         return replace(profile, shape_px2=(uu, uv, vv), shape_sigma_px2=sigma)
 
     def with_uneven(self, profile: SpotProfile) -> SpotProfile:
-        """The profile with what it leaves of the light: with that, chi-square of the brightest spots is 1."""
-        bright = np.argsort(-np.concatenate([d.flux for d in self.spots]))[: int(np.ceil(_BRIGHT * self.count))]
+        """The profile with what it leaves of the light: with that, the brightest spots fit no worse than faint ones.
+
+        Without much fainter ones they fit as well as the noise model states.
+        """
+        flux = np.concatenate([d.flux for d in self.spots])
+        bright = np.argsort(-flux)[: int(np.ceil(_BRIGHT * self.count))]
+        faint = np.flatnonzero(flux < _FAINT * np.median(flux[bright]))
         before, last = 0.0, 0.0
         for uneven in _UNEVEN:
-            misfit = float(np.clip(self.fits(replace(profile, uneven=uneven)).misfits[bright], -_CUT, _CUT).mean())
-            if misfit <= 0.0:
-                uneven -= (uneven - last) * misfit / min(misfit - before, -1e-12)
+            misfits = np.clip(self.fits(replace(profile, uneven=uneven)).misfits, -_CUT, _CUT)
+            worse = float(misfits[bright].mean())
+            if len(faint) >= _FEWEST:
+                worse -= float(misfits[faint].mean() + misfits[bright].std() / np.sqrt(len(bright)))
+            if worse <= 0.0:
+                uneven -= (uneven - last) * worse / min(worse - before, -1e-12)
                 break
-            before, last = misfit, uneven
+            before, last = worse, uneven
         return replace(profile, uneven=uneven)
 
 
