@@ -8,9 +8,11 @@ on stars that are not used in its fit: nine parts, each with the other eight.
 
 Residuals are per axis, px: their 68 % quantile over that of a normal deviate. Error over sigma is that quantile of the
 residual over the stated sigma. The amplitude is that of the first harmonic of the residual over the place of a star
-within its pixel; noise alone gives about residual sqrt(pi / n). The last two columns are residuals of the fit to all
-stars, which are too small; those of stars that are not used are too large by about as much. Rows: single Gaussians; these with a curve over that
-place which makes the places even (no catalogue) or from the other stars' directions; what `beampose detect` writes.
+within its pixel; noise alone gives about residual sqrt(pi / n). The last two columns are residuals of a fit to all
+stars, which are too small by about as much as those of stars that are not used are too large.
+
+Rows: single Gaussians; these with a curve over that place that makes the places even (no catalogue), or from the other
+stars' directions; the same for what `beampose detect` writes.
 
 Limits of the comparison, in the shared four pictures and with Hipparcos (van Leeuwen 2007): proper motion from the
 epoch of the directions to July 2019 moves a star by .003 px in the median, by .015 px or less in 90 %; atmospheric

@@ -2,8 +2,8 @@
 
 Such light is the sum of up to three Gaussians of one centre, of which a second and a third one are wider than the core
 by fixed variances (tracking.noise.SpotProfile; noise_estimation/spot_profile.py estimates it). The covariance of a spot
-is that of the sum. Of a spot that the pixels hardly resolve, its shape and its place within a pixel have similar effects
-on them: so its shape is known beforehand to be near the usual one. Source: ours.
+is that of the sum. Where the pixels hardly resolve a spot, its shape and its place within a pixel have similar effects
+on them; so the fit starts from knowing that the shape is near the usual one of the camera. Source: ours.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def _pixel_moments(
 def _moments_of_row(
     S: tuple[float, float, float], u0: float, dv: float, su: float, sv: float, scale: float, work: Array, out: Array
 ) -> None:
-    """Means over each pixel of a row (n,) of a Gaussian of covariance S, px^2, times 1, x, y, x^2, x y, y^2: out (6, n).
+    """Means over the pixels of a row (n,) of a Gaussian of covariance S, px^2, times 1, x, y, x^2, x y, y^2: (6, n).
 
     u0, dv: px, the first pixel relative to the centre; x and y are such distances over su and sv. scale: its value at
     the centre. Beyond _NEGLIGIBLE sigmas the means are below the rounding of the sums, and 0. work: (4, 8 n) or larger.

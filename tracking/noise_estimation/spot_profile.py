@@ -37,9 +37,10 @@ _FAR, _NEAR, _NEAR_PX = (0.0, 0.1, 0.15), (0.2, 0.4, 0.6, 0.8), (0.5, 0.6, 0.7, 
 _SIGMAS = 3.0  # of the number of spots that fit better
 _SHAPE_NOISE, _LEAST_SCATTER = 3.0, 0.3  # of the shapes: factor for noise; share of their scatter that is not noise
 _UNEVEN = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25)
-_BRIGHT = 1 / 8  # share of the spots, whose fits show what is left ...
+_BRIGHT = 1 / 8  # share of the spots, whose fits show what is left
 _FAINT = 0.25  # of their flux: much fainter
-_CUT = 0.5  # ... and their largest misfits: two stars, or a hot pixel
+_NOISE_KNOWN = 0.1  # relative uncertainty of the variance of a pixel
+_CUT = 0.5  # largest misfit that counts: two stars in one spot, or a hot pixel, have more
 
 
 def spot_profile(
@@ -114,7 +115,10 @@ class _NarrowSpots:
     def of(pictures: Sequence[Picture], noise: NoiseModel, saturation_dn: float | None) -> _NarrowSpots:
         parameters = DetectParameters(max_detections=-(-_MOST // len(pictures)), saturation_dn=saturation_dn)
         spots = tuple(_narrow_and_clear(find_spots(p, parameters, noise)) for p in pictures)
-        places = np.unique(np.rint(np.concatenate([d.uv_px for d in spots]) / _PLACE_PX), axis=0)
+        places = np.zeros((0, 2))
+        for uv in (d.uv_px for d in spots):
+            away = np.linalg.norm(uv[:, None] - places, axis=-1).min(axis=1, initial=np.inf)
+            places = np.concatenate([places, uv[away > _PLACE_PX]])
         return _NarrowSpots(tuple(pictures), spots, noise, parameters, len(places))
 
     @property
@@ -158,7 +162,7 @@ class _NarrowSpots:
     def with_uneven(self, profile: SpotProfile) -> SpotProfile:
         """The profile with what it leaves of the light: with that, the brightest spots fit no worse than faint ones.
 
-        Without much fainter ones they fit as well as the noise model states.
+        Without much fainter ones they fit as well as the noise model states, as far as that is known.
         """
         flux = np.concatenate([d.flux for d in self.spots])
         bright = np.argsort(-flux)[: int(np.ceil(_BRIGHT * self.count))]
@@ -166,9 +170,10 @@ class _NarrowSpots:
         before, last = 0.0, 0.0
         for uneven in _UNEVEN:
             misfits = np.clip(self.fits(replace(profile, uneven=uneven)).misfits, -_CUT, _CUT)
-            worse = float(misfits[bright].mean())
+            expected = _NOISE_KNOWN
             if len(faint) >= _FEWEST:
-                worse -= float(misfits[faint].mean() + misfits[bright].std() / np.sqrt(len(bright)))
+                expected = float(misfits[faint].mean() + misfits[bright].std() / np.sqrt(len(bright)))
+            worse = float(misfits[bright].mean()) - expected
             if worse <= 0.0:
                 uneven -= (uneven - last) * worse / min(worse - before, -1e-12)
                 break
