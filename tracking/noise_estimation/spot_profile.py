@@ -82,7 +82,8 @@ def spot_profile(
         improbable = 0.5 * worse.sum() ** 2 / np.sum(worse**2 + 1e-12) + spots.places * fits.concentration
         weights.append(np.exp(-improbable))
     shapes = [[p.near, p.near_px, p.far] for p in tried]
-    mean = SpotProfile(*map(float, np.average(shapes, axis=0, weights=weights)), _FIRST.uneven)
+    near, near_px, far = np.average(shapes, axis=0, weights=weights).tolist()
+    mean = SpotProfile(near, near_px, far, _FIRST.uneven)
     return spots.with_uneven(spots.with_shape(mean))
 
 
@@ -143,7 +144,8 @@ class _NarrowSpots:
             shapes.append(shape)
             variances.append(variance)
         cosines = np.cos(2 * np.pi * np.concatenate(centres)).mean(axis=0)
-        return _Fits(*map(np.concatenate, (misfits, shapes, variances)), float(cosines @ cosines))
+        joined = [np.concatenate(part) for part in (misfits, shapes, variances)]
+        return _Fits(joined[0], joined[1], joined[2], float(cosines @ cosines))
 
     def with_shape(self, profile: SpotProfile) -> SpotProfile:
         """The profile with the usual shape of the brighter half and its scatter.
