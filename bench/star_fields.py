@@ -14,10 +14,10 @@ stars, which are too small by about as much as those of stars that are not used 
 Rows: single Gaussians; these with a curve over that place that makes the places even (no catalogue), or from the other
 stars' directions; the same for what `beampose detect` writes.
 
-Limits of the comparison, in the shared four pictures. Measured with Hipparcos (van Leeuwen 2007): proper motion from the
-epoch of the directions to July 2019 moves a star by .003 px in the median and by .015 px or less in 90 %; a centre is
-shifted downwards by .025 px per magnitude of B-V, .015 px for the usual star (dispersion of the air, colour error of the
-lens); with both known a residual of .043 px, fitted to all stars, was .040 px. Computed: the part of the refraction
+Limits of the comparison, in the shared four pictures. Measured with Hipparcos (van Leeuwen 2007): proper motion from
+the epoch of the directions to July 2019 moves a star by .003 px in the median and by .015 px or less in 90 %; a centre
+is shifted along v by .025 px per magnitude of B-V, .015 px for the usual star (dispersion of the air, colour error of
+the lens); with both known a residual of .043 px, fitted to all stars, was .040 px. Computed: the part of the refraction
 that is not affine is .02 px at the upper and lower border at an altitude of 40 degrees, .005 px at 60 degrees. The 29
 fitted numbers change 270 residuals by 5 %.
 """
