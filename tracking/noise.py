@@ -29,6 +29,18 @@ NORMAL_68, NORMAL_95 = 0.994457883, 1.959963985  # quantiles 0.68 and 0.95 of |s
 
 
 @dataclass(frozen=True, slots=True)
+class SpotProfile:
+    """The shape that the lens and the pixels of a camera give to narrow spots: Gaussians of one centre."""
+
+    near: float = 0.0  # share of the light in a near wing; with no wing they are single Gaussians
+    near_px: float = 0.0  # by which its sigma is larger than the core's, in quadrature
+    far: float = 0.0  # share of the light in a far wing
+    uneven: float = 0.0  # of each pixel's light: 1-sigma deviations from this shape
+    shape_px2: tuple[float, float, float] = (0.0, 0.0, 0.0)  # uu, uv, vv: usual covariance of a spot with its wings
+    shape_sigma_px2: float = 0.0  # of a spot's covariance about the usual one; 0: that is not known
+
+
+@dataclass(frozen=True, slots=True)
 class NoiseModel:
     """Variance of one pixel of expected grey value v: floor_dn2 + slope_dn (v - black_dn), the floor below black_dn."""
 
@@ -41,6 +53,7 @@ class NoiseModel:
     correlation: float = 1.0  # variance of means of neighbouring pixels over that of independent pixels: above 1 in
     # compressed pictures. A spot's centre is such a mean, so detection uses `of_means`
     compression_dn2: float = 0.0  # variance that lossy compression adds to pixels with light, whose details it rounds
+    profile: SpotProfile = SpotProfile()  # of narrow spots
     # (n, m): texture of each block of BLOCK x BLOCK pixels, at most `texture`; None: that everywhere
     local_texture: NDArray[np.float32] | None = field(default=None, compare=False, repr=False)
 

@@ -22,9 +22,9 @@ from tracking.detection.candidates import (
     block_workspace,
 )
 from tracking.detection.gaussian_fit import REACHES
-from tracking.detection.measuring import DetectionLimits, measure, write_detections
+from tracking.detection.measuring import DetectionLimits, measure
 from tracking.detection.pixels import TEXTURE_SHARE, Noise, Pixels
-from tracking.detection.regions import INITIAL_REACH, MARGIN, boxes_of, find_relevant
+from tracking.detection.regions import INITIAL_REACH, MARGIN, boxes_of, find_relevant, write_detections
 from tracking.detection.search import BORDER_BLOCKS, MAX_COMPARED, find_peaks_in, find_separate_peaks
 from tracking.detection.table import ALGEBRA, CELL_ROWS, CELL_SIZE, COLUMNS, MOST_CELLS
 from tracking.detections import Detections
@@ -87,7 +87,7 @@ class SpotFinder:
             np.zeros(MAX_COMPARED),
         )
         self._cells, self._algebra = np.zeros((CELL_ROWS, MOST_CELLS)), np.zeros((ALGEBRA, 9, 10))
-        self._table, self._count, self._out = np.zeros((most, COLUMNS)), 0, np.zeros((most, 11))
+        self._table, self._count, self._out = np.zeros((most, COLUMNS)), 0, np.zeros((most, 12))
 
     def find(
         self,
@@ -180,7 +180,11 @@ class SpotFinder:
         rows = self._out[: write_detections(self._table[: self._count], regions, self._out)]
         cov = rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
         return Detections(
-            rows[:, :2].copy(), cov, *(rows[:, k].copy() for k in range(5, 10)), misfit=rows[:, 10].copy()
+            rows[:, :2].copy(),
+            cov,
+            *(rows[:, k].copy() for k in range(5, 10)),
+            misfit=rows[:, 10].copy(),
+            chi2=rows[:, 11].copy(),
         )
 
 
@@ -203,13 +207,14 @@ class _Task(NamedTuple):
     def of(image: Picture, parameters: DetectParameters, noise: NoiseModel | None) -> _Task:
         model = (noise or guess_noise(image)).of_means
         image = image if image.flags.c_contiguous else image.copy()
-        saturation = parameters.saturation_dn
+        saturation, p = parameters.saturation_dn, model.profile
         limits = DetectionLimits(
             float(parameters.threshold_sigma),
             float(np.iinfo(image.dtype).max if saturation is None else saturation),
             float(parameters.min_sigma_px),
             float(parameters.max_sigma_px),
             float(parameters.min_explained),
+            np.array([p.near, p.near_px**2, p.far, p.uneven**2, *p.shape_px2, p.shape_sigma_px2**2], dtype=float),
         )
         pixels = Pixels(image.view(np.uint8), image.itemsize, image.shape[1], image.shape[0])
         others = float(model.texture), float(model.banding_dn), float(model.compression_dn2)

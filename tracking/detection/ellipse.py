@@ -42,6 +42,14 @@ def inverse(uu: float, uv: float, vv: float) -> Entries:
 
 
 @compiled
+def between(outer: Entries, inner: Entries) -> Entries:
+    """The product outer inner outer."""
+    a, b = outer[0] * inner[0] + outer[1] * inner[1], outer[0] * inner[1] + outer[1] * inner[2]
+    c, d = outer[1] * inner[0] + outer[2] * inner[1], outer[1] * inner[1] + outer[2] * inner[2]
+    return a * outer[0] + b * outer[1], a * outer[1] + b * outer[2], c * outer[1] + d * outer[2]
+
+
+@compiled
 def mahalanobis(du: float, dv: float, uu: float, uv: float, vv: float) -> float:
     """Mahalanobis length of a step under a covariance."""
     return sqrt(max((vv * du * du - 2 * uv * du * dv + uu * dv * dv) / (uu * vv - uv * uv), 0.0))

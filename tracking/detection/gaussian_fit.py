@@ -10,7 +10,8 @@ from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
 from tracking.detection.ellipse import gaussian_window
-from tracking.detection.normal_equations import PolynomialFrame, accumulate, frame_of, solve_normal
+from tracking.detection.narrow_light import PolynomialFrame, frame_of, variance_of_wings
+from tracking.detection.normal_equations import accumulate, solve_normal
 from tracking.detection.pixels import VALID, Noise, Pixels, Window, insert_nearest, read_window, window_around
 from tracking.detection.quality import assess_fit, exclude_isolated_cells, gain_over_plane
 from tracking.detection.table import (
@@ -53,6 +54,7 @@ from tracking.detection.table import (
 
 _STEPS = 12  # Gauss-Newton converges in three or four; a clipped spot, whose top is extrapolated, needs up to ten
 _CONVERGED, _CONVERGED_MOST = 0.1, 0.4  # of the centre's own sigma: a smaller step is the last one
+_SETTLED = 0.02  # largest last step of the coefficients of the shape, half the relative change of the variance
 _CURVED = 0.02  # the next step is about step^2 / (2 width); it may be a hundredth of the sigma
 _WINDOW = 3.7  # sigmas from centre to side of the window: with 3.2 (2.5) the plane costs 3 % (8 %) of the accuracy
 _WINDOW_WIDE, _WIDE_PX = 3.2, 4.5  # ... of spots wider than this, whose background is not a plane over more
@@ -148,6 +150,8 @@ def _step(
     _advance(frame, spot, X)
     du, dv = spot[U] - before_u, spot[V] - before_v
     moved = _needs_another_step(du, var_u, spot[UU]) or _needs_another_step(dv, var_v, spot[VV])
+    if variance_of_wings(spot) > 0.0:  # their start is far from the shape
+        moved = moved or max(abs(X[3, 0]), abs(X[4, 0]), abs(X[5, 0])) > _SETTLED
     if not moved or last:
         spot[VAR_U], spot[COV_UV], spot[VAR_V], spot[SIGMA_FLUX] = var_u, cov_uv, var_v, sigma_flux
         assess_fit(window, frame, after, noise, cells, spot)
@@ -170,6 +174,12 @@ def _add_light(window: Window, spot: Array, lights: Array, out: Array) -> None:
     gaussian_window(inverse, u0, v0, float(window.cell), window.columns, light)
     for k in range(light.shape[0]):
         out[k] += scale * light[k]
+
+
+@compiled
+def least_variance(spot: Array) -> float:
+    """The least variance, px^2, of a spot in any direction: that of its wings is part of it."""
+    return _LEAST_VARIANCE + variance_of_wings(spot)
 
 
 @compiled
@@ -327,7 +337,7 @@ def _advance(frame: PolynomialFrame, spot: Array, X: Array) -> None:
     )
     short = 1.0 / max(ellipse.mahalanobis(du, dv, base[0], base[1], base[2]), 1.0)
     du, dv = short * du, short * dv
-    spot[UU], spot[UV], spot[VV] = ellipse.clip_eigenvalues(uu - pixel, uv, vv - pixel, _LEAST_VARIANCE, np.inf)
+    spot[UU], spot[UV], spot[VV] = ellipse.clip_eigenvalues(uu - pixel, uv, vv - pixel, least_variance(spot), np.inf)
     spot[SLOPE_U] += X[7, 0] / su
     spot[SLOPE_V] += X[8, 0] / sv
     spot[LEVEL] += X[6, 0] + spot[SLOPE_U] * du + spot[SLOPE_V] * dv

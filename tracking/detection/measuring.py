@@ -12,20 +12,22 @@ from geometry.compilation.jit import compiled, compiled_for_threads
 from tracking.detection import ellipse
 from tracking.detection.candidates import AT_U, AT_V, CONTRAST, HEIGHT, LEVEL, SCALE
 from tracking.detection.candidates import WIDE as WIDE_PEAK
-from tracking.detection.gaussian_fit import fit_all
-from tracking.detection.moments import find_moments, start_variance
+from tracking.detection.gaussian_fit import fit_all, least_variance
+from tracking.detection.moments import CENTRE_SHARE, compact_height, find_moments, start_variance
 from tracking.detection.pixels import Noise, Pixels, texture_variance, with_texture
 from tracking.detection.quality import light_beside
-from tracking.detection.regions import in_a_region
-from tracking.detection.saturated_spots import CENTRE_SHARE, compact_height
+from tracking.detection.regions import NARROWER, drop_duplicates
 from tracking.detection.table import (
     ACCEPTED,
     ACTIVE,
     BACKGROUND,
+    CELL_SIZE,
     CHI2,
+    COLUMNS,
     COV_UV,
     EXPLAINED,
     EXPLAINED_HERE,
+    FAR_WING,
     FLUX,
     GAIN,
     HELD,
@@ -35,6 +37,7 @@ from tracking.detection.table import (
     MOMENT_UV,
     MOMENT_V,
     MOMENT_VV,
+    NEAR_WING,
     PEAK,
     SCRATCH,
     SIGMA_FLUX,
@@ -42,6 +45,7 @@ from tracking.detection.table import (
     SLOPE_V,
     START,
     TEXTURE,
+    UNEVEN,
     UU,
     UV,
     VAR_U,
@@ -61,7 +65,6 @@ _SPOT_FLUX = (
 )
 _ABOVE_GRAINS, _CLEAR_GAIN = 1.5, 2.0  # relative to what is needed of any spot
 _LEAST_GAIN = 0.7  # decrease of chi-square relative to threshold^2 below which the fit stops early
-NARROWER = 0.5  # a spot narrower than this share of another spot is not a duplicate of it
 _PART_APART = 2.0  # sigmas: fits that are nearer to each other are parts of one light
 _MERGES = 3  # fits of a picture at most, with parts joined in between
 _LEAST_START = 2.0  # px^2: least variance of that start
@@ -73,7 +76,8 @@ _BESIDE = 3.0  # sigmas: least light of such a spot outside its two brightest pi
 _UNRESOLVED_GAIN = 2.0  # least decrease of its chi-square, relative to threshold^2: few pixels have longer tails
 _WITHIN_PIXEL = 0.03  # px: error of the centre if the held width is a tenth of a pixel wrong
 _NOTHING = 1e12  # px^2: variance of the start of a candidate that has been joined to another one; the fit leaves it out
-_SAME_SPOT = 1.5  # sigmas of a brighter spot: a second spot nearer to its centre is a duplicate
+NARROW_PX = 1.0  # sigma: in wider spots the centre of a Gaussian does not depend on the place within a pixel
+_FARTHEST = 0.5  # px: from the Gaussian's centre to that of the fit with wings
 
 
 class DetectionLimits(NamedTuple):
@@ -84,6 +88,7 @@ class DetectionLimits(NamedTuple):
     min_sigma: float  # px
     max_sigma: float  # px
     min_explained: float
+    profile: Array  # (n,) of narrow spots: columns NEAR_WING to USUAL_VARIANCE of the table
 
 
 @compiled_for_threads
@@ -103,6 +108,8 @@ def measure(
         spot[MOMENT_U], spot[MOMENT_V], spot[BACKGROUND] = peak[AT_U], peak[AT_V], peak[LEVEL]
         spot[WIDE], spot[START], spot[HELD] = peak[WIDE_PEAK], start_variance(peak[SCALE]), 0.0
         spot[TEXTURE], spot[MISFIT] = peak[CONTRAST], 0.0
+        for p in range(limits.profile.shape[0]):
+            spot[NEAR_WING + p] = 0.0
     find_moments(image, table, cells)
     least = _LEAST_GAIN * limits.threshold_sigma**2
     for _ in range(_MERGES):
@@ -120,7 +127,43 @@ def measure(
         here = with_texture(noise, spot[TEXTURE])
         accepted = _is_spot(image, spot, here, limits) or _is_compact(image, spot, here, limits, cells[SCRATCH])
         spot[ACCEPTED] = 1.0 if accepted else 0.0
-    _drop_duplicates(table)
+    drop_duplicates(table)
+    if limits.profile[0] > 0.0 or limits.profile[FAR_WING - NEAR_WING] > 0.0:
+        _fit_wings(image, table, noise, limits, cells, algebra)
+
+
+@compiled
+def _fit_wings(
+    image: Pixels, table: Array, noise: Noise, limits: DetectionLimits, cells: Array, algebra: Array
+) -> None:
+    """Fit the narrow spots again with the wings that they have in this camera; a Gaussian stays where that fails."""
+    gaussian = table.copy()
+    for k in range(table.shape[0]):
+        spot = table[k]
+        spot[ACTIVE] = 0.0
+        det = spot[UU] * spot[VV] - spot[UV] ** 2
+        if not spot[ACCEPTED] or np.isnan(spot[SIGMA_FLUX]) or spot[CELL_SIZE] > 1.0 or det > NARROW_PX**4:
+            continue
+        for p in range(limits.profile.shape[0]):
+            spot[NEAR_WING + p] = limits.profile[p]
+        spot[MOMENT_U], spot[MOMENT_V], spot[HELD], spot[ACTIVE] = spot[U], spot[V], 0.0, 1.0
+        spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV] = ellipse.clip_eigenvalues(
+            spot[UU], spot[UV], spot[VV], 2.0 * least_variance(spot), np.inf
+        )
+    fit_all(image, table, noise, limits.saturation, limits.max_sigma, 0.0, True, cells, algebra)
+    for k in range(table.shape[0]):
+        spot = table[k]
+        if spot[NEAR_WING] + spot[FAR_WING] <= 0.0:
+            continue
+        away = max(abs(spot[U] - gaussian[k, U]), abs(spot[V] - gaussian[k, V]))
+        unsure = max(spot[VAR_U], spot[VAR_V]) > _FARTHEST**2
+        if not spot[FLUX] > 0.0 or not spot[PEAK] > 0.0 or unsure or away > _FARTHEST:
+            for column in range(COLUMNS):
+                spot[column] = gaussian[k, column]
+        elif spot[UNEVEN] > 0.0:
+            # What the shape leaves belongs to the place within the pixel, and is no noise.
+            noise_share = (1.0 - gaussian[k, MISFIT]) * (gaussian[k, VAR_U] + gaussian[k, VAR_V])
+            spot[MISFIT] = max(spot[MISFIT], 1.0 - noise_share / (spot[VAR_U] + spot[VAR_V]))
 
 
 @compiled
@@ -289,61 +332,3 @@ def _is_compact(image: Pixels, spot: Array, noise: Noise, limits: DetectionLimit
     spot[VAR_U], spot[COV_UV], spot[VAR_V] = share * uu + 0.01, share * uv, share * vv + 0.01
     spot[PEAK], spot[SIGMA_FLUX], spot[MISFIT] = height, np.nan, 1.0
     return True
-
-
-@compiled
-def _brightest(table: Array) -> int:
-    """The row with the largest flux among the ACTIVE ones; -1 if there is none."""
-    best = -1
-    for k in range(table.shape[0]):
-        if table[k, ACTIVE] and (best < 0 or table[k, FLUX] > table[best, FLUX]):
-            best = k
-    return best
-
-
-@compiled
-def _drop_duplicates(table: Array) -> None:
-    """Drop spots near the centre of a brighter spot of about the same width: one light detected twice.
-
-    A much narrower spot is kept: a laser spot on a wide diffuse reflection has less flux, but is not part of it.
-    """
-    for k in range(table.shape[0]):
-        table[k, ACTIVE] = table[k, ACCEPTED]
-    i = _brightest(table)
-    while i >= 0:
-        spot = table[i]
-        spot[ACTIVE] = 0.0
-        uu, uv, vv = spot[UU] + 1 / 12, spot[UV], spot[VV] + 1 / 12
-        area = uu * vv - uv * uv  # sigma^4, px^4
-        for k in range(table.shape[0]):
-            other = table[k]
-            if other[ACTIVE]:
-                du, dv = other[U] - spot[U], other[V] - spot[V]
-                inside = vv * du * du - 2 * uv * du * dv + uu * dv * dv < _SAME_SPOT**2 * area
-                own = (other[UU] + 1 / 12) * (other[VV] + 1 / 12) - other[UV] ** 2
-                if inside and own > NARROWER**4 * area:
-                    other[ACCEPTED] = other[ACTIVE] = 0.0
-        i = _brightest(table)
-
-
-@compiled
-def write_detections(table: Array, regions: Array, out: Array) -> int:
-    """Write the spots that lie in a region (n, 3) into `out`, largest flux first; returns their number.
-
-    Columns of out (most, 11): u, v; cov uu, uv, vv; flux, peak, major, minor, angle; share of the covariance by misfit.
-    """
-    for k in range(table.shape[0]):
-        found = table[k, ACCEPTED] and in_a_region(regions, table[k, U], table[k, V], 0.0)
-        table[k, ACTIVE] = 1.0 if found else 0.0
-    count = 0
-    i = _brightest(table)
-    while i >= 0:
-        spot, row = table[i], out[count]
-        spot[ACTIVE] = 0.0
-        row[0], row[1], row[2], row[3] = spot[U], spot[V], spot[VAR_U], spot[COV_UV]
-        row[4], row[5], row[6] = spot[VAR_V], spot[FLUX], spot[PEAK]
-        row[7], row[8], row[9] = ellipse.axes(spot[UU], spot[UV], spot[VV])
-        row[10] = spot[MISFIT]
-        count += 1
-        i = _brightest(table)
-    return count

@@ -8,14 +8,14 @@ light and weight times squared light, up to the fourth degree. Source: ours.
 from __future__ import annotations
 
 from math import sqrt
-from typing import NamedTuple
 
 import numpy as np
 
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled, compiled_for_sums
 from tracking.detection import ellipse
-from tracking.detection.ellipse import exponential, gaussian_window
+from tracking.detection.ellipse import gaussian_window
+from tracking.detection.narrow_light import PolynomialFrame, add_usual_shape, exact_light, frame_of
 from tracking.detection.pixels import Noise, Window, total_of_products
 from tracking.detection.table import (
     AT_X,
@@ -23,30 +23,22 @@ from tracking.detection.table import (
     FLUX,
     LEVEL,
     LIGHT,
-    LINE,
     NEIGHBOUR_LIGHT,
     NODES,
     NORMAL,
     RESIDUAL,
     RIGHT_SIDE,
-    ROW,
     SCRATCH,
     SLOPE_U,
     SLOPE_V,
+    UNEVEN,
     USE,
-    UU,
-    UV,
     VALUES,
     VECTORS,
-    VV,
     WEIGHT,
-    U,
-    V,
 )
 
-EXACT_PX2 = 0.9**2  # px^2: narrower spots are integrated over the pixels numerically
 _POWERS_U, _POWERS_V = (0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)
-_FOUR_NODES_PX2 = 0.5**2  # px^2: narrower spots need eight instead of four nodes in each direction
 _COLUMNS = (
     NODES,
     NODES + 1,
@@ -58,38 +50,7 @@ _COLUMNS = (
     AT_X,
     AT_Y,
 )  # of the exact model, in cells
-_NEGLIGIBLE = 8.5  # sigmas from the centre at which the light is 2e-16 of its peak
 _EDGEWORTH = 0.4  # cell^2 / variance above which the pixels' fourth cumulant is significant
-
-# Gauss-Legendre nodes and weights on [-1/2, 1/2] for 4 and 8 points: accurate to 1e-4 of the peak for sigmas of at
-# least 0.5 and 0.2 px.
-_FOUR = np.polynomial.legendre.leggauss(4)
-_EIGHT = np.polynomial.legendre.leggauss(8)
-_NODES4, _WEIGHTS4, _NODES8, _WEIGHTS8 = _FOUR[0] / 2, _FOUR[1] / 2, _EIGHT[0] / 2, _EIGHT[1] / 2
-
-
-class PolynomialFrame(NamedTuple):
-    """The coordinates of the polynomial: relative to the spot's centre, in units of its widths."""
-
-    u0: float  # px, centre of the first cell relative to the spot's centre
-    v0: float
-    su: float  # px, the spot's sigma in u and v
-    sv: float
-    S: tuple[float, float, float]  # px^2: covariance of the light after integration over the cells
-    exact: bool  # the light is integrated over each pixel numerically
-
-
-@compiled
-def frame_of(window: Window, spot: Array) -> PolynomialFrame:
-    """The frame of a spot (9,) in a window."""
-    middle, pixel = 0.5 * (window.cell - 1), window.cell**2 / 12.0
-    exact = window.cell == 1 and ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[0] < EXACT_PX2
-    if exact:
-        pixel = 0.0
-    S = (spot[UU] + pixel, spot[UV], spot[VV] + pixel)
-    return PolynomialFrame(
-        window.left + middle - spot[U], window.top + middle - spot[V], sqrt(S[0]), sqrt(S[2]), S, exact
-    )
 
 
 @compiled
@@ -233,19 +194,16 @@ def _accumulate_exact(
     window: Window, frame: PolynomialFrame, spot: Array, noise: Noise, cells: Array, N: Array, b: Array
 ) -> float:
     """`accumulate` for a narrow spot, with light and derivatives integrated over each pixel by quadrature."""
-    low = ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[0]
-    nodes, weights = (_NODES4, _WEIGHTS4) if low > _FOUR_NODES_PX2 else (_NODES8, _WEIGHTS8)
-    inverse = ellipse.inverse(frame.S[0], frame.S[1], frame.S[2])
-    scale = spot[FLUX] / (2 * np.pi * sqrt(frame.S[0] * frame.S[2] - frame.S[1] ** 2))
     count = window.rows * window.columns
     x, y, light, product = cells[AT_X, :count], cells[AT_Y, :count], cells[LIGHT, :count], cells[SCRATCH, :count]
     _fill_coordinates(window, frame, x, y)
-    for r in range(window.rows):
-        _moments_of_row(frame, inverse, r, nodes, weights, scale, window.columns, cells)
+    exact_light(window, frame, spot, cells)
     for k in range(light.shape[0]):
         light[k] = cells[NODES, k]
     _weigh(frame, 1.0, spot, noise, 1.0, x, y, cells)
-    weight, residual = cells[WEIGHT, :count], cells[RESIDUAL, :count]
+    weight, residual, uneven = cells[WEIGHT, :count], cells[RESIDUAL, :count], spot[UNEVEN]
+    for k in range(weight.shape[0]):
+        weight[k] /= 1.0 + weight[k] * uneven * light[k] * light[k]
     for p in range(9):
         column = cells[_COLUMNS[p], :count]
         for k in range(product.shape[0]):
@@ -253,56 +211,8 @@ def _accumulate_exact(
         b[p] = total_of_products(product, residual)
         for q in range(p + 1):
             N[p, q] = N[q, p] = total_of_products(product, cells[_COLUMNS[q], :count])
+    add_usual_shape(frame, spot, N, b)
     return _chi_square(weight, residual)
-
-
-@compiled
-def _moments_of_row(
-    frame: PolynomialFrame, inverse: tuple[float, float, float], r: int, nodes: Array, weights: Array, scale: float,
-    columns: int, cells: Array,
-) -> None:  # fmt: skip
-    """Pixel means of the light times 1, x, y, x^2, x y, y^2 along row r of the pixels, into cells[NODES:].
-
-    Beyond _NEGLIGIBLE sigmas from the centre they are below the rounding of the sums, and 0.
-    """
-    count, dv = nodes.shape[0], frame.v0 + r
-    out = cells[NODES : NODES + 6, r * columns : (r + 1) * columns]
-    for p in range(6):
-        for j in range(columns):
-            out[p, j] = 0.0
-    if abs(dv) - 0.5 > _NEGLIGIBLE * frame.sv:
-        return
-    reach = _NEGLIGIBLE * frame.su + 0.5
-    first, last = max(int(-reach - frame.u0), 0), min(int(reach - frame.u0) + 1, columns)
-    n = max(last - first, 0)
-    # First the sums over the nodes in v, of the light times 1, y and y^2, at all nodes in u of these pixels.
-    u, light = cells[ROW, : count * n], cells[LINE, : count * n]
-    light_y, light_yy = cells[LINE + 1, : count * n], cells[LINE + 2, : count * n]
-    for m in range(count):
-        for j in range(n):
-            u[m * n + j] = frame.u0 + nodes[m] + (first + j)
-    for i in range(light.shape[0]):
-        light[i] = light_y[i] = light_yy[i] = 0.0
-    for k in range(count):
-        v, y, share = dv + nodes[k], (dv + nodes[k]) / frame.sv, scale * weights[k]
-        for i in range(light.shape[0]):
-            g = share * exponential(
-                -0.5 * (inverse[0] * u[i] * u[i] + 2.0 * inverse[1] * u[i] * v + inverse[2] * v * v)
-            )
-            light[i] += g
-            light_y[i] += g * y
-            light_yy[i] += g * y * y
-    narrow, out = 1.0 / frame.su, out[:, first:]
-    for m in range(count):
-        for j in range(n):
-            i = m * n + j
-            x, one, with_y = u[i] * narrow, weights[m] * light[i], weights[m] * light_y[i]
-            out[0, j] += one
-            out[1, j] += one * x
-            out[2, j] += with_y
-            out[3, j] += one * x * x
-            out[4, j] += with_y * x
-            out[5, j] += weights[m] * light_yy[i]
 
 
 @compiled

@@ -9,7 +9,7 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
-from tracking.detection.normal_equations import PolynomialFrame
+from tracking.detection.narrow_light import PolynomialFrame
 from tracking.detection.pixels import (
     OUTSIDE,
     Noise,

@@ -20,6 +20,7 @@ from tracking.noise import FULL_SCALE_E, NoiseModel, Picture, quantile_variance
 from tracking.noise_estimation.block_steps import block_step
 from tracking.noise_estimation.grey_values import clipped_background, full_scale, grey_step, saturation_level
 from tracking.noise_estimation.levels import LEAST_PIXELS, LEVELS, SIDE, LevelVariances, level_variances
+from tracking.noise_estimation.spot_profile import spot_profile
 from tracking.noise_estimation.spot_residuals import SpotResiduals, residuals_of_spots
 from tracking.noise_estimation.texture import MeanPicture, local_texture, texture_of
 from tracking.noise_estimation.texture_shift import TextureShift, texture_shift
@@ -106,6 +107,7 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
     found = [find_spots(p, DetectParameters(max_detections=_MOST_SPOTS), model) for p in usable]
     shift = TextureShift.usual(usable[0]) if stepped else texture_shift(seen, model, full, found)
     shift = shift.with_lights(found)
+    model = replace(model, profile=spot_profile(usable, found, model, saturation))
     return NoiseEstimate(model, floor_sigma, slope_sigma, saturation, step, len(usable), levels.temporal, shift)
 
 

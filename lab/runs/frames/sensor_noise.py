@@ -133,6 +133,7 @@ class CameraNoise:
             stated = replace(
                 stated, texture=estimated.texture, banding_dn=estimated.banding_dn, correlation=estimated.correlation,
                 compression_dn2=estimated.compression_dn2, local_texture=estimated.local_texture,
+                profile=estimated.profile,
             )  # fmt: skip
         self.model = stated
 
