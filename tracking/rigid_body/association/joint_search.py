@@ -201,7 +201,7 @@ def _extend(
         # A coarse gate that costs less than the exact one.
         if distance2 > GATE_CHI2 * (a + c + frame.cov[d, 0, 0] + frame.cov[d, 1, 1]) + MAX_BLEND_DISTANCE2_PX2:
             continue
-        if _is_taken(beam.assigned[node], d):
+        if is_taken(beam.assigned[node], d):
             continue
         gain = log_p_detect - log_false_density(frame, view, d)
         sa, sb, sc, det = inverse_2x2(a + frame.cov[d, 0, 0], b + frame.cov[d, 0, 1], c + frame.cov[d, 1, 1])
@@ -220,7 +220,7 @@ def _extend(
 
 
 @compiled
-def _is_taken(assigned: Ints, d: int) -> bool:
+def is_taken(assigned: Ints, d: int) -> bool:
     """Whether an assignment (n,) already uses a detection."""
     taken = False
     for j in range(assigned.shape[0]):
@@ -296,7 +296,9 @@ def _update_pose(
     frame, calibration_cov = obs.frame, obs.calibration_cov
     uv, J = predictions.uv[node], predictions.J[node]
     a, b, c = predictions.cov[node, 0], predictions.cov[node, 1], predictions.cov[node, 2]
-    curvature = ((a + c) / LINEARISATION_PX) ** 2 if a + c > 1.0 else 0.0
+    y0, y1 = frame.uv[d, 0] - uv[0], frame.uv[d, 1] - uv[1]
+    step2 = max(a + c, y0 * y0 + y1 * y1)
+    curvature = (step2 / LINEARISATION_PX) ** 2 if step2 > 1.0 else 0.0
     a, b, c = a + frame.cov[d, 0, 0] + curvature, b + frame.cov[d, 0, 1], c + frame.cov[d, 1, 1] + curvature
     a, b, c = a + calibration_cov[view, 0, 0], b + calibration_cov[view, 0, 1], c + calibration_cov[view, 1, 1]
     sa, sb, sc, _ = inverse_2x2(a, b, c)
@@ -305,7 +307,6 @@ def _update_pose(
         for j in range(6):
             H[i, 0] += P[i, j] * J[0, j]
             H[i, 1] += P[i, j] * J[1, j]
-    y0, y1 = frame.uv[d, 0] - uv[0], frame.uv[d, 1] - uv[1]
     z0, z1 = sa * y0 + sb * y1, sb * y0 + sc * y1
     step = np.empty(6)
     for i in range(6):

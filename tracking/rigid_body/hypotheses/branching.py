@@ -15,9 +15,10 @@ import numpy as np
 from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled
 from geometry.compiled_linalg import block
+from tracking.rigid_body.association.completion import complete
 from tracking.rigid_body.association.frame_detections import BLENDED, Observation
-from tracking.rigid_body.association.joint_search import associate
-from tracking.rigid_body.association.likelihood import log_clutter_ratio
+from tracking.rigid_body.association.joint_search import associate, is_taken
+from tracking.rigid_body.association.likelihood import detection_log_likelihood, log_clutter_ratio
 from tracking.rigid_body.hypotheses.hypothesis_set import (
     Children,
     Dynamics,
@@ -121,7 +122,10 @@ def _branch_steady(
         prior = steady
         if dt > 0.0 and labelled < MIN_CONFIRMING_SPOTS:
             prior = _with_either_motion(step, h, steady, sudden)
-        result = iterated_update(obs, prior, assigned[k], R[k], t[k])
+        result, again = _completed_update(obs, prior, assigned[:b], k, counted, R[k], t[k], p_unoccluded)
+        if again:
+            continue
+        labelled = _labelled(assigned[k])
         log_likelihood, chi2 = result.log_likelihood, result.chi2
         if 0 < labelled < MIN_CONFIRMING_SPOTS and dt > 0.0:
             # The mixture is at least as likely as its steady part; otherwise a false third spot would seem likelier.
@@ -135,6 +139,7 @@ def _branch_steady(
                 chi2 > dof + UNEXPECTED_SIGMAS * np.sqrt(2.0 * max(dof, 1))
                 or (labelled < MIN_CONFIRMING_SPOTS and sudden)
                 or _misses_whole_screen(assigned[k], p_unoccluded, group)
+                or _leaves_points(obs, assigned[k], p_unoccluded)
             )
         if dt > 0.0 and MIN_CONFIRMING_SPOTS <= labelled < MIN_REDUNDANT_SPOTS:
             prior = _with_either_motion(step, h, steady, sudden)
@@ -168,7 +173,10 @@ def _branch_manoeuvre(
         labelled = _labelled(assigned[k])
         if labelled < MIN_CONFIRMING_SPOTS:
             continue
-        result = iterated_update(obs, prior, assigned[k], R[k], t[k])
+        result, again = _completed_update(obs, prior, assigned[:b], k, counted, R[k], t[k], p_unoccluded)
+        if again:
+            continue
+        labelled = _labelled(assigned[k])
         state = _state_if_determined(obs, prior, result, assigned[k], labelled)
         log_weight = _log_weight(obs, log_prior + counted[k] + result.log_likelihood, p_visible, assigned[k], state)
         if np.isfinite(log_weight):
@@ -176,6 +184,38 @@ def _branch_manoeuvre(
             after = update(p_visible, group, assigned[k], obs.detection_model.p_detect)
             count, _ = add_child(children, count, state, log_weight, after, assigned[k], True, h)
     return count, best
+
+
+@compiled
+def _completed_update(
+    obs: Observation, prior: State, assigned: Ints, k: int, counted: Array, R: Array, t: Array, p_unoccluded: Array
+) -> tuple[Update, bool]:
+    """The update of a state by assignment k of several (b, n), completed by the spots that its pose explains.
+
+    Completes it in place, with its likelihood in counted (b,). The second result is whether it has thereby become
+    another one of the assignments.
+    """
+    result = iterated_update(obs, prior, assigned[k], R, t)
+    state, again = result.state, False
+    if _labelled(assigned[k]) < MIN_CONFIRMING_SPOTS:
+        return result, again
+    if complete(obs, assigned[k], state.R, state.t, state.P, p_unoccluded):
+        for j in range(assigned.shape[0]):
+            again |= j != k and _same(assigned[j], assigned[k])
+        if not again:
+            result = iterated_update(obs, prior, assigned[k], state.R, state.t)
+            state = result.state
+            counted[k] = detection_log_likelihood(obs, p_unoccluded, assigned[k], state.R, state.t)
+    return result, again
+
+
+@compiled
+def _same(a: Ints, b: Ints) -> bool:
+    """Whether two assignments (n,) give the same labels."""
+    for i in range(a.shape[0]):
+        if max(a[i], MISSED) != max(b[i], MISSED):
+            return False
+    return True
 
 
 @compiled
@@ -252,4 +292,21 @@ def _misses_whole_screen(assigned: Ints, p_unoccluded: Array, group: Ints) -> bo
             none = none and (group[j] != group[i] or assigned[j] < 0)
         if none:
             return True
+    return False
+
+
+@compiled
+def _leaves_points(obs: Observation, assigned: Ints, p_unoccluded: Array) -> bool:
+    """Whether a spot that is probably not occluded was not found although its camera shows a point of no spot.
+
+    Beams at equal angles look the same from a pose that is one of these angles off, except for the outermost spots.
+    """
+    frame = obs.frame
+    for i in range(assigned.shape[0]):
+        if assigned[i] != MISSED or p_unoccluded[i] <= 0.5:
+            continue
+        c = obs.view_table.camera[i]
+        for d in range(frame.first[c], frame.first[c + 1]):
+            if frame.log_static[d] <= frame.log_clutter[i] and not is_taken(assigned, d):
+                return True
     return False
