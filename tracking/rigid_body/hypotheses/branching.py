@@ -29,6 +29,7 @@ from tracking.rigid_body.hypotheses.hypothesis_set import (
 )
 from tracking.rigid_body.hypotheses.iterated_update import Update, iterated_update
 from tracking.rigid_body.hypotheses.prediction_checks import (
+    MAX_CHECKING_SIGMA_PX,
     MAX_THREE_SPOT_SIGMA_PX,
     MAX_TRACKING_SIGMA_PX,
     MIN_CONFIRMING_SPOTS,
@@ -112,7 +113,7 @@ def _branch_steady(
     log_prior = old.log_weight[h] + np.log(1 - dynamics.p_manoeuvre)
     assigned, score, counted, R, t, b = associate(obs, steady.R, steady.t, block(steady.P, 6), p_unoccluded)
     bound = _max_clutter_ratio(obs)
-    suspected = False
+    suspected, likeliest = False, -np.inf
     for k in range(b):
         if log_prior + score[k] + bound < best - PRUNE_NATS or (k > 0 and score[k] < score[0] - PRUNE_NATS):
             continue
@@ -133,18 +134,18 @@ def _branch_steady(
             chi2 = narrow.chi2
             p_steady = 1.0 - (P_MANOEUVRE_SUDDEN if sudden else P_MANOEUVRE_OCCLUDED)
             log_likelihood = max(log_likelihood, narrow.log_likelihood + np.log(p_steady))
-        if k == 0 and dt > 0.0 and old.log_weight[h] > -MANOEUVRE_PRUNE_NATS:
-            dof = 2 * result.spots
-            suspected = (
-                chi2 > dof + UNEXPECTED_SIGMAS * np.sqrt(2.0 * max(dof, 1))
-                or (labelled < MIN_CONFIRMING_SPOTS and sudden)
-                or _misses_whole_screen(assigned[k], p_unoccluded, group)
-                or _leaves_points(obs, assigned[k], p_unoccluded)
-            )
         if dt > 0.0 and MIN_CONFIRMING_SPOTS <= labelled < MIN_REDUNDANT_SPOTS:
             prior = _with_either_motion(step, h, steady, sudden)
         state = _state_if_determined(obs, prior, result, assigned[k], labelled)
         log_weight = _log_weight(obs, log_prior + counted[k] + log_likelihood, p_visible, assigned[k], state)
+        if log_weight >= likeliest and dt > 0.0 and old.log_weight[h] > -MANOEUVRE_PRUNE_NATS:
+            likeliest, dof = log_weight, 2 * result.spots
+            suspected = (
+                chi2 > dof + UNEXPECTED_SIGMAS * np.sqrt(2.0 * max(dof, 1))
+                or (labelled < MIN_CONFIRMING_SPOTS and sudden)
+                or _misses_whole_screen(assigned[k], p_unoccluded, group)
+                or _leaves_points(obs, steady, assigned[k], p_unoccluded)
+            )
         if np.isfinite(log_weight):
             best = max(best, log_weight)
             after = update(p_visible, group, assigned[k], obs.detection_model.p_detect)
@@ -296,17 +297,22 @@ def _misses_whole_screen(assigned: Ints, p_unoccluded: Array, group: Ints) -> bo
 
 
 @compiled
-def _leaves_points(obs: Observation, assigned: Ints, p_unoccluded: Array) -> bool:
-    """Whether a spot that is probably not occluded was not found although its camera shows a point of no spot.
+def _leaves_points(obs: Observation, predicted: State, assigned: Ints, p_unoccluded: Array) -> bool:
+    """Whether a spot that is probably not occluded has no label although its camera shows a point of no spot.
 
     Beams at equal angles look the same from a pose that is one of these angles off, except for the outermost spots.
+    A spot outside the picture counts only if the prediction is too uncertain to check the labels.
     """
-    frame = obs.frame
+    frame, beyond = obs.frame, False
     for i in range(assigned.shape[0]):
-        if assigned[i] != MISSED or p_unoccluded[i] <= 0.5:
+        if assigned[i] >= 0 or p_unoccluded[i] <= 0.5:
             continue
-        c = obs.view_table.camera[i]
+        c, free = obs.view_table.camera[i], False
         for d in range(frame.first[c], frame.first[c + 1]):
-            if frame.log_static[d] <= frame.log_clutter[i] and not is_taken(assigned, d):
-                return True
-    return False
+            free |= frame.log_static[d] <= frame.log_clutter[i] and not is_taken(assigned, d)
+        if free and assigned[i] == MISSED:
+            return True
+        beyond |= free
+    return beyond and (
+        largest_spot_sigma(obs.views, predicted.R, predicted.t, predicted.P, assigned) > MAX_CHECKING_SIGMA_PX
+    )

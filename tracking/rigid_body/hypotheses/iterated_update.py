@@ -20,6 +20,9 @@ from tracking.rigid_body.models.information import add_curvature_covariance, fra
 from tracking.rigid_body.models.motion import updated
 
 MAX_STEPS, MAX_HALVINGS = 8, 5  # of Gauss-Newton, and of one step
+# Converged are steps of so many sigmas of the pose, and larger ones where the cost does not fall any more: far from the
+# prior's attitude (0.3 rad) the tangents of the two differ, and the steps end beside the lowest cost.
+MAX_STEP, MAX_LAST_STEP = 0.01, 0.1
 MAX_UPDATE_SIGMA = 0.06  # m, rad: a frame that leaves its widest direction less certain does not update the state
 
 
@@ -122,7 +125,8 @@ def _posterior_mode(
         for i in range(6):
             step[i] -= delta[i]
         # A hundredth of the pose's own sigma is accurate enough.
-        converged = count == spots and dot(step, apply(L, step)) < 1e-4
+        size2 = dot(step, apply(L, step))
+        converged = count == spots and size2 < MAX_STEP**2
         better = False
         for _ in range(MAX_HALVINGS):
             if converged:
@@ -139,6 +143,7 @@ def _posterior_mode(
                 L, g, chi2, count, log_norm = L_new, g_new, chi2_new, count_new, norm_new
                 break
         if not better:
+            converged = count == spots and size2 < MAX_LAST_STEP**2
             break
     # Rounding can make the misfit negative where the prior is wide; a likelihood must not exceed that of a perfect fit.
     misfit = max(cost, 0.0)
