@@ -169,7 +169,8 @@ def _branch_manoeuvre(
     assigned, score, counted, R, t, b = associate(obs, prior.R, prior.t, block(prior.P, 6), p_unoccluded)
     bound = _max_clutter_ratio(obs)
     for k in range(b):
-        if log_prior + score[k] + bound < best - PRUNE_NATS or (k > 0 and score[k] < score[0] - PRUNE_NATS):
+        # The first one's score is no bound: where the prediction is far off, its update finds more spots.
+        if k > 0 and (log_prior + score[k] + bound < best - PRUNE_NATS or score[k] < score[0] - PRUNE_NATS):
             continue
         labelled = _labelled(assigned[k])
         if labelled < MIN_CONFIRMING_SPOTS:
