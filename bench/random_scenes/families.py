@@ -201,7 +201,8 @@ def _shaking_equal_fan(draw: Draw) -> Scene | None:
     shape[:, axes] = np.sin(2 * np.pi * (np.arange(draw.frames)[:, None] / rate * hz + rng.random(2)))
     at_rest = spot_pixels(lab.rig, lab.poses(lab.rest[None]))[0]
     spacing = float(np.median(np.linalg.norm(np.diff(at_rest.reshape(2, count, 2), axis=1), axis=-1)))
-    q = fitted_motion(lab, Motion(shape, np.zeros(0), "shaking"), amplitudes, 4.2 * spacing, 0.8)
+    in_view = 1.0 if count == 2 else 0.8  # three spots leave the labels open
+    q = fitted_motion(lab, Motion(shape, np.zeros(0), "shaking"), amplitudes, 4.2 * spacing, in_view)
     if q is None:
         return None
     reached = np.rad2deg(np.abs(q[:, axes]).max(axis=0))

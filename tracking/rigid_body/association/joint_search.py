@@ -85,7 +85,7 @@ def associate(
     for i in range(n):
         undecided[i] = obs.frame.has_image[obs.view_table.camera[i]]
     for _ in range(n):
-        view = _next_view(obs, beam, undecided)
+        view = _next_view(obs, beam, count, undecided)
         if view < 0:
             break
         undecided[view] = False
@@ -132,29 +132,34 @@ def _copy_pose(beam: _Beam, k: int, R: Array, t: Array, P: Array) -> None:
 
 
 @compiled
-def _next_view(obs: Observation, beam: _Beam, undecided: Bools) -> int:
-    """The undecided view (n,) that the best partial assignment predicts best; -1: none that it projects.
+def _next_view(obs: Observation, beam: _Beam, count: int, undecided: Bools) -> int:
+    """The undecided view (n,) that the best partial assignment predicts best; -1: none that one of them projects.
 
-    Views whose spots are probably outside the picture come last.
+    Where the best one projects none, the next decides: a prediction that is far off may place the spots beside the
+    screen. Views whose spots are probably outside the picture come last.
     """
     uv, J = np.empty(2), np.empty((2, 6))
     view, smallest = -1, np.inf
-    for i in range(undecided.shape[0]):
-        if not undecided[i]:
-            continue
-        projected, a, b, c = predicted_pixel(obs.views, i, beam.R[0], beam.t[0], beam.P[0], uv, J)
-        if not projected:
-            continue
-        a, b, c = (
-            a + obs.calibration_cov[i, 0, 0],
-            b + obs.calibration_cov[i, 0, 1],
-            c + obs.calibration_cov[i, 1, 1],
-        )
-        size = a * c - b * b
-        if p_in_picture(uv[0], uv[1], a, c, obs.view_table.size[i, 0], obs.view_table.size[i, 1]) < MIN_P_IN_PICTURE:
-            size += 1e12
-        if size < smallest:
-            view, smallest = i, size
+    for node in range(count):
+        for i in range(undecided.shape[0]):
+            if not undecided[i]:
+                continue
+            projected, a, b, c = predicted_pixel(obs.views, i, beam.R[node], beam.t[node], beam.P[node], uv, J)
+            if not projected:
+                continue
+            a, b, c = (
+                a + obs.calibration_cov[i, 0, 0],
+                b + obs.calibration_cov[i, 0, 1],
+                c + obs.calibration_cov[i, 1, 1],
+            )
+            size = a * c - b * b
+            width, height = obs.view_table.size[i, 0], obs.view_table.size[i, 1]
+            if p_in_picture(uv[0], uv[1], a, c, width, height) < MIN_P_IN_PICTURE:
+                size += 1e12
+            if size < smallest:
+                view, smallest = i, size
+        if view >= 0:
+            break
     return view
 
 

@@ -198,17 +198,17 @@ def _completed_update(
     another one of the assignments.
     """
     result = iterated_update(obs, prior, assigned[k], R, t)
-    state, again = result.state, False
-    if _labelled(assigned[k]) < MIN_CONFIRMING_SPOTS:
-        return result, again
-    if complete(obs, assigned[k], state.R, state.t, state.P, p_unoccluded):
+    while _labelled(assigned[k]) >= MIN_CONFIRMING_SPOTS:
+        state = result.state
+        if not complete(obs, assigned[k], state.R, state.t, state.P, p_unoccluded):
+            break
         for j in range(assigned.shape[0]):
-            again |= j != k and _same(assigned[j], assigned[k])
-        if not again:
-            result = iterated_update(obs, prior, assigned[k], state.R, state.t)
-            state = result.state
-            counted[k] = detection_log_likelihood(obs, p_unoccluded, assigned[k], state.R, state.t)
-    return result, again
+            if j != k and _same(assigned[j], assigned[k]):
+                return result, True
+        result = iterated_update(obs, prior, assigned[k], state.R, state.t)
+        state = result.state
+        counted[k] = detection_log_likelihood(obs, p_unoccluded, assigned[k], state.R, state.t)
+    return result, False
 
 
 @compiled
