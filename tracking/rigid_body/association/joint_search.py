@@ -24,7 +24,9 @@ GATE_CHI2 = 25.0  # a detection with a larger squared Mahalanobis distance is no
 LINEARISATION_PX = 1500.0
 MAX_BLEND_DISTANCE2_PX2 = 100.0  # squared distance beyond which no neighbour merges with a spot
 MIN_P_IN_PICTURE = 1e-3  # a spot whose probability of being in the picture is smaller is not searched for
-BEAM_PRUNE_NATS = 14.0  # partial assignments that are this much less likely than the best are dropped
+# Partial assignments that are this much less likely than the best are dropped. A wide prediction needs the second one:
+# of two poses that explain the same points of a periodic pattern, one explains a point earlier (17 nats at 0.01 px).
+BEAM_PRUNE_NATS, WIDE_PRUNE_NATS = 14.0, 30.0
 # Partial assignments that are kept: NARROW_BEAM if every spot's prediction has a smaller sigma (root of the
 # covariance's trace) than NARROW_PREDICTION_PX, WIDE_BEAM if smaller than WIDE_PREDICTION_PX, else WIDEST_BEAM.
 NARROW_PREDICTION_PX, WIDE_PREDICTION_PX = 30.0, 120.0
@@ -274,10 +276,11 @@ def _select(
 ) -> int:
     """Turn the best candidates into the next beam, best first, each with its pose updated; returns their number."""
     order = best_first(candidates.score[:found])
+    prune_nats = BEAM_PRUNE_NATS if candidates.score.shape[0] == NARROW_BEAM else WIDE_PRUNE_NATS
     kept = 0
     for place in range(found):
         k = order[place]
-        if candidates.score[k] < candidates.score[order[0]] - BEAM_PRUNE_NATS:
+        if candidates.score[k] < candidates.score[order[0]] - prune_nats:
             break
         node, choice = candidates.node[k], candidates.choice[k]
         copy_into(next_beam.assigned[kept], beam.assigned[node])
