@@ -47,3 +47,23 @@ def complete(obs: Observation, assigned: Ints, R: Array, t: Array, P: Array, p_u
             if chi2 < GATE_CHI2 and gain > best and not is_taken(assigned, d):
                 best, assigned[i], found = gain, d, True
     return found
+
+
+@compiled
+def explainable(obs: Observation, assigned: Ints) -> float:
+    """Upper bound, nats, of what `complete` can add to the log-likelihood of an assignment (n,)."""
+    frame, total = obs.frame, 0.0
+    for c in range(frame.has_image.shape[0]):
+        open_views = 0
+        log_clutter = np.inf
+        for i in range(assigned.shape[0]):
+            if obs.view_table.camera[i] == c and assigned[i] < 0:
+                open_views += 1
+                log_clutter = min(log_clutter, frame.log_clutter[i])
+        for d in range(frame.first[c], frame.first[c + 1]):
+            if open_views > 0 and not is_taken(assigned, d):
+                open_views -= 1
+                det = frame.cov[d, 0, 0] * frame.cov[d, 1, 1] - frame.cov[d, 0, 1] ** 2
+                p = obs.detection_model.p_detect
+                total += max(-np.log(1.0 - p) - log_clutter - 0.5 * np.log(det) - LOG_2PI, 0.0)
+    return total

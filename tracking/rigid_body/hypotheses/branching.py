@@ -15,7 +15,7 @@ import numpy as np
 from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled
 from geometry.compiled_linalg import block
-from tracking.rigid_body.association.completion import complete
+from tracking.rigid_body.association.completion import complete, explainable
 from tracking.rigid_body.association.frame_detections import BLENDED, Observation
 from tracking.rigid_body.association.joint_search import associate, is_taken
 from tracking.rigid_body.association.likelihood import detection_log_likelihood, log_clutter_ratio
@@ -115,7 +115,8 @@ def _branch_steady(
     bound = _max_clutter_ratio(obs)
     suspected, likeliest = False, -np.inf
     for k in range(b):
-        if log_prior + score[k] + bound < best - PRUNE_NATS or (k > 0 and score[k] < score[0] - PRUNE_NATS):
+        most = log_prior + score[k] + bound + explainable(obs, assigned[k])
+        if most < best - PRUNE_NATS or (k > 0 and score[k] < score[0] - PRUNE_NATS):
             continue
         labelled = _labelled(assigned[k])
         # Visible spots that are not found have become occluded, or the vehicle has turned.
@@ -169,8 +170,8 @@ def _branch_manoeuvre(
     assigned, score, counted, R, t, b = associate(obs, prior.R, prior.t, block(prior.P, 6), p_unoccluded)
     bound = _max_clutter_ratio(obs)
     for k in range(b):
-        # The first one's score is no bound: where the prediction is far off, its update finds more spots.
-        if k > 0 and (log_prior + score[k] + bound < best - PRUNE_NATS or score[k] < score[0] - PRUNE_NATS):
+        most = log_prior + score[k] + bound + explainable(obs, assigned[k])
+        if most < best - PRUNE_NATS or (k > 0 and score[k] < score[0] - PRUNE_NATS):
             continue
         labelled = _labelled(assigned[k])
         if labelled < MIN_CONFIRMING_SPOTS:
