@@ -188,7 +188,7 @@ def _shaking_equal_fan(draw: Draw) -> Scene | None:
     rng = draw.rng(scene.LAB)
     count, apart_deg = int(rng.integers(2, 6)), rng.uniform(2.0, 5.0)
     largest = np.deg2rad(rng.uniform(8.0, 25.0))
-    angles = apart_deg * (np.arange(count) - (count - 1) / 2)
+    angles = apart_deg * np.arange(0.5 * (1 - count), 0.5 * count)
     name = f"{count} beams {apart_deg:.1f} deg apart"
     lab = fan_lab(rng, angles, SCREENS_M * float(np.tan(largest)), (600.0, 2500.0), name)
     rng = draw.rng(scene.MOTION)
@@ -210,8 +210,8 @@ def _shaking_equal_fan(draw: Draw) -> Scene | None:
     noise = float(np.exp(rng.uniform(np.log(0.01), np.log(0.2))))
     false = false_points(lab, beside=float(rng.choice([0.0, 0.0, 0.2, 1.0])))
     text = (
-        f"shaking by {reached[0]:.0f} and {reached[1]:.0f} deg at {hz[0]:.1f} and {hz[1]:.1f} Hz, spots {spacing:.0f} px"
-        f" apart move up to {moved:.0f} px per frame"
+        f"shaking by {reached[0]:.0f} and {reached[1]:.0f} deg at {hz[0]:.1f} and {hz[1]:.1f} Hz,"
+        f" spots {spacing:.0f} px apart move up to {moved:.0f} px per frame"
     )
     return Draft(draw, lab, q, rate, noise, false, np.zeros(0), text).scene()
 

@@ -113,7 +113,7 @@ def _branch_steady(
     log_prior = old.log_weight[h] + np.log(1 - dynamics.p_manoeuvre)
     assigned, score, counted, R, t, b = associate(obs, steady.R, steady.t, block(steady.P, 6), p_unoccluded)
     bound = _max_clutter_ratio(obs)
-    suspected, likeliest = False, -np.inf
+    suspected, likeliest, first = False, -np.inf, count
     for k in range(b):
         most = log_prior + score[k] + bound + explainable(obs, assigned[k])
         if most < best - PRUNE_NATS or (k > 0 and score[k] < score[0] - PRUNE_NATS):
@@ -124,8 +124,8 @@ def _branch_steady(
         prior = steady
         if dt > 0.0 and labelled < MIN_CONFIRMING_SPOTS:
             prior = _with_either_motion(step, h, steady, sudden)
-        result, again = _completed_update(obs, prior, assigned[:b], k, counted, R[k], t[k], p_unoccluded)
-        if again:
+        result, counted_k = _completed_update(obs, prior, assigned[k], counted[k], R[k], t[k], p_unoccluded)
+        if _is_known(children, first, count, assigned[k]):
             continue
         labelled = _labelled(assigned[k])
         log_likelihood, chi2 = result.log_likelihood, result.chi2
@@ -138,7 +138,7 @@ def _branch_steady(
         if dt > 0.0 and MIN_CONFIRMING_SPOTS <= labelled < MIN_REDUNDANT_SPOTS:
             prior = _with_either_motion(step, h, steady, sudden)
         state = _state_if_determined(obs, prior, result, assigned[k], labelled)
-        log_weight = _log_weight(obs, log_prior + counted[k] + log_likelihood, p_visible, assigned[k], state)
+        log_weight = _log_weight(obs, log_prior + counted_k + log_likelihood, p_visible, assigned[k], state)
         if log_weight >= likeliest and dt > 0.0 and old.log_weight[h] > -MANOEUVRE_PRUNE_NATS:
             likeliest, dof = log_weight, 2 * result.spots
             suspected = (
@@ -168,7 +168,7 @@ def _branch_manoeuvre(
     p_unoccluded = marginal(p_visible, group)
     log_prior = old.log_weight[h] + np.log(dynamics.p_manoeuvre)
     assigned, score, counted, R, t, b = associate(obs, prior.R, prior.t, block(prior.P, 6), p_unoccluded)
-    bound = _max_clutter_ratio(obs)
+    bound, first = _max_clutter_ratio(obs), count
     for k in range(b):
         most = log_prior + score[k] + bound + explainable(obs, assigned[k])
         if most < best - PRUNE_NATS or (k > 0 and score[k] < score[0] - PRUNE_NATS):
@@ -176,12 +176,12 @@ def _branch_manoeuvre(
         labelled = _labelled(assigned[k])
         if labelled < MIN_CONFIRMING_SPOTS:
             continue
-        result, again = _completed_update(obs, prior, assigned[:b], k, counted, R[k], t[k], p_unoccluded)
-        if again:
+        result, counted_k = _completed_update(obs, prior, assigned[k], counted[k], R[k], t[k], p_unoccluded)
+        if _is_known(children, first, count, assigned[k]):
             continue
         labelled = _labelled(assigned[k])
         state = _state_if_determined(obs, prior, result, assigned[k], labelled)
-        log_weight = _log_weight(obs, log_prior + counted[k] + result.log_likelihood, p_visible, assigned[k], state)
+        log_weight = _log_weight(obs, log_prior + counted_k + result.log_likelihood, p_visible, assigned[k], state)
         if np.isfinite(log_weight):
             best = max(best, log_weight)
             after = update(p_visible, group, assigned[k], obs.detection_model.p_detect)
@@ -191,34 +191,32 @@ def _branch_manoeuvre(
 
 @compiled
 def _completed_update(
-    obs: Observation, prior: State, assigned: Ints, k: int, counted: Array, R: Array, t: Array, p_unoccluded: Array
-) -> tuple[Update, bool]:
-    """The update of a state by assignment k of several (b, n), completed by the spots that its pose explains.
+    obs: Observation, prior: State, assigned: Ints, counted: float, R: Array, t: Array, p_unoccluded: Array
+) -> tuple[Update, float]:
+    """The update of a state by an assignment (n,), completed in place by the spots that the updated pose explains.
 
-    Completes it in place, with its likelihood in counted (b,). The second result is whether it has thereby become
-    another one of the assignments.
+    counted: the assignment's log-likelihood without its Gaussian part, nats; the second result is the completed one's.
     """
-    result = iterated_update(obs, prior, assigned[k], R, t)
-    while _labelled(assigned[k]) >= MIN_CONFIRMING_SPOTS:
+    result = iterated_update(obs, prior, assigned, R, t)
+    while _labelled(assigned) >= MIN_CONFIRMING_SPOTS:
         state = result.state
-        if not complete(obs, assigned[k], state.R, state.t, state.P, p_unoccluded):
+        if not complete(obs, assigned, state.R, state.t, state.P, p_unoccluded):
             break
-        for j in range(assigned.shape[0]):
-            if j != k and _same(assigned[j], assigned[k]):
-                return result, True
-        result = iterated_update(obs, prior, assigned[k], state.R, state.t)
-        state = result.state
-        counted[k] = detection_log_likelihood(obs, p_unoccluded, assigned[k], state.R, state.t)
-    return result, False
+        result = iterated_update(obs, prior, assigned, state.R, state.t)
+        counted = detection_log_likelihood(obs, p_unoccluded, assigned, result.state.R, result.state.t)
+    return result, counted
 
 
 @compiled
-def _same(a: Ints, b: Ints) -> bool:
-    """Whether two assignments (n,) give the same labels."""
-    for i in range(a.shape[0]):
-        if max(a[i], MISSED) != max(b[i], MISSED):
-            return False
-    return True
+def _is_known(children: Children, first: int, count: int, assigned: Ints) -> bool:
+    """Whether one of the children from `first` on has this assignment (n,): completion makes several of them equal."""
+    for k in range(first, count):
+        same = True
+        for i in range(assigned.shape[0]):
+            same &= max(children.assigned[k, i], MISSED) == max(assigned[i], MISSED)
+        if same:
+            return True
+    return False
 
 
 @compiled
