@@ -14,6 +14,7 @@ import numpy as np
 
 from bench.random_scenes import scene
 from bench.random_scenes.drafts import (
+    SCREENS_M,
     Draft,
     Draw,
     false_points,
@@ -183,6 +184,38 @@ def _fast_close(draw: Draw) -> Scene | None:
     return draft.scene() if fastest > 95 else None
 
 
+def _shaking_equal_fan(draw: Draw) -> Scene | None:
+    rng = draw.rng(scene.LAB)
+    count, apart_deg = int(rng.integers(2, 6)), rng.uniform(2.0, 5.0)
+    largest = np.deg2rad(rng.uniform(8.0, 25.0))
+    angles = apart_deg * np.arange(0.5 * (1 - count), 0.5 * count)
+    name = f"{count} beams {apart_deg:.1f} deg apart"
+    lab = fan_lab(rng, angles, SCREENS_M * float(np.tan(largest)), (600.0, 2500.0), name)
+    rng = draw.rng(scene.MOTION)
+    rate = float(np.exp(rng.uniform(np.log(50), np.log(200))))
+    hz = rng.uniform(4.0, 9.0, 2)
+    amplitudes = np.zeros(6)
+    axes = [3, 3 + int(rng.integers(1, 3))]  # yaw moves the spots along the line that they lie on
+    amplitudes[axes] = largest * np.array([1.0, rng.uniform(0.2, 1.0)])
+    shape = np.zeros((draw.frames, 6))
+    shape[:, axes] = np.sin(2 * np.pi * (np.arange(draw.frames)[:, None] / rate * hz + rng.random(2)))
+    at_rest = spot_pixels(lab.rig, lab.poses(lab.rest[None]))[0]
+    spacing = float(np.median(np.linalg.norm(np.diff(at_rest.reshape(2, count, 2), axis=1), axis=-1)))
+    in_view = 1.0 if count == 2 else 0.8  # three spots leave the labels open
+    q = fitted_motion(lab, Motion(shape, np.zeros(0), "shaking"), amplitudes, 4.2 * spacing, in_view)
+    if q is None:
+        return None
+    reached = np.rad2deg(np.abs(q[:, axes]).max(axis=0))
+    moved = np.nanmax(np.linalg.norm(np.diff(spot_pixels(lab.rig, lab.poses(q)), axis=0), axis=-1))
+    noise = float(np.exp(rng.uniform(np.log(0.01), np.log(0.2))))
+    false = false_points(lab, beside=float(rng.choice([0.0, 0.0, 0.2, 1.0])))
+    text = (
+        f"shaking by {reached[0]:.0f} and {reached[1]:.0f} deg at {hz[0]:.1f} and {hz[1]:.1f} Hz,"
+        f" spots {spacing:.0f} px apart move up to {moved:.0f} px per frame"
+    )
+    return Draft(draw, lab, q, rate, noise, false, np.zeros(0), text).scene()
+
+
 def _two_beams_25hz(draw: Draw) -> Scene | None:
     rng = draw.rng(scene.LAB)
     lab = fan_lab(rng, np.array([-5.0, 5.0]), float(rng.uniform(0.06, 0.3)), (2500.0, 6000.0), "2 beams 10 deg apart")
@@ -288,6 +321,9 @@ FAMILIES: dict[str, Family] = {
     "three-left": Family(_three_left, 160, "no wrong label, no confidently wrong pose"),
     "screen-corner": Family(_screen_corner, 200, "no wrong label, no confidently wrong pose"),
     "fast-close": Family(_fast_close, 300, "identity causal / smoothed >= .995 / .999"),
+    "shaking-equal-fan": Family(
+        _shaking_equal_fan, 300, "identity causal and smoothed >= .9995; no confidently wrong pose"
+    ),
     "two-beams-25hz": Family(_two_beams_25hz, 40, "locked in frame <= 3, in all"),
     "no-prior": Family(_no_prior, 20, "first labels right / wrong >= .97 / <= .01; <= 3 s"),
     "drawn-rig": Family(_drawn_rig, 100, "smoothed NEES/6 .85 to 1.2"),

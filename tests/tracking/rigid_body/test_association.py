@@ -23,7 +23,7 @@ from tracking.rigid_body.association.frame_detections import (
     ViewTable,
     distinct_spots,
 )
-from tracking.rigid_body.association.joint_search import BEAM_PRUNE_NATS, GATE_CHI2, associate
+from tracking.rigid_body.association.joint_search import GATE_CHI2, WIDE_PRUNE_NATS, associate
 from tracking.rigid_body.association.likelihood import is_blended, log_clutter_ratio, p_in_picture
 from tracking.rigid_body.models.occlusion import MISSED
 
@@ -273,7 +273,7 @@ def test_no_point_is_two_spots_and_much_less_likely_assignments_are_dropped():
             taken = row[row >= 0] % BLENDED
             assert len(set(taken.tolist())) == len(taken)
         assert len({tuple(row) for row in found.assigned}) == len(found.assigned)
-        assert found.score[0] - found.score[-1] <= BEAM_PRUNE_NATS
+        assert found.score[0] - found.score[-1] <= WIDE_PRUNE_NATS
 
 
 def clutter_ratio(frame: FrameDetections, pose: Pose, P: Array = 1e-4 * P_NEAR) -> float:

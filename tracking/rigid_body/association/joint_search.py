@@ -24,7 +24,9 @@ GATE_CHI2 = 25.0  # a detection with a larger squared Mahalanobis distance is no
 LINEARISATION_PX = 1500.0
 MAX_BLEND_DISTANCE2_PX2 = 100.0  # squared distance beyond which no neighbour merges with a spot
 MIN_P_IN_PICTURE = 1e-3  # a spot whose probability of being in the picture is smaller is not searched for
-BEAM_PRUNE_NATS = 14.0  # partial assignments that are this much less likely than the best are dropped
+# Partial assignments that are this much less likely than the best are dropped. A wide prediction needs the second one:
+# of two poses that explain the same points of a periodic pattern, one explains a point earlier (17 nats at 0.01 px).
+BEAM_PRUNE_NATS, WIDE_PRUNE_NATS = 14.0, 30.0
 # Partial assignments that are kept: NARROW_BEAM if every spot's prediction has a smaller sigma (root of the
 # covariance's trace) than NARROW_PREDICTION_PX, WIDE_BEAM if smaller than WIDE_PREDICTION_PX, else WIDEST_BEAM.
 NARROW_PREDICTION_PX, WIDE_PREDICTION_PX = 30.0, 120.0
@@ -85,7 +87,7 @@ def associate(
     for i in range(n):
         undecided[i] = obs.frame.has_image[obs.view_table.camera[i]]
     for _ in range(n):
-        view = _next_view(obs, beam, undecided)
+        view = _next_view(obs, beam, count, undecided)
         if view < 0:
             break
         undecided[view] = False
@@ -132,29 +134,34 @@ def _copy_pose(beam: _Beam, k: int, R: Array, t: Array, P: Array) -> None:
 
 
 @compiled
-def _next_view(obs: Observation, beam: _Beam, undecided: Bools) -> int:
-    """The undecided view (n,) that the best partial assignment predicts best; -1: none that it projects.
+def _next_view(obs: Observation, beam: _Beam, count: int, undecided: Bools) -> int:
+    """The undecided view (n,) that the best partial assignment predicts best; -1: none that one of them projects.
 
-    Views whose spots are probably outside the picture come last.
+    Where the best one projects none, the next decides: a prediction that is far off may place the spots beside the
+    screen. Views whose spots are probably outside the picture come last.
     """
     uv, J = np.empty(2), np.empty((2, 6))
     view, smallest = -1, np.inf
-    for i in range(undecided.shape[0]):
-        if not undecided[i]:
-            continue
-        projected, a, b, c = predicted_pixel(obs.views, i, beam.R[0], beam.t[0], beam.P[0], uv, J)
-        if not projected:
-            continue
-        a, b, c = (
-            a + obs.calibration_cov[i, 0, 0],
-            b + obs.calibration_cov[i, 0, 1],
-            c + obs.calibration_cov[i, 1, 1],
-        )
-        size = a * c - b * b
-        if p_in_picture(uv[0], uv[1], a, c, obs.view_table.size[i, 0], obs.view_table.size[i, 1]) < MIN_P_IN_PICTURE:
-            size += 1e12
-        if size < smallest:
-            view, smallest = i, size
+    for node in range(count):
+        for i in range(undecided.shape[0]):
+            if not undecided[i]:
+                continue
+            projected, a, b, c = predicted_pixel(obs.views, i, beam.R[node], beam.t[node], beam.P[node], uv, J)
+            if not projected:
+                continue
+            a, b, c = (
+                a + obs.calibration_cov[i, 0, 0],
+                b + obs.calibration_cov[i, 0, 1],
+                c + obs.calibration_cov[i, 1, 1],
+            )
+            size = a * c - b * b
+            width, height = obs.view_table.size[i, 0], obs.view_table.size[i, 1]
+            if p_in_picture(uv[0], uv[1], a, c, width, height) < MIN_P_IN_PICTURE:
+                size += 1e12
+            if size < smallest:
+                view, smallest = i, size
+        if view >= 0:
+            break
     return view
 
 
@@ -201,7 +208,7 @@ def _extend(
         # A coarse gate that costs less than the exact one.
         if distance2 > GATE_CHI2 * (a + c + frame.cov[d, 0, 0] + frame.cov[d, 1, 1]) + MAX_BLEND_DISTANCE2_PX2:
             continue
-        if _is_taken(beam.assigned[node], d):
+        if is_taken(beam.assigned[node], d):
             continue
         gain = log_p_detect - log_false_density(frame, view, d)
         sa, sb, sc, det = inverse_2x2(a + frame.cov[d, 0, 0], b + frame.cov[d, 0, 1], c + frame.cov[d, 1, 1])
@@ -220,7 +227,7 @@ def _extend(
 
 
 @compiled
-def _is_taken(assigned: Ints, d: int) -> bool:
+def is_taken(assigned: Ints, d: int) -> bool:
     """Whether an assignment (n,) already uses a detection."""
     taken = False
     for j in range(assigned.shape[0]):
@@ -269,10 +276,11 @@ def _select(
 ) -> int:
     """Turn the best candidates into the next beam, best first, each with its pose updated; returns their number."""
     order = best_first(candidates.score[:found])
+    prune_nats = BEAM_PRUNE_NATS if candidates.score.shape[0] == NARROW_BEAM else WIDE_PRUNE_NATS
     kept = 0
     for place in range(found):
         k = order[place]
-        if candidates.score[k] < candidates.score[order[0]] - BEAM_PRUNE_NATS:
+        if candidates.score[k] < candidates.score[order[0]] - prune_nats:
             break
         node, choice = candidates.node[k], candidates.choice[k]
         copy_into(next_beam.assigned[kept], beam.assigned[node])
@@ -296,7 +304,9 @@ def _update_pose(
     frame, calibration_cov = obs.frame, obs.calibration_cov
     uv, J = predictions.uv[node], predictions.J[node]
     a, b, c = predictions.cov[node, 0], predictions.cov[node, 1], predictions.cov[node, 2]
-    curvature = ((a + c) / LINEARISATION_PX) ** 2 if a + c > 1.0 else 0.0
+    y0, y1 = frame.uv[d, 0] - uv[0], frame.uv[d, 1] - uv[1]
+    step2 = max(a + c, y0 * y0 + y1 * y1)
+    curvature = (step2 / LINEARISATION_PX) ** 2 if step2 > 1.0 else 0.0
     a, b, c = a + frame.cov[d, 0, 0] + curvature, b + frame.cov[d, 0, 1], c + frame.cov[d, 1, 1] + curvature
     a, b, c = a + calibration_cov[view, 0, 0], b + calibration_cov[view, 0, 1], c + calibration_cov[view, 1, 1]
     sa, sb, sc, _ = inverse_2x2(a, b, c)
@@ -305,7 +315,6 @@ def _update_pose(
         for j in range(6):
             H[i, 0] += P[i, j] * J[0, j]
             H[i, 1] += P[i, j] * J[1, j]
-    y0, y1 = frame.uv[d, 0] - uv[0], frame.uv[d, 1] - uv[1]
     z0, z1 = sa * y0 + sb * y1, sb * y0 + sc * y1
     step = np.empty(6)
     for i in range(6):

@@ -14,10 +14,11 @@ import numpy as np
 
 from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled
-from geometry.compiled_linalg import block
+from geometry.compiled_linalg import block, copy_into, copy_matrix_into
+from tracking.rigid_body.association.completion import complete, explainable
 from tracking.rigid_body.association.frame_detections import BLENDED, Observation
-from tracking.rigid_body.association.joint_search import associate
-from tracking.rigid_body.association.likelihood import log_clutter_ratio
+from tracking.rigid_body.association.joint_search import associate, is_taken
+from tracking.rigid_body.association.likelihood import detection_log_likelihood, log_clutter_ratio
 from tracking.rigid_body.hypotheses.hypothesis_set import (
     Children,
     Dynamics,
@@ -28,6 +29,7 @@ from tracking.rigid_body.hypotheses.hypothesis_set import (
 )
 from tracking.rigid_body.hypotheses.iterated_update import Update, iterated_update
 from tracking.rigid_body.hypotheses.prediction_checks import (
+    MAX_CHECKING_SIGMA_PX,
     MAX_THREE_SPOT_SIGMA_PX,
     MAX_TRACKING_SIGMA_PX,
     MIN_CONFIRMING_SPOTS,
@@ -39,12 +41,23 @@ from tracking.rigid_body.models.motion import predicted
 from tracking.rigid_body.models.occlusion import MISSED, joint_log_likelihood, marginal, predict, update
 
 MANOEUVRE_PRUNE_NATS = 6.0  # a hypothesis that is this much less likely than the best is not tried with a manoeuvre
+MAX_COMPLETED = 8  # assignments of one prediction that are completed after their update
 # Excess of the chi-square over its expectation, in its standard deviations, from which on a manoeuvre is tried although
 # every spot is found.
 UNEXPECTED_SIGMAS = 3.5
 # Probability of a manoeuvre in a frame that does not determine the pose:
 P_MANOEUVRE_SUDDEN = 0.5  # if visible spots are suddenly not where they are expected
 P_MANOEUVRE_OCCLUDED = 0.05  # at least, else: occlusions and manoeuvres often coincide
+
+
+class _Assignments(NamedTuple):
+    """Assignments of a frame's n views, as from `associate`, with room for MAX_COMPLETED more; c in all."""
+
+    assigned: Ints  # (c, n)
+    score: Array  # (c,) nats
+    counted: Array  # (c,) nats
+    R: Array  # (c, 3, 3)
+    t: Array  # (c, 3)
 
 
 class _Step(NamedTuple):
@@ -109,11 +122,14 @@ def _branch_steady(
     steady = _predicted_state(step, h, False)
     p_unoccluded = marginal(p_visible, group)
     log_prior = old.log_weight[h] + np.log(1 - dynamics.p_manoeuvre)
-    assigned, score, counted, R, t, b = associate(obs, steady.R, steady.t, block(steady.P, 6), p_unoccluded)
+    found, b = _assignments(obs, steady, p_unoccluded)
+    assigned, score = found.assigned, found.score
     bound = _max_clutter_ratio(obs)
-    suspected = False
-    for k in range(b):
-        if log_prior + score[k] + bound < best - PRUNE_NATS or (k > 0 and score[k] < score[0] - PRUNE_NATS):
+    suspected, likeliest, highest, k = False, -np.inf, score[0], -1
+    while k < b - 1:
+        k += 1
+        most = log_prior + score[k] + bound + explainable(obs, assigned[k])
+        if most < best - PRUNE_NATS or score[k] < highest - PRUNE_NATS:
             continue
         labelled = _labelled(assigned[k])
         # Visible spots that are not found have become occluded, or the vehicle has turned.
@@ -121,25 +137,27 @@ def _branch_steady(
         prior = steady
         if dt > 0.0 and labelled < MIN_CONFIRMING_SPOTS:
             prior = _with_either_motion(step, h, steady, sudden)
-        result = iterated_update(obs, prior, assigned[k], R[k], t[k])
+        result = iterated_update(obs, prior, assigned[k], found.R[k], found.t[k])
+        b = _add_completed(obs, found, k, b, result.state, p_unoccluded)
         log_likelihood, chi2 = result.log_likelihood, result.chi2
         if 0 < labelled < MIN_CONFIRMING_SPOTS and dt > 0.0:
             # The mixture is at least as likely as its steady part; otherwise a false third spot would seem likelier.
-            narrow = iterated_update(obs, steady, assigned[k], R[k], t[k])
+            narrow = iterated_update(obs, steady, assigned[k], found.R[k], found.t[k])
             chi2 = narrow.chi2
             p_steady = 1.0 - (P_MANOEUVRE_SUDDEN if sudden else P_MANOEUVRE_OCCLUDED)
             log_likelihood = max(log_likelihood, narrow.log_likelihood + np.log(p_steady))
-        if k == 0 and dt > 0.0 and old.log_weight[h] > -MANOEUVRE_PRUNE_NATS:
-            dof = 2 * result.spots
+        if dt > 0.0 and MIN_CONFIRMING_SPOTS <= labelled < MIN_REDUNDANT_SPOTS:
+            prior = _with_either_motion(step, h, steady, sudden)
+        state = _state_if_determined(obs, prior, result, assigned[k], labelled)
+        log_weight = _log_weight(obs, log_prior + found.counted[k] + log_likelihood, p_visible, assigned[k], state)
+        if log_weight >= likeliest and dt > 0.0 and old.log_weight[h] > -MANOEUVRE_PRUNE_NATS:
+            likeliest, dof = log_weight, 2 * result.spots
             suspected = (
                 chi2 > dof + UNEXPECTED_SIGMAS * np.sqrt(2.0 * max(dof, 1))
                 or (labelled < MIN_CONFIRMING_SPOTS and sudden)
                 or _misses_whole_screen(assigned[k], p_unoccluded, group)
+                or _leaves_points(obs, steady, assigned[k], p_unoccluded)
             )
-        if dt > 0.0 and MIN_CONFIRMING_SPOTS <= labelled < MIN_REDUNDANT_SPOTS:
-            prior = _with_either_motion(step, h, steady, sudden)
-        state = _state_if_determined(obs, prior, result, assigned[k], labelled)
-        log_weight = _log_weight(obs, log_prior + counted[k] + log_likelihood, p_visible, assigned[k], state)
         if np.isfinite(log_weight):
             best = max(best, log_weight)
             after = update(p_visible, group, assigned[k], obs.detection_model.p_detect)
@@ -160,22 +178,72 @@ def _branch_manoeuvre(
     prior = _predicted_state(step, h, True)
     p_unoccluded = marginal(p_visible, group)
     log_prior = old.log_weight[h] + np.log(dynamics.p_manoeuvre)
-    assigned, score, counted, R, t, b = associate(obs, prior.R, prior.t, block(prior.P, 6), p_unoccluded)
-    bound = _max_clutter_ratio(obs)
-    for k in range(b):
-        if log_prior + score[k] + bound < best - PRUNE_NATS or (k > 0 and score[k] < score[0] - PRUNE_NATS):
+    found, b = _assignments(obs, prior, p_unoccluded)
+    assigned, score = found.assigned, found.score
+    bound, highest, k = _max_clutter_ratio(obs), score[0], -1
+    while k < b - 1:
+        k += 1
+        most = log_prior + score[k] + bound + explainable(obs, assigned[k])
+        if most < best - PRUNE_NATS or score[k] < highest - PRUNE_NATS:
             continue
         labelled = _labelled(assigned[k])
         if labelled < MIN_CONFIRMING_SPOTS:
             continue
-        result = iterated_update(obs, prior, assigned[k], R[k], t[k])
+        result = iterated_update(obs, prior, assigned[k], found.R[k], found.t[k])
+        b = _add_completed(obs, found, k, b, result.state, p_unoccluded)
         state = _state_if_determined(obs, prior, result, assigned[k], labelled)
-        log_weight = _log_weight(obs, log_prior + counted[k] + result.log_likelihood, p_visible, assigned[k], state)
+        log_weight = _log_weight(
+            obs, log_prior + found.counted[k] + result.log_likelihood, p_visible, assigned[k], state
+        )
         if np.isfinite(log_weight):
             best = max(best, log_weight)
             after = update(p_visible, group, assigned[k], obs.detection_model.p_detect)
             count, _ = add_child(children, count, state, log_weight, after, assigned[k], True, h)
     return count, best
+
+
+@compiled
+def _assignments(obs: Observation, predicted: State, p_unoccluded: Array) -> tuple[_Assignments, int]:
+    """The assignments of a joint search from a predicted state, with room for completed ones, and their number."""
+    assigned, score, counted, R, t, b = associate(obs, predicted.R, predicted.t, block(predicted.P, 6), p_unoccluded)
+    n, room = assigned.shape[1], b + MAX_COMPLETED
+    out = _Assignments(
+        np.empty((room, n), np.int64), np.empty(room), np.empty(room), np.empty((room, 3, 3)), np.empty((room, 3))
+    )
+    for k in range(b):
+        copy_into(out.assigned[k], assigned[k])
+        out.score[k], out.counted[k] = score[k], counted[k]
+        copy_matrix_into(out.R[k], R[k])
+        copy_into(out.t[k], t[k])
+    return out, b
+
+
+@compiled
+def _add_completed(obs: Observation, of: _Assignments, k: int, b: int, state: State, p_unoccluded: Array) -> int:
+    """Add assignment k with the further spots that its updated state explains to b assignments; returns their number.
+
+    Where the prediction is far off, the joint search does not reach these spots.
+    """
+    if b == of.score.shape[0] or _labelled(of.assigned[k]) < MIN_CONFIRMING_SPOTS:
+        return b
+    new = of.assigned[b]
+    copy_into(new, of.assigned[k])
+    if not complete(obs, new, state.R, state.t, state.P, p_unoccluded):
+        return b
+    place = b
+    for j in range(b):
+        same = True
+        for i in range(new.shape[0]):
+            same &= max(of.assigned[j, i], MISSED) == max(new[i], MISSED)
+        if same:
+            place = j
+    of.score[place] = np.inf  # its exact update decides, not the linearised search
+    if place < b:
+        return b
+    of.counted[b] = detection_log_likelihood(obs, p_unoccluded, new, state.R, state.t)
+    copy_matrix_into(of.R[b], state.R)
+    copy_into(of.t[b], state.t)
+    return b + 1
 
 
 @compiled
@@ -253,3 +321,25 @@ def _misses_whole_screen(assigned: Ints, p_unoccluded: Array, group: Ints) -> bo
         if none:
             return True
     return False
+
+
+@compiled
+def _leaves_points(obs: Observation, predicted: State, assigned: Ints, p_unoccluded: Array) -> bool:
+    """Whether a spot that is probably not occluded has no label although its camera shows a point of no spot.
+
+    Beams at equal angles look the same from a pose that is one of these angles off, except for the outermost spots.
+    A spot outside the picture counts only if the prediction is too uncertain to check the labels.
+    """
+    frame, beyond = obs.frame, False
+    for i in range(assigned.shape[0]):
+        if assigned[i] >= 0 or p_unoccluded[i] <= 0.5:
+            continue
+        c, free = obs.view_table.camera[i], False
+        for d in range(frame.first[c], frame.first[c + 1]):
+            free |= frame.log_static[d] <= frame.log_clutter[i] and not is_taken(assigned, d)
+        if free and assigned[i] == MISSED:
+            return True
+        beyond |= free
+    return beyond and (
+        largest_spot_sigma(obs.views, predicted.R, predicted.t, predicted.P, assigned) > MAX_CHECKING_SIGMA_PX
+    )

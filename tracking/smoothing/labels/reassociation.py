@@ -183,7 +183,10 @@ def _prediction_without(
         if not run.detections.has_image[k, run.view_table.camera[i]]:
             continue
         projected, a, _, c = predicted_pixel(run.views, i, R, t, P_without, at, J)
-        if projected and inside(at, run.view_table.size[i]):
+        labelled = weight > 0.0 and assigned[k, i] >= 0
+        if labelled and not projected:
+            return P_without, R, t, np.inf  # the others contribute so little that their share cannot be separated
+        if projected and (labelled or inside(at, run.view_table.size[i])):
             largest = max(largest, 0.5 * (a + c))
     return P_without, R, t, np.sqrt(largest)
 
