@@ -6,7 +6,7 @@ import pytest
 
 from geometry.camera import SensorNoise
 from lab.runs.frames.sensor_noise import CameraNoise, noise_estimation_frames, share_texture
-from tests.tracking.noise_estimation.test_static_background import Recording, path
+from tests.tracking.background.test_static_background import Recording, path
 from tests.tracking.rendering import Scene, Spot, photograph
 from tracking.parameters import DetectParameters
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from geometry.arrays import Array
+from tracking.background import mean_pictures
+from tracking.background.static_background import PICTURES, StaticBackground, is_limited_by_texture
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
-from tracking.noise_estimation import static_background
 from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
-from tracking.noise_estimation.static_background import PICTURES, StaticBackground, is_limited_by_texture
 from tracking.noise_estimation.texture_shift import TextureShift
 from tracking.parameters import DetectParameters
 
@@ -211,8 +211,8 @@ def test_few_pictures_or_different_ones_make_no_background():
 
 def test_of_large_pictures_as_many_are_used_as_may_be_in_memory(monkeypatch):
     pictures = [np.full((64, 64), k, np.uint16) for k in range(15)]
-    monkeypatch.setattr(static_background, "_MOST_BYTES", 10 * pictures[0].nbytes)
-    used = [int(p[0, 0]) for p in static_background._usable(pictures)]
+    monkeypatch.setattr(mean_pictures, "MOST_BYTES", 10 * pictures[0].nbytes)
+    used = [int(p[0, 0]) for p in mean_pictures.usable(pictures)]
     assert len(used) == len(set(used)) == 10
     assert (used[0], used[-1]) == (0, 14)
 

@@ -18,25 +18,32 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Bools, evenly_spread
+from geometry.arrays import Bools
+from tracking.background.mean_pictures import (
+    MOST_BYTES,
+    highest_of_blocks,
+    means_of,
+    smooth_part,
+    sums_around,
+    usable,
+    without_smooth_part,
+)
+from tracking.background.places import AROUND_LIGHT, AROUND_SPOT, ON_LIGHT, inside, number_of_better, places_of
+from tracking.background.resting_lights import RestingLights
 from tracking.detection.detect import find_spots
 from tracking.detection.pixels import TEXTURE_SHARE
 from tracking.detections import Detections
 from tracking.noise import BLOCK, NoiseModel, Picture
-from tracking.noise_estimation.resting_lights import RestingLights
 from tracking.noise_estimation.texture_shift import TextureShift
 from tracking.parameters import DetectParameters
 
 PICTURES = 15  # from which a background is made, spread over the recording
 _LEAST_PICTURES = 9
-_MOST_BYTES = 150_000_000  # of these pictures
 _HIGHEST = 30.0  # sigmas of noise and texture
 _LEAST_CLEAR = 7  # of these pictures without a light at a pixel
-_CUT = 0.25  # share of the lowest and of the highest grey values of a pixel that is left out
 _MEAN_VARIANCE = 1.4  # variance of these means of normal deviates times their number: 1.4 lower half, 1.2 middle
 _LIMITING = 1.0  # variance of the texture over that of the noise, for means of 3x3 pixels, from which it matters ...
 _LIMITED_SHARE = 0.01  # ... in this share of the picture
-_SMOOTH_BLOCKS = 6.0  # blocks: sigma of the smooth part of the background, which is not subtracted
 _DARK = 0.25  # quantile of the background whose noise the difference is taken to have; brighter places count as uneven
 _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
 _TRIED = 3  # every such picture shows whether there are further spots
@@ -44,15 +51,10 @@ _MANY_LIGHTS = 4  # at rest, from which the subtraction is used in any case: it 
 _LEAST_FOUND = 0.2  # further or better spots per picture from which the subtraction is used
 _CUT_STEP, _CUT_MARGIN = 64, 40  # px: sides of the parts of a picture that are searched again; light around a box
 _SAMPLE = (7, 8)  # rows and columns: every such pixel shows how much of the structure is in a picture
-_SMOOTH_SAMPLE = (13, 13)  # of these pixels: what varies over them is not structure
-_AROUND_SAMPLE = (15, 15)  # of these pixels: 100 px: a part of the picture that shows the structure or does not
 _CLEAR_SIGMAS = 4.0  # more than this counts as much: somebody in front of the screen is in many pixels
 _SAME_LIGHT = 0.03  # the light has not changed by more than this share: the structure is not scaled
 _LEAST_LIGHT, _MOST_LIGHT = 0.2, 5.0  # changes of the light beyond which a picture is searched without subtraction
 _LARGEST_MISFIT = 1.3  # sigma of what is left over that of the noise; above it the camera or the light has moved
-_CLEARLY_BETTER = 0.5  # ratio of the variances of two measurements of a spot
-# Widths, and px: kept clear of lights at rest; of other spots; a light itself.
-_AROUND_LIGHT, _AROUND_SPOT, _ON_LIGHT = (3.0, 3.0), (3.0, 2.0), (2.5, 1.5)
 
 
 def is_limited_by_texture(model: NoiseModel) -> bool:
@@ -90,10 +92,10 @@ class StaticBackground:
         the spots in them no better. model: of the camera's noise and texture; shift: errors of its spots by the
         texture; parameters: with the grey value at which the sensor clips.
         """
-        some = _usable(pictures)
+        some = usable(pictures)
         if len(some) < _LEAST_PICTURES:
             return None
-        lower, mean = _means(some)
+        lower, mean = means_of(some)
         background = StaticBackground._of_mean(lower, some, model, parameters)
         shown = [(p, fit[0]) for p in some if (fit := background._light_in(p)) is not None]
         some, lights = [p for p, _ in shown], [light for _, light in shown]
@@ -101,11 +103,11 @@ class StaticBackground:
             return None
         equal: Sequence[NDArray[Any]] = some
         if max(lights) - min(lights) > 2 * _SAME_LIGHT:
-            if 4 * some[0].size * len(some) > _MOST_BYTES:
+            if 4 * some[0].size * len(some) > MOST_BYTES:
                 return None
             smooth = lower - background.structure
-            equal = [smooth + (p - _smooth_part(p.astype(np.float32))) / light for p, light in shown]
-            lower, mean = _means(equal)
+            equal = [smooth + (p - smooth_part(p.astype(np.float32))) / light for p, light in shown]
+            lower, mean = means_of(equal)
             background = StaticBackground._of_mean(lower, some, model, parameters)
         tried = some[::_TRIED]
         few = len(background.lights.found) < _MANY_LIGHTS
@@ -123,7 +125,7 @@ class StaticBackground:
         """
         found = [self._searched(p, self.parameters, shift) for p in pictures]
         holes = [self.spots_in(p, self.parameters, shift, inverted=True) for p in pictures]
-        there, absent = (np.array([_places_of(d, mean.shape, _ON_LIGHT) for d in all_]) for all_ in (found, holes))
+        there, absent = (np.array([places_of(d, mean.shape, ON_LIGHT) for d in all_]) for all_ in (found, holes))
         row, column = np.nonzero(there.any(axis=0) | absent.any(axis=0))
         clear, hole = ~there[:, row, column], absent[:, row, column]
         clear &= hole | ~hole.any(axis=0)
@@ -137,14 +139,14 @@ class StaticBackground:
         better.near_lights[unknown > 0] = True
         _, _, places, _ = cv2.connectedComponentsWithStats(unknown)
         left, top, width, height = places[1:, : cv2.CC_STAT_AREA].T.astype(float)
-        half = 0.5 * np.maximum(width, height) + _AROUND_SPOT[1]
+        half = 0.5 * np.maximum(width, height) + AROUND_SPOT[1]
         boxes = np.column_stack([left + 0.5 * (width - 1), top + 0.5 * (height - 1), half])
         return replace(better, unknown=boxes)
 
     def _better_in(self, picture: Picture, shift: TextureShift) -> int:
         """How many spots the difference of a picture shows that the picture does not, or clearly more precisely."""
         in_picture = shift.added_to(find_spots(picture, self.parameters, self.noise), self.noise.black_dn)
-        return _better(self.spots_in(picture, self.parameters, shift), in_picture)
+        return number_of_better(self.spots_in(picture, self.parameters, shift), in_picture)
 
     def _searched(self, picture: Picture, parameters: DetectParameters, shift: TextureShift) -> Detections:
         """The points of a picture, also of one that does not fit."""
@@ -163,7 +165,7 @@ class StaticBackground:
         mean: NDArray[np.float32], pictures: Sequence[Picture], model: NoiseModel, parameters: DetectParameters
     ) -> StaticBackground:
         share = _MEAN_VARIANCE / len(pictures)
-        smooth = _smooth_part(mean)
+        smooth = smooth_part(mean)
         sigma = float(np.hypot(np.sqrt(model.floor_dn2), model.texture * model.black_dn))
         # In 16 bits there is no room for what is higher: a light, or a hot pixel.
         structure = mean - smooth if pictures[0].dtype == np.uint8 else np.minimum(mean - smooth, _HIGHEST * sigma)
@@ -182,7 +184,7 @@ class StaticBackground:
         at_rest = replace(at_rest, flux=at_rest.flux / steps, peak=at_rest.peak / steps)
         # The difference has one level everywhere, and the noise of the picture.
         dark = float(np.quantile(plain[::8, ::8], _DARK))
-        brighter = model.slope_dn * np.maximum(_of_blocks(plain) - max(dark, model.black_dn), 0.0)
+        brighter = model.slope_dn * np.maximum(highest_of_blocks(plain) - max(dark, model.black_dn), 0.0)
         uneven = np.asarray(np.sqrt(brighter / 9.0) / (TEXTURE_SHARE * level), np.float32)
         black = level - max(dark - model.black_dn, 0.0)
         of_difference = replace(
@@ -190,13 +192,13 @@ class StaticBackground:
             local_texture=uneven, banding_dn=model.banding_dn * steps, compression_dn2=model.compression_dn2 * steps**2,
         )  # fmt: skip
         rows, columns = _SAMPLE
-        near = _places_of(at_rest, mean.shape, _AROUND_LIGHT) | (
+        near = places_of(at_rest, mean.shape, AROUND_LIGHT) | (
             cv2.dilate(mean - np.minimum(plain, level), np.ones((3, 3))) > 1 / steps
         )
         return StaticBackground(
             len(pictures), structure, smooth[::rows, ::columns].copy(), near,
             RestingLights.of(mean, at_rest, model, clips - 0.5), np.zeros((0, 3)), parameters, steps, level, dark,
-            _in_steps(level - plain, steps), of_difference, model,
+            _in_steps(np.asarray(level - plain, np.float32), steps), of_difference, model,
         )  # fmt: skip
 
     def found_in(self, picture: Picture, parameters: DetectParameters, shift: TextureShift) -> Detections | None:
@@ -212,13 +214,13 @@ class StaticBackground:
         lights, changed = self.lights.in_picture(picture)
         boxes = np.column_stack([self.lights.found.uv_px, self.lights.half_px])[changed]
         boxes = np.concatenate([self.unknown, boxes])
-        more = lights[~changed & ~_inside(boxes, lights)]
+        more = lights[~changed & ~inside(boxes, lights)]
         # The error of the mean picture's fit is the same in all pictures.
         fixed = 0.5 * self._noise_share * np.trace(more.cov_px2, axis1=1, axis2=2)
         more = shift.added_to(more, self.noise.black_dn)
         place = np.zeros(len(more)) if more.place_px2 is None else more.place_px2
         more = replace(more, cov_px2=(1 + self._noise_share) * more.cov_px2, place_px2=place + fixed)
-        found = spots[~_inside(boxes, spots)].joined(more, parameters.max_detections)
+        found = spots[~inside(boxes, spots)].joined(more, parameters.max_detections)
         if not len(boxes):
             return found
         again = shift.added_to(self._found_again(picture, parameters, boxes), self.noise.black_dn)
@@ -240,7 +242,7 @@ class StaticBackground:
             model = replace(self.noise, local_texture=local)
             own = find_spots(picture[top : top + side, left : left + side], parameters, model)
             own = replace(own, uv_px=own.uv_px + np.array([left, top]))
-            found = found.joined(own[_inside(boxes[k : k + 1], own) & ~_inside(boxes[:k], own)], len(found) + len(own))
+            found = found.joined(own[inside(boxes[k : k + 1], own) & ~inside(boxes[:k], own)], len(found) + len(own))
         return found
 
     def spots_in(
@@ -305,17 +307,20 @@ class StaticBackground:
         rows, columns = _SAMPLE
         plain = ~self.near_lights[::rows, ::columns]
         own_light = self.structure[::rows, ::columns]
-        structure = _without_smooth_part(own_light, plain)
+        structure = without_smooth_part(own_light, plain)
         above = picture[::rows, ::columns].astype(np.float32) - self.smooth
         more = float(np.median(above))
-        above = _without_smooth_part(above, plain)
+        above = without_smooth_part(above, plain)
         variance = self.noise.variance(self.smooth + own_light + more).astype(np.float32)
         clear = plain & (np.abs(above) < 6 * np.sqrt(variance) + 4 * np.abs(structure))
         seen = np.where(clear, structure, 0.0)
         # A part of what is seen is the background's own noise, which the picture does not show.
         own = self._noise_share * variance
-        power = np.maximum(_around(seen * seen - np.where(clear, own, 0.0)), 1e-12)
-        here, sigma = _around(seen * above) / power, np.sqrt(_around(variance) / power / _around(np.ones_like(power)))
+        power = np.maximum(sums_around(seen * seen - np.where(clear, own, 0.0)), 1e-12)
+        here, sigma = (
+            sums_around(seen * above) / power,
+            np.sqrt(sums_around(variance) / power / sums_around(np.ones_like(power))),
+        )
         light = float(np.median(here[sigma <= np.median(sigma)]))
         if not _LEAST_LIGHT < light < _MOST_LIGHT:
             return None
@@ -323,63 +328,10 @@ class StaticBackground:
         if 1.4826 * float(np.median(np.abs(left[clear]))) > _LARGEST_MISFIT:
             return None
         # Somebody in front of the screen; a moving light is in few of the pixels.
-        others = _around(np.minimum(left * left, _CLEAR_SIGMAS**2)) > _LARGEST_MISFIT**2 * _around(
+        others = sums_around(np.minimum(left * left, _CLEAR_SIGMAS**2)) > _LARGEST_MISFIT**2 * sums_around(
             clear.astype(np.float32)
         )
         return light, ~others
-
-
-def _without_smooth_part(values: NDArray[np.float32], plain: Bools) -> NDArray[np.float32]:
-    """Values on the pixels of _SAMPLE less the means of plain ones around them."""
-    weight = plain.astype(np.float32)
-    mean = cv2.blur(values * weight, _SMOOTH_SAMPLE) / np.maximum(cv2.blur(weight, _SMOOTH_SAMPLE), 1e-3)
-    return np.asarray(values - mean, np.float32)
-
-
-def _around(values: NDArray[Any]) -> NDArray[Any]:
-    """Sums over the surroundings of each pixel of _SAMPLE."""
-    return np.asarray(cv2.boxFilter(values, -1, _AROUND_SAMPLE, normalize=False))
-
-
-def _usable(pictures: Sequence[Picture]) -> list[Picture]:
-    """As many of the pictures as may be in memory, evenly spaced; none if they are too small or not alike."""
-    if not pictures or min(pictures[0].shape) < 4 * BLOCK:
-        return []
-    if any(p.shape != pictures[0].shape or p.dtype != pictures[0].dtype for p in pictures):
-        return []
-    return [pictures[i] for i in evenly_spread(np.arange(len(pictures)), _MOST_BYTES // pictures[0].nbytes)]
-
-
-def _means(pictures: Sequence[NDArray[Any]]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The means (h, w) of the lower half of each pixel's grey values, without the lowest, and of the middle half.
-
-    The lower half does not contain lights that were elsewhere in half of the pictures; its noise is larger.
-    """
-    lower, middle = np.empty((2, *pictures[0].shape), np.float32)
-    count = len(pictures)
-    cut, strip = int(_CUT * count), 16 * BLOCK
-    for top in range(0, len(lower), strip):
-        values = np.sort([p[top : top + strip] for p in pictures], axis=0)
-        lower[top : top + strip] = values[1 : count // 2].mean(axis=0, dtype=np.float32)
-        middle[top : top + strip] = values[cut : count - cut].mean(axis=0, dtype=np.float32)
-    return lower, middle
-
-
-def _smooth_part(mean: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What of a picture (h, w) varies over many blocks, without small lights."""
-    height, width = mean.shape
-    whole = height // BLOCK * BLOCK, width // BLOCK * BLOCK
-    blocks = cv2.resize(mean[: whole[0], : whole[1]], (width // BLOCK, height // BLOCK), interpolation=cv2.INTER_AREA)
-    blurred = cv2.GaussianBlur(cv2.medianBlur(blocks, 5), (0, 0), _SMOOTH_BLOCKS)
-    return np.asarray(cv2.resize(blurred, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
-
-
-def _of_blocks(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The highest mean of each block of BLOCK x BLOCK pixels and its neighbours."""
-    rows, columns = (-(-n // BLOCK) for n in values.shape)
-    missing = (0, rows * BLOCK - values.shape[0]), (0, columns * BLOCK - values.shape[1])
-    blocks = cv2.resize(np.pad(values, missing, mode="edge"), (columns, rows), interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.dilate(blocks, np.ones((3, 3))), np.float32)
 
 
 def _in_steps(values: NDArray[np.float32], steps: int) -> NDArray[np.uint16]:
@@ -390,37 +342,7 @@ def _nearest(at: NDArray[np.float64], size: int) -> NDArray[np.int64]:
     return np.clip(np.rint(at), 0, size - 1).astype(np.int64)
 
 
-def _places_of(lights: Detections, shape: tuple[int, ...], size: tuple[float, float]) -> Bools:
-    """(h, w): pixels near the lights. size: widths, and px."""
-    out = np.zeros(shape, np.uint8)
-    widths, more = size
-    for (u, v), width in zip(lights.uv_px, lights.major_px, strict=True):
-        cv2.circle(out, (round(u), round(v)), round(widths * width + more), 1, cv2.FILLED)
-    return out > 0
-
-
 def _saturation(parameters: DetectParameters, picture: Picture) -> float:
     """The grey value at which the sensor clips."""
     clips = parameters.saturation_dn
     return float(np.iinfo(picture.dtype).max) if clips is None else clips
-
-
-def _better(spots: Detections, found: Detections) -> int:
-    """How many spots of a difference (n,) are not among those found in the picture (m,), or clearly more precise."""
-    near = _near(spots, found)
-    size2, usual2 = (np.trace(d.cov_px2, axis1=1, axis2=2) for d in (spots, found))
-    replaces = near & (size2[:, None] < _CLEARLY_BETTER * usual2)
-    return int(np.count_nonzero(~np.any(near & ~replaces, axis=1)))
-
-
-def _inside(boxes: NDArray[np.float64], found: Detections) -> Bools:
-    """Which of the points (n,) lie in one of the boxes (m, 3): u, v and half side, px."""
-    away = np.abs(found.uv_px[:, None] - boxes[None, :, :2]).max(axis=2)
-    return np.asarray((away <= boxes[None, :, 2]).any(axis=1))
-
-
-def _near(spots: Detections, found: Detections) -> Bools:
-    """(n, m): spots that are parts of others, or the same."""
-    widths, more = _AROUND_SPOT
-    gap = np.linalg.norm(spots.uv_px[:, None] - found.uv_px, axis=-1)
-    return np.asarray(gap < widths * found.major_px + more)

@@ -1,0 +1,44 @@
+"""Places of points in a picture: near lights, inside boxes, alike in two lists."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.arrays import Bools
+from tracking.detections import Detections
+
+_CLEARLY_BETTER = 0.5  # ratio of the variances of two measurements of a spot
+# Widths, and px: kept clear of lights at rest; of other spots; a light itself.
+AROUND_LIGHT, AROUND_SPOT, ON_LIGHT = (3.0, 3.0), (3.0, 2.0), (2.5, 1.5)
+
+
+def places_of(lights: Detections, shape: tuple[int, ...], size: tuple[float, float]) -> Bools:
+    """(h, w): pixels near the lights. size: widths, and px."""
+    out = np.zeros(shape, np.uint8)
+    widths, more = size
+    for (u, v), width in zip(lights.uv_px, lights.major_px, strict=True):
+        cv2.circle(out, (round(u), round(v)), round(widths * width + more), 1, cv2.FILLED)
+    return out > 0
+
+
+def _near(spots: Detections, found: Detections) -> Bools:
+    """(n, m): spots that are parts of others, or the same."""
+    widths, more = AROUND_SPOT
+    gap = np.linalg.norm(spots.uv_px[:, None] - found.uv_px, axis=-1)
+    return np.asarray(gap < widths * found.major_px + more)
+
+
+def number_of_better(spots: Detections, found: Detections) -> int:
+    """How many spots of a difference (n,) are not among those found in the picture (m,), or clearly more precise."""
+    near = _near(spots, found)
+    size2, usual2 = (np.trace(d.cov_px2, axis1=1, axis2=2) for d in (spots, found))
+    replaces = near & (size2[:, None] < _CLEARLY_BETTER * usual2)
+    return int(np.count_nonzero(~np.any(near & ~replaces, axis=1)))
+
+
+def inside(boxes: NDArray[np.float64], found: Detections) -> Bools:
+    """Which of the points (n,) lie in one of the boxes (m, 3): u, v and half side, px."""
+    away = np.abs(found.uv_px[:, None] - boxes[None, :, :2]).max(axis=2)
+    return np.asarray((away <= boxes[None, :, 2]).any(axis=1))
