@@ -10,7 +10,7 @@ import numpy as np
 from lab.detect.findings import SizeGroup, SpotCollection, matched_snr
 from lab.pictures.picture_file import GreyPicture
 from lab.runs.frames.sensor_noise import CameraNoise
-from tracking.detection.wide_lights import overlooked_lights
+from tracking.detection.detect import overlooked_lights
 from tracking.detections import Detections
 from tracking.parameters import DetectParameters
 

@@ -14,7 +14,7 @@ from geometry.camera import SensorNoise
 from lab.files.run.run_file import DetectionsTable, FramesFolder, Run
 from lab.runs.frames.frames import FrameReader, pictures_at
 from tracking.background.static_background import PICTURES, StaticBackground, is_limited_by_texture
-from tracking.detection.wide_lights import WIDE_PX, find_all_sizes
+from tracking.detection.detect import WIDE_PX, find_all_sizes
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.noise_estimation.colour_mosaic import mosaic_contrast
