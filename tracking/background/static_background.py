@@ -28,7 +28,15 @@ from tracking.background.mean_pictures import (
     usable,
     without_smooth_part,
 )
-from tracking.background.places import AROUND_LIGHT, AROUND_SPOT, ON_LIGHT, inside, number_of_better, places_of
+from tracking.background.places import (
+    AROUND_LIGHT,
+    AROUND_SPOT,
+    ON_LIGHT,
+    inside,
+    merged_parts,
+    number_of_better,
+    places_of,
+)
 from tracking.background.resting_lights import RestingLights
 from tracking.detection.detect import find_spots
 from tracking.detection.pixels import TEXTURE_SHARE
@@ -49,9 +57,9 @@ _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
 _TRIED = 3  # every such picture shows whether there are further spots
 _MANY_LIGHTS = 4  # at rest, from which the subtraction is used in any case: it spares their fits
 _LEAST_FOUND = 0.2  # further or better spots per picture from which the subtraction is used
-_CUT_STEP, _CUT_MARGIN = 64, 40  # px: sides of the parts of a picture that are searched again; light around a box
 _SAMPLE = (7, 8)  # rows and columns: every such pixel shows how much of the structure is in a picture
 _CLEAR_SIGMAS = 4.0  # more than this counts as much: somebody in front of the screen is in many pixels
+_EFFICIENCY = 2.0  # sigma of the median over places, of those that show most structure, over that of one fit
 _SAME_LIGHT = 0.03  # the light has not changed by more than this share: the structure is not scaled
 _LEAST_LIGHT, _MOST_LIGHT = 0.2, 5.0  # changes of the light beyond which a picture is searched without subtraction
 _LARGEST_MISFIT = 1.3  # sigma of what is left over that of the noise; above it the camera or the light has moved
@@ -81,6 +89,7 @@ class StaticBackground:
     subtracted: NDArray[np.uint16]  # (h, w): what is added to a picture in these steps
     model: NoiseModel  # of the difference, in its steps
     noise: NoiseModel  # of the pictures
+    reference: float = 1.0  # what of the structure the pictures show on average: it contains noise, which they do not
 
     @staticmethod
     def of(
@@ -96,19 +105,19 @@ class StaticBackground:
         if len(some) < _LEAST_PICTURES:
             return None
         lower, mean = means_of(some)
-        background = StaticBackground._of_mean(lower, some, model, parameters)
+        background = StaticBackground._of_mean(lower, some, model, parameters)._with_reference(some)
         shown = [(p, fit[0]) for p in some if (fit := background._light_in(p)) is not None]
         some, lights = [p for p, _ in shown], [light for _, light in shown]
         if len(some) < _LEAST_PICTURES:
             return None
         equal: Sequence[NDArray[Any]] = some
-        if max(lights) - min(lights) > 2 * _SAME_LIGHT:
+        if set(lights) != {1.0}:
             if 4 * some[0].size * len(some) > MOST_BYTES:
                 return None
             smooth = lower - background.structure
             equal = [smooth + (p - smooth_part(p.astype(np.float32))) / light for p, light in shown]
             lower, mean = means_of(equal)
-            background = StaticBackground._of_mean(lower, some, model, parameters)
+            background = StaticBackground._of_mean(lower, some, model, parameters)._with_reference(some)
         tried = some[::_TRIED]
         few = len(background.lights.found) < _MANY_LIGHTS
         if few and sum(background._better_in(p, shift) for p in tried) < max(_LEAST_FOUND * len(tried), 2):
@@ -141,7 +150,12 @@ class StaticBackground:
         left, top, width, height = places[1:, : cv2.CC_STAT_AREA].T.astype(float)
         half = 0.5 * np.maximum(width, height) + AROUND_SPOT[1]
         boxes = np.column_stack([left + 0.5 * (width - 1), top + 0.5 * (height - 1), half])
-        return replace(better, unknown=boxes)
+        return replace(better, unknown=boxes)._with_reference(pictures)
+
+    def _with_reference(self, pictures: Sequence[Picture]) -> StaticBackground:
+        """The background whose light is 1 in a typical one of the pictures that it is made from."""
+        fits = [fit for p in pictures[::_TRIED] if (fit := self._light_in(p, measured=True)) is not None]
+        return replace(self, reference=float(np.median([light for light, _ in fits]))) if fits else self
 
     def _better_in(self, picture: Picture, shift: TextureShift) -> int:
         """How many spots the difference of a picture shows that the picture does not, or clearly more precisely."""
@@ -227,22 +241,15 @@ class StaticBackground:
         return found.joined(again, parameters.max_detections)
 
     def _found_again(self, picture: Picture, parameters: DetectParameters, boxes: NDArray[np.float64]) -> Detections:
-        """The points of a picture in boxes (m, 3): u, v and half side, px, each found once."""
-        found, height, width = Detections.none(), *picture.shape
-        for k, (u, v, half) in enumerate(boxes):
-            side = _CUT_STEP * int(np.ceil((2 * half + 2 * _CUT_MARGIN) / _CUT_STEP))
-            left, top = (
-                int(np.clip(at - side / 2, 0, max(size - side, 0))) // BLOCK * BLOCK
-                for at, size in ((u, width), (v, height))
-            )
+        """The points of a picture in boxes (m, 3): u, v and half side, px."""
+        found = Detections.none()
+        for left, top, right, bottom in merged_parts(boxes, picture.shape, BLOCK):
             local = self.noise.local_texture
             if local is not None:
-                rows, columns = (np.s_[at // BLOCK : -(-(at + side) // BLOCK)] for at in (top, left))
-                local = local[rows, columns]
-            model = replace(self.noise, local_texture=local)
-            own = find_spots(picture[top : top + side, left : left + side], parameters, model)
+                local = local[top // BLOCK : -(-bottom // BLOCK), left // BLOCK : -(-right // BLOCK)]
+            own = find_spots(picture[top:bottom, left:right], parameters, replace(self.noise, local_texture=local))
             own = replace(own, uv_px=own.uv_px + np.array([left, top]))
-            found = found.joined(own[inside(boxes[k : k + 1], own) & ~inside(boxes[:k], own)], len(found) + len(own))
+            found = found.joined(own[inside(boxes, own)], len(found) + len(own))
         return found
 
     def spots_in(
@@ -297,10 +304,11 @@ class StaticBackground:
         place = np.zeros(len(spots)) if spots.place_px2 is None else spots.place_px2
         return replace(spots, place_px2=place + fixed)
 
-    def _light_in(self, picture: Picture) -> tuple[float, Bools] | None:
+    def _light_in(self, picture: Picture, measured: bool = False) -> tuple[float, Bools] | None:
         """How much of the structure a picture shows, relative to the background, and where it does.
 
-        Places: on the pixels of _SAMPLE. None: the picture and the background do not fit.
+        Places: on the pixels of _SAMPLE. None: the picture and the background do not fit. measured: also where the
+        light is the same within the errors of its measurement; otherwise it is 1 there.
         """
         if picture.shape != self.structure.shape:
             return None
@@ -314,16 +322,15 @@ class StaticBackground:
         variance = self.noise.variance(self.smooth + own_light + more).astype(np.float32)
         clear = plain & (np.abs(above) < 6 * np.sqrt(variance) + 4 * np.abs(structure))
         seen = np.where(clear, structure, 0.0)
-        # A part of what is seen is the background's own noise, which the picture does not show.
-        own = self._noise_share * variance
-        power = np.maximum(sums_around(seen * seen - np.where(clear, own, 0.0)), 1e-12)
-        here, sigma = (
-            sums_around(seen * above) / power,
-            np.sqrt(sums_around(variance) / power / sums_around(np.ones_like(power))),
-        )
-        light = float(np.median(here[sigma <= np.median(sigma)]))
+        power = sums_around(seen * seen)
+        here = sums_around(seen * above) / np.maximum(power, 1e-12)
+        light = float(np.median(here[power >= np.median(power)])) / self.reference
+        sigma = _EFFICIENCY * float(np.sqrt(np.median(variance) / max(np.sum(seen * seen), 1e-12))) / self.reference
+        if not measured and abs(light - 1) < max(_SAME_LIGHT, _CLEAR_SIGMAS * sigma):
+            light = 1.0
         if not _LEAST_LIGHT < light < _MOST_LIGHT:
             return None
+        own = self._noise_share * variance
         left = np.where(clear, (above - light * structure) / np.sqrt(variance + light**2 * own), 0.0)
         if 1.4826 * float(np.median(np.abs(left[clear]))) > _LARGEST_MISFIT:
             return None
