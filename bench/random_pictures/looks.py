@@ -182,7 +182,7 @@ FAMILIES: dict[str, Callable[[np.random.Generator, Look], Look]] = {
     "photographs": lambda r, k: replace(
         k, photograph=0.6, background=40 / 255, gradient=0.0, vignetting=0.0, texture=0.0, flicker=0.0,
         sensor=replace(k.sensor, full_well_e=float(r.uniform(8e3, 15e3)), read_e=4.0), peak_snr=_log(r, 40, 150),
-        hot_pixels=0, motion="sines",
+        hot_pixels=0,
     ),
     "row-noise": lambda r, k: replace(k, sensor=replace(k.sensor, row_e=float(r.uniform(0.5, 1.0) * k.sensor.read_e))),
 }  # fmt: skip

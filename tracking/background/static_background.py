@@ -57,7 +57,7 @@ _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
 _TRIED = 3  # every such picture shows whether there are further spots
 _MANY_LIGHTS = 4  # at rest, from which the subtraction is used in any case: it spares their fits
 _LEAST_FOUND = 0.2  # further or better spots per picture from which the subtraction is used
-_SAMPLE = (7, 8)  # rows and columns: every such pixel shows how much of the structure is in a picture
+_SAMPLE = (10, 11)  # rows and columns: every such pixel shows how much of the structure is in a picture
 _CLEAR_SIGMAS = 4.0  # more than this counts as much: somebody in front of the screen is in many pixels
 _EFFICIENCY = 2.0  # sigma of the median over places, of those that show most structure, over that of one fit
 _SAME_LIGHT = 0.03  # the light has not changed by more than this share: the structure is not scaled
@@ -146,6 +146,7 @@ class StaticBackground:
         unknown = np.zeros(mean.shape, np.uint8)
         unknown[row[~enough], column[~enough]] = 1
         better.near_lights[unknown > 0] = True
+        unknown[places_of(better.lights.found, mean.shape, AROUND_LIGHT)] = 0  # searched where the light has changed
         _, _, places, _ = cv2.connectedComponentsWithStats(unknown)
         left, top, width, height = places[1:, : cv2.CC_STAT_AREA].T.astype(float)
         half = 0.5 * np.maximum(width, height) + AROUND_SPOT[1]
