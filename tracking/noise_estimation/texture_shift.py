@@ -126,11 +126,12 @@ class TextureShift:
 
 
 def texture_shift(
-    seen: MeanPicture, noise: NoiseModel, full_dn: float, found: Sequence[Detections] = ()
+    seen: MeanPicture, noise: NoiseModel, full_dn: float, found: Sequence[Detections] = (), black_dn: float | None = None
 ) -> TextureShift:
     """The errors of spots on the background of one camera's pictures, less those by noise. full_dn: full scale.
 
-    The lights found in the pictures and lines, such as edges and seams, are not texture.
+    The lights found in the pictures and lines, such as edges and seams, are not texture. black_dn: grey value without
+    light; None: not known.
 
     As in `texture_of`, the background counts without its smooth part. For wide spots the smooth part counts, except for
     a plane over the picture: light that falls from one side does not shift a spot, but a response of lens and screen
@@ -146,7 +147,7 @@ def texture_shift(
     variance = noise.of_means.variance(sample) / pictures
     white = float(np.median(variance / sample**2))
     # Contrasts are relative to the level; those of the light are larger.
-    more = level_over_light(mean - background, level, float(np.median(variance)), full_dn)
+    more = level_over_light(mean - background, level, float(np.median(variance)), full_dn, black_dn)
     light, around = [], []
     for sigma_px in (w for w in _WIDTHS_PX if w < _COARSE_PX):
         if sigma_px > _FEWER_PIXELS * cell:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Ints
 
 USUAL_WIDTH_PX = 2.0  # of spots whose width is not known
 _CHUNK = 256  # consecutive frames that are compared with each other
@@ -32,16 +32,9 @@ class PlaceErrors:
     """Estimate for T frames and n views."""
 
     share: float  # of the spots' error variance that belongs to places, in [0, 1]
-    same_error_frames: Array  # (T,) number of frames, this one included, with the same errors; mean over the views
+    factor: Array  # (T,) of covariances that were computed as if the errors of all frames were independent
     reach_px: Array  # (n,) correlation length: the sigma of a spot whose mean over white texture would make it
     elsewhere: float = 0.0  # share of the variance that is the same in all places: errors of the rig, not of a place
-
-    def factor(self, averaged: Array) -> Array:
-        """Factors (T,) of covariances that were computed as if the errors of all frames were independent.
-
-        averaged (T,): number of frames that each pose is a mean of.
-        """
-        return np.asarray(1 + self.share * (np.minimum(self.same_error_frames, np.maximum(averaged, 1.0)) - 1))
 
 
 def correlation(distance_px: Array, width_px: Array | float) -> Array:
@@ -78,7 +71,6 @@ def place_errors(
     best = max(sums, key=lambda p: p.significance)
     if best.significance * np.sqrt(1 - absorbed) < _SIGNIFICANT:
         best = sums[0]
-    same_error_frames = _mean_over_views(best.same_error_frames, labelled)
     share = predicted
     if best.expected > 0:
         # The poses absorb part of the residuals, which reduces the degrees of freedom.
@@ -89,7 +81,9 @@ def place_errors(
         log_likelihood = -0.5 * (best.near / best.expected - expected) ** 2 / variance - 0.5 * np.log(variance)
         weight = _prior(predicted) * np.exp(log_likelihood - log_likelihood.max())
         share = float(weight @ _SHARES / weight.sum())
-    return PlaceErrors(share, same_error_frames, best.reach_px, best.elsewhere)
+    more = np.stack([more_of_means(uv_px[:, i], best.reach_px[i], averaged) for i in range(len(width))], axis=-1)
+    total, views = np.where(labelled, more, 0.0).sum(axis=1), np.maximum(labelled.sum(axis=1), 1)
+    return PlaceErrors(share, 1 + share * total / views, best.reach_px, best.elsewhere)
 
 
 def _prior(predicted: float) -> Array:
@@ -110,12 +104,6 @@ def usable_widths(width_px: Array) -> Array:
     return np.where(np.isfinite(width_px), np.maximum(width_px, 0.5), USUAL_WIDTH_PX)
 
 
-def _mean_over_views(counts: Array, labelled: Bools) -> Array:
-    """(T,): mean of the counts (T, n) over the labelled views; 1 without any."""
-    total = np.where(labelled, counts, 0.0).sum(axis=1)
-    return np.asarray(np.where(labelled.any(axis=1), total / np.maximum(labelled.sum(axis=1), 1), 1.0))
-
-
 def _distances(uv_px: Array) -> Array:
     """(m, m): between all pairs of pixels (m, 2)."""
     du, dv = uv_px[:, None, 0] - uv_px[None, :, 0], uv_px[:, None, 1] - uv_px[None, :, 1]
@@ -130,6 +118,24 @@ def frames_with_same_error(uv_px: Array, reach_px: float) -> Array:
         some = rows[start : start + _CHUNK]
         at = uv_px[some]
         out[some] = correlation(_distances(at), reach_px).sum(axis=1)
+    return out
+
+
+def more_of_means(uv_px: Array, reach_px: float, averaged: Array) -> Array:
+    """(T,): by how much the variance of means exceeds that of means of independent errors, relative to the latter.
+
+    Of the errors of one view's spot, at uv_px (T, 2); averaged (T,): number N of frames that each mean is of. The
+    weights of the mean are taken to be a Gaussian over time, the sum of whose squares is 1 / N. 0 without a spot.
+    """
+    out = np.zeros(len(uv_px))
+    rows = np.flatnonzero(np.isfinite(uv_px).all(axis=-1))
+    for start in range(0, len(rows), _CHUNK):
+        some = rows[start : start + _CHUNK]
+        rho, many = correlation(_distances(uv_px[some]), reach_px), np.maximum(averaged[some], 1.0)
+        np.fill_diagonal(rho, 0.0)
+        weight = np.exp(-0.5 * ((some[:, None] - some) * (2 * np.sqrt(np.pi) / many)[:, None]) ** 2)
+        weight /= weight.sum(axis=1, keepdims=True)
+        out[some] = many * np.sum((weight @ rho) * weight, axis=1)
     return out
 
 

@@ -346,4 +346,4 @@ class _Smoother:
         shares = self.errors.place_px2(detections, self.rec.place_px2())[rows] / size**2
         width_px, share = self.detections.usual_size_px, float(np.mean(shares)) if len(shares) else 0.0
         found = place_errors(residual, uv_px, width_px, averaged, explained, share)
-        return found.share, pose_P * (found.factor(averaged) * self.noise_share)[:, None, None]
+        return found.share, pose_P * (found.factor * self.noise_share)[:, None, None]

@@ -52,7 +52,7 @@ class CameraNoise:
         """Estimate the noise from some pictures in temporal order; without any, nothing changes."""
         if not pictures:
             return
-        self.estimate = estimate_noise(pictures)
+        self.estimate = estimate_noise(pictures, self._black_dn)
         self.mosaic = mosaic_contrast(pictures[0])
         self._update_model()
         if self.stated is not None:
@@ -110,6 +110,11 @@ class CameraNoise:
         known = seen if parameters.saturation_dn is None else parameters.saturation_dn
         return float(np.iinfo(picture.dtype).max) if known is None else known
 
+    @property
+    def _black_dn(self) -> float | None:
+        """The stated grey value without light; 0 is that of a file that does not state it."""
+        return None if self.stated is None or self.stated.black_dn <= 0 else self.stated.black_dn
+
     def _search(self, picture: Picture, parameters: DetectParameters, model: NoiseModel | None) -> Detections:
         return find_spots(picture, replace(parameters, saturation_dn=self.saturation_dn(picture, parameters)), model)
 
@@ -134,7 +139,7 @@ class CameraNoise:
         self.model = stated
 
     def _estimate_again(self, picture: Picture, parameters: DetectParameters) -> Detections:
-        estimate = estimate_noise(list(self._recent))
+        estimate = estimate_noise(list(self._recent), self._black_dn)
         found = self._search(picture, parameters, estimate.model)
         if len(found):
             self.estimate = estimate
