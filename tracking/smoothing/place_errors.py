@@ -23,6 +23,7 @@ _REACHES = (1.0, 2.0, 4.0, 8.0)  # tried correlation lengths, in widths of the s
 _SHARES = np.concatenate([[0.0], np.geomspace(1e-3, 1.0, 61)])  # of the variance: hypotheses
 _FACTOR = 1.5  # 1 sigma of the ratio of a predicted standard deviation of the errors of places to the true one
 _UNFORESEEN = 0.1  # probability that the errors of places are not those predicted: none, or any
+_LEAST_SQUARE = 0.1  # of its expectation by noise: the statistic scatters below zero
 _SIGNIFICANT = 3.0  # sigmas of the statistic under noise alone, above which it decides about the correlation length
 _MAX_ABSORBED = 0.8  # largest share of the errors that is assumed to be absorbed by the poses
 
@@ -77,8 +78,10 @@ def place_errors(
         place = _SHARES * (1 - absorbed)
         expected = place / (place + (1 - _SHARES) * (1 - absorbed / float(np.median(np.maximum(averaged, 1.0)))))
         free = 2 * (1 - absorbed) * float(np.sum(labelled / np.maximum(best.same_error_frames, 1.0)))
-        variance = 0.5 / best.expected / (1 - absorbed) + 2 * expected**2 / max(free, 1.0)
-        log_likelihood = -0.5 * (best.near / best.expected - expected) ** 2 / variance - 0.5 * np.log(variance)
+        # The statistic is a mean square of `free` means over places, less that by noise: a multiple of chi-square.
+        by_noise = np.sqrt(0.25 * free / best.expected / (1 - absorbed))
+        mean_square = max(best.near / best.expected + by_noise, _LEAST_SQUARE * by_noise)
+        log_likelihood = -0.5 * free * (mean_square / (expected + by_noise) + np.log(expected + by_noise))
         weight = _prior(predicted) * np.exp(log_likelihood - log_likelihood.max())
         share = float(weight @ _SHARES / weight.sum())
     more = np.stack([more_of_means(uv_px[:, i], best.reach_px[i], averaged) for i in range(len(width))], axis=-1)
