@@ -40,6 +40,7 @@ _RESOLVED_PX, _CLEAR = 1.8, 0.02  # width from which a misfit shows; noise of th
 _FEWEST_LIGHTS = 6
 _CLEARLY_MORE = 6.0  # ratio of the variance that a fit shows to that expected: of one spot it has a factor of two
 _FEWEST_PLACES = 500  # samples of the filters' outputs without lights and lines; with fewer all are used
+_UNSURE = 0.02  # of the noise of the mean picture, which is subtracted: usual error of its estimate
 _SAMPLED = 3  # px: step of the sample of the filters' outputs
 LARGEST_SHARE = 0.25  # of the spot's width: a larger error is not assumed; faint spots on texture have half of it
 
@@ -189,7 +190,7 @@ def _shift(texture: NDArray[Any], objects: NDArray[np.uint8], sigma_px: float, p
         free[:] = True
     outputs = [o[middle, middle][free] for o in _filtered(texture, *kernels)]
     variance = quantile_variance(np.abs(np.concatenate(outputs)))
-    return float(np.sqrt(max(variance - white * np.sum(odd**2) * np.sum(smooth**2), 0.0)))
+    return float(np.sqrt(max(variance - (1 + _UNSURE) * white * np.sum(odd**2) * np.sum(smooth**2), 0.0)))
 
 
 def _kernels(sigma_px: float, power: int, reach: int) -> tuple[Array, Array]:
