@@ -91,9 +91,7 @@ class Outcome:
 def recorded(cell: Cell, folder: Path) -> Path:
     """Write the pictures of a recording into a new folder."""
     rig = scaled(PLACE_RIGS[cell.rig](), SCALE)
-    base = replace(
-        SCENARIOS["small-motion"], light=PLACE_LIGHTS[cell.light], clutter=Clutter(per_spot=0.0), rig="fan"
-    )
+    base = replace(SCENARIOS["small-motion"], light=PLACE_LIGHTS[cell.light], clutter=Clutter(per_spot=0.0), rig="fan")
     model = SpotModel.of(rig)
     motion = draw_motion(base, model, cell.seed)
     pixels = model.project(motion.pose(np.array([0.0, _SHORT_S])))[0]

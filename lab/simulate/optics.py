@@ -122,8 +122,8 @@ def _skew(covariance_px2: Array, curvature: Array, blur_px: float) -> tuple[Arra
     G = B @ P
     A = np.einsum("la,ljk,jb,kc->abc", P, T, G, G)
     linear = 2 * np.einsum("ljk,jl,kc->c", T, G - np.eye(2), G) + np.einsum("lc,ljk,jk->c", P, T, G @ B - B)
-    cubic = np.array([A[0, 0, 0], A[0, 0, 1] + A[0, 1, 0] + A[1, 0, 0], A[0, 1, 1] + A[1, 0, 1] + A[1, 1, 0], A[1, 1, 1]])
-    return cubic, linear
+    mixed = A[0, 0, 1] + A[0, 1, 0] + A[1, 0, 0], A[0, 1, 1] + A[1, 0, 1] + A[1, 1, 0]
+    return np.array([A[0, 0, 0], *mixed, A[1, 1, 1]]), linear
 
 
 def exposure_instants(length_px: float, sigma_px: float) -> tuple[Array, Array]:

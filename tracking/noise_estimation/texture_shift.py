@@ -128,7 +128,7 @@ class TextureShift:
 
 
 def texture_shift(
-    seen: MeanPicture, noise: NoiseModel, full_dn: float, found: Sequence[Detections] = (), black_dn: float | None = None
+    seen: MeanPicture, noise: NoiseModel, full_dn: float, found: Sequence[Detections], black_dn: float | None
 ) -> TextureShift:
     """The errors of spots on the background of one camera's pictures, less those by noise. full_dn: full scale.
 
