@@ -125,7 +125,7 @@ class StaticBackground:
     def _found_in(self, picture: Picture, shift: TextureShift) -> tuple[Detections, int]:
         """The spots found in a picture or in its difference, and how many of them the difference shows better."""
         usual = DetectParameters()
-        in_picture = shift.added_to(find_spots(picture, usual, self.noise), self.noise.black_dn)
+        in_picture = shift.added_to(find_spots(picture, usual, self.noise), self.noise)
         spots = self.spots_in(picture, usual, shift)
         kept, replaced = _compared(spots, in_picture)
         found = _joined(in_picture[~replaced], spots[kept], len(in_picture) + len(spots))
@@ -209,7 +209,7 @@ class StaticBackground:
         # The background's own noise is the same in all pictures.
         fixed = self._noise_share / (1 + self._noise_share) * 0.5 * np.trace(spots.cov_px2, axis1=1, axis2=2)
         of_light = replace(shift, background_px=(0.0,) * len(shift.background_px))
-        spots = of_light.added_to(spots, self.model.black_dn / self.steps - self.offset_dn)
+        spots = of_light.added_to(spots, self.noise)
         place = np.zeros(len(spots)) if spots.place_px2 is None else spots.place_px2
         return replace(spots, place_px2=place + fixed)
 

@@ -40,6 +40,9 @@ _RESOLVED_PX, _CLEAR = 1.8, 0.02  # width from which a misfit shows; noise of th
 _FEWEST_LIGHTS = 6
 _CLEARLY_MORE = 6.0  # ratio of the variance that a fit shows to that expected: of one spot it has a factor of two
 _FEWEST_PLACES = 500  # samples of the filters' outputs without lights and lines; with fewer all are used
+# Height of a Gaussian at which the weights of its fit count: by a Monte Carlo of fits with 9 parameters on texture of
+# 1.2 px, which shifts spots of 1.6 px with a brightness of 4.6 by 0.9 of what it does with equal weights.
+_WEIGHTED = 0.145
 _UNSURE = 0.02  # of the noise of the mean picture, which is subtracted: usual error of its estimate
 _SAMPLED = 3  # px: step of the sample of the filters' outputs
 LARGEST_SHARE = 0.25  # of the spot's width: a larger error is not assumed; faint spots on texture have half of it
@@ -88,18 +91,23 @@ class TextureShift:
         """That of the spot's own light alone."""
         return replace(self, background_px=tuple(0.0 for _ in self.widths_px))
 
-    def sigma_px(self, width_px: Array, contrast: Array) -> Array:
+    def sigma_px(self, width_px: Array, contrast: Array, brightness: Array | float = 0.0) -> Array:
         """Sigmas (n,), px, of spots with these widths (n,), px, and peaks (n,) relative to the background.
 
-        Both parts come from the same texture, so they are added. nan where a width is not known.
+        brightness (n,): variance of the shot noise at the peak over that of the background's noise; a fit gives bright
+        pixels less weight, so that its kernel in the light is rather x G^p with p < 2, which is (p / 2) times that of a
+        spot wider by sqrt(2 / p). Both parts come from the same texture, so they are added. nan where a width is not
+        known.
         """
         at, widths = np.log(np.maximum(width_px, 1e-3)), np.log(self.widths_px)
-        light = np.interp(at, widths, self.light_px)
+        shot = _WEIGHTED * np.maximum(brightness, 0.0)
+        p = 2 - shot / (1 + shot)
+        light = 0.5 * p * np.interp(at + 0.5 * np.log(2 / p), widths, self.light_px)
         background = np.interp(at, widths, self.background_px)
         return np.minimum(light + background / np.maximum(contrast, 1e-3), LARGEST_SHARE * np.asarray(width_px))
 
-    def added_to(self, found: Detections, level_dn: float) -> Detections:
-        """Points whose covariances include these errors, on a background of this level.
+    def added_to(self, found: Detections, noise: NoiseModel) -> Detections:
+        """Points whose covariances include these errors; noise: of the pictures, with the background's level.
 
         The kernels above of an elliptical Gaussian give variances along its axes in proportion to its half axes. The
         fits' misfits show these errors as well, less precisely; if they are clearly larger, they count instead: they
@@ -108,7 +116,8 @@ class TextureShift:
         misfit = np.zeros(len(found)) if found.misfit is None else found.misfit
         seen = misfit[:, None, None] * found.cov_px2
         major, minor = np.maximum(found.major_px, _NARROWEST_PX), np.maximum(found.minor_px, _NARROWEST_PX)
-        sigma = self.sigma_px(np.sqrt(found.major_px * found.minor_px), found.peak / max(level_dn, 1.0))
+        width_px, brightness = np.sqrt(found.major_px * found.minor_px), noise.slope_dn * found.peak / noise.floor_dn2
+        sigma = self.sigma_px(width_px, found.peak / max(noise.black_dn, 1.0), brightness)
         expected_px2 = np.where(np.isnan(sigma), 0.0, sigma) ** 2
         angle = np.radians(found.angle_deg)
         along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)

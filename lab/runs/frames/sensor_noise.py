@@ -122,7 +122,7 @@ class CameraNoise:
         """The points with covariances that include the errors due to the screen's texture."""
         if self.estimate is None or not len(found):
             return found
-        return self.estimate.texture_shift.added_to(found, self.estimate.model.black_dn)
+        return self.estimate.texture_shift.added_to(found, self.estimate.model)
 
     def _update_model(self) -> None:
         """Stated values take precedence; the rest is estimated: data sheets lack them."""

@@ -56,6 +56,28 @@ def test_the_background_predicts_the_errors_of_bright_and_of_faint_spots(sigma_p
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.mean(expected), rel=0.4)
 
 
+@pytest.mark.parametrize("brightness", [3.0, 10.0])
+@pytest.mark.parametrize(("sigma_px", "grain_px"), [(1.6, 1.2), (3.0, 1.5), (1.6, 6.0)])
+def test_fits_that_give_bright_pixels_less_weight_have_smaller_errors_on_fine_texture(sigma_px, grain_px, brightness):
+    """As a share of those of fits with equal weights; coarse texture shifts all of a spot, whatever the weights."""
+    errors, expected, peak = np.zeros((2, 0)), [], 6000.0
+    for seed in range(4):
+        reflectance = screen(0.04, grain_px, seed)
+        shift = estimate_noise(pictures(reflectance, 0.0, 4)).texture_shift
+        centres, light = spots(sigma_px, peak, seed)
+        picture = pictures(reflectance, light, 1)[0]
+        of_both = []
+        for slope in (0.0, brightness * NOISE**2 / peak):
+            found = find_spots(picture, noise=NoiseModel(NOISE**2, slope, BACKGROUND))
+            nearest = [int(np.argmin(np.hypot(*(found.uv_px - centre).T))) for centre in centres]
+            of_both.append((found.uv_px[nearest] - centres).ravel())
+        errors = np.concatenate([errors, of_both], axis=1)
+        at = np.array([sigma_px]), np.array([peak / BACKGROUND])
+        expected.append(float(shift.sigma_px(*at, brightness)[0] / shift.sigma_px(*at)[0]))
+    seen = np.sqrt(np.mean(errors[1] ** 2) / np.mean(errors[0] ** 2))
+    assert seen == pytest.approx(np.mean(expected), abs=0.1)
+
+
 @pytest.mark.parametrize("angle_deg", [0.0, 35.0, 90.0])
 def test_elongated_spots_have_larger_errors_along_their_major_axis(angle_deg):
     """Variances along the axes are in proportion to the half axes."""
@@ -75,7 +97,7 @@ def test_elongated_spots_have_larger_errors_along_their_major_axis(angle_deg):
             for a, b in centres
         )
         picture = pictures(reflectance, peak * np.asarray(light), 1)[0]
-        found = estimate.texture_shift.added_to(find_spots(picture, noise=estimate.model), BACKGROUND)
+        found = estimate.texture_shift.added_to(find_spots(picture, noise=estimate.model), estimate.model)
         for centre in centres:
             nearest = int(np.argmin(np.hypot(*(found.uv_px - centre).T)))
             errors.append((found.uv_px[nearest] - centre) @ np.array([[p, -q], [q, p]]))
