@@ -38,6 +38,7 @@ _NARROWEST_PX = 0.5  # half axis, with the pixel's own width
 _USUAL = 0.3  # quantile of the lights' misfits: of reflections and other clutter many have larger ones than spots
 _RESOLVED_PX, _CLEAR = 1.8, 0.02  # width from which a misfit shows; noise of the centre, in widths, of clear lights
 _FEWEST_LIGHTS = 6
+_WIDER = 4.0  # times the usual width: no spot
 _CLEARLY_MORE = 6.0  # ratio of the variance that a fit shows to that expected: of one spot it has a factor of two
 _FEWEST_PLACES = 500  # samples of the filters' outputs without lights and lines; with fewer all are used
 # Height of a Gaussian at which the weights of its fit count: by a Monte Carlo of fits with 9 parameters on texture of
@@ -76,13 +77,22 @@ class TextureShift:
         return TextureShift(_WIDTHS_PX, light, tuple(0.0 for _ in _WIDTHS_PX), known=False)
 
     def with_lights(self, found: Sequence[Detections]) -> TextureShift:
-        """These errors with `misfit_share` from the lights found in pictures."""
-        shares = []
-        for points in found:
-            width = np.sqrt(points.major_px * points.minor_px)
+        """These errors with `misfit_share` from the lights found in pictures.
+
+        Reflections are much wider than the spots, which are the bright lights, and no Gaussians.
+        """
+        shares: list[float] = []
+        widths = [np.sqrt(points.major_px * points.minor_px) for points in found]
+        every, peaks = np.concatenate([*widths, np.zeros(1)]), np.concatenate([*(p.peak for p in found), np.zeros(1)])
+        order = np.argsort(every)
+        by_peak = np.cumsum(peaks[order])
+        usual_px = every[order][np.searchsorted(by_peak, 0.5 * by_peak[-1])]  # median, weighted with the peaks
+        for points, width in zip(found, widths, strict=True):
             variance = 0.5 * np.trace(points.cov_px2, axis1=1, axis2=2)
             misfit = np.zeros(len(points)) if points.misfit is None else points.misfit
-            clear = (width > _RESOLVED_PX) & (variance * (1 - misfit) < (_CLEAR * width) ** 2)
+            clear = (
+                (width > _RESOLVED_PX) & (width < _WIDER * usual_px) & (variance * (1 - misfit) < (_CLEAR * width) ** 2)
+            )
             shares.extend(np.sqrt(misfit * variance)[clear] / width[clear])
         return replace(self, misfit_share=float(np.quantile(shares, _USUAL))) if len(shares) >= _FEWEST_LIGHTS else self
 

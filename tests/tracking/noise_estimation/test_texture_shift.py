@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from geometry.arrays import Array
 from tracking.detection.detect import find_spots
+from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
 from tracking.noise_estimation.photon_transfer import estimate_noise
 from tracking.noise_estimation.texture_shift import LARGEST_SHARE, TextureShift
@@ -193,3 +196,19 @@ def test_a_prediction_is_limited_and_pictures_without_room_have_none():
     assert rough.sigma_px(np.array([2.0]), np.array([0.1]))[0] == pytest.approx(2.0 * LARGEST_SHARE)
     small = [np.full((60, 60), 20, np.uint8) + np.eye(60, dtype=np.uint8) * k for k in (0, 1)]
     assert estimate_noise(small).texture_shift.sigma_px(np.array([3.0]), np.array([1.0]))[0] == 0.0
+
+
+def lights(widths_px: list[float], peaks: list[float], misfits: list[float]) -> Detections:
+    """Points of these widths, peaks and shares of misfits, with centres known to 1 % of their widths."""
+    width = np.array(widths_px)
+    points = Detections.at(np.zeros((len(width), 2)), (0.01 * width[:, None, None]) ** 2 * np.eye(2))
+    return replace(points, major_px=width, minor_px=width, peak=np.array(peaks), misfit=np.array(misfits))
+
+
+@pytest.mark.parametrize("spot_px", [1.6, 3.0])
+def test_wide_reflections_do_not_show_the_grain_of_the_spots(spot_px):
+    of_spots = lights([spot_px] * 3, [150.0] * 3, [0.5] * 3)
+    with_reflections = lights([spot_px] * 3 + [28.0] * 3, [150.0] * 3 + [20.0] * 3, [0.5] * 3 + [1.0] * 3)
+    alone, both = (TextureShift.none().with_lights([found] * 6).misfit_share for found in (of_spots, with_reflections))
+    assert both == pytest.approx(alone, nan_ok=True)
+    assert np.isnan(both) == (spot_px < 1.8)  # narrower ones do not show it at all
