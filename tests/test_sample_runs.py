@@ -103,7 +103,7 @@ def test_the_pictures_are_reproduced(name, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_papers_run_passes_with_sigmas_that_agree_with_the_truth(tmp_path):
-    """Its light has speckle that no fit shows, and texture that its dark background does not show."""
+    """Its light has speckle that no fit shows, and texture that its unlit background does not show."""
     outcome = process_run(FOLDER / "huo2015", tmp_path / "run")
     assert outcome.verdict.status == "pass"
     for name in ("pose", "pose_causal"):
