@@ -40,7 +40,7 @@ class CentroidOffsets:
         self._size = np.array([width - 1.0, height - 1.0])
         u, v = (np.linspace(0.0, end, _NODES) for end in self._size)
         nodes = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1)
-        self._curvature = _curvature(camera, screen, nodes)  # (_NODES, _NODES, 2, 3)
+        self._curvature = map_curvature(camera, screen, nodes)  # (_NODES, _NODES, 2, 3)
 
     def at(self, uv_px: Array, shape_px2: Array, brightness: Array, clip: Array) -> Array:
         """Fitted centres minus the images of the beams' axes (n, 2), px; 0 where the ray misses the screen.
@@ -100,7 +100,7 @@ def _interpolate(curvature: Array, size: Array, uv: Array, out: Array) -> None:
             out[a, b] = (1 - x) * low + x * high
 
 
-def _curvature(camera: Camera, screen: Screen, uv_px: Array) -> Array:
+def map_curvature(camera: Camera, screen: Screen, uv_px: Array) -> Array:
     """The quadratic terms T (..., 2, 3: uu, uv, vv), 1/px, of the map from the picture to the screen.
 
     s(u + x) = s(u) + J (x + T(x, x)): half of the second derivatives, in pixels. 0 where a ray misses the screen.

@@ -101,6 +101,15 @@ def test_the_pictures_are_reproduced(name, tmp_path, monkeypatch):
         assert (again != kept).mean() < 1e-4
 
 
+@pytest.mark.slow
+def test_the_papers_run_passes_with_sigmas_that_agree_with_the_truth(tmp_path):
+    """Its light has speckle that no fit shows, and texture that its unlit background does not show."""
+    outcome = process_run(FOLDER / "huo2015", tmp_path / "run")
+    assert outcome.verdict.status == "pass"
+    for name in ("pose", "pose_causal"):
+        assert 0.7 < outcome.errors[name]["measured"]["nees_mean"] / 6 < 1.35
+
+
 def test_the_papers_run_agrees_with_its_readme_line():
     sample = make.SAMPLES["huo2015"]
     scene = compose(sample["scenario"], sample["seed"], sample["frames"])

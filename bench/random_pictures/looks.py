@@ -152,6 +152,9 @@ FAMILIES: dict[str, Callable[[np.random.Generator, Look], Look]] = {
     ),
     "saturated": lambda r, k: replace(k, peak_snr=1e4, most_peak=float(r.uniform(1.2, 4.0)), sigma_px=_log(r, 0.9, 6)),
     "still": lambda r, k: replace(k, motion="rest", texture=0.04, texture_grain_px=_log(r, 0.7, 4)),
+    "slow": lambda r, k: replace(
+        k, motion="sines", fastest_px=_log(r, 0.1, 7), texture=0.04, texture_grain_px=_log(r, 0.7, 4)
+    ),
     "streaks": lambda r, k: replace(
         k, exposure_share=float(r.uniform(0.4, 0.9)), fastest_px=float(r.uniform(12, 30)), least_streak_px=5.0,
         motion="sines",

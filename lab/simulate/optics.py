@@ -14,6 +14,7 @@ from geometry.pose import Pose
 _REACH = 5.0  # sigmas that are drawn: a spot of 150 DN ends below 0.001 DN
 # Gauss-Legendre nodes within a pixel, per axis. With four, the integral over a pixel of a Gaussian with sigma 0.5 px
 # has an error of 1e-6 of its peak; three suffice from 0.8 px on.
+_FLAT = np.zeros((2, 3))
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
@@ -73,12 +74,17 @@ class Patch:
     values: Array  # (h, w)
 
 
-def spot_patch(path_px: Array, weights: Array, covariance_px2: Array, size_px: tuple[int, int]) -> Patch | None:
+def spot_patch(
+    path_px: Array, weights: Array, covariance_px2: Array, size_px: tuple[int, int],
+    curvature: Array = _FLAT, blur_px: float = 0.0,
+) -> Patch | None:  # fmt: skip
     """A Gaussian spot of flux 1 that moves during the exposure, integrated over pixels; None outside the picture.
 
-    path_px (m, 2): centres at m instants; weights (m,): their shares of the exposure. covariance_px2 (2, 2): constant
-    during the exposure. size_px: width, height.
+    path_px (m, 2): images of the beam's axis at m instants; weights (m,): their shares of the exposure. covariance_px2
+    (2, 2): constant during the exposure. size_px: width, height. curvature (2, 3), 1/px: see
+    geometry.light_centroid.map_curvature; it skews the spot except for the blur of the lens, whose sigma is blur_px.
     """
+    cubic, linear = _skew(covariance_px2, curvature, blur_px)
     reach = _REACH * np.sqrt(np.diagonal(covariance_px2)) + 1.0
     first = np.maximum(np.floor(path_px.min(axis=0) - reach), 0).astype(int)
     last = np.minimum(np.ceil(path_px.max(axis=0) + reach), np.array(size_px) - 1).astype(int)
@@ -90,15 +96,34 @@ def spot_patch(path_px: Array, weights: Array, covariance_px2: Array, size_px: t
     v = (np.arange(first[1], last[1] + 1)[:, None] + _NODES / 2).ravel()
     light = np.zeros((len(v), len(u)))
     for centre, weight in zip(path_px, weights, strict=True):
-        du, dv = u - centre[0], v - centre[1]
-        exponent = precision[0, 1] * dv[:, None] * du
+        du, dv = u - centre[0], v[:, None] - centre[1]
+        exponent = precision[0, 1] * dv * du
         exponent += 0.5 * precision[0, 0] * du**2
-        exponent += 0.5 * precision[1, 1] * (dv**2)[:, None]
+        exponent += 0.5 * precision[1, 1] * dv**2
+        if curvature.any():
+            exponent += du * (du * (cubic[0] * du + cubic[1] * dv) - linear[0])
+            exponent += dv * (dv * (cubic[3] * dv + cubic[2] * du) - linear[1])
         light += weight * np.exp(-exponent)
     k = len(_NODES)
     blocks = light.reshape(len(v) // k, k, len(u) // k, k)
     values = norm * np.einsum("ijkl,j,l->ik", blocks, _WEIGHTS / 2, _WEIGHTS / 2)
     return Patch(int(first[1]), int(first[0]), values)
+
+
+def _skew(covariance_px2: Array, curvature: Array, blur_px: float) -> tuple[Array, Array]:
+    """The third order of a spot's exponent: coefficients of uuu, uuv, uvv, vvv (4,) and, to subtract, of u, v (2,).
+
+    The light before the blur is exp(-|d + T(d, d)|^2 / 2), in the metric of its covariance B, with the curvature T. To
+    first order in T it is (1 + linear and cubic derivatives) of exp(-|d|^2 / 2); the blur changes only the covariance
+    of the latter, to C. Source: ours.
+    """
+    T = np.stack([curvature[:, :2], curvature[:, 1:]], axis=1)  # (2, 2, 2)
+    B, P = covariance_px2 - blur_px**2 * np.eye(2), np.linalg.inv(covariance_px2)
+    G = B @ P
+    A = np.einsum("la,ljk,jb,kc->abc", P, T, G, G)
+    linear = 2 * np.einsum("ljk,jl,kc->c", T, G - np.eye(2), G) + np.einsum("lc,ljk,jk->c", P, T, G @ B - B)
+    mixed = A[0, 0, 1] + A[0, 1, 0] + A[1, 0, 0], A[0, 1, 1] + A[1, 0, 1] + A[1, 1, 0]
+    return np.array([A[0, 0, 0], *mixed, A[1, 1, 1]]), linear
 
 
 def exposure_instants(length_px: float, sigma_px: float) -> tuple[Array, Array]:

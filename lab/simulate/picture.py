@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array
 from geometry.camera import SensorNoise
+from geometry.light_centroid import map_curvature
 from geometry.pose import Pose
 from lab.simulate.optics import exposure_instants, spot_images, spot_patch
 from lab.simulate.scenarios import Light
@@ -120,8 +121,12 @@ def _lit(scene: Scene, sensor: Sensor, powers: LaserPowers, k: int) -> tuple[Flo
     picture = sensor.background.copy()
     pieces: list[tuple[slice, slice]] = []
 
+    camera = scene.rig.cameras[model.camera_names[sensor.camera]]
+    screen = scene.rig.screens[camera.screen]
+
     def add(path: Array, share: Array, covariance: Array, flux: float) -> None:
-        patch = spot_patch(path, share, covariance, sensor.size_px)
+        curvature = map_curvature(camera, screen, np.mean(path, axis=0))
+        patch = spot_patch(path, share, covariance, sensor.size_px, curvature, light.blur_px)
         if patch is None:
             return
         h, w = patch.values.shape

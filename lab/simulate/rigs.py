@@ -52,7 +52,8 @@ def with_noise(rig: Rig, noise: SensorNoise) -> Rig:
     return Rig(rig.screens, cameras, rig.beams, rig.spots)
 
 
-def _camera(name: str, screen: str, position_m: Sequence[float], target_m: Sequence[float]) -> Camera:
+def lab_camera(name: str, screen: str, position_m: Sequence[float], target_m: Sequence[float]) -> Camera:
+    """A camera of the simulated lab at `position_m`, aimed at `target_m`, with the usual size and lens."""
     width, height = IMAGE_SIZE_PX
     matrix = np.array([[FOCAL_PX, 0, (width - 1) / 2], [0, FOCAL_PX, (height - 1) / 2], [0, 0, 1]])
     pose = look_at(np.asarray(position_m, dtype=float), np.asarray(target_m, dtype=float))
@@ -75,8 +76,8 @@ def _two_cameras() -> dict[str, Camera]:
     while C leaves it.
     """
     return {
-        "left": _camera("left", "left", (1.6, 0.6, 1.5), (-2.5, 0.35, 0.0)),
-        "right": _camera("right", "right", (-1.6, -0.6, 1.5), (2.5, -0.35, 0.0)),
+        "left": lab_camera("left", "left", (1.6, 0.6, 1.5), (-2.5, 0.35, 0.0)),
+        "right": lab_camera("right", "right", (-1.6, -0.6, 1.5), (2.5, -0.35, 0.0)),
     }
 
 
@@ -109,10 +110,10 @@ def two_cameras_per_screen() -> Rig:
     """As `fan`, each screen observed by two cameras from different sides: twelve views of six spots."""
     rig = fan()
     cameras = {
-        "left-a": _camera("left-a", "left", (1.6, 0.6, 1.5), (-2.5, 0.35, 0.0)),
-        "left-b": _camera("left-b", "left", (1.2, -1.5, 1.3), (-2.5, 0.0, 0.0)),
-        "right-a": _camera("right-a", "right", (-1.6, -0.6, 1.5), (2.5, -0.35, 0.0)),
-        "right-b": _camera("right-b", "right", (-1.2, 1.5, 1.3), (2.5, 0.0, 0.0)),
+        "left-a": lab_camera("left-a", "left", (1.6, 0.6, 1.5), (-2.5, 0.35, 0.0)),
+        "left-b": lab_camera("left-b", "left", (1.2, -1.5, 1.3), (-2.5, 0.0, 0.0)),
+        "right-a": lab_camera("right-a", "right", (-1.6, -0.6, 1.5), (2.5, -0.35, 0.0)),
+        "right-b": lab_camera("right-b", "right", (-1.2, 1.5, 1.3), (2.5, 0.0, 0.0)),
     }
     return Rig(rig.screens, cameras, rig.beams, rig.spots)
 

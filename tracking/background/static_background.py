@@ -160,14 +160,14 @@ class StaticBackground:
 
     def _better_in(self, picture: Picture, shift: TextureShift) -> int:
         """How many spots the difference of a picture shows that the picture does not, or clearly more precisely."""
-        in_picture = shift.added_to(find_spots(picture, self.parameters, self.noise), self.noise.black_dn)
+        in_picture = shift.added_to(find_spots(picture, self.parameters, self.noise), self.noise)
         return number_of_better(self.spots_in(picture, self.parameters, shift), in_picture)
 
     def _searched(self, picture: Picture, parameters: DetectParameters, shift: TextureShift) -> Detections:
         """The points of a picture, also of one that does not fit."""
         found = self.found_in(picture, parameters, shift)
         if found is None:
-            return shift.added_to(find_spots(picture, parameters, self.noise), self.noise.black_dn)
+            return shift.added_to(find_spots(picture, parameters, self.noise), self.noise)
         return found
 
     @property
@@ -232,13 +232,13 @@ class StaticBackground:
         more = lights[~changed & ~inside(boxes, lights)]
         # The error of the mean picture's fit is the same in all pictures.
         fixed = 0.5 * self._noise_share * np.trace(more.cov_px2, axis1=1, axis2=2)
-        more = shift.added_to(more, self.noise.black_dn)
+        more = shift.added_to(more, self.noise)
         place = np.zeros(len(more)) if more.place_px2 is None else more.place_px2
         more = replace(more, cov_px2=(1 + self._noise_share) * more.cov_px2, place_px2=place + fixed)
         found = spots[~inside(boxes, spots)].joined(more, parameters.max_detections)
         if not len(boxes):
             return found
-        again = shift.added_to(self._found_again(picture, parameters, boxes), self.noise.black_dn)
+        again = shift.added_to(self._found_again(picture, parameters, boxes), self.noise)
         return found.joined(again, parameters.max_detections)
 
     def _found_again(self, picture: Picture, parameters: DetectParameters, boxes: NDArray[np.float64]) -> Detections:
@@ -301,7 +301,7 @@ class StaticBackground:
         # The background's own noise is the same in all pictures.
         fixed = self._noise_share / (1 + self._noise_share) * 0.5 * np.trace(spots.cov_px2, axis1=1, axis2=2)
         of_light = replace(shift, background_px=(0.0,) * len(shift.background_px))
-        spots = of_light.added_to(spots, self.noise.black_dn)
+        spots = of_light.added_to(spots, self.noise)
         place = np.zeros(len(spots)) if spots.place_px2 is None else spots.place_px2
         return replace(spots, place_px2=place + fixed)
 

@@ -23,13 +23,18 @@ _MEDIAN_SQUARE = 0.4549  # median of the square of a standard normal deviate
 _LEVELS = 25  # black levels that are tried
 
 
-def level_over_light(texture_dn: NDArray[Any], level_dn: NDArray[Any], white_dn2: float, full_dn: float) -> float:
+def level_over_light(
+    texture_dn: NDArray[Any], level_dn: NDArray[Any], white_dn2: float, full_dn: float, black_dn: float | None = None
+) -> float:
     """The expected ratio of the background's level to its light: 1 for a black level of zero.
 
     texture_dn (h, w): a mean picture less its smooth background; level_dn (h, w): that background; white_dn2: variance
     of the noise in texture_dn; full_dn: full scale. A black level between 0 and 5 % of full scale is assumed, as far as
-    the texture does not show it.
+    the texture does not show it, unless it is known: black_dn.
     """
+    if black_dn is not None:
+        usual = float(np.median(level_dn))
+        return usual / max(usual - black_dn, _LEAST_LIGHT * usual) if usual > 0 else 1.0
     rows, columns = (n // _TILE for n in texture_dn.shape)
     if rows * columns < 4:
         return 1.0

@@ -59,11 +59,11 @@ class NoiseEstimate:
     texture_shift: TextureShift = field(default_factory=TextureShift.none)  # errors of spots due to texture
 
 
-def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
+def estimate_noise(pictures: Sequence[Picture], black_dn: float | None = None) -> NoiseEstimate:
     """The noise of a sensor from pictures (h, w) of one camera in order of time, preferably consecutive in pairs.
 
     One picture gives a usable model, two to six an accurate one. Pictures with another size or type than the first are
-    ignored.
+    ignored. black_dn: grey value without light; None: not known.
 
     Raises:
         ValueError: without a picture.
@@ -105,7 +105,7 @@ def estimate_noise(pictures: Sequence[Picture]) -> NoiseEstimate:
     steps = banding(model.floor_dn2, rounding)
     stepped = steps > max(_STEPS_SEEN, _TEXTURE_SEEN * model.texture) * background
     found = [find_spots(p, DetectParameters(max_detections=_MOST_SPOTS), model) for p in usable]
-    shift = TextureShift.usual(usable[0]) if stepped else texture_shift(seen, model, full, found)
+    shift = TextureShift.usual(usable[0]) if stepped else texture_shift(seen, model, full, found, black_dn)
     shift = shift.with_lights(found)
     model = replace(model, profile=spot_profile(usable, found, model, saturation))
     return NoiseEstimate(model, floor_sigma, slope_sigma, saturation, step, len(usable), levels.temporal, shift)

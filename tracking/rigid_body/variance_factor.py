@@ -6,7 +6,8 @@ from collections import deque
 
 import numpy as np
 
-MEMORY = 100  # fits: time constant of the estimate
+MEMORY = 100  # fits: time constant of the estimate, once it has seen so many
+PRIOR_DOF = 30  # degrees of freedom that the stated sigmas count at the start: the first fits have more weight
 DEADBAND = 1.3  # no effect below; if the stated sigmas are correct the estimate scatters by 0.06 about 1
 MAX_RATIO = 3.0  # a single fit counts at most this many times the estimate
 RECENT_FITS = 9  # if the median of so many exceeds the estimate by MAX_RATIO, the estimate jumps to it
@@ -17,6 +18,7 @@ class VarianceFactor:
 
     def __init__(self) -> None:
         self._mean = 1.0
+        self._seen = float(PRIOR_DOF)  # degrees of freedom
         self._deadband = DEADBAND
         self._recent: deque[float] = deque(maxlen=RECENT_FITS)
 
@@ -38,7 +40,8 @@ class VarianceFactor:
         median = sorted(self._recent)[len(self._recent) // 2]
         if len(self._recent) == self._recent.maxlen and median > MAX_RATIO * max(self._mean, 1.0):
             self._mean = median
-        self._mean *= 1 + (min(factor / self._mean, MAX_RATIO) - 1) / MEMORY
+        self._seen += dof
+        self._mean *= 1 + (min(factor / self._mean, MAX_RATIO) - 1) * max(dof / self._seen, 1 / MEMORY)
         self._mean = max(self._mean, 0.1)
         self._deadband = DEADBAND + 3 * systematic_share * np.sqrt(2 / dof)
 

@@ -10,19 +10,21 @@ Source: ours.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Ints
 
 USUAL_WIDTH_PX = 2.0  # of spots whose width is not known
 _CHUNK = 256  # consecutive frames that are compared with each other
 _MIN_CORRELATION = 0.05  # below it two places count as different
 _REACHES = (1.0, 2.0, 4.0, 8.0)  # tried correlation lengths, in widths of the spot
-_SIGNIFICANT = 3.0  # sigmas of the statistic under noise alone, above which errors of places are assumed
-_UPPER = 3.0  # sigmas of the statistic above it: upper limit
-_MAX_STUDENT = 3.0  # largest variance factor of Student's distribution: that of three degrees of freedom
+_SHARES = np.concatenate([[0.0], 1 / (1 + np.geomspace(1e3, 1e-3, 61))])  # of the variance: hypotheses
+_FACTOR = 1.5  # 1 sigma of the ratio of a predicted standard deviation of the errors of places to the true one
+_UNFORESEEN = 0.1  # probability that the errors of places are not those predicted: none, or any
+_LEAST_SQUARE = 0.1  # of its expectation by noise: the statistic scatters below zero
+_SIGNIFICANT = 3.0  # sigmas of the statistic under noise alone, above which it decides about the correlation length
 _MAX_ABSORBED = 0.8  # largest share of the errors that is assumed to be absorbed by the poses
 
 
@@ -31,37 +33,9 @@ class PlaceErrors:
     """Estimate for T frames and n views."""
 
     share: float  # of the spots' error variance that belongs to places, in [0, 1]
-    same_error_frames: Array  # (T,) number of frames, this one included, with the same errors; mean over the views
+    factor: Array  # (T,) of covariances that were computed as if the errors of all frames were independent
     reach_px: Array  # (n,) correlation length: the sigma of a spot whose mean over white texture would make it
     elsewhere: float = 0.0  # share of the variance that is the same in all places: errors of the rig, not of a place
-    few_places_factor: float = 1.0  # factor of their variance, because it is estimated from few places
-    most: float = 1.0  # upper limit of `share`: the residuals would show more
-
-    def factor(self, averaged: Array) -> Array:
-        """Factors (T,) of covariances that were computed as if the errors of all frames were independent.
-
-        averaged (T,): number of frames that each pose is a mean of.
-        """
-        return np.asarray(
-            1
-            + self.share * (self.few_places_factor * np.minimum(self.same_error_frames, np.maximum(averaged, 1.0)) - 1)
-        )
-
-    def at_least(self, share: float, uv_px: Array, width_px: Array) -> PlaceErrors:
-        """This estimate, or at least a share of the variance that is known to belong to places.
-
-        The residuals of few spots hardly show errors of places, because the poses absorb them; the texture of the
-        background does. uv_px (T, n, 2): the labelled pixels, nan without. width_px (n,): as in `place_errors`.
-        """
-        share = min(share, self.most)
-        if share <= self.share:
-            return self
-        reach = usable_widths(width_px)
-        counts = np.stack([frames_with_same_error(uv_px[:, i], reach[i]) for i in range(len(reach))], axis=-1)
-        return replace(
-            self, share=min(share, 1.0), same_error_frames=_mean_over_views(counts, np.isfinite(uv_px[..., 0])),
-            reach_px=reach, few_places_factor=1.0,
-        )  # fmt: skip
 
 
 def correlation(distance_px: Array, width_px: Array | float) -> Array:
@@ -74,49 +48,65 @@ def correlation(distance_px: Array, width_px: Array | float) -> Array:
     return np.asarray(np.where(rho < _MIN_CORRELATION, 0.0, rho))
 
 
-def place_errors(residual: Array, uv_px: Array, width_px: Array, averaged: Array, explained: Array) -> PlaceErrors:
-    """Estimate the errors that belong to places from a run's residuals.
+def place_errors(
+    residual: Array, uv_px: Array, width_px: Array, averaged: Array, explained: Array, predicted: float = 0.0
+) -> PlaceErrors:
+    """Estimate the errors that belong to places from a run's residuals and from what is predicted.
 
     residual (T, n, 2): labelled pixels less those of the smoothed poses, in sigmas; nan without a label. uv_px
     (T, n, 2): the pixels. width_px (n,): 1-sigma width of the spots, nan where not known. averaged (T,): number of
     frames that each pose is a mean of. explained (n,): share of the residuals' variance that is expected from
-    calibration errors, which are constant as well.
+    calibration errors, which are constant as well. predicted: the share according to the texture of the background and
+    the misfit of the fits; 0: nothing is known.
+
+    The share is its mean under the posterior distribution. Few places, or few spots, whose poses absorb such errors,
+    hardly show it: then the prediction decides. Many places show it whatever was predicted. The mean of a variance is
+    that of Student's distribution, which allows for the few places from which it was estimated.
     """
     width = usable_widths(width_px)
     labelled = np.isfinite(residual[..., 0])
     count = float(np.mean(labelled.sum(axis=1)[labelled.any(axis=1)])) if labelled.any() else 0.0
     absorbed = min(3.0 / max(count, 1e-9), _MAX_ABSORBED)
     # Coarse texture and edges of the screen reach farther than a spot is wide: take the most significant length.
-    reaches = [r * width for r in _REACHES]
-    sums = max(_products(residual, uv_px, reaches, explained), key=lambda p: p.significance)
-    same_error_frames = _mean_over_views(sums.same_error_frames, labelled)
-    # The poses absorb part of the residuals, which reduces the degrees of freedom.
-    free_of_white = 1 - absorbed / float(np.median(np.maximum(averaged, 1.0)))
+    sums = _products(residual, uv_px, [r * width for r in _REACHES], explained)
+    best = max(sums, key=lambda p: p.significance)
+    if best.significance * np.sqrt(1 - absorbed) < _SIGNIFICANT:
+        best = sums[0]
+    share = predicted
+    if best.expected > 0:
+        # The poses absorb part of the residuals, which reduces the degrees of freedom.
+        place = _SHARES * (1 - absorbed)
+        expected = place / (place + (1 - _SHARES) * (1 - absorbed / float(np.median(np.maximum(averaged, 1.0)))))
+        free = 2 * (1 - absorbed) * float(np.sum(labelled / np.maximum(best.same_error_frames, 1.0)))
+        # The statistic is a mean square of `free` means over places, less that by noise: a multiple of chi-square.
+        by_noise = np.sqrt(0.25 * free / best.expected / (1 - absorbed))
+        mean_square = max(best.near / best.expected + by_noise, _LEAST_SQUARE * by_noise)
+        log_likelihood = -0.5 * free * (mean_square / (expected + by_noise) + np.log(expected + by_noise))
+        weight = _prior(predicted) * np.exp(log_likelihood - log_likelihood.max())
+        share = float(weight @ _SHARES / weight.sum())
+    more = np.stack([more_of_means(uv_px[:, i], best.reach_px[i], averaged) for i in range(len(width))], axis=-1)
+    total, views = np.where(labelled, more, 0.0).sum(axis=1), np.maximum(labelled.sum(axis=1), 1)
+    return PlaceErrors(share, 1 + share * total / views, best.reach_px, best.elsewhere)
 
-    def share_of(seen: float) -> float:
-        place, white = min(seen, 1.0) / (1 - absorbed), max(1 - seen, 0.0) / free_of_white
-        return place / (place + white)
 
-    seen = sums.near / sums.expected if sums.expected > 0 else 0.0
-    scatter = np.sqrt(0.5 / sums.expected / (1 - absorbed)) if sums.expected > 0 else np.inf
-    most = share_of(max(seen, 0.0) + _UPPER * scatter)
-    if sums.significance * np.sqrt(1 - absorbed) < _SIGNIFICANT:
-        return PlaceErrors(0.0, same_error_frames, sums.reach_px, most=most)
-    # A variance estimated from few places is uncertain: Student's distribution is wider by this factor in variance.
-    free = 2 * (1 - absorbed) * float(np.sum(labelled / np.maximum(sums.same_error_frames, 1.0)))
-    few_places_factor = min(free / max(free - 2, 1e-9), _MAX_STUDENT)
-    return PlaceErrors(share_of(seen), same_error_frames, sums.reach_px, sums.elsewhere, few_places_factor, most)
+def _prior(predicted: float) -> Array:
+    """Probabilities of _SHARES before the residuals are seen, given the predicted share."""
+    out = np.full(len(_SHARES), 0.5 * _UNFORESEEN / (len(_SHARES) - 1))
+    out[0] = 0.5 * _UNFORESEEN
+    if predicted <= 0:
+        out[0] += 1 - _UNFORESEEN
+        return out
+    # The variance of the noise is known: uncertain is its ratio to that of the errors of places.
+    noise = np.log(1 / min(predicted, _SHARES[-1]) - 1)
+    away = (np.log(1 / _SHARES[1:] - 1) - noise) / (2 * np.log(_FACTOR))
+    near = np.exp(-0.5 * away**2)
+    out[1:] += (1 - _UNFORESEEN) * near / near.sum()
+    return out
 
 
 def usable_widths(width_px: Array) -> Array:
     """(n,): the widths of the spots, px; a usual one where not known."""
     return np.where(np.isfinite(width_px), np.maximum(width_px, 0.5), USUAL_WIDTH_PX)
-
-
-def _mean_over_views(counts: Array, labelled: Bools) -> Array:
-    """(T,): mean of the counts (T, n) over the labelled views; 1 without any."""
-    total = np.where(labelled, counts, 0.0).sum(axis=1)
-    return np.asarray(np.where(labelled.any(axis=1), total / np.maximum(labelled.sum(axis=1), 1), 1.0))
 
 
 def _distances(uv_px: Array) -> Array:
@@ -133,6 +123,24 @@ def frames_with_same_error(uv_px: Array, reach_px: float) -> Array:
         some = rows[start : start + _CHUNK]
         at = uv_px[some]
         out[some] = correlation(_distances(at), reach_px).sum(axis=1)
+    return out
+
+
+def more_of_means(uv_px: Array, reach_px: float, averaged: Array) -> Array:
+    """(T,): by how much the variance of means exceeds that of means of independent errors, relative to the latter.
+
+    Of the errors of one view's spot, at uv_px (T, 2); averaged (T,): number N of frames that each mean is of. The
+    weights of the mean are taken to be a Gaussian over time, the sum of whose squares is 1 / N. 0 without a spot.
+    """
+    out = np.zeros(len(uv_px))
+    rows = np.flatnonzero(np.isfinite(uv_px).all(axis=-1))
+    for start in range(0, len(rows), _CHUNK):
+        some = rows[start : start + _CHUNK]
+        rho, many = correlation(_distances(uv_px[some]), reach_px), np.maximum(averaged[some], 1.0)
+        np.fill_diagonal(rho, 0.0)
+        weight = np.exp(-0.5 * ((some[:, None] - some) * (2 * np.sqrt(np.pi) / many)[:, None]) ** 2)
+        weight /= weight.sum(axis=1, keepdims=True)
+        out[some] = many * np.sum((weight @ rho) * weight, axis=1)
     return out
 
 

@@ -345,5 +345,5 @@ class _Smoother:
         explained[view] = 0.5 * np.trace(self.calibration_cov[view], axis1=1, axis2=2) / size**2  # in the last frame
         shares = self.errors.place_px2(detections, self.rec.place_px2())[rows] / size**2
         width_px, share = self.detections.usual_size_px, float(np.mean(shares)) if len(shares) else 0.0
-        found = place_errors(residual, uv_px, width_px, averaged, explained).at_least(share, uv_px, width_px)
-        return found.share, pose_P * (found.factor(averaged) * self.noise_share)[:, None, None]
+        found = place_errors(residual, uv_px, width_px, averaged, explained, share)
+        return found.share, pose_P * (found.factor * self.noise_share)[:, None, None]

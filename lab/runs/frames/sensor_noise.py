@@ -52,7 +52,7 @@ class CameraNoise:
         """Estimate the noise from some pictures in temporal order; without any, nothing changes."""
         if not pictures:
             return
-        self.estimate = estimate_noise(pictures)
+        self.estimate = estimate_noise(pictures, self._black_dn)
         self.mosaic = mosaic_contrast(pictures[0])
         self._update_model()
         if self.stated is not None:
@@ -111,6 +111,11 @@ class CameraNoise:
         known = seen if parameters.saturation_dn is None else parameters.saturation_dn
         return float(np.iinfo(picture.dtype).max) if known is None else known
 
+    @property
+    def _black_dn(self) -> float | None:
+        """The stated grey value without light; 0 is that of a file that does not state it."""
+        return None if self.stated is None or self.stated.black_dn <= 0 else self.stated.black_dn
+
     def _search(self, picture: Picture, parameters: DetectParameters, model: NoiseModel | None) -> Detections:
         return find_all_sizes(
             picture, replace(parameters, saturation_dn=self.saturation_dn(picture, parameters)), model
@@ -120,7 +125,7 @@ class CameraNoise:
         """The points with covariances that include the errors due to the screen's texture."""
         if self.estimate is None or not len(found):
             return found
-        return self.estimate.texture_shift.added_to(found, self.estimate.model.black_dn)
+        return self.estimate.texture_shift.added_to(found, self.estimate.model)
 
     def _update_model(self) -> None:
         """Stated values take precedence; the rest is estimated: data sheets lack them."""
@@ -138,7 +143,7 @@ class CameraNoise:
         self.model = stated
 
     def _estimate_again(self, picture: Picture, parameters: DetectParameters) -> Detections:
-        estimate = estimate_noise(list(self._recent))
+        estimate = estimate_noise(list(self._recent), self._black_dn)
         found = self._search(picture, parameters, estimate.model)
         if len(found):
             self.estimate = estimate

@@ -41,9 +41,7 @@ def with_place_errors(recording: ModelCheckRecording, model: SpotModel) -> Model
         width = recording.width_px[view] if np.isfinite(recording.width_px[view]) else np.nanmedian(recording.width_px)
         square = np.mean(np.sum((recording.uv_px[rows, view] - uv[rows, view]) ** 2, axis=-1)) / 2
         # An error larger than texture and speckle can cause is a displacement.
-        place = min(
-            found.few_places_factor * share * max(square, size2[rows, view].mean()), (LARGEST_WIDTH_SHARE * width) ** 2
-        )
+        place = min(share * max(square, size2[rows, view].mean()), (LARGEST_WIDTH_SHARE * width) ** 2)
         for some in np.array_split(rows, len(rows) // _CHUNK + 1):
             at = recording.uv_px[some, view]
             rho = correlation(np.linalg.norm(at[:, None] - at[None], axis=-1), found.reach_px[view])

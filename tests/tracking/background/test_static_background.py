@@ -84,7 +84,7 @@ class Recording:
     def usual(self, k: int) -> Detections:
         """What the picture alone shows."""
         found = find_spots(self.pictures[k], USUAL, self.model)
-        return self.estimate.texture_shift.added_to(found, self.model.black_dn)
+        return self.estimate.texture_shift.added_to(found, self.model)
 
 
 def judged(recording: Recording, background: StaticBackground, frames: range) -> tuple[float, float, float]:

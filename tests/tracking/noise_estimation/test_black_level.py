@@ -38,3 +38,11 @@ def test_without_uneven_light_a_usual_black_level_is_assumed(contrast):
 def test_a_picture_without_room_or_light_changes_nothing():
     assert level_over_light(np.zeros((40, 40)), np.full((40, 40), 10.0), 0.1, FULL) == 1.0
     assert level_over_light(np.zeros(SIZE), np.zeros(SIZE), 0.1, FULL) == 1.0
+
+
+def test_a_known_black_level_decides():
+    """At most as far as a background that is nearly black still shows texture."""
+    nothing, level = np.zeros(SIZE), np.full(SIZE, 14.0)
+    assert level_over_light(nothing, level, 0.1, FULL, 8.0) == pytest.approx(14 / 6)
+    assert level_over_light(nothing, level, 0.1, FULL, 13.9) == pytest.approx(1 / 0.35)
+    assert level_over_light(nothing, np.zeros(SIZE), 0.1, FULL, 8.0) == 1.0

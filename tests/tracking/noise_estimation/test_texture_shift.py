@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from geometry.arrays import Array
 from tracking.detection.detect import find_spots
+from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
 from tracking.noise_estimation.photon_transfer import estimate_noise
 from tracking.noise_estimation.texture_shift import LARGEST_SHARE, TextureShift
@@ -56,6 +59,28 @@ def test_the_background_predicts_the_errors_of_bright_and_of_faint_spots(sigma_p
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.mean(expected), rel=0.4)
 
 
+@pytest.mark.parametrize("brightness", [3.0, 10.0])
+@pytest.mark.parametrize(("sigma_px", "grain_px"), [(1.6, 1.2), (3.0, 1.5), (1.6, 6.0)])
+def test_fits_that_give_bright_pixels_less_weight_have_smaller_errors_on_fine_texture(sigma_px, grain_px, brightness):
+    """As a share of those of fits with equal weights; coarse texture shifts all of a spot, whatever the weights."""
+    errors, expected, peak = np.zeros((2, 0)), [], 6000.0
+    for seed in range(4):
+        reflectance = screen(0.04, grain_px, seed)
+        shift = estimate_noise(pictures(reflectance, 0.0, 4)).texture_shift
+        centres, light = spots(sigma_px, peak, seed)
+        picture = pictures(reflectance, light, 1)[0]
+        of_both = []
+        for slope in (0.0, brightness * NOISE**2 / peak):
+            found = find_spots(picture, noise=NoiseModel(NOISE**2, slope, BACKGROUND))
+            nearest = [int(np.argmin(np.hypot(*(found.uv_px - centre).T))) for centre in centres]
+            of_both.append((found.uv_px[nearest] - centres).ravel())
+        errors = np.concatenate([errors, of_both], axis=1)
+        at = np.array([sigma_px]), np.array([peak / BACKGROUND])
+        expected.append(float(shift.sigma_px(*at, brightness)[0] / shift.sigma_px(*at)[0]))
+    seen = np.sqrt(np.mean(errors[1] ** 2) / np.mean(errors[0] ** 2))
+    assert seen == pytest.approx(np.mean(expected), abs=0.1)
+
+
 @pytest.mark.parametrize("angle_deg", [0.0, 35.0, 90.0])
 def test_elongated_spots_have_larger_errors_along_their_major_axis(angle_deg):
     """Variances along the axes are in proportion to the half axes."""
@@ -75,7 +100,7 @@ def test_elongated_spots_have_larger_errors_along_their_major_axis(angle_deg):
             for a, b in centres
         )
         picture = pictures(reflectance, peak * np.asarray(light), 1)[0]
-        found = estimate.texture_shift.added_to(find_spots(picture, noise=estimate.model), BACKGROUND)
+        found = estimate.texture_shift.added_to(find_spots(picture, noise=estimate.model), estimate.model)
         for centre in centres:
             nearest = int(np.argmin(np.hypot(*(found.uv_px - centre).T)))
             errors.append((found.uv_px[nearest] - centre) @ np.array([[p, -q], [q, p]]))
@@ -171,3 +196,19 @@ def test_a_prediction_is_limited_and_pictures_without_room_have_none():
     assert rough.sigma_px(np.array([2.0]), np.array([0.1]))[0] == pytest.approx(2.0 * LARGEST_SHARE)
     small = [np.full((60, 60), 20, np.uint8) + np.eye(60, dtype=np.uint8) * k for k in (0, 1)]
     assert estimate_noise(small).texture_shift.sigma_px(np.array([3.0]), np.array([1.0]))[0] == 0.0
+
+
+def lights(widths_px: list[float], peaks: list[float], misfits: list[float]) -> Detections:
+    """Points of these widths, peaks and shares of misfits, with centres known to 1 % of their widths."""
+    width = np.array(widths_px)
+    points = Detections.at(np.zeros((len(width), 2)), (0.01 * width[:, None, None]) ** 2 * np.eye(2))
+    return replace(points, major_px=width, minor_px=width, peak=np.array(peaks), misfit=np.array(misfits))
+
+
+@pytest.mark.parametrize("spot_px", [1.6, 3.0])
+def test_wide_reflections_do_not_show_the_grain_of_the_spots(spot_px):
+    of_spots = lights([spot_px] * 3, [150.0] * 3, [0.5] * 3)
+    with_reflections = lights([spot_px] * 3 + [28.0] * 3, [150.0] * 3 + [20.0] * 3, [0.5] * 3 + [1.0] * 3)
+    alone, both = (TextureShift.none().with_lights([found] * 6).misfit_share for found in (of_spots, with_reflections))
+    assert both == pytest.approx(alone, nan_ok=True)
+    assert np.isnan(both) == (spot_px < 1.8)  # narrower ones do not show it at all
