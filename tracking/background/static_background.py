@@ -58,8 +58,9 @@ _TRIED = 3  # every such picture shows whether there are further spots
 _MANY_LIGHTS = 4  # at rest, from which the subtraction is used in any case: it spares their fits
 _LEAST_FOUND = 0.2  # further or better spots per picture from which the subtraction is used
 _SAMPLE = (10, 11)  # rows and columns: every such pixel shows how much of the structure is in a picture
-_CLEAR_SIGMAS = 4.0  # more than this counts as much: somebody in front of the screen is in many pixels
+_CLEAR_SIGMAS = 4.0  # of the measured light
 _EFFICIENCY = 2.0  # sigma of the median over places, of those that show most structure, over that of one fit
+_MOST_LEFT = 2.5  # sigmas: more counts as much, since somebody in front of the screen is in many pixels
 _SAME_LIGHT = 0.03  # the light has not changed by more than this share: the structure is not scaled
 _LEAST_LIGHT, _MOST_LIGHT = 0.2, 5.0  # changes of the light beyond which a picture is searched without subtraction
 _LARGEST_MISFIT = 1.3  # sigma of what is left over that of the noise; above it the camera or the light has moved
@@ -80,6 +81,7 @@ class StaticBackground:
     structure: NDArray[np.float32]  # (h, w), DN: the fixed picture without its smooth part
     smooth: NDArray[np.float32]  # (h, w), DN, on the pixels of _SAMPLE
     near_lights: Bools  # (h, w): near lights that do not move
+    blind: Bools  # (h, w): the difference does not show what is there
     lights: RestingLights
     unknown: NDArray[np.float64]  # (m, 3): u, v and half side, px, of places that are searched in the pictures
     parameters: DetectParameters
@@ -146,7 +148,7 @@ class StaticBackground:
         unknown = np.zeros(mean.shape, np.uint8)
         unknown[row[~enough], column[~enough]] = 1
         better.near_lights[unknown > 0] = True
-        unknown[places_of(better.lights.found, mean.shape, AROUND_LIGHT)] = 0  # searched where the light has changed
+        better.blind[unknown > 0] = True
         _, _, places, _ = cv2.connectedComponentsWithStats(unknown)
         left, top, width, height = places[1:, : cv2.CC_STAT_AREA].T.astype(float)
         half = 0.5 * np.maximum(width, height) + AROUND_SPOT[1]
@@ -164,11 +166,9 @@ class StaticBackground:
         return number_of_better(self.spots_in(picture, self.parameters, shift), in_picture)
 
     def _searched(self, picture: Picture, parameters: DetectParameters, shift: TextureShift) -> Detections:
-        """The points of a picture, also of one that does not fit."""
-        found = self.found_in(picture, parameters, shift)
-        if found is None:
-            return shift.added_to(find_spots(picture, parameters, self.noise), self.noise)
-        return found
+        """The points of a picture that move or have changed; all points of one that does not fit."""
+        parts = self._parts(picture, parameters, shift)
+        return shift.added_to(find_spots(picture, parameters, self.noise), self.noise) if parts is None else parts[0]
 
     @property
     def _noise_share(self) -> float:
@@ -207,11 +207,10 @@ class StaticBackground:
             local_texture=uneven, banding_dn=model.banding_dn * steps, compression_dn2=model.compression_dn2 * steps**2,
         )  # fmt: skip
         rows, columns = _SAMPLE
-        near = places_of(at_rest, mean.shape, AROUND_LIGHT) | (
-            cv2.dilate(mean - np.minimum(plain, level), np.ones((3, 3))) > 1 / steps
-        )
+        blind = cv2.dilate(mean - np.minimum(plain, level), np.ones((3, 3))) > 1 / steps
+        near = places_of(at_rest, mean.shape, AROUND_LIGHT) | blind
         return StaticBackground(
-            len(pictures), structure, smooth[::rows, ::columns].copy(), near,
+            len(pictures), structure, smooth[::rows, ::columns].copy(), near, blind,
             RestingLights.of(mean, at_rest, model, clips - 0.5), np.zeros((0, 3)), parameters, steps, level, dark,
             _in_steps(np.asarray(level - plain, np.float32), steps), of_difference, model,
         )  # fmt: skip
@@ -222,6 +221,13 @@ class StaticBackground:
         What moves is searched in the difference from the background; the lights at rest are measured by one step, and
         searched where they have changed. None: the picture and the background do not fit.
         """
+        parts = self._parts(picture, parameters, shift)
+        return None if parts is None else parts[0].joined(parts[1], parameters.max_detections)
+
+    def _parts(
+        self, picture: Picture, parameters: DetectParameters, shift: TextureShift
+    ) -> tuple[Detections, Detections] | None:
+        """The points of a picture that move or have changed, and the lights at rest that have not."""
         fit = self._light_in(picture)
         if fit is None:
             return None
@@ -229,17 +235,17 @@ class StaticBackground:
         lights, changed = self.lights.in_picture(picture)
         boxes = np.column_stack([self.lights.found.uv_px, self.lights.half_px])[changed]
         boxes = np.concatenate([self.unknown, boxes])
-        more = lights[~changed & ~inside(boxes, lights)]
+        rest = lights[~changed & ~inside(boxes, lights)]
         # The error of the mean picture's fit is the same in all pictures.
-        fixed = 0.5 * self._noise_share * np.trace(more.cov_px2, axis1=1, axis2=2)
-        more = shift.added_to(more, self.noise)
-        place = np.zeros(len(more)) if more.place_px2 is None else more.place_px2
-        more = replace(more, cov_px2=(1 + self._noise_share) * more.cov_px2, place_px2=place + fixed)
-        found = spots[~inside(boxes, spots)].joined(more, parameters.max_detections)
-        if not len(boxes):
-            return found
-        again = shift.added_to(self._found_again(picture, parameters, boxes), self.noise)
-        return found.joined(again, parameters.max_detections)
+        fixed = 0.5 * self._noise_share * np.trace(rest.cov_px2, axis1=1, axis2=2)
+        rest = shift.added_to(rest, self.noise)
+        place = np.zeros(len(rest)) if rest.place_px2 is None else rest.place_px2
+        rest = replace(rest, cov_px2=(1 + self._noise_share) * rest.cov_px2, place_px2=place + fixed)
+        found = spots[~inside(boxes, spots)]
+        if len(boxes):
+            again = shift.added_to(self._found_again(picture, parameters, boxes), self.noise)
+            found = found.joined(again, parameters.max_detections)
+        return found, rest
 
     def _found_again(self, picture: Picture, parameters: DetectParameters, boxes: NDArray[np.float64]) -> Detections:
         """The points of a picture in boxes (m, 3): u, v and half side, px."""
@@ -289,7 +295,7 @@ class StaticBackground:
         spots = find_spots(difference, replace(parameters, saturation_dn=float(top)), model)
         row, column = (_nearest(spots.uv_px[:, i], picture.shape[1 - i]) for i in (1, 0))
         sampled = np.minimum(row // _SAMPLE[0], len(fits) - 1), np.minimum(column // _SAMPLE[1], fits.shape[1] - 1)
-        kept = ~self.near_lights[row, column] & fits[sampled]
+        kept = ~self.blind[row, column] & fits[sampled]
         spots, row, column, sampled = spots[kept], row[kept], column[kept], (sampled[0][kept], sampled[1][kept])
         if not len(spots):
             return spots
@@ -336,7 +342,7 @@ class StaticBackground:
         if 1.4826 * float(np.median(np.abs(left[clear]))) > _LARGEST_MISFIT:
             return None
         # Somebody in front of the screen; a moving light is in few of the pixels.
-        others = sums_around(np.minimum(left * left, _CLEAR_SIGMAS**2)) > _LARGEST_MISFIT**2 * sums_around(
+        others = sums_around(np.minimum(left * left, _MOST_LEFT**2)) > _LARGEST_MISFIT**2 * sums_around(
             clear.astype(np.float32)
         )
         return light, ~others
