@@ -92,7 +92,7 @@ def guess_noise(image: Picture) -> NoiseModel:
 
     The floor comes from differences of neighbouring pixels in a sparse sample. Texture that is everywhere counts as
     noise; edges and objects, which are in few of the differences, do not. In a picture that is clipped at black the
-    normal distribution that was clipped counts if it is wider; dark objects on a brighter background do not matter.
+    normal distribution that was clipped counts if it is wider; black objects on a brighter background do not matter.
     """
     sample = image[2:-2:17, ::2].astype(np.float32) if min(image.shape) > 40 else image.astype(np.float32)
     first, second = sample[:, ::4][:, : sample[:, 1::4].shape[1]], sample[:, 1::4][:, : sample[:, ::4].shape[1]]

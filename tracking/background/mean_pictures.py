@@ -70,3 +70,8 @@ def without_smooth_part(values: NDArray[np.float32], plain: Bools) -> NDArray[np
 def sums_around(values: NDArray[Any]) -> NDArray[Any]:
     """Sums over the surroundings of each pixel of _SAMPLE."""
     return np.asarray(cv2.boxFilter(values, -1, _AROUND_SAMPLE, normalize=False))
+
+
+def in_steps(values: NDArray[np.float32], steps: int) -> NDArray[np.uint16]:
+    """Grey values, DN, in steps of a fraction of 1 DN."""
+    return np.clip(np.rint(values * steps), 0, np.iinfo(np.uint16).max).astype(np.uint16)

@@ -65,3 +65,8 @@ def merged_parts(boxes: NDArray[np.float64], shape: tuple[int, ...], multiple: i
             first, last = np.minimum(other[:2], (left, top)), np.maximum(other[2:], (right, bottom))
             parts.append((int(first[0]), int(first[1]), int(last[0]), int(last[1])))
     return merged
+
+
+def nearest(at: NDArray[np.float64], size: int) -> NDArray[np.int64]:
+    """The nearest rows, or columns, of a picture with so many of them."""
+    return np.clip(np.rint(at), 0, size - 1).astype(np.int64)

@@ -1,11 +1,9 @@
-"""Faint spots on a textured screen: found after the fixed structure of the background has been subtracted.
+"""What moves in front of a fixed background: found after the background has been subtracted.
 
-The cameras and screens of a recording do not move, so texture, seams and the offsets of pixels are the same in all of
-its pictures. They limit the detection in a single picture to spots well above the texture; in the difference from the
-fixed picture only the noise is left. A light at rest and a reflection look the same in that picture, so the places of
-its lights are left to the search in the whole picture (detection/detect.py), whose spots stay as they are. Source:
-ours; the subtraction of a mean background is usual in particle image velocimetry, e.g. Raffel et al. (2018), "Particle
-Image Velocimetry".
+The cameras and screens of a recording do not move, so texture, objects, lamps and the offsets of pixels are the same in
+all of its pictures. They limit the detection in a single picture; in the difference from the fixed picture only what
+moves is left, and the noise. Lights at rest are measured separately (resting_lights.py). Source: ours; the subtraction
+of a mean background is usual in particle image velocimetry, e.g. Raffel et al. (2018), "Particle Image Velocimetry".
 """
 
 from __future__ import annotations
@@ -22,6 +20,7 @@ from geometry.arrays import Bools
 from tracking.background.mean_pictures import (
     MOST_BYTES,
     highest_of_blocks,
+    in_steps,
     means_of,
     smooth_part,
     sums_around,
@@ -34,11 +33,12 @@ from tracking.background.places import (
     ON_LIGHT,
     inside,
     merged_parts,
+    nearest,
     number_of_better,
     places_of,
 )
 from tracking.background.resting_lights import RestingLights
-from tracking.detection.detect import find_spots
+from tracking.detection.detect import find_spots, saturation_of
 from tracking.detection.pixels import TEXTURE_SHARE
 from tracking.detections import Detections
 from tracking.noise import BLOCK, NoiseModel, Picture
@@ -52,7 +52,7 @@ _LEAST_CLEAR = 7  # of these pictures without a light at a pixel
 _MEAN_VARIANCE = 1.4  # variance of these means of normal deviates times their number: 1.4 lower half, 1.2 middle
 _LIMITING = 1.0  # variance of the texture over that of the noise, for means of 3x3 pixels, from which it matters ...
 _LIMITED_SHARE = 0.01  # ... in this share of the picture
-_DARK = 0.25  # quantile of the background whose noise the difference is taken to have; brighter places count as uneven
+_LOW = 0.25  # quantile of the background whose noise the difference is taken to have; brighter places count as uneven
 _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
 _TRIED = 3  # every such picture shows whether there are further spots
 _MANY_LIGHTS = 4  # at rest, from which the subtraction is used in any case: it spares their fits
@@ -87,7 +87,7 @@ class StaticBackground:
     parameters: DetectParameters
     steps: int  # grey values per DN of the difference
     level_dn: float  # of the difference
-    dark_dn: float  # level of the pictures whose noise `model` has at that level
+    low_dn: float  # level of the pictures whose noise `model` has at that level
     subtracted: NDArray[np.uint16]  # (h, w): what is added to a picture in these steps
     model: NoiseModel  # of the difference, in its steps
     noise: NoiseModel  # of the pictures
@@ -194,14 +194,14 @@ class StaticBackground:
             model, floor_dn2=floor, slope_dn=slope, black_dn=model.black_dn * steps,
             banding_dn=model.banding_dn * steps, compression_dn2=model.compression_dn2 * steps**2,
         )  # fmt: skip
-        clips = _saturation(parameters, pictures[0])
-        at_rest = find_spots(_in_steps(mean, steps), replace(parameters, saturation_dn=(clips - 0.5) * steps), once)
+        clips = saturation_of(parameters, pictures[0])
+        at_rest = find_spots(in_steps(mean, steps), replace(parameters, saturation_dn=(clips - 0.5) * steps), once)
         at_rest = replace(at_rest, flux=at_rest.flux / steps, peak=at_rest.peak / steps)
         # The difference has one level everywhere, and the noise of the picture.
-        dark = float(np.quantile(plain[::8, ::8], _DARK))
-        brighter = model.slope_dn * np.maximum(highest_of_blocks(plain) - max(dark, model.black_dn), 0.0)
+        low = float(np.quantile(plain[::8, ::8], _LOW))
+        brighter = model.slope_dn * np.maximum(highest_of_blocks(plain) - max(low, model.black_dn), 0.0)
         uneven = np.asarray(np.sqrt(brighter / 9.0) / (TEXTURE_SHARE * level), np.float32)
-        black = level - max(dark - model.black_dn, 0.0)
+        black = level - max(low - model.black_dn, 0.0)
         of_difference = replace(
             model, floor_dn2=floor * (1 + share), slope_dn=slope, black_dn=black * steps, texture=0.0,
             local_texture=uneven, banding_dn=model.banding_dn * steps, compression_dn2=model.compression_dn2 * steps**2,
@@ -211,8 +211,8 @@ class StaticBackground:
         near = places_of(at_rest, mean.shape, AROUND_LIGHT) | blind
         return StaticBackground(
             len(pictures), structure, smooth[::rows, ::columns].copy(), near, blind,
-            RestingLights.of(mean, at_rest, model, clips - 0.5), np.zeros((0, 3)), parameters, steps, level, dark,
-            _in_steps(np.asarray(level - plain, np.float32), steps), of_difference, model,
+            RestingLights.of(mean, at_rest, model, clips - 0.5), np.zeros((0, 3)), parameters, steps, level, low,
+            in_steps(np.asarray(level - plain, np.float32), steps), of_difference, model,
         )  # fmt: skip
 
     def found_in(self, picture: Picture, parameters: DetectParameters, shift: TextureShift) -> Detections | None:
@@ -284,7 +284,7 @@ class StaticBackground:
             model = replace(model, floor_dn2=model.floor_dn2 * (1 + light**2 * own) / (1 + own))
         raised: NDArray[np.uint16] = np.multiply(picture, np.uint16(self.steps), dtype=np.uint16)
         difference = np.asarray(cv2.add(raised, added), np.uint16)
-        clips = _saturation(parameters, picture)
+        clips = saturation_of(parameters, picture)
         top = min(int((clips + self.level_dn) * self.steps), np.iinfo(np.uint16).max)
         if not inverted and picture.max() >= clips:
             difference[picture >= clips] = top
@@ -293,7 +293,7 @@ class StaticBackground:
                 cv2.subtract(np.full_like(difference, 2 * int(self.level_dn * self.steps)), difference)
             )
         spots = find_spots(difference, replace(parameters, saturation_dn=float(top)), model)
-        row, column = (_nearest(spots.uv_px[:, i], picture.shape[1 - i]) for i in (1, 0))
+        row, column = (nearest(spots.uv_px[:, i], picture.shape[1 - i]) for i in (1, 0))
         sampled = np.minimum(row // _SAMPLE[0], len(fits) - 1), np.minimum(column // _SAMPLE[1], fits.shape[1] - 1)
         kept = ~self.blind[row, column] & fits[sampled]
         spots, row, column, sampled = spots[kept], row[kept], column[kept], (sampled[0][kept], sampled[1][kept])
@@ -302,7 +302,7 @@ class StaticBackground:
         spots = replace(spots, flux=spots.flux / self.steps, peak=spots.peak / self.steps)
         bright = self.smooth[sampled] + self.structure[row, column]
         light_of_spot = 0.5 * self.noise.slope_dn * spots.peak
-        here, used = (self.noise.variance(at) + light_of_spot for at in (bright, np.full(len(spots), self.dark_dn)))
+        here, used = (self.noise.variance(at) + light_of_spot for at in (bright, np.full(len(spots), self.low_dn)))
         spots = replace(spots, cov_px2=spots.cov_px2 * (here / used)[:, None, None])
         # The background's own noise is the same in all pictures.
         fixed = self._noise_share / (1 + self._noise_share) * 0.5 * np.trace(spots.cov_px2, axis1=1, axis2=2)
@@ -346,17 +346,3 @@ class StaticBackground:
             clear.astype(np.float32)
         )
         return light, ~others
-
-
-def _in_steps(values: NDArray[np.float32], steps: int) -> NDArray[np.uint16]:
-    return np.clip(np.rint(values * steps), 0, np.iinfo(np.uint16).max).astype(np.uint16)
-
-
-def _nearest(at: NDArray[np.float64], size: int) -> NDArray[np.int64]:
-    return np.clip(np.rint(at), 0, size - 1).astype(np.int64)
-
-
-def _saturation(parameters: DetectParameters, picture: Picture) -> float:
-    """The grey value at which the sensor clips."""
-    clips = parameters.saturation_dn
-    return float(np.iinfo(picture.dtype).max) if clips is None else clips

@@ -74,6 +74,12 @@ def find_spots(
     return finder.find(image, parameters, noise, regions)
 
 
+def saturation_of(parameters: DetectParameters, picture: Picture) -> float:
+    """The grey value at which the sensor clips, DN."""
+    clips = parameters.saturation_dn
+    return float(np.iinfo(picture.dtype).max) if clips is None else float(clips)
+
+
 def find_all_sizes(picture: Picture, parameters: DetectParameters, noise: NoiseModel | None) -> Detections:
     """`find_spots`; lights wider than WIDE_PX, if max_sigma_px admits them, are found in sums of 8x8 pixels."""
     if parameters.max_sigma_px <= WIDE_PX:
@@ -97,10 +103,9 @@ def find_wide_lights(picture: Picture, parameters: DetectParameters, noise: Nois
     pixels = float(_SIDE**2)
     gain = pixels if picture.dtype == np.uint8 else 1.0
     small = np.rint(gain * means).astype(np.uint16)
-    top = np.iinfo(picture.dtype).max if parameters.saturation_dn is None else parameters.saturation_dn
     finer = replace(
         parameters, min_sigma_px=0.5 * WIDE_PX / _SIDE, max_sigma_px=parameters.max_sigma_px / _SIDE,
-        saturation_dn=gain * float(top),
+        saturation_dn=gain * saturation_of(parameters, picture),
     )  # fmt: skip
     of_sums = NoiseModel(
         gain**2 * model.of_means.floor_dn2 / pixels + 1 / 12, gain * model.of_means.slope_dn / pixels,
@@ -277,7 +282,7 @@ class _Task(NamedTuple):
         saturation, p = parameters.saturation_dn, model.profile
         limits = DetectionLimits(
             float(parameters.threshold_sigma),
-            float(np.iinfo(image.dtype).max if saturation is None else saturation),
+            saturation_of(parameters, image),
             float(parameters.min_sigma_px),
             float(parameters.max_sigma_px),
             float(parameters.min_explained),

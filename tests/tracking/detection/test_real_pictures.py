@@ -71,7 +71,7 @@ def places(rows: list[dict[str, float]]) -> np.ndarray:
 def test_a_laser_pointer_in_a_room_is_found_by_the_command(tmp_path, name, published):
     """Published by eye, to about 2 px. In 4.jpg the red halo, which is faint in grey, lies to the right.
 
-    In 5.jpg the spot lies on cloth whose light has a slope, in 7.jpg on an even door beside dark edges: what stands
+    In 5.jpg the spot lies on cloth whose light has a slope, in 7.jpg on an even door beside black edges: what stands
     elsewhere in the picture must not raise the threshold there.
     """
     rows = reported(tmp_path, [data_file(f"laser_spot_room/{name}.jpg")])

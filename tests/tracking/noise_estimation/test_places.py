@@ -17,7 +17,7 @@ def board(height: int, width: int, square: int) -> np.ndarray:
 
 
 def room(seed: int, peak: float, at: tuple[float, float] = (410.3, 240.6), sigma: float = 3.0) -> np.ndarray:
-    """An even wall with a spot, between a board, cables and a dark frame that fill half of the picture."""
+    """An even wall with a spot, between a board, cables and a black frame that fill half of the picture."""
     rng = np.random.default_rng(seed)
     scene = np.full((480, 640), WALL)
     scene[:, :300] = board(480, 300, 22)
@@ -62,7 +62,7 @@ def test_objects_do_not_count_as_noise_of_the_sensor():
 
 
 @pytest.mark.parametrize("sigma", [0.6, 1.5])
-def test_a_dark_picture_clipped_at_black_keeps_its_noise(sigma):
+def test_a_picture_clipped_at_black_keeps_its_noise(sigma):
     rng = np.random.default_rng(9)
     picture = np.clip(np.rint(rng.normal(0.5 * sigma, sigma, (400, 500))), 0, 255).astype(np.uint8)
     assert 0.7 * sigma**2 < estimate_noise([picture]).model.variance(0.5 * sigma) < 1.5 * sigma**2 + 0.1
