@@ -279,7 +279,7 @@ class _Task(NamedTuple):
     def of(image: Picture, parameters: DetectParameters, noise: NoiseModel | None) -> _Task:
         model = (noise or guess_noise(image)).of_means
         image = image if image.flags.c_contiguous else image.copy()
-        saturation, p = parameters.saturation_dn, model.profile
+        p = model.profile
         limits = DetectionLimits(
             float(parameters.threshold_sigma),
             saturation_of(parameters, image),

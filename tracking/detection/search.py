@@ -65,6 +65,7 @@ _CIRCLES, _RING = (4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0), (12, 20, 28, 36, 52,
 _HIGHEST = (1.6, 1.9, 2.0, 2.1, 2.2, 2.4, 2.5)  # expected highest of as many normal deviates, in sigmas
 # Of the texture around: an even place among objects has less than this on a circle, homogeneous texture never.
 _EVEN = 1 / 3
+_CLEARLY_HIGH = 2.0  # times the threshold by the texture: for such a peak it does not matter how even its place is
 _LEAST_ON_RING = 3
 _ON_RING = 1.0  # sigmas of a pixel: three of the means
 _NARROW = 2.5  # half side, px, below which means of 3x3 pixels are compared
@@ -157,6 +158,8 @@ def _stands_out(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float
     """
     here, column, row = peak[HEIGHT] + peak[LEVEL], int(peak[AT_U]), int(peak[AT_V])
     sigma, alone, lowest, second = sqrt(variance(noise, peak[LEVEL])), False, np.inf, np.inf
+    structure = sqrt(texture_variance(with_texture(noise, peak[CONTRAST]), peak[LEVEL]))
+    high = peak[HEIGHT] >= _CLEARLY_HIGH * threshold_sigma * structure
     for k in range(len(_CIRCLES)):
         n = 0  # points inside the picture
         for i in range(_RING[k]):
@@ -171,11 +174,13 @@ def _stands_out(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float
         insertion_sort(ring, n)
         around, highest = ring[n // 2], ring[n - 1]
         if highest - around < 0.5 * (here - around) + _ON_RING * sigma:
+            if high:
+                return True
             alone, scatter = True, (highest - around) / _HIGHEST[k]
             lowest, second = min(lowest, scatter), min(second, max(lowest, scatter))
     if second < _EVEN * peak[CONTRAST] * peak[LEVEL]:
         peak[CONTRAST] = second / max(peak[LEVEL], 1.0)
-    structure = sqrt(texture_variance(with_texture(noise, peak[CONTRAST]), peak[LEVEL]))
+        structure = sqrt(texture_variance(with_texture(noise, peak[CONTRAST]), peak[LEVEL]))
     return alone and peak[HEIGHT] >= PEAK_SHARE * threshold_sigma * structure
 
 
