@@ -50,8 +50,6 @@ _LEAST_PICTURES = 9
 _HIGHEST = 30.0  # sigmas of noise and texture
 _LEAST_CLEAR = 7  # of these pictures without a light at a pixel
 _MEAN_VARIANCE = 1.4  # variance of these means of normal deviates times their number: 1.4 lower half, 1.2 middle
-_LIMITING = 1.0  # variance of the texture over that of the noise, for means of 3x3 pixels, from which it matters ...
-_LIMITED_SHARE = 0.01  # ... in this share of the picture
 _LOW = 0.25  # quantile of the background whose noise the difference is taken to have; brighter places count as uneven
 _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
 _TRIED = 3  # every such picture shows whether there are further spots
@@ -64,13 +62,6 @@ _MOST_LEFT = 2.5  # sigmas: more counts as much, since somebody in front of the 
 _SAME_LIGHT = 0.03  # the light has not changed by more than this share: the structure is not scaled
 _LEAST_LIGHT, _MOST_LIGHT = 0.2, 5.0  # changes of the light beyond which a picture is searched without subtraction
 _LARGEST_MISFIT = 1.3  # sigma of what is left over that of the noise; above it the camera or the light has moved
-
-
-def is_limited_by_texture(model: NoiseModel) -> bool:
-    """Whether texture or objects in a part of a camera's background hide spots that its noise would show."""
-    contrast = np.asarray(model.texture if model.local_texture is None else model.local_texture)
-    noise = float(model.of_means.variance(model.black_dn)) / 9
-    return bool(np.mean((contrast * model.black_dn) ** 2 > _LIMITING * noise) > _LIMITED_SHARE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +82,7 @@ class StaticBackground:
     subtracted: NDArray[np.uint16]  # (h, w): what is added to a picture in these steps
     model: NoiseModel  # of the difference, in its steps
     noise: NoiseModel  # of the pictures
-    reference: float = 1.0  # what of the structure the pictures show on average: it contains noise, which they do not
+    reference: float = 1.0  # what of the structure, which contains noise, the pictures show; 0: too little to measure
 
     @staticmethod
     def of(
@@ -156,9 +147,19 @@ class StaticBackground:
         return replace(better, unknown=boxes)._with_reference(pictures)
 
     def _with_reference(self, pictures: Sequence[Picture]) -> StaticBackground:
-        """The background whose light is 1 in a typical one of the pictures that it is made from."""
-        fits = [fit for p in pictures[::_TRIED] if (fit := self._light_in(p, measured=True)) is not None]
-        return replace(self, reference=float(np.median([light for light, _ in fits]))) if fits else self
+        """The background whose light is 1 in a typical picture.
+
+        Each of these pictures is a part of the mean, whose noise it shows with a weight of one over their number.
+        """
+        lights = [fit[0] for p in pictures[::_TRIED] if (fit := self._light_in(p, measured=True)) is not None]
+        if not lights:
+            return replace(self, reference=0.0)
+        rows, columns = _SAMPLE
+        plain = ~self.near_lights[::rows, ::columns]
+        structure = without_smooth_part(self.structure[::rows, ::columns], plain)[plain]
+        own = float(np.mean(self.noise.variance(self.smooth[plain]))) / self.pictures
+        reference = float(np.median(lights)) - own / max(float(np.mean(structure**2)), 1e-12)
+        return replace(self, reference=reference if reference > _LEAST_LIGHT else 0.0)
 
     def _better_in(self, picture: Picture, shift: TextureShift) -> int:
         """How many spots the difference of a picture shows that the picture does not, or clearly more precisely."""
@@ -331,9 +332,12 @@ class StaticBackground:
         seen = np.where(clear, structure, 0.0)
         power = sums_around(seen * seen)
         here = sums_around(seen * above) / np.maximum(power, 1e-12)
-        light = float(np.median(here[power >= np.median(power)])) / self.reference
-        sigma = _EFFICIENCY * float(np.sqrt(np.median(variance) / max(np.sum(seen * seen), 1e-12))) / self.reference
-        if not measured and abs(light - 1) < max(_SAME_LIGHT, _CLEAR_SIGMAS * sigma):
+        share = self.reference or 1.0
+        light = float(np.median(here[power >= np.median(power)])) / share
+        sigma = _EFFICIENCY * float(np.sqrt(np.median(variance) / max(np.sum(seen * seen), 1e-12))) / share
+        if measured:
+            return light, plain
+        if not self.reference or abs(light - 1) < max(_SAME_LIGHT, _CLEAR_SIGMAS * sigma):
             light = 1.0
         if not _LEAST_LIGHT < light < _MOST_LIGHT:
             return None
@@ -342,7 +346,5 @@ class StaticBackground:
         if 1.4826 * float(np.median(np.abs(left[clear]))) > _LARGEST_MISFIT:
             return None
         # Somebody in front of the screen; a moving light is in few of the pixels.
-        others = sums_around(np.minimum(left * left, _MOST_LEFT**2)) > _LARGEST_MISFIT**2 * sums_around(
-            clear.astype(np.float32)
-        )
-        return light, ~others
+        least = _LARGEST_MISFIT**2 * sums_around(clear.astype(np.float32))
+        return light, sums_around(np.minimum(left * left, _MOST_LEFT**2)) <= least

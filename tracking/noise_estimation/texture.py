@@ -15,6 +15,8 @@ from tracking.noise import BLOCK, NoiseModel, Picture, quantile_variance
 _MEAN = 3  # px: side of the means compared with the background
 _AROUND, _QUANTILE = 9, 75  # blocks along a side; per cent: an edge through the surroundings is in fewer of them
 _BY_NOISE = 2.5  # times its expectation: most of the variance of a block's few means that noise alone causes
+_LIMITING = 1.0  # variance of the texture over that of the noise, for means of 3x3 pixels, from which it matters ...
+_LIMITED_SHARE = 0.01  # ... in this share of the picture
 
 
 class MeanPicture(NamedTuple):
@@ -69,3 +71,10 @@ def local_texture(seen: MeanPicture, noise: NoiseModel, size_px: tuple[int, int]
     rows, columns = -(-size_px[1] // BLOCK), -(-size_px[0] // BLOCK)
     missing = (0, rows - contrast.shape[0]), (0, columns - contrast.shape[1])
     return np.asarray(np.pad(contrast, missing, mode="edge"), np.float32)
+
+
+def is_limited_by_texture(model: NoiseModel) -> bool:
+    """Whether texture or objects in a part of a camera's background hide spots that its noise would show."""
+    contrast = np.asarray(model.texture if model.local_texture is None else model.local_texture)
+    noise = float(model.of_means.variance(model.black_dn)) / 9
+    return bool(np.mean((contrast * model.black_dn) ** 2 > _LIMITING * noise) > _LIMITED_SHARE)

@@ -13,12 +13,13 @@ from geometry.arrays import evenly_spread
 from geometry.camera import SensorNoise
 from lab.files.run.run_file import DetectionsTable, FramesFolder, Run
 from lab.runs.frames.frames import FrameReader, pictures_at
-from tracking.background.static_background import PICTURES, StaticBackground, is_limited_by_texture
+from tracking.background.static_background import PICTURES, StaticBackground
 from tracking.detection.detect import WIDE_PX, find_all_sizes
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.noise_estimation.colour_mosaic import mosaic_contrast
 from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
+from tracking.noise_estimation.texture import is_limited_by_texture
 from tracking.parameters import DetectParameters
 
 VIDEO_PICTURES = (0, 1, 8, 9, 16, 17)  # used for the estimate: the end of a video cannot be read without all of it

@@ -10,11 +10,12 @@ import pytest
 
 from geometry.arrays import Array
 from tracking.background import mean_pictures
-from tracking.background.static_background import PICTURES, StaticBackground, is_limited_by_texture
+from tracking.background.static_background import PICTURES, StaticBackground
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
 from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
+from tracking.noise_estimation.texture import is_limited_by_texture
 from tracking.noise_estimation.texture_shift import TextureShift
 from tracking.parameters import DetectParameters
 
