@@ -31,7 +31,7 @@ from tracking.parameters import DetectParameters
 Image = NDArray[Any]
 # The spots in laser_spot_room: place, and radius, px, of the place around them that holds nothing else.
 ROOM = {"4": (1434, 1146, 26), "5": (1635, 731, 16), "6": (837, 746, 26), "7": (1919, 284, 26)}
-STREETS = ("chessboard_webcam_c920/*.jpg", "circles_stills/*", "charuco_aruco_stills/*.jpg")
+STREETS = ("chessboard_webcam_c920/*.jpg", "circles_stills/*g", "charuco_aruco_stills/*.jpg")
 BOARDS = ("chessboard_stereo_opencv/*.jpg", "chessboard_lowquality_400x300/*.png")
 GROUPS = {
     "room": ("laser_spot_room/*.jpg",), "board": BOARDS, "bright field": ("rings_brightfield/*.png",),

@@ -18,7 +18,7 @@ from geometry.camera import Camera
 from geometry.rig import Screen
 
 _NODE_PX = 16  # spacing of the pixels at which the position on the screen is computed; cubic interpolation between them
-_PHOTOGRAPHS = ("laser_spot_room/*.jpg", "chessboard_webcam_c920/*.jpg", "circles_stills/*")
+_PHOTOGRAPHS = ("laser_spot_room/*.jpg", "chessboard_webcam_c920/*.jpg", "circles_stills/*g")
 _TILE = 1024  # samples of the periodic texture
 
 
