@@ -12,9 +12,9 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 
 _REACH = 5.0  # sigmas that are drawn: a spot of 150 DN ends below 0.001 DN
+_FLAT = np.zeros((2, 3))
 # Gauss-Legendre nodes within a pixel, per axis. With four, the integral over a pixel of a Gaussian with sigma 0.5 px
 # has an error of 1e-6 of its peak; three suffice from 0.8 px on.
-_FLAT = np.zeros((2, 3))
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 

@@ -14,7 +14,7 @@ from tracking.noise import BLOCK, Picture
 
 MOST_BYTES = 150_000_000  # of these pictures
 _CUT = 0.25  # share of the lowest and of the highest grey values of a pixel that is left out
-_SMOOTH_BLOCKS = 6.0  # blocks: sigma of the smooth part of the background, which is not subtracted
+_SMOOTH_BLOCKS = 6.0  # blocks: sigma of the smooth part of the background, which is no structure
 _SMOOTH_SAMPLE = (9, 9)  # of these pixels: what varies over them is not structure
 _AROUND_SAMPLE = (11, 11)  # of these pixels: 100 px: a part of the picture that shows the structure or does not
 

@@ -249,7 +249,7 @@ class StaticBackground:
         return found, rest
 
     def _found_again(self, picture: Picture, parameters: DetectParameters, boxes: NDArray[np.float64]) -> Detections:
-        """The points of a picture in boxes (m, 3): u, v and half side, px."""
+        """The points of a picture in boxes (m, 3), px. `regions` would be followed from light to light beyond them."""
         found = Detections.none()
         for left, top, right, bottom in merged_parts(boxes, picture.shape, BLOCK):
             local = self.noise.local_texture
@@ -263,7 +263,7 @@ class StaticBackground:
     def spots_in(
         self, picture: Picture, parameters: DetectParameters, shift: TextureShift, inverted: bool = False
     ) -> Detections:
-        """The spots in the difference of a picture (h, w) from the background, apart from those near lights at rest.
+        """The spots in the difference of a picture (h, w) from the background, where that shows them.
 
         shift: errors of spots by the texture; the part that the background causes is subtracted with it. inverted: the
         holes of the difference instead.

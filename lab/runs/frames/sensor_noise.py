@@ -14,7 +14,7 @@ from geometry.camera import SensorNoise
 from lab.files.run.run_file import DetectionsTable, FramesFolder, Run
 from lab.runs.frames.frames import FrameReader, pictures_at
 from tracking.background.static_background import PICTURES, StaticBackground
-from tracking.detection.detect import WIDE_PX, find_all_sizes
+from tracking.detection.detect import WIDE_PX, find_all_sizes, saturation_of
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.noise_estimation.colour_mosaic import mosaic_contrast
@@ -70,7 +70,7 @@ class CameraNoise:
     def make_background(self, pictures: Sequence[Picture], parameters: DetectParameters) -> None:
         """Make the static background of pictures spread over the recording, if that shows more or spares fits."""
         if pictures and self.model is not None and self.estimate is not None:
-            usual = replace(parameters, saturation_dn=self.saturation_dn(pictures[0], parameters))
+            usual = self._with_saturation(parameters, pictures[0])
             self.background = StaticBackground.of(pictures, self.model, self.estimate.texture_shift, usual)
 
     def detect(self, picture: Picture, parameters: DetectParameters) -> Detections:
@@ -78,7 +78,7 @@ class CameraNoise:
         if self.model is None:
             self.estimate_from([picture])
         if self.background is not None and self.estimate is not None and parameters.max_sigma_px <= WIDE_PX:
-            usual = replace(parameters, saturation_dn=self.saturation_dn(picture, parameters))
+            usual = self._with_saturation(parameters, picture)
             seen = self.background.found_in(picture, usual, self.estimate.texture_shift)
             if seen is not None and len(seen):
                 return seen
@@ -110,7 +110,7 @@ class CameraNoise:
         """The grey value at which the sensor clips: stated, seen in the pictures, or the largest of their type."""
         seen = None if self.estimate is None else self.estimate.saturation_dn
         known = seen if parameters.saturation_dn is None else parameters.saturation_dn
-        return float(np.iinfo(picture.dtype).max) if known is None else known
+        return saturation_of(replace(parameters, saturation_dn=known), picture)
 
     @property
     def _black_dn(self) -> float | None:
@@ -118,9 +118,10 @@ class CameraNoise:
         return None if self.stated is None or self.stated.black_dn <= 0 else self.stated.black_dn
 
     def _search(self, picture: Picture, parameters: DetectParameters, model: NoiseModel | None) -> Detections:
-        return find_all_sizes(
-            picture, replace(parameters, saturation_dn=self.saturation_dn(picture, parameters)), model
-        )
+        return find_all_sizes(picture, self._with_saturation(parameters, picture), model)
+
+    def _with_saturation(self, parameters: DetectParameters, picture: Picture) -> DetectParameters:
+        return replace(parameters, saturation_dn=self.saturation_dn(picture, parameters))
 
     def _with_texture(self, found: Detections) -> Detections:
         """The points with covariances that include the errors due to the screen's texture."""
