@@ -65,7 +65,11 @@ class RestingLights:
         )  # fmt: skip
 
     def in_picture(self, picture: Picture) -> tuple[Detections, Bools]:
-        """The lights (n,) in a picture (h, w), and which of them have changed: those are not measured correctly."""
+        """The lights (n,) in a picture (h, w), and which of them have changed: those are not measured correctly.
+
+        Where there is more light than in the mean and nowhere less, something else passes over an unchanged light: that
+        is in the difference from the mean, and the light stays where the mean shows it.
+        """
         if not len(self.found):
             return self.found, np.zeros(0, dtype=bool)
         residual = picture.ravel()[self.pixels].astype(np.float32) - self.mean
@@ -75,10 +79,16 @@ class RestingLights:
         chi2 = np.add.reduceat(residual * weighted, self.starts) - np.einsum("ni,ni->n", step, right)
         more = np.einsum("ni,ni->n", self.flux_of, step)
         allowed = _MISFIT * (1.0 + _MISFIT_SIGMAS * np.sqrt(2.0 / self.free))
-        changed = (chi2 > allowed * self.free) | (np.abs(more) > _LARGEST_CHANGE)
+        misfit = chi2 > allowed * self.free
+        less = (residual < 0) & (self.weight > 0)
+        darker = np.maximum(np.add.reduceat(less, self.starts, dtype=float), 1.0)
+        allowed = _MISFIT * (1.0 + _MISFIT_SIGMAS * np.sqrt(2.0 / darker))
+        passed = misfit & (np.add.reduceat(residual * weighted * less, self.starts) < allowed * darker)
+        changed = misfit | (np.abs(more) > _LARGEST_CHANGE)
         changed |= np.linalg.norm(step[:, :2], axis=1) > _LARGEST_STEP * self.found.minor_px
+        step, more = np.where(passed[:, None], 0.0, step), np.where(passed, 0.0, more)
         found = replace(self.found, uv_px=self.found.uv_px + step[:, :2], flux=self.found.flux * (1.0 + more))
-        return found, np.asarray(changed)
+        return found, np.asarray(changed & ~passed)
 
 
 @dataclass(frozen=True, slots=True)

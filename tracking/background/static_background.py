@@ -48,7 +48,7 @@ from tracking.parameters import DetectParameters
 PICTURES = 15  # from which a background is made, spread over the recording
 _LEAST_PICTURES = 9
 _HIGHEST = 30.0  # sigmas of noise and texture
-_LEAST_CLEAR = 7  # of these pictures without a light at a pixel
+_LEAST_CLEAR = 3  # of these pictures without a light at a pixel
 _MEAN_VARIANCE = 1.4  # variance of these means of normal deviates times their number: 1.4 lower half, 1.2 middle
 _LOW = 0.25  # quantile of the background whose noise the difference is taken to have; brighter places count as uneven
 _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
