@@ -29,8 +29,6 @@ from tracking.background.mean_pictures import (
 )
 from tracking.background.places import (
     AROUND_LIGHT,
-    AROUND_SPOT,
-    ON_LIGHT,
     inside,
     merged_parts,
     nearest,
@@ -38,6 +36,7 @@ from tracking.background.places import (
     places_of,
 )
 from tracking.background.resting_lights import RestingLights
+from tracking.background.slow_lights import ROUNDS, SlowLights
 from tracking.detection.detect import find_spots, saturation_of
 from tracking.detection.pixels import TEXTURE_SHARE
 from tracking.detections import Detections
@@ -48,7 +47,6 @@ from tracking.parameters import DetectParameters
 PICTURES = 15  # from which a background is made, spread over the recording
 _LEAST_PICTURES = 9
 _HIGHEST = 30.0  # sigmas of noise and texture
-_LEAST_CLEAR = 3  # of these pictures without a light at a pixel
 _MEAN_VARIANCE = 1.4  # variance of these means of normal deviates times their number: 1.4 lower half, 1.2 middle
 _LOW = 0.25  # quantile of the background whose noise the difference is taken to have; brighter places count as uneven
 _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
@@ -73,6 +71,7 @@ class StaticBackground:
     smooth: NDArray[np.float32]  # (h, w), DN, on the pixels of _SAMPLE
     near_lights: Bools  # (h, w): near lights that do not move
     blind: Bools  # (h, w): the difference does not show what is there
+    shares: NDArray[np.float32]  # (h, w): variance of the fixed picture's own errors over that of a picture's noise
     lights: RestingLights
     unknown: NDArray[np.float64]  # (m, 3): u, v and half side, px, of places that are searched in the pictures
     parameters: DetectParameters
@@ -127,24 +126,34 @@ class StaticBackground:
         """
         found = [self._searched(p, self.parameters, shift) for p in pictures]
         holes = [self.spots_in(p, self.parameters, shift, inverted=True) for p in pictures]
-        there, absent = (np.array([places_of(d, mean.shape, ON_LIGHT) for d in all_]) for all_ in (found, holes))
-        row, column = np.nonzero(there.any(axis=0) | absent.any(axis=0))
-        clear, hole = ~there[:, row, column], absent[:, row, column]
-        clear &= hole | ~hole.any(axis=0)
-        count = np.count_nonzero(clear, axis=0)
-        values = np.array([p[row, column] for p in equal], np.float32)
-        enough = count >= _LEAST_CLEAR
-        mean[row[enough], column[enough]] = ((values * clear).sum(axis=0) / np.maximum(count, 1))[enough]
+        slow = SlowLights.of(equal, found, holes)
+        mean[slow.row, slow.column] = slow.means()
         better = StaticBackground._of_mean(mean, pictures, self.noise, self.parameters)
-        unknown = np.zeros(mean.shape, np.uint8)
-        unknown[row[~enough], column[~enough]] = 1
-        better.near_lights[unknown > 0] = True
-        better.blind[unknown > 0] = True
-        _, _, places, _ = cv2.connectedComponentsWithStats(unknown)
-        left, top, width, height = places[1:, : cv2.CC_STAT_AREA].T.astype(float)
-        half = 0.5 * np.maximum(width, height) + AROUND_SPOT[1]
-        boxes = np.column_stack([left + 0.5 * (width - 1), top + 0.5 * (height - 1), half])
-        return replace(better, unknown=boxes)._with_reference(pictures)
+        slow = slow[~slow.known]
+        if len(slow.row):
+            better = better._behind(slow, mean, pictures, shift)
+        return better._with_reference(pictures)
+
+    def _behind(
+        self, slow: SlowLights, mean: NDArray[np.float32], pictures: Sequence[Picture], shift: TextureShift
+    ) -> StaticBackground:
+        """This background from a mean (h, w), improved behind lights that are nearly everywhere in all pictures."""
+        better, boxes = self, slow.boxes(np.ones(len(slow.row), dtype=bool))
+        at, behind = (slow.row, slow.column), mean[slow.row, slow.column]
+        information = np.zeros(len(behind))
+        for _ in range(ROUNDS):
+            found = [better.spots_in(p, self.parameters, shift, regions=boxes) for p in pictures]
+            behind, information = slow.behind(found, behind, self.noise.variance(behind))
+            added = better.subtracted.copy()
+            added[at] = in_steps(np.asarray(self.level_dn - behind, np.float32), self.steps)
+            better = replace(better, subtracted=added)
+        mean[at] = behind
+        better = StaticBackground._of_mean(mean, pictures, self.noise, self.parameters)
+        better.shares[at] = 1 / np.maximum(information, 1e-3)
+        hidden = ~slow.is_sure(information)
+        better.near_lights[at] |= hidden
+        better.blind[at] |= hidden
+        return replace(better, unknown=slow.boxes(hidden))
 
     def _with_reference(self, pictures: Sequence[Picture]) -> StaticBackground:
         """The background whose light is 1 in a typical picture.
@@ -212,7 +221,7 @@ class StaticBackground:
         near = places_of(at_rest, mean.shape, AROUND_LIGHT) | blind
         return StaticBackground(
             len(pictures), structure, smooth[::rows, ::columns].copy(), near, blind,
-            RestingLights.of(mean, at_rest, model, clips - 0.5), np.zeros((0, 3)), parameters, steps, level, low,
+            np.full(mean.shape, share, np.float32), RestingLights.of(mean, at_rest, model, clips - 0.5), np.zeros((0, 3)), parameters, steps, level, low,
             in_steps(np.asarray(level - plain, np.float32), steps), of_difference, model,
         )  # fmt: skip
 
@@ -261,19 +270,20 @@ class StaticBackground:
         return found
 
     def spots_in(
-        self, picture: Picture, parameters: DetectParameters, shift: TextureShift, inverted: bool = False
-    ) -> Detections:
+        self, picture: Picture, parameters: DetectParameters, shift: TextureShift, inverted: bool = False,
+        regions: NDArray[np.float64] | None = None,
+    ) -> Detections:  # fmt: skip
         """The spots in the difference of a picture (h, w) from the background, where that shows them.
 
         shift: errors of spots by the texture; the part that the background causes is subtracted with it. inverted: the
-        holes of the difference instead.
+        holes of the difference instead. regions: of `find_spots`.
         """
         fit = self._light_in(picture)
-        return Detections.none() if fit is None else self._moving(picture, parameters, shift, fit, inverted)
+        return Detections.none() if fit is None else self._moving(picture, parameters, shift, fit, inverted, regions)
 
     def _moving(
         self, picture: Picture, parameters: DetectParameters, shift: TextureShift, fit: tuple[float, Bools],
-        inverted: bool = False,
+        inverted: bool = False, regions: NDArray[np.float64] | None = None,
     ) -> Detections:  # fmt: skip
         """`spots_in`, with the result of `_light_in`."""
         light, fits = fit
@@ -293,7 +303,7 @@ class StaticBackground:
             difference = np.asarray(
                 cv2.subtract(np.full_like(difference, 2 * int(self.level_dn * self.steps)), difference)
             )
-        spots = find_spots(difference, replace(parameters, saturation_dn=float(top)), model)
+        spots = find_spots(difference, replace(parameters, saturation_dn=float(top)), model, regions)
         row, column = (nearest(spots.uv_px[:, i], picture.shape[1 - i]) for i in (1, 0))
         sampled = np.minimum(row // _SAMPLE[0], len(fits) - 1), np.minimum(column // _SAMPLE[1], fits.shape[1] - 1)
         kept = ~self.blind[row, column] & fits[sampled]
@@ -304,9 +314,11 @@ class StaticBackground:
         bright = self.smooth[sampled] + self.structure[row, column]
         light_of_spot = 0.5 * self.noise.slope_dn * spots.peak
         here, used = (self.noise.variance(at) + light_of_spot for at in (bright, np.full(len(spots), self.low_dn)))
+        own = self.shares[row, column]
+        here *= (1 + own) / (1 + self._noise_share)
         spots = replace(spots, cov_px2=spots.cov_px2 * (here / used)[:, None, None])
         # The background's own noise is the same in all pictures.
-        fixed = self._noise_share / (1 + self._noise_share) * 0.5 * np.trace(spots.cov_px2, axis1=1, axis2=2)
+        fixed = own / (1 + own) * 0.5 * np.trace(spots.cov_px2, axis1=1, axis2=2)
         of_light = replace(shift, background_px=(0.0,) * len(shift.background_px))
         spots = of_light.added_to(spots, self.noise)
         place = np.zeros(len(spots)) if spots.place_px2 is None else spots.place_px2
