@@ -37,9 +37,7 @@ class SlowLights:
     shape: tuple[int, ...]
 
     @staticmethod
-    def of(
-        pictures: Sequence[NDArray[Any]], found: Sequence[Detections], holes: Sequence[Detections]
-    ) -> SlowLights:
+    def of(pictures: Sequence[NDArray[Any]], found: Sequence[Detections], holes: Sequence[Detections]) -> SlowLights:
         """From the lights of each picture, and the holes that their absence leaves in the background used so far."""
         shape = pictures[0].shape
         there, absent = (np.array([places_of(d, shape, ON_LIGHT) for d in all_]) for all_ in (found, holes))

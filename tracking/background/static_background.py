@@ -41,7 +41,7 @@ from tracking.detection.detect import find_spots, saturation_of
 from tracking.detection.pixels import TEXTURE_SHARE
 from tracking.detections import Detections
 from tracking.noise import BLOCK, NoiseModel, Picture
-from tracking.noise_estimation.texture_shift import TextureShift
+from tracking.noise_estimation.texture_shift import TextureShift, local_shifts
 from tracking.parameters import DetectParameters
 
 PICTURES = 15  # from which a background is made, spread over the recording
@@ -81,6 +81,9 @@ class StaticBackground:
     subtracted: NDArray[np.uint16]  # (h, w): what is added to a picture in these steps
     model: NoiseModel  # of the difference, in its steps
     noise: NoiseModel  # of the pictures
+    spot_px: float = 0.0  # usual width of the lights that move; 0: not known
+    shifts_px: NDArray[np.float32] | None = None  # (h, w): `local_shifts` of such a light
+    misfit_share: float = float("nan")  # of the lights that move, as in TextureShift
     reference: float = 1.0  # what of the structure, which contains noise, the pictures show; 0: too little to measure
 
     @staticmethod
@@ -132,7 +135,19 @@ class StaticBackground:
         slow = slow[~slow.known]
         if len(slow.row):
             better = better._behind(slow, mean, pictures, shift)
-        return better._with_reference(pictures)
+        return better._with_reference(pictures)._with_shifts(mean, found, shift)
+
+    def _with_shifts(
+        self, mean: NDArray[np.float32], found: Sequence[Detections], shift: TextureShift
+    ) -> StaticBackground:
+        """The background with the errors of the lights that move, which were found in some of its pictures."""
+        widths = np.concatenate([np.sqrt(d.major_px * d.minor_px) for d in found])
+        if not len(widths):
+            return self
+        width = float(np.median(widths))
+        own = (self.shares * self.noise.variance(mean)).astype(np.float32)
+        share = replace(shift, misfit_share=float("nan")).with_lights(found).misfit_share
+        return replace(self, spot_px=width, shifts_px=local_shifts(mean, own, width), misfit_share=share)
 
     def _behind(
         self, slow: SlowLights, mean: NDArray[np.float32], pictures: Sequence[Picture], shift: TextureShift
@@ -320,7 +335,11 @@ class StaticBackground:
         # The background's own noise is the same in all pictures.
         fixed = own / (1 + own) * 0.5 * np.trace(spots.cov_px2, axis1=1, axis2=2)
         of_light = replace(shift, background_px=(0.0,) * len(shift.background_px))
-        spots = of_light.added_to(spots, self.noise)
+        here_px = None
+        if self.shifts_px is not None:
+            of_light = replace(of_light, misfit_share=self.misfit_share)
+            here_px = self.shifts_px[row, column] * np.sqrt(spots.major_px * spots.minor_px) / self.spot_px
+        spots = of_light.added_to(spots, self.noise, here_px)
         place = np.zeros(len(spots)) if spots.place_px2 is None else spots.place_px2
         return replace(spots, place_px2=place + fixed)
 

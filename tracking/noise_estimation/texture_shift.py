@@ -101,23 +101,29 @@ class TextureShift:
         """That of the spot's own light alone."""
         return replace(self, background_px=tuple(0.0 for _ in self.widths_px))
 
-    def sigma_px(self, width_px: Array, contrast: Array, brightness: Array | float = 0.0) -> Array:
+    def sigma_px(
+        self, width_px: Array, contrast: Array, brightness: Array | float = 0.0, light_px: Array | None = None
+    ) -> Array:
         """Sigmas (n,), px, of spots with these widths (n,), px, and peaks (n,) relative to the background.
 
         brightness (n,): variance of the shot noise at the peak over that of the background's noise; a fit gives bright
         pixels less weight, so that its kernel in the light is rather x G^p with p < 2, which is (p / 2) times that of a
         spot wider by sqrt(2 / p). Both parts come from the same texture, so they are added. nan where a width is not
-        known.
+        known. light_px (n,): `local_shifts` at their places, instead of those of any place.
         """
         at, widths = np.log(np.maximum(width_px, 1e-3)), np.log(self.widths_px)
         shot = _WEIGHTED * np.maximum(brightness, 0.0)
         p = 2 - shot / (1 + shot)
         light = 0.5 * p * np.interp(at + 0.5 * np.log(2 / p), widths, self.light_px)
+        if light_px is not None:
+            light = np.sqrt(0.5 * p) * light_px
         background = np.interp(at, widths, self.background_px)
         return np.minimum(light + background / np.maximum(contrast, 1e-3), LARGEST_SHARE * np.asarray(width_px))
 
-    def added_to(self, found: Detections, noise: NoiseModel) -> Detections:
+    def added_to(self, found: Detections, noise: NoiseModel, light_px: Array | None = None) -> Detections:
         """Points whose covariances include these errors; noise: of the pictures, with the background's level.
+
+        light_px (n,): sigmas by the texture in the light of each, with equal weights, where its place is known.
 
         The kernels above of an elliptical Gaussian give variances along its axes in proportion to its half axes. The
         fits' misfits show these errors as well, less precisely; if they are clearly larger, they count instead: they
@@ -127,7 +133,7 @@ class TextureShift:
         seen = misfit[:, None, None] * found.cov_px2
         major, minor = np.maximum(found.major_px, _NARROWEST_PX), np.maximum(found.minor_px, _NARROWEST_PX)
         width_px, brightness = np.sqrt(found.major_px * found.minor_px), noise.slope_dn * found.peak / noise.floor_dn2
-        sigma = self.sigma_px(width_px, found.peak / max(noise.black_dn, 1.0), brightness)
+        sigma = self.sigma_px(width_px, found.peak / max(noise.black_dn, 1.0), brightness, light_px)
         expected_px2 = np.where(np.isnan(sigma), 0.0, sigma) ** 2
         angle = np.radians(found.angle_deg)
         along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -223,6 +229,24 @@ def _kernels(sigma_px: float, power: int, reach: int) -> tuple[Array, Array]:
 def _filtered(texture: NDArray[Any], odd: Array, smooth: Array) -> list[NDArray[Any]]:
     """The shifts in u and in v, both (h, w)."""
     return [cv2.sepFilter2D(texture, cv2.CV_32F, *k) for k in ((odd, smooth), (smooth, odd))]
+
+
+def local_shifts(
+    background: NDArray[np.float32], variance: NDArray[np.float32] | float, width_px: float
+) -> NDArray[np.float32]:
+    """Sigmas, px, of a spot of this width at each place of a known background (h, w), by the texture in its light.
+
+    That of the surroundings of a pixel, as large as the spot, as if the background were the screen, lit evenly. Where it
+    is not, or lit by other lamps as well, the errors are smaller: an upper bound, of which the residuals show how much
+    is true. variance, DN^2: of the background's own noise.
+    """
+    reach = int(np.ceil(_REACH * width_px / np.sqrt(2)))
+    odd, smooth = _kernels(width_px, 2, reach)
+    light = np.maximum(cv2.sepFilter2D(background, cv2.CV_32F, smooth / smooth.sum(), smooth / smooth.sum()), 1.0)
+    moved = [(x / light) ** 2 for x in _filtered(background, odd, smooth)]
+    noise = variance * np.sum(odd**2) * np.sum(smooth**2) / light**2
+    side = 2 * int(np.ceil(width_px)) + 1
+    return np.asarray(np.sqrt(np.maximum(cv2.blur(0.5 * (moved[0] + moved[1]) - noise, (side, side)), 0.0)), np.float32)
 
 
 def _coarse_shifts(

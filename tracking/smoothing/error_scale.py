@@ -146,7 +146,7 @@ def usual_misfit(run: RunDetections, place_px2: Array, assigned: Ints, camera_of
         shares = np.sort(some[wide & np.isfinite(some)])
         if len(shares) >= _LEAST_CHANGES:
             cut = len(shares) // 10
-            out[camera] = np.sqrt(0.5 * np.mean(shares[cut : len(shares) - cut]))
+            out[camera] = np.sqrt(min(0.5 * np.mean(shares[cut : len(shares) - cut]), np.median(shares)))
     usual = float(np.nanmax(out)) if np.isfinite(out).any() else 0.0
     return np.where(np.isnan(out), usual, out)
 
