@@ -24,6 +24,8 @@ _REACH = 2.0  # widths of the spot: assumed correlation length of the errors
 _BELOW = 0.05  # share of the distribution of the residuals that is taken to be below them
 _MOVING = 0.5  # share of the residuals that are independent in spite of errors of places, if the spots move
 _FRAMES = 2000  # at most so many, evenly spaced
+_PLACE_FACTORS = np.geomspace(1e-3, 1.0, 61)  # hypotheses
+_LEAST_LIKELY = 1.35  # nats below the most likely factor: a one-sided bound of 95 %
 _LEAST_FREEDOM = 4.0  # independent residuals from which the bound is used
 
 
@@ -75,15 +77,32 @@ def residual_bounds(
         if freedom < _LEAST_FREEDOM:
             continue
         residual = float(np.sum(square[of_camera])) / float(np.sum(weight))
+        ratio = square[of_camera] / weight
+        most_of_places = _most_of_places(ratio, share[of_camera], weight / same[of_camera])
         of_place = float(np.sum(share[of_camera] * weight)) / float(np.sum(weight))
         most = residual / _lower_quantile(freedom)
         if places > _MOVING * freedom:
-            noise[camera] = place[camera] = min(most, 1.0)
+            noise[camera] = min(most, 1.0)
+            place[camera] = min(noise[camera], most_of_places)
             continue
         noise[camera] = min(most / max(1 - of_place, 1e-12), 1.0)
         if places >= _LEAST_FREEDOM:
-            place[camera] = min(residual / (_lower_quantile(places) * max(of_place, 1e-12)), 1.0)
+            most = residual / (_lower_quantile(places) * max(of_place, 1e-12))
+            place[camera] = min(most, most_of_places, 1.0)
     return VarianceFactors(noise, place)
+
+
+def _most_of_places(ratio: Array, share: Array, weight: Array) -> float:
+    """The largest factor of the part that belongs to places which is likely, given how the residuals vary with it.
+
+    ratio (m,): of squares of residuals to stated variances; share (m,): of these, the part that belongs to places;
+    weight (m,): independent pairs of coordinates. Where places differ, the even ones show the noise and the others the
+    factor: a spot whose light the texture modulates by less than expected has smaller errors in all of them.
+    """
+    variance = 1 - share[:, None] * (1 - _PLACE_FACTORS)
+    log_likelihood = -np.sum(weight[:, None] * (ratio[:, None] / variance + np.log(variance)), axis=0)
+    likely = log_likelihood >= log_likelihood.max() - _LEAST_LIKELY
+    return float(_PLACE_FACTORS[likely].max())
 
 
 def _lower_quantile(freedom: float) -> float:
