@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -29,6 +29,7 @@ from tracking.background.mean_pictures import (
 )
 from tracking.background.places import (
     AROUND_LIGHT,
+    AROUND_SPOT,
     inside,
     merged_parts,
     nearest,
@@ -59,7 +60,11 @@ _EFFICIENCY = 2.0  # sigma of the median over places, of those that show most st
 _MOST_LEFT = 2.5  # sigmas: more counts as much, since somebody in front of the screen is in many pixels
 _SAME_LIGHT = 0.03  # the light has not changed by more than this share: the structure is not scaled
 _LEAST_LIGHT, _MOST_LIGHT = 0.2, 5.0  # changes of the light beyond which a picture is searched without subtraction
+_WIDE_PX = 4.0  # a narrower light is in few of the sampled pixels
 _LARGEST_MISFIT = 1.3  # sigma of what is left over that of the noise; above it the camera or the light has moved
+
+# Light of a picture relative to the background; on the pixels of _SAMPLE: those with nothing else, and sigmas left.
+_Fit: TypeAlias = tuple[float, Bools, NDArray[np.float32]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,11 +302,11 @@ class StaticBackground:
         return Detections.none() if fit is None else self._moving(picture, parameters, shift, fit, inverted, regions)
 
     def _moving(
-        self, picture: Picture, parameters: DetectParameters, shift: TextureShift, fit: tuple[float, Bools],
+        self, picture: Picture, parameters: DetectParameters, shift: TextureShift, fit: _Fit,
         inverted: bool = False, regions: NDArray[np.float64] | None = None,
     ) -> Detections:  # fmt: skip
         """`spots_in`, with the result of `_light_in`."""
-        light, fits = fit
+        light, clear, left = fit
         added, model = self.subtracted, self.model
         if abs(light - 1) > _SAME_LIGHT:
             change = (np.float32(1 - light) * self.structure * self.steps).astype(np.int32)
@@ -319,6 +324,12 @@ class StaticBackground:
                 cv2.subtract(np.full_like(difference, 2 * int(self.level_dn * self.steps)), difference)
             )
         spots = find_spots(difference, replace(parameters, saturation_dn=float(top)), model, regions)
+        wide = spots.major_px > _WIDE_PX
+        if wide.any():  # its pixels are explained
+            clear = clear & ~places_of(spots[wide], picture.shape, AROUND_SPOT)[:: _SAMPLE[0], :: _SAMPLE[1]]
+        # Somebody in front of the screen is in many pixels.
+        least = _LARGEST_MISFIT**2 * sums_around(clear.astype(np.float32))
+        fits = sums_around(np.where(clear, np.minimum(left * left, _MOST_LEFT**2), 0)) <= least
         row, column = (nearest(spots.uv_px[:, i], picture.shape[1 - i]) for i in (1, 0))
         sampled = np.minimum(row // _SAMPLE[0], len(fits) - 1), np.minimum(column // _SAMPLE[1], fits.shape[1] - 1)
         kept = ~self.blind[row, column] & fits[sampled]
@@ -343,10 +354,10 @@ class StaticBackground:
         place = np.zeros(len(spots)) if spots.place_px2 is None else spots.place_px2
         return replace(spots, place_px2=place + fixed)
 
-    def _light_in(self, picture: Picture, measured: bool = False) -> tuple[float, Bools] | None:
-        """How much of the structure a picture shows, relative to the background, and where it does.
+    def _light_in(self, picture: Picture, measured: bool = False) -> _Fit | None:
+        """How much of the structure a picture shows, relative to the background, and what it leaves.
 
-        Places: on the pixels of _SAMPLE. None: the picture and the background do not fit. measured: also where the
+        None: the picture and the background do not fit. measured: also where the
         light is the same within the errors of its measurement; otherwise it is 1 there.
         """
         if picture.shape != self.structure.shape:
@@ -367,7 +378,7 @@ class StaticBackground:
         light = float(np.median(here[power >= np.median(power)])) / share
         sigma = _EFFICIENCY * float(np.sqrt(np.median(variance) / max(np.sum(seen * seen), 1e-12))) / share
         if measured:
-            return light, plain
+            return light, plain, np.zeros(plain.shape, np.float32)
         if not self.reference or abs(light - 1) < max(_SAME_LIGHT, _CLEAR_SIGMAS * sigma):
             light = 1.0
         if not _LEAST_LIGHT < light < _MOST_LIGHT:
@@ -376,6 +387,4 @@ class StaticBackground:
         left = np.where(clear, (above - light * structure) / np.sqrt(variance + light**2 * own), 0.0)
         if 1.4826 * float(np.median(np.abs(left[clear]))) > _LARGEST_MISFIT:
             return None
-        # Somebody in front of the screen; a moving light is in few of the pixels.
-        least = _LARGEST_MISFIT**2 * sums_around(clear.astype(np.float32))
-        return light, sums_around(np.minimum(left * left, _MOST_LEFT**2)) <= least
+        return light, clear, left
