@@ -365,11 +365,12 @@ class StaticBackground:
         rows, columns = _SAMPLE
         plain = ~self.near_lights[::rows, ::columns]
         own_light = self.structure[::rows, ::columns]
-        structure = without_smooth_part(own_light, plain)
         above = picture[::rows, ::columns].astype(np.float32) - self.smooth
         more = float(np.median(above))
-        above = without_smooth_part(above, plain)
         variance = self.noise.variance(self.smooth + own_light + more).astype(np.float32)
+        # Wide lights are in the means around them.
+        even = plain & (np.abs(above - more - own_light) < 6 * np.sqrt(variance) + np.abs(own_light))
+        structure, above = (without_smooth_part(x, even) for x in (own_light, above))
         clear = plain & (np.abs(above) < 6 * np.sqrt(variance) + 4 * np.abs(structure))
         seen = np.where(clear, structure, 0.0)
         power = sums_around(seen * seen)
