@@ -11,8 +11,8 @@ from tracking.detections import Detections
 
 _MARGIN, _STEP = 40, 64  # px: light around a box; sides are rounded up, so that few sizes occur
 _CLEARLY_BETTER = 0.5  # ratio of the variances of two measurements of a spot
-# Widths, and px: kept clear of lights at rest; of other spots; a light itself.
-AROUND_LIGHT, AROUND_SPOT, ON_LIGHT = (3.0, 3.0), (3.0, 2.0), (2.5, 1.5)
+# Widths, and px: kept clear of lights at rest; of other spots; a light itself; its middle.
+AROUND_LIGHT, AROUND_SPOT, ON_LIGHT, SAME_LIGHT = (3.0, 3.0), (3.0, 2.0), (2.5, 1.5), (1.0, 0.0)
 
 
 def places_of(lights: Detections, shape: tuple[int, ...], size: tuple[float, float]) -> Bools:
@@ -24,19 +24,24 @@ def places_of(lights: Detections, shape: tuple[int, ...], size: tuple[float, flo
     return out > 0
 
 
-def _near(spots: Detections, found: Detections) -> Bools:
-    """(n, m): spots that are parts of others, or the same."""
-    widths, more = AROUND_SPOT
+def near_each(spots: Detections, found: Detections, size: tuple[float, float]) -> Bools:
+    """(n, m): spots that are near others. size: widths of those, and px."""
+    widths, more = size
     gap = np.linalg.norm(spots.uv_px[:, None] - found.uv_px, axis=-1)
     return np.asarray(gap < widths * found.major_px + more)
 
 
+def near(spots: Detections, found: Detections, size: tuple[float, float]) -> Bools:
+    """(n,): spots that are near any of the others."""
+    return np.asarray(near_each(spots, found, size).any(axis=1))
+
+
 def number_of_better(spots: Detections, found: Detections) -> int:
     """How many spots of a difference (n,) are not among those found in the picture (m,), or clearly more precise."""
-    near = _near(spots, found)
+    part = near_each(spots, found, AROUND_SPOT)
     size2, usual2 = (np.trace(d.cov_px2, axis1=1, axis2=2) for d in (spots, found))
-    replaces = near & (size2[:, None] < _CLEARLY_BETTER * usual2)
-    return int(np.count_nonzero(~np.any(near & ~replaces, axis=1)))
+    replaces = part & (size2[:, None] < _CLEARLY_BETTER * usual2)
+    return int(np.count_nonzero(~np.any(part & ~replaces, axis=1)))
 
 
 def inside(boxes: NDArray[np.float64], found: Detections) -> Bools:

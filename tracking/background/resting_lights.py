@@ -64,14 +64,14 @@ class RestingLights:
             np.maximum(used - _PARAMETERS, 1.0), inverse, flux_of,
         )  # fmt: skip
 
-    def in_picture(self, picture: Picture) -> tuple[Detections, Bools]:
-        """The lights (n,) in a picture (h, w), and which of them have changed: those are not measured correctly.
+    def in_picture(self, picture: Picture) -> tuple[Detections, Bools, Bools]:
+        """The lights (n,) in a picture (h, w), which of them have changed, and which are passed by another light.
 
-        Where there is more light than in the mean and nowhere less, something else passes over an unchanged light: that
+        Those that have changed are not measured correctly. Where there is more light than in the mean and nowhere less, something else passes over an unchanged light: that
         is in the difference from the mean, and the light stays where the mean shows it.
         """
         if not len(self.found):
-            return self.found, np.zeros(0, dtype=bool)
+            return self.found, np.zeros(0, dtype=bool), np.zeros(0, dtype=bool)
         residual = picture.ravel()[self.pixels].astype(np.float32) - self.mean
         weighted = residual * self.weight
         right = np.add.reduceat(self.slopes * weighted, self.starts, axis=1).T
@@ -88,7 +88,7 @@ class RestingLights:
         changed |= np.linalg.norm(step[:, :2], axis=1) > _LARGEST_STEP * self.found.minor_px
         step, more = np.where(passed[:, None], 0.0, step), np.where(passed, 0.0, more)
         found = replace(self.found, uv_px=self.found.uv_px + step[:, :2], flux=self.found.flux * (1.0 + more))
-        return found, np.asarray(changed & ~passed)
+        return found, np.asarray(changed & ~passed), np.asarray(passed)
 
 
 @dataclass(frozen=True, slots=True)

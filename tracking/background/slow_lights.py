@@ -23,6 +23,7 @@ LEAST_CLEAR = 3  # pictures without a light at a pixel, from which these alone c
 ROUNDS = 10  # of spots and of the background behind them
 _SURE = 0.1  # as many pictures, or more, have the information on the background that counts as sufficient
 _MODULATED = 0.3  # share of the fitted light of a spot by which the true one may differ
+_MOVED = 1.7  # ratio of the places of moving lights in all pictures to those in one
 _UNEXPLAINED = 5.0  # sigmas of light that is in no fitted spot: such a pixel of a picture does not count
 
 
@@ -35,6 +36,7 @@ class SlowLights:
     values: NDArray[np.float32]  # (n, m), DN
     clear: Bools  # (n, m): no light there
     shape: tuple[int, ...]
+    moved: bool  # the lights have been in clearly more places than they fill
 
     @staticmethod
     def of(pictures: Sequence[NDArray[Any]], found: Sequence[Detections], holes: Sequence[Detections]) -> SlowLights:
@@ -42,14 +44,18 @@ class SlowLights:
         shape = pictures[0].shape
         there, absent = (np.array([places_of(d, shape, ON_LIGHT) for d in all_]) for all_ in (found, holes))
         row, column = np.nonzero(there.any(axis=0) | absent.any(axis=0))
+        filled = np.count_nonzero(there, axis=(1, 2))
+        moved = np.median(filled) > 0 and len(row) > _MOVED * np.median(filled)
         clear, hole = ~there[:, row, column], absent[:, row, column]
         clear &= hole | ~hole.any(axis=0)
-        return SlowLights(row, column, np.array([p[row, column] for p in pictures], np.float32), clear, shape)
+        return SlowLights(
+            row, column, np.array([p[row, column] for p in pictures], np.float32), clear, shape, bool(moved)
+        )
 
     def __getitem__(self, pixels: Bools) -> SlowLights:
         """Some of the pixels."""
         return SlowLights(
-            self.row[pixels], self.column[pixels], self.values[:, pixels], self.clear[:, pixels], self.shape
+            self.row[pixels], self.column[pixels], self.values[:, pixels], self.clear[:, pixels], self.shape, self.moved
         )
 
     @property
@@ -68,7 +74,7 @@ class SlowLights:
 
         before (m,): background in which they were found; variance (m,), DN^2: of a pixel.
         """
-        light = np.array([_light_at(d, self.column, self.row) for d in found])
+        light = np.array([light_at(d, self.column, self.row) for d in found])
         left = self.values - light
         weight = variance / (variance + (_MODULATED * light) ** 2)
         weight[left - before > _UNEXPLAINED * np.sqrt(variance / weight)] = 0.0
@@ -90,7 +96,7 @@ class SlowLights:
         return np.asarray(information >= _SURE)
 
 
-def _light_at(spots: Detections, u: Ints, v: Ints) -> NDArray[np.float32]:
+def light_at(spots: Detections, u: Ints, v: Ints) -> NDArray[np.float32]:
     """The light of Gaussian spots at pixels (m,), DN."""
     out = np.zeros(len(u), np.float32)
     for i in range(len(spots)):

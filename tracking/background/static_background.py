@@ -9,14 +9,14 @@ of a mean background is usual in particle image velocimetry, e.g. Raffel et al. 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Bools
+from geometry.arrays import Array, Bools
 from tracking.background.mean_pictures import (
     MOST_BYTES,
     highest_of_blocks,
@@ -30,14 +30,16 @@ from tracking.background.mean_pictures import (
 from tracking.background.places import (
     AROUND_LIGHT,
     AROUND_SPOT,
+    SAME_LIGHT,
     inside,
     merged_parts,
+    near,
     nearest,
     number_of_better,
     places_of,
 )
 from tracking.background.resting_lights import RestingLights
-from tracking.background.slow_lights import ROUNDS, SlowLights
+from tracking.background.slow_lights import ROUNDS, SlowLights, light_at
 from tracking.detection.detect import find_spots, saturation_of
 from tracking.detection.pixels import TEXTURE_SHARE
 from tracking.detections import Detections
@@ -88,6 +90,7 @@ class StaticBackground:
     noise: NoiseModel  # of the pictures
     spot_px: float = 0.0  # usual width of the lights that move; 0: not known
     shifts_px: NDArray[np.float32] | None = None  # (h, w): `local_shifts` of such a light
+    fixed: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))  # lights at rest while others move
     misfit_share: float = float("nan")  # of the lights that move, as in TextureShift
     reference: float = 1.0  # what of the structure, which contains noise, the pictures show; 0: too little to measure
 
@@ -137,22 +140,28 @@ class StaticBackground:
         slow = SlowLights.of(equal, found, holes)
         mean[slow.row, slow.column] = slow.means()
         better = StaticBackground._of_mean(mean, pictures, self.noise, self.parameters)
-        slow = slow[~slow.known]
+        moved, slow = slow.moved, slow[~slow.known]
         if len(slow.row):
             better = better._behind(slow, mean, pictures, shift)
-        return better._with_reference(pictures)._with_shifts(mean, found, shift)
+        return better._with_reference(pictures)._with_shifts(pictures, found, moved, shift)
 
     def _with_shifts(
-        self, mean: NDArray[np.float32], found: Sequence[Detections], shift: TextureShift
+        self, pictures: Sequence[Picture], found: Sequence[Detections], moved: bool, shift: TextureShift
     ) -> StaticBackground:
-        """The background with the errors of the lights that move, which were found in some of its pictures."""
+        """The background with the errors of the lights that move, found in these pictures, and with those at rest."""
         widths = np.concatenate([np.sqrt(d.major_px * d.minor_px) for d in found])
+        changed = np.array([self.lights.in_picture(p)[1] for p in pictures])
+        better = replace(self, fixed=~changed.any(axis=0) & moved)
         if not len(widths):
-            return self
-        width = float(np.median(widths))
+            return better
+        width, still = float(np.median(widths)), self.lights.found
+        at = row, column = np.nonzero(places_of(still, self.structure.shape, AROUND_LIGHT))
+        rows, columns = self.structure.shape
+        mean = self.structure + cv2.resize(self.smooth, (columns, rows), interpolation=cv2.INTER_LINEAR)
+        mean[at] -= light_at(still, column, row)
         own = (self.shares * self.noise.variance(mean)).astype(np.float32)
         share = replace(shift, misfit_share=float("nan")).with_lights(found).misfit_share
-        return replace(self, spot_px=width, shifts_px=local_shifts(mean, own, width), misfit_share=share)
+        return replace(better, spot_px=width, shifts_px=local_shifts(mean, own, width), misfit_share=share)
 
     def _behind(
         self, slow: SlowLights, mean: NDArray[np.float32], pictures: Sequence[Picture], shift: TextureShift
@@ -238,9 +247,9 @@ class StaticBackground:
         )  # fmt: skip
         rows, columns = _SAMPLE
         blind = cv2.dilate(mean - np.minimum(plain, level), np.ones((3, 3))) > 1 / steps
-        near = places_of(at_rest, mean.shape, AROUND_LIGHT) | blind
+        near_lights = places_of(at_rest, mean.shape, AROUND_LIGHT) | blind
         return StaticBackground(
-            len(pictures), structure, smooth[::rows, ::columns].copy(), near, blind,
+            len(pictures), structure, smooth[::rows, ::columns].copy(), near_lights, blind,
             np.full(mean.shape, share, np.float32), RestingLights.of(mean, at_rest, model, clips - 0.5), np.zeros((0, 3)), parameters, steps, level, low,
             in_steps(np.asarray(level - plain, np.float32), steps), of_difference, model,
         )  # fmt: skip
@@ -262,20 +271,32 @@ class StaticBackground:
         if fit is None:
             return None
         spots = self._moving(picture, parameters, shift, fit)
-        lights, changed = self.lights.in_picture(picture)
+        lights, changed, passed = self.lights.in_picture(picture)
+        # A lamp that flickers is in the difference, too.
+        spots = spots[~near(spots, lights[~changed & ~passed], SAME_LIGHT)]
         boxes = np.column_stack([self.lights.found.uv_px, self.lights.half_px])[changed]
         boxes = np.concatenate([self.unknown, boxes])
-        rest = lights[~changed & ~inside(boxes, lights)]
+        there = ~changed & ~inside(boxes, lights)
+        rest = lights[there]
         # The error of the mean picture's fit is the same in all pictures.
         fixed = 0.5 * self._noise_share * np.trace(rest.cov_px2, axis1=1, axis2=2)
-        rest = shift.added_to(rest, self.noise)
+        rest = shift.added_to(rest, self.noise, self._shifts_at(rest))
         place = np.zeros(len(rest)) if rest.place_px2 is None else rest.place_px2
-        rest = replace(rest, cov_px2=(1 + self._noise_share) * rest.cov_px2, place_px2=place + fixed)
+        at_rest = self.fixed[there].astype(float) if len(self.fixed) else None
+        rest = replace(rest, cov_px2=(1 + self._noise_share) * rest.cov_px2, place_px2=place + fixed, at_rest=at_rest)
         found = spots[~inside(boxes, spots)]
         if len(boxes):
-            again = shift.added_to(self._found_again(picture, parameters, boxes), self.noise)
+            again = self._found_again(picture, parameters, boxes)
+            again = shift.added_to(again, self.noise, self._shifts_at(again))
             found = found.joined(again, parameters.max_detections)
         return found, rest
+
+    def _shifts_at(self, points: Detections) -> Array | None:
+        """(n,): `local_shifts` of points; None: not known."""
+        if self.shifts_px is None:
+            return None
+        row, column = (nearest(points.uv_px[:, i], self.shifts_px.shape[1 - i]) for i in (1, 0))
+        return np.asarray(self.shifts_px[row, column] * np.sqrt(points.major_px * points.minor_px) / self.spot_px)
 
     def _found_again(self, picture: Picture, parameters: DetectParameters, boxes: NDArray[np.float64]) -> Detections:
         """The points of a picture in boxes (m, 3), px. `regions` would be followed from light to light beyond them."""
@@ -346,11 +367,9 @@ class StaticBackground:
         # The background's own noise is the same in all pictures.
         fixed = own / (1 + own) * 0.5 * np.trace(spots.cov_px2, axis1=1, axis2=2)
         of_light = replace(shift, background_px=(0.0,) * len(shift.background_px))
-        here_px = None
         if self.shifts_px is not None:
             of_light = replace(of_light, misfit_share=self.misfit_share)
-            here_px = self.shifts_px[row, column] * np.sqrt(spots.major_px * spots.minor_px) / self.spot_px
-        spots = of_light.added_to(spots, self.noise, here_px)
+        spots = of_light.added_to(spots, self.noise, self._shifts_at(spots))
         place = np.zeros(len(spots)) if spots.place_px2 is None else spots.place_px2
         return replace(spots, place_px2=place + fixed)
 

@@ -115,9 +115,11 @@ class TextureShift:
         shot = _WEIGHTED * np.maximum(brightness, 0.0)
         p = 2 - shot / (1 + shot)
         light = 0.5 * p * np.interp(at + 0.5 * np.log(2 / p), widths, self.light_px)
-        if light_px is not None:
-            light = np.sqrt(0.5 * p) * light_px
         background = np.interp(at, widths, self.background_px)
+        if light_px is not None:
+            # At an edge the kernel in the background moves the fit twice as far as that in the light.
+            background = 2.0 * light_px * (max(self.background_px) > 0)
+            light = np.sqrt(0.5 * p) * light_px
         return np.minimum(light + background / np.maximum(contrast, 1e-3), LARGEST_SHARE * np.asarray(width_px))
 
     def added_to(self, found: Detections, noise: NoiseModel, light_px: Array | None = None) -> Detections:

@@ -13,7 +13,14 @@ from tracking.parameters import TrackerParameters
 from tracking.rigid_body.association.frame_detections import BLENDED, FrameDetections
 from tracking.rigid_body.clutter import ClutterNearSpots
 from tracking.rigid_body.frame_summary import FrameSummary
-from tracking.rigid_body.static_points import DECAY, PicturePoints, no_places, static_log_density, update_places
+from tracking.rigid_body.static_points import (
+    DECAY,
+    PicturePoints,
+    no_places,
+    static_log_density,
+    sure_log_density,
+    update_places,
+)
 
 SIZE_GAIN = 0.1  # weight of one frame in the usual size of a spot
 
@@ -49,6 +56,9 @@ class PointStatistics:
             uv, cov, blend = np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0)
         has_image = np.array([f is not None for f in found])
         static = static_log_density(self._static, uv, cov, first_rows)
+        if any(f.at_rest is not None for f in some):
+            at_rest = np.concatenate([np.zeros(len(f)) if f.at_rest is None else f.at_rest for f in some]) > 0
+            static[at_rest] = np.maximum(static[at_rest], sure_log_density(cov[at_rest]))
         log_clutter, log_excess = self._clutter.log_density(first_rows)
         if first:
             # The excess of clutter near spots must not make points without any spot evidence of a vehicle.

@@ -70,6 +70,12 @@ def static_log_density(places: StaticPlaces, uv: Array, cov: Array, first: Ints)
     return out
 
 
+def sure_log_density(cov: Array) -> Array:
+    """Log density, 1/px^2, of static points that are known to be in their places in every picture; cov (m, 2, 2)."""
+    r2 = np.maximum(RADIUS_SIGMAS**2 * 0.5 * np.trace(cov, axis1=1, axis2=2), MIN_RADIUS_PX**2)
+    return np.asarray(-np.log(np.pi * r2))
+
+
 @compiled
 def update_places(
     places: StaticPlaces, points: PicturePoints, assigned: Ints, expected: Array, camera_of: Ints, decay: float
