@@ -15,10 +15,10 @@ from tracking.rigid_body.clutter import ClutterNearSpots
 from tracking.rigid_body.frame_summary import FrameSummary
 from tracking.rigid_body.static_points import (
     DECAY,
+    SURE_LOG_DENSITY,
     PicturePoints,
     no_places,
     static_log_density,
-    sure_log_density,
     update_places,
 )
 
@@ -58,7 +58,7 @@ class PointStatistics:
         static = static_log_density(self._static, uv, cov, first_rows)
         if any(f.at_rest is not None for f in some):
             at_rest = np.concatenate([np.zeros(len(f)) if f.at_rest is None else f.at_rest for f in some]) > 0
-            static[at_rest] = np.maximum(static[at_rest], sure_log_density(cov[at_rest]))
+            static[at_rest] = np.maximum(static[at_rest], SURE_LOG_DENSITY)
         log_clutter, log_excess = self._clutter.log_density(first_rows)
         if first:
             # The excess of clutter near spots must not make points without any spot evidence of a vehicle.

@@ -197,8 +197,7 @@ class RigidTracker:
             self._last_pose, self._last_pose_age_s, self.process_noise.fastest, self._schedule.just_found,
             self._schedule.doubted or self._schedule.astray,
         )  # fmt: skip
-        # A recording's lights at rest may be known from its first frame on.
-        static_too = self._schedule.searches % STATIC_SEARCH_INTERVAL == (STATIC_SEARCH_INTERVAL - 1 if first else 0)
+        static_too = self._schedule.searches % STATIC_SEARCH_INTERVAL == 0
         candidates = self._acquisition.labellings(obs.frame, found, prior, first, static_too, events)
         if first and len(candidates) == 1 and candidates[0].fit.dof > 0 and candidates[0].score >= MIN_EVIDENCE_NATS:
             # Later the scale is known, and a misfit shows a wrong answer (a scale of 3 after a screen was occluded).

@@ -16,6 +16,7 @@ from geometry.compilation.jit import compiled
 MAX_PLACES = 64  # per camera
 RADIUS_SIGMAS, MIN_RADIUS_PX = 5.0, 0.4  # radius of a place in sigmas of a point, and at least
 MIN_SEEN = 4.0  # count from which on a place is taken for static
+SURE_LOG_DENSITY = -float(np.log(np.pi * MIN_RADIUS_PX**2))  # 1/px^2, of points that are known to be static
 DECAY = 0.99  # of the counts per frame while tracking: a place is forgotten some hundred frames after its point is gone
 NEAR_PX = 3.0  # a point this near to an expected spot may be that spot, labelled or not
 
@@ -68,12 +69,6 @@ def static_log_density(places: StaticPlaces, uv: Array, cov: Array, first: Ints)
             if count >= MIN_SEEN:
                 out[d] = np.log(min(count / places.frames[c], 1.0) / (np.pi * r2))
     return out
-
-
-def sure_log_density(cov: Array) -> Array:
-    """Log density, 1/px^2, of static points that are known to be in their places in every picture; cov (m, 2, 2)."""
-    r2 = np.maximum(RADIUS_SIGMAS**2 * 0.5 * np.trace(cov, axis1=1, axis2=2), MIN_RADIUS_PX**2)
-    return np.asarray(-np.log(np.pi * r2))
 
 
 @compiled
