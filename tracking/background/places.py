@@ -31,11 +31,6 @@ def near_each(spots: Detections, found: Detections, size: tuple[float, float]) -
     return np.asarray(gap < widths * found.major_px + more)
 
 
-def near(spots: Detections, found: Detections, size: tuple[float, float]) -> Bools:
-    """(n,): spots that are near any of the others."""
-    return np.asarray(near_each(spots, found, size).any(axis=1))
-
-
 def number_of_better(spots: Detections, found: Detections) -> int:
     """How many spots of a difference (n,) are not among those found in the picture (m,), or clearly more precise."""
     part = near_each(spots, found, AROUND_SPOT)

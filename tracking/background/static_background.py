@@ -33,7 +33,7 @@ from tracking.background.places import (
     SAME_LIGHT,
     inside,
     merged_parts,
-    near,
+    near_each,
     nearest,
     number_of_better,
     places_of,
@@ -53,6 +53,7 @@ _HIGHEST = 30.0  # sigmas of noise and texture
 _MEAN_VARIANCE = 1.4  # variance of these means of normal deviates times their number: 1.4 lower half, 1.2 middle
 _LOW = 0.25  # quantile of the background whose noise the difference is taken to have; brighter places count as uneven
 _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
+_AS_WIDE = 0.7  # of a light at rest: what is in its middle and as wide is that light, brighter than in the mean
 _TRIED = 3  # every such picture shows whether there are further spots
 _MANY_LIGHTS = 4  # at rest, from which the subtraction is used in any case: it spares their fits
 _LEAST_FOUND = 0.2  # further or better spots per picture from which the subtraction is used
@@ -273,7 +274,9 @@ class StaticBackground:
         spots = self._moving(picture, parameters, shift, fit)
         lights, changed, passed = self.lights.in_picture(picture)
         # A lamp that flickers is in the difference, too.
-        spots = spots[~near(spots, lights[~changed & ~passed], SAME_LIGHT)]
+        same = lights[~changed & ~passed]
+        as_wide = spots.major_px[:, None] > _AS_WIDE * same.major_px
+        spots = spots[~(near_each(spots, same, SAME_LIGHT) & as_wide).any(axis=1)]
         boxes = np.column_stack([self.lights.found.uv_px, self.lights.half_px])[changed]
         boxes = np.concatenate([self.unknown, boxes])
         there = ~changed & ~inside(boxes, lights)

@@ -61,7 +61,7 @@ def test_a_step_measures_a_light_as_precisely_as_a_fit(shift_px):
     lamps = lamps_of(pictures(along(60), 1))
     truth, errors = LAMPS[:, :2] + [shift_px, 0.0], []
     for picture in pictures(along(60), 2, shift_px):
-        found, changed = lamps.in_picture(picture)
+        found, changed, _ = lamps.in_picture(picture)
         plain = find_spots(picture, USUAL, NOISE)
         rows = [int(np.argmin(np.hypot(*(plain.uv_px - at).T))) for at in truth]
         sigma = np.sqrt(np.trace(plain.cov_px2[rows], axis1=1, axis2=2) / 2)

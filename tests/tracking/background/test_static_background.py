@@ -191,9 +191,7 @@ def test_lights_that_do_not_move_stay_as_the_picture_shows_them():
     assert background is not None
     brightest = int(np.argmax(flicker))
     usual, found = recording.usual(brightest), recording.found_in(background, brightest)
-    further = background.spots_in(pictures[brightest], USUAL, TextureShift.none())
     for at in still[0]:
-        assert np.min(np.hypot(*(further.uv_px - at).T), initial=99) > 5
         rows = [d.uv_px[np.hypot(*(d.uv_px - at).T) < 2] for d in (usual, found)]
         assert len(rows[0]) == 1
         np.testing.assert_allclose(rows[0], rows[1], atol=0.02)
