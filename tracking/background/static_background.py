@@ -63,6 +63,7 @@ _EFFICIENCY = 2.0  # sigma of the median over places, of those that show most st
 _MOST_LEFT = 2.5  # sigmas: more counts as much, since somebody in front of the screen is in many pixels
 _SAME_LIGHT = 0.03  # the light has not changed by more than this share: the structure is not scaled
 _LEAST_LIGHT, _MOST_LIGHT = 0.2, 5.0  # changes of the light beyond which a picture is searched without subtraction
+_BY_CHANCE = 4.0  # sigmas of the sum of squares, of few pixels between lights at rest
 _WIDE_PX = 4.0  # a narrower light is in few of the sampled pixels
 _LARGEST_MISFIT = 1.3  # sigma of what is left over that of the noise; above it the camera or the light has moved
 
@@ -352,7 +353,8 @@ class StaticBackground:
         if wide.any():  # its pixels are explained
             clear = clear & ~places_of(spots[wide], picture.shape, AROUND_SPOT)[:: _SAMPLE[0], :: _SAMPLE[1]]
         # Somebody in front of the screen is in many pixels.
-        least = _LARGEST_MISFIT**2 * sums_around(clear.astype(np.float32))
+        count = sums_around(clear.astype(np.float32))
+        least = _LARGEST_MISFIT**2 * count + _BY_CHANCE * np.sqrt(2 * count)
         fits = sums_around(np.where(clear, np.minimum(left * left, _MOST_LEFT**2), 0)) <= least
         row, column = (nearest(spots.uv_px[:, i], picture.shape[1 - i]) for i in (1, 0))
         sampled = np.minimum(row // _SAMPLE[0], len(fits) - 1), np.minimum(column // _SAMPLE[1], fits.shape[1] - 1)
