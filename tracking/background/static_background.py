@@ -54,6 +54,9 @@ _MEAN_VARIANCE = 1.4  # variance of these means of normal deviates times their n
 _LOW = 0.25  # quantile of the background whose noise the difference is taken to have; brighter places count as uneven
 _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
 _AS_WIDE = 0.7  # of a light at rest: what is in its middle and as wide is that light, brighter than in the mean
+# Contrast up to which the structure is that of the screen's surface, and modulates the spots' light in full. Of what is
+# more, prints or objects, the spots show a part: 0.25 to 0.57 where photographs modulate their light by up to 60 %.
+_OF_SURFACE, _OF_OBJECTS = 0.1, 0.5
 _TRIED = 3  # every such picture shows whether there are further spots
 _MANY_LIGHTS = 4  # at rest, from which the subtraction is used in any case: it spares their fits
 _LEAST_FOUND = 0.2  # further or better spots per picture from which the subtraction is used
@@ -145,12 +148,11 @@ class StaticBackground:
         moved, slow = slow.moved, slow[~slow.known]
         if len(slow.row):
             better = better._behind(slow, mean, pictures, shift)
-        return better._with_reference(pictures)._with_shifts(pictures, found, moved, shift)
+        return better._with_reference(pictures)._with_shifts(pictures, moved, shift)
 
-    def _with_shifts(
-        self, pictures: Sequence[Picture], found: Sequence[Detections], moved: bool, shift: TextureShift
-    ) -> StaticBackground:
-        """The background with the errors of the lights that move, found in these pictures, and with those at rest."""
+    def _with_shifts(self, pictures: Sequence[Picture], moved: bool, shift: TextureShift) -> StaticBackground:
+        """The background with the errors of lights by its texture, and with those of its lights that stay at rest."""
+        found = [self.spots_in(p, self.parameters, shift) for p in pictures[::_TRIED]]
         widths = np.concatenate([np.sqrt(d.major_px * d.minor_px) for d in found])
         changed = np.array([self.lights.in_picture(p)[1] for p in pictures])
         better = replace(self, fixed=~changed.any(axis=0) & moved)
@@ -163,7 +165,9 @@ class StaticBackground:
         mean[at] -= light_at(still, column, row)
         own = (self.shares * self.noise.variance(mean)).astype(np.float32)
         share = replace(shift, misfit_share=float("nan")).with_lights(found).misfit_share
-        return replace(better, spot_px=width, shifts_px=local_shifts(mean, own, width), misfit_share=share)
+        part = 1.0 if self.noise.texture < _OF_SURFACE else _OF_OBJECTS
+        shifts_px = np.float32(part) * local_shifts(mean, own, width)
+        return replace(better, spot_px=width, shifts_px=shifts_px, misfit_share=share)
 
     def _behind(
         self, slow: SlowLights, mean: NDArray[np.float32], pictures: Sequence[Picture], shift: TextureShift
