@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools, Ints
-from tracking.background.places import AROUND_SPOT, ON_LIGHT, places_of
+from tracking.background.places import AROUND_SPOT, ON_LIGHT, near_each, places_of
 from tracking.detections import Detections
 
 LEAST_CLEAR = 3  # pictures without a light at a pixel, from which these alone count
@@ -24,6 +24,7 @@ ROUNDS = 10  # of spots and of the background behind them
 _SURE = 0.1  # as many pictures, or more, have the information on the background that counts as sufficient
 _MODULATED = 0.3  # share of the fitted light of a spot by which the true one may differ
 _MOVED = 1.7  # ratio of the places of moving lights in all pictures to those in one
+_WELL = 1.5  # chi-square per degree of freedom of a fit to the picture, up to which the spot stands on even ground
 _UNEXPLAINED = 5.0  # sigmas of light that is in no fitted spot: such a pixel of a picture does not count
 
 
@@ -107,3 +108,13 @@ def light_at(spots: Detections, u: Ints, v: Ints) -> NDArray[np.float32]:
         height = spots.flux[i] / (2 * np.pi * major * minor)
         out += (height * np.exp(-0.5 * ((along / major) ** 2 + (across / minor) ** 2))).astype(np.float32)
     return out
+
+
+def as_pictures_show(spots: Detections, found: Detections) -> Detections:
+    """The spots of a difference from a background that contains some of their light, with those of the picture itself.
+
+    Those that fit the picture well count instead of the spots near them: all of their light is in it.
+    """
+    well = found[(np.zeros(len(found)) if found.chi2 is None else found.chi2) < _WELL]
+    same = near_each(spots, well, AROUND_SPOT)
+    return spots[~same.any(axis=1)].joined(well[same.any(axis=0)], len(spots) + len(found))

@@ -39,7 +39,7 @@ from tracking.background.places import (
     places_of,
 )
 from tracking.background.resting_lights import RestingLights
-from tracking.background.slow_lights import ROUNDS, SlowLights, light_at
+from tracking.background.slow_lights import ROUNDS, SlowLights, as_pictures_show, light_at
 from tracking.detection.detect import find_spots, saturation_of
 from tracking.detection.pixels import TEXTURE_SHARE
 from tracking.detections import Detections
@@ -176,8 +176,13 @@ class StaticBackground:
         better, boxes = self, slow.boxes(np.ones(len(slow.row), dtype=bool))
         at, behind = (slow.row, slow.column), mean[slow.row, slow.column]
         information = np.zeros(len(behind))
-        for _ in range(ROUNDS):
+        for k in range(ROUNDS):
             found = [better.spots_in(p, self.parameters, shift, regions=boxes) for p in pictures]
+            if k == 0:
+                found = [
+                    as_pictures_show(d, self._found_again(p, self.parameters, boxes))
+                    for d, p in zip(found, pictures, strict=True)
+                ]
             behind, information = slow.behind(found, behind, self.noise.variance(behind))
             added = better.subtracted.copy()
             added[at] = in_steps(np.asarray(self.level_dn - behind, np.float32), self.steps)
