@@ -67,8 +67,9 @@ class RestingLights:
     def in_picture(self, picture: Picture) -> tuple[Detections, Bools, Bools]:
         """The lights (n,) in a picture (h, w), which of them have changed, and which are passed by another light.
 
-        Those that have changed are not measured correctly. Where there is more light than in the mean and nowhere less, something else passes over an unchanged light: that
-        is in the difference from the mean, and the light stays where the mean shows it.
+        Those that have changed are not measured correctly. Where there is more light than in the mean and nowhere less,
+        something else passes over an unchanged light: that is in the difference from the mean, and the light stays
+        where the mean shows it.
         """
         if not len(self.found):
             return self.found, np.zeros(0, dtype=bool), np.zeros(0, dtype=bool)

@@ -117,4 +117,5 @@ def as_pictures_show(spots: Detections, found: Detections) -> Detections:
     """
     well = found[(np.zeros(len(found)) if found.chi2 is None else found.chi2) < _WELL]
     same = near_each(spots, well, AROUND_SPOT)
-    return spots[~same.any(axis=1)].joined(well[same.any(axis=0)], len(spots) + len(found))
+    alone, shown = np.asarray(~same.any(axis=1)), np.asarray(same.any(axis=0))
+    return spots[alone].joined(well[shown], len(spots) + len(found))

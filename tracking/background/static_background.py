@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -18,13 +18,10 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools
 from tracking.background.mean_pictures import (
-    MOST_BYTES,
     highest_of_blocks,
     in_steps,
-    means_of,
     smooth_part,
     sums_around,
-    usable,
     without_smooth_part,
 )
 from tracking.background.places import (
@@ -35,31 +32,22 @@ from tracking.background.places import (
     merged_parts,
     near_each,
     nearest,
-    number_of_better,
     places_of,
 )
 from tracking.background.resting_lights import RestingLights
-from tracking.background.slow_lights import ROUNDS, SlowLights, as_pictures_show, light_at
 from tracking.detection.detect import find_spots, saturation_of
 from tracking.detection.pixels import TEXTURE_SHARE
 from tracking.detections import Detections
 from tracking.noise import BLOCK, NoiseModel, Picture
-from tracking.noise_estimation.texture_shift import TextureShift, local_shifts
+from tracking.noise_estimation.texture_shift import TextureShift
 from tracking.parameters import DetectParameters
 
-PICTURES = 15  # from which a background is made, spread over the recording
-_LEAST_PICTURES = 9
 _HIGHEST = 30.0  # sigmas of noise and texture
 _MEAN_VARIANCE = 1.4  # variance of these means of normal deviates times their number: 1.4 lower half, 1.2 middle
 _LOW = 0.25  # quantile of the background whose noise the difference is taken to have; brighter places count as uneven
 _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
 _AS_WIDE = 0.7  # of a light at rest: what is in its middle and as wide is that light, brighter than in the mean
-# Contrast up to which the structure is that of the screen's surface, and modulates the spots' light in full. Of what is
-# more, prints or objects, the spots show a part: 0.25 to 0.57 where photographs modulate their light by up to 60 %.
-_OF_SURFACE, _OF_OBJECTS = 0.1, 0.5
-_TRIED = 3  # every such picture shows whether there are further spots
-_MANY_LIGHTS = 4  # at rest, from which the subtraction is used in any case: it spares their fits
-_LEAST_FOUND = 0.2  # further or better spots per picture from which the subtraction is used
+TRIED = 3  # every such picture shows whether there are further spots
 _SAMPLE = (10, 11)  # rows and columns: every such pixel shows how much of the structure is in a picture
 _CLEAR_SIGMAS = 4.0  # of the measured light
 _EFFICIENCY = 2.0  # sigma of the median over places, of those that show most structure, over that of one fit
@@ -99,108 +87,12 @@ class StaticBackground:
     misfit_share: float = float("nan")  # of the lights that move, as in TextureShift
     reference: float = 1.0  # what of the structure, which contains noise, the pictures show; 0: too little to measure
 
-    @staticmethod
-    def of(
-        pictures: Sequence[Picture], model: NoiseModel, shift: TextureShift, parameters: DetectParameters
-    ) -> StaticBackground | None:
-        """The background of pictures spread over a recording.
-
-        None: too few, or of different sizes or types, or with few lights at rest, while the differences from it show
-        the spots in them no better. model: of the camera's noise and texture; shift: errors of its spots by the
-        texture; parameters: with the grey value at which the sensor clips.
-        """
-        some = usable(pictures)
-        if len(some) < _LEAST_PICTURES:
-            return None
-        lower, mean = means_of(some)
-        background = StaticBackground._of_mean(lower, some, model, parameters)._with_reference(some)
-        shown = [(p, fit[0]) for p in some if (fit := background._light_in(p)) is not None]
-        some, lights = [p for p, _ in shown], [light for _, light in shown]
-        if len(some) < _LEAST_PICTURES:
-            return None
-        equal: Sequence[NDArray[Any]] = some
-        if set(lights) != {1.0}:
-            if 4 * some[0].size * len(some) > MOST_BYTES:
-                return None
-            smooth = lower - background.structure
-            equal = [smooth + (p - smooth_part(p.astype(np.float32))) / light for p, light in shown]
-            lower, mean = means_of(equal)
-            background = StaticBackground._of_mean(lower, some, model, parameters)._with_reference(some)
-        tried = some[::_TRIED]
-        few = len(background.lights.found) < _MANY_LIGHTS
-        if few and sum(background._better_in(p, shift) for p in tried) < max(_LEAST_FOUND * len(tried), 2):
-            return None
-        return background._without_slow_lights(mean, some, equal, shift)
-
-    def _without_slow_lights(
-        self, mean: NDArray[np.float32], pictures: Sequence[Picture], equal: Sequence[NDArray[Any]], shift: TextureShift
-    ) -> StaticBackground:
-        """The background from the mean (h, w) of these pictures (in equal light), given the one from the lower half.
-
-        A light that moves slowly, or rests for a part of the recording, is in the mean of the pictures. Where it is in
-        some of them the others count; where its absence leaves a hole, those with the hole.
-        """
-        found = [self._searched(p, self.parameters, shift) for p in pictures]
-        holes = [self.spots_in(p, self.parameters, shift, inverted=True) for p in pictures]
-        slow = SlowLights.of(equal, found, holes)
-        mean[slow.row, slow.column] = slow.means()
-        better = StaticBackground._of_mean(mean, pictures, self.noise, self.parameters)
-        moved, slow = slow.moved, slow[~slow.known]
-        if len(slow.row):
-            better = better._behind(slow, mean, pictures, shift)
-        return better._with_reference(pictures)._with_shifts(pictures, moved, shift)
-
-    def _with_shifts(self, pictures: Sequence[Picture], moved: bool, shift: TextureShift) -> StaticBackground:
-        """The background with the errors of lights by its texture, and with those of its lights that stay at rest."""
-        found = [self.spots_in(p, self.parameters, shift) for p in pictures[::_TRIED]]
-        widths = np.concatenate([np.sqrt(d.major_px * d.minor_px) for d in found])
-        changed = np.array([self.lights.in_picture(p)[1] for p in pictures])
-        better = replace(self, fixed=~changed.any(axis=0) & moved)
-        if not len(widths):
-            return better
-        width, still = float(np.median(widths)), self.lights.found
-        at = row, column = np.nonzero(places_of(still, self.structure.shape, AROUND_LIGHT))
-        rows, columns = self.structure.shape
-        mean = self.structure + cv2.resize(self.smooth, (columns, rows), interpolation=cv2.INTER_LINEAR)
-        mean[at] -= light_at(still, column, row)
-        own = (self.shares * self.noise.variance(mean)).astype(np.float32)
-        share = replace(shift, misfit_share=float("nan")).with_lights(found).misfit_share
-        part = 1.0 if self.noise.texture < _OF_SURFACE else _OF_OBJECTS
-        shifts_px = np.float32(part) * local_shifts(mean, own, width)
-        return replace(better, spot_px=width, shifts_px=shifts_px, misfit_share=share)
-
-    def _behind(
-        self, slow: SlowLights, mean: NDArray[np.float32], pictures: Sequence[Picture], shift: TextureShift
-    ) -> StaticBackground:
-        """This background from a mean (h, w), improved behind lights that are nearly everywhere in all pictures."""
-        better, boxes = self, slow.boxes(np.ones(len(slow.row), dtype=bool))
-        at, behind = (slow.row, slow.column), mean[slow.row, slow.column]
-        information = np.zeros(len(behind))
-        for k in range(ROUNDS):
-            found = [better.spots_in(p, self.parameters, shift, regions=boxes) for p in pictures]
-            if k == 0:
-                found = [
-                    as_pictures_show(d, self._found_again(p, self.parameters, boxes))
-                    for d, p in zip(found, pictures, strict=True)
-                ]
-            behind, information = slow.behind(found, behind, self.noise.variance(behind))
-            added = better.subtracted.copy()
-            added[at] = in_steps(np.asarray(self.level_dn - behind, np.float32), self.steps)
-            better = replace(better, subtracted=added)
-        mean[at] = behind
-        better = StaticBackground._of_mean(mean, pictures, self.noise, self.parameters)
-        better.shares[at] = 1 / np.maximum(information, 1e-3)
-        hidden = ~slow.is_sure(information)
-        better.near_lights[at] |= hidden
-        better.blind[at] |= hidden
-        return replace(better, unknown=slow.boxes(hidden))
-
-    def _with_reference(self, pictures: Sequence[Picture]) -> StaticBackground:
+    def with_reference(self, pictures: Sequence[Picture]) -> StaticBackground:
         """The background whose light is 1 in a typical picture.
 
         Each of these pictures is a part of the mean, whose noise it shows with a weight of one over their number.
         """
-        lights = [fit[0] for p in pictures[::_TRIED] if (fit := self._light_in(p, measured=True)) is not None]
+        lights = [fit[0] for p in pictures[::TRIED] if (fit := self.light_in(p, measured=True)) is not None]
         if not lights:
             return replace(self, reference=0.0)
         rows, columns = _SAMPLE
@@ -210,23 +102,13 @@ class StaticBackground:
         reference = float(np.median(lights)) - own / max(float(np.mean(structure**2)), 1e-12)
         return replace(self, reference=reference if reference > _LEAST_LIGHT else 0.0)
 
-    def _better_in(self, picture: Picture, shift: TextureShift) -> int:
-        """How many spots the difference of a picture shows that the picture does not, or clearly more precisely."""
-        in_picture = shift.added_to(find_spots(picture, self.parameters, self.noise), self.noise)
-        return number_of_better(self.spots_in(picture, self.parameters, shift), in_picture)
-
-    def _searched(self, picture: Picture, parameters: DetectParameters, shift: TextureShift) -> Detections:
-        """The points of a picture that move or have changed; all points of one that does not fit."""
-        parts = self._parts(picture, parameters, shift)
-        return shift.added_to(find_spots(picture, parameters, self.noise), self.noise) if parts is None else parts[0]
-
     @property
     def _noise_share(self) -> float:
         """Variance of the background's own noise over that of a picture."""
         return _MEAN_VARIANCE / self.pictures
 
     @staticmethod
-    def _of_mean(
+    def of_mean(
         mean: NDArray[np.float32], pictures: Sequence[Picture], model: NoiseModel, parameters: DetectParameters
     ) -> StaticBackground:
         share = _MEAN_VARIANCE / len(pictures)
@@ -261,7 +143,8 @@ class StaticBackground:
         near_lights = places_of(at_rest, mean.shape, AROUND_LIGHT) | blind
         return StaticBackground(
             len(pictures), structure, smooth[::rows, ::columns].copy(), near_lights, blind,
-            np.full(mean.shape, share, np.float32), RestingLights.of(mean, at_rest, model, clips - 0.5), np.zeros((0, 3)), parameters, steps, level, low,
+            np.full(mean.shape, share, np.float32), RestingLights.of(mean, at_rest, model, clips - 0.5),
+            np.zeros((0, 3)), parameters, steps, level, low,
             in_steps(np.asarray(level - plain, np.float32), steps), of_difference, model,
         )  # fmt: skip
 
@@ -271,14 +154,14 @@ class StaticBackground:
         What moves is searched in the difference from the background; the lights at rest are measured by one step, and
         searched where they have changed. None: the picture and the background do not fit.
         """
-        parts = self._parts(picture, parameters, shift)
+        parts = self.parts(picture, parameters, shift)
         return None if parts is None else parts[0].joined(parts[1], parameters.max_detections)
 
-    def _parts(
+    def parts(
         self, picture: Picture, parameters: DetectParameters, shift: TextureShift
     ) -> tuple[Detections, Detections] | None:
         """The points of a picture that move or have changed, and the lights at rest that have not."""
-        fit = self._light_in(picture)
+        fit = self.light_in(picture)
         if fit is None:
             return None
         spots = self._moving(picture, parameters, shift, fit)
@@ -286,7 +169,7 @@ class StaticBackground:
         # A lamp that flickers is in the difference, too.
         same = lights[~changed & ~passed]
         as_wide = spots.major_px[:, None] > _AS_WIDE * same.major_px
-        spots = spots[~(near_each(spots, same, SAME_LIGHT) & as_wide).any(axis=1)]
+        spots = spots[np.asarray(~(near_each(spots, same, SAME_LIGHT) & as_wide).any(axis=1))]
         boxes = np.column_stack([self.lights.found.uv_px, self.lights.half_px])[changed]
         boxes = np.concatenate([self.unknown, boxes])
         there = ~changed & ~inside(boxes, lights)
@@ -299,7 +182,7 @@ class StaticBackground:
         rest = replace(rest, cov_px2=(1 + self._noise_share) * rest.cov_px2, place_px2=place + fixed, at_rest=at_rest)
         found = spots[~inside(boxes, spots)]
         if len(boxes):
-            again = self._found_again(picture, parameters, boxes)
+            again = self.found_again(picture, parameters, boxes)
             again = shift.added_to(again, self.noise, self._shifts_at(again))
             found = found.joined(again, parameters.max_detections)
         return found, rest
@@ -311,7 +194,7 @@ class StaticBackground:
         row, column = (nearest(points.uv_px[:, i], self.shifts_px.shape[1 - i]) for i in (1, 0))
         return np.asarray(self.shifts_px[row, column] * np.sqrt(points.major_px * points.minor_px) / self.spot_px)
 
-    def _found_again(self, picture: Picture, parameters: DetectParameters, boxes: NDArray[np.float64]) -> Detections:
+    def found_again(self, picture: Picture, parameters: DetectParameters, boxes: NDArray[np.float64]) -> Detections:
         """The points of a picture in boxes (m, 3), px. `regions` would be followed from light to light beyond them."""
         found = Detections.none()
         for left, top, right, bottom in merged_parts(boxes, picture.shape, BLOCK):
@@ -332,14 +215,14 @@ class StaticBackground:
         shift: errors of spots by the texture; the part that the background causes is subtracted with it. inverted: the
         holes of the difference instead. regions: of `find_spots`.
         """
-        fit = self._light_in(picture)
+        fit = self.light_in(picture)
         return Detections.none() if fit is None else self._moving(picture, parameters, shift, fit, inverted, regions)
 
     def _moving(
         self, picture: Picture, parameters: DetectParameters, shift: TextureShift, fit: _Fit,
         inverted: bool = False, regions: NDArray[np.float64] | None = None,
     ) -> Detections:  # fmt: skip
-        """`spots_in`, with the result of `_light_in`."""
+        """`spots_in`, with the result of `light_in`."""
         light, clear, left = fit
         added, model = self.subtracted, self.model
         if abs(light - 1) > _SAME_LIGHT:
@@ -387,7 +270,7 @@ class StaticBackground:
         place = np.zeros(len(spots)) if spots.place_px2 is None else spots.place_px2
         return replace(spots, place_px2=place + fixed)
 
-    def _light_in(self, picture: Picture, measured: bool = False) -> _Fit | None:
+    def light_in(self, picture: Picture, measured: bool = False) -> _Fit | None:
         """How much of the structure a picture shows, relative to the background, and what it leaves.
 
         None: the picture and the background do not fit. measured: also where the

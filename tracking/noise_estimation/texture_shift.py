@@ -238,9 +238,9 @@ def local_shifts(
 ) -> NDArray[np.float32]:
     """Sigmas, px, of a spot of this width at each place of a known background (h, w), by the texture in its light.
 
-    That of the surroundings of a pixel, as large as the spot, as if the background were the screen, lit evenly. Where it
-    is not, or lit by other lamps as well, the errors are smaller: an upper bound, of which the residuals show how much
-    is true. variance, DN^2: of the background's own noise.
+    That of the surroundings of a pixel, as large as the spot, as if the background were the screen, lit evenly. Where
+    it is not, or is lit by other lamps as well, the errors are smaller: an upper bound, of which the residuals show how
+    much is true. variance, DN^2: of the background's own noise.
     """
     reach = int(np.ceil(_REACH * width_px / np.sqrt(2)))
     odd, smooth = _kernels(width_px, 2, reach)

@@ -133,7 +133,8 @@ def usual_misfit(run: RunDetections, place_px2: Array, assigned: Ints, camera_of
     """Errors (cameras,) of the labelled spots that belong to their places, as a share of the widths.
 
     The grain of the light is the same for all spots of a camera, but does not show in each fit: each spot has at least
-    half of their mean variance. A camera whose spots are too narrow to show it takes that of the others.
+    half of their mean variance, or the median where few spots, on edges of the background, have most of it. A camera
+    whose spots are too narrow to show it takes that of the others.
     """
     share2, size = np.full(assigned.shape, np.nan), np.full(assigned.shape, np.nan)
     labelled = (assigned >= 0) & (assigned < BLENDED)

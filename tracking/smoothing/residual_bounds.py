@@ -78,21 +78,21 @@ def residual_bounds(
             continue
         residual = float(np.sum(square[of_camera])) / float(np.sum(weight))
         ratio = square[of_camera] / weight
-        most_of_places = _most_of_places(ratio, share[of_camera], weight / same[of_camera])
+        likely = most_of_places(ratio, share[of_camera], weight / same[of_camera])
         of_place = float(np.sum(share[of_camera] * weight)) / float(np.sum(weight))
         most = residual / _lower_quantile(freedom)
         if places > _MOVING * freedom:
             noise[camera] = min(most, 1.0)
-            place[camera] = min(noise[camera], most_of_places)
+            place[camera] = min(noise[camera], likely)
             continue
         noise[camera] = min(most / max(1 - of_place, 1e-12), 1.0)
         if places >= _LEAST_FREEDOM:
             most = residual / (_lower_quantile(places) * max(of_place, 1e-12))
-            place[camera] = min(most, most_of_places, 1.0)
+            place[camera] = min(most, likely, 1.0)
     return VarianceFactors(noise, place)
 
 
-def _most_of_places(ratio: Array, share: Array, weight: Array) -> float:
+def most_of_places(ratio: Array, share: Array, weight: Array) -> float:
     """The largest factor of the part that belongs to places which is likely, given how the residuals vary with it.
 
     ratio (m,): of squares of residuals to stated variances; share (m,): of these, the part that belongs to places;

@@ -13,7 +13,8 @@ from geometry.arrays import evenly_spread
 from geometry.camera import SensorNoise
 from lab.files.run.run_file import DetectionsTable, FramesFolder, Run
 from lab.runs.frames.frames import FrameReader, pictures_at
-from tracking.background.static_background import PICTURES, StaticBackground
+from tracking.background.estimation import PICTURES, static_background
+from tracking.background.static_background import StaticBackground
 from tracking.detection.detect import WIDE_PX, find_all_sizes, saturation_of
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
@@ -71,7 +72,7 @@ class CameraNoise:
         """Make the static background of pictures spread over the recording, if that shows more or spares fits."""
         if pictures and self.model is not None and self.estimate is not None:
             usual = self._with_saturation(parameters, pictures[0])
-            self.background = StaticBackground.of(pictures, self.model, self.estimate.texture_shift, usual)
+            self.background = static_background(pictures, self.model, self.estimate.texture_shift, usual)
 
     def detect(self, picture: Picture, parameters: DetectParameters) -> Detections:
         """The points of one picture. After pictures without any point the noise is estimated again."""

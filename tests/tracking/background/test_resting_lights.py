@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tracking.background.estimation import static_background
 from tracking.background.resting_lights import RestingLights
-from tracking.background.static_background import StaticBackground
 from tracking.detection.detect import find_spots
 from tracking.noise import NoiseModel
 from tracking.noise_estimation.texture_shift import TextureShift
@@ -83,7 +83,7 @@ def test_a_light_that_moves_far_or_dims_or_is_covered_has_changed():
 def test_a_spot_that_passes_a_lamp_is_found_in_each_picture_and_the_lamps_stay():
     path = np.column_stack([np.full(45, 200.1), np.linspace(20, 300, 45)])  # over the second lamp
     seen = pictures(path, 6)
-    background = StaticBackground.of(seen[::3], NOISE, TextureShift.none(), USUAL)
+    background = static_background(seen[::3], NOISE, TextureShift.none(), USUAL)
     assert background is not None
     for place, picture in zip(path, seen, strict=True):
         found = background.found_in(picture, USUAL, TextureShift.none())

@@ -10,7 +10,8 @@ import pytest
 
 from geometry.arrays import Array
 from tracking.background import mean_pictures
-from tracking.background.static_background import PICTURES, StaticBackground
+from tracking.background.estimation import PICTURES, static_background
+from tracking.background.static_background import StaticBackground
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
@@ -72,7 +73,7 @@ class Recording:
         return Recording(pictures, centres, estimate_noise(pictures[:2] + pictures[-2:]))
 
     def background(self) -> StaticBackground | None:
-        return StaticBackground.of(
+        return static_background(
             self.pictures[:: max(len(self.pictures) // PICTURES, 1)][:PICTURES], self.model,
             self.estimate.texture_shift, USUAL,
         )  # fmt: skip
@@ -200,9 +201,9 @@ def test_lights_that_do_not_move_stay_as_the_picture_shows_them():
 def test_few_pictures_or_different_ones_make_no_background():
     recording = Recording.of(path(45, 6, 4.0, 9), 4.5)
     p, model, shift = recording.pictures, recording.model, recording.estimate.texture_shift
-    assert StaticBackground.of(p[:8], model, shift, USUAL) is None
-    assert StaticBackground.of([], model, shift, USUAL) is None
-    assert StaticBackground.of([*p[:14], p[14][:-8]], model, shift, USUAL) is None
+    assert static_background(p[:8], model, shift, USUAL) is None
+    assert static_background([], model, shift, USUAL) is None
+    assert static_background([*p[:14], p[14][:-8]], model, shift, USUAL) is None
     background = recording.background()
     assert background is not None
     assert background.found_in(recording.pictures[0][:-8], USUAL, TextureShift.none()) is None

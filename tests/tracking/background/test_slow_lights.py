@@ -1,0 +1,92 @@
+"""Spots in front of boards: found on edges, also where they hardly move, with sigmas that follow the background."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from geometry.arrays import Array
+from tracking.background.estimation import PICTURES, static_background
+from tracking.detections import Detections
+from tracking.noise import Picture
+from tracking.noise_estimation.photon_transfer import estimate_noise
+from tracking.parameters import DetectParameters
+
+SIZE, CELL = (320, 400), 40
+BLACK, WHITE, NOISE = 14.0, 70.0, 0.8  # DN
+USUAL = DetectParameters(saturation_dn=255.0)
+Y, X = np.mgrid[: SIZE[0], : SIZE[1]]
+BOARD = BLACK + (WHITE - BLACK) / (1 + np.exp(-3 * np.sin(np.pi * X / CELL) * np.sin(np.pi * Y / CELL) * CELL / 4))
+
+
+def board_pictures(paths: Array, sigma_px: float, modulated: float, seed: int) -> list[Picture]:
+    """Pictures of spots at places (pictures, spots, 2), whose light the board modulates by this share."""
+    rng = np.random.default_rng(seed)
+    response = 1 - modulated * (1 - BOARD / WHITE)
+    pictures = []
+    for at in paths:
+        light = sum(90.0 * np.exp(-0.5 * ((X - u) ** 2 + (Y - v) ** 2) / sigma_px**2) for u, v in at)
+        pictures.append(np.clip(np.rint(BOARD + response * light + NOISE * rng.standard_normal(SIZE)), 0, 255))
+    return [p.astype(np.uint8) for p in pictures]
+
+
+def found_in_all(pictures: list[Picture]) -> list[Detections]:
+    estimate = estimate_noise(pictures[:2] + pictures[-2:])
+    some = pictures[:: len(pictures) // PICTURES][:PICTURES]
+    background = static_background(some, estimate.model, estimate.texture_shift, USUAL)
+    assert background is not None
+    out = [background.found_in(p, USUAL, estimate.texture_shift) for p in pictures]
+    return [d for d in out if d is not None]
+
+
+def errors(found: list[Detections], paths: Array) -> tuple[Array, Array]:
+    """Distances (pictures, spots), px, of the nearest points to the spots, and their sigmas."""
+    gap = np.array([[np.hypot(*(d.uv_px - at).T).min() for at in spots] for d, spots in zip(found, paths, strict=True)])
+    nearest = [
+        [int(np.hypot(*(d.uv_px - at).T).argmin()) for at in spots] for d, spots in zip(found, paths, strict=True)
+    ]
+    sigma = np.array([
+        np.sqrt(0.5 * np.trace(d.cov_px2[rows], axis1=1, axis2=2)) for d, rows in zip(found, nearest, strict=True)
+    ])  # fmt: skip
+    return gap, sigma
+
+
+def over_edges(pictures: int, length_px: float) -> Array:
+    """Places (pictures, 4, 2) of spots that move by a length across edges of the board."""
+    along = np.linspace(-0.5, 0.5, pictures)[:, None] * length_px * np.array([0.8, 0.6])
+    return np.array([[80.0, 60.0], [180.0, 121.0], [300.0, 201.0], [199.0, 260.0]]) + along[:, None]
+
+
+@pytest.mark.parametrize("length_px", [12.0, 25.0])
+def test_a_spot_that_moves_by_a_few_of_its_widths_over_an_edge_is_found_in_each_picture(length_px):
+    paths = over_edges(45, length_px)
+    gap, _ = errors(found_in_all(board_pictures(paths, 2.0, 0.0, 1)), paths)
+    assert gap.max() < 0.5
+
+
+@pytest.mark.parametrize("modulated", [0.0, 0.3, 0.6])
+def test_the_sigmas_follow_the_edges_whether_or_not_they_modulate_the_spots(modulated):
+    paths = over_edges(45, 160.0)
+    gap, sigma = errors(found_in_all(board_pictures(paths, 2.0, modulated, 2)), paths)
+    even = sigma < np.quantile(sigma, 0.3)
+    assert gap.max() < 1.0
+    assert np.median(sigma[even]) < 0.03 < 0.2 * sigma.max()
+    assert np.sqrt(np.mean((gap[even] / sigma[even]) ** 2) / 2) == pytest.approx(1.0, abs=0.25)
+    assert np.sqrt(np.mean((gap / sigma) ** 2) / 2) < 1.25
+
+
+def test_a_wide_bright_spot_is_no_person_in_front_of_the_board():
+    lamps = np.broadcast_to(np.array([[340.0, 40.0], [350.0, 280.0], [40.0, 280.0], [200.0, 40.0]]), (45, 4, 2))
+    paths = np.concatenate([over_edges(45, 120.0)[:, :1] + [60.0, 60.0], lamps], axis=1)
+    gap, _ = errors(found_in_all(board_pictures(paths, 9.0, 0.3, 3)), paths[:, :1])
+    assert np.mean(gap < 3.0) > 0.9
+
+
+def test_a_light_at_rest_is_marked_if_others_move():
+    lamp = np.broadcast_to(np.array([60.0, 100.0]), (45, 1, 2))
+    for length_px, marked in ((60.0, True), (0.0, False)):
+        paths = np.concatenate([over_edges(45, length_px), lamp], axis=1)
+        for d in found_in_all(board_pictures(paths, 2.0, 0.0, 4)):
+            at = np.hypot(*(d.uv_px - lamp[0, 0]).T) < 1
+            assert np.count_nonzero(at) == 1
+            assert bool(d.at_rest is not None and d.at_rest[at].any()) == marked

@@ -1,0 +1,148 @@
+"""A static background estimated from pictures spread over a recording: without what moves, or moves slowly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.arrays import Array
+from tracking.background.mean_pictures import MOST_BYTES, in_steps, means_of, smooth_part, usable
+from tracking.background.places import AROUND_LIGHT, number_of_better, places_of
+from tracking.background.slow_lights import ROUNDS, SlowLights, as_pictures_show, light_at
+from tracking.background.static_background import TRIED, StaticBackground
+from tracking.detection.detect import find_spots
+from tracking.detections import Detections
+from tracking.noise import NoiseModel, Picture
+from tracking.noise_estimation.texture_shift import TextureShift, local_shifts
+from tracking.parameters import DetectParameters
+
+PICTURES = 15  # from which a background is made, spread over the recording
+_LEAST_PICTURES = 9
+_MANY_LIGHTS = 4  # at rest, from which the subtraction is used in any case: it spares their fits
+_LEAST_FOUND = 0.2  # further or better spots per picture from which the subtraction is used
+# Contrast up to which the structure is that of the screen's surface, and modulates the spots' light in full. Of what is
+# more, prints or objects, the spots show a part: 0.25 to 0.57 where photographs modulate their light by up to 60 %.
+_OF_SURFACE, _OF_OBJECTS = 0.1, 0.5
+
+
+def static_background(
+    pictures: Sequence[Picture], model: NoiseModel, shift: TextureShift, parameters: DetectParameters
+) -> StaticBackground | None:
+    """The background of pictures spread over a recording.
+
+    None: too few, or of different sizes or types, or with few lights at rest, while the differences from it show
+    the spots in them no better. model: of the camera's noise and texture; shift: errors of its spots by the
+    texture; parameters: with the grey value at which the sensor clips.
+    """
+    some = usable(pictures)
+    if len(some) < _LEAST_PICTURES:
+        return None
+    lower, mean = means_of(some)
+    background = StaticBackground.of_mean(lower, some, model, parameters).with_reference(some)
+    shown = [(p, fit[0]) for p in some if (fit := background.light_in(p)) is not None]
+    some, lights = [p for p, _ in shown], [light for _, light in shown]
+    if len(some) < _LEAST_PICTURES:
+        return None
+    equal: Sequence[NDArray[Any]] = some
+    if set(lights) != {1.0}:
+        if 4 * some[0].size * len(some) > MOST_BYTES:
+            return None
+        smooth = lower - background.structure
+        equal = [smooth + (p - smooth_part(p.astype(np.float32))) / light for p, light in shown]
+        lower, mean = means_of(equal)
+        background = StaticBackground.of_mean(lower, some, model, parameters).with_reference(some)
+    tried = some[::TRIED]
+    few = len(background.lights.found) < _MANY_LIGHTS
+    if few and sum(_better_in(background, p, shift) for p in tried) < max(_LEAST_FOUND * len(tried), 2):
+        return None
+    return _without_slow_lights(background, mean, some, equal, shift)
+
+
+def _without_slow_lights(
+    background: StaticBackground, mean: NDArray[np.float32], pictures: Sequence[Picture],
+    equal: Sequence[NDArray[Any]], shift: TextureShift,
+) -> StaticBackground:  # fmt: skip
+    """The background from the mean (h, w) of these pictures (in equal light), given the one from the lower half.
+
+    A light that moves slowly, or rests for a part of the recording, is in the mean of the pictures. Where it is in
+    some of them the others count; where its absence leaves a hole, those with the hole.
+    """
+    found = [_searched(background, p, shift) for p in pictures]
+    holes = [background.spots_in(p, background.parameters, shift, inverted=True) for p in pictures]
+    slow = SlowLights.of(equal, found, holes)
+    mean[slow.row, slow.column] = slow.means()
+    better = StaticBackground.of_mean(mean, pictures, background.noise, background.parameters)
+    moved, slow = slow.moved, slow[~slow.known]
+    if len(slow.row):
+        better = _behind(better, slow, mean, pictures, shift)
+    return _with_shifts(better.with_reference(pictures), pictures, moved, shift)
+
+
+def _with_shifts(
+    background: StaticBackground, pictures: Sequence[Picture], moved: bool, shift: TextureShift
+) -> StaticBackground:
+    """The background with the errors of lights by its texture, and with those of its lights that stay at rest."""
+    found = [background.spots_in(p, background.parameters, shift) for p in pictures[::TRIED]]
+    widths = np.concatenate([np.sqrt(d.major_px * d.minor_px) for d in found])
+    changed = np.array([background.lights.in_picture(p)[1] for p in pictures])
+    better = replace(background, fixed=np.asarray(~changed.any(axis=0) & moved))
+    if not len(widths):
+        return better
+    width, still = float(np.median(widths)), background.lights.found
+    at = row, column = np.nonzero(places_of(still, background.structure.shape, AROUND_LIGHT))
+    rows, columns = background.structure.shape
+    mean = background.structure + cv2.resize(background.smooth, (columns, rows), interpolation=cv2.INTER_LINEAR)
+    mean[at] -= light_at(still, column, row)
+    own = (background.shares * background.noise.variance(mean)).astype(np.float32)
+    share = replace(shift, misfit_share=float("nan")).with_lights(found).misfit_share
+    part = 1.0 if background.noise.texture < _OF_SURFACE else _OF_OBJECTS
+    shifts_px = np.float32(part) * local_shifts(mean, own, width)
+    return replace(better, spot_px=width, shifts_px=shifts_px, misfit_share=share)
+
+
+def _behind(
+    background: StaticBackground, slow: SlowLights, mean: NDArray[np.float32], pictures: Sequence[Picture],
+    shift: TextureShift,
+) -> StaticBackground:  # fmt: skip
+    """This background from a mean (h, w), improved behind lights that are nearly everywhere in all pictures."""
+    better, boxes = background, slow.boxes(np.ones(len(slow.row), dtype=bool))
+    at = (slow.row, slow.column)
+    behind: Array = mean[at].astype(float)
+    information = np.zeros(len(behind))
+    for k in range(ROUNDS):
+        found = [better.spots_in(p, background.parameters, shift, regions=boxes) for p in pictures]
+        if k == 0:
+            found = [
+                as_pictures_show(d, background.found_again(p, background.parameters, boxes))
+                for d, p in zip(found, pictures, strict=True)
+            ]
+        behind, information = slow.behind(found, behind, background.noise.variance(behind))
+        added = better.subtracted.copy()
+        added[at] = in_steps(np.asarray(background.level_dn - behind, np.float32), background.steps)
+        better = replace(better, subtracted=added)
+    mean[at] = behind
+    better = StaticBackground.of_mean(mean, pictures, background.noise, background.parameters)
+    better.shares[at] = 1 / np.maximum(information, 1e-3)
+    hidden = ~slow.is_sure(information)
+    better.near_lights[at] |= hidden
+    better.blind[at] |= hidden
+    return replace(better, unknown=slow.boxes(hidden))
+
+
+def _better_in(background: StaticBackground, picture: Picture, shift: TextureShift) -> int:
+    """How many spots the difference of a picture shows that the picture does not, or clearly more precisely."""
+    in_picture = shift.added_to(find_spots(picture, background.parameters, background.noise), background.noise)
+    return number_of_better(background.spots_in(picture, background.parameters, shift), in_picture)
+
+
+def _searched(background: StaticBackground, picture: Picture, shift: TextureShift) -> Detections:
+    """The points of a picture that move or have changed; all points of one that does not fit."""
+    parts = background.parts(picture, background.parameters, shift)
+    if parts is not None:
+        return parts[0]
+    return shift.added_to(find_spots(picture, background.parameters, background.noise), background.noise)
