@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array
 from tracking.background.mean_pictures import MOST_BYTES, in_steps, means_of, smooth_part, usable
-from tracking.background.places import AROUND_LIGHT, number_of_better, places_of
+from tracking.background.places import AROUND_LIGHT, ON_LIGHT, near_each, number_of_better, places_of
 from tracking.background.slow_lights import ROUNDS, SlowLights, as_pictures_show, light_at
 from tracking.background.static_background import TRIED, StaticBackground
 from tracking.detection.detect import find_spots
@@ -25,6 +25,7 @@ PICTURES = 15  # from which a background is made, spread over the recording
 _LEAST_PICTURES = 9
 _MANY_LIGHTS = 4  # at rest, from which the subtraction is used in any case: it spares their fits
 _LEAST_FOUND = 0.2  # further or better spots per picture from which the subtraction is used
+_MOSTLY = 0.7  # share of the pictures with lights that move, above which those at rest in all of them are no spots
 # Contrast up to which the structure is that of the screen's surface, and modulates the spots' light in full. Of what is
 # more, prints or objects, the spots show a part: 0.25 to 0.57 where photographs modulate their light by up to 60 %.
 _OF_SURFACE, _OF_OBJECTS = 0.1, 0.5
@@ -90,6 +91,9 @@ def _with_shifts(
     found = [background.spots_in(p, background.parameters, shift) for p in pictures[::TRIED]]
     widths = np.concatenate([np.sqrt(d.major_px * d.minor_px) for d in found])
     changed = np.array([background.lights.in_picture(p)[1] for p in pictures])
+    # Of a light at rest that trembles something is left in the difference: that does not move.
+    elsewhere = [~near_each(d, background.lights.found, ON_LIGHT).any(axis=1) for d in found]
+    moved = moved and float(np.mean([bool(alone.any()) for alone in elsewhere])) > _MOSTLY
     better = replace(background, fixed=np.asarray(~changed.any(axis=0) & moved))
     if not len(widths):
         return better
