@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array
 from tracking.background.mean_pictures import MOST_BYTES, in_steps, means_of, smooth_part, usable
-from tracking.background.places import AROUND_LIGHT, ON_LIGHT, near_each, number_of_better, places_of
+from tracking.background.places import AROUND_LIGHT, ON_LIGHT, SAME_LIGHT, near_each, number_of_better, places_of
 from tracking.background.slow_lights import ROUNDS, SlowLights, as_pictures_show, light_at
 from tracking.background.static_background import TRIED, StaticBackground
 from tracking.detection.detect import find_spots
@@ -91,9 +92,10 @@ def _with_shifts(
     found = [background.spots_in(p, background.parameters, shift) for p in pictures[::TRIED]]
     widths = np.concatenate([np.sqrt(d.major_px * d.minor_px) for d in found])
     changed = np.array([background.lights.in_picture(p)[1] for p in pictures])
-    # Of a light at rest that trembles something is left in the difference: that does not move.
-    elsewhere = [~near_each(d, background.lights.found, ON_LIGHT).any(axis=1) for d in found]
-    moved = moved and float(np.mean([bool(alone.any()) for alone in elsewhere])) > _MOSTLY
+    # Of a light at rest that trembles something is left in the difference: that stays in its place.
+    alone = [d[np.asarray(~near_each(d, background.lights.found, ON_LIGHT).any(axis=1))] for d in found]
+    gone = [bool((~near_each(d, later, SAME_LIGHT).any(axis=1)).any()) for d, later in pairwise(alone)]
+    moved = moved and float(np.mean(gone)) > _MOSTLY
     better = replace(background, fixed=np.asarray(~changed.any(axis=0) & moved))
     if not len(widths):
         return better
