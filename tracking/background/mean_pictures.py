@@ -9,14 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Bools, evenly_spread
+from geometry.arrays import evenly_spread
+from geometry.compilation.jit import compiled_for_threads
 from tracking.noise import BLOCK, Picture
 
 MOST_BYTES = 150_000_000  # of these pictures
 _CUT = 0.25  # share of the lowest and of the highest grey values of a pixel that is left out
 _SMOOTH_BLOCKS = 6.0  # blocks: sigma of the smooth part of the background, which is no structure
-_SMOOTH_SAMPLE = (9, 9)  # of these pixels: what varies over them is not structure
-_AROUND_SAMPLE = (11, 11)  # of these pixels: 100 px: a part of the picture that shows the structure or does not
 
 
 def usable(pictures: Sequence[Picture]) -> list[Picture]:
@@ -60,18 +59,46 @@ def highest_of_blocks(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.dilate(blocks, np.ones((3, 3))), np.float32)
 
 
-def without_smooth_part(values: NDArray[np.float32], plain: Bools) -> NDArray[np.float32]:
-    """Values on the pixels of _SAMPLE less the means of plain ones around them."""
-    weight = plain.astype(np.float32)
-    mean = cv2.blur(values * weight, _SMOOTH_SAMPLE) / np.maximum(cv2.blur(weight, _SMOOTH_SAMPLE), 1e-3)
-    return np.asarray(values - mean, np.float32)
-
-
-def sums_around(values: NDArray[Any]) -> NDArray[Any]:
-    """Sums over the surroundings of each pixel of _SAMPLE."""
-    return np.asarray(cv2.boxFilter(values, -1, _AROUND_SAMPLE, normalize=False))
-
-
 def in_steps(values: NDArray[np.float32], steps: int) -> NDArray[np.uint16]:
     """Grey values, DN, in steps of a fraction of 1 DN."""
     return np.clip(np.rint(values * steps), 0, np.iinfo(np.uint16).max).astype(np.uint16)
+
+
+def raised_difference(
+    picture: Picture, steps: int, subtracted: NDArray[np.uint16], structure: NDArray[np.float32], more: float,
+    clips: float, top: int,
+) -> NDArray[np.uint16]:  # fmt: skip
+    """A picture (h, w) in steps of a fraction of 1 DN, plus `subtracted` and `more` times the structure (h, w).
+
+    Pixels of at least `clips`, DN, become `top`. In one pass: whole pictures in between take most of the time.
+    """
+    out = np.empty_like(subtracted)
+    most = int(np.iinfo(picture.dtype).max) + 1
+    _raise(picture, steps, subtracted, structure, np.float32(more), min(int(np.ceil(min(clips, most))), most), top, out)
+    return out
+
+
+@compiled_for_threads
+def _raise(
+    picture: NDArray[Any], steps: int, subtracted: NDArray[np.uint16], structure: NDArray[np.float32],
+    more: np.float32, clips: int, top: int, out: NDArray[np.uint16],
+) -> None:  # fmt: skip
+    many, limit, high = np.int32(steps), np.int32(clips), np.int32(top)
+    lowest, most = np.int32(0), np.int32(65535)
+    for i in range(out.shape[0]):
+        seen, added, to = picture[i], subtracted[i], out[i]
+        if more == np.float32(0.0):
+            for j in range(to.shape[0]):
+                x = np.int32(seen[j])
+                y = x * many + np.int32(added[j])
+                y = y if y < most else most
+                to[j] = np.uint16(y if x < limit else high)
+            continue
+        own = structure[i]
+        for j in range(to.shape[0]):
+            x = np.int32(seen[j])
+            z = np.int32(added[j]) + np.int32(more * own[j])
+            z = z if z > lowest else lowest
+            y = x * many + (z if z < most else most)
+            y = y if y < most else most
+            to[j] = np.uint16(y if x < limit else high)
