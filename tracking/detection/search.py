@@ -31,6 +31,7 @@ from tracking.detection.candidates import (
     PeakSearch,
     find_peaks,
 )
+from tracking.detection.moments import is_round
 from tracking.detection.pixels import (
     Noise,
     Pixels,
@@ -74,6 +75,7 @@ _CLEARLY_HIGH = 2.0  # times the threshold by the texture: for such a peak it do
 _LEAST_ON_RING = 3
 _ON_RING = 1.0  # sigmas of a pixel: three of the means
 _NARROW = 2.5  # half side, px, below which means of 3x3 pixels are compared
+_ROUND = 0.35  # least share of the light around a peak that a round Gaussian explains: others cost the most to fit
 BLOCK_SHARE, PEAK_SHARE = 0.63, 0.75  # shares of the threshold above which a block is searched and a peak is measured
 
 
@@ -136,6 +138,9 @@ def find_separate_peaks(
                 least = max(needed, HALO_SHARE * peaks[near[k], HEIGHT])
                 alone = alone and peaks[i, HEIGHT] - lowest >= least
             alone = alone and _stands_out(image, peaks[i], noise, threshold_sigma, ring)
+            alone = alone and is_round(
+                image, int(peaks[i, AT_U]), int(peaks[i, AT_V]), variance(noise, peaks[i, LEVEL]), _ROUND
+            )
             if alone:
                 level = _find_scale(image, peaks[i], border)
                 for k in range(_nearest(peaks, i, separate, count, near, gaps)):

@@ -194,10 +194,9 @@ def camera_noises(run: Run, reader: FrameReader) -> dict[str, CameraNoise]:
                 wanted = evenly_spread(numbers, PICTURES).tolist()
             else:
                 wanted = list(range(0, VIDEO_FRAMES, VIDEO_FRAMES // PICTURES))
-            shown = pictures_at(run, name, wanted)
-            out[name].make_background(
-                [p for _, p in sorted(shown.items()) if isinstance(p, np.ndarray)], run.tracker.detect
-            )
+            shown |= pictures_at(run, name, [k for k in wanted if k not in shown])
+            spread = [shown[k] for k in wanted]
+            out[name].make_background([p for p in spread if isinstance(p, np.ndarray)], run.tracker.detect)
     share_texture(list(out.values()))
     return out
 
