@@ -5,20 +5,30 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from bench.random_pictures.render import Renderer
+from bench.random_pictures.scene import picture_scene
+from bench.random_pictures.write_folder import write_pictures
+from lab.simulate.scenarios import SCENARIOS, Light
 from lab.simulate.write import simulate
 
 PICTURES = 300  # simulated; longer runs repeat them forwards and backwards, so that the motion is continuous
 SEED = 9100
 FORMATS = ("png", "tiff", "pgm", "mjpeg", "points")
+TEXTURED = "textured"  # the first scenario on a screen with a texture of 4 %: 12 hot pixels, 20 % clutter
+PHOTOGRAPHS = "photographs-"  # and a seed: that recording of bench.random_pictures, 1280x1024
 
 
 def run_folder(kept: Path, kind: str, frames: int, scenario: str) -> Path:
-    """A run folder with this format and number of frames; it is written if it does not exist."""
+    """A run folder with this format and number of frames; it is written if it does not exist.
+
+    scenario: of lab.simulate, TEXTURED, or PHOTOGRAPHS with a seed.
+    """
     folder = kept / f"{scenario}-{kind}-{frames}"
     if (folder / "run.yaml").is_file():
         return folder
@@ -49,7 +59,14 @@ def _simulated(kept: Path, scenario: str) -> Path:
     folder = kept / scenario
     if not (folder / "run.yaml").is_file():
         shutil.rmtree(folder, ignore_errors=True)
-        simulate(scenario, folder, seed=SEED, frames=PICTURES)
+        if scenario.startswith(PHOTOGRAPHS):
+            seed = int(scenario.removeprefix(PHOTOGRAPHS))
+            shown = picture_scene(seed, "photographs", PICTURES, sizes_px=((1280, 1024),))
+            write_pictures(Renderer(shown), folder)
+        elif scenario == TEXTURED:
+            simulate(replace(SCENARIOS["huo2015"], light=Light(texture=0.04)), folder, seed=SEED, frames=PICTURES)
+        else:
+            simulate(scenario, folder, seed=SEED, frames=PICTURES)
     return folder
 
 

@@ -28,8 +28,10 @@ from lab.runs.frames.sensor_noise import CameraNoise
 from lab.runs.process import RunOutcome, are_results, ready_run, write_results
 from lab.runs.smoothing_pass import TRACKING, Progress
 from lab.runs.verdict.frame_checks import FrameChecks
+from lab.watch.live_background import LiveBackground
 from lab.watch.live_frames import LiveFrames, WatchOptions
 from lab.watch.live_output import Latency, LiveOutput, UdpLines, is_live_table
+from tracking.background.estimation import PICTURES
 from tracking.detections import Detections
 
 _log = logging.getLogger("beampose")
@@ -70,8 +72,9 @@ def watch_run(
     During the recording `out` contains attitude_live.csv: a row per frame by the causal tracker, flushed at once. udp:
     HOST:PORT that receives the same as a line of JSON. The recording ends when nothing has come for `options.idle_s`,
     when all devices have ended, or when `stop` is set; then `out` receives the results of `beampose run`, computed from
-    the received detections. These differ from those of a run by the pictures that the noise is estimated from (here
-    each camera's first ones) and by pictures that came too late. reprocess: computes the results from the finished
+    the received detections. These differ from those of a run by the pictures that the noise and the static background
+    are estimated from (here each camera's first ones; of the background, those before each picture) and by pictures
+    that came too late. reprocess: computes the results from the finished
     folders instead, as `beampose run` does, which takes longer. provenance: added to summary.json, such as the command.
 
     Raises:
@@ -96,6 +99,8 @@ def watch_run(
                     if progress is not None:
                         progress(done, None, TRACKING)
                 pipeline = Pipeline.of(run)
+            for finder in finders.values():
+                finder.background.finish()
 
             def more() -> dict[str, Any]:
                 if not reprocess:
@@ -117,7 +122,7 @@ def _started(run: Run, frames: LiveFrames, output: LiveOutput) -> tuple[Pipeline
     with ThreadPoolExecutor(max(len(first), 1)) as pool:  # in parallel, since pictures queue up meanwhile
         list(pool.map(lambda name: noise[name].estimate_from(first[name]), first))
     pipeline = Pipeline(run, frames, tracker_of(run), noise, output.write)
-    finders = {name: _Finder(pipeline, name) for name in noise}
+    finders = {name: _Finder(pipeline, name, LiveBackground(noise[name], run.tracker.detect)) for name in noise}
     frames.inbox.set_finders(finders)
     return pipeline, finders
 
@@ -128,12 +133,14 @@ class _Finder:
 
     pipeline: Pipeline
     camera: str
+    background: LiveBackground
     seconds: float = 0.0
 
     def __call__(self, picture: GreyPicture) -> Detections:
         clock = time.perf_counter()
         found = self.pipeline.spots_in(self.camera, picture)
         self.seconds += time.perf_counter() - clock
+        self.background.add(picture)
         return found
 
 
@@ -164,6 +171,12 @@ def _load_compiled_code(run: Run) -> None:
         noise = CameraNoise("synthetic")
         noise.estimate_from(pictures)
         noise.detect(pictures[0], run.tracker.detect)
+        moving = [
+            np.roll(pictures[0], 8 * k, axis=1)[:: height // 128, :: width // 128].copy() for k in range(PICTURES)
+        ]
+        noise = CameraNoise("small")
+        noise.estimate_from(moving[:2])
+        noise.make_background(moving, run.tracker.detect)
     uv_px, _ = model.project(Pose.identity() if run.prior is None else run.prior.centre)
     seen = np.isfinite(uv_px).all(axis=1) & ((uv_px > 0) & (uv_px < model.image_size_px)).all(axis=1)
     found = []

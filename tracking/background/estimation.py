@@ -45,8 +45,8 @@ def static_background(
     if len(some) < _LEAST_PICTURES:
         return None
     lower, mean = means_of(some)
-    background = StaticBackground.of_mean(lower, some, model, parameters).with_reference(some)
-    shown = [(p, fit[0]) for p in some if (fit := background.light_in(p)) is not None]
+    background = StaticBackground.of_mean(lower, some, model, parameters).with_light(some)
+    shown = [(p, fit[0]) for p in some if (fit := background.shown.in_picture(p)) is not None]
     some, lights = [p for p, _ in shown], [light for _, light in shown]
     if len(some) < _LEAST_PICTURES:
         return None
@@ -57,7 +57,7 @@ def static_background(
         smooth = lower - background.structure
         equal = [smooth + (p - smooth_part(p.astype(np.float32))) / light for p, light in shown]
         lower, mean = means_of(equal)
-        background = StaticBackground.of_mean(lower, some, model, parameters).with_reference(some)
+        background = StaticBackground.of_mean(lower, some, model, parameters).with_light(some)
     tried = some[::TRIED]
     few = len(background.lights.found) < _MANY_LIGHTS
     if few and sum(_better_in(background, p, shift) for p in tried) < max(_LEAST_FOUND * len(tried), 2):
@@ -82,7 +82,7 @@ def _without_slow_lights(
     moved, slow = slow.moved, slow[~slow.known]
     if len(slow.row):
         better = _behind(better, slow, mean, pictures, shift)
-    return _with_shifts(better.with_reference(pictures), pictures, moved, shift)
+    return _with_shifts(better.with_light(pictures), pictures, moved, shift)
 
 
 def _with_shifts(
@@ -124,7 +124,7 @@ def _behind(
         found = [better.spots_in(p, background.parameters, shift, regions=boxes) for p in pictures]
         if k == 0:
             found = [
-                as_pictures_show(d, background.found_again(p, background.parameters, boxes))
+                as_pictures_show(d, find_spots(p, background.parameters, background.noise, boxes))
                 for d, p in zip(found, pictures, strict=True)
             ]
         behind, information = slow.behind(found, behind, background.noise.variance(behind))

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -20,25 +19,24 @@ from geometry.arrays import Array, Bools
 from tracking.background.mean_pictures import (
     highest_of_blocks,
     in_steps,
+    raised_difference,
     smooth_part,
-    sums_around,
-    without_smooth_part,
 )
 from tracking.background.places import (
     AROUND_LIGHT,
     AROUND_SPOT,
     SAME_LIGHT,
     inside,
-    merged_parts,
     near_each,
     nearest,
     places_of,
 )
 from tracking.background.resting_lights import RestingLights
+from tracking.background.shown_light import LEAST_CHANGE, SAMPLE, Shown, ShownLight, fits_around
 from tracking.detection.detect import find_spots, saturation_of
 from tracking.detection.pixels import TEXTURE_SHARE
 from tracking.detections import Detections
-from tracking.noise import BLOCK, NoiseModel, Picture
+from tracking.noise import NoiseModel, Picture
 from tracking.noise_estimation.texture_shift import TextureShift
 from tracking.parameters import DetectParameters
 
@@ -48,18 +46,7 @@ _LOW = 0.25  # quantile of the background whose noise the difference is taken to
 _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
 _AS_WIDE = 0.7  # of a light at rest: what is in its middle and as wide is that light, brighter than in the mean
 TRIED = 3  # every such picture shows whether there are further spots
-_SAMPLE = (10, 11)  # rows and columns: every such pixel shows how much of the structure is in a picture
-_CLEAR_SIGMAS = 4.0  # of the measured light
-_EFFICIENCY = 2.0  # sigma of the median over places, of those that show most structure, over that of one fit
-_MOST_LEFT = 2.5  # sigmas: more counts as much, since somebody in front of the screen is in many pixels
-_SAME_LIGHT = 0.03  # the light has not changed by more than this share: the structure is not scaled
-_LEAST_LIGHT, _MOST_LIGHT = 0.2, 5.0  # changes of the light beyond which a picture is searched without subtraction
-_BY_CHANCE = 4.0  # sigmas of the sum of squares, of few pixels between lights at rest
 _WIDE_PX = 4.0  # a narrower light is in few of the sampled pixels
-_LARGEST_MISFIT = 1.3  # sigma of what is left over that of the noise; above it the camera or the light has moved
-
-# Light of a picture relative to the background; on the pixels of _SAMPLE: those with nothing else, and sigmas left.
-_Fit: TypeAlias = tuple[float, Bools, NDArray[np.float32]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +55,7 @@ class StaticBackground:
 
     pictures: int  # from which it is made
     structure: NDArray[np.float32]  # (h, w), DN: the fixed picture without its smooth part
-    smooth: NDArray[np.float32]  # (h, w), DN, on the pixels of _SAMPLE
+    smooth: NDArray[np.float32]  # DN, on the pixels of shown_light.SAMPLE
     near_lights: Bools  # (h, w): near lights that do not move
     blind: Bools  # (h, w): the difference does not show what is there
     shares: NDArray[np.float32]  # (h, w): variance of the fixed picture's own errors over that of a picture's noise
@@ -81,26 +68,19 @@ class StaticBackground:
     subtracted: NDArray[np.uint16]  # (h, w): what is added to a picture in these steps
     model: NoiseModel  # of the difference, in its steps
     noise: NoiseModel  # of the pictures
+    shown: ShownLight
     spot_px: float = 0.0  # usual width of the lights that move; 0: not known
     shifts_px: NDArray[np.float32] | None = None  # (h, w): `local_shifts` of such a light
     fixed: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))  # lights at rest while others move
     misfit_share: float = float("nan")  # of the lights that move, as in TextureShift
-    reference: float = 1.0  # what of the structure, which contains noise, the pictures show; 0: too little to measure
 
-    def with_reference(self, pictures: Sequence[Picture]) -> StaticBackground:
-        """The background whose light is 1 in a typical picture.
-
-        Each of these pictures is a part of the mean, whose noise it shows with a weight of one over their number.
-        """
-        lights = [fit[0] for p in pictures[::TRIED] if (fit := self.light_in(p, measured=True)) is not None]
-        if not lights:
-            return replace(self, reference=0.0)
-        rows, columns = _SAMPLE
-        plain = ~self.near_lights[::rows, ::columns]
-        structure = without_smooth_part(self.structure[::rows, ::columns], plain)[plain]
-        own = float(np.mean(self.noise.variance(self.smooth[plain]))) / self.pictures
-        reference = float(np.median(lights)) - own / max(float(np.mean(structure**2)), 1e-12)
-        return replace(self, reference=reference if reference > _LEAST_LIGHT else 0.0)
+    def with_light(self, pictures: Sequence[Picture]) -> StaticBackground:
+        """The background whose light is 1 in a typical one of the pictures that it is made from."""
+        shown = ShownLight.of(
+            self.structure, self.smooth, self.near_lights, self.noise, self._noise_share, self.pictures,
+            pictures[::TRIED],
+        )  # fmt: skip
+        return replace(self, shown=shown)
 
     @property
     def _noise_share(self) -> float:
@@ -138,7 +118,7 @@ class StaticBackground:
             model, floor_dn2=floor * (1 + share), slope_dn=slope, black_dn=black * steps, texture=0.0,
             local_texture=uneven, banding_dn=model.banding_dn * steps, compression_dn2=model.compression_dn2 * steps**2,
         )  # fmt: skip
-        rows, columns = _SAMPLE
+        rows, columns = SAMPLE
         blind = cv2.dilate(mean - np.minimum(plain, level), np.ones((3, 3))) > 1 / steps
         near_lights = places_of(at_rest, mean.shape, AROUND_LIGHT) | blind
         return StaticBackground(
@@ -146,6 +126,7 @@ class StaticBackground:
             np.full(mean.shape, share, np.float32), RestingLights.of(mean, at_rest, model, clips - 0.5),
             np.zeros((0, 3)), parameters, steps, level, low,
             in_steps(np.asarray(level - plain, np.float32), steps), of_difference, model,
+            ShownLight.of(structure, smooth[::rows, ::columns].copy(), near_lights, model, share, len(pictures), ()),
         )  # fmt: skip
 
     def found_in(self, picture: Picture, parameters: DetectParameters, shift: TextureShift) -> Detections | None:
@@ -161,7 +142,7 @@ class StaticBackground:
         self, picture: Picture, parameters: DetectParameters, shift: TextureShift
     ) -> tuple[Detections, Detections] | None:
         """The points of a picture that move or have changed, and the lights at rest that have not."""
-        fit = self.light_in(picture)
+        fit = self.shown.in_picture(picture)
         if fit is None:
             return None
         spots = self._moving(picture, parameters, shift, fit)
@@ -182,7 +163,7 @@ class StaticBackground:
         rest = replace(rest, cov_px2=(1 + self._noise_share) * rest.cov_px2, place_px2=place + fixed, at_rest=at_rest)
         found = spots[~inside(boxes, spots)]
         if len(boxes):
-            again = self.found_again(picture, parameters, boxes)
+            again = find_spots(picture, parameters, self.noise, boxes)
             again = shift.added_to(again, self.noise, self._shifts_at(again))
             found = found.joined(again, parameters.max_detections)
         return found, rest
@@ -194,18 +175,6 @@ class StaticBackground:
         row, column = (nearest(points.uv_px[:, i], self.shifts_px.shape[1 - i]) for i in (1, 0))
         return np.asarray(self.shifts_px[row, column] * np.sqrt(points.major_px * points.minor_px) / self.spot_px)
 
-    def found_again(self, picture: Picture, parameters: DetectParameters, boxes: NDArray[np.float64]) -> Detections:
-        """The points of a picture in boxes (m, 3), px. `regions` would be followed from light to light beyond them."""
-        found = Detections.none()
-        for left, top, right, bottom in merged_parts(boxes, picture.shape, BLOCK):
-            local = self.noise.local_texture
-            if local is not None:
-                local = local[top // BLOCK : -(-bottom // BLOCK), left // BLOCK : -(-right // BLOCK)]
-            own = find_spots(picture[top:bottom, left:right], parameters, replace(self.noise, local_texture=local))
-            own = replace(own, uv_px=own.uv_px + np.array([left, top]))
-            found = found.joined(own[inside(boxes, own)], len(found) + len(own))
-        return found
-
     def spots_in(
         self, picture: Picture, parameters: DetectParameters, shift: TextureShift, inverted: bool = False,
         regions: NDArray[np.float64] | None = None,
@@ -215,27 +184,23 @@ class StaticBackground:
         shift: errors of spots by the texture; the part that the background causes is subtracted with it. inverted: the
         holes of the difference instead. regions: of `find_spots`.
         """
-        fit = self.light_in(picture)
+        fit = self.shown.in_picture(picture)
         return Detections.none() if fit is None else self._moving(picture, parameters, shift, fit, inverted, regions)
 
     def _moving(
-        self, picture: Picture, parameters: DetectParameters, shift: TextureShift, fit: _Fit,
+        self, picture: Picture, parameters: DetectParameters, shift: TextureShift, fit: Shown,
         inverted: bool = False, regions: NDArray[np.float64] | None = None,
     ) -> Detections:  # fmt: skip
-        """`spots_in`, with the result of `light_in`."""
-        light, clear, left = fit
-        added, model = self.subtracted, self.model
-        if abs(light - 1) > _SAME_LIGHT:
-            change = (np.float32(1 - light) * self.structure * self.steps).astype(np.int32)
-            added = np.clip(self.subtracted + change, 0, np.iinfo(np.uint16).max).astype(np.uint16)
-            own = self._noise_share
+        """`spots_in`, with the result of `ShownLight.in_picture`."""
+        light, clear, left2 = fit
+        model, more = self.model, 0.0
+        if abs(light - 1) > LEAST_CHANGE:
+            own, more = self._noise_share, (1 - light) * self.steps
             model = replace(model, floor_dn2=model.floor_dn2 * (1 + light**2 * own) / (1 + own))
-        raised: NDArray[np.uint16] = np.multiply(picture, np.uint16(self.steps), dtype=np.uint16)
-        difference = np.asarray(cv2.add(raised, added), np.uint16)
         clips = saturation_of(parameters, picture)
         top = min(int((clips + self.level_dn) * self.steps), np.iinfo(np.uint16).max)
-        if not inverted and picture.max() >= clips:
-            difference[picture >= clips] = top
+        clipped = np.inf if inverted else clips
+        difference = raised_difference(picture, self.steps, self.subtracted, self.structure, more, clipped, top)
         if inverted:
             difference = np.asarray(
                 cv2.subtract(np.full_like(difference, 2 * int(self.level_dn * self.steps)), difference)
@@ -243,13 +208,10 @@ class StaticBackground:
         spots = find_spots(difference, replace(parameters, saturation_dn=float(top)), model, regions)
         wide = spots.major_px > _WIDE_PX
         if wide.any():  # its pixels are explained
-            clear = clear & ~places_of(spots[wide], picture.shape, AROUND_SPOT)[:: _SAMPLE[0], :: _SAMPLE[1]]
-        # Somebody in front of the screen is in many pixels.
-        count = sums_around(clear.astype(np.float32))
-        least = _LARGEST_MISFIT**2 * count + _BY_CHANCE * np.sqrt(2 * count)
-        fits = sums_around(np.where(clear, np.minimum(left * left, _MOST_LEFT**2), 0)) <= least
+            clear = clear & ~places_of(spots[wide], picture.shape, AROUND_SPOT)[:: SAMPLE[0], :: SAMPLE[1]]
+        fits = fits_around(clear, left2)
         row, column = (nearest(spots.uv_px[:, i], picture.shape[1 - i]) for i in (1, 0))
-        sampled = np.minimum(row // _SAMPLE[0], len(fits) - 1), np.minimum(column // _SAMPLE[1], fits.shape[1] - 1)
+        sampled = np.minimum(row // SAMPLE[0], len(fits) - 1), np.minimum(column // SAMPLE[1], fits.shape[1] - 1)
         kept = ~self.blind[row, column] & fits[sampled]
         spots, row, column, sampled = spots[kept], row[kept], column[kept], (sampled[0][kept], sampled[1][kept])
         if not len(spots):
@@ -269,39 +231,3 @@ class StaticBackground:
         spots = of_light.added_to(spots, self.noise, self._shifts_at(spots))
         place = np.zeros(len(spots)) if spots.place_px2 is None else spots.place_px2
         return replace(spots, place_px2=place + fixed)
-
-    def light_in(self, picture: Picture, measured: bool = False) -> _Fit | None:
-        """How much of the structure a picture shows, relative to the background, and what it leaves.
-
-        None: the picture and the background do not fit. measured: also where the
-        light is the same within the errors of its measurement; otherwise it is 1 there.
-        """
-        if picture.shape != self.structure.shape:
-            return None
-        rows, columns = _SAMPLE
-        plain = ~self.near_lights[::rows, ::columns]
-        own_light = self.structure[::rows, ::columns]
-        above = picture[::rows, ::columns].astype(np.float32) - self.smooth
-        more = float(np.median(above))
-        variance = self.noise.variance(self.smooth + own_light + more).astype(np.float32)
-        # Wide lights are in the means around them.
-        even = plain & (np.abs(above - more - own_light) < 6 * np.sqrt(variance) + np.abs(own_light))
-        structure, above = (without_smooth_part(x, even) for x in (own_light, above))
-        clear = plain & (np.abs(above) < 6 * np.sqrt(variance) + 4 * np.abs(structure))
-        seen = np.where(clear, structure, 0.0)
-        power = sums_around(seen * seen)
-        here = sums_around(seen * above) / np.maximum(power, 1e-12)
-        share = self.reference or 1.0
-        light = float(np.median(here[power >= np.median(power)])) / share
-        sigma = _EFFICIENCY * float(np.sqrt(np.median(variance) / max(np.sum(seen * seen), 1e-12))) / share
-        if measured:
-            return light, plain, np.zeros(plain.shape, np.float32)
-        if not self.reference or abs(light - 1) < max(_SAME_LIGHT, _CLEAR_SIGMAS * sigma):
-            light = 1.0
-        if not _LEAST_LIGHT < light < _MOST_LIGHT:
-            return None
-        own = self._noise_share * variance
-        left = np.where(clear, (above - light * structure) / np.sqrt(variance + light**2 * own), 0.0)
-        if 1.4826 * float(np.median(np.abs(left[clear]))) > _LARGEST_MISFIT:
-            return None
-        return light, clear, left

@@ -22,17 +22,15 @@ from tracking.detection.candidates import (
     PeakSearch,
     block_workspace,
 )
-from tracking.detection.gaussian_fit import REACHES
 from tracking.detection.measuring import DetectionLimits, measure
 from tracking.detection.pixels import TEXTURE_SHARE, Noise, Pixels
-from tracking.detection.regions import INITIAL_REACH, MARGIN, boxes_of, find_relevant, write_detections
+from tracking.detection.regions import EVERYWHERE, boxes_of, margin_of, write_detections
 from tracking.detection.search import BORDER_BLOCKS, MAX_COMPARED, find_peaks_in, find_separate_peaks
-from tracking.detection.table import ALGEBRA, CELL_ROWS, CELL_SIZE, COLUMNS, MOST_CELLS
+from tracking.detection.table import ALGEBRA, CELL_ROWS, COLUMNS, MOST_CELLS
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.parameters import DetectParameters
 
-_EVERYWHERE = np.array([[0.0, 0.0, 1e9]])
 _thread_local = threading.local()  # .finders: the last finders of each thread, by width, height, most points
 _MOST_FINDERS = 4
 
@@ -54,9 +52,9 @@ def find_spots(
     Without a noise model the noise of the background is estimated from the picture (0.3 ms more). For a run it is
     better to estimate it once from several pictures (noise_estimation.photon_transfer.estimate_noise).
 
-    regions (n, 3), px: boxes u, v, half size; only spots in one of them are searched and returned. They are identical,
-    bit for bit, to those of the whole picture, if that has fewer than max_detections. Boxes with nan or a negative size
-    are empty.
+    regions (n, 3), px: boxes u, v, half size; only spots in one of them are searched and returned. The light of
+    others is subtracted as in the whole picture if they are nearer to the box than its half size, or than 16 px; that
+    of others farther away is not. Boxes with nan or a negative size are empty.
 
     Raises:
         ValueError: if the picture or the regions have another shape or type.
@@ -147,7 +145,6 @@ class SpotFinder:
         self.width, self.height, self.most = width, height, most
         self._blocks = Blocks.of(width, height)
         rows, columns = self._blocks.maps.shape[1:]
-        self._whole = np.array([[0, rows - 1, 0, columns - 1]])
         self._runs = np.zeros((rows + 4, 3), np.int64)
         self._searched = np.zeros((rows, columns), np.uint8)
         self._bright_blocks = np.zeros((rows * columns, 3), np.int64)
@@ -172,43 +169,16 @@ class SpotFinder:
         task = _Task.of(image, parameters, NoiseModel.of(noise) if isinstance(noise, SensorNoise) else noise)
         self._searched[:] = 0
         self._blocks.maps[TEXTURE] = task.model.texture_of_blocks(*self._blocks.maps.shape[1:])
-        if regions is None:
-            self._measure(task, self._search(task, self._whole, 0))
-            return self._detections(_EVERYWHERE)
-        boxes = np.asarray(regions, dtype=float)
-        if boxes.ndim != 2 or boxes.shape[1] != 3:
-            raise ValueError(f"regions: expected (n, 3): u, v and half size in px, got shape {boxes.shape}")
-        boxes = np.ascontiguousarray(boxes)
-        self._find_in_regions(task, boxes)
-        return self._detections(boxes)
+        places = np.ascontiguousarray(EVERYWHERE if regions is None else regions, dtype=float)
+        if places.ndim != 2 or places.shape[1] != 3:
+            raise ValueError(f"regions: expected (n, 3): u, v and half size in px, got shape {places.shape}")
+        boxes = np.zeros((len(places), 4), np.int64)
+        boxes = boxes[: boxes_of(places, self.width, self.height, boxes)]
+        self._measure(task, self._search(task, boxes) if len(boxes) else 0, places)
+        return self._detections(places)
 
-    def _find_in_regions(self, task: _Task, regions: Array) -> None:
-        """Measure the peaks in the regions and all other peaks that affect them."""
-        workspace = np.zeros((max(len(regions), 64), 4), np.int64)
-        boxes, count = workspace[: boxes_of(regions, self.width, self.height, workspace)], 0
-        reach, chosen = np.zeros(0), None
-        while True:
-            if len(boxes):
-                count = self._search(task, boxes, count)
-            reach = np.concatenate([reach, np.full(count - len(reach), INITIAL_REACH)])
-            relevant = np.zeros(count, np.int64)
-            more = find_relevant(
-                self._peaks[:count], regions, reach, self._searched, self.width, self.height, relevant, workspace
-            )
-            if more:
-                boxes = workspace[:more]
-                continue
-            chosen = self._measure(task, count, relevant, chosen)
-            needed = np.array(REACHES)[self._table[: len(chosen), CELL_SIZE].astype(int)]
-            far = needed + MARGIN > reach[chosen]
-            far &= needed > REACHES[1]
-            if not far.any():
-                return
-            reach[chosen[far]] = needed[far] + MARGIN
-            boxes = workspace[:0]
-
-    def _search(self, task: _Task, boxes: Ints, count: int) -> int:
-        """Append the peaks in boxes of blocks to the first `count` peaks; returns the new number of peaks."""
+    def _search(self, task: _Task, boxes: Ints) -> int:
+        """Find the peaks in boxes of blocks; returns their number."""
         rows, columns = self._blocks.maps.shape[1:]
         needed = int((boxes[:, 1] - boxes[:, 0] + 5).sum())
         if len(self._runs) < needed:
@@ -222,30 +192,23 @@ class SpotFinder:
         find_highest_between(task.image, inner, self._blocks.maps, self._blocks.lines[0])
         search = PeakSearch(task.pixels, task.noise, self._blocks, self._workspace, self._scratch, self._peaks)
         threshold = task.limits.threshold_sigma
-        return find_peaks_in(boxes, search, threshold, self._searched, self._bright_blocks, self._runs, count)
+        return find_peaks_in(boxes, search, threshold, self._searched, self._bright_blocks, self._runs, 0)
 
-    def _measure(self, task: _Task, count: int, relevant: Ints | None = None, measured: Ints | None = None) -> Ints:
-        """Measure the separate spots among the first `count` peaks, as far as relevant; the rows of their peaks.
-
-        measured: the rows that the last call, for the same picture, has measured; the same rows are not measured again.
-        """
+    def _measure(self, task: _Task, count: int, regions: Array) -> None:
+        """Measure the separate spots among the first `count` peaks that lie in the regions (n, 3), or near them."""
         peaks = self._peaks[:count]
         order = np.lexsort((peaks[:, AT_U], peaks[:, AT_V], -peaks[:, HEIGHT]))
         if count > len(self._separate):  # bright objects have many peaks, which must not displace spots in even places
             first = np.argsort(_insignificance(peaks[order], task.model), kind="stable")[: len(self._separate)]
             order = order[np.sort(first)]
+        away = np.abs(peaks[:, None, :2] - regions[:, :2]).max(axis=2)
+        wanted = (away <= regions[:, 2] + margin_of(regions)).any(axis=1)
         near, threshold = (self._near, self._gaps), task.limits.threshold_sigma
-        n = find_separate_peaks(task.pixels, peaks, order, task.noise, threshold, self._separate, *near)
-        chosen = self._separate[:n]
-        if relevant is not None:
-            chosen = chosen[relevant[chosen] > 0]
-        chosen = chosen[: self.most].copy()
-        if measured is not None and np.array_equal(chosen, measured):
-            return chosen
+        n = find_separate_peaks(task.pixels, peaks, order, wanted, task.noise, threshold, self._separate, *near)
+        chosen = self._separate[: min(n, self.most)].copy()
         self._count = len(chosen)
         table = self._table[: self._count]
         measure(task.pixels, peaks, chosen, task.noise, task.limits, table, self._cells, self._algebra)
-        return chosen
 
     def _detections(self, regions: Array) -> Detections:
         """The spots, among the candidates measured last, that lie in one of the regions."""

@@ -67,14 +67,15 @@ _LEAST_VARIANCE = 0.02  # px^2: narrower spots cannot be distinguished from a po
 @compiled
 def fit_all(
     image: Pixels, table: Array, noise: Noise, saturation: float, max_sigma: float, min_gain: float, again: bool,
-    cells: Array, algebra: Array,
+    together: bool, cells: Array, algebra: Array,
 ) -> None:  # fmt: skip
     """Fit all candidates of a picture (n, COLUMNS) together, in place, starting from their moments.
 
     Gauss-Newton steps until the centres converge; clipped pixels, pixels outside and hot pixels are excluded, and the
     light of the neighbours is subtracted. A candidate that grows beyond `max_sigma`, px, diverges, or lowers chi-square
     by less than `min_gain` is rejected: its flux becomes 0. again: only those with ACTIVE start from their moments; the
-    others have been fitted and stay as they are.
+    others have been fitted. together: these are fitted further where the light of a neighbour has changed; otherwise
+    they stay as they are.
     """
     n = table.shape[0]
     for i in range(n):
@@ -103,7 +104,7 @@ def fit_all(
             elif moved:
                 spot[ACTIVE] = 1.0
             changed = changed or moved
-            if moved and not again:
+            if moved and together:
                 _reactivate_neighbours(table, i)
         if not changed:
             break

@@ -66,7 +66,7 @@ _SPOT_FLUX = (
 _ABOVE_GRAINS, _CLEAR_GAIN = 1.5, 2.0  # relative to what is needed of any spot
 _LEAST_GAIN = 0.7  # decrease of chi-square relative to threshold^2 below which the fit stops early
 _PART_APART = 2.0  # sigmas: fits that are nearer to each other are parts of one light
-_MERGES = 3  # fits of a picture at most, with parts joined in between
+_MERGES = 2  # times at most that parts are joined
 _LEAST_START = 2.0  # px^2: least variance of that start
 _OUTGROWN = 4.0  # variance of the moments over that of the start above which they have left the light
 _STEEPEST = 0.6065  # exp(-1/2): slope of a Gaussian at one sigma, in heights per sigma
@@ -112,15 +112,16 @@ def measure(
             spot[NEAR_WING + p] = 0.0
     find_moments(image, table, cells)
     least = _LEAST_GAIN * limits.threshold_sigma**2
+    fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, False, True, cells, algebra)
     for _ in range(_MERGES):
-        fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, False, cells, algebra)
         if not _merge_parts(table):
             break
+        fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, True, cells, algebra)
     if _start_again(peaks, chosen, table, limits):
-        fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, cells, algebra)
+        fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, False, cells, algebra)
         _drop_background(table)
     if _hold_unresolved(peaks, chosen, table, limits):
-        fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, cells, algebra)
+        fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, False, cells, algebra)
         _judge_unresolved(image, table, noise, limits)
     for k in range(chosen.shape[0]):
         spot = table[k]
@@ -150,7 +151,7 @@ def _fit_wings(
         spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV] = ellipse.clip_eigenvalues(
             spot[UU], spot[UV], spot[VV], 2.0 * least_variance(spot), np.inf
         )
-    fit_all(image, table, noise, limits.saturation, limits.max_sigma, 0.0, True, cells, algebra)
+    fit_all(image, table, noise, limits.saturation, limits.max_sigma, 0.0, True, False, cells, algebra)
     for k in range(table.shape[0]):
         spot = table[k]
         if spot[NEAR_WING] + spot[FAR_WING] <= 0.0:
@@ -251,12 +252,14 @@ def _judge_unresolved(image: Pixels, table: Array, noise: Noise, limits: Detecti
 
 @compiled
 def _merge_parts(table: Array) -> bool:
-    """Join fits that are parts of one light into one start of another fit; whether there are any.
+    """Join fits that are parts of one light into one start of another fit, ACTIVE; whether there are any.
 
     The sum of two equal Gaussians has two maxima only if they are more than two sigmas apart. Two fits that are nearer
     to each other and about equally wide were therefore not two lights, but speckle of one.
     """
     found = False
+    for i in range(table.shape[0]):
+        table[i, ACTIVE] = 0.0
     for i in range(table.shape[0]):
         spot = table[i]
         for j in range(i + 1, table.shape[0]):
@@ -280,6 +283,7 @@ def _merge_parts(table: Array) -> bool:
                 spot[UU], spot[UV], spot[VV] = spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV]
                 spot[FLUX], other[FLUX] = spot[FLUX] + other[FLUX], 0.0
                 other[MOMENT_UU], other[MOMENT_UV], other[MOMENT_VV] = _NOTHING, 0.0, _NOTHING
+                spot[ACTIVE], other[ACTIVE] = 1.0, 0.0
                 found = True
     return found
 

@@ -218,6 +218,29 @@ def insertion_sort(values: Array, n: int) -> None:
 
 
 @compiled
+def nth_smallest(values: Array, n: int, rank: int) -> float:
+    """The value of this rank, from 0, among the first n values, whose order changes (Hoare's selection)."""
+    first, last = 0, n - 1
+    while first < last:
+        middle, i, j = values[(first + last) // 2], first, last
+        while i <= j:
+            while values[i] < middle:
+                i += 1
+            while values[j] > middle:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i, j = i + 1, j - 1
+        if rank <= j:
+            last = j
+        elif rank >= i:
+            first = i
+        else:
+            break
+    return values[rank]
+
+
+@compiled
 def insert_nearest(near: NDArray, gaps: Array, filled: int, most: int, gap: float, row: int) -> int:
     """Enter a row into the at most `most` nearest ones, sorted by gap; returns their new number."""
     if filled == most and gap >= gaps[most - 1]:

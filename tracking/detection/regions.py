@@ -1,19 +1,15 @@
-"""Search in parts of a picture, with the same results as from the whole picture; and the spots that are returned.
+"""Boxes of a picture that are searched, and the spots that are returned.
 
-The measurement of a spot depends on its neighbours: separate peaks are decided with the brighter peaks within
-search.RADIUS, and the light of other spots within gaussian_fit.reach_of is subtracted. The search is therefore
-extended around each peak of a region, and around the peaks found in this way, until there are no more.
+In a region only what lies in it, or near it, is measured: the cost follows the region, not what is bright elsewhere.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
-from tracking.detection.candidates import AT_U, AT_V
 from tracking.detection.search import RADIUS
 from tracking.detection.table import (
     ACCEPTED,
@@ -36,16 +32,25 @@ from tracking.noise import BLOCK
 NARROWER = 0.5  # a spot narrower than this share of another spot is not a duplicate of it
 _SAME_SPOT = 1.5  # sigmas of a brighter spot: a second spot nearer to its centre is a duplicate
 MARGIN = 16  # px: largest distance of a peak from its spot's centre
+EVERYWHERE = np.array([[0.0, 0.0, 1e9]])
+
+
+def margin_of(regions: Array) -> Array:
+    """(n,) px: how far around regions (n, 3) peaks are measured: those of their spots, and of others beside those."""
+    return np.asarray(np.maximum(regions[:, 2], MARGIN))
 
 
 @compiled
 def boxes_of(regions: Array, width: int, height: int, boxes: Ints) -> int:
-    """The blocks (n, 4: first row, last, first column, last) of regions (n, 3: u, v, half size, px) with a margin."""
+    """The blocks (n, 4: first row, last, first column, last) of regions (n, 3: u, v, half size, px) and around them.
+
+    A peak is compared with brighter ones up to RADIUS from it.
+    """
     count = 0
     for k in range(regions.shape[0]):
         u, v, half = regions[k, 0], regions[k, 1], regions[k, 2]
         if half >= 0.0 and half < np.inf and abs(u) < np.inf and abs(v) < np.inf:  # false for nan
-            count = _add_box(u, v, half + MARGIN, width, height, boxes, count)
+            count = _add_box(u, v, half + max(half, MARGIN) + RADIUS, width, height, boxes, count)
     return count
 
 
@@ -68,50 +73,6 @@ def in_a_region(regions: Array, u: float, v: float, more: float) -> bool:
         if abs(u - regions[k, 0]) <= half and abs(v - regions[k, 1]) <= half:
             return True
     return False
-
-
-@compiled
-def find_relevant(
-    peaks: Array, regions: Array, reach: Array, searched: NDArray[np.uint8], width: int, height: int, relevant: Ints,
-    boxes: Ints,
-) -> int:  # fmt: skip
-    """Find the peaks (n, PEAK_COLUMNS) that affect the regions (n, 3), and the boxes of blocks still to be searched.
-
-    reach (n,), px: largest distance of other peaks that affect each peak. relevant (n,) becomes positive for the peaks
-    that affect the regions; returns the number of boxes.
-    """
-    n, count = peaks.shape[0], 0
-    for i in range(n):
-        relevant[i] = 1 if in_a_region(regions, peaks[i, AT_U], peaks[i, AT_V], MARGIN) else 0
-    changed = True
-    while changed:
-        changed = False
-        for i in range(n):
-            if relevant[i] != 1:
-                continue
-            relevant[i] = 2  # its neighbours are entered
-            for j in range(n):
-                distance = max(abs(peaks[i, AT_U] - peaks[j, AT_U]), abs(peaks[i, AT_V] - peaks[j, AT_V]))
-                if relevant[j] == 0 and distance <= reach[i]:
-                    relevant[j], changed = 1, True
-    for i in range(n):
-        if relevant[i] and count < boxes.shape[0]:
-            more = _add_box(peaks[i, AT_U], peaks[i, AT_V], reach[i], width, height, boxes, count)
-            if not _is_searched(searched, boxes[count]):
-                count = more
-    return count
-
-
-@compiled
-def _is_searched(searched: NDArray[np.uint8], box: Ints) -> bool:
-    for row in range(box[0], box[1] + 1):
-        for column in range(box[2], box[3] + 1):
-            if not searched[row, column]:
-                return False
-    return True
-
-
-INITIAL_REACH = float(RADIUS)  # px: reach of a peak before its size is known
 
 
 @compiled

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from math import cos, pi, sin, sqrt
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Array, Ints
+from geometry.arrays import Array, Bools, Ints
 from geometry.compilation.jit import compiled, compiled_for_threads
 from tracking.detection.block_search import (
     BACKGROUND_REACH,
@@ -31,13 +31,16 @@ from tracking.detection.candidates import (
     PeakSearch,
     find_peaks,
 )
+from tracking.detection.moments import is_round
 from tracking.detection.pixels import (
     Noise,
     Pixels,
     clamped,
     insert_nearest,
     insertion_sort,
+    maximum_of,
     mean3,
+    nth_smallest,
     pixel,
     texture_variance,
     variance,
@@ -62,6 +65,9 @@ _SURROUNDINGS = 4  # ... this many half sides, 3.3 sigmas
 _LEVEL_HALF_SIDE = 4  # px: half side of the squares of the background
 # Radii, px, of the circles on which the light of a line continues, and the numbers of points on them.
 _CIRCLES, _RING = (4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0), (12, 20, 28, 36, 52, 72, 108)
+_TURNS = [np.exp(2j * np.pi * np.arange(n) / n) for n in _RING]
+_ON_CIRCLES = np.concatenate([r * turn for r, turn in zip(_CIRCLES, _TURNS, strict=True)])
+_POINTS = np.rint(np.column_stack([_ON_CIRCLES.real, _ON_CIRCLES.imag])).astype(np.int64)  # (sum of _RING, 2), px
 _HIGHEST = (1.6, 1.9, 2.0, 2.1, 2.2, 2.4, 2.5)  # expected highest of as many normal deviates, in sigmas
 # Of the texture around: an even place among objects has less than this on a circle, homogeneous texture never.
 _EVEN = 1 / 3
@@ -69,6 +75,7 @@ _CLEARLY_HIGH = 2.0  # times the threshold by the texture: for such a peak it do
 _LEAST_ON_RING = 3
 _ON_RING = 1.0  # sigmas of a pixel: three of the means
 _NARROW = 2.5  # half side, px, below which means of 3x3 pixels are compared
+_ROUND = 0.35  # least share of the light around a peak that a round Gaussian explains: others cost the most to fit
 BLOCK_SHARE, PEAK_SHARE = 0.63, 0.75  # shares of the threshold above which a block is searched and a peak is measured
 
 
@@ -104,10 +111,12 @@ def find_peaks_in(
 
 @compiled
 def find_separate_peaks(
-    image: Pixels, peaks: Array, order: Ints, noise: Noise, threshold_sigma: float, separate: Ints, near: Ints,
-    gaps: Array,
+    image: Pixels, peaks: Array, order: Ints, wanted: Bools, noise: Noise, threshold_sigma: float, separate: Ints,
+    near: Ints, gaps: Array,
 ) -> int:  # fmt: skip
-    """The rows of separate spots among the peaks, into `separate`; returns their number. order: brightest peak first.
+    """The rows of separate spots among the wanted peaks (n,), into `separate`; returns their number.
+
+    order: the rows of all peaks that these are compared with, brightest first.
 
     Between a peak and each of the nearest brighter ones the light must fall by `DIP` of the fainter peak, and by four
     sigmas of the difference of two means of nine pixels. Speckle makes deeper dips within a wide spot, so there the
@@ -117,6 +126,8 @@ def find_separate_peaks(
     count, border, ring = 0, np.zeros(8), np.zeros(_RING[-1])
     for place in range(order.shape[0]):
         i = order[place]
+        if not wanted[i]:
+            continue
         if peaks[i, WIDE]:
             alone = not _has_neighbour(peaks, order, i)
         else:
@@ -127,6 +138,9 @@ def find_separate_peaks(
                 least = max(needed, HALO_SHARE * peaks[near[k], HEIGHT])
                 alone = alone and peaks[i, HEIGHT] - lowest >= least
             alone = alone and _stands_out(image, peaks[i], noise, threshold_sigma, ring)
+            alone = alone and is_round(
+                image, int(peaks[i, AT_U]), int(peaks[i, AT_V]), variance(noise, peaks[i, LEVEL]), _ROUND
+            )
             if alone:
                 level = _find_scale(image, peaks[i], border)
                 for k in range(_nearest(peaks, i, separate, count, near, gaps)):
@@ -160,19 +174,19 @@ def _stands_out(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float
     sigma, alone, lowest, second = sqrt(variance(noise, peak[LEVEL])), False, np.inf, np.inf
     structure = sqrt(texture_variance(with_texture(noise, peak[CONTRAST]), peak[LEVEL]))
     high = peak[HEIGHT] >= _CLEARLY_HIGH * threshold_sigma * structure
+    first = 0
     for k in range(len(_CIRCLES)):
         n = 0  # points inside the picture
-        for i in range(_RING[k]):
-            angle = 2 * pi * i / _RING[k]
-            u, v = column + int(np.rint(_CIRCLES[k] * cos(angle))), row + int(np.rint(_CIRCLES[k] * sin(angle)))
+        for i in range(first, first + _RING[k]):
+            u, v = column + _POINTS[i, 0], row + _POINTS[i, 1]
             if 0 < u < image.width - 1 and 0 < v < image.height - 1:
                 ring[n] = mean3(image, u, v)
                 n += 1
+        first += _RING[k]
         if n < _LEAST_ON_RING:
             alone = True
             break
-        insertion_sort(ring, n)
-        around, highest = ring[n // 2], ring[n - 1]
+        around, highest = nth_smallest(ring, n, n // 2), maximum_of(ring[:n])
         if highest - around < 0.5 * (here - around) + _ON_RING * sigma:
             if high:
                 return True

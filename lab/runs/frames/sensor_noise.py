@@ -43,6 +43,7 @@ class CameraNoise:
         default=None, init=False
     )  # in use; None before the first estimate if none is stated
     background: StaticBackground | None = field(default=None, init=False)  # for faint spots; None: not used
+    unfit: int = field(default=0, init=False)  # consecutive pictures that do not fit the background
     _overruled: bool = field(default=False, init=False)  # the stated noise misses visible spots
     _blank: int = field(default=0, init=False)  # consecutive pictures without any point
     _recent: deque[Picture] = field(default_factory=lambda: deque(maxlen=2), init=False)
@@ -68,6 +69,11 @@ class CameraNoise:
                     " leave it out"
                 )
 
+    @property
+    def shows_structure(self) -> bool:
+        """Whether the pictures show texture or objects that hide spots, from which a background may free them."""
+        return self.model is not None and is_limited_by_texture(self.model)
+
     def make_background(self, pictures: Sequence[Picture], parameters: DetectParameters) -> None:
         """Make the static background of pictures spread over the recording, if that shows more or spares fits."""
         if pictures and self.model is not None and self.estimate is not None:
@@ -81,7 +87,8 @@ class CameraNoise:
         if self.background is not None and self.estimate is not None and parameters.max_sigma_px <= WIDE_PX:
             usual = self._with_saturation(parameters, picture)
             seen = self.background.found_in(picture, usual, self.estimate.texture_shift)
-            if seen is not None and len(seen):
+            self.unfit = 0 if seen is not None else self.unfit + 1
+            if seen is not None:
                 return seen
         found = self._search(picture, parameters, self.model)
         if len(found):
@@ -183,16 +190,14 @@ def camera_noises(run: Run, reader: FrameReader) -> dict[str, CameraNoise]:
             wanted = list(VIDEO_PICTURES)
         shown = pictures_at(run, name, wanted)
         out[name].estimate_from([p for _, p in sorted(shown.items()) if isinstance(p, np.ndarray)])
-        model = out[name].model
-        if model is not None and is_limited_by_texture(model):
+        if out[name].shows_structure:
             if isinstance(run.cameras[name], FramesFolder):
                 wanted = evenly_spread(numbers, PICTURES).tolist()
             else:
                 wanted = list(range(0, VIDEO_FRAMES, VIDEO_FRAMES // PICTURES))
-            shown = pictures_at(run, name, wanted)
-            out[name].make_background(
-                [p for _, p in sorted(shown.items()) if isinstance(p, np.ndarray)], run.tracker.detect
-            )
+            shown |= pictures_at(run, name, [k for k in wanted if k not in shown])
+            spread = [shown[k] for k in wanted]
+            out[name].make_background([p for p in spread if isinstance(p, np.ndarray)], run.tracker.detect)
     share_texture(list(out.values()))
     return out
 

@@ -184,7 +184,7 @@ def test_without_noise_the_moments_are_close_to_the_truth_and_the_fit_reaches_it
     table = start(spot, 1000.0)
     find_moments(image, table, cells)
     assert np.abs(table[0, [MOMENT_U, MOMENT_V]] - [40.3, 30.8]).max() < 0.1 * px
-    fit_all(image, table, Noise(1.0, 1.0, 1000.0, 0.0, 0.0, 0.0), 65535.0, 20.0, 0.0, False, cells, algebra)
+    fit_all(image, table, Noise(1.0, 1.0, 1000.0, 0.0, 0.0, 0.0), 65535.0, 20.0, 0.0, False, True, cells, algebra)
     assert np.abs(table[0, [U, V]] - [40.3, 30.8]).max() < 2e-4 * px
     assert ellipse.axes(*table[0, UU : UU + 3]) == pytest.approx((3.1, 1.7, 25.0), abs=0.01)
     assert table[0, FLUX] == pytest.approx(spot.flux, rel=1e-3)
@@ -198,7 +198,7 @@ def fitted(scene: Scene, seed: int, spot: Spot, hot: tuple[int, int] | None = No
     cells, algebra = workspace()
     table = start(spot, scene.background)
     find_moments(pixels(image), table, cells)
-    fit_all(pixels(image), table, NOISE, 255.0, 20.0, 0.0, False, cells, algebra)
+    fit_all(pixels(image), table, NOISE, 255.0, 20.0, 0.0, False, True, cells, algebra)
     return table[0]
 
 
@@ -230,7 +230,7 @@ def test_a_candidate_that_diverges_is_rejected():
     cells, algebra = workspace()
     table = start(Spot(40.0, 40.0, 1.0), 20.0)
     table[0, [MOMENT_UU, MOMENT_UV, MOMENT_VV, FLUX]] = 4.0, 0.0, 4.0, 4000.0
-    fit_all(pixels(image), table, NOISE, 255.0, 5.0, 0.0, False, cells, algebra)
+    fit_all(pixels(image), table, NOISE, 255.0, 5.0, 0.0, False, True, cells, algebra)
     assert table[0, FLUX] == 0.0
 
 
@@ -255,5 +255,5 @@ def test_centres_are_not_biased_towards_pixel_centres(sigma, lock):
         cells, algebra = workspace()
         table = start(spot, 1000.0)
         find_moments(image, table, cells)
-        fit_all(image, table, Noise(100.0, 0.1, 1000.0, 0.0, 0.0, 0.0), 65535.0, 20.0, 0.0, False, cells, algebra)
+        fit_all(image, table, Noise(100.0, 0.1, 1000.0, 0.0, 0.0, 0.0), 65535.0, 20.0, 0.0, False, True, cells, algebra)
         assert np.abs(table[0, [U, V]] - [spot.u, spot.v]).max() < lock * px

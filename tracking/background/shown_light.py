@@ -1,0 +1,136 @@
+"""How much of the light of the background a picture shows, and where it does: on a sample of the pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.arrays import Array, Bools
+from tracking.noise import NoiseModel, Picture
+
+SAMPLE = (10, 11)  # rows and columns: every such pixel shows how much of the structure is in a picture
+_SMOOTH = (9, 9)  # of these pixels: what varies over them is not structure
+_AROUND = (11, 11)  # of these pixels: 100 px: a part of the picture that shows the structure or does not
+_CLEAR_SIGMAS = 4.0  # of the measured light
+_EFFICIENCY = 2.0  # sigma of the median over places, of those that show most structure, over that of one fit
+_MOST_LEFT = 2.5  # sigmas: more counts as much, since somebody in front of the screen is in many pixels
+LEAST_CHANGE = 0.03  # the light has not changed by more than this share: the structure is not scaled
+_LEAST_LIGHT, _MOST_LIGHT = 0.2, 5.0  # changes of the light beyond which a picture is searched without subtraction
+_BY_CHANCE = 4.0  # sigmas of the sum of squares, of few pixels between lights at rest
+_LARGEST_MISFIT = 1.3  # sigma of what is left over that of the noise; above it the camera or the light has moved
+
+_SOME = (slice(None, None, 2), slice(None, None, 2))  # of the sample, for medians over the whole picture
+_Values = NDArray[np.float32]
+# Light of a picture relative to the background; on the sample: what is clear of lights, and squared sigmas left there.
+Shown: TypeAlias = tuple[float, Bools, _Values]
+
+
+@dataclass(frozen=True, slots=True)
+class ShownLight:
+    """The structure of the background on a sample (a, b) of the pixels of pictures (h, w)."""
+
+    size: tuple[int, int]  # h, w
+    smooth: _Values  # (a, b), DN: the smooth part of the background
+    level: _Values  # (a, b), DN: the background
+    own: _Values  # (a, b), DN: the background without its smooth part
+    plain: _Values  # (a, b): 1, and 0 near lights
+    showing: Bools  # (a, b): the half of the places that show most structure
+    noise: NoiseModel  # of the pictures
+    noise_share: float  # variance of the background's own noise over that of a picture
+    reference: float = 1.0  # what of the structure, which contains noise, the pictures show; 0: too little to measure
+
+    @staticmethod
+    def of(
+        structure: _Values, smooth: _Values, near_lights: Bools, noise: NoiseModel, noise_share: float, count: int,
+        pictures: Sequence[Picture],
+    ) -> ShownLight:  # fmt: skip
+        """structure, near_lights: (h, w); smooth: on the sample. The light is 1 in a typical one of these pictures.
+
+        Each of the pictures is one of `count` in the mean, whose noise it shows with a weight of one over their number.
+        """
+        rows, columns = SAMPLE
+        plain = (~near_lights[::rows, ::columns]).astype(np.float32)
+        own = structure[::rows, ::columns]
+        seen = np.where(plain > 0, _about_means(own, plain), np.float32(0.0))
+        power = _sums(seen * seen)
+        first = ShownLight(
+            structure.shape, smooth, smooth + own, own, plain, power >= np.median(power), noise, noise_share,
+        )  # fmt: skip
+        lights = [first._measured(p)[0] for p in pictures]
+        if not lights or not plain.any():
+            return replace(first, reference=0.0)
+        where = plain > 0
+        of_noise = float(np.mean(noise.variance(smooth[where]))) / count
+        reference = float(np.median(lights)) - of_noise / max(float(np.mean(seen[where] ** 2)), 1e-12)
+        return replace(first, reference=reference if reference > _LEAST_LIGHT else 0.0)
+
+    def in_picture(self, picture: Picture) -> Shown | None:
+        """How much of the structure a picture shows, relative to the background, and what it leaves.
+
+        1 if it is the same within the errors of its measurement. None: the picture and the background do not fit.
+        """
+        if picture.shape != self.size:
+            return None
+        light, above, structure, clear, variance = self._measured(picture)
+        light /= self.reference or 1.0
+        power = float(np.sum(np.square(clear * structure)))
+        sigma = _EFFICIENCY * float(np.sqrt(_median(variance[_SOME]) / max(power, 1e-12))) / (self.reference or 1.0)
+        if not self.reference or abs(light - 1) < max(LEAST_CHANGE, _CLEAR_SIGMAS * sigma):
+            light = 1.0
+        if not _LEAST_LIGHT < light < _MOST_LIGHT:
+            return None
+        left = above - np.float32(light) * structure
+        left *= left
+        left /= variance * np.float32(1 + light**2 * self.noise_share)
+        if 1.4826**2 * _median(left[_SOME][clear[_SOME]]) > _LARGEST_MISFIT**2:
+            return None
+        return light, clear, left
+
+    def _measured(self, picture: Picture) -> tuple[float, _Values, _Values, Bools, _Values]:
+        """The light, not yet relative to the reference; and, on the sample: what is above the smooth part, and the
+        structure, DN, about the means around them; whether the place is clear of lights; variances, DN^2.
+        """
+        rows, columns = SAMPLE
+        above = picture[::rows, ::columns].astype(np.float32) - self.smooth
+        more = _median(above[_SOME])
+        slope, black = np.float32(self.noise.slope_dn), np.float32(self.noise.black_dn - more)
+        variance = np.float32(self.noise.floor_dn2) + slope * np.maximum(self.level - black, np.float32(0.0))
+        sigmas = 6 * np.sqrt(variance)
+        # Wide lights are in the means around them.
+        even = self.plain * (np.abs(above - more - self.own) < sigmas + np.abs(self.own))
+        above, structure = _about_means(above, even), _about_means(self.own, even)
+        clear = (self.plain > 0) & (np.abs(above) < sigmas + 4 * np.abs(structure))
+        seen = clear * structure
+        share = _sums(seen * above)[self.showing] / np.maximum(_sums(seen * seen)[self.showing], np.float32(1e-12))
+        return _median(share), above, structure, clear, variance
+
+
+def fits_around(clear: Bools, left2: _Values) -> Bools:
+    """(a, b): where what a picture leaves, squared sigmas, is noise: somebody in front of the screen is not.
+
+    clear: the pixels of the sample that count. A moving light is in few of them.
+    """
+    count = _sums(clear.astype(np.float32))
+    least = _LARGEST_MISFIT**2 * count + _BY_CHANCE * np.sqrt(2 * count)
+    return np.asarray(_sums(np.where(clear, np.minimum(left2, np.float32(_MOST_LEFT**2)), np.float32(0.0))) <= least)
+
+
+def _about_means(values: _Values, weights: _Values) -> _Values:
+    """Values on the sample less the weighted means around them."""
+    means = cv2.blur(values * weights, _SMOOTH) / np.maximum(cv2.blur(weights, _SMOOTH), np.float32(1e-3))
+    return np.asarray(values - means, np.float32)
+
+
+def _sums(values: _Values) -> _Values:
+    """Sums over the surroundings of each pixel of the sample."""
+    return np.asarray(cv2.boxFilter(values, -1, _AROUND, normalize=False), np.float32)
+
+
+def _median(values: Array | _Values) -> float:
+    """The upper median; nan without values."""
+    return float(np.partition(values.ravel(), values.size // 2)[values.size // 2]) if values.size else float("nan")
