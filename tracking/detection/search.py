@@ -65,6 +65,7 @@ _CIRCLES, _RING = (4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0), (12, 20, 28, 36, 52,
 _HIGHEST = (1.6, 1.9, 2.0, 2.1, 2.2, 2.4, 2.5)  # expected highest of as many normal deviates, in sigmas
 # Of the texture around: an even place among objects has less than this on a circle, homogeneous texture never.
 _EVEN = 1 / 3
+_SHARP_CIRCLES = 4  # of them, for what is about two pixels wide
 _CLEARLY_HIGH = 2.0  # times the threshold by the texture: for such a peak it does not matter how even its place is
 _LEAST_ON_RING = 3
 _ON_RING = 1.0  # sigmas of a pixel: three of the means
@@ -95,7 +96,7 @@ def find_peaks_in(
     find_highest_quads(blocks, runs[: runs_of(boxes, 1, 1, rows, columns, runs)])
     find_row_medians(blocks, runs[: runs_of(boxes, BACKGROUND_REACH, 0, rows, columns, runs)])
     inner = runs[: runs_of(boxes, 0, 0, rows, columns, runs)]
-    find_background(blocks, inner)
+    find_background(blocks, inner, search.saturation)
     find_highest_pairs(blocks, inner)
     least, measured = BLOCK_SHARE * threshold_sigma, PEAK_SHARE * threshold_sigma
     n = find_bright_blocks(blocks, inner, search.noise, least, measured, searched, found)
@@ -126,7 +127,8 @@ def find_separate_peaks(
                 lowest = _lowest_between(image, peaks, i, near[k], 1) - peaks[i, LEVEL]
                 least = max(needed, HALO_SHARE * peaks[near[k], HEIGHT])
                 alone = alone and peaks[i, HEIGHT] - lowest >= least
-            alone = alone and _stands_out(image, peaks[i], noise, threshold_sigma, ring)
+            if alone and not _stands_out(image, peaks[i], noise, threshold_sigma, ring):
+                alone = _is_sharp(image, peaks[i], noise, threshold_sigma)
             if alone:
                 level = _find_scale(image, peaks[i], border)
                 for k in range(_nearest(peaks, i, separate, count, near, gaps)):
@@ -158,6 +160,7 @@ def _stands_out(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float
     """
     here, column, row = peak[HEIGHT] + peak[LEVEL], int(peak[AT_U]), int(peak[AT_V])
     sigma, alone, lowest, second = sqrt(variance(noise, peak[LEVEL])), False, np.inf, np.inf
+    level = peak[LEVEL]  # without the light of a wide spot, which is in the background from the search
     structure = sqrt(texture_variance(with_texture(noise, peak[CONTRAST]), peak[LEVEL]))
     high = peak[HEIGHT] >= _CLEARLY_HIGH * threshold_sigma * structure
     for k in range(len(_CIRCLES)):
@@ -176,12 +179,56 @@ def _stands_out(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float
         if highest - around < 0.5 * (here - around) + _ON_RING * sigma:
             if high:
                 return True
-            alone, scatter = True, (highest - around) / _HIGHEST[k]
+            alone, scatter, level = True, (highest - around) / _HIGHEST[k], min(level, around)
             lowest, second = min(lowest, scatter), min(second, max(lowest, scatter))
     if second < _EVEN * peak[CONTRAST] * peak[LEVEL]:
         peak[CONTRAST] = second / max(peak[LEVEL], 1.0)
-        structure = sqrt(texture_variance(with_texture(noise, peak[CONTRAST]), peak[LEVEL]))
-    return alone and peak[HEIGHT] >= PEAK_SHARE * threshold_sigma * structure
+    structure = sqrt(texture_variance(with_texture(noise, peak[CONTRAST]), level))
+    return alone and here - level >= PEAK_SHARE * threshold_sigma * structure
+
+
+@compiled
+def _is_sharp(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float) -> bool:
+    """Whether a peak is far sharper than the structure around it; if so, CONTRAST is that of sharp structure.
+
+    Edges and objects have a high contrast in means of 3x3 pixels, of which a narrow spot fills only a part, but little
+    light that exceeds all neighbours. The second lowest of the maxima on circles counts, as in `_stands_out`.
+    """
+    column, row, best = int(peak[AT_U]), int(peak[AT_V]), 0.0
+    for i in range(row - 1, row + 1):
+        for j in range(column - 1, column + 1):
+            best = max(best, _sharpness(image, j, i))
+    # Speckle is on the light of a wider spot.
+    if best < max(threshold_sigma * sqrt(variance(noise, peak[LEVEL]) / 3.0), peak[HEIGHT]):
+        return False
+    lowest, second = np.inf, np.inf
+    for k in range(_SHARP_CIRCLES):
+        highest = 0.0
+        for i in range(_RING[k]):
+            angle = 2 * pi * i / _RING[k]
+            u, v = column + int(np.rint(_CIRCLES[k] * cos(angle))), row + int(np.rint(_CIRCLES[k] * sin(angle)))
+            highest = max(highest, _sharpness(image, u, v))
+        scatter = highest / _HIGHEST[k]
+        lowest, second = min(lowest, scatter), min(second, max(lowest, scatter))
+    contrast = second / max(peak[LEVEL], 1.0)
+    if best < threshold_sigma * sqrt(texture_variance(with_texture(noise, contrast), peak[LEVEL])):
+        return False
+    peak[CONTRAST] = min(peak[CONTRAST], contrast)
+    return True
+
+
+@compiled
+def _sharpness(image: Pixels, u: int, v: int) -> float:
+    """The mean of the 2x2 pixels from (u, v) on less that of the twelve around them, DN; 0 at the picture's border."""
+    if not (1 <= u < image.width - 2 and 1 <= v < image.height - 2):
+        return 0.0
+    inner, whole = 0.0, 0.0
+    for i in range(-1, 3):
+        for j in range(-1, 3):
+            x = pixel(image, u + j, v + i)
+            whole += x
+            inner += x if 0 <= i <= 1 and 0 <= j <= 1 else 0.0
+    return inner / 4.0 - (whole - inner) / 12.0
 
 
 @compiled
