@@ -235,7 +235,7 @@ def search(folder: Path) -> list[Detections]:
     inputs = open_inputs([folder])
     series = PictureSeries(inputs.camera, str(folder), DetectParameters())
     series.estimate_noise(list(inputs.noise_pictures()))
-    return [series.search(frame, picture) for frame, picture in inputs.pictures(1)]
+    return [series.search(frame, picture)[0] for frame, picture in inputs.pictures(1)]
 
 
 @dataclass(frozen=True, slots=True)

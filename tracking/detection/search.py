@@ -48,6 +48,7 @@ BORDER_BLOCKS = 2  # blocks around a box that its search needs
 RADIUS = 48  # px: peaks farther apart than this are never parts of one spot of the largest size
 MAX_COMPARED = 4  # number of brighter peaks that a peak is compared with
 DIP = 0.12  # share of the fainter peak by which the light must fall between two spots: the top of a spot falls by less
+_HIGHER = 0.4  # share of the light of a square by which it exceeds that around a peak that is no part of the same spot
 HALO_SHARE = 0.012  # ... and of the brighter peak: rings and halos of real beams have up to 0.009
 # Half sides, px, of the squares that are tried for the scale of a light, each with the one of half its size.
 _HALF_SIDES, _HALVED = (3, 4, 6, 8, 12, 16, 24), (2, 2, 3, 4, 6, 8, 12)
@@ -63,6 +64,8 @@ _LEVEL_HALF_SIDE = 4  # px: half side of the squares of the background
 # Radii, px, of the circles on which the light of a line continues, and the numbers of points on them.
 _CIRCLES, _RING = (4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0), (12, 20, 28, 36, 52, 72, 108)
 _HIGHEST = (1.6, 1.9, 2.0, 2.1, 2.2, 2.4, 2.5)  # expected highest of as many normal deviates, in sigmas
+# The first circle outside a spot that is wide enough to raise the background from the search, and by this ratio.
+_OUTSIDE_WIDE, _RAISED = 5, 0.8
 # Of the texture around: an even place among objects has less than this on a circle, homogeneous texture never.
 _EVEN = 1 / 3
 _SHARP_CIRCLES = 4  # of them, for what is about two pixels wide
@@ -140,6 +143,8 @@ def find_separate_peaks(
                     j = near[k]
                     here = _mean_of_square(image, peaks[i, AT_U], peaks[i, AT_V], half)
                     there = _mean_of_square(image, peaks[j, AT_U], peaks[j, AT_V], half)
+                    if here - there > _HIGHER * (here - level):
+                        continue  # the other one is part of a brighter background
                     height = min(here, there) - level
                     lowest = _lowest_between(image, peaks, i, j, half) - level
                     alone = height - lowest >= DIP * height
@@ -179,7 +184,9 @@ def _stands_out(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float
         if highest - around < 0.5 * (here - around) + _ON_RING * sigma:
             if high:
                 return True
-            alone, scatter, level = True, (highest - around) / _HIGHEST[k], min(level, around)
+            alone, scatter = True, (highest - around) / _HIGHEST[k]
+            if k >= _OUTSIDE_WIDE and around < _RAISED * level:
+                level = min(level, around)
             lowest, second = min(lowest, scatter), min(second, max(lowest, scatter))
     if second < _EVEN * peak[CONTRAST] * peak[LEVEL]:
         peak[CONTRAST] = second / max(peak[LEVEL], 1.0)
@@ -211,9 +218,11 @@ def _is_sharp(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float) 
         scatter = highest / _HIGHEST[k]
         lowest, second = min(lowest, scatter), min(second, max(lowest, scatter))
     contrast = second / max(peak[LEVEL], 1.0)
+    if contrast > _EVEN * peak[CONTRAST]:  # the texture is as fine as the peak
+        return False
     if best < threshold_sigma * sqrt(texture_variance(with_texture(noise, contrast), peak[LEVEL])):
         return False
-    peak[CONTRAST] = min(peak[CONTRAST], contrast)
+    peak[CONTRAST] = contrast
     return True
 
 
