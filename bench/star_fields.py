@@ -17,9 +17,9 @@ stars' directions; the same for what `beampose detect` writes.
 Limits of the comparison, in the shared four pictures. Measured with Hipparcos (van Leeuwen 2007): proper motion from
 the epoch of the directions to July 2019 moves a star by .003 px in the median and by .015 px or less in 90 %; a centre
 is shifted along v by .025 px per magnitude of B-V, .015 px for the usual star (dispersion of the air, colour error of
-the lens); with both known a residual of .043 px, fitted to all stars, was .040 px. Computed: the part of the refraction
-that is not affine is .02 px at the upper and lower border at an altitude of 40 degrees, .005 px at 60 degrees. The 29
-fitted numbers change 270 residuals by 5 %.
+the lens); with both known a residual of .043 px, fitted to all stars, was .040 px. The refraction is
+computed from the altitude in the picture's name, the zenith upwards; what is not affine of it is .02 px at the upper and
+lower border at an altitude of 40 degrees, .005 px at 60 degrees. The 29 fitted numbers change 270 residuals by 5 %.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def gaussians(files: list[Path]) -> Spots:
     pictures = [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) for file in files]
     estimate = estimate_noise(pictures)
     model = replace(estimate.model, profile=SpotProfile())
-    found = [estimate.texture_shift.added_to(find_spots(p, noise=model), model.black_dn) for p in pictures]
+    found = [estimate.texture_shift.added_to(find_spots(p, noise=model), model) for p in pictures]
     sigma = np.concatenate([np.sqrt(d.cov_px2[:, [0, 1], [0, 1]]) for d in found])
     numbers = np.repeat(np.arange(len(found)), [len(d) for d in found])
     return Spots(numbers, np.concatenate([d.uv_px for d in found]), sigma)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import cos, pi, sin, sqrt
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,6 @@ from tracking.detection.block_search import (
 from tracking.detection.candidates import (
     AT_U,
     AT_V,
-    CONTRAST,
     HEIGHT,
     LEVEL,
     SCALE,
@@ -31,6 +30,7 @@ from tracking.detection.candidates import (
     PeakSearch,
     find_peaks,
 )
+from tracking.detection.moments import MOST_ON_RING, PEAK_SHARE, is_sharp, stands_out
 from tracking.detection.pixels import (
     Noise,
     Pixels,
@@ -39,9 +39,7 @@ from tracking.detection.pixels import (
     insertion_sort,
     mean3,
     pixel,
-    texture_variance,
     variance,
-    with_texture,
 )
 
 BORDER_BLOCKS = 2  # blocks around a box that its search needs
@@ -61,19 +59,8 @@ _OUTLIER, _LEAST_BESIDE = 4.0, 0.2
 _FIRST_SURROUNDINGS = 40  # px: distance of the background from a peak; of a wide one ...
 _SURROUNDINGS = 4  # ... this many half sides, 3.3 sigmas
 _LEVEL_HALF_SIDE = 4  # px: half side of the squares of the background
-# Radii, px, of the circles on which the light of a line continues, and the numbers of points on them.
-_CIRCLES, _RING = (4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0), (12, 20, 28, 36, 52, 72, 108)
-_HIGHEST = (1.6, 1.9, 2.0, 2.1, 2.2, 2.4, 2.5)  # expected highest of as many normal deviates, in sigmas
-# The first circle outside a spot that is wide enough to raise the background from the search, and by this ratio.
-_OUTSIDE_WIDE, _RAISED = 5, 0.8
-# Of the texture around: an even place among objects has less than this on a circle, homogeneous texture never.
-_EVEN = 1 / 3
-_SHARP_CIRCLES = 4  # of them, for what is about two pixels wide
-_CLEARLY_HIGH = 2.0  # times the threshold by the texture: for such a peak it does not matter how even its place is
-_LEAST_ON_RING = 3
-_ON_RING = 1.0  # sigmas of a pixel: three of the means
 _NARROW = 2.5  # half side, px, below which means of 3x3 pixels are compared
-BLOCK_SHARE, PEAK_SHARE = 0.63, 0.75  # shares of the threshold above which a block is searched and a peak is measured
+BLOCK_SHARE = 0.63  # share of the threshold above which a block is searched
 
 
 @compiled_for_threads
@@ -118,7 +105,7 @@ def find_separate_peaks(
     means of squares as large as the light around the peak must fall as well. A wide faint peak must have no other peak
     within 16 px. Fills SCALE of the separate peaks. `near`, `gaps` (MAX_COMPARED,) are workspace. Source: ours.
     """
-    count, border, ring = 0, np.zeros(8), np.zeros(_RING[-1])
+    count, border, ring = 0, np.zeros(8), np.zeros(MOST_ON_RING)
     for place in range(order.shape[0]):
         i = order[place]
         if peaks[i, WIDE]:
@@ -130,8 +117,8 @@ def find_separate_peaks(
                 lowest = _lowest_between(image, peaks, i, near[k], 1) - peaks[i, LEVEL]
                 least = max(needed, HALO_SHARE * peaks[near[k], HEIGHT])
                 alone = alone and peaks[i, HEIGHT] - lowest >= least
-            if alone and not _stands_out(image, peaks[i], noise, threshold_sigma, ring):
-                alone = _is_sharp(image, peaks[i], noise, threshold_sigma)
+            if alone and not stands_out(image, peaks[i], noise, threshold_sigma, ring):
+                alone = is_sharp(image, peaks[i], noise, threshold_sigma)
             if alone:
                 level = _find_scale(image, peaks[i], border)
                 for k in range(_nearest(peaks, i, separate, count, near, gaps)):
@@ -152,92 +139,6 @@ def find_separate_peaks(
             separate[count] = i
             count += 1
     return count
-
-
-@compiled
-def _stands_out(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float, ring: Array) -> bool:
-    """Whether a peak is far higher than the light on a circle around it; lowers CONTRAST in an even place.
-
-    On each circle around a part of an edge, a cable or another long line some light continues; fits of candidates on
-    lines would grow over large windows and take most of the time. A spot, also a streak, is brighter than all light on
-    a circle that is large enough. The structure of the background at a place is that on the second most even of such
-    circles: what stands farther away does not matter. ring (_RING[-1],) is workspace. Source: ours.
-    """
-    here, column, row = peak[HEIGHT] + peak[LEVEL], int(peak[AT_U]), int(peak[AT_V])
-    sigma, alone, lowest, second = sqrt(variance(noise, peak[LEVEL])), False, np.inf, np.inf
-    level = peak[LEVEL]  # without the light of a wide spot, which is in the background from the search
-    structure = sqrt(texture_variance(with_texture(noise, peak[CONTRAST]), peak[LEVEL]))
-    high = peak[HEIGHT] >= _CLEARLY_HIGH * threshold_sigma * structure
-    for k in range(len(_CIRCLES)):
-        n = 0  # points inside the picture
-        for i in range(_RING[k]):
-            angle = 2 * pi * i / _RING[k]
-            u, v = column + int(np.rint(_CIRCLES[k] * cos(angle))), row + int(np.rint(_CIRCLES[k] * sin(angle)))
-            if 0 < u < image.width - 1 and 0 < v < image.height - 1:
-                ring[n] = mean3(image, u, v)
-                n += 1
-        if n < _LEAST_ON_RING:
-            alone = True
-            break
-        insertion_sort(ring, n)
-        around, highest = ring[n // 2], ring[n - 1]
-        if highest - around < 0.5 * (here - around) + _ON_RING * sigma:
-            if high:
-                return True
-            alone, scatter = True, (highest - around) / _HIGHEST[k]
-            if k >= _OUTSIDE_WIDE and around < _RAISED * level:
-                level = min(level, around)
-            lowest, second = min(lowest, scatter), min(second, max(lowest, scatter))
-    if second < _EVEN * peak[CONTRAST] * peak[LEVEL]:
-        peak[CONTRAST] = second / max(peak[LEVEL], 1.0)
-    structure = sqrt(texture_variance(with_texture(noise, peak[CONTRAST]), level))
-    return alone and here - level >= PEAK_SHARE * threshold_sigma * structure
-
-
-@compiled
-def _is_sharp(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float) -> bool:
-    """Whether a peak is far sharper than the structure around it; if so, CONTRAST is that of sharp structure.
-
-    Edges and objects have a high contrast in means of 3x3 pixels, of which a narrow spot fills only a part, but little
-    light that exceeds all neighbours. The second lowest of the maxima on circles counts, as in `_stands_out`.
-    """
-    column, row, best = int(peak[AT_U]), int(peak[AT_V]), 0.0
-    for i in range(row - 1, row + 1):
-        for j in range(column - 1, column + 1):
-            best = max(best, _sharpness(image, j, i))
-    # Speckle is on the light of a wider spot.
-    if best < max(threshold_sigma * sqrt(variance(noise, peak[LEVEL]) / 3.0), peak[HEIGHT]):
-        return False
-    lowest, second = np.inf, np.inf
-    for k in range(_SHARP_CIRCLES):
-        highest = 0.0
-        for i in range(_RING[k]):
-            angle = 2 * pi * i / _RING[k]
-            u, v = column + int(np.rint(_CIRCLES[k] * cos(angle))), row + int(np.rint(_CIRCLES[k] * sin(angle)))
-            highest = max(highest, _sharpness(image, u, v))
-        scatter = highest / _HIGHEST[k]
-        lowest, second = min(lowest, scatter), min(second, max(lowest, scatter))
-    contrast = second / max(peak[LEVEL], 1.0)
-    if contrast > _EVEN * peak[CONTRAST]:  # the texture is as fine as the peak
-        return False
-    if best < threshold_sigma * sqrt(texture_variance(with_texture(noise, contrast), peak[LEVEL])):
-        return False
-    peak[CONTRAST] = contrast
-    return True
-
-
-@compiled
-def _sharpness(image: Pixels, u: int, v: int) -> float:
-    """The mean of the 2x2 pixels from (u, v) on less that of the twelve around them, DN; 0 at the picture's border."""
-    if not (1 <= u < image.width - 2 and 1 <= v < image.height - 2):
-        return 0.0
-    inner, whole = 0.0, 0.0
-    for i in range(-1, 3):
-        for j in range(-1, 3):
-            x = pixel(image, u + j, v + i)
-            whole += x
-            inner += x if 0 <= i <= 1 and 0 <= j <= 1 else 0.0
-    return inner / 4.0 - (whole - inner) / 12.0
 
 
 @compiled
