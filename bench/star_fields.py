@@ -18,8 +18,8 @@ Limits of the comparison, in the shared four pictures. Measured with Hipparcos (
 the epoch of the directions to July 2019 moves a star by .003 px in the median and by .015 px or less in 90 %; a centre
 is shifted along v by .025 px per magnitude of B-V, .015 px for the usual star (dispersion of the air, colour error of
 the lens); with both known a residual of .043 px, fitted to all stars, was .040 px. The refraction is
-computed from the altitude in the picture's name, the zenith upwards; what is not affine of it is .02 px at the upper and
-lower border at an altitude of 40 degrees, .005 px at 60 degrees. The 29 fitted numbers change 270 residuals by 5 %.
+computed from the altitude in the picture's name, the zenith upwards; what is not affine of it is .02 px at the upper
+and lower border at an altitude of 40 degrees, .005 px at 60 degrees. The 29 fitted numbers change 270 residuals by 5 %.
 """
 
 from __future__ import annotations
