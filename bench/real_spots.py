@@ -6,7 +6,9 @@ PNG or JPEG (quality 70 to 95), in grey or colour, as one picture or as a series
 files are searched as `beampose detect` does. --keep FOLDER keeps the pictures in which a spot was missed.
 
 A local sigma is the standard deviation of the background's pixels within 15 px of the place, before the light is added,
-and of the noise and the errors of the compression there.
+and of the noise and the errors of the compression there. A spot's peak is what the file holds of it: compression and
+clipping take a part of the light, and of some faint narrow spots all of it. The stars are those of the catalogue: the
+brightest pixels of the star fields include a hot pixel, at the same place in each.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections import Counter, defaultdict
+from csv import DictReader
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -116,13 +119,20 @@ class Lights:
             half = int(min(u, v, image.shape[1] - u - 1, image.shape[0] - v - 1, 260))
             self.beams.append(_cut(image, (int(u), int(v)), half))
         self.stars = []
+        with (data / "star_fields/matches.csv").open(encoding="utf-8") as lines:
+            known = [
+                (row["picture"], float(row["tetra3_u_px"]), float(row["tetra3_v_px"])) for row in DictReader(lines)
+            ]
         for path in sorted((data / "star_fields").glob("*.tiff")):
             image = _grey(cv2.imread(str(path), -1))
             smooth = ndimage.gaussian_filter(image, 1.0)
             highest = (smooth == ndimage.maximum_filter(smooth, 41)) & (image < 50_000)
-            v, u = np.nonzero(highest[40:-40, 40:-40])
-            order = np.argsort(-smooth[v + 40, u + 40])[:8]
-            self.stars += [_cut(image, (int(u[i]) + 40, int(v[i]) + 40), 8) for i in order]
+            v, u = (x + 40 for x in np.nonzero(highest[40:-40, 40:-40]))
+            stars = np.array([(a, b) for name, a, b in known if name == path.name])
+            real = np.hypot(u[:, None] - stars[:, 0], v[:, None] - stars[:, 1]).min(axis=1) < 1.5
+            u, v = u[real], v[real]
+            order = np.argsort(-smooth[v, u])[:8]
+            self.stars += [_cut(image, (int(u[i]), int(v[i])), 8) for i in order]
 
     def draw(self, random: np.random.Generator) -> Light:
         """A spot of a random kind, scale and place within the pixel."""
@@ -157,18 +167,22 @@ class Picture:
     """One picture with one spot."""
 
     image: Image
+    background: Image  # (h, w), DN, grey, without the light
     uv: tuple[float, float]  # px
     light: Light
     peak: float  # DN
     sigma: float  # DN, of the background and the noise at the place
 
     def local_sigmas(self, file: Path) -> float:
-        """The spot's peak in local sigmas, with the errors of compression that the file has there."""
+        """The spot's peak in the file in local sigmas, with the errors of compression that the file has there."""
         j, i = round(self.uv[0]), round(self.uv[1])
         here = np.s_[max(i - LOCAL, 0) : i + LOCAL + 1, max(j - LOCAL, 0) : j + LOCAL + 1]
-        kept = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        error = _grey(kept)[here] - _grey(self.image)[here]
-        return self.peak / float(np.hypot(self.sigma, error.std()))
+        kept, light = _grey(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)), self.light.pixels
+        error = kept[here] - _grey(self.image)[here]
+        left, top = round(self.uv[0] - self.light.centre[0]), round(self.uv[1] - self.light.centre[1])
+        own = np.s_[top : top + light.shape[0], left : left + light.shape[1]]
+        shown = float(np.sum(light * (kept - self.background)[own]) / np.sum(light * light))  # least squares
+        return min(shown, self.peak) / float(np.hypot(self.sigma, error.std()))
 
 
 def draw_pictures(backgrounds: list[Image], lights: Lights, random: np.random.Generator) -> list[Picture]:
@@ -202,7 +216,7 @@ def draw_pictures(backgrounds: list[Image], lights: Lights, random: np.random.Ge
         own = image[v : v + more.shape[0], u : u + more.shape[1]]
         own += more[..., None] * bgr if colour else more
         image = np.clip(np.rint(image + random.normal(0.0, 1.0, image.shape) * noise), 0, 255).astype(np.uint8)
-        out.append(Picture(image, (at_u, at_v), light, peak, sigma))
+        out.append(Picture(image, grey, (at_u, at_v), light, peak, sigma))
         u, v = u + int(step[0]), v + int(step[1])
     return out
 
@@ -221,7 +235,7 @@ def search(folder: Path) -> list[Detections]:
     inputs = open_inputs([folder])
     series = PictureSeries(inputs.camera, str(folder), DetectParameters())
     series.estimate_noise(list(inputs.noise_pictures()))
-    return [series.search(frame, picture) for frame, picture in inputs.pictures(1)]
+    return [series.search(frame, picture)[0] for frame, picture in inputs.pictures(1)]
 
 
 @dataclass(frozen=True, slots=True)

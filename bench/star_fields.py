@@ -17,9 +17,9 @@ stars' directions; the same for what `beampose detect` writes.
 Limits of the comparison, in the shared four pictures. Measured with Hipparcos (van Leeuwen 2007): proper motion from
 the epoch of the directions to July 2019 moves a star by .003 px in the median and by .015 px or less in 90 %; a centre
 is shifted along v by .025 px per magnitude of B-V, .015 px for the usual star (dispersion of the air, colour error of
-the lens); with both known a residual of .043 px, fitted to all stars, was .040 px. Computed: the part of the refraction
-that is not affine is .02 px at the upper and lower border at an altitude of 40 degrees, .005 px at 60 degrees. The 29
-fitted numbers change 270 residuals by 5 %.
+the lens); with both known a residual of .043 px, fitted to all stars, was .040 px. The refraction is
+computed from the altitude in the picture's name, the zenith upwards; what is not affine of it is .02 px at the upper
+and lower border at an altitude of 40 degrees, .005 px at 60 degrees. The 29 fitted numbers change 270 residuals by 5 %.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ from tracking.noise_estimation.photon_transfer import estimate_noise
 
 PARTS = 9
 NEAR_PX = 1.5
+REFRACTION_ARCSEC = 58.3  # at an altitude of 45 degrees
 FOCAL_PX = 5000.0  # start of the fit: a field of about 11 degrees
 CLEAR_PX = 0.1  # sigma of the spots whose places are made even
 SMALLEST = 1e-3, 1e-2  # priors: sigmas of the affine map, and of the tangential terms
@@ -56,9 +57,10 @@ class Stars:
     picture: Ints
     direction: Array
     near: Array
+    altitude: Array  # (n,) deg, of the middle of the star's picture
 
     def of(self, rows: Bools | Ints) -> Stars:
-        return Stars(self.picture[rows], self.direction[rows], self.near[rows])
+        return Stars(self.picture[rows], self.direction[rows], self.near[rows], self.altitude[rows])
 
 
 @dataclass(frozen=True)
@@ -79,8 +81,9 @@ def read_stars(folder: Path) -> tuple[list[Path], Stars]:
     direction = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)
     near = np.array([[float(row["tetra3_u_px"]), float(row["tetra3_v_px"])] for row in rows])
     return [folder / name for name in names], Stars(
-        np.array([names.index(row["picture"]) for row in rows]), direction, near
-    )
+        np.array([names.index(row["picture"]) for row in rows]), direction, near,
+        np.array([float(row["picture"].split("_Alt")[1].split("_")[0]) for row in rows]),
+    )  # fmt: skip
 
 
 def detected(files: list[Path]) -> Spots:
@@ -102,10 +105,23 @@ def gaussians(files: list[Path]) -> Spots:
     pictures = [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) for file in files]
     estimate = estimate_noise(pictures)
     model = replace(estimate.model, profile=SpotProfile())
-    found = [estimate.texture_shift.added_to(find_spots(p, noise=model), model.black_dn) for p in pictures]
+    found = [estimate.texture_shift.added_to(find_spots(p, noise=model), model) for p in pictures]
     sigma = np.concatenate([np.sqrt(d.cov_px2[:, [0, 1], [0, 1]]) for d in found])
     numbers = np.repeat(np.arange(len(found)), [len(d) for d in found])
     return Spots(numbers, np.concatenate([d.uv_px for d in found]), sigma)
+
+
+def refracted(rays: Array, altitude_deg: Array) -> Array:
+    """Unit rays (n, 3) in the camera, lifted by the air towards the zenith, which is upwards (-v) of the picture.
+
+    Source: Smart (1977), Textbook on Spherical Astronomy, section 36: R = 58.3'' tan z, z the distance from the zenith.
+    """
+    away = np.radians(90.0 - altitude_deg)
+    zenith = np.stack([np.zeros_like(away), -np.sin(away), np.cos(away)], axis=-1)
+    cosine = np.sum(rays * zenith, axis=-1, keepdims=True)
+    sine = np.sqrt(1.0 - cosine**2)
+    lift = np.radians(REFRACTION_ARCSEC / 3600.0) * sine / cosine
+    return np.asarray(rays * np.cos(lift) + (zenith - cosine * rays) / sine * np.sin(lift))
 
 
 @dataclass(frozen=True)
@@ -134,7 +150,7 @@ class Lens:
         q = np.zeros((len(stars.picture), 2))
         for picture, attitude in enumerate(self.attitudes):
             rows, own = stars.picture == picture, self.x[4 + 6 * picture : 10 + 6 * picture]
-            rays = stars.direction[rows] @ (cv2.Rodrigues(own[:3])[0] @ attitude).T
+            rays = refracted(stars.direction[rows] @ (cv2.Rodrigues(own[:3])[0] @ attitude).T, stars.altitude[rows])
             q[rows] = rays[:, :2] / rays[:, 2:] @ (np.eye(2) + np.array([[own[3], own[4]], [own[4], own[5]]]))
         scale, k1, p1, p2 = self.x[:4]
         x, y = q.T

@@ -119,14 +119,15 @@ def _search_all(
 ) -> None:
     total, camera = _total(inputs, options), csv_word(series.camera)
     with table.open("w", encoding="utf-8", newline="") as file:
-        file.write(",".join(columns.DETECTIONS) + "\n")
+        file.write(",".join([*columns.DETECTIONS, columns.LIKENESS]) + "\n")
         pictures = islice(inputs.pictures(options.every), options.limit)
         for done, (frame, picture) in enumerate(pictures, start=1):
             if isinstance(picture, MissingPicture):
                 series.unreadable.setdefault(picture.reason, []).append(frame)
             else:
-                found = series.search(frame, picture)
-                file.writelines(detection_rows([(frame, camera, found)]))
+                found, likeness = series.search(frame, picture)
+                rows = detection_rows([(frame, camera, found)])
+                file.writelines(f"{row[:-1]},{like:.3f}\n" for row, like in zip(rows, likeness, strict=True))
                 sheet.offer(done - 1, frame, picture, found)
             if progress is not None:
                 progress(done, total)

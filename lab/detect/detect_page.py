@@ -25,6 +25,7 @@ from lab.versions import versions
 from tracking.noise_estimation.levels import LevelVariances, level_variances
 
 _MOST_KINDS = 4  # kinds of pictures (size and depth) whose noise is drawn
+_MOST_SPOTS = 20  # spots that look most like a laser's
 _MOST_ROWS = 20  # kinds of pictures whose noise is listed
 
 
@@ -35,7 +36,7 @@ def write_detect_page(series: PictureSeries, sheet: ContactSheet, folder: Path) 
     sections = [
         _sheet(sheet),
         _spots(series, table),
-        *([_places(table, groups)] if len(table) else []),
+        *([_most_alike(table), _places(table, groups)] if len(table) else []),
         _noise(series, groups),
     ]
     context: dict[str, Any] = {
@@ -132,6 +133,18 @@ def _spots(series: PictureSeries, table: Array) -> Section:
         " finds fainter spots, and more false ones."
     )
     return Section("Spots", description, drawings)
+
+
+def _most_alike(table: Array) -> Section:
+    """The spots that look most like a laser's: among many points of a room, the spot is one of the first."""
+    best = table[np.argsort(-table[:, 7], kind="stable")[:_MOST_SPOTS]]
+    heads = ("frame", "u (px)", "v (px)", "likeness", "signal to noise", "peak (DN)", "major (px)", "minor (px)")
+    rows = [[int(row[0]), *row[[1, 2, 7, 5, 6, 3, 4]].tolist()] for row in best]
+    description = (
+        "Likeness, 0 to 1: how much of the light a round Gaussian explains, times the ratio of the axes, times the"
+        " brightness of the core relative to that of a clipped pixel. All spots: detections.csv, column likeness."
+    )
+    return Section("Most like the spot of a laser", description, (), PageTable(heads, rows))
 
 
 def _places(table: Array, groups: list[SizeGroup]) -> Section:

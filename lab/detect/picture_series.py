@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lab.detect.findings import SizeGroup, SpotCollection, matched_snr
+from geometry.arrays import Array
+from lab.detect.findings import SizeGroup, SpotCollection, laser_likeness, matched_snr
 from lab.pictures.picture_file import GreyPicture
 from lab.runs.frames.sensor_noise import CameraNoise
 from tracking.detection.detect import overlooked_lights
@@ -58,8 +59,8 @@ class PictureSeries:
         for some in self.noise_pictures.values():
             self.group_of(some[0]).noise.estimate_from(some)
 
-    def search(self, frame: int, picture: GreyPicture) -> Detections:
-        """Detect the spots of a picture and add them to the results."""
+    def search(self, frame: int, picture: GreyPicture) -> tuple[Detections, Array]:
+        """Detect the spots (n) of a picture and add them to the results; with their likeness to a laser's (n,)."""
         group = self.group_of(picture)
         found = group.noise.detect(picture, self.parameters)
         group.pictures += 1
@@ -69,8 +70,9 @@ class PictureSeries:
         if len(wide):
             i = int(np.argmax(wide.peak))
             self.overlooked.append(WideLight(frame, (wide.uv_px[i, 0], wide.uv_px[i, 1]), float(wide.major_px[i])))
-        self.spots.add(frame, found, matched_snr(found, float(np.sqrt(model.of_means.floor_dn2))))
-        return found
+        likeness = laser_likeness(picture, found, group.noise.saturation_dn(picture, self.parameters))
+        self.spots.add(frame, found, matched_snr(found, float(np.sqrt(model.of_means.floor_dn2))), likeness)
+        return found, likeness
 
 
 def _kind(picture: GreyPicture) -> tuple[tuple[int, int], int]:

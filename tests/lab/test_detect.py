@@ -13,7 +13,7 @@ import pytest
 
 from lab.detect.contact_sheet import MOST, ContactSheet
 from lab.detect.detect import SHEET, DetectOptions, detect_pictures
-from lab.detect.findings import MOST_KEPT, SpotCollection, matched_snr
+from lab.detect.findings import MOST_KEPT, SpotCollection, laser_likeness, matched_snr
 from lab.errors import InputError
 from lab.files.text import columns
 from tests.tracking.rendering import Scene, Spot, expected
@@ -264,10 +264,29 @@ def test_the_signal_to_noise_ratio_is_that_of_a_matched_filter():
     assert matched_snr(found, sigma)[0] == pytest.approx(response / spread, rel=1e-3)
 
 
+def test_a_round_bright_spot_looks_most_like_that_of_a_laser():
+    """Beside it a fainter one, a streak, a bar and the corner of a bright square; each as the fit of its moments."""
+    v, u = np.mgrid[:80, :400].astype(float)
+
+    def gaussian(at: float, major: float, minor: float) -> np.ndarray:
+        return np.exp(-0.5 * (((u - at) / major) ** 2 + ((v - 40) / minor) ** 2))
+
+    light = 250 * gaussian(40, 3, 3) + 100 * gaussian(120, 3, 3) + 200 * gaussian(200, 9, 3)
+    light[37:44, 265:296], light[40:, 360:] = 240.0, 240.0
+    image = np.clip(light + 10.0, 0, 255).astype(np.uint8)
+    places = np.column_stack([[40.0, 120.0, 200.0, 280.0, 361.0], [40.0, 40.0, 40.0, 40.0, 41.0]])
+    major, minor = np.array([3.0, 3.0, 9.0, 9.0, 3.0]), np.array([3.0, 3.0, 3.0, 2.0, 3.0])
+    found = Detections(places, np.tile(np.eye(2), (5, 1, 1)), major, major, major, minor, major)
+    likeness = laser_likeness(image, found, 255.0)
+    assert likeness[0] > 0.95
+    assert np.all(likeness[1:] < 0.8)
+    assert np.all(likeness >= 0.0)
+
+
 def test_the_memory_for_figures_is_bounded():
     collection, n = SpotCollection(), MOST_KEPT // 8
     found = Detections(np.zeros((n, 2)), np.zeros((n, 2, 2)), *(np.zeros(n) for _ in range(5)))
     for frame in range(20):
-        collection.add(frame, found, np.zeros(n))
+        collection.add(frame, found, np.zeros(n), np.zeros(n))
     assert collection.total == 20 * n
     assert len(collection.table()) <= MOST_KEPT

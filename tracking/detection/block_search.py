@@ -21,6 +21,8 @@ from tracking.noise import BLOCK
 
 BACKGROUND_REACH = 2  # blocks on each side that contribute to the median for the background
 
+_CLIPPED, _BRIGHT = 0.97, 0.7  # of the saturation: compressed pictures leave no flat top; least level beside it
+
 Sums = NDArray[np.float32]
 
 
@@ -212,12 +214,14 @@ def find_row_medians(blocks: Blocks, runs: Ints) -> None:
 
 
 @compiled
-def find_background(blocks: Blocks, runs: Ints) -> None:
+def find_background(blocks: Blocks, runs: Ints, saturation: float) -> None:
     """Compute BACKGROUND: the median of five ROW_MEDIANs.
 
-    Nearly as accurate as the median of all 25 blocks, and ten times as fast.
+    Nearly as accurate as the median of all 25 blocks, and ten times as fast. In a block that is clipped at
+    `saturation`, DN, it is the light of a wide spot if it is nearly as bright; then the lowest block counts.
     """
-    rows = blocks.maps.shape[1]
+    rows, columns = blocks.maps.shape[1:]
+    bright, clipped = np.float32(_BRIGHT * 64.0 * saturation), np.float32(_CLIPPED * 64.0 * saturation)
     for k in range(runs.shape[0]):
         row, first, last = runs[k, 0], runs[k, 1], runs[k, 2]
         a, b = (
@@ -227,8 +231,14 @@ def find_background(blocks: Blocks, runs: Ints) -> None:
         below, last_row = min(row + 1, rows - 1), min(row + 2, rows - 1)
         d, e = blocks.maps[ROW_MEDIAN, below, first:last], blocks.maps[ROW_MEDIAN, last_row, first:last]
         c, out = blocks.maps[ROW_MEDIAN, row, first:last], blocks.maps[BACKGROUND, row, first:last]
+        own = blocks.maps[SUMS, row, first:last]
         for j in range(out.shape[0]):
             out[j] = median5(a[j], b[j], c[j], d[j], e[j])
+        for j in range(out.shape[0]):
+            if own[j] >= clipped and out[j] >= bright:
+                for i in range(max(row - 2, 0), min(row + 3, rows)):
+                    for m in range(max(first + j - 2, 0), min(first + j + 3, columns)):
+                        out[j] = min(out[j], blocks.maps[SUMS, i, m])
 
 
 @compiled

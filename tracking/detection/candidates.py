@@ -61,6 +61,7 @@ class PeakSearch(NamedTuple):
 
     image: Pixels
     noise: Noise
+    saturation: float  # DN
     blocks: Blocks
     workspace: Sums  # see `block_workspace`
     scratch: Array  # (16,)

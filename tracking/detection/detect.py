@@ -190,7 +190,9 @@ class SpotFinder:
         )
         inner = self._runs[: runs_of(boxes, 0, 0, rows, columns, self._runs)]
         find_highest_between(task.image, inner, self._blocks.maps, self._blocks.lines[0])
-        search = PeakSearch(task.pixels, task.noise, self._blocks, self._workspace, self._scratch, self._peaks)
+        search = PeakSearch(
+            task.pixels, task.noise, task.limits.saturation, self._blocks, self._workspace, self._scratch, self._peaks
+        )
         threshold = task.limits.threshold_sigma
         return find_peaks_in(boxes, search, threshold, self._searched, self._bright_blocks, self._runs, 0)
 

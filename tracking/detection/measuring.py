@@ -55,6 +55,7 @@ from tracking.detection.table import (
     U,
     V,
 )
+from tracking.detection.table import LEVEL as FITTED_LEVEL
 
 # Least decrease of chi-square by a spot, relative to threshold^2. The maximum of noise over positions and shapes is
 # higher than at one position: with 1.0 a picture of 1280x1024 has 0.04 false points, with 1.1 fewer than 0.01.
@@ -75,6 +76,7 @@ _UNRESOLVED = 1.0  # px: of a wider fit the centre is known
 _BESIDE = 3.0  # sigmas: least light of such a spot outside its two brightest pixels, which may be hot
 _UNRESOLVED_GAIN = 2.0  # least decrease of its chi-square, relative to threshold^2: few pixels have longer tails
 _WITHIN_PIXEL = 0.03  # px: error of the centre if the held width is a tenth of a pixel wrong
+_IN_BACKGROUND = 6.0  # px: the background from the search, a median over 40 px, contains the light of a wider spot
 _NOTHING = 1e12  # px^2: variance of the start of a candidate that has been joined to another one; the fit leaves it out
 NARROW_PX = 1.0  # sigma: in wider spots the centre of a Gaussian does not depend on the place within a pixel
 _FARTHEST = 0.5  # px: from the Gaussian's centre to that of the fit with wings
@@ -295,7 +297,10 @@ def _is_spot(image: Pixels, spot: Array, noise: Noise, limits: DetectionLimits) 
     major, minor, _ = ellipse.axes(spot[UU], spot[UV], spot[VV])
     sigma_u, sigma_v = sqrt(max(spot[VAR_U], 0.0)), sqrt(max(spot[VAR_V], 0.0))
     amplitude = spot[FLUX] / (2 * pi * (major * minor + 1 / 12))
-    structure = limits.threshold_sigma * sqrt(texture_variance(noise, spot[BACKGROUND]))
+    level = spot[BACKGROUND]
+    if major > _IN_BACKGROUND:
+        level = min(level, max(spot[FITTED_LEVEL], 0.5 * level))
+    structure = limits.threshold_sigma * sqrt(texture_variance(noise, level))
     needed = _SPOT_GAIN * limits.threshold_sigma**2 * max(spot[CHI2] / _CHI2, 1.0)
     # Texture around a faint spot is not a misfit of the spot if that is clearly higher than the grains.
     clear = amplitude > _ABOVE_GRAINS * structure and spot[GAIN] > _CLEAR_GAIN * needed

@@ -1,4 +1,4 @@
-"""What the light around a peak is like before any fit: how much of it is round; its moments under a Gaussian window.
+"""What the light around a peak is like before any fit: whether it stands out, is sharp, or round; its moments.
 
 The moments are a first centre and size of each candidate, and the result for bright compact spots that are not
 Gaussian: saturated cores with rings, spots at an edge of the screen. `compact_height` recognises these.
@@ -13,6 +13,7 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
+from tracking.detection.candidates import AT_U, AT_V, CONTRAST, HEIGHT, LEVEL
 from tracking.detection.ellipse import gaussian_window
 from tracking.detection.pixels import (
     OUTSIDE,
@@ -20,12 +21,16 @@ from tracking.detection.pixels import (
     Pixels,
     Window,
     insertion_sort,
+    maximum_of,
+    mean3,
+    nth_smallest,
     pixel,
     read_window,
     texture_variance,
     total_of_products,
     variance,
     window_around,
+    with_texture,
 )  # fmt: skip
 from tracking.detection.table import (
     BACKGROUND,
@@ -74,6 +79,109 @@ _CLOSE_PLANE, _CLOSE_ROUND = _round_shapes(_CLOSE)  # for spots with others arou
 
 # Share of the texture's sigma in it: the light falls off in all directions, which most grains of texture do not.
 _OF_TEXTURE = 0.7
+
+PEAK_SHARE = 0.75  # share of the threshold above which a peak is measured
+# Radii, px, of the circles on which the light of a line continues, and the numbers of points on them.
+_CIRCLES, _RING = (4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0), (12, 20, 28, 36, 52, 72, 108)
+_TURNS = [np.exp(2j * np.pi * np.arange(n) / n) for n in _RING]
+_ON_CIRCLES = np.concatenate([r * turn for r, turn in zip(_CIRCLES, _TURNS, strict=True)])
+_POINTS = np.rint(np.column_stack([_ON_CIRCLES.real, _ON_CIRCLES.imag])).astype(np.int64)  # (sum of _RING, 2), px
+_HIGHEST = (1.6, 1.9, 2.0, 2.1, 2.2, 2.4, 2.5)  # expected highest of as many normal deviates, in sigmas
+# The first circle outside a spot that is wide enough to raise the background from the search, and by this ratio.
+_OUTSIDE_WIDE, _RAISED = 5, 0.8
+# Of the texture around: an even place among objects has less than this on a circle, homogeneous texture never.
+_EVEN = 1 / 3
+_SHARP_CIRCLES = 4  # of them, for what is about two pixels wide
+_CLEARLY_HIGH = 2.0  # times the threshold by the texture: for such a peak it does not matter how even its place is
+_LEAST_ON_RING = 3
+_ON_RING = 1.0  # sigmas of a pixel: three of the means
+MOST_ON_RING = _RING[-1]
+
+
+@compiled
+def stands_out(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float, ring: Array) -> bool:
+    """Whether a peak is far higher than the light on a circle around it; lowers CONTRAST in an even place.
+
+    On each circle around a part of an edge, a cable or another long line some light continues; fits of candidates on
+    lines would grow over large windows and take most of the time. A spot, also a streak, is brighter than all light on
+    a circle that is large enough. The structure of the background at a place is that on the second most even of such
+    circles: what stands farther away does not matter. ring (MOST_ON_RING,) is workspace. Source: ours.
+    """
+    here, column, row = peak[HEIGHT] + peak[LEVEL], int(peak[AT_U]), int(peak[AT_V])
+    sigma, alone, lowest, second = sqrt(variance(noise, peak[LEVEL])), False, np.inf, np.inf
+    level = peak[LEVEL]  # without the light of a wide spot, which is in the background from the search
+    structure = sqrt(texture_variance(with_texture(noise, peak[CONTRAST]), peak[LEVEL]))
+    high = peak[HEIGHT] >= _CLEARLY_HIGH * threshold_sigma * structure
+    first = 0
+    for k in range(len(_CIRCLES)):
+        n = 0  # points inside the picture
+        for i in range(first, first + _RING[k]):
+            u, v = column + _POINTS[i, 0], row + _POINTS[i, 1]
+            if 0 < u < image.width - 1 and 0 < v < image.height - 1:
+                ring[n] = mean3(image, u, v)
+                n += 1
+        first += _RING[k]
+        if n < _LEAST_ON_RING:
+            alone = True
+            break
+        around, highest = nth_smallest(ring, n, n // 2), maximum_of(ring[:n])
+        if highest - around < 0.5 * (here - around) + _ON_RING * sigma:
+            if high:
+                return True
+            alone, scatter = True, (highest - around) / _HIGHEST[k]
+            if k >= _OUTSIDE_WIDE and around < _RAISED * level:
+                level = min(level, around)
+            lowest, second = min(lowest, scatter), min(second, max(lowest, scatter))
+    if second < _EVEN * peak[CONTRAST] * peak[LEVEL]:
+        peak[CONTRAST] = second / max(peak[LEVEL], 1.0)
+    structure = sqrt(texture_variance(with_texture(noise, peak[CONTRAST]), level))
+    return alone and here - level >= PEAK_SHARE * threshold_sigma * structure
+
+
+@compiled
+def is_sharp(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float) -> bool:
+    """Whether a peak is far sharper than the structure around it; if so, CONTRAST is that of sharp structure.
+
+    Edges and objects have a high contrast in means of 3x3 pixels, of which a narrow spot fills only a part, but little
+    light that exceeds all neighbours. The second lowest of the maxima on circles counts, as in `stands_out`.
+    """
+    column, row, best = int(peak[AT_U]), int(peak[AT_V]), 0.0
+    for i in range(row - 1, row + 1):
+        for j in range(column - 1, column + 1):
+            best = max(best, _sharpness(image, j, i))
+    # Speckle is on the light of a wider spot.
+    if best < max(threshold_sigma * sqrt(variance(noise, peak[LEVEL]) / 3.0), peak[HEIGHT]):
+        return False
+    lowest, second = np.inf, np.inf
+    first = 0
+    for k in range(_SHARP_CIRCLES):
+        highest = 0.0
+        for i in range(first, first + _RING[k]):
+            highest = max(highest, _sharpness(image, column + _POINTS[i, 0], row + _POINTS[i, 1]))
+        first += _RING[k]
+        scatter = highest / _HIGHEST[k]
+        lowest, second = min(lowest, scatter), min(second, max(lowest, scatter))
+    contrast = second / max(peak[LEVEL], 1.0)
+    if contrast > _EVEN * peak[CONTRAST]:  # the texture is as fine as the peak
+        return False
+    if best < threshold_sigma * sqrt(texture_variance(with_texture(noise, contrast), peak[LEVEL])):
+        return False
+    peak[CONTRAST] = contrast
+    return True
+
+
+@compiled
+def _sharpness(image: Pixels, u: int, v: int) -> float:
+    """The mean of the 2x2 pixels from (u, v) on less that of the twelve around them, DN; 0 at the picture's border."""
+    if not (1 <= u < image.width - 2 and 1 <= v < image.height - 2):
+        return 0.0
+    inner, whole = 0.0, 0.0
+    for i in range(-1, 3):
+        for j in range(-1, 3):
+            x = pixel(image, u + j, v + i)
+            whole += x
+            inner += x if 0 <= i <= 1 and 0 <= j <= 1 else 0.0
+    return inner / 4.0 - (whole - inner) / 12.0
 
 
 @compiled

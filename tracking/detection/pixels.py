@@ -161,7 +161,7 @@ def _read_cells(
 # Share of the threshold that applies to the sigma of the texture, which has far fewer independent places than pixels.
 TEXTURE_SHARE = 5.0 / 6.0
 # Largest contrast of the texture in the search: an even place may lie between objects that have more. The peaks found
-# are then compared with the light on circles around them (search._stands_out).
+# are then compared with the light on circles around them (moments.stands_out).
 SEARCHED_TEXTURE = 0.045
 _FINER = 9.0 / 4.0  # ratio of the variances of means of 2x2 and 3x3 pixels of a texture finer than a pixel
 

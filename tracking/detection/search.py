@@ -23,7 +23,6 @@ from tracking.detection.block_search import (
 from tracking.detection.candidates import (
     AT_U,
     AT_V,
-    CONTRAST,
     HEIGHT,
     LEVEL,
     SCALE,
@@ -31,26 +30,23 @@ from tracking.detection.candidates import (
     PeakSearch,
     find_peaks,
 )
-from tracking.detection.moments import is_round
+from tracking.detection.moments import MOST_ON_RING, PEAK_SHARE, is_round, is_sharp, stands_out
 from tracking.detection.pixels import (
     Noise,
     Pixels,
     clamped,
     insert_nearest,
     insertion_sort,
-    maximum_of,
     mean3,
-    nth_smallest,
     pixel,
-    texture_variance,
     variance,
-    with_texture,
 )
 
 BORDER_BLOCKS = 2  # blocks around a box that its search needs
 RADIUS = 48  # px: peaks farther apart than this are never parts of one spot of the largest size
 MAX_COMPARED = 4  # number of brighter peaks that a peak is compared with
 DIP = 0.12  # share of the fainter peak by which the light must fall between two spots: the top of a spot falls by less
+_HIGHER = 0.4  # share of the light of a square by which it exceeds that around a peak that is no part of the same spot
 HALO_SHARE = 0.012  # ... and of the brighter peak: rings and halos of real beams have up to 0.009
 # Half sides, px, of the squares that are tried for the scale of a light, each with the one of half its size.
 _HALF_SIDES, _HALVED = (3, 4, 6, 8, 12, 16, 24), (2, 2, 3, 4, 6, 8, 12)
@@ -63,20 +59,9 @@ _OUTLIER, _LEAST_BESIDE = 4.0, 0.2
 _FIRST_SURROUNDINGS = 40  # px: distance of the background from a peak; of a wide one ...
 _SURROUNDINGS = 4  # ... this many half sides, 3.3 sigmas
 _LEVEL_HALF_SIDE = 4  # px: half side of the squares of the background
-# Radii, px, of the circles on which the light of a line continues, and the numbers of points on them.
-_CIRCLES, _RING = (4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0), (12, 20, 28, 36, 52, 72, 108)
-_TURNS = [np.exp(2j * np.pi * np.arange(n) / n) for n in _RING]
-_ON_CIRCLES = np.concatenate([r * turn for r, turn in zip(_CIRCLES, _TURNS, strict=True)])
-_POINTS = np.rint(np.column_stack([_ON_CIRCLES.real, _ON_CIRCLES.imag])).astype(np.int64)  # (sum of _RING, 2), px
-_HIGHEST = (1.6, 1.9, 2.0, 2.1, 2.2, 2.4, 2.5)  # expected highest of as many normal deviates, in sigmas
-# Of the texture around: an even place among objects has less than this on a circle, homogeneous texture never.
-_EVEN = 1 / 3
-_CLEARLY_HIGH = 2.0  # times the threshold by the texture: for such a peak it does not matter how even its place is
-_LEAST_ON_RING = 3
-_ON_RING = 1.0  # sigmas of a pixel: three of the means
 _NARROW = 2.5  # half side, px, below which means of 3x3 pixels are compared
 _ROUND = 0.35  # least share of the light around a peak that a round Gaussian explains: others cost the most to fit
-BLOCK_SHARE, PEAK_SHARE = 0.63, 0.75  # shares of the threshold above which a block is searched and a peak is measured
+BLOCK_SHARE = 0.63  # share of the threshold above which a block is searched
 
 
 @compiled_for_threads
@@ -102,7 +87,7 @@ def find_peaks_in(
     find_highest_quads(blocks, runs[: runs_of(boxes, 1, 1, rows, columns, runs)])
     find_row_medians(blocks, runs[: runs_of(boxes, BACKGROUND_REACH, 0, rows, columns, runs)])
     inner = runs[: runs_of(boxes, 0, 0, rows, columns, runs)]
-    find_background(blocks, inner)
+    find_background(blocks, inner, search.saturation)
     find_highest_pairs(blocks, inner)
     least, measured = BLOCK_SHARE * threshold_sigma, PEAK_SHARE * threshold_sigma
     n = find_bright_blocks(blocks, inner, search.noise, least, measured, searched, found)
@@ -123,7 +108,7 @@ def find_separate_peaks(
     means of squares as large as the light around the peak must fall as well. A wide faint peak must have no other peak
     within 16 px. Fills SCALE of the separate peaks. `near`, `gaps` (MAX_COMPARED,) are workspace. Source: ours.
     """
-    count, border, ring = 0, np.zeros(8), np.zeros(_RING[-1])
+    count, border, ring = 0, np.zeros(8), np.zeros(MOST_ON_RING)
     for place in range(order.shape[0]):
         i = order[place]
         if not wanted[i]:
@@ -137,10 +122,11 @@ def find_separate_peaks(
                 lowest = _lowest_between(image, peaks, i, near[k], 1) - peaks[i, LEVEL]
                 least = max(needed, HALO_SHARE * peaks[near[k], HEIGHT])
                 alone = alone and peaks[i, HEIGHT] - lowest >= least
-            alone = alone and _stands_out(image, peaks[i], noise, threshold_sigma, ring)
-            alone = alone and is_round(
-                image, int(peaks[i, AT_U]), int(peaks[i, AT_V]), variance(noise, peaks[i, LEVEL]), _ROUND
-            )
+            if alone and stands_out(image, peaks[i], noise, threshold_sigma, ring):
+                sigma2 = variance(noise, peaks[i, LEVEL])
+                alone = is_round(image, int(peaks[i, AT_U]), int(peaks[i, AT_V]), sigma2, _ROUND)
+            elif alone:
+                alone = is_sharp(image, peaks[i], noise, threshold_sigma)
             if alone:
                 level = _find_scale(image, peaks[i], border)
                 for k in range(_nearest(peaks, i, separate, count, near, gaps)):
@@ -152,6 +138,8 @@ def find_separate_peaks(
                     j = near[k]
                     here = _mean_of_square(image, peaks[i, AT_U], peaks[i, AT_V], half)
                     there = _mean_of_square(image, peaks[j, AT_U], peaks[j, AT_V], half)
+                    if here - there > _HIGHER * (here - level):
+                        continue  # the other one is part of a brighter background
                     height = min(here, there) - level
                     lowest = _lowest_between(image, peaks, i, j, half) - level
                     alone = height - lowest >= DIP * height
@@ -159,43 +147,6 @@ def find_separate_peaks(
             separate[count] = i
             count += 1
     return count
-
-
-@compiled
-def _stands_out(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float, ring: Array) -> bool:
-    """Whether a peak is far higher than the light on a circle around it; lowers CONTRAST in an even place.
-
-    On each circle around a part of an edge, a cable or another long line some light continues; fits of candidates on
-    lines would grow over large windows and take most of the time. A spot, also a streak, is brighter than all light on
-    a circle that is large enough. The structure of the background at a place is that on the second most even of such
-    circles: what stands farther away does not matter. ring (_RING[-1],) is workspace. Source: ours.
-    """
-    here, column, row = peak[HEIGHT] + peak[LEVEL], int(peak[AT_U]), int(peak[AT_V])
-    sigma, alone, lowest, second = sqrt(variance(noise, peak[LEVEL])), False, np.inf, np.inf
-    structure = sqrt(texture_variance(with_texture(noise, peak[CONTRAST]), peak[LEVEL]))
-    high = peak[HEIGHT] >= _CLEARLY_HIGH * threshold_sigma * structure
-    first = 0
-    for k in range(len(_CIRCLES)):
-        n = 0  # points inside the picture
-        for i in range(first, first + _RING[k]):
-            u, v = column + _POINTS[i, 0], row + _POINTS[i, 1]
-            if 0 < u < image.width - 1 and 0 < v < image.height - 1:
-                ring[n] = mean3(image, u, v)
-                n += 1
-        first += _RING[k]
-        if n < _LEAST_ON_RING:
-            alone = True
-            break
-        around, highest = nth_smallest(ring, n, n // 2), maximum_of(ring[:n])
-        if highest - around < 0.5 * (here - around) + _ON_RING * sigma:
-            if high:
-                return True
-            alone, scatter = True, (highest - around) / _HIGHEST[k]
-            lowest, second = min(lowest, scatter), min(second, max(lowest, scatter))
-    if second < _EVEN * peak[CONTRAST] * peak[LEVEL]:
-        peak[CONTRAST] = second / max(peak[LEVEL], 1.0)
-        structure = sqrt(texture_variance(with_texture(noise, peak[CONTRAST]), peak[LEVEL]))
-    return alone and peak[HEIGHT] >= PEAK_SHARE * threshold_sigma * structure
 
 
 @compiled

@@ -11,6 +11,7 @@ from tests.tracking.rendering import Scene, Spot, expected
 from tracking.detection.detect import SpotFinder, _Task, find_spots
 from tracking.detection.regions import EVERYWHERE
 from tracking.noise import NoiseModel, Picture
+from tracking.noise_estimation.photon_transfer import estimate_noise
 from tracking.parameters import DetectParameters
 
 SIZE = (480, 360)  # width, height
@@ -55,3 +56,40 @@ def test_few_candidates_on_lines_are_measured():
     assert peaks > 150
     assert finder._count < 0.1 * peaks
     assert len(find_spots(picture, noise=NOISE)) <= 4  # corners and ends
+
+
+def board(light: Array, seed: int) -> Picture:
+    """A chessboard of 40 px squares of 10 and 40 grey values, turned by 5 degrees, with more light on it."""
+    v, u = np.mgrid[: SIZE[1], : SIZE[0]] * 1.0
+    across, down = u * np.cos(0.09) + v * np.sin(0.09), v * np.cos(0.09) - u * np.sin(0.09)
+    squares = np.where((np.floor(across / 40) + np.floor(down / 40)) % 2 > 0, 40.0, 10.0)
+    mean = cv2.GaussianBlur(squares, (0, 0), 0.8) + light
+    noisy = mean + np.random.default_rng(seed).normal(0.0, 1.0, mean.shape)
+    return np.rint(noisy).clip(0, 255).astype("u1")
+
+
+def points_on_board(light: Array, seed: int) -> Array:
+    """(n, 2) px, as the command finds them: with the noise of this picture."""
+    picture = board(light, seed)
+    return find_spots(picture, noise=estimate_noise([picture]).model).uv_px
+
+
+def test_a_narrow_spot_beside_the_edges_and_corners_of_a_board_is_found():
+    """In means of 3x3 pixels it is as high as the squares, whose contrast counts as texture there."""
+    found, drawn = 0, 0
+    for seed in range(4):
+        places = np.random.default_rng(seed).uniform(40.0, (440.0, 320.0), (6, 2))
+        light = expected(Scene([Spot(u, v, 160.0, 0.55, 0.55) for u, v in places], SIZE, 0.0))
+        gap = np.linalg.norm(points_on_board(light, seed)[:, None] - places, axis=-1)
+        found, drawn = found + int(np.sum(gap.min(axis=0) < 0.5)), drawn + len(places)
+    assert found >= 0.9 * drawn
+
+
+@pytest.mark.parametrize("core", [10.0, 18.0, 22.0])
+def test_a_clipped_light_as_wide_as_the_squares_of_a_board_is_found(core):
+    """Its own light is most of what surrounds it within 40 px."""
+    v, u = np.mgrid[: SIZE[1], : SIZE[0]] * 1.0
+    for seed, (u0, v0) in enumerate([(200.3, 150.8), (260.0, 190.2)]):
+        light = 250.0 * np.exp(-0.5 * np.maximum(np.hypot(u - u0, v - v0) - core, 0.0) ** 2 / 3.0**2)
+        gap = np.linalg.norm(points_on_board(light, seed) - (u0, v0), axis=-1)
+        assert gap.min(initial=np.inf) < 0.1 * core
