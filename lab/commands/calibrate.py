@@ -6,8 +6,16 @@ from pathlib import Path
 
 import click
 
-from lab.commands import completion
-from lab.commands.common import ANY_PATH, FOLDER, Commands, NumberRange, conclude, progress_bar, show_line
+from lab.commands.common import (
+    ANY_PATH,
+    FOLDER,
+    Commands,
+    NumberRange,
+    complete_rigs,
+    conclude,
+    progress_bar,
+    show_line,
+)
 
 
 @click.group(cls=Commands)
@@ -205,7 +213,7 @@ def convert(source: Path, destination: Path, origin: str | None, target: str | N
     "--rig",
     default="fan",
     show_default=True,
-    shell_complete=completion.rigs,
+    shell_complete=complete_rigs,
     help="A rig.yaml as designed, or fan, unequal-fan, two-cameras-per-screen, four-skew-beams.",
 )
 @click.option(

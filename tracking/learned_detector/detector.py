@@ -1,7 +1,8 @@
 """Drogues found by a small fully convolutional network on an image pyramid, run by `cv2.dnn`.
 
-The network was trained by lab/learned_detector/train.py on rendered drogues; no deep-learning library is needed to run
-it. Per cell of STRIDE pixels it gives the logit of a centre, the offset of the centre and the log of the diameter.
+The network was trained by studies/learned_detector/train.py on rendered drogues; no deep-learning library is needed to
+run it. Per cell of STRIDE pixels it gives the logit of a centre, the offset of the centre and the log of the
+diameter.
 Source: after Zhou (2020), section 1, whose network has 42 layers; ours has eleven.
 """
 
@@ -53,9 +54,7 @@ def _network(weights: Path) -> cv2.dnn.Net:
     try:
         return cv2.dnn.readNetFromONNX(str(weights))
     except cv2.error as error:
-        remedy = (
-            "install beampose again" if weights == WEIGHTS else "expected a file that lab.learned_detector.train made"
-        )
+        remedy = "install beampose again" if weights == WEIGHTS else "expected a file of studies.learned_detector.train"
         raise ValueError(f"{weights}: the weights of the learned detector are damaged: {remedy}") from error
 
 
@@ -69,7 +68,7 @@ def find_drogues(
     """Drogues of a picture (h, w), the most confident first.
 
     smallest_px, largest_px: range of the diameters; None: up to the picture's smaller side. 16-bit pictures are scaled
-    by their largest value. weights: of another network of lab/learned_detector/networks.py, whose confidence
+    by their largest value. weights: of another network of studies/learned_detector/train.py, whose confidence
     is an order and no probability; None: those of the package.
 
     Raises:

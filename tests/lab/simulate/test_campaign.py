@@ -14,8 +14,7 @@ from lab.files.project.point_files import read_observations, read_poses, read_su
 from lab.files.project.project import load_project
 from lab.files.rig.rig_file import load_rig
 from lab.files.text.csv_text import read_table
-from lab.init.files import start
-from lab.init.layout import Layout
+from lab.setup.init import Layout, start
 from lab.simulate.calibration_campaign import CampaignQuality, draw_campaign, lens_covariance
 from lab.simulate.campaign_files import simulate_calibration
 from lab.simulate.rigs import RIGS

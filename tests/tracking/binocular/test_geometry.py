@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from geometry.arrays import numeric_jacobian
 from geometry.rotations import ypr_from_matrix
 from geometry.uncertainty.rig_parameters import RigCovariance
-from lab.binocular.distance_experiment import pose_errors
-from lab.binocular.zhou2020 import PRINTED_ROTATION
+from studies.zhou2020 import PRINTED_ROTATION, pose_errors
 from tests.tracking.binocular.scenes import MODEL, NOISE_PX, PAIR, pose_at
 from tracking.binocular.first_fit import first_fit
 from tracking.binocular.horn import pose_of_points, quaternion_matrix

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from geometry.pose import Pose
-from lab.binocular.distance_experiment import random_pose
+from studies.zhou2020 import random_pose
 from tests.tracking.binocular.scenes import MODEL, PAIR, images, pose_at
 from tracking.binocular.acquisition import matching_pairs, mirrored
 from tracking.binocular.clock_offset import FittedFrame, clock_offset

@@ -9,7 +9,7 @@ import pytest
 
 from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose
-from lab.unscented.tanker_pictures import CLEAR, GUST, MARKERS, Difficulty, marker_model, pose_of, render
+from studies.fu2016_experiments import CLEAR, GUST, MARKERS, Difficulty, marker_model, pose_of, render
 from tracking.corner_markers.harris import harris_corners, harris_response
 from tracking.corner_markers.matching import MatchParameters, match_markers
 from tracking.detections import UNMATCHED

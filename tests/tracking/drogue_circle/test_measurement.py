@@ -104,7 +104,7 @@ def test_circles_about_one_centre_are_one_target():
 
 @pytest.mark.slow
 def test_the_covariance_is_that_of_the_errors():
-    from lab.drogue_circle.experiment import still_errors
+    from studies.zhou2014 import still_errors
 
     errors = still_errors(77, 150)
     for hidden in (0.0, 0.2, 0.4):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bench.related_measurements.learned_detector import calibration, is_right, recall_at, reliability
-from lab.learned_detector.samples import draw_sample
+from studies.learned_detector.samples import draw_sample
 from tracking.drogue_circle.candidates import Window
 from tracking.learned_detector import detector, pyramid
 from tracking.learned_detector.detector import DrogueCandidate, find_drogues, learned_detector
