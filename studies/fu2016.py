@@ -8,9 +8,8 @@ import numpy as np
 
 from geometry.arrays import Array
 from lab.number_format import format_number
-from lab.report.plot.scales import robust_range
+from lab.report.plot.axes import BLUE, GREEN, ORANGE, VERMILLION, robust_range
 from lab.report.plot.series import Line, Shade, time_panel
-from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION
 from studies.comparison import Comparison, ComparisonRow, Figure
 from studies.fu2016_experiments import (
     DISTURBANCES,
@@ -26,9 +25,8 @@ from studies.fu2016_experiments import (
     run_pictures,
     simulate,
 )
-from tracking.unscented.fu2016 import P0, STATES, R, bearings, process, selection
-from tracking.unscented.observability import Observability, observability
-from tracking.unscented.sigma_points import Function
+from tracking.unscented.fu2016 import P0, STATES, Observability, R, bearings, observability, process, selection
+from tracking.unscented.ukf import Function
 
 RECORDINGS = 20
 COLOURS = {"standard": BLUE, "as printed": ORANGE, "gate": GREEN, "Student-t": VERMILLION}

@@ -20,15 +20,13 @@ from geometry.camera import Camera
 from geometry.pose import Pose
 from geometry.pose_solver.marker_model import MarkerModel
 from geometry.rotations import ypr_jacobian
+from lab.report.plot.axes import ORANGE, VERMILLION, picture_uri
 from lab.report.plot.series import Line, Shade, time_panel
-from lab.report.plot.svg import ORANGE, VERMILLION, picture_uri
 from studies.comparison import ComparisonRow, Figure
-from tracking.corner_markers.harris import harris_corners
-from tracking.corner_markers.matching import MarkerMatch, MatchParameters, match_markers
+from tracking.corner_markers.matching import MarkerMatch, MatchParameters, harris_corners, match_markers
 from tracking.detections import UNMATCHED
 from tracking.unscented.fu2016 import P0, SPREAD, X0, PrintedFilter, Q, R, process, selection
-from tracking.unscented.robust import gated_update, student_t_update
-from tracking.unscented.ukf import Updated, predict, update
+from tracking.unscented.ukf import Updated, gated_update, predict, student_t_update, update
 
 DT_S, STEPS = 0.1, 201
 FROM_S, TO_S = 6.0, 8.0  # the disturbance

@@ -10,16 +10,27 @@ from geometry.arrays import Array, Bools
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import fit_pose
-from lab.report.plot.axes import axes, plot_area, svg_of
-from lab.report.plot.scales import robust_range
+from lab.report.plot.axes import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    axes,
+    line_path,
+    plot_area,
+    robust_range,
+    svg_of,
+    text,
+)
 from lab.report.plot.series import Line, Shade, time_panel
-from lab.report.plot.svg import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION, line_path, text
 from lab.simulate.points import PointRun, simulate_points
 from studies.comparison import Comparison, ComparisonRow, Figure
 from tracking.curve_switching import kalman
-from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
+from tracking.curve_switching.pose_filter import CoplanarViews, quadratic_positions
 from tracking.curve_switching.spot_tracker import SpotTracker
-from tracking.curve_switching.tracks import BENT_NIS
+from tracking.curve_switching.vehicle import BENT_NIS
 from tracking.labelling.first_labels import NO_POINT
 from tracking.parameters import TrackerParameters
 from tracking.statuses import SpotStatus

@@ -11,18 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array
-from lab.report.plot.axes import axes, frame, plot_area, svg_of
+from lab.report.plot.axes import BLUE, GREEN, VERMILLION, axes, frame, line_path, plot_area, svg_of, text
 from lab.report.plot.series import Line, Shade, time_panel
-from lab.report.plot.svg import BLUE, GREEN, VERMILLION, line_path, text
 from lab.targets.circle import CircleOptions
 from studies.comparison import Comparison, ComparisonRow, Figure
 from studies.zhou2014_lights import PAPER_PERCENT, LightResult, followed
 from tracking.drogue_circle.candidates import CircleCandidate, Picture, Window
-from tracking.drogue_circle.classical import classical_detector
+from tracking.drogue_circle.detectors import classical_detector
 from tracking.drogue_circle.parameters import CircleParameters
 from tracking.drogue_circle.printed import printed_measurement
-from tracking.drogue_circle.rim import smooth_crop
-from tracking.drogue_circle.rim_fit import RimFit, fit_rim
+from tracking.drogue_circle.rim_fit import RimFit, fit_rim, smooth_crop
 
 SIZE = (240, 200)  # width, height, px
 _SAMPLES = 4  # per pixel and axis

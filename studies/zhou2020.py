@@ -19,18 +19,29 @@ from geometry.arrays import Array, Ints
 from geometry.camera import in_picture
 from geometry.pose import Pose
 from geometry.rotations import ypr_from_matrix
-from lab.report.plot.axes import axes, frame, note, plot_area, svg_of
-from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION, dots, line_path, text
+from lab.report.plot.axes import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    VERMILLION,
+    axes,
+    dots,
+    frame,
+    line_path,
+    note,
+    plot_area,
+    svg_of,
+    text,
+)
 from lab.targets.stereo.simulated_recording import drogue_markers, occluded, render, scene, simulated_pair, true_pixels
 from studies.comparison import Comparison, ComparisonRow, Figure
 from studies.learned_detector.samples import draw_sample
 from tracking.binocular.first_fit import first_fit
-from tracking.binocular.horn import pose_of_points
 from tracking.binocular.joint_fit import MarkerObservations, bound
 from tracking.binocular.marker_model import StereoPair, project, project_markers
 from tracking.binocular.parameters import SegmentationParameters
 from tracking.binocular.segmentation import ColourRange, marker_candidates, prepared
-from tracking.binocular.triangulation import linear_points, triangulate, undistorted_pixels
+from tracking.binocular.triangulation import linear_points, pose_of_points, triangulate, undistorted_pixels
 from tracking.learned_detector.detector import find_drogues
 
 FOCAL_PX, SIZE_PX, BASELINE_M = 939.0, (1920, 1080), 0.5

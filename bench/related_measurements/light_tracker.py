@@ -26,8 +26,7 @@ from bench.related_measurements.learned_detector import reliability
 from geometry.arrays import Array, Bools
 from studies.drogue.sequences import SequenceFrame, moving_drogue
 from tracking.learned_detector.detector import find_drogues, learned_detector
-from tracking.light_tracker.confidence import FEATURES, RIGHT_SHARE, SIGNS
-from tracking.light_tracker.parameters import LightParameters
+from tracking.light_tracker.frames import FEATURES, RIGHT_SHARE, SIGNS, LightParameters
 from tracking.light_tracker.tracker import DrogueTracker
 from tracking.statuses import PoseStatus
 

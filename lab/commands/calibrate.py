@@ -230,7 +230,7 @@ def simulate_campaign(out: Path, rig: str, seed: int, positions: int, photos: bo
     Example:
         beampose calibrate simulate --out campaign
     """
-    from lab.simulate.campaign_files import simulate_calibration
+    from lab.simulate.campaign import simulate_calibration
 
     folder = simulate_calibration(out, seed=seed, rig=rig, positions=positions, photos=photos)
     show_line(f"project: {folder / 'calibration.yaml'}")

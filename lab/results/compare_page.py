@@ -15,10 +15,24 @@ from lab.files.text.json_text import write_json
 from lab.number_format import format_number, format_percent, format_with_sigma
 from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section, section_context
 from lab.report.html import environment
-from lab.report.plot.axes import frame, note, plot_area, svg_of, x_ticks, y_ticks
-from lab.report.plot.scales import robust_range
+from lab.report.plot.axes import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    dots,
+    frame,
+    line_path,
+    note,
+    plot_area,
+    robust_range,
+    segments,
+    svg_of,
+    text,
+    vertical_text,
+    x_ticks,
+    y_ticks,
+)
 from lab.report.plot.series import Band, Line, Shade, time_panel
-from lab.report.plot.svg import BLUE, GREEN, ORANGE, dots, line_path, segments, text, vertical_text
 from lab.results.compare import (
     AxisStatistic,
     Comparison,

@@ -26,10 +26,8 @@ from lab.report.calibration.calibration_page import (
     write_calibration_report,
 )
 from lab.report.calibration.calibration_scene import rig_things, scene_views
-from lab.report.plot import svg
-from lab.report.plot.colour_map import colours, hex_colour
-from lab.report.plot.maps import heat_map
-from lab.report.plot.scales import number
+from lab.report.plot.axes import BLUE, number, text
+from lab.report.plot.maps import colours, heat_map, hex_colour
 from lab.setup.plan_findings import (
     CORRELATION,
     TOTAL_CALIBRATION,
@@ -70,7 +68,7 @@ def cell_map(
     else:
         share = (values - lo) / (hi - lo) if hi > lo else np.zeros_like(values)
     share = 0.12 + 0.76 * (1 - share if low_is_bad and hi > lo else share)  # avoids the ends of the colour scale
-    out = [svg.text(_LEFT, 15, title, "title")]
+    out = [text(_LEFT, 15, title, "title")]
     for j in range(rows):
         top = _TOP + (rows - 1 - j) * high
         for i in range(columns):
@@ -79,23 +77,22 @@ def cell_map(
             value = float(values[j, i])
             middle = (left + wide / 2, top + high / 2 + 3.5)
             if not np.isfinite(value):
-                out.append(f'<rect {box} fill="none" stroke="var(--line)"/>{svg.text(*middle, "×", "mid")}')
+                out.append(f'<rect {box} fill="none" stroke="var(--line)"/>{text(*middle, "×", "mid")}')
                 continue
             fill = hex_colour(colours(np.array(share[j, i])))
             out.append(f'<rect {box} fill="{fill}" stroke="var(--line)" stroke-width="0.5"/>')
             if columns <= _MAX_LABELLED_COLUMNS:
                 ink = "#fff" if share[j, i] > 0.5 else "#1c2126"
-                out.append(svg.text(*middle, _cell(value), "mid", f"fill:{ink}"))
+                out.append(text(*middle, _cell(value), "mid", f"fill:{ink}"))
     bottom = _TOP + _HIGH
     out += [
-        svg.text(_LEFT + (i + 0.5) * wide, bottom + 14, _plain(x[i]), "mid")
-        for i in range(0, columns, -(-columns // 12))
+        text(_LEFT + (i + 0.5) * wide, bottom + 14, _plain(x[i]), "mid") for i in range(0, columns, -(-columns // 12))
     ]
     out += [
-        svg.text(_LEFT - 6, _TOP + (rows - 0.5 - j) * high + 3.5, _plain(y[j]), "end")
+        text(_LEFT - 6, _TOP + (rows - 0.5 - j) * high + 3.5, _plain(y[j]), "end")
         for j in range(0, rows, -(-rows // 12))
     ]
-    out.append(svg.text(_LEFT + _WIDE / 2, bottom + 30, x_name, "mid"))
+    out.append(text(_LEFT + _WIDE / 2, bottom + 30, x_name, "mid"))
     turned = f'transform="translate(12 {_TOP + _HIGH / 2:.1f}) rotate(-90)"'
     out.append(f'<text x="0" y="0" class="mid" {turned}>{escape(y_name)}</text>')
     return _svg(out, title, bottom + 38)
@@ -104,15 +101,15 @@ def cell_map(
 def share_bars(parts: Sequence[tuple[str, float]], title: str) -> str:
     """Named shares (fractions; negative ones are drawn paler) as bars, in the given order."""
     left, wide, step = 132.0, 330.0, 22.0
-    out = [svg.text(8, 14, title, "title")]
+    out = [text(8, 14, title, "title")]
     scale = wide / max(max((abs(s) for _, s in parts), default=1.0), 1e-9)
     for k, (name, share) in enumerate(parts):
         y = 26 + step * k
         size = max(abs(share) * scale, 0.5)
         pale = ' opacity="0.4"' if share < 0 else ""
-        out.append(svg.text(left - 8, y + 11, name, "end"))
-        out.append(f'<rect x="{left}" y="{y}" width="{size:.1f}" height="14" fill="{svg.BLUE}"{pale}/>')
-        out.append(svg.text(left + size + 6, y + 11, format_percent(share)))
+        out.append(text(left - 8, y + 11, name, "end"))
+        out.append(f'<rect x="{left}" y="{y}" width="{size:.1f}" height="14" fill="{BLUE}"{pale}/>')
+        out.append(text(left + size + 6, y + 11, format_percent(share)))
     return _svg(out, title, 30 + step * len(parts))
 
 

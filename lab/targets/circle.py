@@ -19,8 +19,8 @@ from lab.files.text.csv_text import write_table
 from lab.files.text.json_text import write_json
 from lab.number_format import format_number, format_percent
 from lab.report.calibration.calibration_page import PageDrawing, Section
+from lab.report.plot.axes import BLUE, SKY, VERMILLION
 from lab.report.plot.series import Band, Line, time_panel
-from lab.report.plot.svg import BLUE, SKY, VERMILLION
 from lab.targets.page import Words, path_section, status_shades, write_target_page
 from lab.targets.series import (
     Content,
@@ -35,10 +35,10 @@ from lab.targets.series import (
 )
 from lab.targets.verdict import WHY_MEASURED_MATTERS, far_reacquisitions, measured_share, missing_pictures, some_frames
 from tracking.drogue_circle.candidates import CircleDetector
-from tracking.drogue_circle.classical import classical_detector
-from tracking.drogue_circle.frames import Cause, CircleFrame
+from tracking.drogue_circle.detectors import classical_detector
 from tracking.drogue_circle.parameters import CircleParameters
 from tracking.drogue_circle.printed import PrintedTracker
+from tracking.drogue_circle.rim_fit import Cause, CircleFrame
 from tracking.drogue_circle.tracker import CircleTracker
 from tracking.learned_detector.detector import learned_detector
 from tracking.statuses import PoseStatus

@@ -20,8 +20,8 @@ from lab.files.text.csv_text import write_table
 from lab.files.text.json_text import write_json
 from lab.number_format import format_number, format_percent
 from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section
+from lab.report.plot.axes import BLUE, SKY, VERMILLION
 from lab.report.plot.series import Band, Line, time_panel
-from lab.report.plot.svg import BLUE, SKY, VERMILLION
 from lab.targets.page import Words, path_section, status_shades, write_target_page
 from lab.targets.series import (
     Content,
@@ -36,8 +36,7 @@ from lab.targets.series import (
 )
 from lab.targets.verdict import WHY_MEASURED_MATTERS, far_reacquisitions, measured_share, missing_pictures, some_frames
 from tracking.learned_detector.detector import learned_detector
-from tracking.light_tracker.frames import Cause, DrogueFrame, Source
-from tracking.light_tracker.parameters import LightParameters
+from tracking.light_tracker.frames import Cause, DrogueFrame, LightParameters, Source
 from tracking.light_tracker.tracker import DrogueTracker
 from tracking.statuses import PoseStatus
 

@@ -13,9 +13,8 @@ from lab.files.text.atomic_write import atomic_write_text
 from lab.number_format import format_percent
 from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section, section_context
 from lab.report.html import environment
-from lab.report.plot.axes import axes, frame, image_area, note, svg_of
+from lab.report.plot.axes import BLUE, VERMILLION, axes, dots, frame, image_area, line_path, note, svg_of
 from lab.report.plot.series import Shade
-from lab.report.plot.svg import BLUE, VERMILLION, dots, line_path
 from lab.targets.series import WORDS, F, FrameSeries
 from lab.versions import versions
 from tracking.statuses import PoseStatus

@@ -12,11 +12,23 @@ from lab.files.text.atomic_write import atomic_write_text
 from lab.number_format import format_number, format_percent
 from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section, section_context
 from lab.report.html import environment
-from lab.report.plot.axes import axes, frame, image_area, note, plot_area, svg_of
-from lab.report.plot.histogram import histogram
-from lab.report.plot.scales import padded_range
+from lab.report.plot.axes import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    VERMILLION,
+    axes,
+    dots,
+    frame,
+    histogram,
+    image_area,
+    line_path,
+    note,
+    padded_range,
+    plot_area,
+    svg_of,
+)
 from lab.report.plot.series import Band, Line, Shade, time_panel
-from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION, dots, line_path
 from lab.targets.point_recording import TABLE, PointRecording
 from lab.targets.point_results import PointOutcome
 from lab.versions import versions

@@ -13,11 +13,11 @@ import numpy as np
 from geometry.arrays import Array
 from tracking.drogue_circle.acquisition import Wanted, acquire
 from tracking.drogue_circle.candidates import CircleDetector, Picture, Window, crop_bounds
-from tracking.drogue_circle.frames import Cause, CircleFrame, nothing_known
-from tracking.drogue_circle.gradient_votes import centre_votes, centres, edge_pixels
+from tracking.drogue_circle.detectors import centre_votes, centres, edge_pixels
 from tracking.drogue_circle.kalman import PRINTED_P0, predict, printed_coefficient, printed_step, transition
 from tracking.drogue_circle.occlusion import Appearance, disc_cells, first_appearance
 from tracking.drogue_circle.parameters import CircleParameters
+from tracking.drogue_circle.rim_fit import Cause, CircleFrame, nothing_known
 from tracking.statuses import PoseStatus
 
 _MOST_CENTRES = 200

@@ -14,7 +14,7 @@ import numpy as np
 
 from geometry.arrays import Array
 from tracking.curve_switching import kalman
-from tracking.light_tracker.parameters import LightParameters
+from tracking.light_tracker.frames import LightParameters
 from tracking.light_tracker.pattern import Match
 
 _MATCH_SIGMA_PX = 0.03  # of a match, beside its own covariance

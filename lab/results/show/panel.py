@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools
 from lab.pictures.picture_file import GreyPicture
+from lab.report.plot.axes import GREY, YELLOW, true_ranges
 from lab.report.plot.image import grey_limits, stretched
-from lab.report.plot.svg import GREY, YELLOW
-from lab.report.plot.thinning import true_ranges
 from lab.report.run.tracks import SPOT_COLOURS
 from lab.results.show.data import SIGMAS, CameraFrame, SpotMark
 from tracking.statuses import SpotStatus

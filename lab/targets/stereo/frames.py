@@ -17,8 +17,8 @@ from lab.files.run.detections_file import CameraPoints, is_too_sparse, read_dete
 from lab.files.run.run_file import DetectionsTable, FramesFolder
 from lab.pictures.colour import ColourPicture, colour_of, read_colour
 from lab.pictures.picture_file import DROPPED, UNREADABLE, MissingPicture
+from lab.report.plot.axes import GREEN, ORANGE
 from lab.report.plot.image import image_uri
-from lab.report.plot.svg import GREEN, ORANGE
 from lab.runs.frames.frame_sources import list_folder, open_video
 from lab.targets.stereo.run import Source, StereoRecord, StereoResults, StereoRun
 from tracking.binocular.marker_model import MarkerImages, project_markers

@@ -14,9 +14,8 @@ from lab.files.text.atomic_write import atomic_write_text
 from lab.number_format import format_angle, format_length, format_number
 from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section, section_context
 from lab.report.html import environment
-from lab.report.plot.scales import padded_range
+from lab.report.plot.axes import BLUE, GREEN, ORANGE, VERMILLION, padded_range
 from lab.report.plot.series import Band, Line, Shade, time_panel
-from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION
 from lab.targets.stereo.frames import annotated_pictures
 from lab.targets.stereo.run import StereoResults, TruthErrors
 from lab.versions import versions

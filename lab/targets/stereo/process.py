@@ -28,9 +28,8 @@ from lab.targets.stereo.frames import Content, StereoFrame, stereo_frames
 from lab.targets.stereo.run import StereoRecord, StereoResults, StereoRun, load_stereo_run, truth_errors
 from lab.targets.stereo.tables import write_tables
 from lab.versions import versions
-from tracking.binocular.clock_offset import FittedFrame, clock_offset
 from tracking.binocular.marker_model import MarkerImages
-from tracking.binocular.pose_tracker import BinocularTracker
+from tracking.binocular.pose_tracker import BinocularTracker, FittedFrame, clock_offset
 from tracking.binocular.segmentation import marker_candidates, prepared
 
 SUMMARY_SCHEMA = "beampose/stereo-summary/1"

@@ -41,10 +41,9 @@ from lab.files.text.fields import Block, Name, Text, Word, field_error, number_b
 from lab.files.text.yaml_text import read_mapping
 from lab.pictures.picture_file import PICTURE_SUFFIXES
 from lab.targets.stereo.target_block import Target, load_target
-from tracking.binocular.clock_offset import ClockOffset
 from tracking.binocular.marker_model import MarkerImages, StereoPair
 from tracking.binocular.parameters import BinocularParameters, MatchParameters, SegmentationParameters
-from tracking.binocular.pose_tracker import BinocularFrame
+from tracking.binocular.pose_tracker import BinocularFrame, ClockOffset
 from tracking.statuses import PoseStatus
 
 SCHEMA = "beampose/stereo/1"

@@ -16,9 +16,9 @@ from lab.errors import InputError
 from lab.files.text.error_text import suggest_name
 from lab.files.text.fields import Block, Name, NonNegative, Positive, Vector3, Word, field_error, numbers, validated
 from lab.files.text.yaml_text import read_mapping
-from tracking.binocular.horn import pose_of_points
 from tracking.binocular.marker_model import MarkerModel
 from tracking.binocular.segmentation import ColourRange
+from tracking.binocular.triangulation import pose_of_points
 
 _SYMMETRIC = 0.03  # share of the target's size within which turned markers count as the same
 

@@ -9,10 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from lab.pictures.opencv import load_cv2
-from lab.setup import doctor_checks as calibrations
-from lab.setup import doctor_checks as opencv
-from lab.setup import doctor_checks as places
-from lab.setup import installation
+from lab.setup import doctor_checks, installation
 from lab.setup.installation import Line, State, exit_status
 from tests.lab.run_folders import RIG, write_run
 
@@ -21,7 +18,7 @@ TODAY = datetime.date(2026, 6, 1)
 
 def test_the_installation_that_runs_these_tests_has_no_fault():
     assert [line for line in installation.check_installation() if line.state is State.FAIL] == []
-    assert [line for line in opencv.check_opencv() if line.state is State.FAIL] == []
+    assert [line for line in doctor_checks.check_opencv() if line.state is State.FAIL] == []
 
 
 def test_a_library_that_cannot_be_loaded_is_named_with_its_package():
@@ -76,31 +73,31 @@ class WithoutTiff:
 
 
 def test_a_picture_format_that_opencv_lacks_fails():
-    line = opencv.check_pictures(WithoutTiff())
+    line = doctor_checks.check_pictures(WithoutTiff())
     assert line.state is State.FAIL
     assert "cannot read .tiff with 8 bits, .tiff with 16 bits" in line.what
 
 
 def test_a_video_format_that_opencv_lacks_is_a_warning(monkeypatch):
-    monkeypatch.setattr(opencv, "VIDEOS", (("MJPG", ".avi"), ("none", ".none")))
-    line = opencv.check_videos(load_cv2())
+    monkeypatch.setattr(doctor_checks, "VIDEOS", (("MJPG", ".avi"), ("none", ".none")))
+    line = doctor_checks.check_videos(load_cv2())
     assert line.state is State.WARN
     assert line.what.startswith("videos: none cannot be read back")
 
 
 @pytest.mark.parametrize(("free", "state"), [(10**10, State.OK), (10**9, State.WARN), (10**6, State.FAIL)])
 def test_little_free_space_is_reported(tmp_path, monkeypatch, free, state):
-    monkeypatch.setattr(places.shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
-    assert places.check_space(places.existing(tmp_path / "not" / "made"), "results").state is state
+    monkeypatch.setattr(doctor_checks.shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
+    assert doctor_checks.check_space(doctor_checks.existing(tmp_path / "not" / "made"), "results").state is state
 
 
 def test_all_compiled_code_is_looked_at_and_a_missing_part_is_a_warning(monkeypatch):
-    assert {"geometry", "tracking"} <= {f.relative_to(places.Path(places.geometry.__file__).parents[1]).parts[0]
-                                        for f in places.compiled_folders()}  # fmt: skip
-    monkeypatch.setattr(places, "is_empty", lambda folder: True)
-    assert places.check_cache().state is State.WARN
-    monkeypatch.setattr(places, "cache_folder", lambda folder: None)
-    assert "cannot be kept" in places.check_cache().what
+    root = doctor_checks.Path(doctor_checks.geometry.__file__).parents[1]
+    assert {"geometry", "tracking"} <= {f.relative_to(root).parts[0] for f in doctor_checks.compiled_folders()}
+    monkeypatch.setattr(doctor_checks, "is_empty", lambda folder: True)
+    assert doctor_checks.check_cache().state is State.WARN
+    monkeypatch.setattr(doctor_checks, "cache_folder", lambda folder: None)
+    assert "cannot be kept" in doctor_checks.check_cache().what
 
 
 @pytest.mark.parametrize(
@@ -120,23 +117,23 @@ def test_all_compiled_code_is_looked_at_and_a_missing_part_is_a_warning(monkeypa
 def test_the_age_of_a_calibration_is_judged(tmp_path: Path, block, state, words):
     path = tmp_path / "rig.yaml"
     path.write_text(RIG + (f"calibration: {block}\n" if block else ""))
-    line = calibrations.check_calibration(path, TODAY)
+    line = doctor_checks.check_calibration(path, TODAY)
     assert (line.state, line.code) == (state, "BP-D09")
     assert words in line.what
 
 
 def test_a_run_folder_and_a_camera_file_are_read_too(tmp_path):
-    assert calibrations.check_calibration(write_run(tmp_path / "run"), TODAY).state is State.WARN
+    assert doctor_checks.check_calibration(write_run(tmp_path / "run"), TODAY).state is State.WARN
     camera = "schema: beampose/camera/1\nname: left\nimage_size_px: [64, 48]\n"
     camera += "camera_matrix: {fx: 40, fy: 40, cx: 31, cy: 23}\ncalibration: {date: DAY, verdict: PASS}\n"
     path = tmp_path / "camera.yaml"
     for day, state in (("2026-05-01", State.OK), ("may", State.FAIL)):
         path.write_text(camera.replace("DAY", day))
-        assert calibrations.check_calibration(path, TODAY).state is state
+        assert doctor_checks.check_calibration(path, TODAY).state is state
 
 
 def test_a_file_that_cannot_be_read_fails_as_a_wrong_file(tmp_path):
-    line = calibrations.check_calibration(tmp_path / "none.yaml", TODAY)
+    line = doctor_checks.check_calibration(tmp_path / "none.yaml", TODAY)
     assert (line.code, exit_status([line])) == ("BP-D10", 2)
 
 

@@ -8,11 +8,9 @@ import pytest
 from tests.tracking.drogue_circle.discs import covered, discs
 from tracking.drogue_circle.acquisition import Wanted, acquire
 from tracking.drogue_circle.candidates import CircleCandidate, Window
-from tracking.drogue_circle.classical import classical_detector
-from tracking.drogue_circle.gradient_votes import edge_pixels, radii_of
+from tracking.drogue_circle.detectors import classical_detector, edge_pixels, radii_of
 from tracking.drogue_circle.parameters import CircleParameters
-from tracking.drogue_circle.rim import smooth_crop
-from tracking.drogue_circle.rim_fit import fit_rim
+from tracking.drogue_circle.rim_fit import fit_rim, smooth_crop
 
 P = CircleParameters()
 DETECT = classical_detector(P)

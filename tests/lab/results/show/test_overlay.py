@@ -14,8 +14,7 @@ from cli import main
 from lab.errors import InputError, RunError
 from lab.files.run.results import read_poses
 from lab.report.run.tracks import SPOT_COLOURS
-from lab.results.show import panel as canvas
-from lab.results.show import video
+from lab.results.show import panel, video
 from lab.results.show.data import frame_content, pose_words, read_result_data
 from lab.results.show.panel import bgr
 from lab.results.show.sheet import Layout, sheet
@@ -223,7 +222,7 @@ def test_frames_that_the_results_do_not_have_and_options_without_a_video_are_ref
 
 
 def test_names_are_drawn_as_far_as_this_opencv_can(monkeypatch):
-    monkeypatch.setattr(canvas, "_DRAWS_UNICODE", False)
-    assert canvas.plain("línks ü 屏 1\n") == "links u ? 1?"
-    monkeypatch.setattr(canvas, "_DRAWS_UNICODE", True)
-    assert canvas.plain("línks ü 1\n") == "línks ü 1?"
+    monkeypatch.setattr(panel, "_DRAWS_UNICODE", False)
+    assert panel.plain("línks ü 屏 1\n") == "links u ? 1?"
+    monkeypatch.setattr(panel, "_DRAWS_UNICODE", True)
+    assert panel.plain("línks ü 1\n") == "línks ü 1?"

@@ -7,7 +7,7 @@ import pytest
 
 from studies.zhou2014_lights import approach
 from tracking.drogue_circle.acquisition import Wanted, acquire
-from tracking.drogue_circle.classical import classical_detector
+from tracking.drogue_circle.detectors import classical_detector
 from tracking.drogue_circle.parameters import CircleParameters
 
 
