@@ -15,7 +15,7 @@ from geometry.arrays import Array, Bools
 from lab.report.plot.axes import BLUE, GREEN, ORANGE, VERMILLION
 from lab.report.plot.series import Line, Shade, time_panel
 from studies.comparison import Comparison, ComparisonRow, Figure
-from tracking.curve_switching import kalman
+from tracking import kalman
 from tracking.detections import Detections
 from tracking.single_target.parameters import PointParameters
 from tracking.single_target.point_tracker import track_point

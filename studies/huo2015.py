@@ -27,7 +27,7 @@ from lab.report.plot.axes import (
 from lab.report.plot.series import Line, Shade, time_panel
 from lab.simulate.points import PointRun, simulate_points
 from studies.comparison import Comparison, ComparisonRow, Figure
-from tracking.curve_switching import kalman
+from tracking import kalman
 from tracking.curve_switching.pose_filter import CoplanarViews, quadratic_positions
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.curve_switching.vehicle import BENT_NIS

@@ -11,6 +11,7 @@ from geometry.arrays import Array, Bools, Ints, symmetric
 from geometry.camera import in_picture
 from geometry.pose import Pose
 from geometry.uncertainty.chi_square import chi2_tail
+from tracking import kalman
 from tracking.binocular.acquisition import acquire, distinct, mirrored
 from tracking.binocular.joint_fit import JointFit, MarkerObservations
 from tracking.binocular.labelling import Images, LabelledPose, labelled_pose, observations
@@ -41,21 +42,14 @@ class Motion:
     def predicted(self, t_s: float, acceleration: float, turn: float) -> Motion:
         """At a later time, with accelerations of these sigmas, m/s^2 and rad/s^2, constant between two times."""
         dt = t_s - self.t_s
-        F = np.eye(12)
-        F[:6, 6:] = dt * np.eye(6)
-        G = np.concatenate([0.5 * dt * dt * np.eye(6), dt * np.eye(6)])
-        q = np.diag([acceleration**2] * 3 + [turn**2] * 3)
-        P = F @ self.covariance @ F.T + G @ q @ G.T
-        return Motion(t_s, self.pose.plus(dt * self.velocity), self.velocity, symmetric(P))
+        Q = kalman.process_noise(np.repeat([acceleration, turn], 3), dt)
+        pose = self.pose.plus(dt * self.velocity)
+        _, P = kalman.propagate(np.zeros(12), self.covariance, kalman.transition(dt, 6), Q)
+        return Motion(t_s, pose, self.velocity, P)
 
     def updated(self, pose: Pose, covariance: Array) -> Motion:
-        """With a measured pose of covariance (6, 6): Kalman update, Joseph form."""
-        H = np.eye(6, 12)
-        S = self.covariance[:6, :6] + covariance
-        gain = np.linalg.solve(S, self.covariance[:6]).T
-        change = gain @ pose.minus(self.pose)
-        keep = np.eye(12) - gain @ H
-        P = symmetric(keep @ self.covariance @ keep.T + gain @ covariance @ gain.T)
+        """With a measured pose of covariance (6, 6)."""
+        change, P = kalman.update(np.zeros(12), self.covariance, pose.minus(self.pose), covariance)
         return Motion(self.t_s, self.pose.plus(change[:6]), self.velocity + change[6:], P)
 
     @property

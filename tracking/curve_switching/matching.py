@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.arrays import Array, Ints
-from tracking.curve_switching.kalman import combined, picture_scale
+from tracking.curve_switching.gains import combined, picture_scale
 from tracking.detections import UNMATCHED
 from tracking.parameters import TrackerParameters
 

@@ -12,7 +12,8 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import PoseFit, pixel_covariance
-from tracking.curve_switching import kalman, pose_filter
+from tracking import kalman
+from tracking.curve_switching import pose_filter
 from tracking.curve_switching.pose_filter import RigidMotion
 from tracking.parameters import TrackerParameters
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, PoseStatus

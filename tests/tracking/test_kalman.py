@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tracking.curve_switching import kalman
+from tracking import kalman
 
 DT = 0.01  # s
 
@@ -58,7 +58,7 @@ def test_process_noise_is_the_scatter_from_random_accelerations_constant_within_
     a = 40.0 * rng.standard_normal((20_000, 2))
     moved = np.column_stack([a * DT**2 / 2, a * DT])
     sampled = moved.T @ moved / len(moved)
-    Q = kalman.process_noise(np.array(40.0), DT)
+    Q = kalman.process_noise(np.full(2, 40.0), DT)
     scale = np.sqrt(np.outer(np.diagonal(Q), np.diagonal(Q)))
     np.testing.assert_allclose(sampled / scale, Q / scale, atol=0.05)
 
