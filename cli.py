@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import click
 
-from lab.commands import batch, calibrate, compare, maintenance, plan_and_simulate, results, run, show, view
+from lab.commands import batch, calibrate, maintenance, plan_and_simulate, results, run, track
 from lab.commands.common import Commands
-from lab.commands.measurements import stereo, study, track
+from studies.command import study
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -27,12 +27,12 @@ for command in (
     plan_and_simulate.simulate,
     results.check,
     results.report,
-    study.study,
+    study,
     track.track,
-    stereo.stereo,
-    compare.compare,
-    view.view,
-    show.show,
+    track.stereo,
+    results.compare,
+    results.view,
+    results.show,
     calibrate.calibrate,
     plan_and_simulate.plan,
     maintenance.init,
@@ -42,7 +42,7 @@ for command in (
     maintenance.explain,
 ):
     main.add_command(command)
-calibrate.calibrate.add_command(stereo.pair)
+calibrate.calibrate.add_command(track.pair)
 
 if __name__ == "__main__":
     main()

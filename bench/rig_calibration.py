@@ -29,9 +29,8 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance
-from geometry.uncertainty.rig_uncertainty import RigUncertainty
-from lab.simulate.calibration_campaign import Campaign, CampaignQuality, draw_campaign, spots_at
+from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty
+from lab.simulate.campaign import Campaign, CampaignQuality, draw_campaign, spots_at
 
 POSES_PER_CAMPAIGN = 5  # of the new recording; they share the errors of the calibration
 

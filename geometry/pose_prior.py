@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.arrays import Array, Bools
+from geometry.planes import intersect_surface
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.surfaces import intersect_surface
 
 SLACK, SLACK_M, SLACK_RAD = 1.02, 0.005, float(np.deg2rad(0.25))  # the limits are widened by this: poses are noisy
 CUBE_FACTOR = 2.0  # side of the vehicle's cube over that of the screens and cameras

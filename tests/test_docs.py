@@ -13,7 +13,7 @@ import pytest
 from cli import main
 from tests.paths import ROOT
 
-PACKAGES = ("geometry", "tracking", "calibration", "lab")
+PACKAGES = ("geometry", "tracking", "calibration", "lab", "studies")
 MENTIONS = (
     re.compile(r"`(beampose [^`]+)`"),  # a command in backticks
     re.compile(r"`(calibrate [a-z][^`]*)`"),  # ... without the program's name
@@ -117,7 +117,7 @@ def documents(root: Path) -> list[Path]:
 
 def missing_paths(text: str, root: Path) -> list[str]:
     """Paths of the program, its tests and benches in backticks that do not exist, and functions that a file lacks."""
-    tops = ("geometry", "tracking", "calibration", "lab", "tests", "bench", "docs", "sample_runs")
+    tops = ("geometry", "tracking", "calibration", "lab", "studies", "tests", "bench", "docs", "sample_runs")
     paths = [path for path in PATH.findall(text) if path.split("/")[0] in tops]
     wrong = [path for path in paths if not (root / path).exists()]
     for path, names in FUNCTIONS_OF.findall(text):

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
-from lab.schema.files import BLOCKS, schema
+from lab.setup.schema import BLOCKS, schema
 from website.text import cell, code, table
 
 _HEAD = """# Fields of the YAML files
@@ -16,7 +16,7 @@ items of a list. A required field must be there if its block is. An unknown fiel
 `beampose schema --out schemas` writes the same as JSON schemas, with which editors complete and check the files.
 Meanings, frames and conventions: [File formats](../formats.md).
 
-This page is generated from `lab/schema/`.
+This page is generated from `lab/setup/schema.py`.
 """
 _WORDS = {"string": "text", "number": "number", "integer": "whole number", "boolean": "true or false"}
 

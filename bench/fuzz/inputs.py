@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from geometry.rotations import quaternion_from_matrix
-from lab.compare.reference_file import read_reference
 from lab.files.rig.interchange import convert
+from lab.results.compare import read_reference
 from lab.runs.batch.batch import BatchOptions, process_batch
 from lab.runs.process import process_run
 from lab.simulate.write import simulate

@@ -11,7 +11,7 @@ from geometry.arrays import Array, Bools
 from geometry.forward_model import SpotModel
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import SolveLimits, fit_pose, is_measurement
-from geometry.pose_solver.symmetry import symmetries
+from geometry.pose_solver.visibility import symmetries
 from tracking.detections import Detections
 from tracking.labelling.first_labels import find_labels
 

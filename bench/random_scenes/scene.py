@@ -23,7 +23,7 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from tracking.detections import Detections
 
 # Independent streams of random numbers, so that the kinds of draws do not affect each other.

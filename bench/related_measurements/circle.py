@@ -16,10 +16,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from lab.drogue_circle.experiment import HIDDEN, cost_ratio, hidden_run, still_errors
-from lab.drogue_circle.lights import PAPER_PERCENT, approach, followed
+from studies.zhou2014 import HIDDEN, cost_ratio, hidden_run, still_errors
+from studies.zhou2014_lights import PAPER_PERCENT, approach, followed
 from tracking.drogue_circle.acquisition import Wanted, acquire
-from tracking.drogue_circle.classical import classical_detector
+from tracking.drogue_circle.detectors import classical_detector
 from tracking.drogue_circle.parameters import CircleParameters
 
 

@@ -3,7 +3,7 @@
 Rendered pictures of 640 x 480 with a drogue of 9 to 200 px before backgrounds that no training picture shows. The
 threshold is the one with 0.1 false detections per frame. Beside it: cv2.HoughCircles with its best threshold.
 `--calibrate` fits the logistic curve of the confidence on other pictures, with backgrounds as in training. `--weights`
-measures another network, such as the paper's layout, trained by lab/learned_detector/train.py.
+measures another network, such as the paper's layout, trained by studies/learned_detector/train.py.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from geometry.arrays import Array, Bools
-from lab.learned_detector.samples import Sample, draw_sample
+from studies.learned_detector.samples import Sample, draw_sample
 from tracking.learned_detector.detector import WEIGHTS, DrogueCandidate, find_drogues
 
 SIZE_PX = (640, 480)

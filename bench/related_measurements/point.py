@@ -18,9 +18,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lab.single_target.experiment_duan2020 import FILTERS, simulate, track
-from lab.single_target.study_duan2020 import QUANTITIES, figures_of
-from lab.single_target.track_point import PointOptions, track_target
+from lab.targets.track_point import PointOptions, track_target
+from studies.duan2020 import FILTERS, QUANTITIES, figures_of, simulate, track
 
 EARTH_RADIUS_M = 6_371_000.0
 FLIGHT_NOISE_M = 3.0

@@ -13,14 +13,14 @@ import argparse
 
 import numpy as np
 
-from lab.binocular.distance_experiment import (
+from lab.targets.stereo.simulated_recording import drogue_markers
+from studies.zhou2020 import (
     DISTANCES_M,
     METHODS,
     distance_errors,
     pose_errors,
     simulated_calibration,
 )
-from lab.binocular.simulated_recording import drogue_markers
 from tracking.binocular.joint_fit import MarkerObservations, fit_pose
 from tracking.binocular.marker_model import StereoPair, project_markers
 
@@ -71,8 +71,8 @@ def _campaigns(count: int, seed: int) -> None:
 
 def _calibrated_nees(pair: StereoPair, rng: np.random.Generator) -> float:
     """NEES of one pose with noise and the errors of this calibration: one draw per campaign is independent."""
-    from lab.binocular.distance_experiment import BASELINE_M, FOCAL_PX, SIZE_PX, random_pose
-    from lab.binocular.simulated_recording import simulated_pair
+    from lab.targets.stereo.simulated_recording import simulated_pair
+    from studies.zhou2020 import BASELINE_M, FOCAL_PX, SIZE_PX, random_pose
 
     true, model = simulated_pair(FOCAL_PX, SIZE_PX, BASELINE_M), drogue_markers()
     pose = random_pose(10.0, rng)

@@ -15,8 +15,7 @@ import sys
 
 import numpy as np
 
-from lab.unscented.experiment_fu2016 import DISTURBANCES, estimate, peaks, quiet_rms, simulate
-from lab.unscented.picture_experiment import run_pictures
+from studies.fu2016_experiments import DISTURBANCES, estimate, peaks, quiet_rms, run_pictures, simulate
 
 LARGEST_PEAK_RATIO, LARGEST_QUIET_RATIO = 0.2, 1.2
 

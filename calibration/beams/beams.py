@@ -27,7 +27,7 @@ from geometry.arrays import Array, Bools
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Spot
-from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 
 _FOR_THE_STAND = 15  # positions used for the start value of its pose
 

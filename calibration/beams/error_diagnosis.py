@@ -21,7 +21,7 @@ from calibration.terms.spot_term import SpotPixels
 from geometry.arrays import Array, Ints
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 
 _MOST_POSITIONS = 60  # positions used; more do not improve the diagnosis
 _FOR_LABELS = 12  # positions whose spots are fitted with each exchange of labels

@@ -19,7 +19,7 @@ from geometry.camera import FISHEYE, Camera, Projected, pinhole_numbers, project
 from geometry.lens import padded
 from geometry.planes import intersect_plane
 from geometry.rig import Rig, Screen
-from geometry.uncertainty.rig_parameters import (
+from geometry.uncertainty.rig_uncertainty import (
     DIRECTION,
     PINHOLE,
     POINT,

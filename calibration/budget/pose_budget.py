@@ -19,7 +19,7 @@ from geometry.camera import in_picture
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import RANK_TOLERANCE
-from geometry.uncertainty.rig_parameters import BOW, DIRECTION, POSE, Sensitivity, split_name
+from geometry.uncertainty.rig_uncertainty import BOW, DIRECTION, POSE, Sensitivity, split_name
 
 INTRINSICS, CAMERA_POSES, SCREEN_POSES = "camera intrinsics", "camera poses", "screen poses"
 SCREEN_SHAPES, BEAM_DIRECTIONS, BEAM_POINTS = "screen shapes", "beam directions", "beam points"
@@ -40,7 +40,7 @@ def group_of(name: str) -> str:
 class RigErrors:
     """Uncertainty of the p parameters of a rig, by source."""
 
-    names: tuple[str, ...]  # (p,) as in geometry/uncertainty/rig_parameters.py
+    names: tuple[str, ...]  # (p,) as in geometry/uncertainty/rig_uncertainty.py
     covariance: Array  # (p, p)
     groups: Mapping[str, Array]  # by group (p, p): its part of the covariance; cross-covariance is not included
     moves: Array  # (p, q) joint change of the parameters by one sigma of each of q errors

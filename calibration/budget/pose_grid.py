@@ -15,7 +15,7 @@ from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import SolveLimits
 from geometry.rig import Rig
 from geometry.rotations import ypr_jacobian
-from geometry.uncertainty.rig_parameters import Sensitivity
+from geometry.uncertainty.rig_uncertainty import Sensitivity
 
 NOISE = "noise"
 MEASURED, VAGUE, NOT_OBSERVABLE = "measured", "vague", "not observable"

@@ -32,7 +32,7 @@ from calibration.model_check.unseen import UnseenView, unseen_views
 from geometry.arrays import Ints
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 
 MOST_FRAMES = 2000  # for the statistics: four times as many would only halve their sigmas
 MOST_FRAMES_FOR_DIAGNOSIS = 400  # for the normal equations; enough to find 0.02 deg of a camera

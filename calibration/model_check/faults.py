@@ -17,7 +17,7 @@ from calibration.model_check.recording import ModelCheckRecording, finite
 from geometry.arrays import Array, Bools, Ints, normalised, skew
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import DIRECTION, POINT, POSE, RigCovariance, Sensitivity, is_known
+from geometry.uncertainty.rig_uncertainty import DIRECTION, POINT, POSE, RigCovariance, Sensitivity, is_known
 
 CAMERA, SCREEN, BEAM, VIEW, CLOCK = "camera", "screen", "beam", "spot", "clock"  # the faulty component
 TURNED, MOVED, SHIFTED, ZOOMED = "turned", "moved and turned", "picture shifted", "focal length changed"
@@ -47,7 +47,7 @@ class PossibleFault:
 class FaultParameters:
     """Names of the p parameters that may be wrong, and the derivatives of the pixels by them."""
 
-    # As in geometry.uncertainty.rig_parameters, then `clock.CAMERA`, then `view.CAMERA/SPOT.u` and `.v`.
+    # As in geometry.uncertainty.rig_uncertainty, then `clock.CAMERA`, then `view.CAMERA/SPOT.u` and `.v`.
     names: tuple[str, ...]
     sensitivity: Sensitivity  # to the parameters of the rig, which come first
     model: SpotModel

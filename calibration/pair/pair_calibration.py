@@ -20,7 +20,7 @@ from calibration.terms.corners import CornerTerm
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import FISHEYE, PERSPECTIVE, Camera
 from geometry.pose import Pose
-from geometry.uncertainty.rig_parameters import POSE, RigCovariance
+from geometry.uncertainty.rig_uncertainty import POSE, RigCovariance
 
 FEWEST_PAIRS = 3
 PAIR_GATE = 3.0  # residuals of a pair over those of the median pair, above which the board moved between the exposures

@@ -27,7 +27,7 @@ from calibration.terms.term_subset import picked, rows_of, widened
 from geometry.arrays import Array, Bools
 from geometry.camera import FISHEYE
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 
 # The kinds of measurement, named as in reports.
 LENSES, SURVEY, DOTS, SURFACES = "lens calibrations", "survey", "pixels of dots", "screen surfaces"

@@ -19,7 +19,7 @@ from geometry.arrays import Array, Ints, symmetric
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
-from geometry.uncertainty.rig_parameters import Sensitivity
+from geometry.uncertainty.rig_uncertainty import Sensitivity
 
 FOLDS = 5  # groups of positions; each is predicted from the other four
 

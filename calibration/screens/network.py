@@ -26,7 +26,7 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.camera import FISHEYE
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 
 OUTLIER_SIGMAS = 5.0  # in two dimensions one correct point of 270 000 exceeds it
 WARP_SIGMA_M = 1e-3  # sigma of a board's bend at its edge

@@ -6,7 +6,7 @@ import numpy as np
 
 from calibration.screens.screens import ScreensResult
 from geometry.arrays import Array, skew
-from geometry.uncertainty.rig_parameters import BOW, POSE
+from geometry.uncertainty.rig_uncertainty import BOW, POSE
 
 
 def spot_sigmas(result: ScreensResult, screen: int) -> Array:

@@ -18,7 +18,7 @@ from geometry.arrays import Array, Bools
 from geometry.camera import Camera, pinhole_numbers
 from geometry.lens import padded
 from geometry.rig import Beam, Rig
-from geometry.uncertainty.rig_parameters import BOW, DIRECTION, PINHOLE, POINT, POSE, RigCovariance, distortion_names
+from geometry.uncertainty.rig_uncertainty import BOW, DIRECTION, PINHOLE, POINT, POSE, RigCovariance, distortion_names
 
 INTRINSICS, CAMERAS, SCREENS, BOWS, BEAMS = "intrinsics", "cameras", "screens", "bow", "beams"
 STAND, POSES = "stand", "poses"  # world_from_stand (1), and stand_from_body, one per stand position

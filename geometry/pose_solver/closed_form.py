@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from geometry.arrays import Array, normalised
-from geometry.lines import nearest_point
+from geometry.arrays import Array, Bools, normalised
+from geometry.planes import common_perpendicular, nearest_point
 from geometry.pose import Pose
 
 
@@ -31,3 +31,108 @@ def pose_from_lines(
     R = Rotation.align_vectors(world, body)[0].as_matrix()
     origin = nearest_point(line_points - beam_points @ R.T, world)
     return None if np.isnan(origin).any() else Pose(R, origin)
+
+
+# The paper's closed forms for a spot out of view: coplanar beams through one point.
+#
+# Source: Huo, Yang & Yang, Optics and Precision Engineering 23(8), 2015, section 4.2, eqs. (10) to (14), with its
+# misprints corrected: (11) C = B + k (B - A) is right, and the coefficients of (14) belong to it; (12) must end in
+# X_B, Y_B; l begins with (X_B - X_O)^2. The formulas are written with vectors, so that the screen may be any plane,
+# and with two angles, which may differ.
+#
+# O is the point where the beams meet; A, B, C are the spots of three beams on one screen, in this order; alpha is the
+# angle AOB and beta the angle BOC.
+
+
+# Largest difference, rad, between the angle AOC of the accepted root and alpha + beta. With noise, the wrong root (it
+# gives A, or a point behind O) is off by at least the smaller of 2 alpha and 180 deg - 2 alpha.
+ANGLE_TOLERANCE = np.deg2rad(3.0)
+
+
+def meeting_point(point_a: Array, direction_a: Array, point_b: Array, direction_b: Array) -> Array:
+    """O (..., 3), m: the middle of the common perpendicular of two beams. Points (..., 3), m, directions (..., 3)."""
+    on_a, on_b = common_perpendicular(point_a, direction_a, point_b, direction_b)
+    return 0.5 * (on_a + on_b)
+
+
+def quadratic_coefficients(O: Array, A: Array, B: Array, beta: float) -> tuple[Array, Array, Array]:
+    """a, b, c (...) of the paper's a k^2 + b k + c = 0, eq. (14), for C = B + k (B - A) and the angle BOC = beta.
+
+    O, A, B (..., 3), m; beta in rad.
+    """
+    OB, AB = B - O, B - A
+    l = np.sum(OB * OB, axis=-1)
+    m = np.sum(OB * AB, axis=-1)
+    cos2 = np.cos(beta) ** 2
+    m1 = l * np.sum(AB * AB, axis=-1) * cos2
+    m2 = 2 * cos2 * l * m
+    m3 = cos2 * l * l
+    return m1 - m * m, m2 - 2 * m * l, m3 - l * l
+
+
+def outer_spot(O: Array, A: Array, B: Array, alpha: float, beta: float, tolerance: float = ANGLE_TOLERANCE) -> Array:
+    """C (..., 3), m, eq. (11): the spot beyond B, of a beam at the angle `beta` (rad) from B's; nan if it misses.
+
+    O, A, B (..., 3), m, in world; alpha, the calibrated angle AOB, and beta are in (0, pi/2). Of the two roots of eq.
+    (14), the one with k > 0 and an angle AOC of alpha + beta, within the tolerance, is taken. The paper's rule, "the
+    root whose angle AOC is 2 alpha", is not fulfilled by any root if the beam points away from the plane (8 % of
+    geometries for alpha of 10 to 30 deg, 90 % for 60 to 89 deg); the nearest root is then A itself.
+    """
+    a, b, c = quadratic_coefficients(O, A, B, beta)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        # b^2 - 4ac = 4 l^2 sin^2(beta) cos^2(beta) |OB x AB|^2 >= 0; rounding may make it negative.
+        root = np.sqrt(np.maximum(b * b - 4 * a * c, 0.0))
+        # The form without cancellation: one root is q / a, the other c / q. If a = 0 (OC parallel to AB), k is inf.
+        q = -0.5 * (b + np.where(b >= 0, root, -root))
+        k = np.stack([q / a, c / q], axis=-1)  # (..., 2)
+        C = B[..., None, :] + k[..., None] * (B - A)[..., None, :]
+        OA, OC = normalised(A - O)[..., None, :], normalised(C - O[..., None, :])
+        off = np.abs(_angle(OA, OC) - (alpha + beta))
+        fits = np.isfinite(k) & (k > 0) & (off < tolerance)
+        best = np.argmin(np.where(fits, off, np.inf), axis=-1)
+    chosen = np.take_along_axis(C, best[..., None, None], axis=-2)[..., 0, :]
+    return np.where(np.any(fits, axis=-1, keepdims=True), chosen, np.nan)
+
+
+def middle_spot(O: Array, A: Array, C: Array, alpha: float, beta: float, world_from_screen: Pose) -> Array:
+    """B (..., 3), m: the spot between A and C, of a beam `alpha` from A's and `beta` from C's (rad); nan if it misses.
+
+    The paper has no formula like eq. (14) for the middle beam: OA is rotated towards OC by the share
+    alpha / (alpha + beta) of the measured angle AOC, then intersected with the screen. Source: ours.
+    """
+    OA, OC = normalised(A - O), normalised(C - O)
+    return _rotated_ray_on_screen(O, OA, OC, alpha / (alpha + beta), world_from_screen)
+
+
+def rotated_spot(O: Array, A: Array, B: Array, alpha: float, beta: float, world_from_screen: Pose) -> Array:
+    """C (..., 3), m, by rotation of OA towards and beyond OB: equal to `outer_spot` to rounding. Source: ours.
+
+    The rotation goes beyond B by exactly beta, so that an error of alpha does not enter, as in eq. (14).
+    """
+    OA, OB = normalised(A - O), normalised(B - O)
+    share = 1 + beta / _angle(OA, OB)
+    return _rotated_ray_on_screen(O, OA, OB, share, world_from_screen)
+
+
+def _rotated_ray_on_screen(O: Array, start: Array, towards: Array, share: Array | float, screen: Pose) -> Array:
+    """Intersection (..., 3), m, of a screen with the ray from O; nan if the ray points away from it.
+
+    The ray's direction is `start`, rotated by a share of the angle to `towards`; both are unit vectors (..., 3).
+    """
+    angle = _angle(start, towards)
+    across = normalised(towards - np.sum(start * towards, axis=-1)[..., None] * start)
+    turn = angle * share
+    ray = np.cos(turn)[..., None] * start + np.sin(turn)[..., None] * across
+    normal = screen.rotation[:, 2]
+    facing = ray @ normal
+    height = (screen.translation - O) @ normal
+    with np.errstate(invalid="ignore", divide="ignore"):
+        t = height / facing
+        ahead: Bools = np.asarray((t > 0) & np.isfinite(t))
+        return np.where(ahead[..., None], O + t[..., None] * ray, np.nan)
+
+
+def _angle(a: Array, b: Array) -> Array:
+    """Angle (...), rad, between unit vectors; accurate near 0 and pi too."""
+
+    return 2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))

@@ -1,21 +1,4 @@
-"""All poses that put three rays of the vehicle through three known points, compiled.
-
-The rays are given in body, the points in world. This is the generalised perspective-three-point problem: with the rays
-through one point it is P3P (Grunert 1841), otherwise it has up to eight solutions (Nister & Stewenius 2007, "A minimal
-solution to the generalised 3-point pose problem", J. Math. Imaging Vis. 27). The formulation by the three lengths is
-theirs; the elimination and the root finder are ours.
-
-With q_i = p_i + l_i d_i the lit point of ray i in body, the distances between the lit points are those between the
-world points X_i:
-
-    |q_i - q_j|^2 = l_i^2 + l_j^2 - 2 c_ij l_i l_j + e_ij l_i + f_ij l_j + g_ij = 0,    c_ij = d_i . d_j.
-
-The pair (1, 3) is a quadratic in l_1 with coefficients that depend on x = l_3, the pair (2, 3) one in l_2:
-l_1^2 + B_1 l_1 + C_1 = 0 and l_2^2 + B_2 l_2 + C_2 = 0. Subtracting both from the pair (1, 2) leaves an equation that
-is linear in l_1, so l_1 = -N / M with N and M linear in l_2. Substituted into the first quadratic and reduced by the
-second, this becomes P(x) l_2 + Q(x) = 0; substituted into the second quadratic, it gives
-Q^2 - B_2 P Q + C_2 P^2 = 0, of degree 8 in x.
-"""
+"""Real roots of polynomials of degree 8, compiled. Coefficients are given with the lowest power first. Source: ours."""
 
 from __future__ import annotations
 
@@ -26,7 +9,114 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from geometry.pose import Pose
-from geometry.pose_solver.polynomial_roots import add_product, roots_within
+
+
+@compiled
+def add_product(out: Array, a: Array, deg_a: int, b: Array, deg_b: int, factor: float) -> None:
+    """out += factor a b, of polynomials a and b of the given degrees."""
+    for i in range(deg_a + 1):
+        x = factor * a[i]
+        if x != 0.0:
+            for j in range(deg_b + 1):
+                out[i + j] += x * b[j]
+
+
+@compiled
+def roots_within(p: Array, d: Array, before: Array, roots: Array) -> int:
+    """Writes the real roots in [-1, 1] of a polynomial p (9,) to roots (9,), ascending; returns their number.
+
+    d, before (9,) are scratch. Between two neighbouring zeros of its derivative a polynomial has at most one root, so
+    the roots of the derivatives are found from the linear one upwards. A minimum that misses zero by less than the
+    rounding of the coefficients counts as a root: a double one.
+    """
+    size = 0.0
+    for r in range(9):
+        size = max(size, abs(p[r]))
+    if not size > 0.0:
+        return 0
+    count = 0
+    for degree in range(1, 9):
+        # The derivative of this degree, of order 8 - degree.
+        for r in range(degree + 1):
+            factor = 1.0
+            for s in range(8 - degree):
+                factor *= (r + 8 - degree - s) / (8 - s)
+            d[r] = p[r + 8 - degree] * factor
+        for r in range(count):
+            before[r] = roots[r]
+        extremes, count = count, 0
+        left, at_left = -1.0, _value(d, degree, -1.0)
+        for r in range(extremes + 1):
+            right = before[r] if r < extremes else 1.0
+            at_right = _value(d, degree, right)
+            if at_left == 0.0:
+                roots[count] = left
+                count += 1
+            elif (at_left < 0.0) != (at_right < 0.0) and at_right != 0.0:
+                roots[count] = _root_between(d, degree, left, right, at_left)
+                count += 1
+            elif degree == 8 and r < extremes and abs(at_right) < 1e-12 * size:
+                roots[count] = right
+                count += 1
+            left, at_left = right, at_right
+        if at_left == 0.0:
+            roots[count] = left
+            count += 1
+        if count > degree:
+            count = degree
+    return count
+
+
+@compiled
+def _value(p: Array, degree: int, x: float) -> float:
+    """The value at x of a polynomial of this degree."""
+    y = p[degree]
+    for r in range(degree - 1, -1, -1):
+        y = y * x + p[r]
+    return y
+
+
+@compiled
+def _root_between(p: Array, degree: int, left: float, right: float, at_left: float) -> float:
+    """The root in an interval with a change of sign: Newton's method, and bisection where that leaves the interval."""
+    x = 0.5 * (left + right)
+    for _ in range(60):
+        y, slope = p[degree], 0.0
+        for r in range(degree - 1, -1, -1):
+            slope = slope * x + y
+            y = y * x + p[r]
+        if (y < 0.0) == (at_left < 0.0):
+            left = x
+        else:
+            right = x
+        step = y / slope
+        x_new = x - step
+        if not (left < x_new < right):
+            x_new = 0.5 * (left + right)
+        if abs(x_new - x) < 1e-14:
+            return x_new
+        x = x_new
+    return x
+
+
+# All poses that put three rays of the vehicle through three known points, compiled.
+#
+# The rays are given in body, the points in world. This is the generalised perspective-three-point problem: with the
+# rays through one point it is P3P (Grunert 1841), otherwise it has up to eight solutions (Nister & Stewenius 2007, "A
+# minimal solution to the generalised 3-point pose problem", J. Math. Imaging Vis. 27). The formulation by the three
+# lengths is theirs; the elimination and the root finder are ours.
+#
+# With q_i = p_i + l_i d_i the lit point of ray i in body, the distances between the lit points are those between the
+# world points X_i:
+#
+#     |q_i - q_j|^2 = l_i^2 + l_j^2 - 2 c_ij l_i l_j + e_ij l_i + f_ij l_j + g_ij = 0,    c_ij = d_i . d_j.
+#
+# The pair (1, 3) is a quadratic in l_1 with coefficients that depend on x = l_3, the pair (2, 3) one in l_2: l_1^2 +
+# B_1 l_1 + C_1 = 0 and l_2^2 + B_2 l_2 + C_2 = 0. Subtracting both from the pair (1, 2) leaves an equation that is
+# linear in l_1, so l_1 = -N / M with N and M linear in l_2. Substituted into the first quadratic and reduced by the
+# second, this becomes P(x) l_2 + Q(x) = 0; substituted into the second quadratic, it gives Q^2 - B_2 P Q + C_2 P^2 =
+# 0, of degree 8 in x.
+
 
 MOST_POSES = 8
 # Two rays are parallel where the sine of their angle is below this: a distance then does not bound their lengths.

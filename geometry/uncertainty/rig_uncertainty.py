@@ -1,20 +1,198 @@
-"""Effect of a calibration's errors on the pixels of all spots together; the errors are the same in every frame.
+"""The parameters of a rig that a calibration determines: their names, their covariance, and their effect on pixels.
 
-A calibration that is wrong by a draw of its covariance moves the spots of one frame jointly, and those of the next
-frame in the same way. The pose is therefore solved with this covariance beside the noise (generalised least squares),
-which keeps the consistency tests correct, and its share of the pose's covariance is reported separately: averaging over
-frames does not reduce it. Source: ours.
+Names are those of rig.yaml's covariance blocks: `cameras.left.fx`, `screens.right.rot_x_rad`, `beams.A.direction_y`.
+Cameras have fx, fy, cx, cy (px), as many of k1 ... tau_y as their lens model uses, and the error of camera_from_world;
+screens have the error of world_from_screen and the bow; beams have a direction and a point in body, whose components
+along the beam have no effect.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from geometry.arrays import Array, symmetric
-from geometry.forward_model import SpotModel
+from geometry.camera import FISHEYE, Camera
+from geometry.forward_model import SpotDerivatives, SpotModel
 from geometry.pose import Pose
-from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance, Sensitivity
+from geometry.rig import Beam, Rig, Screen
+
+PINHOLE = ("fx", "fy", "cx", "cy")
+DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
+FISHEYE_DISTORTION = ("k1", "k2", "k3", "k4")
+POSE = ("x_m", "y_m", "z_m", "rot_x_rad", "rot_y_rad", "rot_z_rad")
+BOW = ("bow_xx_per_m", "bow_xy_per_m", "bow_yy_per_m")
+DIRECTION = ("direction_x", "direction_y", "direction_z")
+POINT = ("point_x_m", "point_y_m", "point_z_m")
+
+
+@dataclass(frozen=True, slots=True)
+class RigCovariance:
+    """The joint covariance of the errors of a rig's parameters."""
+
+    names: tuple[str, ...]  # p names, as in the module's docstring
+    matrix: Array  # (p, p), in the parameters' units; may be singular
+
+
+def distortion_names(camera: Camera) -> tuple[str, ...]:
+    """The names of a camera's distortion coefficients, in order."""
+    names = FISHEYE_DISTORTION if camera.lens == FISHEYE else DISTORTION
+    return names[: len(camera.distortion)]
+
+
+def camera_names(camera: Camera) -> tuple[str, ...]:
+    """The names of all parameters of a camera, without its own name."""
+    return (*PINHOLE, *distortion_names(camera), *POSE)
+
+
+def rig_names(rig: Rig, bow: bool = False) -> tuple[str, ...]:
+    """The names of all parameters of a rig: cameras, screens (optionally with their bows), beams."""
+    names = [f"cameras.{n}.{p}" for n, c in rig.cameras.items() for p in camera_names(c)]
+    names += [f"screens.{n}.{p}" for n in rig.screens for p in ((*POSE, *BOW) if bow else POSE)]
+    names += [f"beams.{n}.{p}" for n in rig.beams for p in (*DIRECTION, *POINT)]
+    return tuple(names)
+
+
+def split_name(name: str) -> tuple[str, str, str]:
+    """Kind, item and parameter: `cameras.left.fx` gives cameras, left, fx; the item's own name may contain dots."""
+    kind, rest = name.split(".", 1)
+    item, parameter = rest.rsplit(".", 1)
+    return kind, item, parameter
+
+
+def is_known(rig: Rig, name: str) -> bool:
+    """Whether this rig has a parameter of this name."""
+    if name.count(".") < 2:
+        return False
+    kind, item, parameter = split_name(name)
+    if kind == "cameras" and item in rig.cameras:
+        return parameter in camera_names(rig.cameras[item])
+    if kind == "screens" and item in rig.screens:
+        return parameter in (*POSE, *BOW)
+    return kind == "beams" and item in rig.beams and parameter in (*DIRECTION, *POINT)
+
+
+def perturbed(rig: Rig, names: Sequence[str], delta: Array) -> Rig:
+    """The rig with each named parameter changed by delta (p,), in the parameters' units.
+
+    Raises:
+        KeyError: the rig has no parameter of this name.
+    """
+    changes: dict[tuple[str, str], dict[str, float]] = {}
+    for name, value in zip(names, delta, strict=True):
+        if not is_known(rig, name):
+            raise KeyError(name)
+        kind, item, parameter = split_name(name)
+        changes.setdefault((kind, item), {})[parameter] = float(value)
+    cameras, screens, beams = dict(rig.cameras), dict(rig.screens), dict(rig.beams)
+    for (kind, item), change in changes.items():
+        if kind == "cameras":
+            cameras[item] = _perturbed_camera(cameras[item], change)
+        elif kind == "screens":
+            screens[item] = _perturbed_screen(screens[item], change)
+        else:
+            beams[item] = _perturbed_beam(beams[item], change)
+    return Rig(screens, cameras, beams, rig.spots)
+
+
+def _changes_of(change: dict[str, float], names: Sequence[str]) -> Array:
+    """The changes of the named parameters (k,), 0 for those that do not change."""
+    return np.array([change.get(n, 0.0) for n in names])
+
+
+def _perturbed_pose(pose: Pose, change: dict[str, float]) -> Pose:
+    delta = _changes_of(change, POSE)
+    return pose.plus(delta) if delta.any() else pose
+
+
+def _perturbed_camera(camera: Camera, change: dict[str, float]) -> Camera:
+    d = _changes_of(change, PINHOLE)
+    matrix = camera.matrix + np.array([[d[0], 0, d[2]], [0, d[1], d[3]], [0, 0, 0]])
+    distortion = np.array(camera.distortion) + _changes_of(change, distortion_names(camera))
+    return replace(
+        camera,
+        matrix=matrix,
+        distortion=tuple(distortion.tolist()),
+        camera_from_world=_perturbed_pose(camera.camera_from_world, change),
+    )
+
+
+def _perturbed_screen(screen: Screen, change: dict[str, float]) -> Screen:
+    a, b, c = (np.array(screen.bow) + _changes_of(change, BOW)).tolist()
+    return replace(screen, world_from_screen=_perturbed_pose(screen.world_from_screen, change), bow=(a, b, c))
+
+
+def _perturbed_beam(beam: Beam, change: dict[str, float]) -> Beam:
+    return Beam(beam.name, beam.direction + _changes_of(change, DIRECTION), beam.point + _changes_of(change, POINT))
+
+
+class Sensitivity:
+    """Derivatives of the pixels of a rig's n views by the named parameters.
+
+    Prepared once per rig: which parameter acts on which view does not depend on the pose.
+    """
+
+    def __init__(self, rig: Rig, model: SpotModel, names: Sequence[str]) -> None:
+        """model: of this rig, possibly of a subset of its views.
+
+        Raises:
+            KeyError: the rig has no parameter of this name.
+        """
+        self.names = tuple(names)
+        cameras, screens, beams = list(rig.cameras), list(rig.screens), list(rig.beams)
+        camera_of = model.camera_of
+        screen_of = np.array([screens.index(rig.spots[s].screen) for _, s in model.views], dtype=np.int64)
+        # Per field of SpotDerivatives: indices of parameters, their columns in it, and the views (n, .) they act on.
+        self._actions: dict[str, tuple[list[int], list[int], Array]] = {}
+        masks: dict[str, list[Array]] = {}
+        for i, name in enumerate(self.names):
+            if not is_known(rig, name):
+                raise KeyError(name)
+            kind, item, parameter = split_name(name)
+            if kind == "cameras":
+                field, column = _camera_column(rig.cameras[item], parameter)
+                views = camera_of == cameras.index(item)
+            elif kind == "screens":
+                field, column = ("bow", BOW.index(parameter)) if parameter in BOW else ("screen", POSE.index(parameter))
+                views = screen_of == screens.index(item)
+            else:
+                is_direction = parameter in DIRECTION
+                field = "direction" if is_direction else "point"
+                column = (DIRECTION if is_direction else POINT).index(parameter)
+                views = model.beam_of == beams.index(item)
+            indices, columns, _ = self._actions.setdefault(field, ([], [], np.empty(0)))
+            indices.append(i)
+            columns.append(column)
+            masks.setdefault(field, []).append(views.astype(float))
+        for field, (indices, columns, _) in self._actions.items():
+            self._actions[field] = indices, columns, np.stack(masks[field], axis=-1)
+
+    def of(self, derivatives: SpotDerivatives) -> Array:
+        """d(pixels)/d(parameters) (..., n, 2, p), px per unit."""
+        out = np.zeros((*derivatives.pixels.shape, len(self.names)))
+        for field, (indices, columns, views) in self._actions.items():
+            out[..., indices] = getattr(derivatives, field)[..., columns] * views[:, None, :]
+        return out
+
+
+def _camera_column(camera: Camera, parameter: str) -> tuple[str, int]:
+    """Field of SpotDerivatives and column in it of a camera's parameter."""
+
+    if parameter in PINHOLE:
+        return "pinhole", PINHOLE.index(parameter)
+    if parameter in POSE:
+        return "camera", POSE.index(parameter)
+    return "distortion", distortion_names(camera).index(parameter)
+
+
+# Effect of a calibration's errors on the pixels of all spots together; the errors are the same in every frame.
+#
+# A calibration that is wrong by a draw of its covariance moves the spots of one frame jointly, and those of the next
+# frame in the same way. The pose is therefore solved with this covariance beside the noise (generalised least
+# squares), which keeps the consistency tests correct, and its share of the pose's covariance is reported separately:
+# averaging over frames does not reduce it. Source: ours.
 
 
 class RigUncertainty:
@@ -50,3 +228,28 @@ def _root(covariance: Array) -> Array:
     eigenvalues, vectors = np.linalg.eigh(symmetric(covariance / np.outer(safe, safe)))
     real = eigenvalues > 1e-12 * max(float(eigenvalues[-1]), 1e-300)
     return (vectors[:, real] * np.sqrt(eigenvalues[real])) * unit[:, None]
+
+
+# Covariance of a smoother whose measurements have errors that do not change from frame to frame.
+
+
+# Share of the measurements' noise in the variance of an optimal estimate of a motion with white jerk; the rest comes
+# from the jerk. The variance grows as R^(5/6) q^(1/6) with the variances R of the noise and q of the jerk.
+NOISE_OF_ESTIMATE = 5 / 6
+
+
+def share_without_calibration(J: Array, noise: Array, calibration: Array) -> float:
+    """Share of an estimate's covariance that is left without the calibration's errors, which its weights include.
+
+    A smoother that weights m points with noise and calibration errors takes both for noise. The calibration's errors,
+    which no averaging reduces, are stated separately, so that they would count twice. J (m, 2, 6): Jacobians of the
+    points; noise, calibration (m, 2, 2), px^2: their covariances. 1 where the points do not determine the pose.
+    Source: ours.
+    """
+    W = np.linalg.inv(noise + calibration)
+    JW = np.swapaxes(J, 1, 2) @ W  # (m, 6, 2)
+    H = np.sum(JW @ J, axis=0)
+    if not np.linalg.cond(H) < 1 / np.finfo(float).eps:
+        return 1.0
+    own = float(np.trace(np.linalg.solve(H, np.sum(JW @ noise @ np.swapaxes(JW, 1, 2), axis=0)))) / 6
+    return 1 - NOISE_OF_ESTIMATE * (1 - own)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,14 +16,14 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
-from lab.api.frames import read_frame
 from lab.errors import InputError
-from lab.files.run.results import PoseTrack, has_causal, read_poses, read_summary
+from lab.files.run.results import PoseTrack, has_causal, read_poses, read_result_table, read_summary
 from lab.files.run.run_file import Run, load_run
 from lab.files.text import columns
-from lab.overlay.canvas import Pixels
-from lab.overlay.sheet import png
-from lab.overlay.show import show_frame, write_picture
+from lab.files.text.csv_table import Categorical, Table
+from lab.results.show.panel import Pixels
+from lab.results.show.sheet import png
+from lab.results.show.show import show_frame, write_picture
 from lab.runs.process import are_results
 
 _EVENT_COLUMNS = ("frame", "last_frame", "kind", "camera", "spot", "text")
@@ -238,3 +239,36 @@ def load(folder: Path | str, *, run: Path | str | None = None) -> Results:
     if not are_results(folder):
         raise InputError(f"{folder}: expected a folder that `beampose run` wrote, found no summary.json of one")
     return Results(folder, None if run is None else Path(run))
+
+
+# Tables of results as pandas frames, with the names of the CSV files, which contain the units.
+
+
+WHOLE = ("frame", "spots_used")  # columns of whole numbers
+
+
+def read_frame(path: Path, names: Iterable[str], optional: Iterable[str] = ()) -> pd.DataFrame:
+    """A CSV file of results: numbers are float64, frame numbers int64, names and statuses categories.
+
+    Columns that an older file does not have are nan. Raises InputError.
+    """
+    names, optional = list(names), list(optional)
+    table = read_result_table(path, [n for n in names if n not in optional], optional)
+    return frame_of(table, names)
+
+
+def frame_of(table: Table, names: Iterable[str]) -> pd.DataFrame:
+    """The named columns of a table."""
+    return pd.DataFrame({name: _column(table, name) for name in names})
+
+
+def _column(table: Table, name: str) -> object:
+    if name in table.words:
+        return category(table.words[name])
+    values = table.numbers[name]
+    return values.astype(np.int64) if name in WHOLE and np.isfinite(values).all() else values
+
+
+def category(column: Categorical) -> pd.Categorical[str]:
+    """A column of words as categories, in the order in which the file names them."""
+    return pd.Categorical.from_codes(column.codes, categories=pd.Index(column.words, dtype=str))

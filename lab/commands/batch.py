@@ -13,9 +13,17 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from lab.commands.common import ANY_PATH, FOLDER, complain, set_option, show_line
+from lab.commands.common import (
+    ANY_PATH,
+    FOLDER,
+    check_verbosity,
+    complain,
+    quiet_option,
+    set_option,
+    show_line,
+    silenced,
+)
 from lab.commands.run import causal_option
-from lab.commands.verbosity import check_verbosity, quiet_option, silenced
 from lab.errors import BeamposeError
 
 Shown = Callable[[int, int, int], None]
@@ -85,7 +93,7 @@ def batch(
     if dask is not None and ctx.get_parameter_source("jobs") is ParameterSource.COMMANDLINE:
         raise click.UsageError("expected --jobs or --dask, got both", ctx)
     check_verbosity(verbose=verbose, quiet=quiet)
-    from lab.commands.command_line import provenance
+    from lab.commands.common import provenance
     from lab.runs.batch.batch import BatchOptions, process_batch
     from lab.runs.batch.run_list import shard_of
 

@@ -6,8 +6,16 @@ from pathlib import Path
 
 import click
 
-from lab.commands import completion
-from lab.commands.common import ANY_PATH, FOLDER, Commands, NumberRange, conclude, progress_bar, show_line
+from lab.commands.common import (
+    ANY_PATH,
+    FOLDER,
+    Commands,
+    NumberRange,
+    complete_rigs,
+    conclude,
+    progress_bar,
+    show_line,
+)
 
 
 @click.group(cls=Commands)
@@ -205,7 +213,7 @@ def convert(source: Path, destination: Path, origin: str | None, target: str | N
     "--rig",
     default="fan",
     show_default=True,
-    shell_complete=completion.rigs,
+    shell_complete=complete_rigs,
     help="A rig.yaml as designed, or fan, unequal-fan, two-cameras-per-screen, four-skew-beams.",
 )
 @click.option(
@@ -222,7 +230,7 @@ def simulate_campaign(out: Path, rig: str, seed: int, positions: int, photos: bo
     Example:
         beampose calibrate simulate --out campaign
     """
-    from lab.simulate.campaign_files import simulate_calibration
+    from lab.simulate.campaign import simulate_calibration
 
     folder = simulate_calibration(out, seed=seed, rig=rig, positions=positions, photos=photos)
     show_line(f"project: {folder / 'calibration.yaml'}")

@@ -6,8 +6,9 @@ import contextlib
 import logging
 import math
 import os
+import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -225,3 +226,133 @@ def conclude(outcome: Any) -> None:
     """Prints an outcome and ends with its exit status."""
     show_line(outcome.line())
     sys.exit(outcome.exit_status)
+
+
+# What a run shows while it works: a progress bar, the lines of its log (--verbose), or nothing (--quiet).
+
+
+verbose_option = click.option(
+    "--verbose", "-v", is_flag=True, help="Show the lines of run.log on standard error as they come."
+)
+quiet_option = click.option("--quiet", "-q", is_flag=True, help="Show nothing but errors.")
+
+
+class _Lines(logging.Handler):
+    def emit(self, record: logging.LogRecord) -> None:
+        print(record.getMessage(), file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def shown(name: str, *, verbose: bool, quiet: bool) -> Iterator[Callable[..., None] | None]:
+    """The callback for the progress of a run; None without a progress bar.
+
+    Raises:
+        click.UsageError: both options are given.
+    """
+    check_verbosity(verbose=verbose, quiet=quiet)
+    if quiet:
+        with silenced():
+            yield None
+    elif verbose:
+        from lab.runs.run_log import LOGGER
+
+        handler = _Lines()
+        LOGGER.addHandler(handler)
+        try:
+            yield None
+        finally:
+            LOGGER.removeHandler(handler)
+    else:
+        with progress_bar(name) as progress:
+            yield progress
+
+
+def check_verbosity(*, verbose: bool, quiet: bool) -> None:
+    """Raises click.UsageError where both options are given."""
+    if verbose and quiet:
+        raise click.UsageError("expected --verbose or --quiet, got both")
+
+
+@contextlib.contextmanager
+def silenced() -> Iterator[None]:
+    """Messages of the libraries, such as that they compile, are not shown on the terminal in this block."""
+    handlers = [h for h in logging.getLogger("beampose").handlers if isinstance(h, StderrHandler)]
+    before = [handler.level for handler in handlers]
+    for handler in handlers:
+        handler.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        for handler, level in zip(handlers, before, strict=True):
+            handler.setLevel(level)
+
+
+# The command as it was typed, for summary.json and the log.
+
+
+_MOST_ARGUMENTS = 20  # of a list of runs: each of its results records the command
+
+
+def command_line(ctx: click.Context) -> str:
+    """The command of a context with its arguments and the options that differ from their defaults."""
+    words = ["beampose", *ctx.command_path.split()[1:]]
+    options: list[str] = []
+    for parameter in ctx.command.params:
+        value = ctx.params.get(parameter.name or "")
+        if isinstance(parameter, click.Argument):
+            words += _arguments(value) if isinstance(value, tuple) else [str(value)]
+        elif value not in (None, False, (), {}) and value != parameter.get_default(ctx):
+            options += _option(max(parameter.opts, key=len), value)
+    return shlex.join([*words, *options])
+
+
+def _arguments(values: tuple[Any, ...]) -> list[str]:
+    """The values of an argument; of a long list the first ones, and how many there are."""
+    words = [str(v) for v in values]
+    if len(words) <= _MOST_ARGUMENTS:
+        return words
+    return [*words[:_MOST_ARGUMENTS], f"... ({len(words)} in all)"]
+
+
+def _option(name: str, value: Any) -> list[str]:
+    if value is True:
+        return [name]
+    if isinstance(value, Mapping):  # --set
+        return [word for key, inner in value.items() for word in (name, f"{key}={_as_yaml(inner)}")]
+    values = value if isinstance(value, tuple) else (value,)
+    return [word for v in values for word in (name, str(v))]
+
+
+def _as_yaml(value: Any) -> str:
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    return str(value)
+
+
+def provenance(ctx: click.Context) -> dict[str, Any]:
+    """What summary.json records of the command: the line, and the folder that relative paths start from."""
+    return {"command": command_line(ctx), "working_folder": str(Path.cwd())}
+
+
+# Words that the shell completes (docs/shell_completion.md): scenarios, rigs and codes.
+
+
+def complete_scenarios(ctx: click.Context, parameter: click.Parameter, begun: str) -> list[str]:
+    """Scenarios of `simulate` that begin with `begun`."""
+    from lab.simulate.scenarios import SCENARIOS
+
+    return [name for name in ("list", *SCENARIOS) if name.startswith(begun)]
+
+
+def complete_rigs(ctx: click.Context, parameter: click.Parameter, begun: str) -> list[str]:
+    """Rigs of `calibrate simulate` that begin with `begun`."""
+    from lab.simulate.rigs import RIGS
+
+    return [name for name in RIGS if name.startswith(begun)]
+
+
+def complete_codes(ctx: click.Context, parameter: click.Parameter, begun: str) -> list[str]:
+    """Codes of `explain` that begin with `begun`, in any case."""
+    from lab.explain.catalogue import EXPLANATIONS
+
+    return [code for code in EXPLANATIONS if code.startswith(begun.upper())]

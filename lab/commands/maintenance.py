@@ -8,8 +8,7 @@ from pathlib import Path
 
 import click
 
-from lab.commands import completion
-from lab.commands.common import ANY_PATH, FOLDER, NumberRange, progress_bar, show_line
+from lab.commands.common import ANY_PATH, FOLDER, NumberRange, complete_codes, progress_bar, show_line
 
 
 @click.command()
@@ -26,8 +25,8 @@ def doctor(files: tuple[Path, ...], out: Path) -> None:
     Example:
         beampose doctor sample_runs/huo2015
     """
-    from lab.doctor.doctor import examine
-    from lab.doctor.lines import exit_status
+    from lab.setup.doctor import examine
+    from lab.setup.installation import exit_status
 
     lines = examine(files, out)
     for line in lines:
@@ -36,7 +35,7 @@ def doctor(files: tuple[Path, ...], out: Path) -> None:
 
 
 @click.command()
-@click.argument("codes", metavar="[CODE]...", nargs=-1, shell_complete=completion.codes)
+@click.argument("codes", metavar="[CODE]...", nargs=-1, shell_complete=complete_codes)
 def explain(codes: tuple[str, ...]) -> None:
     """Explain the code of a warning, a verdict reason, a finding or an error; without a code, list all codes.
 
@@ -110,8 +109,7 @@ def init(
     Example:
         beampose init my-lab --screens 2 --cameras 2 --beams 3 --rate 100
     """
-    from lab.init.files import start
-    from lab.init.layout import Layout
+    from lab.setup.init import Layout, start
 
     values = _asked({"screens": screens, "cameras": cameras, "beams": beams, "rate": rate})
     layout = Layout(
@@ -145,7 +143,7 @@ def verify(results: Path, run_folder: Path | None) -> None:
     Example:
         beampose verify results/huo2015
     """
-    from lab.verify.verify import verify as verify_results
+    from lab.results.verify import verify as verify_results
 
     with progress_bar(results.name) as progress:
         verification = verify_results(results, run_folder, progress)
@@ -167,7 +165,7 @@ def schema(name: str | None, out: Path | None) -> None:
     Example:
         beampose schema --out schemas
     """
-    from lab.schema.files import as_text, write
+    from lab.setup.schema import as_text, write
 
     if out is None and name is None:
         raise click.UsageError(f"expected a kind of file ({', '.join(_FILES)}) or --out FOLDER, got neither")

@@ -8,12 +8,20 @@ from typing import Any
 
 import click
 
-from lab.commands import completion
-from lab.commands.common import ANY_PATH, FOLDER, NumberRange, conclude, progress_bar, read_settings, show_line
+from lab.commands.common import (
+    ANY_PATH,
+    FOLDER,
+    NumberRange,
+    complete_scenarios,
+    conclude,
+    progress_bar,
+    read_settings,
+    show_line,
+)
 
 
 @click.command()
-@click.argument("scenario", shell_complete=completion.scenarios)
+@click.argument("scenario", shell_complete=complete_scenarios)
 @click.option("--out", type=FOLDER, help="The run folder to write; it must not exist yet.")
 @click.option(
     "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="The same seed gives the same bytes."
@@ -55,10 +63,10 @@ def simulate(
     Example:
         beampose simulate sharp-turns --frames 50 --out runs/sharp-turns
     """
-    from lab.binocular.simulated_recording import SCENARIO as STEREO
-    from lab.binocular.simulated_recording import SUMMARY as STEREO_SUMMARY
     from lab.simulate.scenarios import LIGHTS, SCENARIOS
     from lab.simulate.write import simulate as write_run
+    from lab.targets.stereo.simulated_recording import SCENARIO as STEREO
+    from lab.targets.stereo.simulated_recording import SUMMARY as STEREO_SUMMARY
 
     if scenario == "list":
         for listed in SCENARIOS.values():
@@ -69,7 +77,7 @@ def simulate(
     if out is None:
         raise click.UsageError("Missing option '--out'.")
     if scenario == STEREO:
-        from lab.binocular.simulated_recording import write_stereo_recording
+        from lab.targets.stereo.simulated_recording import write_stereo_recording
 
         unused = {"--video": video, "--clutter": clutter, "--light": light, "--rig": rig, "--known-rig": known_rig}
         for option, value in unused.items():
@@ -151,8 +159,8 @@ def plan(
     Example:
         beampose plan sample_runs/huo2015/rig.yaml --out results/plan
     """
-    from lab.plan.plan import plan_rig
-    from lab.plan.plan_options import options_of
+    from lab.setup.plan import plan_rig
+    from lab.setup.plan_findings import options_of
 
     goal_m = None if goal_mm is None else goal_mm / 1000
     options = options_of(ranges, sigma_px=sigma_px, goal_deg=goal_deg, goal_m=goal_m, expected=settings)

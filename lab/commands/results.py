@@ -62,7 +62,7 @@ def report(
         raise InputError(f"{results}: expected a folder that `beampose run` wrote, found no summary.json of one")
     show_line(f"report: {write_report(results, run_folder)}")
     if video:
-        from lab.overlay.video import DEFAULT_FPS, write_video
+        from lab.results.show.video import DEFAULT_FPS, write_video
 
         with progress_bar(results.name) as progress:
             done = write_video(
@@ -71,3 +71,143 @@ def report(
         show_line(f"video: {done.path} ({done.frames} frames)")
         for note in done.notes:
             complain(note)
+
+
+# `beampose compare`: a result against another result of the run, or against a reference.
+
+
+_RESULTS = click.Path(exists=True, file_okay=False, path_type=Path)
+_WAYS = ("time", "rate", "world", "body")
+
+
+def _read_align(ctx: click.Context, parameter: click.Parameter, value: str | None) -> tuple[str, ...] | None:
+    """all, none, or names separated by commas; None where the option is not given."""
+    if value is None:
+        return None
+    if value in ("all", "none"):
+        return _WAYS if value == "all" else ()
+    names = tuple(name.strip() for name in value.split(","))
+    for name in names:
+        if name not in _WAYS:
+            raise click.BadParameter(f"expected all, none or some of {','.join(_WAYS)}, got {name!r}", ctx, parameter)
+    if "rate" in names and "time" not in names:
+        raise click.BadParameter("rate needs time too: write time,rate", ctx, parameter)
+    return names
+
+
+@click.command()
+@click.argument("result", metavar="OUT", type=_RESULTS)
+@click.argument("other", metavar="[OTHER]", required=False, type=_RESULTS)
+@click.option(
+    "--reference",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="A CSV table (t_s with qw,qx,qy,qz or yaw_deg,pitch_deg,roll_deg and x_m,y_m,z_m) or a TUM file.",
+)
+@click.option("--out", type=FOLDER, help="Gets report.html, differences.csv, allan.csv and comparison.json.")
+@click.option(
+    "--align",
+    metavar="WHAT",
+    callback=_read_align,
+    help="all, none, or some of time,rate,world,body. Default: all for a reference, none for two results.",
+)
+@click.option(
+    "--offset", "offset_s", type=NumberRange(-1e12, 1e12), help="Reference time minus result time in s, approximately."
+)
+@click.option(
+    "--sigma-m", type=NumberRange(0, 1e6), default=0.0, help="Sigma of the reference's positions, if it has none."
+)
+@click.option(
+    "--sigma-deg", type=NumberRange(0, 1e6), default=0.0, help="Sigma of the reference's angles, if it has none."
+)
+def compare(
+    result: Path,
+    other: Path | None,
+    reference: Path | None,
+    out: Path | None,
+    align: tuple[str, ...] | None,
+    offset_s: float | None,
+    sigma_m: float,
+    sigma_deg: float,
+) -> None:
+    """Compare a result with another one, or with a reference.
+
+    The time offset, the clock rate and the frames of the reference are estimated. What the motion does not determine is
+    reported as such.
+
+    \b
+    Example:
+        beampose compare results/huo2015 --reference sample_runs/huo2015/truth/pose.csv --out results/compared
+    """
+    from lab.results.compare_page import compare_and_write
+
+    outcome = compare_and_write(
+        result, other, reference, out, align=align, offset_s=offset_s, sigma_m=sigma_m, sigma_deg=sigma_deg
+    )
+    for line in outcome.lines:
+        show_line(line)
+    if outcome.report is not None:
+        show_line(f"report: {outcome.report}")
+
+
+# `beampose view`: a rig, a run or results in three dimensions.
+
+
+@click.command()
+@click.argument("path", type=ANY_PATH)
+@click.option("--out", type=FOLDER, help="Write files here and open no window. Without a display: results/view.")
+@click.option("--frame", type=int, help="Frame number of the beams and spots; default: the middle one.")
+@click.option("--rig", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Instead of the run's rig.")
+@click.option(
+    "--sigma-scale",
+    type=NumberRange(min=0, max=1e9, min_open=True),
+    help="Size of the sigma ellipsoids; default: a round number that makes them visible.",
+)
+def view(path: Path, out: Path | None, frame: int | None, rig: Path | None, sigma_scale: float | None) -> None:
+    """Show a rig.yaml, a run folder or results in three dimensions.
+
+    Screens, cameras with their fields of view, beams, spots and the trajectory with sigma ellipsoids. Opens a window
+    where there is a display: space plays, arrow keys step, and with a driver of Vulkan it has a slider. Otherwise, or
+    with --out, it writes view.html to turn and play in a browser, scene.glb, scene.ply and pictures.
+
+    \b
+    Example:
+        beampose view sample_runs/huo2015 --out results/view
+    """
+    from lab.results.view.view import show
+
+    done = show(path, out, frame=frame, rig=rig, sigma_scale=sigma_scale)
+    for file in done.files:
+        show_line(str(file))
+    for note in done.notes:
+        complain(note)
+
+
+# `beampose show`: one annotated picture.
+
+
+@click.command()
+@click.argument("path", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--frame", required=True, type=int, help="Frame number.")
+@click.option("--camera", help="Only this camera; default: all, side by side.")
+@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="A .png file; default: frame-N.png.")
+@click.option("--run", "run_folder", type=FOLDER, help="The run folder of the results, if it has moved.")
+def show(path: Path, frame: int, camera: str | None, out: Path | None, run_folder: Path | None) -> None:
+    """Draw what was found in one frame over its pictures.
+
+    PATH is a folder of results; or a run folder, whose frames up to this one are then processed first. The picture
+    shows detections, labelled spots with their status, predictions, and for each spot that is not measured where it
+    can lie: along the uncertainty of the pose, and along the image of its beam.
+
+    \b
+    Example:
+        beampose show results/huo2015 --frame 11 --out results/frame-11.png
+    """
+    from lab.results.show.show import show_frame, write_picture
+
+    with progress_bar(path.name) as progress:
+        shown = show_frame(path, frame, camera=camera, run_folder=run_folder, progress=progress)
+    file = out or Path(f"frame-{frame}.png")
+    write_picture(shown.image, file)
+    show_line(f"picture: {file}")
+    for note in shown.notes:
+        complain(note)

@@ -8,8 +8,18 @@ from typing import Any
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, NumberRange, conclude, progress_bar, set_option, show_line
-from lab.commands.verbosity import quiet_option, shown, verbose_option
+from lab.commands.common import (
+    ANY_PATH,
+    FOLDER,
+    NumberRange,
+    conclude,
+    progress_bar,
+    quiet_option,
+    set_option,
+    show_line,
+    shown,
+    verbose_option,
+)
 
 causal_option = click.option(
     "--causal", is_flag=True, help="No smoothing pass: attitude.csv has the poses as known at each instant."
@@ -43,7 +53,7 @@ def run(
     Example:
         beampose run sample_runs/huo2015 --out results/huo2015
     """
-    from lab.commands.command_line import provenance
+    from lab.commands.common import provenance
     from lab.files.run.fingerprints import fingerprints
     from lab.files.run.run_file import Run
     from lab.runs.process import process_run
@@ -136,7 +146,7 @@ def watch(
     Example:
         beampose watch runs/today --out results/today --udp 127.0.0.1:5005
     """
-    from lab.commands.command_line import provenance
+    from lab.commands.common import provenance
     from lab.watch.live_frames import WatchOptions
     from lab.watch.watch import stopped_by_ctrl_c, watch_run
 

@@ -8,9 +8,23 @@ import numpy as np
 
 from geometry.arrays import Array, Bools
 from lab.number_format import format_number
-from lab.report.plot.axes import PlotArea, axes, frame, image_area, note, plot_area, svg_of
-from lab.report.plot.scales import ticks
-from lab.report.plot.svg import BLUE, ORANGE, VERMILLION, dots, line_path, polyline, text
+from lab.report.plot.axes import (
+    BLUE,
+    ORANGE,
+    VERMILLION,
+    PlotArea,
+    axes,
+    dots,
+    frame,
+    image_area,
+    line_path,
+    note,
+    plot_area,
+    polyline,
+    svg_of,
+    text,
+    ticks,
+)
 from tracking.noise_estimation.levels import LevelVariances
 from tracking.noise_estimation.photon_transfer import NoiseEstimate
 

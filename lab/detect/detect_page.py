@@ -19,8 +19,8 @@ from lab.number_format import format_number
 from lab.pictures.picture_file import GreyPicture
 from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section, section_context
 from lab.report.html import environment
+from lab.report.plot.axes import BLUE, picture_uri
 from lab.report.plot.series import Line, time_panel
-from lab.report.plot.svg import BLUE, picture_uri
 from lab.versions import versions
 from tracking.noise_estimation.levels import LevelVariances, level_variances
 

@@ -12,7 +12,7 @@ from geometry.arrays import Array
 from geometry.camera import SensorNoise
 from geometry.light_centroid import map_curvature
 from geometry.pose import Pose
-from lab.simulate.optics import exposure_instants, spot_images, spot_patch
+from lab.simulate.points import exposure_instants, spot_images, spot_patch
 from lab.simulate.scenarios import Light
 from lab.simulate.scene import LIGHT, PIXELS, VISIBLE, Scene
 

@@ -17,9 +17,8 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from lab.errors import InputError
-from lab.simulate.motion import Motion
 from lab.simulate.rigs import RIGS, scaled, with_noise
-from lab.simulate.scenarios import SCENARIOS, Scenario
+from lab.simulate.scenarios import SCENARIOS, Motion, Scenario
 
 # Every random number comes from a generator seeded by (seed, purpose, frame, ...): frame 7 is the same in a recording
 # of ten frames and of a thousand, and the clutter does not depend on the noise.

@@ -26,9 +26,8 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import POSE as POSE_NAMES
-from geometry.uncertainty.rig_parameters import RigCovariance, Sensitivity, perturbed
-from geometry.uncertainty.rig_uncertainty import RigUncertainty
+from geometry.uncertainty.rig_uncertainty import POSE as POSE_NAMES
+from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty, Sensitivity, perturbed
 from tests.geometry.scenes import LENSES, paper_rig
 
 SIGMA_PX = 0.1

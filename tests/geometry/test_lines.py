@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from geometry.lines import common_perpendicular, nearest_point
+from geometry.planes import common_perpendicular, nearest_point
 
 seeds = st.integers(0, 2**32 - 1)
 

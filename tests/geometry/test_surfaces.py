@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from geometry.planes import intersect_plane, screen_to_world
-from geometry.surfaces import intersect_surface
+from geometry.planes import intersect_plane, intersect_surface, screen_to_world
 from tests.geometry.scenes import random_pose
 
 

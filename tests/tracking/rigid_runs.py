@@ -11,7 +11,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.simulate.points import CLUTTER, PointRun
 from lab.simulate.scenarios import PriorRegion
 from lab.simulate.scene import OCCLUDED, OUTSIDE, VISIBLE

@@ -11,12 +11,12 @@ from lab.calibrate.camera.camera import CORNER_COLUMNS
 from lab.calibrate.drift_check import drift_check, drift_history
 from lab.calibrate.rig import rig_tables
 from lab.calibrate.screens.screen_tables import DOT_COLUMNS
-from lab.compare.tables import ALLAN, DIFFERENCES
 from lab.files.project.point_files import POINTS, POSE_SIGMAS, SURVEY, SURVEY_SIGMAS
 from lab.files.text import columns
 from lab.files.text.yaml_text import parse_mapping
+from lab.results.compare_page import ALLAN, DIFFERENCES
 from lab.runs.batch import task
-from lab.schema.files import schema
+from lab.setup.schema import schema
 from tests.paths import ROOT
 from tracking.statuses import PoseStatus, SpotStatus
 

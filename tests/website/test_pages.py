@@ -13,7 +13,7 @@ import pytest
 
 from calibration.budget.expected_errors import ExpectedErrors
 from lab.explain.catalogue import EXPLANATIONS
-from lab.schema.files import BLOCKS
+from lab.setup.schema import BLOCKS
 from tests.paths import ROOT
 from tracking.parameters import DetectParameters, LabelParameters, TrackerParameters
 from website import codes, commands, parameters, study_tables, yaml_files

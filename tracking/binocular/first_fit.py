@@ -12,10 +12,9 @@ from geometry.pose import Pose
 from geometry.pose_solver.three_spots import poses_from_three_spots
 from geometry.uncertainty.chi_square import chi2_tail
 from tracking.binocular.acquisition import marker_triples, mirrored, same_pose
-from tracking.binocular.horn import pose_of_points
 from tracking.binocular.joint_fit import JointFit, MarkerObservations, fit_pose
 from tracking.binocular.marker_model import MarkerModel, StereoPair, project_markers
-from tracking.binocular.triangulation import triangulate
+from tracking.binocular.triangulation import pose_of_points, triangulate
 
 _STARTS = 3  # poses of three markers that are tried
 _TRIPLES = 4

@@ -10,7 +10,7 @@ from geometry.arrays import Array, Bools, Ints, cross
 from geometry.camera import FISHEYE, Camera, pinhole_numbers, project_points, project_points_full
 from geometry.lens import padded
 from geometry.pose import Pose
-from geometry.uncertainty.rig_parameters import DISTORTION, PINHOLE, POSE, RigCovariance, split_name
+from geometry.uncertainty.rig_uncertainty import DISTORTION, PINHOLE, POSE, RigCovariance, split_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ class CameraNumbers:
 class StereoPair:
     """Two calibrated cameras; the pictures of the first are the reference of the histogram specification.
 
-    covariance: of the errors of the calibration, names as in geometry/uncertainty/rig_parameters.py.
+    covariance: of the errors of the calibration, names as in geometry/uncertainty/rig_uncertainty.py.
 
     Raises:
         ValueError: the cameras are at the same place, or a covariance names another camera.
@@ -137,7 +137,7 @@ def project_markers(pair: StereoPair, model: MarkerModel, world_from_body: Pose)
 def calibration_jacobian(pair: StereoPair, points_world: Array) -> Array:
     """Derivatives (2, K, 2, p) of the pixels of world points (K, 3) by the p parameters of the pair's covariance.
 
-    Source: ours; the parameters and their errors are those of geometry/uncertainty/rig_parameters.py.
+    Source: ours; the parameters and their errors are those of geometry/uncertainty/rig_uncertainty.py.
     """
     assert pair.covariance is not None
     names = pair.covariance.names

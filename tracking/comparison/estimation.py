@@ -1,4 +1,4 @@
-"""Estimates time offset, clock rate and frame alignment by robust weighted least squares, with covariance."""
+"""Candidates of the time offset between two motions, from the speeds, which do not depend on the frames."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.signal import fftconvolve
 
 from geometry.arrays import Array, Bools, symmetric
 from geometry.uncertainty.chi_square import chi2_limit
-from tracking.comparison.first_alignment import first_alignment
 from tracking.comparison.frame_alignment import (
     BODY,
     LEVER,
@@ -19,12 +19,178 @@ from tracking.comparison.frame_alignment import (
     WORLD,
     Alignment,
     Residuals,
+    first_alignment,
     jacobians,
     residuals,
 )
-from tracking.comparison.motion import GAP, Motion
-from tracking.comparison.observability import Determined, Information, determined
-from tracking.comparison.time_candidates import offset_candidates
+from tracking.comparison.motion import GAP, Motion, rates
+
+_MOST_POINTS = 1 << 15
+_LEAST_SHARE = 0.5  # of the shorter recording that must overlap
+_LEAST_CORRELATION = 0.5  # of the largest one, for a candidate
+
+
+def speeds_correlation(result: Motion, reference: Motion) -> tuple[Array, Array]:
+    """Time offsets (k,), s, reference minus result, and the correlation (k,) of the speeds at these offsets.
+
+    Rotation rates are used if both motions have attitudes, otherwise velocities.
+    """
+    rotating = result.rotation is not None and reference.rotation is not None
+    part = slice(3, 6) if rotating else slice(0, 3)
+    spans = [float(m.t_s[-1] - m.t_s[0]) for m in (result, reference)]
+    step = max(min(result.step_s, reference.step_s), sum(spans) / _MOST_POINTS)
+    series = []
+    for motion, span in zip((result, reference), spans, strict=True):
+        speed = np.linalg.norm(rates(motion)[:, part], axis=1)
+        grid = motion.t_s[0] + step * np.arange(int(span / step) + 1)
+        series.append(np.interp(grid, motion.t_s, speed))
+    a, b = series
+    ones_a, ones_b = np.ones(len(a)), np.ones(len(b))
+
+    def correlate(x: Array, y: Array) -> Array:
+        return np.asarray(fftconvolve(y, x[::-1]))
+
+    a, b = a - a.mean(), b - b.mean()
+    count = np.maximum(np.round(correlate(ones_a, ones_b)), 1.0)
+    sum_a, sum_b = correlate(a, ones_b), correlate(ones_a, b)
+    covariance = correlate(a, b) - sum_a * sum_b / count
+    variance_a = correlate(a * a, ones_b) - sum_a**2 / count
+    variance_b = correlate(ones_a, b * b) - sum_b**2 / count
+    floor_a, floor_b = (1e-6 * float(np.sum(x * x)) + 1e-300 for x in (a, b))
+    r = covariance / np.sqrt(np.maximum(variance_a, floor_a) * np.maximum(variance_b, floor_b))
+    lags = np.arange(-(len(a) - 1), len(b))
+    enough = count >= max(_LEAST_SHARE * min(len(a), len(b)), 2)
+    offset = reference.t_s[0] - result.t_s[0] + step * lags
+    return offset[enough], r[enough]
+
+
+def offset_candidates(result: Motion, reference: Motion, most: int = 6) -> list[float]:
+    """Offsets at the largest local maxima of the correlation of the speeds, best first."""
+    offset, r = speeds_correlation(result, reference)
+    if not len(r):
+        return []
+    padded = np.concatenate([[-np.inf], r, [-np.inf]])
+    peaks = np.flatnonzero((padded[1:-1] >= padded[:-2]) & (padded[1:-1] > padded[2:]))
+    order = peaks[np.argsort(-r[peaks], kind="stable")]
+    return [float(offset[i]) for i in order[:most] if r[i] >= _LEAST_CORRELATION * r[order[0]]]
+
+
+# What the motion determines: which parameters of an alignment the data distinguish from noise.
+
+
+_SIGNIFICANT = 4.0  # sigmas by which the motion seen by both must exceed its noise, for the clocks
+_NOISE_FACTOR = 100.0  # information must exceed what noise alone feigns by this factor: a motion of ten sigmas
+_LARGEST_TURN_RAD = np.deg2rad(5.0)  # sigma above which a direction of the world's rotation counts as undetermined
+_LARGEST_LEVER_M = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Determined:
+    """A basis of the parameters that are estimated, and the directions that are not."""
+
+    basis: Array  # (14, k): orthonormal columns
+    undetermined: tuple[str, ...]  # parameters of the clocks that the motion does not show
+    world_axes: Array  # (j, 3): axes, in the reference's world, about which A and B are not distinguished
+    lever_axes: Array  # (j, 3): directions, in the result's body, along which the lever arm is not distinguished
+
+
+@dataclass(frozen=True, slots=True)
+class Information:
+    """Normal equations of n residuals."""
+
+    J: Array  # (n, 6, 14): with the result's rates
+    J_reference: Array  # (n, 6, 14): with the reference's rates
+    W: Array  # (n, 6, 6): weights, zero where nothing is compared
+    noise: Array  # (n, 6, 6): covariance of the result in the reference's frames, as large as the residuals show
+
+
+def determined(info: Information, basis: Array) -> Determined:
+    """Removes from a basis (14, k) of the free parameters the directions that the data do not determine."""
+    lost: list[str] = []
+    for k in (1, 0):  # the rate first: it needs the offset
+        column = np.eye(len(PARAMETERS))[:, k]
+        if not np.any(basis[k]):
+            continue
+        others = _without(basis, column)
+        if k == 0 and np.any(basis[1]):
+            others = _without(others, np.eye(len(PARAMETERS))[:, 1])
+        if not _clock_is_seen(info, column, others):
+            lost.append(PARAMETERS[k])
+            basis = _without(basis, column)
+            if k == 0 and np.any(basis[1]):
+                lost.append(PARAMETERS[1])
+                basis = _without(basis, np.eye(len(PARAMETERS))[:, 1])
+    W, noise = info.W, info.noise
+    turn = _trace(noise[:, 3:, 3:])
+    world_noise = float(np.sum(2 / 9 * (_trace(W[:, 3:, 3:]) * turn + _trace(W[:, :3, :3]) * _trace(noise[:, :3, :3]))))
+    basis, world_axes = _reduced(info, basis, WORLD, world_noise, float(_LARGEST_TURN_RAD))
+    lever_noise = float(np.sum(2 / 9 * _trace(W[:, :3, :3]) * turn))
+    basis, lever_axes = _reduced(info, basis, LEVER, lever_noise, _LARGEST_LEVER_M)
+    return Determined(basis, tuple(lost), world_axes, lever_axes)
+
+
+def _clock_is_seen(info: Information, column: Array, others: Array) -> bool:
+    """Whether both motions show the same rates, beyond what the other parameters explain and beyond noise."""
+    rate, rate_there = info.J @ column, info.J_reference @ column
+    if others.shape[1]:
+        J = info.J @ others
+        WJ = info.W @ J
+        normal = np.einsum("nik,nil->kl", J, WJ)
+        inverse = np.linalg.pinv(symmetric(normal), rcond=1e-12, hermitian=True)
+        rate = rate - J @ (inverse @ np.einsum("nik,ni->k", WJ, rate))
+        rate_there = rate_there - J @ (inverse @ np.einsum("nik,ni->k", WJ, rate_there))
+    product = np.einsum("ni,nij,nj->n", rate, info.W, rate_there)
+    total, scatter = float(product.sum()), float(np.sqrt(np.sum(product**2)))
+    return total > _SIGNIFICANT * scatter > 0 and _is_larger_than_rounding(info, column, total)
+
+
+def _is_larger_than_rounding(info: Information, column: Array, total: float) -> bool:
+    rate = info.J @ column
+    return total > 1e-9 * float(np.einsum("ni,nij,nj->", rate, info.W, rate))
+
+
+def _reduced(info: Information, basis: Array, part: slice, noise: float, largest: float) -> tuple[Array, Array]:
+    """The basis without the directions of one part (three parameters) that are undetermined, and these directions."""
+    none = np.zeros((0, 3))
+    if not np.any(basis[part]):
+        return basis, none
+    J = info.J @ basis
+    H = symmetric(np.einsum("nik,nil->kl", J, info.W @ J))
+    block = basis[part]  # (3, k)
+    scale = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(H * scale[:, None] * scale)
+    # Covariance of the three parameters, with null directions at a relative 1e-13 of the information.
+    half = (block * scale) @ (vectors / np.sqrt(np.maximum(eigenvalues, 1e-13 * eigenvalues[-1])))
+    U, sigma, _ = np.linalg.svd(half, full_matrices=False)
+    information = 1 / np.maximum(sigma, 1e-300) ** 2
+    bad = (information < _NOISE_FACTOR * noise) | (sigma > largest)
+    axes = U[:, bad].T
+    for axis in axes:
+        column = np.zeros(len(basis))
+        column[part] = axis
+        basis = _without(basis, column)
+    return basis, _signed(axes)
+
+
+def _signed(axes: Array) -> Array:
+    """Axes (j, 3) with a positive largest component."""
+    largest = np.take_along_axis(axes, np.argmax(np.abs(axes), axis=1)[:, None], axis=1) if len(axes) else axes[:, :1]
+    return np.asarray(axes * np.where(largest < 0, -1.0, 1.0))
+
+
+def _without(basis: Array, column: Array) -> Array:
+    """An orthonormal basis of the part of a basis (m, k) that is orthogonal to a unit vector (m,)."""
+    rest = basis - np.outer(column, column @ basis)
+    U, sigma, _ = np.linalg.svd(rest, full_matrices=False)
+    return np.asarray(U[:, sigma > 0.5])
+
+
+def _trace(stack: Array) -> Array:
+    return np.asarray(np.trace(stack, axis1=1, axis2=2))
+
+
+# Estimates time offset, clock rate and frame alignment by robust weighted least squares, with covariance.
+
 
 _OUTLIER_P = 1e-5
 _HUBER_P = 0.01

@@ -5,7 +5,8 @@ R_ref(s) = A R(t) B and p_ref(s) = A (p(t) + R(t) l) + c with s = t + offset + r
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -135,3 +136,176 @@ def jacobians(result: Motion, reference: Motion, alignment: Alignment, compared:
         target[:, :, 0], target[:, :, 1] = rate, rate * elapsed[:, None]
         target[:, ~compared] = 0.0
     return J, with_reference
+
+
+# First values of the frames of an alignment, in closed form, for given clocks.
+
+
+_BASES = 5  # samples that are tried as the one to which the others are related: some may be outliers
+_TURNS = 24  # rotations about the main axis of the motion that are tried: one axis alone does not determine A
+_ALTERNATIONS = 8
+_MOST_SAMPLES = 400
+
+
+def first_alignment(result: Motion, reference: Motion, start: Alignment, free: Bools) -> Alignment:
+    """Frames of an alignment for the clocks of `start`; free (14,): which parameters may change.
+
+    Rotation vectors, or centred positions, are turned onto each other (Kabsch 1976); what attitudes leave open, the
+    positions decide. What neither determines stays as near to the identity as it can.
+    """
+    known = np.flatnonzero(interpolate(reference, start.reference_time(result.t_s)).known)
+    if not len(known):
+        return start
+    result = result.select(known[:: max(1, len(known) // _MOST_SAMPLES)])
+    there = interpolate(reference, start.reference_time(result.t_s))
+    found = start
+    if result.rotation is not None and there.rotation is not None:
+        noise = float(np.trace(result.covariance[:, 3:, 3:], axis1=1, axis2=2).sum())
+        found = _by_attitude(start, result.rotation, there.rotation, noise, free)
+    if result.position_m is None or there.position_m is None:
+        return found
+    places = there.position_m
+    turns = [found.world]
+    if free[WORLD].all():
+        if result.rotation is not None and there.rotation is not None:
+            axis = _main_axis(there.rotation)
+            angles = np.arange(1, _TURNS) * 2 * np.pi / _TURNS
+            turns += list(rotations.exp(angles[:, None] * axis) @ found.world)
+        noise = float(np.trace(result.covariance[:, :3, :3], axis1=1, axis2=2).sum())
+        p, q = result.position_m, places
+        by_places = _turn_of_places(p, q, noise, np.eye(3))
+        turns.append(by_places)
+        if result.rotation is not None and there.rotation is None:
+            turns += _with_lever_arm(start, result, q, noise, by_places, free)
+    candidates = []
+    for world in turns:
+        candidate = replace(found, world=world)
+        if free[BODY].all() and result.rotation is not None and there.rotation is not None:
+            candidate = replace(
+                candidate, body=_mean_rotation(np.swapaxes(world @ result.rotation, -1, -2) @ there.rotation)
+            )
+        candidate = _with_places(candidate, result, places, free)
+        candidates.append((_misfit(result, reference, candidate), candidate))
+    least = min(misfit for misfit, _ in candidates)
+    return next(candidate for misfit, candidate in candidates if misfit <= 1.05 * least)
+
+
+def _with_lever_arm(
+    start: Alignment, result: Motion, places: Array, noise: float, first: Array, free: Bools
+) -> list[Array]:
+    """Rotations A for places of a point with an unknown lever arm, by alternating between A and the lever arm.
+
+    From 24 starting rotations, since the alternation finds the nearest minimum.
+    """
+    assert result.position_m is not None
+    assert result.rotation is not None
+    found = []
+    for quarter in _quarter_turns():
+        world = quarter @ first
+        for _ in range(_ALTERNATIONS):
+            lever = _with_places(replace(start, world=world), result, places, free).lever_m
+            points = result.position_m + result.rotation @ lever
+            world = _turn_of_places(points, places, noise, world)
+        found.append(world)
+    return found
+
+
+def _turn_of_places(points: Array, places: Array, noise: float, near: Array) -> Array:
+    """The rotation between two clouds of points (n, 3) with unknown centres, without the worst tenth."""
+    good, world = np.ones(len(points), dtype=bool), near
+    for _ in range(2):
+        moved, seen = points - points[good].mean(axis=0), places - places[good].mean(axis=0)
+        world = _turn(moved[good], seen[good], noise, near)
+        away = np.linalg.norm(seen - moved @ world.T, axis=1)
+        good = away <= np.quantile(away, 0.9)
+    return world
+
+
+def _quarter_turns() -> list[Array]:
+    """The 24 rotations of a cube."""
+    found = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            if np.linalg.det(matrix) > 0:
+                found.append(matrix)
+    return found
+
+
+def _misfit(result: Motion, reference: Motion, alignment: Alignment) -> float:
+    """The median of the squared residuals over the mean variances."""
+    r = residuals(result, reference, alignment)
+    variances = np.diagonal(r.result_covariance + r.reference_covariance, axis1=1, axis2=2).mean(axis=0)
+    d2 = np.sum(r.values[r.known] ** 2 / np.where(variances > 0, variances, 1.0), axis=1)
+    return float(np.median(d2)) if len(d2) else np.inf
+
+
+def _with_places(alignment: Alignment, result: Motion, places: Array, free: Bools) -> Alignment:
+    """Lever arm and translation by linear least squares, twice: the second time without the worst tenth."""
+    assert result.position_m is not None
+    n = len(places)
+    rest = places - result.position_m @ alignment.world.T
+    J = np.zeros((n, 3, 6))
+    if free[LEVER].all() and result.rotation is not None:
+        J[:, :, :3] = alignment.world @ result.rotation
+    else:
+        rest = rest - (0 if result.rotation is None else alignment.world @ result.rotation @ alignment.lever_m)
+    if free[TRANSLATION].all():
+        J[:, :, 3:] = np.eye(3)
+    else:
+        rest = rest - alignment.translation_m
+    rest = rest - (middle := np.median(rest, axis=0) * bool(free[TRANSLATION].all()))
+    good = np.ones(n, dtype=bool)
+    x: Array = np.zeros(6)
+    for _ in range(2):
+        # rcond: where attitudes hardly change, the lever arm stays near zero.
+        x = np.asarray(np.linalg.lstsq(J[good].reshape(-1, 6), rest[good].ravel(), rcond=1e-2)[0])
+        away = np.linalg.norm(rest - J @ x, axis=1)
+        good = away <= np.quantile(away, 0.9)
+    lever = x[:3] if free[LEVER].all() else alignment.lever_m
+    translation = x[3:] + middle if free[TRANSLATION].all() else alignment.translation_m
+    return replace(alignment, lever_m=lever, translation_m=translation)
+
+
+def _main_axis(stack: Array) -> Array:
+    """The axis (3,) about which attitudes (n, 3, 3) rotate most, in their outer frame."""
+    turned = rotations.log(stack @ stack[len(stack) // 2].T)
+    return np.asarray(np.linalg.eigh(turned.T @ turned)[1][:, -1])
+
+
+def _by_attitude(start: Alignment, R: Array, Q: Array, noise: float, free: Bools) -> Alignment:
+    """A and B with Q = A R B for attitudes (n, 3, 3): the best of several samples to which the others are related."""
+    best, found = np.inf, (start.world, start.body)
+    for i in np.unique(np.linspace(0, len(R) - 1, _BASES).round().astype(int)).tolist():
+        world, body = found if best < np.inf else (start.world, start.body)
+        if free[WORLD].all():
+            world = _turn(rotations.log(R @ R[i].T), rotations.log(Q @ Q[i].T), noise)
+        if free[BODY].all():
+            body = _mean_rotation(np.swapaxes(world @ R, -1, -2) @ Q)
+        away = float(np.median(rotations.angle(np.swapaxes(world @ R @ body, -1, -2) @ Q)))
+        if away < best:
+            best, found = away, (world, body)
+    return replace(start, world=found[0], body=found[1])
+
+
+def _turn(moved: Array, seen: Array, noise: float, near: Array | None = None) -> Array:
+    """The rotation A (3, 3) with seen = A moved, both (n, 3); about axes without motion close to `near` (identity)."""
+    length = np.linalg.norm(moved, axis=1)
+    gap = np.linalg.norm(np.abs(np.linalg.norm(seen, axis=1) - length)[:, None], axis=1)
+    good = gap <= 3 * np.median(gap) + 1e-12  # lengths do not depend on A: outliers show before A is known
+    M = seen[good].T @ moved[good]
+    M = M + (1e-3 * float(np.sum(moved[good] ** 2)) + 10 * noise + 1e-12) * (np.eye(3) if near is None else near)
+    return _nearest_rotation(M)
+
+
+def _mean_rotation(stack: Array) -> Array:
+    """A rotation in the middle of a stack (n, 3, 3), robust: the mean of the half nearest to the plain mean."""
+    mean = _nearest_rotation(stack.mean(axis=0))
+    away = rotations.angle(mean.T @ stack)
+    return _nearest_rotation(stack[away <= np.median(away)].mean(axis=0))
+
+
+def _nearest_rotation(matrix: Array) -> Array:
+    U, _, Vt = np.linalg.svd(matrix)
+    return np.asarray(U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt)

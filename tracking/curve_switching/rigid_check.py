@@ -13,11 +13,16 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from geometry.pose_solver.gauss_newton import PoseFit, SolveLimits, fit_pose, is_measurement
-from geometry.pose_solver.robust_pose import EXPECTED_GATE, fit_pose_robust
+from geometry.pose_solver.gauss_newton import (
+    EXPECTED_GATE,
+    PoseFit,
+    SolveLimits,
+    fit_pose,
+    fit_pose_robust,
+    is_measurement,
+)
 from geometry.uncertainty.rig_uncertainty import RigUncertainty
-from tracking.curve_switching.tracks import Tracks
-from tracking.curve_switching.vehicle import Vehicle
+from tracking.curve_switching.vehicle import Tracks, Vehicle
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.tracked_frame import Event

@@ -18,13 +18,11 @@ from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import PoseFit, SolveLimits, is_measurement, pixel_covariance
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance
-from geometry.uncertainty.rig_uncertainty import RigUncertainty
+from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty
 from tracking.curve_switching.matching import match
-from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
+from tracking.curve_switching.pose_filter import CoplanarViews, quadratic_positions
 from tracking.curve_switching.rigid_check import RigidCheck, matched_pixels, outside_first_search
-from tracking.curve_switching.tracks import Tracks
-from tracking.curve_switching.vehicle import Vehicle
+from tracking.curve_switching.vehicle import Tracks, Vehicle
 from tracking.detections import UNMATCHED, Detections
 from tracking.input_validation import check_step
 from tracking.labelling.first_labels import NO_POINT, find_labels

@@ -10,8 +10,7 @@ import numpy as np
 
 from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window
 from tracking.drogue_circle.parameters import CircleParameters
-from tracking.drogue_circle.rim import SmoothCrop, smooth_crop
-from tracking.drogue_circle.rim_fit import RimFit, fit_rim
+from tracking.drogue_circle.rim_fit import RimFit, SmoothCrop, fit_rim, smooth_crop
 
 _MOST_FITTED = 24  # of the whole picture
 _SAME_CENTRE = 0.6  # distance of two centres, as a share of the larger radius, below which they are one target

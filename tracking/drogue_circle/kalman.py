@@ -13,47 +13,10 @@ from functools import lru_cache
 import numpy as np
 
 from geometry.arrays import Array, symmetric
+from tracking.kalman import innovation, process_noise, propagate, transition, update
 
 PRINTED_P0 = np.diag([50.0, 20.0, 5.0, 50.0, 20.0, 5.0]) ** 2 / 9  # eq. (3)
 PRINTED_Q, PRINTED_R = 2e-5, 1e-3  # eq. (6): initial values
-
-
-def transition(dt: float) -> Array:
-    """Phi of eq. (1), (6, 6). dt: frames."""
-    phi = np.eye(6)
-    phi[:3, 3:] = dt * np.eye(3)
-    return phi
-
-
-def process_noise(dt: float, acceleration_px: Array) -> Array:
-    """Gamma Q Gamma' (..., 6, 6) of accelerations (..., 3), px/frame^2, 1 sigma, constant within a step."""
-    gamma = np.concatenate([0.5 * dt**2 * np.eye(3), dt * np.eye(3)])
-    q = np.asarray(acceleration_px, dtype=float)[..., None, :] ** 2 * np.eye(3)
-    return np.asarray(gamma @ q @ gamma.T)
-
-
-def predict(x: Array, P: Array, phi: Array, Q: Array) -> tuple[Array, Array]:
-    """Prediction of states (..., n) and covariances (..., n, n)."""
-    return (phi @ x[..., None])[..., 0], symmetric(phi @ P @ np.swapaxes(phi, -1, -2) + Q)
-
-
-def update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array]:
-    """Update by a circle z (3,) with covariance R (3, 3), H = [I 0], Joseph form, of stacked states."""
-    S = P[..., :3, :3] + R
-    K = np.swapaxes(np.linalg.solve(S, np.swapaxes(P[..., :, :3], -1, -2)), -1, -2)
-    x = x + (K @ (z - x[..., :3])[..., None])[..., 0]
-    keep = np.broadcast_to(np.eye(x.shape[-1]), P.shape).copy()
-    keep[..., :, :3] -= K
-    P = keep @ P @ np.swapaxes(keep, -1, -2) + K @ R @ np.swapaxes(K, -1, -2)
-    return x, symmetric(P)
-
-
-def distance2(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array]:
-    """Squared Mahalanobis distance (...,) of a circle from predictions, and log det S / 2 + distance^2 / 2."""
-    S = P[..., :3, :3] + R
-    away = z - x[..., :3]
-    d2 = np.sum(away * np.linalg.solve(S, away[..., None])[..., 0], axis=-1)
-    return d2, 0.5 * (d2 + np.linalg.slogdet(S)[1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +29,7 @@ class MotionModel:
     def transition(self, dt: float) -> Array:
         """Phi (9, 9). Where the acceleration is white, its state stays zero."""
         phi = np.zeros((9, 9))
-        phi[:6, :6] = transition(dt)
+        phi[:6, :6] = transition(dt, 3)
         if self.jerk_px.any():
             phi[:3, 6:], phi[3:6, 6:], phi[6:, 6:] = 0.5 * dt**2 * np.eye(3), dt * np.eye(3), np.eye(3)
         return phi
@@ -74,7 +37,7 @@ class MotionModel:
     def noise(self, dt: float) -> Array:
         """Q (9, 9), of values that are constant within a step."""
         Q = np.zeros((9, 9))
-        Q[:6, :6] = process_noise(dt, self.acceleration_px)
+        Q[:6, :6] = process_noise(self.acceleration_px, dt)
         gamma = np.concatenate([dt**3 / 6 * np.eye(3), 0.5 * dt**2 * np.eye(3), dt * np.eye(3)])
         return Q + gamma @ np.diag(self.jerk_px**2) @ gamma.T
 
@@ -108,12 +71,13 @@ class FilterBank:
     def predicted(self, dt: float) -> FilterBank:
         """The bank dt frames later."""
         phi, Q = _stacked(self.models, dt)
-        x, P = predict(self.x, self.P, phi, Q)
+        x, P = propagate(self.x, self.P, phi, Q)
         return FilterBank(x, P, self.log_weight, self.models)
 
     def updated(self, z: Array, R: Array, forgetting: float) -> FilterBank:
         """The bank after a measured circle. forgetting: factor of the earlier log likelihoods."""
-        log_weight = forgetting * self.log_weight - distance2(self.x, self.P, z, R)[1]
+        _, S, d2 = innovation(self.x, self.P, z, R)
+        log_weight = forgetting * self.log_weight - 0.5 * (d2 + np.linalg.slogdet(S)[1])
         x, P = update(self.x, self.P, z, R)
         return FilterBank(x, P, log_weight - log_weight.max(), self.models)
 
@@ -130,9 +94,9 @@ class FilterBank:
     def distance2(self, z: Array, R: Array, any_model: bool = False) -> float:
         """Squared Mahalanobis distance of a circle from the prediction; any_model: from the nearest filter's."""
         if any_model:
-            return float(distance2(self.x, self.P, z, R)[0].min())
+            return float(innovation(self.x, self.P, z, R)[2].min())
         x, P = self.state()
-        return float(distance2(x, P, z, R)[0])
+        return float(innovation(x, P, z, R)[2])
 
 
 def motion_models(
@@ -170,5 +134,5 @@ def printed_step(x: Array, P: Array, dt: float, z: Array | None, gamma: float, b
     z None: nothing was measured, as for gamma >= beta.
     """
     measured = z is not None and gamma < beta
-    x, P = predict(x, P, transition(dt), (1 - gamma) * np.eye(6) if measured else np.zeros((6, 6)))
+    x, P = propagate(x, P, transition(dt, 3), (1 - gamma) * np.eye(6) if measured else np.zeros((6, 6)))
     return update(x, P, z, gamma * np.eye(3)) if measured and z is not None else (x, P)

@@ -14,8 +14,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools
 from tracking.drogue_circle.candidates import Picture
-from tracking.drogue_circle.rim import median
-from tracking.drogue_circle.rim_fit import SECTORS, RimFit
+from tracking.drogue_circle.rim_fit import SECTORS, RimFit, median
 
 _RINGS, _SECTORS = 10, SECTORS
 _MATCH = 3.0  # mean absolute deviations within which a cell looks as before

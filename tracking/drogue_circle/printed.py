@@ -13,11 +13,12 @@ import numpy as np
 from geometry.arrays import Array
 from tracking.drogue_circle.acquisition import Wanted, acquire
 from tracking.drogue_circle.candidates import CircleDetector, Picture, Window, crop_bounds
-from tracking.drogue_circle.frames import Cause, CircleFrame, nothing_known
-from tracking.drogue_circle.gradient_votes import centre_votes, centres, edge_pixels
-from tracking.drogue_circle.kalman import PRINTED_P0, predict, printed_coefficient, printed_step, transition
+from tracking.drogue_circle.detectors import centre_votes, centres, edge_pixels
+from tracking.drogue_circle.kalman import PRINTED_P0, printed_coefficient, printed_step
 from tracking.drogue_circle.occlusion import Appearance, disc_cells, first_appearance
 from tracking.drogue_circle.parameters import CircleParameters
+from tracking.drogue_circle.rim_fit import Cause, CircleFrame, nothing_known
+from tracking.kalman import transition
 from tracking.statuses import PoseStatus
 
 _MOST_CENTRES = 200
@@ -63,7 +64,7 @@ class PrintedTracker:
         """The next frame. picture None: there is none. dt: frames since the last step."""
         if self._x is None:
             return self._first(picture)
-        predicted = predict(self._x, self._P, transition(dt), np.zeros((6, 6)))[0][:3]
+        predicted = (transition(dt, 3) @ self._x)[:3]
         z = None if picture is None else printed_measurement(picture, self._x[:3], self.parameters)
         gamma = 1.0
         if picture is not None:

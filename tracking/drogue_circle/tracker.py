@@ -1,20 +1,151 @@
-"""Tracks one circle through pictures: Zhou (2014), figure 2, with a rim fit, a sound noise model and acquisition."""
+"""The circle that is followed: its filters, its appearance, and its measurement in a window of the picture."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from geometry.arrays import Array
+from geometry.arrays import Array, Bools
 from tracking.drogue_circle.acquisition import Wanted, acquire
-from tracking.drogue_circle.candidates import CircleDetector, Picture
-from tracking.drogue_circle.frames import Cause, CircleFrame, nothing_known
-from tracking.drogue_circle.occlusion import disc_cells, is_clear
+from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window
+from tracking.drogue_circle.kalman import FilterBank, motion_models
+from tracking.drogue_circle.occlusion import Appearance, RimHabit, disc_cells, first_appearance, is_clear
 from tracking.drogue_circle.parameters import CircleParameters
-from tracking.drogue_circle.rim_fit import RimFit
-from tracking.drogue_circle.track import WHOLE, Track
+from tracking.drogue_circle.rim_fit import Cause, CircleFrame, RimFit, SmoothCrop, fit_rim, nothing_known, smooth_crop
 from tracking.statuses import PoseStatus
+
+_START_RATE_RADII = 0.25  # 1 sigma of the rate of a new circle, in radii per frame
+_COVERAGE_COST, _POLARITY_COST = 40.0, 15.0  # against distance^2, of a whole rim and of the other polarity
+_AS_PREDICTED, _WELL_SEEN = 16.0, 0.75  # distance^2 and coverage of a fit that needs no comparison with others
+_SURE_PX, _SETTLED = 0.7, 5  # sigma of a prediction, and measurements before it, from which the fit may start
+_USUAL = 0.9  # of the usual coverage, the same
+WHOLE = 0.85  # coverage of a rim that is seen whole
+_GATE_PX2 = 0.1**2 * np.eye(3)  # of the gate: a rim is not a perfect circle
+_WHOLE_GATE = 10.0  # factor of the innovation gate of such a rim
+_REFITS = 2  # without the sectors of an occluder
+_LEAST_RADIUS = 0.7  # of the smallest radius of an acquisition, below which a circle is not tracked
+
+
+@dataclass(slots=True)
+class Track:
+    """The circle that is followed."""
+
+    bank: FilterBank
+    appearance: Appearance
+    habit: RimHabit
+    fit: RimFit  # the last one
+    cells: tuple[Array, Bools]  # of the disc that was last compared with the appearance
+    misses: int = 0  # frames since the last measurement
+    measured: int = 1  # frames with a measurement since the acquisition
+
+    @classmethod
+    def started(cls, picture: Picture, fit: RimFit, p: CircleParameters) -> Track:
+        """A track that begins with a circle of the whole picture, at rest within a quarter of its radius per frame."""
+        cells = disc_cells(picture, *fit.circle)
+        habit = RimHabit(fit.sectors, fit.rms_px, 1)
+        return cls(_bank_at(fit, p), first_appearance(*cells), habit, fit, cells)
+
+    def restart(self, fit: RimFit, p: CircleParameters) -> None:
+        """Continue at another place; the target looks as before."""
+        self.bank, self.fit, self.misses, self.measured = _bank_at(fit, p), fit, 0, 1
+
+    def window(self, p: CircleParameters) -> Window:
+        """The search window around the prediction: four radii wide, larger where the prediction is uncertain."""
+        x, P = self.bank.state()
+        sigma = float(np.sqrt(max(P[0, 0], P[1, 1])))
+        radius = max(float(x[2]), 3.0)
+        gate = max(p.gate_px, min(3 * sigma, 2 * radius))
+        change = max(p.radius_gate * radius, min(3 * float(np.sqrt(P[2, 2])), 0.5 * radius), 2.0)
+        half = max(0.5 * p.window_radii * radius, 1.15 * radius + gate)
+        return Window(float(x[0]), float(x[1]), half, gate, max(radius - change, 3.0), radius + change)
+
+    def measure(self, picture: Picture, detector: CircleDetector, p: CircleParameters) -> tuple[RimFit | None, float]:
+        """The best rim in the window, and the occlusion coefficient there or, without a rim, at the prediction."""
+        window = self.window(p)
+        crop = smooth_crop(picture, window, p.blur_px)
+        x, P = self.bank.state()
+        sure = bool(max(P[0, 0], P[1, 1], P[2, 2]) < _SURE_PX**2) and self.measured > _SETTLED
+        best, best_cost = None, np.inf
+        fitted: list[RimFit] = []
+        for c in self._candidates(picture, window, detector, p):
+            fit = fit_rim(crop, c, p.min_coverage, sure=True) if sure else None
+            if fit is None or fit.coverage < _USUAL * self.habit.coverage:
+                fit = fit_rim(crop, c, p.min_coverage)
+            sure = False  # of the first candidate only, the prediction
+            if fit is None or any(fit.is_equal(f) for f in fitted):
+                continue
+            fitted.append(fit)
+            # A rim that is seen whole may be where any of the filters expects it, since the target may turn.
+            d2 = self.bank.distance2(fit.centre_and_radius, fit.covariance_px2 + _GATE_PX2, fit.coverage > WHOLE)
+            near = np.hypot(fit.rim.u_px - window.u_px, fit.rim.v_px - window.v_px) < window.gate_px
+            gate = p.gate_chi2 * (_WHOLE_GATE if fit.coverage > WHOLE else 1.0)
+            if not near or d2 > gate or fit.rim.radius_px < _LEAST_RADIUS * p.min_radius_px:
+                continue
+            cost = d2 - _COVERAGE_COST * fit.coverage + (_POLARITY_COST if fit.polarity != self.fit.polarity else 0)
+            if cost < best_cost:
+                best, best_cost = fit, cost
+            if d2 < _AS_PREDICTED and fit.coverage > min(_WELL_SEEN, _USUAL * self.habit.coverage):
+                break  # before the detector is called, where the prediction itself fits
+        if best is None:
+            return None, self._coefficient(picture, window.u_px, window.v_px, max(float(x[2]), 1.0))
+        return self._without_occluder(picture, crop, best, p)
+
+    def update(self, fit: RimFit, gamma: float, p: CircleParameters) -> None:
+        """Use a measurement: R = R0 / (1 - gamma)^2 with the covariance of the fit as R0."""
+        self.bank = self.bank.updated(fit.centre_and_radius, fit.covariance_px2 / (1 - gamma) ** 2, p.forgetting)
+        if is_clear(gamma):
+            self.appearance = self.appearance.updated(*self.cells)
+            self.habit = self.habit.updated(fit)
+        self.fit, self.misses, self.measured = fit, 0, self.measured + 1
+
+    def _without_occluder(
+        self, picture: Picture, crop: SmoothCrop, fit: RimFit, p: CircleParameters
+    ) -> tuple[RimFit | None, float]:
+        """The fit without the edges in sectors that an occluder hides: they pull the circle to one side."""
+        gamma = self._coefficient(picture, *fit.circle)
+        for _ in range(_REFITS):
+            hidden = self.appearance.hidden_sectors(*self.cells)
+            if not hidden.any():
+                break
+            u, v, radius = fit.circle
+            coarse = CircleCandidate(u, v, radius, 0.0, fit.polarity)
+            again = fit_rim(crop, coarse, p.min_coverage, hidden | self.habit.without_edge)
+            if again is None:
+                return None, gamma
+            still, fit = again.is_equal(fit), again
+            if still:
+                break
+            gamma = self._coefficient(picture, *fit.circle)
+        usual = is_clear(gamma) or self.habit.is_usual(fit)
+        return (fit if usual else None), gamma
+
+    def _candidates(
+        self, picture: Picture, window: Window, detector: CircleDetector, p: CircleParameters
+    ) -> Iterator[CircleCandidate]:
+        """The predicted circle, then those of the detector: which is called only if it is needed."""
+        radius = 0.5 * (window.min_radius_px + window.max_radius_px)
+        yield CircleCandidate(window.u_px, window.v_px, radius, np.inf, self.fit.polarity)
+        yield from sorted(detector(picture, window), key=self._preference, reverse=True)[: p.candidates]
+
+    def _preference(self, c: CircleCandidate) -> float:
+        """The score of a candidate, halved if its polarity is not that of the tracked rim."""
+        return c.score * (1.0 if c.polarity in (0, self.fit.polarity) else 0.5)
+
+    def _coefficient(self, picture: Picture, u_px: float, v_px: float, radius_px: float) -> float:
+        self.cells = disc_cells(picture, u_px, v_px, radius_px)
+        return self.appearance.coefficient(*self.cells)
+
+
+def _bank_at(fit: RimFit, p: CircleParameters) -> FilterBank:
+    rate = _START_RATE_RADII * fit.rim.radius_px
+    models = motion_models(p.accelerations_px, p.jerks_px, p.radius_share)
+    return FilterBank.started(fit.centre_and_radius, fit.covariance_px2, rate, models)
+
+
+# Tracks one circle through pictures: Zhou (2014), figure 2, with a rim fit, a sound noise model and acquisition.
+
 
 _CONFIRMED = 3  # measurements after which an acquisition is confirmed
 _CHANGED = 4  # searches of the whole picture after which a circle of another appearance is accepted

@@ -18,8 +18,7 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose_prior import PosePrior
-from geometry.pose_solver.gauss_newton import SolveLimits, whiten
-from geometry.pose_solver.robust_pose import fit_pose_robust
+from geometry.pose_solver.gauss_newton import SolveLimits, fit_pose_robust, whiten
 from geometry.rig import Rig
 from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import RigUncertainty

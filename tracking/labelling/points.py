@@ -9,8 +9,8 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
+from geometry.planes import intersect_surface
 from geometry.rig import Rig
-from geometry.surfaces import intersect_surface
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
+from geometry.planes import intersect_surface
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import PoseFit, fit_pose
 from geometry.rig import Rig
-from geometry.surfaces import intersect_surface
 from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking.detections import Detections
 from tracking.labelling.candidates import BestCandidates, generate

@@ -7,7 +7,7 @@ import numpy as np
 from geometry import rotations
 from geometry.arrays import Array, Bools
 from geometry.forward_model import SpotModel
-from geometry.pose_solver.symmetry import is_symmetry
+from geometry.pose_solver.visibility import is_symmetry
 from tracking.labelling.points import NO_POINT
 from tracking.labelling.search import Labelling
 

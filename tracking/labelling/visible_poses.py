@@ -16,11 +16,11 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
+from geometry.planes import intersect_surface
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.three_spots import poses_from_three_spots
 from geometry.rig import Rig
-from geometry.surfaces import intersect_surface
 
 DRAWN = 4000  # sets of three pixels; the relative error of the volume is then 0.1 to 0.2
 FIXES = 1e-4  # least ratio of the singular values of three spots' Jacobian; collinear spots have 1e-12

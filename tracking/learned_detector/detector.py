@@ -1,22 +1,60 @@
-"""Drogues found by a small fully convolutional network on an image pyramid, run by `cv2.dnn`.
-
-The network was trained by lab/learned_detector/train.py on rendered drogues; no deep-learning library is needed to run
-it. Per cell of STRIDE pixels it gives the logit of a centre, the offset of the centre and the log of the diameter.
-Source: after Zhou (2020), section 1, whose network has 42 layers; ours has eleven.
-"""
+"""A picture at several sizes, each with its exact scale."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import TypeAlias
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from geometry.arrays import Array
 from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window, crop_bounds
-from tracking.learned_detector.pyramid import Floats, Level, pyramid
+
+Floats: TypeAlias = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """A reduced picture (h, w) of 0 to 1, and its exact scales: sizes are whole numbers, so they differ a little."""
+
+    grey: Floats
+    scale_u: float
+    scale_v: float
+
+    @property
+    def scale(self) -> float:
+        """Of lengths."""
+        return float(np.sqrt(self.scale_u * self.scale_v))
+
+
+def pyramid(grey: Floats, scale: float, reaches_px: float, largest_px: float) -> list[Level]:
+    """A picture (h, w) reduced to a scale, then by further factors of 2, the last one such that the largest drogue of
+    interest is no larger than what a level reaches.
+    """
+    levels: list[Level] = []
+    full_height, full_width = grey.shape
+    while True:
+        width, height = max(round(scale * full_width), 1), max(round(scale * full_height), 1)
+        source = levels[-1].grey if levels else grey
+        reduced = source
+        if source.shape != (height, width):
+            reduced = np.asarray(cv2.resize(source, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+        levels.append(Level(reduced, width / full_width, height / full_height))
+        if reaches_px / scale >= largest_px:
+            return levels
+        scale /= 2
+
+
+# Drogues found by a small fully convolutional network on an image pyramid, run by `cv2.dnn`.
+#
+# The network was trained by studies/learned_detector/train.py on rendered drogues; no deep-learning library is needed
+# to run it. Per cell of STRIDE pixels it gives the logit of a centre, the offset of the centre and the log of the
+# diameter. Source: after Zhou (2020), section 1, whose network has 42 layers; ours has eleven.
+
 
 WEIGHTS = Path(__file__).with_name("weights.onnx")
 STRIDE = 4
@@ -53,9 +91,7 @@ def _network(weights: Path) -> cv2.dnn.Net:
     try:
         return cv2.dnn.readNetFromONNX(str(weights))
     except cv2.error as error:
-        remedy = (
-            "install beampose again" if weights == WEIGHTS else "expected a file that lab.learned_detector.train made"
-        )
+        remedy = "install beampose again" if weights == WEIGHTS else "expected a file of studies.learned_detector.train"
         raise ValueError(f"{weights}: the weights of the learned detector are damaged: {remedy}") from error
 
 
@@ -69,7 +105,7 @@ def find_drogues(
     """Drogues of a picture (h, w), the most confident first.
 
     smallest_px, largest_px: range of the diameters; None: up to the picture's smaller side. 16-bit pictures are scaled
-    by their largest value. weights: of another network of lab/learned_detector/networks.py, whose confidence
+    by their largest value. weights: of another network of studies/learned_detector/train.py, whose confidence
     is an order and no probability; None: those of the package.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The drogue in one frame: status, cause, place, size, confidence and who measured it."""
+"""Parameters of the light tracker and of the hand-over between it and the detector. Times are frames."""
 
 from __future__ import annotations
 
@@ -9,6 +9,54 @@ import numpy as np
 
 from geometry.arrays import Array
 from tracking.statuses import PoseStatus
+
+
+@dataclass(frozen=True, slots=True)
+class LightParameters:
+    """Each field with its unit and the reason for its default. All are ours; Zhou (2020) prints none."""
+
+    check_every: int = 5  # frames between two checks by the detector
+    smallest_px: float = 8.0  # px: diameters that the detector looks for; it knows no smaller ones
+    largest_px: float | None = None  # px; None: the picture's smaller side
+    acquire_confidence: float = 0.5  # of a detection that starts a track by itself
+    elsewhere_confidence: float = 0.8  # of a detection that replaces a track elsewhere in the picture
+    confirm_confidence: float = 0.15  # of a detection where the tracker is: two independent ones agree
+    ambiguous_logit: float = 2.5  # a second detection whose log odds are less than this below the best: ambiguous
+    measured_confidence: float = 0.5  # with less, the frame is predicted
+    hand_back_confidence: float = 0.9  # with less, the detector is asked at once
+    window_diameters: float = 1.0  # largest distance of a checking detection, in diameters, beyond 3 sigma
+    agree_diameters: float = 0.3  # a detection nearer to the tracked centre confirms it
+    size_ratio: float = 1.7  # largest ratio of the diameters of a detection and of the tracked drogue
+    least_correlation: float = 0.5  # with less there is no match
+    update_rate: float = 0.08  # of the pattern per frame: it follows tilt and light
+    update_correlation: float = 0.8  # least correlation of a frame that updates the pattern
+    sigma_a_diameters: float = 0.03  # diameters/frame^2: 1-sigma acceleration ...
+    sigma_a_px: float = 0.3  # ... and this much in px: motion of the camera
+    sigma_growth: float = 0.02  # 1 sigma of the relative change of the diameter per frame
+    detection_sigma: float = 0.015  # of a detected centre, per axis, in diameters
+    detection_size_sigma: float = 0.15  # of the logarithm of a detected diameter
+    offset_drift: float = 0.006  # per frame, in diameters: motion of the rim's centre in the pattern
+    search_after: int = 3  # frames without a measurement after which the detector searches the whole picture
+    most_predicted: int = 50  # frames without a measurement after which the drogue is lost
+    most_unseen: int = 100  # frames without a detection after which a drogue that is not measured is lost, too
+    lost_sigma_diameters: float = 1.0  # 1 sigma of the centre above which the status is lost
+    most_unconfirmed: int = 6  # checks in a row without a detection, after each of which the whole picture is searched
+
+    def __post_init__(self) -> None:
+        if self.check_every < 1:
+            raise ValueError(f"check_every: expected 1 or more, got {self.check_every}")
+        if not self.smallest_px >= 8:
+            raise ValueError(f"smallest_px: expected 8 px or more, got {self.smallest_px:g}")
+        if self.largest_px is not None and not self.largest_px > self.smallest_px:
+            raise ValueError(
+                f"largest_px: expected more than smallest_px ({self.smallest_px:g}), got {self.largest_px:g}"
+            )
+
+
+USUAL = LightParameters()
+
+
+# The drogue in one frame: status, cause, place, size, confidence and who measured it.
 
 
 class Cause(StrEnum):
@@ -92,3 +140,51 @@ def nothing_known(cause: Cause, event: str = "", searched: str = "", found: int 
         PoseStatus.LOST, cause, Source.NONE, np.full(2, nan), np.full(2, nan), nan, np.full((2, 2), nan), nan, 0.0,
         nan, searched, found, event,
     )  # fmt: skip
+
+
+# The probability that the tracked place is right, from the checks by the detector.
+#
+# A logistic curve whose coefficients were fitted on rendered sequences with `python -m
+# bench.related_measurements.light_tracker --calibrate` (maximum likelihood; Platt 1999). "Right" is a centre within
+# RIGHT_SHARE of the diameter of the drogue's. The correlation of the match, its lead over the next best place and the
+# time since the last check were inputs too; their coefficients were zero, since a match with a low correlation is
+# none.
+
+
+RIGHT_SHARE = 0.25  # of the diameter
+FEATURES = ("1", "support", "confirmed", "unconfirmed")
+SIGNS = (0, 1, 1, -1)  # of the coefficients: more of a good sign never lowers the confidence
+COEFFICIENTS = (-0.29, 0.83, 1.62, -1.3)
+ABSENT_LOGIT = -2.0  # of a check without a detection, in the running mean of the checks
+_CAP = 0.995  # of correlations: above it, noise decides
+_MOST_CONFIRMED = 10
+
+
+def fisher(correlation: float) -> float:
+    """Fisher's transformation: its scatter does not depend on the correlation."""
+    return float(np.arctanh(np.clip(correlation, 0.0, _CAP)))
+
+
+def features(support: float, confirmed: int, unconfirmed: int) -> Array:
+    """The inputs (4,) of the curve.
+
+    support: running mean of the log odds of the checks. confirmed: detections of this track; unconfirmed: checks in a
+    row without one.
+    """
+    return np.array([1.0, support, np.log(min(max(confirmed, 1), _MOST_CONFIRMED)), np.log1p(unconfirmed)])
+
+
+def probability(inputs: Array) -> float:
+    """The probability that a match is right."""
+    return float(1 / (1 + np.exp(-float(np.dot(COEFFICIENTS, inputs)))))
+
+
+def within(sigma_px: float, diameter_px: float) -> float:
+    """The probability that a predicted centre is right: that of a normal distribution, the same in both axes."""
+    return float(1 - np.exp(-0.5 * (RIGHT_SHARE * diameter_px / max(sigma_px, 1e-9)) ** 2))
+
+
+def logit(p: float) -> float:
+    """Log odds of a probability."""
+    q = float(np.clip(p, 1e-3, 1 - 1e-3))
+    return float(np.log(q / (1 - q)))

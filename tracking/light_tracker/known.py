@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tracking.drogue_circle.candidates import Picture
-from tracking.light_tracker.confidence import fisher
+from tracking.light_tracker.frames import fisher
 from tracking.light_tracker.motion import Motion
 from tracking.light_tracker.pattern import Match, Pattern, unexplained
 

@@ -1,6 +1,6 @@
 """The motion of the pattern, and where the rim's centre lies in it: three small Kalman filters.
 
-The centre moves with a nearly constant velocity (the filter of tracking/curve_switching/kalman.py), the logarithm of
+The centre moves with a nearly constant velocity (the filter of tracking/kalman.py), the logarithm of
 the diameter is a random walk. A match is accurate to a few hundredths of a pixel, but its pattern drifts with tilt and
 light; a detection has an error of some percent of the diameter, but does not drift. So the offset between the two is a
 state of its own: detections correct the drift, and their errors average out. Source: ours.
@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geometry.arrays import Array
-from tracking.curve_switching import kalman
-from tracking.light_tracker.parameters import LightParameters
+from tracking import kalman
+from tracking.light_tracker.frames import LightParameters
 from tracking.light_tracker.pattern import Match
 
 _MATCH_SIGMA_PX = 0.03  # of a match, beside its own covariance

@@ -1,12 +1,4 @@
-"""Tracks one drogue: the detector acquires it and checks every few frames, the light tracker follows it in between.
-
-Rules of the hand-over (ours; Zhou (2020) only states that a light tracker follows the network):
-- The detector searches the whole picture until it finds one drogue that it is confident of.
-- In each frame the light tracker finds the pattern near its prediction. Every `check_every` frames, after a frame
-  without a match, or as soon as the confidence is low, the detector searches a window around it. A detection there
-  confirms the track and corrects it.
-- After frames without a match, or checks in a row without a detection, the detector searches the whole picture.
-"""
+"""What is known of a drogue while it is followed."""
 
 from __future__ import annotations
 
@@ -17,14 +9,80 @@ import numpy as np
 
 from geometry.arrays import Array
 from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window
-from tracking.light_tracker.confidence import ABSENT_LOGIT, features, fisher, logit, probability, within
-from tracking.light_tracker.frames import Cause, DrogueFrame, Source, nothing_known
-from tracking.light_tracker.known import is_clear
+from tracking.light_tracker.frames import (
+    ABSENT_LOGIT,
+    USUAL,
+    Cause,
+    DrogueFrame,
+    LightParameters,
+    Source,
+    features,
+    fisher,
+    logit,
+    nothing_known,
+    probability,
+    within,
+)
+from tracking.light_tracker.known import Known, is_clear, is_similar
 from tracking.light_tracker.motion import WHOLE, Motion
-from tracking.light_tracker.parameters import USUAL, LightParameters
 from tracking.light_tracker.pattern import Match, Pattern, unexplained
-from tracking.light_tracker.track import LONGEST_GAP, TRUSTED, Track
 from tracking.statuses import PoseStatus
+
+TRUSTED = 4  # detections that confirmed a track
+LONGEST_GAP = 20  # frames
+_MOSTLY = 0.6  # visible share from which the agreement of this share counts
+
+
+@dataclass(slots=True)
+class Track:
+    """What is known of the drogue while it is followed."""
+
+    motion: Motion
+    pattern: Pattern
+    support: float  # running mean of the log odds of the checks
+    usual: float = float("nan")  # running mean of Fisher's z of the matches' correlation
+    confirmed: int = 1  # detections
+    unconfirmed: int = 0  # checks in a row without a detection
+    age: float = 0.0  # frames since the last confirmation
+    since_check: int = 0  # frames since the detector searched
+    lost: bool = False  # reported as lost
+    trusted: float = 1.0  # confidence of the last measured frame
+    misses: int = 0  # frames in a row without a measurement
+    blind: int = 0  # frames in a row without a match that resembles the pattern
+    gap: int = 0  # the same, and falling by one with each match afterwards: how far the drogue can have moved away
+    before: Known | None = None  # the appearance before the pattern was cut out again
+
+    @property
+    def known(self) -> Known | None:
+        """The appearance that detections confirmed last."""
+        if self.confirmed < TRUSTED or np.isnan(self.usual):
+            return self.before
+        return Known(self.pattern, self.usual, self.confirmed, self.motion)
+
+    def take_back(self, known: Known, found: Match, p: LightParameters) -> None:
+        """Continue with the appearance from before, found again at a place."""
+        self.motion = known.motion.moved(found, p)
+        self.pattern, self.usual, self.confirmed, self.before = known.pattern, known.usual, known.confirmed, None
+
+    def count_blind(self) -> None:
+        """One more frame without a match."""
+        self.blind, self.gap = self.blind + 1, min(self.gap + 1, LONGEST_GAP)
+
+    def resembles(self, match: Match) -> bool:
+        """Whether a match is about as good as the ones before."""
+        z = fisher(match.agreement if match.visible > _MOSTLY else match.correlation)
+        return bool(np.isnan(self.usual)) or is_similar(self.usual, z)  # nan: a new pattern
+
+
+# Tracks one drogue: the detector acquires it and checks every few frames, the light tracker follows it in between.
+#
+# Rules of the hand-over (ours; Zhou (2020) only states that a light tracker follows the network):
+# - The detector searches the whole picture until it finds one drogue that it is confident of.
+# - In each frame the light tracker finds the pattern near its prediction. Every `check_every` frames, after a frame
+#   without a match, or as soon as the confidence is low, the detector searches a window around it. A detection there
+#   confirms the track and corrects it.
+# - After frames without a match, or checks in a row without a detection, the detector searches the whole picture.
+
 
 _NEAR_PX = 20.0  # distance of the first drogue from the place that the user states
 _SUPPORT_RATE = 0.25  # of the running mean of the log odds of the checks

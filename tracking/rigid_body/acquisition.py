@@ -12,7 +12,7 @@ from geometry.arrays import Array
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
-from geometry.pose_solver.symmetry import symmetries
+from geometry.pose_solver.visibility import symmetries
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking.detections import Detections

@@ -27,8 +27,7 @@ from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import SolveLimits, fit_pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance
-from geometry.uncertainty.rig_uncertainty import RigUncertainty
+from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty
 from tracking.detections import Detections
 from tracking.input_validation import UsablePoints, check_step
 from tracking.labelling.first_labels import MIN_EVIDENCE_NATS, NO_POINT, Labelling

@@ -12,7 +12,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools
 from geometry.uncertainty.chi_square import chi2_limit
-from tracking.curve_switching import kalman
+from tracking import kalman
 from tracking.detections import Detections
 from tracking.single_target.parameters import PointParameters
 

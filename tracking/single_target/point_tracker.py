@@ -2,7 +2,7 @@
 
 Source: Duan, Yuan, Wang & Huangfu, "Target tracking system of UAV based on Kalman filter", Intelligent Computer and
 Applications 10(10), 92 (2020), eqs. (1) to (9). Gate, confirmation, estimated process noise and statuses are ours. The
-filter's equations are those of tracking/curve_switching/kalman.py with the time step 1 of the paper (one frame).
+filter's equations are those of tracking/kalman.py with the time step 1 of the paper (one frame).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from geometry.arrays import Array
 from geometry.uncertainty.chi_square import chi2_limit
-from tracking.curve_switching import kalman
+from tracking import kalman
 from tracking.detections import UNMATCHED, Detections
 from tracking.single_target.candidate_tracks import CandidateTracks, Step, nearest
 from tracking.single_target.parameters import USUAL, PointParameters, TargetStatus

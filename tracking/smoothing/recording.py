@@ -10,8 +10,7 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance
-from geometry.uncertainty.rig_uncertainty import RigUncertainty
+from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.association.frame_detections import BLENDED

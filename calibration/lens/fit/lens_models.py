@@ -10,7 +10,7 @@ from calibration.terms.corners import INTRINSICS_COUNT
 from geometry import lens
 from geometry.arrays import Array, Bools
 from geometry.camera import FISHEYE, PERSPECTIVE
-from geometry.uncertainty.rig_parameters import DISTORTION, FISHEYE_DISTORTION, PINHOLE
+from geometry.uncertainty.rig_uncertainty import DISTORTION, FISHEYE_DISTORTION, PINHOLE
 
 _BORDER = 25  # sampled pixels along each side of the picture; distortion varies little between them
 

@@ -15,7 +15,7 @@ from calibration.beams.beams import calibrate_beams as solve_beams
 from calibration.beams.excitation import summary_of
 from calibration.findings import Finding, Level, verdict
 from calibration.least_squares.adjustment import AdjustmentError
-from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.calibrate.beams.beam_tables import BEAMS, write_tables
 from lab.calibrate.beams.recording_check import check_no_duplicates, diagnose_failed_fit
 from lab.calibrate.beams.recordings import Recordings, read_recordings, stand_of

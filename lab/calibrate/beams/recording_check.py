@@ -6,7 +6,7 @@ from pathlib import Path
 
 from calibration.beams.error_diagnosis import diagnose_error
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.calibrate.beams.recordings import Recordings, stand_of
 from lab.errors import InputError
 from lab.files.project.project_types import Project

@@ -23,7 +23,7 @@ from geometry.lens import padded
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import (
+from geometry.uncertainty.rig_uncertainty import (
     BOW,
     PINHOLE,
     POSE,

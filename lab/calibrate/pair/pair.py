@@ -226,7 +226,7 @@ def _report(outcome: PairOutcome, day: datetime.date, paths: Sequence[Path]) -> 
 def _value(outcome: PairOutcome, name: str) -> float:
     """The value of a parameter; of rotations those of the rotation vector of camera_from_world."""
     from geometry.rotations import log
-    from geometry.uncertainty.rig_parameters import PINHOLE, POSE, distortion_names, split_name
+    from geometry.uncertainty.rig_uncertainty import PINHOLE, POSE, distortion_names, split_name
 
     _, item, parameter = split_name(name)
     camera = outcome.pair.cameras[outcome.names.index(item)]

@@ -10,7 +10,7 @@ from calibration.terms.surveyed import pose_of
 from geometry.arrays import Array
 from geometry.pose import ypr_sigmas
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import split_name
+from geometry.uncertainty.rig_uncertainty import split_name
 from lab.calibrate.rig.rig_outcome import RigOutcome
 from lab.report.calibration.calibration_maps import correlation_matrix, flatness_map
 from lab.report.calibration.calibration_page import (

@@ -20,7 +20,7 @@ from calibration.terms.rig_blocks import prior_of
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from geometry.rig import Rig, Screen
-from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.calibrate.screens.screen_boards import board_views
 from lab.errors import InputError
 from lab.files.project.cloud_file import read_point_cloud

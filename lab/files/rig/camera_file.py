@@ -12,7 +12,7 @@ import pydantic
 from geometry.arrays import Array
 from geometry.camera import PERSPECTIVE, Camera
 from geometry.pose import Pose
-from geometry.uncertainty.rig_parameters import PINHOLE, distortion_names
+from geometry.uncertainty.rig_uncertainty import PINHOLE, distortion_names
 from lab.files.rig.calibration_state import VERDICTS
 from lab.files.rig.camera_block import (
     Covariance,

@@ -13,7 +13,7 @@ import pydantic
 from geometry.arrays import symmetric
 from geometry.camera import Camera
 from geometry.pose import Pose
-from geometry.uncertainty.rig_parameters import RigCovariance, camera_names
+from geometry.uncertainty.rig_uncertainty import RigCovariance, camera_names
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState, CalibrationStateBlock, state_mapping
 from lab.files.rig.camera_block import (

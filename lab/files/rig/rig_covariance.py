@@ -9,7 +9,7 @@ import numpy as np
 
 from geometry.arrays import Array, symmetric
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance, is_known, split_name
+from geometry.uncertainty.rig_uncertainty import RigCovariance, is_known, split_name
 from lab.errors import InputError
 from lab.files.rig.camera_block import Covariance, covariance_error
 

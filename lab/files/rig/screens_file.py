@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import pydantic
 
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.files.rig.calibration_state import CalibrationState, CalibrationStateBlock, state_mapping
 from lab.files.rig.camera_block import Covariance, CovarianceBlock, covariance_mapping
 from lab.files.rig.rig_covariance import TARGET, joint_covariance

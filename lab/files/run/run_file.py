@@ -15,7 +15,7 @@ import pydantic
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState, OptionalDay
 from lab.files.rig.rig_covariance import joint_covariance

@@ -10,10 +10,30 @@ from html import escape
 import numpy as np
 
 from geometry.arrays import Array
-from lab.report.plot.axes import PlotArea, frame, heading, plot_area, svg_of, x_ticks, y_ticks
-from lab.report.plot.histogram import histogram
-from lab.report.plot.scales import Scale, number, tick_texts, ticks
-from lab.report.plot.svg import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, dots, line_path, text
+from lab.report.plot.axes import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    PlotArea,
+    Scale,
+    dots,
+    frame,
+    heading,
+    histogram,
+    line_path,
+    number,
+    plot_area,
+    svg_of,
+    text,
+    tick_texts,
+    ticks,
+    x_ticks,
+    y_ticks,
+)
 
 SERIES = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION)
 

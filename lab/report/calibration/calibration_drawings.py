@@ -12,9 +12,26 @@ import cv2
 import numpy as np
 
 from geometry.arrays import Array, Bools
-from lab.report.plot.axes import PlotArea, axes, frame, image_area, note, svg_of
-from lab.report.plot.scales import Scale, number, round_size
-from lab.report.plot.svg import BLUE, INK, ORANGE, VERMILLION, dots, picture_uri, polyline, segments, text
+from lab.report.plot.axes import (
+    BLUE,
+    INK,
+    ORANGE,
+    VERMILLION,
+    PlotArea,
+    Scale,
+    axes,
+    dots,
+    frame,
+    image_area,
+    note,
+    number,
+    picture_uri,
+    polyline,
+    round_size,
+    segments,
+    svg_of,
+    text,
+)
 
 _MOST_VECTORS = 2000  # in a residual field: more cover each other
 _ARROW = 24.0  # drawing units: length of the 95th percentile of the residuals

@@ -8,11 +8,21 @@ from html import escape
 import numpy as np
 
 from geometry.arrays import Array
-from lab.report.plot.axes import PlotArea, axes, frame, note, plot_area, svg_of
-from lab.report.plot.colour_map import BAR_WIDTH, colour_bar, colours, hex_colour, value_range
-from lab.report.plot.maps import contour_lines, label_place
-from lab.report.plot.scales import Scale, number, ticks
-from lab.report.plot.svg import dots, polyline, text
+from lab.report.plot.axes import (
+    PlotArea,
+    Scale,
+    axes,
+    dots,
+    frame,
+    note,
+    number,
+    plot_area,
+    polyline,
+    svg_of,
+    text,
+    ticks,
+)
+from lab.report.plot.maps import BAR_WIDTH, colour_bar, colours, contour_lines, hex_colour, label_place, value_range
 
 
 def flatness_map(

@@ -13,9 +13,23 @@ from geometry.camera import Camera, pinhole_numbers
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from lab.report.plot.axes import PlotArea, svg_of
-from lab.report.plot.scales import Scale, number, round_size
-from lab.report.plot.svg import BLUE, GREEN, ORANGE, PURPLE, VERMILLION, dots, line_path, polyline, segments, text
+from lab.report.plot.axes import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    VERMILLION,
+    PlotArea,
+    Scale,
+    dots,
+    line_path,
+    number,
+    polyline,
+    round_size,
+    segments,
+    svg_of,
+    text,
+)
 
 
 @dataclass(frozen=True, slots=True)

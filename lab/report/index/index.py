@@ -1,12 +1,14 @@
-"""The index of a batch: one row per run with a link to its report, the worst runs first."""
+"""Thumbnails: three curves of a run in one small drawing, with a common scale."""
 
 from __future__ import annotations
 
 import base64
+import datetime
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +20,187 @@ from lab.files.text.atomic_write import atomic_write_text
 from lab.number_format import format_number
 from lab.report.html import environment
 from lab.report.index.indexed_run import LINK, NAME, VERDICT, IndexedRun, indexed_run
-from lab.report.index.thumbnails import thumbnail
-from lab.report.index.trends import dated, trends
+from lab.report.plot.axes import (
+    PlotArea,
+    Scale,
+    envelope,
+    frame,
+    heading,
+    line_path,
+    number,
+    svg_of,
+    text,
+    tick_texts,
+    ticks,
+    true_ranges,
+    x_ticks,
+    y_ticks,
+)
+
+WIDTH, HEIGHT = 96, 26  # viewBox units
+_MARGIN = 2
+
+
+def thumbnail(values: Array, names: tuple[str, str, str], unit: str, least: float, points: int) -> str:
+    """An svg element with three curves; empty where no value is known.
+
+    values: (F, 3), nan where unknown. Each curve is drawn about the middle of its range, all with one scale, so that
+    their heights compare. least: the smallest range that fills the height; noise at rest stays flat. points: at most so
+    many per curve; the extremes are kept.
+    """
+    spans = [_span(values[:, k]) for k in range(3)]
+    known = [span for span in spans if span is not None]
+    if not known:
+        return ""
+    scale = (HEIGHT - 2 * _MARGIN) / max(least, *(high - low for low, high in known))
+    words = ", ".join(
+        f"{name} {number(span[0])} to {number(span[1])}" for name, span in zip(names, spans, strict=True) if span
+    )
+    paths = "".join(
+        f'<path class="{css}" d="{_thumbnail_path(values[:, k], span, scale, points)}"/>'
+        for k, (css, span) in enumerate(zip("abc", spans, strict=True))
+        if span is not None
+    )
+    return (
+        f'<svg class="t" viewBox="0 0 {WIDTH} {HEIGHT}" role="img"><title>{escape(words)} {unit}</title>{paths}</svg>'
+    )
+
+
+def _span(y: Array) -> tuple[float, float] | None:
+    finite = y[np.isfinite(y)]
+    return (float(finite.min()), float(finite.max())) if finite.size else None
+
+
+def _thumbnail_path(y: Array, span: tuple[float, float], scale: float, points: int) -> str:
+    """The `d` of a curve, in whole viewBox units relative to the point before."""
+    n = len(y)
+    x, y = envelope(np.arange(n, dtype=float), y, max(points // 2, 1))
+    xs = np.rint(x * ((WIDTH - 1) / max(n - 1, 1)))
+    ys = np.rint(HEIGHT / 2 - (y - (span[0] + span[1]) / 2) * scale)
+    out = []
+    for start, stop in true_ranges(np.isfinite(ys)):
+        dx, dy = np.diff(xs[start:stop]).astype(int), np.diff(ys[start:stop]).astype(int)
+        out.append(f"M{xs[start]:.0f} {ys[start]:.0f}{_steps(dx.tolist(), dy.tolist())}")
+    return "".join(out)
+
+
+def _steps(dx: list[int], dy: list[int]) -> str:
+    """Relative lines; level ones are joined."""
+    steps: list[tuple[int, int]] = []
+    for step in zip(dx, dy, strict=True):
+        if steps and step[1] == 0 and steps[-1][1] == 0:
+            steps[-1] = (steps[-1][0] + step[0], 0)
+        elif step != (0, 0):
+            steps.append(step)
+    if not steps:
+        return "h0"
+    return "l" + " ".join(f"{a} {b}" for a, b in steps).replace(" -", "-")
+
+
+# Trends of a batch: quantities of its runs over the day of the recording.
+
+
+_WIDTH, _HEIGHT = 540.0, 150.0
+_DAYS = (1, 2, 5, 10)  # steps between ticks
+_MONTHS = (1, 2, 3, 6, 12, 24, 60, 120, 240, 600, 1200, 2400, 6000, 12000)
+_LEAST_DAYS_OF_A_MEDIAN = 4
+QUANTITIES: tuple[tuple[str, str, Callable[[IndexedRun], float | None]], ...] = (
+    ("Residual rms, median of the run", "px", lambda run: run.rms_px),
+    ("Largest mean residual of a camera", "px", lambda run: run.mean_residual_px),
+    ("Attitude sigma, median of the run", "deg", lambda run: run.sigma_attitude_deg),
+    ("Position sigma, median of the run", "mm", lambda run: _times(run.sigma_position_m, 1e3)),
+    ("Share of frames measured", "%", lambda run: _times(run.measured_share, 100.0)),
+    ("Age of the calibration at the recording", "days", lambda run: _times(run.calibration_age, 1.0)),
+)
+
+
+def dated(runs: Sequence[IndexedRun]) -> list[IndexedRun]:
+    """The runs whose day of recording is known."""
+    return [run for run in runs if run.recorded is not None]
+
+
+def trends(runs: Sequence[IndexedRun]) -> list[str]:
+    """An svg element per quantity that at least two days state; none where all runs are of one day."""
+    known = dated(runs)
+    day = np.array([run.recorded.toordinal() for run in known if run.recorded is not None], dtype=float)
+    if len(np.unique(day)) < 2:
+        return []
+    pad = max(0.5, 0.02 * float(np.ptp(day)))
+    limits = float(day.min()) - pad, float(day.max()) + pad
+    out = []
+    for title, unit, of in QUANTITIES:
+        values = np.array([np.nan if (value := of(run)) is None else value for run in known])
+        if len(np.unique(day[np.isfinite(values)])) > 1:
+            out.append(_trend(day, values, [run.status for run in known], limits, title, unit))
+    return out
+
+
+def _times(value: float | None, factor: float) -> float | None:
+    return None if value is None else value * factor
+
+
+def _trend(
+    day: Array, values: Array, statuses: Sequence[str], limits: tuple[float, float], title: str, unit: str
+) -> str:
+    lo, hi = _value_range(values, unit)
+    p = PlotArea(Scale(*limits, 54.0, _WIDTH - 10.0), Scale(lo, hi, _HEIGHT - 24.0, 22.0), _WIDTH, _HEIGHT)
+    marks = ticks(lo, hi, 4)
+    out = [y_ticks(p, marks, tick_texts(marks), grid=True), x_ticks(p, *date_ticks(*limits))]
+    days, medians = _medians(day, values)
+    if len(days) >= _LEAST_DAYS_OF_A_MEDIAN:
+        d = line_path(p.X(days), p.Y(np.clip(medians, lo, hi)))
+        out.append(f'<path class="line median" d="{d}"><title>Median of the runs of each day</title></path>')
+    status = np.array(statuses)
+    for name in dict.fromkeys(statuses):
+        which = (status == name) & np.isfinite(values)
+        # A line of length zero with round ends is a dot: a tenth of the bytes of a circle.
+        places = zip(p.X(day[which]).tolist(), p.Y(np.clip(values[which], lo, hi)).tolist(), strict=True)
+        d = "".join(map("M%.0f %.0fh0".__mod__, places))
+        css = name if name in ("pass", "check", "fail") else "error"
+        out.append(f'<path class="dots {css}" d="{d}"/>')
+    if np.nanmax(values) > hi:
+        out.append(text(p.X.b, 14, f"▲ up to {format_number(float(np.nanmax(values)))} {unit}", "end"))
+    out.append(heading(p, f"{title} ({unit})"))
+    return svg_of(p, title, [*out, frame(p, closed=False)])
+
+
+def _value_range(values: Array, unit: str) -> tuple[float, float]:
+    """From zero (shares: up to 100 %); a few values far above the others do not set the scale."""
+    finite = values[np.isfinite(values)]
+    low = float(finite.min())
+    if unit == "%":
+        return (max(0.0, low - 0.1 * (100.0 - low) - 0.5), 100.5)
+    usual, high = float(np.percentile(finite, 95)), float(finite.max())
+    high = high if high <= 3.0 * usual or usual <= 0 else 1.5 * usual
+    low = min(low, 0.0)
+    return low, max(low + (high - low) * 1.08, low + 1e-9)
+
+
+def _medians(day: Array, values: Array) -> tuple[Array, Array]:
+    """The days with a value, rising, and the median of each."""
+    days = np.unique(day[np.isfinite(values)])
+    return days, np.array([np.nanmedian(values[day == d]) for d in days])
+
+
+def date_ticks(lo: float, hi: float, about: int = 6) -> tuple[Array, list[str]]:
+    """Days (ordinals) between two ordinals, roughly `about` of them, and their labels: a day, a month or a year."""
+    span = hi - lo
+    first, last = (datetime.date.fromordinal(int(max(1, edge))) for edge in (np.ceil(lo), np.floor(hi)))
+    for step in _DAYS:
+        if span / step <= about + 1 and span < 60:
+            start = -(-first.toordinal() // step) * step
+            places = range(start, last.toordinal() + 1, step)
+            return np.array(places, dtype=float), [datetime.date.fromordinal(p).isoformat() for p in places]
+    months = next((m for m in _MONTHS if span / 30.4 / m <= about + 1), _MONTHS[-1])
+    count = range(-(-(first.year * 12 + first.month - 1) // months) * months, last.year * 12 + last.month, months)
+    begun = [datetime.date(m // 12, m % 12 + 1, 1) for m in count if m >= 12]
+    begun = [day for day in begun if first <= day <= last]
+    labels = [f"{day.year:04d}" if months >= 12 else f"{day:%Y-%m}" for day in begun]
+    return np.array([day.toordinal() for day in begun], dtype=float), labels
+
+
+# The index of a batch: one row per run with a link to its report, the worst runs first.
+
 
 FILE_NAME = "index.html"
 _MANY = 500  # runs from which the thumbnails have fewer points

@@ -1,15 +1,227 @@
-"""Plot areas with two axes: frame, grid, ticks with labels, names, title and footnote."""
+"""Long series reduced to what a screen can show, without losing extremes or gaps."""
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
+from html import escape
 
 import numpy as np
 
-from geometry.arrays import Array
-from lab.report.plot.scales import Scale, tick_texts, ticks
-from lab.report.plot.svg import figure, text, vertical_text
+from geometry.arrays import Array, Bools, Ints
+
+
+def true_ranges(mask: Bools) -> list[tuple[int, int]]:
+    """First index and one past the last index of each run of True in (n,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def envelope(x: Array, y: Array, bins: int) -> tuple[Array, Array]:
+    """A line of n points reduced to at most 2 * bins points that draws the same.
+
+    Keeps the smallest and the largest value of each bin, in their order, so that no spike is lost. A bin without a
+    finite value stays a gap.
+    """
+    n = len(x)
+    if n <= 2 * bins:
+        return x, y
+    per_bin = -(-n // bins)
+    padded = np.full(per_bin * bins, np.nan)
+    padded[:n] = y
+    block = padded.reshape(bins, per_bin)
+    low = np.argmin(np.where(np.isnan(block), np.inf, block), axis=1)
+    high = np.argmax(np.where(np.isnan(block), -np.inf, block), axis=1)
+    order = np.sort(np.stack([low, high], -1), axis=1) + per_bin * np.arange(bins)[:, None]
+    at = np.minimum(order.ravel(), n - 1)
+    return x[at], padded[order.ravel()]
+
+
+def band_envelope(x: Array, low: Array, high: Array, bins: int) -> tuple[Array, Array, Array]:
+    """A band of n points reduced to at most `bins` points: the smallest low and the largest high of each bin."""
+    n = len(x)
+    if n <= bins:
+        return x, low, high
+    starts = np.arange(0, n, -(-n // bins))
+    lows = np.minimum.reduceat(np.where(np.isnan(low), np.inf, low), starts)
+    highs = np.maximum.reduceat(np.where(np.isnan(high), -np.inf, high), starts)
+    return x[starts], np.where(np.isinf(lows), np.nan, lows), np.where(np.isinf(highs), np.nan, highs)
+
+
+def true_shares(mask: Bools, n_columns: int) -> list[tuple[float, float]]:
+    """The runs of True in (n,) as shares 0..1 of the length; runs within one of the n columns are joined."""
+    n = len(mask)
+    if n > n_columns:
+        column = np.arange(n) * n_columns // n
+        mask = np.bincount(column, weights=mask.astype(float), minlength=n_columns) > 0
+        n = n_columns
+    return [(start / n, stop / n) for start, stop in true_ranges(mask)]
+
+
+# Elements of a plot in SVG text: colours, text, lines, areas, dots and embedded images.
+#
+# Coordinates are viewBox units, about one screen pixel each. Plots are written as text because importing matplotlib
+# takes 0.33 s of process time, as long as the whole report of a usual run (docs/decisions/figures.md).
+
+
+# The palette of Okabe & Ito: distinct with any kind of colour vision.
+BLUE, ORANGE, GREEN, VERMILLION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
+PURPLE, SKY, YELLOW, GREY = "#CC79A7", "#56B4E9", "#F0E442", "#8a8f98"
+INK = "var(--ink)"  # the page's text colour
+
+
+def figure(width: float, height: float, title: str, parts: list[str], *, css: str = "plot", data: str = "") -> str:
+    """A whole drawing as an svg element with a name for screen readers. data: further attributes."""
+    name = escape(title, quote=True)
+    return (
+        f'<svg class="{css}" viewBox="0 0 {width:.0f} {height:.0f}"{data} role="img" aria-label="{name}">'
+        f"<title>{escape(title)}</title>{''.join(parts)}</svg>"
+    )
+
+
+def text(x: float, y: float, words: str, css: str = "", style: str = "") -> str:
+    """A text element; the words are escaped. style: CSS, which takes precedence over the page's rules for text."""
+    own = f' style="{escape(style)}"' if style else ""
+    return f'<text x="{x:.1f}" y="{y:.1f}" class="{css}"{own}>{escape(words)}</text>'
+
+
+def vertical_text(x: float, y: float, words: str) -> str:
+    """A text element that reads upwards, centred on (x, y)."""
+    return f'<text x="0" y="0" class="mid" transform="translate({x:.0f} {y:.1f}) rotate(-90)">{escape(words)}</text>'
+
+
+def line_path(x: Array, y: Array) -> str:
+    """The `d` of a line through drawing coordinates (n,), interrupted at nan; an isolated point becomes a dot."""
+    parts = []
+    for start, stop in true_ranges(np.isfinite(x) & np.isfinite(y)):
+        parts.append(_steps(x[start:stop], y[start:stop]) + ("" if stop - start > 1 else "h0"))
+    return "".join(parts)
+
+
+def _steps(x: Array, y: Array) -> str:
+    """The `d` of a line through finite drawing coordinates (n,), n > 0: its start and then steps, in tenths."""
+    places = np.round(10 * np.stack([x, y], -1)).astype(np.int64)  # rounded first: steps do not accumulate errors
+    start = f"M{places[0, 0] / 10:.1f} {places[0, 1] / 10:.1f}"
+    return start + ("l" + _tenths(np.diff(places, axis=0).ravel()) if len(places) > 1 else "")
+
+
+def _tenths(values: Ints) -> str:
+    """Integers (n,) divided by ten as a list of numbers in as few characters as SVG allows."""
+    distinct, which = np.unique(values, return_inverse=True)
+    words = [f"{v / 10:g}".replace("0.", ".") if abs(v) < 10 else f"{v / 10:g}" for v in distinct.tolist()]
+    words = [w if w.startswith("-") else f" {w}" for w in words]
+    return "".join([words[i] for i in which.tolist()]).lstrip()
+
+
+def area_path(x: Array, low: Array, high: Array) -> str:
+    """The `d` of the area between two lines (n,) in drawing coordinates, interrupted at nan."""
+    parts = []
+    for start, stop in true_ranges(np.isfinite(low) & np.isfinite(high)):
+        xs = np.concatenate([x[start:stop], x[start:stop][::-1]])
+        ys = np.concatenate([high[start:stop], low[start:stop][::-1]])
+        parts.append(_steps(xs, ys) + "z")
+    return "".join(parts)
+
+
+def bar_path(edges: Array, tops: Array, base: float) -> str:
+    """The `d` of adjacent bars: edges (n + 1,), tops (n,) and base in drawing coordinates."""
+    bars = zip(edges[:-1].tolist(), edges[1:].tolist(), tops.tolist(), strict=True)
+    return "".join(f"M{a:.1f} {base:.1f}V{y:.1f}H{b:.1f}V{base:.1f}z" for a, b, y in bars)
+
+
+def polyline(places: Array, closed: bool = False) -> str:
+    """The `d` of one line through finite drawing coordinates (n, 2)."""
+    return "M" + " ".join(map("%.1f %.1f".__mod__, map(tuple, places.tolist()))) + ("z" if closed else "")
+
+
+def segments(starts: Array, ends: Array) -> str:
+    """The `d` of separate lines from (n, 2) to (n, 2), drawing coordinates; lines with a nan are omitted."""
+    good = np.isfinite(starts).all(axis=1) & np.isfinite(ends).all(axis=1)
+    rows = np.concatenate([starts[good], ends[good]], axis=1)
+    return "".join(map("M%.1f %.1fL%.1f %.1f".__mod__, map(tuple, rows.tolist())))
+
+
+def dots(places: Array, radius: float) -> str:
+    """The `d` of filled circles at (n, 2), drawing coordinates; nan are omitted."""
+    good = places[np.isfinite(places).all(axis=1)]
+    r = f"{radius:g}"
+    ring = f"a{r} {r} 0 1 0 {2 * radius:g} 0a{r} {r} 0 1 0 {-2 * radius:g} 0z"
+    return "".join(f"M{x - radius:.1f} {y:.1f}{ring}" for x, y in good.tolist())
+
+
+def picture_uri(data: bytes, kind: str) -> str:
+    """The bytes of an image file as a data URI; kind: png or jpeg."""
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
+
+
+# Scales: linear maps from values to drawing coordinates, ranges, ticks and their labels.
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """A linear map from values lo..hi to drawing coordinates a..b."""
+
+    lo: float
+    hi: float
+    a: float
+    b: float
+
+    def __call__(self, values: Array) -> Array:
+        """Drawing coordinates of values, any shape."""
+        return self.a + (np.asarray(values, dtype=float) - self.lo) * (self.b - self.a) / (self.hi - self.lo)
+
+
+def ticks(lo: float, hi: float, about: int) -> Array:
+    """Round numbers between lo and hi, roughly `about` of them, in steps of 1, 2 or 5 times a power of ten."""
+    raw = (hi - lo) / max(about, 1)
+    power = 10.0 ** np.floor(np.log10(raw))
+    step = power * min((m for m in (1, 2, 5, 10) if m * power >= raw * 0.999), default=10)
+    first = np.ceil(lo / step - 1e-9)
+    return step * np.arange(first, np.floor(hi / step + 1e-9) + 1) + 0.0  # + 0.0: no negative zero
+
+
+def tick_texts(values: Array) -> list[str]:
+    """Labels of ticks, with as many decimals as are needed to distinguish them, and a true minus sign."""
+    step = float(np.min(np.diff(values))) if len(values) > 1 else abs(float(values[0])) if len(values) else 1.0
+    decimals = max(0, -int(np.floor(np.log10(step) + 1e-9))) if step > 0 else 0
+    return [f"{0.0 if abs(v) < step / 2 else v:.{min(decimals, 9)}f}".replace("-", "\u2212") for v in values]
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number with at most `digits` significant digits, without trailing zeros, and a true minus sign."""
+    return f"{value:.{digits}g}".replace("-", "\u2212")
+
+
+def padded_range(values: Array, margin: float = 0.06) -> tuple[float, float]:
+    """The range of the finite values with a small margin; never empty."""
+    finite = values[np.isfinite(values)]
+    lo, hi = (float(finite.min()), float(finite.max())) if finite.size else (-1.0, 1.0)
+    pad = max(margin * (hi - lo), 1e-9, 1e-6 * abs(hi))
+    return lo - pad, hi + pad
+
+
+def robust_range(values: Array, at_least: float = 0.0) -> tuple[float, float]:
+    """A range symmetric about zero that a few spikes do not widen.
+
+    The whole range where it is below three times the 99th percentile; otherwise 1.6 times that percentile, and the plot
+    must mark the values beyond.
+    """
+    size = np.abs(values[np.isfinite(values)])
+    if not size.size:
+        return -1.0, 1.0
+    usual, largest = float(np.percentile(size, 99)), float(size.max())
+    limit = max(largest * 1.08 if largest < 3 * usual else 1.6 * usual, at_least, 1e-9)
+    return -limit, limit
+
+
+def round_size(value: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is at most `value` (> 0): the length of a scale bar."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(max(m * power for m in (1, 2, 5) if m * power <= value * 1.0001))
+
+
+# Plot areas with two axes: frame, grid, ticks with labels, names, title and footnote.
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,3 +334,39 @@ def frame(p: PlotArea, closed: bool = True) -> str:
     d = f"M{left:.1f} {top:.1f}"
     d += f"h{wide:.1f}v{high:.1f}h{-wide:.1f}z" if closed else f"v{high:.1f}h{wide:.1f}"
     return f'<path class="frame" d="{d}"/>'
+
+
+# Histograms, with the normal curve of a given sigma over them.
+
+
+def histogram(
+    values: Array,
+    limits: tuple[float, float],
+    title: str,
+    x_name: str,
+    *,
+    sigma: float = 0.0,
+    footnote: str = "",
+    bins: int = 60,
+    height: float = 240,
+) -> str:
+    """Counts of the finite values (any shape) between two limits.
+
+    sigma: of a normal curve about zero with the area of all finite values, also those beyond the limits; 0: no curve.
+    """
+    values = np.asarray(values, dtype=float).ravel()
+    values = values[np.isfinite(values)]
+    edges = np.linspace(*limits, bins + 1)
+    counts: Ints = np.histogram(values, edges)[0]
+    middle, wide = (edges[1:] + edges[:-1]) / 2, edges[1] - edges[0]
+    normal = np.zeros(bins)
+    if sigma:
+        normal = len(values) * wide * np.exp(-((middle / sigma) ** 2) / 2) / (sigma * np.sqrt(2 * np.pi))
+    top = max(float(counts.max(initial=0)), float(normal.max(initial=0)), 1) * 1.06
+    p = plot_area(limits, (0, top), height=height)
+    bars = bar_path(p.X(edges), p.Y(counts.astype(float)), float(p.Y(np.array(0.0))))
+    out = [*axes(p, title, x_name, "count"), f'<path d="{bars}" fill="{BLUE}" fill-opacity="0.7"/>']
+    if sigma:
+        d = line_path(p.X(middle), p.Y(normal))
+        out.append(f'<path class="line ink" d="{d}" stroke-width="1.5" stroke-dasharray="5 3"/>')
+    return svg_of(p, title, [*out, note(p, footnote), frame(p)])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array
 from lab.pictures.opencv import load_cv2
-from lab.report.plot.svg import picture_uri
+from lab.report.plot.axes import picture_uri
 
 Bytes: TypeAlias = NDArray[np.uint8]
 GreyValues: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16] | Array  # whole numbers are faster

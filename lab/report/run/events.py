@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lab.files.run.run_file import VideoFile
-from lab.report.plot.thinning import true_ranges
+from lab.report.plot.axes import true_ranges
 from lab.report.run.report_data import ReportData
 from tracking.statuses import PoseStatus, SpotStatus
 

@@ -5,11 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.arrays import Array
-from lab.report.plot.histogram import histogram
-from lab.report.plot.scales import robust_range
-from lab.report.plot.series import Band, Line, Shade, time_panel
-from lab.report.plot.svg import BLUE, GREEN, VERMILLION
-from lab.report.plot.zoom_data import ZoomData
+from lab.report.plot.axes import BLUE, GREEN, VERMILLION, histogram, robust_range
+from lab.report.plot.series import Band, Line, Shade, ZoomData, time_panel
 from lab.report.run.report_data import ReportData
 from lab.runs.score.score import normalised_squares
 from tracking.statuses import PoseStatus, SpotStatus

@@ -13,7 +13,7 @@ from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_text
 from lab.report.failure import Failure, files_beside, write_failure_report
 from lab.report.html import environment
-from lab.report.run import error_tables, figures, pose_curves, tables, trust, uncertainty
+from lab.report.run import figures, pose_curves, tables, trust
 from lab.report.run.blocks.model_fit import HEADS as MODEL_FIT_HEADS
 from lab.report.run.blocks.model_fit import model_fit
 from lab.report.run.blocks.scene import scene_of
@@ -70,16 +70,16 @@ def page(m: ReportData, results: Path) -> str:
         "evidence": trust.evidence(m, fit),
         "methods": trust.methods(m, fit),
         "keys": tables.key_figures(m),
-        "truth_keys": error_tables.truth_figures(m.errors),
-        "pixel_rows": error_tables.pixel_rows(m.errors),
+        "truth_keys": tables.truth_figures(m.errors),
+        "pixel_rows": tables.pixel_rows(m.errors),
         "run_line": _run_line(m),
         "pose_figure": Markup(pose_curves.pose_figure(m, zoom)),
         "motion_figure": Markup(pose_curves.motion_figure(m, zoom)),
         "smoothed": m.causal is not None,
         "method": method,
-        "budget_heads": uncertainty.HEADS,
-        "budget_rows": uncertainty.budget_rows(m),
-        "budget_words": uncertainty.words(m),
+        "budget_heads": tables.HEADS,
+        "budget_rows": tables.budget_rows(m),
+        "budget_words": tables.words(m),
         "tracks": [Markup(t) for c in m.spots.cameras if (t := tracks_figure(m, c, zoom))],
         "scene": scene_of(m.name, None if m.run is None else m.run.rig, m.poses),
         "timeline": Markup(timeline_figure(m)) if len(m.spots.frames) and m.spots.views else "",
@@ -95,7 +95,7 @@ def page(m: ReportData, results: Path) -> str:
         "model_fit": fit,
         "model_fit_heads": MODEL_FIT_HEADS,
         "model_fit_drawings": [] if fit is None else [Markup(d) for d in fit.drawings],
-        "error_rows": error_tables.error_rows(m.errors),
+        "error_rows": tables.error_rows(m.errors),
         "has_truth": m.errors is not None,
         "spot_heads": heads,
         "spot_rows": rows,

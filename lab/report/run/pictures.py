@@ -14,7 +14,7 @@ from lab.files.run.results import SPOT_STATUSES, read_result_table
 from lab.files.run.run_file import DetectionsTable, LiveDevice
 from lab.pictures.opencv import load_cv2
 from lab.pictures.picture_file import GreyPicture, MissingPicture
-from lab.report.plot import svg
+from lab.report.plot import axes
 from lab.report.plot.image import grey_limits, image_uri, stretched
 from lab.report.run.events import ShownEvent
 from lab.report.run.report_data import ReportData
@@ -94,12 +94,12 @@ def _drawing(shot: _Shot, picture: GreyPicture | str) -> str:
     when = f", t = {m.t_s[event.index]:.3f} s" if m.time_name != "frame" else ""
     head = f"frame {shot.frame}{when}, camera {event.camera}"
     out = [
-        svg.text(0, 12, head, "title") + svg.text(0, 27, event.text),
+        axes.text(0, 12, head, "title") + axes.text(0, 27, event.text),
         f'<svg x="0" y="34" width="{_SHOWN_WIDTH}" height="{tall:.1f}" viewBox="-0.5 -0.5 {w} {h}">',
     ]
     if isinstance(picture, str):
         out.append(f'<rect class="nopicture" x="-0.5" y="-0.5" width="{w}" height="{h}"/>')
-        out.append(svg.text(w / 2, 0.09 * h, picture, "halo mid", f"fill:#fff;font-size:{14 / scale:.0f}px"))
+        out.append(axes.text(w / 2, 0.09 * h, picture, "halo mid", f"fill:#fff;font-size:{14 / scale:.0f}px"))
     else:
         shown = stretched(picture, *grey_limits(picture))
         if w > 2 * _SHOWN_WIDTH:
@@ -116,7 +116,7 @@ def _drawing(shot: _Shot, picture: GreyPicture | str) -> str:
     out.append(_statuses(shot, tall))
     height = max(tall, _ZOOM_SHOWN + 96) + 36
     data = f' data-at="{float(m.t_s[event.index])!r}" data-frame="{shot.frame}"'
-    return svg.figure(540, height, f"{head}: {event.text}", out, css="plot shot", data=data)
+    return axes.figure(540, height, f"{head}: {event.text}", out, css="plot shot", data=data)
 
 
 def _focus(shot: _Shot) -> Array | None:
@@ -156,7 +156,7 @@ def _markers(shot: _Shot, unit: float, enlarged: bool) -> list[str]:
             a, b = predicted[0] - r, predicted[1] - r
             d = f"M{a:.2f} {b:.2f}l{2 * r:.2f} {2 * r:.2f}m0 {-2 * r:.2f}l{-2 * r:.2f} {2 * r:.2f}"
             out.append(
-                f'<path d="{d}" fill="none" stroke="{svg.YELLOW}" stroke-width="{1.2 * unit:.2f}">'
+                f'<path d="{d}" fill="none" stroke="{axes.YELLOW}" stroke-width="{1.2 * unit:.2f}">'
                 f"<title>{escape(f'spot {spot}: predicted')}</title></path>"
             )
         if not np.isfinite(uv).all():
@@ -200,7 +200,7 @@ def _names(shot: _Shot, unit: float) -> list[str]:
                 break
             y = y + 14 * unit if y < h / 2 else y - 14 * unit
         taken.append((x, y))
-        out.append(svg.text(x, y, name, "halo", f"fill:#fff;font-size:{13 * unit:.1f}px"))
+        out.append(axes.text(x, y, name, "halo", f"fill:#fff;font-size:{13 * unit:.1f}px"))
     return out
 
 
@@ -236,7 +236,7 @@ def _zoom(shot: _Shot, picture: GreyPicture, focus: Array) -> str:
         f'<image {frame} style="image-rendering:pixelated" href="{data}"/>{marks}</svg>'
     )
     words = (f"enlarged: {side} × {side} px", f"from u = {corner[0]}, v = {corner[1]}")
-    return inner + "".join(svg.text(408, 34 + _ZOOM_SHOWN + 15 + 14 * i, line) for i, line in enumerate(words))
+    return inner + "".join(axes.text(408, 34 + _ZOOM_SHOWN + 15 + 14 * i, line) for i, line in enumerate(words))
 
 
 def _statuses(shot: _Shot, tall: float) -> str:
@@ -251,6 +251,6 @@ def _statuses(shot: _Shot, tall: float) -> str:
     last = 34 + tall - 4
     return "".join(
         f'<circle cx="413" cy="{last - 15 * (len(shown) - 1 - i) - 4:.1f}" r="4" fill="{colour}"/>'
-        + svg.text(422, last - 15 * (len(shown) - 1 - i), words)
+        + axes.text(422, last - 15 * (len(shown) - 1 - i), words)
         for i, (words, colour) in enumerate(shown)
     )

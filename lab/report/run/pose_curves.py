@@ -10,10 +10,8 @@ from geometry import rotations
 from geometry.arrays import Array, Bools
 from geometry.pose import Pose
 from lab.files.run.results import PoseTrack
-from lab.report.plot.scales import padded_range, robust_range
-from lab.report.plot.series import Band, Line, time_panel
-from lab.report.plot.svg import BLUE, GREY, SKY, VERMILLION
-from lab.report.plot.zoom_data import ZoomData
+from lab.report.plot.axes import BLUE, GREY, SKY, VERMILLION, padded_range, robust_range
+from lab.report.plot.series import Band, Line, ZoomData, time_panel
 from lab.report.run.figures import pose_shades
 from lab.report.run.report_data import ReportData
 from lab.runs.score.motion_score import differenced

@@ -8,11 +8,25 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from lab.files.run.results import POSE_STATUSES, SPOT_STATUSES
-from lab.report.plot.axes import PlotArea, axes, frame, plot_area
-from lab.report.plot.scales import Scale
-from lab.report.plot.series import time_data, time_scale, time_ticks
-from lab.report.plot.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILLION, figure, line_path, text
-from lab.report.plot.zoom_data import ZoomData
+from lab.report.plot.axes import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    PlotArea,
+    Scale,
+    axes,
+    figure,
+    frame,
+    line_path,
+    plot_area,
+    text,
+)
+from lab.report.plot.series import ZoomData, time_data, time_scale, time_ticks
 from lab.report.run.report_data import ReportData
 from tracking.statuses import PoseStatus, SpotStatus
 

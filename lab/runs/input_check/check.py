@@ -11,9 +11,9 @@ from geometry import rotations
 from geometry.forward_model import SpotModel
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import SolveLimits
-from geometry.pose_solver.symmetry import symmetries
+from geometry.pose_solver.visibility import symmetries
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.calibration_state import CalibrationState, require_valid_calibration
 from lab.files.rig.rig_covariance import joint_covariance

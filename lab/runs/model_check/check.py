@@ -11,7 +11,7 @@ from calibration.model_check.check import ModelCheckResult, NotTested, evaluate_
 from calibration.model_check.recording import ModelCheckRecording
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.runs.model_check.frame_sampler import FrameSampler
 from lab.runs.model_check.messages import findings_of, why_not_tested
 from lab.runs.model_check.place import with_place_errors

@@ -19,8 +19,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance
-from geometry.uncertainty.rig_uncertainty import RigUncertainty
+from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty
 from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.verdict.frame_ranges import FrameRanges
 from tracking.consistency import (

@@ -16,7 +16,7 @@ from calibration.least_squares.adjustment import AdjustmentError
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance, perturbed
+from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed
 from lab.simulate.rigs import RIGS
 from tests.calibration.beams.bench import (
     ARCSEC,

@@ -13,7 +13,7 @@ from geometry import rotations
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import perturbed
+from geometry.uncertainty.rig_uncertainty import perturbed
 from lab.simulate.scene import Scene, compose
 
 SCENES = ("smooth", "sharp-turns", "huo2015", "two-cameras-per-screen", "four-skew-beams")
@@ -35,7 +35,7 @@ def turned(camera: str, angle_deg: float, axis: int) -> Change:
 
 
 def changed(name: str, by: float) -> Change:
-    """One parameter of the rig changed, by its name in geometry.uncertainty.rig_parameters."""
+    """One parameter of the rig changed, by its name in geometry.uncertainty.rig_uncertainty."""
     return lambda rig: perturbed(rig, [name], np.array([by]))
 
 

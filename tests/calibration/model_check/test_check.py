@@ -14,7 +14,7 @@ from calibration.model_check.recording import ModelCheckRecording
 from geometry.forward_model import SpotModel
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from tests.calibration.model_check.model_scenes import NOISE_PX, SCENES, changed, one_camera, recorded, turned
 
 

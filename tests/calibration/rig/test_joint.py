@@ -18,7 +18,7 @@ from calibration.rig.rig_steps import calibrate_in_steps
 from calibration.screens.screens import calibrate
 from calibration.terms.corners import CornerTerm
 from geometry.pose import Pose
-from lab.simulate.calibration_campaign import Campaign, CampaignQuality, draw_campaign, spots_at
+from lab.simulate.campaign import Campaign, CampaignQuality, draw_campaign, spots_at
 
 SMALL = CampaignQuality(positions=15, dots=(5, 4))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -15,7 +16,7 @@ from typing import Any
 import pytest
 
 from geometry import compiled_projection
-from geometry.compilation import compile_cache, jit
+from geometry.compilation import compile_cache, jit, numba_internals
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from tests.geometry.scenes import paper_rig
@@ -49,6 +50,9 @@ FIND = """
 import json, logging, sys, tempfile
 if "nowhere" in sys.argv:
     tempfile.tempdir = "/dev/null/nowhere"
+if "other" in sys.argv:  # a numba without one of the undocumented interfaces
+    from numba.core import codegen
+    del codegen.JITCodeLibrary
 lines, begun = [], []
 logging.getLogger("beampose").setLevel(logging.INFO)
 logging.getLogger("beampose").addHandler(type("Keep", (logging.Handler,), {"emit": lambda _, r: lines.append(r)})())
@@ -76,7 +80,7 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for floor in ("geometry", "geometry/compilation", "floor"):
         (folder / floor).mkdir()
         (folder / floor / "__init__.py").write_text("")
-    for module in (jit, compile_cache):
+    for module in (jit, compile_cache, numba_internals):
         shutil.copy(str(module.__file__), folder / "geometry" / "compilation")
     (folder / "geometry" / "constants.py").write_text(CONSTANTS)
     (folder / "geometry" / "inner.py").write_text(INNER)
@@ -159,6 +163,24 @@ def test_code_from_disk_is_inlined_into_a_caller_that_is_compiled_again(program,
     outer.write_text(outer.read_text().replace("x + count", "x + 2 * count"))
     again = found(started(copy))
     assert (again["value"], again["compiled"]) == (40.0, ["twice_grown"])
+
+
+def test_with_a_numba_that_has_other_internals_code_is_kept_and_never_that_of_an_edited_source(program, tmp_path):
+    copy = tmp_path / "program"
+    shutil.copytree(program, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    first = found(started(copy, "other"))
+    assert first["value"] == 20.0
+    assert {"grown", "twice_grown"} <= set(first["compiled"])
+    later = found(started(copy, "other"))
+    assert (later["value"], later["compiled"], later["reports"]) == (20.0, [], [])
+    (copy / "geometry" / "constants.py").write_text(CONSTANTS.replace("10", "100"))
+    assert found(started(copy, "other"))["value"] == 200.0
+
+
+def test_the_undocumented_interfaces_of_numba_are_used_in_one_module():
+    private = re.compile(r"numba\.core\.(?!event\b|types\b)|JITCodeLibrary|_load_overload|get_call_template|c_helpers")
+    users = {name for name, path in modules(ROOT).items() if private.search(path.read_text("utf-8"))}
+    assert users == {"geometry.compilation.numba_internals"}
 
 
 def test_a_truncated_cache_file_is_discarded_and_compiled_again(program, first_two, tmp_path):

@@ -9,7 +9,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.alternative_poses import alternative_poses
 from geometry.pose_solver.gauss_newton import fit_pose
-from geometry.pose_solver.symmetry import symmetries
+from geometry.pose_solver.visibility import symmetries
 from lab.simulate.rigs import RIGS
 from tests.geometry.scenes import random_pose
 

@@ -14,11 +14,11 @@ from geometry.pose_solver.gauss_newton import (
     SolveLimits,
     covariance_of,
     fit_pose,
+    fit_pose_robust,
     is_measurement,
     pixel_covariance,
     whiten,
 )
-from geometry.pose_solver.robust_pose import fit_pose_robust
 from geometry.rig import Beam, Rig
 from tests.geometry.scenes import LENSES, paper_rig, random_pose, random_rig
 

@@ -10,8 +10,15 @@ from hypothesis import strategies as st
 from geometry.arrays import numeric_jacobian
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from geometry.uncertainty.rig_parameters import RigCovariance, Sensitivity, is_known, perturbed, rig_names, split_name
-from geometry.uncertainty.rig_uncertainty import RigUncertainty
+from geometry.uncertainty.rig_uncertainty import (
+    RigCovariance,
+    RigUncertainty,
+    Sensitivity,
+    is_known,
+    perturbed,
+    rig_names,
+    split_name,
+)
 from tests.geometry.scenes import LENSES, paper_rig, random_pose, uncommon_rig
 
 seeds = st.integers(0, 2**32 - 1)

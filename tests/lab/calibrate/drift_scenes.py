@@ -12,7 +12,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.rotations import exp
-from geometry.uncertainty.rig_parameters import camera_names, perturbed
+from geometry.uncertainty.rig_uncertainty import camera_names, perturbed
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import Covariance, RigFile, save_rig
 from tests.geometry.scenes import LENSES, paper_rig

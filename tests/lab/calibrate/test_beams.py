@@ -18,7 +18,7 @@ from calibration.terms.spot_term import SpotPixels
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance, rig_names
+from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names
 from lab.calibrate.beams.beams import calibrate_beams
 from lab.calibrate.beams.recordings import limit_frames, read_recordings
 from lab.calibrate.beams.stationary_frames import SpotRows, average, mean_of_frames, positions_at_rest

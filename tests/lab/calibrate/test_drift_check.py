@@ -17,7 +17,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.rotations import exp
-from geometry.uncertainty.rig_parameters import RigCovariance, perturbed, rig_names
+from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed, rig_names
 from lab.calibrate.drift_check.drift_check import COLUMNS, DriftLimits, check_drift
 from lab.calibrate.drift_check.drift_comparison import compare_points
 from lab.calibrate.drift_check.drift_history import read_history

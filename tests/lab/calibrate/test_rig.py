@@ -23,8 +23,7 @@ from lab.files.rig.rig_covariance import joint_covariance
 from lab.files.rig.rig_file import load_rig, load_rig_file, save_rig
 from lab.files.run.results import read_poses
 from lab.runs.process import process_run
-from lab.simulate.calibration_campaign import CampaignQuality
-from lab.simulate.campaign_files import simulate_calibration
+from lab.simulate.campaign import CampaignQuality, simulate_calibration
 from lab.simulate.write import simulate
 
 DAY = datetime.date(2026, 3, 14)

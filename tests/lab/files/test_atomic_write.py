@@ -365,7 +365,7 @@ def test_a_usable_target_is_accepted_and_nothing_is_made(tmp_path):
         lambda out: importlib.import_module("lab.calibrate.drift_check.drift_check").check_drift(
             Path("none.yaml"), out, None
         ),
-        lambda out: importlib.import_module("lab.plan.plan").plan_rig(Path("none.yaml"), out),
+        lambda out: importlib.import_module("lab.setup.plan").plan_rig(Path("none.yaml"), out),
     ],
     ids=["screen", "beams", "rig", "camera", "check", "plan"],
 )

@@ -18,11 +18,11 @@ from lab.files.text.csv_text import csv_text, read_table
 from lab.files.text.error_text import is_formula, name_of_path, printable
 from lab.files.text.json_text import has_schema
 from lab.files.text.yaml_text import parse_mapping, parse_value, read_mapping
-from lab.plan.plan_options import options_of
 from lab.runs.batch.result_folders import allotted
 from lab.runs.batch.run_list import listed_runs
 from lab.runs.batch.table import read_rows
 from lab.runs.frames.frame_sources import open_video
+from lab.setup.plan_findings import options_of
 from tests.paths import ROOT
 
 CALIBRATED = ROOT / "sample_runs" / "calibrated"
@@ -97,10 +97,10 @@ def test_files_of_users_are_read_through_the_helpers_that_refuse_pipes():
     """Reading a pipe waits for ever. The others read what the program itself holds, or have asked for a file before."""
     asked = {
         "calibrate/camera/camera_page.py",
-        "compare/reference_file.py",
-        "doctor/places.py",
+        "results/compare.py",
+        "setup/doctor_checks.py",
         "files/project/cloud_file.py",
-        "init/files.py",
+        "setup/init.py",
         "pictures/colour.py",
         "runs/batch/cluster.py",
         "runs/batch/resumption.py",

@@ -7,7 +7,7 @@ import datetime
 import numpy as np
 import pytest
 
-from geometry.uncertainty.rig_parameters import rig_names
+from geometry.uncertainty.rig_uncertainty import rig_names
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.calibration_state import CalibrationState, require_valid_calibration
 from lab.files.rig.camera_block import Covariance

@@ -12,9 +12,8 @@ import pytest
 
 from lab.report.index.index import write_index
 from lab.report.run.page import write_report
-from lab.view.content import read_content
-from lab.view.scene import View, view_of
-from lab.view.view import write_files
+from lab.results.view.scene import View, read_content, view_of
+from lab.results.view.view import write_files
 from tests.lab.report.test_report import make
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

@@ -30,8 +30,7 @@ from lab.report.calibration.calibration_page import (
     representative_views,
     write_calibration_report,
 )
-from lab.report.plot.colour_map import value_range
-from lab.report.plot.maps import contour_levels, contour_lines, heat_map
+from lab.report.plot.maps import contour_levels, contour_lines, heat_map, value_range
 from tests.geometry.scenes import paper_rig
 
 SIZE = (640, 480)

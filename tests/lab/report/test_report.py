@@ -16,11 +16,10 @@ from lab import number_format
 from lab.errors import InputError
 from lab.files.run.results import read_poses
 from lab.report.index.index import write_index
-from lab.report.plot import thinning
+from lab.report.plot import axes
+from lab.report.plot.axes import BLUE, line_path, tick_texts, ticks
 from lab.report.plot.image import grey_limits, stretched
-from lab.report.plot.scales import tick_texts, ticks
 from lab.report.plot.series import Line, Shade, time_panel
-from lab.report.plot.svg import BLUE, line_path
 from lab.report.run.events import MOST_PICTURES, events, selected
 from lab.report.run.page import write_report
 from lab.report.run.pictures import _arrow
@@ -340,7 +339,7 @@ class TestDrawing:
     def test_a_spike_of_one_frame_survives_thinning(self):
         t, y = np.arange(100_000.0), np.zeros(100_000)
         y[51_234] = 7.0
-        x, thin = thinning.envelope(t, y, 500)
+        x, thin = axes.envelope(t, y, 500)
         assert len(x) <= 1000
         assert x[np.argmax(thin)] == 51_234
         assert thin.max() == 7.0
@@ -349,7 +348,7 @@ class TestDrawing:
     def test_a_gap_survives_thinning(self):
         t, y = np.arange(10_000.0), np.ones(10_000)
         y[4000:6000] = np.nan
-        x, thin = thinning.envelope(t, y, 100)
+        x, thin = axes.envelope(t, y, 100)
         assert np.isnan(thin[(x > 4200) & (x < 5800)]).all()
         assert np.isfinite(thin[(x < 3900) | (x > 6100)]).all()
 
@@ -357,7 +356,7 @@ class TestDrawing:
         t = np.arange(10_000.0)
         low, high = -np.ones(10_000), np.ones(10_000)
         high[777], low[778] = 5.0, -6.0
-        _, thin_low, thin_high = thinning.band_envelope(t, low, high, 100)
+        _, thin_low, thin_high = axes.band_envelope(t, low, high, 100)
         assert (thin_low.min(), thin_high.max()) == (-6.0, 5.0)
 
     def test_a_plot_of_a_hundred_thousand_frames_stays_small(self):

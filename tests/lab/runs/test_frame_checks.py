@@ -9,7 +9,7 @@ import pytest
 
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.verdict.frame_checks import CONTRADICTION, NOT_A_COVARIANCE, FrameChecks
 from tests.geometry.scenes import paper_rig

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from geometry.uncertainty.rig_parameters import rig_names
+from geometry.uncertainty.rig_uncertainty import rig_names
 from lab.errors import CalibrationError
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.camera_block import Covariance

@@ -56,7 +56,7 @@ def test_verbose_shows_the_lines_of_the_log_and_quiet_nothing(points, tmp_path):
     assert done.exit_code == 0
     assert done.stderr == (tmp_path / "out" / "run.log").read_text("utf-8")
     assert done.stdout.startswith("smooth-5: PASS")
-    assert not any(type(handler).__module__ == "lab.commands.verbosity" for handler in LOGGER.handlers)
+    assert not any(type(handler).__module__ == "lab.commands.common" for handler in LOGGER.handlers)
     done = typed("run", points, "--out", tmp_path / "out", "-q")
     assert (done.exit_code, done.stdout, done.stderr) == (0, "", "")
 

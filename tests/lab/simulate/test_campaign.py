@@ -14,10 +14,8 @@ from lab.files.project.point_files import read_observations, read_poses, read_su
 from lab.files.project.project import load_project
 from lab.files.rig.rig_file import load_rig
 from lab.files.text.csv_text import read_table
-from lab.init.files import start
-from lab.init.layout import Layout
-from lab.simulate.calibration_campaign import CampaignQuality, draw_campaign, lens_covariance
-from lab.simulate.campaign_files import simulate_calibration
+from lab.setup.init import Layout, start
+from lab.simulate.campaign import CampaignQuality, draw_campaign, lens_covariance, simulate_calibration
 from lab.simulate.rigs import RIGS
 from lab.simulate.write import simulate
 
@@ -134,7 +132,7 @@ def test_board_photographs_show_the_board_that_the_folder_names(tmp_path, monkey
     from calibration.boards.board_view import NotFound
     from lab.files.rig.board_file import load_board
     from lab.pictures.picture_file import read_picture
-    from lab.simulate import campaign_files
+    from lab.simulate import campaign as campaign_files
 
     monkeypatch.setattr(campaign_files, "PHOTOS", 1)
     folder = simulate_calibration(tmp_path / "photos", seed=1, positions=3, photos=True)

@@ -10,10 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from geometry.camera import Camera
 from geometry.pose import Pose
-from lab.light_tracker.sequences import moving_drogue
-from lab.simulate.drogue.render import render_drogue
-from lab.simulate.drogue.rim import ellipse_through
-from lab.simulate.drogue.scene import (
+from studies.drogue.render import render_drogue
+from studies.drogue.scene import (
     DISC,
     PICTURE,
     SIDE_LIGHT,
@@ -22,7 +20,9 @@ from lab.simulate.drogue.scene import (
     DrogueLook,
     DrogueScene,
     Occluder,
+    ellipse_through,
 )
+from studies.drogue.sequences import moving_drogue
 
 SIZE, FOCAL = (320, 240), 500.0
 GREY = 60

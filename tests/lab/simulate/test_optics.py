@@ -14,8 +14,8 @@ from geometry.light_centroid import map_curvature
 from geometry.planes import intersect_plane
 from geometry.pose import Pose
 from geometry.rig import Rig
-from lab.simulate.optics import exposure_instants, on_screen_covariance, spot_images, spot_patch
 from lab.simulate.picture import expected_light, laser_powers, make_sensor
+from lab.simulate.points import exposure_instants, on_screen_covariance, spot_images, spot_patch
 from lab.simulate.rigs import fan, look_at
 from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter
 from lab.simulate.scene import compose

@@ -9,9 +9,8 @@ import pytest
 from geometry import rotations
 from geometry.pose import Pose
 from lab.errors import InputError
-from lab.simulate.motion import Motion, Wave
 from lab.simulate.points import CLUTTER, simulate_points
-from lab.simulate.scenarios import SCENARIOS, Occlusion, RecordingFault
+from lab.simulate.scenarios import SCENARIOS, Motion, Occlusion, RecordingFault, Wave
 from lab.simulate.scene import VISIBLE, compose
 
 HIDDEN = 2

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from geometry.uncertainty.rig_parameters import perturbed
+from geometry.uncertainty.rig_uncertainty import perturbed
 from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig, save_rig
 from lab.files.run.detections_file import read_detections

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lab.binocular.distance_experiment import random_pose
-from lab.binocular.simulated_recording import drogue_markers, simulated_pair
+from lab.targets.stereo.simulated_recording import drogue_markers, simulated_pair
+from studies.zhou2020 import random_pose
 from tracking.binocular.marker_model import MarkerImages, project_markers
 
 PAIR = simulated_pair(1100.0, (1280, 1024))

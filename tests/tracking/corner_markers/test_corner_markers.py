@@ -9,9 +9,8 @@ import pytest
 
 from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose
-from lab.unscented.tanker_pictures import CLEAR, GUST, MARKERS, Difficulty, marker_model, pose_of, render
-from tracking.corner_markers.harris import harris_corners, harris_response
-from tracking.corner_markers.matching import MatchParameters, match_markers
+from studies.fu2016_experiments import CLEAR, GUST, MARKERS, Difficulty, marker_model, pose_of, render
+from tracking.corner_markers.matching import MatchParameters, harris_corners, harris_response, match_markers
 from tracking.detections import UNMATCHED
 
 STATE = np.array([21.0, 6.0, 0.5, 0, 0, 0, 0.1, 0.05])

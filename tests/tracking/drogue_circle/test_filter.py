@@ -11,14 +11,11 @@ from tests.tracking.drogue_circle.discs import covered, discs
 from tracking.drogue_circle.kalman import (
     FilterBank,
     motion_models,
-    predict,
     printed_coefficient,
     printed_step,
-    process_noise,
-    transition,
-    update,
 )
 from tracking.drogue_circle.occlusion import disc_cells, first_appearance
+from tracking.kalman import process_noise, propagate, transition, update
 
 SIGMA = np.array([0.3, 0.3, 0.05])
 
@@ -26,7 +23,7 @@ SIGMA = np.array([0.3, 0.3, 0.05])
 def test_the_process_noise_is_that_of_an_acceleration_constant_in_a_step():
     a = np.random.default_rng(0).normal(0, SIGMA, (200_000, 3))
     moved = np.concatenate([0.5 * 4 * a, 2 * a], axis=1)  # dt = 2: dt^2/2 and dt
-    np.testing.assert_allclose(process_noise(2.0, SIGMA), np.cov(moved.T), atol=0.01)
+    np.testing.assert_allclose(process_noise(SIGMA, 2.0), np.cov(moved.T), atol=0.01)
 
 
 def test_a_measurement_counts_as_in_the_information_form():
@@ -46,8 +43,8 @@ def test_a_bank_of_one_filter_is_that_filter():
     bank = FilterBank.started(z, R, 2.0, models).predicted(1.0).updated(z + 1, R, 0.95)
     P = np.zeros((6, 6))
     P[:3, :3], P[3:, 3:] = R, np.diag([2.0, 2.0, 0.3]) ** 2
-    Q = process_noise(1.0, np.array([0.3, 0.3, 0.045]))
-    x, P = update(*predict(np.array([*z, 0, 0, 0]), P, transition(1.0), Q), z + 1, R)
+    Q = process_noise(np.array([0.3, 0.3, 0.045]), 1.0)
+    x, P = update(*propagate(np.array([*z, 0, 0, 0]), P, transition(1.0, 3), Q), z + 1, R)
     got_x, got_P = bank.state()
     np.testing.assert_allclose(got_x, x, rtol=1e-9)
     np.testing.assert_allclose(got_P, P, rtol=1e-9, atol=1e-12)

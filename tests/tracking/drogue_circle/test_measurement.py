@@ -8,11 +8,9 @@ import pytest
 from tests.tracking.drogue_circle.discs import covered, discs
 from tracking.drogue_circle.acquisition import Wanted, acquire
 from tracking.drogue_circle.candidates import CircleCandidate, Window
-from tracking.drogue_circle.classical import classical_detector
-from tracking.drogue_circle.gradient_votes import edge_pixels, radii_of
+from tracking.drogue_circle.detectors import classical_detector, edge_pixels, radii_of
 from tracking.drogue_circle.parameters import CircleParameters
-from tracking.drogue_circle.rim import smooth_crop
-from tracking.drogue_circle.rim_fit import fit_rim
+from tracking.drogue_circle.rim_fit import fit_rim, smooth_crop
 
 P = CircleParameters()
 DETECT = classical_detector(P)
@@ -104,7 +102,7 @@ def test_circles_about_one_centre_are_one_target():
 
 @pytest.mark.slow
 def test_the_covariance_is_that_of_the_errors():
-    from lab.drogue_circle.experiment import still_errors
+    from studies.zhou2014 import still_errors
 
     errors = still_errors(77, 150)
     for hidden in (0.0, 0.2, 0.4):

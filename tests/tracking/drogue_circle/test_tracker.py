@@ -7,10 +7,10 @@ import pytest
 
 from tests.tracking.drogue_circle.discs import covered, discs
 from tracking.drogue_circle.candidates import CircleCandidate
-from tracking.drogue_circle.classical import classical_detector
-from tracking.drogue_circle.frames import Cause
+from tracking.drogue_circle.detectors import classical_detector
 from tracking.drogue_circle.parameters import CircleParameters
 from tracking.drogue_circle.printed import PrintedTracker
+from tracking.drogue_circle.rim_fit import Cause
 from tracking.drogue_circle.tracker import CircleTracker
 from tracking.statuses import PoseStatus
 

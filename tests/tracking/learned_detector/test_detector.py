@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from bench.related_measurements.learned_detector import calibration, is_right, recall_at, reliability
-from lab.learned_detector.samples import draw_sample
+from studies.learned_detector.samples import draw_sample
 from tracking.drogue_circle.candidates import Window
-from tracking.learned_detector import detector, pyramid
+from tracking.learned_detector import detector
 from tracking.learned_detector.detector import DrogueCandidate, find_drogues, learned_detector
 
 
@@ -63,7 +63,7 @@ def test_colour_pictures_and_damaged_weights_are_errors_with_a_remedy(tmp_path, 
 def test_the_levels_of_the_pyramid_know_their_exact_scales():
     for shape in ((97, 131), (480, 640), (5, 300)):
         grey = np.zeros(shape, np.float32)
-        levels = pyramid.pyramid(grey, 7 / 9, 40.0, 180.0)
+        levels = detector.pyramid(grey, 7 / 9, 40.0, 180.0)
         assert len(levels) == 3
         for level in levels:
             assert level.grey.shape == (round(level.scale_v * shape[0]), round(level.scale_u * shape[1]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tracking.light_tracker.confidence import COEFFICIENTS, FEATURES, SIGNS, features, logit, probability, within
+from tracking.light_tracker.frames import COEFFICIENTS, FEATURES, SIGNS, features, logit, probability, within
 
 GOOD = {"support": 2.0, "confirmed": 5, "unconfirmed": 0}
 

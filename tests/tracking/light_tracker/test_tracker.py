@@ -9,8 +9,7 @@ import pytest
 
 from tests.tracking.light_tracker.targets import SIZE, picture
 from tracking.drogue_circle.candidates import CircleCandidate, Picture, Window
-from tracking.light_tracker.frames import Cause, DrogueFrame, Source
-from tracking.light_tracker.parameters import USUAL, LightParameters
+from tracking.light_tracker.frames import USUAL, Cause, DrogueFrame, LightParameters, Source
 from tracking.light_tracker.tracker import DrogueTracker
 from tracking.statuses import PoseStatus
 

@@ -7,11 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tracking.unscented.fu2016 import SPREAD, X0, PrintedFilter, bearings, process, selection
-from tracking.unscented.observability import observability
-from tracking.unscented.robust import gated_update, student_t_update
-from tracking.unscented.sigma_points import Spread, sigma_points, square_root, transform, with_angles
-from tracking.unscented.ukf import predict, update
+from tracking.unscented.fu2016 import SPREAD, X0, PrintedFilter, bearings, observability, process, selection
+from tracking.unscented.ukf import (
+    Spread,
+    gated_update,
+    predict,
+    sigma_points,
+    square_root,
+    student_t_update,
+    transform,
+    update,
+    with_angles,
+)
 
 SPREADS = [Spread(), Spread(0.55, 2.0, -2.0), Spread(1e-3, 2.0, 0.0)]
 

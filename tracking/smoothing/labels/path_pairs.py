@@ -17,8 +17,8 @@ import numpy as np
 
 from geometry.arrays import Array, Ints
 from geometry.camera import Camera
+from geometry.planes import intersect_surface
 from geometry.rig import Rig
-from geometry.surfaces import intersect_surface
 from tracking.smoothing.labels.path_prediction import (
     MAX_AHEAD,
     Prediction,

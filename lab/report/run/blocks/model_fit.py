@@ -11,9 +11,20 @@ import numpy as np
 
 from geometry.arrays import Array
 from lab.number_format import format_number, format_with_sigma
-from lab.report.plot.axes import frame, heading, image_area, note, svg_of
-from lab.report.plot.scales import number, round_size
-from lab.report.plot.svg import BLUE, VERMILLION, dots, segments, text
+from lab.report.plot.axes import (
+    BLUE,
+    VERMILLION,
+    dots,
+    frame,
+    heading,
+    image_area,
+    note,
+    number,
+    round_size,
+    segments,
+    svg_of,
+    text,
+)
 
 HEADS = (
     "spot", "camera", "frames", "mean u (px)", "mean v (px)", "u, v in σ", "calibration sigma (px)", "scatter",

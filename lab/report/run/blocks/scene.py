@@ -12,9 +12,8 @@ from markupsafe import Markup
 from geometry.rig import Rig
 from lab.files.run.results import PoseTrack
 from lab.report.calibration.calibration_scene import LAB_VIEWS, scene_views
-from lab.view.content import content_of_poses
-from lab.view.page import as_script, scene_data
-from lab.view.scene import view_of
+from lab.results.view.page import as_script, scene_data
+from lab.results.view.scene import content_of_poses, view_of
 
 _MOMENTS, _POINTS = 40, 160  # of the playback and of the trajectory: together 9 kB
 _DIGITS = 3  # of coordinates in m

@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from cli import main
-from lab.commands.command_line import command_line
+from lab.commands.common import command_line
 from lab.errors import CalibrationError, InputError, RunError
 from lab.explain.catalogue import EXPLANATIONS
 from lab.files.text.csv_text import write_table

@@ -1,0 +1,144 @@
+"""Faster loading of machine code from disk, with parts of numba that its releases may change.
+
+All uses of numba's undocumented interfaces are here (docs/decisions/compile-cache.md). Where one of them is missing,
+importing this module raises ImportError and `geometry.compilation.jit` uses numba's public cache: slower, same results.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.core import codegen
+from numba.core.caching import FunctionCache
+from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]  # written in C, without types
+from numba.core.types import unliteral
+
+_NEEDED = {
+    "codegen": (codegen, ("ll", "JITCodeLibrary")),
+    "JITCodeLibrary": (
+        getattr(codegen, "JITCodeLibrary", None),
+        (
+            "enable_object_caching", "get_pointer_to_function", "_finalize_final_module",
+            "_get_module_for_linking", "_set_compiled_object",
+        ),
+    ),
+    "FunctionCache": (
+        FunctionCache,
+        ("_guard_against_spurious_io_errors", "_load_overload", "flush", "load_overload", "save_overload"),
+    ),
+    "_nrt_python": (_nrt_python, ("c_helpers",)),
+    "dispatcher": (type(numba.njit(lambda: None)), ("get_call_template",)),
+}  # fmt: skip
+_missing = [
+    f"{place}.{name}" for place, (found, names) in _NEEDED.items() for name in names if not hasattr(found, name)
+]
+if _missing:
+    raise ImportError(f"numba {numba.__version__} has no {', '.join(_missing)}")
+
+_llvm: Any = codegen.ll  # type: ignore[attr-defined]  # llvmlite.binding, as numba imports it; numba has no types
+
+
+class _Library(codegen.JITCodeLibrary):
+    """numba's holder of machine code; for code from disk, LLVM's bitcode is parsed only when it is needed.
+
+    It is needed to compile a caller, which may inline this code. numba parses it in every process: half of the time
+    of loading (docs/decisions/compile-cache.md).
+    """
+
+    _unparsed: bytes | None = None  # bitcode of code from disk
+
+    @classmethod
+    def _unserialize(cls, generator: Any, state: Any) -> _Library:
+        name, _, (machine_code, bitcode) = state
+        library: Any = cls(generator, name)
+        library._unparsed = bitcode
+        library.enable_object_caching()
+        library._set_compiled_object(machine_code)
+        library._finalize_final_module()
+        out: _Library = library
+        return out
+
+    def _get_module_for_linking(self) -> Any:
+        if self._unparsed is not None:
+            self._shared_module = _llvm.parse_bitcode(self._unparsed)
+            self._unparsed = None
+        return super()._get_module_for_linking()  # type: ignore[no-untyped-call]  # numba has no types
+
+    def get_pointer_to_function(self, name: str) -> int:
+        if self._disable_inspection:  # code from disk: numba knows its symbols only from the bitcode
+            address: int = self._codegen._engine.get_function_address(name)
+            return address
+        return int(super().get_pointer_to_function(name))  # type: ignore[no-untyped-call]  # numba has no types
+
+
+class _Cache(FunctionCache):
+    """numba's cache of one function, for which an unreadable or unwritable file is a missing one.
+
+    It is opened by the first call of the function: a run calls a quarter of all functions.
+    """
+
+    def __init__(self, function: Callable, folder: Path) -> None:
+        self._function, self._folder, self._is_open = function, folder, False
+
+    def _open(self) -> None:
+        settings: Any = numba.config
+        before, settings.CACHE_DIR = settings.CACHE_DIR, str(self._folder)
+        try:
+            super().__init__(self._function)  # type: ignore[no-untyped-call]  # numba has no types
+        finally:
+            settings.CACHE_DIR = before
+        self._is_open = True
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        if not self._is_open:
+            self._open()
+        target_context.codegen()._library_class = _Library
+        _name_functions_of_numba()
+        try:
+            # Not FunctionCache.load_overload: it first imports what numba needs to compile, as numba does again there.
+            with self._guard_against_spurious_io_errors():
+                return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]  # numba has no types
+        except Exception:  # unpickling a truncated file raises almost anything
+            with suppress(OSError):
+                self.flush()  # type: ignore[no-untyped-call]  # numba has no types
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        with suppress(OSError):  # for instance a full disk: the code is compiled, only not kept
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]  # numba has no types
+
+
+@cache
+def _name_functions_of_numba() -> None:
+    """Gives the linker the addresses of the functions that machine code calls for the memory of arrays.
+
+    The first half of what numba does before it compiles; the other half compiles functions that machine code from disk
+    contains.
+    """
+    for name, address in _nrt_python.c_helpers.items():
+        _llvm.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
+
+
+def keep_on_disk(dispatcher: Any, function: Callable, folder: Path) -> None:
+    """Makes a compiled function (numba's dispatcher) keep its machine code in a folder and load it from there."""
+    dispatcher._cache = _Cache(function, folder)
+
+
+def treat_literals_as_numbers(dispatcher: Any) -> None:
+    """Makes calls with a literal argument, `f(x, 0)`, use the code for any number.
+
+    numba would compile the function once more for each literal, and for the first value of a variable such as
+    `count = 0`, and discard some of these versions: a sixth of all compilations (docs/decisions/numba.md).
+    """
+    of_types = dispatcher.get_call_template
+    plain: Any = unliteral
+
+    def of_plain_types(args: Any, kws: Any) -> Any:
+        return of_types([plain(a) for a in args], {name: plain(a) for name, a in kws.items()})
+
+    dispatcher.get_call_template = of_plain_types

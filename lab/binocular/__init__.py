@@ -1,1 +1,0 @@
-"""`beampose stereo`: files, processing, report and study of the binocular measurement."""

@@ -1,1 +1,0 @@
-"""Commands of the related measurements and of the published experiments."""

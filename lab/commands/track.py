@@ -1,0 +1,282 @@
+"""`beampose track`: one target through a video or a folder of pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lab.commands.common import ANY_PATH, FOLDER, Commands, NumberRange, conclude, progress_bar, read_settings
+
+_PIXEL = NumberRange(-1e6, 1e6)
+
+
+@click.group(cls=Commands)
+def track() -> None:
+    """Track one target through the pictures of one camera, without a rig.
+
+    \b
+    Example:
+        beampose track circle drogue.avi --out results/drogue
+    """
+
+
+@track.command()
+@click.argument("pictures", metavar="VIDEO_OR_FOLDER", type=ANY_PATH)
+@click.option("--out", required=True, type=FOLDER, help="Gets circle.csv, summary.json and report.html.")
+@click.option("--near", type=(_PIXEL, _PIXEL), metavar="U V", help="Centre of the first circle, px, within 20 px.")
+@click.option(
+    "--min-radius", default=7.0, show_default=True, type=NumberRange(4, 10_000), help="Smallest radius to look for, px."
+)
+@click.option("--max-radius", type=NumberRange(4, 10_000), help="Largest one; default: half of the smaller side.")
+@click.option("--rate", type=NumberRange(0.01, 1e6), help="Frames per second; default: the video's, or 25.")
+@click.option(
+    "--form",
+    default="sound",
+    show_default=True,
+    type=click.Choice(["sound", "printed"]),
+    help="Equations: corrected with a fit of the rim, or as printed in Zhou (2014).",
+)
+@click.option(
+    "--detector",
+    default="classical",
+    show_default=True,
+    type=click.Choice(["classical", "learned"]),
+    help="What proposes circles: votes of gradients, or a network that was trained on rendered drogues.",
+)
+@click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
+@click.option("--video", is_flag=True, help="Also write overlay.avi: the pictures with the circle drawn into them.")
+@click.pass_context
+def circle(
+    ctx: click.Context,
+    pictures: Path,
+    out: Path,
+    near: tuple[float, float] | None,
+    min_radius: float,
+    max_radius: float | None,
+    rate: float | None,
+    form: str,
+    detector: str,
+    limit: int | None,
+    video: bool,
+) -> None:
+    """Track a circle (the rim of a drogue, a ring, a disc): centre, radius, rates, sigmas and occlusion.
+
+    The circle is found by itself in the first pictures. Where several circles fit equally well, none is chosen: state
+    its place (--near) or its range of radii. Frames in which half of the target or more is hidden are predicted.
+
+    \b
+    Example:
+        beampose track circle drogue.avi --out results/drogue --video
+    """
+    from lab.commands.common import provenance
+    from lab.targets.circle import CircleOptions, track_circle
+
+    options = CircleOptions(near, min_radius, max_radius, rate, form, detector, video, limit)
+    with progress_bar(pictures.name) as progress:
+        outcome = track_circle(pictures, out, options, progress, provenance(ctx))
+    conclude(outcome)
+
+
+# `beampose track drogue`: a refuelling drogue, by the learned detector and the light tracker.
+
+
+@click.command()
+@click.argument("pictures", metavar="VIDEO_OR_FOLDER", type=ANY_PATH)
+@click.option("--out", required=True, type=FOLDER, help="Gets drogue.csv, summary.json and report.html.")
+@click.option("--near", type=(_PIXEL, _PIXEL), metavar="U V", help="Centre of the first drogue, px, within 20 px.")
+@click.option(
+    "--every",
+    default=5,
+    show_default=True,
+    type=click.IntRange(1, 1000),
+    help="Frames between two checks by the detector.",
+)
+@click.option(
+    "--min-diameter",
+    default=8.0,
+    show_default=True,
+    type=NumberRange(8, 10_000),
+    help="Smallest diameter to look for, px.",
+)
+@click.option("--max-diameter", type=NumberRange(8, 10_000), help="Largest one; default: the picture's smaller side.")
+@click.option("--rate", type=NumberRange(0.01, 1e6), help="Frames per second; default: the video's, or 25.")
+@click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
+@click.option("--video", is_flag=True, help="Also write overlay.avi: the pictures with the drogue drawn into them.")
+@click.pass_context
+def drogue(
+    ctx: click.Context,
+    pictures: Path,
+    out: Path,
+    near: tuple[float, float] | None,
+    every: int,
+    min_diameter: float,
+    max_diameter: float | None,
+    rate: float | None,
+    limit: int | None,
+    video: bool,
+) -> None:
+    """Track a refuelling drogue: centre, diameter, sigmas and confidence.
+
+    A learned detector finds the drogue in the whole picture and checks it every few frames; in between, a light tracker
+    follows its pattern. Drogues from 9 px on. Where several drogues are in view, none is chosen: state its place
+    (--near). For the rim itself, with occlusion and ellipse, use `track circle --detector learned`.
+
+    \b
+    Example:
+        beampose track drogue drogue.avi --out results/drogue --video
+    """
+    from lab.commands.common import provenance
+    from lab.targets.drogue import DrogueOptions, track_drogue
+
+    options = DrogueOptions(near, every, min_diameter, max_diameter, rate, video, limit)
+    with progress_bar(pictures.name) as progress:
+        outcome = track_drogue(pictures, out, options, progress, provenance(ctx))
+    conclude(outcome)
+
+
+# `beampose track point`: the centre of one target.
+
+
+def _place(ctx: click.Context, parameter: click.Parameter, value: str | None) -> tuple[float, float] | None:
+    """U,V as two numbers."""
+    if value is None:
+        return None
+    try:
+        u, v = (float(part) for part in value.split(","))
+    except ValueError:
+        raise click.BadParameter(f"expected U,V in pixels such as 640,512, got {value!r}", ctx, parameter) from None
+    if not abs(u) + abs(v) < 1e6:
+        raise click.BadParameter(f"expected U,V in pixels such as 640,512, got {value!r}", ctx, parameter)
+    return u, v
+
+
+@click.command()
+@click.argument("source", metavar="VIDEO_OR_FOLDER_OR_CSV", type=ANY_PATH)
+@click.option("--out", required=True, type=FOLDER, help="Gets track.csv, summary.json and report.html.")
+@click.option(
+    "--detector",
+    default="spots",
+    show_default=True,
+    type=click.Choice(["spots", "darker", "brighter", "colour"]),
+    help="Points of light, or larger targets: darker or brighter than what is around them, or of a colour. Not used for"
+    " a table.",
+)
+@click.option("--colour", metavar="NAME", help="Of a coloured target: red, orange, yellow, green, cyan, blue, magenta,"
+              " or #rrggbb.")  # fmt: skip
+@click.option("--start", metavar="U,V", callback=_place, help="Where the target is at the start, px; default: the"
+              " brightest one.")  # fmt: skip
+@click.option(
+    "--frame-rate", type=NumberRange(min=1e-6, max=1e6), help="Pictures per second; default: that of the video or t_s."
+)
+@click.option("--camera", help="The camera, for a table with several.")
+@click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
+@click.option(
+    "--min-measured",
+    default=0.5,
+    show_default=True,
+    type=NumberRange(min=0, max=1),
+    help="Least share of measured frames; with less the exit status is 4.",
+)
+@click.option("--overlay", is_flag=True, help="Also write overlay.mp4: the pictures with the track.")
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="NAME=VALUE",
+    callback=read_settings,
+    help="A parameter, e.g. --set track.sigma_model_px=0.5, detect.threshold_sigma=5 or blobs.max_size_px=100.",
+)
+def point(
+    source: Path,
+    out: Path,
+    detector: str,
+    colour: str | None,
+    start: tuple[float, float] | None,
+    frame_rate: float | None,
+    camera: str | None,
+    limit: int | None,
+    min_measured: float,
+    overlay: bool,
+    settings: dict[str, Any],
+) -> None:
+    """Track the centre of one target: position, velocity and covariance in every frame.
+
+    A video, a folder of pictures, or a CSV table with frame,u_px,v_px (such as detections.csv). A constant-velocity
+    Kalman filter predicts the position where the target is hidden, and finds it again.
+
+    \b
+    Example:
+        beampose track point sample_runs/huo2015/frames/left --out results/point
+    """
+    from lab.targets.track_point import PointOptions, track_target
+
+    options = PointOptions(detector, start, frame_rate, camera, limit, min_measured, overlay, settings, colour)
+    with progress_bar("pictures") as progress:
+        outcome = track_target(source, out, options, progress)
+    conclude(outcome)
+
+
+# `beampose stereo`: the pose of a target with coloured markers from a pair of cameras.
+
+
+@click.command()
+@click.argument("run_folder", metavar="RUN", type=ANY_PATH)
+@click.option("--out", required=True, type=FOLDER, help="Where the results go; earlier results there are replaced.")
+def stereo(run_folder: Path, out: Path) -> None:
+    """Pose of a target with coloured markers from the pictures of two cameras.
+
+    RUN is a folder whose run.yaml has the schema beampose/stereo/1: the calibrated pair, the pictures of both cameras,
+    and the markers with their colours. `beampose simulate stereo-drogue --out runs/drogue` writes an example. Results:
+    attitude.csv, covariance.csv, points.csv, spots.csv, detections.csv, summary.json and report.html.
+
+    \b
+    Example:
+        beampose stereo runs/drogue --out results/drogue
+    """
+    from lab.targets.stereo.process import process_stereo_run
+
+    with progress_bar(run_folder.name) as progress:
+        outcome = process_stereo_run(run_folder, out, progress)
+    conclude(outcome)
+
+
+@click.command()
+@click.argument("left", type=ANY_PATH)
+@click.argument("right", type=ANY_PATH)
+@click.option("--board", required=True, help="The board in the photos: as for `calibrate board`, or a board.yaml.")
+@click.option("--out", required=True, type=FOLDER, help="Gets pair.yaml, pairs.csv and report.html.")
+@click.option("--names", default="left,right", show_default=True, help="Names of the two cameras.")
+@click.option("--lens", default="auto", show_default=True, help="0, 4, 5, 8, 12 or fisheye; auto: by views held out.")
+@click.option(
+    "--valid-days",
+    default=365,
+    show_default=True,
+    type=click.IntRange(min=1),
+    help="Validity of the calibration, days.",
+)
+def pair(left: Path, right: Path, board: str, out: Path, names: str, lens: str, valid_days: int) -> None:
+    """Calibrate two cameras and their relative pose from photos of a board, for `beampose stereo`.
+
+    LEFT and RIGHT: a folder of photos or a pattern. Photos of one instant have the same number in their names.
+
+    \b
+    Example:
+        beampose calibrate pair boards/left boards/right --board chessboard:9x6:25mm --out results/pair
+    """
+    from lab.calibrate.pair.pair import PairOptions, calibrate_pair_folder
+    from lab.errors import InputError
+
+    both = [name.strip() for name in names.split(",")]
+    if len(both) != 2 or not all(both):
+        raise InputError(f"--names: expected two names with a comma between them, got {names!r}")
+    options = PairOptions((both[0], both[1]), lens, valid_days)
+    with progress_bar("photos") as progress:
+        shown = None if progress is None else lambda done, total, _: progress(done, total)
+        outcome = calibrate_pair_folder(left, right, board, out, options, progress=shown)
+    conclude(outcome)
+
+
+track.add_command(drogue)
+track.add_command(point)

@@ -1,1 +1,0 @@
-"""`beampose compare`: a result against another result or a reference; tables and a report."""

@@ -1,1 +1,0 @@
-"""`beampose init`: a first rig.yaml and run.yaml, with comments."""

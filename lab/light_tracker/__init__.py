@@ -1,1 +1,0 @@
-"""`beampose track drogue`: the learned detector with the light tracker between its frames."""

@@ -1,1 +1,0 @@
-"""`beampose plan`: visibility and expected uncertainty of a rig before it is built."""

@@ -1,0 +1,1 @@
+"""What is done with results: `compare`, `verify`, `show`, `view`."""

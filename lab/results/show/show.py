@@ -1,0 +1,139 @@
+"""`beampose show`: one annotated picture of one frame."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lab.errors import InputError
+from lab.files.run.run_file import Run
+from lab.files.text.atomic_write import atomic_write_bytes
+from lab.files.text.error_text import suggest_name
+from lab.results.show.data import FrameContent, ResultData, frame_content, read_result_data
+from lab.results.show.panel import Pixels
+from lab.results.show.sheet import Layout, png, sheet
+from lab.runs.frames.frames import Picture, pictures_at
+
+if TYPE_CHECKING:
+    from lab.runs.frames.pipeline import FrameRecord, Pipeline
+
+
+Progress = Callable[..., None]  # frames done, frames in all, stage
+PICTURE_SUFFIX = ".png"
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """An annotated picture, and what could not be shown."""
+
+    image: Pixels
+    content: FrameContent
+    notes: tuple[str, ...]
+
+
+def show_frame(
+    path: Path,
+    frame: int,
+    *,
+    camera: str | None = None,
+    run_folder: Path | None = None,
+    progress: Progress | None = None,
+) -> Shown:
+    """The annotated picture of a frame of results, or of a run folder.
+
+    path: a results folder, or a run folder: its frames up to this one are then processed, without smoothing. camera:
+    one camera; None: all side by side. run_folder: of the results, if it has moved.
+
+    Raises:
+        InputError: the path is neither, or has no such frame or camera.
+        BeamposeError: the run cannot be processed.
+    """
+    path = Path(path)
+    if (path / "spots.csv").is_file() and (path / "attitude.csv").is_file():
+        return _shown(read_result_data(path, run_folder), frame, camera)
+    if not (path / "run.yaml").is_file():
+        raise InputError(
+            f"{path}: expected a folder of results (with spots.csv and attitude.csv) or a run folder (with run.yaml),"
+            " found neither"
+        )
+    if run_folder is not None:
+        raise InputError(f"--run: expected results to combine it with, got the run folder {path}; leave --run out")
+    return _of_run(path, frame, camera, progress)
+
+
+def write_picture(image: Pixels, path: Path) -> None:
+    """Write a PNG file. Raises InputError."""
+    if path.suffix.lower() != PICTURE_SUFFIX:
+        raise InputError(f"--out {path}: expected the name of a {PICTURE_SUFFIX} file")
+    atomic_write_bytes(png(image), path)
+
+
+def chosen_cameras(data: ResultData, camera: str | None) -> list[str]:
+    """The cameras to show. Raises InputError for one that the results do not have."""
+    if camera is None:
+        return list(data.spots.cameras)
+    if camera not in data.spots.cameras:
+        known = ", ".join(data.spots.cameras)
+        raise InputError(f"--camera {camera}: expected one of {known}{suggest_name(camera, data.spots.cameras)}")
+    return [camera]
+
+
+def _shown(data: ResultData, frame: int, camera: str | None) -> Shown:
+    index = data.index_of(frame)
+    cameras = chosen_cameras(data, camera)
+    pictures: dict[str, Picture] = {}
+    if data.run is not None:
+        pictures = {c: pictures_at(data.run, c, [frame])[frame] for c in cameras if c in data.run.cameras}
+    content = frame_content(data, index, pictures, cameras)
+    layout = Layout.of([data.sizes_px[c] for c in cameras])
+    return Shown(sheet(content, layout), content, data.notes)
+
+
+def _of_run(folder: Path, frame: int, camera: str | None, progress: Progress | None) -> Shown:
+    """The frame of a run folder, processed up to it by the causal pass."""
+    from lab.runs.frames.frames import open_frames
+    from lab.runs.frames.pipeline import Pipeline
+    from lab.runs.process import ready_run
+    from lab.runs.tables import TableWriter
+    from lab.runs.verdict.frame_checks import FrameChecks
+
+    run = ready_run(folder)
+    reader = open_frames(run)
+    last = np.inf if reader.last is None else reader.last
+    if not reader.first <= frame <= last:
+        end = "" if reader.last is None else f" to {reader.last}"
+        raise InputError(f"--frame {frame}: expected a frame of the run, {reader.first}{end}")
+    pipeline = Pipeline.of(run)
+    reached = False
+    with tempfile.TemporaryDirectory(prefix="beampose-show-") as made:
+        work = Path(made)
+        with TableWriter(work, run.rig, run.covariance is not None) as tables:
+            checks = FrameChecks(run.rig, run.covariance)
+            for record, _ in checks.passed(_up_to(frame, pipeline, progress)):
+                tables.write(record, None)
+                reached = record.frame == frame
+        if not reached:
+            raise InputError(f"--frame {frame}: the recording ends before it")
+        data = _with_run(read_result_data(work, folder), run)
+    notes = (f"processed up to frame {frame} without smoothing; for more pictures show the results of `beampose run`",)
+    shown = _shown(data, frame, camera)
+    return replace(shown, notes=(*shown.notes, *notes))
+
+
+def _up_to(frame: int, pipeline: Pipeline, progress: Progress | None) -> Iterator[tuple[FrameRecord, None]]:
+    """The records of the causal pass up to a frame."""
+    for done, record in enumerate(pipeline.records(), start=1):
+        if progress is not None:
+            progress(done, done + frame - record.frame, "processing")
+        yield record, None
+        if record.frame >= frame:
+            return
+
+
+def _with_run(data: ResultData, run: Run) -> ResultData:
+    return replace(data, name=run.name, run=run)

@@ -1,0 +1,172 @@
+"""Which pose a window of `beampose view` shows, and how keys, a slider and the clock change it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from geometry.arrays import Array, Ints
+from geometry.forward_model import SpotModel
+from lab.files.text.atomic_write import atomic_write_text
+from lab.report.calibration.calibration_scene import Rectangle, scene_views
+from lab.report.html import environment
+from lab.report.plot.axes import ORANGE, PURPLE
+from lab.results.view.scene import Content, View, edges, thinned
+
+
+class Player:
+    """The moment that is shown, of the known poses of a view."""
+
+    def __init__(self, view: View, index: int | None) -> None:
+        self.view = view
+        self.known = np.flatnonzero(view.content.known)
+        self.at = 0 if index is None else int(np.searchsorted(self.known, index))
+        self._started: tuple[float, float] | None = None  # while playing: clock, s, and time of the run, s
+
+    @property
+    def index(self) -> int | None:
+        """Of the pose shown; None without poses."""
+        return int(self.known[self.at]) if len(self.known) else None
+
+    @property
+    def playing(self) -> bool:
+        """Whether time runs."""
+        return self._started is not None
+
+    @property
+    def caption(self) -> str:
+        """The frame shown and its time, and whether its pose is measured; empty without poses."""
+        if self.index is None:
+            return ""
+        content = self.view.content
+        kind = "" if content.measured[self.index] or not content.measured.any() else ", predicted"
+        return f"frame {content.frames[self.index]}, {content.t_s[self.index]:.3f} s{kind}"
+
+    def seek(self, at: int) -> None:
+        """Go to a known pose by its number, from 0; playing stops."""
+        self.step(at - self.at)
+
+    def step(self, frames: int) -> None:
+        """Go some known poses on or back, at most to the ends; playing stops."""
+        self._started = None
+        self.at = int(np.clip(self.at + frames, 0, max(len(self.known) - 1, 0)))
+
+    def leap(self, share: float) -> None:
+        """Go a share of the run on or back."""
+        self.step(round(share * len(self.known)) or int(np.sign(share)))
+
+    def toggle(self, now_s: float) -> None:
+        """Play from here, from the start if this is the end; or pause."""
+        if self.playing or len(self.known) < 2:
+            self._started = None
+            return
+        if self.at == len(self.known) - 1:
+            self.at = 0
+        self._started = (now_s, float(self._times()[self.at]))
+
+    def advance(self, now_s: float) -> bool:
+        """Move to the pose of this moment while playing, at the speed of the recording. Whether the pose changed."""
+        if self._started is None:
+            return False
+        before = self.at
+        clock, begun = self._started
+        self.at = int(np.searchsorted(self._times(), begun + now_s - clock, side="right")) - 1
+        self.at = max(self.at, before)
+        if self.at >= len(self.known) - 1:
+            self._started = None
+        return self.at != before
+
+    def _times(self) -> Any:
+        return self.view.content.t_s[self.known]
+
+
+# view.html: the scene to turn and to play in a browser, and still drawings of it, in one file that works offline.
+
+
+MOST_MOMENTS = 800  # of the playback
+
+
+def write_page(view: View, index: int | None, path: Path) -> None:
+    """Write view.html; index: of the pose in the still drawings. Raises InputError."""
+    things = [*view.fixed, *view.moving(index), *(c for e in view.ellipsoids for c in e.circles())]
+    content = view.content
+    html = (
+        environment()
+        .get_template("view.html.j2")
+        .render(
+            name=content.name,
+            poses=content.poses_from,
+            frame=None if index is None else int(content.frames[index]),
+            moments=int(content.known.sum()),
+            ellipsoids=len(view.ellipsoids),
+            too_large=view.too_large,
+            scale=f"{view.sigma_scale:g}",
+            drawings=[Markup(d) for d in scene_views(things)],
+            data=as_script(scene_data(view, index)),
+        )
+    )
+    atomic_write_text(html, path)
+
+
+def as_script(data: dict[str, Any]) -> Markup:
+    """Data for a script element of type application/json."""
+    return Markup(json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"))
+
+
+def scene_data(
+    view: View, index: int | None, most_moments: int = MOST_MOMENTS, digits: int = 4, labels: bool = True
+) -> dict[str, Any]:
+    """The scene for the page's program: lines, labels and moments; coordinates in m, rounded to so many digits.
+
+    labels: with the names of screens and cameras.
+    """
+    lines = []
+    for thing in view.fixed:
+        for number, line in enumerate(edges(thing, view.reach_m)):
+            label = thing.name if labels and number == 0 and not thing.name.startswith("trajectory") else ""
+            lines.append(
+                {"c": thing.colour, "n": label, "f": isinstance(thing, Rectangle), "p": _rounded(line, digits)}
+            )
+    for e in view.ellipsoids:
+        lines += [{"c": e.colour, "n": "", "f": False, "p": _rounded(c.places, digits)} for c in e.circles()]
+    content = view.content
+    indices = thinned(np.flatnonzero(content.known), most_moments)
+    first = 0 if index is None else min(int(np.searchsorted(indices, index)), len(indices) - 1)
+    return {"lines": lines, "moments": _moments(content, indices, digits), "first": first}
+
+
+def _moments(content: Content, indices: Ints, digits: int) -> list[dict[str, Any]]:
+    """Frame, time, status, rays and spots (name, colour and place) of some poses: as View.moving, all at once."""
+    rig, poses = content.rig, content.world_from_body[indices]
+    model = SpotModel.of(rig)
+    hits = model.hits(poses)[0]
+    starts = {b.name: poses.apply(b.point) for b in rig.beams.values()} if len(indices) else {}
+    out = []
+    for k, i in enumerate(indices.tolist()):
+        rays, spots, drawn = [], [], set()
+        for j, (_, spot) in enumerate(model.views):
+            if spot in drawn or not np.isfinite(hits[k, j]).all():
+                continue
+            drawn.add(spot)
+            rays.append(_rounded(np.stack([starts[rig.spots[spot].beam][k], hits[k, j]]), digits))
+            spots.append([spot, ORANGE, *hits[k, j].round(digits).tolist()])
+        spots.append(["vehicle", PURPLE, *poses.translation[k].round(digits).tolist()])
+        out.append(
+            {
+                "k": int(content.frames[i]),
+                "t": round(float(content.t_s[i]), 4),
+                "m": bool(content.measured[i]),
+                "r": rays,
+                "s": spots,
+            }
+        )
+    return out
+
+
+def _rounded(points: Array, digits: int) -> list[list[float] | None]:
+    """Points (n, 3) as lists; None where not finite."""
+    return [[round(v, digits) for v in p] if np.isfinite(p).all() else None for p in points.tolist()]

@@ -1,0 +1,403 @@
+"""What `beampose view` shows: a rig, and the poses of a run's truth or of results."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.pose import Pose
+from geometry.rig import Rig
+from lab.errors import InputError
+from lab.files.rig.rig_file import load_rig
+from lab.files.run.results import PoseTrack, read_poses, read_summary
+from lab.files.run.run_file import load_run
+from lab.files.run.truth import load_run_truth
+from lab.files.text.atomic_write import atomic_write_bytes
+from lab.report.calibration.calibration_scene import (
+    Frustum,
+    Marker,
+    Ray,
+    Rectangle,
+    SceneObject,
+    Trail,
+    frustum_length,
+    outline,
+    rig_things,
+)
+from lab.report.plot.axes import GREY, PURPLE, round_size
+from tracking.statuses import PoseStatus
+
+
+@dataclass(frozen=True, slots=True)
+class Content:
+    """A rig and F poses of the vehicle; F is 0 for a rig alone."""
+
+    name: str
+    poses_from: str  # what the poses are, in words; empty without poses
+    rig: Rig
+    frames: Ints  # (F,), rising
+    t_s: Array  # (F,), or frame numbers where times are missing
+    world_from_body: Pose  # (F,); nan translation where unknown
+    position_covariance: Array  # (F, 3, 3), m^2, in world; nan where unknown
+    measured: Bools  # (F,)
+
+    @property
+    def known(self) -> Bools:
+        """(F,): whether there is a pose."""
+        return np.all(np.isfinite(self.world_from_body.translation), axis=-1)
+
+    def at_frame(self, frame: int | None) -> int | None:
+        """Index of a frame; None: the middle one of the known poses, or None without any.
+
+        Raises:
+            InputError: there is no such frame, or it has no pose.
+        """
+        known = np.flatnonzero(self.known)
+        if frame is None:
+            return int(known[len(known) // 2]) if len(known) else None
+        if not len(known):
+            raise InputError(f"--frame {frame}: {self.name} has no poses; leave --frame out")
+        numbers = self.frames[known]
+        if frame not in numbers:
+            raise InputError(f"--frame {frame}: expected a frame with a pose, {numbers[0]} to {numbers[-1]}")
+        return int(known[np.flatnonzero(numbers == frame)[0]])
+
+
+def read_content(path: Path, rig_path: Path | None) -> Content:
+    """A rig.yaml, a run folder (with the poses of its truth) or a results folder.
+
+    rig_path: a rig.yaml in place of the one that the run names.
+
+    Raises:
+        InputError: the path is none of these, or a file is not as it should be.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: expected a rig.yaml, a run folder or a folder of results, found nothing")
+    if path.is_dir() and (path / "attitude.csv").is_file():
+        return _of_results(path, rig_path)
+    if path.is_dir() or path.name == "run.yaml":
+        return _of_run(path, rig_path)
+    rig = load_rig(path)
+    if rig_path is not None:
+        raise InputError(f"--rig: expected a run or results to combine it with, got the rig {path}; leave --rig out")
+    return _without_poses(path.name, rig)
+
+
+def _of_results(results: Path, rig_path: Path | None) -> Content:
+    summary = read_summary(results)
+    rig = load_rig(rig_path) if rig_path is not None else _rig_of_results(results, str(summary.get("run_folder") or ""))
+    track = read_poses(results)
+    return content_of_poses(str(summary.get("name") or results.resolve().name), rig, track)
+
+
+def content_of_poses(name: str, rig: Rig, track: PoseTrack) -> Content:
+    """The poses of attitude.csv with the covariances of their positions."""
+    covariance = track.covariance[:, :3, :3].copy()
+    without = ~np.isfinite(covariance).all(axis=(1, 2))
+    covariance[without] = track.sigma_position_m[without][:, :, None] ** 2 * np.eye(3)
+    measured = track.has(PoseStatus.MEASURED)
+    t_s = _times(track.frames, track.t_s)
+    return Content(name, "attitude.csv", rig, track.frames, t_s, track.world_from_body, covariance, measured)
+
+
+def _rig_of_results(results: Path, run_folder: str) -> Rig:
+    """The rig of the run that results are of."""
+    for folder in (Path(run_folder), results / run_folder) if run_folder else ():
+        if folder.is_dir():
+            return load_run(folder).rig
+    was = f"its run folder {run_folder} is not there" if run_folder else "summary.json names no run folder"
+    raise InputError(f"{results}: the rig is unknown, because {was}; name it: --rig rig.yaml")
+
+
+def _of_run(path: Path, rig_path: Path | None) -> Content:
+    run = load_run(path)
+    rig = run.rig if rig_path is None else load_rig(rig_path)
+    truth = load_run_truth(run)
+    if truth is not None and truth.pose is not None:
+        t = truth.pose
+        n = len(t.frame)
+        poses = Pose.from_quaternion(t.quaternion_wxyz, t.position_m)
+        unknown = np.full((n, 3, 3), np.nan)
+        return Content(run.name, "truth/pose.csv", rig, t.frame, t.t_s, poses, unknown, np.ones(n, dtype=bool))
+    if run.prior is None:
+        return _without_poses(run.name, rig)
+    centre = run.prior.centre
+    poses = Pose(centre.rotation[None], centre.translation[None])
+    # An even spread within a cube has this variance along each axis.
+    covariance = np.eye(3)[None] * run.prior.within_m**2 / 3
+    one = np.zeros(1, dtype=np.int64)
+    return Content(run.name, "the prior of run.yaml", rig, one, np.zeros(1), poses, covariance, np.zeros(1, dtype=bool))
+
+
+def _without_poses(name: str, rig: Rig) -> Content:
+    none = Pose(np.zeros((0, 3, 3)), np.zeros((0, 3)))
+    empty = np.zeros(0)
+    return Content(name, "", rig, empty.astype(np.int64), empty, none, np.zeros((0, 3, 3)), empty.astype(bool))
+
+
+def _times(frames: Ints, t_s: Array) -> Array:
+    return t_s if np.isfinite(t_s).all() else frames.astype(float)
+
+
+# A scene as one coloured triangle mesh: lines as thin tubes, spots as balls, sigmas as ellipsoids.
+
+
+_SIDES = 6  # of a tube
+_GRID_LINES = 9  # across a screen
+_THIN, _THICK = 0.0006, 0.0016  # radii of tubes, in shares of the scene's extent
+_BALL = 0.005  # radius of a spot's ball, in the same shares
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """A triangle mesh."""
+
+    vertices: Array  # (n, 3), m, in world
+    triangles: Ints  # (m, 3), counter-clockwise seen from outside
+    colours: Array  # (n, 3), red, green, blue in [0, 1]
+
+
+def mesh_of(things: Sequence[SceneObject], ellipsoids: Sequence[Ellipsoid], reach_m: float, extent_m: float) -> Mesh:
+    """The mesh of a scene. reach_m: length of a field of view. extent_m: of the scene, which decides line widths."""
+    parts: list[Mesh] = []
+    for thing in things:
+        if not np.isfinite(outline(thing, reach_m)).any():
+            continue
+        if isinstance(thing, Marker):
+            parts.append(ball(thing.place, np.eye(3) * _BALL * extent_m, thing.colour))
+            continue
+        parts += [tube(line, _THICK * extent_m, thing.colour) for line in edges(thing, reach_m)]
+        if isinstance(thing, Rectangle):
+            parts += [tube(line, _THIN * extent_m, thing.colour) for line in _grid(thing)]
+    parts += [ball(e.centre, e.axes, e.colour) for e in ellipsoids]
+    return merged(parts)
+
+
+def edges(thing: SceneObject, reach_m: float) -> list[Array]:
+    """The lines (k, 3), m, of a thing; one point for a marker."""
+    at = outline(thing, reach_m)
+    if isinstance(thing, Frustum):
+        return [at[[1, 2, 3, 4, 1]], *(at[[0, k]] for k in range(1, 5))]
+    return [at[[0, 1, 2, 3, 0]]] if isinstance(thing, Rectangle) else [at]
+
+
+def tube(line: Array, radius_m: float, colour: str) -> Mesh:
+    """A tube around a line (k, 3); a piece with nan at an end is left out."""
+    a, b = line[:-1], line[1:]
+    use = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1) & (np.abs(b - a).max(axis=1, initial=0.0) > 0)
+    a, b = a[use], b[use]
+    along = (b - a) / np.linalg.norm(b - a, axis=1, keepdims=True)
+    across = np.cross(along, np.eye(3)[np.argmin(np.abs(along), axis=1)])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
+    ring = np.cos(angle)[:, None] * across[:, None] + np.sin(angle)[:, None] * np.cross(along, across)[:, None]
+    vertices = np.stack([a[:, None] + radius_m * ring, b[:, None] + radius_m * ring], axis=1).reshape(-1, 3)
+    k = np.arange(_SIDES)
+    n = (k + 1) % _SIDES
+    one = np.concatenate([np.stack([k, n, n + _SIDES], -1), np.stack([k, n + _SIDES, k + _SIDES], -1)])
+    triangles = (2 * _SIDES * np.arange(len(a))[:, None, None] + one).reshape(-1, 3)
+    return Mesh(vertices, triangles, _coloured(colour, len(vertices)))
+
+
+def ball(centre: Array, axes: Array, colour: str, rows: int = 8, columns: int = 12) -> Mesh:
+    """An ellipsoid: centre (3,) + axes (3, 3) @ u for u on the unit sphere."""
+    latitude = np.pi * (np.arange(rows + 1) / rows - 0.5)
+    longitude = 2 * np.pi * np.arange(columns) / columns
+    up, round_ = np.meshgrid(latitude, longitude, indexing="ij")
+    unit = np.stack([np.cos(up) * np.cos(round_), np.cos(up) * np.sin(round_), np.sin(up)], axis=-1).reshape(-1, 3)
+    i, j = (v.ravel() for v in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
+    here, right = i * columns + j, i * columns + (j + 1) % columns
+    triangles = np.concatenate(
+        [np.stack([here, right, right + columns], -1), np.stack([here, right + columns, here + columns], -1)]
+    )
+    if np.linalg.det(axes) < 0:
+        triangles = triangles[:, ::-1]
+    return Mesh(centre + unit @ axes.T, triangles, _coloured(colour, len(unit)))
+
+
+def merged(parts: Sequence[Mesh]) -> Mesh:
+    """Several meshes as one."""
+    if not parts:
+        return Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3)))
+    first = np.cumsum([0, *(len(p.vertices) for p in parts)])
+    return Mesh(
+        np.concatenate([p.vertices for p in parts]),
+        np.concatenate([p.triangles + k for p, k in zip(parts, first, strict=False)]),
+        np.concatenate([p.colours for p in parts]),
+    )
+
+
+def _grid(rectangle: Rectangle) -> list[Array]:
+    """Lines (2, 3) across a rectangle, which stays transparent."""
+    a, b, c, d = outline(rectangle, 0.0)
+    shares = np.linspace(0, 1, _GRID_LINES + 2)[1:-1, None]
+    across, along = (
+        zip(a + shares * (b - a), d + shares * (c - d), strict=True),
+        zip(a + shares * (d - a), b + shares * (c - b), strict=True),
+    )
+    return [np.stack(ends) for ends in (*across, *along)]
+
+
+def _coloured(colour: str, n: int) -> Array:
+    rgb = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255
+    return np.tile(rgb, (n, 1))
+
+
+# The objects of a view: what stays, and what moves with the vehicle; sigma ellipsoids at a stated scale.
+
+
+MOST_ELLIPSOIDS = 60
+MOST_POINTS = 1500  # of the trajectory
+_LARGEST = 0.2  # largest semi-axis that is drawn, in shares of the scene's extent: larger ones would cover it
+_SHARE = 0.02  # of the scene's extent: the size at which a typical ellipsoid is drawn
+_SIZING = 200  # poses whose spots decide the size of a screen that states none
+_TURN = np.linspace(0, 2 * np.pi, 33)
+
+
+@dataclass(frozen=True, slots=True)
+class Ellipsoid:
+    """The positions within k sigma of one pose: centre + axes @ u, u on the unit sphere."""
+
+    centre: Array  # (3,), m, in world
+    axes: Array  # (3, 3), m: columns are the semi-axes
+    colour: str
+
+    def circles(self) -> list[Trail]:
+        """Its three principal ellipses."""
+        ring = np.stack([np.cos(_TURN), np.sin(_TURN), 0 * _TURN])
+        return [
+            Trail("sigma of the position", self.centre + (self.axes @ np.roll(ring, k, axis=0)).T, self.colour)
+            for k in range(3)
+        ]
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A scene to be drawn."""
+
+    content: Content
+    fixed: Sequence[SceneObject]  # screens, cameras and the trajectory
+    ellipsoids: list[Ellipsoid]
+    sigma_scale: float  # the ellipsoids' semi-axes over the sigmas
+    too_large: int  # ellipsoids that are not drawn, because they would cover the scene
+    reach_m: float  # length of a field of view
+    extent_m: float  # of the scene: the longest side of its box
+
+    def moving(self, index: int | None) -> list[SceneObject]:
+        """The beams, spots and vehicle at one pose of the content."""
+        if index is None:
+            return []
+        things = rig_things(self.content.rig, self.content.world_from_body[index])
+        return [t for t in things if isinstance(t, Ray | Marker)]
+
+
+def view_of(
+    content: Content,
+    index: int | None,
+    sigma_scale: float | None = None,
+    most_points: int = MOST_POINTS,
+    most_ellipsoids: int = MOST_ELLIPSOIDS,
+) -> View:
+    """The scene of a content. index: of the pose whose spots size screens without a size.
+
+    sigma_scale: None: a round number that makes the ellipsoids visible. most_points: of the trajectory.
+    """
+    pose = None if index is None else content.world_from_body[index]
+    known = np.flatnonzero(content.known)
+    others = content.world_from_body[thinned(known, _SIZING)] if len(known) > 1 else None
+    fixed: list[SceneObject] = [t for t in rig_things(content.rig, pose, others) if not isinstance(t, Ray | Marker)]
+    if len(known) > 1:
+        fixed.append(Trail("trajectory", _trajectory(content, most_points), PURPLE))
+    reach = frustum_length(fixed)
+    points = np.concatenate([outline(t, reach) for t in fixed])
+    extent = float(np.ptp(points[np.isfinite(points).all(axis=1)], axis=0).max())
+    with_sigma = known[np.isfinite(content.position_covariance[known]).all(axis=(1, 2))]
+    scale = _scale(content, with_sigma, extent) if sigma_scale is None else sigma_scale
+    ellipsoids = [ellipsoid(content, int(i), scale) for i in thinned(with_sigma, most_ellipsoids)]
+    drawn = [e for e in ellipsoids if np.linalg.norm(e.axes, axis=0).max() <= _LARGEST * extent]
+    return View(content, fixed, drawn, scale, len(ellipsoids) - len(drawn), reach, extent)
+
+
+def ellipsoid(content: Content, index: int, scale: float) -> Ellipsoid:
+    """The ellipsoid of `scale` sigmas of one pose's position; grey where the pose is predicted."""
+    values, vectors = np.linalg.eigh(content.position_covariance[index])
+    axes = vectors * np.sqrt(np.maximum(values, 0.0)) * scale
+    return Ellipsoid(content.world_from_body.translation[index], axes, PURPLE if content.measured[index] else GREY)
+
+
+def thinned(indices: Ints, most: int) -> Ints:
+    """At most so many of the indices, evenly spread, with the first and the last."""
+    if len(indices) <= most:
+        return indices
+    return indices[np.unique(np.linspace(0, len(indices) - 1, most).round().astype(np.int64))]
+
+
+def _trajectory(content: Content, most: int) -> Array:
+    """Positions (n, 3), at most so many, at even steps of the frames, with nan where the pose is unknown."""
+    return content.world_from_body.translation[thinned(np.arange(len(content.frames)), most)]
+
+
+def _scale(content: Content, indices: Ints, extent_m: float) -> float:
+    """A round factor with which the median sigma is a share of the scene; at least 1."""
+    if not len(indices):
+        return 1.0
+    sigmas = np.sqrt(np.linalg.eigvalsh(content.position_covariance[indices])[:, -1].clip(min=0.0))
+    typical = float(np.median(sigmas))
+    return max(1.0, round_size(_SHARE * extent_m / typical)) if typical > 0 else 1.0
+
+
+# Scenes as binary glTF 2.0 (.glb), which browsers, Blender and presentation programs open.
+#
+# Open3D 0.20 writes .glb with base64 text instead of a binary part, which its own reader refuses.
+
+
+_FLOAT, _UINT32, _VERTICES, _INDICES = 5126, 5125, 34962, 34963
+_UPRIGHT = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]  # glTF's y is up, the lab's z: a turn of -90 degrees about x
+
+
+def write_glb(mesh: Mesh, path: Path) -> None:
+    """Write a mesh with vertex colours, complete or not at all. Raises InputError."""
+    points = mesh.vertices.astype("<f4")
+    blocks = [
+        (points.tobytes(), _VERTICES),
+        (_linear(mesh.colours).astype("<f4").tobytes(), _VERTICES),
+        (mesh.triangles.astype("<u4").tobytes(), _INDICES),
+    ]
+    starts = np.cumsum([0, *(len(data) for data, _ in blocks)])
+    n = len(points)
+    span = {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
+    tree = {
+        "asset": {"version": "2.0", "generator": "beampose"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "rotation": _UPRIGHT}],
+        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}, "doubleSided": True}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "material": 0}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": _FLOAT, "count": n, "type": "VEC3", **span},
+            {"bufferView": 1, "componentType": _FLOAT, "count": n, "type": "VEC3"},
+            {"bufferView": 2, "componentType": _UINT32, "count": mesh.triangles.size, "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": int(start), "byteLength": len(data), "target": target}
+            for (data, target), start in zip(blocks, starts, strict=False)
+        ],
+        "buffers": [{"byteLength": int(starts[-1])}],
+    }
+    text = json.dumps(tree, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    binary = b"".join(data for data, _ in blocks)  # float32 and uint32: a multiple of four bytes
+    parts = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    atomic_write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(parts)) + parts, path)
+
+
+def _linear(srgb: np.ndarray) -> np.ndarray:
+    """Light intensities of sRGB colours, as glTF has them."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)

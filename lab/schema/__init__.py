@@ -1,1 +1,0 @@
-"""`beampose schema`: JSON schemas of the YAML files, for editors."""

@@ -1,0 +1,1 @@
+"""Before the first recording: `init`, `plan`, `doctor`, `schema`."""

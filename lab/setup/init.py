@@ -1,0 +1,242 @@
+"""A plausible rig from a few numbers; the lab replaces its poses and directions by measurements."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shutil
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from geometry.arrays import Array
+from geometry.camera import Camera
+from geometry.pose import Pose
+from geometry.rig import Beam, Rig, Screen, Spot
+from lab.errors import InputError
+from lab.files.rig.rig_file import load_rig, save_rig
+from lab.files.run.run_file import load_run, save_run
+from lab.files.text.atomic_write import atomic_folder, atomic_write_text
+from lab.simulate.rigs import look_at
+from lab.simulate.scenarios import SCENARIOS
+from lab.simulate.write import simulate
+
+# Name of a screen, where it stands as seen from the vehicle, and the rotation world_from_screen.
+_SCREENS = (
+    ("left", (-1.0, 0.0, 0.0), ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))),
+    ("right", (1.0, 0.0, 0.0), ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))),
+    ("front", (0.0, 1.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))),
+    ("back", (0.0, -1.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))),
+)
+_HALF_FAN_DEG = 20.0  # between the middle and the outermost beam of a fan
+_UNEQUAL = 1.25  # ratio of neighbouring angles: beams at unequal angles can be distinguished
+_TILT = 0.08  # tangent by which every second beam leaves the plane of its fan: coplanar beams determine less
+_VIEW_M = 2.6  # width of the picture at a screen 2.5 m away
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """What the user states about the rig."""
+
+    cameras: int = 2
+    screens: int = 2
+    beams: int = 3
+    distance_m: float = 2.5  # from the vehicle to each screen
+    image_size_px: tuple[int, int] = (1280, 1024)  # width, height
+
+
+def rig_of(layout: Layout) -> Rig:
+    """The rig of a layout.
+
+    Raises:
+        InputError: it cannot measure a pose.
+    """
+    _check(layout)
+    used = _SCREENS[: layout.screens] if layout.screens > 1 else _SCREENS[1:2]
+    d = layout.distance_m
+    screens = {
+        name: Screen(name, Pose(np.array(axes), d * np.array(normal)), (1.6 * d, 1.2 * d))
+        for name, normal, axes in used
+    }
+    cameras: dict[str, Camera] = {}
+    for i in range(layout.cameras):
+        name, normal, _ = used[i % len(used)]
+        number, several = i // len(used), layout.cameras > len(used)
+        own = f"{name}-{number + 1}" if several else name
+        cameras[own] = _camera(own, name, np.array(normal), number, layout)
+    beams, spots = _beams_and_spots(layout.beams, [name for name, _, _ in used])
+    return Rig(screens, cameras, beams, spots)
+
+
+def _check(layout: Layout) -> None:
+    if layout.cameras < layout.screens:
+        raise InputError(
+            f"cameras: expected at least one per screen ({layout.screens}), got {layout.cameras}; add cameras, or take"
+            " fewer screens"
+        )
+    least = 3 if layout.screens == 1 else 4 if layout.screens > 2 else 2
+    if layout.beams < least:
+        raise InputError(
+            f"beams: expected at least {least} for {layout.screens} screen{'s' if layout.screens > 1 else ''}, got"
+            f" {layout.beams}; fewer do not determine a pose"
+        )
+
+
+def _camera(name: str, screen: str, normal: Array, number: int, layout: Layout) -> Camera:
+    """A camera on the far side of the vehicle and above it, beside it by turns on either side."""
+    d = layout.distance_m
+    aside = np.array([-normal[1], normal[0], 0.0]) * (0.24 + 0.2 * (number // 2)) * (-1) ** number
+    position = d * (-0.64 * normal + aside + np.array([0.0, 0.0, 0.6]))
+    width, height = layout.image_size_px
+    target = d * normal
+    focal = round(width * float(np.linalg.norm(target - position)) / (_VIEW_M * d / 2.5 * 1.6), 1)
+    matrix = np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
+    return Camera(name, screen, (width, height), matrix, (0.0,) * 5, look_at(position, target))
+
+
+def _fan(count: int, axis: Array) -> list[Array]:
+    """Directions of `count` beams about a horizontal axis, at unequal angles."""
+    steps = _UNEQUAL ** np.arange(max(count - 1, 0))
+    places = np.concatenate([[0.0], np.cumsum(steps)]) if count > 1 else np.zeros(1)
+    angles = np.deg2rad(_HALF_FAN_DEG) * (2 * places / places[-1] - 1) if count > 1 else places
+    across = np.array([-axis[1], axis[0], 0.0])
+    out = []
+    for i, angle in enumerate(angles):
+        d = np.cos(angle) * axis + np.sin(angle) * across + np.array([0.0, 0.0, _TILT * (-1) ** i])
+        out.append(np.round(d / np.linalg.norm(d), 6))
+    return out
+
+
+def _beams_and_spots(count: int, screens: list[str]) -> tuple[dict[str, Beam], dict[str, Spot]]:
+    along_y = count // 2 if len(screens) > 2 else 0
+    directions = [(d, "x") for d in _fan(count - along_y, np.array([1.0, 0.0, 0.0]))]
+    directions += [(d, "y") for d in _fan(along_y, np.array([0.0, 1.0, 0.0]))] if along_y else []
+    beams: dict[str, Beam] = {}
+    spots: dict[str, Spot] = {}
+    ends = {"x": (("left", -1), ("right", 1)), "y": (("back", -1), ("front", 1))}
+    for i, (direction, along) in enumerate(directions):
+        name = chr(ord("A") + i)
+        beams[name] = Beam(name, direction, np.zeros(3))
+        for screen, sign in ends[along]:
+            if screen in screens:
+                number = str(len(spots) + 1)
+                spots[number] = Spot(number, name, sign, screen)
+    return beams, spots
+
+
+# The files of `beampose init`: rig.yaml and run.yaml with comments, and simulated points to try them with.
+
+
+EXAMPLE = "example-points.csv"
+FRAMES = 100  # of the simulated points
+
+# A comment before the first line that has this key, by key and indentation.
+_RIG_COMMENTS = {
+    "screens": "Screens. The world frame is yours to choose: right-handed, metres. Poses are a_from_b:\n# coordinates"
+    " in b to coordinates in a.",
+    "  *.world_from_screen": "Origin and x, y axes of the screen lie in its surface. Measured by `beampose calibrate"
+    " screen`.",
+    "  *.size_m": "Extent along x and y, centred on the origin; leave it out for an unlimited screen.",
+    "cameras": "Cameras, each with the screen that it observes.",
+    "  *.image_size_px": "Width, height, in pixels.",
+    "  *.camera_matrix": "Lens, in pixels; (0, 0) is the centre of the top-left pixel. Measured by `beampose calibrate"
+    " camera`.",
+    "  *.camera_from_world": "Pose: x right, y down, z forward. Measured by `beampose calibrate screen`.",
+    "target": "Lasers of the vehicle, in its own (body) frame. Measured by `beampose calibrate beams`.",
+    "  beams": "A beam is a line: a direction and a point on it.",
+    "  spots": "A spot is where one end of a beam (+ along its direction, - against it) meets a screen.",
+}
+_RUN_COMMENTS = {
+    "name": "Shown in reports.",
+    "rig": "Path of the rig file; paths start at the folder of this file.",
+    "frame_rate_hz": "Pictures per second. For an uneven rate add `timestamps: times.csv` with columns frame,t_s.",
+    "cameras": f"Simulated points, to try `beampose run` at once. For your recording replace `detections: {EXAMPLE}`"
+    " by\n# `frames: frames/NAME` (a folder of pictures, the number in a name is the frame) or `frames: NAME.avi` (a"
+    " video).",
+    "prior": "Where the vehicle is in the first frame, and how far it may be from there. Leave it out if unknown.",
+    "notes": "Optional, shown in the report.",
+}
+_START = "A start, not a measurement: replace the numbers by those of your lab."
+_OPTIONAL_RIG = (
+    "# Optional, in each camera: noise: {gain_e_per_dn: 38.0, read_noise_e: 6.0, black_dn: 4.0}; estimated if absent.\n"
+    "# Optional: calibration: {date: 2026-03-14, verdict: PASS, valid_until: 2026-09-14}\n"
+)
+_OPTIONAL_RUN = (
+    "# Optional: exposure_s: 0.0005; recorded: 2026-03-14\n"
+    "# Optional: tracker: {method: rigid}, and any parameter that summary.json lists under parameters.tracker.\n"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Started:
+    """The files written."""
+
+    folder: Path
+    rig: Path
+    run: Path
+
+
+def start(folder: Path, layout: Layout, frame_rate_hz: float) -> Started:
+    """Write rig.yaml, run.yaml and simulated points into a new or empty folder.
+
+    Raises:
+        InputError: the folder holds files, or the layout cannot measure a pose.
+    """
+    folder = Path(folder)
+    if folder.is_dir() and any(folder.iterdir()):
+        raise InputError(f"{folder}: expected a new or empty folder, found files in it; name another one")
+    rig = rig_of(layout)
+    with atomic_folder(folder, may_replace=lambda _: False) as work:
+        rig_path = work / "rig.yaml"
+        save_rig(rig, rig_path)
+        _comment(rig_path, _RIG_COMMENTS, f"{_START}\n# Check it with `beampose check rig.yaml`.", _OPTIONAL_RIG)
+        _points(work, frame_rate_hz)
+        run = {
+            "name": "first-run",
+            "rig": "rig.yaml",
+            "frame_rate_hz": float(frame_rate_hz),
+            "cameras": {name: {"detections": EXAMPLE} for name in rig.cameras},
+            "prior": {
+                "position_m": [0.0, 0.0, 0.0],
+                "yaw_pitch_roll_deg": [0.0, 0.0, 0.0],
+                "within_m": min(0.5, 0.2 * layout.distance_m),
+                "within_deg": 25.0,
+            },
+            "notes": "Simulated points of an example rig.",
+        }
+        _comment(save_run(run, work), _RUN_COMMENTS, "One recording.", _OPTIONAL_RUN)
+        load_rig(rig_path)
+        load_run(work)
+    return Started(folder, folder / "rig.yaml", folder / "run.yaml")
+
+
+def _points(work: Path, frame_rate_hz: float) -> None:
+    """Simulated points of the rig in `work`, a slow motion."""
+    scenario = dataclasses.replace(
+        SCENARIOS["clean"],
+        motion=SCENARIOS["small-motion"].motion,
+        always_in_view=(),
+        leaves_and_returns=(),
+        frame_rate_hz=frame_rate_hz,
+    )
+    with tempfile.TemporaryDirectory(prefix="beampose-") as name:
+        made = simulate(
+            scenario, Path(name) / "run", frames=FRAMES, detections_only=True, clutter=0.0, rig=work / "rig.yaml"
+        )
+        shutil.copyfile(made / "detections.csv", work / EXAMPLE)
+
+
+def _comment(path: Path, comments: Mapping[str, str], head: str, tail: str) -> None:
+    """Add comments to a YAML file: `key`, or `  *.key` for a key two levels down, stands for its first line."""
+    lines, waiting = [f"# {head}"], dict(comments)
+    for line in path.read_text("utf-8").splitlines():
+        match = re.match(r"^( *)([\w'\"-]+):", line)
+        if match:
+            indent, key = match[1], match[2]
+            names = (f"{indent}{key}", f"{indent[2:]}*.{key}")
+            lines += [f"{indent}# {waiting.pop(name)}" for name in names if name in waiting]
+        lines.append(line)
+    atomic_write_text("\n".join([*lines, tail]), path)

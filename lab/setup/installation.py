@@ -1,0 +1,178 @@
+"""The lines that the checks of `beampose doctor` return."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from importlib import metadata
+from importlib.util import find_spec
+
+from lab.errors import CalibrationError, InputError, RunError
+from lab.versions import versions
+
+
+class State(IntEnum):
+    """Severity of a line, in ascending order."""
+
+    OK = 0
+    WARN = 1  # works; the user should know
+    FAIL = 2  # some command will not work
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """The result of one check."""
+
+    code: str  # BP-D01 ...: `beampose explain CODE`
+    state: State
+    what: str
+    remedy: str = ""  # what to do; empty for OK
+    exit_status: int = RunError.exit_status  # of the command, if the state is FAIL
+
+    def __str__(self) -> str:
+        remedy = f". {self.remedy} [{self.code}]" if self.state > State.OK else ""
+        return f"{self.state.name:<5}{self.what}{remedy}"
+
+
+def exit_status(lines: Sequence[Line]) -> int:
+    """Exit status of the command: 0 without a FAIL; 2: a file is wrong; 1: the installation is; 3: a calibration."""
+    failed = {line.exit_status for line in lines if line.state is State.FAIL}
+    order = (InputError.exit_status, RunError.exit_status, CalibrationError.exit_status)
+    return next((status for status in order if status in failed), 0)
+
+
+# Checks of Python, of the libraries and of the settings of the environment.
+
+
+_CV2_PACKAGES = ("opencv-python", "opencv-python-headless", "opencv-contrib-python", "opencv-contrib-python-headless")
+# Modules with code of their own, by package: a damaged installation shows only when they are loaded.
+_MODULES = {
+    "numpy": "numpy", "scipy": "scipy.linalg", "numba": "numba", "opencv-python-headless": "cv2", "isal": "isal",
+    "simplejpeg": "simplejpeg", "pydantic": "pydantic", "pandas": "pandas", "pyyaml": "yaml", "jinja2": "jinja2",
+}  # fmt: skip
+# Variables that change what OpenCV reads: a limit of the picture size, or options of the video decoder.
+_OPENCV_VARIABLES = ("OPENCV_IO_MAX_IMAGE_", "OPENCV_FFMPEG_CAPTURE_OPTIONS", "OPENCV_VIDEOIO_PRIORITY", "OPENCV_IPP")
+_REQUIREMENT = re.compile(r"^([A-Za-z0-9._-]+)>=([\d.]+)$")
+
+
+def check_installation() -> list[Line]:
+    """All checks of this module."""
+    return [
+        check_versions(versions(), requirements()),
+        check_libraries(_MODULES),
+        check_opencv_packages(installed_packages()),
+        check_variables(os.environ),
+        check_encoding(sys.getfilesystemencoding()),
+        check_point_clouds(),
+    ]
+
+
+def requirements() -> dict[str, str]:
+    """Lowest versions that beampose declares, by package; empty if it is not installed as a package."""
+    try:
+        declared = metadata.requires("beampose") or []
+    except metadata.PackageNotFoundError:
+        return {}
+    return {m[1].lower(): m[2] for text in declared if (m := _REQUIREMENT.match(text.strip()))}
+
+
+def installed_packages() -> set[str]:
+    """Names of the packages of this Python that bring a module `cv2`."""
+    found = set()
+    for name in _CV2_PACKAGES:
+        try:
+            metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+        found.add(name)
+    return found
+
+
+def check_versions(found: Mapping[str, str], lowest: Mapping[str, str]) -> Line:
+    """Versions of Python and the libraries. lowest: the declared ones."""
+    text = ", ".join(f"{name} {version}" for name, version in found.items())
+    old = []
+    for name, least in lowest.items():
+        version = found.get(name)
+        if version is None:
+            try:
+                version = metadata.version(name)
+            except metadata.PackageNotFoundError:
+                old.append(f"{name} is missing")
+                continue
+        if _numbers(version) < _numbers(least):
+            old.append(f"{name} {version} is older than {least}")
+    if old:
+        remedy = "Install beampose again: `python -m pip install --upgrade beampose`"
+        return Line("BP-D01", State.FAIL, f"versions: {'; '.join(old)}", remedy)
+    if not lowest:
+        remedy = "Run `make setup`, so that results record the program's version"
+        return Line("BP-D01", State.WARN, f"versions: {text}; beampose is not installed as a package", remedy)
+    return Line("BP-D01", State.OK, f"versions: {text}")
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    return tuple(int(n) for n in re.findall(r"\d+", version.split("+")[0])[:3])
+
+
+def check_libraries(modules: Mapping[str, str]) -> Line:
+    """Whether the libraries can be loaded. modules: a module of each package."""
+    broken = []
+    for package, module in modules.items():
+        try:
+            importlib.import_module(module)
+        except Exception as error:  # any: a damaged binary raises what it likes
+            broken.append(f"{package} ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''})")
+    if not broken:
+        return Line("BP-D02", State.OK, f"libraries: all {len(modules)} can be loaded")
+    names = " ".join(text.split(" ")[0] for text in broken)
+    remedy = f"Install them again: `python -m pip install --force-reinstall {names}`"
+    return Line("BP-D02", State.FAIL, f"libraries: cannot be loaded: {'; '.join(broken)}", remedy)
+
+
+def check_opencv_packages(installed: set[str]) -> Line:
+    """Several OpenCV packages in one Python overwrite each other's files."""
+    if len(installed) < 2:
+        return Line("BP-D03", State.OK, f"OpenCV: one package ({', '.join(installed) or 'none listed'})")
+    names = sorted(installed)
+    remedy = (
+        f"Keep one: `python -m pip uninstall {' '.join(names)}`, then `python -m pip install opencv-python-headless`"
+    )
+    what = f"OpenCV: {len(names)} packages share the folder cv2 and overwrite each other: {', '.join(names)}"
+    return Line("BP-D03", State.WARN, what, remedy)
+
+
+def check_variables(environment: Mapping[str, str]) -> Line:
+    """Variables that change what OpenCV decodes, or that switch the compiled code off."""
+    found = [name for name in environment if name.startswith(_OPENCV_VARIABLES)]
+    if environment.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
+        found.append("NUMBA_DISABLE_JIT")
+    if not found:
+        return Line("BP-D06", State.OK, "environment: no variable changes how pictures are read or code is run")
+    texts = ", ".join(f"{name}={environment[name]}" for name in sorted(found))
+    return Line("BP-D06", State.WARN, f"environment: {texts}", f"Unset them, unless they are meant: `unset {found[0]}`")
+
+
+def check_encoding(encoding: str) -> Line:
+    """The encoding of file names."""
+    if encoding.lower().replace("-", "") == "utf8":
+        return Line("BP-D11", State.OK, "file names: UTF-8")
+    remedy = "Set it: `export LC_ALL=C.UTF-8`"
+    return Line("BP-D11", State.WARN, f"file names: {encoding}, other letters than those cannot be opened", remedy)
+
+
+def check_point_clouds() -> Line:
+    """open3d, which only clouds of points and 3-D views need."""
+    if find_spec("open3d") is None:
+        return Line("BP-D12", State.OK, "open3d: not installed; only point clouds and 3-D views need it")
+    return Line("BP-D12", State.OK, f"open3d: {metadata.version(_open3d_package())}")
+
+
+def _open3d_package() -> str:
+    names = metadata.packages_distributions().get("open3d", ["open3d"])
+    return names[0]

@@ -1,1 +1,0 @@
-"""`beampose study`: published experiments repeated."""

@@ -1,1 +1,0 @@
-"""What the trackers of one target share: frames of a recording, verdict, summary, overlay video, parts of a page."""

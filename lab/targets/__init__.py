@@ -1,0 +1,1 @@
+"""One target in the pictures of one camera (`track`: point, circle, drogue) or of two (`stereo`)."""

@@ -1,0 +1,1 @@
+"""`beampose stereo`: files, processing and report of the binocular measurement."""

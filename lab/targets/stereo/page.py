@@ -1,0 +1,276 @@
+"""report.html of a stereo run: verdict, key figures, poses, residuals by camera, annotated pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.findings import Finding, Level, verdict
+from geometry import rotations
+from geometry.arrays import Array, Ints
+from lab.files.text.atomic_write import atomic_write_text
+from lab.number_format import format_angle, format_length, format_number
+from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section, section_context
+from lab.report.html import environment
+from lab.report.plot.axes import BLUE, GREEN, ORANGE, VERMILLION, padded_range
+from lab.report.plot.series import Band, Line, Shade, time_panel
+from lab.targets.stereo.frames import annotated_pictures
+from lab.targets.stereo.run import StereoResults, TruthErrors
+from lab.versions import versions
+from tracking.statuses import PoseStatus
+
+_WORDS = {Level.PASS: ("PASS", "pass"), Level.WARN: ("CHECK", "check"), Level.FAIL: ("FAIL", "fail")}
+_SENTENCES = {
+    Level.PASS: "The poses may be used.",
+    Level.WARN: "The poses may be used; note the warnings below.",
+    Level.FAIL: "The poses must not be used as they are.",
+}
+_AXES = ("x", "y", "z")
+
+
+def write_stereo_page(results: StereoResults, findings: tuple[Finding, ...], folder: Path) -> Path:
+    """Write report.html into a folder. Returns its path."""
+    word, css = _WORDS[verdict(findings)]
+    sections = [_pictures(results), _poses(results), _residuals(results), _pair(results)]
+    if results.errors is not None:
+        sections.insert(1, _truth(results, results.errors))
+    context: dict[str, Any] = {
+        "name": results.run.name,
+        "source": str(results.run.folder),
+        "word": word,
+        "css": css,
+        "sentence": _SENTENCES[verdict(findings)],
+        "findings": [
+            {"css": _WORDS[f.level][1], "word": f.level.name, "what": f.what, "why": f.why, "remedy": f.remedy,
+             "code": f.code}
+            for f in findings
+        ],
+        "notes": [*results.notes, *([results.run.notes] if results.run.notes else [])],
+        "key_figures": _key_figures(results),
+        "sections": [section_context(s) for s in sections],
+        "made": _made(results),
+    }  # fmt: skip
+    path = folder / "report.html"
+    atomic_write_text(environment().get_template("stereo.html.j2").render(context), path)
+    return path
+
+
+def _key_figures(results: StereoResults) -> list[tuple[str, str, str]]:
+    measured = results.measured
+    out = [("Measured", f"{len(measured)} of {len(results.records)}", "frames")]
+    if not measured:
+        return out
+    covariances = np.array([r.tracked.covariance for r in measured])
+    away = np.array([_distance(results, r.tracked.pose.translation) for r in measured if r.tracked.pose is not None])
+    position = np.sqrt(np.trace(covariances[:, :3, :3], axis1=1, axis2=2))
+    turn = np.sqrt(np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2))
+    rms = [r.tracked.fit.rms_px for r in measured if r.tracked.fit is not None]
+    out += [
+        ("Distance", f"{format_number(away.min())} to {format_number(away.max())} m", "of the body origin"),
+        ("Position sigma", format_length(float(np.median(position))), "median, all axes together"),
+        ("Rotation sigma", format_angle(float(np.rad2deg(np.median(turn)))), "median, all axes together"),
+        ("Residual", f"{format_number(float(np.median(rms)))} px", "RMS of a frame, median"),
+        ("Markers", format_number(float(np.mean([r.tracked.markers for r in measured]))),
+         f"of {len(results.run.target.model)} in a pose, mean"),
+    ]  # fmt: skip
+    if results.errors is not None:
+        e = results.errors.as_mapping()
+        out += [
+            ("Position error", format_length(e["position_rms_m"]), "RMS against truth"),
+            ("NEES", format_number(e["nees_mean"]), "mean; 6 if the covariance is right"),
+        ]
+    return out
+
+
+def _distance(results: StereoResults, position: Array) -> float:
+    eye = results.run.pair.cameras[0].camera_from_world.inverse().translation
+    return float(np.linalg.norm(position - eye))
+
+
+def _pictures(results: StereoResults) -> Section:
+    drawings = [PageDrawing(p, caption, wide=True) for p, caption in annotated_pictures(results)]
+    words = (
+        "Green: markers with their labels; orange: candidates without a label; crosses: where the pose puts markers"
+        " that are not found. Left and right camera side by side, cut to the target."
+        if drawings
+        else "The run has no pictures: the markers come from a table."
+    )
+    return Section("Annotated pictures", words, drawings)
+
+
+def _shades(results: StereoResults) -> tuple[Shade, ...]:
+    status = [r.tracked.status for r in results.records]
+    return (
+        Shade(np.array([s is PoseStatus.PREDICTED for s in status]), "predicted", "predicted, not measured"),
+        Shade(np.array([s is PoseStatus.LOST for s in status]), "lost", "lost"),
+    )
+
+
+def _poses(results: StereoResults) -> Section:
+    n = len(results.records)
+    value, sigma = np.full((n, 6), np.nan), np.full((n, 6), np.nan)
+    for i, r in enumerate(results.records):
+        if r.tracked.pose is None or r.tracked.covariance is None:
+            continue
+        value[i] = [*r.tracked.pose.translation, *np.rad2deg(r.tracked.pose.ypr)]
+        J = rotations.ypr_jacobian(r.tracked.pose.rotation)
+        turned = J @ r.tracked.covariance[3:, 3:] @ J.T
+        sigma[i] = np.sqrt([*np.diagonal(r.tracked.covariance)[:3], *np.diagonal(turned)])
+        sigma[i, 3:] = np.rad2deg(sigma[i, 3:])
+    t = np.array([r.t_s for r in results.records])
+    drawings = []
+    for k in (0, 3, 1, 4, 2, 5):
+        name, unit = (f"{_AXES[k]}", "m") if k < 3 else (("yaw", "pitch", "roll")[k - 3], "deg")
+        shown = value[:, k] if k < 3 else _unwrapped(value[:, k])
+        measured = np.array([r.measured for r in results.records])
+        band = np.where(measured, sigma[:, k], np.nan)
+        drawings.append(
+            PageDrawing(
+                time_panel(
+                    t, name, unit,
+                    lines=(Line(shown, BLUE, name),),
+                    bands=(Band.about(shown, band, 3.0, BLUE, "3 sigma"),),
+                    shades=_shades(results),
+                    y_range=padded_range(shown),
+                )
+            )
+        )  # fmt: skip
+    words = (
+        "Position of the body origin and attitude (Rz(yaw) Ry(pitch) Rx(roll)) in the frame of the pair, with 3 sigma."
+        " Shaded: not measured."
+    )
+    return Section("Pose", words, drawings)
+
+
+def _unwrapped(degrees: Array) -> Array:
+    out = degrees.copy()
+    good = np.isfinite(out)
+    out[good] = np.rad2deg(np.unwrap(np.deg2rad(out[good])))
+    return out
+
+
+def _truth(results: StereoResults, e: TruthErrors) -> Section:
+    at: Ints = np.searchsorted([r.frame for r in results.records], e.frames)
+    t = np.array([r.t_s for r in results.records])[at]
+    panels = [
+        time_panel(
+            t, f"error of {axis}", "mm",
+            lines=(Line(1000 * e.deltas[:, k], BLUE, f"error of {axis}"),),
+            bands=(Band.about(0.0, 1000 * _sigmas(results, at)[:, k], 2.0, GREEN, "2 sigma", 0.2),),
+        )
+        for k, axis in enumerate(_AXES)
+    ]  # fmt: skip
+    panels.append(
+        time_panel(
+            t, "NEES: squared pose error over its covariance; band: 95 %", "",
+            lines=(Line(e.nees, BLUE, "NEES"), Line(np.full(len(t), 6.0), GREEN, "6, the expected mean", 1.3, "6 4")),
+            bands=(Band(np.full(len(t), 1.237), np.full(len(t), 14.449), GREEN, "95 %", 0.15),),
+        )
+    )  # fmt: skip
+    m = e.as_mapping()
+    rows = [
+        ("position, RMS", format_length(m["position_rms_m"])),
+        ("rotation, RMS", format_angle(m["rotation_rms_deg"])),
+        ("distance, bias", format_length(m["range_bias_m"])),
+        ("distance, RMS", format_length(m["range_rms_m"])),
+        ("NEES, mean (6 expected)", format_number(m["nees_mean"])),
+    ]
+    words = f"Truth minus estimate in {m['frames']} measured frames."
+    return Section(
+        "Errors against truth", words, [PageDrawing(p) for p in panels], PageTable(("quantity", "value"), rows)
+    )
+
+
+def _sigmas(results: StereoResults, at: Ints) -> Array:
+    covariances = [results.records[int(i)].tracked.covariance for i in at]
+    return np.sqrt(np.array([np.diagonal(C)[:3] for C in covariances if C is not None]))
+
+
+def _residuals(results: StereoResults) -> Section:
+    t = np.array([r.t_s for r in results.records])
+    K = len(results.run.target.model)
+    residuals = np.full((len(t), 2, K, 2), np.nan)
+    for i, r in enumerate(results.records):
+        if r.measured and r.tracked.fit is not None:
+            residuals[i] = r.tracked.fit.residuals_px
+    drawings = []
+    for c, camera in enumerate(results.run.pair.cameras):
+        seen = np.isfinite(residuals[:, c]).any(axis=(1, 2))
+        rms = np.full((len(t), 2), np.nan)
+        rms[seen] = np.sqrt(np.nanmean(residuals[seen, c] ** 2, axis=1))
+        drawings.append(
+            PageDrawing(
+                time_panel(
+                    t, f"camera {camera.name}: RMS residual of a frame", "px",
+                    lines=(Line(rms[:, 0], BLUE, "u"), Line(rms[:, 1], VERMILLION, "v")),
+                    shades=_shades(results),
+                    y_range=(0.0, max(float(np.nanmax(rms, initial=0.05)) * 1.1, 0.05)),
+                ),
+                "u: blue, v: vermilion",
+            )
+        )  # fmt: skip
+    rows: list[list[object]] = []
+    for k, name in enumerate(results.run.target.model.names):
+        row: list[object] = [name]
+        for c in range(2):
+            own = residuals[:, c, k]
+            own = own[np.isfinite(own[:, 0])]
+            row += [len(own), *(own.mean(axis=0) if len(own) else (np.nan, np.nan)),
+                    float(np.sqrt(np.mean(own**2))) if len(own) else np.nan]  # fmt: skip
+        rows.append(row)
+    heads = ["marker"]
+    for camera in results.run.pair.cameras:
+        heads += [f"{camera.name}: frames", "mean u (px)", "mean v (px)", "RMS (px)"]
+    words = (
+        "Measured minus predicted pixels of the joint fit. A marker with a mean far from 0 in both cameras is not where"
+        " run.yaml puts it; an even mean of all markers in one camera is an error of the calibration."
+    )
+    return Section("Residuals by camera", words, drawings, PageTable(heads, rows))
+
+
+def _pair(results: StereoResults) -> Section:
+    pair, clock = results.run.pair, results.clock
+    rows: list[list[object]] = [["baseline", f"{pair.baseline_m:.4f} m"]]
+    rows += [[f"focal length of {c.name}", f"{c.matrix[0, 0]:.2f} px"] for c in pair.cameras]
+    if clock is not None:
+        rows += [
+            ["right exposure after the left one", f"{1000 * clock.offset_s:.3f} ± {1000 * clock.sigma_s:.3f} ms"],
+            ["scatter of that offset between frames", f"{1000 * clock.jitter_s:.3f} ms"],
+        ]
+        angles = np.rad2deg(np.stack([clock.rotation_rad, clock.rotation_sigma_rad], axis=1)).tolist()
+        for axis, (v, s) in zip(_AXES, angles, strict=True):
+            rows.append(
+                [f"rotation of the right camera about {axis}, against the calibration", f"{v:.4f} ± {s:.4f} deg"]
+            )
+    else:
+        rows.append(["synchronisation", "not tested: too few moving frames"])
+    words = (
+        "Synchronisation and rotation are estimated from the residuals of all frames: an offset in time shifts images"
+        " in proportion to their velocity, a rotation shifts them equally in all frames."
+    )
+    drawings = []
+    if len(results.measured) > 1:
+        chi = np.full(len(results.records), np.nan)
+        for i, r in enumerate(results.records):
+            if r.measured and r.tracked.fit is not None and r.tracked.fit.dof > 0:
+                chi[i] = r.tracked.fit.chi2 / r.tracked.fit.dof
+        t = np.array([r.t_s for r in results.records])
+        top = max(float(np.nanpercentile(chi, 99)) * 1.2, 2.0)
+        panel = time_panel(
+            t, "misfit: chi-square over degrees of freedom; 1 expected", "", lines=(Line(chi, ORANGE, "misfit"),),
+            y_range=(0.0, top), shades=_shades(results), width=1090, height=130,
+        )  # fmt: skip
+        drawings.append(PageDrawing(panel, wide=True))
+    return Section("The pair", words, drawings, PageTable(("quantity", "value"), rows))
+
+
+def _made(results: StereoResults) -> list[tuple[str, str]]:
+    own, p = versions(), results.run.parameters.segmentation
+    histogram = "right picture with the histogram of the left" if p.specify_histogram else "no histogram specification"
+    return [
+        ("segmentation", f"gamma {p.gamma:g}, {histogram}, median {p.median_px}, opening {p.opening_px}, closing"
+         f" {p.closing_px} px, {p.centroid} centroids"),
+        ("beampose", f"{own['beampose']}, numpy {own['numpy']}, OpenCV {own['opencv-python-headless']}"),
+    ]  # fmt: skip

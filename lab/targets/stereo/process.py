@@ -1,0 +1,244 @@
+"""Processes one stereo run: a run folder in, a result folder out."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.findings import Finding, Level, verdict
+from geometry.pose import Pose
+from lab.errors import QUALITY_GATE_FAILED, InputError
+from lab.files.rig.calibration_state import require_valid_calibration, state_mapping
+from lab.files.run.fingerprints import fingerprints_of
+from lab.files.run.truth import TruePoses, read_true_poses
+from lab.files.text.atomic_write import atomic_folder
+from lab.files.text.json_text import has_schema, write_json
+from lab.number_format import format_length
+from lab.pictures.picture_file import MissingPicture
+from lab.targets.stereo.findings import findings_of
+from lab.targets.stereo.frames import Content, StereoFrame, stereo_frames
+from lab.targets.stereo.run import StereoRecord, StereoResults, StereoRun, load_stereo_run, truth_errors
+from lab.targets.stereo.tables import write_tables
+from lab.versions import versions
+from tracking.binocular.marker_model import MarkerImages
+from tracking.binocular.pose_tracker import BinocularTracker, FittedFrame, clock_offset
+from tracking.binocular.segmentation import marker_candidates, prepared
+
+SUMMARY_SCHEMA = "beampose/stereo-summary/1"
+_WORDS = {Level.PASS: "pass", Level.WARN: "check", Level.FAIL: "fail"}
+_GREY_CHECKED = 5  # pictures in which a target of saturated colours must have some colour
+
+Progress = Callable[..., None]
+
+
+@dataclass(frozen=True, slots=True)
+class StereoOutcome:
+    """The outcome of one stereo run."""
+
+    results: StereoResults
+    findings: tuple[Finding, ...]
+    out: Path
+
+    @property
+    def exit_status(self) -> int:
+        """0, or 4 where a quality gate failed."""
+        return QUALITY_GATE_FAILED if verdict(self.findings) is Level.FAIL else 0
+
+    def line(self) -> str:
+        """One line for the command line."""
+        word, worst = _WORDS[verdict(self.findings)].upper(), self.findings[0]
+        texts = "; ".join(f.what for f in self.findings if f.level > Level.PASS)
+        remedy = f" {worst.remedy}" if worst.level is Level.FAIL else ""
+        count = f"{len(self.results.measured)} of {len(self.results.records)} frames measured"
+        errors = self.results.errors
+        if errors is not None:
+            texts += (
+                "; " if texts else ""
+            ) + f"position error {format_length(errors.as_mapping()['position_rms_m'])} RMS"
+        return (
+            f"{self.results.run.name}: {word}: {count}" + (f" ({texts})" if texts else "") + f"{remedy} -> {self.out}"
+        )
+
+
+def process_stereo_run(run_folder: Path, out: Path, progress: Progress | None = None) -> StereoOutcome:
+    """Process one stereo run folder into the folder `out`: tables, summary.json, pictures and report.html.
+
+    Raises:
+        BeamposeError: the run cannot be processed (CalibrationError: its pair's calibration must not be used); `out` is
+            then unchanged.
+    """
+    started = time.perf_counter()
+    run = load_stereo_run(run_folder)
+    recorded = datetime.date.today() if run.recorded is None else run.recorded
+    require_valid_calibration(run.calibration, run.pair_path, recorded)
+    truth_path = run.folder / "truth" / "pose.csv"
+    truth = read_true_poses(truth_path) if truth_path.is_file() else None
+    with atomic_folder(out, may_replace=are_stereo_results) as work:
+        results = measure(run, progress)
+        add_truth(results, truth)
+        findings = findings_of(results)
+        write_tables(results, work)
+        write_json(_summary(results, findings, time.perf_counter() - started), work / "summary.json")
+        from lab.targets.stereo.page import write_stereo_page  # imports the template engine
+
+        write_stereo_page(results, findings, work)
+    return StereoOutcome(results, findings, Path(out))
+
+
+def are_stereo_results(folder: Path) -> bool:
+    """Whether a folder holds the results of an earlier stereo run."""
+    return has_schema(folder, SUMMARY_SCHEMA)
+
+
+def measure(run: StereoRun, progress: Progress | None = None) -> StereoResults:
+    """The records of all frames, and the offset between the cameras' clocks.
+
+    Raises:
+        InputError: the pictures cannot be read, or are grey while the markers are coloured.
+    """
+    results = StereoResults(run)
+    tracker = BinocularTracker(run.pair, run.target.model, run.parameters.match)
+    grey = 0
+    for frame in stereo_frames(run):
+        if len(results.records) < _GREY_CHECKED:
+            grey += int(_all_grey(frame))
+            if grey == _GREY_CHECKED:
+                _refuse_grey(run)
+        candidates = candidates_of(run, frame)
+        t_s = float(run.times.t_s(frame.frame))
+        missing = [c.reason if isinstance(c, MissingPicture) else "" for c in frame.content]
+        tracked = tracker.step(t_s, candidates)
+        results.records.append(StereoRecord(frame.frame, t_s, candidates, (missing[0], missing[1]), tracked))
+        if progress is not None:
+            progress(len(results.records), None, "frames")
+    _require_pictures(results)
+    fitted = [
+        FittedFrame(r.t_s, r.tracked.fit, r.tracked.observed)
+        for r in results.records
+        if r.tracked.fit is not None and r.tracked.observed is not None
+    ]
+    results.clock = clock_offset(run.pair, run.target.model, fitted)
+    if run.pair.covariance is None:
+        results.notes.append(
+            f"{run.pair_path.name} states no covariance: the sigmas contain the noise of the markers, not the errors of"
+            " the calibration"
+        )
+    return results
+
+
+def candidates_of(run: StereoRun, frame: StereoFrame) -> tuple[MarkerImages | None, MarkerImages | None]:
+    """The marker candidates of both pictures of a frame; None where there is no picture."""
+    p = run.parameters.segmentation
+    pictures = [c if isinstance(c, np.ndarray) else None for c in frame.content]
+    as_seen = prepared(pictures[0], pictures[1], p)
+    out: list[MarkerImages | None] = []
+    for content, picture, seen in zip(frame.content, pictures, as_seen, strict=True):
+        if picture is not None and seen is not None:
+            out.append(marker_candidates(picture, seen, run.target.colours, p))
+        else:
+            out.append(content if isinstance(content, MarkerImages) else None)
+    return out[0], out[1]
+
+
+def add_truth(results: StereoResults, truth: TruePoses | None) -> None:
+    """Compare the measured poses with the true ones, where there are any."""
+    if truth is not None:
+        poses = Pose.from_quaternion(truth.quaternion_wxyz, truth.position_m)
+        results.errors = truth_errors(results.records, results.run, truth.frame.astype(float), poses)
+
+
+def _all_grey(frame: StereoFrame) -> bool:
+    def grey(content: Content) -> bool:
+        return isinstance(content, np.ndarray) and bool(np.ptp(content, axis=2).max() == 0)
+
+    return any(grey(c) for c in frame.content)
+
+
+def _refuse_grey(run: StereoRun) -> None:
+    """Raises InputError where no colour range can match a grey pixel."""
+    if all(colour.saturation[0] > 0 for colour in run.target.colours):
+        raise InputError(
+            f"{run.path}: cameras: expected colour pictures, got grey ones; for bright lamps in grey pictures set"
+            " saturation: [0, 1] and a high value in target.colours"
+        )
+
+
+def _require_pictures(results: StereoResults) -> None:
+    """Raises InputError where a camera has no usable picture at all: one camera is no pair."""
+    for c, (name, source) in enumerate(results.run.cameras.items()):
+        reasons = Counter(r.missing[c] for r in results.records if r.missing[c])
+        if not results.records or sum(reasons.values()) == len(results.records):
+            why = f" ({reasons.most_common(1)[0][0]})" if reasons else ""
+            raise InputError(
+                f"{source.path}: camera {name}: expected pictures, got none that can be used{why}; a single camera is"
+                " no stereo pair"
+            )
+
+
+def _summary(results: StereoResults, findings: tuple[Finding, ...], wall_s: float) -> dict[str, Any]:
+    run, records = results.run, results.records
+    status = Counter(r.tracked.status.value for r in records)
+    files = [run.path, run.pair_path, *(p for p in (run.target_path, run.times_path) if p is not None)]
+    files += [p for p in (run.folder / "truth" / name for name in ("pose.csv", "spots.csv")) if p.is_file()]
+    clock = results.clock
+    return {
+        "schema": SUMMARY_SCHEMA,
+        "name": run.name,
+        "run_folder": str(run.folder.resolve()),
+        "pair": str(run.pair_path.resolve()),
+        "calibration": None if run.calibration is None else state_mapping(run.calibration),
+        "notes_of_run": run.notes,
+        "verdict": {
+            "status": _WORDS[verdict(findings)],
+            "reasons": [f.what for f in findings if f.level > Level.PASS],
+            "exit_status": QUALITY_GATE_FAILED if verdict(findings) is Level.FAIL else 0,
+            "evidence": [
+                {"level": f.level.name, "what": f.what, "why": f.why, "remedy": f.remedy, "code": f.code}
+                for f in findings
+            ],
+        },
+        "counts": {
+            "frames": len(records),
+            "pose_status": dict(status),
+            "not_measured": dict(Counter(r.tracked.reason for r in records if not r.measured)),
+            "no_image": {name: sum(1 for r in records if r.missing[c]) for c, name in enumerate(run.cameras)},
+            "candidates_per_frame": {
+                name: float(np.mean([0 if f is None else len(f) for f in (r.candidates[c] for r in records)]))
+                for c, name in enumerate(run.cameras)
+            },
+        },
+        "rates": {
+            "measured_share": status["measured"] / max(len(records), 1),
+            "frame_rate_hz": run.frame_rate_hz,
+            "processed_frames_per_s": len(records) / wall_s if wall_s > 0 else None,
+            "noise_scale": results.noise_scale,
+        },
+        "pair_check": {
+            "baseline_m": run.pair.baseline_m,
+            "clock": None
+            if clock is None
+            else {
+                "offset_s": clock.offset_s,
+                "sigma_s": clock.sigma_s,
+                "jitter_s": clock.jitter_s,
+                "shift_px": clock.shift_px,
+                "significant": clock.significant,
+                "rotation_of_right_rad": clock.rotation_rad.tolist(),
+                "rotation_sigma_rad": clock.rotation_sigma_rad.tolist(),
+            },
+        },
+        "errors": None if results.errors is None else results.errors.as_mapping(),
+        "timings": {"wall_s": wall_s},
+        "versions": versions(),
+        "parameters": dataclasses.asdict(run.parameters),
+        "inputs": fingerprints_of(files, [s.path for s in run.cameras.values()]),
+        "notes": results.notes,
+    }

@@ -1,0 +1,268 @@
+"""A stereo run folder: run.yaml with the schema beampose/stereo/1, the pair, the target and the pictures.
+
+```yaml
+schema: beampose/stereo/1
+pair: pair.yaml                  # of `beampose calibrate pair`; or a rig.yaml, a Kalibr camchain ... with poses
+frame_rate_hz: 25.0
+cameras:                         # two; the first is the reference of the histogram specification
+  left: {frames: frames/left}    # a folder of colour pictures or a video, or {detections: detections.csv}
+  right: {frames: frames/right}
+target:                          # or the name of a file with this content
+  colours: {red: {hue_deg: [340, 20], saturation: [0.4, 1], value: [0.2, 1]}}
+  markers: {"1": {position_m: [0.3, 0, 0], colour: red, radius_m: 0.02}}
+  sigma_m: 0.0005                # optional: of the survey of the markers
+segmentation: {gamma: 0.8}       # optional: SegmentationParameters
+match: {gate_sigmas: 4.5}        # optional: MatchParameters
+```
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pydantic
+
+from geometry.arrays import Array
+from geometry.camera import Camera
+from geometry.pose import Pose
+from lab.errors import InputError
+from lab.files.rig.calibration_state import CalibrationState, OptionalDay
+from lab.files.rig.pair_file import REMEDY, load_pair_file, of_two_cameras
+from lab.files.run.run_file import RATE_RANGE_HZ, DetectionsTable, FramesFolder, VideoFile
+from lab.files.run.times import Times, load_times
+from lab.files.text.dataclass_fields import dataclass_from_yaml
+from lab.files.text.error_text import name_of_path, suggest_name
+from lab.files.text.fields import Block, Name, Text, Word, field_error, number_between, one_of, validated
+from lab.files.text.yaml_text import read_mapping
+from lab.pictures.picture_file import PICTURE_SUFFIXES
+from lab.targets.stereo.target_block import Target, load_target
+from tracking.binocular.marker_model import MarkerImages, StereoPair
+from tracking.binocular.parameters import BinocularParameters, MatchParameters, SegmentationParameters
+from tracking.binocular.pose_tracker import BinocularFrame, ClockOffset
+from tracking.statuses import PoseStatus
+
+SCHEMA = "beampose/stereo/1"
+
+Source = FramesFolder | VideoFile | DetectionsTable
+
+
+@dataclass(frozen=True, slots=True)
+class StereoRun:
+    """One stereo recording, before its pictures are opened."""
+
+    folder: Path
+    name: str
+    pair: StereoPair
+    pair_path: Path
+    target: Target
+    target_path: Path | None  # a file of its own
+    frame_rate_hz: float
+    times: Times
+    times_path: Path | None
+    cameras: Mapping[str, Source]  # two, by name, the left one first
+    parameters: BinocularParameters
+    calibration: CalibrationState | None
+    recorded: datetime.date | None
+    notes: str
+
+    @property
+    def path(self) -> Path:
+        """Path of run.yaml."""
+        return self.folder / "run.yaml"
+
+
+class _SourceBlock(Block):
+    frames: Word | None = None
+    detections: Word | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _one_of_them(self) -> _SourceBlock:
+        if (self.frames is None) == (self.detections is None):
+            raise field_error("expected frames or detections, one of the two")
+        return self
+
+
+class _StereoRunBlock(Block):
+    schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
+    name: Name | None = None
+    pair: Word
+    frame_rate_hz: Annotated[float, pydantic.PlainValidator(number_between(*RATE_RANGE_HZ, "Hz"))]
+    timestamps: Word | None = None
+    cameras: dict[str, _SourceBlock]
+    target: Any
+    segmentation: Any = None
+    match: Any = None
+    recorded: OptionalDay = None
+    notes: Text = ""
+
+
+def load_stereo_run(run_folder: Path) -> StereoRun:
+    """Read and check a stereo run folder; pictures are not opened. Raises InputError, a line for each mistake."""
+    folder = Path(run_folder)
+    if folder.name == "run.yaml" and not folder.is_dir():
+        folder = folder.parent
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected a run folder, found {'a file' if folder.exists() else 'nothing'}")
+    path = folder / "run.yaml"
+    mapping = read_mapping(path)
+    if mapping.get("schema") == "beampose/run/1":
+        raise InputError(
+            f"{path}: schema: expected {SCHEMA!r}, got a run of laser spots; process it with `beampose run`"
+        )
+    content = validated(_StereoRunBlock, mapping, path)
+    names = list(content.cameras)
+    if len(names) != 2:
+        what = f"the single camera {names[0]}" if len(names) == 1 else f"{len(names)} cameras"
+        raise InputError(f"{path}: cameras: expected two cameras, got {what}; add the second camera of the pair")
+    pair_path = folder / content.pair
+    file = load_pair_file(pair_path)
+    for name in names:
+        if name not in file.cameras:
+            raise InputError(
+                f"{path}: cameras.{name}: expected a camera of {pair_path.name}, got {name!r}"
+                f"{suggest_name(name, file.cameras)}"
+            )
+    cameras, covariance = of_two_cameras(file, names)
+    times_path = None if content.timestamps is None else folder / content.timestamps
+    target = load_target(content.target, folder, path)
+    sources = {n: _source_of(b, folder, f"{path}: cameras.{n}") for n, b in content.cameras.items()}
+    if len(target.colours) > 1 and any(isinstance(s, DetectionsTable) for s in sources.values()):
+        raise InputError(f"{path}: target.colours: expected one colour with detections, which have none; got several")
+    return StereoRun(
+        folder=folder,
+        name=content.name or name_of_path(folder),
+        pair=_pair_of(cameras, covariance, pair_path),
+        pair_path=pair_path,
+        target=target,
+        target_path=folder / content.target if isinstance(content.target, str) else None,
+        frame_rate_hz=content.frame_rate_hz,
+        times=Times(content.frame_rate_hz) if times_path is None else load_times(times_path, content.frame_rate_hz),
+        times_path=times_path,
+        cameras=sources,
+        parameters=BinocularParameters(
+            dataclass_from_yaml(SegmentationParameters, content.segmentation, path, "segmentation"),
+            dataclass_from_yaml(MatchParameters, content.match, path, "match"),
+        ),
+        calibration=file.calibration,
+        recorded=content.recorded,
+        notes=content.notes,
+    )
+
+
+def _pair_of(cameras: tuple[Camera, Camera], covariance: Any, path: Path) -> StereoPair:
+    try:
+        return StereoPair(cameras, covariance)
+    except ValueError as error:
+        raise InputError(f"{path}: cameras: {error}; {REMEDY}") from None
+
+
+def _source_of(block: _SourceBlock, folder: Path, where: str) -> Source:
+    if block.detections is not None:
+        path = folder / block.detections
+        if not path.is_file():
+            raise InputError(f"{where}.detections: expected a table, found none at {path}")
+        return DetectionsTable(path)
+    path = folder / str(block.frames)
+    if path.is_dir():
+        return FramesFolder(path)
+    if path.suffix.lower() in PICTURE_SUFFIXES and path.is_file():
+        raise InputError(
+            f"{where}.frames: expected a folder or a video, got the single picture {path}; name its folder"
+        )
+    if path.is_file():
+        return VideoFile(path)
+    raise InputError(f"{where}.frames: expected a folder of pictures or a video, found nothing at {path}")
+
+
+# What processing keeps of each frame of a stereo run; tables, findings and the report are made from it.
+
+
+@dataclass(frozen=True, slots=True)
+class StereoRecord:
+    """One frame."""
+
+    frame: int
+    t_s: float
+    candidates: tuple[MarkerImages | None, MarkerImages | None]  # None: no picture
+    missing: tuple[str, str]  # why there is no picture; empty where there is one
+    tracked: BinocularFrame
+
+    @property
+    def measured(self) -> bool:
+        """Whether the pose is a measurement."""
+        return self.tracked.status is PoseStatus.MEASURED
+
+
+@dataclass(frozen=True, slots=True)
+class TruthErrors:
+    """Errors of the measured poses against truth/pose.csv, n frames."""
+
+    frames: Array  # (n,)
+    deltas: Array  # (n, 6): truth minus estimate, section 1 of the file contract
+    nees: Array  # (n,)
+    range_m: Array  # (n,): estimated minus true distance of the body origin from the left camera
+    true_range_m: Array  # (n,)
+
+    def as_mapping(self) -> dict[str, float | int]:
+        """Figures for summary.json."""
+        return {
+            "frames": len(self.frames),
+            "position_rms_m": _rms(np.linalg.norm(self.deltas[:, :3], axis=1)),
+            "rotation_rms_deg": float(np.rad2deg(_rms(np.linalg.norm(self.deltas[:, 3:], axis=1)))),
+            "range_bias_m": float(self.range_m.mean()),
+            "range_rms_m": _rms(self.range_m),
+            "nees_mean": float(self.nees.mean()),
+        }
+
+
+@dataclass(slots=True)
+class StereoResults:
+    """A whole run."""
+
+    run: StereoRun
+    records: list[StereoRecord] = field(default_factory=list)
+    clock: ClockOffset | None = None
+    errors: TruthErrors | None = None
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def measured(self) -> list[StereoRecord]:
+        """The frames with a measured pose."""
+        return [r for r in self.records if r.measured]
+
+    @property
+    def noise_scale(self) -> float:
+        """Root of chi-square over degrees of freedom of all measured frames: 1 if the stated sigmas are right."""
+        fits = [r.tracked.fit for r in self.measured if r.tracked.fit is not None]
+        dof = sum(f.dof for f in fits)
+        return float(np.sqrt(sum(f.chi2 for f in fits) / dof)) if dof else float("nan")
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def truth_errors(records: Sequence[StereoRecord], run: StereoRun, frames: Array, poses: Pose) -> TruthErrors | None:
+    """Errors of the measured poses against true ones at some frames; None where none is shared."""
+    place = {int(f): i for i, f in enumerate(frames)}
+    shared = [r for r in records if r.measured and r.frame in place]
+    if not shared:
+        return None
+    eye = run.pair.cameras[0].camera_from_world.inverse().translation
+    deltas, nees, apart, far = [], [], [], []
+    for r in shared:
+        assert r.tracked.pose is not None
+        assert r.tracked.covariance is not None
+        true = poses[place[r.frame]]
+        delta = true.minus(r.tracked.pose)
+        deltas.append(delta)
+        nees.append(float(delta @ np.linalg.solve(r.tracked.covariance, delta)))
+        far.append(float(np.linalg.norm(true.translation - eye)))
+        apart.append(float(np.linalg.norm(r.tracked.pose.translation - eye)) - far[-1])
+    numbers = np.array([r.frame for r in shared])
+    return TruthErrors(numbers, np.array(deltas), np.array(nees), np.array(apart), np.array(far))

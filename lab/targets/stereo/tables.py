@@ -1,0 +1,115 @@
+"""The tables of a stereo run: those of a run (section 4 of the files' contract), and points.csv."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from geometry.arrays import Array
+from geometry.camera import in_picture
+from lab.files.text import columns
+from lab.files.text.csv_text import write_table
+from lab.runs.tables import pose_numbers
+from lab.targets.stereo.run import StereoRecord, StereoResults, StereoRun
+from tracking.binocular.marker_model import project_markers
+from tracking.binocular.triangulation import triangulate
+from tracking.statuses import view_statuses
+
+POINTS = (
+    "frame", "t_s", "spot", "x_m", "y_m", "z_m", "sigma_x_m", "sigma_y_m", "sigma_z_m", "epipolar_sigmas",
+)  # fmt: skip
+_UPPER = np.triu_indices(6)
+
+
+def write_tables(results: StereoResults, folder: Path) -> None:
+    """Write attitude.csv, covariance.csv, systematic.csv, spots.csv, points.csv and detections.csv into a folder."""
+    run, records = results.run, results.records
+    write_table(folder / "attitude.csv", columns.ATTITUDE, map(_attitude_row, records))
+    known = [r for r in records if r.tracked.covariance is not None]
+    write_table(
+        folder / "covariance.csv",
+        columns.COVARIANCE,
+        (
+            [r.frame, *map(repr, r.tracked.covariance[_UPPER].tolist())]
+            for r in known
+            if r.tracked.covariance is not None
+        ),
+    )
+    if run.pair.covariance is not None or run.target.model.sigma_m > 0:
+        fitted = [(r.frame, r.tracked.fit.systematic) for r in records if r.measured and r.tracked.fit is not None]
+        rows = ([frame, *map(repr, S[_UPPER].tolist())] for frame, S in fitted)
+        write_table(folder / "systematic.csv", columns.COVARIANCE, rows)
+    write_table(folder / "spots.csv", columns.SPOTS, (row for r in records for row in _spot_rows(run, r)))
+    write_table(folder / "points.csv", POINTS, (row for r in records for row in _point_rows(run, r)))
+    write_table(
+        folder / "detections.csv", columns.DETECTIONS, (row for r in records for row in _candidate_rows(run, r))
+    )
+
+
+def _numbers(values: Array | list[float]) -> list[str]:
+    """Fields with ten digits; empty for nan."""
+    return ["" if v != v else f"{v:.10g}" for v in np.asarray(values, dtype=float).tolist()]
+
+
+def _attitude_row(record: StereoRecord) -> list[object]:
+    t = record.tracked
+    head: list[object] = [record.frame, *_numbers([record.t_s])]
+    motion = [""] * len(columns.MOTION)  # poses are of single frames: they have no velocity
+    if t.pose is None or t.covariance is None:
+        return [*head, *[""] * len(columns.POSE), 0, "", t.status.value, *motion]
+    used = int((t.index >= 0).sum())
+    rms = _numbers([t.fit.rms_px if t.fit is not None and used else float("nan")])
+    return [*head, *_numbers(pose_numbers(t.pose, t.covariance)), used, *rms, t.status.value, *motion]
+
+
+def _spot_rows(run: StereoRun, record: StereoRecord) -> Iterator[list[object]]:
+    """One row per camera and marker. Where no candidate has the label, u and v are those of the pose."""
+    t, model = record.tracked, run.target.model
+    uv, cov = np.full((2, len(model), 2), np.nan), np.full((2, len(model), 2, 2), np.nan)
+    if t.pose is not None and t.covariance is not None:
+        uv, J = project_markers(run.pair, model, t.pose)
+        cov = J @ t.covariance @ np.swapaxes(J, -1, -2)
+    for c, camera in enumerate(run.pair.cameras):
+        seen, found = t.index[c] >= 0, record.candidates[c]
+        exists = np.isfinite(uv[c, :, 0])
+        inside = in_picture(uv[c], np.array(camera.image_size_px))
+        has_image = np.full(len(model), found is not None)
+        status = view_statuses(seen, np.zeros(len(model), dtype=bool), exists, inside, has_image, t.pose is not None)
+        for k, name in enumerate(model.names):
+            at, C = uv[c, k], cov[c, k]
+            if seen[k] and found is not None:
+                at, C = found.uv_px[t.index[c, k]], found.cov_px2[t.index[c, k]]
+            with np.errstate(invalid="ignore"):
+                sigma = np.sqrt(np.diagonal(C))
+            yield [
+                record.frame, *_numbers([record.t_s]), camera.name, name, *_numbers([*at, *sigma]), status[k].value,
+                *_numbers(t.predicted_px[c, k]), "", *_numbers([C[0, 1], float("nan")]),
+            ]  # fmt: skip
+
+
+def _point_rows(run: StereoRun, record: StereoRecord) -> Iterator[list[object]]:
+    """One row per marker seen by both cameras: its most likely point from its two images alone."""
+    t = record.tracked
+    both = np.flatnonzero((t.index >= 0).all(axis=0))
+    left, right = record.candidates
+    if not len(both) or left is None or right is None:
+        return
+    pick = (left.pick(t.index[0, both]), right.pick(t.index[1, both]))
+    found = triangulate(run.pair, np.stack([p.uv_px for p in pick]), np.stack([p.cov_px2 for p in pick]))
+    for i, k in enumerate(both.tolist()):
+        sigma = np.sqrt(np.diagonal(found.covariance[i]))
+        numbers = _numbers([*found.points[i], *sigma, float(np.sqrt(found.chi2[i]))])
+        yield [record.frame, *_numbers([record.t_s]), run.target.model.names[k], *numbers]
+
+
+def _candidate_rows(run: StereoRun, record: StereoRecord) -> Iterator[list[object]]:
+    """All candidates; major and minor axis are those of a disc of the candidate's area: half its radius."""
+    for camera, found in zip(run.pair.cameras, record.candidates, strict=True):
+        if found is None:
+            continue
+        for uv, C, area in zip(found.uv_px, found.cov_px2, found.area_px2.tolist(), strict=True):
+            axis = float(np.sqrt(area / np.pi)) / 2
+            sigma = np.sqrt(np.diagonal(C))
+            yield [record.frame, camera.name, *_numbers([*uv, *sigma]), "", "", *_numbers([axis, axis, 0.0, C[0, 1]])]

@@ -1,0 +1,39 @@
+"""The options of `beampose compare`."""
+
+from __future__ import annotations
+
+import pytest
+from click.testing import CliRunner
+
+from cli import main
+from tests.lab.results.compare.test_compare import write_results, write_tum
+from tests.tracking.comparison.motions import recordings
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--align", "tme"), "expected all, none or some of time,rate,world,body, got 'tme'"),
+        (("--align", "rate"), "rate needs time too"),
+        (("--sigma-m", "-1"), "not in the range"),
+        (("--sigma-deg", "nan"), "expected a finite number"),
+        (("--offset", "1e300"), "not in the range"),
+        (("--reference", "nowhere.csv"), "does not exist"),
+        ((), "expected a second result folder or --reference FILE"),
+    ],
+)
+def test_a_wrong_option_is_exit_status_2(tmp_path, options, words):
+    result = write_results(tmp_path / "one", recordings(1)[0])
+    done = CliRunner().invoke(main, ["compare", str(result), *options])
+    assert done.exit_code == 2
+    assert words in done.stderr
+
+
+def test_a_comparison_without_out_prints_and_writes_nothing(tmp_path):
+    mine, theirs = recordings(1)
+    result, reference = write_results(tmp_path / "one", mine), write_tum(tmp_path / "other.tum", theirs)
+    before = sorted(tmp_path.rglob("*"))
+    done = CliRunner().invoke(main, ["compare", str(result), "--reference", str(reference), "--align", "all"])
+    assert done.exit_code == 0, done.output
+    assert "chi-square per degree of freedom" in done.stdout
+    assert sorted(tmp_path.rglob("*")) == before

@@ -1,0 +1,285 @@
+"""A view shows what the rig and the results say, as a page, a mesh, pictures, and a window that keys play."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from calibration.open3d_loader import open3d
+from geometry.forward_model import SpotModel
+from lab.errors import InputError
+from lab.files.rig.rig_file import save_rig
+from lab.results.view import render, slider_window
+from lab.results.view import scene as solids
+from lab.results.view import view as view_module
+from lab.results.view.page import Player, scene_data
+from lab.results.view.scene import read_content, view_of, write_glb
+from lab.results.view.slider_window import Controls
+from lab.results.view.view import show
+from lab.results.view.window import fill
+from tests.lab.fake_results import make
+from tests.open3d_marker import needs_open3d
+
+
+@pytest.fixture(scope="module")
+def fake(tmp_path_factory):
+    return make(tmp_path_factory.mktemp("fake"))
+
+
+@pytest.fixture
+def content(fake):
+    return read_content(fake.results, None)
+
+
+def test_the_poses_of_results_and_of_a_runs_truth_are_shown_and_a_rig_has_none(fake, content, tmp_path):
+    assert content.known.sum() > 10
+    assert read_content(fake.run_folder, None).known.sum() > 10
+    save_rig(content.rig, tmp_path / "rig.yaml")
+    assert len(read_content(tmp_path / "rig.yaml", None).frames) == 0
+
+
+def test_the_beams_end_where_the_forward_model_says(content):
+    index = content.at_frame(None)
+    view = view_of(content, index)
+    ends = np.array([t.end for t in view.moving(index) if hasattr(t, "end")])
+    hits = SpotModel.of(content.rig).hits(content.world_from_body[index])[0]
+    hits = np.unique(hits[np.isfinite(hits).all(axis=1)].round(9), axis=0)
+    np.testing.assert_allclose(np.unique(ends.round(9), axis=0), hits, atol=1e-9)
+
+
+def test_the_ellipsoids_are_the_sigmas_times_the_stated_scale(content):
+    view = view_of(content, None, 100.0)
+    first = int(np.flatnonzero(content.known)[0])
+    e = view.ellipsoids[0]
+    np.testing.assert_allclose(e.axes @ e.axes.T, 1e4 * content.position_covariance[first], rtol=1e-9, atol=1e-15)
+    drawn = solids.ball(e.centre, e.axes, e.colour)
+    off = drawn.vertices - e.centre
+    chi2 = np.einsum("ni,ij,nj->n", off, np.linalg.inv(e.axes @ e.axes.T), off)
+    np.testing.assert_allclose(chi2, 1.0, rtol=1e-6)
+
+
+def test_an_ellipsoid_that_would_cover_the_scene_is_counted_and_not_drawn(content):
+    content.position_covariance[np.flatnonzero(content.known)[0]] = 1e4 * np.eye(3)
+    view = view_of(content, None)
+    assert view.too_large >= 1
+    assert max(np.linalg.norm(e.axes, axis=0).max() for e in view.ellipsoids) < 0.25 * view.extent_m
+    assert view_of(content, None, 1e-6).too_large == 0
+
+
+def test_an_unknown_frame_and_a_missing_run_folder_are_named(fake, content, tmp_path):
+    with pytest.raises(InputError, match=r"--frame 99999: expected a frame with a pose, \d+ to \d+"):
+        content.at_frame(99999)
+    with pytest.raises(InputError, match=r"expected a rig.yaml, a run folder or a folder of results, found nothing"):
+        read_content(tmp_path / "nothing", None)
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    for path in fake.results.iterdir():
+        if path.is_file():
+            (moved / path.name).write_bytes(path.read_bytes())
+    summary = json.loads((moved / "summary.json").read_text())
+    text = json.dumps(summary).replace(json.dumps(str(fake.run_folder))[1:-1], "gone")
+    (moved / "summary.json").write_text(text)
+    with pytest.raises(InputError, match=r"the rig is unknown, because .*; name it: --rig rig.yaml"):
+        read_content(moved, None)
+    save_rig(content.rig, tmp_path / "rig.yaml")
+    assert read_content(moved, tmp_path / "rig.yaml").known.any()
+
+
+def test_the_page_has_a_moment_for_each_pose_and_opens_offline(content, tmp_path, monkeypatch):
+    monkeypatch.setattr(view_module, "_by_open3d", lambda mesh, out: [])
+    index = content.at_frame(None)
+    view = view_of(content, index)
+    view_module.write_files(view, index, tmp_path)
+    page = (tmp_path / "view.html").read_text()
+    data = json.loads(re.search(r'<script type="application/json" id="scene-data">(.*?)</script>', page, re.DOTALL)[1])
+    assert data == json.loads(json.dumps(scene_data(view, index)))
+    assert [m["k"] for m in data["moments"]] == content.frames[content.known].tolist()
+    assert data["moments"][data["first"]]["k"] == content.frames[index]
+    assert not re.search(r"""(?:src|href)=["']?(?!data:|#)""", page)
+
+
+@needs_open3d
+def test_the_glb_has_the_mesh_in_the_upright_frame_of_gltf(content, tmp_path):
+    view = view_of(content, None)
+    mesh = solids.mesh_of(view.fixed, view.ellipsoids, view.reach_m, view.extent_m)
+    write_glb(mesh, tmp_path / "scene.glb")
+    read = open3d().io.read_triangle_mesh(str(tmp_path / "scene.glb"))
+    points = np.asarray(read.vertices)
+    assert len(read.triangles) == len(mesh.triangles)
+    upright = mesh.vertices @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    for one in (points, upright, mesh.vertices):
+        assert np.isfinite(one).all()
+    box = [(p.min(axis=0), p.max(axis=0)) for p in (points, upright, mesh.vertices)]
+    # Open3D's reader may leave the node's rotation out.
+    assert np.allclose(box[0], box[1], atol=1e-4) or np.allclose(box[0], box[2], atol=1e-4)
+
+
+def test_tubes_and_balls_are_closed_to_the_outside():
+    ball = solids.ball(np.zeros(3), np.diag([1.0, 2.0, 3.0]), "#0072B2")
+    a, b, c = (ball.vertices[ball.triangles[:, k]] for k in range(3))
+    volume = np.einsum("ni,ni->n", a, np.cross(b, c)).sum() / 6
+    assert 0.8 * 8 * np.pi < volume < 8 * np.pi  # 4/3 pi 1 2 3, from inside
+    tube = solids.tube(np.array([[0.0, 0, 0], [1, 0, 0], [np.nan] * 3, [2, 0, 0]]), 0.1, "#0072B2")
+    assert len(tube.vertices) == 12  # nothing to or from the gap
+    np.testing.assert_allclose(np.linalg.norm(tube.vertices[:, 1:], axis=1), 0.1)
+    a, b, c = (tube.vertices[tube.triangles[:, k]] for k in range(3))
+    assert (np.einsum("ni,ni->n", np.cross(b - a, c - a), (a + b + c) * [0, 1, 1]) > 0).all()
+
+
+@needs_open3d
+def test_files_are_written_without_a_display(fake, tmp_path, monkeypatch):
+    monkeypatch.setattr(view_module, "has_display", lambda: False)
+    monkeypatch.chdir(tmp_path)
+    done = show(fake.results, None)
+    names = {path.name for path in done.files}
+    assert {"view.html", "scene.glb", "scene.ply"} <= names
+    assert all(path.stat().st_size > 1000 for path in done.files)
+    mesh = open3d().io.read_triangle_mesh(str(tmp_path / "results" / "view" / "scene.ply"))
+    assert len(mesh.triangles) > 1000
+    for name in names & {"view-oblique.png", "view-above.png", "view-front.png"}:  # none where nothing can draw
+        picture = cv2.imread(str(tmp_path / "results" / "view" / name))
+        assert (picture.max(axis=2) - picture.min(axis=2) > 60).mean() > 1e-3  # coloured lines on white
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems always have a display")
+def test_a_display_that_does_not_answer_is_none(monkeypatch):
+    monkeypatch.setenv("DISPLAY", ":9876")
+    assert not view_module.has_display()
+    monkeypatch.delenv("DISPLAY")
+    assert not view_module.has_display()
+
+
+def test_without_open3d_the_page_and_the_glb_are_written_and_the_reason_is_said(fake, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    done = show(fake.results, tmp_path / "out")
+    assert [path.name for path in done.files] == ["view.html", "scene.glb"]
+    assert "no scene.ply and no rendered pictures: this needs Open3D" in done.notes[0]
+
+
+def test_the_player_runs_at_the_speed_of_the_recording_and_stops_at_the_end(content):
+    player = Player(view_of(content, None), None)
+    times = content.t_s[content.known]
+    player.toggle(50.0)
+    assert player.playing
+    player.advance(50.0 + times[3] - times[0] + 1e-6)
+    assert player.at == 3
+    player.advance(1e6)
+    assert (player.at, player.playing) == (len(times) - 1, False)
+    player.step(-1)
+    assert player.at == len(times) - 2
+    player.step(-(10**6))
+    assert player.at == 0
+    player.leap(0.5)
+    assert player.at == round(0.5 * len(times))
+
+
+@needs_open3d
+def test_a_rig_without_poses_has_nothing_to_play(content, tmp_path):
+    save_rig(content.rig, tmp_path / "rig.yaml")
+    view = view_of(read_content(tmp_path / "rig.yaml", None), None)
+    player = Player(view, None)
+    player.toggle(0.0)
+    player.step(5)
+    assert (player.index, player.playing, player.advance(9.0)) == (None, False, False)
+
+
+def _ends(view, index, opened):
+    os._exit(139)
+
+
+def _opens_and_ends(view, index, opened):
+    opened.send(True)
+    os._exit(139)
+
+
+class Window:
+    """Notes what is added to a window, and its keys."""
+
+    def __init__(self):
+        self.shown, self.keys, self.tick = [], {}, None
+        self.remove_geometry = lambda thing, **_: self.shown.remove(thing)
+
+    def add_geometry(self, thing, **_):
+        self.shown.append(thing)
+
+    def register_key_callback(self, key, action):
+        self.keys[key] = action
+
+    def register_animation_callback(self, tick):
+        self.tick = tick
+
+    def get_render_option(self):
+        return self
+
+    def get_view_control(self):
+        return self
+
+    def set_front(self, _):
+        pass
+
+    set_up = set_zoom = set_front
+
+
+@needs_open3d
+def test_a_key_moves_the_beams_of_the_window(content):
+    view = view_of(content, None)
+    window, player = Window(), Player(view, None)
+    fill(window, view, player)
+    assert len(window.shown) == 2
+    before = np.asarray(window.shown[1].vertices).copy()
+    assert window.keys[269](window)  # end
+    assert len(window.shown) == 2
+    assert np.abs(np.asarray(window.shown[1].vertices) - before).max() > 1e-3
+    assert not window.tick(window)  # nothing plays
+
+
+@needs_open3d
+def test_the_slider_the_button_the_keys_and_the_clock_move_one_and_the_same_player(content):
+    """With Open3D's own widgets, which work without a window."""
+    gui, drawn = open3d().visualization.gui, []
+    player = Player(view_of(content, None), None)
+    controls = Controls(gui, player, lambda: drawn.append(player.at))
+    last = len(player.known) - 1
+    assert (controls.slider.get_minimum_value, controls.slider.get_maximum_value) == (0, last)
+    controls.slid(3.0)
+    assert (player.at, drawn, controls.slider.int_value) == (3, [3], 3)
+    frame, t_s = content.frames[player.known[3]], content.t_s[player.known[3]]
+    assert controls.caption.text == f"frame {frame}, {t_s:.3f} s"
+    assert controls.press(gui.KeyName.END)
+    assert (controls.slider.int_value, drawn[-1]) == (last, last)
+    assert not controls.press(gui.KeyName.Q)
+    assert controls.press(gui.KeyName.SPACE)  # plays from the start again
+    assert (controls.button.text, player.at) == ("Pause", 0)
+    assert controls.tick(time.monotonic() + 1e6)
+    assert (controls.slider.int_value, controls.button.text, drawn[-1]) == (last, "Play", last)
+    assert not controls.tick(time.monotonic() + 2e6)
+    controls.slid(float(last + 10))  # beyond the end
+    assert player.at == last
+
+
+@needs_open3d
+def test_where_the_window_with_a_slider_cannot_open_the_other_one_is_tried(content, monkeypatch):
+    """Its process ends without a window, whatever the reason: no Vulkan, or a driver that ends the process."""
+    monkeypatch.setattr(slider_window, "_show", _ends)
+    assert not slider_window.open_slider_window(view_of(content, None), None)
+
+
+@needs_open3d
+def test_a_window_that_was_open_is_not_followed_by_another(content, monkeypatch):
+    monkeypatch.setattr(slider_window, "_show", _opens_and_ends)
+    assert slider_window.open_slider_window(view_of(content, None), None)
+
+
+@needs_open3d
+def test_a_renderer_that_hangs_or_fails_gives_no_pictures(content, tmp_path, monkeypatch):
+    monkeypatch.setattr(render, "_SECONDS", 0.05)
+    view = view_of(content, None)
+    mesh = solids.mesh_of(view.fixed, [], view.reach_m, view.extent_m)
+    assert render.render(mesh, {"from above (along −z)": tmp_path / "a.png"}) == []

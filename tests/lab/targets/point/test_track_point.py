@@ -1,0 +1,280 @@
+"""`beampose track point`: tables, statuses and verdicts for good and bad input."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from cli import main
+from lab.errors import InputError
+from lab.targets.point_results import COLUMNS
+from lab.targets.track_point import PointOptions, track_target
+from studies.duan2020 import compare_duan2020
+
+FRAMES = 30
+
+
+def path_of(k):
+    return np.array([40.0 + 1.5 * k, 60.0 + 0.5 * k])
+
+
+def picture(k, ink=40, ground=150):
+    """A disc of radius 6 px on an even ground with a little noise, 8 bit."""
+    v, u = np.mgrid[:120, :160]
+    cover = np.clip(6.5 - np.hypot(u - path_of(k)[0], v - path_of(k)[1]), 0, 1)
+    noise = np.random.default_rng(k).normal(0, 1.5, u.shape)
+    return np.clip(ground + (ink - ground) * cover + noise, 0, 255).round().astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Pictures of a black disc; two are missing, one shows nothing, one is damaged."""
+    out = tmp_path_factory.mktemp("pictures") / "disc"
+    out.mkdir()
+    for k in range(FRAMES):
+        if k in (10, 11):
+            continue
+        shown = np.full((120, 160), 150, np.uint8) if k == 15 else picture(k)
+        cv2.imwrite(str(out / f"{k:04d}.png"), shown)
+    (out / "0020.png").write_bytes((out / "0020.png").read_bytes()[:200])
+    return out
+
+
+def rows_of(out):
+    with (out / "track.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def write_points(path, places, header="frame,u_px,v_px"):
+    path.write_text(header + "\n" + "".join(f"{k},{u},{v}\n" for k, (u, v) in places.items()))
+    return path
+
+
+def test_a_black_target_in_pictures_is_tracked_through_missing_pictures(folder, tmp_path):
+    outcome = track_target(folder, tmp_path / "out", PointOptions("darker", rate_hz=50.0, overlay=True))
+    rows = rows_of(tmp_path / "out")
+    assert [int(r["frame"]) for r in rows] == list(range(FRAMES))
+    words = [r["status"] for r in rows]
+    assert [k for k, w in enumerate(words) if w != "measured"] == [10, 11, 15, 20]
+    assert set(words) == {"measured", "predicted"}
+    for k, r in enumerate(rows):
+        error = np.array([float(r["u_px"]), float(r["v_px"])]) - path_of(k)
+        assert np.abs(error).max() < 0.3
+        assert np.abs(error).max() < 5 * float(r["sigma_u_px"])
+    assert float(rows[-1]["velocity_u_px_s"]) == pytest.approx(75.0, abs=4.0)
+    assert float(rows[-1]["t_s"]) == pytest.approx((FRAMES - 1) / 50)
+    assert (outcome.verdict, outcome.exit_status) == ("CHECK", 0)
+    assert [r.code for r in outcome.reasons] == ["BP-N02", "BP-N06"]
+    video = cv2.VideoCapture(str(tmp_path / "out" / "overlay.mp4"))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == FRAMES - 3
+    page = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert "BP-N06" in page
+    assert not any(word in page for word in ("http://", "https://", ">nan", "None"))
+
+
+def test_the_summary_has_what_other_results_have(folder, tmp_path):
+    track_target(folder, tmp_path / "out", PointOptions("darker"))
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["counts"]["status"] == {"measured": 26, "predicted": 4, "lost": 0}
+    assert summary["inputs"][0]["sha256"]
+    assert summary["versions"]["numpy"]
+    assert summary["verdict"]["status"] == "CHECK"
+    assert summary["parameters"]["blobs"]["polarity"] == "darker"
+    assert summary["events"] == [{"frame": 0, "kind": "acquired"}]
+    track_target(folder, tmp_path / "out", PointOptions("darker"))  # replaces its own results
+
+
+def test_a_plain_table_is_tracked_and_irregular_times_count(tmp_path):
+    rng = np.random.default_rng(1)
+    t = np.cumsum(rng.uniform(0.05, 0.15, 60))
+    lines = [f"{k},{s:.6f},{100 * s:.4f},{50 - 20 * s:.4f},0.1,0.1" for k, s in enumerate(t) if k % 20 != 13]
+    table = tmp_path / "points.csv"
+    table.write_text("frame,t_s,u_px,v_px,sigma_u_px,sigma_v_px\n" + "\n".join(lines) + "\n")
+    outcome = track_target(table, tmp_path / "out")
+    assert outcome.statistics.counts == {"measured": 57, "predicted": 3, "lost": 0}
+    last = rows_of(tmp_path / "out")[-1]
+    assert float(last["velocity_u_px_s"]) == pytest.approx(100, abs=3)
+    assert tuple(rows_of(tmp_path / "out")[0]) == COLUMNS
+
+
+def test_without_a_frame_rate_there_are_no_seconds(tmp_path):
+    table = write_points(tmp_path / "points.csv", {k: path_of(k) for k in range(10)})
+    track_target(table, tmp_path / "out")
+    last = rows_of(tmp_path / "out")[-1]
+    assert (last["t_s"], last["velocity_u_px_s"]) == ("", "")
+    assert float(last["velocity_u_px_frame"]) == pytest.approx(1.5, abs=1e-6)
+
+
+def test_a_target_that_is_not_there_is_a_failed_gate_without_positions(folder, tmp_path):
+    done = CliRunner().invoke(
+        main, ["track", "point", str(folder), "--out", str(tmp_path / "out"), "--detector", "brighter"]
+    )
+    assert done.exit_code == 4
+    assert done.output.startswith("FAIL disc: 30 frames")
+    rows = rows_of(tmp_path / "out")
+    assert {r["status"] for r in rows} == {"lost"}
+    assert all(r["u_px"] == r["sigma_u_px"] == r["c00"] == "" for r in rows)
+    assert "BP-N01" in (tmp_path / "out" / "report.html").read_text("utf-8")
+
+
+def test_too_few_measured_frames_fail_the_gate(folder, tmp_path):
+    outcome = track_target(folder, tmp_path / "out", PointOptions("darker", min_measured=0.9))
+    assert (outcome.verdict, outcome.exit_status) == ("FAIL", 4)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["verdict"]["exit_status"] == 4
+    assert "FAIL" in (tmp_path / "out" / "report.html").read_text("utf-8")
+
+
+def test_two_similar_targets_are_reported_and_one_can_be_chosen(tmp_path):
+    lines = [f"{k},{u},{v}" for k in range(20) for u, v in (path_of(k), path_of(k) + np.array([300, 0]))]
+    table = tmp_path / "two.csv"
+    table.write_text("frame,u_px,v_px\n" + "\n".join(lines) + "\n")
+    assert "BP-N05" in [r.code for r in track_target(table, tmp_path / "out").reasons]
+    chosen = track_target(table, tmp_path / "other", PointOptions(start_px=(345.0, 60.0)))
+    assert chosen.reasons == ()
+    assert chosen.track[-1].x[0] == pytest.approx(path_of(19)[0] + 300, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("frame,u_px\n0,1\n", "expected a column 'v_px'"),
+        ("frame,u_px,v_px\n", "expected rows"),
+        ("frame,u_px,v_px\n0,a,b\n", "not a finite number"),
+        ("frame,u_px,v_px\n0,1,1\n900000000,2,2\n", "time stamps"),
+        ("frame,camera,u_px,v_px\n0,left,1,1\n0,right,5,5\n", "expected points of one camera, got left, right"),
+        ("frame,t_s,u_px,v_px\n0,1.0,1,1\n1,0.5,5,5\n", "t_s: expected times that rise"),
+        ("", "an empty file"),
+    ],
+)
+def test_a_table_that_cannot_be_used_is_one_plain_line(tmp_path, text, words):
+    table = tmp_path / "points.csv"
+    table.write_text(text)
+    done = CliRunner().invoke(main, ["track", "point", str(table), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 2
+    assert words in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--camera", "left"], "expected a table with a column camera"),
+        (["--start", "5"], "expected U,V in pixels such as 640,512, got '5'"),
+        (["--set", "track.sigma_a=1"], "unknown key"),
+        (["--set", "track.p_gate=2"], "expected a number between 0 and 1"),
+    ],
+)
+def test_an_option_that_cannot_be_used_is_exit_status_2(folder, tmp_path, arguments, words):
+    done = CliRunner().invoke(main, ["track", "point", str(folder), "--out", str(tmp_path / "out"), *arguments])
+    assert done.exit_code == 2
+    assert words in done.stderr
+
+
+@pytest.mark.parametrize("name", ["empty.mp4", "broken.mp4"])
+def test_a_broken_video_is_one_plain_line(tmp_path, name):
+    (tmp_path / name).write_bytes(b"" if name == "empty.mp4" else b"not a video" * 100)
+    with pytest.raises(InputError, match="expected a picture"):
+        track_target(tmp_path / name, tmp_path / "out")
+
+
+def test_the_study_shows_why_a_gate_is_needed():
+    study = compare_duan2020(seed=2, scenes=2)
+    hidden = "largest error, 20 hidden frames, with false detections"
+    assert study.value(hidden, "beampose") < 0.1 * study.value(hidden, "corrected")
+    in_view = "RMS error in view, without false detections"
+    assert study.value(in_view, "beampose") < 0.85 * study.value(in_view, "detections")
+    nees = "NEES per coordinate, without false detections"
+    assert study.value(nees, "as printed") < 0, "the printed covariance has negative variances"
+    assert 0.7 < study.value(nees, "beampose") < 1.3
+
+
+def coloured(k, bgr=(40, 40, 190)):
+    """The disc in colour on a grey ground, before a brighter grey one."""
+    v, u = np.mgrid[:120, :160]
+    out = np.full((120, 160, 3), 150.0)
+    for place, ink in ((np.array([120.0, 20.0]), (250, 250, 250)), (path_of(k), bgr)):
+        cover = np.clip(6.5 - np.hypot(u - place[0], v - place[1]), 0, 1)[..., None]
+        out += cover * (np.asarray(ink, float) - out)
+    noise = np.random.default_rng(k).normal(0, 1.5, out.shape)
+    return np.clip(out + noise, 0, 255).round().astype(np.uint8)
+
+
+@pytest.mark.parametrize("kind", ["pictures", "video"])
+@pytest.mark.parametrize("name", ["red", "#be2828"])
+def test_a_coloured_target_is_tracked(kind, name, tmp_path):
+    if kind == "video":
+        source = tmp_path / "ball.avi"
+        writer = cv2.VideoWriter(str(source), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (160, 120))
+        for k in range(FRAMES):
+            writer.write(np.full((120, 160, 3), 150, np.uint8) if k == 15 else coloured(k))
+        writer.release()
+    else:
+        source = tmp_path / "ball"
+        source.mkdir()
+        for k in range(FRAMES):
+            shown = np.full((120, 160, 3), 150, np.uint8) if k == 15 else coloured(k)
+            cv2.imwrite(str(source / f"{k:04d}.png"), shown)
+    arguments = ["track", "point", str(source), "--out", str(tmp_path / "out"), "--detector", "colour", "--colour"]
+    result = CliRunner().invoke(main, [*arguments, name])
+    assert result.exit_code == 0, result.output
+    rows = rows_of(tmp_path / "out")
+    assert [k for k, r in enumerate(rows) if r["status"] != "measured"] == [15]
+    errors = [np.hypot(*(np.array([float(r["u_px"]), float(r["v_px"])]) - path_of(k))) for k, r in enumerate(rows)]
+    assert max(errors) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--detector", "colour"], "expected --colour with red"),
+        (["--detector", "colour", "--colour", "mauve"], "expected red, orange"),
+        (["--detector", "colour", "--colour", "#808080"], "got the grey #808080"),
+        (["--detector", "colour", "--colour", "red"], "got grey ones; use --detector darker"),
+        (["--detector", "darker", "--colour", "red"], "belongs to --detector colour"),
+    ],
+)
+def test_a_colour_that_cannot_be_searched_is_one_plain_line(arguments, words, folder, tmp_path):
+    result = CliRunner().invoke(main, ["track", "point", str(folder), "--out", str(tmp_path / "out"), *arguments])
+    assert result.exit_code == 2
+    assert words in result.output
+    assert len(result.output.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_target_of_another_colour_is_lost_and_never_reported(tmp_path):
+    source = tmp_path / "ball"
+    source.mkdir()
+    for k in range(8):
+        cv2.imwrite(str(source / f"{k:04d}.png"), coloured(k))
+    options = PointOptions("colour", rate_hz=25.0, colour="blue")
+    assert track_target(source, tmp_path / "out", options).exit_status == 4
+    assert {r["status"] for r in rows_of(tmp_path / "out")} == {"lost"}
+
+
+def test_pictures_of_another_size_than_the_first_are_no_pictures_of_the_recording(tmp_path):
+    source = tmp_path / "disc"
+    source.mkdir()
+    for k in range(12):
+        cv2.imwrite(str(source / f"{k:04d}.png"), picture(k)[: 100 if k in (5, 6) else None])
+    outcome = track_target(source, tmp_path / "out", PointOptions("darker", rate_hz=50.0))
+    assert [k for k, r in enumerate(rows_of(tmp_path / "out")) if r["status"] != "measured"] == [5, 6]
+    assert outcome.recording.missing == {"another size: 160x100 px, the first picture has 160x120": 2}
+
+
+def test_a_video_that_ends_early_is_noted(tmp_path):
+    path = tmp_path / "cut.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (160, 120))
+    for k in range(FRAMES):
+        writer.write(cv2.cvtColor(picture(k), cv2.COLOR_GRAY2BGR))
+    writer.release()
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    outcome = track_target(path, tmp_path / "out", PointOptions("darker"))
+    assert any(f"of the {FRAMES} pictures that its header states" in note for note in outcome.recording.notes)

@@ -1,0 +1,250 @@
+"""`beampose stereo` on simulated recordings: the files of the contract, honest sigmas, and plain messages."""
+
+import csv
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+
+from cli import main
+from lab.errors import InputError
+from lab.files.text import columns
+from lab.targets.stereo.process import process_stereo_run
+from lab.targets.stereo.simulated_recording import write_stereo_recording
+
+
+def typed(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments], prog_name="beampose")
+
+
+@pytest.fixture(scope="module")
+def drogue(tmp_path_factory):
+    """A recording of points."""
+    return write_stereo_recording(tmp_path_factory.mktemp("points") / "run", seed=5, frames=24, points=True)
+
+
+@pytest.fixture(scope="module")
+def result(drogue, tmp_path_factory):
+    return process_stereo_run(drogue, tmp_path_factory.mktemp("results") / "out")
+
+
+def rows(folder, name):
+    with (folder / name).open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def changed(drogue, folder, **fields):
+    """A copy of a run folder with other fields in run.yaml; None removes one."""
+    shutil.copytree(drogue, folder)
+    content = yaml.safe_load((folder / "run.yaml").read_text(encoding="utf-8")) | fields
+    content = {key: value for key, value in content.items() if value is not None}
+    (folder / "run.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+    return folder
+
+
+def test_the_tables_have_the_columns_of_the_contract_and_a_row_per_frame(result):
+    for name, header in (
+        ("attitude.csv", columns.ATTITUDE), ("covariance.csv", columns.COVARIANCE), ("spots.csv", columns.SPOTS),
+        ("detections.csv", columns.DETECTIONS),
+    ):  # fmt: skip
+        assert tuple(rows(result.out, name)[0]) == header
+    attitude = rows(result.out, "attitude.csv")
+    assert [int(r["frame"]) for r in attitude] == list(range(24))
+    assert {r["status"] for r in attitude} == {"measured"}
+    assert len(rows(result.out, "spots.csv")) == 24 * 2 * 7
+
+
+def test_the_pose_errors_agree_with_the_stated_covariance(result):
+    assert result.exit_status == 0
+    nees = result.results.errors.nees
+    assert 3.5 < nees.mean() < 9.5  # 6 expected; sigma of the mean: 0.7
+    assert np.abs(result.results.errors.range_m).max() < 0.05
+
+
+def test_the_triangulated_points_are_where_the_pose_puts_the_markers(result):
+    record = result.results.records[0]
+    points = {r["spot"]: r for r in rows(result.out, "points.csv") if r["frame"] == "0"}
+    model = result.results.run.target.model
+    for name, x in zip(model.names, record.tracked.pose.apply(model.positions), strict=True):
+        if name in points:
+            at, sigma = (np.array([float(points[name][f"{p}{a}_m"]) for a in "xyz"]) for p in ("", "sigma_"))
+            assert np.all(np.abs(at - x) < 5 * sigma + 0.01)
+
+
+def test_the_summary_has_fingerprints_versions_and_the_verdict_of_the_exit_status(result):
+    summary = json.loads((result.out / "summary.json").read_text(encoding="utf-8"))
+    assert summary["verdict"]["exit_status"] == result.exit_status == 0
+    assert {"run.yaml", "pair.yaml", "detections.csv"} <= {i["path"].rsplit("/", 1)[-1] for i in summary["inputs"]}
+    assert "numpy" in summary["versions"]
+    report = (result.out / "report.html").read_text(encoding="utf-8")
+    assert "Content-Security-Policy" in report
+    assert "http" not in report.replace("http-equiv", "").replace("http://www.w3.org", "")
+
+
+def test_pictures_are_segmented_and_hidden_markers_do_not_disturb(tmp_path):
+    assert typed("simulate", "stereo-drogue", "--seed", 4, "--frames", 3, "--out", tmp_path / "run").exit_code == 0
+    done = typed("stereo", tmp_path / "run", "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    errors = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["errors"]
+    assert errors["frames"] == 3
+    assert errors["position_rms_m"] < 0.015
+    assert errors["nees_mean"] < 15
+    assert "data:image/jpeg" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    again = typed("stereo", tmp_path / "run", "--out", tmp_path / "out")  # earlier results are replaced
+    assert again.exit_code == 0
+
+
+def test_unsynchronised_pictures_fail_the_run_and_say_by_how_much(tmp_path):
+    run = write_stereo_recording(tmp_path / "run", seed=5, frames=25, points=True, noise_px=0.03, right_delay_s=0.0015)
+    outcome = process_stereo_run(run, tmp_path / "out")
+    assert outcome.exit_status == 4
+    clock = outcome.results.clock
+    assert clock.offset_s == pytest.approx(0.0015, abs=5 * clock.sigma_s)
+    assert any(f.code == "BP-W05" for f in outcome.findings)
+
+
+@pytest.mark.parametrize(("shift", "words"), [(4, "frames with markers in both pictures"), (200, "right: 200 to 223")])
+def test_frame_numbers_of_one_camera_that_are_shifted_fail_the_run(drogue, tmp_path, shift, words):
+    """Frames that only one camera has are measured by it alone: without the others they would seem right."""
+    run = changed(drogue, tmp_path / "run")
+    shutil.rmtree(run / "truth")
+    table = rows(run, "detections.csv")
+    with (run / "detections.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, table[0])
+        writer.writeheader()
+        writer.writerows({**r, "frame": int(r["frame"]) + shift * (r["camera"] == "right")} for r in table)
+    outcome = process_stereo_run(run, tmp_path / "out")
+    assert outcome.exit_status == 4
+    assert any(f.code == "BP-W09" and words in f.what for f in outcome.findings)
+
+
+def test_markers_that_are_not_where_run_yaml_says_are_reported(drogue, tmp_path):
+    target = yaml.safe_load((drogue / "run.yaml").read_text(encoding="utf-8"))["target"]
+    target["markers"]["3"]["position_m"][0] += 0.02
+    outcome = process_stereo_run(changed(drogue, tmp_path / "run", target=target), tmp_path / "out")
+    assert [r for r in outcome.results.records if r.measured and (r.tracked.index[:, 2] >= 0).all()] == []
+    stated = {**target, "sigma_m": 0.02}
+    outcome = process_stereo_run(changed(drogue, tmp_path / "known", target=stated), tmp_path / "again")
+    assert len(outcome.results.measured) == 24
+    assert outcome.results.errors.nees.mean() < 15  # the survey's error is part of the covariance
+
+
+def test_two_cameras_exchanged_give_no_confident_pose(tmp_path):
+    drogue = write_stereo_recording(tmp_path / "drogue", seed=6, frames=3, points=True)
+    pair = yaml.safe_load((drogue / "pair.yaml").read_text(encoding="utf-8"))
+    left, right = pair["cameras"]["left"], pair["cameras"]["right"]
+    pair["cameras"] = {"left": right, "right": left}
+    run = changed(drogue, tmp_path / "run")
+    (run / "pair.yaml").write_text(yaml.safe_dump(pair), encoding="utf-8")
+    outcome = process_stereo_run(run, tmp_path / "out")
+    assert outcome.exit_status == 4
+    assert outcome.results.measured == []
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"cameras": {"left": {"detections": "detections.csv"}}}, "expected two cameras, got the single camera left"),
+        ({"cameras": {"left": {"detections": "detections.csv"}, "rihgt": {"detections": "detections.csv"}}}, "right"),
+        ({"pair": "nothing.yaml"}, "beampose calibrate pair"),
+        ({"target": None}, "target: expected a value"),
+        ({"target": {"colours": {"red": {"hue_deg": [0, 500]}}, "markers": {}}}, "hue_deg: expected 0 to 360"),
+        ({"target": "markers.yaml"}, "found nothing"),
+        ({"match": {"gate_sigma": 3}}, "gate_sigma"),
+        ({"segmentation": {"median_px": 4}}, "odd"),
+        ({"schema": "beampose/run/1"}, "beampose run"),
+    ],
+)
+def test_a_mistake_in_run_yaml_is_one_plain_line(drogue, tmp_path, fields, message):
+    run = changed(drogue, tmp_path / "run", **fields)
+    done = typed("stereo", run, "--out", tmp_path / "out")
+    assert done.exit_code == 2
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_pair_without_poses_names_the_command_that_makes_one(drogue, tmp_path):
+    run = changed(drogue, tmp_path / "run")
+    pair = yaml.safe_load((drogue / "pair.yaml").read_text(encoding="utf-8"))
+    camera = {k: v for k, v in pair["cameras"]["left"].items() if k != "camera_from_world"}
+    (run / "pair.yaml").write_text(yaml.safe_dump({"schema": "beampose/camera/1", "name": "left", **camera}))
+    done = typed("stereo", run, "--out", tmp_path / "out")
+    assert done.exit_code == 2
+    assert "beampose calibrate pair" in done.stderr
+
+
+def test_a_rig_and_a_foreign_file_with_poses_are_pairs_too(drogue, tmp_path):
+    run = changed(drogue, tmp_path / "run")
+    chain = {
+        name: {
+            "camera_model": "pinhole", "distortion_model": "radtan", "distortion_coeffs": c["distortion"],
+            "intrinsics": [c["camera_matrix"][k] for k in ("fx", "fy", "cx", "cy")], "resolution": c["image_size_px"],
+        }
+        for name, c in zip(
+            ("cam0", "cam1"),
+            yaml.safe_load((drogue / "pair.yaml").read_text(encoding="utf-8"))["cameras"].values(),
+            strict=True,
+        )
+    }  # fmt: skip
+    from lab.files.rig.pair_file import load_pair_file
+
+    T = np.eye(4)
+    right = load_pair_file(drogue / "pair.yaml").cameras["right"].camera_from_world
+    T[:3, :3], T[:3, 3] = right.rotation, right.translation
+    chain["cam1"]["T_cn_cnm1"] = T.tolist()
+    (run / "camchain.yaml").write_text(yaml.safe_dump(chain), encoding="utf-8")
+    cameras = load_pair_file(run / "camchain.yaml").cameras
+    np.testing.assert_allclose(cameras["cam1"].camera_from_world.minus(right), 0, atol=1e-9)
+
+
+def test_a_symmetric_target_is_refused(drogue, tmp_path):
+    angles = np.deg2rad(np.arange(7) * 360 / 7)
+    markers = {
+        str(i): {"position_m": [float(np.cos(a)), float(np.sin(a)), 0.0], "colour": "red"} for i, a in enumerate(angles)
+    }
+    target = {"colours": {"red": {"hue_deg": [340, 20]}, "blue": {"hue_deg": [200, 250]}}, "markers": markers}
+    with pytest.raises(InputError, match="symmetric"):
+        process_stereo_run(changed(drogue, tmp_path / "run", target=target), tmp_path / "out")
+
+
+def test_empty_and_grey_and_missing_pictures_are_plain_errors(tmp_path):
+    import cv2
+
+    run = write_stereo_recording(tmp_path / "run", seed=4, frames=1, scale=0.3)
+    for path in sorted((run / "frames" / "right").iterdir()):
+        path.write_bytes(b"")
+    with pytest.raises(InputError, match="camera right: expected pictures"):
+        process_stereo_run(run, tmp_path / "out")
+    for camera in ("left", "right"):
+        for i in range(6):
+            cv2.imwrite(str(run / "frames" / camera / f"{i:06d}.png"), np.full((216, 288), 90, np.uint8))
+    with pytest.raises(InputError, match="expected colour pictures"):
+        process_stereo_run(run, tmp_path / "out")
+    shutil.rmtree(run / "frames" / "left")
+    with pytest.raises(InputError, match="found nothing"):
+        process_stereo_run(run, tmp_path / "out")
+
+
+def test_colour_videos_give_the_markers_that_their_pictures_show(tmp_path):
+    """Videos of cameras are YUV: their colour must be decoded, not only the brightness."""
+    run = write_stereo_recording(tmp_path / "run", seed=5, frames=1, scale=0.75)
+    content = yaml.safe_load((run / "run.yaml").read_text(encoding="utf-8"))
+    for name, source in content["cameras"].items():
+        files = sorted((run / source["frames"]).iterdir())
+        pictures = [cv2.imread(str(f)) for f in files if f.suffix == ".png"]
+        path = run / f"{name}.avi"
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, pictures[0].shape[1::-1])
+        writer.set(cv2.VIDEOWRITER_PROP_QUALITY, 98)
+        for picture in pictures:
+            writer.write(picture)
+        writer.release()
+        content["cameras"][name] = {"frames": path.name}
+    (run / "run.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+    done = process_stereo_run(run, tmp_path / "out")
+    assert len(rows(done.out, "detections.csv")) >= 10
+    assert np.abs(done.results.errors.range_m).max() < 0.3

@@ -1,0 +1,193 @@
+"""The improved Hough gradient method of Zhou (2014), section 2.3: edges vote for centres, then for radii.
+
+Departures from the print: the window and the 8 px gate are around the prediction, not around the last position, and the
+votes of a radius are divided by the circumference. Otherwise large circles win with the votes of clutter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.arrays import Array, Ints
+from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window, crop_bounds
+from tracking.drogue_circle.parameters import CircleParameters
+
+_STRONG_PERCENTILE, _STRONG_SHARE, _WEAK_SHARE = 98.0, 0.35, 0.4  # of Canny's thresholds, from the gradients themselves
+_LEAST_GRADIENT = 24.0  # Sobel sum of a step of 6 DN in a picture stretched to 8 bits
+_ALIGNED = 0.9  # least cosine between gradient and radius
+_LEAST_SUPPORT = 0.15  # edge pixels per pixel of circumference
+_MOST_EDGES = 60_000
+
+
+@dataclass(frozen=True, slots=True)
+class EdgePixels:
+    """Edge pixels of a picture, n of them."""
+
+    x: Array  # (n,) px
+    y: Array  # (n,) px
+    along_x: Array  # (n,) unit gradient, towards the brighter side
+    along_y: Array
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+
+def edge_pixels(picture: Picture, blur_px: float) -> EdgePixels:
+    """Edges by Gaussian filter, Sobel gradients and Canny's non-maximum suppression with hysteresis.
+
+    The grey values are stretched to 8 bits and the thresholds follow from the gradients, so that neither the contrast
+    nor the bit depth matters.
+    """
+    low, high = float(picture.min()), float(picture.max())
+    scale = 255.0 / max(high - low, 32.0 if picture.dtype == np.uint8 else 512.0)
+    stretched = cv2.convertScaleAbs(picture, alpha=scale, beta=-low * scale)
+    smooth = cv2.GaussianBlur(stretched, (0, 0), blur_px)
+    gx, gy = cv2.Sobel(smooth, cv2.CV_16S, 1, 0), cv2.Sobel(smooth, cv2.CV_16S, 0, 1)
+    steps = max(1, picture.size // 40_000)  # a sample determines the percentile
+    sample = np.hypot(gx.ravel()[::steps].astype(np.float32), gy.ravel()[::steps].astype(np.float32))
+    strong = max(_LEAST_GRADIENT, _STRONG_SHARE * float(np.percentile(sample, _STRONG_PERCENTILE)))
+    edges = cv2.Canny(gx, gy, _WEAK_SHARE * strong, strong, L2gradient=True)
+    places = np.flatnonzero(edges)
+    if len(places) > _MOST_EDGES:
+        places = places[:: -(-len(places) // _MOST_EDGES)]
+    dx, dy = gx.ravel()[places].astype(float), gy.ravel()[places].astype(float)
+    length = np.maximum(np.hypot(dx, dy), 1e-9)
+    rows, columns = np.divmod(places, picture.shape[1])
+    return EdgePixels(columns.astype(float), rows.astype(float), dx / length, dy / length)
+
+
+def centre_votes(
+    edges: EdgePixels, radii_px: tuple[float, float], area: tuple[int, int, int, int], smooth: bool = True
+) -> NDArray[np.float32]:
+    """Votes (height, width) for centres along the gradients, in both directions.
+
+    radii_px: smallest and largest distance of a centre from its edge. area: top, bottom, left, right of the cells, px.
+    smooth: sums over 3 x 3 cells, since rounding distributes the votes for one centre over neighbours.
+    """
+    top, bottom, left, right = area
+    height, width = bottom - top, right - left
+    radii = np.arange(np.floor(radii_px[0]), np.ceil(radii_px[1]) + 1)
+    radii = np.concatenate([radii, -radii]).astype(np.float32)[:, None]
+    x = np.rint(edges.x.astype(np.float32) + radii * edges.along_x.astype(np.float32)).astype(np.int32) - left
+    y = np.rint(edges.y.astype(np.float32) + radii * edges.along_y.astype(np.float32)).astype(np.int32) - top
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    votes = np.bincount(y[inside] * width + x[inside], minlength=height * width)
+    cells = votes.reshape(height, width).astype(np.float32)
+    if not smooth:
+        return cells
+    return np.asarray(cv2.boxFilter(cells, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT), np.float32)
+
+
+def centres(votes: NDArray[np.float32], most: int) -> tuple[Ints, Ints]:
+    """Rows and columns of the best local maxima among eight neighbours, eq. (5), at most `most`, best first."""
+    peaks = np.flatnonzero((votes >= cv2.dilate(votes, np.ones((3, 3), np.uint8))) & (votes > 0))
+    values = votes.ravel()[peaks]
+    if len(peaks) > 4 * most:
+        keep = np.argpartition(-values, 4 * most)[: 4 * most]
+        peaks, values = peaks[keep], values[keep]
+    rows, columns = np.divmod(peaks[np.argsort(-values, kind="stable")][:most], votes.shape[1])
+    return rows, columns
+
+
+def radii_of(
+    edges: EdgePixels, u_px: float, v_px: float, radii_px: tuple[float, float], most: int
+) -> list[CircleCandidate]:
+    """The best-supported radii about one centre, each with its polarity; votes per pixel of circumference."""
+    dx, dy = edges.x - u_px, edges.y - v_px
+    distance = np.hypot(dx, dy)
+    radial = dx * edges.along_x + dy * edges.along_y
+    near = (distance >= radii_px[0] - 1.5) & (distance <= radii_px[1] + 1.5) & (np.abs(radial) > _ALIGNED * distance)
+    first = int(np.floor(radii_px[0])) - 1
+    bins = int(np.ceil(radii_px[1])) - first + 2
+    out = []
+    for polarity in (1, -1):
+        own = distance[near & (polarity * radial > 0)]
+        counts = np.bincount(np.clip(np.rint(own).astype(int) - first, 0, bins - 1), minlength=bins).astype(float)
+        support = np.convolve(counts, np.ones(3), "same") / (2 * np.pi * np.maximum(first + np.arange(bins), 1))
+        peaks = np.flatnonzero((support[1:-1] >= support[:-2]) & (support[1:-1] > support[2:])) + 1
+        for i in peaks[support[peaks] > _LEAST_SUPPORT].tolist():
+            members = own[np.abs(own - (first + i)) <= 1.5]
+            out.append(CircleCandidate(u_px, v_px, float(members.mean()), float(support[i]), polarity))
+    return sorted(out, key=lambda c: -c.score)[:most]
+
+
+# The classical detector: gradient votes in the window around a prediction, or in a pyramid of the whole picture.
+
+
+_CENTRES_OF_WINDOW, _CENTRES_OF_LEVEL = 3, 12
+_RADII_OF_CENTRE = 3
+_LEAST_SIDE = 32  # px: smaller levels of the pyramid are not searched
+
+
+def classical_detector(p: CircleParameters) -> CircleDetector:
+    """The detector of Zhou (2014) in its corrected form; see `gradient_votes`."""
+
+    def detect(picture: Picture, window: Window | None) -> list[CircleCandidate]:
+        return whole_picture(picture, p) if window is None else in_window(picture, window, p)
+
+    return detect
+
+
+def in_window(picture: Picture, window: Window, p: CircleParameters) -> list[CircleCandidate]:
+    """Candidates with a centre within the gate of the predicted one, best supported first."""
+    top, bottom, left, right = crop_bounds(picture.shape, window)
+    if min(bottom - top, right - left) < 8:
+        return []
+    edges = edge_pixels(picture[top:bottom, left:right], p.blur_px)
+    if not len(edges):
+        return []
+    u, v, gate = window.u_px - left, window.v_px - top, window.gate_px
+    low, high = np.floor([v - gate, u - gate]).astype(int) - 1, np.ceil([v + gate, u + gate]).astype(int) + 2
+    area = (int(low[0]), int(high[0]), int(low[1]), int(high[1]))
+    radii = (window.min_radius_px, window.max_radius_px)
+    rows, columns = centres(centre_votes(edges, radii, area), 4 * _CENTRES_OF_WINDOW)
+    out: list[CircleCandidate] = []
+    used = 0
+    for row, column in zip((rows + area[0]).tolist(), (columns + area[2]).tolist(), strict=True):
+        if np.hypot(column - u, row - v) < gate and used < _CENTRES_OF_WINDOW:
+            used += 1
+            out += radii_of(edges, column, row, radii, _RADII_OF_CENTRE)
+    moved = [replace(c, u_px=c.u_px + left, v_px=c.v_px + top) for c in out]
+    return sorted(moved, key=lambda c: -c.score)
+
+
+def whole_picture(picture: Picture, p: CircleParameters) -> list[CircleCandidate]:
+    """Candidates anywhere in the picture, best supported first.
+
+    Every level of the pyramid is searched for circles of the same radii in its own pixels, an octave each: the cost is
+    4/3 of that of the first level. Centres outside the picture are not searched.
+    """
+    largest = p.max_radius_px or 0.5 * min(picture.shape[:2])
+    scale = 1
+    level: Picture = picture
+    out: list[CircleCandidate] = []
+    band = p.min_radius_px
+    while band * scale <= largest and min(level.shape[:2]) >= _LEAST_SIDE:
+        top = min(2 * band, largest / scale)
+        edges = edge_pixels(level, p.blur_px)
+        if len(edges):
+            area = (0, level.shape[0], 0, level.shape[1])
+            for row, column in zip(*centres(centre_votes(edges, (band, top), area), _CENTRES_OF_LEVEL), strict=True):
+                for c in radii_of(edges, float(column), float(row), (band, top), _RADII_OF_CENTRE):
+                    away = 0.5 * (scale - 1)  # the centre of the first pixel of a level, in pixels of the picture
+                    out.append(
+                        replace(
+                            c,
+                            u_px=c.u_px * scale + away,
+                            v_px=c.v_px * scale + away,
+                            radius_px=c.radius_px * scale,
+                        )
+                    )
+        scale *= 2
+        level = _reduced(picture, scale)
+    return sorted(out, key=lambda c: -c.score)
+
+
+def _reduced(picture: Picture, scale: int) -> Picture:
+    """The picture with a side of 1 / scale, means of blocks."""
+    smaller = np.asarray(cv2.resize(picture, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA))
+    return smaller.astype(np.uint8) if picture.dtype == np.uint8 else smaller.astype(np.uint16)
