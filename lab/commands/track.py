@@ -73,7 +73,7 @@ def circle(
     from lab.commands.common import provenance
     from lab.targets.circle import CircleOptions, track_circle
 
-    options = CircleOptions(near, min_radius, max_radius, rate, form, detector, video, limit)
+    options = CircleOptions(near, min_radius, max_radius, form, detector, rate_hz=rate, overlay=video, limit=limit)
     with progress_bar(pictures.name) as progress:
         outcome = track_circle(pictures, out, options, progress, provenance(ctx))
     conclude(outcome)
@@ -130,7 +130,7 @@ def drogue(
     from lab.commands.common import provenance
     from lab.targets.drogue import DrogueOptions, track_drogue
 
-    options = DrogueOptions(near, every, min_diameter, max_diameter, rate, video, limit)
+    options = DrogueOptions(near, every, min_diameter, max_diameter, rate_hz=rate, overlay=video, limit=limit)
     with progress_bar(pictures.name) as progress:
         outcome = track_drogue(pictures, out, options, progress, provenance(ctx))
     conclude(outcome)
@@ -188,7 +188,9 @@ def _place(ctx: click.Context, parameter: click.Parameter, value: str | None) ->
     callback=read_settings,
     help="A parameter, e.g. --set track.sigma_model_px=0.5, detect.threshold_sigma=5 or blobs.max_size_px=100.",
 )
+@click.pass_context
 def point(
+    ctx: click.Context,
     source: Path,
     out: Path,
     detector: str,
@@ -210,11 +212,14 @@ def point(
     Example:
         beampose track point sample_runs/huo2015/frames/left --out results/point
     """
-    from lab.targets.track_point import PointOptions, track_target
+    from lab.commands.common import provenance
+    from lab.targets.point import PointOptions, track_point
 
-    options = PointOptions(detector, start, frame_rate, camera, limit, min_measured, overlay, settings, colour)
+    options = PointOptions(
+        detector, start, camera, min_measured, settings, colour, rate_hz=frame_rate, overlay=overlay, limit=limit
+    )
     with progress_bar("pictures") as progress:
-        outcome = track_target(source, out, options, progress)
+        outcome = track_point(source, out, options, progress, provenance(ctx))
     conclude(outcome)
 
 

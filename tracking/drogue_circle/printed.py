@@ -13,12 +13,12 @@ import numpy as np
 from geometry.arrays import Array
 from tracking.drogue_circle.acquisition import Wanted, acquire
 from tracking.drogue_circle.candidates import CircleDetector, Picture, Window, crop_bounds
-from tracking.drogue_circle.frames import Cause, CircleFrame, nothing_known
+from tracking.drogue_circle.frames import CircleFrame, nothing_known
 from tracking.drogue_circle.gradient_votes import centre_votes, centres, edge_pixels
 from tracking.drogue_circle.kalman import PRINTED_P0, predict, printed_coefficient, printed_step, transition
 from tracking.drogue_circle.occlusion import Appearance, disc_cells, first_appearance
 from tracking.drogue_circle.parameters import CircleParameters
-from tracking.statuses import PoseStatus
+from tracking.statuses import Cause, PoseStatus
 
 _MOST_CENTRES = 200
 _LOST_AFTER = 25  # frames without a measurement; the print has no such rule

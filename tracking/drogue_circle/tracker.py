@@ -9,12 +9,12 @@ import numpy as np
 from geometry.arrays import Array
 from tracking.drogue_circle.acquisition import Wanted, acquire
 from tracking.drogue_circle.candidates import CircleDetector, Picture
-from tracking.drogue_circle.frames import Cause, CircleFrame, nothing_known
+from tracking.drogue_circle.frames import CircleFrame, nothing_known
 from tracking.drogue_circle.occlusion import disc_cells, is_clear
 from tracking.drogue_circle.parameters import CircleParameters
 from tracking.drogue_circle.rim_fit import RimFit
 from tracking.drogue_circle.track import WHOLE, Track
-from tracking.statuses import PoseStatus
+from tracking.statuses import Cause, PoseStatus
 
 _CONFIRMED = 3  # measurements after which an acquisition is confirmed
 _CHANGED = 4  # searches of the whole picture after which a circle of another appearance is accepted
@@ -81,7 +81,7 @@ class CircleTracker:
         self._ambiguous = ambiguous
         if search.found is None:
             cause = Cause.AMBIGUOUS if ambiguous else Cause.NOT_FOUND
-            return replace(nothing_known(cause, event), circles=len(search.circles))
+            return replace(nothing_known(cause, event), found=len(search.circles))
         self._track, self._searches = Track.started(picture, search.found, self.parameters), 0
         event = "acquired" if self._trusted is None else "reacquired"
         return self._at_start(self._track, np.full(3, np.nan), len(search.circles), event)
@@ -103,11 +103,11 @@ class CircleTracker:
             return None
         return self._at_start(track, predicted, len(search.circles), "reacquired")
 
-    def _at_start(self, track: Track, predicted: Array, circles: int, event: str) -> CircleFrame:
+    def _at_start(self, track: Track, predicted: Array, found: int, event: str) -> CircleFrame:
         """The frame of an acquisition. No appearance is known yet: the coefficient is that of the rim."""
         x, P = track.bank.state()
         gamma = float(np.clip(1 - track.fit.coverage, 0.0, 1.0))
-        return CircleFrame(PoseStatus.MEASURED, Cause.NONE, x, P, predicted, track.fit, gamma, circles, event)
+        return CircleFrame(PoseStatus.MEASURED, Cause.NONE, x, P, predicted, track.fit, gamma, found, event)
 
     def _unmeasured(self, track: Track, cause: Cause, predicted: Array, gamma: float) -> CircleFrame:
         """A frame without a measurement: predicted, or lost."""

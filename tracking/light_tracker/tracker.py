@@ -18,13 +18,13 @@ import numpy as np
 from geometry.arrays import Array
 from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window
 from tracking.light_tracker.confidence import ABSENT_LOGIT, features, fisher, logit, probability, within
-from tracking.light_tracker.frames import Cause, DrogueFrame, Source, nothing_known
+from tracking.light_tracker.frames import DrogueFrame, Source, nothing_known
 from tracking.light_tracker.known import is_clear
 from tracking.light_tracker.motion import WHOLE, Motion
 from tracking.light_tracker.parameters import USUAL, LightParameters
 from tracking.light_tracker.pattern import Match, Pattern, unexplained
 from tracking.light_tracker.track import LONGEST_GAP, TRUSTED, Track
-from tracking.statuses import PoseStatus
+from tracking.statuses import Cause, PoseStatus
 
 _NEAR_PX = 20.0  # distance of the first drogue from the place that the user states
 _SUPPORT_RATE = 0.25  # of the running mean of the log odds of the checks
