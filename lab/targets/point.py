@@ -25,7 +25,7 @@ from lab.report.plot.series import Line
 from lab.report.plot.svg import VERMILLION
 from lab.runs.frames.sensor_noise import CameraNoise
 from lab.targets.page import panel
-from lab.targets.recording import AnyPicture, Progress, header_rate, read_pictures, read_points
+from lab.targets.recording import Progress, colour_frames, grey_frames, header_rate, read_pictures, read_points
 from lab.targets.target import Codes, Target, Track, TrackOptions
 from lab.targets.track import track_target
 from lab.targets.verdict import Outcome, some_frames
@@ -180,10 +180,11 @@ class PointTarget(Target[PointFrame]):
                 raise InputError(f"--camera: expected a table with a column camera, got {path}; leave the option out")
             inputs = open_inputs([path])
             search = self._search(inputs)
+            frames_of: Any = colour_frames if isinstance(search, _ColourSearch) else grey_frames
             recording, found, detection_s = read_pictures(
-                inputs, path, lambda picture: None if picture is None else search(picture),
-                options.rate_hz or header_rate(inputs), limit=options.limit, colour=self.detector == COLOUR,
-                progress=progress,
+                inputs, path, frames_of(inputs, limit=options.limit),
+                lambda picture: None if picture is None else search(picture), options.rate_hz or header_rate(inputs),
+                limit=options.limit, progress=progress,
             )  # fmt: skip
             if isinstance(search, _ColourSearch) and not search.shown:
                 raise InputError(
@@ -195,10 +196,10 @@ class PointTarget(Target[PointFrame]):
         begun = time.process_time()
         track = track_point_in(recording.steps, found, self.settings.track)
         tracking_s = detection_s + time.process_time() - begun
-        frames = [PointFrame(e, d, event) for e, d, event in zip(track, found, _events(track), strict=True)]
-        return Track(recording, frames, tracking_s)
+        together = zip(track, found, _events(track), strict=True)
+        return Track(recording, [PointFrame(*each) for each in together], tracking_s)
 
-    def _search(self, inputs: PictureFiles | Video) -> Callable[[AnyPicture], Detections]:
+    def _search(self, inputs: PictureFiles | Video) -> Callable[[Any], Detections]:
         if self.detector == COLOUR:
             return _ColourSearch(hue_named(self.options.colour), self.settings.blobs)
         if self.options.colour is not None:

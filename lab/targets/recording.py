@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -31,7 +31,7 @@ _COMPLETE_SHARE = 0.98  # of the pictures that a video's header states
 Progress = Callable[[int, int | None], None]  # pictures done, total number of pictures where known
 Inputs = PictureFiles | Video
 Looked = TypeVar("Looked")
-AnyPicture = GreyPicture | ColourPicture
+P = TypeVar("P", bound=np.ndarray)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,41 +70,55 @@ def header_rate(inputs: Inputs) -> float | None:
     return rate if RATE_RANGE_HZ[0] <= rate <= RATE_RANGE_HZ[1] else None
 
 
-def colour_picture(grabbed: Grabbed, size_px: tuple[int, int] | None) -> ColourPicture | MissingPicture:
+def _colour_picture(grabbed: Grabbed, size_px: tuple[int, int] | None) -> ColourPicture | MissingPicture:
     """The picture that a capture has grabbed, in colour."""
     decoded, picture = grabbed.retrieve()
     usable = decoded and picture is not None
     return colour_of(picture, size_px) if usable else MissingPicture(f"{UNREADABLE}: damaged")
 
 
-def _in_colour(inputs: Inputs) -> Iterator[tuple[int, ColourPicture | MissingPicture]]:
+def _in_colour(
+    inputs: Inputs, size_px: tuple[int, int] | None, wanted: Collection[int] | None
+) -> Iterator[tuple[int, ColourPicture | MissingPicture]]:
     """All pictures with their frame numbers, (h, w, 3), BGR, 8 bits."""
+    unread = MissingPicture("not read")
     if isinstance(inputs, PictureFiles):
         for number, path in inputs.files:
-            yield number, read_colour(path, None)
+            yield number, read_colour(path, size_px) if wanted is None or number in wanted else unread
         return
     capture = open_video(inputs.path, colour=True)
     try:
         number = 0
         while capture.grab():
-            yield number, colour_picture(capture, None)
+            yield number, _colour_picture(capture, size_px) if wanted is None or number in wanted else unread
             number += 1
     finally:
         capture.release()
 
 
-def every_frame(
-    inputs: Inputs, limit: int | None = None, colour: bool = False
-) -> Iterator[tuple[int, AnyPicture | MissingPicture]]:
-    """All frame numbers from the first to the last with their pictures; a gap in the numbers is dropped frames.
+def grey_frames(inputs: Inputs, limit: int | None = None) -> Iterator[tuple[int, GreyPicture | MissingPicture]]:
+    """All frame numbers from the first to the last with their pictures, as `_every_frame`; limit: of the pictures."""
+    _require_frame_numbers(inputs, limit)
+    return _every_frame(islice(inputs.pictures(1), limit))
 
-    Pictures of another size than the first are missing: their pixels would not be comparable.
 
-    limit: largest number of pictures.
+def colour_frames(
+    inputs: Inputs,
+    size_px: tuple[int, int] | None = None,
+    wanted: Collection[int] | None = None,
+    limit: int | None = None,
+) -> Iterator[tuple[int, ColourPicture | MissingPicture]]:
+    """As `grey_frames`, in colour.
 
-    Raises:
-        InputError: the numbers in the names of the pictures are not those of frames.
+    size_px: width and height of all pictures; None: those of the first. wanted: numbers of the frames that are needed;
+    the others are not read.
     """
+    _require_frame_numbers(inputs, limit)
+    return _every_frame(islice(_in_colour(inputs, size_px, wanted), limit))
+
+
+def _require_frame_numbers(inputs: Inputs, limit: int | None) -> None:
+    """Raises InputError where the numbers in the names of the pictures are not those of frames."""
     if isinstance(inputs, PictureFiles):
         numbers = [number for number, _ in inputs.files[:limit]]
         if is_too_sparse(numbers[-1] - numbers[0] + 1, len(numbers)):
@@ -112,34 +126,43 @@ def every_frame(
                 f"{inputs.camera}: expected pictures numbered by frame, got {len(numbers)} with numbers from"
                 f" {numbers[0]} to {numbers[-1]}; rename them, or move the strays out of the folder"
             )
-    last, size = None, None
-    for number, picture in islice(_in_colour(inputs) if colour else inputs.pictures(1), limit):
+
+
+def _every_frame(pictures: Iterator[tuple[int, P | MissingPicture]]) -> Iterator[tuple[int, P | MissingPicture]]:
+    """All frame numbers from the first to the last; a gap in the numbers is dropped frames.
+
+    Pictures of another size than the first are missing: their pixels would not be comparable.
+    """
+    last: int | None = None
+    size: tuple[int, int] | None = None
+    for number, picture in pictures:
         for dropped in range(number if last is None else last + 1, number):
             yield dropped, MissingPicture(DROPPED)
-        if not isinstance(picture, MissingPicture):
-            own = picture.shape[1], picture.shape[0]
-            size = size or own
-            if own != size:
-                words = f"another size: {own[0]}x{own[1]} px, the first picture has {size[0]}x{size[1]}"
-                picture = MissingPicture(words)
-        yield number, picture
+        own = None if isinstance(picture, MissingPicture) else (picture.shape[1], picture.shape[0])
+        size = size or own
+        if own is None or size is None or own == size:
+            yield number, picture
+        else:
+            words = f"another size: {own[0]}x{own[1]} px, the first picture has {size[0]}x{size[1]}"
+            yield number, MissingPicture(words)
         last = number
 
 
 def read_pictures(
     inputs: Inputs,
     path: Path,
-    look: Callable[[AnyPicture | None], Looked],
+    frames: Iterator[tuple[int, P | MissingPicture]],
+    look: Callable[[P | None], Looked],
     rate_hz: float | None,
     *,
     limit: int | None,
-    colour: bool = False,
     smallest_px: int = 1,
     progress: Progress | None = None,
 ) -> tuple[Recording, list[Looked], float]:
     """Look at every frame of a recording; with what was seen in each, and the process time of that, s.
 
-    look: gets the picture, or None where there is no usable one. smallest_px: least side of the pictures.
+    frames: of `grey_frames` or `colour_frames`. look: gets the picture, or None where there is no usable one.
+    smallest_px: least side of the pictures.
 
     Raises:
         InputError: no picture could be read, or they are too small.
@@ -150,12 +173,12 @@ def read_pictures(
     size: tuple[int, int] | None = None
     stated, process_s = inputs.count(1), 0.0
     total = stated if limit is None or stated is None else min(stated, limit)
-    for number, picture in every_frame(inputs, limit, colour):
+    for number, picture in frames:
+        usable = None if isinstance(picture, MissingPicture) else picture
         if isinstance(picture, MissingPicture):
             missing[picture.reason] += 1
-            usable = None
         else:
-            usable, size = picture, (picture.shape[1], picture.shape[0])
+            size = picture.shape[1], picture.shape[0]
         begun = time.process_time()
         looked.append(look(usable))
         process_s += time.process_time() - begun

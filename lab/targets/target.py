@@ -14,8 +14,9 @@ import numpy as np
 from calibration.findings import Finding
 from geometry.arrays import Array, Bools
 from lab.detect.inputs import open_inputs
+from lab.pictures.picture_file import GreyPicture
 from lab.report.calibration.calibration_page import Section
-from lab.targets.recording import DEFAULT_RATE_HZ, AnyPicture, Progress, Recording, header_rate, read_pictures
+from lab.targets.recording import DEFAULT_RATE_HZ, Progress, Recording, grey_frames, header_rate, read_pictures
 from tracking.statuses import Cause, PoseStatus
 
 LEAST_MEASURED = 0.5  # share of the frames; with less, the tracker may have followed something else in the others
@@ -166,7 +167,7 @@ class Target(ABC, Generic[F]):
 
 
 def track_pictures(
-    path: Path, step: Callable[[AnyPicture | None], F], options: TrackOptions, progress: Progress | None
+    path: Path, step: Callable[[GreyPicture | None], F], options: TrackOptions, progress: Progress | None
 ) -> Track[F]:
     """The track of a tracker through the pictures of a folder or a video.
 
@@ -178,8 +179,8 @@ def track_pictures(
     inputs = open_inputs([path])
     rate = options.rate_hz or header_rate(inputs)
     recording, frames, tracking_s = read_pictures(
-        inputs, path, step, rate or DEFAULT_RATE_HZ, limit=options.limit, smallest_px=_SMALLEST_SIDE_PX,
-        progress=progress,
+        inputs, path, grey_frames(inputs, options.limit), step, rate or DEFAULT_RATE_HZ, limit=options.limit,
+        smallest_px=_SMALLEST_SIDE_PX, progress=progress,
     )  # fmt: skip
     if rate is None:
         note = f"the frame rate is not stated: {DEFAULT_RATE_HZ:g} Hz assumed (--rate)"
