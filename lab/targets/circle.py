@@ -15,7 +15,7 @@ from lab.number_format import format_number, format_percent
 from lab.report.calibration.calibration_page import Section
 from lab.report.plot.series import Line
 from lab.report.plot.svg import BLUE, VERMILLION
-from lab.targets.page import panel
+from lab.targets.page import TimeAxis
 from lab.targets.recording import Progress
 from lab.targets.target import Codes, Target, Track, TrackOptions, texts, track_pictures
 from lab.targets.track import quantiles, track_target
@@ -156,21 +156,21 @@ class CircleTarget(Target[CircleFrame]):
         return out
 
     def sections(self, track: Track[CircleFrame]) -> list[Section]:
-        quality = _quality(track)
+        axis, quality = TimeAxis.of(track), _quality(track)
         away = _fits(track) - np.array([f.predicted for f in track.frames])
         top = float(np.nanmax(quality[:, 2])) if np.isfinite(quality[:, 2]).any() else 1.0
         panels = [
-            panel(
-                track, "Occlusion coefficient (blue) and share of the rim with edge points (orange)", "",
+            axis.panel(
+                "Occlusion coefficient (blue) and share of the rim with edge points (orange)", "",
                 Line(quality[:, 0], BLUE, "occlusion"), Line(quality[:, 1], VERMILLION, "coverage"),
                 y_range=(0.0, 1.05),
             ),
-            panel(
-                track, "Residuals of the rim, RMS", "px", Line(quality[:, 2], BLUE, "RMS"),
+            axis.panel(
+                "Residuals of the rim, RMS", "px", Line(quality[:, 2], BLUE, "RMS"),
                 y_range=(0.0, max(1.1 * top, 0.1)),
             ),
-            panel(
-                track, "Measured minus predicted centre: u (blue), v (orange)", "px", Line(away[:, 0], BLUE, "u"),
+            axis.panel(
+                "Measured minus predicted centre: u (blue), v (orange)", "px", Line(away[:, 0], BLUE, "u"),
                 Line(away[:, 1], VERMILLION, "v"),
             ),
         ]  # fmt: skip

@@ -17,7 +17,7 @@ from lab.number_format import format_percent
 from lab.report.calibration.calibration_page import PageTable, Section
 from lab.report.plot.series import Line
 from lab.report.plot.svg import BLUE, VERMILLION
-from lab.targets.page import panel
+from lab.targets.page import TimeAxis
 from lab.targets.recording import Progress
 from lab.targets.target import Codes, Target, Track, TrackOptions, texts, track_pictures
 from lab.targets.track import quantiles, track_target
@@ -173,8 +173,8 @@ class DrogueTarget(Target[DrogueFrame]):
 
     def sections(self, track: Track[DrogueFrame]) -> list[Section]:
         confidence: Array = np.where(track.has_status(PoseStatus.LOST), np.nan, _confidences(track))
-        drawing = panel(
-            track, "Confidence (blue) and correlation of the match (orange)", "", Line(confidence, BLUE, "confidence"),
+        drawing = TimeAxis.of(track).panel(
+            "Confidence (blue) and correlation of the match (orange)", "", Line(confidence, BLUE, "confidence"),
             Line(_correlations(track), VERMILLION, "correlation"), y_range=(0.0, 1.05), height=170,
         )  # fmt: skip
         words = (

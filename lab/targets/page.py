@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,6 @@ from lab.report.plot.axes import axes, frame, image_area, note, plot_area, svg_o
 from lab.report.plot.scales import padded_range
 from lab.report.plot.series import Band, Line, Shade, time_panel
 from lab.report.plot.svg import BLUE, SKY, VERMILLION, dots, line_path
-from lab.targets.recording import Recording
 from lab.targets.target import F, Target, Track
 from lab.targets.verdict import WORDS
 from lab.versions import versions
@@ -102,43 +102,50 @@ def _key_figures(target: Target[F], track: Track[F]) -> list[tuple[str, str, str
     return out
 
 
-def time_axis(recording: Recording) -> tuple[Array, str]:
-    """Times (n,) of the frames and their name; frame numbers where the rate is not known."""
-    if recording.t_s is None:
-        return recording.numbers.astype(float), "frame"
-    return recording.t_s, "time (s)"
+@dataclass(frozen=True, slots=True)
+class TimeAxis:
+    """The time axis of the n frames of a page; frames without a measurement are shaded in its plots."""
 
+    t: Array  # (n,)
+    name: str
+    statuses: Sequence[PoseStatus]
 
-def panel(
-    track: Track[F],
-    title: str,
-    unit: str,
-    *lines: Line,
-    bands: tuple[Band, ...] = (),
-    y_range: tuple[float, float] | None = None,
-    height: int = 140,
-) -> PageDrawing:
-    """Lines (n,) over time, as wide as the page; frames without a measurement are shaded."""
-    t, name = time_axis(track.recording)
-    shades = tuple(
-        Shade(track.has_status(status), status.value, status.value)
-        for status in (PoseStatus.PREDICTED, PoseStatus.LOST)
-        if track.has_status(status).any()
-    )
-    drawing = time_panel(
-        t, title, unit, lines=lines, bands=bands, shades=shades, y_range=y_range, width=1100, height=height,
-        time_name=name,
-    )  # fmt: skip
-    return PageDrawing(drawing, wide=True)
+    @classmethod
+    def of(cls, track: Track[F]) -> TimeAxis:
+        """Times, or frame numbers where the rate is not known."""
+        t_s, statuses = track.recording.t_s, [f.status for f in track.frames]
+        if t_s is None:
+            return cls(track.recording.numbers.astype(float), "frame", statuses)
+        return cls(t_s, "time (s)", statuses)
+
+    def panel(
+        self,
+        title: str,
+        unit: str,
+        *lines: Line,
+        bands: tuple[Band, ...] = (),
+        y_range: tuple[float, float] | None = None,
+        wide: bool = True,
+        height: int = 140,
+        caption: str = "",
+    ) -> PageDrawing:
+        """Lines (n,) over time. wide: as the page; else half as wide."""
+        at = {s: np.array([status is s for status in self.statuses]) for s in (PoseStatus.PREDICTED, PoseStatus.LOST)}
+        drawing = time_panel(
+            self.t, title, unit, lines=lines, bands=bands, y_range=y_range, width=1100 if wide else 540, height=height,
+            shades=tuple(Shade(where, status.value, status.value) for status, where in at.items() if where.any()),
+            time_name=self.name,
+        )  # fmt: skip
+        return PageDrawing(drawing, caption, wide)
 
 
 def _motion(target: Target[F], track: Track[F]) -> Section:
     names = ["u of the centre", "v of the centre", *([target.size_name] if target.size_name else [])]
-    panels = []
+    panels, axis = [], TimeAxis.of(track)
     for i, name in enumerate(names):
         values = track.places[:, i]
         band = Band.about(values, track.sigmas[:, i], 3.0, SKY, "3 sigma", 0.5)
-        panels.append(panel(track, name, "px", Line(values, BLUE, name), bands=(band,), height=150))
+        panels.append(axis.panel(name, "px", Line(values, BLUE, name), bands=(band,), height=150))
     words = (
         "Place after each frame, with a band of 3 sigma. Shaded: frames without a measurement (predicted), and frames"
         " in which nothing is known (lost)."

@@ -17,6 +17,7 @@ from geometry.arrays import Array
 from lab.detect.inputs import PictureFiles, Video, open_inputs
 from lab.errors import InputError
 from lab.files.run.parameter_overrides import with_overrides
+from lab.files.text.csv_text import number_fields
 from lab.number_format import format_number, format_percent
 from lab.pictures.picture_file import MissingPicture
 from lab.report.calibration.calibration_page import Section
@@ -24,7 +25,7 @@ from lab.report.plot.histogram import histogram
 from lab.report.plot.series import Line
 from lab.report.plot.svg import VERMILLION
 from lab.runs.frames.sensor_noise import CameraNoise
-from lab.targets.page import panel
+from lab.targets.page import TimeAxis
 from lab.targets.recording import Progress, colour_frames, grey_frames, header_rate, read_pictures, read_points
 from lab.targets.target import Codes, Target, Track, TrackOptions
 from lab.targets.track import track_target
@@ -218,7 +219,7 @@ class PointTarget(Target[PointFrame]):
         before = [*frame.place[:2], *frame.sigmas[:2]]
         after = [*e.predicted_px, e.nis, *frame.measured_px, *e.x[2:], *(e.x[2:] * rate), *e.P[_UPPER]]
         number = int(recording.numbers[k])
-        return [number, *_numbers([t_s]), *_numbers(before), e.status.value, *_numbers(after)]
+        return [number, *number_fields([t_s]), *number_fields(before), e.status.value, *number_fields(after)]
 
     def findings(self, track: Track[PointFrame]) -> list[Finding]:
         """A lost target, innovations that are too large, and similar targets."""
@@ -287,11 +288,11 @@ class PointTarget(Target[PointFrame]):
         ]
 
     def sections(self, track: Track[PointFrame]) -> list[Section]:
-        rate = track.recording.rate_hz
+        axis, rate = TimeAxis.of(track), track.recording.rate_hz
         velocity = (rate or 1.0) * np.array([f.estimate.x[2:] for f in track.frames])
         unit = "px/frame" if rate is None else "px/s"
         panels = [
-            panel(track, name, unit, Line(velocity[:, i], VERMILLION, name))
+            axis.panel(name, unit, Line(velocity[:, i], VERMILLION, name))
             for i, name in enumerate(("rate of u", "rate of v"))
         ]
         out = [Section("Velocity", (), panels)]
@@ -360,11 +361,6 @@ def _similar(track: Track[PointFrame]) -> float:
         bright = np.delete(fluxes, row) >= SIMILAR_FLUX * fluxes[row]
         others += bool(bright.any()) if np.isfinite(fluxes[row]) else f.found > 1
     return others / max(measured, 1)
-
-
-def _numbers(values: Sequence[float] | Array) -> list[str]:
-    """Ten significant digits; empty for nan."""
-    return ["" if v != v else f"{v:.10g}" for v in values]
 
 
 DEFAULTS = PointOptions()

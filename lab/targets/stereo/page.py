@@ -7,17 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from calibration.findings import Finding
-from geometry import rotations
 from geometry.arrays import Array, Ints
 from lab.number_format import format_angle, format_length, format_number
 from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section
 from lab.report.plot.scales import padded_range
-from lab.report.plot.series import Band, Line, Shade, time_panel
+from lab.report.plot.series import Band, Line, time_panel
 from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION
-from lab.targets.page import write_page
+from lab.runs.tables import pose_numbers
+from lab.targets.page import TimeAxis, write_page
 from lab.targets.stereo.frames import annotated_pictures
 from lab.targets.stereo.run import StereoResults, TruthErrors
-from tracking.statuses import PoseStatus
 
 _SENTENCES = (
     "The poses may be used.",
@@ -83,12 +82,8 @@ def _pictures(results: StereoResults) -> Section:
     return Section("Annotated pictures", words, drawings)
 
 
-def _shades(results: StereoResults) -> tuple[Shade, ...]:
-    status = [r.tracked.status for r in results.records]
-    return (
-        Shade(np.array([s is PoseStatus.PREDICTED for s in status]), "predicted", "predicted, not measured"),
-        Shade(np.array([s is PoseStatus.LOST for s in status]), "lost", "lost"),
-    )
+def _axis(results: StereoResults) -> TimeAxis:
+    return TimeAxis(results.t_s, "time (s)", [r.tracked.status for r in results.records])
 
 
 def _poses(results: StereoResults) -> Section:
@@ -97,29 +92,16 @@ def _poses(results: StereoResults) -> Section:
     for i, r in enumerate(results.records):
         if r.tracked.pose is None or r.tracked.covariance is None:
             continue
-        value[i] = [*r.tracked.pose.translation, *np.rad2deg(r.tracked.pose.ypr)]
-        J = rotations.ypr_jacobian(r.tracked.pose.rotation)
-        turned = J @ r.tracked.covariance[3:, 3:] @ J.T
-        sigma[i] = np.sqrt([*np.diagonal(r.tracked.covariance)[:3], *np.diagonal(turned)])
-        sigma[i, 3:] = np.rad2deg(sigma[i, 3:])
-    t = results.t_s
-    drawings = []
+        numbers = pose_numbers(r.tracked.pose, r.tracked.covariance)
+        value[i], sigma[i] = numbers[[0, 1, 2, 7, 8, 9]], numbers[10:]
+    measured = np.array([r.measured for r in results.records])
+    axis, drawings = _axis(results), []
     for k in (0, 3, 1, 4, 2, 5):
         name, unit = (f"{_AXES[k]}", "m") if k < 3 else (("yaw", "pitch", "roll")[k - 3], "deg")
         shown = value[:, k] if k < 3 else _unwrapped(value[:, k])
-        measured = np.array([r.measured for r in results.records])
-        band = np.where(measured, sigma[:, k], np.nan)
-        drawings.append(
-            PageDrawing(
-                time_panel(
-                    t, name, unit,
-                    lines=(Line(shown, BLUE, name),),
-                    bands=(Band.about(shown, band, 3.0, BLUE, "3 sigma"),),
-                    shades=_shades(results),
-                    y_range=padded_range(shown),
-                )
-            )
-        )  # fmt: skip
+        band = Band.about(shown, np.where(measured, sigma[:, k], np.nan), 3.0, BLUE, "3 sigma")
+        line, y_range = Line(shown, BLUE, name), padded_range(shown)
+        drawings.append(axis.panel(name, unit, line, bands=(band,), y_range=y_range, wide=False, height=118))
     words = (
         "Position of the body origin and attitude (Rz(yaw) Ry(pitch) Rx(roll)) in the frame of the pair, with 3 sigma."
         " Shaded: not measured."
@@ -172,26 +154,21 @@ def _sigmas(results: StereoResults, at: Ints) -> Array:
 
 
 def _residuals(results: StereoResults) -> Section:
-    t = results.t_s
-    K = len(results.run.target.model)
-    residuals = np.full((len(t), 2, K, 2), np.nan)
+    n, K = len(results.records), len(results.run.target.model)
+    residuals = np.full((n, 2, K, 2), np.nan)
     for i, fit in enumerate(results.fits):
         if fit is not None:
             residuals[i] = fit.residuals_px
     drawings = []
     for c, camera in enumerate(results.run.pair.cameras):
         seen = np.isfinite(residuals[:, c]).any(axis=(1, 2))
-        rms = np.full((len(t), 2), np.nan)
+        rms = np.full((n, 2), np.nan)
         rms[seen] = np.sqrt(np.nanmean(residuals[seen, c] ** 2, axis=1))
         drawings.append(
-            PageDrawing(
-                time_panel(
-                    t, f"camera {camera.name}: RMS residual of a frame", "px",
-                    lines=(Line(rms[:, 0], BLUE, "u"), Line(rms[:, 1], VERMILLION, "v")),
-                    shades=_shades(results),
-                    y_range=(0.0, max(float(np.nanmax(rms, initial=0.05)) * 1.1, 0.05)),
-                ),
-                "u: blue, v: vermilion",
+            _axis(results).panel(
+                f"camera {camera.name}: RMS residual of a frame", "px", Line(rms[:, 0], BLUE, "u"),
+                Line(rms[:, 1], VERMILLION, "v"), y_range=(0.0, max(float(np.nanmax(rms, initial=0.05)) * 1.1, 0.05)),
+                wide=False, height=118, caption="u: blue, v: vermilion",
             )
         )  # fmt: skip
     rows: list[list[object]] = []
@@ -239,13 +216,9 @@ def _pair(results: StereoResults) -> Section:
         for i, fit in enumerate(results.fits):
             if fit is not None and fit.dof > 0:
                 chi[i] = fit.chi2 / fit.dof
-        t = results.t_s
         top = max(float(np.nanpercentile(chi, 99)) * 1.2, 2.0)
-        panel = time_panel(
-            t, "misfit: chi-square over degrees of freedom; 1 expected", "", lines=(Line(chi, ORANGE, "misfit"),),
-            y_range=(0.0, top), shades=_shades(results), width=1090, height=130,
-        )  # fmt: skip
-        drawings.append(PageDrawing(panel, wide=True))
+        name, line = "misfit: chi-square over degrees of freedom; 1 expected", Line(chi, ORANGE, "misfit")
+        drawings.append(_axis(results).panel(name, "", line, y_range=(0.0, top), height=130))
     return Section("The pair", words, drawings, PageTable(("quantity", "value"), rows))
 
 
