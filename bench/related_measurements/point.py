@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lab.targets.point import PointOptions, track_point
+from lab.targets.point import PointOptions, PointTarget
+from lab.targets.track import track_target
 from studies.duan2020 import FILTERS, QUANTITIES, figures_of, simulate, track
 
 EARTH_RADIUS_M = 6_371_000.0
@@ -56,10 +57,12 @@ def flight(path: Path, seed: int) -> None:
     points["sigma_u_px"] = points["sigma_v_px"] = FLIGHT_NOISE_M
     with tempfile.TemporaryDirectory() as folder:
         points[seen].to_csv(Path(folder) / "points.csv", index=False)
-        outcome = track_point(
+        outcome = track_target(
+            PointTarget(
+                PointOptions(rate_hz=1.0, overrides={"track.max_speed_px": 100.0, "track.lost_sigma_px": 300.0})
+            ),
             Path(folder) / "points.csv",
             Path(folder) / "track",
-            PointOptions(rate_hz=1.0, overrides={"track.max_speed_px": 100.0, "track.lost_sigma_px": 300.0}),
         )
     at = frame - int(outcome.results.recording.numbers[0])
     inside = (at >= 0) & (at < len(outcome.results.frames))
@@ -90,7 +93,7 @@ def video(path: Path, published: Path, limit: int | None) -> None:
             overrides={"track.sigma_model_px": 1.0},
         )
         with tempfile.TemporaryDirectory() as folder:
-            outcome = track_point(path, Path(folder) / "track", options)
+            outcome = track_target(PointTarget(options), path, Path(folder) / "track")
         positions = positions[positions.frame <= len(outcome.results.frames)]
         # The published table counts frames from 1.
         estimates = [outcome.results.frames[int(k) - 1] for k in positions.frame]

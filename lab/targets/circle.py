@@ -17,9 +17,7 @@ from lab.report.plot.series import Line
 from lab.report.plot.svg import BLUE, VERMILLION
 from lab.targets.page import TimeAxis
 from lab.targets.recording import Progress
-from lab.targets.target import Codes, Target, Track, TrackOptions, texts, track_pictures
-from lab.targets.track import quantiles, track_target
-from lab.targets.verdict import Outcome
+from lab.targets.target import Codes, Target, Track, TrackOptions, quantiles, texts, track_pictures
 from tracking.drogue_circle.candidates import CircleDetector
 from tracking.drogue_circle.classical import classical_detector
 from tracking.drogue_circle.frames import CircleFrame
@@ -102,7 +100,7 @@ class CircleTarget(Target[CircleFrame]):
 
     options: CircleOptions
 
-    def __init__(self, options: CircleOptions) -> None:
+    def __init__(self, options: CircleOptions = CircleOptions()) -> None:
         self.options = options
         self.tracker = options.tracker()
 
@@ -191,17 +189,3 @@ def _quality(track: Track[CircleFrame]) -> Array:
     """(n, 3): occlusion coefficient, coverage and RMS of the fit (px); nan where there is none."""
     fits = [(np.nan, np.nan) if f.measured is None else (f.measured.coverage, f.measured.rms_px) for f in track.frames]
     return np.array([(f.occlusion, *fit) for f, fit in zip(track.frames, fits, strict=True)], dtype=float)
-
-
-DEFAULTS = CircleOptions()
-
-
-def track_circle(
-    given: Path,
-    out: Path,
-    options: CircleOptions = DEFAULTS,
-    progress: Progress | None = None,
-    more: Mapping[str, Any] | None = None,
-) -> Outcome[Track[CircleFrame]]:
-    """Track one circle through the pictures of a folder or a video, into the folder `out`: as `track_target`."""
-    return track_target(CircleTarget(options), given, out, progress, more)

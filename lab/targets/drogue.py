@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,9 +18,7 @@ from lab.report.plot.series import Line
 from lab.report.plot.svg import BLUE, VERMILLION
 from lab.targets.page import TimeAxis
 from lab.targets.recording import Progress
-from lab.targets.target import Codes, Target, Track, TrackOptions, texts, track_pictures
-from lab.targets.track import quantiles, track_target
-from lab.targets.verdict import Outcome
+from lab.targets.target import Codes, Target, Track, TrackOptions, quantiles, texts, track_pictures
 from tracking.learned_detector.detector import learned_detector
 from tracking.light_tracker.frames import DrogueFrame, Source
 from tracking.light_tracker.parameters import LightParameters
@@ -74,7 +71,7 @@ class DrogueTarget(Target[DrogueFrame]):
     """A drogue as a whole."""
 
     schema, table, columns = "beampose/drogue/1", "drogue.csv", DROGUE
-    subject, size_name, several = "drogue", "diameter", "several drogues"
+    subject, size_name, size_radii, several = "drogue", "diameter", 2.0, "several drogues"
     codes = Codes(none="BP-G01", few="BP-G02", missing="BP-G03", ambiguous="BP-G04", far="BP-G05")
     far_sizes, far_words = 1.0, "a diameter"
     none_found = "There is no drogue in view, it is larger than the picture, or several are alike."
@@ -90,7 +87,7 @@ class DrogueTarget(Target[DrogueFrame]):
 
     options: DrogueOptions
 
-    def __init__(self, options: DrogueOptions) -> None:
+    def __init__(self, options: DrogueOptions = DrogueOptions()) -> None:
         self.options = options
         self.tracker = options.tracker()
 
@@ -207,17 +204,3 @@ def _checks(track: Track[DrogueFrame]) -> tuple[int, int]:
     """Checks of measured frames by the detector, and those that confirmed the drogue."""
     checked = [f for f in track.frames if f.status is PoseStatus.MEASURED and f.searched and not f.event]
     return len(checked), sum(f.source is Source.BOTH for f in checked)
-
-
-DEFAULTS = DrogueOptions()
-
-
-def track_drogue(
-    given: Path,
-    out: Path,
-    options: DrogueOptions = DEFAULTS,
-    progress: Progress | None = None,
-    more: Mapping[str, Any] | None = None,
-) -> Outcome[Track[DrogueFrame]]:
-    """Track one drogue through the pictures of a folder or a video, into the folder `out`: as `track_target`."""
-    return track_target(DrogueTarget(options), given, out, progress, more)

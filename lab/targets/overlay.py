@@ -49,12 +49,12 @@ def write_overlay(target: Target[F], track: Track[F], folder: Path) -> None:
                 limits = limits or grey_limits(picture)
                 shown = cv2.resize(stretched(picture, *limits), (width, height), interpolation=cv2.INTER_AREA)
                 grey = np.asarray(shown, np.uint8)
-            writer.write(drawn(grey, track, k, np.array([width, height]) / recording.size_px))
+            writer.write(drawn(grey, target, track, k, np.array([width, height]) / recording.size_px))
     finally:
         writer.release()
 
 
-def drawn(grey: NDArray[np.uint8], track: Track[F], k: int, scale: Array) -> NDArray[np.uint8]:
+def drawn(grey: NDArray[np.uint8], target: Target[F], track: Track[F], k: int, scale: Array) -> NDArray[np.uint8]:
     """A picture (h, w) of frame k (from 0) as (h, w, 3), BGR, with the track up to it.
 
     scale: (2,) of the picture, against that of the recording. The outline is a circle of the target's size; of a target
@@ -73,7 +73,8 @@ def drawn(grey: NDArray[np.uint8], track: Track[F], k: int, scale: Array) -> NDA
     now = track.frames[k]
     colour = _COLOURS[now.status]
     if np.isfinite(at[-1]).all():
-        size = places[-1][2] if np.isfinite(places[-1][2]) else max(3 * float(now.sigmas[:2].max()), 4 / scale[0])
+        size = places[-1][2] / target.size_radii
+        size = size if np.isfinite(size) else max(3 * float(now.sigmas[:2].max()), 4 / scale[0])
         centre = round(float(at[-1][0])), round(float(at[-1][1]))
         radius = max(round(float(np.clip(size, 0, 1e5)) * float(scale.mean()) * 2**_SHIFT), 1)
         cv2.circle(image, centre, radius, colour, line, cv2.LINE_AA, _SHIFT)

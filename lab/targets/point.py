@@ -28,15 +28,13 @@ from lab.runs.frames.sensor_noise import CameraNoise
 from lab.targets.page import TimeAxis
 from lab.targets.recording import Progress, colour_frames, grey_frames, header_rate, read_pictures, read_points
 from lab.targets.target import Codes, Target, Track, TrackOptions
-from lab.targets.track import track_target
-from lab.targets.verdict import Outcome, some_frames
+from lab.targets.verdict import some_frames
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import DetectParameters
 from tracking.single_target.blobs import find_blobs
 from tracking.single_target.colour import HUES, find_coloured, has_colour, hue_of
 from tracking.single_target.parameters import BlobParameters, PointParameters
-from tracking.single_target.point_tracker import PointEstimate
-from tracking.single_target.point_tracker import track_point as track_point_in
+from tracking.single_target.point_tracker import PointEstimate, track_point
 from tracking.statuses import Cause, PoseStatus
 
 COLOUR = "colour"
@@ -163,7 +161,7 @@ class PointTarget(Target[PointFrame]):
     }
     options: PointOptions
 
-    def __init__(self, options: PointOptions) -> None:
+    def __init__(self, options: PointOptions = PointOptions()) -> None:
         self.options, self.settings = options, options.settings()
         self.least_measured = options.min_measured
         self.detector = options.detector
@@ -195,7 +193,7 @@ class PointTarget(Target[PointFrame]):
                 t_s = (recording.numbers - recording.numbers[0]) / recording.rate_hz
                 recording = replace(recording, t_s=t_s)
         begun = time.process_time()
-        track = track_point_in(recording.steps, found, self.settings.track)
+        track = track_point(recording.steps, found, self.settings.track)
         tracking_s = detection_s + time.process_time() - begun
         together = zip(track, found, _events(track), strict=True)
         return Track(recording, [PointFrame(*each) for each in together], tracking_s)
@@ -361,17 +359,3 @@ def _similar(track: Track[PointFrame]) -> float:
         bright = np.delete(fluxes, row) >= SIMILAR_FLUX * fluxes[row]
         others += bool(bright.any()) if np.isfinite(fluxes[row]) else f.found > 1
     return others / max(measured, 1)
-
-
-DEFAULTS = PointOptions()
-
-
-def track_point(
-    path: Path,
-    out: Path,
-    options: PointOptions = DEFAULTS,
-    progress: Progress | None = None,
-    more: Mapping[str, Any] | None = None,
-) -> Outcome[Track[PointFrame]]:
-    """Track one target through pictures, a video or a table, into the folder `out`: as `track_target`."""
-    return track_target(PointTarget(options), path, out, progress, more)

@@ -122,6 +122,7 @@ class Target(ABC, Generic[F]):
     columns: ClassVar[tuple[str, ...]]
     subject: ClassVar[str]  # such as circle
     size_name: ClassVar[str] = ""  # of the third number of a place; empty: a point has none
+    size_radii: ClassVar[float] = 1.0  # that number, in radii of the outline
     several: ClassVar[str] = ""  # what an ambiguous frame shows
     overlay_name: ClassVar[str] = "overlay.avi"
     codes: ClassVar[Codes]
@@ -191,3 +192,11 @@ def track_pictures(
 def texts(values: Iterable[float], decimals: int = 4) -> list[str]:
     """Fields of a table; empty for nan. Four decimals of a pixel are as many as a measurement resolves."""
     return [f"{v:.{decimals}f}" if np.isfinite(v) else "" for v in values]
+
+
+def quantiles(values: Array) -> dict[str, float] | None:
+    """5 %, median and 95 % of the finite values; None without one."""
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return None
+    return dict(zip(("p5", "median", "p95"), np.percentile(values, [5, 50, 95]).tolist(), strict=True))

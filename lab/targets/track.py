@@ -7,10 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from calibration.findings import Finding
-from geometry.arrays import Array
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import write_table
@@ -82,11 +79,3 @@ def _summary(target: Target[F], track: Track[F], findings: Sequence[Finding], wa
     for name, value in target.figures(track).items():
         content[name] = {**content.get(name, {}), **value} if isinstance(value, Mapping) else value
     return content
-
-
-def quantiles(values: Array) -> dict[str, float] | None:
-    """5 %, median and 95 % of the finite values; None without one."""
-    values = values[np.isfinite(values)]
-    if not len(values):
-        return None
-    return dict(zip(("p5", "median", "p95"), np.percentile(values, [5, 50, 95]).tolist(), strict=True))

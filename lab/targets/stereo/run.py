@@ -188,7 +188,6 @@ class TruthErrors:
     deltas: Array  # (n, 6): truth minus estimate, section 1 of the file contract
     nees: Array  # (n,)
     range_m: Array  # (n,): estimated minus true distance of the body origin from the left camera
-    true_range_m: Array  # (n,)
 
     def as_mapping(self) -> dict[str, float | int]:
         """Figures for summary.json."""
@@ -246,7 +245,7 @@ def truth_errors(records: Sequence[StereoRecord], run: StereoRun, frames: Array,
     if not shared:
         return None
     eye = run.pair.cameras[0].camera_from_world.inverse().translation
-    deltas, nees, apart, far = [], [], [], []
+    deltas, nees, apart = [], [], []
     for r in shared:
         assert r.tracked.pose is not None
         assert r.tracked.covariance is not None
@@ -254,7 +253,7 @@ def truth_errors(records: Sequence[StereoRecord], run: StereoRun, frames: Array,
         delta = true.minus(r.tracked.pose)
         deltas.append(delta)
         nees.append(float(delta @ np.linalg.solve(r.tracked.covariance, delta)))
-        far.append(float(np.linalg.norm(true.translation - eye)))
-        apart.append(float(np.linalg.norm(r.tracked.pose.translation - eye)) - far[-1])
+        far = float(np.linalg.norm(true.translation - eye))
+        apart.append(float(np.linalg.norm(r.tracked.pose.translation - eye)) - far)
     numbers = np.array([r.frame for r in shared])
-    return TruthErrors(numbers, np.array(deltas), np.array(nees), np.array(apart), np.array(far))
+    return TruthErrors(numbers, np.array(deltas), np.array(nees), np.array(apart))

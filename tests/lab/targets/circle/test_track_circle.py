@@ -13,7 +13,8 @@ from click.testing import CliRunner, Result
 
 from cli import main
 from lab.errors import InputError
-from lab.targets.circle import CIRCLE, DETECTORS, FORMS, CircleOptions, track_circle
+from lab.targets.circle import CIRCLE, DETECTORS, FORMS, CircleOptions, CircleTarget
+from lab.targets.track import track_target
 from tests.tracking.drogue_circle.discs import discs
 
 SIZE = (128, 96)
@@ -86,14 +87,14 @@ def test_a_folder_of_pictures_gives_all_files(folder, tmp_path):
 
 def test_a_video_has_its_own_rate_and_the_same_circle(tmp_path):
     file = video(tmp_path / "drogue.avi", [picture(k) for k in range(6)])
-    outcome = track_circle(file, tmp_path / "out")
+    outcome = track_target(CircleTarget(), file, tmp_path / "out")
     assert (outcome.frames, outcome.measured, outcome.exit_status) == (6, 6, 0)
     assert float(rows(tmp_path / "out")[5]["t_s"]) == pytest.approx(0.1)
     assert not (tmp_path / "out" / "overlay.avi").exists()
 
 
 def test_the_printed_form_is_another_tracker(folder, tmp_path):
-    track_circle(folder, tmp_path / "out", CircleOptions(form="printed"))
+    track_target(CircleTarget(CircleOptions(form="printed")), folder, tmp_path / "out")
     table = rows(tmp_path / "out")
     assert table[3]["measured_u_px"] == ""  # whole pixels, without a fit
     assert abs(float(table[3]["u_px"]) - place(3)[0]) < 4
@@ -119,7 +120,7 @@ def test_without_one_clear_circle_the_quality_gate_fails(tmp_path, circles, caus
 
 
 def test_an_empty_or_broken_video_is_one_line_and_leaves_the_results(tmp_path):
-    track_circle(video(tmp_path / "good.avi", [picture(0), picture(1)]), tmp_path / "out")
+    track_target(CircleTarget(), video(tmp_path / "good.avi", [picture(0), picture(1)]), tmp_path / "out")
     before = (tmp_path / "out" / "circle.csv").read_bytes()
     for name, content in (("empty.avi", b""), ("broken.avi", b"RIFF\0\0\0\0AVI " + bytes(200)), ("text.mp4", b"hello")):
         (tmp_path / name).write_bytes(content)
@@ -160,7 +161,7 @@ def test_a_missing_input_and_a_folder_of_something_else_are_refused(tmp_path, fo
     (tmp_path / "kept").mkdir()
     (tmp_path / "kept" / "thesis.txt").write_text("mine")
     with pytest.raises(InputError, match="something other than earlier results"):
-        track_circle(folder, tmp_path / "kept")
+        track_target(CircleTarget(), folder, tmp_path / "kept")
 
 
 def test_the_command_offers_the_detectors_and_forms_that_exist():
