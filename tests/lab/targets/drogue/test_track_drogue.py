@@ -149,18 +149,6 @@ def test_of_a_drogue_larger_than_the_picture_no_wrong_place_is_reported(tmp_path
     assert done.exit_code == (0 if len(places) == 3 else 4)
 
 
-def test_an_empty_or_broken_video_is_one_line_and_leaves_the_results(tmp_path, pictures):
-    track_target(DrogueTarget(), video(tmp_path / "good.avi", pictures[:2]), tmp_path / "out")
-    before = (tmp_path / "out" / "drogue.csv").read_bytes()
-    for name, content in (("empty.avi", b""), ("broken.avi", b"RIFF\0\0\0\0AVI " + bytes(200)), ("text.mp4", b"hello")):
-        (tmp_path / name).write_bytes(content)
-        done = typed(tmp_path / name, "--out", tmp_path / "out")
-        assert done.exit_code == 2
-        assert len(done.output.strip().splitlines()) == 1
-        assert name in done.output
-    assert (tmp_path / "out" / "drogue.csv").read_bytes() == before
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -12,7 +12,6 @@ from click.testing import CliRunner
 
 from calibration.findings import Level, verdict
 from cli import main
-from lab.errors import InputError
 from lab.targets.point import COLUMNS, PointOptions, PointTarget
 from lab.targets.track import track_target
 from studies.duan2020 import compare_duan2020
@@ -178,13 +177,6 @@ def test_an_option_that_cannot_be_used_is_exit_status_2(folder, tmp_path, argume
     assert words in done.stderr
 
 
-@pytest.mark.parametrize("name", ["empty.mp4", "broken.mp4"])
-def test_a_broken_video_is_one_plain_line(tmp_path, name):
-    (tmp_path / name).write_bytes(b"" if name == "empty.mp4" else b"not a video" * 100)
-    with pytest.raises(InputError, match="expected a picture"):
-        track_target(PointTarget(), tmp_path / name, tmp_path / "out")
-
-
 def test_the_study_shows_why_a_gate_is_needed():
     study = compare_duan2020(seed=2, scenes=2)
     hidden = "largest error, 20 hidden frames, with false detections"
@@ -257,16 +249,6 @@ def test_a_target_of_another_colour_is_lost_and_never_reported(tmp_path):
     options = PointOptions("colour", rate_hz=25.0, colour="blue")
     assert track_target(PointTarget(options), source, tmp_path / "out").exit_status == 4
     assert {r["status"] for r in rows_of(tmp_path / "out")} == {"lost"}
-
-
-def test_pictures_of_another_size_than_the_first_are_no_pictures_of_the_recording(tmp_path):
-    source = tmp_path / "disc"
-    source.mkdir()
-    for k in range(12):
-        cv2.imwrite(str(source / f"{k:04d}.png"), picture(k)[: 100 if k in (5, 6) else None])
-    outcome = track_target(PointTarget(PointOptions("darker", rate_hz=50.0)), source, tmp_path / "out")
-    assert [k for k, r in enumerate(rows_of(tmp_path / "out")) if r["status"] != "measured"] == [5, 6]
-    assert outcome.results.recording.missing == {"another size: 160x100 px, the first picture has 160x120": 2}
 
 
 def test_a_video_that_ends_early_is_noted(tmp_path):
