@@ -52,10 +52,18 @@ def test_every_finding_that_may_be_a_warning_has_a_code():
     assert [wrong for name, text in sources() for wrong in without_code(name, text)] == []
 
 
-@pytest.mark.parametrize("call", ["Finding(Level.WARN, 'x')", "unless_pass(level, 'x', 'y', 'z', code=other)"])
+@pytest.mark.parametrize(
+    "call",
+    [
+        "Finding(Level.WARN, 'x')",
+        "unless_pass(level, 'x', 'y', 'z', code=other)",
+        "Finding(Level.WARN, 'x', code=self.other)",
+    ],
+)
 def test_a_finding_without_a_code_is_found(call):
     assert without_code("here.py", call) == ["here.py:1"]
     assert without_code("here.py", "Finding(Level.PASS, 'x')\nFinding(Level.FAIL, 'x', code='BP-B01')") == []
+    assert without_code("here.py", "Finding(Level.WARN, 'x', code=target.codes.few)") == []
 
 
 def test_every_code_in_use_is_explained_and_every_explained_code_is_in_use():
