@@ -1,4 +1,4 @@
-"""The statuses of spots and poses with their meanings. The report and the documentation read them from here."""
+"""The statuses of spots, poses and targets with their meanings, which report and documentation read here."""
 
 from __future__ import annotations
 
@@ -56,6 +56,35 @@ class PoseStatus(StrEnum):
         """One sentence for the user."""
         return _POSE_MEANINGS[self]
 
+
+class Cause(StrEnum):
+    """Why a frame has no measured target of one camera (a circle, a drogue, a point); empty where it has one."""
+
+    NONE = ""
+    NO_IMAGE = "no_image"
+    OCCLUDED = "occluded"
+    NOT_FOUND = "not_found"
+    NO_MATCH = "no_match"
+    UNCERTAIN = "uncertain"
+    AMBIGUOUS = "ambiguous"
+    OUT_OF_VIEW = "out_of_view"
+
+    @property
+    def meaning(self) -> str:
+        """One sentence for the user."""
+        return _CAUSE_MEANINGS[self]
+
+
+_CAUSE_MEANINGS = {
+    Cause.NONE: "the target is measured",
+    Cause.NO_IMAGE: "there is no usable picture",
+    Cause.OCCLUDED: "half of the target or more is hidden",
+    Cause.NOT_FOUND: "nothing in the picture is found that can be the target",
+    Cause.NO_MATCH: "nothing in the window looks like the target: it is hidden or moved away",
+    Cause.UNCERTAIN: "the match has a low confidence",
+    Cause.AMBIGUOUS: "several targets fit equally well",
+    Cause.OUT_OF_VIEW: "the predicted centre is outside the picture",
+}
 
 _SPOT_MEANINGS = {
     SpotStatus.MATCHED: "a detection of this image has this spot's label",

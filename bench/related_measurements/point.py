@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lab.targets.track_point import PointOptions, track_target
+from lab.targets.point import PointOptions, PointTarget
+from lab.targets.track import track_target
 from studies.duan2020 import FILTERS, QUANTITIES, figures_of, simulate, track
 
 EARTH_RADIUS_M = 6_371_000.0
@@ -57,14 +58,17 @@ def flight(path: Path, seed: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         points[seen].to_csv(Path(folder) / "points.csv", index=False)
         outcome = track_target(
+            PointTarget(
+                PointOptions(rate_hz=1.0, overrides={"track.max_speed_px": 100.0, "track.lost_sigma_px": 300.0})
+            ),
             Path(folder) / "points.csv",
             Path(folder) / "track",
-            PointOptions(rate_hz=1.0, overrides={"track.max_speed_px": 100.0, "track.lost_sigma_px": 300.0}),
         )
-    at = frame - int(outcome.recording.frames[0])
-    inside = (at >= 0) & (at < len(outcome.track))
-    e = np.array([np.linalg.norm(outcome.track[k].x[:2] - truth[i]) for i, k in enumerate(at) if inside[i]])
-    words = np.array([outcome.track[k].status.value for k in at[inside]])
+    at = frame - int(outcome.results.recording.numbers[0])
+    inside = (at >= 0) & (at < len(outcome.results.frames))
+    frames = [outcome.results.frames[k] for k in at[inside]]
+    e = np.array([np.linalg.norm(f.place[:2] - true) for f, true in zip(frames, truth[inside], strict=True)])
+    words = np.array([f.status.value for f in frames])
     speed = np.linalg.norm(np.diff(truth, axis=0), axis=1)
     print(outcome.line().partition(" ->")[0])
     print(f"flight: {len(frame)} s, median speed {np.median(speed):.1f} m/s, {FLIGHT_NOISE_M:g} m noise per coordinate")
@@ -89,11 +93,11 @@ def video(path: Path, published: Path, limit: int | None) -> None:
             overrides={"track.sigma_model_px": 1.0},
         )
         with tempfile.TemporaryDirectory() as folder:
-            outcome = track_target(path, Path(folder) / "track", options)
-        positions = positions[positions.frame <= len(outcome.track)]
+            outcome = track_target(PointTarget(options), path, Path(folder) / "track")
+        positions = positions[positions.frame <= len(outcome.results.frames)]
         # The published table counts frames from 1.
-        estimates = [outcome.track[int(k) - 1] for k in positions.frame]
-        difference = np.array([e.x[:2] for e in estimates]) - positions[["pos_x", "pos_y"]].to_numpy()
+        estimates = [outcome.results.frames[int(k) - 1] for k in positions.frame]
+        difference = np.array([e.place[:2] for e in estimates]) - positions[["pos_x", "pos_y"]].to_numpy()
         known = np.isfinite(difference[:, 0])
         named = f"  target {name}: {known.sum()} of {len(positions)} published frames have a position"
         distance = np.linalg.norm(difference[known], axis=1)

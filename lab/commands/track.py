@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, Commands, NumberRange, conclude, progress_bar, read_settings
+from lab.commands.common import (
+    ANY_PATH,
+    FOLDER,
+    Commands,
+    NumberRange,
+    conclude,
+    progress_bar,
+    provenance,
+    read_settings,
+)
+
+if TYPE_CHECKING:
+    from lab.targets.target import Target
 
 _PIXEL = NumberRange(-1e6, 1e6)
 
@@ -20,6 +32,15 @@ def track() -> None:
     Example:
         beampose track circle drogue.avi --out results/drogue
     """
+
+
+def _track(ctx: click.Context, target: Target[Any], given: Path, out: Path) -> None:
+    """Track a target and show the outcome."""
+    from lab.targets.track import track_target
+
+    with progress_bar(given.name) as progress:
+        outcome = track_target(target, given, out, progress, provenance(ctx))
+    conclude(outcome)
 
 
 @track.command()
@@ -70,13 +91,10 @@ def circle(
     Example:
         beampose track circle drogue.avi --out results/drogue --video
     """
-    from lab.commands.common import provenance
-    from lab.targets.circle import CircleOptions, track_circle
+    from lab.targets.circle import CircleOptions, CircleTarget
 
-    options = CircleOptions(near, min_radius, max_radius, rate, form, detector, video, limit)
-    with progress_bar(pictures.name) as progress:
-        outcome = track_circle(pictures, out, options, progress, provenance(ctx))
-    conclude(outcome)
+    options = CircleOptions(near, min_radius, max_radius, form, detector, rate_hz=rate, overlay=video, limit=limit)
+    _track(ctx, CircleTarget(options), pictures, out)
 
 
 # `beampose track drogue`: a refuelling drogue, by the learned detector and the light tracker.
@@ -127,13 +145,10 @@ def drogue(
     Example:
         beampose track drogue drogue.avi --out results/drogue --video
     """
-    from lab.commands.common import provenance
-    from lab.targets.drogue import DrogueOptions, track_drogue
+    from lab.targets.drogue import DrogueOptions, DrogueTarget
 
-    options = DrogueOptions(near, every, min_diameter, max_diameter, rate, video, limit)
-    with progress_bar(pictures.name) as progress:
-        outcome = track_drogue(pictures, out, options, progress, provenance(ctx))
-    conclude(outcome)
+    options = DrogueOptions(near, every, min_diameter, max_diameter, rate_hz=rate, overlay=video, limit=limit)
+    _track(ctx, DrogueTarget(options), pictures, out)
 
 
 # `beampose track point`: the centre of one target.
@@ -188,7 +203,9 @@ def _place(ctx: click.Context, parameter: click.Parameter, value: str | None) ->
     callback=read_settings,
     help="A parameter, e.g. --set track.sigma_model_px=0.5, detect.threshold_sigma=5 or blobs.max_size_px=100.",
 )
+@click.pass_context
 def point(
+    ctx: click.Context,
     source: Path,
     out: Path,
     detector: str,
@@ -210,12 +227,12 @@ def point(
     Example:
         beampose track point sample_runs/huo2015/frames/left --out results/point
     """
-    from lab.targets.track_point import PointOptions, track_target
+    from lab.targets.point import PointOptions, PointTarget
 
-    options = PointOptions(detector, start, frame_rate, camera, limit, min_measured, overlay, settings, colour)
-    with progress_bar("pictures") as progress:
-        outcome = track_target(source, out, options, progress)
-    conclude(outcome)
+    options = PointOptions(
+        detector, start, camera, min_measured, settings, colour, rate_hz=frame_rate, overlay=overlay, limit=limit
+    )
+    _track(ctx, PointTarget(options), source, out)
 
 
 # `beampose stereo`: the pose of a target with coloured markers from a pair of cameras.

@@ -1,21 +1,36 @@
-"""report.html of a tracked target: what the pages of all trackers have."""
+"""report.html of a target: the page of verdict, key figures and sections, and what all targets in one camera show."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+
+import numpy as np
 
 from calibration.findings import Finding, Level, verdict
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array
 from lab.files.text.atomic_write import atomic_write_text
-from lab.number_format import format_percent
+from lab.number_format import format_number, format_percent
 from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section, section_context
 from lab.report.html import environment
-from lab.report.plot.axes import BLUE, VERMILLION, axes, dots, frame, image_area, line_path, note, svg_of
-from lab.report.plot.series import Shade
-from lab.targets.series import WORDS, F, FrameSeries
+from lab.report.plot.axes import (
+    BLUE,
+    SKY,
+    VERMILLION,
+    axes,
+    dots,
+    frame,
+    image_area,
+    line_path,
+    note,
+    padded_range,
+    plot_area,
+    svg_of,
+)
+from lab.report.plot.series import Band, Line, Shade, time_panel
+from lab.targets.target import F, Target, Track
+from lab.targets.verdict import WORDS
 from lab.versions import versions
 from tracking.statuses import PoseStatus
 
@@ -25,49 +40,36 @@ _EVENTS = {
     "lost": "lost: the prediction is too uncertain",
 }
 _MOST_EVENTS = 60  # rows of the table
+_MOST_DOTS = 6000
 
 
-@dataclass(frozen=True, slots=True)
-class Words:
-    """What the target is called."""
-
-    subject: str  # such as "circle"
-    targets: str  # name of the number of targets of an event
-    ambiguous: str  # meaning of that event
-    cause: Callable[[str], str]  # meaning of a cause
-
-
-def write_target_page(
-    series: FrameSeries[F],
+def write_page(
+    folder: Path,
+    maker: str,
+    name: str,
+    source: Path,
     findings: Sequence[Finding],
-    words: Words,
+    sentences: tuple[str, str, str],
     key_figures: Sequence[tuple[str, str, str]],
+    notes: Sequence[str],
     sections: Sequence[Section],
     method: str,
-    folder: Path,
 ) -> Path:
-    """Write report.html into a folder. Returns its path."""
-    level = verdict(findings)
-    own = versions()
-    sentences = {
-        Level.PASS: f"The {words.subject} was followed.",
-        Level.WARN: f"The {words.subject} was followed; note the warnings below.",
-        Level.FAIL: "The results must not be used as they are.",
-    }
-    context: dict[str, Any] = {
-        "subject": words.subject,
-        "name": series.name,
-        "source": series.source,
-        "word": WORDS[level].upper(),
+    """Write report.html into a folder. Returns its path.
+
+    maker: what the results are, such as "tracked circle"; sentences: of a verdict PASS, CHECK and FAIL.
+    """
+    level, own = verdict(findings), versions()
+    context = {
+        "maker": maker,
+        "name": name,
+        "source": str(source),
         "status": WORDS[level],
         "sentence": sentences[level],
-        "findings": [
-            {"status": WORDS[f.level], "what": f.what, "why": f.why, "remedy": f.remedy, "code": f.code}
-            for f in findings
-        ],
-        "key_figures": [measured_figure(series), *key_figures],
-        "notes": series.notes,
-        "sections": [section_context(s) for s in (*sections, *event_sections(series, words))],
+        "findings": [(WORDS[f.level], f) for f in findings],
+        "key_figures": key_figures,
+        "notes": notes,
+        "sections": [section_context(s) for s in sections],
         "made": [
             ("method", method),
             ("beampose", f"{own['beampose']}, numpy {own['numpy']}, OpenCV {own['opencv-python-headless']}"),
@@ -78,49 +80,124 @@ def write_target_page(
     return path
 
 
-def measured_figure(series: FrameSeries[F]) -> tuple[str, str, str]:
-    """The share of measured frames."""
-    counts, n = series.statuses(), len(series.frames)
+def write_target_page(target: Target[F], track: Track[F], findings: Sequence[Finding], folder: Path) -> Path:
+    """Write the page of a target in one camera into a folder. Returns its path."""
+    sentences = {
+        Level.PASS: f"The {target.subject} was followed.",
+        Level.WARN: f"The {target.subject} was followed; note the warnings below.",
+        Level.FAIL: "The results must not be used as they are.",
+    }
+    own = target.key_figures(track) if track.measured.any() else []
+    sections = [_motion(target, track), *target.sections(track), *_path(track), *_events(target, track)]
+    recording = track.recording
+    return write_page(
+        folder, f"tracked {target.subject}", recording.name, recording.path, findings,
+        (sentences[Level.PASS], sentences[Level.WARN], sentences[Level.FAIL]), [*_key_figures(target, track), *own],
+        recording.notes, sections, target.method(),
+    )  # fmt: skip
+
+
+def _key_figures(target: Target[F], track: Track[F]) -> list[tuple[str, str, str]]:
+    """The share of measured frames, and the sigma and the size in them."""
+    counts, n, measured = track.statuses(), len(track.frames), track.measured
     of = f"{counts['measured']} of {n} frames; {counts['predicted']} predicted, {counts['lost']} lost"
-    return "Measured", format_percent(counts["measured"] / n), of
+    out = [("Measured", format_percent(counts["measured"] / n), of)]
+    if measured.any():
+        sigma = np.median(track.sigmas[measured], axis=0)
+        centre = f"± {format_number(float(np.hypot(*sigma[:2])), 2)} px"
+        out.append(("Centre", centre, "median sigma, both axes together"))
+        if target.size_name:
+            size = track.places[measured, 2]
+            span = f"{size.min():.1f} to {size.max():.1f} px"
+            out.append((target.size_name.capitalize(), f"{format_number(float(np.median(size)))} px", span))
+    return out
 
 
-def status_shades(series: FrameSeries[F]) -> tuple[Shade, ...]:
-    """Shades of the frames that are not measured."""
-    return tuple(
-        Shade(series.has_status(status), status.value, status.value)
-        for status in (PoseStatus.PREDICTED, PoseStatus.LOST)
-        if series.has_status(status).any()
+@dataclass(frozen=True, slots=True)
+class TimeAxis:
+    """The time axis of the n frames of a page; frames without a measurement are shaded in its plots."""
+
+    t: Array  # (n,)
+    name: str
+    statuses: Sequence[PoseStatus]
+
+    @classmethod
+    def of(cls, track: Track[F]) -> TimeAxis:
+        """Times, or frame numbers where the rate is not known."""
+        t_s, statuses = track.recording.t_s, [f.status for f in track.frames]
+        if t_s is None:
+            return cls(track.recording.numbers.astype(float), "frame", statuses)
+        return cls(t_s, "time (s)", statuses)
+
+    def panel(
+        self,
+        title: str,
+        unit: str,
+        *lines: Line,
+        bands: tuple[Band, ...] = (),
+        y_range: tuple[float, float] | None = None,
+        wide: bool = True,
+        height: int = 140,
+        caption: str = "",
+    ) -> PageDrawing:
+        """Lines (n,) over time. wide: as the page; else half as wide."""
+        at = {s: np.array([status is s for status in self.statuses]) for s in (PoseStatus.PREDICTED, PoseStatus.LOST)}
+        drawing = time_panel(
+            self.t, title, unit, lines=lines, bands=bands, y_range=y_range, width=1100 if wide else 540, height=height,
+            shades=tuple(Shade(where, status.value, status.value) for status, where in at.items() if where.any()),
+            time_name=self.name,
+        )  # fmt: skip
+        return PageDrawing(drawing, caption, wide)
+
+
+def _motion(target: Target[F], track: Track[F]) -> Section:
+    names = ["u of the centre", "v of the centre", *([target.size_name] if target.size_name else [])]
+    panels, axis = [], TimeAxis.of(track)
+    for i, name in enumerate(names):
+        values = track.places[:, i]
+        band = Band.about(values, track.sigmas[:, i], 3.0, SKY, "3 sigma", 0.5)
+        panels.append(axis.panel(name, "px", Line(values, BLUE, name), bands=(band,), height=150))
+    words = (
+        "Place after each frame, with a band of 3 sigma. Shaded: frames without a measurement (predicted), and frames"
+        " in which nothing is known (lost)."
     )
+    return Section(f"Position{f' and {target.size_name}' if target.size_name else ''}", words, panels)
 
 
-def path_section(size_px: tuple[int, int] | None, uv_px: Array, predicted: Bools) -> Section:
-    """The path (n, 2) of a centre in the picture, with the predicted frames (n,) as dots."""
-    assert size_px is not None  # there is a usable picture
-    p = image_area(size_px)
+def _path(track: Track[F]) -> list[Section]:
+    """The path of the centre in the picture, with the predicted frames as dots."""
+    uv, predicted = track.places[:, :2], track.has_status(PoseStatus.PREDICTED)
+    known = np.isfinite(uv[:, 0])
+    if not known.any():
+        return []
+    if track.recording.size_px is not None:
+        p = image_area(track.recording.size_px)
+    else:
+        ranges = [padded_range(uv[known, i]) for i in range(2)]
+        half = 0.5 * max(*(high - low for low, high in ranges), 1.0)
+        (u0, u1), (v0, v1) = ((low + high) / 2 + np.array([-half, half]) for low, high in ranges)
+        p = plot_area((u0, u1), (v0, v1), equal=True, y_down=True)
     out = axes(p, "Path of the centre", "u (px)", "v (px)", grid=False)
-    at = p.at(uv_px)
+    at = p.at(uv)
     out.append(f'<path d="{line_path(at[:, 0], at[:, 1])}" fill="none" stroke="{BLUE}" stroke-width="1.1"/>')
     if predicted.any():
-        out.append(f'<path d="{dots(p.at(uv_px[predicted]), 1.8)}" fill="{VERMILLION}"/>')
+        some = at[predicted][:: 1 + int(predicted.sum()) // _MOST_DOTS]
+        out.append(f'<path d="{dots(some, 1.8)}" fill="{VERMILLION}"/>')
     out.append(note(p, "line: all frames; dots: predicted ones"))
-    return Section("Path", (), [PageDrawing(svg_of(p, "Path of the centre", [*out, frame(p)]))])
+    return [Section("Path", (), [PageDrawing(svg_of(p, "Path of the centre", [*out, frame(p)]))])]
 
 
-def event_sections(series: FrameSeries[F], words: Words) -> list[Section]:
+def _events(target: Target[F], track: Track[F]) -> list[Section]:
     """Tables of the events and of the causes of frames without a measurement."""
     sections = []
-    meanings = {**_EVENTS, "ambiguous": words.ambiguous}
-    rows = [
-        [e["frame"], meanings.get(str(e["kind"]), str(e["kind"])), e[words.targets] or None]
-        for e in series.events(words.targets)
-    ]
+    meanings = {**_EVENTS, "ambiguous": f"{target.several}; none is chosen"}
+    rows = [(number, meanings[f.event], f.found or None) for number, f in track.events()]
     if rows:
         more = f"The first {_MOST_EVENTS} of {len(rows)}." if len(rows) > _MOST_EVENTS else ()
-        table = PageTable(("frame", "event", f"{words.subject}s in the picture"), rows[:_MOST_EVENTS])
+        table = PageTable(("frame", "event", f"{target.subject}s in the picture"), rows[:_MOST_EVENTS])
         sections.append(Section("Events", more, (), table))
-    causes = series.causes()
+    causes = [(cause.value, count, cause.meaning) for cause, count in track.causes().items()]
     if causes:
-        table = PageTable(("cause", "frames", "meaning"), [[c, n, words.cause(c)] for c, n in causes.items()])
+        table = PageTable(("cause", "frames", "meaning"), causes)
         sections.append(Section("Frames without a measurement", (), (), table))
     return sections

@@ -1,71 +1,143 @@
-"""What the verdicts of all trackers of one target judge alike; the findings and their codes are the tracker's own."""
+"""The verdict on a tracked target: the findings that all kinds share, and the outcome of a call."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from calibration.findings import Level
-from geometry.arrays import Array
-from lab.targets.series import F, FrameSeries
-from tracking.statuses import PoseStatus
+from calibration.findings import Finding, Level, unless_pass, verdict
+from lab.errors import QUALITY_GATE_FAILED
+from lab.targets.target import F, Target, Track
+from tracking.statuses import Cause
 
-# With a smaller measured share, the tracker may have followed something else in the other frames.
-LEAST_MEASURED = 0.5
 GOOD_MEASURED = 0.95  # a smaller share is reported with its causes
-WHY_MEASURED_MATTERS = "Predicted positions have growing sigmas; lost frames have none."
+WORDS = {Level.PASS: "pass", Level.WARN: "check", Level.FAIL: "fail"}
+R = TypeVar("R")
 
 
-class MeasuredShare(NamedTuple):
-    """What the measured frames say."""
-
-    level: Level
-    what: str
-    remedy: str  # of the most frequent cause
-    none: bool  # no frame is measured
+def exit_status(findings: Sequence[Finding]) -> int:
+    """0, or 4 where a quality gate failed."""
+    return QUALITY_GATE_FAILED if verdict(findings) is Level.FAIL else 0
 
 
-def measured_share(series: FrameSeries[F], subject: str, remedies: Mapping[str, str]) -> MeasuredShare:
-    """The share of measured frames against its limits. remedies: by cause."""
-    measured = int(series.has_status(PoseStatus.MEASURED).sum())
-    causes = series.causes()
-    share = measured / max(len(series.frames), 1)
-    remedy = remedies[next(iter(causes))] if causes else ""
+def reasons(findings: Sequence[Finding]) -> list[str]:
+    """The texts of warnings and failures."""
+    return [f.what for f in findings if f.level > Level.PASS]
+
+
+def verdict_block(findings: Sequence[Finding]) -> dict[str, Any]:
+    """The block `verdict` of summary.json."""
+    return {
+        "status": WORDS[verdict(findings)],
+        "reasons": reasons(findings),
+        "exit_status": exit_status(findings),
+        "evidence": [
+            {"code": f.code, "level": WORDS[f.level], "what": f.what, "why": f.why, "remedy": f.remedy}
+            for f in findings
+        ],
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome(Generic[R]):
+    """The outcome of one call: the results R of a target in one camera or in two."""
+
+    name: str
+    out: Path
+    frames: int
+    measured: int
+    findings: tuple[Finding, ...]  # failures first
+    results: R
+    errors: str = ""  # against truth, in words
+
+    @property
+    def exit_status(self) -> int:
+        """0, or 4 where a quality gate failed."""
+        return exit_status(self.findings)
+
+    def line(self) -> str:
+        """One line for the command line; where a gate failed, with the remedy."""
+        level = verdict(self.findings)
+        texts = "; ".join([*reasons(self.findings), *([self.errors] if self.errors else [])])
+        return (
+            f"{self.name}: {WORDS[level].upper()}: {self.measured} of {self.frames} frames measured"
+            f"{f' ({texts})' if texts else ''}{f' {self.findings[0].remedy}' if level is Level.FAIL else ''}"
+            f" -> {self.out}"
+        )
+
+
+def findings_of(target: Target[F], track: Track[F]) -> tuple[Finding, ...]:
+    """All findings, failures first."""
+    found = [
+        _measured(target, track),
+        *_ambiguous(target, track),
+        *_far_away(target, track),
+        *target.findings(track),
+        *_missing(target, track),
+    ]
+    return tuple(sorted(found, key=lambda f: -f.level))
+
+
+def _measured(target: Target[F], track: Track[F]) -> Finding:
+    measured, n, causes = int(track.measured.sum()), len(track.frames), track.causes()
+    share, least = measured / n, target.least_measured
+    remedy = target.remedies[next(iter(causes))] if causes else ""
     of_others = ", ".join(f"{count} {cause}" for cause, count in list(causes.items())[:3])
-    if measured == 0:
-        what = f"no {subject} was found in {len(series.frames)} frames ({of_others})"
-        return MeasuredShare(Level.FAIL, what, remedy, none=True)
-    what = f"{measured} of {len(series.frames)} frames ({share:.1%}) have a measured {subject}"
-    if share >= GOOD_MEASURED:
-        return MeasuredShare(Level.PASS, what, remedy, none=False)
-    what += f" (gate: {LEAST_MEASURED:.0%}; usual: {GOOD_MEASURED:.0%} and more); of the others {of_others}"
-    return MeasuredShare(Level.FAIL if share < LEAST_MEASURED else Level.WARN, what, remedy, none=False)
+    if not measured:
+        what = f"no {target.subject} was found in {n} frames ({of_others})"
+        return Finding(Level.FAIL, what, target.none_found, remedy, code=target.codes.none)
+    what = f"{measured} of {n} frames ({share:.1%}) have a measured {target.subject}"
+    level = Level.FAIL if share < least else Level.WARN if share < GOOD_MEASURED else Level.PASS
+    if level > Level.PASS:
+        gate = f"gate: {100 * least:.3g}%; usual: {GOOD_MEASURED:.0%} and more"
+        what += f" ({gate})" + (f"; of the others {of_others}" if of_others else "")
+    why = "Predicted positions have growing sigmas; lost frames have none."
+    return unless_pass(level, what, why, remedy, code=target.codes.few)
 
 
-def missing_pictures(series: FrameSeries[F]) -> str:
-    """Frames without a usable picture, in words; empty where each frame has one."""
-    if not series.missing:
-        return ""
-    reason, _ = series.missing.most_common(1)[0]
-    return f"{series.missing.total()} of {len(series.frames)} frames have no usable picture (most frequent: {reason})"
+def _ambiguous(target: Target[F], track: Track[F]) -> list[Finding]:
+    numbered = zip(track.recording.numbers.tolist(), track.frames, strict=True)
+    frames = [(number, f.found) for number, f in numbered if f.cause is Cause.AMBIGUOUS]
+    if not frames:
+        return []
+    most = max(found for _, found in frames)
+    what = f"{len(frames)} frames show {target.several} (first: frame {frames[0][0]}; up to {most})"
+    why = "None of them is reported, since the choice would be a guess."
+    return [Finding(Level.WARN, what, why, target.remedies[Cause.AMBIGUOUS], code=target.codes.ambiguous)]
 
 
-def far_reacquisitions(series: FrameSeries[F], circles: Iterable[Array], limit: float) -> list[int]:
-    """Frames that are found again far from the last known place.
-
-    circles: u, v and size (3,) of each frame, px; nan where unknown. limit: in sizes.
-    """
+def _far_away(target: Target[F], track: Track[F]) -> list[Finding]:
+    """Reacquisitions far from the last known place: it may be another object."""
     known, far = np.full(3, np.nan), []
-    for number, frame, now in zip(series.numbers, series.frames, circles, strict=True):
-        if frame.event == "reacquired" and np.hypot(*(now[:2] - known[:2])) > limit * known[2]:
+    for number, frame, now in zip(track.recording.numbers.tolist(), track.frames, track.places, strict=True):
+        if frame.event == "reacquired" and np.hypot(*(now[:2] - known[:2])) > target.far_sizes * known[2]:
             far.append(number)
         if np.isfinite(now).all():
             known = now
-    return far
+    if not far:
+        return []
+    what = (
+        f"{len(far)} reacquisition{' lies' if len(far) == 1 else 's lie'} more than {target.far_words} from the last"
+        f" known place (frame {some_frames(far)})"
+    )
+    why = "What was found there, or what was followed before, may be another object."
+    return [Finding(Level.WARN, what, why, "Compare these frames in the overlay (--video).", code=target.codes.far)]
 
 
-def some_frames(frames: list[int]) -> str:
+def _missing(target: Target[F], track: Track[F]) -> list[Finding]:
+    missing, n = track.recording.missing, len(track.frames)
+    if sum(missing.values()) <= target.usual_missing * n:
+        return []
+    reason = max(missing, key=lambda r: missing[r])
+    what = f"{sum(missing.values())} of {n} frames have no usable picture (most frequent: {reason})"
+    why = f"The {target.subject} is predicted there."
+    return [Finding(Level.WARN, what, why, target.remedies[Cause.NO_IMAGE], code=target.codes.missing)]
+
+
+def some_frames(frames: Sequence[int]) -> str:
     """The first five numbers."""
     return ", ".join(map(str, frames[:5])) + (", ..." if len(frames) > 5 else "")

@@ -29,7 +29,7 @@ def sources() -> Iterator[tuple[str, str]]:
 
 
 def without_code(name: str, text: str) -> list[str]:
-    """Calls that make a finding that may be a warning, without a literal code."""
+    """Calls that make a finding that may be a warning, without a literal code or one of a table `codes`."""
     wrong, makers = (
         [],
         MAKERS | ({"Line"} if name.startswith(("lab/setup/doctor", "lab/setup/installation")) else set()),
@@ -41,6 +41,7 @@ def without_code(name: str, text: str) -> list[str]:
             continue
         given = [k.value for k in node.keywords if k.arg == "code"] or node.args[:1]
         codes = [c.value for c in given if isinstance(c, ast.Constant) and CODE.fullmatch(str(c.value))]
+        codes += [c.attr for c in given if isinstance(c, ast.Attribute) and ast.unparse(c.value).endswith("codes")]
         if not codes:
             wrong.append(f"{name}:{node.lineno}")
     return wrong
@@ -54,10 +55,18 @@ def test_every_finding_that_may_be_a_warning_has_a_code():
     assert [wrong for name, text in sources() for wrong in without_code(name, text)] == []
 
 
-@pytest.mark.parametrize("call", ["Finding(Level.WARN, 'x')", "unless_pass(level, 'x', 'y', 'z', code=other)"])
+@pytest.mark.parametrize(
+    "call",
+    [
+        "Finding(Level.WARN, 'x')",
+        "unless_pass(level, 'x', 'y', 'z', code=other)",
+        "Finding(Level.WARN, 'x', code=self.other)",
+    ],
+)
 def test_a_finding_without_a_code_is_found(call):
     assert without_code("here.py", call) == ["here.py:1"]
     assert without_code("here.py", "Finding(Level.PASS, 'x')\nFinding(Level.FAIL, 'x', code='BP-B01')") == []
+    assert without_code("here.py", "Finding(Level.WARN, 'x', code=target.codes.few)") == []
 
 
 def test_every_code_in_use_is_explained_and_every_explained_code_is_in_use():

@@ -17,9 +17,9 @@ from tracking.drogue_circle.detectors import centre_votes, centres, edge_pixels
 from tracking.drogue_circle.kalman import PRINTED_P0, printed_coefficient, printed_step
 from tracking.drogue_circle.occlusion import Appearance, disc_cells, first_appearance
 from tracking.drogue_circle.parameters import CircleParameters
-from tracking.drogue_circle.rim_fit import Cause, CircleFrame, nothing_known
+from tracking.drogue_circle.rim_fit import CircleFrame, nothing_known
 from tracking.kalman import transition
-from tracking.statuses import PoseStatus
+from tracking.statuses import Cause, PoseStatus
 
 _MOST_CENTRES = 200
 _LOST_AFTER = 25  # frames without a measurement; the print has no such rule

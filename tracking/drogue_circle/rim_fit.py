@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 from math import erf
 
 import cv2
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools, symmetric
 from tracking.drogue_circle.candidates import CircleCandidate, Picture, Window, crop_bounds
-from tracking.statuses import PoseStatus
+from tracking.statuses import Cause, PoseStatus
 
 _STEP_PX = 0.5  # sampling along a ray
 _LEAST_RAYS, _MOST_RAYS = 40, 256
@@ -374,32 +373,6 @@ def _correlation_length(away: Array, good: Bools, spacing_px: float) -> float:
 # The circle in one frame: status, cause, state, and the fit behind it.
 
 
-class Cause(StrEnum):
-    """Why a frame has no measured circle; empty where it has one."""
-
-    NONE = ""
-    NO_IMAGE = "no_image"
-    OCCLUDED = "occluded"
-    NOT_FOUND = "not_found"
-    AMBIGUOUS = "ambiguous"
-    OUT_OF_VIEW = "out_of_view"
-
-    @property
-    def meaning(self) -> str:
-        """One sentence for the user."""
-        return _MEANINGS[self]
-
-
-_MEANINGS = {
-    Cause.NONE: "the circle is measured",
-    Cause.NO_IMAGE: "there is no usable picture",
-    Cause.OCCLUDED: "half of the target or more is hidden",
-    Cause.NOT_FOUND: "no circle in the picture fits",
-    Cause.AMBIGUOUS: "several circles fit equally well",
-    Cause.OUT_OF_VIEW: "the predicted centre is outside the picture",
-}
-
-
 @dataclass(frozen=True, slots=True)
 class CircleFrame:
     """The circle in one frame. Arrays are nan while nothing is known."""
@@ -411,13 +384,18 @@ class CircleFrame:
     predicted: Array  # (3,) u, v, r before the picture was used
     measured: RimFit | None  # the fit that was used
     occlusion: float  # gamma; nan where it is unknown
-    circles: int = 0  # separate circles, where the whole picture was searched
+    found: int = 0  # separate circles, where the whole picture was searched
     event: str = ""  # acquired, reacquired, lost, ambiguous
 
     @property
-    def found(self) -> int:
-        """The same as `circles`, by the name that all trackers share."""
-        return self.circles
+    def place(self) -> Array:
+        """u, v, radius (3,), px."""
+        return self.state[:3]
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations (3,) of `place`."""
+        return np.sqrt(np.diag(self.covariance))[:3]
 
 
 def nothing_known(cause: Cause, event: str = "") -> CircleFrame:

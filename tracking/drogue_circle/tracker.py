@@ -13,8 +13,8 @@ from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, P
 from tracking.drogue_circle.kalman import FilterBank, motion_models
 from tracking.drogue_circle.occlusion import Appearance, RimHabit, disc_cells, first_appearance, is_clear
 from tracking.drogue_circle.parameters import CircleParameters
-from tracking.drogue_circle.rim_fit import Cause, CircleFrame, RimFit, SmoothCrop, fit_rim, nothing_known, smooth_crop
-from tracking.statuses import PoseStatus
+from tracking.drogue_circle.rim_fit import CircleFrame, RimFit, SmoothCrop, fit_rim, nothing_known, smooth_crop
+from tracking.statuses import Cause, PoseStatus
 
 _START_RATE_RADII = 0.25  # 1 sigma of the rate of a new circle, in radii per frame
 _COVERAGE_COST, _POLARITY_COST = 40.0, 15.0  # against distance^2, of a whole rim and of the other polarity
@@ -212,7 +212,7 @@ class CircleTracker:
         self._ambiguous = ambiguous
         if search.found is None:
             cause = Cause.AMBIGUOUS if ambiguous else Cause.NOT_FOUND
-            return replace(nothing_known(cause, event), circles=len(search.circles))
+            return replace(nothing_known(cause, event), found=len(search.circles))
         self._track, self._searches = Track.started(picture, search.found, self.parameters), 0
         event = "acquired" if self._trusted is None else "reacquired"
         return self._at_start(self._track, np.full(3, np.nan), len(search.circles), event)
@@ -234,11 +234,11 @@ class CircleTracker:
             return None
         return self._at_start(track, predicted, len(search.circles), "reacquired")
 
-    def _at_start(self, track: Track, predicted: Array, circles: int, event: str) -> CircleFrame:
+    def _at_start(self, track: Track, predicted: Array, found: int, event: str) -> CircleFrame:
         """The frame of an acquisition. No appearance is known yet: the coefficient is that of the rim."""
         x, P = track.bank.state()
         gamma = float(np.clip(1 - track.fit.coverage, 0.0, 1.0))
-        return CircleFrame(PoseStatus.MEASURED, Cause.NONE, x, P, predicted, track.fit, gamma, circles, event)
+        return CircleFrame(PoseStatus.MEASURED, Cause.NONE, x, P, predicted, track.fit, gamma, found, event)
 
     def _unmeasured(self, track: Track, cause: Cause, predicted: Array, gamma: float) -> CircleFrame:
         """A frame without a measurement: predicted, or lost."""

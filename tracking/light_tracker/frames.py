@@ -8,7 +8,7 @@ from enum import StrEnum
 import numpy as np
 
 from geometry.arrays import Array
-from tracking.statuses import PoseStatus
+from tracking.statuses import Cause, PoseStatus
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,34 +59,6 @@ USUAL = LightParameters()
 # The drogue in one frame: status, cause, place, size, confidence and who measured it.
 
 
-class Cause(StrEnum):
-    """Why a frame has no measured drogue; empty where it has one."""
-
-    NONE = ""
-    NO_IMAGE = "no_image"
-    NOT_FOUND = "not_found"
-    NO_MATCH = "no_match"
-    UNCERTAIN = "uncertain"
-    AMBIGUOUS = "ambiguous"
-    OUT_OF_VIEW = "out_of_view"
-
-    @property
-    def meaning(self) -> str:
-        """One sentence for the user."""
-        return _MEANINGS[self]
-
-
-_MEANINGS = {
-    Cause.NONE: "the drogue is measured",
-    Cause.NO_IMAGE: "there is no usable picture",
-    Cause.NOT_FOUND: "the detector finds no drogue in the picture",
-    Cause.NO_MATCH: "nothing in the window looks like the drogue: it is hidden or moved away",
-    Cause.UNCERTAIN: "the match has a low confidence",
-    Cause.AMBIGUOUS: "several drogues are in the picture",
-    Cause.OUT_OF_VIEW: "the predicted centre is outside the picture",
-}
-
-
 class Source(StrEnum):
     """What measured the drogue."""
 
@@ -126,6 +98,16 @@ class DrogueFrame:
     searched: str = ""  # what the detector searched in this frame: window, picture, or both
     found: int = 0  # drogues that it found
     event: str = ""  # acquired, reacquired, lost, ambiguous
+
+    @property
+    def place(self) -> Array:
+        """u, v, diameter (3,), px."""
+        return np.array([*self.centre_px, self.diameter_px])
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations (3,) of `place`."""
+        return np.array([*np.sqrt(np.diag(self.covariance)), self.sigma_diameter_px])
 
     @property
     def known(self) -> bool:

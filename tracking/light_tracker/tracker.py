@@ -12,7 +12,6 @@ from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, P
 from tracking.light_tracker.frames import (
     ABSENT_LOGIT,
     USUAL,
-    Cause,
     DrogueFrame,
     LightParameters,
     Source,
@@ -26,7 +25,7 @@ from tracking.light_tracker.frames import (
 from tracking.light_tracker.known import Known, is_clear, is_similar
 from tracking.light_tracker.motion import WHOLE, Motion
 from tracking.light_tracker.pattern import Match, Pattern, unexplained
-from tracking.statuses import PoseStatus
+from tracking.statuses import Cause, PoseStatus
 
 TRUSTED = 4  # detections that confirmed a track
 LONGEST_GAP = 20  # frames

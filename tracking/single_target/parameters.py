@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Literal
 
 
@@ -50,23 +49,3 @@ class BlobParameters:
     threshold_share: float = 0.3  # ... and as a share of the picture's largest contrast: shadows are fainter
     min_size_px: float = 3.0  # px: longest side of the blob's box; below it is noise
     max_size_px: float = 250.0  # px: above it is an edge of the scene
-
-
-class TargetStatus(StrEnum):
-    """The status of the target in one frame."""
-
-    MEASURED = "measured"
-    PREDICTED = "predicted"
-    LOST = "lost"
-
-    @property
-    def meaning(self) -> str:
-        """One sentence for the user."""
-        return _MEANINGS[self]
-
-
-_MEANINGS = {
-    TargetStatus.MEASURED: "a detection of this picture lies in the gate: the filtered position",
-    TargetStatus.PREDICTED: "no detection in the gate, or no picture: the motion predicts the position",
-    TargetStatus.LOST: "no track: not found yet, or not seen for too long",
-}

@@ -17,7 +17,8 @@ from geometry.uncertainty.chi_square import chi2_limit
 from tracking import kalman
 from tracking.detections import UNMATCHED, Detections
 from tracking.single_target.candidate_tracks import CandidateTracks, Step, nearest
-from tracking.single_target.parameters import USUAL, PointParameters, TargetStatus
+from tracking.single_target.parameters import USUAL, PointParameters
+from tracking.statuses import PoseStatus
 
 SIGMA_A_RANGE = (0.05, 1e3)  # limits of the estimated acceleration, in initial values: a target at rest may start
 SIGMA_A_RATE = 0.05  # relative change of the estimated acceleration per excess of one normalised innovation
@@ -33,7 +34,7 @@ _FLUX_RATE = 0.1  # of the running mean of the target's brightness
 class PointEstimate:
     """The target in one frame. Numbers that are not known are nan."""
 
-    status: TargetStatus
+    status: PoseStatus
     x: Array  # (4,) u, v, px, and their rates, px/frame
     P: Array  # (4, 4)
     predicted_px: Array  # (2,) predicted before this frame's picture
@@ -43,7 +44,7 @@ class PointEstimate:
 
 
 NOTHING = PointEstimate(
-    TargetStatus.LOST, np.full(4, np.nan), np.full((4, 4), np.nan), np.full(2, np.nan), np.nan, UNMATCHED, np.nan
+    PoseStatus.LOST, np.full(4, np.nan), np.full((4, 4), np.nan), np.full(2, np.nan), np.nan, UNMATCHED, np.nan
 )
 
 
@@ -79,7 +80,7 @@ class PointTracker:
             row, nis = nearest(self._x, self._P, found.uv_px, cov, self.parameters.p_gate)
             if row is not None:
                 self._update(found, cov, row, nis)
-                return self._estimate(TargetStatus.MEASURED, predicted, nis, row)
+                return self._estimate(PoseStatus.MEASURED, predicted, nis, row)
             near = nis < NEAR_MISS * chi2_limit(self.parameters.p_gate, 2)
             self._learn(nis if near else float("nan"))
         self._growth = min(self._growth * (NEAR_MISS_GROWTH if near else MISS_GROWTH) ** dt, MOST_GROWTH)
@@ -88,7 +89,7 @@ class PointTracker:
             self._last_px, self._x = predicted, None
             self._candidates, self._waited = CandidateTracks.none(self.parameters), 0.0
             return replace(NOTHING, predicted_px=predicted, nis=nis, sigma_a_px=self._sigma_a)
-        return self._estimate(TargetStatus.PREDICTED, predicted, nis, UNMATCHED)
+        return self._estimate(PoseStatus.PREDICTED, predicted, nis, UNMATCHED)
 
     def _acquire(self, found: Detections) -> PointEstimate:
         cov = self._covariances(found)
@@ -101,7 +102,7 @@ class PointTracker:
         self._unseen, self._growth = 0.0, 1.0
         fluxes = [s.flux for s in steps if np.isfinite(s.flux)]
         self._flux = float(np.mean(fluxes)) if fluxes else self._flux
-        return self._estimate(TargetStatus.MEASURED, np.full(2, np.nan), float("nan"), last.row)
+        return self._estimate(PoseStatus.MEASURED, np.full(2, np.nan), float("nan"), last.row)
 
     def _update(self, found: Detections, cov: Array, row: int, nis: float) -> None:
         assert self._x is not None
@@ -140,7 +141,7 @@ class PointTracker:
     def _covariances(self, found: Detections) -> Array:
         return found.cov_px2 + self.parameters.sigma_model_px**2 * np.eye(2)
 
-    def _estimate(self, status: TargetStatus, predicted: Array, nis: float, row: int) -> PointEstimate:
+    def _estimate(self, status: PoseStatus, predicted: Array, nis: float, row: int) -> PointEstimate:
         assert self._x is not None
         return PointEstimate(status, self._x.copy(), self._P.copy(), predicted, nis, row, self._sigma_a)
 

@@ -118,20 +118,26 @@ class Run:
         return tuple(dict.fromkeys(p for p in named if not p.resolve().is_relative_to(home)))
 
 
+def folder_of_run(given: Path) -> Path:
+    """The run folder that a path names: itself, or the folder of its run.yaml. Raises InputError: it is none."""
+    folder = Path(given)
+    if folder.name == "run.yaml" and not folder.is_dir():
+        folder = folder.parent
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected a run folder, found {'a file' if folder.exists() else 'nothing'}")
+    if not (folder / "run.yaml").exists():
+        raise no_run_error(folder)
+    return folder
+
+
 def load_run(run_folder: Path) -> Run:
     """Read and check run.yaml of a run folder, its rig and its timestamps; pictures are not opened.
 
     Raises:
         InputError: with file, field, what was expected and what was found; FileError for several mistakes.
     """
-    folder = Path(run_folder)
-    if folder.name == "run.yaml" and not folder.is_dir():
-        folder = folder.parent
-    if not folder.is_dir():
-        raise InputError(f"{folder}: expected a run folder, found {'a file' if folder.exists() else 'nothing'}")
+    folder = folder_of_run(run_folder)
     path = folder / "run.yaml"
-    if not path.exists():
-        raise no_run_error(folder)
     content = validated(_RunBlock, read_mapping(path), path)
     tracker = dataclass_from_yaml(TrackerParameters, content.tracker, path, "tracker")
 
@@ -152,7 +158,7 @@ def load_run(run_folder: Path) -> Run:
         if name not in content.cameras:
             continue
         try:
-            sources[name] = _source_of(content.cameras[name], folder, f"{path}: cameras.{name}")
+            sources[name] = source_of(content.cameras[name], folder, f"{path}: cameras.{name}")
         except InputError as error:
             mistakes.append(str(error))
     if mistakes:
@@ -204,13 +210,15 @@ def _a_device(value: Any) -> int | str:
     raise unexpected_value("a camera's number from 0, or the name of a device", value)
 
 
-class _SourceBlock(Block):
+class SourceBlock(Block):
+    """The pictures of one camera in run.yaml."""
+
     frames: Word | None = None
     detections: Word | None = None
     device: Annotated[int | str | None, pydantic.PlainValidator(_a_device)] = None
 
     @pydantic.model_validator(mode="after")
-    def _one_of_them(self) -> _SourceBlock:
+    def _one_of_them(self) -> SourceBlock:
         given = [n for n in ("frames", "detections", "device") if getattr(self, n) is not None]
         if "device" in given and len(given) > 1:
             raise field_error(f"expected one of frames, detections and device, got {' and '.join(given)}; keep one")
@@ -247,7 +255,7 @@ class _RunBlock(Block):
     frame_rate_hz: Annotated[float, pydantic.PlainValidator(number_between(*RATE_RANGE_HZ, "Hz"))]
     exposure_s: Positive | None = None
     timestamps: Word | None = None
-    cameras: Annotated[dict[str, _SourceBlock], pydantic.BeforeValidator(_some_cameras)]
+    cameras: Annotated[dict[str, SourceBlock], pydantic.BeforeValidator(_some_cameras)]
     prior: _PriorBlock | None = None
     tracker: Any = None
     recorded: OptionalDay = None
@@ -276,7 +284,8 @@ def prior_from(content: Mapping[str, Any], place: str) -> PosePrior:
     return _prior_of(validated(_PriorBlock, dict(content), place))
 
 
-def _source_of(block: _SourceBlock, folder: Path, where: str) -> Source:
+def source_of(block: SourceBlock, folder: Path, where: str) -> Source:
+    """The pictures that a block names, in a run folder. where: of the block, in messages. Raises InputError."""
     if block.device is not None:
         return LiveDevice(block.device)
     if block.detections is not None:

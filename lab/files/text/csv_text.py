@@ -292,6 +292,11 @@ def text_of_field(field: str) -> str:
     return field[1:] if field.startswith("'") and is_formula(field[1:]) else field
 
 
+def number_fields(values: Iterable[float]) -> list[str]:
+    """Fields with ten significant digits, more than any measurement here has; empty for nan."""
+    return ["" if v != v else f"{v:.10g}" for v in values]
+
+
 def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write a CSV file, complete or not at all. Raises InputError."""
     atomic_write_text(csv_text(header, rows), path)

@@ -3,58 +3,39 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from calibration.findings import Finding, Level, verdict
-from geometry import rotations
+from calibration.findings import Finding
 from geometry.arrays import Array, Ints
-from lab.files.text.atomic_write import atomic_write_text
 from lab.number_format import format_angle, format_length, format_number
-from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section, section_context
-from lab.report.html import environment
+from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section
 from lab.report.plot.axes import BLUE, GREEN, ORANGE, VERMILLION, padded_range
-from lab.report.plot.series import Band, Line, Shade, time_panel
+from lab.report.plot.series import Band, Line, time_panel
+from lab.runs.tables import pose_numbers
+from lab.targets.page import TimeAxis, write_page
 from lab.targets.stereo.frames import annotated_pictures
 from lab.targets.stereo.run import StereoResults, TruthErrors
-from lab.versions import versions
-from tracking.statuses import PoseStatus
 
-_WORDS = {Level.PASS: ("PASS", "pass"), Level.WARN: ("CHECK", "check"), Level.FAIL: ("FAIL", "fail")}
-_SENTENCES = {
-    Level.PASS: "The poses may be used.",
-    Level.WARN: "The poses may be used; note the warnings below.",
-    Level.FAIL: "The poses must not be used as they are.",
-}
+_SENTENCES = (
+    "The poses may be used.",
+    "The poses may be used; note the warnings below.",
+    "The poses must not be used as they are.",
+)
 _AXES = ("x", "y", "z")
 
 
 def write_stereo_page(results: StereoResults, findings: tuple[Finding, ...], folder: Path) -> Path:
     """Write report.html into a folder. Returns its path."""
-    word, css = _WORDS[verdict(findings)]
     sections = [_pictures(results), _poses(results), _residuals(results), _pair(results)]
     if results.errors is not None:
         sections.insert(1, _truth(results, results.errors))
-    context: dict[str, Any] = {
-        "name": results.run.name,
-        "source": str(results.run.folder),
-        "word": word,
-        "css": css,
-        "sentence": _SENTENCES[verdict(findings)],
-        "findings": [
-            {"css": _WORDS[f.level][1], "word": f.level.name, "what": f.what, "why": f.why, "remedy": f.remedy,
-             "code": f.code}
-            for f in findings
-        ],
-        "notes": [*results.notes, *([results.run.notes] if results.run.notes else [])],
-        "key_figures": _key_figures(results),
-        "sections": [section_context(s) for s in sections],
-        "made": _made(results),
-    }  # fmt: skip
-    path = folder / "report.html"
-    atomic_write_text(environment().get_template("stereo.html.j2").render(context), path)
-    return path
+    run = results.run
+    notes = [*results.notes, *([run.notes] if run.notes else [])]
+    return write_page(
+        folder, "pose from two cameras", run.name, run.folder, findings, _SENTENCES, _key_figures(results), notes,
+        sections, _method(results),
+    )  # fmt: skip
 
 
 def _key_figures(results: StereoResults) -> list[tuple[str, str, str]]:
@@ -66,7 +47,7 @@ def _key_figures(results: StereoResults) -> list[tuple[str, str, str]]:
     away = np.array([_distance(results, r.tracked.pose.translation) for r in measured if r.tracked.pose is not None])
     position = np.sqrt(np.trace(covariances[:, :3, :3], axis1=1, axis2=2))
     turn = np.sqrt(np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2))
-    rms = [r.tracked.fit.rms_px for r in measured if r.tracked.fit is not None]
+    rms = [fit.rms_px for fit in results.fits if fit is not None]
     out += [
         ("Distance", f"{format_number(away.min())} to {format_number(away.max())} m", "of the body origin"),
         ("Position sigma", format_length(float(np.median(position))), "median, all axes together"),
@@ -100,12 +81,8 @@ def _pictures(results: StereoResults) -> Section:
     return Section("Annotated pictures", words, drawings)
 
 
-def _shades(results: StereoResults) -> tuple[Shade, ...]:
-    status = [r.tracked.status for r in results.records]
-    return (
-        Shade(np.array([s is PoseStatus.PREDICTED for s in status]), "predicted", "predicted, not measured"),
-        Shade(np.array([s is PoseStatus.LOST for s in status]), "lost", "lost"),
-    )
+def _axis(results: StereoResults) -> TimeAxis:
+    return TimeAxis(results.t_s, "time (s)", [r.tracked.status for r in results.records])
 
 
 def _poses(results: StereoResults) -> Section:
@@ -114,29 +91,16 @@ def _poses(results: StereoResults) -> Section:
     for i, r in enumerate(results.records):
         if r.tracked.pose is None or r.tracked.covariance is None:
             continue
-        value[i] = [*r.tracked.pose.translation, *np.rad2deg(r.tracked.pose.ypr)]
-        J = rotations.ypr_jacobian(r.tracked.pose.rotation)
-        turned = J @ r.tracked.covariance[3:, 3:] @ J.T
-        sigma[i] = np.sqrt([*np.diagonal(r.tracked.covariance)[:3], *np.diagonal(turned)])
-        sigma[i, 3:] = np.rad2deg(sigma[i, 3:])
-    t = np.array([r.t_s for r in results.records])
-    drawings = []
+        numbers = pose_numbers(r.tracked.pose, r.tracked.covariance)
+        value[i], sigma[i] = numbers[[0, 1, 2, 7, 8, 9]], numbers[10:]
+    measured = np.array([r.measured for r in results.records])
+    axis, drawings = _axis(results), []
     for k in (0, 3, 1, 4, 2, 5):
         name, unit = (f"{_AXES[k]}", "m") if k < 3 else (("yaw", "pitch", "roll")[k - 3], "deg")
         shown = value[:, k] if k < 3 else _unwrapped(value[:, k])
-        measured = np.array([r.measured for r in results.records])
-        band = np.where(measured, sigma[:, k], np.nan)
-        drawings.append(
-            PageDrawing(
-                time_panel(
-                    t, name, unit,
-                    lines=(Line(shown, BLUE, name),),
-                    bands=(Band.about(shown, band, 3.0, BLUE, "3 sigma"),),
-                    shades=_shades(results),
-                    y_range=padded_range(shown),
-                )
-            )
-        )  # fmt: skip
+        band = Band.about(shown, np.where(measured, sigma[:, k], np.nan), 3.0, BLUE, "3 sigma")
+        line, y_range = Line(shown, BLUE, name), padded_range(shown)
+        drawings.append(axis.panel(name, unit, line, bands=(band,), y_range=y_range, wide=False, height=118))
     words = (
         "Position of the body origin and attitude (Rz(yaw) Ry(pitch) Rx(roll)) in the frame of the pair, with 3 sigma."
         " Shaded: not measured."
@@ -153,7 +117,7 @@ def _unwrapped(degrees: Array) -> Array:
 
 def _truth(results: StereoResults, e: TruthErrors) -> Section:
     at: Ints = np.searchsorted([r.frame for r in results.records], e.frames)
-    t = np.array([r.t_s for r in results.records])[at]
+    t = results.t_s[at]
     panels = [
         time_panel(
             t, f"error of {axis}", "mm",
@@ -189,26 +153,21 @@ def _sigmas(results: StereoResults, at: Ints) -> Array:
 
 
 def _residuals(results: StereoResults) -> Section:
-    t = np.array([r.t_s for r in results.records])
-    K = len(results.run.target.model)
-    residuals = np.full((len(t), 2, K, 2), np.nan)
-    for i, r in enumerate(results.records):
-        if r.measured and r.tracked.fit is not None:
-            residuals[i] = r.tracked.fit.residuals_px
+    n, K = len(results.records), len(results.run.target.model)
+    residuals = np.full((n, 2, K, 2), np.nan)
+    for i, fit in enumerate(results.fits):
+        if fit is not None:
+            residuals[i] = fit.residuals_px
     drawings = []
     for c, camera in enumerate(results.run.pair.cameras):
         seen = np.isfinite(residuals[:, c]).any(axis=(1, 2))
-        rms = np.full((len(t), 2), np.nan)
+        rms = np.full((n, 2), np.nan)
         rms[seen] = np.sqrt(np.nanmean(residuals[seen, c] ** 2, axis=1))
         drawings.append(
-            PageDrawing(
-                time_panel(
-                    t, f"camera {camera.name}: RMS residual of a frame", "px",
-                    lines=(Line(rms[:, 0], BLUE, "u"), Line(rms[:, 1], VERMILLION, "v")),
-                    shades=_shades(results),
-                    y_range=(0.0, max(float(np.nanmax(rms, initial=0.05)) * 1.1, 0.05)),
-                ),
-                "u: blue, v: vermilion",
+            _axis(results).panel(
+                f"camera {camera.name}: RMS residual of a frame", "px", Line(rms[:, 0], BLUE, "u"),
+                Line(rms[:, 1], VERMILLION, "v"), y_range=(0.0, max(float(np.nanmax(rms, initial=0.05)) * 1.1, 0.05)),
+                wide=False, height=118, caption="u: blue, v: vermilion",
             )
         )  # fmt: skip
     rows: list[list[object]] = []
@@ -253,24 +212,19 @@ def _pair(results: StereoResults) -> Section:
     drawings = []
     if len(results.measured) > 1:
         chi = np.full(len(results.records), np.nan)
-        for i, r in enumerate(results.records):
-            if r.measured and r.tracked.fit is not None and r.tracked.fit.dof > 0:
-                chi[i] = r.tracked.fit.chi2 / r.tracked.fit.dof
-        t = np.array([r.t_s for r in results.records])
+        for i, fit in enumerate(results.fits):
+            if fit is not None and fit.dof > 0:
+                chi[i] = fit.chi2 / fit.dof
         top = max(float(np.nanpercentile(chi, 99)) * 1.2, 2.0)
-        panel = time_panel(
-            t, "misfit: chi-square over degrees of freedom; 1 expected", "", lines=(Line(chi, ORANGE, "misfit"),),
-            y_range=(0.0, top), shades=_shades(results), width=1090, height=130,
-        )  # fmt: skip
-        drawings.append(PageDrawing(panel, wide=True))
+        name, line = "misfit: chi-square over degrees of freedom; 1 expected", Line(chi, ORANGE, "misfit")
+        drawings.append(_axis(results).panel(name, "", line, y_range=(0.0, top), height=130))
     return Section("The pair", words, drawings, PageTable(("quantity", "value"), rows))
 
 
-def _made(results: StereoResults) -> list[tuple[str, str]]:
-    own, p = versions(), results.run.parameters.segmentation
+def _method(results: StereoResults) -> str:
+    p = results.run.parameters.segmentation
     histogram = "right picture with the histogram of the left" if p.specify_histogram else "no histogram specification"
-    return [
-        ("segmentation", f"gamma {p.gamma:g}, {histogram}, median {p.median_px}, opening {p.opening_px}, closing"
-         f" {p.closing_px} px, {p.centroid} centroids"),
-        ("beampose", f"{own['beampose']}, numpy {own['numpy']}, OpenCV {own['opencv-python-headless']}"),
-    ]  # fmt: skip
+    return (
+        f"segmentation: gamma {p.gamma:g}, {histogram}, median {p.median_px}, opening {p.opening_px}, closing"
+        f" {p.closing_px} px, {p.centroid} centroids"
+    )

@@ -6,16 +6,14 @@ import dataclasses
 import datetime
 import time
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calibration.findings import Finding, Level, verdict
+from calibration.findings import Finding
 from geometry.pose import Pose
-from lab.errors import QUALITY_GATE_FAILED, InputError
+from lab.errors import InputError
 from lab.files.rig.calibration_state import require_valid_calibration, state_mapping
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.run.truth import TruePoses, read_true_poses
@@ -23,52 +21,23 @@ from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.json_text import has_schema, write_json
 from lab.number_format import format_length
 from lab.pictures.picture_file import MissingPicture
+from lab.targets.recording import Progress
 from lab.targets.stereo.findings import findings_of
 from lab.targets.stereo.frames import Content, StereoFrame, stereo_frames
+from lab.targets.stereo.page import write_stereo_page
 from lab.targets.stereo.run import StereoRecord, StereoResults, StereoRun, load_stereo_run, truth_errors
 from lab.targets.stereo.tables import write_tables
+from lab.targets.verdict import Outcome, verdict_block
 from lab.versions import versions
 from tracking.binocular.marker_model import MarkerImages
 from tracking.binocular.pose_tracker import BinocularTracker, FittedFrame, clock_offset
 from tracking.binocular.segmentation import marker_candidates, prepared
 
 SUMMARY_SCHEMA = "beampose/stereo-summary/1"
-_WORDS = {Level.PASS: "pass", Level.WARN: "check", Level.FAIL: "fail"}
 _GREY_CHECKED = 5  # pictures in which a target of saturated colours must have some colour
 
-Progress = Callable[..., None]
 
-
-@dataclass(frozen=True, slots=True)
-class StereoOutcome:
-    """The outcome of one stereo run."""
-
-    results: StereoResults
-    findings: tuple[Finding, ...]
-    out: Path
-
-    @property
-    def exit_status(self) -> int:
-        """0, or 4 where a quality gate failed."""
-        return QUALITY_GATE_FAILED if verdict(self.findings) is Level.FAIL else 0
-
-    def line(self) -> str:
-        """One line for the command line."""
-        word, worst = _WORDS[verdict(self.findings)].upper(), self.findings[0]
-        texts = "; ".join(f.what for f in self.findings if f.level > Level.PASS)
-        remedy = f" {worst.remedy}" if worst.level is Level.FAIL else ""
-        count = f"{len(self.results.measured)} of {len(self.results.records)} frames measured"
-        errors = self.results.errors
-        if errors is not None:
-            texts += (
-                "; " if texts else ""
-            ) + f"position error {format_length(errors.as_mapping()['position_rms_m'])} RMS"
-        return (
-            f"{self.results.run.name}: {word}: {count}" + (f" ({texts})" if texts else "") + f"{remedy} -> {self.out}"
-        )
-
-
-def process_stereo_run(run_folder: Path, out: Path, progress: Progress | None = None) -> StereoOutcome:
+def process_stereo_run(run_folder: Path, out: Path, progress: Progress | None = None) -> Outcome[StereoResults]:
     """Process one stereo run folder into the folder `out`: tables, summary.json, pictures and report.html.
 
     Raises:
@@ -81,21 +50,16 @@ def process_stereo_run(run_folder: Path, out: Path, progress: Progress | None = 
     require_valid_calibration(run.calibration, run.pair_path, recorded)
     truth_path = run.folder / "truth" / "pose.csv"
     truth = read_true_poses(truth_path) if truth_path.is_file() else None
-    with atomic_folder(out, may_replace=are_stereo_results) as work:
+    with atomic_folder(out, may_replace=lambda folder: has_schema(folder, SUMMARY_SCHEMA)) as work:
         results = measure(run, progress)
         add_truth(results, truth)
         findings = findings_of(results)
         write_tables(results, work)
         write_json(_summary(results, findings, time.perf_counter() - started), work / "summary.json")
-        from lab.targets.stereo.page import write_stereo_page  # imports the template engine
-
         write_stereo_page(results, findings, work)
-    return StereoOutcome(results, findings, Path(out))
-
-
-def are_stereo_results(folder: Path) -> bool:
-    """Whether a folder holds the results of an earlier stereo run."""
-    return has_schema(folder, SUMMARY_SCHEMA)
+    errors = None if results.errors is None else results.errors.as_mapping()["position_rms_m"]
+    words = "" if errors is None else f"position error {format_length(errors)} RMS"
+    return Outcome(run.name, Path(out), len(results.records), len(results.measured), findings, results, words)
 
 
 def measure(run: StereoRun, progress: Progress | None = None) -> StereoResults:
@@ -118,7 +82,7 @@ def measure(run: StereoRun, progress: Progress | None = None) -> StereoResults:
         tracked = tracker.step(t_s, candidates)
         results.records.append(StereoRecord(frame.frame, t_s, candidates, (missing[0], missing[1]), tracked))
         if progress is not None:
-            progress(len(results.records), None, "frames")
+            progress(len(results.records), None)
     _require_pictures(results)
     fitted = [
         FittedFrame(r.t_s, r.tracked.fit, r.tracked.observed)
@@ -196,15 +160,7 @@ def _summary(results: StereoResults, findings: tuple[Finding, ...], wall_s: floa
         "pair": str(run.pair_path.resolve()),
         "calibration": None if run.calibration is None else state_mapping(run.calibration),
         "notes_of_run": run.notes,
-        "verdict": {
-            "status": _WORDS[verdict(findings)],
-            "reasons": [f.what for f in findings if f.level > Level.PASS],
-            "exit_status": QUALITY_GATE_FAILED if verdict(findings) is Level.FAIL else 0,
-            "evidence": [
-                {"level": f.level.name, "what": f.what, "why": f.why, "remedy": f.remedy, "code": f.code}
-                for f in findings
-            ],
-        },
+        "verdict": verdict_block(findings),
         "counts": {
             "frames": len(records),
             "pose_status": dict(status),

@@ -33,14 +33,23 @@ from geometry.pose import Pose
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState, OptionalDay
 from lab.files.rig.pair_file import REMEDY, load_pair_file, of_two_cameras
-from lab.files.run.run_file import RATE_RANGE_HZ, DetectionsTable, FramesFolder, VideoFile
+from lab.files.run.run_file import (
+    RATE_RANGE_HZ,
+    DetectionsTable,
+    FramesFolder,
+    LiveDevice,
+    SourceBlock,
+    VideoFile,
+    folder_of_run,
+    source_of,
+)
 from lab.files.run.times import Times, load_times
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.error_text import name_of_path, suggest_name
-from lab.files.text.fields import Block, Name, Text, Word, field_error, number_between, one_of, validated
+from lab.files.text.fields import Block, Name, Text, Word, number_between, one_of, validated
 from lab.files.text.yaml_text import read_mapping
-from lab.pictures.picture_file import PICTURE_SUFFIXES
 from lab.targets.stereo.target_block import Target, load_target
+from tracking.binocular.joint_fit import JointFit
 from tracking.binocular.marker_model import MarkerImages, StereoPair
 from tracking.binocular.parameters import BinocularParameters, MatchParameters, SegmentationParameters
 from tracking.binocular.pose_tracker import BinocularFrame, ClockOffset
@@ -76,24 +85,13 @@ class StereoRun:
         return self.folder / "run.yaml"
 
 
-class _SourceBlock(Block):
-    frames: Word | None = None
-    detections: Word | None = None
-
-    @pydantic.model_validator(mode="after")
-    def _one_of_them(self) -> _SourceBlock:
-        if (self.frames is None) == (self.detections is None):
-            raise field_error("expected frames or detections, one of the two")
-        return self
-
-
 class _StereoRunBlock(Block):
     schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
     name: Name | None = None
     pair: Word
     frame_rate_hz: Annotated[float, pydantic.PlainValidator(number_between(*RATE_RANGE_HZ, "Hz"))]
     timestamps: Word | None = None
-    cameras: dict[str, _SourceBlock]
+    cameras: dict[str, SourceBlock]
     target: Any
     segmentation: Any = None
     match: Any = None
@@ -103,11 +101,7 @@ class _StereoRunBlock(Block):
 
 def load_stereo_run(run_folder: Path) -> StereoRun:
     """Read and check a stereo run folder; pictures are not opened. Raises InputError, a line for each mistake."""
-    folder = Path(run_folder)
-    if folder.name == "run.yaml" and not folder.is_dir():
-        folder = folder.parent
-    if not folder.is_dir():
-        raise InputError(f"{folder}: expected a run folder, found {'a file' if folder.exists() else 'nothing'}")
+    folder = folder_of_run(run_folder)
     path = folder / "run.yaml"
     mapping = read_mapping(path)
     if mapping.get("schema") == "beampose/run/1":
@@ -130,7 +124,12 @@ def load_stereo_run(run_folder: Path) -> StereoRun:
     cameras, covariance = of_two_cameras(file, names)
     times_path = None if content.timestamps is None else folder / content.timestamps
     target = load_target(content.target, folder, path)
-    sources = {n: _source_of(b, folder, f"{path}: cameras.{n}") for n, b in content.cameras.items()}
+    sources: dict[str, Source] = {}
+    for name, block in content.cameras.items():
+        source = source_of(block, folder, f"{path}: cameras.{name}")
+        if isinstance(source, LiveDevice):
+            raise InputError(f"{path}: cameras.{name}: expected frames or detections, got a live camera")
+        sources[name] = source
     if len(target.colours) > 1 and any(isinstance(s, DetectionsTable) for s in sources.values()):
         raise InputError(f"{path}: target.colours: expected one colour with detections, which have none; got several")
     return StereoRun(
@@ -161,24 +160,6 @@ def _pair_of(cameras: tuple[Camera, Camera], covariance: Any, path: Path) -> Ste
         raise InputError(f"{path}: cameras: {error}; {REMEDY}") from None
 
 
-def _source_of(block: _SourceBlock, folder: Path, where: str) -> Source:
-    if block.detections is not None:
-        path = folder / block.detections
-        if not path.is_file():
-            raise InputError(f"{where}.detections: expected a table, found none at {path}")
-        return DetectionsTable(path)
-    path = folder / str(block.frames)
-    if path.is_dir():
-        return FramesFolder(path)
-    if path.suffix.lower() in PICTURE_SUFFIXES and path.is_file():
-        raise InputError(
-            f"{where}.frames: expected a folder or a video, got the single picture {path}; name its folder"
-        )
-    if path.is_file():
-        return VideoFile(path)
-    raise InputError(f"{where}.frames: expected a folder of pictures or a video, found nothing at {path}")
-
-
 # What processing keeps of each frame of a stereo run; tables, findings and the report are made from it.
 
 
@@ -206,7 +187,6 @@ class TruthErrors:
     deltas: Array  # (n, 6): truth minus estimate, section 1 of the file contract
     nees: Array  # (n,)
     range_m: Array  # (n,): estimated minus true distance of the body origin from the left camera
-    true_range_m: Array  # (n,)
 
     def as_mapping(self) -> dict[str, float | int]:
         """Figures for summary.json."""
@@ -236,9 +216,19 @@ class StereoResults:
         return [r for r in self.records if r.measured]
 
     @property
+    def fits(self) -> list[JointFit | None]:
+        """The fits of all frames; None of a frame without a measured pose."""
+        return [r.tracked.fit if r.measured else None for r in self.records]
+
+    @property
+    def t_s(self) -> Array:
+        """Times (n,) of all frames."""
+        return np.array([r.t_s for r in self.records])
+
+    @property
     def noise_scale(self) -> float:
         """Root of chi-square over degrees of freedom of all measured frames: 1 if the stated sigmas are right."""
-        fits = [r.tracked.fit for r in self.measured if r.tracked.fit is not None]
+        fits = [fit for fit in self.fits if fit is not None]
         dof = sum(f.dof for f in fits)
         return float(np.sqrt(sum(f.chi2 for f in fits) / dof)) if dof else float("nan")
 
@@ -254,7 +244,7 @@ def truth_errors(records: Sequence[StereoRecord], run: StereoRun, frames: Array,
     if not shared:
         return None
     eye = run.pair.cameras[0].camera_from_world.inverse().translation
-    deltas, nees, apart, far = [], [], [], []
+    deltas, nees, apart = [], [], []
     for r in shared:
         assert r.tracked.pose is not None
         assert r.tracked.covariance is not None
@@ -262,7 +252,7 @@ def truth_errors(records: Sequence[StereoRecord], run: StereoRun, frames: Array,
         delta = true.minus(r.tracked.pose)
         deltas.append(delta)
         nees.append(float(delta @ np.linalg.solve(r.tracked.covariance, delta)))
-        far.append(float(np.linalg.norm(true.translation - eye)))
-        apart.append(float(np.linalg.norm(r.tracked.pose.translation - eye)) - far[-1])
+        far = float(np.linalg.norm(true.translation - eye))
+        apart.append(float(np.linalg.norm(r.tracked.pose.translation - eye)) - far)
     numbers = np.array([r.frame for r in shared])
-    return TruthErrors(numbers, np.array(deltas), np.array(nees), np.array(apart), np.array(far))
+    return TruthErrors(numbers, np.array(deltas), np.array(nees), np.array(apart))

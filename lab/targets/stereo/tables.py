@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from geometry.arrays import Array
 from geometry.camera import in_picture
 from lab.files.text import columns
-from lab.files.text.csv_text import write_table
+from lab.files.text.csv_text import number_fields, write_table
 from lab.runs.tables import pose_numbers
 from lab.targets.stereo.run import StereoRecord, StereoResults, StereoRun
 from tracking.binocular.marker_model import project_markers
@@ -48,20 +47,15 @@ def write_tables(results: StereoResults, folder: Path) -> None:
     )
 
 
-def _numbers(values: Array | list[float]) -> list[str]:
-    """Fields with ten digits; empty for nan."""
-    return ["" if v != v else f"{v:.10g}" for v in np.asarray(values, dtype=float).tolist()]
-
-
 def _attitude_row(record: StereoRecord) -> list[object]:
     t = record.tracked
-    head: list[object] = [record.frame, *_numbers([record.t_s])]
+    head: list[object] = [record.frame, *number_fields([record.t_s])]
     motion = [""] * len(columns.MOTION)  # poses are of single frames: they have no velocity
     if t.pose is None or t.covariance is None:
         return [*head, *[""] * len(columns.POSE), 0, "", t.status.value, *motion]
     used = int((t.index >= 0).sum())
-    rms = _numbers([t.fit.rms_px if t.fit is not None and used else float("nan")])
-    return [*head, *_numbers(pose_numbers(t.pose, t.covariance)), used, *rms, t.status.value, *motion]
+    rms = number_fields([t.fit.rms_px if t.fit is not None and used else float("nan")])
+    return [*head, *number_fields(pose_numbers(t.pose, t.covariance)), used, *rms, t.status.value, *motion]
 
 
 def _spot_rows(run: StereoRun, record: StereoRecord) -> Iterator[list[object]]:
@@ -84,8 +78,8 @@ def _spot_rows(run: StereoRun, record: StereoRecord) -> Iterator[list[object]]:
             with np.errstate(invalid="ignore"):
                 sigma = np.sqrt(np.diagonal(C))
             yield [
-                record.frame, *_numbers([record.t_s]), camera.name, name, *_numbers([*at, *sigma]), status[k].value,
-                *_numbers(t.predicted_px[c, k]), "", *_numbers([C[0, 1], float("nan")]),
+                record.frame, *number_fields([record.t_s]), camera.name, name, *number_fields([*at, *sigma]),
+                status[k].value, *number_fields(t.predicted_px[c, k]), "", *number_fields([C[0, 1], float("nan")]),
             ]  # fmt: skip
 
 
@@ -100,8 +94,8 @@ def _point_rows(run: StereoRun, record: StereoRecord) -> Iterator[list[object]]:
     found = triangulate(run.pair, np.stack([p.uv_px for p in pick]), np.stack([p.cov_px2 for p in pick]))
     for i, k in enumerate(both.tolist()):
         sigma = np.sqrt(np.diagonal(found.covariance[i]))
-        numbers = _numbers([*found.points[i], *sigma, float(np.sqrt(found.chi2[i]))])
-        yield [record.frame, *_numbers([record.t_s]), run.target.model.names[k], *numbers]
+        numbers = number_fields([*found.points[i], *sigma, float(np.sqrt(found.chi2[i]))])
+        yield [record.frame, *number_fields([record.t_s]), run.target.model.names[k], *numbers]
 
 
 def _candidate_rows(run: StereoRun, record: StereoRecord) -> Iterator[list[object]]:
@@ -112,4 +106,5 @@ def _candidate_rows(run: StereoRun, record: StereoRecord) -> Iterator[list[objec
         for uv, C, area in zip(found.uv_px, found.cov_px2, found.area_px2.tolist(), strict=True):
             axis = float(np.sqrt(area / np.pi)) / 2
             sigma = np.sqrt(np.diagonal(C))
-            yield [record.frame, camera.name, *_numbers([*uv, *sigma]), "", "", *_numbers([axis, axis, 0.0, C[0, 1]])]
+            shape = number_fields([axis, axis, 0.0, C[0, 1]])
+            yield [record.frame, camera.name, *number_fields([*uv, *sigma]), "", "", *shape]

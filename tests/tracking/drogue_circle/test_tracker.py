@@ -10,9 +10,8 @@ from tracking.drogue_circle.candidates import CircleCandidate
 from tracking.drogue_circle.detectors import classical_detector
 from tracking.drogue_circle.parameters import CircleParameters
 from tracking.drogue_circle.printed import PrintedTracker
-from tracking.drogue_circle.rim_fit import Cause
 from tracking.drogue_circle.tracker import CircleTracker
-from tracking.statuses import PoseStatus
+from tracking.statuses import Cause, PoseStatus
 
 P = CircleParameters()
 
@@ -63,7 +62,7 @@ def test_a_second_equal_disc_does_not_take_over():
 
 def test_two_equal_discs_at_the_start_are_not_guessed():
     frame = new_tracker().step(discs([(45.0, 60.0, 18.0), (115.0, 60.0, 18.0)]))
-    assert (frame.status, frame.cause, frame.circles) == (PoseStatus.LOST, Cause.AMBIGUOUS, 2)
+    assert (frame.status, frame.cause, frame.found) == (PoseStatus.LOST, Cause.AMBIGUOUS, 2)
     assert np.isnan(frame.state).all()
     frame = new_tracker(near_px=(45.0, 60.0)).step(discs([(45.0, 60.0, 18.0), (115.0, 60.0, 18.0)]))
     assert frame.state[0] == pytest.approx(45.0, abs=0.1)

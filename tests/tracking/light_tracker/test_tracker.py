@@ -9,9 +9,9 @@ import pytest
 
 from tests.tracking.light_tracker.targets import SIZE, picture
 from tracking.drogue_circle.candidates import CircleCandidate, Picture, Window
-from tracking.light_tracker.frames import USUAL, Cause, DrogueFrame, LightParameters, Source
+from tracking.light_tracker.frames import USUAL, DrogueFrame, LightParameters, Source
 from tracking.light_tracker.tracker import DrogueTracker
-from tracking.statuses import PoseStatus
+from tracking.statuses import Cause, PoseStatus
 
 Circle = tuple[float, float, float]
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from tracking.detections import Detections
-from tracking.single_target.parameters import PointParameters, TargetStatus
+from tracking.single_target.parameters import PointParameters
 from tracking.single_target.point_tracker import PointTracker, track_point
+from tracking.statuses import PoseStatus
 
 SIGMA = 0.2
 FIXED = PointParameters(learn_sigma_a=False, sigma_a_px=0.05, sigma_model_px=0.0)
@@ -68,7 +69,7 @@ def test_hidden_frames_are_predicted_with_sigmas_that_cover_the_error():
         path = motion(rng, 40)
         track = track_point(steps(40), seen(rng, path, hidden=range(25, 33)), FIXED)
         assert statuses(track)[25:33] == ["predicted"] * 8
-        assert track[33].status is TargetStatus.MEASURED
+        assert track[33].status is PoseStatus.MEASURED
         errors.append((track[32].x[:2] - path[32]) / np.sqrt(np.diagonal(track[32].P)[:2]))
         assert track[32].P[0, 0] > track[25].P[0, 0] > track[24].P[0, 0]
     assert np.mean(np.square(errors)) < 1.5
@@ -81,7 +82,7 @@ def test_two_frames_in_one_step_are_two_steps():
     found = seen(rng, path)
     all_frames = track_point(steps(12), [*found[:6], None, *found[7:]], FIXED)
     without = track_point(np.array([0, 1, 1, 1, 1, 1, 2, 1, 1, 1, 1.0]), [*found[:6], *found[7:]], FIXED)
-    assert all_frames[6].status is TargetStatus.PREDICTED
+    assert all_frames[6].status is PoseStatus.PREDICTED
     np.testing.assert_allclose(all_frames[-1].x, without[-1].x, atol=0.05)
 
 
@@ -106,7 +107,7 @@ def test_before_the_target_appears_and_after_it_is_lost_there_is_no_position():
     predicted = words[25:].count("predicted")
     assert 10 <= predicted <= 50
     assert words[25:] == ["predicted"] * predicted + ["lost"] * (60 - predicted)
-    assert all(np.isnan(e.x).all() for e in track if e.status is TargetStatus.LOST)
+    assert all(np.isnan(e.x).all() for e in track if e.status is PoseStatus.LOST)
 
 
 def test_a_lost_target_is_found_again_by_its_brightness():
@@ -150,7 +151,7 @@ def test_the_process_noise_is_estimated(true):
 
 def test_without_a_picture_nothing_is_measured():
     tracker = PointTracker(FIXED)
-    assert tracker.step(0.0, None).status is TargetStatus.LOST
+    assert tracker.step(0.0, None).status is PoseStatus.LOST
 
 
 @pytest.mark.parametrize("wrong", [{"confirm": 1}, {"p_gate": 0.0}, {"sigma_a_px": -1.0}, {"max_size_ratio": 1.0}])

@@ -12,8 +12,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from cli import main
-from lab.errors import InputError
-from lab.targets.circle import CIRCLE, DETECTORS, FORMS, CircleOptions, track_circle
+from lab.targets.circle import CIRCLE, DETECTORS, FORMS, CircleOptions, CircleTarget
+from lab.targets.track import track_target
 from tests.tracking.drogue_circle.discs import discs
 
 SIZE = (128, 96)
@@ -86,14 +86,14 @@ def test_a_folder_of_pictures_gives_all_files(folder, tmp_path):
 
 def test_a_video_has_its_own_rate_and_the_same_circle(tmp_path):
     file = video(tmp_path / "drogue.avi", [picture(k) for k in range(6)])
-    outcome = track_circle(file, tmp_path / "out")
+    outcome = track_target(CircleTarget(), file, tmp_path / "out")
     assert (outcome.frames, outcome.measured, outcome.exit_status) == (6, 6, 0)
     assert float(rows(tmp_path / "out")[5]["t_s"]) == pytest.approx(0.1)
     assert not (tmp_path / "out" / "overlay.avi").exists()
 
 
 def test_the_printed_form_is_another_tracker(folder, tmp_path):
-    track_circle(folder, tmp_path / "out", CircleOptions(form="printed"))
+    track_target(CircleTarget(CircleOptions(form="printed")), folder, tmp_path / "out")
     table = rows(tmp_path / "out")
     assert table[3]["measured_u_px"] == ""  # whole pixels, without a fit
     assert abs(float(table[3]["u_px"]) - place(3)[0]) < 4
@@ -116,18 +116,6 @@ def test_without_one_clear_circle_the_quality_gate_fails(tmp_path, circles, caus
         assert "--near" in done.output
         assert typed(tmp_path / "pictures", "--out", tmp_path / "out", "--near", 90, 48).exit_code == 0
         assert float(rows(tmp_path / "out")[0]["u_px"]) == pytest.approx(90.0, abs=0.1)
-
-
-def test_an_empty_or_broken_video_is_one_line_and_leaves_the_results(tmp_path):
-    track_circle(video(tmp_path / "good.avi", [picture(0), picture(1)]), tmp_path / "out")
-    before = (tmp_path / "out" / "circle.csv").read_bytes()
-    for name, content in (("empty.avi", b""), ("broken.avi", b"RIFF\0\0\0\0AVI " + bytes(200)), ("text.mp4", b"hello")):
-        (tmp_path / name).write_bytes(content)
-        done = typed(tmp_path / name, "--out", tmp_path / "out")
-        assert done.exit_code == 2
-        assert len(done.output.strip().splitlines()) == 1
-        assert name in done.output
-    assert (tmp_path / "out" / "circle.csv").read_bytes() == before
 
 
 def test_a_video_that_is_cut_off_is_tracked_to_its_end(tmp_path):
@@ -155,26 +143,8 @@ def test_a_wrong_option_is_one_plain_line(folder, tmp_path, arguments, words):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_missing_input_and_a_folder_of_something_else_are_refused(tmp_path, folder):
-    assert typed(tmp_path / "nothing", "--out", tmp_path / "out").exit_code == 2
-    (tmp_path / "kept").mkdir()
-    (tmp_path / "kept" / "thesis.txt").write_text("mine")
-    with pytest.raises(InputError, match="something other than earlier results"):
-        track_circle(folder, tmp_path / "kept")
-
-
 def test_the_command_offers_the_detectors_and_forms_that_exist():
     parameters = main.commands["track"].commands["circle"].params
     options = {p.name: p.type.choices for p in parameters if p.name in ("detector", "form")}
     assert tuple(options["detector"]) == tuple(DETECTORS)
     assert tuple(options["form"]) == FORMS
-
-
-def test_pictures_of_another_size_than_the_first_are_no_pictures_of_the_recording(tmp_path):
-    source = tmp_path / "drogue"
-    source.mkdir()
-    for k in range(12):
-        cv2.imwrite(str(source / f"{k:04d}.png"), picture(k)[: 80 if k in (5, 6) else None])
-    result = typed(source, "--out", tmp_path / "out")
-    assert "another size: 128x80 px, the first picture has 128x96" in result.output
-    assert [k for k, r in enumerate(rows(tmp_path / "out")) if r["cause"] == "no_image"] == [5, 6]

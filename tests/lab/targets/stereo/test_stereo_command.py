@@ -78,6 +78,8 @@ def test_the_triangulated_points_are_where_the_pose_puts_the_markers(result):
 def test_the_summary_has_fingerprints_versions_and_the_verdict_of_the_exit_status(result):
     summary = json.loads((result.out / "summary.json").read_text(encoding="utf-8"))
     assert summary["verdict"]["exit_status"] == result.exit_status == 0
+    assert summary["verdict"]["status"] == "pass"
+    assert {e["level"] for e in summary["verdict"]["evidence"]} == {"pass"}
     assert {"run.yaml", "pair.yaml", "detections.csv"} <= {i["path"].rsplit("/", 1)[-1] for i in summary["inputs"]}
     assert "numpy" in summary["versions"]
     report = (result.out / "report.html").read_text(encoding="utf-8")
@@ -150,6 +152,7 @@ def test_two_cameras_exchanged_give_no_confident_pose(tmp_path):
     [
         ({"cameras": {"left": {"detections": "detections.csv"}}}, "expected two cameras, got the single camera left"),
         ({"cameras": {"left": {"detections": "detections.csv"}, "rihgt": {"detections": "detections.csv"}}}, "right"),
+        ({"cameras": {"left": {"device": 0}, "right": {"detections": "detections.csv"}}}, "got a live camera"),
         ({"pair": "nothing.yaml"}, "beampose calibrate pair"),
         ({"target": None}, "target: expected a value"),
         ({"target": {"colours": {"red": {"hue_deg": [0, 500]}}, "markers": {}}}, "hue_deg: expected 0 to 360"),

@@ -1,0 +1,86 @@
+"""The overlay video: the pictures with the target's outline, its centre, its path and the status."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.arrays import Array
+from lab.detect.inputs import open_inputs
+from lab.errors import RunError
+from lab.pictures.picture_file import MissingPicture
+from lab.report.plot.image import grey_limits, stretched
+from lab.targets.recording import DEFAULT_RATE_HZ, grey_frames
+from lab.targets.target import F, Target, Track
+from tracking.statuses import PoseStatus
+
+_CODECS = {".avi": "MJPG", ".mp4": "mp4v"}
+_LARGEST_SIDE = 1920  # px of the video
+_RATE_RANGE_HZ = (1.0, 240.0)  # of the video: players do not show others well
+_PATH_FRAMES = 100  # frames of the path that are drawn
+_SHIFT = 4  # bits of sub-pixel positions in OpenCV's drawing functions
+_COLOURS = {PoseStatus.MEASURED: (60, 220, 60), PoseStatus.PREDICTED: (30, 160, 255), PoseStatus.LOST: (60, 60, 230)}
+
+
+def write_overlay(target: Target[F], track: Track[F], folder: Path) -> None:
+    """Write the video, a picture per frame number; black where there is none.
+
+    Raises:
+        RunError: OpenCV cannot write it.
+    """
+    recording = track.recording
+    assert recording.size_px is not None  # of pictures
+    scale = min(1.0, _LARGEST_SIDE / max(recording.size_px))
+    width, height = (2 * max(round(side * scale / 2), 1) for side in recording.size_px)
+    rate = float(np.clip(recording.rate_hz or DEFAULT_RATE_HZ, *_RATE_RANGE_HZ))
+    code = cv2.VideoWriter.fourcc(*_CODECS[Path(target.overlay_name).suffix])
+    writer = cv2.VideoWriter(str(folder / target.overlay_name), code, rate, (width, height))
+    if not writer.isOpened():
+        raise RunError(f"{target.overlay_name}: OpenCV cannot write such a video here; leave the video out")
+    limits: tuple[float, float] | None = None
+    try:
+        frames = grey_frames(open_inputs([recording.path]), target.options.limit)
+        for k, (_, picture) in enumerate(frames):
+            grey: NDArray[np.uint8] = np.zeros((height, width), np.uint8)
+            if not isinstance(picture, MissingPicture):
+                limits = limits or grey_limits(picture)
+                shown = cv2.resize(stretched(picture, *limits), (width, height), interpolation=cv2.INTER_AREA)
+                grey = np.asarray(shown, np.uint8)
+            writer.write(drawn(grey, target, track, k, np.array([width, height]) / recording.size_px))
+    finally:
+        writer.release()
+
+
+def drawn(grey: NDArray[np.uint8], target: Target[F], track: Track[F], k: int, scale: Array) -> NDArray[np.uint8]:
+    """A picture (h, w) of frame k (from 0) as (h, w, 3), BGR, with the track up to it.
+
+    scale: (2,) of the picture, against that of the recording. The outline is a circle of the target's size; of a target
+    without a size, of 3 sigma.
+    """
+    image = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    line = max(1, round(min(grey.shape) / 500))
+    first = max(0, k - _PATH_FRAMES)
+    places = [f.place for f in track.frames[first : k + 1]]
+    at = [((np.clip(p[:2], -1e5, 1e5) + 0.5) * scale - 0.5) * 2**_SHIFT for p in places]
+    for i in range(1, len(at)):
+        if np.isfinite([at[i - 1], at[i]]).all():
+            ends = [(round(float(u)), round(float(v))) for u, v in (at[i - 1], at[i])]
+            colour = _COLOURS[track.frames[first + i].status]
+            cv2.line(image, ends[0], ends[1], colour, 1, cv2.LINE_AA, _SHIFT)
+    now = track.frames[k]
+    colour = _COLOURS[now.status]
+    if np.isfinite(at[-1]).all():
+        size = places[-1][2] / target.size_radii
+        size = size if np.isfinite(size) else max(3 * float(now.sigmas[:2].max()), 4 / scale[0])
+        centre = round(float(at[-1][0])), round(float(at[-1][1]))
+        radius = max(round(float(np.clip(size, 0, 1e5)) * float(scale.mean()) * 2**_SHIFT), 1)
+        cv2.circle(image, centre, radius, colour, line, cv2.LINE_AA, _SHIFT)
+        cross = centre[0] >> _SHIFT, centre[1] >> _SHIFT
+        cv2.drawMarker(image, cross, colour, cv2.MARKER_CROSS, 9 * line, line)
+    label = f"{track.recording.numbers[k]}  {now.status.value}" + (f" ({now.cause})" if now.cause.value else "")
+    size_of_letters = 0.45 * line
+    cv2.putText(image, label, (6, 8 + 14 * line), cv2.FONT_HERSHEY_SIMPLEX, size_of_letters, colour, line)
+    return np.asarray(image, np.uint8)
