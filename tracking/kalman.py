@@ -37,7 +37,7 @@ def predict(x: Array, P: Array, dt: float, sigma_a: Array) -> tuple[Array, Array
 
 def propagate(x: Array, P: Array, F: Array, Q: Array) -> tuple[Array, Array]:
     """States (..., n) and covariances (..., n, n) predicted with F and Q (..., n, n)."""
-    return (F @ x[..., None])[..., 0], symmetric(F @ P @ np.swapaxes(F, -1, -2) + Q)
+    return (F @ x[..., None])[..., 0], F @ P @ np.swapaxes(F, -1, -2) + Q
 
 
 def innovation(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Array]:

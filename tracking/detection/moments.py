@@ -77,6 +77,7 @@ _HALF, _CLOSE = 7, 4
 _PLANE, _ROUND = _round_shapes(_HALF)
 _CLOSE_PLANE, _CLOSE_ROUND = _round_shapes(_CLOSE)  # for spots with others around them
 
+_BY_NOISE = 2.0  # sigmas of the sum of squared noise on the squares of `is_round`
 # Share of the texture's sigma in it: the light falls off in all directions, which most grains of texture do not.
 _OF_TEXTURE = 0.7
 
@@ -211,7 +212,8 @@ def _explains(
         for j in range(u - reach, u + reach + 1, step):
             light[k] = pixel(image, j, i)
             k += 1
-    total = total_of_products(light, light) - n * variance_dn2
+    # Less what the noise may add: of a faint spot it is most of the sum.
+    total = total_of_products(light, light) - (n + _BY_NOISE * sqrt(2.0 * n)) * variance_dn2
     for p in range(plane.shape[0]):
         total -= total_of_products(light, plane[p]) ** 2
     for p in range(shapes.shape[0]):

@@ -72,7 +72,7 @@ class FilterBank:
         """The bank dt frames later."""
         phi, Q = _stacked(self.models, dt)
         x, P = propagate(self.x, self.P, phi, Q)
-        return FilterBank(x, P, self.log_weight, self.models)
+        return FilterBank(x, symmetric(P), self.log_weight, self.models)
 
     def updated(self, z: Array, R: Array, forgetting: float) -> FilterBank:
         """The bank after a measured circle. forgetting: factor of the earlier log likelihoods."""
