@@ -77,7 +77,7 @@ _HALF, _CLOSE = 7, 4
 _PLANE, _ROUND = _round_shapes(_HALF)
 _CLOSE_PLANE, _CLOSE_ROUND = _round_shapes(_CLOSE)  # for spots with others around them
 
-_BY_NOISE = 2.0  # sigmas of the sum of squared noise on the squares of `is_round`
+_BY_NOISE = 3.0  # sigmas of the sum of squared noise on the squares of `is_round`
 # Share of the texture's sigma in it: the light falls off in all directions, which most grains of texture do not.
 _OF_TEXTURE = 0.7
 
