@@ -9,6 +9,7 @@ import numpy as np
 from calibration.findings import Finding, Level, unless_pass
 from calibration.lens.board_findings import circles_finding, model_uncertainty_finding, points_finding, stretch_finding
 from calibration.lens.fit.lens_models import folds_in_picture
+from calibration.lens.fit.model_selection import UNKNOWN_PX
 from calibration.lens.fit.projection_map import Difference
 from calibration.lens.intrinsics_result import Intrinsics
 
@@ -31,7 +32,7 @@ class FindingLimits:
     views: int = 8
     p_value: float = 0.01  # of the halves' difference, and of the scatter between photographs
     halves_px: float = 1.0  # a significant difference larger than this fails
-    map_px: tuple[float, float] = (0.5, 3.0)  # projection uncertainty, 90 % quantile over the picture
+    map_px: tuple[float, float] = (0.5, UNKNOWN_PX)  # projection uncertainty, 90 % quantile over the picture
     warp_m: float = 0.002  # a larger bend is not described by a quadratic surface
 
 
@@ -216,10 +217,10 @@ def _principal_point(c: Intrinsics, limits: FindingLimits) -> Finding:
 
 
 def _overfit(c: Intrinsics, limits: FindingLimits) -> Finding:
-    ratio = c.held.rms_px / c.fit.sigma_px
+    ratio = c.held_out_rms_px / c.fit.sigma_px
     return unless_pass(
         _level(ratio, limits.overfit),
-        f"Hold-out error: {_mm(c, c.held.rms_px)}, {ratio:.2f} times the corners' own noise.",
+        f"Hold-out error: {_mm(c, c.held_out_rms_px)}, {ratio:.2f} times the corners' own noise.",
         "The lens is fitted to the noise of its own photographs.",
         _MORE[0].upper() + _MORE[1:] + ".",
         code="BP-L19",
@@ -306,7 +307,8 @@ def _warp(c: Intrinsics, limits: FindingLimits) -> Finding | None:
         return None
     text = f"The board is bent by {1000 * w.rise_m:.2f} mm (p = {w.p_value:.1g} for a flat board): {w.why}"
     if not w.corrected:
-        return Finding(Level.PASS, text + "; taken as flat.")
+        change = f" Solving for it would change directions by {_two(w.change_px)} px RMS." if w.change_px else ""
+        return Finding(Level.PASS, f"{text}; taken as flat.{change}")
     return unless_pass(
         Level.WARN if w.rise_m > limits.warp_m else Level.PASS,
         text + "; corrected.",

@@ -45,7 +45,6 @@ class CameraOptions:
     name: str = "camera"
     distance_m: float | None = None  # distance of the screen, for figures in mm; None: median distance of the boards
     valid_days: int | None = 365  # a run warns after that; None: no expiry. One year: mounts and lenses creep
-    folds: int | None = None  # of the cross-validation; None: five, or leave-one-out up to ten views
     lens: str = "auto"  # or 0, 4, 5, 8, 12, fisheye: fixed lens model in place of the selected one
     warp: str = "auto"  # or on, off: estimation of the board's bend
     stretch: str = "auto"  # or on, off: estimation of the board's scale along rows and columns, and of its point errors
@@ -60,8 +59,6 @@ class CameraOptions:
             raise InputError(f"stretch: expected {', '.join(WARPS)}, got {self.stretch!r}{near}")
         if self.distance_m is not None and not (np.isfinite(self.distance_m) and self.distance_m > 0):
             raise InputError(f"distance: expected metres above 0, got {self.distance_m:g}")
-        if self.folds is not None and self.folds < 2:
-            raise InputError(f"folds: expected 2 or more, got {self.folds}")
         if self.valid_days is not None and self.valid_days < 1:
             raise InputError(f"valid days: expected 1 or more, got {self.valid_days}")
 
@@ -69,7 +66,7 @@ class CameraOptions:
         """The options of the solver. origins: source of each view, see `origins_of`."""
         lens = None if self.lens == "auto" else named(self.lens)
         warp, stretch = WARPS[self.warp], WARPS[self.stretch]
-        return IntrinsicsOptions(self.distance_m, lens, warp, stretch, self.folds, origins)
+        return IntrinsicsOptions(self.distance_m, lens, warp, stretch, origins)
 
 
 def calibrate_camera(
@@ -141,7 +138,7 @@ def camera_file(outcome: CameraOutcome, options: CameraOptions, day: datetime.da
         verdict=outcome.level.name,
         rms_px=r.rms_px,
         sigma_px=r.fit.sigma_px,
-        hold_out_rms_px=r.held.rms_px,
+        hold_out_rms_px=r.held_out_rms_px,
         views=int(np.sum(r.table.counts(r.fit.used) > 0)),
         corners=int(r.fit.used.sum()),
         board=outcome.photos.board.describe(),

@@ -16,7 +16,7 @@ from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
 from calibration.lens.intrinsics_result import Intrinsics
 from tests.calibration.lens.rendered_circles import LENS, CircleScene, table_of
 
-QUICK = IntrinsicsOptions(lens=LensModel(5), warp=False, stretch=False, folds=2)
+QUICK = IntrinsicsOptions(lens=LensModel(5), warp=False, stretch=False)
 SCENE = CircleScene(parse("acircles:4x9:20mm"), views=8)
 
 
