@@ -39,7 +39,8 @@ from geometry.camera import project_points_full
 RATIONAL = LensModel(8)
 FEWEST_INLIERS = 0.99  # share of used corners below which a lens model is considered too small
 UNKNOWN_PX = 3.0  # sigma of the directions in 90 % of the picture from which on a model leaves them unknown
-EQUAL = 1.1  # ratio of expected errors up to which the model with fewer coefficients is chosen
+EQUAL = 1.1  # ratio of expected errors up to which the model with fewer coefficients is chosen ...
+PLAUSIBLE = 0.01  # ... if its probability is not smaller
 # Models with parameters that the views hardly determine converge very slowly along a valley. They are stopped early: a
 # twentieth of a sigma is negligible against the differences between models.
 _BRIEF = Limits(steps=40, small_step_sigmas=0.05)
@@ -144,8 +145,10 @@ def choose(table: CornerTable, candidates: Sequence[ModelCandidate]) -> ModelSel
     out = [done.get(c.candidate.model, c.candidate) for c in judged]
     usable = [c for c in out if c.fit is not None and not c.refused]
     if usable:
-        least = min(c.error_px for c in usable)
-        chosen = next(c for c in usable if c.error_px <= EQUAL * least)
+        least = min(usable, key=lambda c: c.error_px)
+        chosen = next(
+            c for c in usable if c is least or (c.error_px <= EQUAL * least.error_px and c.probability >= PLAUSIBLE)
+        )
         why = f"its directions have the smallest expected error where corners were seen ({chosen.error_px:.2g} px)"
     else:
         chosen = done[min(solved, key=lambda j: (j.folds, j.unknown_px)).candidate.model]
