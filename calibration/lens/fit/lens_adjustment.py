@@ -50,12 +50,18 @@ def term_of(
     )
 
 
-def coefficient_prior(table: CornerTable, used: Bools, model: LensModel, values: Values) -> Term:
+def coefficient_prior(
+    table: CornerTable, used: Bools, model: LensModel, values: Values, camera: int = 0
+) -> Sequence[Term]:
     """A weak prior that limits the effect of each distortion coefficient on a point at the picture's edge.
+
+    Only for models of more than five coefficients. camera: index of the lens among those of an adjustment.
 
     Numerator and denominator of the rational model nearly cancel: without the prior, photographs leave combinations of
     its coefficients undetermined, and the iteration diverges slowly along them. Its bias is far below the noise.
     """
+    if model.coefficients <= 5:
+        return ()
     poses = values["boards"]
     assert isinstance(poses, Poses)
     xyz = poses.pose[table.view[used]].apply(table.points[used])
@@ -68,7 +74,7 @@ def coefficient_prior(table: CornerTable, used: Bools, model: LensModel, values:
     prism = np.array([8, 9, 10, 11])
     sigmas[4 + prism] = _MODERATE_PRISM / float(r2) ** power[prism]
     sigmas[~model.free] = np.inf
-    return independent("intrinsics", Vectors(np.zeros((1, INTRINSICS_COUNT))), sigmas[None])[0]
+    return independent("intrinsics", Vectors(np.zeros((1, INTRINSICS_COUNT))), sigmas[None], camera)
 
 
 def with_circle_radius(table: CornerTable, used: Bools, model: LensModel, values: Values) -> tuple[Values, list[Term]]:
@@ -107,7 +113,7 @@ def _radius_by_areas(table: CornerTable, used: Bools, model: LensModel, values: 
 def prior_terms(table: CornerTable, used: Bools, model: LensModel, values: Values) -> list[Term]:
     """The weak priors of a fit of the whole lens: on the coefficients of rich models, and on the radius of circles."""
     known = with_circle_radius(table, used, model, values)[1]
-    return [*known, coefficient_prior(table, used, model, values)] if model.coefficients > 5 else known
+    return [*known, *coefficient_prior(table, used, model, values)]
 
 
 def adjust(
@@ -147,11 +153,11 @@ def adjust(
         free["print"] = np.repeat(seen[:, None], 3, axis=1)
         known.append(Anchors("print", np.zeros((len(seen), 3)), _PRINT_SIGMA * table.spacing_m))
     term = term_of(table, used, model.fisheye, settings.sigma_px, settings.loss)
-    basis = {"intrinsics": lens_basis([term, *known], model, values)} if whole_lens and model.coefficients > 5 else {}
+    basis = {"intrinsics": _lens_basis([term, *known], model, values)} if whole_lens and model.coefficients > 5 else {}
     return solve(values, [term, *known], free, settings.limits, basis)
 
 
-def lens_basis(terms: Sequence[Term], model: LensModel, values: Values) -> Array:
+def _lens_basis(terms: Sequence[Term], model: LensModel, values: Values) -> Array:
     """(18, 18): columns are combinations of the lens parameters with orthogonal effects on the corners, about 1 sigma.
 
     From the R factor of a QR decomposition of the derivatives at the start; the identity if R is singular.
