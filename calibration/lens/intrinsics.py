@@ -60,7 +60,10 @@ def calibrate_intrinsics(table: CornerTable, options: IntrinsicsOptions | None =
     try:
         return _calibrated(table, options)
     except StartError as error:
-        raise IntrinsicsError(str(error)) from None
+        raise IntrinsicsError(
+            f"{error}; check the kind and size of the board, then photograph it again: 15 to 30 sharp photographs,"
+            " tilted by 20 to 45 deg to all sides and moved into the picture's corners"
+        ) from None
     except AdjustmentError as error:
         raise IntrinsicsError(
             f"the photographs do not determine the lens: {error}; take more of them, the board tilted by 20 to 45 deg"
@@ -97,7 +100,7 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
         selection=selection,
         board=shape,
         halves=_halves(equations, pixel_map, noise),
-        origins=_origins(equations, pixel_map, noise, options.origins),
+        origins=_origins(equations, pixel_map, options.origins),
         map=pixel_map,
         distance_m=distance,
         coverage=coverage_of(table, found.used, found.poses),
@@ -178,14 +181,17 @@ def _halves(equations: ViewEquations, at: ProjectionMap, noise: float) -> Differ
     return _difference(equations, at, noise, ~odd, odd)
 
 
-def _origins(equations: ViewEquations, at: ProjectionMap, noise: float, origins: Sequence[str]) -> Origins | None:
-    """The views of the two most frequent origins compared; None where the second one has too few views."""
+def _origins(equations: ViewEquations, at: ProjectionMap, origins: Sequence[str]) -> Origins | None:
+    """The views of the two most frequent origins compared; None where the second one has too few views.
+
+    Two cameras make the photographs scatter: the sigmas are therefore those of the corners' noise alone.
+    """
     of_views = np.array([origins[v] for v in equations.views] if origins else [])
     common = [(name, count) for name, count in Counter(of_views.tolist()).most_common(2) if count >= FEWEST_VIEWS]
     if len(common) < 2:
         return None
     names = (common[0][0], common[1][0])
-    found = _difference(equations, at, noise, *(of_views == name for name in names))
+    found = _difference(equations, at, 1.0, *(of_views == name for name in names))
     return None if found is None else Origins(names, found)
 
 

@@ -14,6 +14,7 @@ from calibration.lens.fit.projection_map import Difference
 from calibration.lens.intrinsics_result import Intrinsics
 
 _TILTED = "tilt the board by 20 to 45 deg to all sides and photograph it at two or three distances"
+_ENOUGH_VIEWS, _FEWEST_MORE = 15, 5  # photographs in all, and at least to add
 _MORE = "take more photographs, the board tilted by 20 to 45 deg to all sides and moved into the picture's corners"
 
 
@@ -63,6 +64,24 @@ def findings_of(c: Intrinsics, limits: FindingLimits = LIMITS) -> tuple[Finding,
         circles_finding(c),
     ]
     return tuple(f for f in found if f is not None)
+
+
+def next_photographs(c: Intrinsics, limits: FindingLimits = LIMITS) -> str:
+    """What to photograph next, in one sentence, from what the photographs lack."""
+    count = int(np.sum(c.table.counts(c.fit.used) > 0))
+    wanted = max(_ENOUGH_VIEWS - count, _FEWEST_MORE)
+    places = " and ".join(filter(None, [", ".join(c.coverage.gaps[:-1]), *c.coverage.gaps[-1:]]))
+    where = f"near the {places} of the picture" if places else "in every part of the picture up to its corners"
+    tilt = "tilted by 20 to 45 deg to all sides"
+    if c.coverage.spread_deg < limits.spread_deg[0]:
+        tilt += f" (so far {c.coverage.spread_deg:.0f} deg between any two)"
+    turned = (
+        ", half of them turned by 90 deg in its plane"
+        if _level(abs(c.fit.lens[0] / c.fit.lens[1] - 1), limits.aspect)
+        else ""
+    )
+    sharp = ", sharp, on a stiff flat plate" if _level(c.fit.sigma_px, limits.noise_px) else ""
+    return f"Photograph next: {wanted} more, the board {where}, {tilt}{turned}{sharp}."
 
 
 def _level(value: float, limits: tuple[float, float]) -> Level:

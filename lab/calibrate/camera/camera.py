@@ -23,6 +23,7 @@ from calibration.lens.intrinsics import (
 from calibration.lens.intrinsics_result import Intrinsics
 from geometry.camera import FISHEYE, PERSPECTIVE
 from lab.calibrate.camera.camera_outcome import CameraOutcome
+from lab.calibrate.camera.corner_tables import TABLE_SUFFIXES, read_corner_table
 from lab.calibrate.camera.photos import PhotoSet, Progress, find_in_photos, origins_of
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.board_file import load_board_or_text
@@ -44,6 +45,7 @@ class CameraOptions:
 
     name: str = "camera"
     distance_m: float | None = None  # distance of the screen, for figures in mm; None: median distance of the boards
+    image_size_px: tuple[int, int] | None = None  # width, height, of the pictures of a table of corners
     valid_days: int | None = 365  # a run warns after that; None: no expiry. One year: mounts and lenses creep
     lens: str = "auto"  # or 0, 4, 5, 8, 12, fisheye: fixed lens model in place of the selected one
     warp: str = "auto"  # or on, off: estimation of the board's bend
@@ -79,6 +81,8 @@ def calibrate_camera(
 ) -> CameraOutcome:
     """Calibrate a camera from photographs (files, folders, patterns, videos) of a board (value, text or board.yaml).
 
+    photos may also be one table of corners, see `corner_tables`, with the size of its pictures in the options.
+
     Writes camera.yaml, corners.csv and report.html into the folder `out`, all or none. If the verdict is FAIL, the
     camera file is called camera.failed.yaml so that no program reads it by mistake; a FAIL never replaces an earlier
     calibration, its results go to `OUT-failed`.
@@ -91,7 +95,7 @@ def calibrate_camera(
     check_output_folder(out, _is_ours)
     day = today or datetime.date.today()
     known = load_board_or_text(board) if isinstance(board, str | Path) else board
-    found = find_in_photos(photos, known, progress, fewest=FEWEST_VIEWS)
+    found = _views(list(photos), known, options, progress)
     table = corner_table(found)
     try:
         result = calibrate_intrinsics(table, options.intrinsics(origins_of(found)))
@@ -109,6 +113,18 @@ def calibrate_camera(
 
         write_page(outcome, file, day, work)
     return outcome
+
+
+def _views(photos: list[Path | str], board: Board, options: CameraOptions, progress: Progress | None) -> PhotoSet:
+    """From photographs or from a table of corners."""
+    table = Path(photos[0]) if len(photos) == 1 and Path(photos[0]).suffix.lower() in TABLE_SUFFIXES else None
+    if table is None and options.image_size_px is None:
+        return find_in_photos(photos, board, progress, fewest=FEWEST_VIEWS)
+    if table is None:
+        raise InputError("image size: expected with a table of corners only; photographs have their own size")
+    if options.image_size_px is None:
+        raise InputError(f"{table}: a table of corners does not state the size of its pictures; add --image-size WxH")
+    return read_corner_table(table, board, options.image_size_px)
 
 
 def corner_table(photos: PhotoSet) -> CornerTable:
