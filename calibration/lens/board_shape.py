@@ -29,7 +29,7 @@ from geometry.arrays import Array, Bools
 
 SIGNIFICANT = 1e-3  # p-value below which a deviation from the stated board is significant
 HALF_SIGNIFICANT = 0.01  # the same in each half of the photographs
-SCATTER_SIGNIFICANT = 0.01  # p-value of scatter between photographs below which noise does not explain it
+EXPLAINED = 0.01  # p-value of scatter between photographs below which noise does not explain it
 _SEEN_OFTEN = 3.0  # views of each point required to solve for all points
 _MOST_POINTS = 2000  # above it the points are not solved for: three unknowns each
 _WARP, _STRETCH = slice(0, 3), slice(3, 5)  # of the shape's five parameters
@@ -204,7 +204,7 @@ class _Evidence:
 
     @property
     def is_stretched(self) -> bool:
-        explains = self.scatter.p_value >= SCATTER_SIGNIFICANT
+        explains = self.scatter.p_value >= EXPLAINED
         return self.p_stretch < SIGNIFICANT and self._in_both_halves(_STRETCH) and explains
 
     @property
@@ -257,7 +257,7 @@ def _points(
     except AdjustmentError as problem:
         return PointsTest(nothing, p, False, f"significant, but they cannot be solved for: {problem}"), found
     off = np.where((seen > 0)[:, None], _without_similarity(table.board_points, freed.printed), 0.0)
-    if left.p_value < SCATTER_SIGNIFICANT and options.stretch is None:
+    if left.p_value < EXPLAINED and options.stretch is None:
         why = (
             f"significant in both halves of the photographs, but they do not explain them: they still scatter"
             f" {left.factor:.1f} times more than noise"

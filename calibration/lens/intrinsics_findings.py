@@ -9,7 +9,7 @@ import numpy as np
 from calibration.findings import Finding, Level, unless_pass
 from calibration.lens.board_findings import circles_finding, model_uncertainty_finding, points_finding, stretch_finding
 from calibration.lens.fit.lens_models import folds_in_picture
-from calibration.lens.fit.model_selection import UNKNOWN_PX
+from calibration.lens.fit.model_selection import OVERFIT, UNKNOWN_PX
 from calibration.lens.fit.projection_map import Difference
 from calibration.lens.intrinsics_result import Intrinsics
 
@@ -29,7 +29,7 @@ class FindingLimits:
     aspect: tuple[float, float] = (0.005, 0.03)  # |fx/fy - 1|: pixels of today's sensors are square to 0.1 %
     off_centre: tuple[float, float] = (0.08, 0.2)  # principal point from the middle, share of the width or height
     focal: tuple[float, float] = (0.003, 0.02)  # relative sigma of the focal length
-    overfit: tuple[float, float] = (1.5, 3.0)  # hold-out error over the noise
+    overfit: tuple[float, float] = (1.5, OVERFIT)  # hold-out error over the noise
     views: int = 8
     p_value: float = 0.01  # of the halves' difference, and of the scatter between photographs
     halves_px: float = 1.0  # a significant difference larger than this fails

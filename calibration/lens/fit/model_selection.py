@@ -39,6 +39,7 @@ from geometry.camera import project_points_full
 RATIONAL = LensModel(8)
 FEWEST_INLIERS = 0.99  # share of used corners below which a lens model is considered too small
 UNKNOWN_PX = 3.0  # sigma of the directions in 90 % of the picture from which on a model leaves them unknown
+OVERFIT = 3.0  # error in held-out photographs over the noise from which on a model depends on single photographs
 EQUAL = 1.1  # ratio of expected errors up to which the model with fewer coefficients is chosen ...
 PLAUSIBLE = 0.01  # ... if its probability is not smaller
 # Models with parameters that the views hardly determine converge very slowly along a valley. They are stopped early: a
@@ -168,6 +169,7 @@ class _Judged:
     sigma_px: float = np.nan  # of directions where corners were seen
     unknown_px: float = np.inf  # of directions in 90 % of the picture
     folds: bool = False
+    overfit: float = 1.0  # RMS error in held-out photographs over the noise of the corners
 
     def refused(self, raised: float) -> str:
         """Reason why the model cannot be chosen; empty if it can. raised: factor on the sigmas."""
@@ -176,6 +178,10 @@ class _Judged:
         unknown = self.unknown_px * raised
         if unknown > UNKNOWN_PX:
             return f"the photographs leave its directions unknown: {unknown:.2g} px or more in a tenth of the picture"
+        if self.overfit > OVERFIT:
+            return (
+                f"it depends on single photographs: held out, they err {self.overfit:.1f} times more than their noise"
+            )
         return ""
 
 
@@ -200,6 +206,7 @@ def _judged(table: CornerTable, candidate: ModelCandidate) -> _Judged:
         sigma_px=float(np.sqrt(np.mean(variance))) if inside.any() else np.inf,
         unknown_px=float(np.nanquantile(at.sigma_px(C), 0.9)),
         folds=folds_in_picture(found.lens, found.model.fisheye, table.image_size_px),
+        overfit=float(np.sqrt(np.mean(equations.held_out_px2()))),
     )
 
 
