@@ -1,4 +1,4 @@
-"""Lenses and pairs from real photographs: `python -m bench.real_lenses [subsets] [seed] [PART ...]`.
+"""Lenses and pairs from real photographs: `python -m bench.lenses.real [subsets] [seed] [PART ...]`.
 
 PART: a set of SETS (the whole set, OpenCV's plain solve and the published focal length, then random subsets of 5 to 13
 photographs), a pair of PAIRS, or sets (whole sets only); default: all sets and pairs. 100 subsets of each take an hour.
@@ -25,7 +25,7 @@ from lab.calibrate.camera.camera import corner_table
 from lab.calibrate.camera.photos import find_in_photos
 from lab.calibrate.pair.pair import baseline_sigma
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 _TWO = "charuco_two_cameras/cam_"
 _CHARUCO = "charuco:4x5:54mm:40.5mm:DICT_4X4_1000:inverted"
 # Photographs, board, published focal length in px (None: none; see SOURCE.md of each set).
@@ -64,7 +64,8 @@ def line(found: Intrinsics | str) -> str:
     if isinstance(found, str):
         return f"ERROR {found[:80]}"
     failed = ",".join(f.code for f in found.findings if f.level is Level.FAIL)
-    return f"{found.verdict.name:4s} {found.model.title:7s} fx {found.fit.lens[0]:8.2f} ± {found.sigmas[0]:5.2f} px {failed}"
+    fx, sigma = found.fit.lens[0], found.sigmas[0]
+    return f"{found.verdict.name:4s} {found.model.title:7s} fx {fx:8.2f} ± {sigma:5.2f} px {failed}"
 
 
 def plain_opencv(table: CornerTable) -> tuple[float, float]:

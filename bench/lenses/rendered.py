@@ -1,4 +1,4 @@
-"""Lenses from rendered photographs with exact truth: `python -m bench.rendered_lenses [sets] [seed] [KIND ...]`.
+"""Lenses from rendered photographs with exact truth: `python -m bench.lenses.rendered [sets] [seed] [KIND ...]`.
 
 KIND: LENS-BOARD with LENS plain (five coefficients), rational (eight) or fisheye and BOARD chess, circles, acircles or
 charuco; default: all twelve. A set has 6 to 40 photographs of 1280 x 960 px. Ten sets per kind take an hour.
