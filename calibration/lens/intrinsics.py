@@ -14,7 +14,7 @@ from calibration.lens.board_shape import BoardShapeOptions, BoardTest, board_tes
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import coverage_of, spread_deg
 from calibration.lens.fit.lens_fit import FEWEST_CORNERS, LensFit, robust_fit, used_views
-from calibration.lens.fit.lens_models import LensModel
+from calibration.lens.fit.lens_models import LensModel, folds_in_picture
 from calibration.lens.fit.lens_parameters import AS_STATED, BOARD_BLOCKS, BoardFreedom, Values, board_as_stated
 from calibration.lens.fit.lens_start import StartError, start
 from calibration.lens.fit.model_selection import RATIONAL, ModelCandidate, inliers_of_rich_models, select_model
@@ -167,9 +167,11 @@ def _final(table: CornerTable, chosen: ModelCandidate, board: BoardFreedom) -> t
     assert chosen.fit is not None
     try:
         found = robust_fit(table, chosen.model, chosen.fit.values, board)
-        return found, ViewEquations.of(table, found)
+        if chosen.refused or not folds_in_picture(found.lens, found.model.fisheye, table.image_size_px):
+            return found, ViewEquations.of(table, found)
     except AdjustmentError:
-        return chosen.fit, ViewEquations.of(table, chosen.fit)
+        pass
+    return chosen.fit, ViewEquations.of(table, chosen.fit)
 
 
 def _typical_depth(table: CornerTable, found: LensFit) -> float:

@@ -39,6 +39,8 @@ from geometry.camera import project_points_full
 RATIONAL = LensModel(8)
 FEWEST_INLIERS = 0.99  # share of used corners below which a lens model is considered too small
 UNKNOWN_PX = 3.0  # sigma of the directions in 90 % of the picture from which on a model leaves them unknown
+_MARGIN = 0.8  # share of that limit for the choice: the final fit, with its own outliers, is a little different
+_COMMON = 0.9  # share of the covered picture over which errors are averaged: at its rim single places may diverge
 OVERFIT = 3.0  # error in held-out photographs over the noise from which on a model depends on single photographs
 EQUAL = 1.1  # ratio of expected errors up to which the model with fewer coefficients is chosen ...
 PLAUSIBLE = 0.01  # ... if its probability is not smaller
@@ -176,7 +178,7 @@ class _Judged:
         if self.folds:
             return "it folds inside the picture: two directions would map to the same pixel"
         unknown = self.unknown_px * raised
-        if unknown > UNKNOWN_PX:
+        if unknown > _MARGIN * UNKNOWN_PX:
             return f"the photographs leave its directions unknown: {unknown:.2g} px or more in a tenth of the picture"
         if self.overfit > OVERFIT:
             return (
@@ -203,7 +205,7 @@ def _judged(table: CornerTable, candidate: ModelCandidate) -> _Judged:
         inside=inside,
         scatter=equations.scatter().factor,
         held_out_px2=float(np.sum(equations.held_out_px2() * equations.count)) * found.sigma_px**2,
-        sigma_px=float(np.sqrt(np.mean(variance))) if inside.any() else np.inf,
+        sigma_px=float(np.sqrt(_common_mean(variance))) if inside.any() else np.inf,
         unknown_px=float(np.nanquantile(at.sigma_px(C), 0.9)),
         folds=folds_in_picture(found.lens, found.model.fisheye, table.image_size_px),
         overfit=float(np.sqrt(np.mean(equations.held_out_px2()))),
@@ -224,7 +226,7 @@ def _excess_px2(one: _Judged, other: _Judged, raised: float) -> float:
 
 
 def difference_px(pixels: Array, first: LensFit, second: LensFit) -> float:
-    """RMS difference (px) at pixels (n, 2) between the rays of two lenses, after the best-fitting rotation."""
+    """RMS difference (px) at most of the pixels (n, 2) between the rays of two lenses, after the best rotation."""
     flat = undistorted(pixels, first.lens, first.model.fisheye)
     pixels, flat = pixels[np.isfinite(flat).all(axis=1)], flat[np.isfinite(flat).all(axis=1)]
     rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
@@ -235,7 +237,12 @@ def difference_px(pixels: Array, first: LensFit, second: LensFit) -> float:
     turn = np.cross(rays[:, None, :], seen.d_point)[good].reshape(-1, 3)
     moved = away[good].reshape(-1)
     left = moved - turn @ np.linalg.lstsq(turn, moved, rcond=None)[0]
-    return float(np.sqrt(np.sum(left**2) / max(int(good.sum()), 1)))
+    return float(np.sqrt(_common_mean(np.sum(left.reshape(-1, 2) ** 2, axis=1))))
+
+
+def _common_mean(squares: Array) -> float:
+    """Mean of squared errors (n,) without the largest ones."""
+    return float(np.mean(np.sort(squares)[: max(int(_COMMON * len(squares)), 1)])) if len(squares) else 0.0
 
 
 def _fitted(
