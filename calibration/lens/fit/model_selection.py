@@ -39,7 +39,6 @@ from geometry.camera import project_points_full
 RATIONAL = LensModel(8)
 FEWEST_INLIERS = 0.99  # share of used corners below which a lens model is considered too small
 UNKNOWN_PX = 3.0  # sigma of the directions in 90 % of the picture from which on a model leaves them unknown
-_MARGIN = 0.8  # share of that limit for the choice: the final fit, with its own outliers, is a little different
 _COMMON = 0.9  # share of the covered picture over which errors are averaged: at its rim single places may diverge
 OVERFIT = 3.0  # error in held-out photographs over the noise from which on a model depends on single photographs
 EQUAL = 1.1  # ratio of expected errors up to which the model with fewer coefficients is chosen ...
@@ -140,7 +139,7 @@ def choose(table: CornerTable, candidates: Sequence[ModelCandidate]) -> ModelSel
         excess = sum(w * _excess_px2(j, other, raised) for w, other in zip(weights, solved, strict=True))
         done[j.candidate.model] = replace(
             j.candidate,
-            refused=j.refused(raised),
+            refused=j.refused(raised, float(np.sqrt(excess))),
             sigma_px=j.sigma_px * raised,
             probability=weight,
             model_error_px=float(np.sqrt(excess)),
@@ -154,7 +153,11 @@ def choose(table: CornerTable, candidates: Sequence[ModelCandidate]) -> ModelSel
         )
         why = f"its directions have the smallest expected error where corners were seen ({chosen.error_px:.2g} px)"
     else:
-        chosen = done[min(solved, key=lambda j: (j.folds, j.unknown_px)).candidate.model]
+        models = {
+            j.candidate.model: (j.folds, np.hypot(j.unknown_px * raised, done[j.candidate.model].model_error_px))
+            for j in solved
+        }
+        chosen = done[min(models, key=lambda m: models[m])]
         why = "every model leaves directions unknown, this one in the smallest part of the picture"
     return ModelSelection(out, chosen, "as requested" if len(candidates) == 1 else why)
 
@@ -173,12 +176,12 @@ class _Judged:
     folds: bool = False
     overfit: float = 1.0  # RMS error in held-out photographs over the noise of the corners
 
-    def refused(self, raised: float) -> str:
+    def refused(self, raised: float, model_error_px: float) -> str:
         """Reason why the model cannot be chosen; empty if it can. raised: factor on the sigmas."""
         if self.folds:
             return "it folds inside the picture: two directions would map to the same pixel"
-        unknown = self.unknown_px * raised
-        if unknown > _MARGIN * UNKNOWN_PX:
+        unknown = float(np.hypot(self.unknown_px * raised, model_error_px))
+        if unknown > UNKNOWN_PX:
             return f"the photographs leave its directions unknown: {unknown:.2g} px or more in a tenth of the picture"
         if self.overfit > OVERFIT:
             return (
