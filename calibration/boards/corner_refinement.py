@@ -12,10 +12,12 @@ import cv2
 import numpy as np
 
 from calibration.boards.board_view import GreyImage
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array, Bools, Ints
 
 _REACH = 0.4  # half of the window, in distances of the nearest parallel edge, which would be included from 0.5 on
 _MOST_PX = 20  # half of the window: a larger one includes curved edges and takes longer without being more accurate
+_MARGIN = 3  # px around the window in resampled pictures: the second measurement moves corners by less
+_FEWEST_NEAR = 8  # known corners around a corner from which its curvature is estimated
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
 
 
@@ -29,16 +31,68 @@ def refined(image: GreyImage, grid: Array, known: Bools | None = None, reach: fl
     known = np.ones((rows, columns), dtype=bool) if known is None else known
     height = edge_distance(grid, known)
     half = np.clip(np.nan_to_num(reach * height, nan=2.0).astype(int), 2, _MOST_PX)
+    first = _measured(image, grid, half, known, None)
+    found = known & np.isfinite(first).all(axis=-1)
+    out = _measured(image, first, half, found, _curvature(first, found))
+    out[np.linalg.norm(out - grid, axis=-1) > np.maximum(1.5, 0.75 * half)] = np.nan
+    return out
+
+
+def _measured(image: GreyImage, grid: Array, half: Ints, known: Bools, bent: Array | None) -> Array:
+    """Corners (rows, columns, 2) by cv2.cornerSubPix from start positions; nan where unknown or outside the picture.
+
+    bent: local curvature of the grid (see `_curvature`). The picture around each corner is then resampled such that
+    edges are straight: in a window of 20 px the curved edges of a fisheye lens would displace corners by .04 px.
+    """
     out = np.full(grid.shape, np.nan)
-    for size in np.unique(half[known]):
-        which = known & (half == size)
-        start = np.ascontiguousarray(grid[which], dtype=np.float32).reshape(-1, 1, 2)
-        inside = np.all((start >= 0) & (start <= np.array(image.shape[::-1]) - 1), axis=(1, 2))
-        end = np.full((len(start), 2), np.nan)
-        if inside.any():
-            end[inside] = cv2.cornerSubPix(image, start[inside], (int(size), int(size)), (-1, -1), _STOP).reshape(-1, 2)
-        end[np.linalg.norm(end - start[:, 0], axis=1) > max(1.5, 0.75 * size)] = np.nan
-        out[which] = end
+    within = known & np.all((grid >= 0) & (grid <= np.array(image.shape[::-1]) - 1), axis=-1)
+    for size in np.unique(half[within]).tolist():
+        which = within & (half == size)
+        start, window = grid[which], (size, size)
+        if bent is None:
+            points = np.ascontiguousarray(start, dtype=np.float32).reshape(-1, 1, 2)
+            out[which] = cv2.cornerSubPix(image, points, window, (-1, -1), _STOP).reshape(-1, 2)
+            continue
+        reach = size + _MARGIN
+        t = np.stack(np.meshgrid(np.arange(-reach, reach + 1.0), np.arange(-reach, reach + 1.0)), axis=-1)
+        C = bent[which]
+        at = start[:, None, None] + t + _quadratic(C[:, None, None], t)
+        patches = sampled(image, at, cv2.INTER_CUBIC).reshape(-1, 2 * reach + 1)
+        middle = np.stack([np.full(len(C), reach), reach + (2 * reach + 1) * np.arange(len(C))], axis=1)
+        points = np.ascontiguousarray(middle, dtype=np.float32).reshape(-1, 1, 2)
+        ends = cv2.cornerSubPix(patches.astype(np.float32), points, window, (-1, -1), _STOP).reshape(-1, 2)
+        moved = ends - middle
+        moved[np.linalg.norm(moved, axis=1) > _MARGIN] = np.nan
+        out[which] = start + moved + _quadratic(C, moved)
+    return out
+
+
+def _quadratic(C: Array, t: Array) -> Array:
+    """(..., 2): the second-order displacement at offsets t (..., 2), px, with coefficients C (..., 3, 2), 1/px."""
+    x, y = t[..., 0], t[..., 1]
+    return np.einsum("...k,...kj->...j", np.stack([x * x, x * y, y * y], axis=-1), C)
+
+
+def _curvature(grid: Array, known: Bools) -> Array:
+    """(rows, columns, 3, 2), 1/px: coefficients of x², xy, y² of the curvature of the grid around each corner.
+
+    Of the quadratic through the corners of three rows and columns around, seen as a displacement from its own
+    linear part, along which edges are straight. 0 where too few corners are known.
+    """
+    out = np.zeros((*known.shape, 3, 2))
+    for i, j in np.argwhere(known):
+        rows, columns = (slice(f := min(max(k - 1, 0), n - 3), f + 3) for k, n in zip((i, j), known.shape, strict=True))
+        b, a = np.nonzero(known[rows, columns])
+        near = grid[rows, columns][b, a]
+        a, b = a + columns.start - j, b + rows.start - i
+        if len(np.unique(a)) < 3 or len(np.unique(b)) < 3 or len(a) < _FEWEST_NEAR:
+            continue
+        M = np.stack([np.ones(len(a)), a, b, a * a, a * b, b * b], axis=1)
+        X = np.linalg.lstsq(M, near, rcond=None)[0]
+        L = np.linalg.inv(X[1:3])  # offset in px times L: offset in squares
+        (p, q), (r, s) = L
+        squares = np.array([[p * p, p * q, q * q], [2 * p * r, p * s + q * r, 2 * q * s], [r * r, r * s, s * s]])
+        out[i, j] = squares @ X[3:]
     return out
 
 
@@ -103,12 +157,12 @@ def edge_blur(image: GreyImage, grid: Array, reach: float = 0.4) -> tuple[float,
     return float(np.sqrt(max(1 / (2 * np.pi * slope**2) - 1 / 6, 0.0))), contrast
 
 
-def sampled(image: GreyImage, where: Array) -> Array:
-    """Grey values (...) at (..., 2) by bilinear interpolation; outside, those of the border."""
+def sampled(image: GreyImage, where: Array, method: int = cv2.INTER_LINEAR) -> Array:
+    """Grey values (...) at (..., 2), by default by bilinear interpolation; outside, those of the border."""
     flat = np.nan_to_num(where, nan=-1.0).reshape(-1, 2).astype(np.float32)
     out = np.empty(len(flat))
     for first in range(0, len(flat), 30_000):  # cv2.remap's maps have at most 32767 rows
         u, v = np.ascontiguousarray(flat[first : first + 30_000].T)[..., None]
-        read = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        read = cv2.remap(image, u, v, method, borderMode=cv2.BORDER_REPLICATE)
         out[first : first + 30_000] = read.ravel()
     return out.reshape(where.shape[:-1])

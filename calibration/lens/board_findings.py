@@ -7,7 +7,9 @@ import numpy as np
 from calibration.findings import Finding, Level, unless_pass
 from calibration.lens.intrinsics_result import Intrinsics
 
+SLIGHT_MODEL_ERROR = 1.02  # that factor below which it is not worth a remark
 UNCERTAIN_MODEL = 2.0  # factor on the sigmas, from rival models and correlated residuals, above which to warn
+UNNOTICED_PX = 0.1  # change of directions by an unsolved deviation of the board above which to warn
 OUT_OF_SCALE = 0.001  # relative scale difference of rows and columns above which to warn: printers reach .1 %
 UNDETERMINED = 0.002  # relative, of that difference and of fx / fy: above it the two cannot be distinguished
 OTHER_CIRCLE = 0.03  # relative difference from the stated diameter above which to warn
@@ -24,9 +26,9 @@ def model_uncertainty_finding(c: Intrinsics) -> Finding | None:
     parts = []
     if d.left_px > 0:
         parts.append(f"correlated residuals over the picture of {d.left_px:.2g} px (p = {d.p_value:.1g})")
-    if d.other is not None and d.between_px > 0:
-        parts.append(f"{_two(d.between_px)} px to the {d.other.words}, which predicts held-out views nearly as well")
-    if not parts:
+    if d.between_px > 0:
+        parts.append(f"{_two(d.between_px)} px to the other models, by their probabilities")
+    if d.factor < SLIGHT_MODEL_ERROR:
         return None
     return unless_pass(
         Level.WARN if d.factor > UNCERTAIN_MODEL or d.left_px > 0 else Level.PASS,
@@ -53,6 +55,14 @@ def stretch_finding(c: Intrinsics) -> Finding | None:
     if not s.corrected:
         fx, fy = c.fit.lens[:2]
         open_question = s.sigma[0] > UNDETERMINED and abs(fx / fy - 1) > UNDETERMINED
+        if s.change_px > 0 and not open_question:
+            return unless_pass(
+                Level.WARN if s.change_px > UNNOTICED_PX else Level.PASS,
+                f"{text}; taken as stated. Solving for it would change directions by {_two(s.change_px)} px RMS.",
+                "The photographs do not show whether the board, the lens model or the corners cause this.",
+                "Measure the board along both directions and state the sizes, or solve for them (--stretch on).",
+                code="BP-L03",
+            )
         return unless_pass(
             Level.WARN if open_question else Level.PASS,
             text + "; taken as stated.",
@@ -85,7 +95,11 @@ def points_finding(c: Intrinsics) -> Finding | None:
         Level.WARN if p.corrected else Level.PASS,
         f"Points of the board are displaced by {1000 * p.rms_m:.2g} mm RMS, the worst, at {where[0]:.0f},"
         f" {where[1]:.0f} mm, by {off:.2g} mm (p = {p.p_value:.1g} for a correct board): {p.why}"
-        + ("; each was solved for." if p.corrected else "; taken as stated."),
+        + (
+            "; each was solved for."
+            if p.corrected
+            else f"; taken as stated. Solving for them would change directions by {_two(p.change_px)} px RMS."
+        ),
         "The board's points are not where they were stated to be: it is printed unevenly, joined from several sheets,"
         " wavy or damaged."
         if p.corrected

@@ -1,10 +1,13 @@
 """Tests whether a board is as stated: flat, with rows and columns to scale and each point in its place.
 
-Deviations that the photographs show are solved for together with the lens, if this predicts held-out photographs as
-well or better. The absolute size of the board cannot be determined from photographs. Bend has three parameters and
-scale two; the displacements of single points follow Strobl and Hirzinger (2011), "More accurate pinhole camera
-calibration with imperfect planar target", ICCV workshops, with their common shift, rotation and scale fixed by wide
-priors instead of by three chosen points.
+One set of photographs of one board hardly separates an error of the board from one of the lens model: both are in all
+photographs, so that held-out photographs do not separate them either. A deviation is therefore solved for together
+with the lens only if each half of the photographs shows it. Scale and single points, which errors of lenses and of
+corners imitate more easily than a bend, must in addition explain the residuals: what is left must be noise. Where a
+significant deviation is not solved for, the result says by how much it would change the lens. The absolute size of the
+board cannot be determined from photographs. Bend has three parameters and scale two; the displacements of single points
+follow Strobl and Hirzinger (2011), "More accurate pinhole camera calibration with imperfect planar target", ICCV
+workshops, with their common shift, rotation and scale fixed by wide priors instead of by three chosen points.
 """
 
 from __future__ import annotations
@@ -16,15 +19,20 @@ from scipy.stats import chi2
 
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.lens.fit.corner_table import CornerTable
-from calibration.lens.fit.hold_out import HeldOut, hold_out, scatter
 from calibration.lens.fit.lens_adjustment import term_of
 from calibration.lens.fit.lens_fit import LensFit, fit
 from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, Values, board_as_stated
-from geometry.arrays import Array
+from calibration.lens.fit.model_selection import difference_px
+from calibration.lens.fit.projection_map import projection_map
+from calibration.lens.fit.view_equations import Scatter, ViewEquations
+from geometry.arrays import Array, Bools
 
 SIGNIFICANT = 1e-3  # p-value below which a deviation from the stated board is significant
+HALF_SIGNIFICANT = 0.01  # the same in each half of the photographs
+EXPLAINED = 0.01  # p-value of scatter between photographs below which noise does not explain it
 _SEEN_OFTEN = 3.0  # views of each point required to solve for all points
 _MOST_POINTS = 2000  # above it the points are not solved for: three unknowns each
+_WARP, _STRETCH = slice(0, 3), slice(3, 5)  # of the shape's five parameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +43,9 @@ class WarpTest:
     sigma: tuple[float, float, float]
     rise_m: float  # from its lowest to its highest point
     p_value: float  # of a bend at least as large, if the board is flat
-    gain_px2: float  # decrease of the mean squared hold-out error with the bend; nan where p is too large to test it
     corrected: bool
     why: str
+    change_px: float  # RMS of directions over the picture by solving for it; 0 where not significant
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +58,7 @@ class StretchTest:
     p_value: float  # of a deviation at least as large, if the board is as stated
     corrected: bool
     why: str
+    change_px: float  # RMS of directions over the picture by solving for it; 0 where not significant
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +69,7 @@ class PointsTest:
     p_value: float  # of residuals as strongly correlated per point, if the board is as stated
     corrected: bool
     why: str
+    change_px: float = 0.0  # RMS of directions over the picture by solving for them; 0 where not significant
 
     @property
     def rms_m(self) -> float:
@@ -89,11 +99,10 @@ class BoardShapeOptions:
 
     warp: bool | None = None
     stretch: bool | None = None
-    folds: int | None = None
 
 
 def board_test(table: CornerTable, found: LensFit, options: BoardShapeOptions = BoardShapeOptions()) -> BoardTest:
-    """Solve with the board as stated and with its shape free.
+    """Test each kind of deviation, and solve for those that are accepted.
 
     found: a fit of a lens model that is rich enough not to attribute its own error to the board.
 
@@ -101,47 +110,37 @@ def board_test(table: CornerTable, found: LensFit, options: BoardShapeOptions = 
         AdjustmentError: not even the bend can be determined.
     """
     flat = fit(table, found.used, found.model, {**found.values, **_stated_board(table, found)}, AS_STATED)
-    other, widths = _freed(table, flat)
-    warp_sure, stretch_sure = _p_value(other.warp, other.shape_covariance[:3, :3]), 1.0
-    if widths:
-        stretch_sure = _p_value(other.stretch, other.shape_covariance[3:, 3:])
-    factor, flat_held = 1.0, None
-    if min(warp_sure, stretch_sure) < SIGNIFICANT:
-        # Errors within one photograph are correlated: against noise alone nearly every real board would appear bent.
-        factor = max(1.0, scatter(other, hold_out(table, other, options.folds)).factor)
-        flat_held = hold_out(table, flat, options.folds)
-        warp_sure = _p_value(other.warp, other.shape_covariance[:3, :3] * factor**2)
-        if widths:
-            stretch_sure = _p_value(other.stretch, other.shape_covariance[3:, 3:] * factor**2)
-    wanted = BoardFreedom(warp_sure < SIGNIFICANT, stretch_sure < SIGNIFICANT)
-    wanted = BoardFreedom(
-        wanted.warp if options.warp is None else options.warp,
-        wanted.stretch if options.stretch is None or not widths else options.stretch,
-    )
-    kept, gain, error = _accepted(table, flat, flat_held, wanted, options)
-    sigmas = np.sqrt(np.maximum(np.diagonal(other.shape_covariance), 0)) * factor
-    return BoardTest(
-        WarpTest(
-            tuple(other.warp),
-            tuple(sigmas[:3]),
-            rise(table, other),
-            warp_sure,
-            gain,
-            kept.board.warp,
-            _why(kept.board.warp, options.warp, warp_sure, "a flat board", gain, error),
-        ),
-        StretchTest(
-            float(other.stretch[0]),
-            float(other.stretch[1]),
+    bent = fit(table, flat.used, flat.model, flat.values, BoardFreedom(warp=True))
+    test = _Evidence.of(table, bent)
+    warp, why = test.is_bent, test.why_bent
+    if options.warp is not None:
+        warp, why = options.warp, "as requested"
+    C = test.covariance
+    sigmas = np.sqrt(np.maximum(np.diagonal(C), 0))
+    change = _change_px(table, flat, bent) if test.p_warp < SIGNIFICANT else 0.0
+    warp_test = WarpTest(
+        tuple(test.shape[_WARP]), tuple(sigmas[_WARP]), rise(table, bent), test.p_warp, warp, why, change
+    )  # fmt: skip
+    kept, stretch_test = (bent if warp else flat), None
+    if len(test.shape) > 3:
+        stretch, why, change = test.is_stretched, test.why_stretched, 0.0
+        if options.stretch is not None:
+            stretch, why = options.stretch, "as requested"
+        if stretch or test.p_stretch < SIGNIFICANT:
+            freed = fit(table, kept.used, kept.model, kept.values, BoardFreedom(warp, stretch=True))
+            change = _change_px(table, kept, freed)
+            kept = freed if stretch else kept
+        stretch_test = StretchTest(
+            float(test.shape[3]),
+            float(test.shape[4]),
             (float(sigmas[3]), float(sigmas[4])),
-            stretch_sure,
-            kept.board.stretch,
-            _why(kept.board.stretch, options.stretch, stretch_sure, "rows and columns to scale", gain, error),
+            test.p_stretch,
+            stretch,
+            why,
+            change,
         )
-        if widths
-        else None,
-        *_points(table, kept, options, factor),
-    )
+    points, kept = _points(table, kept, options, max(1.0, test.scatter.factor))
+    return BoardTest(warp_test, stretch_test, points, kept)
 
 
 def _stated_board(table: CornerTable, found: LensFit) -> Values:
@@ -149,18 +148,86 @@ def _stated_board(table: CornerTable, found: LensFit) -> Values:
     return {**board_as_stated(len(table.board_points)), "radius": found.values["radius"]}
 
 
-def _freed(table: CornerTable, flat: LensFit) -> tuple[LensFit, bool]:
-    """The fit with bend and stretch free, or with the bend alone if the stretch is undetermined; and which it is."""
-    try:
-        other = fit(table, flat.used, flat.model, flat.values, BoardFreedom(warp=True, stretch=True))
-        if np.all(np.diagonal(other.shape_covariance) > 0):
-            return other, True
-    except AdjustmentError:
-        pass
-    other = fit(table, flat.used, flat.model, flat.values, BoardFreedom(warp=True))
-    if not np.all(np.diagonal(other.shape_covariance)[:3] > 0):
-        raise AdjustmentError("the views do not determine the board's bend")
-    return other, False
+@dataclass(frozen=True, slots=True)
+class _Evidence:
+    """Estimates of bend and scale by all photographs and by both halves, and the scatter once they are free."""
+
+    shape: Array  # (5,) or, where the scale is not determined, (3,)
+    covariance: Array
+    halves: tuple[tuple[Array, Array], ...]  # the same two of each half; empty if a half does not determine them
+    scatter: Scatter
+
+    @staticmethod
+    def of(table: CornerTable, bent: LensFit) -> _Evidence:
+        """From a fit with the bend free."""
+        try:
+            equations = ViewEquations.of(table, bent, BoardFreedom(warp=True, stretch=True))
+            count = 5
+        except AdjustmentError:
+            equations, count = ViewEquations.of(table, bent), 3
+        p = equations.lens
+        at = slice(p, p + count)
+        start = np.append(bent.warp, [0.0, 0.0])[:count]
+        change, C = equations.solution()
+        spread = equations.moved(change).scatter()
+        raised = max(1.0, spread.factor) ** 2
+        odd = np.arange(len(equations.views)) % 2 == 1
+        try:
+            both = [equations.solution(which) for which in (odd, ~odd)]
+            halves = tuple((start + d[at], c[at, at] * raised) for d, c in both)
+        except AdjustmentError:
+            halves = ()
+        return _Evidence(start + change[at], C[at, at] * raised, halves, spread)
+
+    @property
+    def p_warp(self) -> float:
+        return _p_value(self.shape[_WARP], self.covariance[_WARP, _WARP])
+
+    @property
+    def p_stretch(self) -> float:
+        return _p_value(self.shape[_STRETCH], self.covariance[_STRETCH, _STRETCH])
+
+    def _in_both_halves(self, part: slice) -> bool:
+        return len(self.halves) == 2 and all(
+            _p_value(x[part], C[part, part]) < HALF_SIGNIFICANT for x, C in self.halves
+        )
+
+    @property
+    def is_bent(self) -> bool:
+        return self.p_warp < SIGNIFICANT and self._in_both_halves(_WARP)
+
+    @property
+    def why_bent(self) -> str:
+        if self.p_warp >= SIGNIFICANT:
+            return "not significantly different from a flat board"
+        return "significant in both halves of the photographs" if self.is_bent else _NOT_IN_HALVES
+
+    @property
+    def is_stretched(self) -> bool:
+        explains = self.scatter.p_value >= EXPLAINED
+        return self.p_stretch < SIGNIFICANT and self._in_both_halves(_STRETCH) and explains
+
+    @property
+    def why_stretched(self) -> str:
+        if self.p_stretch >= SIGNIFICANT:
+            return "not significantly different from rows and columns to scale"
+        if not self._in_both_halves(_STRETCH):
+            return _NOT_IN_HALVES
+        if not self.is_stretched:
+            return (
+                f"significant in both halves of the photographs, but it does not explain them: they still scatter"
+                f" {self.scatter.factor:.1f} times more than noise"
+            )
+        return "significant in both halves of the photographs, and it explains them"
+
+
+_NOT_IN_HALVES = "significant, but not in both halves of the photographs"
+
+
+def _change_px(table: CornerTable, first: LensFit, second: LensFit) -> float:
+    """RMS difference of the directions of two lenses over the picture."""
+    pixels = projection_map(first.model, first.lens, table.image_size_px, 1.0).pixels.reshape(-1, 2)
+    return difference_px(pixels, first, second)
 
 
 def _p_value(found: Array, C: Array) -> float:
@@ -168,62 +235,43 @@ def _p_value(found: Array, C: Array) -> float:
     return float(chi2.sf(float(found @ np.linalg.solve(C, found)), len(found)))
 
 
-def _accepted(
-    table: CornerTable, flat: LensFit, flat_held: HeldOut | None, wanted: BoardFreedom, options: BoardShapeOptions
-) -> tuple[LensFit, float, float]:
-    """The fit with the wanted freedom, unless the hold-out error grows; its hold-out gain and standard error (px^2)."""
-    if wanted == AS_STATED:
-        return flat, np.nan, np.nan
-    freed = fit(table, flat.used, flat.model, flat.values, wanted)
-    if flat_held is None:  # requested by the user
-        return freed, np.nan, np.nan
-    gain, error = hold_out(table, freed, options.folds).better_than(flat_held)
-    if gain >= -error:
-        return freed, gain, error
-    requested = BoardFreedom(bool(options.warp), bool(options.stretch))
-    return (fit(table, flat.used, flat.model, flat.values, requested) if requested != AS_STATED else flat), gain, error
-
-
-def _why(corrected: bool, requested: bool | None, p: float, true: str, gain: float, error: float) -> str:
-    if requested is not None and corrected == requested:
-        return "as requested"
-    if p >= SIGNIFICANT:
-        return f"not significantly different from {true}"
-    if not corrected:
-        return "significant, but held-out views are predicted worse"
-    return f"significant, and held-out views are predicted {'better' if gain > error else 'as well'}"
-
-
 def _points(
     table: CornerTable, found: LensFit, options: BoardShapeOptions, factor: float
 ) -> tuple[PointsTest, LensFit]:
-    """Test for residuals correlated per point; if significant, the fit with all points free if it predicts better."""
-    p = _p_of_points(table, found, factor)
+    """Test for residuals correlated per point; if they explain the residuals, the fit with all points free."""
     nothing = np.zeros((len(table.board_points), 3))
-    seen = np.bincount(table.point[found.used], minlength=len(nothing))
+    p = _p_of_points(table, found, factor, found.used)
     if p >= SIGNIFICANT or options.stretch is False:
         return PointsTest(nothing, p, False, "the points lie as stated"), found
+    odd = table.view % 2 == 1
+    if any(_p_of_points(table, found, factor, found.used & half) >= HALF_SIGNIFICANT for half in (odd, ~odd)):
+        return PointsTest(nothing, p, False, _NOT_IN_HALVES), found
+    seen = np.bincount(table.point[found.used], minlength=len(nothing))
     if np.median(seen[seen > 0]) < _SEEN_OFTEN or np.sum(seen > 0) > _MOST_POINTS:
         why = "significant, but there are too few photographs to solve for each point"
         return PointsTest(nothing, p, False, why), found
     board = BoardFreedom(found.board.warp, found.board.stretch, points=True)
     try:
         freed = fit(table, found.used, found.model, found.values, board)
-        gain, error = hold_out(table, freed, options.folds).better_than(hold_out(table, found, options.folds))
+        left = ViewEquations.of(table, freed, AS_STATED).scatter()
     except AdjustmentError as problem:
         return PointsTest(nothing, p, False, f"significant, but they cannot be solved for: {problem}"), found
     off = np.where((seen > 0)[:, None], _without_similarity(table.board_points, freed.printed), 0.0)
-    if gain <= error:
-        return PointsTest(off, p, False, "significant, but held-out views are not predicted better with them"), found
-    return PointsTest(off, p, True, "significant, and held-out views are predicted better"), freed
+    if left.p_value < EXPLAINED and options.stretch is None:
+        why = (
+            f"significant in both halves of the photographs, but they do not explain them: they still scatter"
+            f" {left.factor:.1f} times more than noise"
+        )
+        return PointsTest(off, p, False, why, _change_px(table, found, freed)), found
+    why = "significant in both halves of the photographs, and they explain them"
+    return PointsTest(off, p, True, why, _change_px(table, found, freed)), freed
 
 
-def _p_of_points(table: CornerTable, found: LensFit, factor: float) -> float:
-    """P-value of the score test of point displacements within the board, with all other parameters fixed.
+def _p_of_points(table: CornerTable, found: LensFit, factor: float, used: Bools) -> float:
+    """P-value of the score test of point displacements, from some corners (N,), with all other parameters fixed.
 
     Poses and lens have absorbed a part of the displacements, so that the chi-square is too small rather than too large.
     """
-    used = found.used
     term = term_of(table, used, found.model.fisheye, found.sigma_px * factor)
     line = term.linearise(found.values)
     J = next(p for p in line.parts if p.stack == "print").jacobian[..., :2]

@@ -9,10 +9,12 @@ import numpy as np
 from calibration.findings import Finding, Level, unless_pass
 from calibration.lens.board_findings import circles_finding, model_uncertainty_finding, points_finding, stretch_finding
 from calibration.lens.fit.lens_models import folds_in_picture
+from calibration.lens.fit.model_selection import OVERFIT, UNKNOWN_PX
 from calibration.lens.fit.projection_map import Difference
 from calibration.lens.intrinsics_result import Intrinsics
 
 _TILTED = "tilt the board by 20 to 45 deg to all sides and photograph it at two or three distances"
+_ENOUGH_VIEWS, _FEWEST_MORE = 15, 5  # photographs in all, and at least to add
 _MORE = "take more photographs, the board tilted by 20 to 45 deg to all sides and moved into the picture's corners"
 
 
@@ -27,11 +29,11 @@ class FindingLimits:
     aspect: tuple[float, float] = (0.005, 0.03)  # |fx/fy - 1|: pixels of today's sensors are square to 0.1 %
     off_centre: tuple[float, float] = (0.08, 0.2)  # principal point from the middle, share of the width or height
     focal: tuple[float, float] = (0.003, 0.02)  # relative sigma of the focal length
-    overfit: tuple[float, float] = (1.5, 3.0)  # hold-out error over the noise
+    overfit: tuple[float, float] = (1.5, OVERFIT)  # hold-out error over the noise
     views: int = 8
     p_value: float = 0.01  # of the halves' difference, and of the scatter between photographs
     halves_px: float = 1.0  # a significant difference larger than this fails
-    map_px: tuple[float, float] = (0.5, 3.0)  # projection uncertainty, 90 % quantile over the picture
+    map_px: tuple[float, float] = (0.5, UNKNOWN_PX)  # projection uncertainty, 90 % quantile over the picture
     warp_m: float = 0.002  # a larger bend is not described by a quadratic surface
 
 
@@ -62,6 +64,24 @@ def findings_of(c: Intrinsics, limits: FindingLimits = LIMITS) -> tuple[Finding,
         circles_finding(c),
     ]
     return tuple(f for f in found if f is not None)
+
+
+def next_photographs(c: Intrinsics, limits: FindingLimits = LIMITS) -> str:
+    """What to photograph next, in one sentence, from what the photographs lack."""
+    count = int(np.sum(c.table.counts(c.fit.used) > 0))
+    wanted = max(_ENOUGH_VIEWS - count, _FEWEST_MORE)
+    places = " and ".join(filter(None, [", ".join(c.coverage.gaps[:-1]), *c.coverage.gaps[-1:]]))
+    where = f"near the {places} of the picture" if places else "in every part of the picture up to its corners"
+    tilt = "tilted by 20 to 45 deg to all sides"
+    if c.coverage.spread_deg < limits.spread_deg[0]:
+        tilt += f" (so far {c.coverage.spread_deg:.0f} deg between any two)"
+    turned = (
+        ", half of them turned by 90 deg in its plane"
+        if _level(abs(c.fit.lens[0] / c.fit.lens[1] - 1), limits.aspect)
+        else ""
+    )
+    sharp = ", sharp, on a stiff flat plate" if _level(c.fit.sigma_px, limits.noise_px) else ""
+    return f"Photograph next: {wanted} more, the board {where}, {tilt}{turned}{sharp}."
 
 
 def _level(value: float, limits: tuple[float, float]) -> Level:
@@ -216,10 +236,10 @@ def _principal_point(c: Intrinsics, limits: FindingLimits) -> Finding:
 
 
 def _overfit(c: Intrinsics, limits: FindingLimits) -> Finding:
-    ratio = c.held.rms_px / c.fit.sigma_px
+    ratio = c.held_out_rms_px / c.fit.sigma_px
     return unless_pass(
         _level(ratio, limits.overfit),
-        f"Hold-out error: {_mm(c, c.held.rms_px)}, {ratio:.2f} times the corners' own noise.",
+        f"Hold-out error: {_mm(c, c.held_out_rms_px)}, {ratio:.2f} times the corners' own noise.",
         "The lens is fitted to the noise of its own photographs.",
         _MORE[0].upper() + _MORE[1:] + ".",
         code="BP-L19",
@@ -306,7 +326,8 @@ def _warp(c: Intrinsics, limits: FindingLimits) -> Finding | None:
         return None
     text = f"The board is bent by {1000 * w.rise_m:.2f} mm (p = {w.p_value:.1g} for a flat board): {w.why}"
     if not w.corrected:
-        return Finding(Level.PASS, text + "; taken as flat.")
+        change = f" Solving for it would change directions by {_two(w.change_px)} px RMS." if w.change_px else ""
+        return Finding(Level.PASS, f"{text}; taken as flat.{change}")
     return unless_pass(
         Level.WARN if w.rise_m > limits.warp_m else Level.PASS,
         text + "; corrected.",

@@ -10,11 +10,11 @@ from calibration.findings import Finding, Level, verdict
 from calibration.lens.board_shape import BoardTest, WarpTest
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import Coverage
-from calibration.lens.fit.hold_out import HeldOut, Scatter
 from calibration.lens.fit.lens_fit import LensFit
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.fit.model_selection import ModelSelection
 from calibration.lens.fit.projection_map import Difference, ProjectionMap
+from calibration.lens.fit.view_equations import Scatter
 from calibration.lens.model_uncertainty import ModelUncertainty
 from geometry.arrays import Array
 
@@ -39,7 +39,7 @@ class Intrinsics:
     model_uncertainty: ModelUncertainty
     correlated_noise: float  # factor on the sigmas from that scatter; 1 where it is not significant
     scatter: Scatter
-    held: HeldOut
+    held_out_rms_px: float  # per coordinate, of corners in photographs that the lens was predicted without
     selection: ModelSelection
     board: BoardTest | None  # None where the photographs do not determine the board's bend
     halves: Difference | None  # None where one half does not determine the lens

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.least_squares.adjustment import Adjusted, AdjustmentError, solve
+from calibration.least_squares.adjustment import Adjusted, AdjustmentError, Limits, solve
 from calibration.least_squares.parameter_blocks import Poses, Vectors
+from calibration.lens.fit.lens_adjustment import coefficient_prior
 from calibration.lens.fit.lens_parameters import Values
 from calibration.lens.intrinsics_result import Intrinsics
 from calibration.terms.corners import CornerTerm
@@ -25,6 +26,8 @@ from geometry.uncertainty.rig_uncertainty import POSE, RigCovariance
 FEWEST_PAIRS = 3
 PAIR_GATE = 3.0  # residuals of a pair over those of the median pair, above which the board moved between the exposures
 _ROUNDS = 4  # of solving and separating pairs
+# Coefficients that the photographs hardly determine converge slowly; a fiftieth of a sigma is negligible.
+_LIMITS = Limits(steps=200, small_step_sigmas=0.02)
 
 
 class PairError(ValueError):
@@ -134,7 +137,12 @@ class _Problem:
             "boards": True,
             "warp": bent,
         }
-        return solve(self.values, [self.term], free)
+        priors = [
+            prior
+            for c, s in enumerate(self.single)
+            for prior in coefficient_prior(s.table, s.fit.used, s.model, s.fit.values, c)
+        ]
+        return solve(self.values, [self.term, *priors], free, _LIMITS)
 
     def pair_rms(self, adjusted: Adjusted, shared: Sequence[int]) -> Array:
         """RMS (pairs,), in px, of the residuals of each pair that shares a board; nan for separated ones."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import click
@@ -16,6 +17,18 @@ from lab.commands.common import (
     progress_bar,
     show_line,
 )
+
+
+class ImageSize(click.ParamType[tuple[int, int]]):
+    """Width and height of a picture as WxH."""
+
+    name = "size"
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        match = re.fullmatch(r"(\d{1,6})[xX](\d{1,6})", str(value))
+        if match is None or min(int(match[1]), int(match[2])) < 1:
+            self.fail(f"expected width and height in px such as 1920x1080, got {value!r}", param, ctx)
+        return int(match[1]), int(match[2])
 
 
 @click.group(cls=Commands)
@@ -57,7 +70,9 @@ def board(board: str, out: Path, page: str, dpi: float) -> None:
 @click.option("--out", required=True, type=FOLDER, help="Gets camera.yaml, corners.csv and report.html.")
 @click.option("--name", help="The camera's name; default: that of the folder --out.")
 @click.option("--distance-m", type=NumberRange(min=0, min_open=True), help="Distance to the screen, for figures in mm.")
-@click.option("--lens", default="auto", show_default=True, help="0, 4, 5, 8, 12 or fisheye; auto: by views held out.")
+@click.option(
+    "--lens", default="auto", show_default=True, help="0, 4, 5, 8, 12 or fisheye; auto: by the error of directions."
+)
 @click.option(
     "--warp", default="auto", show_default=True, help="auto, on, off: whether the bending of the board is solved for."
 )
@@ -67,6 +82,7 @@ def board(board: str, out: Path, page: str, dpi: float) -> None:
     show_default=True,
     help="auto, on, off: whether the ratio of the board's x and y scales is solved for.",
 )
+@click.option("--image-size", type=ImageSize(), metavar="WxH", help="Of the pictures of a table of corners, px.")
 @click.option(
     "--valid-days",
     default=365,
@@ -83,9 +99,12 @@ def camera(
     lens: str,
     warp: str,
     stretch: str,
+    image_size: tuple[int, int] | None,
     valid_days: int,
 ) -> None:
     """Calibrate a camera's lens from photos of a board: files, folders, patterns or a video.
+
+    Or from a table of corners: mrcal's corners.vnl, or a CSV with view,id,u_px,v_px; --image-size is then required.
 
     \b
     Example:
@@ -99,6 +118,7 @@ def camera(
         lens=lens,
         warp=warp,
         stretch=stretch,
+        image_size_px=image_size,
         valid_days=valid_days,
     )
     with progress_bar("photos") as progress:

@@ -50,12 +50,18 @@ def term_of(
     )
 
 
-def coefficient_prior(table: CornerTable, used: Bools, model: LensModel, values: Values) -> Term:
+def coefficient_prior(
+    table: CornerTable, used: Bools, model: LensModel, values: Values, camera: int = 0
+) -> Sequence[Term]:
     """A weak prior that limits the effect of each distortion coefficient on a point at the picture's edge.
+
+    Only for models of more than five coefficients. camera: index of the lens among those of an adjustment.
 
     Numerator and denominator of the rational model nearly cancel: without the prior, photographs leave combinations of
     its coefficients undetermined, and the iteration diverges slowly along them. Its bias is far below the noise.
     """
+    if model.coefficients <= 5:
+        return ()
     poses = values["boards"]
     assert isinstance(poses, Poses)
     xyz = poses.pose[table.view[used]].apply(table.points[used])
@@ -68,7 +74,7 @@ def coefficient_prior(table: CornerTable, used: Bools, model: LensModel, values:
     prism = np.array([8, 9, 10, 11])
     sigmas[4 + prism] = _MODERATE_PRISM / float(r2) ** power[prism]
     sigmas[~model.free] = np.inf
-    return independent("intrinsics", Vectors(np.zeros((1, INTRINSICS_COUNT))), sigmas[None])[0]
+    return independent("intrinsics", Vectors(np.zeros((1, INTRINSICS_COUNT))), sigmas[None], camera)
 
 
 def with_circle_radius(table: CornerTable, used: Bools, model: LensModel, values: Values) -> tuple[Values, list[Term]]:
@@ -104,6 +110,12 @@ def _radius_by_areas(table: CornerTable, used: Bools, model: LensModel, values: 
     return float(np.sqrt(np.nanmedian(squared)))
 
 
+def prior_terms(table: CornerTable, used: Bools, model: LensModel, values: Values) -> list[Term]:
+    """The weak priors of a fit of the whole lens: on the coefficients of rich models, and on the radius of circles."""
+    known = with_circle_radius(table, used, model, values)[1]
+    return [*known, *coefficient_prior(table, used, model, values)]
+
+
 def adjust(
     table: CornerTable,
     used: Bools,
@@ -127,7 +139,8 @@ def adjust(
     whole_lens = lens_free is None
     known: list[Term] = []
     if whole_lens:
-        values, known = with_circle_radius(table, used, model, values)
+        known = prior_terms(table, used, model, values)
+        values, _ = with_circle_radius(table, used, model, values)
     free: dict[str, bool | Bools] = {
         "intrinsics": (model.free if lens_free is None else lens_free)[None],
         "boards": np.repeat(in_use[:, None], 6, axis=1),
@@ -135,23 +148,21 @@ def adjust(
         "stretch": board.stretch and not board.points,
         "radius": whole_lens and table.circles is not None,
     }
-    if model.coefficients > 5 and whole_lens:
-        known.append(coefficient_prior(table, used, model, values))
     if board.points:
         seen = np.bincount(table.point[used], minlength=len(table.board_points)) > 0
         free["print"] = np.repeat(seen[:, None], 3, axis=1)
         known.append(Anchors("print", np.zeros((len(seen), 3)), _PRINT_SIGMA * table.spacing_m))
     term = term_of(table, used, model.fisheye, settings.sigma_px, settings.loss)
-    basis = {"intrinsics": _lens_basis(term, known, model, values)} if whole_lens and model.coefficients > 5 else {}
+    basis = {"intrinsics": _lens_basis([term, *known], model, values)} if whole_lens and model.coefficients > 5 else {}
     return solve(values, [term, *known], free, settings.limits, basis)
 
 
-def _lens_basis(term: CornerTerm, known: Sequence[Term], model: LensModel, values: Values) -> Array:
+def _lens_basis(terms: Sequence[Term], model: LensModel, values: Values) -> Array:
     """(18, 18): columns are combinations of the lens parameters with orthogonal effects on the corners, about 1 sigma.
 
     From the R factor of a QR decomposition of the derivatives at the start; the identity if R is singular.
     """
-    own = [p.jacobian for t in [term, *known] for p in t.linearise(values).parts if p.stack == "intrinsics"]
+    own = [p.jacobian for t in terms for p in t.linearise(values).parts if p.stack == "intrinsics"]
     rows = np.concatenate([J.reshape(-1, INTRINSICS_COUNT) for J in own])[:, model.free]
     basis = np.eye(INTRINSICS_COUNT)
     scale = np.linalg.norm(rows, axis=0)

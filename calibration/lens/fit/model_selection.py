@@ -1,4 +1,14 @@
-"""Selection of the lens model: the smallest one that predicts held-out photographs as well as the best one."""
+"""Selection of the lens model by the expected error of directions.
+
+Residuals decrease with every coefficient, and held-out photographs share the board and its errors, so neither decides.
+What a lens is used for are directions. Their expected squared error has two parts: the variance that the photographs
+leave, which grows with the coefficients, and the difference to the other models, weighted with the probability that
+these are right. The chosen model has the smallest sum where corners were seen, and leaves no part of the picture
+unknown. The sum is the variance of Bayesian model averaging (Hoeting et al. 1999, Statistical Science 14) about one of
+the models, with probabilities from the errors in held-out photographs (Yao et al. 2018, Bayesian Analysis 13, pseudo
+averaging), whose noise is raised by the scatter between photographs. Its use as a criterion is ours, after the focused
+information criterion (Claeskens and Hjort 2003, JASA 98).
+"""
 
 from __future__ import annotations
 
@@ -6,37 +16,53 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
 
-from calibration.least_squares.adjustment import AdjustmentError
+from calibration.least_squares.adjustment import AdjustmentError, Limits
 from calibration.least_squares.parameter_blocks import Vectors
 from calibration.lens.fit.corner_table import CornerTable
-from calibration.lens.fit.hold_out import BRIEF, HeldOut, Scatter, hold_out, scatter
+from calibration.lens.fit.coverage import seen_at
 from calibration.lens.fit.lens_fit import CORNER_GATE, LensFit, fit, robust_fit
-from calibration.lens.fit.lens_models import LENS_MODELS, LensModel, folds_in_picture, rational_of_fisheye
+from calibration.lens.fit.lens_models import (
+    LENS_MODELS,
+    LensModel,
+    folds_in_picture,
+    rational_of_fisheye,
+    undistorted,
+)
 from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, Values
+from calibration.lens.fit.projection_map import ProjectionMap, projection_map
 from calibration.lens.fit.residual_cells import SIGNIFICANT, beyond_noise, cell_means
-from geometry.arrays import Bools
+from calibration.lens.fit.view_equations import ViewEquations
+from geometry.arrays import Array, Bools
+from geometry.camera import project_points_full
 
-# With more corners, models that can no longer be chosen are not cross-validated. 400 views took 25 s without this
-# limit and 11 s with it; the choice is the same.
-MANY_CORNERS = 4000
 RATIONAL = LensModel(8)
 FEWEST_INLIERS = 0.99  # share of used corners below which a lens model is considered too small
-SYSTEMATIC = 1e-3  # p-value of residuals larger than the best model's, below which the difference is not noise
+UNKNOWN_PX = 3.0  # sigma of the directions in 90 % of the picture from which on a model leaves them unknown
+_COMMON = 0.9  # share of the covered picture over which errors are averaged: at its rim single places may diverge
+OVERFIT = 3.0  # error in held-out photographs over the noise from which on a model depends on single photographs
+EQUAL = 1.1  # ratio of expected errors up to which the model with fewer coefficients is chosen ...
+PLAUSIBLE = 0.01  # ... if its probability is not smaller
+# Models with parameters that the views hardly determine converge very slowly along a valley. They are stopped early: a
+# twentieth of a sigma is negligible against the differences between models.
+_BRIEF = Limits(steps=40, small_step_sigmas=0.05)
 
 
 @dataclass(frozen=True, slots=True)
 class ModelCandidate:
-    """One candidate model with its fit and its hold-out error."""
+    """One candidate model with its fit and the expected error of its directions where corners were seen."""
 
     model: LensModel
     fit: LensFit | None  # None where it could not be solved
-    held: HeldOut | None  # None where the model was skipped, or a fold could not be solved
-    scatter: Scatter | None = None
-    refused: str = ""  # reason why the model cannot be chosen, regardless of its fit
-    excess_px2: float = np.nan  # mean squared hold-out error in excess of the best model's
-    standard_error_px2: float = np.nan  # of excess_px2
+    refused: str = ""  # reason why the model cannot be chosen
+    sigma_px: float = np.nan  # of directions, from noise and scatter between photographs
+    probability: float = np.nan  # that this model is right, if one of them is
+    model_error_px: float = np.nan  # RMS difference to the other models, weighted with their probabilities
+
+    @property
+    def error_px(self) -> float:
+        """Expected error of a direction, RMS per pixel."""
+        return float(np.hypot(self.sigma_px, self.model_error_px))
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +80,9 @@ def select_model(
     rich: Sequence[LensFit],
     shape: Values,
     board: BoardFreedom,
-    folds: int | None = None,
     only: LensModel | None = None,
 ) -> ModelSelection:
-    """Fit and cross-validate every model (or `only` one) on the same corners (N,).
+    """Fit every model (or `only` one) to the same corners (N,), and choose.
 
     rich: fits of rich models, from which the others start; shape: start values of the board's shape. Each candidate
     also starts from the next smaller one of its kind.
@@ -78,13 +103,7 @@ def select_model(
         if candidate.fit is not None and not model.fisheye and model.coefficients:
             below = candidate.fit
         fitted.append(candidate)
-    candidates = []
-    for candidate in fitted:
-        hopeless = _reason_to_skip(candidate, fitted) if int(used.sum()) > MANY_CORNERS else ""
-        candidates.append(replace(candidate, refused=hopeless) if hopeless else _held_out(table, candidate, folds))
-    if only is not None and candidates[0].held is not None:
-        return ModelSelection(candidates, candidates[0], "as requested")
-    return choose(candidates)
+    return choose(table, fitted)
 
 
 def _best_start(
@@ -95,58 +114,138 @@ def _best_start(
     return min(candidates, key=lambda r: np.inf if r.fit is None else r.fit.sigma_px)
 
 
-def choose(candidates: Sequence[ModelCandidate]) -> ModelSelection:
-    """Of candidates in ascending order, the first that predicts as well as the best one and leaves no systematic error.
+def choose(table: CornerTable, candidates: Sequence[ModelCandidate]) -> ModelSelection:
+    """Of candidates in ascending order, the first with about the smallest expected error that leaves none unknown.
 
-    As well: its hold-out error is within one standard error of the smallest. Its residuals may exceed those of the best
-    model only by noise: the standard error is large if few views reach the parts of the picture in which two models
-    differ, although all corners together may distinguish them clearly.
+    If all leave directions unknown, the one that leaves the least is chosen: findings report it.
 
     Raises:
         AdjustmentError: no candidate can be used.
     """
-    usable = [r for r in candidates if not r.refused and r.held is not None]
-    if not usable:
-        reasons = "; ".join(f"{r.model.title}: {r.refused}" for r in candidates)
+    judged = [_judged(table, c) for c in candidates]
+    solved = [j for j in judged if j.map is not None]
+    if not solved:
+        reasons = "; ".join(f"{j.candidate.model.title}: {j.candidate.refused}" for j in judged)
         raise AdjustmentError(f"no lens model can be used ({reasons})")
-    best = min(usable, key=lambda r: _rms(r))
-    out = []
-    for r in candidates:
-        if r.held is None or best.held is None:
-            out.append(r)
-            continue
-        gain, error = best.held.better_than(r.held)
-        out.append(replace(r, excess_px2=gain, standard_error_px2=error))
-    as_good = [r for r in out if not r.refused and r.held is not None and r.excess_px2 <= r.standard_error_px2]
-    chosen = next(r for r in as_good if r.model == best.model or not leaves_systematic_residuals(r, best))
-    if chosen.model == best.model:
-        why = f"it has the smallest hold-out error ({_rms(best):.3f} px)"
-        smaller = [r for r in out if r.held is not None and not r.refused][
-            : [r.model for r in usable].index(best.model)
-        ]
-        if smaller:
-            least = min(_rms(r) for r in smaller)
-            why += f", and every smaller usable model errs more ({least:.3f} px at best) or leaves a systematic error"
-    else:
-        why = (
-            f"its hold-out error ({_rms(chosen):.3f} px) is within one standard error of the best model's"
-            f" ({best.model.words}: {_rms(best):.3f} px), and it has fewer parameters"
+    best = min(solved, key=lambda j: j.held_out_px2)
+    assert best.candidate.fit is not None
+    # One factor for all models: a rich model takes up a part of the scatter between few photographs.
+    raised = max(1.0, best.scatter)
+    score = np.array([j.held_out_px2 for j in solved]) / (best.candidate.fit.sigma_px * raised) ** 2
+    weights = np.exp(-(score - score.min()) / 2)
+    weights /= weights.sum()
+    done = {}
+    for j, weight in zip(solved, weights.tolist(), strict=True):
+        excess = sum(w * _excess_px2(j, other, raised) for w, other in zip(weights, solved, strict=True))
+        done[j.candidate.model] = replace(
+            j.candidate,
+            refused=j.refused(raised, float(np.sqrt(excess))),
+            sigma_px=j.sigma_px * raised,
+            probability=weight,
+            model_error_px=float(np.sqrt(excess)),
         )
-    return ModelSelection(out, chosen, why)
+    out = [done.get(c.candidate.model, c.candidate) for c in judged]
+    usable = [c for c in out if c.fit is not None and not c.refused]
+    if usable:
+        least = min(usable, key=lambda c: c.error_px)
+        chosen = next(
+            c for c in usable if c is least or (c.error_px <= EQUAL * least.error_px and c.probability >= PLAUSIBLE)
+        )
+        why = f"its directions have the smallest expected error where corners were seen ({chosen.error_px:.2g} px)"
+    else:
+        models = {
+            j.candidate.model: (j.folds, np.hypot(j.unknown_px * raised, done[j.candidate.model].model_error_px))
+            for j in solved
+        }
+        chosen = done[min(models, key=lambda m: models[m])]
+        why = "every model leaves directions unknown, this one in the smallest part of the picture"
+    return ModelSelection(out, chosen, "as requested" if len(candidates) == 1 else why)
 
 
-def leaves_systematic_residuals(candidate: ModelCandidate, best: ModelCandidate) -> bool:
-    """Whether a model's residuals exceed the best model's by more than noise and the missing parameters explain."""
-    if candidate.fit is None or best.fit is None or best.scatter is None:
-        return False
-    more, least = (f.sigma_px**2 * f.adjusted.dof for f in (candidate.fit, best.fit))
-    noise = best.fit.sigma_px * max(1.0, best.scatter.factor)
-    fewer = max(best.model.coefficients - candidate.model.coefficients, 3)
-    return bool(chi2.sf((more - least) / noise**2, fewer) < SYSTEMATIC)
+@dataclass(frozen=True, slots=True)
+class _Judged:
+    """A candidate with the figures that the choice needs; sigmas are from the noise of corners alone."""
+
+    candidate: ModelCandidate
+    map: ProjectionMap | None = None  # None: no fit, or the views do not determine it
+    inside: Bools | None = None  # (rows, columns): corners were seen there
+    scatter: float = 1.0  # between photographs, factor on the sigmas
+    held_out_px2: float = np.inf  # sum of squared errors of all photographs, each predicted without it
+    sigma_px: float = np.nan  # of directions where corners were seen
+    unknown_px: float = np.inf  # of directions in 90 % of the picture
+    folds: bool = False
+    overfit: float = 1.0  # RMS error in held-out photographs over the noise of the corners
+
+    def refused(self, raised: float, model_error_px: float) -> str:
+        """Reason why the model cannot be chosen; empty if it can. raised: factor on the sigmas."""
+        if self.folds:
+            return "it folds inside the picture: two directions would map to the same pixel"
+        unknown = float(np.hypot(self.unknown_px * raised, model_error_px))
+        if unknown > UNKNOWN_PX:
+            return f"the photographs leave its directions unknown: {unknown:.2g} px or more in a tenth of the picture"
+        if self.overfit > OVERFIT:
+            return (
+                f"it depends on single photographs: held out, they err {self.overfit:.1f} times more than their noise"
+            )
+        return ""
 
 
-def _rms(candidate: ModelCandidate) -> float:
-    return np.inf if candidate.held is None else candidate.held.rms_px
+def _judged(table: CornerTable, candidate: ModelCandidate) -> _Judged:
+    found = candidate.fit
+    if found is None:
+        return _Judged(candidate)
+    try:
+        equations = ViewEquations.of(table, found)
+    except AdjustmentError as error:
+        return _Judged(replace(candidate, refused=f"the views do not determine it: {error}"))
+    C = equations.solution()[1][: equations.lens, : equations.lens]
+    at = projection_map(found.model, found.lens, table.image_size_px, 1.0)
+    inside = seen_at(table, found.used, at.pixels) & np.isfinite(at.by_parameter).all(axis=(2, 3))
+    variance = np.trace(at.covariance_px2(C)[inside], axis1=-2, axis2=-1)
+    return _Judged(
+        candidate,
+        map=at,
+        inside=inside,
+        scatter=equations.scatter().factor,
+        held_out_px2=float(np.sum(equations.held_out_px2() * equations.count)) * found.sigma_px**2,
+        sigma_px=float(np.sqrt(_common_mean(variance))) if inside.any() else np.inf,
+        unknown_px=float(np.nanquantile(at.sigma_px(C), 0.9)),
+        folds=folds_in_picture(found.lens, found.model.fisheye, table.image_size_px),
+        overfit=float(np.sqrt(np.mean(equations.held_out_px2()))),
+    )
+
+
+def _excess_px2(one: _Judged, other: _Judged, raised: float) -> float:
+    """Mean squared difference of the directions of two models where corners were seen, beyond that of their noise."""
+    if other is one:
+        return 0.0
+    first, second = one.candidate.fit, other.candidate.fit
+    assert one.map is not None
+    assert one.inside is not None
+    assert first is not None
+    assert second is not None
+    noise2 = abs(other.sigma_px**2 - one.sigma_px**2) * raised**2
+    return max(difference_px(one.map.pixels[one.inside], first, second) ** 2 - noise2, 0.0)
+
+
+def difference_px(pixels: Array, first: LensFit, second: LensFit) -> float:
+    """RMS difference (px) at most of the pixels (n, 2) between the rays of two lenses, after the best rotation."""
+    flat = undistorted(pixels, first.lens, first.model.fisheye)
+    pixels, flat = pixels[np.isfinite(flat).all(axis=1)], flat[np.isfinite(flat).all(axis=1)]
+    rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+    wide = np.asarray(second.model.fisheye)
+    seen = project_points_full(rays, second.lens[:4], second.lens[4:], np.asarray(np.inf), wide)
+    away = seen.pixels - pixels
+    good = np.isfinite(away).all(axis=1)
+    turn = np.cross(rays[:, None, :], seen.d_point)[good].reshape(-1, 3)
+    moved = away[good].reshape(-1)
+    left = moved - turn @ np.linalg.lstsq(turn, moved, rcond=None)[0]
+    return float(np.sqrt(_common_mean(np.sum(left.reshape(-1, 2) ** 2, axis=1))))
+
+
+def _common_mean(squares: Array) -> float:
+    """Mean of squared errors (n,) without the largest ones."""
+    return float(np.mean(np.sort(squares)[: max(int(_COMMON * len(squares)), 1)])) if len(squares) else 0.0
 
 
 def _fitted(
@@ -154,51 +253,12 @@ def _fitted(
 ) -> ModelCandidate:
     """A model fitted to all views."""
     if start is None:
-        return ModelCandidate(model, None, None, refused="no focal length and no pose of the board explain the corners")
+        return ModelCandidate(model, None, refused="no focal length and no pose of the board explain the corners")
     try:
-        found = fit(table, used, model, start, board, limits=BRIEF)
+        found = fit(table, used, model, start, board, limits=_BRIEF)
     except AdjustmentError as error:
-        return ModelCandidate(model, None, None, refused=f"it cannot be solved: {error}")
-    return ModelCandidate(model, found, None)
-
-
-def _reason_to_skip(candidate: ModelCandidate, others: Sequence[ModelCandidate]) -> str:
-    """Reason why a model cannot be chosen whatever its hold-out error; empty if it can."""
-    solved = [r for r in others if r.fit is not None]
-    if candidate.fit is None or not solved:
-        return ""
-    best = min(solved, key=lambda r: np.inf if r.fit is None else r.fit.sigma_px)
-    assert best.fit is not None
-    if candidate.fit.sigma_px > 1.2 * best.fit.sigma_px:
-        return f"its residuals are {candidate.fit.sigma_px / best.fit.sigma_px:.1f} times those of the best model"
-    smaller = [r for r in solved if not r.model.fisheye and r.model.coefficients < candidate.model.coefficients]
-    if candidate.model.fisheye or not smaller or smaller[-1].fit is None:
-        return ""
-    less = smaller[-1].fit
-    before, after = (f.sigma_px**2 * f.adjusted.dof for f in (less, candidate.fit))
-    more = candidate.model.coefficients - less.model.coefficients
-    if chi2.sf((before - after) / candidate.fit.sigma_px**2, more) > 0.01:
-        return f"it does not fit better than the model with {less.model.coefficients} coefficients"
-    return ""
-
-
-def _held_out(table: CornerTable, candidate: ModelCandidate, folds: int | None) -> ModelCandidate:
-    """The candidate with its hold-out error, or with the reason why it is refused."""
-    found = candidate.fit
-    if found is None:
-        return candidate
-    try:
-        held = hold_out(table, found, folds)
-        spread = scatter(found, held)
-    except AdjustmentError as error:
-        return replace(candidate, refused=f"the views do not determine it: {error}")
-    folded = folds_in_picture(found.lens, candidate.model.fisheye, table.image_size_px)
-    return replace(
-        candidate,
-        held=held,
-        scatter=spread,
-        refused="it folds inside the picture: two directions would map to the same pixel" if folded else "",
-    )
+        return ModelCandidate(model, None, refused=f"it cannot be solved: {error}")
+    return ModelCandidate(model, found)
 
 
 def inliers_of_rich_models(
@@ -221,7 +281,7 @@ def inliers_of_rich_models(
     ]
     wanted = only is not None and only.coefficients >= RATIONAL.coefficients
     if wanted or (only is None and all(leaves)):
-        for values in [_as_rational(table, f) for f in fits]:
+        for values in [as_rational(table, f) for f in fits]:
             fits += _rich_fit(table, RATIONAL, values, reasons)
     if not fits:
         raise AdjustmentError(reasons[-1])
@@ -234,8 +294,8 @@ def inliers_of_rich_models(
 
 
 def _rich_fit(table: CornerTable, model: LensModel, values: Values, reasons: list[str]) -> list[LensFit]:
-    """The robust fit with as much of the board's shape as can be solved for; empty if not even the lens can."""
-    for board in (BoardFreedom(warp=True, stretch=True), BoardFreedom(warp=True), AS_STATED):
+    """The robust fit with the bend of the board free if it can be solved for; empty if not even the lens can."""
+    for board in (BoardFreedom(warp=True), AS_STATED):
         try:
             return [robust_fit(table, model, values, board)]
         except AdjustmentError as error:
@@ -243,7 +303,7 @@ def _rich_fit(table: CornerTable, model: LensModel, values: Values, reasons: lis
     return []
 
 
-def _as_rational(table: CornerTable, found: LensFit) -> Values:
+def as_rational(table: CornerTable, found: LensFit) -> Values:
     """The values of a fit, with its lens approximated by a rational one."""
     if not found.model.fisheye:
         return found.values

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from calibration.lens.fit.lens_fit import LensFit
 from calibration.lens.fit.lens_models import LensModel, fold_r2, undistorted
 from geometry.arrays import Array
 from geometry.camera import project_points_full
@@ -87,15 +86,8 @@ class Difference:
         return self.rms_px / self.expected_rms_px
 
 
-def difference(at: ProjectionMap, first: LensFit, second: LensFit) -> Difference:
-    """Difference of two independent fits of the same model, to first order about the lens of the map.
-
-    Raises:
-        AdjustmentError: a covariance does not exist.
-    """
-    free = first.model.free
-    delta = (second.lens - first.lens)[free]
-    C = first.covariance + second.covariance
+def difference(at: ProjectionMap, delta: Array, C: Array) -> Difference:
+    """Difference of two lenses, to first order about that of the map: delta (p,) of the parameters, covariance C."""
     moved = at.by_parameter @ delta
     rows = at.by_parameter.reshape(-1, len(delta))
     rows = rows[np.isfinite(rows).all(axis=1)]

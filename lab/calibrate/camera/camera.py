@@ -23,6 +23,7 @@ from calibration.lens.intrinsics import (
 from calibration.lens.intrinsics_result import Intrinsics
 from geometry.camera import FISHEYE, PERSPECTIVE
 from lab.calibrate.camera.camera_outcome import CameraOutcome
+from lab.calibrate.camera.corner_tables import TABLE_SUFFIXES, read_corner_table
 from lab.calibrate.camera.photos import PhotoSet, Progress, find_in_photos, origins_of
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.board_file import load_board_or_text
@@ -44,8 +45,8 @@ class CameraOptions:
 
     name: str = "camera"
     distance_m: float | None = None  # distance of the screen, for figures in mm; None: median distance of the boards
+    image_size_px: tuple[int, int] | None = None  # width, height, of the pictures of a table of corners
     valid_days: int | None = 365  # a run warns after that; None: no expiry. One year: mounts and lenses creep
-    folds: int | None = None  # of the cross-validation; None: five, or leave-one-out up to ten views
     lens: str = "auto"  # or 0, 4, 5, 8, 12, fisheye: fixed lens model in place of the selected one
     warp: str = "auto"  # or on, off: estimation of the board's bend
     stretch: str = "auto"  # or on, off: estimation of the board's scale along rows and columns, and of its point errors
@@ -60,8 +61,6 @@ class CameraOptions:
             raise InputError(f"stretch: expected {', '.join(WARPS)}, got {self.stretch!r}{near}")
         if self.distance_m is not None and not (np.isfinite(self.distance_m) and self.distance_m > 0):
             raise InputError(f"distance: expected metres above 0, got {self.distance_m:g}")
-        if self.folds is not None and self.folds < 2:
-            raise InputError(f"folds: expected 2 or more, got {self.folds}")
         if self.valid_days is not None and self.valid_days < 1:
             raise InputError(f"valid days: expected 1 or more, got {self.valid_days}")
 
@@ -69,7 +68,7 @@ class CameraOptions:
         """The options of the solver. origins: source of each view, see `origins_of`."""
         lens = None if self.lens == "auto" else named(self.lens)
         warp, stretch = WARPS[self.warp], WARPS[self.stretch]
-        return IntrinsicsOptions(self.distance_m, lens, warp, stretch, self.folds, origins)
+        return IntrinsicsOptions(self.distance_m, lens, warp, stretch, origins)
 
 
 def calibrate_camera(
@@ -81,6 +80,8 @@ def calibrate_camera(
     progress: Progress | None = None,
 ) -> CameraOutcome:
     """Calibrate a camera from photographs (files, folders, patterns, videos) of a board (value, text or board.yaml).
+
+    photos may also be one table of corners, see `corner_tables`, with the size of its pictures in the options.
 
     Writes camera.yaml, corners.csv and report.html into the folder `out`, all or none. If the verdict is FAIL, the
     camera file is called camera.failed.yaml so that no program reads it by mistake; a FAIL never replaces an earlier
@@ -94,7 +95,7 @@ def calibrate_camera(
     check_output_folder(out, _is_ours)
     day = today or datetime.date.today()
     known = load_board_or_text(board) if isinstance(board, str | Path) else board
-    found = find_in_photos(photos, known, progress, fewest=FEWEST_VIEWS)
+    found = _views(list(photos), known, options, progress)
     table = corner_table(found)
     try:
         result = calibrate_intrinsics(table, options.intrinsics(origins_of(found)))
@@ -112,6 +113,18 @@ def calibrate_camera(
 
         write_page(outcome, file, day, work)
     return outcome
+
+
+def _views(photos: list[Path | str], board: Board, options: CameraOptions, progress: Progress | None) -> PhotoSet:
+    """From photographs or from a table of corners."""
+    table = Path(photos[0]) if len(photos) == 1 and Path(photos[0]).suffix.lower() in TABLE_SUFFIXES else None
+    if table is None and options.image_size_px is None:
+        return find_in_photos(photos, board, progress, fewest=FEWEST_VIEWS)
+    if table is None:
+        raise InputError("image size: expected with a table of corners only; photographs have their own size")
+    if options.image_size_px is None:
+        raise InputError(f"{table}: a table of corners does not state the size of its pictures; add --image-size WxH")
+    return read_corner_table(table, board, options.image_size_px)
 
 
 def corner_table(photos: PhotoSet) -> CornerTable:
@@ -141,7 +154,7 @@ def camera_file(outcome: CameraOutcome, options: CameraOptions, day: datetime.da
         verdict=outcome.level.name,
         rms_px=r.rms_px,
         sigma_px=r.fit.sigma_px,
-        hold_out_rms_px=r.held.rms_px,
+        hold_out_rms_px=r.held_out_rms_px,
         views=int(np.sum(r.table.counts(r.fit.used) > 0)),
         corners=int(r.fit.used.sum()),
         board=outcome.photos.board.describe(),

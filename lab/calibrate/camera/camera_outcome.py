@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration.findings import Level
+from calibration.lens.intrinsics_findings import next_photographs
 from calibration.lens.intrinsics_result import Intrinsics
 from lab.calibrate.camera.photos import PhotoSet
 from lab.errors import CalibrationError
@@ -38,6 +39,8 @@ class CameraOutcome:
         r = self.result
         worst = max(r.findings, key=lambda f: f.level)
         reason = "" if self.level == Level.PASS else f": {worst.what.rstrip('.')}"
+        if self.level == Level.FAIL:
+            reason += f". {next_photographs(r).rstrip('.')}"
         px, mm = (np.nanmedian(m) for m in (r.map.sigma_px(r.covariance), r.map.sigma_mm(r.covariance)))
         return (
             f"{self.name}: {self.level.name}: fx {r.fit.lens[0]:.2f} ± {format_number(r.sigmas[0], 2)} px,"

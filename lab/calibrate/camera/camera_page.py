@@ -62,7 +62,7 @@ def write_page(outcome: CameraOutcome, file: CameraFile, day: datetime.date, fol
 def _key_figures(r: Intrinsics, file: CameraFile) -> list[tuple[str, str, str]]:
     px, mm = r.map.sigma_px(r.covariance), r.map.sigma_mm(r.covariance)
     at = f"at {format_number(r.distance_m)} m"
-    held = r.held.rms_px * _mm_per_px(r)
+    held = r.held_out_rms_px * _mm_per_px(r)
     until = file.calibration.valid_until if file.calibration else ""
     failed = r.verdict is Level.FAIL
     return [
@@ -71,7 +71,7 @@ def _key_figures(r: Intrinsics, file: CameraFile) -> list[tuple[str, str, str]]:
             f"{r.fit.lens[0]:.2f} ± {format_number(r.sigmas[0], 2)} px",
             f"{r.sigmas[0] / r.fit.lens[0]:.2%}",
         ),
-        ("lens model", r.model.words, "smallest that predicts new photographs as well as the best"),
+        ("lens model", r.model.words, "the smallest expected error of directions"),
         (
             "direction of a pixel, median",
             f"{format_number(np.nanmedian(px), 2)} px · {format_number(np.nanmedian(mm), 2)} mm",
@@ -85,7 +85,7 @@ def _key_figures(r: Intrinsics, file: CameraFile) -> list[tuple[str, str, str]]:
         ("RMS of corners", f"{r.rms_px:.3f} px", f"per coordinate; {r.rms_2d_px:.3f} px per corner, as in OpenCV"),
         (
             "RMS in held-out photographs",
-            f"{r.held.rms_px:.3f} px · {format_number(held, 2)} mm",
+            f"{r.held_out_rms_px:.3f} px · {format_number(held, 2)} mm",
             f"per coordinate, {at}",
         ),
         ("valid until", "must not be used" if failed else until or "no expiry date", ""),
@@ -118,26 +118,27 @@ def _numbers(r: Intrinsics) -> Section:
 
 
 def _model(r: Intrinsics) -> Section:
-    candidates = [x for x in r.selection.candidates if x.held is not None]
-    held = np.array([np.nan if x.held is None else x.held.rms_px for x in candidates])
-    fitted = np.array([np.nan if x.fit is None else x.fit.sigma_px for x in candidates])
-    # Standard error of the difference to the best model, which is much smaller than that of each error alone.
-    spread = np.array([x.standard_error_px2 for x in candidates]) / (2 * held)
+    candidates = [x for x in r.selection.candidates if np.isfinite(x.error_px)]
+    error = np.array([x.error_px for x in candidates])
+    noise = np.array([x.sigma_px for x in candidates])
     chosen = next(k for k, x in enumerate(candidates) if x.model == r.selection.chosen.model)
-    chart = lens_model_chart([_label(x.model) for x in candidates], held, chosen, fit_rms_px=fitted, sigma_px=spread)
+    chart = lens_model_chart([_label(x.model) for x in candidates], error, chosen, noise_px=noise)
     rows = [
         (
             x.model.words,
             np.nan if x.fit is None else x.fit.sigma_px,
-            np.nan if x.held is None else x.held.rms_px,
-            "chosen" if x.model == r.selection.chosen.model else x.refused or "larger error, or no improvement",
+            x.sigma_px,
+            x.model_error_px,
+            x.error_px,
+            "chosen" if x.model == r.selection.chosen.model else x.refused or "larger error",
         )
         for x in r.selection.candidates
     ]
     words = [
-        f"Cross-validation with {len(r.held.folds)} folds: each model was fitted without some of the photographs and"
-        " then used to predict these (only the pose of the board was fitted in them). Residuals of the fitted"
-        " photographs decrease with every coefficient; residuals of held-out photographs do not.",
+        "The expected error of a direction where corners were seen: the part that noise and the scatter between"
+        " photographs leave, which grows with the number of coefficients, and the difference to the other models,"
+        " weighted with the probabilities that these are right. Residuals, which decrease with every coefficient, do"
+        " not decide. A model that leaves directions unknown in a part of the picture is not used.",
         f"Chosen: {r.model.words}: {r.selection.why}.",
     ]
     if r.warp is not None:
@@ -149,10 +150,9 @@ def _model(r: Intrinsics) -> Section:
     words += [
         f.what for f in (stretch_finding(r), points_finding(r), circles_finding(r), model_uncertainty_finding(r)) if f
     ]
-    caption = (
-        "Bars: error on held-out photographs; whiskers: sigma of the difference to the best; ticks: fitted photographs."
-    )
-    table = PageTable(("model", "fitted photographs (px)", "held-out photographs (px)", "result"), rows)
+    caption = "Bars: expected error of a direction; ticks: the part from noise and scatter between photographs."
+    heads = ("model", "residuals (px)", "noise (px)", "other models (px)", "expected error (px)", "result")
+    table = PageTable(heads, rows)
     return Section("Selection of the lens model", words, [PageDrawing(chart, caption)], table)
 
 

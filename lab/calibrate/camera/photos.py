@@ -46,7 +46,7 @@ class PhotoSet:
     """Views of a board in the photographs of one camera."""
 
     board: Board
-    image_size_px: tuple[int, int]  # width, height, of every picture
+    image_size_px: tuple[int, int]  # width, height, of every picture that is used
     views: tuple[tuple[str, BoardView], ...]  # picture name and view, in the order of the pictures
     refused: tuple[tuple[str, str], ...]  # picture name and reason
     paths: dict[str, Path]  # file of each picture name (for a frame, the video's path)
@@ -108,7 +108,8 @@ def find_in_photos(
     """Detect a board in every photograph. One picture at a time is held in memory.
 
     Raises:
-        InputError: if no picture can be read, sizes differ, or fewer than `fewest` pictures show the board.
+        InputError: if no picture can be read, no size is that of most pictures, or fewer than `fewest` pictures of
+            that size show the board.
     """
     files = load_photos(paths)
     names = _names(files)
@@ -128,7 +129,7 @@ def find_in_photos(
             original = first_of.setdefault(hashlib.sha256(picture.tobytes()).digest(), name)
             if original != name:
                 refused.append((name, f"{_DUPLICATE}{original}: it would count twice"))
-            elif len(sizes) == 1:  # pictures of different sizes are an error: only their sizes are collected
+            else:
                 found = find_board(as_8_bit(picture), board, _search_thoroughly(board, bool(views), refused))
                 if found is QUICK_SEARCH_FAILED:
                     quick.add(name)
@@ -140,8 +141,15 @@ def find_in_photos(
             progress(done, max(total, done), name)
     if not sizes:
         raise InputError(f"none of {len(refused)} pictures can be read; {most_frequent_reason(refused)}")
-    if len(sizes) > 1:
-        raise InputError(_mixed(sizes))
+    size = _usual_size(sizes)
+    other = {name: made for made, names in sizes.items() if made != size for name in names}
+    views = [view for view in views if view[0] not in other]
+    quick -= set(other)
+    refused = [item for item in refused if item[0] not in other]
+    refused += [
+        (name, f"{w}x{h} px, most pictures have {size[0]}x{size[1]}: another camera or setting")
+        for name, (w, h) in other.items()
+    ]
     if views and quick and isinstance(board, Chessboard):  # some show the board: search the others thoroughly too
         for name, _, picture in _pictures(files, names):
             if name in quick and not isinstance(picture, MissingPicture):
@@ -156,7 +164,7 @@ def find_in_photos(
     views.sort(key=lambda view: order[view[0]])
     refused.sort(key=lambda item: order[item[0]])
     _refuse_too_few(views, refused, board, fewest)
-    return PhotoSet(board, next(iter(sizes)), tuple(views), tuple(refused), path_of)
+    return PhotoSet(board, size, tuple(views), tuple(refused), path_of)
 
 
 def as_8_bit(picture: GreyPicture) -> GreyImage:
@@ -261,16 +269,19 @@ def _search_thoroughly(board: Board, found_before: bool, refused: Sequence[tuple
     return searched < (_REASONS if found_before else _THOROUGH_SEARCHES)
 
 
-def _mixed(sizes: dict[tuple[int, int], list[str]]) -> str:
-    """The message for pictures of different sizes."""
+def _usual_size(sizes: dict[tuple[int, int], list[str]]) -> tuple[int, int]:
+    """The size of more than half of the pictures. Raises InputError if there is none."""
     by_count = sorted(sizes.items(), key=lambda item: -len(item[1]))
+    size, names = by_count[0]
+    if 2 * len(names) > sum(len(n) for n in sizes.values()):
+        return size
     parts = []
     for (width, height), names in by_count:
         more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
         parts.append(f"{width}x{height} ({', '.join(names[:_MAX_NAMES])}{more})")
     rotated = {(w, h) for w, h in sizes} == {(h, w) for w, h in sizes}
     remedy = "; some are rotated by 90 degrees: keep the camera's own orientation" if rotated else ""
-    return (
+    raise InputError(
         f"the pictures have different sizes: {', '.join(parts)}; a calibration needs pictures of one camera at one"
         f" size{remedy}"
     )

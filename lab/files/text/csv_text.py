@@ -24,7 +24,7 @@ from lab.files.text.csv_table import Categorical, Table
 from lab.files.text.error_text import is_formula, printable_line, suggest_name
 
 # The columns that hold words; every other column holds numbers.
-WORD_COLUMNS = ("camera", "spot", "beam", "status", "point", "screen", "date", "verdict")
+WORD_COLUMNS = ("camera", "spot", "beam", "status", "point", "screen", "date", "verdict", "view")
 LARGE_BYTES = 4_000_000  # pandas reads regular files of this size and larger
 _ROWS_AT_ONCE, _BYTES_AT_ONCE = 1_500, 200_000  # bound the memory of the text (1 MB): a table is read in pieces
 _MAX_TEXTS = 1000  # kept per column, of fields that are not numbers

@@ -61,19 +61,17 @@ def residual_histogram(
 
 def lens_model_chart(
     names: Sequence[str],
-    holdout_rms_px: Array,
+    error_px: Array,
     chosen: int,
-    title: str = "Lens models: error on views that the fit has not seen",
+    title: str = "Lens models: expected error of directions",
     *,
-    fit_rms_px: Array | None = None,
-    sigma_px: Array | None = None,
+    noise_px: Array | None = None,
 ) -> str:
-    """A bar per lens model: its RMS error on held-out views, px; the chosen model is marked.
+    """A bar per lens model: the expected error of its directions, px; the chosen model is marked.
 
-    names, holdout_rms_px (n,): nan where a fit failed. fit_rms_px (n,): RMS on the fitted views, drawn as ticks: a
-    model that improves only there fits noise. sigma_px (n,): of the hold-out error, drawn as whiskers.
+    names, error_px (n,): nan where a fit failed. noise_px (n,): the part of the error from noise, drawn as ticks.
     """
-    rms = np.asarray(holdout_rms_px, dtype=float)
+    rms = np.asarray(error_px, dtype=float)
     finite = rms[np.isfinite(rms)]
     # The bar of a model with a much larger error is cut and its number marked, so that the others stay readable.
     top = max(min(float(finite.max()), 4 * float(finite.min())) * 1.15 if finite.size else 1.0, 1e-9)
@@ -82,7 +80,7 @@ def lens_model_chart(
     p = PlotArea(Scale(0, top, left, 470), Scale(0, len(names), 28, low), 540, low + 38)
     marks = ticks(0, top, 6)
     out = [text(8, 15, title, "title"), x_ticks(p, marks, tick_texts(marks), grid=True)]
-    out.append(text((left + 470) / 2, low + 30, "hold-out RMS (px)", "mid"))
+    out.append(text((left + 470) / 2, low + 30, "expected error (px)", "mid"))
     for i, name in enumerate(names):
         y = float(p.Y(np.array(i + 0.5)))
         bold = "font-weight:600;fill:var(--ink)" if i == chosen else ""
@@ -96,22 +94,16 @@ def lens_model_chart(
             f'<rect x="{left:.1f}" y="{y - 8:.1f}" width="{long:.1f}" height="16" fill="{fill}" fill-opacity="0.85">'
             f"<title>{escape(name)}: {rms[i]:.4g} px</title></rect>"
         )
-        if sigma_px is not None and np.isfinite(sigma_px[i]) and rms[i] <= top:
-            a, b = p.X(np.clip(np.array([rms[i] - sigma_px[i], rms[i] + sigma_px[i]]), 0, top)).tolist()
-            out.append(
-                f'<path d="M{a:.1f} {y:.1f}H{b:.1f}M{a:.1f} {y - 4:.1f}v8M{b:.1f} {y - 4:.1f}v8"'
-                ' stroke="var(--ink)" fill="none"/>'
-            )
-        if fit_rms_px is not None and np.isfinite(fit_rms_px[i]):
-            x = float(p.X(np.array(min(fit_rms_px[i], top))))
+        if noise_px is not None and np.isfinite(noise_px[i]):
+            x = float(p.X(np.array(min(noise_px[i], top))))
             out.append(
                 f'<path d="M{x:.1f} {y - 11:.1f}v22" stroke="{ORANGE}" stroke-width="2.5">'
-                f"<title>fitted views: {fit_rms_px[i]:.4g} px</title></path>"
+                f"<title>noise: {noise_px[i]:.4g} px</title></path>"
             )
         words = number(float(rms[i])) + (" ✓" if i == chosen else "") + (" ▸" if rms[i] > top else "")
         out.append(text(476, y + 4, words, "", bold))
-    if fit_rms_px is not None:
-        out.append(text(532, low + 30, "orange: fitted views", "end"))
+    if noise_px is not None:
+        out.append(text(532, low + 30, "orange: noise", "end"))
     return svg_of(p, title, [*out, frame(p, closed=False)])
 
 

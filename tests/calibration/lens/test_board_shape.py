@@ -13,7 +13,7 @@ from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
 from tests.calibration.lens.lens_scenes import TRUTH, Scene, photographs
 
-FIVE = IntrinsicsOptions(lens=LensModel(5), folds=2)
+FIVE = IntrinsicsOptions(lens=LensModel(5))
 
 
 def stated(table: CornerTable, points: np.ndarray) -> CornerTable:

@@ -19,13 +19,13 @@ from geometry.camera import FISHEYE
 from tests.calibration.lens.lens_scenes import SIZE, TRUTH, WIDE, Scene, board_points, photographs
 
 FIVE = IntrinsicsOptions(lens=LensModel(5))
-BRISK = replace(FIVE, folds=2)
-QUICK = IntrinsicsOptions(lens=LensModel(4), warp=False, folds=3)  # the true k3 is too small to be significant
+FIVE = replace(FIVE)
+QUICK = IntrinsicsOptions(lens=LensModel(4), warp=False)  # the true k3 is too small to be significant
 
 
 @cache
 def typical() -> Intrinsics:
-    return calibrate_intrinsics(photographs(Scene(views=10), 1), IntrinsicsOptions(folds=3))
+    return calibrate_intrinsics(photographs(Scene(views=10), 1), IntrinsicsOptions())
 
 
 def errors(result: Intrinsics, lens: tuple[float, ...] = TRUTH) -> np.ndarray:
@@ -45,7 +45,7 @@ def test_the_lens_is_estimated_within_its_sigmas():
     chi2 = errors(c) @ np.linalg.solve(c.covariance, errors(c))
     assert chi2 < 30  # of nine parameters: exceeded with probability 1/2000
     assert c.fit.sigma_px == pytest.approx(0.2, rel=0.05)
-    assert c.held.rms_px == pytest.approx(0.2, rel=0.08)
+    assert c.held_out_rms_px == pytest.approx(0.2, rel=0.08)
     assert c.verdict < Level.FAIL
 
 
@@ -82,13 +82,13 @@ def bowed(sag_m: float, width_m: float) -> tuple[float, float, float]:
 def test_a_board_bowed_by_1_5_mm_over_0_33_m_does_not_bias_the_focal_length(seed):
     scene = Scene(views=10, warp=bowed(0.0015, 0.33), columns=12, rows=8, distance_m=(0.45, 0.9))
     table = photographs(scene, seed)
-    corrected = calibrate_intrinsics(table, BRISK)
+    corrected = calibrate_intrinsics(table, FIVE)
     assert corrected.warp is not None
     assert corrected.warp.corrected
     assert np.all(np.abs(errors(corrected)[:2]) < 2 * corrected.sigmas[:2])
     assert corrected.fit.warp[0] == pytest.approx(scene.warp[0], abs=4 * corrected.warp.sigma[0])
     # Without the correction the focal length would be biased significantly.
-    flat = calibrate_intrinsics(table, replace(BRISK, warp=False))
+    flat = calibrate_intrinsics(table, replace(FIVE, warp=False))
     assert abs(errors(flat)[0]) > 5 * np.sqrt(np.diagonal(flat.fit.covariance))[0]
 
 
@@ -104,7 +104,7 @@ def test_four_corners_with_errors_of_8_px_do_not_change_the_result():
     pixels = table.pixels.copy()
     hit = np.flatnonzero(table.view == 5)[[0, 1, 9, 10]]
     pixels[hit] += 8 / np.sqrt(2)
-    clean, found = (calibrate_intrinsics(t, replace(BRISK, warp=False)) for t in (table, replace(table, pixels=pixels)))
+    clean, found = (calibrate_intrinsics(t, replace(FIVE, warp=False)) for t in (table, replace(table, pixels=pixels)))
     assert np.all(np.abs(found.fit.lens - clean.fit.lens)[:9] < 0.5 * clean.sigmas)
     np.testing.assert_allclose(found.sigmas, clean.sigmas, rtol=0.05)
     assert not found.fit.used[hit].any()
@@ -211,7 +211,7 @@ def coverage_and_nees(seeds: range, options: IntrinsicsOptions) -> tuple[np.ndar
 
 
 def test_errors_agree_with_the_covariance():
-    _, nees = coverage_and_nees(range(100, 103), replace(BRISK, warp=False))
+    _, nees = coverage_and_nees(range(100, 103), replace(FIVE, warp=False))
     # The mean of 27 squared normal numbers is within 0.44 to 1.84 with probability 99 %.
     assert 0.44 < nees.mean() < 1.84
 

@@ -13,7 +13,7 @@ from tests.calibration.lens.random_lenses import corners_of, lens_error, random_
 @pytest.mark.slow
 def test_a_wide_rational_lens_is_not_taken_for_a_fisheye():
     true = random_lens(2, "rational")
-    c = calibrate_intrinsics(corners_of(true, 2, views=12), IntrinsicsOptions(warp=False, stretch=False, folds=3))
+    c = calibrate_intrinsics(corners_of(true, 2, views=12), IntrinsicsOptions(warp=False, stretch=False))
     assert c.model == LensModel(8)
     e = lens_error(true, c)
     assert e.error_px < 2.5 * e.stated_px

@@ -201,7 +201,6 @@ def test_mixed_sizes_are_refused(tmp_path):
         ({"lens": "fishey"}, "lens: expected .*did you mean 'fisheye'"),
         ({"warp": "yes"}, "warp: expected auto, on, off, got 'yes'"),
         ({"distance_m": float("nan")}, "distance: expected metres above 0, got nan"),
-        ({"folds": 1}, "folds: expected 2 or more, got 1"),
         ({"valid_days": 0}, "valid days: expected 1 or more, got 0"),
     ],
 )

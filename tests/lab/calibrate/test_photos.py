@@ -53,11 +53,21 @@ def test_the_same_picture_twice_counts_once(tmp_path, picture):
 
 
 def test_the_error_for_mixed_sizes_names_the_pictures(tmp_path, picture):
-    for k in range(3):
+    for k in range(2):
         cv2.imwrite(str(tmp_path / f"a{k}.png"), picture + np.uint8(k))
-    cv2.imwrite(str(tmp_path / "b.png"), picture[:, ::2])
-    with pytest.raises(InputError, match=r"different sizes: 400x300 \(a0.png, a1.png, a2.png\), 200x300 \(b.png\)"):
+        cv2.imwrite(str(tmp_path / f"b{k}.png"), picture[:, ::2] + np.uint8(k))
+    with pytest.raises(InputError, match=r"different sizes: 400x300 \(a0.png, a1.png\), 200x300 \(b0.png, b1.png\)"):
         find_in_photos([tmp_path / "*.png"], BOARD)
+
+
+def test_pictures_of_another_size_than_most_are_named_and_left_out(tmp_path, picture):
+    cv2.imwrite(str(tmp_path / "a.png"), picture[:, ::2])
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"b{k}.png"), picture + np.uint8(k))
+    photos = find_in_photos([tmp_path / "*.png"], BOARD)
+    assert photos.image_size_px == (400, 300)
+    assert len(photos.views) == 3
+    assert photos.refused == (("a.png", "200x300 px, most pictures have 400x300: another camera or setting"),)
 
 
 def test_a_path_without_pictures_is_refused_with_the_reason(tmp_path):

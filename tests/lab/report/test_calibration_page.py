@@ -71,7 +71,7 @@ def all_drawings() -> dict[str, str]:
         "histogram": charts.residual_histogram(RESIDUALS, sigma=0.2),
         "histogram of none": charts.residual_histogram(RESIDUALS[:0]),
         "ladder": charts.lens_model_chart(
-            ["4 <&>", "5", "fisheye"], np.array([0.3, 0.2, np.nan]), 1, fit_rms_px=np.array([0.3, 0.1, np.nan])
+            ["4 <&>", "5", "fisheye"], np.array([0.3, 0.2, np.nan]), 1, noise_px=np.array([0.3, 0.1, np.nan])
         ),
         "flatness": maps.flatness_map(
             RNG.normal(size=(40, 2)), RNG.normal(0, 1e-3, 40), size_m=(4, 3), bow=(1e-3, 0, 0)

@@ -1,0 +1,189 @@
+"""Lenses and pairs from real photographs: `python -m bench.lenses.real [subsets] [seed] [PART ...]`.
+
+PART: a set of SETS (the whole set, OpenCV's plain solve and the published focal length, then random subsets of 5 to 13
+photographs), a pair of PAIRS, or sets (whole sets only); default: all sets and pairs. 100 subsets of each take an hour.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from calibration.boards.board_types import parse
+from calibration.findings import Level
+from calibration.lens.fit.corner_table import CornerTable
+from calibration.lens.fit.lens_models import LensModel
+from calibration.lens.intrinsics import IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
+from calibration.lens.intrinsics_result import Intrinsics
+from calibration.pair.pair_calibration import PairError, calibrate_pair
+from geometry.arrays import Ints
+from lab.calibrate.camera.camera import corner_table
+from lab.calibrate.camera.photos import find_in_photos
+from lab.calibrate.pair.pair import baseline_sigma
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+_TWO = "charuco_two_cameras/cam_"
+_CHARUCO = "charuco:4x5:54mm:40.5mm:DICT_4X4_1000:inverted"
+# Photographs, board, published focal length in px (None: none; see SOURCE.md of each set).
+SETS: dict[str, tuple[str, str, float | None]] = {
+    "stereo-left": ("chessboard_stereo_opencv/left0*.jpg", "chessboard:9x6:25mm", 535.9),
+    "stereo-right": ("chessboard_stereo_opencv/right0*.jpg", "chessboard:9x6:25mm", None),
+    "lowquality": ("chessboard_lowquality_400x300/*.png", "chessboard:9x6:25mm", None),
+    "portrait-1": ("chessboard_portrait_cams/cam01/*.jpg", "chessboard:4x7:60mm", 1681.2),
+    "portrait-2": ("chessboard_portrait_cams/cam02/*.jpg", "chessboard:4x7:60mm", 1673.7),
+    "webcam": ("chessboard_webcam_c920/*.jpg", "chessboard:9x7:24.4mm", None),
+    "robot-wrist": ("circlegrid_robot_wrist/images/*.png", "circles:10x10:25.4mm", 542.3),
+    "charuco-0": (f"{_TWO}0.mp4", _CHARUCO, 903.6),
+    "charuco-1": (f"{_TWO}1.mp4", _CHARUCO, 760.3),
+}
+PAIRS = {"stereo": ("stereo-left", "stereo-right")}
+
+
+def table_of(name: str) -> tuple[CornerTable, float]:
+    """The corners of a set, and the process time of their detection."""
+    pattern, board, _ = SETS[name]
+    start = time.process_time()
+    photos = find_in_photos([DATA / pattern], parse(board))
+    return corner_table(photos), time.process_time() - start
+
+
+def calibrated(table: CornerTable, lens: LensModel | None = None) -> Intrinsics | str:
+    """The camera, or why it could not be calibrated."""
+    try:
+        return calibrate_intrinsics(table, IntrinsicsOptions(lens=lens))
+    except IntrinsicsError as error:
+        return str(error)
+
+
+def line(found: Intrinsics | str) -> str:
+    """The result in a few words."""
+    if isinstance(found, str):
+        return f"ERROR {found[:80]}"
+    failed = ",".join(f.code for f in found.findings if f.level is Level.FAIL)
+    fx, sigma = found.fit.lens[0], found.sigmas[0]
+    return f"{found.verdict.name:4s} {found.model.title:7s} fx {fx:8.2f} ± {sigma:5.2f} px {failed}"
+
+
+def plain_opencv(table: CornerTable) -> tuple[float, float]:
+    """fx of cv2.calibrateCamera with five coefficients, and how much it scatters if one photograph is left out, px.
+
+    The scatter is the jackknife's sigma of the whole set.
+    """
+
+    def solved(views: Ints) -> float:
+        points = [table.points[table.view == v].astype(np.float32) for v in views]
+        pixels = [table.pixels[table.view == v].astype(np.float32) for v in views]
+        return float(cv2.calibrateCamera(points, pixels, table.image_size_px, None, None)[1][0, 0])
+
+    every = np.flatnonzero(table.counts() >= 6)
+    left = np.array([solved(np.delete(every, k)) for k in range(len(every))])
+    return solved(every), float(np.sqrt((len(left) - 1) * np.mean((left - left.mean()) ** 2)))
+
+
+def is_usable(found: Intrinsics | str) -> bool:
+    return not isinstance(found, str) and found.verdict < Level.FAIL
+
+
+def spread(values: list[float], sigmas: list[float], shares: list[float], whole: float) -> str:
+    """RMS and robust spread of subsets about the whole set, in sigmas.
+
+    A subset with the share s of the photographs differs from the whole set by its sigma times sqrt(1 - s).
+    """
+    z = (np.array(values) - whole) / (np.array(sigmas) * np.sqrt(1 - np.array(shares)))
+    if not len(z):
+        return "no smaller subset"
+    return f"RMS {np.sqrt(np.mean(z**2)):.2f}, by the median {np.median(np.abs(z)) / 0.6745:.2f} of {len(z)}"
+
+
+def bench_set(name: str, count: int, seed: int) -> None:
+    """A whole set, then random subsets of it."""
+    table, seconds = table_of(name)
+    start = time.process_time()
+    whole = calibrated(table)
+    took = (time.process_time() - start + seconds) * 20 / table.views
+    fx, scatter = plain_opencv(table)
+    print(
+        f"{name} ({table.views} photographs): {line(whole)}; OpenCV {fx:.2f}, jackknife ± {scatter:.2f}; published"
+        f" {SETS[name][2]}; {took:.1f} s per 20 photographs",
+        flush=True,
+    )
+    rng = np.random.default_rng([seed, list(SETS).index(name)])
+    values: list[float] = []
+    sigmas: list[float] = []
+    shares: list[float] = []
+    failed = lost = 0
+    for _ in range(count):
+        size = int(rng.integers(5, min(13, table.views) + 1))
+        part = table.only_views(np.sort(rng.choice(table.views, size, replace=False)))
+        found = calibrated(part)
+        if not is_usable(found):
+            failed += 1
+            others = [calibrated(part, LensModel(k)) for k in (4, 5)]
+            if any(map(is_usable, others)):
+                lost += 1
+                print(f"  {size} photographs: {line(found)} | 4: {line(others[0])} | 5: {line(others[1])}", flush=True)
+        if not isinstance(found, str) and size < table.views:
+            values.append(float(found.fit.lens[0]))
+            sigmas.append(float(found.sigmas[0]))
+            shares.append(size / table.views)
+    if count and not isinstance(whole, str):
+        around = spread(values, sigmas, shares, float(whole.fit.lens[0]))
+        print(
+            f"  {count} subsets: FAIL {failed}, of these where 4 or 5 do not {lost}; fx in sigmas {around}", flush=True
+        )
+
+
+def bench_pair(name: str, count: int, seed: int) -> None:
+    """The baseline of a pair: all photographs, then random subsets."""
+    tables = [table_of(side)[0] for side in PAIRS[name]]
+    views = tables[0].views
+
+    def solved(rows: Ints) -> tuple[float, float] | str:
+        single = [calibrated(t.only_views(rows)) for t in tables]
+        if isinstance(single[0], str) or isinstance(single[1], str):
+            return f"{single[0]} {single[1]}"
+        numbers = list(range(len(rows)))
+        try:
+            pair = calibrate_pair(("left", "right"), (single[0], single[1]), (numbers, numbers))
+        except PairError as error:
+            return str(error)
+        return 1000 * pair.baseline_m, 1000 * baseline_sigma(pair)
+
+    whole = solved(np.arange(views))
+    print(f"pair {name}: baseline and sigma, mm: {whole}", flush=True)
+    rng = np.random.default_rng(seed)
+    values: list[float] = []
+    sigmas: list[float] = []
+    shares: list[float] = []
+    lost = 0
+    for _ in range(count):
+        size = int(rng.integers(5, min(13, views - 1) + 1))
+        found = solved(np.sort(rng.choice(views, size, replace=False)))
+        if isinstance(found, str):
+            lost += 1
+            print(f"  {size} pairs: {found}")
+            continue
+        values.append(found[0])
+        sigmas.append(found[1])
+        shares.append(size / views)
+    if count and not isinstance(whole, str):
+        print(f"  {count} subsets: not solved {lost}; baseline in sigmas {spread(values, sigmas, shares, whole[0])}")
+
+
+def main(arguments: list[str]) -> None:
+    """Print the figures."""
+    count = int(arguments[0]) if arguments else 100
+    seed = int(arguments[1]) if len(arguments) > 1 else 1
+    parts = arguments[2:] or [*SETS, *PAIRS]
+    if parts == ["sets"]:
+        count, parts = 0, [*SETS]
+    for part in parts:
+        (bench_set if part in SETS else bench_pair)(part, count, seed)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

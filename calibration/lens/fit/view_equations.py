@@ -1,0 +1,165 @@
+"""Each photograph's own equations for the unknowns that all photographs share, with the pose of its board eliminated.
+
+From them follow, without another fit, the solution of any set of photographs, the error of each photograph when it is
+held out, and how much the photographs scatter: in first order about the solution of all, which residuals far below the
+picture's size justify. Source: ours, from the elimination of poses in a bundle adjustment (Triggs et al. 2000, "Bundle
+adjustment: a modern synthesis", section 6.1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.stats import chi2
+
+from calibration.least_squares.adjustment import AdjustmentError
+from calibration.lens.fit.corner_table import CornerTable
+from calibration.lens.fit.lens_adjustment import prior_terms, term_of
+from calibration.lens.fit.lens_fit import LensFit, used_views
+from calibration.lens.fit.lens_parameters import BoardFreedom
+from geometry.arrays import Array, Bools, Ints
+
+_UNDETERMINED = 1e-9  # relative size of a pivot below which a direction of the unknowns is not determined
+
+
+@dataclass(frozen=True, slots=True)
+class Scatter:
+    """Whether photographs pull the shared unknowns apart by more than the noise of their corners explains."""
+
+    factor: float  # on the sigmas that explains it; about 1 for a good model
+    p_value: float  # of at least as much scatter, if model and noise are right
+
+
+@dataclass(frozen=True, slots=True)
+class ViewEquations:
+    """Information and gradient of V views on q shared unknowns: p of the lens, then bend (3) and scale (2) if present.
+
+    In coordinates in which all views together have the identity as information: unknowns = basis @ coordinates.
+    """
+
+    information: Array  # (V, q, q)
+    gradient: Array  # (V, q): half of the derivative of chi-square; sums to 0 over all views and the prior
+    chi2: Array  # (V,)
+    count: Ints  # (V,): coordinates minus the six numbers of the pose
+    views: Ints  # (V,): their numbers in the table
+    basis: Array  # (q, q)
+    lens: int  # p
+
+    @staticmethod
+    def of(table: CornerTable, found: LensFit, board: BoardFreedom | None = None) -> ViewEquations:
+        """At a solution; board: shape parameters among the unknowns, None: those that were free.
+
+        Raises:
+            AdjustmentError: the views do not determine the unknowns.
+        """
+        board = found.board if board is None else board
+        model, views = found.model, used_views(found, table)
+        line = term_of(table, found.used, model.fisheye, found.sigma_px).linearise(found.values)
+        parts = {p.stack: p.jacobian for p in line.parts}
+        shared = _shared(parts, model.free, board, table.circles is not None)
+        view = table.view[found.used]
+        rows, misses = [], []
+        for v in views:
+            mine = view == v
+            J, r = shared[mine].reshape(-1, shared.shape[-1]), line.residuals[mine].ravel()
+            Q = np.linalg.qr(parts["boards"][mine].reshape(-1, 6))[0]
+            rows.append(J - Q @ (Q.T @ J))
+            misses.append(r - Q @ (Q.T @ r))
+        known = _prior_rows(table, found, board, shared.shape[-1])
+        J = np.concatenate([*rows, known])
+        scale = np.linalg.norm(J, axis=0)
+        if not np.all(scale > 0):
+            raise AdjustmentError("the views do not determine every unknown")
+        R = np.linalg.qr(J / scale, mode="r")
+        if np.min(np.abs(np.diagonal(R))) < _UNDETERMINED:
+            raise AdjustmentError("the views do not determine every unknown")
+        basis = solve_triangular(R, np.eye(len(R))) / scale[:, None]
+        own = [A @ basis for A in rows]
+        return ViewEquations(
+            information=np.stack([A.T @ A for A in own]),
+            gradient=np.stack([A.T @ r for A, r in zip(own, misses, strict=True)]),
+            chi2=np.array([r @ r for r in misses]),
+            count=np.array([max(len(r) - 6, 1) for r in misses]),
+            views=views,
+            basis=basis,
+            lens=int(model.free.sum()),
+        )
+
+    def solution(self, which: Bools | None = None) -> tuple[Array, Array]:
+        """Change (q,) of the unknowns against all views, and covariance (q, q), from some of the views (V,); None: all.
+
+        The prior, which is weak, counts for each set in full.
+
+        Raises:
+            AdjustmentError: they do not determine the unknowns.
+        """
+        every = np.eye(len(self.basis))
+        left = np.ones(len(self.views), dtype=bool) if which is None else which
+        H = every - np.sum(self.information[~left], axis=0)
+        values, vectors = np.linalg.eigh(H)
+        if values[0] < _UNDETERMINED:
+            raise AdjustmentError("these views do not determine every unknown")
+        half = self.basis @ (vectors / np.sqrt(values))
+        C = half @ half.T
+        inverse = (vectors / values) @ vectors.T
+        return -self.basis @ (inverse @ np.sum(self.gradient[left], axis=0)), C
+
+    def moved(self, change: Array) -> ViewEquations:
+        """The equations at other values of the unknowns: changed by (q,)."""
+        y = np.linalg.solve(self.basis, change)
+        by = self.information @ y
+        chi = self.chi2 + 2 * self.gradient @ y + by @ y
+        return ViewEquations(
+            self.information, self.gradient + by, chi, self.count, self.views, self.basis, self.lens
+        )  # fmt: skip
+
+    def held_out_px2(self) -> Array:
+        """(V,): squared error per coordinate, in units of the noise, of each view when it is held out."""
+        error = np.empty(len(self.views))
+        for v, (S, g) in enumerate(zip(self.information, self.gradient, strict=True)):
+            # A view that alone determines some direction would be predicted with an unlimited error there.
+            y = np.linalg.solve((1 + _UNDETERMINED) * np.eye(len(g)) - S, g)
+            error[v] = (self.chi2[v] + 2 * g @ y + y @ S @ y) / self.count[v]
+        return error
+
+    def scatter(self) -> Scatter:
+        """Compare the gradients of single views with their covariance S - S S, which they have at the solution of all.
+
+        Errors that are correlated within a photograph (a board that bends differently each time, blur, a lens that the
+        model cannot describe) increase them. Compared as sums over views and directions of equal information, and with
+        the chi-square distribution of the same mean and variance (Satterthwaite 1946); the covariance that follows is
+        the sandwich estimate of White (1980, Econometrica 48) for clusters, reduced to one factor.
+        """
+        S = self.information
+        C = S - S @ S
+        measured = float(np.sum(self.gradient**2))
+        expected = float(np.trace(C, axis1=1, axis2=2).sum())
+        # The gradients sum to zero: those of different views have the covariance -S_u S_v.
+        squared = S @ S
+        squares = float(np.sum(C**2) + np.sum(np.sum(squared, axis=0) ** 2) - np.sum(squared**2))
+        dof = expected**2 / max(squares, 1e-300)
+        ratio = measured / expected if expected > 0 else 1.0
+        return Scatter(float(np.sqrt(ratio)), float(chi2.sf(ratio * dof, dof)))
+
+
+def _shared(parts: dict[str, Array], free: Bools, board: BoardFreedom, circles: bool) -> Array:
+    """Derivatives (N, 2, q) by the lens, the shape of the board and, last, the radius of its circles."""
+    names = [n for n, is_free in (("warp", board.warp), ("stretch", board.stretch), ("radius", circles)) if is_free]
+    return np.concatenate([parts["intrinsics"][..., free], *(parts[n] for n in names)], axis=2)
+
+
+def _prior_rows(table: CornerTable, found: LensFit, board: BoardFreedom, q: int) -> Array:
+    """Derivatives (n, q) of the priors on the lens and on the radius of circles."""
+    rows = []
+    for term in prior_terms(table, found.used, found.model, found.values):
+        for part in term.linearise(found.values).parts:
+            J = part.jacobian.reshape(-1, part.jacobian.shape[-1])
+            whole = np.zeros((len(J), q))
+            if part.stack == "intrinsics":
+                whole[:, : int(found.model.free.sum())] = J[:, found.model.free]
+            elif part.stack == "radius":
+                whole[:, -1:] = J
+            rows.append(whole)
+    return np.concatenate(rows) if rows else np.zeros((0, q))

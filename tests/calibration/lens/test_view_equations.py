@@ -1,0 +1,73 @@
+"""Solutions of some photographs, held-out errors and scatter from the equations of single photographs."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from calibration.lens.fit.corner_table import CornerTable
+from calibration.lens.fit.lens_fit import LensFit, fit, robust_fit
+from calibration.lens.fit.lens_models import LensModel
+from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom
+from calibration.lens.fit.lens_start import start
+from calibration.lens.fit.view_equations import ViewEquations
+from tests.calibration.lens.lens_scenes import TRUTH, Scene, photographs
+
+
+@cache
+def fitted(coefficients: int = 5) -> tuple[CornerTable, LensFit]:
+    table = photographs(Scene(views=12), 1)
+    _, values = start(table, False)
+    return table, robust_fit(table, LensModel(coefficients), values, AS_STATED)
+
+
+@pytest.mark.parametrize("coefficients", [5, 8])
+def test_all_views_have_the_covariance_of_the_fit(coefficients):
+    table, found = fitted(coefficients)
+    _, C = ViewEquations.of(table, found).solution()
+    np.testing.assert_allclose(np.sqrt(np.diagonal(C))[:4], np.sqrt(np.diagonal(found.covariance))[:4], rtol=2e-3)
+
+
+def test_half_of_the_views_have_the_solution_of_a_fit_to_them():
+    table, found = fitted()
+    half = np.arange(12) % 2 == 0
+    change, C = ViewEquations.of(table, found).solution(half)
+    other = fit(table, found.used & half[table.view], found.model, found.values, AS_STATED)
+    apart = (other.lens - found.lens)[found.model.free] - change
+    assert np.all(np.abs(apart) < 0.1 * np.sqrt(np.diagonal(C)))
+
+
+def test_a_view_held_out_is_predicted_as_by_a_fit_without_it():
+    table, found = fitted()
+    equations = ViewEquations.of(table, found)
+    without = fit(table, found.used & (table.view != 3), found.model, found.values, AS_STATED)
+    change = (without.lens - found.lens)[found.model.free]
+    assert equations.moved(change).chi2[3] / equations.count[3] == pytest.approx(equations.held_out_px2()[3], rel=0.02)
+
+
+def test_the_bend_follows_without_a_fit_in_which_it_is_free():
+    table = photographs(Scene(views=12, warp=(0.02, 0.0, 0.01)), 3)
+    _, values = start(table, False)
+    flat = robust_fit(table, LensModel(5), values, AS_STATED)
+    bent = fit(table, flat.used, flat.model, flat.values, BoardFreedom(warp=True))
+    change, _ = ViewEquations.of(table, flat, BoardFreedom(warp=True)).solution()
+    np.testing.assert_allclose(change[9:], bent.warp, rtol=0.1, atol=1e-3)
+
+
+def test_scatter_is_one_for_noise_and_larger_for_errors_common_to_a_photograph():
+    factors = []
+    for common_px in (0.0, 0.3):
+        squares = []
+        for seed in range(6):
+            table = photographs(Scene(views=12, lens=TRUTH), 70 + seed)
+            rng = np.random.default_rng(seed)
+            middle = table.pixels.mean(axis=0)
+            grow = 1 + rng.normal(0, common_px / 300, (table.views, 2))
+            table.pixels[:] = middle + (table.pixels - middle) * grow[table.view]
+            _, values = start(table, False)
+            squares.append(ViewEquations.of(table, robust_fit(table, LensModel(5), values, AS_STATED)).scatter().factor)
+        factors.append(float(np.sqrt(np.mean(np.square(squares)))))
+    assert factors[0] == pytest.approx(1, abs=0.15)
+    assert factors[1] > 1.2
