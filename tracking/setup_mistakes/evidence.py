@@ -1,0 +1,150 @@
+"""How well a rig explains sampled frames of a recording, and which mistake explains them better.
+
+Each frame is labelled without a track (tracking/labelling): the evidence of its best pose against "all points are
+false", summed over the frames, compares a mistake with the set-up as given (Bayes factor of two models). Source: ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.forward_model import SpotModel
+from geometry.pose_prior import PosePrior
+from geometry.pose_solver.gauss_newton import whiten
+from geometry.rig import Rig
+from geometry.uncertainty.chi_square import chi2_limit
+from geometry.uncertainty.rig_parameters import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigUncertainty
+from tracking.labelling.points import NO_POINT
+from tracking.labelling.search import Labelling, candidate_labellings
+from tracking.parameters import LabelParameters
+from tracking.setup_mistakes.mistake import HERE, Block, Mistake
+from tracking.setup_mistakes.possible import possible_mistakes
+
+LEAD_NATS = 20.0  # by which a mistake must explain the frames better than the set-up as given
+SAME_NATS = 10.0  # mistakes nearer to the best are named with it
+FIRST_FRAMES = 2  # with which all mistakes are compared; the best ones also with the others
+BEST = 8  # mistakes that are compared with all frames
+LEAST_FITTING = 0.75  # share of the frames that a set-up must explain to their sigmas
+P_FIT = 1e-6  # probability that correct labels do not fit their sigmas
+LEAST_POINTS = 2  # points per picture, median, from which a camera without any label is reported
+MODEL_PX = 0.03  # px: model error that is allowed beside the sigmas of the points (calibrations are no better)
+# A frame is searched with at most this effort: 60 mistakes are compared.
+MOST_POINTS, MOST_TRIPLES = 12, 20_000
+
+
+@dataclass(frozen=True, slots=True)
+class Frames:
+    """Sampled frames. `at_start`: the first block is at the start of the recording, where the prior holds."""
+
+    blocks: Sequence[Block]
+    prior: PosePrior | None
+    at_start: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Explained:
+    """How well a set-up explains K frames."""
+
+    nats: Array  # (K,) evidence of the best pose; 0: no pose is better than "all points are false"
+    fits: Bools  # (K,) the pose fits its points to their sigmas
+    labelled: Ints  # (K, c) points with a label, by camera
+    points: Ints  # (K, c)
+
+    @property
+    def good(self) -> bool:
+        """Whether the frames are explained."""
+        return bool(self.fits.mean() >= LEAST_FITTING) and not self.unused
+
+    @property
+    def unused(self) -> tuple[int, ...]:
+        """Cameras with points of which none is labelled."""
+        enough = np.median(self.points, axis=0) >= LEAST_POINTS
+        return tuple(int(c) for c in np.flatnonzero(enough & (self.labelled.sum(axis=0) == 0)))
+
+    def joined(self, more: Explained) -> Explained:
+        """Of these and further frames."""
+        pairs = ((getattr(self, name), getattr(more, name)) for name in Explained.__slots__)
+        return Explained(*(np.concatenate(pair) for pair in pairs))
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """The set-up as given, and the mistakes that explain the recording better, best first."""
+
+    given: Explained
+    found: tuple[tuple[Mistake, Explained], ...]
+
+
+def compare(
+    rig: Rig, frames: Frames, parameters: LabelParameters, covariance: RigCovariance | None = None
+) -> Comparison:
+    """Test all possible mistakes, unless the set-up as given explains the frames.
+
+    covariance: of the rig's calibration, if known.
+    """
+    parameters = replace(
+        parameters,
+        max_points=min(parameters.max_points, MOST_POINTS),
+        max_triples=min(parameters.max_triples, MOST_TRIPLES),
+    )
+    as_given = Mistake("", "", "", rig)
+    given = explained(as_given, frames, parameters, covariance)
+    if given.good:
+        return Comparison(given, ())
+    first = replace(frames, blocks=frames.blocks[:FIRST_FRAMES])
+    others = replace(frames, blocks=frames.blocks[FIRST_FRAMES:], at_start=False)
+    scored = []
+    for mistake in possible_mistakes(rig, frames.prior):
+        score = explained(mistake, first, parameters, covariance)
+        gain = float(score.nats.sum() - given.nats[:FIRST_FRAMES].sum())
+        if gain > 0:
+            scored.append((gain, mistake, score))
+    scored.sort(key=lambda one: -one[0])
+    whole = [(m, s.joined(explained(m, others, parameters, covariance))) for _, m, s in scored[:BEST]]
+    whole.sort(key=lambda one: -float(one[1].nats.sum()))
+    found = [one for one in whole if _better(one[1], given)]
+    limit = float(found[0][1].nats.sum()) - SAME_NATS if found else 0.0
+    return Comparison(given, tuple(one for one in found if one[1].nats.sum() >= limit))
+
+
+def _better(one: Explained, given: Explained) -> bool:
+    """Whether a mistake explains the frames, and better than the set-up as given."""
+    return one.good and float(one.nats.sum() - given.nats.sum()) >= LEAD_NATS
+
+
+def explained(
+    mistake: Mistake, frames: Frames, parameters: LabelParameters, covariance: RigCovariance | None
+) -> Explained:
+    """How well the set-up without a mistake explains frames."""
+    rig = mistake.rig
+    model = SpotModel.of(rig)
+    calibration = None if covariance is None else RigUncertainty(rig, model, covariance)
+    K, c = len(frames.blocks), len(rig.cameras)
+    out = Explained(np.zeros(K), np.zeros(K, bool), np.zeros((K, c), np.int64), np.zeros((K, c), np.int64))
+    for k, block in enumerate(frames.blocks):
+        prior = (mistake.prior or frames.prior) if k == 0 and frames.at_start else None
+        points = mistake.points(block)
+        out.points[k] = [len(block[HERE].get(name, ())) for name in rig.cameras]
+        found = candidate_labellings(rig, model, points, prior, parameters, calibration, most=1)
+        if not found or found[0].score <= 0:
+            continue
+        best = found[0]
+        out.nats[k] = best.score
+        given = best.point_of != NO_POINT
+        out.labelled[k] = np.bincount(model.camera_of[given], minlength=c)
+        out.fits[k] = _fits(best, model, points) if calibration is None else best.fit.consistent(P_FIT)
+    return out
+
+
+def _fits(one: Labelling, model: SpotModel, points: dict[str, object]) -> bool:
+    """Whether labelled points agree to their sigmas; `one.fit` allows for a larger model error."""
+    rows = one.fit.rows
+    cov = np.array([points[model.views[v][0]].cov_px2[one.point_of[v]] for v in rows])  # type: ignore[attr-defined]
+    W = whiten(cov + MODEL_PX**2 * np.eye(2))
+    misfit = float(np.sum((W @ one.fit.residuals_px[..., None]) ** 2))
+    return one.fit.dof <= 0 or misfit <= chi2_limit(P_FIT, one.fit.dof)
