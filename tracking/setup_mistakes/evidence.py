@@ -130,6 +130,8 @@ def explained(
         prior = (mistake.prior or frames.prior) if k == 0 and frames.at_start else None
         points = mistake.points(block)
         out.points[k] = [len(block[HERE].get(name, ())) for name in rig.cameras]
+        if sum(map(len, points.values())) < parameters.min_spots:
+            continue
         found = candidate_labellings(rig, model, points, prior, parameters, calibration, most=1)
         if not found or found[0].score <= 0:
             continue
