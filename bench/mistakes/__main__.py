@@ -63,10 +63,9 @@ def answer(folder: Path, out: Path, truth: Path | None) -> Answer:
         except BeamposeError as error:
             outcome, refusal = None, str(error)
     clock.append(time.process_time())
-    end = next((i for i, line in enumerate(lines) if line == "Rig"), len(lines))
     seconds = (clock[1] - clock[0], clock[2] - clock[1])
     if outcome is None:
-        return Answer("\n".join(lines[:end]), "refused", refusal, 0, 0, seconds)
+        return Answer("\n".join(lines), "refused", refusal, 0, 0, seconds)
     wrong = 0
     if truth is not None:
         tables = read_tables(out)
@@ -79,7 +78,7 @@ def answer(folder: Path, out: Path, truth: Path | None) -> Answer:
     verdict = outcome.verdict
     codes = tuple(str(r.as_mapping()["code"]) for r in verdict.reasons)
     texts = "\n".join(verdict.texts)
-    return Answer("\n".join(lines[:end]), verdict.status, texts, wrong, outcome.measured, seconds, codes)
+    return Answer("\n".join(lines), verdict.status, texts, wrong, outcome.measured, seconds, codes)
 
 
 def outcome_of(case: Case, a: Answer) -> str:

@@ -113,7 +113,9 @@ def _numbered_later(which: int) -> Callable[[Files], None]:
     return make
 
 
-def _poses(change: Callable[[dict[str, Any]], None], cameras: bool, screens: bool, every: bool) -> Callable[[Files], None]:
+def _poses(
+    change: Callable[[dict[str, Any]], None], cameras: bool, screens: bool, every: bool
+) -> Callable[[Files], None]:
     def make(f: Files) -> None:
         for name, c in f.rig["cameras"].items():
             if cameras and (every or name == f.pair[0]):
@@ -152,7 +154,7 @@ def _turned_aside(pose: dict[str, Any]) -> None:
     """The camera's frame turned by 35 deg about its own y axis: a pose of another day."""
     w, x, y, z = pose["quaternion_wxyz"]
     c, s = np.cos(np.deg2rad(17.5)), np.sin(np.deg2rad(17.5))
-    pose["quaternion_wxyz"] = [c * w - s * y, c * x + s * z, c * y + s * w, c * z - s * x]
+    pose["quaternion_wxyz"] = [float(q) for q in (c * w - s * y, c * x + s * z, c * y + s * w, c * z - s * x)]
 
 
 def _rig_in_millimetres(f: Files) -> None:
@@ -233,8 +235,8 @@ CASES = (
     Case("world_from_screen inverted, all", "inverse", _poses(_invert, False, True, True)),
     Case("xyzw quaternion, one camera", "x, y, z, w", _poses(_xyzw, True, False, False)),
     Case("xyzw quaternions, all", "x, y, z, w", _poses(_xyzw, True, True, True)),
-    Case("two beams exchanged", "beams? .*exchanged", _beams_exchanged),
-    Case("two spots exchanged", "spots? .*exchanged", _spots_exchanged),
+    Case("two beams exchanged", "beams .*exchanged", _beams_exchanged),
+    Case("two spots exchanged", "names of two spots|spots .*exchanged", _spots_exchanged),
     Case("the ends of a beam exchanged", "ends? .*(exchanged|right)", _ends_exchanged),
     Case("lens of another camera", "lens", _lens_of_other),
     Case("two lenses exchanged", "lens", _lenses_exchanged),
@@ -243,5 +245,9 @@ CASES = (
     Case("fx in millimetres", "millimetres", _focal_in_millimetres),
     Case("prior in millimetres", "millimetres", _prior_in_millimetres),
     Case("prior in radians", "radians", _prior_in_radians),
-    Case("camera pose of another day", "(none of its|camera_from_world|camera .*moved)", _poses(_turned_aside, True, False, False)),
+    Case(
+        "camera pose of another day",
+        "(none of its|camera_from_world|camera .*moved)",
+        _poses(_turned_aside, True, False, False),
+    ),
 )

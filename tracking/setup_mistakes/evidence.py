@@ -32,6 +32,7 @@ BEST = 8  # mistakes that are compared with all frames
 LEAST_FITTING = 0.75  # share of the frames that a set-up must explain to their sigmas
 P_FIT = 1e-6  # probability that correct labels do not fit their sigmas
 LEAST_POINTS = 2  # points per picture, median, from which a camera without any label is reported
+LEAST_LABELLED = 0.5  # labels per picture of such a camera, above which they are not taken to be clutter
 MODEL_PX = 0.03  # px: model error that is allowed beside the sigmas of the points (calibrations are no better)
 # A frame is searched with at most this effort: 60 mistakes are compared.
 MOST_POINTS, MOST_TRIPLES = 12, 20_000
@@ -58,13 +59,12 @@ class Explained:
     @property
     def good(self) -> bool:
         """Whether the frames are explained."""
-        return bool(self.fits.mean() >= LEAST_FITTING) and not self.unused
+        return bool(self.fits.mean() >= LEAST_FITTING) and not self.with_few_labels(LEAST_LABELLED)
 
-    @property
-    def unused(self) -> tuple[int, ...]:
-        """Cameras with points of which none is labelled."""
+    def with_few_labels(self, labelled: float = 0.0) -> tuple[int, ...]:
+        """Cameras with points of which at most so many per frame have a label."""
         enough = np.median(self.points, axis=0) >= LEAST_POINTS
-        return tuple(int(c) for c in np.flatnonzero(enough & (self.labelled.sum(axis=0) == 0)))
+        return tuple(int(c) for c in np.flatnonzero(enough & (self.labelled.mean(axis=0) <= labelled)))
 
     def joined(self, more: Explained) -> Explained:
         """Of these and further frames."""

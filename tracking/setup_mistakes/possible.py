@@ -298,5 +298,3 @@ def _reordered(pose: Pose) -> Pose:
     """The transform whose quaternion, in the order x, y, z, w, is that of `pose` in the order w, x, y, z."""
     x, y, z, w = quaternion_from_matrix(pose.rotation)
     return Pose(matrix_from_quaternion(np.array([w, x, y, z])), pose.translation)
-
-

@@ -12,8 +12,10 @@ from lab.errors import InputError
 from lab.files.run.run_file import Run
 from lab.files.run.truth import largest_disagreement_px, load_run_truth
 from lab.pictures.picture_file import DROPPED, UNREADABLE, MissingPicture
-from lab.runs.frames.frames import FrameReader
+from lab.runs.even_sampler import EvenSampler
+from lab.runs.frames.frames import FrameReader, FrameSet
 from lab.runs.input_check.findings import Findings, table
+from lab.runs.setup_check.check import MOST_KEPT
 from tracking.detections import Detections
 
 Progress = Callable[[int, int | None], None]  # frames done, total number of frames where known
@@ -34,11 +36,16 @@ class _Seen:
     wrong_size: int = 0
 
 
-def check_pictures(findings: Findings, run: Run, reader: FrameReader, progress: Progress | None) -> None:
-    """Decode all pictures of a run, and check them with its times and its truth."""
+def check_pictures(
+    findings: Findings, run: Run, reader: FrameReader, progress: Progress | None
+) -> EvenSampler[FrameSet]:
+    """Decode all pictures of a run, and check them with its times and its truth; returns a sample without pixels."""
     seen = {name: _Seen() for name in reader.cameras}
+    sampler: EvenSampler[FrameSet] = EvenSampler(MOST_KEPT)
     done = 0
     for frame_set in reader:
+        points = {name: found for name, found in frame_set.images.items() if isinstance(found, Detections)}
+        sampler.add(FrameSet(frame_set.frame, points))
         for name, picture in frame_set.images.items():
             _count(seen[name], frame_set.frame, picture)
         done += 1
@@ -57,6 +64,7 @@ def check_pictures(findings: Findings, run: Run, reader: FrameReader, progress: 
     frames = np.unique(np.concatenate([np.array(s.frames, dtype=np.int64) for s in seen.values()]))
     _check_times(findings, run, frames)
     _check_truth(findings, run, frames)
+    return sampler
 
 
 def _describe_pictures(findings: Findings, run: Run, seen: dict[str, _Seen]) -> None:

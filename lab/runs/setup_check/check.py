@@ -9,14 +9,12 @@ import numpy as np
 from calibration.findings import Finding, Level
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
-from geometry.uncertainty.rig_parameters import RigCovariance
 from lab.files.run.run_file import Run
 from lab.runs.even_sampler import EvenSampler
 from lab.runs.verdict.run_statistics import RunStatistics
 from tracking.detections import Detections
-from tracking.parameters import LabelParameters
 from tracking.setup_mistakes.evidence import LEAST_POINTS, Comparison, Frames, compare
-from tracking.setup_mistakes.mistake import HERE, Mistake
+from tracking.setup_mistakes.mistake import HERE, Block, Mistake
 from tracking.setup_mistakes.possible import possible_mistakes
 
 FRAMES = 6  # of a recording, with which mistakes are tested
@@ -30,9 +28,8 @@ def pictures_sampler() -> Pictures:
     return EvenSampler(MOST_KEPT)
 
 
-def frames_of(pictures: Pictures, prior: PosePrior | None, min_spots: int) -> Frames | None:
-    """The frames to be tested: the first, and others with many points; None where too few have enough points."""
-    blocks = pictures.blocks
+def frames_of(blocks: Sequence[Block], prior: PosePrior | None, min_spots: int) -> Frames | None:
+    """The frames to be tested: the first, and others with many points; None where none has enough points."""
     counts = np.array([sum(map(len, block[HERE].values())) for block in blocks])
     rows = np.flatnonzero(counts >= min_spots)
     if not len(rows):
@@ -44,18 +41,12 @@ def frames_of(pictures: Pictures, prior: PosePrior | None, min_spots: int) -> Fr
     return Frames([blocks[i] for i in chosen], prior, at_start=bool(chosen[0] == 0))
 
 
-def recorded_mistakes(
-    rig: Rig,
-    pictures: Pictures,
-    prior: PosePrior | None,
-    parameters: LabelParameters,
-    covariance: RigCovariance | None,
-) -> tuple[Finding, ...]:
-    """Findings on mistakes that a recording shows. covariance: of the rig's calibration, if known."""
-    frames = frames_of(pictures, prior, parameters.min_spots)
+def recorded_mistakes(run: Run, blocks: Sequence[Block]) -> tuple[Finding, ...]:
+    """Findings on mistakes that sampled frames of a recording show."""
+    frames = frames_of(blocks, run.prior, run.tracker.labels.min_spots)
     if frames is None:
         return ()
-    return _findings(compare(rig, frames, parameters, covariance), rig)
+    return _findings(compare(run.rig, frames, run.tracker.labels, run.covariance), run.rig)
 
 
 def mistakes_of_run(run: Run, statistics: RunStatistics, pictures: Pictures, *, passes: bool) -> tuple[Finding, ...]:
@@ -68,7 +59,7 @@ def mistakes_of_run(run: Run, statistics: RunStatistics, pictures: Pictures, *, 
     unused = [n for n, c in statistics.cameras.items() if c.points >= LEAST_POINTS * max(c.pictures, 1) and not c.found]
     if by_themselves or (passes and not unused):
         return by_themselves
-    found = recorded_mistakes(run.rig, pictures, run.prior, run.tracker.labels, run.covariance)
+    found = recorded_mistakes(run, pictures.blocks)
     named = tuple(f for f in found if f.code == MISTAKE)
     if named or not statistics.measured:
         return named
@@ -94,8 +85,13 @@ def _findings(compared: Comparison, rig: Rig) -> tuple[Finding, ...]:
         )
         found: Sequence[Mistake] = [m for m, _ in compared.found]
         remedies = dict.fromkeys(m.remedy for m in found)
-        return (Finding(Level.FAIL, ", or ".join(m.what for m in found), why, _sentence("; or ".join(remedies)), MISTAKE),)
-    return tuple(unused_finding(list(rig.cameras)[c], int(given.points[:, c].sum()), len(given.fits)) for c in given.unused)
+        return (
+            Finding(Level.FAIL, ", or ".join(m.what for m in found), why, _sentence("; or ".join(remedies)), MISTAKE),
+        )
+    return tuple(
+        unused_finding(list(rig.cameras)[c], int(given.points[:, c].sum()), len(given.fits))
+        for c in given.with_few_labels()
+    )
 
 
 def unused_finding(camera: str, points: int, pictures: int) -> Finding:
