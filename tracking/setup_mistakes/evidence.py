@@ -27,8 +27,8 @@ from tracking.setup_mistakes.possible import possible_mistakes
 
 LEAD_NATS = 20.0  # by which a mistake must explain the frames better than the set-up as given
 SAME_NATS = 10.0  # mistakes nearer to the best are named with it
-FIRST_FRAMES = 2  # with which all mistakes are compared; the best ones also with the others
-BEST = 8  # mistakes that are compared with all frames
+LONGEST_SEARCH = 2  # frames with which all mistakes are compared; fewer where one of them leads
+BEST = 5  # mistakes that are compared with all frames
 LEAST_FITTING = 0.75  # share of the frames that a set-up must explain to their sigmas
 P_FIT = 1e-6  # probability that correct labels do not fit their sigmas
 LEAST_POINTS = 2  # points per picture, median, from which a camera without any label is reported
@@ -66,11 +66,6 @@ class Explained:
         enough = np.median(self.points, axis=0) >= LEAST_POINTS
         return tuple(int(c) for c in np.flatnonzero(enough & (self.labelled.mean(axis=0) <= labelled)))
 
-    def joined(self, more: Explained) -> Explained:
-        """Of these and further frames."""
-        pairs = ((getattr(self, name), getattr(more, name)) for name in Explained.__slots__)
-        return Explained(*(np.concatenate(pair) for pair in pairs))
-
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
@@ -96,20 +91,32 @@ def compare(
     given = explained(as_given, frames, parameters, covariance)
     if given.good:
         return Comparison(given, ())
-    first = replace(frames, blocks=frames.blocks[:FIRST_FRAMES])
-    others = replace(frames, blocks=frames.blocks[FIRST_FRAMES:], at_start=False)
-    scored = []
-    for mistake in possible_mistakes(rig, frames.prior):
-        score = explained(mistake, first, parameters, covariance)
-        gain = float(score.nats.sum() - given.nats[:FIRST_FRAMES].sum())
-        if gain > 0:
-            scored.append((gain, mistake, score))
-    scored.sort(key=lambda one: -one[0])
-    whole = [(m, s.joined(explained(m, others, parameters, covariance))) for _, m, s in scored[:BEST]]
+    left: list[tuple[Mistake, Explained | None]] = [
+        (m, None) for m in possible_mistakes(rig, frames.prior) if m.has_effect(rig)
+    ]
+    whole: list[tuple[Mistake, Explained]] = []
+    for k, block in enumerate(frames.blocks):
+        one = Frames([block], frames.prior, frames.at_start and k == 0)
+        whole = [(m, _joined(s, explained(m, one, parameters, covariance))) for m, s in left]
+        gains = [float(s.nats.sum() - given.nats[: k + 1].sum()) for _, s in whole]
+        order = sorted(range(len(whole)), key=lambda i: -gains[i])
+        if k + 1 >= LONGEST_SEARCH and gains[order[0]] <= 0:
+            return Comparison(given, ())
+        if gains[order[0]] >= LEAD_NATS or k + 1 >= LONGEST_SEARCH:
+            order = order[:BEST]
+        left = [*(whole[i] for i in order)]
     whole.sort(key=lambda one: -float(one[1].nats.sum()))
     found = [one for one in whole if _better(one[1], given)]
     limit = float(found[0][1].nats.sum()) - SAME_NATS if found else 0.0
     return Comparison(given, tuple(one for one in found if one[1].nats.sum() >= limit))
+
+
+def _joined(one: Explained | None, more: Explained) -> Explained:
+    """Of some frames and further ones."""
+    if one is None:
+        return more
+    pairs = ((getattr(one, name), getattr(more, name)) for name in Explained.__slots__)
+    return Explained(*(np.concatenate(pair) for pair in pairs))
 
 
 def _better(one: Explained, given: Explained) -> bool:

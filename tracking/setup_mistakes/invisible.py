@@ -25,6 +25,7 @@ from tracking.parameters import LabelParameters
 from tracking.setup_mistakes.mistake import Mistake
 from tracking.setup_mistakes.possible import possible_mistakes
 
+NAMES = "target"  # the kind of mistakes that may exchange names only
 POSES = 200  # of which the TRIED with the most visible spots are tried
 TRIED = 2
 SIGMA_PX = 0.1  # of the simulated points; they are exact, and fit a symmetric rig ...
@@ -52,7 +53,8 @@ def invisible_mistakes(rig: Rig, prior: PosePrior | None, parameters: LabelParam
     poses = poses_within(DEFAULT_RANGE if prior is None else prior, POSES)
     views = np.count_nonzero(model.in_picture(model.project(poses)[0]).any(axis=0))
     for mistake in possible_mistakes(rig):
-        if mistake.by_itself or any(change.later for change in mistake.pictures.values()):
+        late = any(change.later for change in mistake.pictures.values())
+        if mistake.by_itself or late or not (mistake.kind == NAMES or mistake.has_effect(rig)):
             continue
         true = SpotModel.of(mistake.rig)
         pixels = true.project(poses)[0]

@@ -9,10 +9,13 @@ from types import MappingProxyType
 import numpy as np
 
 from geometry.arrays import Array
+from geometry.forward_model import SpotModel
 from geometry.pose_prior import PosePrior
+from geometry.pose_solver.visibility import DEFAULT_RANGE, poses_within
 from geometry.rig import Rig
 from tracking.detections import Detections
 
+FEW_POSES = 40
 # The points of consecutive pictures by camera: of the frame before, the frame itself and the frame after. A camera
 # without a picture is absent.
 Block = Sequence[Mapping[str, Detections]]
@@ -50,6 +53,12 @@ class Mistake:
     prior: PosePrior | None = None  # as it is without the mistake; None: as given
     by_itself: bool = False  # numbers of the files show it, without a recording
 
+    def has_effect(self, given: Rig) -> bool:
+        """Whether the mistake changes more than names: the pictures, the prior, or the points of some pose."""
+        if self.pictures or self.prior is not None or self.by_itself:
+            return True
+        return not all(np.array_equal(a, b) for a, b in zip(_points_of(self.rig), _points_of(given), strict=True))
+
     def points(self, block: Block) -> dict[str, Detections]:
         """The points of the frame in the middle of a block, by camera, as they are without the mistake."""
         out = {}
@@ -65,12 +74,21 @@ class Mistake:
         return out
 
 
+def _points_of(rig: Rig) -> list[Array]:
+    """The pixels of some poses by camera and pose, sorted and rounded: which spots they are plays no part."""
+    model = SpotModel.of(rig)
+    pixels = np.round(model.project(poses_within(DEFAULT_RANGE, FEW_POSES))[0], 6)
+    pixels = np.where(model.in_picture(pixels)[..., None], pixels, np.inf)
+    keys = np.stack([np.broadcast_to(model.camera_of, pixels.shape[:2]), pixels[..., 0], pixels[..., 1]], axis=-1)
+    return [frame[np.lexsort(frame.T)] for frame in keys]
+
+
 # What shows a mistake of each kind that a recording cannot show, because the set-up is symmetric.
 SHOWN_BY = MappingProxyType(
     {
         "exchanged": "cover the lens of one camera for some frames: the pictures of that camera must be empty",
         "turned": "film a page of text on the screen: it must be readable and upright as in the room",
-        "size": "compare the size of the pictures with `image_size_px`, and both with that of the calibration photographs",
+        "size": "compare the size of the pictures with `image_size_px`, and both with those of the calibration",
         "pose": "measure the distance from that camera to two points of its screen with a tape",
         "unit": "measure the distance between two cameras with a tape",
         "focal": "compute the focal length in pixels: millimetres of the lens / millimetres of a pixel",

@@ -1,4 +1,4 @@
-"""The list of possible mistakes for a rig. Those that change no picture (spots that only exchange names) are not in it."""
+"""The list of possible mistakes for a rig."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ def _lenses(rig: Rig) -> Iterator[Mistake]:
 
 
 def _target(rig: Rig) -> Iterator[Mistake]:
-    """Beams and spots that are exchanged."""
+    """Beams that are exchanged, or their ends. (Two spots of one screen that are exchanged only exchange names.)"""
     for a, b in combinations(rig.beams, 2):
         one, other = rig.beams[a], rig.beams[b]
         yield Mistake(
@@ -194,22 +194,6 @@ def _target(rig: Rig) -> Iterator[Mistake]:
             "exchange their direction and point_m in rig.yaml",
             replace(rig, beams={**rig.beams, a: replace(other, name=a), b: replace(one, name=b)}),
         )
-    for a, b in combinations(rig.spots, 2):
-        one, other = rig.spots[a], rig.spots[b]
-        if one.screen != other.screen:
-            yield Mistake(
-                "target",
-                f"spots `{a}` and `{b}` are exchanged: each falls on the other's screen",
-                "exchange their screens in rig.yaml",
-                replace(
-                    rig,
-                    spots={
-                        **rig.spots,
-                        a: replace(one, screen=other.screen),
-                        b: replace(other, screen=one.screen),
-                    },
-                ),
-            )
     for a in rig.beams:
         beam = rig.beams[a]
         yield Mistake(

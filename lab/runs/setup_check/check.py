@@ -14,7 +14,7 @@ from lab.runs.even_sampler import EvenSampler
 from lab.runs.verdict.run_statistics import RunStatistics
 from tracking.detections import Detections
 from tracking.setup_mistakes.evidence import LEAST_POINTS, Comparison, Frames, compare
-from tracking.setup_mistakes.mistake import HERE, Block, Mistake
+from tracking.setup_mistakes.mistake import HERE, Block
 from tracking.setup_mistakes.possible import possible_mistakes
 
 FRAMES = 6  # of a recording, with which mistakes are tested
@@ -79,19 +79,17 @@ def _findings(compared: Comparison, rig: Rig) -> tuple[Finding, ...]:
     given = compared.given
     if compared.found:
         best = compared.found[0][1]
+        count = len(best.fits)
         why = (
-            f"without this mistake {best.labelled.sum()} of {best.points.sum()} points in {len(best.fits)} sampled frames"
-            f" fit a pose; with the files as given {given.labelled[given.fits].sum()}. The poses are wrong"
+            f"without this mistake {best.labelled.sum()} of {best.points.sum()} points in {count} sampled frames fit a"
+            f" pose; with the files as given {given.labelled[given.fits].sum()}. The poses are wrong, or do not use this"
+            " camera"
         )
-        found: Sequence[Mistake] = [m for m, _ in compared.found]
-        remedies = dict.fromkeys(m.remedy for m in found)
-        return (
-            Finding(Level.FAIL, ", or ".join(m.what for m in found), why, _sentence("; or ".join(remedies)), MISTAKE),
-        )
-    return tuple(
-        unused_finding(list(rig.cameras)[c], int(given.points[:, c].sum()), len(given.fits))
-        for c in given.with_few_labels()
-    )
+        what = ", or ".join(m.what for m, _ in compared.found)
+        remedies = dict.fromkeys(m.remedy for m, _ in compared.found)
+        return (Finding(Level.FAIL, what, why, _sentence("; or ".join(remedies)), MISTAKE),)
+    names, points = list(rig.cameras), given.points.sum(axis=0)
+    return tuple(unused_finding(names[c], int(points[c]), len(given.fits)) for c in given.with_few_labels())
 
 
 def unused_finding(camera: str, points: int, pictures: int) -> Finding:
