@@ -147,6 +147,7 @@ def _write_results(
     from lab.runs.score.score import against_truth, read_tables
 
     tables, added = against_truth(read_tables(work), run.folder), more()
+    verdict = quality.against_truth(verdict, tables.errors)
     results = RunResults(tally, statistics, model_check, verdict, passes.smoothing, tables.errors)
     content = summary_of(pipeline, results, time.perf_counter() - started)
     write_json({**content, **added}, work / "summary.json")

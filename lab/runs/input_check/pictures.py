@@ -12,7 +12,7 @@ from lab.errors import InputError
 from lab.files.run.run_file import Run
 from lab.files.run.truth import largest_disagreement_px, load_run_truth
 from lab.pictures.picture_file import DROPPED, UNREADABLE, MissingPicture
-from lab.runs.even_sampler import EvenSampler
+from lab.runs.frames.even_sampler import EvenSampler
 from lab.runs.frames.frames import FrameReader, FrameSet
 from lab.runs.input_check.findings import Findings, table
 from lab.runs.setup_check.check import MOST_KEPT
@@ -34,6 +34,7 @@ class _Seen:
     dropped: int = 0
     unreadable: int = 0
     wrong_size: int = 0
+    size: str = ""  # why the last of them is wrong
 
 
 def check_pictures(
@@ -74,7 +75,7 @@ def _describe_pictures(findings: Findings, run: Run, seen: dict[str, _Seen]) -> 
         kind = ", ".join(sorted(s.kinds)) + (f" ({s.points})" if "points" in s.kinds else "")
         rows.append((name, str(len(s.frames)), span, str(s.dropped), str(s.unreadable), str(s.wrong_size), kind))
         if not s.frames:
-            why = "all are of the wrong size" if s.wrong_size else "none can be read"
+            why = f"all are of the {s.size}" if s.wrong_size else "none can be read"
             findings.problems.append(f"{run.cameras[name].path}: camera {name!r} has no usable picture: {why}")
         if len(s.kinds) > 1:
             findings.remarks.append(f"{run.cameras[name].path}: pictures of different kinds: {', '.join(s.kinds)}")
@@ -89,7 +90,9 @@ def _count(seen: _Seen, frame: int, picture: object) -> None:
     if isinstance(picture, MissingPicture):
         seen.dropped += picture.reason == DROPPED
         seen.unreadable += picture.reason.startswith(UNREADABLE)
-        seen.wrong_size += picture.reason.startswith("wrong size")
+        if picture.reason.startswith("wrong size"):
+            seen.wrong_size += 1
+            seen.size = picture.reason
         return
     seen.frames.append(frame)
     if isinstance(picture, Detections):

@@ -11,10 +11,10 @@ from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.files.run.run_file import DetectionsTable, Run
 from lab.number_format import format_number
-from lab.runs.even_sampler import EvenSampler
+from lab.runs.frames.even_sampler import EvenSampler
 from lab.runs.frames.frames import FrameSet, pictures_at
 from lab.runs.input_check.findings import Findings
-from lab.runs.setup_check.check import FRAMES, mistakes_by_themselves, recorded_mistakes
+from lab.runs.setup_check.check import FRAMES, mistakes_by_themselves, rates_of_videos, recorded_mistakes
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters
 from tracking.setup_mistakes.invisible import Invisible, invisible_mistakes
@@ -52,7 +52,7 @@ def check_rig(findings: Findings, rig: Rig, prior: PosePrior | None, parameters:
 
 def check_recording(findings: Findings, run: Run, sampler: EvenSampler[FrameSet]) -> None:
     """Mistakes that a sample of the recording shows."""
-    for f in recorded_mistakes(run, _blocks(run, sampler)):
+    for f in (*recorded_mistakes(run, _blocks(run, sampler)), *rates_of_videos(run)):
         text = f"{f.what}; {f.why}. {f.remedy} ({f.code})"
         (findings.problems if f.level is Level.FAIL else findings.remarks).append(text)
 

@@ -10,7 +10,7 @@ import numpy as np
 from calibration.model_check.recording import ModelCheckRecording
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
-from lab.runs.even_sampler import EvenSampler
+from lab.runs.frames.even_sampler import EvenSampler
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.statuses import PoseStatus

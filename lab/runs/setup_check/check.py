@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 
 import numpy as np
 
-from calibration.findings import Finding, Level
+from calibration.findings import Finding, Level, verdict
+from geometry.camera import Camera
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
-from lab.files.run.run_file import Run
-from lab.runs.even_sampler import EvenSampler
+from lab.files.run.run_file import Run, VideoFile
+from lab.runs.frames.even_sampler import EvenSampler
+from lab.runs.frames.frame_sources import header_rate_hz
 from lab.runs.verdict.run_statistics import RunStatistics
 from tracking.detections import Detections
-from tracking.setup_mistakes.evidence import LEAST_POINTS, Comparison, Frames, compare
+from tracking.setup_mistakes.evidence import LEAST_FITTING, LEAST_POINTS, Comparison, Frames, compare
 from tracking.setup_mistakes.mistake import HERE, Block
 from tracking.setup_mistakes.possible import possible_mistakes
 
 FRAMES = 6  # of a recording, with which mistakes are tested
 MOST_KEPT = 90  # frames from which they are chosen
-MISTAKE, UNUSED = "BP-M06", "BP-M07"  # codes
+SAME_RATE = 0.02  # relative difference of frame rates, above which they are not the same
+MISTAKE, UNUSED, CONTRADICTION = "BP-M06", "BP-M07", "BP-M08"  # codes
 Pictures = EvenSampler[Mapping[str, Detections]]  # the points of each frame, by camera
 
 
@@ -55,15 +59,54 @@ def mistakes_of_run(run: Run, statistics: RunStatistics, pictures: Pictures, *, 
     passes: whether nothing else is to be reported: the rig then explains the recording, and only cameras that the poses
     do not use are tested.
     """
-    by_themselves = mistakes_by_themselves(run.rig, run.prior)
+    of_files = (*mistakes_by_themselves(run.rig, run.prior), *rates_of_videos(run))
     unused = [n for n, c in statistics.cameras.items() if c.points >= LEAST_POINTS * max(c.pictures, 1) and not c.found]
-    if by_themselves or (passes and not unused):
-        return by_themselves
+    if verdict(of_files) is Level.FAIL or (passes and not unused):
+        return of_files
     found = recorded_mistakes(run, pictures.blocks)
-    named = tuple(f for f in found if f.code == MISTAKE)
-    if named or not statistics.measured:
-        return named
-    return tuple(unused_finding(n, statistics.cameras[n].points, statistics.cameras[n].pictures) for n in unused)
+    if verdict(found) is Level.FAIL or not statistics.measured:
+        return (*found, *of_files)
+    unlabelled = [unused_finding(n, statistics.cameras[n].points, statistics.cameras[n].pictures) for n in unused]
+    return (*unlabelled, *(f for f in found if f.code != UNUSED), *of_files)
+
+
+def rates_of_videos(run: Run) -> tuple[Finding, ...]:
+    """Findings on videos whose header states another frame rate than the run, unless the run has timestamps."""
+    if run.times.frames is not None:
+        return ()
+    rates = {n: header_rate_hz(source.path) for n, source in run.cameras.items() if isinstance(source, VideoFile)}
+    return tuple(
+        Finding(
+            Level.WARN,
+            f"the header of the video of camera `{name}` states {rate:.6g} pictures per second, run.yaml"
+            f" {run.frame_rate_hz:.6g}",
+            "velocities and times scale with the frame rate",
+            "Correct frame_rate_hz in run.yaml; where the header is wrong, give the times in a table `timestamps`.",
+            CONTRADICTION,
+        )
+        for name, rate in rates.items()
+        if rate is not None and abs(rate / run.frame_rate_hz - 1) > SAME_RATE
+    )
+
+
+def same_lenses(rig: Rig) -> tuple[Finding, ...]:
+    """A finding on cameras with the same lens to the last digit, where the rig does not explain a recording."""
+    return tuple(
+        Finding(
+            Level.WARN,
+            f"cameras `{a}` and `{b}` have the same lens to the last digit, and the recording does not fit: the wrong"
+            " camera.yaml for one of them?",
+            "two calibrations never agree to the last digit",
+            f"Compare camera_matrix and distortion of `{a}` and `{b}` with their camera.yaml.",
+            CONTRADICTION,
+        )
+        for a, b in combinations(rig.cameras, 2)
+        if _lens(rig.cameras[a]) == _lens(rig.cameras[b])
+    )
+
+
+def _lens(camera: Camera) -> tuple[object, ...]:
+    return (camera.matrix.tolist(), camera.distortion, camera.lens)
 
 
 def mistakes_by_themselves(rig: Rig, prior: PosePrior | None) -> tuple[Finding, ...]:
@@ -88,8 +131,11 @@ def _findings(compared: Comparison, rig: Rig) -> tuple[Finding, ...]:
         what = ", or ".join(m.what for m, _ in compared.found)
         remedies = dict.fromkeys(m.remedy for m, _ in compared.found)
         return (Finding(Level.FAIL, what, why, _sentence("; or ".join(remedies)), MISTAKE),)
+    if given.good:
+        return ()
     names, points = list(rig.cameras), given.points.sum(axis=0)
-    return tuple(unused_finding(names[c], int(points[c]), len(given.fits)) for c in given.with_few_labels())
+    unused = [unused_finding(names[c], int(points[c]), len(given.fits)) for c in given.with_few_labels()]
+    return (*unused, *(same_lenses(rig) if given.fits.mean() < LEAST_FITTING else ()))
 
 
 def unused_finding(camera: str, points: int, pictures: int) -> Finding:
