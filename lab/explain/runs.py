@@ -116,8 +116,8 @@ VERDICT: Explanations = {
     "BP-V20": Explanation(
         "The poses contradict the truth",
         "The run folder has a truth (truth/pose.csv), and measured poses are farther from it than 10 of their sigmas,"
-        " to which 0.01 mm and 0.01 mrad are added. FAIL for more than 0.5 % of the poses. A rig that fits every recording"
-        " may still be wrong: two cameras of a symmetric rig that are exchanged, for example.",
+        " to which 0.01 mm and 0.01 mrad are added. FAIL for more than 0.5 % of the poses. A rig that fits every"
+        " recording may still be wrong: two cameras of a symmetric rig that are exchanged, for example.",
         "Check that the truth belongs to this recording and is in the world of rig.yaml; then check the rig and the"
         " names of the cameras.",
     ),

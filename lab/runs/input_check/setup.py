@@ -31,13 +31,13 @@ def check_rig(findings: Findings, rig: Rig, prior: PosePrior | None, parameters:
     only_names = []
     for one in invisible_mistakes(rig, prior, parameters):
         if one.is_harmless:
-            only_names.append(one.mistake.what)
+            only_names.append(one.mistake.what.removesuffix(" are exchanged"))
         else:
             kinds.setdefault(one.mistake.kind, []).append(one)
     if only_names:
         findings.facts.append(
-            f"No recording shows whether {'; or '.join(only_names)}, or the names of two spots: the poses are the same,"
-            " the names in the tables are not"
+            f"Exchanged names of {', of '.join(only_names)}, or of two spots of a screen: no recording shows them; the"
+            " poses are the same"
         )
     for kind, those in kinds.items():
         what = "; or ".join(

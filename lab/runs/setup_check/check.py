@@ -23,7 +23,6 @@ from tracking.setup_mistakes.possible import possible_mistakes
 FRAMES = 6  # of a recording, with which mistakes are tested
 MOST_KEPT = 90  # frames from which they are chosen
 SAME_RATE = 0.02  # relative difference of frame rates, above which they are not the same
-MISTAKE, UNUSED, CONTRADICTION = "BP-M06", "BP-M07", "BP-M08"  # codes
 Pictures = EvenSampler[Mapping[str, Detections]]  # the points of each frame, by camera
 
 
@@ -67,7 +66,7 @@ def mistakes_of_run(run: Run, statistics: RunStatistics, pictures: Pictures, *, 
     if verdict(found) is Level.FAIL or not statistics.measured:
         return (*found, *of_files)
     unlabelled = [unused_finding(n, statistics.cameras[n].points, statistics.cameras[n].pictures) for n in unused]
-    return (*unlabelled, *(f for f in found if f.code != UNUSED), *of_files)
+    return (*unlabelled, *(f for f in found if f.code != "BP-M07"), *of_files)
 
 
 def rates_of_videos(run: Run) -> tuple[Finding, ...]:
@@ -82,7 +81,7 @@ def rates_of_videos(run: Run) -> tuple[Finding, ...]:
             f" {run.frame_rate_hz:.6g}",
             "velocities and times scale with the frame rate",
             "Correct frame_rate_hz in run.yaml; where the header is wrong, give the times in a table `timestamps`.",
-            CONTRADICTION,
+            code="BP-M08",
         )
         for name, rate in rates.items()
         if rate is not None and abs(rate / run.frame_rate_hz - 1) > SAME_RATE
@@ -98,7 +97,7 @@ def same_lenses(rig: Rig) -> tuple[Finding, ...]:
             " camera.yaml for one of them?",
             "two calibrations never agree to the last digit",
             f"Compare camera_matrix and distortion of `{a}` and `{b}` with their camera.yaml.",
-            CONTRADICTION,
+            code="BP-M08",
         )
         for a, b in combinations(rig.cameras, 2)
         if _lens(rig.cameras[a]) == _lens(rig.cameras[b])
@@ -112,7 +111,7 @@ def _lens(camera: Camera) -> tuple[object, ...]:
 def mistakes_by_themselves(rig: Rig, prior: PosePrior | None) -> tuple[Finding, ...]:
     """Findings on numbers of the files that cannot be those of a lab."""
     return tuple(
-        Finding(Level.FAIL, m.what, "no lab has such numbers", _sentence(m.remedy), MISTAKE)
+        Finding(Level.FAIL, m.what, "no lab has such numbers", _sentence(m.remedy), code="BP-M06")
         for m in possible_mistakes(rig, prior)
         if m.by_itself
     )
@@ -125,12 +124,12 @@ def _findings(compared: Comparison, rig: Rig) -> tuple[Finding, ...]:
         count = len(best.fits)
         why = (
             f"without this mistake {best.labelled.sum()} of {best.points.sum()} points in {count} sampled frames fit a"
-            f" pose; with the files as given {given.labelled[given.fits].sum()}. The poses are wrong, or do not use this"
-            " camera"
+            f" pose; with the files as given {given.labelled[given.fits].sum()}. The poses are wrong, or do not use"
+            " this camera"
         )
         what = ", or ".join(m.what for m, _ in compared.found)
         remedies = dict.fromkeys(m.remedy for m, _ in compared.found)
-        return (Finding(Level.FAIL, what, why, _sentence("; or ".join(remedies)), MISTAKE),)
+        return (Finding(Level.FAIL, what, why, _sentence("; or ".join(remedies)), code="BP-M06"),)
     if given.good:
         return ()
     names, points = list(rig.cameras), given.points.sum(axis=0)
@@ -146,7 +145,7 @@ def unused_finding(camera: str, points: int, pictures: int) -> Finding:
         "the poses do not use this camera, and none of the usual mistakes explains it",
         f"Check that the pictures and camera_matrix, camera_from_world and the screen of `{camera}` belong together"
         " (`beampose calibrate check`), or leave the camera out.",
-        UNUSED,
+        code="BP-M07",
     )
 
 
