@@ -82,14 +82,7 @@ def _content(path: Path) -> NDArray[np.uint8]:
 
 
 def _wrong_size(width: int, height: int, size_px: tuple[int, int]) -> str:
-    guess = ""
-    if (height, width) == size_px:
-        guess = " (turned by 90 deg, or transposed?)"
-    elif width * size_px[1] == height * size_px[0]:
-        guess = f" ({width / size_px[0]:.3g} times the resolution?)"
-    elif width <= size_px[0] and height <= size_px[1]:
-        guess = " (cropped?)"
-    return f"wrong size {width}x{height}, the rig says {size_px[0]}x{size_px[1]}{guess}"
+    return f"wrong size {width}x{height}, the rig says {size_px[0]}x{size_px[1]}"
 
 
 def _decoded(data: NDArray[np.uint8], size_px: tuple[int, int] | None) -> GreyPicture | MissingPicture:

@@ -50,7 +50,8 @@ class Invisible:
 def invisible_mistakes(rig: Rig, prior: PosePrior | None, parameters: LabelParameters) -> Iterator[Invisible]:
     """The mistakes that a rig hides, over the poses of a prior (without one: of a usual range)."""
     model = SpotModel.of(rig)
-    poses = poses_within(DEFAULT_RANGE if prior is None else prior, POSES)
+    prior = DEFAULT_RANGE if prior is None else prior
+    poses = poses_within(prior, POSES)
     views = np.count_nonzero(model.in_picture(model.project(poses)[0]).any(axis=0))
     for mistake in possible_mistakes(rig):
         late = any(change.later for change in mistake.pictures.values())

@@ -58,7 +58,8 @@ def _check_run(folder: Path, progress: Progress | None) -> CheckResult:
         return findings.result()
     findings.subject = f"{folder} ({run.name})"
     _describe_rig(findings, run.rig)
-    check_rig(findings, run.rig, run.prior, run.tracker.labels)
+    with_truth = (run.folder / "truth" / "pose.csv").exists()
+    check_rig(findings, run.rig, run.prior, run.tracker.labels, with_truth)
     _describe_calibration(findings, run.calibration, run.covariance, run.rig_path, run.recorded)
     for name in run.left_out:
         findings.remarks.append(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -75,7 +76,7 @@ def _describe_pictures(findings: Findings, run: Run, seen: dict[str, _Seen]) -> 
         kind = ", ".join(sorted(s.kinds)) + (f" ({s.points})" if "points" in s.kinds else "")
         rows.append((name, str(len(s.frames)), span, str(s.dropped), str(s.unreadable), str(s.wrong_size), kind))
         if not s.frames:
-            why = f"all are of the {s.size}" if s.wrong_size else "none can be read"
+            why = f"all are of the {s.size}: {_why_size(s.size)}" if s.wrong_size else "none can be read"
             findings.problems.append(f"{run.cameras[name].path}: camera {name!r} has no usable picture: {why}")
         if len(s.kinds) > 1:
             findings.remarks.append(f"{run.cameras[name].path}: pictures of different kinds: {', '.join(s.kinds)}")
@@ -84,6 +85,18 @@ def _describe_pictures(findings: Findings, run: Run, seen: dict[str, _Seen]) -> 
         if "points" in s.kinds and s.points == 0:
             findings.remarks.append(f"{run.cameras[name].path}: no points of camera {name!r}")
     findings.facts += table(("camera", "usable", "frames", "dropped", "unreadable", "wrong size", "kind"), rows)
+
+
+def _why_size(reason: str) -> str:
+    """The usual mistake behind a picture's size. reason: of the missing picture, with both sizes."""
+    width, height, right_width, right_height = (int(n) for n in re.findall(r"\d+", reason)[:4])
+    if (width, height) == (right_height, right_width):
+        return "turned by 90 deg, or transposed (rows and columns exchanged)?"
+    if width * right_height == height * right_width:
+        return f"recorded with {width / right_width:.3g} times the resolution of the calibration?"
+    if width <= right_width and height <= right_height:
+        return "cropped?"
+    return "pictures of another camera?"
 
 
 def _count(seen: _Seen, frame: int, picture: object) -> None:

@@ -78,7 +78,7 @@ def test_missing_and_damaged_pictures_are_remarks(folder):
     for words in (
         "left: 1 frame dropped (2)",
         "right: 1 frame unreadable: cut short (3)",
-        "right: 1 frame wrong size 4x4, the rig says 64x48 (cropped?) (4)",
+        "right: 1 frame wrong size 4x4, the rig says 64x48 (4)",
         "3 of 5 frames are missing in at least one camera",
         "1 files of 'left' are no frames: Thumbs.db",
         "pictures of different kinds: ",
