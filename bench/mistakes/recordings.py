@@ -14,7 +14,7 @@ from lab.files.rig.rig_file import save_rig
 from lab.simulate.rigs import fan, four_skew_beams, two_cameras_per_screen, unequal_fan
 from lab.simulate.write import simulate
 
-FRAMES = 200
+FRAMES = 100
 RANDOM_SEEDS = (26004, 26011)
 
 

@@ -15,6 +15,7 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import whiten
+from geometry.pose_solver.visibility import poses_within
 from geometry.rig import Rig
 from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_parameters import RigCovariance
@@ -22,7 +23,7 @@ from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking.labelling.points import NO_POINT
 from tracking.labelling.search import Labelling, candidate_labellings
 from tracking.parameters import LabelParameters
-from tracking.setup_mistakes.mistake import HERE, Block, Mistake
+from tracking.setup_mistakes.mistake import FEW_POSES, HERE, Block, Mistake
 from tracking.setup_mistakes.possible import possible_mistakes
 
 LEAD_NATS = 20.0  # by which a mistake must explain the frames better than the set-up as given
@@ -92,7 +93,9 @@ def compare(
     if given.good:
         return Comparison(given, ())
     left: list[tuple[Mistake, Explained | None]] = [
-        (m, None) for m in possible_mistakes(rig, frames.prior) if m.has_effect(rig)
+        (m, None)
+        for m in possible_mistakes(rig, frames.prior)
+        if m.has_effect(rig) and _may_see(m.rig, frames.prior, parameters.min_spots)
     ]
     whole: list[tuple[Mistake, Explained]] = []
     for k, block in enumerate(frames.blocks):
@@ -109,6 +112,15 @@ def compare(
     found = [one for one in whole if _better(one[1], given)]
     limit = float(found[0][1].nats.sum()) - SAME_NATS if found else 0.0
     return Comparison(given, tuple(one for one in found if one[1].nats.sum() >= limit))
+
+
+def _may_see(rig: Rig, prior: PosePrior | None, min_spots: int) -> bool:
+    """Whether a rig sees enough spots in a quarter of the poses of a prior; it saves searches. True without a prior."""
+    if prior is None:
+        return True
+    model = SpotModel.of(rig)
+    seen = model.in_picture(model.project(poses_within(prior, FEW_POSES))[0]).sum(axis=1)
+    return bool(np.quantile(seen, 0.75) >= min_spots)
 
 
 def _joined(one: Explained | None, more: Explained) -> Explained:
