@@ -101,6 +101,7 @@ def run_cases(seed: int, only: str, rigs: str, verbose: bool) -> None:
     made = {name: run for name, run in recordings(folder, seed).items() if rigs in name}
     table: dict[str, Counter[str]] = {}
     pass_wrong = silent = 0
+    seconds = np.zeros(2)
     for case in (Case("none", "BP-M0[678]", lambda f: None), *CASES):
         if only not in case.name:
             continue
@@ -118,6 +119,7 @@ def run_cases(seed: int, only: str, rigs: str, verbose: bool) -> None:
             counts[kind] += 1
             pass_wrong += a.status == "pass" and a.wrong > 0
             silent += kind == "PASS wrong"
+            seconds += a.seconds
             if verbose:
                 text = a.checked if kind == "check" else a.texts
                 hit = re.search(f".*({case.words}).*", text)
@@ -140,7 +142,8 @@ def run_cases(seed: int, only: str, rigs: str, verbose: bool) -> None:
     print(
         f"{made_count} mistakes, {total['harmless']} harmless (PASS, and right); of the {harmful} others {named} are"
         f" named ({named / max(harmful, 1):.1%}), {total['check']} by `check`; PASS with a pose beyond 10 sigmas:"
-        f" {pass_wrong}, of which {pass_wrong - silent} are named by `check`"
+        f" {pass_wrong}, of which {pass_wrong - silent} are named by `check`; process time of check"
+        f" {seconds[0] / max(made_count, 1):.1f} s, of run {seconds[1] / max(made_count, 1):.1f} s"
     )
 
 

@@ -150,7 +150,7 @@ def _millimetres(pose: dict[str, Any]) -> None:
     pose["translation_m"] = [MM * v for v in pose["translation_m"]]
 
 
-def _turned_aside(pose: dict[str, Any]) -> None:
+def turned_aside(pose: dict[str, Any]) -> None:
     """The camera's frame turned by 35 deg about its own y axis: a pose of another day."""
     w, x, y, z = pose["quaternion_wxyz"]
     c, s = np.cos(np.deg2rad(17.5)), np.sin(np.deg2rad(17.5))
@@ -248,6 +248,6 @@ CASES = (
     Case(
         "camera pose of another day",
         "(none of its|camera_from_world|camera .*moved)",
-        _poses(_turned_aside, True, False, False),
+        _poses(turned_aside, True, False, False),
     ),
 )

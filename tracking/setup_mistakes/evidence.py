@@ -31,12 +31,13 @@ SAME_NATS = 10.0  # mistakes nearer to the best are named with it
 LONGEST_SEARCH = 2  # frames with which all mistakes are compared; fewer where one of them leads
 BEST = 5  # mistakes that are compared with all frames
 LEAST_FITTING = 0.75  # share of the frames that a set-up must explain to their sigmas
+SURE_SPOTS = 5  # labels of a frame: false points often agree with the pose of four
 P_FIT = 1e-6  # probability that correct labels do not fit their sigmas
 LEAST_POINTS = 2  # points per picture, median, from which a camera without any label is reported
 LEAST_LABELLED = 0.5  # labels per picture of such a camera, above which they are not taken to be clutter
 MODEL_PX = 0.03  # px: model error that is allowed beside the sigmas of the points (calibrations are no better)
 # A frame is searched with at most this effort: 60 mistakes are compared.
-MOST_POINTS, MOST_TRIPLES = 12, 20_000
+MOST_POINTS, MOST_TRIPLES = 12, 3000
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +62,12 @@ class Explained:
     def good(self) -> bool:
         """Whether the frames are explained."""
         return bool(self.fits.mean() >= LEAST_FITTING) and not self.with_few_labels(LEAST_LABELLED)
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the frames are explained, with more spots than agree by chance."""
+        many = self.labelled.sum(axis=1) >= SURE_SPOTS
+        return self.good and bool((self.fits & many).mean() >= LEAST_FITTING)
 
     def with_few_labels(self, labelled: float = 0.0) -> tuple[int, ...]:
         """Cameras with points of which at most so many per frame have a label."""
@@ -90,7 +97,7 @@ def compare(
     )
     as_given = Mistake("", "", "", rig)
     given = explained(as_given, frames, parameters, covariance)
-    if given.good:
+    if given.is_certain:
         return Comparison(given, ())
     left: list[tuple[Mistake, Explained | None]] = [
         (m, None)
