@@ -14,7 +14,7 @@ from lab.files.rig.rig_file import save_rig
 from lab.simulate.rigs import fan, four_skew_beams, unequal_fan
 from lab.simulate.write import simulate
 
-FRAMES = 100
+FRAMES, RANDOM_FRAMES = 60, 30
 RANDOM_SEEDS = (116, 123)
 
 
@@ -47,6 +47,6 @@ def recordings(folder: Path, seed: int) -> dict[str, Path]:
         out[name] = simulate(scenario, folder / f"run-{k}", seed=seed, frames=FRAMES, detections_only=True, rig=path)
     for k, first in enumerate(RANDOM_SEEDS):
         out[f"random {k + 1}"] = write_run_folder(
-            random_scene(first + 1000 * (seed - 1), FRAMES), folder / f"random-{k}"
+            random_scene(first + 1000 * (seed - 1), RANDOM_FRAMES), folder / f"random-{k}"
         )
     return out
