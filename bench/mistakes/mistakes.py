@@ -49,7 +49,8 @@ class Files:
 def read(folder: Path) -> Files:
     with (folder / "detections.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    return Files(*(yaml.safe_load((folder / n).read_text()) for n in ("rig.yaml", "run.yaml")), rows)
+    rig, run = (yaml.safe_load((folder / n).read_text()) for n in ("rig.yaml", "run.yaml"))
+    return Files(rig, run, rows)
 
 
 def write(files: Files, folder: Path) -> Path:

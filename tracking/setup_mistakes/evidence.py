@@ -20,6 +20,7 @@ from geometry.rig import Rig
 from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_parameters import RigCovariance
 from geometry.uncertainty.rig_uncertainty import RigUncertainty
+from tracking.detections import Detections
 from tracking.labelling.points import NO_POINT
 from tracking.labelling.search import Labelling, candidate_labellings
 from tracking.parameters import LabelParameters
@@ -169,10 +170,10 @@ def explained(
     return out
 
 
-def _fits(one: Labelling, model: SpotModel, points: dict[str, object]) -> bool:
+def _fits(one: Labelling, model: SpotModel, points: dict[str, Detections]) -> bool:
     """Whether labelled points agree to their sigmas; `one.fit` allows for a larger model error."""
     rows = one.fit.rows
-    cov = np.array([points[model.views[v][0]].cov_px2[one.point_of[v]] for v in rows])  # type: ignore[attr-defined]
+    cov = np.array([points[model.views[v][0]].cov_px2[one.point_of[v]] for v in rows])
     W = whiten(cov + MODEL_PX**2 * np.eye(2))
     misfit = float(np.sum((W @ one.fit.residuals_px[..., None]) ** 2))
     return one.fit.dof <= 0 or misfit <= chi2_limit(P_FIT, one.fit.dof)

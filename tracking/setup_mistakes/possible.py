@@ -133,7 +133,8 @@ def _units(rig: Rig) -> Iterator[Mistake]:
     far_cameras = [n for n, c in rig.cameras.items() if np.linalg.norm(c.camera_from_world.translation) > FAR_M]
     far_screens = [n for n, s in rig.screens.items() if np.linalg.norm(s.world_from_screen.translation) > FAR_M]
     far_beams = [n for n, b in rig.beams.items() if np.linalg.norm(b.point) > FAR_ON_TARGET_M]
-    changed, words = rig, []
+    changed: Rig = rig
+    words: list[str] = []
     if far_cameras:
         poses = {n: _in_metres(rig.cameras[n].camera_from_world) for n in far_cameras}
         changed, words = _with_camera_poses(changed, poses), [*words, f"camera_from_world of {_names(far_cameras)}"]

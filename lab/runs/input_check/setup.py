@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from calibration.findings import Level
@@ -77,7 +75,7 @@ def _points(frame: FrameSet) -> dict[str, Detections]:
     return {name: points for name, points in frame.images.items() if isinstance(points, Detections)}
 
 
-def _detected(run: Run, cameras: list[str], frames: list[int]) -> dict[int, Mapping[str, Detections]]:
+def _detected(run: Run, cameras: list[str], frames: list[int]) -> dict[int, dict[str, Detections]]:
     """The points in some pictures, by frame and camera."""
     from lab.runs.frames.pipeline import Pipeline  # with the tracker and the detection: only for pictures
 
@@ -87,4 +85,4 @@ def _detected(run: Run, cameras: list[str], frames: list[int]) -> dict[int, Mapp
         for frame, picture in pictures_at(run, camera, frames).items():
             if isinstance(picture, np.ndarray):
                 out.setdefault(frame, {})[camera] = pipeline.spots_in(camera, picture)
-    return dict(out)
+    return out

@@ -98,8 +98,8 @@ def judge(
 
 def against_truth(verdict: Verdict, errors: Mapping[str, Any] | None) -> Verdict:
     """The verdict with what the truth of the run says; errors: as lab.runs.score.score gives them."""
-    measured = ((errors or {}).get("pose") or {}).get("measured")
-    wrong = 0 if measured is None else measured["beyond_10_sigmas"]
+    measured: Mapping[str, Any] = ((errors or {}).get("pose") or {}).get("measured") or {}
+    wrong = measured.get("beyond_10_sigmas", 0)
     if not wrong:
         return verdict
     what = (
