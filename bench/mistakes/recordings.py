@@ -14,8 +14,8 @@ from lab.files.rig.rig_file import save_rig
 from lab.simulate.rigs import fan, four_skew_beams, unequal_fan
 from lab.simulate.write import simulate
 
-FRAMES, RANDOM_FRAMES = 60, 30
-RANDOM_SEEDS = (116, 123)
+FRAMES, RANDOM_FRAMES = 60, 40
+RANDOM_SEEDS = (116, 113)
 
 
 def calibrated(rig: Rig, seed: int) -> Rig:

@@ -140,8 +140,11 @@ def _joined(one: Explained | None, more: Explained) -> Explained:
 
 
 def _better(one: Explained, given: Explained) -> bool:
-    """Whether a mistake explains the frames, and better than the set-up as given."""
-    return one.good and float(one.nats.sum() - given.nats.sum()) >= LEAD_NATS
+    """Whether a mistake explains the frames that show a pose, and better than the set-up as given."""
+    shows = one.nats > 0
+    fitting = bool(shows.any()) and float(one.fits[shows].mean()) >= LEAST_FITTING
+    all_cameras = not one.with_few_labels(LEAST_LABELLED) or bool(given.with_few_labels(LEAST_LABELLED))
+    return fitting and all_cameras and float(one.nats.sum() - given.nats.sum()) >= LEAD_NATS
 
 
 def explained(

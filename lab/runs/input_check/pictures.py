@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import combinations
 
 import numpy as np
 
@@ -121,6 +122,13 @@ def _compare_cameras(findings: Findings, seen: dict[str, _Seen]) -> None:
     """Reports frames that some cameras have and others lack."""
     if len(seen) < 2:
         return
+    ranges = {name: (min(s.frames), max(s.frames), len(s.frames)) for name, s in seen.items() if s.frames}
+    for (a, one), (b, other) in combinations(ranges.items(), 2):
+        if one[2] == other[2] and one[0] != other[0] and one[1] - one[0] == other[1] - other[0]:
+            findings.remarks.append(
+                f"cameras: {a!r} and {b!r} have {one[2]} pictures each, numbered from {one[0]} and from {other[0]}: the"
+                " same number must be the same instant. Film one flash with both: it must have the same number"
+            )
     in_all = set.intersection(*(set(s.frames) for s in seen.values()))
     in_any = set.union(*(set(s.frames) for s in seen.values()))
     if in_any and not in_all:
