@@ -28,6 +28,7 @@ from tracking.setup_mistakes.mistake import FEW_POSES, HERE, Block, Mistake
 from tracking.setup_mistakes.possible import possible_mistakes
 
 LEAD_NATS = 20.0  # by which a mistake must explain the frames better than the set-up as given
+MORE_LABELS = 0.5  # per frame, that fit a pose: a mistake must explain more points
 SAME_NATS = 10.0  # mistakes nearer to the best are named with it
 LONGEST_SEARCH = 2  # frames with which all mistakes are compared; fewer where one of them leads
 BEST = 5  # mistakes that are compared with all frames
@@ -143,8 +144,10 @@ def _better(one: Explained, given: Explained) -> bool:
     """Whether a mistake explains the frames that show a pose, and better than the set-up as given."""
     shows = one.nats > 0
     fitting = bool(shows.any()) and float(one.fits[shows].mean()) >= LEAST_FITTING
-    all_cameras = not one.with_few_labels(LEAST_LABELLED) or bool(given.with_few_labels(LEAST_LABELLED))
-    return fitting and all_cameras and float(one.nats.sum() - given.nats.sum()) >= LEAD_NATS
+    # A rig with a camera that looks elsewhere is likelier than one whose camera should see spots and does not.
+    more = one.labelled[one.fits].sum() - given.labelled[given.fits].sum() >= MORE_LABELS * len(one.fits)
+    all_cameras = set(one.with_few_labels(LEAST_LABELLED)) <= set(given.with_few_labels(LEAST_LABELLED))
+    return fitting and bool(more) and all_cameras and float(one.nats.sum() - given.nats.sum()) >= LEAD_NATS
 
 
 def explained(
