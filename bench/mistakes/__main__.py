@@ -95,18 +95,20 @@ def outcome_of(case: Case, a: Answer) -> str:
     return "CHECK unnamed" if a.status == "check" else "FAIL unnamed"
 
 
-def run_cases(seed: int, only: str, rigs: str, verbose: bool) -> None:
+def run_cases(seed: int, only: str, rigs: str, share: tuple[int, int], verbose: bool) -> None:
     """The table of all mistakes and rigs."""
     folder = Path(tempfile.mkdtemp(prefix="mistakes-"))
     made = {name: run for name, run in recordings(folder, seed).items() if rigs in name}
     table: dict[str, Counter[str]] = {}
     pass_wrong = silent = 0
     seconds = np.zeros(2)
-    for case in (Case("none", "BP-M0[678]", lambda f: None), *CASES):
+    for c, case in enumerate((Case("none", "BP-M0[678]", lambda f: None), *CASES)):
         if only not in case.name:
             continue
         counts = table.setdefault(case.name, Counter())
-        for name, run in made.items():
+        for r, (name, run) in enumerate(made.items()):
+            if (c + r) % share[1] != share[0]:
+                continue
             files = read(run)
             before = repr((files.rig, files.run, files.rows[:2000]))
             case.make(files)
@@ -179,13 +181,15 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", default="")
     parser.add_argument("--rig", default="", help="rigs whose name contains this text")
+    parser.add_argument("--share", default="0/1", help="0/3: a third of the pairs of mistake and rig, evenly")
     parser.add_argument("--correct", type=seed_range, metavar="A:B")
     parser.add_argument("-v", "--verbose", action="store_true", help="a line for each mistake and rig")
     a = parser.parse_args()
     if a.correct is not None:
         run_correct(a.correct)
     else:
-        run_cases(a.seed, a.only, a.rig, a.verbose)
+        part, parts = (int(n) for n in a.share.split("/"))
+        run_cases(a.seed, a.only, a.rig, (part, parts), a.verbose)
 
 
 if __name__ == "__main__":
