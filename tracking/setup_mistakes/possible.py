@@ -8,6 +8,7 @@ from itertools import combinations, permutations
 
 import numpy as np
 
+from geometry.arrays import Array
 from geometry.camera import FISHEYE, Camera
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
@@ -15,7 +16,7 @@ from geometry.rig import Rig
 from geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from tracking.setup_mistakes.mistake import Mistake, PictureChange
 
-FAR_M = 100.0  # a camera or screen farther from the origin is not in a lab ...
+FAR_M = 100.0  # a camera or screen farther from the others is not in a lab ...
 FAR_ON_TARGET_M = 10.0  # ... and a point of a beam farther from the body's origin is not on a vehicle model
 SHORT_FOCAL = 1 / 12  # focal length over picture width of a perspective lens with a field of view of 161 deg
 PIXEL_MM = 0.005  # an assumed pixel, to try a focal length that is given in millimetres
@@ -130,28 +131,33 @@ def _camera_poses(rig: Rig) -> Iterator[Mistake]:
 
 def _units(rig: Rig) -> Iterator[Mistake]:
     """Lengths in millimetres, where they are too large for a lab."""
-    far_cameras = [n for n, c in rig.cameras.items() if np.linalg.norm(c.camera_from_world.translation) > FAR_M]
-    far_screens = [n for n, s in rig.screens.items() if np.linalg.norm(s.world_from_screen.translation) > FAR_M]
-    far_beams = [n for n, b in rig.beams.items() if np.linalg.norm(b.point) > FAR_ON_TARGET_M]
-    changed: Rig = rig
-    words: list[str] = []
-    if far_cameras:
-        poses = {n: _in_metres(rig.cameras[n].camera_from_world) for n in far_cameras}
-        changed, words = _with_camera_poses(changed, poses), [*words, f"camera_from_world of {_names(far_cameras)}"]
-    if far_screens:
-        poses = {n: _in_metres(rig.screens[n].world_from_screen) for n in far_screens}
-        changed, words = _with_screen_poses(changed, poses), [*words, f"world_from_screen of {_names(far_screens)}"]
-    if far_beams:
-        beams = {n: replace(rig.beams[n], point=rig.beams[n].point / 1000) for n in far_beams}
-        changed, words = replace(changed, beams={**rig.beams, **beams}), [*words, f"point_m of {_names(far_beams)}"]
+    far_cameras, far_screens = _far(rig)
+    # The fewest of them whose conversion brings all places together.
+    none: list[str] = []
+    for cameras, screens in ((none, none), (far_cameras, none), (none, far_screens), (far_cameras, far_screens)):
+        changed = _with_camera_poses(rig, {n: _in_metres(rig.cameras[n].camera_from_world) for n in cameras})
+        changed = _with_screen_poses(changed, {n: _in_metres(rig.screens[n].world_from_screen) for n in screens})
+        if not any(_far(changed)):
+            break
+    beams = [n for n, b in rig.beams.items() if np.linalg.norm(b.point) > FAR_ON_TARGET_M]
+    in_metres = {n: replace(rig.beams[n], point=rig.beams[n].point / 1000) for n in beams}
+    groups = (("camera_from_world", cameras), ("world_from_screen", screens), ("point_m", beams))
+    words = [f"{field} of {_names(names)}" for field, names in groups if names]
     if words:
         yield Mistake(
             "unit",
             f"the lengths of {' and '.join(words)} are in millimetres",
             "write them in metres in rig.yaml",
-            changed,
+            replace(changed, beams={**rig.beams, **in_metres}),
             by_itself=True,
         )
+
+
+def _far(rig: Rig) -> tuple[list[str], list[str]]:
+    """Names of the cameras and of the screens that are too far from the middle of all for a lab."""
+    middle = _middle(rig)
+    cameras = [n for n, c in rig.cameras.items() if _is_far(c.camera_from_world.inverse(), middle)]
+    return cameras, [n for n, s in rig.screens.items() if _is_far(s.world_from_screen, middle)]
 
 
 def _lenses(rig: Rig) -> Iterator[Mistake]:
@@ -224,7 +230,7 @@ def _prior(rig: Rig, prior: PosePrior | None) -> Iterator[Mistake]:
             rig,
             prior=replace(prior, centre=centre, within_rad=within),
         )
-    if prior.within_m > FAR_M or np.abs(prior.centre.translation).max() > FAR_M:
+    if prior.within_m > FAR_M or _is_far(prior.centre, _middle(rig)):
         yield Mistake(
             "prior",
             "prior: position_m or within_m is in millimetres",
@@ -244,6 +250,16 @@ def _prior(rig: Rig, prior: PosePrior | None) -> Iterator[Mistake]:
         rig,
         prior=PosePrior.everywhere(rig),
     )
+
+
+def _middle(rig: Rig) -> Array:
+    """The median (3,), m, of the places of cameras and screens; a world may have its origin far away."""
+    cameras = [c.camera_from_world.inverse().translation for c in rig.cameras.values()]
+    return np.asarray(np.median([*cameras, *(s.world_from_screen.translation for s in rig.screens.values())], axis=0))
+
+
+def _is_far(pose: Pose, middle: Array) -> bool:
+    return bool(np.linalg.norm(pose.translation - middle) > FAR_M)
 
 
 def _each_and_all(names: Mapping[str, object], word: str = "camera") -> Iterator[tuple[str, list[str]]]:
