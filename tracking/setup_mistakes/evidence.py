@@ -36,7 +36,7 @@ LEAST_FITTING = 0.75  # share of the frames that a set-up must explain to their 
 SURE_SPOTS = 5  # labels of a frame: false points often agree with the pose of four
 P_FIT = 1e-6  # probability that correct labels do not fit their sigmas
 LEAST_POINTS = 2  # points per picture, median, from which a camera without any label is reported
-LEAST_LABELLED = 0.5  # labels per picture of such a camera, above which they are not taken to be clutter
+LEAST_LABELLED = 0.5  # share of the spots that the poses put into a camera's pictures which have a label
 MODEL_PX = 0.03  # px: model error that is allowed beside the sigmas of the points (calibrations are no better)
 # A frame is searched with at most this effort: 60 mistakes are compared.
 MOST_POINTS, MOST_TRIPLES = 12, 3000
@@ -58,6 +58,7 @@ class Explained:
     nats: Array  # (K,) evidence of the best pose; 0: no pose is better than "all points are false"
     fits: Bools  # (K,) the pose fits its points to their sigmas
     labelled: Ints  # (K, c) points with a label, by camera
+    expected: Ints  # (K, c) spots that the pose puts into the picture
     points: Ints  # (K, c)
 
     @property
@@ -71,10 +72,11 @@ class Explained:
         many = self.labelled.sum(axis=1) >= SURE_SPOTS
         return self.good and bool((self.fits & many).mean() >= LEAST_FITTING)
 
-    def with_few_labels(self, labelled: float = 0.0) -> tuple[int, ...]:
-        """Cameras with points of which at most so many per frame have a label."""
+    def with_few_labels(self, share: float = 0.0) -> tuple[int, ...]:
+        """Cameras with points whose labels are at most this share of the spots that they should see."""
         enough = np.median(self.points, axis=0) >= LEAST_POINTS
-        return tuple(int(c) for c in np.flatnonzero(enough & (self.labelled.mean(axis=0) <= labelled)))
+        few = self.labelled.sum(axis=0) <= share * self.expected.sum(axis=0)
+        return tuple(int(c) for c in np.flatnonzero(enough & few))
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +160,8 @@ def explained(
     model = SpotModel.of(rig)
     calibration = None if covariance is None else RigUncertainty(rig, model, covariance)
     K, c = len(frames.blocks), len(rig.cameras)
-    out = Explained(np.zeros(K), np.zeros(K, bool), np.zeros((K, c), np.int64), np.zeros((K, c), np.int64))
+    counts = (np.zeros((K, c), dtype=np.int64) for _ in range(3))
+    out = Explained(np.zeros(K), np.zeros(K, dtype=bool), *counts)
     for k, block in enumerate(frames.blocks):
         prior = (mistake.prior or frames.prior) if k == 0 and frames.at_start else None
         points = mistake.points(block)
@@ -172,6 +175,8 @@ def explained(
         out.nats[k] = best.score
         given = best.point_of != NO_POINT
         out.labelled[k] = np.bincount(model.camera_of[given], minlength=c)
+        in_view = model.in_picture(best.fit.projected_px)
+        out.expected[k] = np.bincount(model.camera_of[in_view], minlength=c)
         out.fits[k] = _fits(best, model, points) if calibration is None else best.fit.consistent(P_FIT)
     return out
 

@@ -22,6 +22,7 @@ from tracking.setup_mistakes.possible import possible_mistakes
 
 FRAMES = 6  # of a recording, with which mistakes are tested
 MOST_KEPT = 90  # frames from which they are chosen
+FEWEST, PART = 10, 0.6  # points, and the share of width and height that they do not exceed in part of a picture
 SAME_RATE = 0.02  # relative difference of frame rates, above which they are not the same
 Pictures = EvenSampler[Mapping[str, Detections]]  # the points of each frame, by camera
 
@@ -49,7 +50,35 @@ def recorded_mistakes(run: Run, blocks: Sequence[Block]) -> tuple[Finding, ...]:
     frames = frames_of(blocks, run.prior, run.tracker.labels.min_spots)
     if frames is None:
         return ()
-    return _findings(compare(run.rig, frames, run.tracker.labels, run.covariance), run.rig)
+    compared = compare(run.rig, frames, run.tracker.labels, run.covariance)
+    found = _findings(compared, run.rig)
+    return found if compared.found or compared.given.good else (*found, *_parts_of_pictures(run.rig, blocks))
+
+
+def _parts_of_pictures(rig: Rig, blocks: Sequence[Block]) -> tuple[Finding, ...]:
+    """Findings on cameras whose points all lie in the upper left part of the picture, as in cropped pictures.
+
+    Of a recording that nothing explains: the corner of the crop is not known, so that it cannot be undone.
+    """
+    out = []
+    for name, camera in rig.cameras.items():
+        parts = [block[HERE][name].uv_px for block in blocks if name in block[HERE]]
+        uv = np.concatenate(parts) if parts else np.zeros((0, 2))
+        if len(uv) < FEWEST or np.any(uv.max(axis=0) > PART * np.array(camera.image_size_px)):
+            continue
+        (u, v), (width, height) = uv.max(axis=0), camera.image_size_px
+        out.append(
+            Finding(
+                Level.WARN,
+                f"all points of camera `{name}` lie in the upper left part of its picture (u up to {u:.0f} of {width}, v"
+                f" up to {v:.0f} of {height}), and the recording does not fit: cropped pictures, or of a lower"
+                " resolution, than those that it was calibrated with?",
+                "pixels of another picture are other directions",
+                "Compare the size of the pictures with image_size_px and with that of the calibration.",
+                code="BP-M08",
+            )
+        )
+    return tuple(out)
 
 
 def mistakes_of_run(run: Run, statistics: RunStatistics, pictures: Pictures, *, passes: bool) -> tuple[Finding, ...]:
