@@ -70,9 +70,9 @@ def _parts_of_pictures(rig: Rig, blocks: Sequence[Block]) -> tuple[Finding, ...]
         out.append(
             Finding(
                 Level.WARN,
-                f"all points of camera `{name}` lie in the upper left part of its picture (u up to {u:.0f} of {width}, v"
-                f" up to {v:.0f} of {height}), and the recording does not fit: cropped pictures, or of a lower"
-                " resolution, than those that it was calibrated with?",
+                f"all points of camera `{name}` lie in the upper left part of its picture (u up to {u:.0f} of {width},"
+                f" v up to {v:.0f} of {height}), and the recording does not fit: were the pictures cropped, or recorded"
+                " with a lower resolution than for the calibration?",
                 "pixels of another picture are other directions",
                 "Compare the size of the pictures with image_size_px and with that of the calibration.",
                 code="BP-M08",

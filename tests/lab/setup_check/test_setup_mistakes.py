@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,9 @@ import yaml
 from bench.mistakes.mistakes import CASES, read, turned_aside, write
 from bench.mistakes.recordings import calibrated
 from geometry.arrays import Array
+from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
+from geometry.rig import Rig
 from lab.calibrate.camera.photos import _frames
 from lab.files.project.project_types import Cloud
 from lab.files.rig.rig_file import save_rig
@@ -57,6 +60,42 @@ def with_mistake(name: str, run: Path, out: Path) -> Path:
 def checked(path: Path) -> tuple[str, int]:
     result = check(path)
     return "\n".join(result.lines), result.exit_status
+
+
+def far_away(rig: Rig, offset_m: float) -> Rig:
+    """The rig in a world whose origin is so far away, as in a national grid."""
+    moved = Pose(np.eye(3), np.full(3, offset_m))
+    cameras = {n: replace(c, camera_from_world=c.camera_from_world @ moved.inverse()) for n, c in rig.cameras.items()}
+    screens = {n: replace(s, world_from_screen=moved @ s.world_from_screen) for n, s in rig.screens.items()}
+    return replace(rig, cameras=cameras, screens=screens)
+
+
+def in_millimetres(rig: Rig, cameras: tuple[str, ...], screens: tuple[str, ...]) -> Rig:
+    def mm(pose: Pose) -> Pose:
+        return Pose(pose.rotation, 1000 * pose.translation)
+
+    changed = {n: replace(rig.cameras[n], camera_from_world=mm(rig.cameras[n].camera_from_world)) for n in cameras}
+    others = {n: replace(rig.screens[n], world_from_screen=mm(rig.screens[n].world_from_screen)) for n in screens}
+    return replace(rig, cameras={**rig.cameras, **changed}, screens={**rig.screens, **others})
+
+
+@pytest.mark.parametrize(
+    ("rig", "words"),
+    [
+        (unequal_fan(), []),
+        (far_away(unequal_fan(), 4e6), []),
+        (in_millimetres(unequal_fan(), ("left",), ()), ["camera_from_world of `left`"]),
+        (in_millimetres(unequal_fan(), ("left", "right"), ()), ["camera_from_world of `left`, `right`"]),
+        (in_millimetres(unequal_fan(), (), ("left", "right")), ["world_from_screen of `left`, `right`"]),
+        (
+            in_millimetres(unequal_fan(), ("left", "right"), ("left", "right")),
+            ["camera_from_world of `left`, `right` and world_from_screen of `left`, `right`"],
+        ),
+    ],
+)
+def test_lengths_in_millimetres_show_by_themselves_wherever_the_world_has_its_origin(rig, words):
+    found = [m.what for m in possible_mistakes(rig) if m.by_itself]
+    assert found == [f"the lengths of {w} are in millimetres" for w in words]
 
 
 def test_a_correct_set_up_is_fine(recording):
