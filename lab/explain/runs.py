@@ -173,8 +173,8 @@ MODEL_CHECK: Explanations = {
     "BP-M08": Explanation(
         "Numbers that contradict each other",
         "The frame rate of run.yaml is not that of the video's header, or the recording does not fit, and"
-        " two cameras have the same lens to the last digit or all points of a camera lie in a part of its picture. Poses"
-        " do not depend on the frame rate; velocities do.",
+        " two cameras have the same lens to the last digit or all points of a camera lie in a part of its picture."
+        " Poses do not depend on the frame rate; velocities do.",
         "Correct the number that is wrong; times in a `timestamps` table are used instead of both frame rates.",
     ),
 }
