@@ -106,7 +106,7 @@ def compare(
     left: list[tuple[Mistake, Explained | None]] = [
         (m, None)
         for m in possible_mistakes(rig, frames.prior)
-        if m.has_effect(rig) and _may_see(m.rig, frames.prior, parameters.min_spots)
+        if m.rig is rig or (m.has_effect(rig) and _may_see(m.rig, frames.prior, parameters.min_spots))
     ]
     whole: list[tuple[Mistake, Explained]] = []
     for k, block in enumerate(frames.blocks):
