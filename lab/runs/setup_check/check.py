@@ -92,10 +92,12 @@ def mistakes_of_run(run: Run, statistics: RunStatistics, pictures: Pictures, *, 
     if verdict(of_files) is Level.FAIL or (passes and not unused):
         return of_files
     found = recorded_mistakes(run, pictures.blocks)
+    # Of a run, all pictures show whether a camera is used, not only the sampled ones; without any pose none is.
+    others = [f for f in found if f.code != "BP-M07"]
     if verdict(found) is Level.FAIL or not statistics.measured:
-        return (*found, *of_files)
+        return (*others, *of_files)
     unlabelled = [unused_finding(n, statistics.cameras[n].points, statistics.cameras[n].pictures) for n in unused]
-    return (*unlabelled, *(f for f in found if f.code != "BP-M07"), *of_files)
+    return (*unlabelled, *others, *of_files)
 
 
 def rates_of_videos(run: Run) -> tuple[Finding, ...]:
@@ -117,8 +119,11 @@ def rates_of_videos(run: Run) -> tuple[Finding, ...]:
     )
 
 
-def same_lenses(rig: Rig) -> tuple[Finding, ...]:
-    """A finding on cameras with the same lens to the last digit, where the rig does not explain a recording."""
+def same_lenses(rig: Rig, names: Sequence[str]) -> tuple[Finding, ...]:
+    """Findings on cameras with the same lens to the last digit, of a recording that the rig does not explain.
+
+    names: of the cameras with points.
+    """
     return tuple(
         Finding(
             Level.WARN,
@@ -128,7 +133,7 @@ def same_lenses(rig: Rig) -> tuple[Finding, ...]:
             f"Compare camera_matrix and distortion of `{a}` and `{b}` with their camera.yaml.",
             code="BP-M08",
         )
-        for a, b in combinations(rig.cameras, 2)
+        for a, b in combinations(names, 2)
         if _lens(rig.cameras[a]) == _lens(rig.cameras[b])
     )
 
@@ -162,8 +167,9 @@ def _findings(compared: Comparison, rig: Rig) -> tuple[Finding, ...]:
     if given.good:
         return ()
     names, points = list(rig.cameras), given.points.sum(axis=0)
+    with_points = [n for n, count in zip(names, points, strict=True) if count >= LEAST_POINTS * len(given.fits)]
     unused = [unused_finding(names[c], int(points[c]), len(given.fits)) for c in given.with_few_labels()]
-    return (*unused, *(same_lenses(rig) if given.fits.mean() < LEAST_FITTING else ()))
+    return (*unused, *(same_lenses(rig, with_points) if given.fits.mean() < LEAST_FITTING else ()))
 
 
 def unused_finding(camera: str, points: int, pictures: int) -> Finding:
