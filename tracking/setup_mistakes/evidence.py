@@ -27,7 +27,8 @@ from tracking.parameters import LabelParameters
 from tracking.setup_mistakes.mistake import FEW_POSES, HERE, Block, Mistake
 from tracking.setup_mistakes.possible import possible_mistakes
 
-LEAD_NATS = 20.0  # by which a mistake must explain the frames better than the set-up as given
+LEAD_NATS = 30.0  # by which a mistake must explain the frames better than the set-up as given
+LEAST_SEEN = 0.75  # share of the spots that the poses without the mistake put into the pictures, which has a label
 MORE_LABELS = 0.5  # per frame, that fit a pose: a mistake must explain more points
 SAME_NATS = 10.0  # mistakes nearer to the best are named with it
 LONGEST_SEARCH = 2  # frames with which all mistakes are compared; fewer where one of them leads
@@ -149,7 +150,10 @@ def _better(one: Explained, given: Explained) -> bool:
     # A rig with a camera that looks elsewhere is likelier than one whose camera should see spots and does not.
     more = one.labelled[one.fits].sum() - given.labelled[given.fits].sum() >= MORE_LABELS * len(one.fits)
     all_cameras = set(one.with_few_labels(LEAST_LABELLED)) <= set(given.with_few_labels(LEAST_LABELLED))
-    return fitting and bool(more) and all_cameras and float(one.nats.sum() - given.nats.sum()) >= LEAD_NATS
+    seen = one.labelled.sum() >= LEAST_SEEN * one.expected.sum()
+    return (
+        fitting and bool(more) and bool(seen) and all_cameras and float(one.nats.sum() - given.nats.sum()) >= LEAD_NATS
+    )
 
 
 def explained(
