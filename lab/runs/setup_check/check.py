@@ -71,8 +71,8 @@ def _parts_of_pictures(rig: Rig, blocks: Sequence[Block]) -> tuple[Finding, ...]
             Finding(
                 Level.WARN,
                 f"all points of camera `{name}` lie in the upper left part of its picture (u up to {u:.0f} of {width},"
-                f" v up to {v:.0f} of {height}), and the recording does not fit: were the pictures cropped, or recorded"
-                " with a lower resolution than for the calibration?",
+                f" v up to {v:.0f} of {height}), and the recording does not fit: the pictures may be cropped, or of a"
+                " lower resolution than for the calibration",
                 "pixels of another picture are other directions",
                 "Compare the size of the pictures with image_size_px and with that of the calibration.",
                 code="BP-M08",
@@ -127,8 +127,8 @@ def same_lenses(rig: Rig, names: Sequence[str]) -> tuple[Finding, ...]:
     return tuple(
         Finding(
             Level.WARN,
-            f"cameras `{a}` and `{b}` have the same lens to the last digit, and the recording does not fit: the wrong"
-            " camera.yaml for one of them?",
+            f"cameras `{a}` and `{b}` have the same lens to the last digit, and the recording does not fit: one of them"
+            " may have the wrong camera.yaml",
             "two calibrations never agree to the last digit",
             f"Compare camera_matrix and distortion of `{a}` and `{b}` with their camera.yaml.",
             code="BP-M08",
