@@ -11,9 +11,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from lab.simulate.campaign_files import PROJECT, simulate_calibration
-
 from lab.calibrate.rig.rig import RIG, calibrate_rig
+from lab.simulate.campaign import PROJECT, simulate_calibration
 from lab.simulate.write import simulate
 
 # Light "quiet" (unlit room, low-noise sensor) keeps the files small: most pixels show the black level. A picture of

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import permutations
@@ -95,20 +94,6 @@ def _sigmas(J: Array, limits: SolveLimits) -> tuple[Array, Array, Bools]:
             sigma_m[i] = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
             sigma_rad[i] = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
     return sigma_m, sigma_rad, (sigma_m <= limits.max_sigma_m) & (sigma_rad <= limits.max_sigma_rad)
-
-
-def with_inverted_camera(rig: Rig, camera: str) -> Rig:
-    """The rig with the inverse of this camera's pose: a hypothesis about a wrong rig file."""
-    turned = dataclasses.replace(rig.cameras[camera], camera_from_world=rig.cameras[camera].camera_from_world.inverse())
-    return dataclasses.replace(rig, cameras={**rig.cameras, camera: turned})
-
-
-def with_other_end(rig: Rig, spot: str) -> Rig:
-    """The rig with this spot at the other end of its beam: a hypothesis about a wrong rig file."""
-
-    return dataclasses.replace(
-        rig, spots={**rig.spots, spot: dataclasses.replace(rig.spots[spot], sign=-rig.spots[spot].sign)}
-    )
 
 
 # Symmetries of a vehicle: transforms that map its beams onto themselves. Spots cannot distinguish such poses.

@@ -95,7 +95,7 @@ VERDICT: Explanations = {
     ),
     "BP-V17": Explanation(
         "A finding of the model check",
-        "The spots of the whole run show a systematic deviation from rig.yaml. Its own code, BP-M01 to BP-M05,"
+        "The spots of the whole run show a systematic deviation from rig.yaml. Its own code, BP-M01 to BP-M08,"
         " says which kind.",
         "Act on the finding: the report names the component.",
     ),
@@ -112,6 +112,14 @@ VERDICT: Explanations = {
         "From some frame on, all spots of one camera are displaced by the same shift from where the pose of the other"
         " cameras puts them. They keep their labels, but the poses of these frames are computed without them.",
         "Check the mounts of this camera and its screen, and calibrate again.",
+    ),
+    "BP-V20": Explanation(
+        "The poses contradict the truth",
+        "The run folder has a truth (truth/pose.csv), and measured poses are farther from it than 10 of their sigmas,"
+        " to which 0.01 mm and 0.01 mrad are added. FAIL for more than 0.5 % of the poses. A rig that fits every"
+        " recording may still be wrong: two cameras of a symmetric rig that are exchanged, for example.",
+        "Check that the truth belongs to this recording and is in the world of rig.yaml; then check the rig and the"
+        " names of the cameras.",
     ),
 }
 
@@ -147,5 +155,26 @@ MODEL_CHECK: Explanations = {
         "A spot is hardly ever measured",
         "The pose puts this spot well inside the picture, but it is not found there. The pose is computed without it.",
         "Check whether its laser is on and unobstructed; then its mount; or calibrate the beams again.",
+    ),
+    "BP-M06": Explanation(
+        "A mistake of the set-up",
+        "Sampled frames of the recording were labelled with the files as given and, where these do not explain them,"
+        " without each of the usual mistakes: exchanged, mirrored, turned, transposed, smaller or cropped pictures,"
+        " numbers that are off by one, inverted transforms, quaternions in the order x, y, z, w, exchanged beams or"
+        " lenses, other units, a wrong prior. The mistake that is named explains the frames to their sigmas. Numbers"
+        " that no lab has are named without a recording.",
+        "Correct what is named, run `beampose check` again, then process the recording again.",
+    ),
+    "BP-M07": Explanation(
+        "A camera whose points are never labelled",
+        "A camera sees points of light, and none of them is ever the spot of a pose: the poses do not use the camera.",
+        "Check that the pictures, the lens and camera_from_world of that camera belong together; or leave it out.",
+    ),
+    "BP-M08": Explanation(
+        "Numbers that contradict each other",
+        "The frame rate of run.yaml is not that of the video's header, or the recording does not fit, and"
+        " two cameras have the same lens to the last digit or all points of a camera lie in a part of its picture."
+        " Poses do not depend on the frame rate; velocities do.",
+        "Correct the number that is wrong; times in a `timestamps` table are used instead of both frame rates.",
     ),
 }

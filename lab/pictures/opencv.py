@@ -5,6 +5,10 @@ from __future__ import annotations
 import os
 from functools import cache
 from types import ModuleType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import cv2
 
 
 @cache
@@ -18,3 +22,11 @@ def load_cv2() -> ModuleType:
 
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     return cv2
+
+
+def opened(source: str | int) -> cv2.VideoCapture:
+    """A video or a device. An orientation flag is not applied, as in pictures: pixels stay in the sensor's order."""
+    cv2 = load_cv2()
+    capture = cv2.VideoCapture(source)
+    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    return capture

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from calibration.findings import Level
+from calibration.findings import verdict as verdict_of
 from geometry.forward_model import SpotModel
 from lab.files.rig.calibration_state import require_valid_calibration
 from lab.files.run.parameter_overrides import with_overrides
@@ -22,6 +24,7 @@ from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.model_check.frame_sampler import FrameSampler, stated_covariances, widths
 from lab.runs.run_log import RunLog, listening
 from lab.runs.run_tally import RunTally
+from lab.runs.setup_check.check import mistakes_of_run, pictures_sampler
 from lab.runs.smoothing_pass import Progress, TrackingAndSmoothing
 from lab.runs.summary import SUMMARY_SCHEMA, RunResults, summary_of
 from lab.runs.tables import TableWriter
@@ -144,6 +147,7 @@ def _write_results(
     from lab.runs.score.score import against_truth, read_tables
 
     tables, added = against_truth(read_tables(work), run.folder), more()
+    verdict = quality.against_truth(verdict, tables.errors)
     results = RunResults(tally, statistics, model_check, verdict, passes.smoothing, tables.errors)
     content = summary_of(pipeline, results, time.perf_counter() - started)
     write_json({**content, **added}, work / "summary.json")
@@ -180,7 +184,7 @@ def write_tables(
         causal=checks.causal,
         invalid=checks.invalid,
     )
-    sampler = FrameSampler()
+    sampler, pictures = FrameSampler(), pictures_sampler()
     with (
         TableWriter(work, run.rig, run.covariance is not None, with_causal=not causal) as tables,
         contextlib.closing(passes.causal_only() if causal else passes.records()) as records,
@@ -191,6 +195,8 @@ def write_tables(
             width = widths(record.tracked, record.detections, model.camera_of)
             sampler.add_tracked(record.t_s, record.tracked, record.tracked.predicted_cov_px2, stated, width)
             statistics.add(record, in_causal_pass)
+            found = zip(run.rig.cameras, record.detections, strict=True)
+            pictures.add({name: points for name, points in found if points is not None})
             on_frame(record, in_causal_pass)
     from lab.runs.model_check.check import check_sampled_frames  # deferred: only needed at the end of a run
 
@@ -198,7 +204,13 @@ def write_tables(
     # Where the model check has tested the residuals, it has separated noise from faults.
     noise_scale = None if model_check.result.diagnosis is not None else pipeline.tracker.noise_scale
     mosaics = {name: noise.mosaic for name, noise in pipeline.noise.items() if noise.mosaic}
-    return statistics, model_check, quality.judge(statistics, model_check.findings, noise_scale, mosaics)
+    verdict = quality.judge(statistics, model_check.findings, noise_scale, mosaics)
+    mistakes = mistakes_of_run(run, statistics, pictures, passes=verdict.status == "pass")
+    if mistakes:
+        # The deviations of a rig with such a mistake are its consequences.
+        others = () if verdict_of(mistakes) is Level.FAIL else model_check.findings
+        verdict = quality.judge(statistics, (*mistakes, *others), noise_scale, mosaics)
+    return statistics, model_check, verdict
 
 
 def are_results(folder: Path) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.errors import InputError
-from lab.pictures.opencv import load_cv2
+from lab.pictures.opencv import load_cv2, opened
 from lab.pictures.picture_file import UNREADABLE, MissingPicture, read_picture
 from lab.runs.frames.frame_sources import retrieved
 from lab.watch.folder_poll import FolderPoll
@@ -212,7 +212,7 @@ def open_device(name: str, device: int | str, size_px: tuple[int, int], inbox: I
         InputError: the device cannot be opened.
     """
     cv2 = load_cv2()
-    capture = cv2.VideoCapture(device)
+    capture = opened(device)
     if not capture.isOpened():
         raise InputError(
             f"cameras.{name}.device: expected a camera that OpenCV can open, got {device!r}, which it cannot"

@@ -18,6 +18,7 @@ from lab.calibrate.camera.camera_outcome import CameraOutcome
 from lab.calibrate.camera.photos import VIDEO_SUFFIXES
 from lab.files.rig.camera_file import CameraFile
 from lab.number_format import format_number
+from lab.pictures.opencv import opened
 from lab.pictures.picture_file import MissingPicture, decode
 from lab.report.calibration.calibration_charts import lens_model_chart, residual_histogram
 from lab.report.calibration.calibration_drawings import corners_overlay, coverage_map, residual_field, tilt_polar
@@ -246,7 +247,7 @@ def _picture(outcome: CameraOutcome, name: str) -> NDArray[np.uint8] | None:
     """The photograph as 8 bits for display; None if it can no longer be read."""
     path = outcome.photos.paths[name]
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        video = cv2.VideoCapture(str(path))
+        video = opened(str(path))
         video.set(cv2.CAP_PROP_POS_FRAMES, int(name.rpartition("#")[2]))
         good, frame = video.read()
         video.release()

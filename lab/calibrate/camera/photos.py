@@ -16,7 +16,7 @@ from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Board, Chessboard
 from calibration.boards.board_view import QUICK_SEARCH_FAILED, BoardView, GreyImage, NotFound
 from lab.errors import InputError
-from lab.pictures.opencv import load_cv2
+from lab.pictures.opencv import load_cv2, opened
 from lab.pictures.picture_file import (
     PICTURE_SUFFIXES,
     UNREADABLE,
@@ -211,7 +211,7 @@ def _frame_count(path: Path) -> int:
     if path.suffix.lower() not in VIDEO_SUFFIXES:
         return 1
     cv2 = load_cv2()
-    video = cv2.VideoCapture(str(path))
+    video = opened(str(path))
     count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
     video.release()
     return min(max(count, 1), VIDEO_PICTURES)
@@ -220,7 +220,7 @@ def _frame_count(path: Path) -> int:
 def _frames(path: Path) -> Iterator[tuple[int, GreyPicture | MissingPicture]]:
     """Evenly spaced frames of a video with their numbers."""
     cv2 = load_cv2()
-    video = cv2.VideoCapture(str(path))
+    video = opened(str(path))
     try:
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         step = max(1, -(-count // VIDEO_PICTURES))

@@ -216,7 +216,8 @@ def _scan(cloud: Cloud, entry: ScreenEntry, survey: Survey, project: Project) ->
             a = [targets.names.index(n) for n in both]
             b = [survey.names.index(n) for n in both]
             sigma = cloud.point_sigma_m or _TARGET_SIGMA_M
-            at = targets.xyz[a] * cloud.unit_m
+            at, note = _in_metres(targets.xyz[a], survey.xyz[b], cloud)
+            words += note
             found = register(both, at, survey.xyz[b], survey.covariance[b], sigma)
             pose, covariance = found.world_from_cloud, found.covariance
             misses = 1e3 * float(np.sqrt(np.mean(np.sum(found.residuals_m**2, axis=1))))
@@ -227,6 +228,22 @@ def _scan(cloud: Cloud, entry: ScreenEntry, survey: Survey, project: Project) ->
     except ValueError as error:
         raise InputError(f"{cloud.path}: {error}") from None
     return scan, [*words, f"{cloud.path.name}: {scan.words}"]
+
+
+def _in_metres(targets: Array, survey: Array, cloud: Cloud) -> tuple[Array, list[str]]:
+    """Targets of a scan (n, 3), m, and a note where the file has them in the unit of the scan.
+
+    survey (n, 3), m: the same points. A factor of 10 and more between the two units shows which one fits.
+    """
+
+    def misfit(unit_m: float) -> float:
+        sizes = [np.linalg.norm(xyz - xyz.mean(axis=0)) for xyz in (targets * unit_m, survey)]
+        return float(abs(np.log(sizes[0] / sizes[1]))) if min(sizes) > 0 else 0.0
+
+    if cloud.unit_m == 1.0 or not len(targets) or misfit(1.0) <= misfit(cloud.unit_m):
+        return targets, []
+    note = f"{cloud.targets}: x_m, y_m, z_m are in the unit of the scan ({cloud.unit_m:g} m), not in metres: converted"
+    return targets * cloud.unit_m, [note]
 
 
 def _points(cloud: Cloud) -> tuple[Array, list[str]]:

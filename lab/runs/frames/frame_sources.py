@@ -15,7 +15,7 @@ from geometry.arrays import Ints
 from lab.errors import InputError
 from lab.files.run.detections_file import CameraPoints
 from lab.files.text.regular_file import require_regular_file
-from lab.pictures.opencv import load_cv2
+from lab.pictures.opencv import load_cv2, opened
 from lab.pictures.picture_file import (
     DROPPED,
     PICTURE_SUFFIXES,
@@ -211,7 +211,7 @@ def open_video(path: Path, colour: bool = False) -> cv2.VideoCapture:
     """
     require_regular_file(path)
     cv2 = load_cv2()
-    capture = cv2.VideoCapture(str(path))
+    capture = opened(str(path))
     if not capture.isOpened():
         raise InputError(
             f"{path}: expected a video that OpenCV can read; it cannot open this file (damaged, no video?)"
@@ -219,13 +219,23 @@ def open_video(path: Path, colour: bool = False) -> cv2.VideoCapture:
     if not colour:
         # Keeps grey videos, of 8 or 16 bits, unchanged; of YUV videos only the luma comes, of RGB videos all channels.
         capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
-    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # no rotation: pixels stay in the sensor's order
     return capture
 
 
 def header_picture_count(path: Path) -> int | None:
     """Number of pictures by the video's header, which may be wrong; None where it states none."""
-    capture = open_video(path)
-    count = capture.get(load_cv2().CAP_PROP_FRAME_COUNT)
-    capture.release()
+    count = _stated(path, load_cv2().CAP_PROP_FRAME_COUNT)
     return int(count) if 0 < count < 2**40 else None
+
+
+def header_rate_hz(path: Path) -> float | None:
+    """Pictures per second by the video's header, which may be wrong; None where it states none."""
+    rate = _stated(path, load_cv2().CAP_PROP_FPS)
+    return rate if 0 < rate < 2**40 else None
+
+
+def _stated(path: Path, what: int) -> float:
+    capture = open_video(path)
+    number = capture.get(what)
+    capture.release()
+    return float(number)

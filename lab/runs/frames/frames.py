@@ -262,7 +262,7 @@ class FrameReader:
         if outside.mean() > 0.5:
             raise InputError(
                 f"{path}: camera {name!r}: expected points in the picture, got {text}; are u and v exchanged, or the"
-                " pictures of another size than the rig says?"
+                " pictures turned by 90 deg, transposed, exchanged with those of another camera, or of another size?"
             )
         self._notes.append(f"{path}: camera {name!r}: left out: {text}")
         return points.without(outside)

@@ -22,7 +22,9 @@ from lab.files.run.run_file import Run, load_run
 from lab.runs.frames.frames import open_frames
 from lab.runs.input_check.findings import CheckResult, Findings, table
 from lab.runs.input_check.pictures import Progress, check_pictures
+from lab.runs.input_check.setup import check_recording, check_rig
 from lab.runs.input_check.visibility import check_visibility
+from tracking.parameters import LabelParameters
 
 
 def check(path: Path, progress: Progress | None = None) -> CheckResult:
@@ -41,6 +43,7 @@ def check(path: Path, progress: Progress | None = None) -> CheckResult:
         findings.add_error(error)
     else:
         _describe_rig(findings, rig)
+        check_rig(findings, rig, None, LabelParameters())
         _describe_calibration(findings, file.calibration, covariance, path, None)
         check_visibility(findings, rig, None, SolveLimits(), str(path))
     return findings.result()
@@ -55,6 +58,8 @@ def _check_run(folder: Path, progress: Progress | None) -> CheckResult:
         return findings.result()
     findings.subject = f"{folder} ({run.name})"
     _describe_rig(findings, run.rig)
+    with_truth = (run.folder / "truth" / "pose.csv").exists()
+    check_rig(findings, run.rig, run.prior, run.tracker.labels, with_truth)
     _describe_calibration(findings, run.calibration, run.covariance, run.rig_path, run.recorded)
     for name in run.left_out:
         findings.remarks.append(
@@ -69,7 +74,7 @@ def _check_run(folder: Path, progress: Progress | None) -> CheckResult:
     except InputError as error:
         findings.add_error(error)
     else:
-        check_pictures(findings, run, reader, progress)
+        check_recording(findings, run, check_pictures(findings, run, reader, progress))
     limits = SolveLimits(run.tracker.max_sigma_m, float(np.deg2rad(run.tracker.max_sigma_deg)))
     check_visibility(findings, run.rig, run.prior, limits, str(run.rig_path))
     return findings.result()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import combinations
 
 import numpy as np
 
@@ -12,8 +14,10 @@ from lab.errors import InputError
 from lab.files.run.run_file import Run
 from lab.files.run.truth import largest_disagreement_px, load_run_truth
 from lab.pictures.picture_file import DROPPED, UNREADABLE, MissingPicture
-from lab.runs.frames.frames import FrameReader
+from lab.runs.frames.even_sampler import EvenSampler
+from lab.runs.frames.frames import FrameReader, FrameSet
 from lab.runs.input_check.findings import Findings, table
+from lab.runs.setup_check.check import MOST_KEPT
 from tracking.detections import Detections
 
 Progress = Callable[[int, int | None], None]  # frames done, total number of frames where known
@@ -32,13 +36,19 @@ class _Seen:
     dropped: int = 0
     unreadable: int = 0
     wrong_size: int = 0
+    size: str = ""  # why the last of them is wrong
 
 
-def check_pictures(findings: Findings, run: Run, reader: FrameReader, progress: Progress | None) -> None:
-    """Decode all pictures of a run, and check them with its times and its truth."""
+def check_pictures(
+    findings: Findings, run: Run, reader: FrameReader, progress: Progress | None
+) -> EvenSampler[FrameSet]:
+    """Decode all pictures of a run, and check them with its times and its truth; returns a sample without pixels."""
     seen = {name: _Seen() for name in reader.cameras}
+    sampler: EvenSampler[FrameSet] = EvenSampler(MOST_KEPT)
     done = 0
     for frame_set in reader:
+        points = {name: found for name, found in frame_set.images.items() if isinstance(found, Detections)}
+        sampler.add(FrameSet(frame_set.frame, points))
         for name, picture in frame_set.images.items():
             _count(seen[name], frame_set.frame, picture)
         done += 1
@@ -57,6 +67,7 @@ def check_pictures(findings: Findings, run: Run, reader: FrameReader, progress: 
     frames = np.unique(np.concatenate([np.array(s.frames, dtype=np.int64) for s in seen.values()]))
     _check_times(findings, run, frames)
     _check_truth(findings, run, frames)
+    return sampler
 
 
 def _describe_pictures(findings: Findings, run: Run, seen: dict[str, _Seen]) -> None:
@@ -66,7 +77,7 @@ def _describe_pictures(findings: Findings, run: Run, seen: dict[str, _Seen]) -> 
         kind = ", ".join(sorted(s.kinds)) + (f" ({s.points})" if "points" in s.kinds else "")
         rows.append((name, str(len(s.frames)), span, str(s.dropped), str(s.unreadable), str(s.wrong_size), kind))
         if not s.frames:
-            why = "all are of the wrong size" if s.wrong_size else "none can be read"
+            why = f"all are of the {s.size}: {_why_size(s.size)}" if s.wrong_size else "none can be read"
             findings.problems.append(f"{run.cameras[name].path}: camera {name!r} has no usable picture: {why}")
         if len(s.kinds) > 1:
             findings.remarks.append(f"{run.cameras[name].path}: pictures of different kinds: {', '.join(s.kinds)}")
@@ -77,11 +88,25 @@ def _describe_pictures(findings: Findings, run: Run, seen: dict[str, _Seen]) -> 
     findings.facts += table(("camera", "usable", "frames", "dropped", "unreadable", "wrong size", "kind"), rows)
 
 
+def _why_size(reason: str) -> str:
+    """The usual mistake behind a picture's size. reason: of the missing picture, with both sizes."""
+    width, height, right_width, right_height = (int(n) for n in re.findall(r"\d+", reason)[:4])
+    if (width, height) == (right_height, right_width):
+        return "turned by 90 deg, or transposed (rows and columns exchanged)?"
+    if width * right_height == height * right_width:
+        return f"recorded with {width / right_width:.3g} times the resolution of the calibration?"
+    if width <= right_width and height <= right_height:
+        return "cropped?"
+    return "pictures of another camera?"
+
+
 def _count(seen: _Seen, frame: int, picture: object) -> None:
     if isinstance(picture, MissingPicture):
         seen.dropped += picture.reason == DROPPED
         seen.unreadable += picture.reason.startswith(UNREADABLE)
-        seen.wrong_size += picture.reason.startswith("wrong size")
+        if picture.reason.startswith("wrong size"):
+            seen.wrong_size += 1
+            seen.size = picture.reason
         return
     seen.frames.append(frame)
     if isinstance(picture, Detections):
@@ -97,6 +122,13 @@ def _compare_cameras(findings: Findings, seen: dict[str, _Seen]) -> None:
     """Reports frames that some cameras have and others lack."""
     if len(seen) < 2:
         return
+    ranges = {name: (min(s.frames), max(s.frames), len(s.frames)) for name, s in seen.items() if s.frames}
+    for (a, one), (b, other) in combinations(ranges.items(), 2):
+        if one[2] == other[2] and one[0] != other[0] and one[1] - one[0] == other[1] - other[0]:
+            findings.remarks.append(
+                f"cameras: {a!r} and {b!r} have {one[2]} pictures each, numbered from {one[0]} and from {other[0]}: the"
+                " same number must be the same instant. Film one flash with both: it must have the same number"
+            )
     in_all = set.intersection(*(set(s.frames) for s in seen.values()))
     in_any = set.union(*(set(s.frames) for s in seen.values()))
     if in_any and not in_all:

@@ -9,7 +9,10 @@ from geometry.pose_solver import visibility
 from geometry.pose_solver.gauss_newton import SolveLimits
 from geometry.rig import Rig
 from lab.runs.input_check.findings import Findings, table
+from tracking.setup_mistakes.possible import possible_mistakes
 
+FEW_POSES = 100  # with which possible mistakes are tried
+MOST_NAMED = 3
 SELDOM = 0.5  # a camera that sees no spot in more than this share of the poses is remarked
 
 
@@ -49,23 +52,34 @@ def check_visibility(findings: Findings, rig: Rig, prior: PosePrior | None, limi
         severe.append(f"{rig_path}: the pose is observable in none of {visibility.POSES} poses of the range")
     findings.facts.append(line)
 
-    for spot, share in seen.on_screen.items():
-        if share == 0:
-            other = visibility.visibility_of(visibility.with_other_end(rig, spot), span, limits).on_screen[spot]
-            hint = f"; from the other end of beam {rig.spots[spot].beam!r} it would: is `end` right?" if other else ""
-            severe.append(f"{rig_path}: target.spots.{spot}: never hits its screen {rig.spots[spot].screen!r}{hint}")
-    for camera, share in seen.blind.items():
-        if share == 1:
-            turned_rig = visibility.with_inverted_camera(rig, camera)
-            other = 1 - visibility.visibility_of(turned_rig, span, limits).blind[camera]
-            hint = (
-                f"; with the inverse of camera_from_world it would in {_percent(other)}: is it world_from_camera?"
-                if other
-                else "; compare camera_from_world, camera_matrix and the screen's pose with the lab"
-            )
-            severe.append(f"{rig_path}: cameras.{camera}: never sees a spot{hint}")
-        elif share > SELDOM:
-            findings.remarks.append(f"{rig_path}: cameras.{camera}: sees no spot in {_percent(share)} of the poses")
+    never = [
+        f"{rig_path}: target.spots.{spot}: never hits its screen {rig.spots[spot].screen!r}"
+        for spot, share in seen.on_screen.items()
+        if share == 0
+    ]
+    never += [f"{rig_path}: cameras.{camera}: never sees a spot" for camera, share in seen.blind.items() if share == 1]
+    if never:
+        severe += never
+        severe.append(f"{rig_path}: {_without_mistake(rig, span, limits)}")
+    findings.remarks += [
+        f"{rig_path}: cameras.{camera}: sees no spot in {_percent(share)} of the poses"
+        for camera, share in seen.blind.items()
+        if SELDOM < share < 1
+    ]
+
+
+def _without_mistake(rig: Rig, span: PosePrior, limits: SolveLimits) -> str:
+    """The mistakes without which every spot hits its screen and every camera sees spots, as a question."""
+    found = []
+    for mistake in possible_mistakes(rig):
+        if mistake.rig is rig:
+            continue
+        seen = visibility.visibility_of(mistake.rig, span, limits, FEW_POSES)
+        if min(seen.on_screen.values()) > 0 and max(seen.blind.values()) < SELDOM:
+            found.append(mistake)
+    if not found:
+        return "compare camera_from_world, camera_matrix and world_from_screen with the lab"
+    return f"it would be otherwise if {', or if '.join(m.what for m in found[:MOST_NAMED])}"
 
 
 def _percent(share: float) -> str:

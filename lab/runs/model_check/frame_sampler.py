@@ -10,13 +10,13 @@ import numpy as np
 from calibration.model_check.recording import ModelCheckRecording
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
+from lab.runs.frames.even_sampler import EvenSampler
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.statuses import PoseStatus
 from tracking.tracked_frame import TrackedFrame
 
 MOST_KEPT = 2000  # frames; as many as the statistics use
-BLOCK = 3  # consecutive frames that are kept together: they give the velocities of the spots
 
 
 def stated_covariances(
@@ -71,26 +71,17 @@ class SampledFrame:
 
 @dataclass(slots=True)
 class FrameSampler:
-    """Keeps evenly spaced blocks of consecutive frames: whenever it is full, every other block is dropped."""
+    """Keeps evenly spaced blocks of consecutive frames."""
 
     most: int = MOST_KEPT
-    _frames: list[SampledFrame] = field(default_factory=list)
-    _numbers: list[int] = field(default_factory=list)
-    _stride: int = 1  # of the blocks that are kept
-    _count: int = 0
+    _sampler: EvenSampler[SampledFrame] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._sampler = EvenSampler(self.most)
 
     def add(self, frame: SampledFrame) -> None:
         """Add the next frame. Its arrays are not copied."""
-        number, self._count = self._count, self._count + 1
-        if (number // BLOCK) % self._stride:
-            return
-        self._frames.append(frame)
-        self._numbers.append(number)
-        if len(self._frames) > self.most:
-            self._stride *= 2
-            kept = [i for i, n in enumerate(self._numbers) if not (n // BLOCK) % self._stride]
-            self._frames = [self._frames[i] for i in kept]
-            self._numbers = [self._numbers[i] for i in kept]
+        self._sampler.add(frame)
 
     def add_tracked(
         self,
@@ -121,7 +112,7 @@ class FrameSampler:
 
     def recording(self) -> ModelCheckRecording | None:
         """The sampled frames; None where no frame was added."""
-        kept = self._frames
+        kept = self._sampler.kept
         if not kept:
             return None
         n = len(kept[0].seen)

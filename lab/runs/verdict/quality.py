@@ -34,6 +34,7 @@ FEW_SHOWN = 0.1  # share of the frames with enough points, below which too few p
 LONG_EMPTY = (
     0.05  # duration, as a share of the run, of an empty end of a camera's recording, above which it is reported
 )
+MOST_WRONG = 0.005  # share of the measured poses beyond 10 sigmas from the truth, up to which the run does not fail
 LEAST_DISPLACED = 5  # frames in which none of a camera's spots fits the others' pose, from which on it is reported
 _FEW_FOUND = 0.2  # measured share of the expected spots, below which a mostly empty camera is reported
 
@@ -93,6 +94,23 @@ def judge(
     return Verdict(
         "pass", (f"{share:.1%} of the frames have a measured pose, and the residuals agree with the stated sigmas",)
     )
+
+
+def against_truth(verdict: Verdict, errors: Mapping[str, Any] | None) -> Verdict:
+    """The verdict with what the truth of the run says; errors: as lab.runs.score.score gives them."""
+    measured: Mapping[str, Any] = ((errors or {}).get("pose") or {}).get("measured") or {}
+    wrong = measured.get("beyond_10_sigmas", 0)
+    if not wrong:
+        return verdict
+    what = (
+        f"{wrong} of {measured['rows']} measured poses contradict the truth of the run by more than 10 of their sigmas"
+        f" (median distance {measured['position_m']['median']:.3g} m, {measured['rotation_deg']['median']:.3g} deg)"
+    )
+    fails = wrong > MOST_WRONG * measured["rows"]
+    numbers = {"wrong": wrong, "rows": measured["rows"]}
+    reason = VerdictReason(ReasonKind.TRUTH, fails, what, REMEDIES[ReasonKind.TRUTH], numbers)
+    reasons = sorted((reason, *verdict.reasons), key=lambda e: not e.fails)
+    return Verdict("fail" if reasons[0].fails else "check", tuple(e.what for e in reasons), tuple(reasons))
 
 
 def _mosaics(mosaics: Mapping[str, float]) -> list[VerdictReason]:

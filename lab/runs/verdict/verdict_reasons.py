@@ -32,6 +32,7 @@ class ReasonKind(StrEnum):
     MODEL = "model"  # a finding of the model check
     COLOUR_MOSAIC = "colour_mosaic"
     CAMERA_MOVED = "camera_moved"  # during the recording
+    TRUTH = "truth"  # the poses contradict the truth of the run
 
 
 # For `beampose explain`; stable: new kinds get new codes.
@@ -55,6 +56,7 @@ CODES = {
     ReasonKind.MODEL: "BP-V17",
     ReasonKind.COLOUR_MOSAIC: "BP-V18",
     ReasonKind.CAMERA_MOVED: "BP-V19",
+    ReasonKind.TRUTH: "BP-V20",
 }
 REMEDIES = {
     ReasonKind.NO_FRAMES: "Check the folders of pictures, or the detections, that run.yaml names (`beampose check`).",
@@ -81,6 +83,8 @@ REMEDIES = {
     " do so; a camera without colour filters is more accurate.",
     ReasonKind.CAMERA_MOVED: "Check the mounts of this camera and its screen, and calibrate again. The poses of these"
     " frames are computed without this camera.",
+    ReasonKind.TRUTH: "Check that truth/pose.csv belongs to this recording and to the world of rig.yaml; then the rig"
+    " and the names of the cameras (`beampose check`).",
     ReasonKind.NOISE_SCALE: "Check the calibration (`beampose calibrate check`) and the light (speckle).",
 }
 REMEDIES_BY_CAUSE = {

@@ -1,0 +1,1 @@
+"""The check of the set-up: whether a usual mistake explains a recording better than the files do."""

@@ -1,0 +1,188 @@
+"""The check of the set-up as findings: mistakes that a recording shows, or that the numbers of the files show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from calibration.findings import Finding, Level, verdict
+from geometry.camera import Camera
+from geometry.pose_prior import PosePrior
+from geometry.rig import Rig
+from lab.files.run.run_file import Run, VideoFile
+from lab.runs.frames.even_sampler import EvenSampler
+from lab.runs.frames.frame_sources import header_rate_hz
+from lab.runs.verdict.run_statistics import RunStatistics
+from tracking.detections import Detections
+from tracking.setup_mistakes.evidence import LEAST_FITTING, LEAST_POINTS, Comparison, Frames, compare
+from tracking.setup_mistakes.mistake import HERE, Block
+from tracking.setup_mistakes.possible import possible_mistakes
+
+FRAMES = 6  # of a recording, with which mistakes are tested
+MOST_KEPT = 90  # frames from which they are chosen
+FEWEST, PART = 10, 0.6  # points, and the share of width and height that they do not exceed in part of a picture
+SAME_RATE = 0.02  # relative difference of frame rates, above which they are not the same
+Pictures = EvenSampler[Mapping[str, Detections]]  # the points of each frame, by camera
+
+
+def pictures_sampler() -> Pictures:
+    """An empty sampler of the points of a recording."""
+    return EvenSampler(MOST_KEPT)
+
+
+def frames_of(blocks: Sequence[Block], prior: PosePrior | None, min_spots: int) -> Frames | None:
+    """The frames to be tested: the first, and others with many points; None where none has enough points."""
+    counts = np.array([sum(map(len, block[HERE].values())) for block in blocks])
+    rows = np.flatnonzero(counts >= min_spots)
+    if not len(rows):
+        return None
+    full = rows[counts[rows] >= np.median(counts[rows])]
+    chosen = full[np.unique(np.linspace(0, len(full) - 1, FRAMES).round().astype(int))]
+    if rows[0] == 0:
+        chosen = np.unique([0, *chosen])[:FRAMES]
+    return Frames([blocks[i] for i in chosen], prior, at_start=bool(chosen[0] == 0))
+
+
+def recorded_mistakes(run: Run, blocks: Sequence[Block]) -> tuple[Finding, ...]:
+    """Findings on mistakes that sampled frames of a recording show."""
+    frames = frames_of(blocks, run.prior, run.tracker.labels.min_spots)
+    if frames is None:
+        return ()
+    compared = compare(run.rig, frames, run.tracker.labels, run.covariance)
+    found = _findings(compared, run.rig)
+    return found if compared.found or compared.given.good else (*found, *_parts_of_pictures(run.rig, blocks))
+
+
+def _parts_of_pictures(rig: Rig, blocks: Sequence[Block]) -> tuple[Finding, ...]:
+    """Findings on cameras whose points all lie in the upper left part of the picture, as in cropped pictures.
+
+    Of a recording that nothing explains: the corner of the crop is not known, so that it cannot be undone.
+    """
+    out = []
+    for name, camera in rig.cameras.items():
+        parts = [block[HERE][name].uv_px for block in blocks if name in block[HERE]]
+        uv = np.concatenate(parts) if parts else np.zeros((0, 2))
+        if len(uv) < FEWEST or np.any(uv.max(axis=0) > PART * np.array(camera.image_size_px)):
+            continue
+        (u, v), (width, height) = uv.max(axis=0), camera.image_size_px
+        out.append(
+            Finding(
+                Level.WARN,
+                f"all points of camera `{name}` lie in the upper left part of its picture (u up to {u:.0f} of {width},"
+                f" v up to {v:.0f} of {height}), and the recording does not fit: the pictures may be cropped, or of a"
+                " lower resolution than for the calibration",
+                "pixels of another picture are other directions",
+                "Compare the size of the pictures with image_size_px and with that of the calibration.",
+                code="BP-M08",
+            )
+        )
+    return tuple(out)
+
+
+def mistakes_of_run(run: Run, statistics: RunStatistics, pictures: Pictures, *, passes: bool) -> tuple[Finding, ...]:
+    """Findings on mistakes in the set-up of a run that has been processed.
+
+    passes: whether nothing else is to be reported: the rig then explains the recording, and only cameras that the poses
+    do not use are tested.
+    """
+    of_files = (*mistakes_by_themselves(run.rig, run.prior), *rates_of_videos(run))
+    unused = [n for n, c in statistics.cameras.items() if c.points >= LEAST_POINTS * max(c.pictures, 1) and not c.found]
+    if verdict(of_files) is Level.FAIL or (passes and not unused):
+        return of_files
+    found = recorded_mistakes(run, pictures.blocks)
+    # Of a run, all pictures show whether a camera is used, not only the sampled ones; without any pose none is.
+    others = [f for f in found if f.code != "BP-M07"]
+    if verdict(found) is Level.FAIL or not statistics.measured:
+        return (*others, *of_files)
+    unlabelled = [unused_finding(n, statistics.cameras[n].points, statistics.cameras[n].pictures) for n in unused]
+    return (*unlabelled, *others, *of_files)
+
+
+def rates_of_videos(run: Run) -> tuple[Finding, ...]:
+    """Findings on videos whose header states another frame rate than the run, unless the run has timestamps."""
+    if run.times.frames is not None:
+        return ()
+    rates = {n: header_rate_hz(source.path) for n, source in run.cameras.items() if isinstance(source, VideoFile)}
+    return tuple(
+        Finding(
+            Level.WARN,
+            f"the header of the video of camera `{name}` states {rate:.6g} pictures per second, run.yaml"
+            f" {run.frame_rate_hz:.6g}",
+            "velocities and times scale with the frame rate",
+            "Correct frame_rate_hz in run.yaml; where the header is wrong, give the times in a table `timestamps`.",
+            code="BP-M08",
+        )
+        for name, rate in rates.items()
+        if rate is not None and abs(rate / run.frame_rate_hz - 1) > SAME_RATE
+    )
+
+
+def same_lenses(rig: Rig, names: Sequence[str]) -> tuple[Finding, ...]:
+    """Findings on cameras with the same lens to the last digit, of a recording that the rig does not explain.
+
+    names: of the cameras with points.
+    """
+    return tuple(
+        Finding(
+            Level.WARN,
+            f"cameras `{a}` and `{b}` have the same lens to the last digit, and the recording does not fit: one of them"
+            " may have the wrong camera.yaml",
+            "two calibrations never agree to the last digit",
+            f"Compare camera_matrix and distortion of `{a}` and `{b}` with their camera.yaml.",
+            code="BP-M08",
+        )
+        for a, b in combinations(names, 2)
+        if _lens(rig.cameras[a]) == _lens(rig.cameras[b])
+    )
+
+
+def _lens(camera: Camera) -> tuple[object, ...]:
+    return (camera.matrix.tolist(), camera.distortion, camera.lens)
+
+
+def mistakes_by_themselves(rig: Rig, prior: PosePrior | None) -> tuple[Finding, ...]:
+    """Findings on numbers of the files that cannot be those of a lab."""
+    return tuple(
+        Finding(Level.FAIL, m.what, "no lab has such numbers", _sentence(m.remedy), code="BP-M06")
+        for m in possible_mistakes(rig, prior)
+        if m.by_itself
+    )
+
+
+def _findings(compared: Comparison, rig: Rig) -> tuple[Finding, ...]:
+    given = compared.given
+    if compared.found:
+        best = compared.found[0][1]
+        count = len(best.fits)
+        why = (
+            f"without this mistake {best.labelled.sum()} of {best.points.sum()} points in {count} sampled frames fit a"
+            f" pose; with the files as given {given.labelled[given.fits].sum()}. The poses are wrong, or do not use"
+            " this camera"
+        )
+        what = ", or ".join(m.what for m, _ in compared.found)
+        remedies = dict.fromkeys(m.remedy for m, _ in compared.found)
+        return (Finding(Level.FAIL, what, why, _sentence("; or ".join(remedies)), code="BP-M06"),)
+    if given.good:
+        return ()
+    names, points = list(rig.cameras), given.points.sum(axis=0)
+    with_points = [n for n, count in zip(names, points, strict=True) if count >= LEAST_POINTS * len(given.fits)]
+    unused = [unused_finding(names[c], int(points[c]), len(given.fits)) for c in given.with_few_labels()]
+    return (*unused, *(same_lenses(rig, with_points) if given.fits.mean() < LEAST_FITTING else ()))
+
+
+def unused_finding(camera: str, points: int, pictures: int) -> Finding:
+    """The finding on a camera of which no point is ever labelled."""
+    return Finding(
+        Level.WARN,
+        f"camera `{camera}`: none of its {points} points in {pictures} pictures is the spot of a pose",
+        "the poses do not use this camera, and none of the usual mistakes explains it",
+        f"Check that the pictures and camera_matrix, camera_from_world and the screen of `{camera}` belong together"
+        " (`beampose calibrate check`), or leave the camera out.",
+        code="BP-M07",
+    )
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}."

@@ -1,0 +1,253 @@
+"""The usual mistakes of setting up are named by `check` or `run`, on files; a correct set-up raises no alarm."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from bench.mistakes.mistakes import CASES, read, turned_aside, write
+from bench.mistakes.recordings import calibrated
+from geometry.arrays import Array
+from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
+from geometry.rig import Rig
+from lab.calibrate.camera.photos import _frames
+from lab.files.project.project_types import Cloud
+from lab.files.rig.rig_file import save_rig
+from lab.runs.frames.frame_sources import VideoSource
+from lab.runs.input_check.check import check
+from lab.runs.process import process_run
+from lab.simulate.rigs import fan, unequal_fan
+from lab.simulate.write import simulate
+from tests.lab.run_folders import edit, write_run
+from tracking.parameters import LabelParameters
+from tracking.setup_mistakes.invisible import invisible_mistakes
+from tracking.setup_mistakes.possible import possible_mistakes
+
+FRAMES = 45
+CASE = {case.name: case for case in CASES}
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Path:
+    """Points of a rig whose cameras differ as calibrated ones do; its truth is kept elsewhere."""
+    folder = tmp_path_factory.mktemp("recording")
+    save_rig(calibrated(unequal_fan(), 1), folder / "rig.yaml")
+    run = simulate("huo2015", folder / "run", seed=1, frames=FRAMES, detections_only=True, rig=folder / "rig.yaml")
+    (run / "truth").rename(folder / "truth")
+    return run
+
+
+@pytest.fixture(scope="module")
+def symmetric(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("symmetric")
+    save_rig(fan(), folder / "rig.yaml")
+    return simulate("huo2015", folder / "run", seed=1, frames=FRAMES, detections_only=True, rig=folder / "rig.yaml")
+
+
+def with_mistake(name: str, run: Path, out: Path) -> Path:
+    files = read(run)
+    CASE[name].make(files)
+    return write(files, out)
+
+
+def checked(path: Path) -> tuple[str, int]:
+    result = check(path)
+    return "\n".join(result.lines), result.exit_status
+
+
+def far_away(rig: Rig, offset_m: float) -> Rig:
+    """The rig in a world whose origin is so far away, as in a national grid."""
+    moved = Pose(np.eye(3), np.full(3, offset_m))
+    cameras = {n: replace(c, camera_from_world=c.camera_from_world @ moved.inverse()) for n, c in rig.cameras.items()}
+    screens = {n: replace(s, world_from_screen=moved @ s.world_from_screen) for n, s in rig.screens.items()}
+    return replace(rig, cameras=cameras, screens=screens)
+
+
+def in_millimetres(rig: Rig, cameras: tuple[str, ...], screens: tuple[str, ...]) -> Rig:
+    def mm(pose: Pose) -> Pose:
+        return Pose(pose.rotation, 1000 * pose.translation)
+
+    changed = {n: replace(rig.cameras[n], camera_from_world=mm(rig.cameras[n].camera_from_world)) for n in cameras}
+    others = {n: replace(rig.screens[n], world_from_screen=mm(rig.screens[n].world_from_screen)) for n in screens}
+    return replace(rig, cameras={**rig.cameras, **changed}, screens={**rig.screens, **others})
+
+
+@pytest.mark.parametrize(
+    ("rig", "words"),
+    [
+        (unequal_fan(), []),
+        (far_away(unequal_fan(), 4e6), []),
+        (in_millimetres(unequal_fan(), ("left",), ()), ["camera_from_world of `left`"]),
+        (in_millimetres(unequal_fan(), ("left", "right"), ()), ["camera_from_world of `left`, `right`"]),
+        (in_millimetres(unequal_fan(), (), ("left", "right")), ["world_from_screen of `left`, `right`"]),
+        (
+            in_millimetres(unequal_fan(), ("left", "right"), ("left", "right")),
+            ["camera_from_world of `left`, `right` and world_from_screen of `left`, `right`"],
+        ),
+    ],
+)
+def test_lengths_in_millimetres_show_by_themselves_wherever_the_world_has_its_origin(rig, words):
+    found = [m.what for m in possible_mistakes(rig) if m.by_itself]
+    assert found == [f"the lengths of {w} are in millimetres" for w in words]
+
+
+def test_a_correct_set_up_is_fine(recording):
+    text, status = checked(recording)
+    assert status == 0
+    assert text.splitlines()[0].endswith(": fine")
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("two cameras' names exchanged", "the pictures of cameras `left` and `right` are exchanged"),
+        ("mirrored left-right", "the pictures of camera `left` are mirrored left to right"),
+        ("turned by 90 deg", "the pictures of camera `right` are turned by 90 deg clockwise"),
+        ("half resolution, all cameras", "the pictures of all cameras have half the resolution"),
+        ("camera_from_world inverted, one", "camera_from_world of camera `left` is world_from_camera: the inverse"),
+        ("xyzw quaternions, all", "in the order x, y, z, w"),
+        ("two lenses exchanged", "cameras `left` and `right` have each other's lens"),
+        ("numbered from 1, another camera", "numbers one too"),
+        ("fx in millimetres", "fx, fy of `left` (5.677) are in millimetres"),
+        ("millimetres, one camera", "the lengths of camera_from_world of `left` are in millimetres"),
+        ("prior in millimetres", "prior: position_m or within_m is in millimetres"),
+    ],
+)
+def test_a_mistake_that_the_recording_shows_is_a_problem_at_check(recording, tmp_path, name, words):
+    text, status = checked(with_mistake(name, recording, tmp_path / "run"))
+    assert status == 2
+    assert words in text
+    assert "(BP-M06)" in text
+
+
+@pytest.mark.parametrize("name", ["turned by 180 deg", "numbered from 1, one camera"])
+def test_a_mistake_fails_the_run_and_is_its_only_explanation(recording, tmp_path, name):
+    outcome = process_run(with_mistake(name, recording, tmp_path / "run"), tmp_path / "out")
+    assert outcome.exit_status == 4
+    codes = [r.as_mapping()["code"] for r in outcome.verdict.reasons]
+    assert codes.count("BP-M06") == 1
+    assert "BP-M01" not in codes  # the deviations of a rig with a mistake are its consequences
+
+
+def test_a_mistake_that_symmetry_hides_is_a_remark_with_the_measurement_that_shows_it(symmetric, tmp_path):
+    run = with_mistake("two cameras' names exchanged", symmetric, tmp_path / "run")
+    text, status = checked(run)
+    assert status == 0
+    assert "no recording with this rig would show, because it is symmetric, that the pictures of cameras" in text
+    assert "cover the lens of one camera for some frames" in text
+    assert process_run(run, tmp_path / "out").verdict.status == "pass"
+
+
+def test_poses_that_contradict_the_truth_fail_the_run(symmetric, tmp_path):
+    run = with_mistake("two cameras' names exchanged", symmetric, tmp_path / "run")
+    shutil.copytree(symmetric / "truth", run / "truth")
+    outcome = process_run(run, tmp_path / "out")
+    assert outcome.exit_status == 4
+    assert [r.as_mapping()["code"] for r in outcome.verdict.reasons] == ["BP-V20"]
+    assert "contradict the truth of the run by more than 10 of their sigmas" in outcome.line()
+
+
+def test_poses_that_agree_with_the_truth_pass(symmetric, tmp_path):
+    assert process_run(symmetric, tmp_path / "out").verdict.status == "pass"
+    assert (
+        "no recording with this rig would show" not in checked(symmetric)[0]
+    )  # the truth would show what symmetry hides
+
+
+def test_exchanged_beams_of_a_fan_change_names_only():
+    hidden = list(invisible_mistakes(unequal_fan(), None, LabelParameters()))
+    beams = [one for one in hidden if one.mistake.kind == "target"]
+    assert len(beams) == 3
+    assert all(one.is_harmless for one in beams)
+
+
+def test_each_possible_mistake_can_be_undone():
+    rig = unequal_fan()
+    rng = np.random.default_rng(0)
+    for mistake in possible_mistakes(rig, PosePrior.everywhere(rig)):
+        for change in mistake.pictures.values():
+            uv: Array = rng.uniform(0, 1000, (20, 2))
+            np.testing.assert_allclose(change.recorded(uv) @ change.turn.T + change.shift, uv, atol=1e-9)
+
+
+def test_a_camera_whose_points_are_never_labelled_is_reported(tmp_path, recording):
+    """A third camera with a pose of another day, which none of the usual mistakes explains."""
+    files = read(recording)
+    files.rig["cameras"]["third"] = yaml.safe_load(yaml.safe_dump(files.rig["cameras"]["left"]))
+    turned_aside(files.rig["cameras"]["third"]["camera_from_world"])
+    files.rig["cameras"]["third"]["camera_matrix"]["fx"] *= 1.7
+    files.run["cameras"]["third"] = {"detections": "detections.csv"}
+    files.rows += [{**row, "camera": "third"} for row in files.rows if row["camera"] == "left"]
+    outcome = process_run(write(files, tmp_path / "run"), tmp_path / "out")
+    assert outcome.verdict.status == "check"
+    assert any("camera `third`: none of its" in text for text in outcome.verdict.texts)
+
+
+def video(path: Path, size: tuple[int, int] = (64, 48), rate: float = 25.0, fourcc: str = "FFV1") -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*fourcc), rate, size, False)
+    ramp = np.tile(np.linspace(0, 250, size[0]).astype(np.uint8), (size[1], 1))
+    for _ in range(5):
+        writer.write(ramp)
+    writer.release()
+    return path
+
+
+def test_a_frame_rate_that_the_header_of_a_video_contradicts_is_reported(tmp_path):
+    run = write_run(tmp_path / "run")
+    for name in ("left", "right"):
+        video(run / f"{name}.avi", rate=100.0)
+        edit(run / "run.yaml", f"frames/{name}", f"{name}.avi")
+    assert "BP-M08" not in checked(run)[0]
+    edit(run / "run.yaml", "frame_rate_hz: 100.0", "frame_rate_hz: 7")
+    text, _ = checked(run)
+    assert "the header of the video of camera `left` states 100 pictures per second, run.yaml 7" in text
+    outcome = process_run(run, tmp_path / "out")
+    assert "BP-M08" in [r.as_mapping()["code"] for r in outcome.verdict.reasons]
+
+
+def test_a_video_with_an_orientation_flag_is_read_the_same_when_calibrating_and_running(tmp_path):
+    path = video(tmp_path / "film.mp4", fourcc="mp4v")
+    data = bytearray(path.read_bytes())
+    # The matrix of the track's header, 40 bytes after its first field; this one is a turn by 90 deg.
+    at = data.index(b"tkhd") + 4 + 40
+    data[at : at + 36] = np.array([0, 65536, 0, -65536, 0, 0, 0, 0, 1 << 30], dtype=">i4").tobytes()
+    path.write_bytes(bytes(data))
+    turned = cv2.VideoCapture(str(path)).read()[1]
+    assert turned.shape[:2] == (64, 48)  # OpenCV applies the flag unless it is asked not to
+    source = VideoSource(path, None)
+    running = source.next_picture()
+    source.close()
+    calibrating = next(picture for _, picture in _frames(path))
+    assert running.shape == calibrating.shape == (48, 64)
+    assert np.corrcoef(running.ravel(), calibrating.ravel())[0, 1] > 0.99  # one is the luma, the other from BGR
+
+
+@pytest.mark.parametrize(("unit", "noted"), [(1.0, False), (1000.0, True)])
+def test_targets_of_a_scan_are_metres_and_its_unit_is_recognised(unit, noted):
+    from lab.calibrate.screens.screen_inputs import _in_metres
+
+    at = np.array([[0.0, 0, 0], [2, 0, 0], [0, 1, 0.5], [1, 1, 0]])
+    cloud = Cloud(Path("scan.ply"), 0.001, None, Path("targets.csv"), None)
+    metres, note = _in_metres((at + 3) * unit, at, cloud)
+    np.testing.assert_allclose(metres, at + 3)
+    assert bool(note) is noted
+
+
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [((48, 64), "turned by 90 deg"), ((32, 24), "0.5 times the resolution"), ((40, 40), "cropped?")],
+)
+def test_the_size_of_a_picture_shows_the_mistake(tmp_path, size, words):
+    run = write_run(tmp_path / "run")
+    for path in (run / "frames/left").iterdir():
+        cv2.imwrite(str(path), np.full((size[1], size[0]), 9, np.uint8))
+    text, status = checked(run)
+    assert status == 2
+    assert words in text

@@ -1,0 +1,193 @@
+"""How well a rig explains sampled frames of a recording, and which mistake explains them better.
+
+Each frame is labelled without a track (tracking/labelling): the evidence of its best pose against "all points are
+false", summed over the frames, compares a mistake with the set-up as given (Bayes factor of two models). Source: ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints
+from geometry.forward_model import SpotModel
+from geometry.pose_prior import PosePrior
+from geometry.pose_solver.gauss_newton import whiten
+from geometry.pose_solver.visibility import poses_within
+from geometry.rig import Rig
+from geometry.uncertainty.chi_square import chi2_limit
+from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty
+from tracking.detections import Detections
+from tracking.labelling.points import NO_POINT
+from tracking.labelling.search import Labelling, candidate_labellings
+from tracking.parameters import LabelParameters
+from tracking.setup_mistakes.mistake import FEW_POSES, HERE, Block, Mistake
+from tracking.setup_mistakes.possible import possible_mistakes
+
+LEAD_NATS = 30.0  # by which a mistake must explain the frames better than the set-up as given
+LEAST_SEEN = 0.75  # share of the spots that the poses without the mistake put into the pictures, which has a label
+MORE_LABELS = 0.5  # per frame, that fit a pose: a mistake must explain more points
+SAME_NATS = 10.0  # mistakes nearer to the best are named with it
+LONGEST_SEARCH = 2  # frames with which all mistakes are compared; fewer where one of them leads
+BEST = 5  # mistakes that are compared with all frames
+LEAST_FITTING = 0.75  # share of the frames that a set-up must explain to their sigmas
+SURE_SPOTS = 5  # labels of a frame: false points often agree with the pose of four
+P_FIT = 1e-6  # probability that correct labels do not fit their sigmas
+LEAST_POINTS = 2  # points per picture, median, from which a camera without any label is reported
+LEAST_LABELLED = 0.5  # share of the spots that the poses put into a camera's pictures which have a label
+MODEL_PX = 0.03  # px: model error that is allowed beside the sigmas of the points (calibrations are no better)
+# A frame is searched with at most this effort: 60 mistakes are compared.
+MOST_POINTS, MOST_TRIPLES = 12, 3000
+
+
+@dataclass(frozen=True, slots=True)
+class Frames:
+    """Sampled frames. `at_start`: the first block is at the start of the recording, where the prior holds."""
+
+    blocks: Sequence[Block]
+    prior: PosePrior | None
+    at_start: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Explained:
+    """How well a set-up explains K frames."""
+
+    nats: Array  # (K,) evidence of the best pose; 0: no pose is better than "all points are false"
+    fits: Bools  # (K,) the pose fits its points to their sigmas
+    labelled: Ints  # (K, c) points with a label, by camera
+    expected: Ints  # (K, c) spots that the pose puts into the picture
+    points: Ints  # (K, c)
+
+    @property
+    def good(self) -> bool:
+        """Whether the frames are explained."""
+        return bool(self.fits.mean() >= LEAST_FITTING) and not self.with_few_labels(LEAST_LABELLED)
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the frames are explained, with more spots than agree by chance."""
+        many = self.labelled.sum(axis=1) >= SURE_SPOTS
+        return self.good and bool((self.fits & many).mean() >= LEAST_FITTING)
+
+    def with_few_labels(self, share: float = 0.0) -> tuple[int, ...]:
+        """Cameras with points whose labels are at most this share of the spots that they should see."""
+        enough = np.median(self.points, axis=0) >= LEAST_POINTS
+        few = self.labelled.sum(axis=0) <= share * self.expected.sum(axis=0)
+        return tuple(int(c) for c in np.flatnonzero(enough & few))
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """The set-up as given, and the mistakes that explain the recording better, best first."""
+
+    given: Explained
+    found: tuple[tuple[Mistake, Explained], ...]
+
+
+def compare(
+    rig: Rig, frames: Frames, parameters: LabelParameters, covariance: RigCovariance | None = None
+) -> Comparison:
+    """Test all possible mistakes, unless the set-up as given explains the frames.
+
+    covariance: of the rig's calibration, if known.
+    """
+    parameters = replace(
+        parameters,
+        max_points=min(parameters.max_points, MOST_POINTS),
+        max_triples=min(parameters.max_triples, MOST_TRIPLES),
+    )
+    as_given = Mistake("", "", "", rig)
+    given = explained(as_given, frames, parameters, covariance)
+    if given.is_certain:
+        return Comparison(given, ())
+    left: list[tuple[Mistake, Explained | None]] = [
+        (m, None)
+        for m in possible_mistakes(rig, frames.prior)
+        if m.rig is rig or (m.has_effect(rig) and _may_see(m.rig, frames.prior, parameters.min_spots))
+    ]
+    whole: list[tuple[Mistake, Explained]] = []
+    for k, block in enumerate(frames.blocks):
+        one = Frames([block], frames.prior, frames.at_start and k == 0)
+        whole = [(m, _joined(s, explained(m, one, parameters, covariance))) for m, s in left]
+        gains = [float(s.nats.sum() - given.nats[: k + 1].sum()) for _, s in whole]
+        order = sorted(range(len(whole)), key=lambda i: -gains[i])
+        if k + 1 >= LONGEST_SEARCH and gains[order[0]] <= 0:
+            return Comparison(given, ())
+        if gains[order[0]] >= LEAD_NATS or k + 1 >= LONGEST_SEARCH:
+            order = order[:BEST]
+        left = [*(whole[i] for i in order)]
+    whole.sort(key=lambda one: -float(one[1].nats.sum()))
+    found = [one for one in whole if _better(one[1], given)]
+    limit = float(found[0][1].nats.sum()) - SAME_NATS if found else 0.0
+    return Comparison(given, tuple(one for one in found if one[1].nats.sum() >= limit))
+
+
+def _may_see(rig: Rig, prior: PosePrior | None, min_spots: int) -> bool:
+    """Whether a rig sees enough spots in a quarter of the poses of a prior; it saves searches. True without a prior."""
+    if prior is None:
+        return True
+    model = SpotModel.of(rig)
+    seen = model.in_picture(model.project(poses_within(prior, FEW_POSES))[0]).sum(axis=1)
+    return bool(np.quantile(seen, 0.75) >= min_spots)
+
+
+def _joined(one: Explained | None, more: Explained) -> Explained:
+    """Of some frames and further ones."""
+    if one is None:
+        return more
+    pairs = ((getattr(one, name), getattr(more, name)) for name in Explained.__slots__)
+    return Explained(*(np.concatenate(pair) for pair in pairs))
+
+
+def _better(one: Explained, given: Explained) -> bool:
+    """Whether a mistake explains the frames that show a pose, and better than the set-up as given."""
+    shows = one.nats > 0
+    fitting = bool(shows.any()) and float(one.fits[shows].mean()) >= LEAST_FITTING
+    # A rig with a camera that looks elsewhere is likelier than one whose camera should see spots and does not.
+    more = one.labelled[one.fits].sum() - given.labelled[given.fits].sum() >= MORE_LABELS * len(one.fits)
+    all_cameras = set(one.with_few_labels(LEAST_LABELLED)) <= set(given.with_few_labels(LEAST_LABELLED))
+    seen = one.labelled.sum() >= LEAST_SEEN * one.expected.sum()
+    return (
+        fitting and bool(more) and bool(seen) and all_cameras and float(one.nats.sum() - given.nats.sum()) >= LEAD_NATS
+    )
+
+
+def explained(
+    mistake: Mistake, frames: Frames, parameters: LabelParameters, covariance: RigCovariance | None
+) -> Explained:
+    """How well the set-up without a mistake explains frames."""
+    rig = mistake.rig
+    model = SpotModel.of(rig)
+    calibration = None if covariance is None else RigUncertainty(rig, model, covariance)
+    K, c = len(frames.blocks), len(rig.cameras)
+    counts = (np.zeros((K, c), dtype=np.int64) for _ in range(3))
+    out = Explained(np.zeros(K), np.zeros(K, dtype=bool), *counts)
+    for k, block in enumerate(frames.blocks):
+        prior = (mistake.prior or frames.prior) if k == 0 and frames.at_start else None
+        points = mistake.points(block)
+        out.points[k] = [len(block[HERE].get(name, ())) for name in rig.cameras]
+        if sum(map(len, points.values())) < parameters.min_spots:
+            continue
+        found = candidate_labellings(rig, model, points, prior, parameters, calibration, most=1)
+        if not found or found[0].score <= 0:
+            continue
+        best = found[0]
+        out.nats[k] = best.score
+        given = best.point_of != NO_POINT
+        out.labelled[k] = np.bincount(model.camera_of[given], minlength=c)
+        in_view = model.in_picture(best.fit.projected_px)
+        out.expected[k] = np.bincount(model.camera_of[in_view], minlength=c)
+        out.fits[k] = _fits(best, model, points) if calibration is None else best.fit.consistent(P_FIT)
+    return out
+
+
+def _fits(one: Labelling, model: SpotModel, points: dict[str, Detections]) -> bool:
+    """Whether labelled points agree to their sigmas; `one.fit` allows for a larger model error."""
+    rows = one.fit.rows
+    cov = np.array([points[model.views[v][0]].cov_px2[one.point_of[v]] for v in rows])
+    W = whiten(cov + MODEL_PX**2 * np.eye(2))
+    misfit = float(np.sum((W @ one.fit.residuals_px[..., None]) ** 2))
+    return one.fit.dof <= 0 or misfit <= chi2_limit(P_FIT, one.fit.dof)

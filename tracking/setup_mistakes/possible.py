@@ -1,0 +1,301 @@
+"""The list of possible mistakes for a rig."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from itertools import combinations, permutations
+
+import numpy as np
+
+from geometry.arrays import Array
+from geometry.camera import FISHEYE, Camera
+from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
+from geometry.rig import Rig
+from geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
+from tracking.setup_mistakes.mistake import Mistake, PictureChange
+
+FAR_M = 100.0  # a camera or screen farther from the others is not in a lab ...
+FAR_ON_TARGET_M = 10.0  # ... and a point of a beam farther from the body's origin is not on a vehicle model
+SHORT_FOCAL = 1 / 12  # focal length over picture width of a perspective lens with a field of view of 161 deg
+PIXEL_MM = 0.005  # an assumed pixel, to try a focal length that is given in millimetres
+
+# Turns of a picture in steps of a right angle, and mirrored ones: the matrix from recorded to true pixels, the words
+# for the recorded picture, and what to do.
+_TURNS = (
+    ([[-1, 0], [0, 1]], "mirrored left to right", "mirror them back, or switch mirroring off in the camera"),
+    ([[1, 0], [0, -1]], "mirrored upside down", "mirror them back, or switch mirroring off in the camera"),
+    ([[-1, 0], [0, -1]], "turned by 180 deg", "turn them back, or switch rotation off in the camera"),
+    ([[0, 1], [-1, 0]], "turned by 90 deg clockwise", "turn them back, or switch rotation off in the camera"),
+    ([[0, -1], [1, 0]], "turned by 90 deg anticlockwise", "turn them back, or switch rotation off in the camera"),
+    ([[0, 1], [1, 0]], "transposed (rows and columns exchanged)", "write them with rows and columns exchanged"),
+    ([[0, -1], [-1, 0]], "transposed and turned by 180 deg", "write them with rows and columns exchanged and turned"),
+)
+
+
+def possible_mistakes(rig: Rig, prior: PosePrior | None = None) -> list[Mistake]:
+    """All mistakes that are tested for a rig as it is given, and the prior of its run."""
+    return [*_pictures(rig), *_camera_poses(rig), *_units(rig), *_lenses(rig), *_target(rig), *_prior(rig, prior)]
+
+
+def _pictures(rig: Rig) -> Iterator[Mistake]:
+    """Pictures that are not those of the camera, of this size, orientation or number."""
+    for a, b in combinations(rig.cameras, 2):
+        yield Mistake(
+            "exchanged",
+            f"the pictures of cameras `{a}` and `{b}` are exchanged",
+            f"exchange the names of `{a}` and `{b}` in run.yaml or in the table of points",
+            rig,
+            {a: PictureChange(b), b: PictureChange(a)},
+        )
+    for name, camera in rig.cameras.items():
+        width, height = camera.image_size_px
+        for rows, words, remedy in _TURNS:
+            turn = np.array(rows, dtype=float)
+            # A coordinate that runs backwards ends at the last pixel of the picture that the rig describes.
+            shift = np.where(turn.sum(axis=1) < 0, [width - 1.0, height - 1.0], 0.0)
+            yield Mistake(
+                "turned",
+                f"the pictures of camera `{name}` are {words}",
+                f"{remedy}; camera.yaml and the run need the same orientation",
+                rig,
+                {name: PictureChange(name, turn, shift)},
+            )
+        quarter = np.array([width, height]) // 4
+        yield Mistake(
+            "size",
+            f"the pictures of camera `{name}` are the middle half of those that it was calibrated with (cropped)",
+            "read out the whole sensor, or subtract the crop's corner from cx, cy",
+            rig,
+            {name: PictureChange(name, shift=quarter.astype(float))},
+        )
+        for later in (-1, 1):
+            yield Mistake(
+                "numbers",
+                f"the pictures of camera `{name}` have numbers one too {'high' if later > 0 else 'low'} (numbered from"
+                f" {'1' if later > 0 else '0'} where the others start at {'0' if later > 0 else '1'}?)",
+                f"renumber the pictures of `{name}`, so that the same number is the same instant in all cameras",
+                rig,
+                {name: PictureChange(name, later=later)},
+            )
+    for words, names in _each_and_all(rig.cameras):
+        for scale, what in ((2.0, "half"), (0.5, "twice")):
+            shift = np.full(2, 0.5 * scale - 0.5)
+            yield Mistake(
+                "size",
+                f"the pictures of {words} have {what} the resolution of those that it was calibrated with",
+                "record with the calibrated resolution, or scale fx, fy, cx, cy and image_size_px",
+                rig,
+                {n: PictureChange(n, scale * np.eye(2), shift) for n in names},
+            )
+
+
+def _camera_poses(rig: Rig) -> Iterator[Mistake]:
+    """Transforms in the wrong direction, and quaternions in another order."""
+    for words, names in _each_and_all(rig.cameras):
+        yield Mistake(
+            "pose",
+            f"camera_from_world of {words} is world_from_camera: the inverse",
+            "invert the rotation and the translation in rig.yaml",
+            _with_camera_poses(rig, {n: rig.cameras[n].camera_from_world.inverse() for n in names}),
+        )
+        yield Mistake(
+            "pose",
+            f"the quaternion of camera_from_world of {words} is in the order x, y, z, w",
+            "write quaternion_wxyz in rig.yaml with w first",
+            _with_camera_poses(rig, {n: _reordered(rig.cameras[n].camera_from_world) for n in names}),
+        )
+    for words, names in _each_and_all(rig.screens, "screen"):
+        yield Mistake(
+            "pose",
+            f"world_from_screen of {words} is screen_from_world: the inverse",
+            "invert the rotation and the translation in rig.yaml",
+            _with_screen_poses(rig, {n: rig.screens[n].world_from_screen.inverse() for n in names}),
+        )
+        yield Mistake(
+            "pose",
+            f"the quaternion of world_from_screen of {words} is in the order x, y, z, w",
+            "write quaternion_wxyz in rig.yaml with w first",
+            _with_screen_poses(rig, {n: _reordered(rig.screens[n].world_from_screen) for n in names}),
+        )
+    every = _with_camera_poses(rig, {n: _reordered(c.camera_from_world) for n, c in rig.cameras.items()})
+    every = _with_screen_poses(every, {n: _reordered(s.world_from_screen) for n, s in rig.screens.items()})
+    yield Mistake(
+        "pose",
+        "all quaternions of the rig are in the order x, y, z, w",
+        "write quaternion_wxyz in rig.yaml with w first",
+        every,
+    )
+
+
+def _units(rig: Rig) -> Iterator[Mistake]:
+    """Lengths in millimetres, where they are too large for a lab."""
+    far_cameras, far_screens = _far(rig)
+    # The fewest of them whose conversion brings all places together.
+    none: list[str] = []
+    for cameras, screens in ((none, none), (far_cameras, none), (none, far_screens), (far_cameras, far_screens)):
+        changed = _with_camera_poses(rig, {n: _in_metres(rig.cameras[n].camera_from_world) for n in cameras})
+        changed = _with_screen_poses(changed, {n: _in_metres(rig.screens[n].world_from_screen) for n in screens})
+        if not any(_far(changed)):
+            break
+    beams = [n for n, b in rig.beams.items() if np.linalg.norm(b.point) > FAR_ON_TARGET_M]
+    in_metres = {n: replace(rig.beams[n], point=rig.beams[n].point / 1000) for n in beams}
+    groups = (("camera_from_world", cameras), ("world_from_screen", screens), ("point_m", beams))
+    words = [f"{field} of {_names(names)}" for field, names in groups if names]
+    if words:
+        yield Mistake(
+            "unit",
+            f"the lengths of {' and '.join(words)} are in millimetres",
+            "write them in metres in rig.yaml",
+            replace(changed, beams={**rig.beams, **in_metres}),
+            by_itself=True,
+        )
+
+
+def _far(rig: Rig) -> tuple[list[str], list[str]]:
+    """Names of the cameras and of the screens that are too far from the middle of all for a lab."""
+    middle = _middle(rig)
+    cameras = [n for n, c in rig.cameras.items() if _is_far(c.camera_from_world.inverse(), middle)]
+    return cameras, [n for n, s in rig.screens.items() if _is_far(s.world_from_screen, middle)]
+
+
+def _lenses(rig: Rig) -> Iterator[Mistake]:
+    """Focal lengths in millimetres, and lenses of another camera."""
+    short = [
+        n for n, c in rig.cameras.items() if c.lens != FISHEYE and c.matrix[0, 0] < SHORT_FOCAL * c.image_size_px[0]
+    ]
+    if short:
+        scale = np.array([[1 / PIXEL_MM, 1, 1], [1, 1 / PIXEL_MM, 1], [1, 1, 1]])
+        yield Mistake(
+            "focal",
+            f"fx, fy of {_names(short)} ({rig.cameras[short[0]].matrix[0, 0]:.4g}) are in millimetres",
+            "write them in pixels in rig.yaml: millimetres of the lens / millimetres of a pixel",
+            _with_cameras(rig, {n: replace(rig.cameras[n], matrix=rig.cameras[n].matrix * scale) for n in short}),
+            by_itself=True,
+        )
+    for a, b in combinations(rig.cameras, 2):
+        one, other = rig.cameras[a], rig.cameras[b]
+        yield Mistake(
+            "lens",
+            f"cameras `{a}` and `{b}` have each other's lens (camera.yaml exchanged)",
+            "exchange camera_matrix and distortion of the two cameras in rig.yaml",
+            _with_cameras(rig, {a: _with_lens_of(one, other), b: _with_lens_of(other, one)}),
+        )
+    for a, b in permutations(rig.cameras, 2):
+        yield Mistake(
+            "lens",
+            f"camera `{a}` has a wrong lens: that of camera `{b}` fits",
+            f"enter camera_matrix and distortion of the right camera.yaml for `{a}`",
+            _with_cameras(rig, {a: _with_lens_of(rig.cameras[a], rig.cameras[b])}),
+        )
+
+
+def _target(rig: Rig) -> Iterator[Mistake]:
+    """Beams that are exchanged, or their ends. (Two spots of one screen that are exchanged only exchange names.)"""
+    for a, b in combinations(rig.beams, 2):
+        one, other = rig.beams[a], rig.beams[b]
+        yield Mistake(
+            "target",
+            f"beams `{a}` and `{b}` are exchanged",
+            "exchange their direction and point_m in rig.yaml",
+            replace(rig, beams={**rig.beams, a: replace(other, name=a), b: replace(one, name=b)}),
+        )
+    for a in rig.beams:
+        beam = rig.beams[a]
+        yield Mistake(
+            "target",
+            f"the ends of beam `{a}` are exchanged",
+            "exchange + and - of its spots, or reverse its direction, in rig.yaml",
+            replace(rig, beams={**rig.beams, a: replace(beam, direction=-beam.direction)}),
+        )
+
+
+def _prior(rig: Rig, prior: PosePrior | None) -> Iterator[Mistake]:
+    """A prior in other units, or one that does not contain the first pose."""
+    if prior is None:
+        return
+    ypr = prior.centre.ypr
+    degrees = Pose.from_ypr(np.rad2deg(ypr), prior.centre.translation)
+    wide = min(float(np.rad2deg(prior.within_rad)), np.pi)
+    for centre, within, words in (
+        (degrees, wide, "yaw_pitch_roll_deg and within_deg are"),
+        (degrees, prior.within_rad, "yaw_pitch_roll_deg is"),
+        (prior.centre, wide, "within_deg is"),
+    ):
+        yield Mistake(
+            "prior",
+            f"prior: {words} in radians",
+            "write it in degrees in run.yaml",
+            rig,
+            prior=replace(prior, centre=centre, within_rad=within),
+        )
+    if prior.within_m > FAR_M or _is_far(prior.centre, _middle(rig)):
+        yield Mistake(
+            "prior",
+            "prior: position_m or within_m is in millimetres",
+            "write it in metres in run.yaml",
+            rig,
+            prior=replace(
+                prior,
+                centre=Pose(prior.centre.rotation, prior.centre.translation / 1000),
+                within_m=prior.within_m / 1000 if prior.within_m > FAR_M else prior.within_m,
+            ),
+            by_itself=True,
+        )
+    yield Mistake(
+        "prior",
+        "prior: the first pose is outside it",
+        "correct position_m and yaw_pitch_roll_deg in run.yaml, or make within_m and within_deg larger",
+        rig,
+        prior=PosePrior.everywhere(rig),
+    )
+
+
+def _middle(rig: Rig) -> Array:
+    """The median (3,), m, of the places of cameras and screens; a world may have its origin far away."""
+    cameras = [c.camera_from_world.inverse().translation for c in rig.cameras.values()]
+    return np.asarray(np.median([*cameras, *(s.world_from_screen.translation for s in rig.screens.values())], axis=0))
+
+
+def _is_far(pose: Pose, middle: Array) -> bool:
+    return bool(np.linalg.norm(pose.translation - middle) > FAR_M)
+
+
+def _each_and_all(names: Mapping[str, object], word: str = "camera") -> Iterator[tuple[str, list[str]]]:
+    """Words for each name, and for all of them."""
+    for name in names:
+        yield f"{word} `{name}`", [name]
+    if len(names) > 1:
+        yield f"all {word}s", list(names)
+
+
+def _names(names: list[str]) -> str:
+    return ", ".join(f"`{n}`" for n in names)
+
+
+def _with_cameras(rig: Rig, cameras: Mapping[str, Camera]) -> Rig:
+    return replace(rig, cameras={**rig.cameras, **cameras})
+
+
+def _with_camera_poses(rig: Rig, poses: Mapping[str, Pose]) -> Rig:
+    return _with_cameras(rig, {n: replace(rig.cameras[n], camera_from_world=pose) for n, pose in poses.items()})
+
+
+def _with_screen_poses(rig: Rig, poses: Mapping[str, Pose]) -> Rig:
+    screens = {n: replace(rig.screens[n], world_from_screen=pose) for n, pose in poses.items()}
+    return replace(rig, screens={**rig.screens, **screens})
+
+
+def _with_lens_of(camera: Camera, other: Camera) -> Camera:
+    return replace(camera, matrix=other.matrix, distortion=other.distortion, lens=other.lens)
+
+
+def _in_metres(pose: Pose) -> Pose:
+    return Pose(pose.rotation, pose.translation / 1000)
+
+
+def _reordered(pose: Pose) -> Pose:
+    """The transform whose quaternion, in the order x, y, z, w, is that of `pose` in the order w, x, y, z."""
+    x, y, z, w = quaternion_from_matrix(pose.rotation)
+    return Pose(matrix_from_quaternion(np.array([w, x, y, z])), pose.translation)
