@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from lab.calibrate.rig.rig import calibrate_rig
-from lab.files.rig.rig_covariance import joint_covariance
-from lab.files.rig.rig_file import load_rig_file
+from lab.files.rig.rig_file import joint_covariance, load_rig_file
 from lab.runs.input_check.check import check
 from lab.runs.process import process_run
 from lab.simulate.scene import compose

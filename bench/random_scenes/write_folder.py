@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.random_scenes.scene import Scene
-from lab.files.rig.rig_covariance import covariance_blocks
-from lab.files.rig.rig_file import RigFile, save_rig
+from lab.files.rig.rig_file import RigFile, covariance_blocks, save_rig
 from lab.files.run.run_file import save_run
 from lab.files.text import columns
 

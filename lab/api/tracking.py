@@ -16,8 +16,7 @@ from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.errors import InputError
-from lab.files.rig.rig_covariance import joint_covariance
-from lab.files.rig.rig_file import RigFile, load_rig_file
+from lab.files.rig.rig_file import RigFile, joint_covariance, load_rig_file
 from lab.files.run.parameter_overrides import with_overrides
 from lab.files.run.run_file import prior_from
 from lab.files.text import columns

@@ -6,7 +6,7 @@ import datetime
 
 from calibration.findings import Finding, Level
 from lab.errors import InputError
-from lab.files.project.project_types import Project
+from lab.files.project.project_blocks import Project
 
 
 def calibration_date(project: Project, today: datetime.date | None) -> datetime.date:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from lab.files.output.unfinished import remove_unfinished
+from lab.files.output.part_folder import remove_unfinished
 
 _GRACE_S = 5.0  # for the regular end; Docker kills after 10 s, Slurm after 30 s
 

@@ -9,8 +9,7 @@ from calibration.budget.expected_errors import expected_errors
 from calibration.budget.pose_grid import plan_grid
 from calibration.findings import Level, verdict
 from lab.errors import QUALITY_GATE_FAILED
-from lab.files.rig.rig_covariance import TARGET, joint_covariance
-from lab.files.rig.rig_file import load_rig_file
+from lab.files.rig.rig_file import TARGET, joint_covariance, load_rig_file
 from lab.files.text.atomic_write import atomic_folder, check_output_folder
 from lab.number_format import format_angle, format_length, format_percent
 from lab.setup.plan_findings import Plan, PlanOptions, findings, median_sigma

@@ -17,8 +17,7 @@ from lab.errors import InputError
 from lab.pictures.opencv import load_cv2, opened
 from lab.pictures.picture_file import UNREADABLE, MissingPicture, read_picture
 from lab.runs.frames.frame_sources import retrieved
-from lab.watch.folder_poll import FolderPoll
-from lab.watch.frame_clock import FrameClock
+from lab.watch.frame_clock import FolderPoll, FrameClock
 from lab.watch.inbox import Inbox
 
 POLL_S = 0.002  # between two polls of a folder ...

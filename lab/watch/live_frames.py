@@ -17,7 +17,7 @@ from lab.files.run.run_file import FramesFolder, LiveDevice, Run
 from lab.pictures.picture_file import GreyPicture, MissingPicture
 from lab.runs.frames.frames import FrameSet
 from lab.watch.cameras import DeviceCamera, FolderCamera, LiveCamera, in_thread, open_device
-from lab.watch.folder_poll import FolderPoll
+from lab.watch.frame_clock import FolderPoll
 from lab.watch.inbox import CameraQueue, Inbox, is_complete
 
 FIRST = 6  # pictures of each camera for the estimate of the noise

@@ -24,8 +24,7 @@ from lab.runs.process import process_run
 from lab.simulate.write import simulate
 from lab.watch import watch
 from lab.watch.cameras import DeviceCamera, FolderCamera
-from lab.watch.folder_poll import FolderPoll
-from lab.watch.frame_clock import FrameClock
+from lab.watch.frame_clock import FolderPoll, FrameClock
 from lab.watch.inbox import MOST_WAITING, Inbox, is_complete
 from lab.watch.live_frames import FIRST, WatchOptions
 from lab.watch.live_output import LIVE_TABLE

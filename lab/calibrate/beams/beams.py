@@ -22,10 +22,9 @@ from lab.calibrate.beams.recordings import Recordings, read_recordings, stand_of
 from lab.calibrate.calibration_date import calibration_date, expiry_date, expiry_findings
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import load_project
-from lab.files.project.project_types import Project
+from lab.files.project.project_blocks import Project
 from lab.files.rig.calibration_state import CalibrationState
-from lab.files.rig.rig_covariance import covariance_blocks, joint_covariance
-from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
+from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance, load_rig_file, save_rig
 from lab.files.rig.screens_file import load_screens
 from lab.files.text.atomic_write import atomic_folder, check_output_folder, keep_good_results
 from lab.files.text.error_text import suggest_name

@@ -17,7 +17,7 @@ from geometry.rig import Rig
 from lab.calibrate.beams.stationary_frames import SpotRows, average, positions_at_rest
 from lab.errors import InputError
 from lab.files.project.point_files import StandPoses, read_poses
-from lab.files.project.project_types import Project, RecordingEntry
+from lab.files.project.project_blocks import Project, RecordingEntry
 from lab.files.text.csv_table import Table
 from lab.files.text.csv_text import read_table
 from lab.files.text.error_text import printable_line, suggest_name

@@ -32,8 +32,7 @@ from geometry.rig import Rig
 from lab.calibrate.drift_check.drift_comparison import PixelComparison, check_at_rest, compare_points, compare_still
 from lab.calibrate.drift_check.drift_history import HistoryRow, read_history, write_history
 from lab.calibrate.drift_check.drift_inputs import DriftInputs, read_points, read_still_pose, read_still_spots
-from lab.calibrate.drift_check.drift_messages import camera_findings, other_findings, state_findings
-from lab.calibrate.drift_check.drift_page import write_page
+from lab.calibrate.drift_check.drift_page import camera_findings, other_findings, state_findings, write_page
 from lab.calibrate.drift_check.drift_result import (
     CameraDrift,
     DriftLimits,
@@ -43,8 +42,7 @@ from lab.calibrate.drift_check.drift_result import (
     level_of,
     not_checked,
 )
-from lab.files.rig.rig_covariance import joint_covariance
-from lab.files.rig.rig_file import RigFile, load_rig_file
+from lab.files.rig.rig_file import RigFile, joint_covariance, load_rig_file
 from lab.files.text.atomic_write import atomic_folder, check_output_folder
 from lab.files.text.csv_text import csv_word
 

@@ -24,14 +24,18 @@ from lab.calibrate.beams.recordings import Recordings, read_recordings, stand_of
 from lab.calibrate.calibration_date import calibration_date, expiry_date, expiry_findings
 from lab.calibrate.rig.rig_outcome import RigOutcome
 from lab.calibrate.rig.rig_tables import RESIDUALS, write_residuals
-from lab.calibrate.screens.screen_inputs import ScreenInputs, screen_inputs
-from lab.calibrate.screens.survey_check import SearchProgress, adjusted_screens, survey_findings
+from lab.calibrate.screens.screen_inputs import (
+    ScreenInputs,
+    SearchProgress,
+    adjusted_screens,
+    screen_inputs,
+    survey_findings,
+)
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import load_project
-from lab.files.project.project_types import Project
+from lab.files.project.project_blocks import Project
 from lab.files.rig.calibration_state import CalibrationState
-from lab.files.rig.rig_covariance import covariance_blocks
-from lab.files.rig.rig_file import RigFile, save_rig
+from lab.files.rig.rig_file import RigFile, covariance_blocks, save_rig
 from lab.files.text.atomic_write import atomic_folder, check_output_folder, keep_good_results
 
 RIG = "rig.yaml"

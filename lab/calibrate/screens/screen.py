@@ -15,15 +15,13 @@ from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
 from calibration.screens.screens import ScreensResult
 from geometry.rig import Rig
 from lab.calibrate.calibration_date import calibration_date, expiry_date, expiry_findings
-from lab.calibrate.screens.screen_inputs import screen_inputs
+from lab.calibrate.screens.screen_inputs import SearchProgress, adjusted_screens, screen_inputs, survey_findings
 from lab.calibrate.screens.screen_tables import DOTS, RESIDUALS, write_tables
-from lab.calibrate.screens.survey_check import SearchProgress, adjusted_screens, survey_findings
 from lab.errors import CalibrationError
 from lab.files.project.project import load_project
-from lab.files.project.project_types import Project
+from lab.files.project.project_blocks import Project
 from lab.files.rig.calibration_state import CalibrationState
-from lab.files.rig.rig_covariance import covariance_blocks
-from lab.files.rig.rig_file import RigFile, save_rig
+from lab.files.rig.rig_file import RigFile, covariance_blocks, save_rig
 from lab.files.rig.screens_file import ScreensFile, save_screens
 from lab.files.text.atomic_write import atomic_folder, check_output_folder, keep_good_results
 

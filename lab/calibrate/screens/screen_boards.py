@@ -19,7 +19,7 @@ from geometry.camera import FISHEYE
 from geometry.rig import Rig
 from lab.calibrate.camera.photos import as_8_bit
 from lab.errors import CalibrationError
-from lab.files.project.project_types import FixedBoard, Project
+from lab.files.project.project_blocks import FixedBoard, Project
 from lab.pictures.picture_file import MissingPicture, read_picture
 
 START_CORNER_SIGMA_PX = 0.2  # initial value; the adjustment estimates it from the residuals

@@ -13,8 +13,8 @@ from calibration.screens.network_sigmas import camera_sigmas, pointing_sigmas_m,
 from calibration.screens.screens import ScreensResult
 from geometry.camera import pinhole_numbers
 from lab.calibrate.screens.screen_inputs import ScreenInputs
-from lab.files.project.project_types import Project
-from lab.files.rig.rig_covariance import covariance_blocks
+from lab.files.project.project_blocks import Project
+from lab.files.rig.rig_file import covariance_blocks
 from lab.number_format import format_number
 from lab.report.calibration.calibration_drawings import corners_overlay
 from lab.report.calibration.calibration_maps import correlation_matrix, flatness_map

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from lab.errors import InputError
-from lab.files.output.unfinished import removed_at_the_end
+from lab.files.output.part_folder import removed_at_the_end
 
 try:
     import fcntl

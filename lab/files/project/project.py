@@ -20,22 +20,20 @@ from lab.errors import InputError
 from lab.files.project.project_blocks import (
     CLOUD_UNITS,
     CameraBlock,
-    CloudBlock,
-    FixedBoardBlock,
-    ProjectBlock,
-    RecordingBlock,
-    ScreenBlock,
-    SharedBoardBlock,
-    broken_references,
-)
-from lab.files.project.project_types import (
     CameraEntry,
     Cloud,
+    CloudBlock,
     FixedBoard,
+    FixedBoardBlock,
     Project,
+    ProjectBlock,
+    RecordingBlock,
     RecordingEntry,
+    ScreenBlock,
     ScreenEntry,
     SharedBoard,
+    SharedBoardBlock,
+    broken_references,
 )
 from lab.files.rig.board_file import load_board
 from lab.files.rig.camera_file import CameraFile, load_camera

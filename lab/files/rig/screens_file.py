@@ -12,8 +12,15 @@ from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.files.rig.calibration_state import CalibrationState, CalibrationStateBlock, state_mapping
 from lab.files.rig.camera_block import Covariance, CovarianceBlock, covariance_mapping
-from lab.files.rig.rig_covariance import TARGET, joint_covariance
-from lab.files.rig.rig_file import CameraBlock, ScreenBlock, camera_mapping, screen_mapping, unknown_name
+from lab.files.rig.rig_file import (
+    TARGET,
+    CameraBlock,
+    ScreenBlock,
+    camera_mapping,
+    joint_covariance,
+    screen_mapping,
+    unknown_name,
+)
 from lab.files.text.error_text import FileError
 from lab.files.text.fields import Block, Word, one_of, validated
 from lab.files.text.yaml_text import read_mapping, write_mapping

@@ -18,8 +18,7 @@ from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState, OptionalDay
-from lab.files.rig.rig_covariance import joint_covariance
-from lab.files.rig.rig_file import load_rig_file
+from lab.files.rig.rig_file import joint_covariance, load_rig_file
 from lab.files.run.not_a_run import no_run_error
 from lab.files.run.times import Times, load_times
 from lab.files.text.dataclass_fields import dataclass_from_yaml

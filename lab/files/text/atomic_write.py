@@ -15,8 +15,7 @@ from pathlib import Path
 
 from lab.errors import InputError
 from lab.files.output.folder_lock import folder_lock, is_at, lock
-from lab.files.output.part_folder import part_folder, recover, replace_folder
-from lab.files.output.unfinished import removed_at_the_end
+from lab.files.output.part_folder import part_folder, recover, removed_at_the_end, replace_folder
 
 _REMEDIES = {
     IsADirectoryError: "; name a file in it",

@@ -11,8 +11,7 @@ import numpy as np
 from geometry.arrays import Array, Bools
 from lab.number_format import format_angle, format_length, format_number, format_percent
 from lab.report.plot.axes import true_ranges
-from lab.report.run.blocks.methods_text import Methods, MethodsFacts, methods_text
-from lab.report.run.blocks.model_fit import ModelFit
+from lab.report.run.blocks.model_fit import Methods, MethodsFacts, ModelFit, methods_text
 from lab.report.run.report_data import ReportData
 from tracking.statuses import PoseStatus
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from geometry.arrays import Ints
 from lab.errors import InputError, RunError
-from lab.files.output.unfinished import removed_at_the_end
+from lab.files.output.part_folder import removed_at_the_end
 from lab.results.show.data import ResultData, frame_content, pictures_of, pose_words, read_result_data
 from lab.results.show.panel import Pixels
 from lab.results.show.sheet import Layout, Limits, limits_of, sheet

@@ -16,8 +16,7 @@ from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.calibration_state import CalibrationState, require_valid_calibration
-from lab.files.rig.rig_covariance import joint_covariance
-from lab.files.rig.rig_file import load_rig_file
+from lab.files.rig.rig_file import joint_covariance, load_rig_file
 from lab.files.run.run_file import Run, load_run
 from lab.runs.frames.frames import open_frames
 from lab.runs.input_check.findings import CheckResult, Findings, table

@@ -26,8 +26,7 @@ from lab.errors import CalibrationError, InputError
 from lab.files.project.project import load_project
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.camera_file import CameraFile, save_camera
-from lab.files.rig.rig_covariance import covariance_blocks, joint_covariance
-from lab.files.rig.rig_file import RigFile, as_mapping, load_rig_file, save_rig
+from lab.files.rig.rig_file import RigFile, as_mapping, covariance_blocks, joint_covariance, load_rig_file, save_rig
 from lab.files.rig.screens_file import ScreensFile, save_screens
 from lab.files.run.run_file import save_run
 from lab.files.text.yaml_text import write_mapping

@@ -24,7 +24,7 @@ from lab.calibrate.drift_check.drift_history import read_history
 from lab.calibrate.drift_check.drift_inputs import DriftInputs, read_points
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState
-from lab.files.rig.rig_covariance import joint_covariance
+from lab.files.rig.rig_file import joint_covariance
 from tests.lab.calibrate import drift_scenes as scenes
 
 RIG, COVARIANCE = scenes.rig_and_covariance()

@@ -19,8 +19,7 @@ from lab.calibrate.rig.rig import calibrate_rig
 from lab.calibrate.rig.rig_tables import COLUMNS
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import load_project
-from lab.files.rig.rig_covariance import joint_covariance
-from lab.files.rig.rig_file import load_rig, load_rig_file, save_rig
+from lab.files.rig.rig_file import joint_covariance, load_rig, load_rig_file, save_rig
 from lab.files.run.results import read_poses
 from lab.runs.process import process_run
 from lab.simulate.campaign import CampaignQuality, simulate_calibration

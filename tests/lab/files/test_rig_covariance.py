@@ -11,8 +11,7 @@ from geometry.uncertainty.rig_uncertainty import rig_names
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.calibration_state import CalibrationState, require_valid_calibration
 from lab.files.rig.camera_block import Covariance
-from lab.files.rig.rig_covariance import joint_covariance
-from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
+from lab.files.rig.rig_file import RigFile, joint_covariance, load_rig_file, save_rig
 from lab.simulate.rigs import RIGS
 
 RIG = RIGS["fan"]()

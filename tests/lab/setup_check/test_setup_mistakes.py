@@ -18,7 +18,7 @@ from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.calibrate.camera.photos import _frames
-from lab.files.project.project_types import Cloud
+from lab.files.project.project_blocks import Cloud
 from lab.files.rig.rig_file import save_rig
 from lab.runs.frames.frame_sources import VideoSource
 from lab.runs.input_check.check import check
