@@ -12,6 +12,7 @@ from geometry.arrays import Array, Ints
 from lab.calibrate.camera.photos import PhotoSet
 from lab.errors import InputError
 from lab.files.text.csv_text import read_table
+from lab.files.text.regular_file import text_of_file
 
 TABLE_SUFFIXES = (".vnl", ".csv")
 CSV_COLUMNS = ("view", "id", "u_px", "v_px")
@@ -51,7 +52,7 @@ def read_corner_table(path: Path, board: Board, image_size_px: tuple[int, int]) 
 
 def _read_vnl(path: Path, board: Board) -> dict[str, tuple[Ints, Array]]:
     try:
-        lines = path.read_text("utf-8").splitlines()
+        lines = text_of_file(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read: {error}") from None
     rows: dict[str, list[tuple[float, float, float]]] = {}
