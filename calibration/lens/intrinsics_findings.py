@@ -32,6 +32,7 @@ class FindingLimits:
     overfit: tuple[float, float] = (1.5, OVERFIT)  # hold-out error over the noise
     views: int = 8
     p_value: float = 0.01  # of the halves' difference, and of the scatter between photographs
+    origins_p_value: float = 0.02  # of the difference between photographs that the user names differently
     halves_px: float = 1.0  # a significant difference larger than this fails
     map_px: tuple[float, float] = (0.5, UNKNOWN_PX)  # projection uncertainty, 90 % quantile over the picture
     warp_m: float = 0.002  # a larger bend is not described by a quadratic surface
@@ -257,7 +258,7 @@ def _halves(c: Intrinsics, limits: FindingLimits) -> Finding:
             code="BP-L20",
         )
     return unless_pass(
-        _disagreement(d, limits),
+        _disagreement(d, limits, limits.p_value),
         f"Two halves of the photographs differ by {d.rms_px:.3g} px ({_two(d.rms_mm)} mm at {c.distance_m:.3g} m), RMS"
         f" over the picture; {d.expected_rms_px:.3g} px are expected from their sigmas (p = {d.p_value:.2g}).",
         "A larger difference than expected means that the lens model, the board or the corners have errors that noise"
@@ -268,8 +269,8 @@ def _halves(c: Intrinsics, limits: FindingLimits) -> Finding:
     )
 
 
-def _disagreement(d: Difference, limits: FindingLimits) -> Level:
-    if d.p_value >= limits.p_value:
+def _disagreement(d: Difference, limits: FindingLimits, p_value: float) -> Level:
+    if d.p_value >= p_value:
         return Level.PASS
     return Level.FAIL if d.rms_px > limits.halves_px else Level.WARN
 
@@ -279,7 +280,7 @@ def _origins(c: Intrinsics, limits: FindingLimits) -> Finding | None:
         return None
     d, (first, second) = c.origins.difference, c.origins.names
     return unless_pass(
-        _disagreement(d, limits),
+        _disagreement(d, limits, limits.origins_p_value),
         f"The photographs {first!r} and {second!r} give lenses that differ by {d.rms_px:.3g} px, RMS over the picture;"
         f" {d.expected_rms_px:.3g} px are expected from their sigmas (p = {d.p_value:.2g}).",
         "The photographs seem to be from two cameras, or focus or zoom was changed in between.",

@@ -71,7 +71,7 @@ def test_the_spots_of_a_folder_have_their_true_positions_and_sizes(tmp_path):
     outcome = detect_pictures([folder], tmp_path / "out")
     assert (outcome.pictures, outcome.spots, outcome.exit_status) == (12, 36, 0)
     found = rows(tmp_path / "out")
-    assert tuple(found[0]) == columns.DETECTIONS
+    assert tuple(found[0]) == (*columns.DETECTIONS, columns.LIKENESS)
     assert {r["camera"] for r in found} == {"left"}
     assert [int(r["frame"]) for r in found] == sorted(3 * list(range(7, 19)))
     for frame in (7, 18):

@@ -26,7 +26,7 @@ TABLES = {
     "covariance": columns.COVARIANCE,
     "beams": columns.BEAMS,
     "spots": columns.SPOTS,
-    "detections": columns.DETECTIONS,
+    "detections": (*columns.DETECTIONS, columns.LIKENESS),  # the last one only of `detect`
     "times": columns.TIMES,
     "truth-pose": columns.TRUTH_POSE,
     "truth-spots": columns.TRUTH_SPOTS,
