@@ -24,6 +24,7 @@ FRAMES = 6  # of a recording, with which mistakes are tested
 MOST_KEPT = 90  # frames from which they are chosen
 FEWEST, PART = 10, 0.6  # points, and the share of width and height that they do not exceed in part of a picture
 SAME_RATE = 0.02  # relative difference of frame rates, above which they are not the same
+WRITTEN_BY_DEFAULT = (25.0, 30.0)  # Hz, in the header of a video
 Pictures = EvenSampler[Mapping[str, Detections]]  # the points of each frame, by camera
 
 
@@ -101,7 +102,10 @@ def mistakes_of_run(run: Run, statistics: RunStatistics, pictures: Pictures, *, 
 
 
 def rates_of_videos(run: Run) -> tuple[Finding, ...]:
-    """Findings on videos whose header states another frame rate than the run, unless the run has timestamps."""
+    """Findings on videos whose header states another frame rate than the run, unless the run has timestamps.
+
+    A header of 25 or 30 pictures per second says little: programs write it where nobody states a rate.
+    """
     if run.times.frames is not None:
         return ()
     rates = {n: header_rate_hz(source.path) for n, source in run.cameras.items() if isinstance(source, VideoFile)}
@@ -115,7 +119,7 @@ def rates_of_videos(run: Run) -> tuple[Finding, ...]:
             code="BP-M08",
         )
         for name, rate in rates.items()
-        if rate is not None and abs(rate / run.frame_rate_hz - 1) > SAME_RATE
+        if rate is not None and rate not in WRITTEN_BY_DEFAULT and abs(rate / run.frame_rate_hz - 1) > SAME_RATE
     )
 
 

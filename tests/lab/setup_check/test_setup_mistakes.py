@@ -212,6 +212,14 @@ def test_a_frame_rate_that_the_header_of_a_video_contradicts_is_reported(tmp_pat
     assert "BP-M08" in [r.as_mapping()["code"] for r in outcome.verdict.reasons]
 
 
+def test_a_frame_rate_that_programs_write_by_default_is_no_contradiction(tmp_path):
+    run = write_run(tmp_path / "run")
+    for name in ("left", "right"):
+        video(run / f"{name}.avi", rate=25.0)
+        edit(run / "run.yaml", f"frames/{name}", f"{name}.avi")
+    assert "BP-M08" not in checked(run)[0]
+
+
 def test_a_video_with_an_orientation_flag_is_read_the_same_when_calibrating_and_running(tmp_path):
     path = video(tmp_path / "film.mp4", fourcc="mp4v")
     data = bytearray(path.read_bytes())
