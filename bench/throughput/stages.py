@@ -32,7 +32,7 @@ STAGES = (
     ("tables", "lab.runs.tables", "TableWriter.__exit__"),
     ("model check", "lab.runs.model_check.check", "check_sampled_frames"),
     ("report", "lab.report.run.page", "write_report"),
-    ("load compiled", "geometry.compilation.jit", "_Cache.load_overload"),
+    ("load compiled", "geometry.compilation.numba_internals", "_Cache.load_overload"),
     ("compile", "numba.core.dispatcher", "_FunctionCompiler.compile"),
 )
 
