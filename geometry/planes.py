@@ -1,4 +1,4 @@
-"""Straight lines in space: where two are closest, and the point nearest to many."""
+"""Straight lines, planes and the surfaces of screens in space."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import numpy as np
 
 from geometry.arrays import Array, cross, normalised
 from geometry.pose import Pose
+
+# Straight lines in space: where two are closest, and the point nearest to many.
 
 
 def common_perpendicular(point_a: Array, direction_a: Array, point_b: Array, direction_b: Array) -> tuple[Array, Array]:

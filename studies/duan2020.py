@@ -1,8 +1,4 @@
-"""Simulated targets for the filter of Duan (2020): the paper shows pictures of a tracked car, but no figure.
-
-The target moves like a car seen from above: white acceleration, one turn. Its centre is detected with noise. It is
-hidden for 8 and for 20 frames, and other detections appear at random places.
-"""
+"""`beampose study duan2020`: the filter of Duan (2020) as printed, corrected, and in beampose, on simulated targets."""
 
 from __future__ import annotations
 
@@ -19,6 +15,11 @@ from tracking import kalman
 from tracking.detections import Detections
 from tracking.single_target.parameters import PointParameters
 from tracking.single_target.point_tracker import track_point
+
+# Simulated targets for the filter of Duan (2020): the paper shows pictures of a tracked car, but no figure.
+#
+# The target moves like a car seen from above: white acceleration, one turn. Its centre is detected with noise. It is
+# hidden for 8 and for 20 frames, and other detections appear at random places.
 
 FRAMES, SIZE_PX = 300, (1280, 720)
 NOISE_PX, SIGMA_A_PX = 0.5, 0.1  # px; px/frame^2

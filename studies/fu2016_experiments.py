@@ -1,9 +1,4 @@
-"""The experiment of Fu (2016), section 4: 20 s at 0.1 s with a disturbance from 6 to 8 s.
-
-The paper gives the filter's numbers, but neither the motion nor the disturbance ("complex additive noise" of high
-order). Both are stated here. Motion: the mean of the paper's first state, with a sway of 0.3 to 0.4 m and 2 degrees.
-Disturbances: noise whose size depends on the state, around an offset; and a smooth error that starts and ends slowly.
-"""
+"""The experiments of Fu (2016) on simulated lamps and on rendered pictures of a tanker, and their figures."""
 
 from __future__ import annotations
 
@@ -27,6 +22,13 @@ from tracking.corner_markers.matching import MarkerMatch, MatchParameters, harri
 from tracking.detections import UNMATCHED
 from tracking.unscented.fu2016 import P0, SPREAD, X0, PrintedFilter, Q, R, process, selection
 from tracking.unscented.ukf import Updated, gated_update, predict, student_t_update, update
+
+# The experiment of Fu (2016), section 4: 20 s at 0.1 s with a disturbance from 6 to 8 s.
+#
+# The paper gives the filter's numbers, but neither the motion nor the disturbance ("complex additive noise" of high
+# order). Both are stated here. Motion: the mean of the paper's first state, with a sway of 0.3 to 0.4 m and 2 degrees.
+# Disturbances: noise whose size depends on the state, around an offset; and a smooth error that starts and ends
+# slowly.
 
 DT_S, STEPS = 0.1, 201
 FROM_S, TO_S = 6.0, 8.0  # the disturbance

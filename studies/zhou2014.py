@@ -1,4 +1,4 @@
-"""Pictures of a ring with known centre, partly behind a straight edge: what the detectors are compared on."""
+"""`beampose study zhou2014`: circles in rendered pictures and behind a probe, compared with the published figures."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ from tracking.drogue_circle.detectors import classical_detector
 from tracking.drogue_circle.parameters import CircleParameters
 from tracking.drogue_circle.printed import printed_measurement
 from tracking.drogue_circle.rim_fit import RimFit, fit_rim, smooth_crop
+
+# Pictures of a ring with known centre, partly behind a straight edge: what the detectors are compared on.
 
 SIZE = (240, 200)  # width, height, px
 _SAMPLES = 4  # per pixel and axis

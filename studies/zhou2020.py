@@ -1,8 +1,4 @@
-"""Monte Carlo of the binocular measurement: distances from 5 to 30 m, and the pose of seven markers at 10 m.
-
-The camera of Zhou (2020): the field of 46 m at 40 m on 1080 lines is a focal length of 939 px. The baseline is not
-printed and cannot be computed from what is; 0.5 m is ours.
-"""
+"""`beampose study zhou2020`: binocular poses over distance, detectors and stereo fits, beside the published figures."""
 
 from __future__ import annotations
 
@@ -43,6 +39,11 @@ from tracking.binocular.parameters import SegmentationParameters
 from tracking.binocular.segmentation import ColourRange, marker_candidates, prepared
 from tracking.binocular.triangulation import linear_points, pose_of_points, triangulate, undistorted_pixels
 from tracking.learned_detector.detector import find_drogues
+
+# Monte Carlo of the binocular measurement: distances from 5 to 30 m, and the pose of seven markers at 10 m.
+#
+# The camera of Zhou (2020): the field of 46 m at 40 m on 1080 lines is a focal length of 939 px. The baseline is not
+# printed and cannot be computed from what is; 0.5 m is ours.
 
 FOCAL_PX, SIZE_PX, BASELINE_M = 939.0, (1920, 1080), 0.5
 DISTANCES_M = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0)

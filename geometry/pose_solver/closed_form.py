@@ -1,9 +1,4 @@
-"""The pose in closed form from beams of which both spots are seen.
-
-It is a start value for geometry/pose_solver/gauss_newton.py. For three single spots see
-geometry/pose_solver/three_spots.py. Source: ours; the rotation from directions is Wahba's problem, solved by scipy
-(Kabsch's method).
-"""
+"""Poses and spots in closed form: from beams of which both spots are seen, and from coplanar beams."""
 
 from __future__ import annotations
 
@@ -12,6 +7,12 @@ import numpy as np
 from geometry.arrays import Array, Bools, normalised
 from geometry.planes import common_perpendicular, nearest_point
 from geometry.pose import Pose
+
+# The pose in closed form from beams of which both spots are seen.
+#
+# It is a start value for geometry/pose_solver/gauss_newton.py. For three single spots see
+# geometry/pose_solver/three_spots.py. Source: ours; the rotation from directions is Wahba's problem, solved by scipy
+# (Kabsch's method).
 
 
 def pose_from_lines(

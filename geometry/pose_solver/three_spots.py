@@ -1,4 +1,4 @@
-"""Real roots of polynomials of degree 8, compiled. Coefficients are given with the lowest power first. Source: ours."""
+"""The poses that three spots allow, by the real roots of a polynomial."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from geometry.pose import Pose
+
+# Real roots of polynomials of degree 8, compiled. Coefficients are given with the lowest power first. Source: ours.
 
 
 @compiled

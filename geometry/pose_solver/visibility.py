@@ -1,4 +1,4 @@
-"""Visibility over a range of poses: which spots are in which pictures, and how well they determine the pose."""
+"""Which spots are seen in which poses, and which poses the spots of a symmetric vehicle cannot distinguish."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import SolveLimits, covariance_of
 from geometry.rig import Rig
+
+# Visibility over a range of poses: which spots are in which pictures, and how well they determine the pose.
 
 POSES = 2000  # number of poses drawn: a share of 50 % then has a standard deviation of 1 %
 SEED = 0

@@ -1,4 +1,4 @@
-"""`beampose check` and `report`: inputs checked, results shown."""
+"""`beampose check`, `report`, `compare`, `view` and `show`: inputs checked, results shown and compared."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import click
 
 from lab.commands.common import ANY_PATH, FOLDER, NumberRange, complain, progress_bar, show_line
 from lab.errors import InputError
+
+# `beampose check` and `report`: inputs checked, results shown.
 
 
 @click.command()

@@ -1,4 +1,4 @@
-"""`beampose track`: one target through a video or a folder of pictures."""
+"""`beampose track`, `stereo` and `calibrate pair`: one target in the pictures of one camera or of two."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ from lab.commands.common import (
 
 if TYPE_CHECKING:
     from lab.targets.target import Target
+
+# `beampose track`: one target through a video or a folder of pictures.
 
 _PIXEL = NumberRange(-1e6, 1e6)
 

@@ -1,4 +1,4 @@
-"""The content security policy of the reports: they load nothing, and run only the scripts of their own template."""
+"""The environment of the HTML templates: kept compiled, with a security policy that loads nothing."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from jinja2.bccache import Bucket
 from markupsafe import Markup, escape
 
 from geometry.compilation.compile_cache import private_folder
+
+# The content security policy of the reports: they load nothing, and run only the scripts of their own template.
 
 _INCLUDE = re.compile(r"{%-?\s*include\s+[\"']([^\"']+)[\"']\s*-?%}")
 _END = "//end"  # Jinja drops a line break at the end of a template, which is not the end of a script

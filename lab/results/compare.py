@@ -1,4 +1,4 @@
-"""Reads the motion of a reference: a TUM file (`t x y z qx qy qz qw`) or a CSV table with named columns."""
+"""`beampose compare`: a result against another result or a reference, and what the comparison leaves open."""
 
 from __future__ import annotations
 
@@ -33,6 +33,8 @@ from tracking.comparison.estimation import Estimate, Free, NotComparableError, e
 from tracking.comparison.frame_alignment import BODY, LEVER, TRANSLATION, WORLD, Alignment
 from tracking.comparison.motion import GAP, Motion
 from tracking.statuses import PoseStatus
+
+# Reads the motion of a reference: a TUM file (`t x y z qx qy qz qw`) or a CSV table with named columns.
 
 POSITION = ("x_m", "y_m", "z_m")
 QUATERNION = ("qw", "qx", "qy", "qz")

@@ -1,4 +1,4 @@
-"""The tables of a comparison: differences.csv, allan.csv and comparison.json."""
+"""Tables and page of a comparison."""
 
 from __future__ import annotations
 
@@ -44,6 +44,8 @@ from lab.results.compare import (
 )
 from lab.versions import versions
 from tracking.comparison.frame_alignment import PARAMETERS
+
+# The tables of a comparison: differences.csv, allan.csv and comparison.json.
 
 SCHEMA = "beampose/comparison/1"
 SUMMARY = "comparison.json"

@@ -1,4 +1,4 @@
-"""What summary.json records of how a result was made, and whether its inputs are still the same."""
+"""`beampose verify`: a result computed again from its recorded inputs, and the differences."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ from lab.runs.smoothing_pass import Progress, TrackingAndSmoothing
 from lab.runs.summary import SUMMARY_SCHEMA
 from lab.versions import versions
 from tracking.parameters import TrackerParameters
+
+# What summary.json records of how a result was made, and whether its inputs are still the same.
 
 
 class _Input(pydantic.BaseModel):

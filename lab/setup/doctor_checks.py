@@ -1,4 +1,4 @@
-"""Checks of the picture and video formats that OpenCV reads here: each is written and read back."""
+"""Checks of `beampose doctor` that need the libraries: picture formats, places on disk, calibration files."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ from lab.files.run.run_file import load_run
 from lab.files.text.yaml_text import read_mapping
 from lab.pictures.opencv import load_cv2
 from lab.setup.installation import Line, State
+
+# Checks of the picture and video formats that OpenCV reads here: each is written and read back.
 
 # Suffix, depth in bits and largest error of a grey level that comes back: 0 for lossless formats.
 PICTURES = ((".png", 8, 0), (".png", 16, 0), (".tiff", 8, 0), (".tiff", 16, 0), (".bmp", 8, 0), (".pgm", 16, 0),

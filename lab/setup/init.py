@@ -1,4 +1,4 @@
-"""A plausible rig from a few numbers; the lab replaces its poses and directions by measurements."""
+"""`beampose init`: a plausible rig from a few numbers, and the files of a first run."""
 
 from __future__ import annotations
 
@@ -23,6 +23,8 @@ from lab.files.text.atomic_write import atomic_folder, atomic_write_text
 from lab.simulate.rigs import look_at
 from lab.simulate.scenarios import SCENARIOS
 from lab.simulate.write import simulate
+
+# A plausible rig from a few numbers; the lab replaces its poses and directions by measurements.
 
 # Name of a screen, where it stands as seen from the vehicle, and the rotation world_from_screen.
 _SCREENS = (

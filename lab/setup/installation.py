@@ -1,4 +1,4 @@
-"""The lines that the checks of `beampose doctor` return."""
+"""Checks of `beampose doctor` that need no library: the installation itself. The lines that all checks return."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from importlib.util import find_spec
 
 from lab.errors import CalibrationError, InputError, RunError
 from lab.versions import versions
+
+# The lines that the checks of `beampose doctor` return.
 
 
 class State(IntEnum):

@@ -1,4 +1,4 @@
-"""Options of a plan: the grid of poses, the noise of a spot, the goals and the expected calibration errors."""
+"""Options of a plan, and the findings on what it predicts."""
 
 from __future__ import annotations
 
@@ -27,6 +27,8 @@ from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.error_text import suggest_name
 from lab.files.text.range_checks import MAX_COORDINATE_M
 from lab.number_format import format_angle, format_length, format_percent
+
+# Options of a plan: the grid of poses, the noise of a spot, the goals and the expected calibration errors.
 
 MAX_POSES = 100_000  # some 300 MB of memory and a table of 70 MB
 MAX_ANGLE_DEG = 360.0

@@ -1,4 +1,4 @@
-"""Drawings of a plan: values on a grid as coloured cells, and shares as bars."""
+"""Drawings, tables and page of a plan."""
 
 from __future__ import annotations
 
@@ -39,6 +39,8 @@ from lab.setup.plan_findings import (
     median_sigma,
     worst_first,
 )
+
+# Drawings of a plan: values on a grid as coloured cells, and shares as bars.
 
 _LEFT, _TOP, _WIDE, _HIGH = 58.0, 24.0, 468.0, 224.0
 _MAX_LABELLED_COLUMNS = 15  # with more columns the cells are too small for a number

@@ -1,4 +1,4 @@
-"""JSON schemas from the blocks of the YAML files (pydantic models whose fields have validators of their own)."""
+"""`beampose schema`: JSON schemas of the YAML files, from their pydantic models."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.dataclass_fields import block_of
 from lab.files.text.fields import Block
 from tracking.parameters import TrackerParameters
+
+# JSON schemas from the blocks of the YAML files (pydantic models whose fields have validators of their own).
 
 Schema = dict[str, Any]
 _TEXT: Schema = {"type": ["string", "number", "boolean"], "minLength": 1}  # a bare number counts as its text

@@ -1,4 +1,4 @@
-"""A simulated calibration campaign: the true rig, and the measurements of it that a laboratory makes."""
+"""A simulated calibration campaign, and its files."""
 
 from __future__ import annotations
 
@@ -38,6 +38,8 @@ from lab.files.text.error_text import suggest_name
 from lab.files.text.yaml_text import write_mapping
 from lab.simulate.board_photo import PhotoSettings, photograph
 from lab.simulate.rigs import RIGS
+
+# A simulated calibration campaign: the true rig, and the measurements of it that a laboratory makes.
 
 # One stream of random numbers per subject, so that the positions of the stand do not depend on the number of dots.
 _MOUNTING, _LENSES, _DOTS, _PIXELS, _STAND, _SPOTS, _WRONG = range(7)

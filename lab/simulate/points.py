@@ -1,4 +1,4 @@
-"""Shape and brightness of a laser spot in a picture, and its light integrated over pixels and exposure."""
+"""A laser spot's light, and simulated points without pictures."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from geometry.rig import Rig
 from lab.simulate.scenarios import PriorRegion, Scenario
 from lab.simulate.scene import OCCLUDED, POINT_NOISE, VISIBLE, compose, with_overrides
 from tracking.detections import Detections
+
+# Shape and brightness of a laser spot in a picture, and its light integrated over pixels and exposure.
 
 _REACH = 5.0  # sigmas that are drawn: a spot of 150 DN ends below 0.001 DN
 _FLAT = np.zeros((2, 3))

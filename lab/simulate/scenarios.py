@@ -1,4 +1,4 @@
-"""Motions of the vehicle as functions of time, which give the exact pose at any instant of an exposure."""
+"""The named scenarios, and the motions of their vehicles."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import numpy as np
 
 from geometry.arrays import Array
 from geometry.pose import Pose
+
+# Motions of the vehicle as functions of time, which give the exact pose at any instant of an exposure.
 
 AXES = ("x", "y", "z", "yaw", "pitch", "roll")
 SHAPES = ("sine", "triangle", "plateau", "steps")

@@ -1,4 +1,4 @@
-"""Frame numbers for the pictures of a device without any: counted, and checked against the clock."""
+"""Frame numbers of devices without any, and new files of folders that are being written."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lab.runs.frames.frame_sources import number_of
+
+# Frame numbers for the pictures of a device without any: counted, and checked against the clock.
 
 _CONFIRMING = 12  # consecutive late pictures that confirm a loss: a burst after a pause is late only at its start
 

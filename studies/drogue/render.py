@@ -1,7 +1,4 @@
-"""Backgrounds: a gradient of the sky, clouds and ground as fractal noise, or a given picture, with distractors.
-
-A background is drawn once, larger than the picture, and shifted by the offset of the frame; mirrored at its edges.
-"""
+"""Renders a drogue in front of a background, with what stands in front of it."""
 
 from __future__ import annotations
 
@@ -26,6 +23,10 @@ from studies.drogue.scene import (
     rim_points_px,
     shade_rays,
 )
+
+# Backgrounds: a gradient of the sky, clouds and ground as fractal noise, or a given picture, with distractors.
+#
+# A background is drawn once, larger than the picture, and shifted by the offset of the frame; mirrored at its edges.
 
 _MARGIN = 0.25  # of the picture's size, on each side, that moves into view
 _CLOUD_SHIFT = 4  # bits of sub-pixel positions in OpenCV's drawing functions

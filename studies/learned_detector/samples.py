@@ -1,8 +1,4 @@
-"""Structured backgrounds of training: roads, arcs, letters and ridges.
-
-They teach the network that sharp man-made patterns are no drogue. None of them is of the kinds of the test (stripes,
-checks, blobs, walls of polygons; samples.py).
-"""
+"""Samples for the training of the learned detector: backgrounds, rendered drogues, and how they are varied."""
 
 from __future__ import annotations
 
@@ -19,6 +15,11 @@ from geometry.camera import Camera
 from geometry.pose import Pose
 from studies.drogue.render import fractal_noise, render_drogue
 from studies.drogue.scene import PICTURE, DrogueBackground, DrogueLight, DrogueLook, DrogueScene, Floats32, Occluder
+
+# Structured backgrounds of training: roads, arcs, letters and ridges.
+#
+# They teach the network that sharp man-made patterns are no drogue. None of them is of the kinds of the test (stripes,
+# checks, blobs, walls of polygons; samples.py).
 
 ROADS, ARCS, LETTERS, RIDGES = "roads", "arcs", "letters", "ridges"
 KINDS = (ROADS, ARCS, LETTERS, RIDGES)

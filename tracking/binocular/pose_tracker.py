@@ -1,4 +1,4 @@
-"""Constant-velocity prediction of the target's pose: for matching, and for frames without a measurement. Ours."""
+"""The pose of a target over a stereo recording, its prediction, and whether both cameras expose together."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from tracking.binocular.labelling import Images, LabelledPose, labelled_pose, ob
 from tracking.binocular.marker_model import MarkerImages, MarkerModel, StereoPair, project, project_markers
 from tracking.binocular.parameters import MatchParameters
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, PoseStatus
+
+# Constant-velocity prediction of the target's pose: for matching, and for frames without a measurement. Ours.
 
 FIRST_SPEED_M_S, FIRST_RATE_RAD_S = 5.0, 2.0  # 1 sigma of the unknown velocity after the first pose
 

@@ -1,9 +1,4 @@
-"""Pose from points in two frames by unit quaternions: Zhou (2020), equations (10) to (18); Horn (1987).
-
-Horn, "Closed-form solution of absolute orientation using unit quaternions", J. Opt. Soc. Am. A 4, 629. The paper does
-not print the matrix M of (14); this is Horn's. Maximising (14) is the same as minimising (13); the text names (12) and
-(13). The largest eigenvalue is lambda_1 in (18). Two quaternions, q and -q, are one rotation. Three points suffice.
-"""
+"""Points from two pictures, Zhou (2020), equations (7) to (9), and the pose that brings them onto the model."""
 
 from __future__ import annotations
 
@@ -16,6 +11,13 @@ from geometry.camera import Camera
 from geometry.planes import common_perpendicular
 from geometry.pose import Pose
 from tracking.binocular.marker_model import StereoPair, project
+
+# Pose from points in two frames by unit quaternions: Zhou (2020), equations (10) to (18); Horn (1987).
+#
+# Horn, "Closed-form solution of absolute orientation using unit quaternions", J. Opt. Soc. Am. A 4, 629. The paper
+# does not print the matrix M of (14); this is Horn's. Maximising (14) is the same as minimising (13); the text names
+# (12) and (13). The largest eigenvalue is lambda_1 in (18). Two quaternions, q and -q, are one rotation. Three points
+# suffice.
 
 
 def quaternion_matrix(from_body: Array, measured: Array) -> Array:

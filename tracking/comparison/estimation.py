@@ -1,4 +1,4 @@
-"""Candidates of the time offset between two motions, from the speeds, which do not depend on the frames."""
+"""The alignment of two motions by least squares: candidates of the time offset, what is determined, the estimate."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ from tracking.comparison.frame_alignment import (
     residuals,
 )
 from tracking.comparison.motion import GAP, Motion, rates
+
+# Candidates of the time offset between two motions, from the speeds, which do not depend on the frames.
 
 _MOST_POINTS = 1 << 15
 _LEAST_SHARE = 0.5  # of the shorter recording that must overlap

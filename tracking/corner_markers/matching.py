@@ -1,8 +1,4 @@
-"""Corners by the Harris method, with the response and the window of Fu (2016).
-
-Source: Fu et al. (2016), eqs. (6) and (7); the response det(M) / (tr(M) + epsilon) is Noble's form, "Finding corners",
-Image and Vision Computing 6(2), 1988, of Harris & Stephens (1988).
-"""
+"""Corners of lamps in a picture (Harris), and the pose that explains them."""
 
 from __future__ import annotations
 
@@ -18,6 +14,11 @@ from geometry.pose_solver.gauss_newton import PoseFit, fit_pose
 from geometry.pose_solver.marker_model import MarkerModel
 from tracking.detections import UNMATCHED
 from tracking.noise import Picture
+
+# Corners by the Harris method, with the response and the window of Fu (2016).
+#
+# Source: Fu et al. (2016), eqs. (6) and (7); the response det(M) / (tr(M) + epsilon) is Noble's form, "Finding
+# corners", Image and Vision Computing 6(2), 1988, of Harris & Stephens (1988).
 
 GROUND_PERCENTILE = 95.0  # of the window's edge: above the noise of the sky, below a neighbouring lamp
 LEAST_LIGHT_DN = 12.0  # of a lamp above it

@@ -1,7 +1,4 @@
-"""The paper's positions of spots outside the image, for rigs with coplanar beams that meet in one point.
-
-Source: Huo, Yang & Yang 2015, section 4.2; the formulas, eqs. (10) to (14), are in geometry/pose_solver/closed_form.py.
-"""
+"""Positions of spots outside the image, and the filter of the pose for frames that do not determine it."""
 
 from __future__ import annotations
 
@@ -16,6 +13,11 @@ from geometry.planes import common_perpendicular, intersect_plane, screen_to_wor
 from geometry.pose import Pose
 from geometry.pose_solver.closed_form import meeting_point, middle_spot, outer_spot
 from geometry.rig import Rig
+
+# The paper's positions of spots outside the image, for rigs with coplanar beams that meet in one point.
+#
+# Source: Huo, Yang & Yang 2015, section 4.2; the formulas, eqs. (10) to (14), are in
+# geometry/pose_solver/closed_form.py.
 
 MEETING_TOLERANCE_M = 1e-3  # beams with a larger distance between their lines do not meet in one point
 COPLANAR_TOLERANCE = 1e-3  # rad: largest angle between a beam and the plane of the other two

@@ -1,4 +1,4 @@
-"""The Kalman filters of all views and their history."""
+"""The trackers of all spots of a vehicle: filters and history of each view, and the frame that they share."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from tracking.curve_switching import pose_filter
 from tracking.curve_switching.pose_filter import RigidMotion
 from tracking.parameters import TrackerParameters
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, PoseStatus
+
+# The Kalman filters of all views and their history.
 
 BENT_NIS = 25.0  # squared sigmas: an innovation beyond this is a bend of the trajectory (p = 4e-6)
 SIGMA_A_RANGE = (50.0, 2e6)  # px/s^2: limits of the estimated acceleration

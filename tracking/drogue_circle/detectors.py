@@ -1,8 +1,4 @@
-"""The improved Hough gradient method of Zhou (2014), section 2.3: edges vote for centres, then for radii.
-
-Departures from the print: the window and the 8 px gate are around the prediction, not around the last position, and the
-votes of a radius are divided by the circumference. Otherwise large circles win with the votes of clutter.
-"""
+"""Circle detectors: the improved Hough gradient method of Zhou (2014), and those of OpenCV to compare with."""
 
 from __future__ import annotations
 
@@ -15,6 +11,11 @@ from numpy.typing import NDArray
 from geometry.arrays import Array, Ints
 from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window, crop_bounds
 from tracking.drogue_circle.parameters import CircleParameters
+
+# The improved Hough gradient method of Zhou (2014), section 2.3: edges vote for centres, then for radii.
+#
+# Departures from the print: the window and the 8 px gate are around the prediction, not around the last position, and
+# the votes of a radius are divided by the circumference. Otherwise large circles win with the votes of clutter.
 
 _STRONG_PERCENTILE, _STRONG_SHARE, _WEAK_SHARE = 98.0, 0.35, 0.4  # of Canny's thresholds, from the gradients themselves
 _LEAST_GRADIENT = 24.0  # Sobel sum of a step of 6 DN in a picture stretched to 8 bits

@@ -1,4 +1,4 @@
-"""Edge points of a rim with sub-pixel precision: the maximum of the slope along the gradient of a circle, on rays."""
+"""The rim of a drogue in a picture: its edge points, the circle fitted to them, and the frames of a track."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from geometry.arrays import Array, Bools, symmetric
 from tracking.drogue_circle.candidates import CircleCandidate, Picture, Window, crop_bounds
 from tracking.statuses import Cause, PoseStatus
+
+# Edge points of a rim with sub-pixel precision: the maximum of the slope along the gradient of a circle, on rays.
 
 _STEP_PX = 0.5  # sampling along a ray
 _LEAST_RAYS, _MOST_RAYS = 40, 256

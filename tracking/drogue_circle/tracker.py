@@ -1,4 +1,4 @@
-"""The circle that is followed: its filters, its appearance, and its measurement in a window of the picture."""
+"""Follows the circle of a drogue: what is known of it, and the steps from picture to picture."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from tracking.drogue_circle.occlusion import Appearance, RimHabit, disc_cells, f
 from tracking.drogue_circle.parameters import CircleParameters
 from tracking.drogue_circle.rim_fit import CircleFrame, RimFit, SmoothCrop, fit_rim, nothing_known, smooth_crop
 from tracking.statuses import Cause, PoseStatus
+
+# The circle that is followed: its filters, its appearance, and its measurement in a window of the picture.
 
 _START_RATE_RADII = 0.25  # 1 sigma of the rate of a new circle, in radii per frame
 _COVERAGE_COST, _POLARITY_COST = 40.0, 15.0  # against distance^2, of a whole rim and of the other polarity

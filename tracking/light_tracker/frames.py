@@ -1,4 +1,4 @@
-"""Parameters of the light tracker and of the hand-over between it and the detector. Times are frames."""
+"""Parameters, frames and confidence of the light tracker."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import numpy as np
 
 from geometry.arrays import Array
 from tracking.statuses import Cause, PoseStatus
+
+# Parameters of the light tracker and of the hand-over between it and the detector. Times are frames.
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""What is known of a drogue while it is followed."""
+"""The light tracker: what is known of a drogue while it is followed, and the steps from picture to picture."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ from tracking.light_tracker.known import Known, is_clear, is_similar
 from tracking.light_tracker.motion import WHOLE, Motion
 from tracking.light_tracker.pattern import Match, Pattern, unexplained
 from tracking.statuses import Cause, PoseStatus
+
+# What is known of a drogue while it is followed.
 
 TRUSTED = 4  # detections that confirmed a track
 LONGEST_GAP = 20  # frames

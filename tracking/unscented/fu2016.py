@@ -1,4 +1,4 @@
-"""Which states a series of measurements determines: information about the first state, and sigmas with a prior."""
+"""The model of Fu (2016), and which of its states a series of measurements determines."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import numpy as np
 
 from geometry.arrays import Array, numeric_jacobian, symmetric
 from tracking.unscented.ukf import Function, Spread, Updated, predict, square_root, update
+
+# Which states a series of measurements determines: information about the first state, and sigmas with a prior.
 
 DETERMINED = 1.0  # information, in units of the prior's, from which a direction counts as observed
 

@@ -1,9 +1,4 @@
-"""Sigma points and the unscented transform: mean and covariance of a function of a random vector.
-
-Source: Julier & Uhlmann, "Unscented filtering and nonlinear estimation", Proc. IEEE 92(3), 2004; scaling by Wan & van
-der Merwe (2000). The covariance is computed in a form that rounding and negative weights cannot make indefinite (ours,
-see `deviations`).
-"""
+"""The unscented Kalman filter of Fu (2016): sigma points, robust updates, the filter."""
 
 from __future__ import annotations
 
@@ -14,6 +9,12 @@ import numpy as np
 
 from geometry.arrays import Array
 from geometry.uncertainty.chi_square import chi2_limit
+
+# Sigma points and the unscented transform: mean and covariance of a function of a random vector.
+#
+# Source: Julier & Uhlmann, "Unscented filtering and nonlinear estimation", Proc. IEEE 92(3), 2004; scaling by Wan &
+# van der Merwe (2000). The covariance is computed in a form that rounding and negative weights cannot make indefinite
+# (ours, see `deviations`).
 
 Function = Callable[[Array], Array]  # (k, n) -> (k, m): rows are independent points
 

@@ -1,4 +1,4 @@
-"""Findings of a drift check in words: the change, its consequence and the remedy."""
+"""Findings of a drift check in words, and its page."""
 
 from __future__ import annotations
 
@@ -35,6 +35,8 @@ from lab.report.calibration.calibration_page import (
     write_calibration_report,
 )
 from lab.report.calibration.calibration_scene import Marker, rig_things, scene_views
+
+# Findings of a drift check in words: the change, its consequence and the remedy.
 
 _CHECK_MOUNT = "Look for a displaced or loose mount; fix it, then recalibrate the camera's pose (`calibrate rig`)."
 _CHECK_LENS = "Check the focus and zoom rings and the lens mount, lock them, then recalibrate this camera's lens."

@@ -1,4 +1,4 @@
-"""Findings of a pair's calibration, and the uncertainty of distances that it leaves."""
+"""`beampose calibrate pair`: two cameras calibrated together, and the findings."""
 
 from __future__ import annotations
 
@@ -35,6 +35,8 @@ from lab.report.calibration.calibration_page import (
 )
 from lab.runs.frames.frame_sources import number_of
 from tracking.binocular.marker_model import StereoPair, calibration_jacobian, project
+
+# Findings of a pair's calibration, and the uncertainty of distances that it leaves.
 
 GOOD_MISFIT, LARGEST_MISFIT = 1.3, 3.0  # joint residuals over those of the cameras by themselves
 GOOD_PAIRS = 8

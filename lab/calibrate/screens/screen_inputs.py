@@ -1,4 +1,4 @@
-"""Reads and checks the tables, boards and scans of a calibration project and builds the network to be adjusted."""
+"""The inputs of `calibrate screen`: tables, boards and scans, and the network of surveyed points checked."""
 
 from __future__ import annotations
 
@@ -32,6 +32,8 @@ from lab.files.project.point_files import Observations, Survey, read_observation
 from lab.files.project.project_blocks import Cloud, Project, ScreenEntry
 from lab.files.text.error_text import suggest_name
 from lab.files.text.range_checks import MAX_SCAN_COORDINATE
+
+# Reads and checks the tables, boards and scans of a calibration project and builds the network to be adjusted.
 
 LARGEST_SCREEN_M = 100.0  # a larger screen is taken for an error of the unit
 SMALLEST_SCREEN_M = 0.02

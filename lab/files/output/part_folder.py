@@ -1,4 +1,4 @@
-"""Paths that this process removes when it stops: parts of results that are not complete, and lock files."""
+"""Result folders that are complete or absent, and what is removed when the process stops."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+# Paths that this process removes when it stops: parts of results that are not complete, and lock files.
 
 _unfinished: dict[Path, int] = {}  # and the process that made it: a forked process must not remove it
 

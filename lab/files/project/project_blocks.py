@@ -1,4 +1,4 @@
-"""The content of a calibration.yaml as values."""
+"""The blocks of a calibration.yaml, and their content as values."""
 
 from __future__ import annotations
 
@@ -35,6 +35,8 @@ from lab.files.text.fields import (
     printable_name,
     unexpected_value,
 )
+
+# The content of a calibration.yaml as values.
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""The covariance blocks of a rig.yaml as one joint covariance of the rig's parameters."""
+"""rig.yaml: the rig, and the joint covariance of its parameters."""
 
 from __future__ import annotations
 
@@ -44,6 +44,8 @@ from lab.files.text.fields import (
     validated,
 )
 from lab.files.text.yaml_text import read_mapping, write_mapping
+
+# The covariance blocks of a rig.yaml as one joint covariance of the rig's parameters.
 
 TARGET = "target"
 

@@ -1,4 +1,4 @@
-"""The YAML loader: core types of YAML 1.2, keys as written, no repeated key, and limits on what a file may hold."""
+"""YAML files: the loader, with its limits, and what reads and writes with it."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ import yaml
 
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
+
+# The YAML loader: core types of YAML 1.2, keys as written, no repeated key, and limits on what a file may hold.
 
 MAX_DEPTH = 60  # nesting of lists and mappings; our own files have 6
 MAX_ALIAS_NODES = 100_000  # values that the aliases of a file stand for, in all

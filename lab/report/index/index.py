@@ -1,4 +1,4 @@
-"""Thumbnails: three curves of a run in one small drawing, with a common scale."""
+"""The index page of a folder of runs, with their curves and trends."""
 
 from __future__ import annotations
 
@@ -36,6 +36,8 @@ from lab.report.plot.axes import (
     x_ticks,
     y_ticks,
 )
+
+# Thumbnails: three curves of a run in one small drawing, with a common scale.
 
 WIDTH, HEIGHT = 96, 26  # viewBox units
 _MARGIN = 2

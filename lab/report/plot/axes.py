@@ -1,4 +1,4 @@
-"""Long series reduced to what a screen can show, without losing extremes or gaps."""
+"""Axes, scales, SVG elements and histograms of the reports, and long series reduced to what a screen can show."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from html import escape
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
+
+# Long series reduced to what a screen can show, without losing extremes or gaps.
 
 
 def true_ranges(mask: Bools) -> list[tuple[int, int]]:

@@ -1,4 +1,4 @@
-"""Colours for values: sequential and diverging maps, their range, and the bar beside a plot."""
+"""Maps over a picture or a range, and the colours of their values."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ from lab.report.plot.axes import (
     tick_texts,
     ticks,
 )
+
+# Colours for values: sequential and diverging maps, their range, and the bar beside a plot.
 
 # Anchors of the colour maps. The lightness is monotonic, so that the order is kept in print and for all colour vision.
 # Sequential: cividis (Nunez, Anderton & Renslow 2018); diverging: blue to vermillion of Okabe & Ito through light grey.

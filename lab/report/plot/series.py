@@ -1,9 +1,4 @@
-"""The series behind a page's time plots, compact enough to embed: cursor.js draws parts of them when a user zooms.
-
-Each series of n values is a row of integers: asinh((y - centre) / scale), rounded. So a few large values cost no
-resolution near the centre. Above a size limit each block of frames is stored as its smallest and largest value. The
-integers are differenced, split into planes of bytes and deflated.
-"""
+"""Plots over time, and their data for enlarging in the page."""
 
 from __future__ import annotations
 
@@ -37,6 +32,12 @@ from lab.report.plot.axes import (
     x_ticks,
     y_ticks,
 )
+
+# The series behind a page's time plots, compact enough to embed: cursor.js draws parts of them when a user zooms.
+#
+# Each series of n values is a row of integers: asinh((y - centre) / scale), rounded. So a few large values cost no
+# resolution near the centre. Above a size limit each block of frames is stored as its smallest and largest value. The
+# integers are differenced, split into planes of bytes and deflated.
 
 _BITS, _FINE_BITS = 14, 20
 _FINE_SHARE = 8  # blocks of fine series are shorter by this factor: they are smooth and so compress better

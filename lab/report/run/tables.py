@@ -1,4 +1,4 @@
-"""The report's tables of errors against truth."""
+"""The tables of a run's report."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from lab.report.plot.axes import true_ranges
 from lab.report.run.report_data import ReportData
 from lab.report.run.truth_errors import MotionErrors, PoseSpread, SpotErrors, TruthErrors, ViewErrors
 from tracking.statuses import PoseStatus, SpotStatus
+
+# The report's tables of errors against truth.
 
 
 def truth_figures(e: TruthErrors | None) -> list[KeyFigure]:

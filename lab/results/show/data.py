@@ -1,4 +1,4 @@
-"""The tables of a results folder and the run behind them, as the annotated pictures need them."""
+"""What the annotated pictures of a result show: its tables, the pictures, and the content of one frame."""
 
 from __future__ import annotations
 
@@ -33,6 +33,8 @@ from lab.runs.frames.frame_sources import FolderSource, Requested, VideoSource, 
 from lab.runs.frames.frames import Picture
 from tracking.detections import Detections
 from tracking.statuses import PoseStatus, SpotStatus
+
+# The tables of a results folder and the run behind them, as the annotated pictures need them.
 
 MOST_OUTSIDE_PX = 50.0  # margin around the measured places where the size of a picture is unknown
 

@@ -1,4 +1,4 @@
-"""Lines, rings and words drawn on pictures. Every mark has a black edge, so that it is visible on any grey value."""
+"""One camera's picture with its marks, and the canvas that they are drawn on."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from lab.report.plot.image import grey_limits, stretched
 from lab.report.run.tracks import SPOT_COLOURS
 from lab.results.show.data import SIGMAS, CameraFrame, SpotMark
 from tracking.statuses import SpotStatus
+
+# Lines, rings and words drawn on pictures. Every mark has a black edge, so that it is visible on any grey value.
 
 Pixels: TypeAlias = NDArray[np.uint8]  # (h, w, 3), BGR
 Colour: TypeAlias = tuple[int, int, int]  # BGR

@@ -1,4 +1,4 @@
-"""Which pose a window of `beampose view` shows, and how keys, a slider and the clock change it."""
+"""The page of `beampose view`, and which pose it or a window shows."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from lab.report.calibration.calibration_scene import Rectangle, scene_views
 from lab.report.html import environment
 from lab.report.plot.axes import ORANGE, PURPLE
 from lab.results.view.scene import Content, View, edges, thinned
+
+# Which pose a window of `beampose view` shows, and how keys, a slider and the clock change it.
 
 
 class Player:

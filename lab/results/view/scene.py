@@ -1,4 +1,4 @@
-"""What `beampose view` shows: a rig, and the poses of a run's truth or of results."""
+"""The scene of `beampose view`: its content, its solids, and the glTF file of them."""
 
 from __future__ import annotations
 
@@ -32,6 +32,8 @@ from lab.report.calibration.calibration_scene import (
 )
 from lab.report.plot.axes import GREY, PURPLE, round_size
 from tracking.statuses import PoseStatus
+
+# What `beampose view` shows: a rig, and the poses of a run's truth or of results.
 
 
 @dataclass(frozen=True, slots=True)

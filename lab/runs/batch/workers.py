@@ -1,4 +1,4 @@
-"""The runs of a batch: folders, patterns and lists in files, and the part of them that one shard processes."""
+"""The runs of a batch, their result folders, and the processes that work on them."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.json_text import read_json
 from lab.files.text.regular_file import bytes_of_file
+
+# The runs of a batch: folders, patterns and lists in files, and the part of them that one shard processes.
 
 
 def listed_runs(given: Sequence[str | os.PathLike[str]], lists: Sequence[str | os.PathLike[str]] = ()) -> list[Path]:

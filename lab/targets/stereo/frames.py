@@ -1,4 +1,4 @@
-"""Annotated pairs of pictures for the report of a stereo run."""
+"""Pictures of a stereo run: read in pairs, and annotated pairs for its report."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ from lab.runs.frames.frame_sources import list_folder
 from lab.targets.recording import colour_frames
 from lab.targets.stereo.run import Source, StereoRecord, StereoResults, StereoRun
 from tracking.binocular.marker_model import MarkerImages, project_markers
+
+# Annotated pairs of pictures for the report of a stereo run.
 
 _MOST = 4  # pairs shown
 _SIDE = 520.0  # width of one picture in the drawing
