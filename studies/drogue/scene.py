@@ -221,18 +221,6 @@ def ellipse_through(points_px: Array) -> Ellipse:
     return Ellipse(mean + scale * centre, float(major), float(minor), float(angle))
 
 
-def ellipse_points(ellipse: Ellipse, angle_rad: Array) -> Array:
-    """Points (..., 2), px, of an ellipse at parametric angles (...)."""
-    turn = np.radians(ellipse.angle_deg)
-    along = np.array([np.cos(turn), np.sin(turn)])
-    across = np.array([-np.sin(turn), np.cos(turn)])
-    return (
-        ellipse.centre_px
-        + ellipse.major_px * np.cos(angle_rad)[..., None] * along
-        + ellipse.minor_px * np.sin(angle_rad)[..., None] * across
-    )
-
-
 # Colours of the drogue along rays: canopy ring, markers, basket of struts with gaps, lining and coupling.
 #
 # A ray is given by its slopes (mx, my) = d(x, y)/dz in the drogue frame and the point (x0, y0) where it meets the
