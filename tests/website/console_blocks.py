@@ -6,8 +6,8 @@ import re
 import textwrap
 from dataclasses import dataclass
 
+from docs.website.pages import GENERATED
 from tests.paths import ROOT
-from website.pages import GENERATED
 
 _BLOCK = re.compile(r"^ *```console\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
 _STATUS = re.compile(r"\s+# exit status (\d+)$")

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-formulas = pytest.importorskip("website.formulas", reason="latex2mathml is not installed; `make docs` installs it")
+formulas = pytest.importorskip("docs.website.formulas", reason="latex2mathml is not installed; `make docs` installs it")
 INLINE, BLOCK = r'<span class="arithmatex">\({}\)</span>', r'<div class="arithmatex">\[{}\]</div>'
 
 

@@ -12,15 +12,15 @@ import sys
 import pytest
 
 from calibration.budget.expected_errors import ExpectedErrors
+from docs.website import codes, commands, parameters, study_tables, yaml_files
+from docs.website.navigation import expanded
+from docs.website.network import network_addresses
+from docs.website.pages import GENERATED
+from docs.website.text import cell
 from lab.explain.catalogue import EXPLANATIONS
 from lab.setup.schema import BLOCKS
 from tests.paths import ROOT
 from tracking.parameters import DetectParameters, LabelParameters, TrackerParameters
-from website import codes, commands, parameters, study_tables, yaml_files
-from website.navigation import expanded
-from website.network import network_addresses
-from website.pages import GENERATED
-from website.text import cell
 
 CLASSES = (("", TrackerParameters), ("detect.", DetectParameters), ("labels.", LabelParameters), ("", ExpectedErrors))
 
@@ -124,7 +124,7 @@ def test_generated_pages_are_not_checked_in():
 @pytest.mark.slow
 def test_the_site_is_built_without_a_warning_and_loads_nothing_from_the_network(tmp_path):
     pytest.importorskip("material", reason="MkDocs is not installed; `make docs` installs it")
-    for path in ("docs", "website", "mkdocs.yml"):
+    for path in ("docs", "mkdocs.yml"):
         copy = shutil.copytree if (ROOT / path).is_dir() else shutil.copy
         copy(ROOT / path, tmp_path / path)
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]

@@ -28,7 +28,9 @@ def test_the_theory_covers_the_equations_of_the_paper():
 
 @pytest.mark.parametrize("page", PAGES)
 def test_every_formula_can_be_rendered(page):
-    formulas = pytest.importorskip("website.formulas", reason="latex2mathml is not installed; `make docs` installs it")
+    formulas = pytest.importorskip(
+        "docs.website.formulas", reason="latex2mathml is not installed; `make docs` installs it"
+    )
     for latex in re.findall(r"\$\$(.+?)\$\$|(?<!\$)\$([^$\n]+)\$(?!\$)", PAGES[page]):
         shown = "".join(latex).replace("&", "&amp;").replace("<", "&lt;")
         assert "<math" in formulas.with_mathml(rf'<span class="arithmatex">\({shown}\)</span>')

@@ -14,9 +14,10 @@ from lab.errors import QUALITY_GATE_FAILED, BeamposeError, CalibrationError, Inp
 from lab.files.run.parameter_overrides import with_overrides
 from lab.runs.batch.parquet import require_pyarrow, update_data_sets
 from lab.runs.batch.resumption import fingerprint_of, finished_summary
+from lab.runs.batch.run_folders import allotted, listed_runs, moved_runs
 from lab.runs.batch.table import BatchTable, locked, read_rows
 from lab.runs.batch.task import Task, TaskOutcome, concluded, failed_row, perform
-from lab.runs.batch.workers import allotted, listed_runs, moved_runs, performed
+from lab.runs.batch.workers import performed
 from lab.runs.process import ready_run
 from tracking.parameters import TrackerParameters
 

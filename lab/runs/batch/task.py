@@ -19,7 +19,7 @@ from lab.files.output.folder_lock import FolderInUseError
 from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_text
 from lab.runs.batch.resumption import fingerprint_of, finished_summary
-from lab.runs.batch.workers import displayed
+from lab.runs.batch.run_folders import displayed
 from lab.runs.process import RunOutcome, process_run
 from lab.runs.run_log import collected_lines
 

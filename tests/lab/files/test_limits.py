@@ -18,8 +18,8 @@ from lab.files.text.csv_text import csv_text, read_table
 from lab.files.text.error_text import is_formula, name_of_path, printable
 from lab.files.text.json_text import has_schema
 from lab.files.text.yaml_text import parse_mapping, parse_value, read_mapping
+from lab.runs.batch.run_folders import allotted, listed_runs
 from lab.runs.batch.table import read_rows
-from lab.runs.batch.workers import allotted, listed_runs
 from lab.runs.frames.frame_sources import open_video
 from lab.setup.plan_findings import options_of
 from tests.paths import ROOT

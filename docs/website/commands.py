@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import click
 
 from cli import main
-from website.text import cell, code, table
+from docs.website.text import cell, code, table
 
 _HEAD = """# All commands
 

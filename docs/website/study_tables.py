@@ -1,4 +1,4 @@
-"""Tables of studies in pages: the figures of a paper beside ours, as `python -m website.figures` keeps them."""
+"""Tables of studies in pages: the figures of a paper beside ours, as `python -m docs.website.figures` keeps them."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import csv
 import re
 from pathlib import Path
 
-from website.text import cell, table
+from docs.website.text import cell, table
 
-IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
+IMAGES = Path(__file__).resolve().parents[1] / "images"
 MARKER = re.compile(r"<!-- table of study (\w+) -->")  # in a page, where the table belongs
 
 

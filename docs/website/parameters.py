@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from calibration.budget.expected_errors import ExpectedErrors
+from docs.website.text import cell, code, table
 from tracking.parameters import DetectParameters, LabelParameters, TrackerParameters
-from website.text import cell, code, table
 
 _CLASSES = (
     ("Tracking", "", TrackerParameters),

@@ -1,4 +1,4 @@
-"""Makes the pictures of the documentation: `python -m website.figures` writes them into docs/images.
+"""Makes the pictures of the documentation: `python -m docs.website.figures` writes them into docs/images.
 
 The program's own commands run on simulated boards, campaigns and recordings; the figures are those of their reports.
 """
@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 IMAGES = ROOT / "docs" / "images"
 COMMANDS = (
     "calibrate simulate --photos --seed 3 --out campaign",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from website import codes, commands, parameters, yaml_files
+from docs.website import codes, commands, parameters, yaml_files
 
 GENERATED: Mapping[str, Callable[[], str]] = {
     "reference/parameters.md": parameters.page,

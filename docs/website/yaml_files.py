@@ -6,8 +6,8 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
+from docs.website.text import cell, code, table
 from lab.setup.schema import BLOCKS, schema
-from website.text import cell, code, table
 
 _HEAD = """# Fields of the YAML files
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from docs.website.text import cell
 from lab.explain.catalogue import SECTIONS
-from website.text import cell
 
 _HEAD = """# Codes
 

@@ -11,15 +11,15 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 if str(ROOT) not in sys.path:  # MkDocs loads this file by its path
     sys.path.insert(0, str(ROOT))
 
-from website.formulas import FormulaError, with_mathml  # noqa: E402
-from website.navigation import expanded  # noqa: E402
-from website.network import network_addresses  # noqa: E402
-from website.pages import GENERATED  # noqa: E402
-from website.study_tables import with_tables  # noqa: E402
+from docs.website.formulas import FormulaError, with_mathml  # noqa: E402
+from docs.website.navigation import expanded  # noqa: E402
+from docs.website.network import network_addresses  # noqa: E402
+from docs.website.pages import GENERATED  # noqa: E402
+from docs.website.study_tables import with_tables  # noqa: E402
 
 _LOG = logging.getLogger("mkdocs.hooks.beampose")
 
