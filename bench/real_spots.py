@@ -26,8 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
-from lab.detect.inputs import open_inputs
 from lab.detect.picture_series import PictureSeries
+from lab.pictures.source import open_inputs, pictures, pictures_of_frames
+from lab.runs.frames.sensor_noise import noise_frames
 from tracking.detections import Detections
 from tracking.parameters import DetectParameters
 
@@ -234,8 +235,8 @@ def search(folder: Path) -> list[Detections]:
     """The spots of each picture of a folder, as `beampose detect` finds them."""
     inputs = open_inputs([folder])
     series = PictureSeries(inputs.camera, str(folder), DetectParameters())
-    series.estimate_noise(list(inputs.noise_pictures()))
-    return [series.search(frame, picture)[0] for frame, picture in inputs.pictures(1)]
+    series.estimate_noise(list(pictures_of_frames(inputs, noise_frames(inputs)).values()))
+    return [series.search(frame, picture)[0] for frame, picture in pictures(inputs)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -89,7 +89,7 @@ class PointReader:
         self._scene = scene
         self.cameras = tuple(scene.rig.cameras)
         self.expected_frames = len(scene)
-        self.listings: dict[str, object] = {}
+        self.sources: dict[str, object] = {}
         self.notes: list[str] = []
 
     def __iter__(self) -> Iterator[FrameSet]:

@@ -22,8 +22,8 @@ from typing import Any
 from lab.cycle_search import search_rarely
 
 STAGES = (
-    ("decode", "lab.runs.frames.frame_sources", "read_picture"),
-    ("decode", "lab.runs.frames.frame_sources", "VideoSource._next"),
+    ("decode", "lab.pictures.source", "read_picture"),
+    ("decode", "lab.pictures.source", "_VideoReader._read"),
     ("detect", "lab.runs.frames.pipeline", "Pipeline._detect"),
     ("track", "tracking.rigid_body.rigid_tracker", "RigidTracker.step"),
     ("smooth", "lab.runs.smoothing_pass", "smooth"),

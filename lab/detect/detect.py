@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from lab.detect.contact_sheet import ContactSheet
-from lab.detect.inputs import PictureFiles, Video, open_inputs
 from lab.detect.picture_series import PictureSeries
 from lab.errors import InputError
 from lab.files.run.parameter_overrides import with_overrides
@@ -22,6 +21,8 @@ from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import csv_word
 from lab.files.text.json_text import has_schema, write_json
 from lab.pictures.picture_file import MissingPicture
+from lab.pictures.source import PictureSource, Video, open_inputs, pictures, pictures_of_frames
+from lab.runs.frames.sensor_noise import noise_frames
 from lab.runs.tables import detection_rows
 from lab.versions import versions
 from tracking.parameters import DetectParameters, TrackerParameters
@@ -91,7 +92,8 @@ def detect_pictures(
     source = str(inputs.path if isinstance(inputs, Video) else given[0] if len(given) == 1 else f"{len(given)} files")
     series = PictureSeries(inputs.camera, source, parameters, notes=list(inputs.notes))
     with atomic_folder(out, may_replace=are_detections) as folder:
-        series.estimate_noise([p for p in inputs.noise_pictures() if not isinstance(p, MissingPicture)])
+        first = pictures_of_frames(inputs, noise_frames(inputs)).values()
+        series.estimate_noise([p for p in first if not isinstance(p, MissingPicture)])
         sheet = ContactSheet(_total(inputs, options))
         _search_all(inputs, series, sheet, folder / "detections.csv", options, progress)
         _add_notes(series)
@@ -110,7 +112,7 @@ def are_detections(folder: Path) -> bool:
 
 
 def _search_all(
-    inputs: PictureFiles | Video,
+    inputs: PictureSource,
     series: PictureSeries,
     sheet: ContactSheet,
     table: Path,
@@ -120,8 +122,8 @@ def _search_all(
     total, camera = _total(inputs, options), csv_word(series.camera)
     with table.open("w", encoding="utf-8", newline="") as file:
         file.write(",".join([*columns.DETECTIONS, columns.LIKENESS]) + "\n")
-        pictures = islice(inputs.pictures(options.every), options.limit)
-        for done, (frame, picture) in enumerate(pictures, start=1):
+        chosen = islice(pictures(inputs, every=options.every), options.limit)
+        for done, (frame, picture) in enumerate(chosen, start=1):
             if isinstance(picture, MissingPicture):
                 series.unreadable.setdefault(picture.reason, []).append(frame)
             else:
@@ -133,8 +135,8 @@ def _search_all(
                 progress(done, total)
 
 
-def _total(inputs: PictureFiles | Video, options: DetectOptions) -> int | None:
-    count = inputs.count(options.every)
+def _total(inputs: PictureSource, options: DetectOptions) -> int | None:
+    count = None if inputs.count is None else -(-inputs.count // options.every)
     return count if count is None or options.limit is None else min(count, options.limit)
 
 

@@ -1,4 +1,4 @@
-"""Decodes one picture file to grey, or gives the reason why it cannot be used.
+"""Decodes one picture file to grey or colour, or gives the reason why it cannot be used.
 
 The header is read first: a picture of another size than the rig's, or of an absurd size, is not decoded. Checksums are
 verified where a format has them. Libraries do not write about damage to standard error.
@@ -11,7 +11,7 @@ import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias, cast
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ _MAX_PADDING_BYTES = 16  # bytes that some cameras add before the end of a JPEG;
 _LARGE_BYTES = 1 << 26  # bytes: a larger file is mapped, not read, since its header may show that it is unusable
 
 GreyPicture: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]  # (h, w), DN
+ColourPicture: TypeAlias = NDArray[np.uint8]  # (h, w, 3), BGR
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,16 +36,32 @@ class MissingPicture:
     reason: str  # "dropped", "unreadable: ...", "wrong size ..."
 
 
-def read_picture(path: Path, size_px: tuple[int, int] | None) -> GreyPicture | MissingPicture:
+def read_picture(path: Path, size_px: tuple[int, int] | None, colour: bool = False) -> Any:
     """The picture in a file as grey (h, w), 8 or 16 bit; Missing where it is damaged or has another (width, height).
 
-    size_px None: any size. The caller owns the array. Thread-safe.
+    size_px None: any size. colour: (h, w, 3), BGR, 8 bits, instead; a grey picture has three equal channels. The caller
+    owns the array. Thread-safe.
     """
     try:
         data = _content(path)
     except OSError as error:
         return MissingPicture(f"{UNREADABLE}: {error.strerror}")
-    return _decoded(data, size_px)
+    grey = _decoded(data, size_px)  # its checks find damage that OpenCV passes over
+    if not colour or isinstance(grey, MissingPicture):
+        return grey
+    cv2 = load_cv2()
+    picture = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return MissingPicture(f"{UNREADABLE}: damaged, or no picture") if picture is None else picture
+
+
+def as_colour(picture: NDArray[Any]) -> ColourPicture:
+    """A picture of 8 or 16 bits, grey or BGR, as (h, w, 3), BGR, 8 bits."""
+    cv2 = load_cv2()
+    if picture.dtype == np.uint16:
+        picture = (picture >> 8).astype(np.uint8)
+    if picture.ndim == 2 or picture.shape[2] == 1:
+        return cast(ColourPicture, cv2.cvtColor(picture.reshape(picture.shape[:2]), cv2.COLOR_GRAY2BGR))
+    return cast(ColourPicture, picture[..., :3])
 
 
 def decode(data: bytes, size_px: tuple[int, int] | None) -> GreyPicture | MissingPicture:

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array
-from lab.detect.inputs import open_inputs
 from lab.errors import RunError
 from lab.pictures.picture_file import MissingPicture
+from lab.pictures.source import open_inputs
 from lab.report.plot.image import grey_limits, stretched
-from lab.targets.recording import DEFAULT_RATE_HZ, grey_frames
+from lab.targets.recording import DEFAULT_RATE_HZ, every_frame
 from lab.targets.target import F, Target, Track
 from tracking.statuses import PoseStatus
 
@@ -42,7 +42,7 @@ def write_overlay(target: Target[F], track: Track[F], folder: Path) -> None:
         raise RunError(f"{target.overlay_name}: OpenCV cannot write such a video here; leave the video out")
     limits: tuple[float, float] | None = None
     try:
-        frames = grey_frames(open_inputs([recording.path]), target.options.limit)
+        frames = every_frame(open_inputs([recording.path]), target.options.limit)
         for k, (_, picture) in enumerate(frames):
             grey: NDArray[np.uint8] = np.zeros((height, width), np.uint8)
             if not isinstance(picture, MissingPicture):

@@ -14,19 +14,19 @@ import numpy as np
 
 from calibration.findings import Finding, Level
 from geometry.arrays import Array
-from lab.detect.inputs import PictureFiles, Video, open_inputs
 from lab.errors import InputError
 from lab.files.run.parameter_overrides import with_overrides
 from lab.files.text.csv_text import number_fields
 from lab.number_format import format_number, format_percent
 from lab.pictures.picture_file import MissingPicture
+from lab.pictures.source import PictureSource, open_inputs, pictures_of_frames
 from lab.report.calibration.calibration_page import Section
 from lab.report.plot.axes import VERMILLION, histogram
 from lab.report.plot.series import Line
-from lab.runs.frames.sensor_noise import CameraNoise
+from lab.runs.frames.sensor_noise import CameraNoise, noise_frames
 from lab.targets.page import TimeAxis
-from lab.targets.recording import Progress, colour_frames, grey_frames, header_rate, read_pictures, read_points
-from lab.targets.target import Codes, Target, Track, TrackOptions
+from lab.targets.recording import Progress, every_frame, read_pictures, read_points
+from lab.targets.target import Codes, Target, Track, TrackOptions, header_rate
 from lab.targets.verdict import some_frames
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import DetectParameters
@@ -178,9 +178,9 @@ class PointTarget(Target[PointFrame]):
                 raise InputError(f"--camera: expected a table with a column camera, got {path}; leave the option out")
             inputs = open_inputs([path])
             search = self._search(inputs)
-            frames_of: Any = colour_frames if isinstance(search, _ColourSearch) else grey_frames
+            frames = every_frame(inputs, options.limit, colour=isinstance(search, _ColourSearch))
             recording, found, detection_s = read_pictures(
-                inputs, path, frames_of(inputs, limit=options.limit),
+                inputs, path, frames,
                 lambda picture: None if picture is None else search(picture), options.rate_hz or header_rate(inputs),
                 limit=options.limit, progress=progress,
             )  # fmt: skip
@@ -197,7 +197,7 @@ class PointTarget(Target[PointFrame]):
         together = zip(track, found, _events(track), strict=True)
         return Track(recording, [PointFrame(*each) for each in together], tracking_s)
 
-    def _search(self, inputs: PictureFiles | Video) -> Callable[[Any], Detections]:
+    def _search(self, inputs: PictureSource) -> Callable[[Any], Detections]:
         if self.detector == COLOUR:
             return _ColourSearch(hue_named(self.options.colour), self.settings.blobs)
         if self.options.colour is not None:
@@ -205,7 +205,8 @@ class PointTarget(Target[PointFrame]):
         if self.detector != "spots":
             return partial(find_blobs, parameters=self.settings.blobs)
         noise = CameraNoise(inputs.camera)
-        noise.estimate_from([p for p in inputs.noise_pictures() if not isinstance(p, MissingPicture)])
+        first = pictures_of_frames(inputs, noise_frames(inputs)).values()
+        noise.estimate_from([p for p in first if not isinstance(p, MissingPicture)])
         return partial(noise.detect, parameters=self.settings.detect)
 
     def row(self, track: Track[PointFrame], k: int) -> list[object]:

@@ -4,32 +4,27 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from geometry.arrays import Array, Ints
-from lab.detect.inputs import PictureFiles, Video
 from lab.errors import InputError
 from lab.files.run.detections_file import is_too_sparse, read_detections
 from lab.files.text.csv_text import read_table
 from lab.files.text.error_text import name_of_path
-from lab.pictures.colour import ColourPicture, colour_of, read_colour
-from lab.pictures.opencv import load_cv2
-from lab.pictures.picture_file import DROPPED, UNREADABLE, GreyPicture, MissingPicture
-from lab.runs.frames.frame_sources import Grabbed, open_video
+from lab.pictures.picture_file import DROPPED, MissingPicture
+from lab.pictures.source import PictureFiles, PictureSource, Video, pictures
 from tracking.detections import Detections
 
 DEFAULT_RATE_HZ = 25.0  # of a folder of pictures, whose rate is not known
-RATE_RANGE_HZ = (0.01, 1e6)  # a rate outside it in a video's header is not one
 _COMPLETE_SHARE = 0.98  # of the pictures that a video's header states
 
 Progress = Callable[[int, int | None], None]  # pictures done, total number of pictures where known
-Inputs = PictureFiles | Video
 Looked = TypeVar("Looked")
 P = TypeVar("P", bound=np.ndarray)
 
@@ -60,67 +55,23 @@ class Recording:
         return np.diff(self.t_s, prepend=self.t_s[0]) * self.rate_hz
 
 
-def header_rate(inputs: Inputs) -> float | None:
-    """The frame rate in a video's header, Hz; None where there is none."""
-    if not isinstance(inputs, Video):
-        return None
-    capture = open_video(inputs.path)
-    rate = float(capture.get(load_cv2().CAP_PROP_FPS))
-    capture.release()
-    return rate if RATE_RANGE_HZ[0] <= rate <= RATE_RANGE_HZ[1] else None
+def every_frame(source: PictureSource, limit: int | None = None, *, colour: bool = False) -> Iterator[tuple[int, Any]]:
+    """All frame numbers from the first to the last with their pictures; a gap in the numbers is dropped frames.
 
+    limit: of the pictures. colour: as for `pictures`. Pictures of another size than the first are missing: their pixels
+    would not be comparable.
 
-def _colour_picture(grabbed: Grabbed, size_px: tuple[int, int] | None) -> ColourPicture | MissingPicture:
-    """The picture that a capture has grabbed, in colour."""
-    decoded, picture = grabbed.retrieve()
-    usable = decoded and picture is not None
-    return colour_of(picture, size_px) if usable else MissingPicture(f"{UNREADABLE}: damaged")
-
-
-def _in_colour(
-    inputs: Inputs, size_px: tuple[int, int] | None, wanted: Collection[int] | None
-) -> Iterator[tuple[int, ColourPicture | MissingPicture]]:
-    """All pictures with their frame numbers, (h, w, 3), BGR, 8 bits."""
-    unread = MissingPicture("not read")
-    if isinstance(inputs, PictureFiles):
-        for number, path in inputs.files:
-            yield number, read_colour(path, size_px) if wanted is None or number in wanted else unread
-        return
-    capture = open_video(inputs.path, colour=True)
-    try:
-        number = 0
-        while capture.grab():
-            yield number, _colour_picture(capture, size_px) if wanted is None or number in wanted else unread
-            number += 1
-    finally:
-        capture.release()
-
-
-def grey_frames(inputs: Inputs, limit: int | None = None) -> Iterator[tuple[int, GreyPicture | MissingPicture]]:
-    """All frame numbers from the first to the last with their pictures, as `_every_frame`; limit: of the pictures."""
-    _require_frame_numbers(inputs, limit)
-    return _every_frame(islice(inputs.pictures(1), limit))
-
-
-def colour_frames(
-    inputs: Inputs,
-    size_px: tuple[int, int] | None = None,
-    wanted: Collection[int] | None = None,
-    limit: int | None = None,
-) -> Iterator[tuple[int, ColourPicture | MissingPicture]]:
-    """As `grey_frames`, in colour.
-
-    size_px: width and height of all pictures; None: those of the first. wanted: numbers of the frames that are needed;
-    the others are not read.
+    Raises:
+        InputError: the numbers in the names of the pictures are not those of frames.
     """
-    _require_frame_numbers(inputs, limit)
-    return _every_frame(islice(_in_colour(inputs, size_px, wanted), limit))
+    _require_frame_numbers(source, limit)
+    return _without_gaps(islice(pictures(source, colour=colour), limit))
 
 
-def _require_frame_numbers(inputs: Inputs, limit: int | None) -> None:
+def _require_frame_numbers(inputs: PictureSource, limit: int | None) -> None:
     """Raises InputError where the numbers in the names of the pictures are not those of frames."""
     if isinstance(inputs, PictureFiles):
-        numbers = [number for number, _ in inputs.files[:limit]]
+        numbers = list(inputs.files)[:limit]
         if is_too_sparse(numbers[-1] - numbers[0] + 1, len(numbers)):
             raise InputError(
                 f"{inputs.camera}: expected pictures numbered by frame, got {len(numbers)} with numbers from"
@@ -128,11 +79,7 @@ def _require_frame_numbers(inputs: Inputs, limit: int | None) -> None:
             )
 
 
-def _every_frame(pictures: Iterator[tuple[int, P | MissingPicture]]) -> Iterator[tuple[int, P | MissingPicture]]:
-    """All frame numbers from the first to the last; a gap in the numbers is dropped frames.
-
-    Pictures of another size than the first are missing: their pixels would not be comparable.
-    """
+def _without_gaps(pictures: Iterator[tuple[int, P | MissingPicture]]) -> Iterator[tuple[int, P | MissingPicture]]:
     last: int | None = None
     size: tuple[int, int] | None = None
     for number, picture in pictures:
@@ -149,7 +96,7 @@ def _every_frame(pictures: Iterator[tuple[int, P | MissingPicture]]) -> Iterator
 
 
 def read_pictures(
-    inputs: Inputs,
+    inputs: PictureSource,
     path: Path,
     frames: Iterator[tuple[int, P | MissingPicture]],
     look: Callable[[P | None], Looked],
@@ -161,7 +108,7 @@ def read_pictures(
 ) -> tuple[Recording, list[Looked], float]:
     """Look at every frame of a recording; with what was seen in each, and the process time of that, s.
 
-    frames: of `grey_frames` or `colour_frames`. look: gets the picture, or None where there is no usable one.
+    frames: of `every_frame`. look: gets the picture, or None where there is no usable one.
     smallest_px: least side of the pictures.
 
     Raises:
@@ -171,7 +118,7 @@ def read_pictures(
     looked: list[Looked] = []
     missing: Counter[str] = Counter()
     size: tuple[int, int] | None = None
-    stated, process_s = inputs.count(1), 0.0
+    stated, process_s = inputs.count, 0.0
     total = stated if limit is None or stated is None else min(stated, limit)
     for number, picture in frames:
         usable = None if isinstance(picture, MissingPicture) else picture

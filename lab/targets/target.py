@@ -13,10 +13,10 @@ import numpy as np
 
 from calibration.findings import Finding
 from geometry.arrays import Array, Bools
-from lab.detect.inputs import open_inputs
 from lab.pictures.picture_file import GreyPicture
+from lab.pictures.source import PictureSource, Video, open_inputs
 from lab.report.calibration.calibration_page import Section
-from lab.targets.recording import DEFAULT_RATE_HZ, Progress, Recording, grey_frames, header_rate, read_pictures
+from lab.targets.recording import DEFAULT_RATE_HZ, Progress, Recording, every_frame, read_pictures
 from tracking.statuses import Cause, PoseStatus
 
 LEAST_MEASURED = 0.5  # share of the frames; with less, the tracker may have followed something else in the others
@@ -180,13 +180,18 @@ def track_pictures(
     inputs = open_inputs([path])
     rate = options.rate_hz or header_rate(inputs)
     recording, frames, tracking_s = read_pictures(
-        inputs, path, grey_frames(inputs, options.limit), step, rate or DEFAULT_RATE_HZ, limit=options.limit,
+        inputs, path, every_frame(inputs, options.limit), step, rate or DEFAULT_RATE_HZ, limit=options.limit,
         smallest_px=_SMALLEST_SIDE_PX, progress=progress,
     )  # fmt: skip
     if rate is None:
         note = f"the frame rate is not stated: {DEFAULT_RATE_HZ:g} Hz assumed (--rate)"
         recording = replace(recording, notes=(*recording.notes, note))
     return Track(recording, frames, tracking_s)
+
+
+def header_rate(source: PictureSource) -> float | None:
+    """The frame rate in a video's header, Hz; None where there is none."""
+    return source.rate_hz if isinstance(source, Video) else None
 
 
 def texts(values: Iterable[float], decimals: int = 4) -> list[str]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lab.errors import InputError
 from lab.pictures.opencv import load_cv2, opened
 from lab.pictures.picture_file import UNREADABLE, MissingPicture, read_picture
-from lab.runs.frames.frame_sources import retrieved
+from lab.pictures.source import retrieved
 from lab.watch.frame_clock import FolderPoll, FrameClock
 from lab.watch.inbox import Inbox
 

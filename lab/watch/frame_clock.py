@@ -9,7 +9,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lab.runs.frames.frame_sources import number_of
+from lab.pictures.source import number_of
 
 # Frame numbers for the pictures of a device without any: counted, and checked against the clock.
 

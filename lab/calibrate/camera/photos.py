@@ -16,15 +16,8 @@ from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Board, Chessboard
 from calibration.boards.board_view import QUICK_SEARCH_FAILED, BoardView, GreyImage, NotFound
 from lab.errors import InputError
-from lab.pictures.opencv import load_cv2, opened
-from lab.pictures.picture_file import (
-    PICTURE_SUFFIXES,
-    UNREADABLE,
-    GreyPicture,
-    MissingPicture,
-    read_picture,
-    require_format,
-)
+from lab.pictures.picture_file import PICTURE_SUFFIXES, UNREADABLE, GreyPicture, MissingPicture, read_picture
+from lab.pictures.source import pictures, video_at
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm")
 VIDEO_PICTURES = 120  # largest number of frames used of one video, evenly spaced: neighbouring frames differ little
@@ -210,32 +203,20 @@ def _pictures(
 def _frame_count(path: Path) -> int:
     if path.suffix.lower() not in VIDEO_SUFFIXES:
         return 1
-    cv2 = load_cv2()
-    video = opened(str(path))
-    count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-    video.release()
-    return min(max(count, 1), VIDEO_PICTURES)
+    try:
+        return min(video_at(path).count or 1, VIDEO_PICTURES)
+    except InputError:
+        return 1
 
 
 def _frames(path: Path) -> Iterator[tuple[int, GreyPicture | MissingPicture]]:
     """Evenly spaced frames of a video with their numbers."""
-    cv2 = load_cv2()
-    video = opened(str(path))
     try:
-        count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-        step = max(1, -(-count // VIDEO_PICTURES))
-        number = 0
-        while video.grab():
-            if number % step == 0:
-                good, frame = video.retrieve()
-                if good:
-                    grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-                    yield number, require_format(grey, None)
-            number += 1
-        if number == 0:
-            yield 0, MissingPicture("unreadable: not a video, or in a format that OpenCV cannot decode")
-    finally:
-        video.release()
+        video = video_at(path)
+    except InputError:
+        yield 0, MissingPicture(f"{UNREADABLE}: not a video, or in a format that OpenCV cannot decode")
+        return
+    yield from pictures(video, every=max(1, -(-(video.count or 0) // VIDEO_PICTURES)))
 
 
 def most_frequent_reason(refused: Sequence[tuple[str, str]]) -> str:

@@ -26,6 +26,7 @@ from lab.files.text.atomic_write import atomic_folder, check_output_folder, keep
 from lab.files.text.csv_text import write_table
 from lab.files.text.error_text import suggest_name
 from lab.number_format import format_length, format_number
+from lab.pictures.source import number_of
 from lab.report.calibration.calibration_page import (
     CalibrationReport,
     PageTable,
@@ -33,7 +34,6 @@ from lab.report.calibration.calibration_page import (
     provenance,
     write_calibration_report,
 )
-from lab.runs.frames.frame_sources import number_of
 from tracking.binocular.marker_model import StereoPair, calibration_jacobian, project
 
 # Findings of a pair's calibration, and the uncertainty of distances that it leaves.

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,8 +27,8 @@ from lab.files.run.results import (
 from lab.files.run.run_file import FramesFolder, Run, VideoFile, load_run
 from lab.files.text.error_text import name_of_path
 from lab.pictures.picture_file import DROPPED, GreyPicture, MissingPicture
-from lab.runs.frames.frame_sources import FolderSource, Requested, VideoSource, list_folder, result_of
-from lab.runs.frames.frames import Picture
+from lab.pictures.source import pictures
+from lab.runs.frames.frames import Picture, recorded_pictures
 from tracking.detections import Detections
 from tracking.statuses import PoseStatus, SpotStatus
 
@@ -210,9 +208,9 @@ class FrameContent:
 
 
 def frame_content(
-    data: ResultData, index: int, pictures: dict[str, Picture], cameras: list[str], tail: int = 0
+    data: ResultData, index: int, shown_by: Mapping[str, Picture], cameras: list[str], tail: int = 0
 ) -> FrameContent:
-    """What is drawn of the frame with this index. pictures: by camera. tail: frames of each spot's past."""
+    """What is drawn of the frame with this index. shown_by: by camera. tail: frames of each spot's past."""
     poses = data.poses
     code = int(poses.status[index])
     near = index if poses.known[index] else _nearest_known(poses, index)
@@ -220,7 +218,7 @@ def frame_content(
     shown = []
     for camera in cameras:
         views = data.views_of(camera)
-        picture = pictures.get(camera)
+        picture = shown_by.get(camera)
         grey = picture if isinstance(picture, np.ndarray) else None
         table = data.detections.get(camera)
         shown.append(
@@ -352,63 +350,23 @@ def _beam(data: ResultData, j: int, world_from_body: Pose) -> Array:
 # The pictures of several frames, one after the other, with a few read ahead.
 
 
-_AHEAD = 4  # frames that are read while earlier ones are drawn
-_THREADS = 2
-
-
 def pictures_of(run: Run | None, cameras: Sequence[str], frames: Sequence[int]) -> Iterator[dict[str, Picture]]:
     """For each of the rising frame numbers the pictures of the cameras; those of points are left out.
 
     A camera whose pictures cannot be opened has none, with the reason. Memory does not grow with the number of frames.
     """
     with ExitStack() as stack:
-        pool = stack.enter_context(ThreadPoolExecutor(_THREADS))
-        sources: dict[str, FolderSource | _Skipping | MissingPicture] = {}
+        streams: dict[str, Iterator[tuple[int, Picture]]] = {}
         for camera in cameras if run is not None else ():
             source = run.cameras.get(camera) if run is not None else None
             if run is None or not isinstance(source, FramesFolder | VideoFile):
                 continue
-            size_px = run.rig.cameras[camera].image_size_px
             try:
-                if isinstance(source, FramesFolder):
-                    sources[camera] = FolderSource(list_folder(source.path), size_px)
-                else:
-                    video = VideoSource(source.path, size_px)
-                    stack.callback(video.close)
-                    sources[camera] = _Skipping(video)
+                opened, size_px = recorded_pictures(camera, source), run.rig.cameras[camera].image_size_px
+                streams[camera] = stack.enter_context(closing(pictures(opened, size_px, wanted=frames)))
             except BeamposeError as error:
-                sources[camera] = MissingPicture(str(error))
-        waiting: deque[dict[str, Requested]] = deque()
-        following = iter(frames)
-        while True:
-            while len(waiting) < _AHEAD and (frame := next(following, None)) is not None:
-                waiting.append(
-                    {
-                        camera: source if isinstance(source, MissingPicture) else source.request(frame, pool)
-                        for camera, source in sources.items()
-                    }
-                )
-            if not waiting:
-                return
-            got = {camera: result_of(later) for camera, later in waiting.popleft().items()}
-            yield {camera: MissingPicture(DROPPED) if p is None else p for camera, p in got.items()}
-
-
-class _Skipping:
-    """A video of which only some pictures are used; they are decoded when requested."""
-
-    def __init__(self, video: VideoSource) -> None:
-        self._video = video
-        self._at = 0
-
-    def request(self, frame: int, pool: ThreadPoolExecutor) -> Requested:
-        """The picture of a frame; frames are requested in rising order."""
-        while self._at < frame and self._video.skip():
-            self._at += 1
-        if self._at != frame:
-            return MissingPicture(DROPPED)
-        self._at += 1
-        picture = self._video.next_picture()
-        if picture is None or isinstance(picture, MissingPicture):
-            return MissingPicture(DROPPED) if picture is None else picture
-        return picture.copy()  # the array may be the capture's own buffer, which the next picture overwrites
+                reason = MissingPicture(str(error))
+                streams[camera] = iter([(frame, reason) for frame in frames])
+        for frame in frames:
+            ended = (frame, MissingPicture(DROPPED))
+            yield {camera: next(stream, ended)[1] for camera, stream in streams.items()}

@@ -268,13 +268,13 @@ def _threads(most: int) -> Iterator[None]:
     """Pictures are decoded and filtered by at most so many threads in this block."""
     import cv2
 
-    from lab.runs.frames import frames
+    from lab.pictures import source
 
-    before: tuple[Any, ...] = cv2.getNumThreads(), frames.THREADS
+    before: tuple[Any, ...] = cv2.getNumThreads(), source.THREADS
     cv2.setNumThreads(most)
-    frames.THREADS = min(frames.THREADS, most)
+    source.THREADS = min(source.THREADS, most)
     try:
         yield
     finally:
         cv2.setNumThreads(before[0])
-        frames.THREADS = before[1]
+        source.THREADS = before[1]

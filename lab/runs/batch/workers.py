@@ -117,10 +117,10 @@ def _limited_threads(threads: int) -> Iterator[None]:
 
 def _prepare(threads: int) -> None:
     """Prepares a new worker process."""
-    from lab.runs.frames import frames
+    from lab.pictures import source
 
     search_rarely()
-    frames.THREADS = min(frames.THREADS, threads)
+    source.THREADS = min(source.THREADS, threads)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent decides
     signal.signal(signal.SIGTERM, _end)
     threading.Thread(target=_end_with_parent, daemon=True).start()

@@ -2,39 +2,26 @@
 
 from __future__ import annotations
 
-import os
-from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from geometry.arrays import Bools, Ints
 from lab.errors import InputError
 from lab.files.run.detections_file import CameraPoints, DetectionsFile, is_too_sparse, read_detections, stray_frames
-from lab.files.run.run_file import DetectionsTable, FramesFolder, LiveDevice, Run, VideoFile
+from lab.files.run.run_file import FramesFolder, LiveDevice, Run, VideoFile
 from lab.files.text.error_text import suggest_name
-from lab.pictures.picture_file import DROPPED, MissingPicture
-from lab.runs.frames.frame_sources import (
-    FolderListing,
-    FolderSource,
-    Picture,
-    Requested,
-    Source,
-    TableSource,
-    VideoSource,
-    header_picture_count,
-    list_folder,
-    result_of,
-)
+from lab.pictures.picture_file import DROPPED, UNREADABLE, GreyPicture, MissingPicture
+from lab.pictures.source import PictureFiles, PictureSource, Video, list_folder, pictures, pictures_of_frames, video_at
+from tracking.detections import Detections
 
-__all__ = ["FrameReader", "FrameSet", "MissingPicture", "Picture", "open_frames", "pictures_at"]
+Picture: TypeAlias = GreyPicture | Detections | MissingPicture
 
-AHEAD = 8  # frames read before they are requested: 21 MB for two 1280x1024 cameras, whatever the run's length
-THREADS = min(4, os.cpu_count() or 1)  # pictures decoded at once
 BEYOND_PX = 32.0  # a fit may put the centre of a spot at the edge outside the picture, but never farther than this
 NAMED = 5  # frames that a note names for each kind of problem
 
@@ -58,23 +45,20 @@ class _MissingFrames:
 class FrameReader:
     """Iterates over all frame numbers from the first to the last of any camera. It can be iterated repeatedly.
 
-    Pictures are read and decoded in threads; at most `AHEAD` frames are in flight.
+    Pictures are read and decoded ahead in threads (lab/pictures/source.py).
     """
 
     def __init__(self, run: Run) -> None:
         self._run = run
-        self._listings: dict[str, FolderListing] = {}
+        self._sources: dict[str, PictureSource] = {}
         self._tables: dict[str, DetectionsFile] = {}
         self._notes: list[str] = []
         self._missing: dict[tuple[str, str], _MissingFrames] = {}  # by camera and reason
         self._ended: dict[str, str] = {}
-        self._stated_counts: dict[str, int | None] = {}
         opened: dict[Path, DetectionsFile] = {}
         for name, source in run.cameras.items():
-            if isinstance(source, FramesFolder):
-                self._listings[name] = list_folder(source.path)
-            elif isinstance(source, VideoFile):
-                self._stated_counts[name] = header_picture_count(source.path)
+            if isinstance(source, FramesFolder | VideoFile):
+                self._sources[name] = recorded_pictures(name, source)
             elif isinstance(source, LiveDevice):
                 raise InputError(
                     f"{run.path}: cameras.{name}.device: expected recorded frames or detections, got a live camera; use"
@@ -95,14 +79,22 @@ class FrameReader:
         return tuple(self._run.cameras)
 
     @property
-    def listings(self) -> Mapping[str, FolderListing]:
-        """The folders' pictures, by camera."""
-        return self._listings
+    def sources(self) -> Mapping[str, PictureSource]:
+        """The pictures of the cameras that have some."""
+        return self._sources
+
+    @property
+    def _folders(self) -> list[PictureFiles]:
+        return [s for s in self._sources.values() if isinstance(s, PictureFiles)]
+
+    @property
+    def _videos(self) -> dict[str, Video]:
+        return {name: s for name, s in self._sources.items() if isinstance(s, Video)}
 
     @property
     def expected_frames(self) -> int | None:
         """Number of frame numbers, for videos by their headers; None where unknown."""
-        counts = list(self._stated_counts.values())
+        counts = [video.count for video in self._videos.values()]
         if None in counts:
             return None
         ends = [n - 1 for n in counts if n is not None] + ([] if self.last is None else [self.last])
@@ -121,59 +113,46 @@ class FrameReader:
 
     def __iter__(self) -> Iterator[FrameSet]:
         self._missing, self._ended = {}, {}
+        videos = self._videos
         with ExitStack() as stack:
-            pool = ThreadPoolExecutor(THREADS, thread_name_prefix="decode")
-            stack.callback(pool.shutdown, cancel_futures=True)
-            sources = {}
-            for name in self._run.cameras:
-                sources[name] = self._open(name)
-                stack.callback(sources[name].close)
-            in_flight: deque[tuple[int, dict[str, Requested]]] = deque()
-            following = self.first
-            while True:
-                while len(in_flight) < AHEAD and (self._stated_counts or self.last is None or following <= self.last):
-                    in_flight.append((following, {name: s.request(following, pool) for name, s in sources.items()}))
-                    following += 1
-                if not in_flight:
+            streams = {name: stack.enter_context(closing(self._stream(name))) for name in self._run.cameras}
+            for frame in count(self.first):
+                if not videos and self.last is not None and frame > self.last:
                     return
-                frame, waiting = in_flight.popleft()
-                got = {name: result_of(w) for name, w in waiting.items()}
-                ended = [name for name, picture in got.items() if picture is None]
+                got = {name: next(stream, None) for name, stream in streams.items()}
+                ended = [name for name in videos if got[name] is None]
                 self._note_ends(ended, frame)
-                if len(ended) == len(self._stated_counts) and (self.last is None or frame > self.last):
+                if len(ended) == len(videos) and (self.last is None or frame > self.last):
                     return
-                images = {
-                    name: MissingPicture(DROPPED) if picture is None else picture for name, picture in got.items()
-                }
+                images = {name: MissingPicture(DROPPED) if one is None else one[1] for name, one in got.items()}
                 self._count(frame, images)
                 yield FrameSet(frame, images)
 
-    def _open(self, name: str) -> Source:
-        size_px = self._run.rig.cameras[name].image_size_px
-        source = self._run.cameras[name]
-        if isinstance(source, FramesFolder):
-            return FolderSource(self._listings[name], size_px)
-        if isinstance(source, VideoFile):
-            return VideoSource(source.path, size_px)
-        table = self._tables[name]
-        return TableSource(table.cameras.get(name), table.first, table.last)
+    def _stream(self, name: str) -> Generator[tuple[int, Any], None, None]:
+        """One camera's pictures or points from the first frame on; they end with a video."""
+        last = None if self._videos else self.last
+        numbers = count(self.first) if last is None else range(self.first, last + 1)
+        if name in self._sources:
+            size_px = self._run.rig.cameras[name].image_size_px
+            return pictures(self._sources[name], size_px, wanted=numbers)
+        return ((frame, _points_at(self._tables[name], name, frame)) for frame in numbers)
 
     def _span(self) -> tuple[int, int | None]:
         """First and last frame number; the last as far as it is known without reading videos to their end."""
-        firsts = [int(v.numbers[0]) for v in self._listings.values()] + [t.first for t in self._tables.values()]
-        lasts = [int(v.numbers[-1]) for v in self._listings.values()] + [t.last for t in self._tables.values()]
-        if self._stated_counts:
+        firsts = [int(v.numbers[0]) for v in self._folders] + [t.first for t in self._tables.values()]
+        lasts = [int(v.numbers[-1]) for v in self._folders] + [t.last for t in self._tables.values()]
+        if self._videos:
             firsts.append(0)
         return min(firsts), max(lasts) if lasts else None
 
     def _check_density(self) -> None:
         if self.last is None:
             return
-        pictures = sum(len(v.names) for v in self._listings.values())
+        pictures = sum(v.count for v in self._folders)
         pictures += sum(len(c.frames) for t in self._tables.values() for c in t.cameras.values())
         if is_too_sparse(self.last - self.first + 1, pictures):
-            stray = "file" if self._listings else "row"
-            holders = "names" if self._listings else "frame numbers"
+            stray = "file" if self._folders else "row"
+            holders = "names" if self._folders else "frame numbers"
             raise InputError(
                 f"{self._run.path}: cameras: expected frame numbers without gaps of many thousands, got {pictures}"
                 f" pictures between frame {self.first} and frame {self.last}; is a stray {stray} among them, or do the"
@@ -183,21 +162,21 @@ class FrameReader:
 
     def _check_strays(self) -> None:
         """Raises InputError for a few pictures with numbers far from all others. (Tables omit such rows.)"""
-        everything: list[Ints] = [v.numbers for v in self._listings.values()]
+        everything: list[Ints] = [v.numbers for v in self._folders]
         everything += [c.frames for t in self._tables.values() for c in t.cameras.values()]
         numbers = np.unique(np.concatenate(everything)) if everything else np.empty(0, np.int64)
         strays = stray_frames(numbers)
-        for listing in self._listings.values():
+        for folder in self._folders:
             for number in numbers[strays].tolist():
-                if number in listing.names:
+                if number in folder.files:
                     others = numbers[~strays]
                     raise InputError(
-                        f"{listing.folder / listing.names[number]}: expected frame numbers without a long gap, got"
+                        f"{folder.files[number]}: expected frame numbers without a long gap, got"
                         f" {number}, where the others are {others[0]} to {others[-1]}; is it a stray file? Remove it"
                     )
 
     def _check_times(self) -> None:
-        with_picture: list[Ints] = [v.numbers for v in self._listings.values()]
+        with_picture: list[Ints] = [v.numbers for v in self._folders]
         with_picture += [c.frames for t in self._tables.values() for c in t.cameras.values()]
         if not with_picture:
             return
@@ -269,10 +248,9 @@ class FrameReader:
 
     def _note_ends(self, ended: Sequence[str], frame: int) -> None:
         for name in ended:
-            stated = self._stated_counts[name]
-            if name not in self._ended and stated is not None and frame < stated:
-                source = self._run.cameras[name]
-                self._ended[name] = f"{source.path}: ended after {frame} pictures; its header states {stated}"
+            video = self._videos[name]
+            if name not in self._ended and video.count is not None and frame < video.count:
+                self._ended[name] = f"{video.path}: ended after {frame} pictures; its header states {video.count}"
 
     def _count(self, frame: int, images: Mapping[str, Picture]) -> None:
         for camera, picture in images.items():
@@ -293,34 +271,35 @@ def open_frames(run: Run) -> FrameReader:
     return FrameReader(run)
 
 
-def pictures_at(run: Run, camera: str, frames: Sequence[int]) -> dict[int, Picture]:
+def recorded_pictures(camera: str, source: FramesFolder | VideoFile) -> PictureSource:
+    """The pictures that run.yaml names for a camera. Raises InputError."""
+    return video_at(source.path, camera) if isinstance(source, VideoFile) else list_folder(source.path, camera)
+
+
+def pictures_at(run: Run, camera: str, frames: Sequence[int]) -> Mapping[int, Picture]:
     """Some pictures of one camera, by frame number.
 
     A video is read from its start, so all pictures should be requested in one call.
     """
-    wanted = sorted(set(frames))
-    source, size_px = run.cameras[camera], run.rig.cameras[camera].image_size_px
-    out: dict[int, Picture] = {}
-    with ExitStack() as stack:
-        if isinstance(source, VideoFile):
-            video = VideoSource(source.path, size_px)
-            stack.callback(video.close)
-            at = 0
-            for frame in wanted:
-                while at < frame and video.skip():
-                    at += 1
-                shown = video.next_picture() if at == frame else None
-                at += 1
-                out[frame] = MissingPicture(DROPPED) if shown is None else shown
-        elif isinstance(source, DetectionsTable):
-            out = dict.fromkeys(wanted, MissingPicture("no pictures: detected points"))
-        elif isinstance(source, LiveDevice):
-            out = dict.fromkeys(wanted, MissingPicture("no pictures: a live camera"))
-        else:
-            folder = FolderSource(list_folder(source.path), size_px)
-            pool = stack.enter_context(ThreadPoolExecutor(THREADS))
-            requested = {frame: folder.request(frame, pool) for frame in wanted}
-            for frame, later in requested.items():
-                picture = result_of(later)
-                out[frame] = MissingPicture(DROPPED) if picture is None else picture
-    return out
+    source = run.cameras[camera]
+    if isinstance(source, FramesFolder | VideoFile):
+        size_px = run.rig.cameras[camera].image_size_px
+        return pictures_of_frames(recorded_pictures(camera, source), frames, size_px)
+    kind = "a live camera" if isinstance(source, LiveDevice) else "detected points"
+    return dict.fromkeys(sorted(set(frames)), MissingPicture(f"no pictures: {kind}"))
+
+
+def _points_at(table: DetectionsFile, camera: str, frame: int) -> Detections | MissingPicture:
+    """Points that another program, or an earlier run, has detected in a frame.
+
+    Within the file's range, a frame without rows is a picture without points; a frame whose rows are all invalid is a
+    picture that cannot be read.
+    """
+    if not table.first <= frame <= table.last:
+        return MissingPicture(DROPPED)
+    points = table.cameras.get(camera)  # None: no row of this camera
+    if points is None:
+        return Detections.none()
+    if points.has_only_unusable_rows(frame):
+        return MissingPicture(f"{UNREADABLE}: no row of it can be used")
+    return points.at(frame)

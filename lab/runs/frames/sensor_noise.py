@@ -11,8 +11,9 @@ import numpy as np
 
 from geometry.arrays import evenly_spread
 from geometry.camera import SensorNoise
-from lab.files.run.run_file import DetectionsTable, FramesFolder, Run
-from lab.runs.frames.frames import FrameReader, pictures_at
+from lab.files.run.run_file import Run
+from lab.pictures.source import PictureFiles, PictureSource, pictures_of_frames
+from lab.runs.frames.frames import FrameReader
 from tracking.background.estimation import PICTURES, static_background
 from tracking.background.static_background import StaticBackground
 from tracking.detection.detect import WIDE_PX, find_all_sizes, saturation_of
@@ -180,22 +181,18 @@ def camera_noises(run: Run, reader: FrameReader) -> dict[str, CameraNoise]:
     """Each camera's noise at the start of a run; cameras with tables of points have no entry."""
     out = {}
     for name, camera in run.rig.cameras.items():
-        if isinstance(run.cameras[name], DetectionsTable):
+        if name not in reader.sources:
             continue
         out[name] = CameraNoise(name, camera.noise)
-        if isinstance(run.cameras[name], FramesFolder):
-            numbers = reader.listings[name].numbers
-            wanted = [int(numbers[i]) for i in noise_estimation_frames(len(numbers))]
-        else:
-            wanted = list(VIDEO_PICTURES)
-        shown = pictures_at(run, name, wanted)
-        out[name].estimate_from([p for _, p in sorted(shown.items()) if isinstance(p, np.ndarray)])
+        source, size_px = reader.sources[name], camera.image_size_px
+        shown = pictures_of_frames(source, noise_frames(source), size_px)
+        out[name].estimate_from([p for p in shown.values() if isinstance(p, np.ndarray)])
         if out[name].shows_structure:
-            if isinstance(run.cameras[name], FramesFolder):
-                wanted = evenly_spread(numbers, PICTURES).tolist()
+            if isinstance(source, PictureFiles):
+                wanted = evenly_spread(source.numbers, PICTURES).tolist()
             else:
                 wanted = list(range(0, VIDEO_FRAMES, VIDEO_FRAMES // PICTURES))
-            shown |= pictures_at(run, name, [k for k in wanted if k not in shown])
+            shown |= pictures_of_frames(source, [k for k in wanted if k not in shown], size_px)
             spread = [shown[k] for k in wanted]
             out[name].make_background([p for p in spread if isinstance(p, np.ndarray)], run.tracker.detect)
     share_texture(list(out.values()))
@@ -222,6 +219,13 @@ def share_texture(cameras: Sequence[CameraNoise]) -> None:
         if camera.estimate is not None and not camera.estimate.texture_shift.known:
             share = camera.estimate.texture_shift.misfit_share
             camera.estimate = replace(camera.estimate, texture_shift=replace(finest, misfit_share=share))
+
+
+def noise_frames(source: PictureSource) -> list[int]:
+    """Numbers of the pictures from which the noise is estimated."""
+    if isinstance(source, PictureFiles):
+        return [int(source.numbers[i]) for i in noise_estimation_frames(source.count)]
+    return list(VIDEO_PICTURES)
 
 
 def noise_estimation_frames(pictures: int) -> list[int]:

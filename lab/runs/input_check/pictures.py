@@ -14,6 +14,7 @@ from lab.errors import InputError
 from lab.files.run.run_file import Run
 from lab.files.run.truth import largest_disagreement_px, load_run_truth
 from lab.pictures.picture_file import DROPPED, UNREADABLE, MissingPicture
+from lab.pictures.source import PictureFiles
 from lab.runs.frames.even_sampler import EvenSampler
 from lab.runs.frames.frames import FrameReader, FrameSet
 from lab.runs.input_check.findings import Findings, table
@@ -59,10 +60,12 @@ def check_pictures(
     findings.facts += ["", f"Pictures: frames {first} to {last}, {done} in all, {done / rate:.3f} s at {rate:g} Hz"]
     _describe_pictures(findings, run, seen)
     findings.remarks += reader.notes
-    for name, listing in reader.listings.items():
-        if listing.ignored:
-            some = ", ".join(listing.ignored[:3]) + (", ..." if len(listing.ignored) > 3 else "")
-            findings.remarks.append(f"{listing.folder}: {len(listing.ignored)} files of {name!r} are no frames: {some}")
+    for name, source in reader.sources.items():
+        if isinstance(source, PictureFiles) and source.ignored:
+            some = ", ".join(source.ignored[:3]) + (", ..." if len(source.ignored) > 3 else "")
+            findings.remarks.append(
+                f"{run.cameras[name].path}: {len(source.ignored)} files of {name!r} are no frames: {some}"
+            )
     _compare_cameras(findings, seen)
     frames = np.unique(np.concatenate([np.array(s.frames, dtype=np.int64) for s in seen.values()]))
     _check_times(findings, run, frames)

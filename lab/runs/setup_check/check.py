@@ -12,8 +12,8 @@ from geometry.camera import Camera
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.files.run.run_file import Run, VideoFile
+from lab.pictures.source import video_at
 from lab.runs.frames.even_sampler import EvenSampler
-from lab.runs.frames.frame_sources import header_rate_hz
 from lab.runs.verdict.run_statistics import RunStatistics
 from tracking.detections import Detections
 from tracking.setup_mistakes.evidence import LEAST_FITTING, LEAST_POINTS, Comparison, Frames, compare
@@ -108,7 +108,7 @@ def rates_of_videos(run: Run) -> tuple[Finding, ...]:
     """
     if run.times.frames is not None:
         return ()
-    rates = {n: header_rate_hz(source.path) for n, source in run.cameras.items() if isinstance(source, VideoFile)}
+    rates = {n: video_at(source.path).rate_hz for n, source in run.cameras.items() if isinstance(source, VideoFile)}
     return tuple(
         Finding(
             Level.WARN,

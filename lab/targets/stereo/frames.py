@@ -12,16 +12,14 @@ import cv2
 import numpy as np
 
 from geometry.arrays import Array
-from lab.detect.inputs import PictureFiles, Video
 from lab.errors import InputError
 from lab.files.run.detections_file import read_detections
-from lab.files.run.run_file import DetectionsTable, FramesFolder
-from lab.pictures.colour import ColourPicture
-from lab.pictures.picture_file import DROPPED, MissingPicture
+from lab.files.run.run_file import DetectionsTable
+from lab.pictures.picture_file import DROPPED, ColourPicture, MissingPicture
+from lab.pictures.source import pictures
 from lab.report.plot.axes import GREEN, ORANGE
 from lab.report.plot.image import image_uri
-from lab.runs.frames.frame_sources import list_folder
-from lab.targets.recording import colour_frames
+from lab.runs.frames.frames import recorded_pictures
 from lab.targets.stereo.run import Source, StereoRecord, StereoResults, StereoRun
 from tracking.binocular.marker_model import MarkerImages, project_markers
 
@@ -157,11 +155,8 @@ def _contents(
             n = len(found.uv_px)
             yield frame, MarkerImages(found.uv_px, found.cov_px2, np.full(n, np.nan), np.zeros(n, dtype=np.int64))
         return
-    inputs: PictureFiles | Video = Video(name, source.path)
-    if isinstance(source, FramesFolder):
-        listing = list_folder(source.path)
-        inputs = PictureFiles(name, tuple((n, listing.folder / file) for n, file in listing.names.items()))
-    yield from colour_frames(inputs, size_px, wanted)
+    chosen = None if wanted is None else sorted(wanted)
+    yield from pictures(recorded_pictures(name, source), size_px, colour=True, wanted=chosen)
 
 
 def stereo_frames(run: StereoRun, wanted: Collection[int] | None = None) -> Iterator[StereoFrame]:

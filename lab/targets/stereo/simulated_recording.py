@@ -23,7 +23,7 @@ from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import write_table
 from lab.files.text.yaml_text import write_mapping
-from lab.pictures.colour import ColourPicture
+from lab.pictures.picture_file import ColourPicture
 from lab.targets.stereo.run import SCHEMA
 from tracking.binocular.marker_model import MarkerModel, StereoPair, project_markers
 

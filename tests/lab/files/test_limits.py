@@ -18,9 +18,9 @@ from lab.files.text.csv_text import csv_text, read_table
 from lab.files.text.error_text import is_formula, name_of_path, printable
 from lab.files.text.json_text import has_schema
 from lab.files.text.yaml_text import parse_mapping, parse_value, read_mapping
+from lab.pictures.source import open_video
 from lab.runs.batch.run_folders import allotted, listed_runs
 from lab.runs.batch.table import read_rows
-from lab.runs.frames.frame_sources import open_video
 from lab.setup.plan_findings import options_of
 from tests.paths import ROOT
 
@@ -100,7 +100,6 @@ def test_files_of_users_are_read_through_the_helpers_that_refuse_pipes():
         "setup/doctor_checks.py",
         "files/project/cloud_file.py",
         "setup/init.py",
-        "pictures/colour.py",
         "runs/batch/cluster.py",
         "runs/batch/resumption.py",
     }

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -18,8 +19,8 @@ import pytest
 from lab.errors import InputError
 from lab.files.run.run_file import load_run
 from lab.pictures.picture_file import MissingPicture, decode, read_picture
+from lab.pictures.source import AHEAD, list_folder, pictures, video_at
 from lab.runs.frames import frames
-from lab.runs.frames.frame_sources import VideoSource, list_folder
 from lab.runs.frames.frames import FrameSet, open_frames, pictures_at
 from tests.lab.run_folders import edit, picture_of, write_run
 
@@ -195,7 +196,7 @@ def test_the_number_is_the_last_group_of_digits_of_the_name(tmp_path):
         (tmp_path / name).write_bytes(b"")
     (tmp_path / "20.png").mkdir()
     listing = list_folder(tmp_path)
-    assert listing.names == dict(zip(range(12, 17), names, strict=True))
+    assert listing.files == {k: tmp_path / name for k, name in zip(range(12, 17), names, strict=True)}
     assert listing.ignored == ("._17.png", "19.png.part", "background.png", "notes18.txt")
 
 
@@ -262,27 +263,27 @@ def test_a_limited_number_of_frames_is_read_ahead(tmp_path, monkeypatch):
     lock, state = threading.Lock(), {"read": 0}
     real = read_picture
 
-    def counted(path, size_px):
+    def counted(path, size_px, colour):
         with lock:
             state["read"] += 1
         return real(path, size_px)
 
-    monkeypatch.setattr("lab.runs.frames.frame_sources.read_picture", counted)
+    monkeypatch.setattr("lab.pictures.source.read_picture", counted)
     for taken, _ in enumerate(open_frames(load_run(write_run(tmp_path / "a", frames=60))), start=1):
         if taken == 20:  # while the consumer processes this frame, the threads read up to the limit
             until = time.monotonic() + 10
-            while state["read"] < 2 * (taken + frames.AHEAD - 1) and time.monotonic() < until:
+            while state["read"] < 2 * (taken + AHEAD - 1) and time.monotonic() < until:
                 time.sleep(0.01)
             time.sleep(0.1)
-            assert state["read"] == 2 * (taken + frames.AHEAD - 1)
+            assert state["read"] == 2 * (taken + AHEAD - 1)
     assert state["read"] == 120
 
 
 def test_an_exception_in_a_thread_reaches_the_reader(tmp_path, monkeypatch):
-    def broken(path, size_px):
+    def broken(path, size_px, colour):
         raise RuntimeError(f"boom {path.name}")
 
-    monkeypatch.setattr("lab.runs.frames.frame_sources.read_picture", broken)
+    monkeypatch.setattr("lab.pictures.source.read_picture", broken)
     with pytest.raises(RuntimeError, match=r"boom 000000\.png"):
         read_all(write_run(tmp_path / "a"))
     assert not [t for t in threading.enumerate() if t.name.startswith("decode")]
@@ -370,9 +371,7 @@ def test_the_grey_of_a_colour_video_is_that_of_all_channels(fourcc, tmp_path):
     for _ in range(3):
         writer.write(np.full((SIZE[1], SIZE[0], 3), (10, 200, 10), np.uint8))
     writer.release()
-    video = VideoSource(path, SIZE)
-    picture = video.next_picture()
-    video.close()
+    picture = next(picture for _, picture in pictures(video_at(path), SIZE))
     assert isinstance(picture, np.ndarray)
     assert np.median(picture) == pytest.approx(0.587 * 200 + 0.413 * 10, abs=8)
 
@@ -397,7 +396,7 @@ def test_a_file_that_is_not_a_video_is_an_input_error(content, video_run):
 
 
 def test_a_video_that_is_shorter_than_its_header_states_is_noted(video_run, monkeypatch):
-    monkeypatch.setattr(frames, "header_picture_count", lambda path: 20)
+    monkeypatch.setattr(frames, "video_at", lambda path, camera: replace(video_at(path, camera), count=20))
     reader = open_frames(load_run(video_run))
     assert len(list(reader)) == 12
     assert reader.notes[0].endswith("left.avi: ended after 12 pictures; its header states 20")

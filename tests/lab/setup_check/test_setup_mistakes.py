@@ -20,7 +20,7 @@ from geometry.rig import Rig
 from lab.calibrate.camera.photos import _frames
 from lab.files.project.project_blocks import Cloud
 from lab.files.rig.rig_file import save_rig
-from lab.runs.frames.frame_sources import VideoSource
+from lab.pictures.source import pictures, video_at
 from lab.runs.input_check.check import check
 from lab.runs.process import process_run
 from lab.simulate.rigs import fan, unequal_fan
@@ -229,9 +229,7 @@ def test_a_video_with_an_orientation_flag_is_read_the_same_when_calibrating_and_
     path.write_bytes(bytes(data))
     turned = cv2.VideoCapture(str(path)).read()[1]
     assert turned.shape[:2] == (64, 48)  # OpenCV applies the flag unless it is asked not to
-    source = VideoSource(path, None)
-    running = source.next_picture()
-    source.close()
+    running = next(picture for _, picture in pictures(video_at(path)))
     calibrating = next(picture for _, picture in _frames(path))
     assert running.shape == calibrating.shape == (48, 64)
     assert np.corrcoef(running.ravel(), calibrating.ravel())[0, 1] > 0.99  # one is the luma, the other from BGR
