@@ -10,9 +10,11 @@ from typing import Any
 import pandas as pd
 
 from lab.api.results import Results
+from lab.files.run.parameter_overrides import with_overrides
 from lab.runs.process import process_run
 from lab.simulate.scenarios import SCENARIOS
 from lab.simulate.write import simulate
+from tracking.parameters import TrackerParameters
 
 
 def process(
@@ -38,6 +40,7 @@ def process(
         CalibrationError: the rig's calibration must not be used.
         RunError: the run could not be processed.
     """
+    with_overrides(TrackerParameters(), settings, "settings")  # a mistake is named in terms of this call
     keep = tempfile.TemporaryDirectory(prefix="beampose-") if out is None else None
     folder = Path(keep.name) / "results" if keep is not None else Path(str(out))
     process_run(Path(run_folder), folder, overrides=settings, causal=causal, progress=progress)

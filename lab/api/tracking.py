@@ -53,11 +53,13 @@ def find_spots(
     [[22.3, 17.6]]
 
     Raises:
-        ValueError: the picture or the regions have another shape or type.
-        InputError: a setting is wrong.
+        InputError: the picture or the regions have another shape or type, or a setting is wrong.
     """
     parameters = _parameters({f"detect.{name}": value for name, value in settings.items()})
-    found = find_in_picture(picture, parameters.detect, noise, regions)
+    try:
+        found = find_in_picture(picture, parameters.detect, noise, regions)
+    except ValueError as error:  # the message names the argument, what it expects and what it got
+        raise InputError(str(error)) from None
     sigma = np.sqrt(np.diagonal(found.cov_px2, axis1=-2, axis2=-1))
     numbers = (found.uv_px, sigma, *(getattr(found, name) for name in _SHAPE), found.cov_px2[:, 0, 1])
     return pd.DataFrame(np.column_stack(numbers), columns=list(columns.DETECTIONS[2:]))

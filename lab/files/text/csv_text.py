@@ -21,7 +21,7 @@ from geometry.arrays import Array
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.csv_table import Categorical, Table
-from lab.files.text.error_text import is_formula, printable_line, suggest_name
+from lab.files.text.error_text import is_formula, near_name, printable_line
 
 # The columns that hold words; every other column holds numbers.
 WORD_COLUMNS = ("camera", "spot", "beam", "status", "point", "screen", "date", "verdict", "view")
@@ -99,9 +99,9 @@ def _checked_header(path: Path, data: bytes, required: Sequence[str]) -> tuple[s
     found = printable_line(",".join(header)) if len(header) > 1 or header[0] in required else "a line without commas"
     for name in required:
         if name not in header:
-            near = suggest_name(name, [h for h in header if h not in required])
-            meant = f"{near.removesuffix('?')} in the header?" if "did you mean" in near else ""
-            raise InputError(f"{path}: expected a column {name!r}, got {found}{meant}")
+            similar = near_name(name, [h for h in header if h not in required])
+            rename = f"; rename {similar!r} to {name!r} if it is that column" if similar else ""
+            raise InputError(f"{path}: expected a column {name!r}, got {found}{rename}")
     twice = [name for i, name in enumerate(header) if name and name in header[:i]]
     if twice:
         raise InputError(

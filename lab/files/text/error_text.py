@@ -20,15 +20,20 @@ class FileError(InputError):
         super().__init__(self.lines[0] + tail)
 
 
+def near_name(word: object, known: Iterable[str]) -> str | None:
+    """The known name that is most similar to a word; None where none is similar."""
+    names = [str(k) for k in known]
+    lowered = {k.lower(): k for k in names}
+    near = difflib.get_close_matches(str(word), names, n=1, cutoff=0.6)
+    return near[0] if near else lowered.get(str(word).lower())
+
+
 def suggest_name(word: object, known: Iterable[str]) -> str:
     """`; did you mean 'frames'?`; `; known: ...` where no name is similar; empty where no name is known."""
     known = [str(k) for k in known]
-    near = difflib.get_close_matches(str(word), known, n=1, cutoff=0.6)
-    if not near:
-        lowered = {k.lower(): k for k in known}
-        near = [lowered[str(word).lower()]] if str(word).lower() in lowered else []
-    if near:
-        return f"; did you mean {near[0]!r}?"
+    near = near_name(word, known)
+    if near is not None:
+        return f"; did you mean {near!r}?"
     return f"; known: {', '.join(known)}" if known else ""
 
 

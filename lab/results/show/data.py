@@ -68,7 +68,7 @@ class ResultData:
         frames = self.spots.frames
         at = int(np.searchsorted(frames, frame))
         if at >= len(frames) or frames[at] != frame:
-            raise InputError(f"--frame {frame}: expected a frame of the results, {frames[0]} to {frames[-1]}")
+            raise InputError(f"frame {frame}: expected a frame of the results, {frames[0]} to {frames[-1]}")
         return at
 
     def views_of(self, camera: str) -> list[int]:

@@ -79,7 +79,7 @@ def chosen_cameras(data: ResultData, camera: str | None) -> list[str]:
         return list(data.spots.cameras)
     if camera not in data.spots.cameras:
         known = ", ".join(data.spots.cameras)
-        raise InputError(f"--camera {camera}: expected one of {known}{suggest_name(camera, data.spots.cameras)}")
+        raise InputError(f"camera {camera}: expected one of {known}{suggest_name(camera, data.spots.cameras)}")
     return [camera]
 
 
@@ -107,7 +107,7 @@ def _of_run(folder: Path, frame: int, camera: str | None, progress: Progress | N
     last = np.inf if reader.last is None else reader.last
     if not reader.first <= frame <= last:
         end = "" if reader.last is None else f" to {reader.last}"
-        raise InputError(f"--frame {frame}: expected a frame of the run, {reader.first}{end}")
+        raise InputError(f"frame {frame}: expected a frame of the run, {reader.first}{end}")
     pipeline = Pipeline.of(run)
     reached = False
     with tempfile.TemporaryDirectory(prefix="beampose-show-") as made:
@@ -118,7 +118,7 @@ def _of_run(folder: Path, frame: int, camera: str | None, progress: Progress | N
                 tables.write(record, None)
                 reached = record.frame == frame
         if not reached:
-            raise InputError(f"--frame {frame}: the recording ends before it")
+            raise InputError(f"frame {frame}: the recording ends before it")
         data = _with_run(read_result_data(work, folder), run)
     notes = (f"processed up to frame {frame} without smoothing; for more pictures show the results of `beampose run`",)
     shown = _shown(data, frame, camera)

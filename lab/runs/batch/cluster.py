@@ -75,7 +75,8 @@ def require_distributed() -> None:
         import distributed  # noqa: F401
     except ImportError:
         raise InputError(
-            "--dask: expected the package distributed, which is not installed: pip install distributed"
+            "--dask: expected the package distributed (the extra `cluster`), which is not installed: pip install"
+            " distributed"
         ) from None
 
 

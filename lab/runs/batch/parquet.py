@@ -23,7 +23,7 @@ def require_pyarrow() -> None:
         import pyarrow  # noqa: F401
     except ImportError:
         raise InputError(
-            "--parquet: expected the package pyarrow, which is not installed: pip install pyarrow"
+            "--parquet: expected the package pyarrow (the extra `parquet`), which is not installed: pip install pyarrow"
         ) from None
 
 

@@ -129,7 +129,8 @@ def test_a_temporary_result_lasts_as_long_as_its_object(run_folder):
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda p, r: lab.process(r, r1_pix=3), "settings|--set"),
+        (lambda p, r: lab.process(r, r1_pix=3), "^settings: unknown key .r1_pix"),
+        (lambda p, r: lab.find_spots(np.zeros((4, 4, 3), np.uint8)), r"^picture: expected grey \(h, w\)"),
         (lambda p, r: lab.find_spots(np.zeros((4, 4), np.uint8), threshold=5), "settings.*threshold"),
         (lambda p, r: lab.Tracker(r / "rig.yaml", methd="spots"), "settings.*methd"),
         (lambda p, r: lab.Tracker(r / "rig.yaml").step(0, {"lfet": None}), "did you mean 'left'|left"),
@@ -137,8 +138,8 @@ def test_a_temporary_result_lasts_as_long_as_its_object(run_folder):
         (lambda p, r: lab.Tracker(r / "rig.yaml").step(-1, {}), "dt_s"),
         (lambda p, r: lab.track(p.detections, r / "rig.yaml"), "t_s or a frame rate"),
         (lambda p, r: lab.track(p.detections, r / "rig.yaml", frame_rate_hz=0), "frame_rate_hz"),
-        (lambda p, r: p.show(9999), "--frame 9999"),
-        (lambda p, r: p.show(3, camera="middle"), "--camera middle"),
+        (lambda p, r: p.show(9999), "^frame 9999"),
+        (lambda p, r: p.show(3, camera="middle"), "^camera middle"),
         (lambda p, r: lab.load(p.folder, run=r / "nowhere").residuals, "is not there"),
     ],
 )
