@@ -1,12 +1,15 @@
-"""Symmetric sparse linear systems of an adjustment: scaling, factors, damped steps."""
+"""Symmetric linear systems of an adjustment: scaling, factors, damped steps; small ones are solved as full matrices."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy import sparse
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse.linalg import SuperLU, splu
 
 from geometry.arrays import Array
+
+_SMALL = 300  # unknowns up to which a full matrix takes less time: forty photographs of one camera (1 ms against 4 ms)
 
 
 def scaled(H: sparse.csc_array, scale: Array) -> sparse.csc_array:
@@ -30,6 +33,13 @@ def damped_step(H: sparse.csc_array, g: Array, damping: float) -> Array:
     """
     diagonal = H.diagonal()
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    if len(g) <= _SMALL:
+        full = H.toarray() * np.outer(scale, scale)
+        full[np.diag_indices_from(full)] += damping
+        try:
+            return np.asarray(cho_solve(cho_factor(full, check_finite=False), g * scale, check_finite=False) * scale)
+        except LinAlgError:
+            return np.zeros_like(g) if damping > 1e6 else damped_step(H, g, max(damping * 100, 1e-9))
     damped = scaled(H, scale) + damping * sparse.eye_array(len(g))
     factor = factored(damped.tocsc())
     if factor is None:

@@ -226,8 +226,8 @@ _NOT_IN_HALVES = "significant, but not in both halves of the photographs"
 
 def _change_px(table: CornerTable, first: LensFit, second: LensFit) -> float:
     """RMS difference of the directions of two lenses over the picture."""
-    pixels = projection_map(first.model, first.lens, table.image_size_px, 1.0).pixels.reshape(-1, 2)
-    return difference_px(pixels, first, second)
+    at = projection_map(first.model, first.lens, table.image_size_px, 1.0)
+    return difference_px(at.pixels.reshape(-1, 2), at.rays.reshape(-1, 3), second)
 
 
 def _p_value(found: Array, C: Array) -> float:

@@ -23,7 +23,7 @@ from calibration.lens.fit.view_equations import ViewEquations
 from calibration.lens.intrinsics_findings import findings_of
 from calibration.lens.intrinsics_result import Intrinsics, Origins
 from calibration.lens.model_uncertainty import estimate_model_uncertainty
-from geometry.arrays import Bools
+from geometry.arrays import Array, Bools
 
 FEWEST_VIEWS = 4
 # With a smaller angle between the boards' normals, focal length and distance cannot be separated.
@@ -31,6 +31,8 @@ LEAST_TILT_DEG = 5.0
 # Scatter between photographs with a smaller p-value inflates the covariance; 5 % of correct models are affected, by a
 # factor of about 1.2. With 1 %, sets of five to seven real photographs often stated sigmas that were too small.
 SCATTER_SIGNIFICANT = 0.05
+# With a smaller p-value of a flat board, the effect of solving for its bend is part of the covariance.
+BEND_PROBABLE = 0.05
 
 
 class IntrinsicsError(ValueError):
@@ -87,15 +89,17 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     noise = max(1.0, spread.factor) if spread.p_value < SCATTER_SIGNIFICANT else 1.0
     distance = options.distance_m or _typical_depth(table, found)
     pixel_map = projection_map(found.model, found.lens, table.image_size_px, distance)
-    model_uncertainty = estimate_model_uncertainty(
-        table, found, selection, pixel_map, found.covariance * noise**2, noise
-    )
+    covariance = found.covariance
+    if noise > 1:
+        covariance = equations.scattered_covariance(noise)[: equations.lens, : equations.lens]
+    covariance = covariance + _by_unsolved_bend(table, found, shape, options)
+    model_uncertainty = estimate_model_uncertainty(table, found, selection, pixel_map, covariance, noise)
     out = Intrinsics(
         table=table,
         model=found.model,
         fit=found,
         parameters=found.model.parameters,
-        covariance=found.covariance * (noise * model_uncertainty.factor) ** 2,
+        covariance=covariance * model_uncertainty.factor**2,
         model_uncertainty=model_uncertainty,
         correlated_noise=noise,
         scatter=spread,
@@ -172,6 +176,25 @@ def _final(table: CornerTable, chosen: ModelCandidate, board: BoardFreedom) -> t
     except AdjustmentError:
         pass
     return chosen.fit, ViewEquations.of(table, chosen.fit)
+
+
+def _by_unsolved_bend(table: CornerTable, found: LensFit, shape: BoardTest | None, options: IntrinsicsOptions) -> Array:
+    """Covariance (p, p) of the lens by a probable bend of the board that is not solved for: its square effect.
+
+    Few photographs show a bend without showing it in each half. 0 if the bend is solved for, not probable, or excluded
+    by the user.
+    """
+    nothing = np.zeros((len(found.model.parameters),) * 2)
+    if shape is None or found.board.warp or found.board.points or options.warp is not None:
+        return nothing
+    if shape.warp.p_value >= BEND_PROBABLE:
+        return nothing
+    try:
+        equations = ViewEquations.of(table, found, replace(found.board, warp=True))
+    except AdjustmentError:
+        return nothing
+    change = equations.solution()[0][: equations.lens]
+    return np.outer(change, change)
 
 
 def _typical_depth(table: CornerTable, found: LensFit) -> float:

@@ -299,7 +299,7 @@ def _scatter(c: Intrinsics) -> Finding:
     return Finding(
         Level.WARN,
         f"The lens parameters scatter from photograph to photograph by {c.scatter.factor:.2f} times what the corners'"
-        f" noise explains (p = {c.scatter.p_value:.1g}); all sigmas have been multiplied by it.",
+        f" noise explains (p = {c.scatter.p_value:.1g}); the sigmas include it.",
         "Errors of the corners within one photograph are correlated: a board that bends, blur, glare, or a lens that"
         " no available model describes.",
         "Use a stiffer board, hold it still, and take more photographs.",

@@ -35,7 +35,7 @@ class Intrinsics:
     model: LensModel
     fit: LensFit
     parameters: tuple[str, ...]  # fx, fy, cx, cy, k1 ...
-    covariance: Array  # (p, p) in that order, inflated by scatter between photographs and by model error
+    covariance: Array  # (p, p) in that order; with scatter between photographs, an unsolved bend and model error
     model_uncertainty: ModelUncertainty
     correlated_noise: float  # factor on the sigmas from that scatter; 1 where it is not significant
     scatter: Scatter

@@ -27,7 +27,6 @@ from calibration.lens.fit.lens_models import (
     LensModel,
     folds_in_picture,
     rational_of_fisheye,
-    undistorted,
 )
 from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, Values
 from calibration.lens.fit.projection_map import ProjectionMap, projection_map
@@ -219,20 +218,21 @@ def _excess_px2(one: _Judged, other: _Judged, raised: float) -> float:
     """Mean squared difference of the directions of two models where corners were seen, beyond that of their noise."""
     if other is one:
         return 0.0
-    first, second = one.candidate.fit, other.candidate.fit
+    second = other.candidate.fit
     assert one.map is not None
     assert one.inside is not None
-    assert first is not None
     assert second is not None
     noise2 = abs(other.sigma_px**2 - one.sigma_px**2) * raised**2
-    return max(difference_px(one.map.pixels[one.inside], first, second) ** 2 - noise2, 0.0)
+    return max(difference_px(one.map.pixels[one.inside], one.map.rays[one.inside], second) ** 2 - noise2, 0.0)
 
 
-def difference_px(pixels: Array, first: LensFit, second: LensFit) -> float:
-    """RMS difference (px) at most of the pixels (n, 2) between the rays of two lenses, after the best rotation."""
-    flat = undistorted(pixels, first.lens, first.model.fisheye)
-    pixels, flat = pixels[np.isfinite(flat).all(axis=1)], flat[np.isfinite(flat).all(axis=1)]
-    rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+def difference_px(pixels: Array, rays: Array, second: LensFit) -> float:
+    """RMS difference (px) at most of the pixels (n, 2) between the rays of two lenses, after the best rotation.
+
+    rays (n, 3): those of the pixels through the first lens, nan where there is none.
+    """
+    there = np.isfinite(rays).all(axis=1)
+    pixels, rays = pixels[there], rays[there]
     wide = np.asarray(second.model.fisheye)
     seen = project_points_full(rays, second.lens[:4], second.lens[4:], np.asarray(np.inf), wide)
     away = seen.pixels - pixels

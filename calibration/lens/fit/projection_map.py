@@ -26,6 +26,7 @@ class ProjectionMap:
     """
 
     pixels: Array  # (rows, columns, 2)
+    rays: Array  # (rows, columns, 3): directions of the pixels, with z = 1
     by_parameter: Array  # (rows, columns, 2, p), px per unit of the model's free parameters, best rotation removed
     mm_per_px: Array  # (rows, columns, 2, 2): on a screen that faces the camera at the distance
 
@@ -66,7 +67,10 @@ def projection_map(
     # The screen faces the camera: its points are distance_m (x, y, 1), and d_point at z = 1 is the derivative by x, y.
     to_mm = np.full((len(flat), 2, 2), np.nan)
     to_mm[good] = 1000 * distance_m * np.linalg.inv(seen.d_point[good][:, :, :2])
-    return ProjectionMap(pixels, left.reshape(rows, columns, 2, -1), to_mm.reshape(rows, columns, 2, 2))
+    rays[~good] = np.nan
+    return ProjectionMap(
+        pixels, rays.reshape(rows, columns, 3), left.reshape(rows, columns, 2, -1), to_mm.reshape(rows, columns, 2, 2)
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

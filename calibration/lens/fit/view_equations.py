@@ -124,13 +124,28 @@ class ViewEquations:
             error[v] = (self.chi2[v] + 2 * g @ y + y @ S @ y) / self.count[v]
         return error
 
+    def scattered_covariance(self, factor: float) -> Array:
+        """Covariance (q, q) of the unknowns where photographs scatter by this factor on the sigmas.
+
+        The mean of two estimates. Noise times the factor, which is one for all directions of the unknowns, is too small
+        for those to which errors common to a photograph are most alike, such as the focal length. The jackknife, from
+        the change by leaving out each photograph (MacKinnon and White 1985, J. Econometrics 29, HC3, with photographs
+        in place of residuals), knows directions, but has only as many squares as there are photographs.
+        """
+        q = len(self.basis)
+        changes = np.empty((len(self.views), q))
+        for v, (S, g) in enumerate(zip(self.information, self.gradient, strict=True)):
+            changes[v] = self.basis @ np.linalg.solve((1 + _UNDETERMINED) * np.eye(q) - S, g)
+        jackknife = (1 - 1 / len(changes)) * changes.T @ changes
+        return (factor**2 * self.basis @ self.basis.T + jackknife) / 2
+
     def scatter(self) -> Scatter:
         """Compare the gradients of single views with their covariance S - S S, which they have at the solution of all.
 
         Errors that are correlated within a photograph (a board that bends differently each time, blur, a lens that the
         model cannot describe) increase them. Compared as sums over views and directions of equal information, and with
-        the chi-square distribution of the same mean and variance (Satterthwaite 1946); the covariance that follows is
-        the sandwich estimate of White (1980, Econometrica 48) for clusters, reduced to one factor.
+        the chi-square distribution of the same mean and variance (Satterthwaite 1946): the sandwich estimate of White
+        (1980, Econometrica 48) for clusters, reduced to one factor.
         """
         S = self.information
         C = S - S @ S

@@ -107,7 +107,7 @@ def _numbers(r: Intrinsics) -> Section:
         "fx, fy, cx and cy are in pixels, the distortion coefficients in OpenCV's order and units. Sigmas follow from"
         " the scatter of the corners"
         + (
-            f", multiplied by {r.correlated_noise:.2f} for the additional scatter between photographs."
+            f" and of the photographs, which is {r.correlated_noise:.2f} times what the corners explain."
             if r.correlated_noise > 1
             else "."
         ),

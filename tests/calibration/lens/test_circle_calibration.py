@@ -42,7 +42,7 @@ def test_lens_and_circle_size_are_estimated_within_their_sigmas():
 
 def test_circles_treated_as_points_would_bias_the_lens_far_beyond_its_sigmas():
     c = calibrate_intrinsics(replace(pictures(), circles=None), QUICK)
-    assert nees(c) > 4  # although scatter between photographs has inflated the sigmas
+    assert nees(c) > 3  # although scatter between photographs has inflated the sigmas
 
 
 def test_an_unknown_circle_size_is_estimated():
