@@ -34,7 +34,7 @@ def check(path: Path) -> None:
 @click.command()
 @click.argument("results", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--run", "run_folder", type=FOLDER, help="The run folder, if it has moved.")
-@click.option("--video", is_flag=True, help="Also write overlay.avi: all cameras with what was found drawn over them.")
+@click.option("--video", is_flag=True, help="Also write overlay.mp4: all cameras with what was found drawn over them.")
 @click.option("--from", "first", type=int, help="With --video: first frame number.")
 @click.option("--to", "last", type=int, help="With --video: last frame number.")
 @click.option("--every", type=click.IntRange(min=1), help="With --video: only each so many frames.")

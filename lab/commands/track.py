@@ -69,7 +69,7 @@ def _track(ctx: click.Context, target: Target[Any], given: Path, out: Path) -> N
     help="What proposes circles: votes of gradients, or a network that was trained on rendered drogues.",
 )
 @click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
-@click.option("--video", is_flag=True, help="Also write overlay.avi: the pictures with the circle drawn into them.")
+@click.option("--video", is_flag=True, help="Also write overlay.mp4: the pictures with the circle drawn into them.")
 @click.pass_context
 def circle(
     ctx: click.Context,
@@ -123,7 +123,7 @@ def circle(
 @click.option("--max-diameter", type=NumberRange(8, 10_000), help="Largest one; default: the picture's smaller side.")
 @click.option("--rate", type=NumberRange(0.01, 1e6), help="Frames per second; default: the video's, or 25.")
 @click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
-@click.option("--video", is_flag=True, help="Also write overlay.avi: the pictures with the drogue drawn into them.")
+@click.option("--video", is_flag=True, help="Also write overlay.mp4: the pictures with the drogue drawn into them.")
 @click.pass_context
 def drogue(
     ctx: click.Context,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array
-from lab.errors import RunError
+from lab.pictures.overlay_video import write_overlay_video
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import open_inputs
 from lab.report.plot.image import grey_limits, stretched
@@ -17,7 +18,6 @@ from lab.targets.recording import DEFAULT_RATE_HZ, every_frame
 from lab.targets.target import F, Target, Track
 from tracking.statuses import PoseStatus
 
-_CODECS = {".avi": "MJPG", ".mp4": "mp4v"}
 _LARGEST_SIDE = 1920  # px of the video
 _RATE_RANGE_HZ = (1.0, 240.0)  # of the video: players do not show others well
 _PATH_FRAMES = 100  # frames of the path that are drawn
@@ -31,27 +31,23 @@ def write_overlay(target: Target[F], track: Track[F], folder: Path) -> None:
     Raises:
         RunError: OpenCV cannot write it.
     """
+    rate = float(np.clip(track.recording.rate_hz or DEFAULT_RATE_HZ, *_RATE_RANGE_HZ))
+    write_overlay_video(folder, _images(target, track), rate)
+
+
+def _images(target: Target[F], track: Track[F]) -> Iterator[NDArray[np.uint8]]:
     recording = track.recording
     assert recording.size_px is not None  # of pictures
     scale = min(1.0, _LARGEST_SIDE / max(recording.size_px))
     width, height = (2 * max(round(side * scale / 2), 1) for side in recording.size_px)
-    rate = float(np.clip(recording.rate_hz or DEFAULT_RATE_HZ, *_RATE_RANGE_HZ))
-    code = cv2.VideoWriter.fourcc(*_CODECS[Path(target.overlay_name).suffix])
-    writer = cv2.VideoWriter(str(folder / target.overlay_name), code, rate, (width, height))
-    if not writer.isOpened():
-        raise RunError(f"{target.overlay_name}: OpenCV cannot write such a video here; leave the video out")
     limits: tuple[float, float] | None = None
-    try:
-        frames = every_frame(open_inputs([recording.path]), target.options.limit)
-        for k, (_, picture) in enumerate(frames):
-            grey: NDArray[np.uint8] = np.zeros((height, width), np.uint8)
-            if not isinstance(picture, MissingPicture):
-                limits = limits or grey_limits(picture)
-                shown = cv2.resize(stretched(picture, *limits), (width, height), interpolation=cv2.INTER_AREA)
-                grey = np.asarray(shown, np.uint8)
-            writer.write(drawn(grey, target, track, k, np.array([width, height]) / recording.size_px))
-    finally:
-        writer.release()
+    for k, (_, picture) in enumerate(every_frame(open_inputs([recording.path]), target.options.limit)):
+        grey: NDArray[np.uint8] = np.zeros((height, width), np.uint8)
+        if not isinstance(picture, MissingPicture):
+            limits = limits or grey_limits(picture)
+            shown = cv2.resize(stretched(picture, *limits), (width, height), interpolation=cv2.INTER_AREA)
+            grey = np.asarray(shown, np.uint8)
+        yield drawn(grey, target, track, k, np.array([width, height]) / recording.size_px)
 
 
 def drawn(grey: NDArray[np.uint8], target: Target[F], track: Track[F], k: int, scale: Array) -> NDArray[np.uint8]:

@@ -149,7 +149,7 @@ class PointTarget(Target[PointFrame]):
     """A point of light, or the centre of a larger target."""
 
     schema, table, columns = "beampose/track-point/1", "track.csv", COLUMNS
-    subject, overlay_name = "target", "overlay.mp4"
+    subject = "target"
     codes = Codes(none="BP-N01", few="BP-N02", missing="BP-N06", ambiguous="", far="")
     usual_missing = 0.05
     none_found = "There is no target in view, or none moves steadily over enough consecutive pictures."

@@ -124,7 +124,6 @@ class Target(ABC, Generic[F]):
     size_name: ClassVar[str] = ""  # of the third number of a place; empty: a point has none
     size_radii: ClassVar[float] = 1.0  # that number, in radii of the outline
     several: ClassVar[str] = ""  # what an ambiguous frame shows
-    overlay_name: ClassVar[str] = "overlay.avi"
     codes: ClassVar[Codes]
     remedies: ClassVar[Mapping[Cause, str]]
     none_found: ClassVar[str]  # why there may be none

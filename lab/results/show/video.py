@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from geometry.arrays import Ints
-from lab.errors import InputError, RunError
-from lab.files.output.part_folder import removed_at_the_end
+from lab.errors import InputError
+from lab.pictures.overlay_video import write_overlay_video
 from lab.results.show.data import ResultData, frame_content, pictures_of, pose_words, read_result_data
 from lab.results.show.panel import Pixels
 from lab.results.show.sheet import Layout, Limits, limits_of, sheet
 
-NAME = "overlay"
-# Motion JPEG is in every OpenCV; MPEG-4 comes with most, and is tried where an OpenCV was built without the first.
-CODECS = (("MJPG", ".avi"), ("mp4v", ".mp4"))
 TAIL = 25  # frames
 DEFAULT_FPS = 25.0
 _SAME_LIMITS = 50  # frames for which the grey values that are shown as black and white stay
@@ -45,7 +40,7 @@ def write_video(
     fps: float = DEFAULT_FPS,
     progress: Callable[[int, int | None, str], None] | None = None,
 ) -> WrittenVideo:
-    """Write overlay.avi (or .mp4) into a results folder; it is complete or as it was before.
+    """Write overlay.mp4 (or .avi) into a results folder; it is complete or as it was before.
 
     first, last: frame numbers. every: show each so many frames. fps: frames per second of the video. The memory of
     pictures does not grow with their number.
@@ -56,33 +51,12 @@ def write_video(
     """
     data = read_result_data(results, run_folder)
     indices = _selected(data, first, last, every)
-    notes: list[str] = list(data.notes)
-    images = _images(data, indices)
-    one = next(images)
-    for codec, suffix in CODECS:
-        path = results / f"{NAME}{suffix}"
-        part = results / f".{NAME}.{secrets.token_hex(8)}{suffix}"
-        with removed_at_the_end(part):
-            writer = _opened(part, codec, fps, one)
-            if writer is None:
-                notes.append(f"this OpenCV cannot write {codec} videos ({suffix})")
-                continue
-            try:
-                writer.write(one)
-                for done, image in enumerate(images, start=2):
-                    writer.write(image)
-                    if progress is not None:
-                        progress(done, len(indices), "video")
-            finally:
-                writer.release()
-                images.close()  # with its files and threads
-            if not part.is_file() or not part.stat().st_size:
-                raise RunError(f"{path}: the video could not be written; is the disk full?")
-            part.replace(path)
-        return WrittenVideo(path, len(indices), tuple(notes))
-    raise RunError(
-        f"{results}: no video could be written: {'; '.join(notes)}; install opencv-python-headless from PyPI"
-    )
+    images = _images(data, indices, progress)
+    try:
+        path, notes = write_overlay_video(results, images, fps)
+    finally:
+        images.close()  # with its files and threads
+    return WrittenVideo(path, len(indices), (*data.notes, *notes))
 
 
 def _selected(data: ResultData, first: int | None, last: int | None, every: int) -> Ints:
@@ -95,7 +69,9 @@ def _selected(data: ResultData, first: int | None, last: int | None, every: int)
     return indices
 
 
-def _images(data: ResultData, indices: Ints) -> Generator[Pixels, None, None]:
+def _images(
+    data: ResultData, indices: Ints, progress: Callable[[int, int | None, str], None] | None
+) -> Generator[Pixels, None, None]:
     """The pictures of the video, all of one size with even sides."""
     cameras = list(data.spots.cameras)
     layout = Layout.of([data.sizes_px[c] for c in cameras], small=True)
@@ -106,7 +82,8 @@ def _images(data: ResultData, indices: Ints) -> Generator[Pixels, None, None]:
     ages: dict[str, int] = {}
     size: tuple[int, int] | None = None
     numbers = [int(n) for n in data.spots.frames[indices]]
-    for index, pictures in zip(indices.tolist(), pictures_of(data.run, cameras, numbers), strict=True):
+    shown_pictures = pictures_of(data.run, cameras, numbers)
+    for done, (index, pictures) in enumerate(zip(indices.tolist(), shown_pictures, strict=True), start=1):
         content = frame_content(data, index, pictures, cameras, tail=TAIL)
         for shown in content.cameras:
             age = ages.get(shown.camera, _SAME_LIMITS)
@@ -120,9 +97,5 @@ def _images(data: ResultData, indices: Ints) -> Generator[Pixels, None, None]:
         h, w = min(size[0], image.shape[0]), min(size[1], image.shape[1])
         out[:h, :w] = image[:h, :w]
         yield out
-
-
-def _opened(path: Path, codec: str, fps: float, image: Pixels) -> cv2.VideoWriter | None:
-    """A video to write pictures of this size to; None where this OpenCV cannot."""
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), fps, (image.shape[1], image.shape[0]))
-    return writer if writer.isOpened() else None
+        if progress is not None:
+            progress(done, len(indices), "video")

@@ -13,8 +13,9 @@ from click.testing import CliRunner
 from cli import main
 from lab.errors import InputError, RunError
 from lab.files.run.results import read_poses
+from lab.pictures import overlay_video
 from lab.report.run.tracks import SPOT_COLOURS
-from lab.results.show import panel, video
+from lab.results.show import panel
 from lab.results.show.data import frame_content, pose_words, read_result_data
 from lab.results.show.panel import bgr
 from lab.results.show.sheet import Layout, sheet
@@ -186,7 +187,7 @@ def played(path):
 def test_a_video_has_the_selected_frames_with_tails(fake):
     written = write_video(fake.results, fake.run_folder, first=10, last=40, every=10)
     pictures = played(written.path)
-    assert (written.frames, len(pictures), written.path.name) == (4, 4, "overlay.avi")
+    assert (written.frames, len(pictures), written.path.name) == (4, 4, "overlay.mp4")
     assert np.abs(pictures[0].astype(int) - pictures[-1]).max() > 50
     assert len({p.shape for p in pictures}) == 1
     assert [p.name for p in fake.results.iterdir() if p.name.startswith(".")] == []
@@ -199,7 +200,7 @@ def test_a_tail_is_the_way_of_the_spot_until_now(data):
 
 
 def test_where_a_codec_is_missing_the_next_one_is_used_and_named(fake, monkeypatch):
-    monkeypatch.setattr(video, "CODECS", (("????", ".avi"), ("MJPG", ".avi")))
+    monkeypatch.setattr(overlay_video, "CODECS", (("????", ".avi"), ("MJPG", ".avi")))
     written = write_video(fake.results, fake.run_folder, last=2)
     assert "cannot write ???? videos" in written.notes[-1]
     assert len(played(written.path)) == 3
@@ -207,7 +208,7 @@ def test_where_a_codec_is_missing_the_next_one_is_used_and_named(fake, monkeypat
 
 def test_where_no_codec_works_nothing_is_left(fake, monkeypatch):
     before = sorted(p.name for p in fake.results.iterdir())
-    monkeypatch.setattr(video, "CODECS", (("????", ".avi"),))
+    monkeypatch.setattr(overlay_video, "CODECS", (("????", ".avi"),))
     with pytest.raises(RunError, match="no video could be written"):
         write_video(fake.results, fake.run_folder, last=2)
     assert sorted(p.name for p in fake.results.iterdir()) == before

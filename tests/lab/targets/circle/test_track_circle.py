@@ -80,7 +80,7 @@ def test_a_folder_of_pictures_gives_all_files(folder, tmp_path):
     assert page.rstrip().endswith("</html>")
     assert "BP-T03" in page
     assert not any(word in page for word in ("http://", "https://", ">nan<"))
-    capture = cv2.VideoCapture(str(tmp_path / "out" / "overlay.avi"))
+    capture = cv2.VideoCapture(str(tmp_path / "out" / "overlay.mp4"))
     assert int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) == 12
 
 
@@ -89,7 +89,7 @@ def test_a_video_has_its_own_rate_and_the_same_circle(tmp_path):
     outcome = track_target(CircleTarget(), file, tmp_path / "out")
     assert (outcome.frames, outcome.measured, outcome.exit_status) == (6, 6, 0)
     assert float(rows(tmp_path / "out")[5]["t_s"]) == pytest.approx(0.1)
-    assert not (tmp_path / "out" / "overlay.avi").exists()
+    assert not (tmp_path / "out" / "overlay.mp4").exists()
 
 
 def test_the_printed_form_is_another_tracker(folder, tmp_path):

@@ -107,7 +107,7 @@ def test_a_folder_of_pictures_gives_all_files(folder, tmp_path):
     assert "tracked drogue" in page
     assert "BP-G03" in page
     assert not any(word in page for word in ("http://", "https://", ">nan<"))
-    capture = cv2.VideoCapture(str(tmp_path / "out" / "overlay.avi"))
+    capture = cv2.VideoCapture(str(tmp_path / "out" / "overlay.mp4"))
     assert int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) == 14
 
 
