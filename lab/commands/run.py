@@ -12,6 +12,7 @@ from lab.commands.common import (
     ANY_PATH,
     FOLDER,
     NumberRange,
+    complain,
     conclude,
     progress_bar,
     quiet_option,
@@ -61,10 +62,13 @@ def run(
     def more(of: Run) -> dict[str, Any]:
         return provenance(ctx) | ({"inputs": fingerprints(of, full=True)} if full_hash else {})
 
+    videos = sorted(out.glob("overlay.*"))  # of the earlier results in this folder
     with shown(run_folder.name, verbose=verbose, quiet=quiet) as progress:
         outcome = process_run(run_folder, out, overrides=settings, causal=causal, progress=progress, more=more)
     if not quiet:
         show_line(outcome.line())
+        for video in videos:
+            complain(f"{video}: removed with the earlier results; make it again with `beampose report {out} --video`")
     sys.exit(outcome.exit_status)
 
 

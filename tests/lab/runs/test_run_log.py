@@ -92,3 +92,11 @@ def test_a_stage_is_noted_once_and_progress_is_passed_on():
         noted(done, 3, "tracking")
     assert seen == [(0, 3, "tracking"), (1, 3, "tracking"), (2, 3, "tracking")]
     assert len(log._lines) == 1
+
+
+def test_a_new_run_states_that_the_video_of_the_earlier_results_is_gone(points, tmp_path):
+    out = tmp_path / "out"
+    assert typed("run", points, "--out", out).stderr == ""
+    assert typed("report", out, "--video").exit_code == 0
+    assert f"{out / 'overlay.mp4'}: removed with the earlier results" in typed("run", points, "--out", out).stderr
+    assert not (out / "overlay.mp4").exists()
