@@ -21,8 +21,7 @@ from lab.files.run.results import PoseTrack, has_causal, read_poses, read_result
 from lab.files.run.run_file import Run, load_run
 from lab.files.text import columns
 from lab.files.text.csv_table import Categorical, Table
-from lab.results.show.panel import Pixels
-from lab.results.show.sheet import png
+from lab.report.frames.canvas import Pixels, png
 from lab.results.show.show import show_frame, write_picture
 from lab.runs.process import are_results
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from geometry.arrays import Array
 from lab.pictures.overlay_video import write_overlay_video
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import open_inputs
+from lab.report.frames.canvas import Canvas, Pixels
 from lab.report.plot.image import grey_limits, stretched
 from lab.targets.recording import DEFAULT_RATE_HZ, every_frame
 from lab.targets.target import F, Target, Track
@@ -21,7 +23,6 @@ from tracking.statuses import PoseStatus
 _LARGEST_SIDE = 1920  # px of the video
 _RATE_RANGE_HZ = (1.0, 240.0)  # of the video: players do not show others well
 _PATH_FRAMES = 100  # frames of the path that are drawn
-_SHIFT = 4  # bits of sub-pixel positions in OpenCV's drawing functions
 _COLOURS = {PoseStatus.MEASURED: (60, 220, 60), PoseStatus.PREDICTED: (30, 160, 255), PoseStatus.LOST: (60, 60, 230)}
 
 
@@ -56,27 +57,19 @@ def drawn(grey: NDArray[np.uint8], target: Target[F], track: Track[F], k: int, s
     scale: (2,) of the picture, against that of the recording. The outline is a circle of the target's size; of a target
     without a size, of 3 sigma.
     """
-    image = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
     line = max(1, round(min(grey.shape) / 500))
-    first = max(0, k - _PATH_FRAMES)
-    places = [f.place for f in track.frames[first : k + 1]]
-    at = [((np.clip(p[:2], -1e5, 1e5) + 0.5) * scale - 0.5) * 2**_SHIFT for p in places]
-    for i in range(1, len(at)):
-        if np.isfinite([at[i - 1], at[i]]).all():
-            ends = [(round(float(u)), round(float(v))) for u, v in (at[i - 1], at[i])]
-            colour = _COLOURS[track.frames[first + i].status]
-            cv2.line(image, ends[0], ends[1], colour, 1, cv2.LINE_AA, _SHIFT)
+    image: Pixels = np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), np.uint8)
+    canvas = Canvas(image, np.array([-0.5, -0.5]), scale, line)
+    path = track.frames[max(0, k - _PATH_FRAMES) : k + 1]
+    for before, after in itertools.pairwise(path):
+        canvas.line(np.array([before.place[:2], after.place[:2]]), _COLOURS[after.status], 1 / line)
     now = track.frames[k]
     colour = _COLOURS[now.status]
-    if np.isfinite(at[-1]).all():
-        size = places[-1][2] / target.size_radii
+    if np.isfinite(now.place[:2]).all():
+        size = now.place[2] / target.size_radii
         size = size if np.isfinite(size) else max(3 * float(now.sigmas[:2].max()), 4 / scale[0])
-        centre = round(float(at[-1][0])), round(float(at[-1][1]))
-        radius = max(round(float(np.clip(size, 0, 1e5)) * float(scale.mean()) * 2**_SHIFT), 1)
-        cv2.circle(image, centre, radius, colour, line, cv2.LINE_AA, _SHIFT)
-        cross = centre[0] >> _SHIFT, centre[1] >> _SHIFT
-        cv2.drawMarker(image, cross, colour, cv2.MARKER_CROSS, 9 * line, line)
+        canvas.ring(now.place[:2], float(np.clip(size, 0, 1e5)) * float(scale.mean()) / line, colour)
+        canvas.cross(now.place[:2], 4.5, colour)
     label = f"{track.recording.numbers[k]}  {now.status.value}" + (f" ({now.cause})" if now.cause.value else "")
-    size_of_letters = 0.45 * line
-    cv2.putText(image, label, (6, 8 + 14 * line), cv2.FONT_HERSHEY_SIMPLEX, size_of_letters, colour, line)
-    return np.asarray(image, np.uint8)
+    canvas.words((6, 8 + 14 * line), label, 11.7 * line, colour)
+    return canvas.image

@@ -10,6 +10,7 @@ from html import escape
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
+from tracking.statuses import PoseStatus, SpotStatus
 
 # Long series reduced to what a screen can show, without losing extremes or gaps.
 
@@ -71,6 +72,20 @@ def true_shares(mask: Bools, n_columns: int) -> list[tuple[float, float]]:
 BLUE, ORANGE, GREEN, VERMILLION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 PURPLE, SKY, YELLOW, GREY = "#CC79A7", "#56B4E9", "#F0E442", "#8a8f98"
 INK = "var(--ink)"  # the page's text colour
+SPOT_COLOURS = {
+    SpotStatus.MATCHED: GREEN,
+    SpotStatus.TURNED: PURPLE,
+    SpotStatus.OCCLUDED: ORANGE,
+    SpotStatus.OUT_OF_VIEW: SKY,
+    SpotStatus.OFF_SCREEN: BLUE,
+    SpotStatus.NO_IMAGE: GREY,
+    SpotStatus.LOST: VERMILLION,
+}
+POSE_COLOURS = {
+    PoseStatus.MEASURED: GREEN,
+    PoseStatus.PREDICTED: ORANGE,
+    PoseStatus.LOST: VERMILLION,
+}
 
 
 def figure(width: float, height: float, title: str, parts: list[str], *, css: str = "plot", data: str = "") -> str:

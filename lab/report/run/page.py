@@ -13,6 +13,7 @@ from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_text
 from lab.report.failure import Failure, files_beside, write_failure_report
 from lab.report.html import environment
+from lab.report.plot.axes import POSE_COLOURS, SPOT_COLOURS
 from lab.report.run import figures, pose_curves, tables, trust
 from lab.report.run.blocks.model_fit import HEADS as MODEL_FIT_HEADS
 from lab.report.run.blocks.model_fit import model_fit
@@ -20,7 +21,7 @@ from lab.report.run.blocks.scene import scene_of
 from lab.report.run.events import ShownEvent, events, selected
 from lab.report.run.pictures import pictures
 from lab.report.run.report_data import ReportData, read_report_data
-from lab.report.run.tracks import POSE_COLOURS, SPOT_COLOURS, timeline_figure, tracks_figure, zoom_data
+from lab.report.run.tracks import timeline_figure, tracks_figure, zoom_data
 from lab.runs.score.score import ResultTables
 from tracking.statuses import PoseStatus, SpotStatus
 

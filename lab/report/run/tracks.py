@@ -11,11 +11,12 @@ from lab.files.run.results import POSE_STATUSES, SPOT_STATUSES
 from lab.report.plot.axes import (
     BLUE,
     GREEN,
-    GREY,
     INK,
     ORANGE,
+    POSE_COLOURS,
     PURPLE,
     SKY,
+    SPOT_COLOURS,
     VERMILLION,
     PlotArea,
     Scale,
@@ -28,23 +29,9 @@ from lab.report.plot.axes import (
 )
 from lab.report.plot.series import ZoomData, time_data, time_scale, time_ticks
 from lab.report.run.report_data import ReportData
-from tracking.statuses import PoseStatus, SpotStatus
+from tracking.statuses import SpotStatus
 
 TRACK_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, "#6b4c9a", "#7a5c2e")
-SPOT_COLOURS = {
-    SpotStatus.MATCHED: GREEN,
-    SpotStatus.TURNED: PURPLE,
-    SpotStatus.OCCLUDED: ORANGE,
-    SpotStatus.OUT_OF_VIEW: SKY,
-    SpotStatus.OFF_SCREEN: BLUE,
-    SpotStatus.NO_IMAGE: GREY,
-    SpotStatus.LOST: VERMILLION,
-}
-POSE_COLOURS = {
-    PoseStatus.MEASURED: GREEN,
-    PoseStatus.PREDICTED: ORANGE,
-    PoseStatus.LOST: VERMILLION,
-}
 _BEYOND = 0.75  # how far outside the picture tracks are drawn, in picture sizes
 _MOST_POINTS = 3000  # of a drawn track
 _MOST_TURNS = 60  # marked turns of a spot

@@ -14,9 +14,9 @@ from lab.errors import InputError
 from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_bytes
 from lab.files.text.error_text import suggest_name
-from lab.results.show.data import FrameContent, ResultData, frame_content, read_result_data
-from lab.results.show.panel import Pixels
-from lab.results.show.sheet import Layout, png, sheet
+from lab.report.frames.canvas import Pixels, png
+from lab.report.frames.content import FrameContent, ResultData, frame_content, read_result_data
+from lab.report.frames.sheet import Layout, sheet
 from lab.runs.frames.frames import Picture, pictures_at
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ import numpy as np
 from geometry.arrays import Ints
 from lab.errors import InputError
 from lab.pictures.overlay_video import write_overlay_video
-from lab.results.show.data import ResultData, frame_content, pictures_of, pose_words, read_result_data
-from lab.results.show.panel import Pixels
-from lab.results.show.sheet import Layout, Limits, limits_of, sheet
+from lab.report.frames.canvas import Pixels
+from lab.report.frames.content import ResultData, frame_content, pictures_of, pose_words, read_result_data
+from lab.report.frames.sheet import Layout, Limits, limits_of, sheet
 
 TAIL = 25  # frames
 DEFAULT_FPS = 25.0

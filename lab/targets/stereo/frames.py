@@ -6,7 +6,6 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from html import escape
 from itertools import takewhile
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +16,7 @@ from lab.files.run.detections_file import read_detections
 from lab.files.run.run_file import DetectionsTable
 from lab.pictures.picture_file import DROPPED, ColourPicture, MissingPicture
 from lab.pictures.source import pictures
+from lab.report.frames.canvas import INK, Box, Canvas, bgr, light
 from lab.report.plot.axes import GREEN, ORANGE
 from lab.report.plot.image import image_uri
 from lab.runs.frames.frames import recorded_pictures
@@ -27,6 +27,7 @@ from tracking.binocular.marker_model import MarkerImages, project_markers
 
 _MOST = 4  # pairs shown
 _SIDE = 520.0  # width of one picture in the drawing
+_FINE = 2.0  # pixels per unit of the drawing, for screens of high resolution
 _LEAST_PX = 120  # smallest cut-out, px
 
 
@@ -78,39 +79,25 @@ def _side(results: StereoResults, record: StereoRecord, content: Content, c: int
     if t.pose is not None:
         expected = project_markers(results.run.pair, results.run.target.model, t.pose)[0][c]
     x0, y0, x1, y1 = _cut(expected if np.isfinite(expected).any() else at, camera.image_size_px)
-    scale = _SIDE / (x1 - x0)
-    patch: Any = content[y0:y1, x0:x1]
-    grown = max(1, min(6, round(scale)))
-    patch = cv2.resize(patch, None, fx=grown, fy=grown, interpolation=cv2.INTER_NEAREST)
-    wide = 2 * _SIDE  # for screens of high resolution
-    if patch.shape[1] > wide:
-        share = wide / patch.shape[1]
-        patch = cv2.resize(patch, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
-    high = (y1 - y0) * scale
-    uri = image_uri(np.asarray(patch, dtype=np.uint8), "jpeg")
-    out = [name, f'<image href="{uri}" x="0" y="20" width="{_SIDE:.0f}" height="{high:.1f}"/>']
-
-    def place(uv: Array) -> tuple[float, float]:
-        return float((uv[0] - x0 + 0.5) * scale), float((uv[1] - y0 + 0.5) * scale + 20)
-
+    size = round(_FINE * _SIDE), max(round(_FINE * _SIDE * (y1 - y0) / (x1 - x0)), 1)
+    scale = size[0] / (x1 - x0)
+    how = cv2.INTER_NEAREST if scale > 1 else cv2.INTER_AREA
+    patch = np.asarray(cv2.resize(np.ascontiguousarray(content[y0:y1, x0:x1]), size, interpolation=how), np.uint8)
+    canvas = Canvas(patch, np.array([x0 - 0.5, y0 - 0.5]), scale, _FINE)
     for i, uv in enumerate(at):
-        inside = x0 <= uv[0] <= x1 and y0 <= uv[1] <= y1
-        if inside and i not in used:
-            out.append(_ring(*place(uv), ORANGE))
+        if canvas.holds(uv) and i not in used:
+            canvas.ring(uv, 9, bgr(ORANGE), 2)
+    taken: list[Box] = []
     for k, label in enumerate(results.run.target.model.names):
         if used[k] >= 0:
-            u, v = place(at[used[k]])
-            out.append(_ring(u, v, GREEN))
-            style = "fill:#7dffce;font-weight:700;font-size:13px"
-            out.append(f'<text x="{u + 9:.1f}" y="{v - 7:.1f}" style="{style}">{escape(label)}</text>')
-        elif np.isfinite(expected[k]).all() and x0 <= expected[k, 0] <= x1 and y0 <= expected[k, 1] <= y1:
-            u, v = place(expected[k])
-            out.append(f'<path d="M{u - 5:.1f} {v:.1f}h10M{u:.1f} {v - 5:.1f}v10" stroke="#fff" stroke-width="1.5"/>')
-    return "".join(out), high + 22
-
-
-def _ring(u: float, v: float, colour: str) -> str:
-    return f'<circle cx="{u:.1f}" cy="{v:.1f}" r="9" fill="none" stroke="{colour}" stroke-width="2"/>'
+            u, v = canvas.at(at[used[k]]).tolist()
+            canvas.ring(at[used[k]], 9, bgr(GREEN), 2)
+            canvas.label((u, v), 9 * _FINE, label, 13 * _FINE, light(bgr(GREEN)), taken)
+        elif canvas.holds(expected[k]):
+            canvas.cross(expected[k], 5, INK, 1.5)
+    high = size[1] / _FINE
+    uri = image_uri(canvas.image, "jpeg")
+    return f'{name}<image href="{uri}" x="0" y="20" width="{_SIDE:.0f}" height="{high:.1f}"/>', high + 22
 
 
 def _cut(uv: Array, size_px: tuple[int, int]) -> tuple[int, int, int, int]:

@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
+import base64
 import csv
+import itertools
 import json
 import re
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from lab import number_format
 from lab.errors import InputError
 from lab.files.run.results import read_poses
+from lab.report.frames.canvas import Canvas, bgr
 from lab.report.index.index import write_index
 from lab.report.plot import axes
-from lab.report.plot.axes import BLUE, line_path, tick_texts, ticks
+from lab.report.plot.axes import BLUE, SPOT_COLOURS, line_path, tick_texts, ticks
 from lab.report.plot.image import grey_limits, stretched
 from lab.report.plot.series import Line, Shade, time_panel
 from lab.report.run.events import MOST_PICTURES, events, selected
 from lab.report.run.page import write_report
-from lab.report.run.pictures import _arrow
 from lab.report.run.report_data import read_report_data
 from lab.report.run.summary import summary_of, verdict_of
 from tests.lab.fake_results import Fake, make, without_added_columns
@@ -278,9 +281,21 @@ def test_without_a_valid_verdict_the_report_says_so(summary):
 
 def test_pictures_show_the_spot_where_it_was_measured(filmed):
     fake, html = filmed
-    row = next(line.split(",") for line in (fake.results / "spots.csv").read_text().splitlines()[1:])
-    assert f'cx="{float(row[4]):.2f}" cy="{float(row[5]):.2f}"' in html
-    assert html.count('class="plot shot"') <= MOST_PICTURES
+    rows = [line.split(",") for line in (fake.results / "spots.csv").read_text().splitlines()[1:]]
+    row = next(r for r in rows if r[2] == "left" and r[8] == "matched")
+    shots = re.findall(r'<svg class="plot shot".*?</svg>', html, re.DOTALL)
+    assert len(shots) <= MOST_PICTURES
+    shot = next(s for s in shots if f'data-frame="{row[0]}"' in s and "camera left" in s)
+    data = base64.b64decode(re.search(r"data:image/jpeg;base64,([^\"]+)", shot)[1])
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).astype(float)
+    scale = image.shape[1] / 1280
+    u, v = ((float(x) + 0.5) * scale - 0.5 for x in row[4:6])
+    around = image[round(v) - 25 : round(v) + 26, round(u) - 25 : round(u) + 26]
+    green = np.argwhere(np.abs(around - bgr(SPOT_COLOURS[SpotStatus.MATCHED])).max(axis=2) < 60) - 25
+    away = np.hypot(*green.T)  # from the centre of a ring of 9 units of 1.5 px
+    assert np.median(away) == pytest.approx(13.5, abs=1)
+    assert away.min() > 9
+    assert away.max() < 18
 
 
 def test_a_damaged_picture_is_shown_as_such(filmed):
@@ -328,11 +343,22 @@ def test_whole_grey_values_are_shown_like_the_same_values_with_a_fraction(kind):
 
 
 def test_a_spot_far_outside_gets_an_arrow_at_the_border_and_a_name_inside():
-    x, y, d = _arrow(np.array([1500.0, 300.0]), (1280, 1024), 2.0)
-    tip = [float(v) for v in d[1:].split("L")[0].split()]
-    assert tip == pytest.approx([1275, 300])  # two units inside the border
-    assert x < tip[0]
-    assert y == pytest.approx(308)
+    canvas = Canvas(np.zeros((1024, 1280, 3), np.uint8), np.array([-0.5, -0.5]), 1.0, 2.0)
+    x, y = canvas.arrow(np.array([1500.0, 300.0]), (10, 200, 30))
+    rows, columns = np.nonzero(canvas.image.max(axis=2) > 100)
+    assert columns.max() == pytest.approx(1276, abs=1)  # two units inside the border
+    assert rows.mean() == pytest.approx(300, abs=0.5)
+    assert x < columns.min()
+    assert y == pytest.approx(300)
+
+
+def test_names_of_spots_that_are_close_together_do_not_cover_each_other():
+    canvas = Canvas(np.zeros((300, 400, 3), np.uint8), np.array([-0.5, -0.5]), 1.0, 1.0)
+    taken = []
+    for k in range(6):
+        canvas.label((200 + 3 * k, 150), 12, f"spot {k}", 16, (255, 255, 255), taken)
+    for a, b in itertools.combinations(taken, 2):
+        assert a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1]
 
 
 class TestDrawing:

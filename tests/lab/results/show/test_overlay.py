@@ -14,11 +14,11 @@ from cli import main
 from lab.errors import InputError, RunError
 from lab.files.run.results import read_poses
 from lab.pictures import overlay_video
-from lab.report.run.tracks import SPOT_COLOURS
-from lab.results.show import panel
-from lab.results.show.data import frame_content, pose_words, read_result_data
-from lab.results.show.panel import bgr
-from lab.results.show.sheet import Layout, sheet
+from lab.report.frames import canvas
+from lab.report.frames.canvas import bgr
+from lab.report.frames.content import frame_content, pose_words, read_result_data
+from lab.report.frames.sheet import Layout, sheet
+from lab.report.plot.axes import SPOT_COLOURS
 from lab.results.show.show import show_frame, write_picture
 from lab.results.show.video import write_video
 from lab.runs.process import process_run
@@ -223,7 +223,7 @@ def test_frames_that_the_results_do_not_have_and_options_without_a_video_are_ref
 
 
 def test_names_are_drawn_as_far_as_this_opencv_can(monkeypatch):
-    monkeypatch.setattr(panel, "_DRAWS_UNICODE", False)
-    assert panel.plain("línks ü 屏 1\n") == "links u ? 1?"
-    monkeypatch.setattr(panel, "_DRAWS_UNICODE", True)
-    assert panel.plain("línks ü 1\n") == "línks ü 1?"
+    monkeypatch.setattr(canvas, "_DRAWS_UNICODE", False)
+    assert canvas.plain("línks ü 屏 1\n") == "links u ? 1?"
+    monkeypatch.setattr(canvas, "_DRAWS_UNICODE", True)
+    assert canvas.plain("línks ü 1\n") == "línks ü 1?"

@@ -91,11 +91,9 @@ def read_result_data(results: Path, run_folder: Path | None = None) -> ResultDat
         raise InputError(f"{results}: spots.csv and attitude.csv have different frames; process the run again")
     summary = read_summary(results)
     run, notes = _run_of(results, run_folder, str(summary.get("run_folder") or ""))
-    model = None
     if run is not None:
-        whole = SpotModel.of(run.rig)
-        place = {view: i for i, view in enumerate(whole.views)}
-        unknown = [view for view in spots.views if view not in place]
+        known = SpotModel.of(run.rig).views
+        unknown = [view for view in spots.views if view not in known]
         if unknown and run_folder is not None:
             raise InputError(
                 f"{run.rig_path}: expected the cameras and spots of {results}, but it has no spot {unknown[0][1]!r} of"
@@ -104,18 +102,20 @@ def read_result_data(results: Path, run_folder: Path | None = None) -> ResultDat
         if unknown:
             notes = (f"the rig of {run.folder} has other spots than the results: no pictures and no beam tracks",)
             run = None
-        else:
-            model = unlimited(whole.subset(np.array([place[view] for view in spots.views], dtype=np.int64)))
-    return ResultData(
-        name=str(summary.get("name") or name_of_path(results)),
-        spots=spots,
-        poses=poses,
-        run=run,
-        model=model,
-        sizes_px=_sizes(spots, run),
-        detections=_detections(results / "detections.csv"),
-        notes=notes,
-    )
+    return result_data(str(summary.get("name") or name_of_path(results)), spots, poses, run, results, notes)
+
+
+def result_data(
+    name: str, spots: SpotGrid, poses: PoseTrack, run: Run | None, results: Path, notes: tuple[str, ...] = ()
+) -> ResultData:
+    """The tables of a results folder, which have been read, with its detections. run: its rig has all their spots."""
+    model = None
+    if run is not None:
+        whole = SpotModel.of(run.rig)
+        place = {view: i for i, view in enumerate(whole.views)}
+        model = unlimited(whole.subset(np.array([place[view] for view in spots.views], dtype=np.int64)))
+    detections = _detections(results / "detections.csv")
+    return ResultData(name, spots, poses, run, model, _sizes(spots, run), detections, notes)
 
 
 def _run_of(results: Path, given: Path | None, named: str) -> tuple[Run | None, tuple[str, ...]]:

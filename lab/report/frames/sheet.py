@@ -5,36 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
-from lab.report.run.tracks import POSE_COLOURS
-from lab.results.show.data import CameraFrame, FrameContent
-from lab.results.show.panel import (
-    BEAM,
-    BOX,
-    DESK,
-    INK,
-    PAPER,
-    PREDICTED,
-    SOFT,
-    Canvas,
-    Colour,
-    Limits,
-    Pixels,
-    bgr,
-    colour_of,
-    cut,
-    grey_picture,
-    light,
-    limits_of,
-    panel,
-    text_size,
-    write,
-)
+from lab.report.frames.canvas import DESK, INK, PAPER, SOFT, Canvas, Colour, Pixels, bgr, light, text_size, write
+from lab.report.frames.content import CameraFrame, FrameContent
+from lab.report.frames.panel import BEAM, BOX, PREDICTED, Limits, colour_of, cut, grey_picture, limits_of, panel
+from lab.report.plot.axes import POSE_COLOURS
 from tracking.statuses import SpotStatus
 
-__all__ = ["Layout", "Limits", "limits_of", "png", "sheet"]
+__all__ = ["Layout", "Limits", "limits_of", "sheet"]
 
 _GAP = 10  # px between parts
 _LINE = 16.0  # px, height of a line of text
@@ -223,8 +202,3 @@ class _Flow:
             symbol(canvas, np.array([x + 13 * self._unit, y]))
             write(out, (x + 30 * self._unit, y + 0.3 * self._line), words, self._line, SOFT)
         return out
-
-
-def png(image: Pixels) -> bytes:
-    """The picture as a PNG file."""
-    return bytes(cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 6])[1].tobytes())
