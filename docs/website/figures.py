@@ -1,6 +1,7 @@
 """Makes the pictures of the documentation: `python -m docs.website.figures` writes them into docs/images.
 
 The program's own commands run on simulated boards, campaigns and recordings; the figures are those of their reports.
+`python -m docs.website.figures report` makes only docs/report.png, the report of sample_runs/huo2015 in Chromium.
 """
 
 from __future__ import annotations
@@ -56,6 +57,8 @@ FIGURES = {
 }
 _FIGURE = re.compile(r'<svg class="plot"[^>]*aria-label="(?P<label>[^"]*)".*?</svg>', re.DOTALL)
 _RIGHT = 14.0  # px added on the right: in a report, words may reach beyond the figure
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+REPORT_SIZE = (1200, 1640)  # px of docs/report.png
 PHOTOS = (0, 3, 7, 11, 15, 19)  # of the campaign's photographs, in the picture of how to take them
 
 
@@ -103,6 +106,35 @@ def mosaic(photos: list[Path], columns: int = 3, width: int = 360) -> np.ndarray
     return np.vstack([np.hstack(small[i : i + columns]) for i in range(0, len(small), columns)])
 
 
+def beampose(command: str, folder: Path) -> None:
+    """Run a command of this checkout in a folder. Raises CalledProcessError."""
+    print(f"beampose {command}", flush=True)
+    start = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from cli import main; main(prog_name='beampose')"
+    subprocess.run([sys.executable, "-P", "-c", start, *command.split()], cwd=folder, check=True)
+
+
+def make_report_picture(work: Path, picture: Path) -> None:
+    """The beginning of the report of sample_runs/huo2015, as headless Chromium shows it.
+
+    Raises:
+        CalledProcessError: a command failed.
+        LookupError: there is no Chromium.
+    """
+    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        raise LookupError(f"docs/report.png needs one of {', '.join(BROWSERS)}; on Debian: apt-get install chromium")
+    beampose(f"run {ROOT / 'sample_runs' / 'huo2015'} --out huo2015", work)
+    options = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--hide-scrollbars",
+        f"--user-data-dir={work / 'browser'}",
+    ]
+    shot = [f"--window-size={REPORT_SIZE[0]},{REPORT_SIZE[1]}", f"--screenshot={picture}"]
+    subprocess.run([browser, *options, *shot, (work / "huo2015" / "report.html").as_uri()], check=True)
+
+
 def make(work: Path, images: Path) -> None:
     """Run the commands in the folder `work` and write all pictures into `images`.
 
@@ -110,10 +142,8 @@ def make(work: Path, images: Path) -> None:
         CalledProcessError: a command failed.
         LookupError: a report has no such figure.
     """
-    start = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from cli import main; main(prog_name='beampose')"
     for command in COMMANDS:
-        print(f"beampose {command}", flush=True)
-        subprocess.run([sys.executable, "-P", "-c", start, *command.split()], cwd=work, check=True)
+        beampose(command, work)
     for name, (folder, label, which) in FIGURES.items():
         found = [
             svg
@@ -137,4 +167,6 @@ def make(work: Path, images: Path) -> None:
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory(prefix="beampose-figures-") as folder:
-        make(Path(folder), IMAGES)
+        if sys.argv[1:] != ["report"]:
+            make(Path(folder), IMAGES)
+        make_report_picture(Path(folder), ROOT / "docs" / "report.png")
