@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from bench.rig_calibration import bench_figures
 from calibration.boards.board_types import parse
-from calibration.findings import Level
+from lab.findings.finding import Level
 from calibration.lens.fit.lens_fit import robust_fit
 from calibration.lens.fit.lens_parameters import AS_STATED
 from calibration.lens.fit.lens_start import start

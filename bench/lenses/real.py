@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from calibration.boards.board_types import parse
-from calibration.findings import Level
+from lab.findings.finding import Level
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics import IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics

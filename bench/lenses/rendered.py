@@ -16,7 +16,7 @@ import numpy as np
 from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Board, CircleGrid, parse
 from calibration.boards.board_view import BoardView
-from calibration.findings import Level
+from lab.findings.finding import Level
 from calibration.lens.fit.corner_table import CircleAreas, CornerTable
 from calibration.lens.fit.lens_models import LensModel, rational_of_fisheye
 from calibration.lens.intrinsics import IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics

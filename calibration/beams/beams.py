@@ -62,6 +62,20 @@ class BeamCalibration:
     frame_free: int  # number of undetermined motions of the body frame: 6 if no position is known
     dropped: Sequence[int]  # positions with too few spots to determine their pose
 
+    @property
+    def direction_sigmas(self) -> Array:
+        """Sigma of each beam's direction (k,), rad: RMS of the two axes across it."""
+        return self._across(0)
+
+    @property
+    def offset_sigmas(self) -> Array:
+        """Sigma of each beam's offset (k,), m: RMS of the two axes across it, at the point nearest to the origin."""
+        return self._across(2)
+
+    def _across(self, first: int) -> Array:
+        variances = np.diagonal(self.lines_covariance).reshape(-1, 4)[:, first : first + 2]
+        return np.sqrt(np.mean(variances, axis=1))
+
 
 def calibrate_beams(
     rig: Rig, spots: SpotPixels, stand: StandModel, knowledge: RigCovariance | None = None, *, nominal: bool = True

@@ -1,4 +1,4 @@
-"""Intrinsic calibration of a camera from photographs of a board: lens model, parameters, covariance and findings."""
+"""Intrinsic calibration of a camera from photographs of a board: lens model, parameters and covariance."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from calibration.lens.fit.lens_start import StartError, start
 from calibration.lens.fit.model_selection import RATIONAL, ModelCandidate, inliers_of_rich_models, select_model
 from calibration.lens.fit.projection_map import Difference, ProjectionMap, difference, projection_map
 from calibration.lens.fit.view_equations import ViewEquations
-from calibration.lens.intrinsics_findings import findings_of
 from calibration.lens.intrinsics_result import Intrinsics, Origins
 from calibration.lens.model_uncertainty import estimate_model_uncertainty
 from geometry.arrays import Array, Bools
@@ -94,7 +93,7 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
         covariance = equations.scattered_covariance(noise)[: equations.lens, : equations.lens]
     covariance = covariance + _by_unsolved_bend(table, found, shape, options)
     model_uncertainty = estimate_model_uncertainty(table, found, selection, pixel_map, covariance, noise)
-    out = Intrinsics(
+    return Intrinsics(
         table=table,
         model=found.model,
         fit=found,
@@ -112,7 +111,6 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
         distance_m=distance,
         coverage=coverage_of(table, found.used, found.poses),
     )
-    return replace(out, findings=findings_of(out))
 
 
 def _check_enough(table: CornerTable) -> None:

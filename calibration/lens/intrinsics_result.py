@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.findings import Finding, Level, verdict
 from calibration.lens.board_shape import BoardTest, WarpTest
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import Coverage
@@ -47,17 +46,11 @@ class Intrinsics:
     map: ProjectionMap
     distance_m: float
     coverage: Coverage
-    findings: tuple[Finding, ...] = ()
 
     @property
     def warp(self) -> WarpTest | None:
         """The test for a bent board; None where the views do not determine it."""
         return None if self.board is None else self.board.warp
-
-    @property
-    def verdict(self) -> Level:
-        """The level of the most severe finding."""
-        return verdict(self.findings)
 
     @property
     def matrix(self) -> Array:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
-from calibration.beams.beam_findings import FEWEST_POSITIONS
 from calibration.beams.mean_rotation import mean_rotation
 from calibration.rig.joint import SPOTS, Joint, Measured, calibrate_jointly
 from calibration.rig.measurement_groups import jacobian, shares
@@ -21,7 +20,20 @@ from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.uncertainty.rig_uncertainty import Sensitivity
 
+# Positions required for a trustworthy result. Without a fifth of eight, six remain, the number of parameters of a pose;
+# with fewer, a single wrong record or label moves the beams without increasing the residuals.
+FEWEST_POSITIONS = 8
 FOLDS = 5  # groups of positions; each is predicted from the other four
+
+
+def in_degrees(covariance: Array) -> float:
+    """RMS over the three axes of the attitude sigmas of a pose covariance (6, 6), deg."""
+    return float(np.rad2deg(np.sqrt(np.mean(np.maximum(np.diagonal(covariance)[3:], 0.0)))))
+
+
+def in_mm(covariance: Array) -> float:
+    """RMS over the three axes of the position sigmas of a pose covariance (6, 6), mm."""
+    return float(1e3 * np.sqrt(np.mean(np.maximum(np.diagonal(covariance)[:3], 0.0))))
 
 
 @dataclass(frozen=True, slots=True)

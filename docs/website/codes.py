@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from docs.website.text import cell
-from lab.explain.catalogue import SECTIONS
+from lab.findings.catalogue import SECTIONS
 
 _HEAD = """# Codes
 
 Every warning, verdict reason, finding and error has a code. It appears in reports, in `summary.json` and on the
 terminal. `beampose explain BP-V03` shows the text of this page. A text may change; a code keeps its meaning.
 
-This page is generated from `lab/explain/`.
+This page is generated from `lab/findings/catalogue.toml`.
 """
 
 

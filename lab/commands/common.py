@@ -353,6 +353,6 @@ def complete_rigs(ctx: click.Context, parameter: click.Parameter, begun: str) ->
 
 def complete_codes(ctx: click.Context, parameter: click.Parameter, begun: str) -> list[str]:
     """Codes of `explain` that begin with `begun`, in any case."""
-    from lab.explain.catalogue import EXPLANATIONS
+    from lab.findings.catalogue import ENTRIES
 
-    return [code for code in EXPLANATIONS if code.startswith(begun.upper())]
+    return [code for code in ENTRIES if code.startswith(begun.upper())]

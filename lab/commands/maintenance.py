@@ -45,7 +45,7 @@ def explain(codes: tuple[str, ...]) -> None:
     Example:
         beampose explain BP-V03
     """
-    from lab.explain import catalogue
+    from lab.findings import catalogue
 
     texts = [catalogue.explain(code) for code in codes] if codes else catalogue.listed()
     show_line(("\n\n" if codes else "\n").join(texts))

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lab.errors import RunError
-from lab.explain.catalogue import EXPLANATIONS
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.error_text import printable
+from lab.findings.catalogue import ENTRIES
 from lab.report.html import environment
 
 
@@ -36,7 +36,7 @@ def files_beside(report: Path) -> list[str]:
 def write_failure_report(path: Path, failure: Failure) -> Path:
     """Write the report of a failure as the HTML file `path`; returns the path. Raises InputError."""
     text = environment().get_template("failure.html.j2").render(
-        f=failure, explanation=EXPLANATIONS[failure.code], log=[printable(line) for line in failure.log]
+        f=failure, explanation=ENTRIES[failure.code], log=[printable(line) for line in failure.log]
     )  # fmt: skip
     atomic_write_text(text, path)
     return path

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calibration.findings import Level
-from calibration.findings import verdict as verdict_of
 from geometry.forward_model import SpotModel
 from lab.files.rig.calibration_state import require_valid_calibration
 from lab.files.run.parameter_overrides import with_overrides
@@ -20,6 +18,8 @@ from lab.files.run.run_file import Run, load_run
 from lab.files.run.truth import load_run_truth
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.json_text import has_schema, write_json
+from lab.findings.finding import Level
+from lab.findings.finding import verdict as verdict_of
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.model_check.frame_sampler import FrameSampler, stated_covariances, widths
 from lab.runs.run_log import RunLog, listening

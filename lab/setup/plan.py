@@ -7,10 +7,10 @@ from pathlib import Path
 
 from calibration.budget.expected_errors import expected_errors
 from calibration.budget.pose_grid import plan_grid
-from calibration.findings import Level, verdict
 from lab.errors import QUALITY_GATE_FAILED
 from lab.files.rig.rig_file import TARGET, joint_covariance, load_rig_file
 from lab.files.text.atomic_write import atomic_folder, check_output_folder
+from lab.findings.finding import Level, verdict
 from lab.number_format import format_angle, format_length, format_percent
 from lab.setup.plan_findings import Plan, PlanOptions, findings, median_sigma
 from lab.setup.plan_page import write_effects, write_plan, write_plan_page

@@ -20,12 +20,12 @@ from calibration.budget.pose_budget import (
     SCREEN_SHAPES,
 )
 from calibration.budget.pose_grid import NOISE, GridPlan
-from calibration.findings import Finding, Level
 from geometry.arrays import Array, Bools
 from lab.errors import InputError
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.error_text import suggest_name
 from lab.files.text.range_checks import MAX_COORDINATE_M
+from lab.findings.finding import Finding, Level
 from lab.number_format import format_angle, format_length, format_percent
 
 # Options of a plan: the grid of poses, the noise of a spot, the goals and the expected calibration errors.

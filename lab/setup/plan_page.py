@@ -12,10 +12,10 @@ import numpy as np
 
 from calibration.budget.pose_budget import group_of
 from calibration.budget.pose_grid import AXES, STATUS, plan_grid, poses_of
-from calibration.findings import Finding, verdict
 from geometry.arrays import Array
 from lab import number_format
 from lab.files.text.csv_text import write_table
+from lab.findings.finding import Finding, verdict
 from lab.number_format import format_angle, format_length, format_percent
 from lab.report.calibration.calibration_page import (
     CalibrationReport,

@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from calibration.findings import Finding, Level
 from geometry.arrays import Array
 from lab.errors import InputError
+from lab.findings.finding import Finding, Level
 from lab.number_format import format_percent
 from lab.report.calibration.calibration_page import PageTable, Section
 from lab.report.plot.axes import BLUE, VERMILLION

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.findings import Finding, Level, verdict
 from geometry.arrays import Array
 from lab.files.text.atomic_write import atomic_write_text
+from lab.findings.finding import Finding, Level, verdict
 from lab.number_format import format_number, format_percent
 from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section, section_context
 from lab.report.html import environment

@@ -12,11 +12,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from calibration.findings import Finding, Level
 from geometry.arrays import Array
 from lab.errors import InputError
 from lab.files.run.parameter_overrides import with_overrides
 from lab.files.text.csv_text import number_fields
+from lab.findings.finding import Finding, Level
 from lab.number_format import format_number, format_percent
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import PictureSource, open_inputs, pictures_of_frames

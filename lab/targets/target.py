@@ -11,8 +11,8 @@ from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from calibration.findings import Finding
 from geometry.arrays import Array, Bools
+from lab.findings.finding import Finding
 from lab.pictures.picture_file import GreyPicture
 from lab.pictures.source import PictureSource, Video, open_inputs
 from lab.report.calibration.calibration_page import Section

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from calibration.findings import Finding
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import write_table
 from lab.files.text.json_text import has_schema, write_json
+from lab.findings.finding import Finding
 from lab.targets.overlay import write_overlay
 from lab.targets.page import write_target_page
 from lab.targets.recording import Progress

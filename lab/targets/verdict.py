@@ -9,8 +9,8 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from calibration.findings import Finding, Level, unless_pass, verdict
 from lab.errors import QUALITY_GATE_FAILED
+from lab.findings.finding import Finding, Level, unless_pass, verdict
 from lab.targets.target import F, Target, Track
 from tracking.statuses import Cause
 

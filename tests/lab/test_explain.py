@@ -8,11 +8,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from calibration.findings import Finding, Level, unless_pass
+from lab.findings.finding import Finding, Level, unless_pass
 from lab import errors
 from lab.errors import InputError
-from lab.explain import catalogue, program
-from lab.explain.catalogue import EXPLANATIONS, SECTIONS
+from lab.findings import catalogue, program
+from lab.findings.catalogue import ENTRIES, SECTIONS
 from lab.runs.verdict.verdict_reasons import CODES, ReasonKind, VerdictReason
 from tests.paths import ROOT
 
@@ -70,8 +70,8 @@ def test_a_finding_without_a_code_is_found(call):
 
 
 def test_every_code_in_use_is_explained_and_every_explained_code_is_in_use():
-    assert codes_in_use() - set(EXPLANATIONS) == set()
-    assert set(EXPLANATIONS) - codes_in_use() - set(program.ERRORS) == set()
+    assert codes_in_use() - set(ENTRIES) == set()
+    assert set(ENTRIES) - codes_in_use() - set(program.ERRORS) == set()
 
 
 def test_every_kind_of_verdict_reason_has_its_own_explained_code():
@@ -99,13 +99,13 @@ def test_every_class_of_error_has_the_code_of_its_exit_status():
     assert len(classes) == 4
     for c in classes:
         assert c.code == f"BP-E0{c.exit_status}"
-        assert f"exit status {c.exit_status}" in EXPLANATIONS[c.code].title
-    assert f"exit status {errors.QUALITY_GATE_FAILED}" in EXPLANATIONS["BP-E04"].title
+        assert f"exit status {c.exit_status}" in ENTRIES[c.code].title
+    assert f"exit status {errors.QUALITY_GATE_FAILED}" in ENTRIES["BP-E04"].title
 
 
 def test_a_code_belongs_to_one_section_and_has_all_texts():
-    assert sum(map(len, SECTIONS.values())) == len(EXPLANATIONS)
-    for code, text in EXPLANATIONS.items():
+    assert sum(map(len, SECTIONS.values())) == len(ENTRIES)
+    for code, text in ENTRIES.items():
         assert CODE.fullmatch(code)
         assert min(map(len, text)) > 3
         assert text.meaning.endswith(".")
@@ -123,7 +123,7 @@ def test_a_code_that_does_not_exist_is_an_input_error():
 
 
 def test_the_list_has_every_code():
-    assert set(CODE.findall("\n".join(catalogue.listed()))) == set(EXPLANATIONS)
+    assert set(CODE.findall("\n".join(catalogue.listed()))) == set(ENTRIES)
 
 
 def test_a_finding_that_passes_keeps_its_code_and_drops_its_remedy():

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.beams.beam_findings import ARCSEC, direction_sigmas, offset_sigmas
 from calibration.beams.beam_start import world_points
 from calibration.beams.beams import BeamCalibration
 from geometry.arrays import Array
 from geometry.rig import Rig
+from lab.calibrate.beams.beam_findings import ARCSEC
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.csv_text import csv_text
 
@@ -39,7 +39,7 @@ def _beam_table(c: BeamCalibration, nominal: Rig) -> str:
     off = difference_from_nominal(c, nominal)
     for i, name in enumerate(c.rig.beams):
         numbers = [*c.lines.directions[i], *c.lines.points[i]]
-        figures = [direction_sigmas(c)[i] / ARCSEC, 1e3 * offset_sigmas(c)[i], off[i, 0] / ARCSEC, 1e3 * off[i, 1]]
+        figures = [c.direction_sigmas[i] / ARCSEC, 1e3 * c.offset_sigmas[i], off[i, 0] / ARCSEC, 1e3 * off[i, 1]]
         if c.undetermined:
             figures[:2] = [np.nan, np.nan]
         rows.append([name, *(f"{v:.12g}" for v in numbers), *(_short(v) for v in figures)])

@@ -4,89 +4,55 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from calibration.beams.beam_findings import ARCSEC, UNDETERMINED, BeamGoals, beam_findings, direction_sigmas
 from calibration.beams.beams import BeamCalibration, self_calibrate
 from calibration.beams.beams import calibrate_beams as solve_beams
-from calibration.beams.excitation import summary_of
-from calibration.findings import Finding, Level, verdict
 from calibration.least_squares.adjustment import AdjustmentError
 from geometry.uncertainty.rig_uncertainty import RigCovariance
+from lab.calibrate.beams.beam_findings import ARCSEC, BeamGoals, beam_findings, stand_findings
 from lab.calibrate.beams.beam_tables import BEAMS, write_tables
+from lab.calibrate.beams.beams_page import page_of
 from lab.calibrate.beams.recording_check import check_no_duplicates, diagnose_failed_fit
-from lab.calibrate.beams.recordings import Recordings, read_recordings, stand_of
-from lab.calibrate.calibration_date import calibration_date, expiry_date, expiry_findings
+from lab.calibrate.beams.recordings import read_recordings, stand_of
+from lab.calibrate.step import Outcome, Solved, Step, calibration_date, expiry_date, expiry_findings, run_step
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import load_project
 from lab.files.project.project_blocks import Project
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance, load_rig_file, save_rig
 from lab.files.rig.screens_file import load_screens
-from lab.files.text.atomic_write import atomic_folder, check_output_folder, keep_good_results
 from lab.files.text.error_text import suggest_name
 from lab.files.text.yaml_text import read_mapping
+from lab.findings.finding import Finding, Level, finding, passed, reasons, verdict
 
 RIG = "rig.yaml"
 
 
-@dataclass(frozen=True, slots=True)
-class BeamsOutcome:
-    """Result of a beam calibration."""
-
-    name: str
-    out: Path
-    level: Level
-    findings: tuple[Finding, ...]
-    calibration: BeamCalibration
-    rig: Path | None  # the rig.yaml written; None where the verdict is FAIL
-
-    @property
-    def exit_status(self) -> int:
-        """0, or 3 if the calibration must not be used."""
-        return CalibrationError.exit_status if self.level == Level.FAIL else 0
-
-    def line(self) -> str:
-        """One line for the terminal."""
-        c = self.calibration
-        sigma = float(np.sqrt(np.mean(direction_sigmas(c) ** 2))) / ARCSEC
-        worst = max(self.findings, key=lambda f: f.level)
-        what = f"{len(c.lines)} beams from {len(c.world_from_body.translation)} positions"
-        if c.world_from_stand is None and c.angles:
-            between = float(np.sqrt(np.mean([a.sigma**2 for a in c.angles]))) / ARCSEC
-            what += f" at unknown poses, angles between beams to {between:.3g} arcsec RMS"
-        elif not c.undetermined:
-            what += f", directions to {sigma:.3g} arcsec RMS"
-        if not c.fit.kept.all():
-            what += f", {int(np.sum(~c.fit.kept))} of {len(c.fit.kept)} spots excluded"
-        warnings = sum(f.level == Level.WARN for f in self.findings)
-        reason = f"; {warnings} warning{'s' if warnings > 1 else ''}, see report.html" if warnings else ""
-        if self.level == Level.FAIL:
-            what_failed = worst.what.split(" (")[0]
-            if c.undetermined and worst.what.startswith(UNDETERMINED):
-                what_failed = f"{UNDETERMINED}: {summary_of(c.undetermined)}"
-            reason = f"; {what_failed}: {worst.remedy}"
-        return f"{self.name}: {self.level.name}: {what}{reason} -> {self.out}"
+_STEP = Step("Beams", (BEAMS,), RIG)
 
 
 def calibrate_beams(
     project_path: Path, out: Path, rig: Path | None = None, today: datetime.date | None = None
-) -> BeamsOutcome:
+) -> Outcome[BeamCalibration]:
     """Calibrate the beams of a project; write three tables, report.html and, unless the verdict is FAIL, rig.yaml.
 
     rig: the rig.yaml or screens.yaml with the calibrated cameras and screens and their covariances (None: `rig.yaml`
     beside the project). The project need not repeat cameras, screens and target; if it has a target, this replaces
-    the rig's. A FAIL never replaces an earlier calibration: its results go to `OUT-failed`.
+    the rig's.
 
     Raises:
         InputError: for errors in the files.
-        CalibrationError: if the spots do not determine a calibration. `out` is left unchanged.
+        CalibrationError: if the spots do not determine a calibration.
     """
-    check_output_folder(out, _is_ours)
-    project = load_project(Path(project_path), lab_known=True)
+    return run_step(_STEP, out, lambda: _solve(Path(project_path), rig, today))
+
+
+def _solve(project_path: Path, rig: Path | None, today: datetime.date | None) -> Solved[BeamCalibration]:
+    project = load_project(project_path, lab_known=True)
     day = calibration_date(project, today)
     check_no_duplicates(project)
     rig_path = Path(rig) if rig is not None else project.path.parent / RIG
@@ -94,36 +60,48 @@ def calibrate_beams(
     recordings = read_recordings(project, file.rig)
     try:
         if recordings.stand_from_body is None:
-            found = self_calibrate(file.rig, recordings.spots, len(recordings.names), lab_covariance)
+            c = self_calibrate(file.rig, recordings.spots, len(recordings.names), lab_covariance)
         else:
-            found = solve_beams(file.rig, recordings.spots, stand_of(project, recordings), lab_covariance)
+            c = solve_beams(file.rig, recordings.spots, stand_of(project, recordings), lab_covariance)
     except AdjustmentError as error:
         if recordings.stand_from_body is not None:
             diagnose_failed_fit(project, file.rig, recordings, lab_covariance)
         raise CalibrationError(f"{project.path}: the beams cannot be calibrated: {error}") from None
-    findings = [
-        *beam_findings(found, file.rig, recordings.names, BeamGoals()),
+    findings = (
+        *beam_findings(c, file.rig, recordings.names, BeamGoals()),
         *expiry_findings(project, day, today),
-        *_input_findings(project, recordings, lab_covariance is not None, file.calibration, rig_path),
-    ]
-    level = verdict(findings)
-    folder = keep_good_results(out, level == Level.FAIL, RIG)
-    outcome = BeamsOutcome(
-        project.name, folder, level, tuple(findings), found, None if level == Level.FAIL else folder / RIG
+        *map(passed, recordings.notes),
+        *_lab_findings(lab_covariance is not None, file.calibration, rig_path),
+        *stand_findings(project, recordings),
     )
-    with atomic_folder(folder, may_replace=_is_ours) as work:
-        write_tables(found, file.rig, recordings.names, work)
-        if level != Level.FAIL:
-            save_rig(_rig_file(file, found, project, findings, day), work / RIG)
-        from lab.calibrate.beams.beams_page import write_page  # imports the template engine
 
-        inputs = [rig_path, *project.inputs]
-        write_page(project.name, found, findings, file.rig, recordings.names, inputs, day, work)
-    return outcome
+    def write(folder: Path) -> None:
+        write_tables(c, file.rig, recordings.names, folder)
+        if verdict(findings) < Level.FAIL:
+            save_rig(_rig_file(file, c, project, findings, day), folder / RIG)
+
+    return Solved(
+        name=project.name,
+        result=c,
+        findings=findings,
+        figures=_figures(c),
+        write=write,
+        page=lambda: page_of(c, file.rig, recordings.names),
+        day=day,
+        inputs=[rig_path, *project.inputs],
+    )
 
 
-def _is_ours(folder: Path) -> bool:
-    return (folder / BEAMS).is_file()
+def _figures(c: BeamCalibration) -> str:
+    out = f"{len(c.lines)} beams from {len(c.world_from_body.translation)} positions"
+    if c.world_from_stand is None and c.angles:
+        between = float(np.sqrt(np.mean([a.sigma**2 for a in c.angles]))) / ARCSEC
+        out += f" at unknown poses, angles between beams to {between:.3g} arcsec RMS"
+    elif not c.undetermined:
+        out += f", directions to {float(np.sqrt(np.mean(c.direction_sigmas**2))) / ARCSEC:.3g} arcsec RMS"
+    if not c.fit.kept.all():
+        out += f", {int(np.sum(~c.fit.kept))} of {len(c.fit.kept)} spots excluded"
+    return out
 
 
 def _calibrated_lab(project: Project, rig_path: Path) -> tuple[RigFile, RigCovariance | None]:
@@ -168,51 +146,16 @@ def _lab_file(path: Path) -> tuple[RigFile, RigCovariance | None]:
     return file, joint_covariance(file.rig, file.covariances, path)
 
 
-def _input_findings(
-    project: Project, recordings: Recordings, with_covariance: bool, lab_state: CalibrationState | None, rig_path: Path
-) -> list[Finding]:
-    out = [Finding(Level.PASS, note) for note in recordings.notes]
-    if lab_state is not None and lab_state.verdict != Level.PASS.name:
-        out.append(
-            Finding(
-                Level[lab_state.verdict],
-                f"{rig_path.name} has the verdict {lab_state.verdict}:"
-                f" {'; '.join(lab_state.reasons) or 'no reason given'}",
-                "errors of cameras and screens carry over to the beams",
-                "see the report beside it",
-                code="BP-K01",
-            )
-        )
+def _lab_findings(with_covariance: bool, state: CalibrationState | None, rig_path: Path) -> list[Finding]:
+    """Findings on the calibrated cameras and screens."""
+    out = []
+    if state is not None and state.verdict != Level.PASS.name:
+        why = "; ".join(state.reasons) or "no reason given"
+        what = f"{rig_path.name} has the verdict {state.verdict}: {why}"
+        out.append(finding("BP-K01", Level[state.verdict], what))
     if not with_covariance:
-        out.append(
-            Finding(
-                Level.WARN,
-                f"{rig_path.name} holds no covariance of cameras and screens: they are taken as exact",
-                "the sigmas of the beams are of the spots' noise alone, too small",
-                "calibrate cameras and screens with beampose, which writes their covariance",
-                code="BP-K02",
-            )
-        )
-    stand = project.stand
-    placed = recordings.stand_from_body is not None and stand is not None and stand.world_from_stand is not None
-    if placed and stand is not None and stand.sigma_m == stand.sigma_rad == 0:
-        out.append(
-            Finding(
-                Level.WARN,
-                "stand.world_from_stand has no sigma: it is assumed exact",
-                "its error goes unnoticed into the boresight of all beams",
-                "give stand.sigma_m and stand.sigma_deg, or omit world_from_stand so that it is estimated",
-                code="BP-K03",
-            )
-        )
-    if recordings.stand_from_body is not None and not np.any(recordings.pose_sigmas):
-        out.append(
-            Finding(
-                Level.PASS,
-                "the stand's positions are assumed exact; give stand.pose_sigma_m and pose_sigma_deg unless its"
-                " encoders are much more precise than the spots",
-            )
-        )
+        what = f"{rig_path.name} holds no covariance of cameras and screens: they are taken as exact"
+        out.append(finding("BP-K02", Level.WARN, what))
     return out
 
 
@@ -221,6 +164,5 @@ def _rig_file(
 ) -> RigFile:
     lab = file.calibration  # of cameras and screens: the new rig.yaml expires no later than they do
     expiry = [d for d in (lab.valid_until if lab is not None else None, expiry_date(project, day)) if d is not None]
-    reasons = [f.what for f in findings if f.level > Level.PASS]
-    state = CalibrationState(day, verdict(findings).name, min(expiry, default=None), tuple(reasons), project.notes)
+    state = CalibrationState(day, verdict(findings).name, min(expiry, default=None), reasons(findings), project.notes)
     return RigFile(c.rig, covariance_blocks(c.covariance), state)

@@ -2,70 +2,43 @@
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
-from calibration.beams.beam_findings import ARCSEC, direction_sigmas, offset_sigmas
 from calibration.beams.beams import BeamCalibration
-from calibration.findings import Finding, verdict
 from geometry.arrays import Array, Bools
 from geometry.pose import ypr_sigmas
 from geometry.rig import Rig
+from lab.calibrate.beams.beam_findings import ARCSEC
 from lab.calibrate.beams.beam_tables import difference_from_nominal, residuals_mm, used_positions
 from lab.number_format import format_number
 from lab.report.calibration.calibration_charts import residual_histogram
 from lab.report.calibration.calibration_drawings import coverage_map, residual_field
 from lab.report.calibration.calibration_page import (
-    CalibrationReport,
+    KeyFigure,
     PageDrawing,
     PageTable,
     Section,
-    provenance,
-    write_calibration_report,
 )
 from lab.report.calibration.calibration_scene import rig_things, scene_views
 
 
-def write_page(
-    name: str,
-    c: BeamCalibration,
-    findings: Sequence[Finding],
-    nominal: Rig,
-    positions: Sequence[str],
-    inputs: Sequence[Path],
-    day: datetime.date,
-    folder: Path,
-) -> Path:
-    """Write report.html. nominal: the rig with the beams as designed; positions: names of all positions."""
-    sections = [
+def page_of(c: BeamCalibration, nominal: Rig, positions: Sequence[str]) -> tuple[list[KeyFigure], list[Section]]:
+    """Key figures and sections of the report. nominal: the rig with the beams as designed; positions: names of all."""
+    scene = [PageDrawing(view) for view in scene_views(rig_things(c.rig, c.world_from_body[0]))]
+    return _key_figures(c), [
         _beams(c, nominal),
         _between(c),
         _body_frame(c),
         _positions(c, positions),
         _residuals(c),
-        Section(
-            "The lab",
-            "The vehicle at the first position, with the calibrated beams.",
-            [PageDrawing(view) for view in scene_views(rig_things(c.rig, c.world_from_body[0]))],
-        ),
+        Section("The lab", "The vehicle at the first position, with the calibrated beams.", scene),
     ]
-    report = CalibrationReport(
-        "Beams",
-        name,
-        verdict(findings),
-        findings,
-        _key_figures(c),
-        sections,
-        provenance(inputs, day),
-    )
-    return write_calibration_report(report, folder)
 
 
-def _key_figures(c: BeamCalibration) -> list[tuple[str, str, str]]:
-    direction, offset = direction_sigmas(c), offset_sigmas(c)
+def _key_figures(c: BeamCalibration) -> list[KeyFigure]:
+    direction, offset = c.direction_sigmas, c.offset_sigmas
     kept = c.fit.kept
     rms_px = float(np.sqrt(np.mean(c.fit.residuals_px[kept] ** 2)))
     rms_mm = float(np.sqrt(np.nanmean(residuals_mm(c)[kept] ** 2) / 2))
@@ -101,7 +74,7 @@ def _key_figures(c: BeamCalibration) -> list[tuple[str, str, str]]:
 
 def _beams(c: BeamCalibration, nominal: Rig) -> Section:
     off = difference_from_nominal(c, nominal)
-    direction, offset = direction_sigmas(c) / ARCSEC, 1e3 * offset_sigmas(c)
+    direction, offset = c.direction_sigmas / ARCSEC, 1e3 * c.offset_sigmas
     if c.undetermined:
         direction, offset = np.full_like(direction, np.nan), np.full_like(offset, np.nan)
     ends = {

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from calibration.boards.board_types import Board, CircleGrid
-from calibration.findings import Level
 from calibration.lens.fit.corner_table import CircleAreas, CornerTable
 from calibration.lens.fit.lens_models import LENS_MODELS, named
 from calibration.lens.intrinsics import (
@@ -22,21 +21,25 @@ from calibration.lens.intrinsics import (
 )
 from calibration.lens.intrinsics_result import Intrinsics
 from geometry.camera import FISHEYE, PERSPECTIVE
-from lab.calibrate.camera.camera_outcome import CameraOutcome
+from lab.calibrate.camera.camera_findings import findings_of, next_photographs
+from lab.calibrate.camera.camera_page import page_of
 from lab.calibrate.camera.corner_tables import TABLE_SUFFIXES, read_corner_table
 from lab.calibrate.camera.photos import PhotoSet, Progress, find_in_photos, origins_of
+from lab.calibrate.step import Outcome, Solved, Step, run_step
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.board_file import load_board_or_text
 from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
-from lab.files.text.atomic_write import atomic_folder, check_output_folder, keep_good_results
 from lab.files.text.csv_text import write_table
 from lab.files.text.error_text import suggest_name
+from lab.findings.finding import Finding, Level, verdict
+from lab.number_format import format_number
 
 CAMERA, FAILED, CORNERS = "camera.yaml", "camera.failed.yaml", "corners.csv"
 CORNER_COLUMNS = ("view", "id", "u_px", "v_px", "residual_u_px", "residual_v_px", "used")  # measured minus model
 LENSES = ("auto", *(m.title for m in LENS_MODELS))
 WARPS = {"auto": None, "on": True, "off": False}
+_STEP = Step("Camera", (CORNERS,), CAMERA)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,41 +81,60 @@ def calibrate_camera(
     options: CameraOptions | None = None,
     today: datetime.date | None = None,
     progress: Progress | None = None,
-) -> CameraOutcome:
+) -> Outcome[Intrinsics]:
     """Calibrate a camera from photographs (files, folders, patterns, videos) of a board (value, text or board.yaml).
 
     photos may also be one table of corners, see `corner_tables`, with the size of its pictures in the options.
 
-    Writes camera.yaml, corners.csv and report.html into the folder `out`, all or none. If the verdict is FAIL, the
-    camera file is called camera.failed.yaml so that no program reads it by mistake; a FAIL never replaces an earlier
-    calibration, its results go to `OUT-failed`.
+    Writes camera.yaml, corners.csv and report.html. If the verdict is FAIL, the camera file is called
+    camera.failed.yaml so that no program reads it by mistake.
 
     Raises:
         InputError: for pictures or a board that cannot be used.
         CalibrationError: if the photographs do not determine the camera.
     """
-    options = options or CameraOptions()
-    check_output_folder(out, _is_ours)
+    return run_step(_STEP, out, lambda: _solve(list(photos), board, options or CameraOptions(), today, progress))
+
+
+def _solve(
+    photos: list[Path | str],
+    board: Board | str | Path,
+    options: CameraOptions,
+    today: datetime.date | None,
+    progress: Progress | None,
+) -> Solved[Intrinsics]:
     day = today or datetime.date.today()
     known = load_board_or_text(board) if isinstance(board, str | Path) else board
-    found = _views(list(photos), known, options, progress)
-    table = corner_table(found)
+    found = _views(photos, known, options, progress)
     try:
-        result = calibrate_intrinsics(table, options.intrinsics(origins_of(found)))
+        r = calibrate_intrinsics(corner_table(found), options.intrinsics(origins_of(found)))
     except TooFewViewsError as error:
         raise InputError(f"{options.name} ({found.line()}): {error}") from None
     except IntrinsicsError as error:
         raise CalibrationError(f"{options.name} ({found.line()}): {error}") from None
-    folder = keep_good_results(out, result.verdict == Level.FAIL, CAMERA)
-    outcome = CameraOutcome(options.name, folder, result, found)
-    file = camera_file(outcome, options, day)
-    with atomic_folder(folder, may_replace=_is_ours) as work:
-        save_camera(file, work / (FAILED if outcome.level == Level.FAIL else CAMERA))
-        _write_corners(outcome, work / CORNERS)
-        from lab.calibrate.camera.camera_page import write_page  # imports the template engine
+    findings = findings_of(r)
+    failed = verdict(findings) is Level.FAIL
+    until = "" if options.valid_days is None or failed else (day + datetime.timedelta(options.valid_days)).isoformat()
+    file = camera_file(r, found.board.describe(), findings, options.name, day, until)
 
-        write_page(outcome, file, day, work)
-    return outcome
+    def write(folder: Path) -> None:
+        save_camera(file, folder / (FAILED if failed else CAMERA))
+        _write_corners(r, found, folder / CORNERS)
+
+    px, mm = (np.nanmedian(m) for m in (r.map.sigma_px(r.covariance), r.map.sigma_mm(r.covariance)))
+    return Solved(
+        name=options.name,
+        result=r,
+        findings=findings,
+        figures=f"fx {r.fit.lens[0]:.2f} ± {format_number(r.sigmas[0], 2)} px, {r.model.words}, RMS {r.rms_px:.3f} px,"
+        f" directions to {format_number(px, 2)} px / {format_number(mm, 2)} mm at {r.distance_m:.3g} m",
+        write=write,
+        page=lambda: page_of(r, found, "must not be used" if failed else until),
+        day=day,
+        inputs=list(dict.fromkeys(found.paths[name] for name, _ in found.views)),
+        title=f"{options.name}, {r.table.image_size_px[0]} x {r.table.image_size_px[1]} px",
+        advice=next_photographs(r),
+    )
 
 
 def _views(photos: list[Path | str], board: Board, options: CameraOptions, progress: Progress | None) -> PhotoSet:
@@ -140,31 +162,26 @@ def corner_table(photos: PhotoSet) -> CornerTable:
     return CornerTable.of(rows, board.points, board.middle, photos.image_size_px, circles)
 
 
-def _is_ours(folder: Path) -> bool:
-    return (folder / CORNERS).is_file()
-
-
-def camera_file(outcome: CameraOutcome, options: CameraOptions, day: datetime.date) -> CameraFile:
-    """The content of camera.yaml."""
-    r = outcome.result
-    failed = outcome.level == Level.FAIL
-    until = "" if options.valid_days is None or failed else (day + datetime.timedelta(options.valid_days)).isoformat()
+def camera_file(
+    r: Intrinsics, board: str, findings: Sequence[Finding], name: str, day: datetime.date, valid_until: str
+) -> CameraFile:
+    """The content of camera.yaml. board: in words; valid_until: ISO date, or empty."""
     calibration = CameraCalibration(
         date=day.isoformat(),
-        verdict=outcome.level.name,
+        verdict=verdict(findings).name,
         rms_px=r.rms_px,
         sigma_px=r.fit.sigma_px,
         hold_out_rms_px=r.held_out_rms_px,
         views=int(np.sum(r.table.counts(r.fit.used) > 0)),
         corners=int(r.fit.used.sum()),
-        board=outcome.photos.board.describe(),
+        board=board,
         distance_m=r.distance_m,
-        valid_until=until,
-        reasons=tuple(f"{f.level.name}: {f.what}" for f in r.findings if f.level > Level.PASS),
+        valid_until=valid_until,
+        reasons=tuple(f"{f.level.name}: {f.what}" for f in findings if f.level > Level.PASS),
         figures=figures_of(r),
     )
     return CameraFile(
-        name=outcome.name,
+        name=name,
         image_size_px=r.table.image_size_px,
         camera_matrix=r.matrix,
         distortion=r.distortion,
@@ -205,10 +222,9 @@ def figures_of(r: Intrinsics) -> dict[str, float]:
     return out
 
 
-def _write_corners(outcome: CameraOutcome, path: Path) -> None:
+def _write_corners(r: Intrinsics, photos: PhotoSet, path: Path) -> None:
     """Write corners.csv, one row per corner; residuals are empty in excluded views."""
-    r, names = outcome.result, [name for name, _ in outcome.photos.views]
-    ids = outcome.photos.board.ids
+    names, ids = [name for name, _ in photos.views], photos.board.ids
     rows = []
     for k in range(len(r.table)):
         miss = ["" if np.isnan(v) else f"{-v:.4f}" for v in r.fit.residuals[k].tolist()]

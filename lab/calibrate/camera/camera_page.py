@@ -2,70 +2,43 @@
 
 from __future__ import annotations
 
-import datetime
-from pathlib import Path
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.findings import Level
-from calibration.lens.board_findings import circles_finding, model_uncertainty_finding, points_finding, stretch_finding
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics_result import Intrinsics
 from geometry.arrays import Array
-from lab.calibrate.camera.camera_outcome import CameraOutcome
-from lab.calibrate.camera.photos import VIDEO_SUFFIXES
-from lab.files.rig.camera_file import CameraFile
+from lab.calibrate.camera.camera_findings import board_and_model_texts
+from lab.calibrate.camera.photos import VIDEO_SUFFIXES, PhotoSet, as_8_bit
 from lab.number_format import format_number
 from lab.pictures.opencv import opened
-from lab.pictures.picture_file import MissingPicture, decode
+from lab.pictures.picture_file import MissingPicture, read_picture
 from lab.report.calibration.calibration_charts import lens_model_chart, residual_histogram
 from lab.report.calibration.calibration_drawings import corners_overlay, coverage_map, residual_field, tilt_polar
 from lab.report.calibration.calibration_maps import correlation_matrix
 from lab.report.calibration.calibration_page import (
-    CalibrationReport,
+    KeyFigure,
     PageDrawing,
     PageTable,
     Section,
-    provenance,
     representative_views,
-    write_calibration_report,
 )
 from lab.report.plot.maps import heat_map
 
 _WORST_VIEWS = 3  # views with the largest residuals that are shown as pictures, besides the median and the best
 
 
-def write_page(outcome: CameraOutcome, file: CameraFile, day: datetime.date, folder: Path) -> Path:
-    """Write report.html into the folder."""
-    r = outcome.result
-    used_paths = [outcome.photos.paths[name] for name, _ in outcome.photos.views]
-    report = CalibrationReport(
-        "Camera",
-        f"{outcome.name}, {r.table.image_size_px[0]} x {r.table.image_size_px[1]} px",
-        outcome.level,
-        r.findings,
-        _key_figures(r, file),
-        [
-            _numbers(r),
-            _model(r),
-            _uncertainty(r),
-            _residuals(outcome),
-            _coverage(r),
-            _views(outcome),
-        ],
-        provenance(dict.fromkeys(used_paths), day),
-    )
-    return write_calibration_report(report, folder)
+def page_of(r: Intrinsics, photos: PhotoSet, valid_until: str) -> tuple[list[KeyFigure], list[Section]]:
+    """Key figures and sections of the report. valid_until: ISO date, empty: no expiry, or another text."""
+    sections = [_numbers(r), _model(r), _uncertainty(r), _residuals(r, photos), _coverage(r), _views(r, photos)]
+    return _key_figures(r, valid_until), sections
 
 
-def _key_figures(r: Intrinsics, file: CameraFile) -> list[tuple[str, str, str]]:
+def _key_figures(r: Intrinsics, valid_until: str) -> list[KeyFigure]:
     px, mm = r.map.sigma_px(r.covariance), r.map.sigma_mm(r.covariance)
     at = f"at {format_number(r.distance_m)} m"
     held = r.held_out_rms_px * _mm_per_px(r)
-    until = file.calibration.valid_until if file.calibration else ""
-    failed = r.verdict is Level.FAIL
     return [
         (
             "focal length fx",
@@ -89,7 +62,7 @@ def _key_figures(r: Intrinsics, file: CameraFile) -> list[tuple[str, str, str]]:
             f"{r.held_out_rms_px:.3f} px · {format_number(held, 2)} mm",
             f"per coordinate, {at}",
         ),
-        ("valid until", "must not be used" if failed else until or "no expiry date", ""),
+        ("valid until", valid_until or "no expiry date", ""),
     ]
 
 
@@ -148,9 +121,7 @@ def _model(r: Intrinsics) -> Section:
             f"Board: {'corrected for its bend' if r.warp.corrected else 'assumed flat'} ({r.warp.why}). Estimated bend:"
             f" {bend} per metre for x², xy, y²; {1000 * r.warp.rise_m:.2f} mm between the lowest and the highest point."
         )
-    words += [
-        f.what for f in (stretch_finding(r), points_finding(r), circles_finding(r), model_uncertainty_finding(r)) if f
-    ]
+    words += board_and_model_texts(r)
     caption = "Bars: expected error of a direction; ticks: the part from noise and scatter between photographs."
     heads = ("model", "residuals (px)", "noise (px)", "other models (px)", "expected error (px)", "result")
     table = PageTable(heads, rows)
@@ -202,8 +173,7 @@ def _uncertainty(r: Intrinsics) -> Section:
     return Section("Uncertainty of a pixel's direction", words, drawings)
 
 
-def _residuals(outcome: CameraOutcome) -> Section:
-    r = outcome.result
+def _residuals(r: Intrinsics, photos: PhotoSet) -> Section:
     t, used = r.table, r.fit.used
     residuals = -r.fit.residuals  # measured minus model
     drawings = [
@@ -215,7 +185,7 @@ def _residuals(outcome: CameraOutcome) -> Section:
     ]
     rms = _rms_per_view(r)
     for v, word in representative_views(rms, worst=_WORST_VIEWS):
-        name, _ = outcome.photos.views[v]
+        name, _ = photos.views[v]
         mine = t.view == v
         drawings.append(
             PageDrawing(
@@ -224,7 +194,7 @@ def _residuals(outcome: CameraOutcome) -> Section:
                     t.pixels[mine],
                     residuals[mine],
                     f"{name} ({word}): RMS {rms[v]:.3f} px",
-                    picture=_picture(outcome, name),
+                    picture=_picture(photos, name),
                     rejected=~used[mine],
                 )
             )
@@ -243,25 +213,17 @@ def _rms_per_view(r: Intrinsics) -> Array:
     return np.sqrt(r.table.mean_per_view(squared, r.fit.used))
 
 
-def _picture(outcome: CameraOutcome, name: str) -> NDArray[np.uint8] | None:
+def _picture(photos: PhotoSet, name: str) -> NDArray[np.uint8] | None:
     """The photograph as 8 bits for display; None if it can no longer be read."""
-    path = outcome.photos.paths[name]
+    path = photos.paths[name]
     if path.suffix.lower() in VIDEO_SUFFIXES:
         video = opened(str(path))
         video.set(cv2.CAP_PROP_POS_FRAMES, int(name.rpartition("#")[2]))
         good, frame = video.read()
         video.release()
         return np.asarray(frame, dtype=np.uint8) if good else None
-    try:
-        picture = decode(path.read_bytes(), outcome.photos.image_size_px)
-    except OSError:
-        return None
-    if isinstance(picture, MissingPicture):
-        return None
-    if picture.dtype == np.uint8:
-        return np.asarray(picture, dtype=np.uint8)
-    low, high = np.percentile(picture, [0.1, 99.9])
-    return np.clip((picture - low) * (255.0 / max(high - low, 1.0)), 0, 255).astype(np.uint8)
+    picture = read_picture(path, photos.image_size_px)
+    return None if isinstance(picture, MissingPicture) else as_8_bit(picture)
 
 
 def _coverage(r: Intrinsics) -> Section:
@@ -286,16 +248,15 @@ def _coverage(r: Intrinsics) -> Section:
     return Section("Coverage by the boards", words, drawings)
 
 
-def _views(outcome: CameraOutcome) -> Section:
-    r, counts = outcome.result, outcome.result.table.counts(outcome.result.fit.used)
-    rms = _rms_per_view(r)
+def _views(r: Intrinsics, photos: PhotoSet) -> Section:
+    counts, rms = r.table.counts(r.fit.used), _rms_per_view(r)
     depth = r.fit.poses.apply(r.table.middle)[:, 2]
     rows: list[tuple[object, ...]] = []
-    for v, (name, view) in enumerate(outcome.photos.views):
+    for v, (name, view) in enumerate(photos.views):
         reason = r.fit.dropped.get(v, "")
         note = f"excluded: {reason}" if reason else "; ".join(view.notes)
         distance_tilt = (np.nan, np.nan) if reason else (float(depth[v]), float(r.coverage.tilt_deg[v]))
         rows.append((name, f"{counts[v]} of {len(view)}", float(rms[v]), *distance_tilt, note))
-    rows += [(name, "none", np.nan, np.nan, np.nan, reason) for name, reason in outcome.photos.refused]
+    rows += [(name, "none", np.nan, np.nan, np.nan, reason) for name, reason in photos.refused]
     heads = ("photograph", "corners used", "RMS (px)", "distance (m)", "tilt (deg)", "remarks")
-    return Section("The photographs", outcome.photos.line() + ".", (), PageTable(heads, rows))
+    return Section("The photographs", photos.line() + ".", (), PageTable(heads, rows))

@@ -24,27 +24,32 @@ from calibration.drift import (
     rms_length,
 )
 from calibration.excess_residual import Change
-from calibration.findings import Finding, Level, verdict
 from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.planes import intersect_plane
 from geometry.rig import Rig
 from lab.calibrate.drift_check.drift_comparison import PixelComparison, check_at_rest, compare_points, compare_still
+from lab.calibrate.drift_check.drift_findings import (
+    camera_findings,
+    other_findings,
+    state_findings,
+    unchecked_finding,
+)
 from lab.calibrate.drift_check.drift_history import HistoryRow, read_history, write_history
 from lab.calibrate.drift_check.drift_inputs import DriftInputs, read_points, read_still_pose, read_still_spots
-from lab.calibrate.drift_check.drift_page import camera_findings, other_findings, state_findings, write_page
+from lab.calibrate.drift_check.drift_page import page_of
 from lab.calibrate.drift_check.drift_result import (
     CameraDrift,
     DriftLimits,
-    DriftOutcome,
+    DriftResult,
     OtherChange,
     is_weak,
     level_of,
-    not_checked,
 )
+from lab.calibrate.step import Outcome, Solved, Step, run_step
 from lab.files.rig.rig_file import RigFile, joint_covariance, load_rig_file
-from lab.files.text.atomic_write import atomic_folder, check_output_folder
-from lab.files.text.csv_text import csv_word
+from lab.files.text.csv_text import write_table
+from lab.findings.finding import Finding, Level, finding, passed
 
 TABLE = "drift.csv"
 COLUMNS = (
@@ -65,6 +70,9 @@ class CheckData:
     pose_free: bool  # whether the vehicle's pose was fitted
 
 
+_STEP = Step("Drift check", (TABLE,))
+
+
 def check_drift(
     rig_path: Path,
     out: Path,
@@ -73,7 +81,7 @@ def check_drift(
     *,
     history: Path | None = None,
     limits: DriftLimits | None = None,
-) -> DriftOutcome:
+) -> Outcome[DriftResult]:
     """Compare known points or a vehicle at rest with the stored calibration; write report.html and drift.csv to `out`.
 
     history: a CSV to which the rows of this check are appended.
@@ -81,35 +89,41 @@ def check_drift(
     Raises:
         InputError: for errors in the files.
     """
-    check_output_folder(out, _is_ours)
-    inputs.check()
-    limits = limits or DriftLimits()
-    today = today or datetime.date.today()
-    rig_path = Path(rig_path)
-    file = load_rig_file(rig_path)
-    data = _compare(file, rig_path, inputs, limits)
-    cameras, others, findings = judge(file, data, limits, today)
+    day = today or datetime.date.today()
     earlier = read_history(history) if history is not None else []
-    rows = [HistoryRow(today, c.camera, c.drift_px, c.noise_px, c.drift_mm, c.level) for c in cameras]
-    outcome = DriftOutcome(
-        Path(out),
-        verdict(findings),
-        tuple(cameras),
-        tuple(findings),
-        tuple(others),
-        _unchecked(file.rig, cameras),
-    )
-    with atomic_folder(Path(out), may_replace=_is_ours) as work:
-        write_drift_table(cameras, work / TABLE)
-        files = [rig_path, *inputs.files()]
-        write_page(outcome, file, data.comparisons, [*earlier, *rows], limits, today, files, work)
+    outcome = run_step(_STEP, out, lambda: _solve(Path(rig_path), inputs, day, earlier, limits or DriftLimits()))
     if history is not None:
-        write_history([*earlier, *rows], history)
+        write_history([*earlier, *_rows(outcome.result, day)], history)
     return outcome
 
 
-def _is_ours(folder: Path) -> bool:
-    return (folder / TABLE).is_file()
+def _solve(
+    rig_path: Path, inputs: DriftInputs, today: datetime.date, earlier: list[HistoryRow], limits: DriftLimits
+) -> Solved[DriftResult]:
+    inputs.check()
+    file = load_rig_file(rig_path)
+    data = _compare(file, rig_path, inputs, limits)
+    result, findings = judge(file, data, limits, today)
+    drifts = ", ".join(f"{c.camera} {_two(c.drift_px)} px / {_two(c.drift_mm)} mm" for c in result.cameras)
+    return Solved(
+        name="drift check",
+        title=f"check of {today.isoformat()}",
+        result=result,
+        findings=findings,
+        figures=drifts + (f"; not checked: {', '.join(result.unchecked)}" if result.unchecked else ""),
+        write=lambda folder: write_drift_table(result.cameras, folder / TABLE),
+        page=lambda: page_of(result, file, data.comparisons, [*earlier, *_rows(result, today)], limits, today),
+        day=today,
+        inputs=[rig_path, *inputs.files()],
+    )
+
+
+def _rows(result: DriftResult, day: datetime.date) -> list[HistoryRow]:
+    return [HistoryRow(day, c.camera, c.drift_px, c.noise_px, c.drift_mm, c.level) for c in result.cameras]
+
+
+def _two(value: float) -> str:
+    return "?" if not np.isfinite(value) else f"{value:.2f}"
 
 
 def _compare(file: RigFile, rig_path: Path, inputs: DriftInputs, limits: DriftLimits) -> CheckData:
@@ -133,7 +147,7 @@ def _pose_covariance(limits: DriftLimits) -> Array:
 
 def judge(
     file: RigFile, data: CheckData, limits: DriftLimits, today: datetime.date
-) -> tuple[list[CameraDrift], list[OtherChange], list[Finding]]:
+) -> tuple[DriftResult, tuple[Finding, ...]]:
     """Judge a check: the drift of each camera, wrong points and moved lasers, and the findings."""
     p_each = limits.p_false_alarm / max(len(data.comparisons), 1)
     cameras: list[CameraDrift] = []
@@ -146,37 +160,16 @@ def judge(
         others += [_other(file.rig, one, c) for c in verdicts.changes if c.kind not in CAMERA_KINDS]
         findings += [f for c in drifts for f in camera_findings(c, limits, data.pose_free)]
     findings += other_findings(others, limits)
-    unchecked = _unchecked(file.rig, cameras)
-    if unchecked:
-        findings.append(
-            Finding(
-                Level.WARN,
-                not_checked(unchecked),
-                "a drift of it would not be noticed",
-                "measure known points in every camera",
-                code="BP-C10",
-            )
-        )
-    if not data.with_covariance:
-        findings.append(
-            Finding(
-                Level.WARN,
-                "rig.yaml has no covariance: the calibration's own errors count as drift here",
-                "false alarms are more frequent than stated",
-                "calibrate with beampose, which writes the covariance",
-                code="BP-C11",
-            )
-        )
-    if not data.sigma_given:
-        findings.append(
-            Finding(Level.PASS, f"the points' file has no sigma_px: {limits.point_sigma_px:g} px is assumed")
-        )
-    return cameras, others, findings
-
-
-def _unchecked(rig: Rig, cameras: Sequence[CameraDrift]) -> tuple[str, ...]:
     checked = {c.camera for c in cameras}
-    return tuple(name for name in rig.cameras if name not in checked)
+    unchecked = tuple(name for name in file.rig.cameras if name not in checked)
+    if unchecked:
+        findings.append(unchecked_finding(unchecked))
+    if not data.with_covariance:
+        what = "rig.yaml has no covariance: the calibration's own errors count as drift here"
+        findings.append(finding("BP-C11", Level.WARN, what))
+    if not data.sigma_given:
+        findings.append(passed(f"the points' file has no sigma_px: {limits.point_sigma_px:g} px is assumed"))
+    return DriftResult(tuple(cameras), tuple(others), unchecked), tuple(findings)
 
 
 def _camera_drift(
@@ -260,9 +253,9 @@ def _other(rig: Rig, one: PixelComparison, change: Change) -> OtherChange:
     return OtherChange(change, rms_length(moved[rows].ravel()), mm)
 
 
-def write_drift_table(cameras: list[CameraDrift], path: Path) -> None:
+def write_drift_table(cameras: Sequence[CameraDrift], path: Path) -> None:
     """Write drift.csv, a row per camera."""
-    lines = [",".join(COLUMNS)]
+    rows: list[list[object]] = []
     for c in cameras:
         numbers = [
             c.drift_px, c.noise_px, c.drift_mm, *c.shift_px, *c.sigma_shift_px, *c.turn_deg, *c.sigma_turn_deg,
@@ -270,5 +263,5 @@ def write_drift_table(cameras: list[CameraDrift], path: Path) -> None:
         ]  # fmt: skip
         explanation = c.change.kind if c.change is not None else ""
         fields = ["" if not np.isfinite(v) else f"{v:.6g}" for v in numbers]
-        lines.append(",".join([csv_word(c.camera), str(len(c.pixels)), *fields, csv_word(explanation), c.level.name]))
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        rows.append([c.camera, len(c.pixels), *fields, explanation, c.level.name])
+    write_table(path, COLUMNS, rows)

@@ -8,11 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibration.findings import Level
 from lab.errors import InputError
-from lab.files.text.atomic_write import atomic_write_text
-from lab.files.text.csv_text import csv_word, read_table
+from lab.files.text.csv_text import read_table, write_table
 from lab.files.text.error_text import printable_line
+from lab.findings.finding import Level
 
 COLUMNS = ("date", "camera", "drift_px", "noise_px", "drift_mm", "verdict")
 
@@ -60,8 +59,8 @@ def read_history(path: Path) -> list[HistoryRow]:
 
 def write_history(rows: Sequence[HistoryRow], path: Path) -> None:
     """Write all rows atomically: an interrupted check leaves the history unchanged."""
-    lines = [",".join(COLUMNS)]
+    table: list[list[object]] = []
     for r in rows:
         numbers = ["" if math.isnan(v) else f"{v:.6g}" for v in (r.drift_px, r.noise_px, r.drift_mm)]
-        lines.append(",".join([r.date.isoformat(), csv_word(r.camera), *numbers, r.verdict.name]))
-    atomic_write_text("\n".join(lines) + "\n", Path(path))
+        table.append([r.date.isoformat(), r.camera, *numbers, r.verdict.name])
+    write_table(Path(path), COLUMNS, table)

@@ -1,260 +1,44 @@
-"""Findings of a drift check in words, and its page."""
+"""Report of a drift check."""
 
 from __future__ import annotations
 
 import datetime
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
-from calibration.drift import ALL_CHANGED, LASER_MOVED, MOVED, TURNED, TURNED_ZOOMED, ZOOMED
-from calibration.findings import Finding, Level
 from geometry.arrays import Array
 from lab.calibrate.drift_check.drift_comparison import PixelComparison
+from lab.calibrate.drift_check.drift_findings import describe_change, size
 from lab.calibrate.drift_check.drift_history import HistoryRow
-from lab.calibrate.drift_check.drift_result import (
-    CameraDrift,
-    DriftLimits,
-    DriftOutcome,
-    OtherChange,
-    is_weak,
-    level_of,
-)
-from lab.files.rig.calibration_state import CalibrationState
+from lab.calibrate.drift_check.drift_result import CameraDrift, DriftLimits, DriftResult, OtherChange, is_weak
 from lab.files.rig.rig_file import RigFile
 from lab.number_format import format_number
 from lab.report.calibration.calibration_charts import DriftLine, drift_chart
 from lab.report.calibration.calibration_drawings import corners_overlay
-from lab.report.calibration.calibration_page import (
-    CalibrationReport,
-    PageDrawing,
-    PageTable,
-    Section,
-    provenance,
-    write_calibration_report,
-)
+from lab.report.calibration.calibration_page import KeyFigure, PageDrawing, PageTable, Section
 from lab.report.calibration.calibration_scene import Marker, rig_things, scene_views
 
-# Findings of a drift check in words: the change, its consequence and the remedy.
 
-_CHECK_MOUNT = "Look for a displaced or loose mount; fix it, then recalibrate the camera's pose (`calibrate rig`)."
-_CHECK_LENS = "Check the focus and zoom rings and the lens mount, lock them, then recalibrate this camera's lens."
-_CHECK_BOTH = "Check the mount and the focus and zoom rings, lock them, then recalibrate the camera's lens and pose."
-_REMEDIES = {
-    TURNED: _CHECK_MOUNT,
-    MOVED: _CHECK_MOUNT,
-    ZOOMED: _CHECK_LENS,
-    TURNED_ZOOMED: _CHECK_BOTH,
-    ALL_CHANGED: _CHECK_BOTH,
-}
-
-
-def state_findings(state: CalibrationState | None, today: datetime.date, warning_days: int) -> list[Finding]:
-    """Findings on the date, verdict and expiry of the calibration in rig.yaml."""
-    if state is None:
-        return [
-            Finding(
-                Level.WARN,
-                "rig.yaml does not state when it was calibrated (no block `calibration`)",
-                "it may be out of date",
-                "Calibrate with beampose, or add calibration: {date: ..., verdict: PASS, valid_until: ...}.",
-                code="BP-C01",
-            )
-        ]
-    out = []
-    if state.verdict == "FAIL":
-        out.append(
-            Finding(
-                Level.FAIL,
-                f"the calibration of {state.date} failed: {state.reasons[0] if state.reasons else 'no reason given'}",
-                "it must not be used, even without drift",
-                "Correct the cause and calibrate again.",
-                code="BP-C02",
-            )
-        )
-    if state.date > today:
-        out.append(
-            Finding(
-                Level.WARN,
-                f"the calibration is dated {state.date}, after today ({today})",
-                "its age is unknown",
-                "Check the clock of this computer and the date in rig.yaml.",
-                code="BP-C03",
-            )
-        )
-    if state.valid_until is None:
-        out.append(Finding(Level.PASS, f"calibrated on {state.date}, without an expiry date"))
-        return out
-    left = (state.valid_until - today).days
-    if left < 0:
-        out.append(
-            Finding(
-                Level.FAIL,
-                f"the calibration expired on {state.valid_until}, {_days(-left)} ago",
-                "mounts and lenses creep; this date was set for the calibration",
-                "Calibrate again, or, if the drift is within the limits, set a new valid_until in rig.yaml.",
-                code="BP-C04",
-            )
-        )
-    elif left <= warning_days:
-        out.append(
-            Finding(
-                Level.WARN,
-                f"the calibration expires on {state.valid_until}, in {_days(left)}",
-                "later runs will be refused",
-                "Plan a new calibration.",
-                code="BP-C05",
-            )
-        )
-    else:
-        out.append(Finding(Level.PASS, f"calibrated on {state.date}, valid until {state.valid_until}"))
-    return out
-
-
-def _days(count: int) -> str:
-    return f"{count} day{'s' if count != 1 else ''}"
-
-
-def size(px: float, mm: float) -> str:
-    """An amount of drift in words: `0.52 px (1.5 mm at the screen)`."""
-    return f"{format_number(px)} px" + (
-        f" ({format_number(mm)} mm at the screen)" if np.isfinite(mm) else " (the rays miss the screen)"
-    )
-
-
-def camera_findings(c: CameraDrift, limits: DriftLimits, pose_free: bool) -> list[Finding]:
-    """Findings on one camera. pose_free: whether the pose of the vehicle was fitted."""
-    out = []
-    name = f"camera {c.camera}"
-    if c.change is not None:
-        level = level_of(c.drift_px, c.drift_mm, limits)
-        limit = limits.fail_mm if level == Level.FAIL else limits.warn_mm
-        why = {
-            Level.PASS: f"it is significant but small: below {limits.warn_mm:g} mm it is less than the spots' noise",
-            Level.WARN: f"beyond {limit:g} mm it affects the pose, and the stated sigmas do not include it",
-            Level.FAIL: f"beyond {limit:g} mm the error of the pose exceeds the stated sigmas",
-        }[level]
-        also = " The fit of the unknown vehicle pose may absorb part of the change." if pose_free else ""
-        remedy = "" if level == Level.PASS else _REMEDIES[c.change.kind]
-        change = describe_change(c)
-        what = f"{name} {change}: its picture is off by {size(c.drift_px, c.drift_mm)}, p = {_p(c.change.p_value)}"
-        out.append(Finding(level, what, why + "." + also if also else why, remedy, code="BP-C06"))
-    if np.isfinite(c.unexplained_px):
-        out.append(
-            Finding(
-                level_of(c.unexplained_px, c.unexplained_mm, limits),
-                f"{name}: pixels are off by {size(c.unexplained_px, c.unexplained_mm)} in a way that a turned or moved"
-                " camera, a changed focus or a few wrong points do not explain",
-                "the points, the screen or the lens differ from the calibration",
-                "Check the names and coordinates of the points; if they are correct, calibrate again.",
-                code="BP-C07",
-            )
-        )
-    if out:
-        return out
-    weak = is_weak(c.detectable_mm, limits)
-    detectable = "a common shift of its picture is not detectable"
-    if np.isfinite(c.detectable_px):
-        detectable = f"the smallest detectable shift is {size(c.detectable_px, c.detectable_mm)}"
-    state = "shows no change, but this check is weak" if weak else "has not changed"
-    what = f"{name} {state}: drift {size(c.drift_px, c.drift_mm)}, expected from noise {format_number(c.noise_px)} px"
-    what += f"; {detectable}"
-    if not weak:
-        return [Finding(Level.PASS, what)]
-    remedy = "Measure more points, distributed over the picture, or with a smaller sigma."
-    if pose_free:
-        remedy = "An unknown vehicle pose absorbs such shifts: give the pose (--pose) or measure known points."
-    why = f"the check can miss a drift far beyond {limits.fail_mm:g} mm, the limit for use"
-    return [Finding(Level.WARN, what, why, remedy, code="BP-C08")]
-
-
-def describe_change(c: CameraDrift) -> str:
-    """The change of a camera in words, with its figures."""
-    assert c.change is not None
-    kind = c.change.kind
-    if kind == ZOOMED:
-        scale = f"{_signed(c.scale_ppm)} ± {format_number(c.sigma_scale_ppm)} ppm"
-        return f"has another focal length ({scale}): focus or zoom changed"
-    if kind in (TURNED, TURNED_ZOOMED):
-        turn = c.change.delta[:3]
-        sigma = np.sqrt(np.maximum(np.diagonal(c.change.covariance)[:3], 0))
-        angle = float(np.linalg.norm(turn))
-        of_angle = float(np.sqrt((turn / max(angle, 1e-12)) ** 2 @ sigma**2))
-        axis = ("its horizontal axis (up or down)", "its vertical axis (sideways)", "its optical axis (rolled)")
-        main = axis[int(np.argmax(np.abs(turn)))]
-        size = f"{format_number(np.rad2deg(angle))} ± {format_number(np.rad2deg(of_angle), 2)} deg"
-        words = f"turned by {size}, mainly about {main}"
-        return words + (", and its focal length changed" if kind == TURNED_ZOOMED else "")
-    moved = 1e3 * float(np.linalg.norm(c.change.delta[3:6]))
-    turned = np.rad2deg(float(np.linalg.norm(c.change.delta[:3])))
-    words = f"moved by about {format_number(moved, 2)} mm and turned by about {format_number(turned, 2)} deg"
-    return words + (", and its focal length changed" if kind == ALL_CHANGED else "")
-
-
-def other_findings(others: Sequence[OtherChange], limits: DriftLimits) -> list[Finding]:
-    """Findings on wrong points and moved lasers."""
-    out = []
-    for o in others:
-        level = level_of(o.px, o.mm, limits)
-        if o.change.kind == LASER_MOVED:
-            what = f"laser {o.change.subject} has moved: its spots are off by {size(o.px, o.mm)}"
-            why = "its direction in rig.yaml is no longer correct"
-            remedy = "Fix its mount, then calibrate the beams again."
-        else:
-            what = f"one point is wrong: {o.change.subject} is off by {size(o.px, o.mm)}, the others are not"
-            why = "the point has moved or was confused with another; the cameras are judged without it"
-            remedy = "Inspect the point and measure it again; remove it from the file if it is lost."
-            level = min(level, Level.WARN)  # an error of the point, not of the calibration
-        out.append(
-            Finding(
-                level, what + f", p = {_p(o.change.p_value)}", why, remedy if level > Level.PASS else "", code="BP-C09"
-            )
-        )
-    return out
-
-
-def _p(p: float) -> str:
-    return "below 1e-12" if p < 1e-12 else f"{p:.1g}"
-
-
-def _signed(value: float) -> str:
-    return ("+" if value > 0 else "") + format_number(value)
-
-
-# Report of a drift check.
-
-
-def write_page(
-    outcome: DriftOutcome,
+def page_of(
+    result: DriftResult,
     file: RigFile,
     compared: Sequence[PixelComparison],
     history: Sequence[HistoryRow],
     limits: DriftLimits,
     today: datetime.date,
-    inputs: Sequence[Path],
-    folder: Path,
-) -> Path:
-    """Write report.html of a check. history: all checks up to and including this one."""
-    sections = [_drift_section(outcome.cameras, compared, limits, file)]
+) -> tuple[list[KeyFigure], list[Section]]:
+    """Key figures and sections of the report. history: all checks up to and including this one."""
+    sections = [_drift_section(result.cameras, compared, limits, file)]
     if len({r.date for r in history}) > 1:
         sections.append(_history_section(history, limits, file))
-    sections += [_points_section(compared, outcome.others, outcome.cameras), _scene_section(file, compared)]
-    report = CalibrationReport(
-        "Drift check",
-        f"check of {today.isoformat()}",
-        outcome.level,
-        outcome.findings,
-        _key_figures(outcome.cameras, file, limits, today),
-        sections,
-        provenance(inputs, today),
-    )
-    return write_calibration_report(report, folder)
+    sections += [_points_section(compared, result.others, result.cameras), _scene_section(file, compared)]
+    return _key_figures(result.cameras, file, limits, today), sections
 
 
 def _key_figures(
     cameras: Sequence[CameraDrift], file: RigFile, limits: DriftLimits, today: datetime.date
-) -> list[tuple[str, str, str]]:
+) -> list[KeyFigure]:
     out = []
     for c in cameras:
         value = f"{format_number(c.drift_px)} px · {format_number(c.drift_mm)} mm"

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from calibration.excess_residual import Change
-from calibration.findings import Finding, Level
 from geometry.arrays import Array
+from lab.findings.finding import Level, level_above
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,39 +84,12 @@ class CameraDrift:
 
 
 @dataclass(frozen=True, slots=True)
-class DriftOutcome:
+class DriftResult:
     """Result of a drift check."""
 
-    out: Path
-    level: Level
     cameras: tuple[CameraDrift, ...]
-    findings: tuple[Finding, ...]
-    others: tuple[OtherChange, ...] = ()  # wrong points and moved lasers
-    unchecked: tuple[str, ...] = ()  # cameras of the rig without measurements
-
-    def line(self) -> str:
-        """One line for the terminal."""
-        worst = max(self.findings, key=lambda f: f.level)
-        drifts = ", ".join(f"{c.camera} {_number(c.drift_px)} px / {_number(c.drift_mm)} mm" for c in self.cameras)
-        reason = f": {worst.what}" if worst.level > Level.PASS else ""
-        unchecked = ""
-        if self.unchecked and worst.what != not_checked(self.unchecked):
-            unchecked = f"; WARN: {not_checked(self.unchecked)}"
-        return f"{self.level.name}: drift {drifts}{reason}{unchecked}; report in {self.out}"
-
-    @property
-    def exit_status(self) -> int:
-        """0 if the calibration may be used (PASS, WARN), else 3."""
-        return 3 if self.level == Level.FAIL else 0
-
-
-def not_checked(cameras: Sequence[str]) -> str:
-    """The message on cameras without measurements, for the terminal and the report."""
-    return f"camera {', '.join(cameras)} not checked: nothing was measured in {'it' if len(cameras) == 1 else 'them'}"
-
-
-def _number(value: float) -> str:
-    return "?" if not np.isfinite(value) else f"{value:.2f}"
+    others: tuple[OtherChange, ...]  # wrong points and moved lasers
+    unchecked: tuple[str, ...]  # cameras of the rig without measurements
 
 
 def is_weak(detectable_mm: float, limits: DriftLimits) -> bool:
@@ -129,5 +100,5 @@ def is_weak(detectable_mm: float, limits: DriftLimits) -> bool:
 def level_of(px: float, mm: float, limits: DriftLimits) -> Level:
     """Verdict on a significant change of this size, by its mm at the screen, else (mm is nan) by its pixels."""
     if np.isfinite(mm):
-        return Level.FAIL if mm > limits.fail_mm else Level.WARN if mm > limits.warn_mm else Level.PASS
+        return level_above(mm, limits.warn_mm, limits.fail_mm)
     return Level.FAIL if px > limits.fail_px else Level.WARN

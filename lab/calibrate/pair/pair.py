@@ -10,30 +10,25 @@ from pathlib import Path
 import numpy as np
 
 from calibration.boards.board_types import Board
-from calibration.findings import Finding, Level, unless_pass, verdict
 from calibration.lens.fit.lens_models import named
 from calibration.lens.intrinsics import FEWEST_VIEWS, IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
 from calibration.lens.intrinsics_result import Intrinsics
 from calibration.pair.pair_calibration import CalibratedPair, PairError, calibrate_pair
 from geometry.arrays import Array
 from lab.calibrate.camera.camera import LENSES, corner_table
+from lab.calibrate.camera.camera_findings import findings_of as lens_findings
 from lab.calibrate.camera.photos import PhotoSet, Progress, find_in_photos
+from lab.calibrate.step import Outcome, Solved, Step, run_step
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.board_file import load_board_or_text
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.pair_file import PairFile, save_pair_file
-from lab.files.text.atomic_write import atomic_folder, check_output_folder, keep_good_results
 from lab.files.text.csv_text import write_table
 from lab.files.text.error_text import suggest_name
+from lab.findings.finding import Finding, Level, finding, level_above, verdict
 from lab.number_format import format_length, format_number
 from lab.pictures.source import number_of
-from lab.report.calibration.calibration_page import (
-    CalibrationReport,
-    PageTable,
-    Section,
-    provenance,
-    write_calibration_report,
-)
+from lab.report.calibration.calibration_page import KeyFigure, PageTable, Section
 from tracking.binocular.marker_model import StereoPair, calibration_jacobian, project
 
 # Findings of a pair's calibration, and the uncertainty of distances that it leaves.
@@ -76,8 +71,8 @@ def findings_of(pair: CalibratedPair, names: tuple[str, str]) -> tuple[Finding, 
     for name, single in zip(names, pair.single, strict=True):
         # Warnings at most: the lens in use is that of the joint adjustment, whose residuals BP-Q01 judges.
         found += [
-            Finding(Level.WARN, f"camera {name} ({f.code}): {f.what}", f.why, f.remedy, code="BP-Q04")
-            for f in single.findings
+            finding("BP-Q04", Level.WARN, f"camera {name} ({f.code}): {f.what}", why=f.why, remedy=f.remedy)
+            for f in lens_findings(single)
             if f.level > Level.PASS
         ]
     return tuple(found)
@@ -87,45 +82,25 @@ def _misfit(pair: CalibratedPair) -> Finding:
     m = pair.misfit
     level = Level.PASS if m < GOOD_MISFIT else Level.WARN if m < LARGEST_MISFIT else Level.FAIL
     apart = f"; in {len(pair.separated)} pairs the board moved between the exposures" if pair.separated else ""
-    return unless_pass(
-        level,
-        f"joint residuals are {format_number(m)} times those of the cameras by themselves{apart}",
-        "The photographs of one number do not show the board at one place.",
-        "Hold the board still, or trigger both cameras together; check the numbers in the file names.",
-        code="BP-Q01",
-    )
+    what = f"joint residuals are {format_number(m)} times those of the cameras by themselves{apart}"
+    return finding("BP-Q01", level, what)
 
 
 def _count(pair: CalibratedPair) -> Finding:
     n = len(pair.keys) - len(pair.separated)
-    return unless_pass(
-        Level.PASS if n >= GOOD_PAIRS else Level.WARN,
-        f"{n} pairs of photographs show the board in both cameras",
-        "The relative pose has large sigmas.",
-        "Take 15 pairs or more, near and far, in all parts of both pictures.",
-        code="BP-Q02",
-    )
+    level = Level.PASS if n >= GOOD_PAIRS else Level.WARN
+    return finding("BP-Q02", level, f"{n} pairs of photographs show the board in both cameras")
 
 
 def _range(pair: CalibratedPair) -> Finding:
     table = range_sigmas(pair)
     distance, sigma = table[BASELINES.index(_JUDGED)]
     share = sigma / distance
-    good = np.isfinite(share) and share <= GOOD_RANGE_SHARE
-    level = Level.PASS if good else Level.FAIL if np.isfinite(share) and share > LARGEST_RANGE_SHARE else Level.WARN
-    what = (
-        f"distances at {format_number(distance)} m (20 baselines) are uncertain by {100 * share:.2g} % due to the"
-        " calibration"
-        if np.isfinite(share)
-        else f"a point {format_number(distance)} m ahead (20 baselines) is not in both pictures"
-    )
-    return unless_pass(
-        level,
-        what,
-        "This error is the same in all frames; averaging does not reduce it.",
-        "Take more pairs; let the board fill the pictures; use a longer baseline.",
-        code="BP-Q03",
-    )
+    ahead = f"{format_number(distance)} m"
+    if not np.isfinite(share):
+        return finding("BP-Q03", Level.WARN, f"a point {ahead} ahead (20 baselines) is not in both pictures")
+    what = f"distances at {ahead} (20 baselines) are uncertain by {100 * share:.2g} % due to the calibration"
+    return finding("BP-Q03", level_above(share, GOOD_RANGE_SHARE, LARGEST_RANGE_SHARE), what)
 
 
 # `calibrate pair`: calibrates two cameras together; writes pair.yaml and a report.
@@ -133,6 +108,7 @@ def _range(pair: CalibratedPair) -> Finding:
 
 PAIR, FAILED, PAIRS = "pair.yaml", "pair.failed.yaml", "pairs.csv"
 PAIR_COLUMNS = ("number", "rms_px", "separated")
+_STEP = Step("Pair", (PAIRS,), PAIR)
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,36 +126,6 @@ class PairOptions:
             raise InputError(f"names: expected two different names, got {self.names[0]!r} twice")
 
 
-@dataclass(frozen=True, slots=True)
-class PairOutcome:
-    """Result of a pair's calibration."""
-
-    pair: CalibratedPair
-    findings: tuple[Finding, ...]
-    names: tuple[str, str]
-    out: Path
-
-    @property
-    def level(self) -> Level:
-        """The verdict."""
-        return verdict(self.findings)
-
-    @property
-    def exit_status(self) -> int:
-        """0, or 3 if the calibration must not be used."""
-        return CalibrationError.exit_status if self.level == Level.FAIL else 0
-
-    def line(self) -> str:
-        """One line for the terminal."""
-        worst = max(self.findings, key=lambda f: f.level)
-        reason = "" if self.level == Level.PASS else f": {worst.what}"
-        left, right = (f"{v:.3f}" for v in self.pair.rms_px)
-        return (
-            f"{self.names[0]} and {self.names[1]}: {self.level.name}: baseline {format_length(self.pair.baseline_m)} ±"
-            f" {format_length(baseline_sigma(self.pair))}, RMS {left} and {right} px{reason} -> {self.out}"
-        )
-
-
 def calibrate_pair_folder(
     left: Path | str,
     right: Path | str,
@@ -188,44 +134,63 @@ def calibrate_pair_folder(
     options: PairOptions = PairOptions(),
     today: datetime.date | None = None,
     progress: Progress | None = None,
-) -> PairOutcome:
+) -> Outcome[CalibratedPair]:
     """Calibrate a pair from photographs of a board by both cameras; equal numbers in file names are one instant.
 
     left, right: a folder or a pattern. Writes pair.yaml, pairs.csv and report.html into the folder `out`. If the
-    verdict is FAIL, the file is called pair.failed.yaml, and earlier good results are kept.
+    verdict is FAIL, the file is called pair.failed.yaml.
 
     Raises:
         InputError: for pictures or a board that cannot be used.
         CalibrationError: if the photographs do not determine a camera or the pair.
     """
-    check_output_folder(out, _is_ours)
+    return run_step(_STEP, out, lambda: _solve((left, right), board, options, today, progress))
+
+
+def _solve(
+    photos: tuple[Path | str, Path | str],
+    board: Board | str | Path,
+    options: PairOptions,
+    today: datetime.date | None,
+    progress: Progress | None,
+) -> Solved[CalibratedPair]:
     day = today or datetime.date.today()
     known = load_board_or_text(board) if isinstance(board, str | Path) else board
     sets, single = [], []
-    for name, photos in zip(options.names, (left, right), strict=True):
-        found = find_in_photos([photos], known, progress, fewest=FEWEST_VIEWS)
+    for name, path in zip(options.names, photos, strict=True):
+        found = find_in_photos([path], known, progress, fewest=FEWEST_VIEWS)
         sets.append(found)
         single.append(_calibrated(name, found, options))
     numbers = (_numbers(sets[0], options.names[0]), _numbers(sets[1], options.names[1]))
+    title = f"{options.names[0]} and {options.names[1]}"
     try:
         pair = calibrate_pair(options.names, (single[0], single[1]), numbers)
     except PairError as error:
-        raise CalibrationError(f"{options.names[0]} and {options.names[1]}: {error}") from None
+        raise CalibrationError(f"{title}: {error}") from None
     findings = findings_of(pair, options.names)
     failed = verdict(findings) is Level.FAIL
-    folder = keep_good_results(out, failed, PAIR)
-    outcome = PairOutcome(pair, findings, options.names, folder)
-    with atomic_folder(folder, may_replace=_is_ours) as work:
-        save_pair_file(_file_of(outcome, day, options), work / (FAILED if failed else PAIR))
+
+    def write(folder: Path) -> None:
+        save_pair_file(_file_of(pair, findings, day, options), folder / (FAILED if failed else PAIR))
         rows = zip(pair.keys, pair.pair_rms_px.tolist(), strict=True)
         write_table(
-            work / PAIRS,
+            folder / PAIRS,
             PAIR_COLUMNS,
             [[k, "" if np.isnan(r) else f"{r:.4f}", int(k in pair.separated)] for k, r in rows],
         )
-        paths = [s.paths[name] for s in sets for name, _ in s.views]
-        write_calibration_report(_report(outcome, day, paths), work)
-    return outcome
+
+    sigma = format_length(baseline_sigma(pair))
+    return Solved(
+        name=title,
+        result=pair,
+        findings=findings,
+        figures=f"baseline {format_length(pair.baseline_m)} ± {sigma}, RMS {pair.rms_px[0]:.3f} and"
+        f" {pair.rms_px[1]:.3f} px",
+        write=write,
+        page=lambda: page_of(pair, options.names),
+        day=day,
+        inputs=list(dict.fromkeys(s.paths[name] for s in sets for name, _ in s.views)),
+    )
 
 
 def baseline_sigma(pair: CalibratedPair) -> float:
@@ -234,10 +199,6 @@ def baseline_sigma(pair: CalibratedPair) -> float:
     along = t / np.linalg.norm(t)
     C = pair.covariance.matrix[-6:-3, -6:-3]
     return float(np.sqrt(along @ C @ along))
-
-
-def _is_ours(folder: Path) -> bool:
-    return (folder / PAIRS).is_file()
 
 
 def _calibrated(name: str, found: PhotoSet, options: PairOptions) -> Intrinsics:
@@ -262,27 +223,24 @@ def _numbers(photos: PhotoSet, name: str) -> list[int]:
     return out
 
 
-def _file_of(outcome: PairOutcome, day: datetime.date, options: PairOptions) -> PairFile:
-    until = None if outcome.level is Level.FAIL else day + datetime.timedelta(options.valid_days)
-    reasons = tuple(f"{f.level.name}: {f.what}" for f in outcome.findings if f.level > Level.PASS)
-    state = CalibrationState(day, outcome.level.name, until, reasons)
-    return PairFile(dict(zip(outcome.names, outcome.pair.cameras, strict=True)), outcome.pair.covariance, state)
+def _file_of(pair: CalibratedPair, findings: Sequence[Finding], day: datetime.date, options: PairOptions) -> PairFile:
+    level = verdict(findings)
+    until = None if level is Level.FAIL else day + datetime.timedelta(options.valid_days)
+    why = tuple(f"{f.level.name}: {f.what}" for f in findings if f.level > Level.PASS)
+    cameras = dict(zip(options.names, pair.cameras, strict=True))
+    return PairFile(cameras, pair.covariance, CalibrationState(day, level.name, until, why))
 
 
-def _report(outcome: PairOutcome, day: datetime.date, paths: Sequence[Path]) -> CalibrationReport:
-    pair = outcome.pair
+def page_of(pair: CalibratedPair, names: tuple[str, str]) -> tuple[list[KeyFigure], list[Section]]:
+    """Key figures and sections of the report."""
     sigma = np.sqrt(np.diagonal(pair.covariance.matrix))
     table = range_sigmas(pair)
     right = pair.cameras[1].camera_from_world
     angles = np.rad2deg(right.ypr)
     parameters = [
-        [name, _value(outcome, name), float(s)] for name, s in zip(pair.covariance.names, sigma, strict=True)
+        [name, _value(pair, names, name), float(s)] for name, s in zip(pair.covariance.names, sigma, strict=True)
     ]  # fmt: skip
-    return CalibrationReport(
-        "Pair",
-        f"{outcome.names[0]} and {outcome.names[1]}",
-        outcome.level,
-        outcome.findings,
+    return (
         [
             ("baseline", format_length(pair.baseline_m), f"± {format_length(baseline_sigma(pair))}"),
             ("pairs", str(len(pair.keys) - len(pair.separated)), "photographs with the board in both cameras"),
@@ -315,17 +273,16 @@ def _report(outcome: PairOutcome, day: datetime.date, paths: Sequence[Path]) -> 
                 table=PageTable(("parameter", "value", "sigma"), parameters),
             ),
         ],
-        provenance(dict.fromkeys(paths), day),
     )
 
 
-def _value(outcome: PairOutcome, name: str) -> float:
+def _value(pair: CalibratedPair, names: tuple[str, str], name: str) -> float:
     """The value of a parameter; of rotations those of the rotation vector of camera_from_world."""
     from geometry.rotations import log
     from geometry.uncertainty.rig_uncertainty import PINHOLE, POSE, distortion_names, split_name
 
     _, item, parameter = split_name(name)
-    camera = outcome.pair.cameras[outcome.names.index(item)]
+    camera = pair.cameras[names.index(item)]
     pinhole = [camera.matrix[0, 0], camera.matrix[1, 1], camera.matrix[0, 2], camera.matrix[1, 2]]
     pose = [*camera.camera_from_world.translation, *log(camera.camera_from_world.rotation)]
     values = dict(zip((*PINHOLE, *distortion_names(camera), *POSE), (*pinhole, *camera.distortion, *pose), strict=True))

@@ -9,37 +9,38 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.beams.beam_findings import BeamGoals, beam_findings
-from calibration.findings import Finding, Level, verdict
 from calibration.least_squares.adjustment import AdjustmentError
-from calibration.rig.joint_findings import RigLimits, joint_findings
-from calibration.rig.rig_figures import central_pose, expected_pose, hold_out, spot_sigma
+from calibration.rig.joint import SPOTS, Joint
+from calibration.rig.rig_figures import (
+    central_pose,
+    expected_pose,
+    hold_out,
+    in_degrees,
+    in_mm,
+    spot_sigma,
+)
 from calibration.rig.rig_steps import RigCalibration, calibrate_in_steps
-from calibration.screens.network_findings import ScreenLimits, near_findings
-from calibration.screens.network_findings import findings as network_findings
 from calibration.screens.screens import ScreensResult
 from geometry.rig import Rig
+from lab.calibrate.beams.beam_findings import BeamGoals, beam_findings, stand_findings
 from lab.calibrate.beams.recording_check import check_no_duplicates, diagnose_failed_fit
 from lab.calibrate.beams.recordings import Recordings, read_recordings, stand_of
-from lab.calibrate.calibration_date import calibration_date, expiry_date, expiry_findings
-from lab.calibrate.rig.rig_outcome import RigOutcome
+from lab.calibrate.rig.rig_findings import RigLimits, RigResult, joint_findings
+from lab.calibrate.rig.rig_page import page_of
 from lab.calibrate.rig.rig_tables import RESIDUALS, write_residuals
-from lab.calibrate.screens.screen_inputs import (
-    ScreenInputs,
-    SearchProgress,
-    adjusted_screens,
-    screen_inputs,
-    survey_findings,
-)
+from lab.calibrate.screens.screen_findings import ScreenLimits, near_findings, network_findings, survey_findings
+from lab.calibrate.screens.screen_inputs import SearchProgress, adjusted_screens, screen_inputs
+from lab.calibrate.step import Outcome, Solved, Step, calibration_date, expiry_date, expiry_findings, run_step
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import load_project
 from lab.files.project.project_blocks import Project
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import RigFile, covariance_blocks, save_rig
-from lab.files.text.atomic_write import atomic_folder, check_output_folder, keep_good_results
+from lab.findings.finding import Finding, Level, finding, passed, reasons, verdict, worst_first
 
 RIG = "rig.yaml"
 FAILED_RIG = "rig.failed.yaml"  # file name if the verdict is FAIL, so that no program reads it by mistake
+_STEP = Step("Rig", (RESIDUALS,), RIG)
 _NO_FIT_LIMITS = ScreenLimits(np.inf, np.inf, factor_warn=np.inf, factor_fail=np.inf)
 _NO_SIGMA_LIMITS = BeamGoals(direction=np.inf, direction_unusable=np.inf, wrong_share=np.inf, noise_scale=np.inf)
 
@@ -51,19 +52,24 @@ def calibrate_rig(
     limits: RigLimits | None = None,
     *,
     progress: SearchProgress | None = None,
-) -> RigOutcome:
+) -> Outcome[RigResult]:
     """Calibrate a whole rig; write rig.yaml, residuals.csv and report.html into the folder `out`.
 
     rig.yaml holds the verdict and the joint covariance of all parameters (in the target's block; cameras and screens
-    hold their own parts of it). If the verdict is FAIL, the file is called rig.failed.yaml; a FAIL never replaces an
-    earlier calibration, its results go to `OUT-failed`. progress: of the search for a mistake in a survey.
+    hold their own parts of it). If the verdict is FAIL, the file is called rig.failed.yaml. progress: of the search for
+    a mistake in a survey.
 
     Raises:
         InputError: for errors in the files.
-        CalibrationError: if the measurements do not determine a calibration. Nothing is written.
+        CalibrationError: if the measurements do not determine a calibration.
     """
-    check_output_folder(out, _is_ours)
-    project = load_project(Path(project_path))
+    return run_step(_STEP, out, lambda: _solve(Path(project_path), today, limits or RigLimits(), progress))
+
+
+def _solve(
+    project_path: Path, today: datetime.date | None, limits: RigLimits, progress: SearchProgress | None
+) -> Solved[RigResult]:
+    project = load_project(project_path)
     day = calibration_date(project, today)
     check_no_duplicates(project)
     if not project.beams or not project.spots:
@@ -83,28 +89,47 @@ def calibrate_rig(
         held_out = hold_out(steps.measured, joint)
     except AdjustmentError:
         held_out = None
-    findings = [
+    result = RigResult(steps, expected, held_out)
+    findings = (
         *near_findings(screens, inputs.near),
-        *joint_findings(steps, recordings.names, expected, held_out, limits or RigLimits()),
+        *joint_findings(steps, recordings.names, expected, held_out, limits),
         *survey_findings(project, screens),
         *_step_findings(steps, rig, recordings.names),
         *expiry_findings(project, day, today),
-        *_input_findings(project, recordings, inputs, day),
-    ]
-    level = verdict(findings)
-    folder = keep_good_results(out, level == Level.FAIL, RIG)
-    outcome = RigOutcome(project.name, folder, level, tuple(findings), steps, expected, held_out)
-    with atomic_folder(folder, may_replace=_is_ours) as work:
-        save_rig(_rig_file(outcome, project, day), work / (FAILED_RIG if level == Level.FAIL else RIG))
-        write_residuals(steps, recordings.names, work / RESIDUALS)
-        from lab.calibrate.rig.rig_page import write_page  # imports the template engine
+        *map(passed, (*inputs.notes, *recordings.notes)),
+        *_lens_findings(project, day),
+        *stand_findings(project, recordings),
+    )
+    failed = verdict(findings) is Level.FAIL
 
-        write_page(outcome, rig, recordings, project.inputs, day, work)
-    return outcome
+    def write(folder: Path) -> None:
+        save_rig(_rig_file(joint, findings, project, day), folder / (FAILED_RIG if failed else RIG))
+        write_residuals(steps, recordings.names, folder / RESIDUALS)
+
+    return Solved(
+        name=project.name,
+        result=result,
+        findings=findings,
+        figures=_figures(result),
+        write=write,
+        page=lambda: page_of(result, rig, recordings.names),
+        day=day,
+        inputs=project.inputs,
+    )
 
 
-def _is_ours(folder: Path) -> bool:
-    return (folder / RESIDUALS).is_file()
+def _figures(result: RigResult) -> str:
+    rig = result.steps.joint.rig
+    out = f"{len(rig.cameras)} cameras, {len(rig.screens)} screens, {len(rig.beams)} beams"
+    if result.expected is not None:
+        out += f"; one frame: {in_degrees(result.expected.total):.2g} deg, {in_mm(result.expected.total):.2g} mm"
+    if result.held_out is not None:
+        deg, mm = np.rad2deg(result.held_out.attitude_rms), 1e3 * result.held_out.position_rms
+        out += f"; held out: {deg:.2g} deg, {mm:.2g} mm"
+    kept = result.steps.joint.kept[SPOTS]
+    if not kept.all():
+        out += f"; {int(np.sum(~kept))} of {len(kept)} spots excluded"
+    return out
 
 
 def _recordings(project: Project, lab: Rig) -> Recordings:
@@ -136,69 +161,25 @@ def _step_findings(steps: RigCalibration, nominal: Rig, positions: Sequence[str]
     return [f for f in out if f.level > Level.PASS]
 
 
-def _input_findings(
-    project: Project, recordings: Recordings, inputs: ScreenInputs, day: datetime.date
-) -> list[Finding]:
-    out = [Finding(Level.PASS, note) for note in (*inputs.notes, *recordings.notes)]
+def _lens_findings(project: Project, day: datetime.date) -> list[Finding]:
+    """Findings on the lens calibrations of the cameras."""
+    out = []
     for name, camera in project.cameras.items():
-        state = camera.lens.calibration
+        state, file = camera.lens.calibration, camera.lens_path.name
         if state is not None and state.verdict == "FAIL":
             why = f": {state.reasons[0]}" if state.reasons else ""
-            out.append(
-                Finding(
-                    Level.FAIL,
-                    f"camera {name!r}: the lens calibration {camera.lens_path.name} has the verdict FAIL{why}",
-                    "an error of the lens distorts every measurement of the camera",
-                    "calibrate the lens again (`beampose calibrate camera`)",
-                    code="BP-K04",
-                )
-            )
+            what = f"camera {name!r}: the lens calibration {file} has the verdict FAIL{why}"
+            out.append(finding("BP-K04", Level.FAIL, what))
         if state is not None and state.valid_until and state.valid_until < day.isoformat():
-            out.append(
-                Finding(
-                    Level.WARN,
-                    f"camera {name!r}: the lens calibration {camera.lens_path.name} expired on {state.valid_until}",
-                    "lenses change with time and temperature",
-                    "calibrate the lens again (`beampose calibrate camera`)",
-                    code="BP-K05",
-                )
-            )
+            what = f"camera {name!r}: the lens calibration {file} expired on {state.valid_until}"
+            out.append(finding("BP-K05", Level.WARN, what))
         if camera.lens.covariance is None:
-            out.append(
-                Finding(
-                    Level.WARN,
-                    f"camera {name!r}: {camera.lens_path.name} has no covariance: its lens is assumed exact",
-                    "all sigmas are too small, since the error of the lens is missing in them",
-                    "calibrate the lens with beampose, which writes the covariance",
-                    code="BP-K06",
-                )
-            )
-    stand = project.stand
-    if stand is not None and stand.world_from_stand is not None and stand.sigma_m == 0 and stand.sigma_rad == 0:
-        out.append(
-            Finding(
-                Level.WARN,
-                "stand.world_from_stand has no sigma: it is assumed exact",
-                "its error goes unnoticed into the boresight of all beams",
-                "give stand.sigma_m and stand.sigma_deg, or omit world_from_stand so that it is estimated",
-                code="BP-K03",
-            )
-        )
-    if not np.any(recordings.pose_sigmas):
-        out.append(
-            Finding(
-                Level.PASS,
-                "the stand's positions are assumed exact; give stand.pose_sigma_m and pose_sigma_deg unless its"
-                " encoders are much more precise than the spots",
-            )
-        )
+            what = f"camera {name!r}: {file} has no covariance: its lens is assumed exact"
+            out.append(finding("BP-K06", Level.WARN, what))
     return out
 
 
-def _rig_file(outcome: RigOutcome, project: Project, day: datetime.date) -> RigFile:
-    joint = outcome.steps.joint
-    until = expiry_date(project, day)
-    worst_first = sorted(outcome.findings, key=lambda f: -f.level)
-    reasons = tuple(f.what for f in worst_first if f.level > Level.PASS)
-    state = CalibrationState(day, outcome.level.name, until, reasons, project.notes)
+def _rig_file(joint: Joint, findings: Sequence[Finding], project: Project, day: datetime.date) -> RigFile:
+    until, why = expiry_date(project, day), reasons(worst_first(findings))
+    state = CalibrationState(day, verdict(findings).name, until, why, project.notes)
     return RigFile(joint.rig, covariance_blocks(joint.covariance), state)

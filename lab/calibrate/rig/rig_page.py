@@ -2,65 +2,49 @@
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from calibration.rig.joint import DOTS, FRAMES, LOST, SPOTS
-from calibration.rig.joint_findings import in_degrees, in_mm
 from calibration.rig.measurement_groups import LEAST_REDUNDANCY
+from calibration.rig.rig_figures import in_degrees, in_mm
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import ypr_sigmas
 from geometry.rig import Rig
-from lab.calibrate.beams.recordings import Recordings
 from lab.calibrate.rig import rig_page_sections
-from lab.calibrate.rig.rig_outcome import RigOutcome
+from lab.calibrate.rig.rig_findings import RigResult
 from lab.number_format import format_number
 from lab.report.calibration.calibration_charts import residual_histogram
 from lab.report.calibration.calibration_drawings import residual_field
 from lab.report.calibration.calibration_page import (
-    CalibrationReport,
+    KeyFigure,
     PageDrawing,
     PageTable,
     Section,
-    provenance,
-    write_calibration_report,
 )
 
 _TABLE_ROWS = 10  # held-out positions in the table
 
 
-def write_page(
-    outcome: RigOutcome, nominal: Rig, recordings: Recordings, inputs: Sequence[Path], day: datetime.date, folder: Path
-) -> Path:
-    """Write report.html. nominal: the rig with the beams as designed."""
+def page_of(o: RigResult, nominal: Rig, positions: Sequence[str]) -> tuple[list[KeyFigure], list[Section]]:
+    """Key figures and sections of the report. nominal: the rig with the beams as designed; positions: their names."""
     sections = [
-        _expected(outcome),
-        _shares(outcome),
-        _held_out(outcome, recordings.names),
-        _groups(outcome),
-        _residuals(outcome),
-        rig_page_sections.screens_section(outcome),
-        rig_page_sections.beams_section(outcome, nominal),
-        rig_page_sections.cameras_section(outcome),
-        rig_page_sections.correlations_section(outcome),
-        rig_page_sections.lab_section(outcome),
+        _expected(o),
+        _shares(o),
+        _held_out(o, positions),
+        _groups(o),
+        _residuals(o),
+        rig_page_sections.screens_section(o),
+        rig_page_sections.beams_section(o, nominal),
+        rig_page_sections.cameras_section(o),
+        rig_page_sections.correlations_section(o),
+        rig_page_sections.lab_section(o),
     ]
-    report = CalibrationReport(
-        "Rig",
-        outcome.name,
-        outcome.level,
-        outcome.findings,
-        _key_figures(outcome),
-        [s for s in sections if s is not None],
-        provenance(inputs, day),
-    )
-    return write_calibration_report(report, folder)
+    return _key_figures(o), [s for s in sections if s is not None]
 
 
-def _key_figures(o: RigOutcome) -> list[tuple[str, str, str]]:
+def _key_figures(o: RigResult) -> list[KeyFigure]:
     joint, out = o.steps.joint, []
     if o.expected is not None:
         e = o.expected
@@ -85,7 +69,7 @@ def _key_figures(o: RigOutcome) -> list[tuple[str, str, str]]:
     return out
 
 
-def _expected(o: RigOutcome) -> Section | None:
+def _expected(o: RigResult) -> Section | None:
     e = o.expected
     if e is None:
         return None
@@ -108,7 +92,7 @@ def _expected(o: RigOutcome) -> Section | None:
     return Section("Expected uncertainty of one frame", words, (), PageTable(heads, rows))
 
 
-def _shares(o: RigOutcome) -> Section | None:
+def _shares(o: RigResult) -> Section | None:
     e = o.expected
     if e is None:
         return None
@@ -134,7 +118,7 @@ def _shares(o: RigOutcome) -> Section | None:
     return Section("Largest contributions", words, (), PageTable(heads, rows))
 
 
-def _held_out(o: RigOutcome, positions: Sequence[str]) -> Section | None:
+def _held_out(o: RigResult, positions: Sequence[str]) -> Section | None:
     h = o.held_out
     if h is None:
         return None
@@ -161,7 +145,7 @@ def _held_out(o: RigOutcome, positions: Sequence[str]) -> Section | None:
     return Section("Held-out positions", words, drawings, PageTable(heads, rows))
 
 
-def _groups(o: RigOutcome) -> Section:
+def _groups(o: RigResult) -> Section:
     joint = o.steps.joint
     rows = []
     for name, g in joint.groups.items():
@@ -192,7 +176,7 @@ def _groups(o: RigOutcome) -> Section:
     return Section("Consistency of the measurements", words, (), PageTable(heads, rows))
 
 
-def _residuals(o: RigOutcome) -> Section:
+def _residuals(o: RigResult) -> Section:
     joint, measured = o.steps.joint, o.steps.measured
     cameras = list(joint.rig.cameras)
     views = joint.rig.views()
@@ -218,7 +202,7 @@ def _residuals(o: RigOutcome) -> Section:
 
 
 def _fields(
-    o: RigOutcome, what: str, pixels: Array, residuals: Array, camera_of: Ints, kept: Bools
+    o: RigResult, what: str, pixels: Array, residuals: Array, camera_of: Ints, kept: Bools
 ) -> list[PageDrawing]:
     out = []
     for c, (name, camera) in enumerate(o.steps.joint.rig.cameras.items()):
@@ -231,7 +215,7 @@ def _fields(
     return out
 
 
-def _spot_pixels(o: RigOutcome, residuals: Array) -> Array:
+def _spot_pixels(o: RigResult, residuals: Array) -> Array:
     """Residuals of spots (N, 2) in px, from normalised residuals (N, 2)."""
     roots = np.linalg.cholesky(o.steps.measured.spots.covariance)
     return np.asarray((roots @ residuals[..., None])[..., 0])

@@ -11,7 +11,7 @@ from geometry.arrays import Array
 from geometry.pose import ypr_sigmas
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import split_name
-from lab.calibrate.rig.rig_outcome import RigOutcome
+from lab.calibrate.rig.rig_findings import RigResult
 from lab.report.calibration.calibration_maps import correlation_matrix, flatness_map
 from lab.report.calibration.calibration_page import (
     PageDrawing,
@@ -24,7 +24,7 @@ ARCSEC = np.deg2rad(1 / 3600)
 _GAUGE_SIGMA = 3e-6  # m, rad: parameters with smaller sigmas are fixed by convention, not measured
 
 
-def screens_section(o: RigOutcome) -> Section | None:
+def screens_section(o: RigResult) -> Section | None:
     """Section on the poses and the flatness of the screens; None if the project has no screens."""
     joint = o.steps.joint
     drawings, rows = [], []
@@ -66,7 +66,7 @@ def screens_section(o: RigOutcome) -> Section | None:
     return Section("Screens", words, drawings, PageTable(heads, rows))
 
 
-def beams_section(o: RigOutcome, nominal: Rig) -> Section:
+def beams_section(o: RigResult, nominal: Rig) -> Section:
     """Section on the beams, compared with the nominal ones, and on the pose of the stand."""
     joint = o.steps.joint
     direction, offset = beam_sigmas(joint)
@@ -102,7 +102,7 @@ def beams_section(o: RigOutcome, nominal: Rig) -> Section:
     return Section("Beams", words, (), PageTable(heads, rows))
 
 
-def cameras_section(o: RigOutcome) -> Section:
+def cameras_section(o: RigResult) -> Section:
     """Section on the poses of the cameras and the change of their focal lengths."""
     joint = o.steps.joint
     sigmas = dict(zip(joint.covariance.names, np.sqrt(np.diagonal(joint.covariance.matrix)), strict=True))
@@ -143,7 +143,7 @@ def _centre_jacobian(R: Array, t: Array) -> Array:
     return np.array([[0, -c[2], c[1]], [c[2], 0, -c[0]], [-c[1], c[0], 0]])
 
 
-def correlations_section(o: RigOutcome) -> Section:
+def correlations_section(o: RigResult) -> Section:
     """Section on the correlations of the parameters."""
     C = o.steps.joint.covariance
     sigma = np.sqrt(np.diagonal(C.matrix))
@@ -167,7 +167,7 @@ def _short_name(name: str) -> str:
     return f"{kind.removesuffix('s')} {thing} {bare}"
 
 
-def lab_section(o: RigOutcome) -> Section:
+def lab_section(o: RigResult) -> Section:
     """Section with three views of the lab."""
     joint = o.steps.joint
     body = (

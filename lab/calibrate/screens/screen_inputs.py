@@ -9,7 +9,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-from calibration.findings import Finding, Level
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.least_squares.priors import Prior
 from calibration.open3d_loader import MissingOpen3DError
@@ -340,66 +339,3 @@ def _explained(where: str, explanations: Sequence[SurveyError]) -> str:
             " two axes swapped; give a camera's position as `near_m` to distinguish them)"
         )
     return f"{text}; correct the file"
-
-
-def survey_findings(project: Project, result: ScreensResult) -> list[Finding]:
-    """Findings on shared lens files, and on control points that are off their screens or cover too little of them."""
-    return [*_shared_lenses(project), *_coverage(project, result)]
-
-
-def _shared_lenses(project: Project) -> list[Finding]:
-    """Warnings for two cameras with the same lens calibration: two lenses are never identical."""
-    out = []
-    names = list(project.cameras)
-    for i, first in enumerate(names):
-        for second in names[i + 1 :]:
-            a, b = project.cameras[first], project.cameras[second]
-            # A file may hold several cameras, each with its own numbers.
-            if a.lens_path == b.lens_path and np.array_equal(a.lens.camera_matrix, b.lens.camera_matrix):
-                out.append(
-                    Finding(
-                        Level.WARN,
-                        f"cameras {first!r} and {second!r} share the lens calibration {a.lens_path.name}",
-                        "two lenses of one type differ by much more than the errors of a calibration",
-                        "give each camera its own lens calibration",
-                        code="BP-S12",
-                    )
-                )
-    return out
-
-
-def _coverage(project: Project, result: ScreensResult) -> list[Finding]:
-    """Warnings for control points outside of their screen, and for screens that the points cover only partly."""
-    out = []
-    for (name, entry), screen in zip(project.screens.items(), result.screens, strict=True):
-        if entry.size_m is None or not screen.control_points:
-            continue
-        half = np.array(entry.size_m) / 2
-        reach = np.abs(screen.xyz[:, :2])
-        beyond = np.flatnonzero((reach > half + 0.01).any(axis=1))
-        if beyond.size:
-            point = result.network.control_points.names[screen.control_points[int(beyond[0])]]
-            count = "1 point" if len(beyond) == 1 else f"{len(beyond)} points"
-            out.append(
-                Finding(
-                    Level.WARN,
-                    f"screen {name!r}: control point {point!r} is outside of size_m ({count} in all)",
-                    "spots outside of size_m count as off the screen",
-                    "correct size_m, or define the screen's frame by three named points (`frame`)",
-                    code="BP-S13",
-                )
-            )
-        share = np.ptp(screen.xyz[screen.used, :2], axis=0) / np.array(entry.size_m)
-        if share.min() < 0.6:
-            out.append(
-                Finding(
-                    Level.WARN,
-                    f"screen {name!r}: the control points cover {100 * share[0]:.0f} % of its width and"
-                    f" {100 * share[1]:.0f} % of its height",
-                    "outside of the control points its shape is extrapolated"
-                    + ("" if entry.frame else ", and the centre of the points is taken as the centre of the screen"),
-                    "survey points near its corners" + ("" if entry.frame else ", or name three points in `frame`"),
-                    code="BP-S14",
-                )
-            )
-    return out

@@ -2,44 +2,31 @@
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
-from calibration.findings import Finding, verdict
 from calibration.screens.network_sigmas import camera_sigmas, pointing_sigmas_m, spot_sigmas
 from calibration.screens.screens import ScreensResult
 from geometry.camera import pinhole_numbers
-from lab.calibrate.screens.screen_inputs import ScreenInputs
 from lab.files.project.project_blocks import Project
 from lab.files.rig.rig_file import covariance_blocks
 from lab.number_format import format_number
 from lab.report.calibration.calibration_drawings import corners_overlay
 from lab.report.calibration.calibration_maps import correlation_matrix, flatness_map
 from lab.report.calibration.calibration_page import (
-    CalibrationReport,
+    KeyFigure,
     PageDrawing,
     PageTable,
     Section,
-    provenance,
-    write_calibration_report,
 )
 from lab.report.calibration.calibration_scene import LAB_VIEWS, Marker, Rectangle, SceneObject, frustum_of, scene_views
 
 _MAX_ROWS = 400  # rows in the table of observations; residuals.csv has all
 
 
-def write_page(
-    result: ScreensResult,
-    findings: Sequence[Finding],
-    project: Project,
-    inputs: ScreenInputs,
-    day: datetime.date,
-    folder: Path,
-) -> Path:
-    """Write report.html."""
+def page_of(result: ScreensResult, project: Project, remarks: Sequence[str]) -> tuple[list[KeyFigure], list[Section]]:
+    """Key figures and sections of the report. remarks: on the scans."""
     sections = [
         _places(result),
         *(_screen(result, project, k) for k in range(len(result.screens))),
@@ -48,21 +35,10 @@ def write_page(
         Section("The lab", "Cameras, screens and surveyed control points in the world frame.", _scene(result)),
         _correlations(result),
     ]
-    if inputs.remarks:
-        sections.append(Section("Scans", inputs.remarks))
-    report = CalibrationReport(
-        kind="Screens",
-        name=project.name,
-        verdict=verdict(findings),
-        findings=findings,
-        key_figures=_key_figures(result),
-        sections=sections,
-        made=provenance(project.inputs, day),
-    )
-    return write_calibration_report(report, folder)
+    return _key_figures(result), [*sections, Section("Scans", remarks)] if remarks else sections
 
 
-def _key_figures(result: ScreensResult) -> list[tuple[str, str, str]]:
+def _key_figures(result: ScreensResult) -> list[KeyFigure]:
     fit = result.fit
     out = []
     for k, name in enumerate(fit.rig.screens):

@@ -10,24 +10,24 @@ from dataclasses import dataclass, field, replace
 from datetime import date
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from markupsafe import Markup
 
-from calibration.findings import Finding, Level
 from geometry.arrays import Array
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.regular_file import bytes_of_file
+from lab.findings.finding import Finding, Level, worst_first
 from lab.number_format import format_number
 from lab.report.html import environment
 
 FILE_NAME = "report.html"
 KINDS = ("Camera", "Pair", "Board", "Screens", "Beams", "Rig", "Drift check", "Plan")
+KeyFigure: TypeAlias = tuple[str, str, str]  # label, value with unit (px and mm), note
 LARGEST_BYTES = 5_000_000  # limit for e-mail, and for a browser to open the report without delay
 _LONG_TABLE = 40  # number of rows above which a table is collapsed
-_CSS = {Level.PASS: "pass", Level.WARN: "check", Level.FAIL: "fail"}  # the classes of style.css
 _SENTENCE = {
     Level.PASS: "The result may be used.",
     Level.WARN: "The result may be used; note the warnings below.",
@@ -89,7 +89,7 @@ class CalibrationReport:
     name: str
     verdict: Level
     findings: Sequence[Finding]
-    key_figures: Sequence[tuple[str, str, str]]  # label, value with unit (px and mm), note
+    key_figures: Sequence[KeyFigure]
     sections: Sequence[Section]
     made: Provenance = field(default_factory=lambda: provenance())
 
@@ -169,25 +169,24 @@ def _drawing(drawing: PageDrawing | str) -> PageDrawing:
 
 
 def _rendered(report: CalibrationReport, drawn: list[list[PageDrawing]]) -> str:
-    worst_first = sorted(report.findings, key=lambda f: -f.level)
     context: dict[str, Any] = {
         "kind": report.kind,
         "name": report.name,
         "word": report.verdict.name,
-        "css": _CSS[report.verdict],
+        "css": report.verdict.word,
         "sentence": (_PLAN_SENTENCE if report.kind == "Plan" else _SENTENCE)[report.verdict],
         "made": report.made,
         "made_line": f"{report.made.date} · {_counted(report.findings)}",
         "findings": [
             {
-                "css": _CSS[f.level],
+                "css": f.level.word,
                 "word": f.level.name,
                 "what": f.what,
                 "why": f.why,
                 "remedy": f.remedy,
                 "code": f.code if f.level > Level.PASS else "",
             }
-            for f in worst_first
+            for f in worst_first(report.findings)
         ],
         "key_figures": report.key_figures,
         "sections": [_section(s, d) for s, d in zip(report.sections, drawn, strict=True)],

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.findings import Level
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.files.run.run_file import DetectionsTable, Run
+from lab.findings.finding import Level
 from lab.number_format import format_number
 from lab.runs.frames.even_sampler import EvenSampler
 from lab.runs.frames.frames import FrameSet, pictures_at

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from calibration.findings import Finding, Level, verdict
 from calibration.model_check.check import ModelCheckResult, NotTested, evaluate_model
 from calibration.model_check.recording import ModelCheckRecording
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
+from lab.findings.finding import Finding, Level, verdict
 from lab.runs.model_check.frame_sampler import FrameSampler
 from lab.runs.model_check.messages import findings_of, why_not_tested
 from lab.runs.model_check.place import with_place_errors

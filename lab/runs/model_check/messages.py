@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.findings import Finding, Level
 from calibration.model_check import faults as f
 from calibration.model_check.check import FEWEST_FRAMES, FEWEST_SPOTS, ModelCheckResult, NotTested
 from calibration.model_check.effect import Effect
@@ -14,6 +13,7 @@ from calibration.model_check.fault_identification import FaultDiagnosis, FittedF
 from calibration.model_check.noise_scales import UNEVEN, is_noisy
 from calibration.model_check.unseen import UnseenView
 from geometry.forward_model import SpotModel
+from lab.findings.finding import Finding, Level
 from lab.number_format import format_number, format_with_sigma
 
 MATTERS_SIGMAS = 0.5  # in stated sigmas of a pose or a spot: a smaller bias is negligible against the stated sigma

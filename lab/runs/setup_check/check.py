@@ -7,11 +7,11 @@ from itertools import combinations
 
 import numpy as np
 
-from calibration.findings import Finding, Level, verdict
 from geometry.camera import Camera
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.files.run.run_file import Run, VideoFile
+from lab.findings.finding import Finding, Level, verdict
 from lab.pictures.source import video_at
 from lab.runs.frames.even_sampler import EvenSampler
 from lab.runs.verdict.run_statistics import RunStatistics

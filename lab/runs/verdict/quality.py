@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Literal
 
-from calibration.findings import Finding, Level
 from lab.errors import QUALITY_GATE_FAILED
+from lab.findings.finding import Finding, Level
 from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, Cause, RunStatistics
 from lab.runs.verdict.verdict_reasons import REMEDIES, REMEDIES_BY_CAUSE, ReasonKind, VerdictReason
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from calibration.findings import Finding, Level
+from lab.findings.finding import Finding, Level
 from lab.number_format import format_number
 from lab.targets.stereo.run import StereoResults
 from tracking.binocular.marker_model import MarkerImages

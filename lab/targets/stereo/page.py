@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.findings import Finding
 from geometry.arrays import Array, Ints
+from lab.findings.finding import Finding
 from lab.number_format import format_angle, format_length, format_number
 from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section
 from lab.report.plot.axes import BLUE, GREEN, ORANGE, VERMILLION, padded_range

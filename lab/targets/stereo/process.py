@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from calibration.findings import Finding
 from geometry.pose import Pose
 from lab.errors import InputError
 from lab.files.rig.calibration_state import require_valid_calibration, state_mapping
@@ -19,6 +18,7 @@ from lab.files.run.fingerprints import fingerprints_of
 from lab.files.run.truth import TruePoses, read_true_poses
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.json_text import has_schema, write_json
+from lab.findings.finding import Finding
 from lab.number_format import format_length
 from lab.pictures.picture_file import MissingPicture
 from lab.targets.recording import Progress

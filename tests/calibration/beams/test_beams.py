@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from calibration.beams.beam_findings import beam_findings, direction_sigmas
 from calibration.beams.beam_start import line_through
 from calibration.beams.beams import StandModel, calibrate_beams
-from calibration.findings import Level
+from lab.findings.finding import Level
 from calibration.least_squares.adjustment import AdjustmentError
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose

@@ -8,7 +8,7 @@ import numpy as np
 
 from calibration.beams.beam_findings import beam_findings
 from calibration.beams.beams import calibrate_beams
-from calibration.findings import Level
+from lab.findings.finding import Level
 from lab.simulate.rigs import RIGS
 from tests.calibration.beams.bench import drawn, exact, positions, recorded
 

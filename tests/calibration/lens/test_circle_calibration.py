@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calibration.boards.board_types import parse
-from calibration.findings import Level
+from lab.findings.finding import Level
 from calibration.lens.fit.corner_table import CircleAreas, CornerTable
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics

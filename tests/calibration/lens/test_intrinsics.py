@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from calibration.findings import Level
+from lab.findings.finding import Level
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LENS_MODELS, LensModel, named
 from calibration.lens.intrinsics import IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics

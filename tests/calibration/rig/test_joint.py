@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bench.rig_calibration import as_measured, bench_figures, calibrated, measured_with, parameter_errors
-from calibration.findings import Level
+from lab.findings.finding import Level
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.joint import CORNERS, DOTS, FRAMES, LENSES, RECORDS, SPOTS, calibrate_jointly
 from calibration.rig.joint_findings import joint_findings

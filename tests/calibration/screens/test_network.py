@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.findings import Level
+from lab.findings.finding import Level
 from calibration.screens.network import ControlPoints, PointObservations
 from calibration.screens.network_findings import classify_outliers, findings, near_findings
 from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from calibration.findings import Level
+from lab.findings.finding import Level
 from calibration.terms.spot_term import SpotPixels
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.findings import Level
+from lab.findings.finding import Level
 from lab.calibrate.camera.camera import (
     CAMERA,
     CORNER_COLUMNS,

@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import binom
 
 from calibration.drift import TURNED, WRONG_POINT, ZOOMED, find_changes
-from calibration.findings import Level
+from lab.findings.finding import Level
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig

@@ -11,7 +11,7 @@ import shutil
 import numpy as np
 import pytest
 
-from calibration.findings import Level
+from lab.findings.finding import Level
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from lab.calibrate.calibration_date import calibration_date, expiry_date, expiry_findings

@@ -14,7 +14,7 @@ import pytest
 
 from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Charuco, parse
-from calibration.findings import Level
+from lab.findings.finding import Level
 from geometry.pose import Pose
 from lab.calibrate.screens.screen import calibrate_screen
 from lab.calibrate.screens.screen_tables import DOT_COLUMNS, RESIDUAL_COLUMNS

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.findings import Finding, Level
+from lab.findings.finding import Finding, Level
 from geometry.pose import Pose
 from lab.errors import InputError
 from lab.report.calibration import calibration_charts as charts

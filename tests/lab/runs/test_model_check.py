@@ -9,7 +9,7 @@ import re
 import numpy as np
 import pytest
 
-from calibration.findings import Level
+from lab.findings.finding import Level
 from calibration.model_check import noise_scales
 from calibration.model_check.effect import Effect
 from calibration.model_check.fault_identification import FaultDiagnosis

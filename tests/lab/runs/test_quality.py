@@ -6,7 +6,7 @@ from collections import Counter
 
 import pytest
 
-from calibration.findings import Finding, Level
+from lab.findings.finding import Finding, Level
 from lab.runs.verdict.frame_ranges import FrameRanges
 from lab.runs.verdict.quality import (
     GOOD_MEASURED,

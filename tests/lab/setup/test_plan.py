@@ -11,7 +11,7 @@ import pytest
 
 from calibration.budget.expected_errors import ExpectedErrors
 from calibration.budget.pose_grid import AXES, NOISE, STATUS, plan_grid, poses_of
-from calibration.findings import Level
+from lab.findings.finding import Level
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose, ypr_sigmas
 from lab.errors import InputError

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from cli import main
 from lab.commands.common import command_line
 from lab.errors import CalibrationError, InputError, RunError
-from lab.explain.catalogue import EXPLANATIONS
+from lab.findings.catalogue import ENTRIES
 from lab.files.text.csv_text import write_table
 from lab.runs import process
 from lab.runs.batch import task as module
@@ -168,7 +168,7 @@ def test_the_report_of_a_failed_run_has_message_status_and_explained_code_and_th
     page = (outcome.table.parent / row["report"]).read_text("utf-8")
     assert html.escape(row["message"]) in page
     assert "BP-E02" in page
-    assert EXPLANATIONS["BP-E02"].meaning in page
+    assert ENTRIES["BP-E02"].meaning in page
     assert "exit status 2" in page
     assert 'href="./errors/nothing.html"' in outcome.index.read_text("utf-8")
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from calibration.findings import Level, verdict
+from lab.findings.finding import Level, verdict
 from cli import main
 from lab.targets.point import COLUMNS, PointOptions, PointTarget
 from lab.targets.track import track_target

@@ -1,0 +1,142 @@
+"""The steps of `beampose calibrate`: each solves and says what it writes; one runner does what all have in common.
+
+The runner checks the folder, solves, judges by the findings, keeps earlier good results, and writes files and page.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Generic, TypeVar
+
+from lab.errors import CalibrationError, InputError
+from lab.files.project.project_blocks import Project
+from lab.files.text.atomic_write import atomic_folder, check_output_folder, keep_good_results
+from lab.findings.finding import Finding, Level, finding, verdict
+from lab.report.calibration.calibration_page import (
+    CalibrationReport,
+    KeyFigure,
+    Section,
+    provenance,
+    write_calibration_report,
+)
+
+R = TypeVar("R")
+R_co = TypeVar("R_co", covariant=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What all calibrations of one kind share."""
+
+    kind: str  # of the report, one of its KINDS
+    own: tuple[str, ...]  # files by which a folder of earlier results is recognised
+    good: str = ""  # file of a usable result, which a FAIL does not replace; empty: each result replaces the last one
+    failed_status: int = CalibrationError.exit_status  # exit status of a FAIL
+
+    def is_ours(self, folder: Path) -> bool:
+        """Whether a folder holds earlier results of this step."""
+        return all((folder / name).is_file() for name in self.own)
+
+
+@dataclass(frozen=True, slots=True)
+class Solved(Generic[R]):
+    """A solved step, before anything is written."""
+
+    name: str
+    result: R
+    findings: tuple[Finding, ...]
+    figures: str  # key figures in words, for the line on the terminal
+    write: Callable[[Path], None]  # writes the tables and files into a folder
+    page: Callable[[], tuple[Sequence[KeyFigure], Sequence[Section]]]  # key figures and sections of the report
+    day: datetime.date
+    inputs: Sequence[Path]  # files of which the report states the checksums
+    title: str = ""  # of the report; empty: the name
+    advice: str = ""  # what to do after a FAIL; empty: the remedy of the worst finding
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome(Generic[R_co]):
+    """Result of a step."""
+
+    name: str
+    out: Path  # folder of the results: `OUT-failed` if a FAIL would have replaced a valid calibration
+    findings: tuple[Finding, ...]
+    result: R_co
+    figures: str
+    advice: str
+    failed_status: int
+
+    @property
+    def level(self) -> Level:
+        """The verdict."""
+        return verdict(self.findings)
+
+    @property
+    def exit_status(self) -> int:
+        """0, or the status of a result that must not be used."""
+        return self.failed_status if self.level is Level.FAIL else 0
+
+    def line(self) -> str:
+        """One line for the terminal: the worst finding, and after a FAIL what to do."""
+        worst = max(self.findings, key=lambda f: f.level)
+        reason = "" if self.level is Level.PASS else f": {worst.what.rstrip('.')}"
+        if self.level is Level.FAIL:
+            reason += f". {(self.advice or worst.remedy).rstrip('.')}"
+        return f"{self.name}: {self.level.name}: {self.figures}{reason} -> {self.out}"
+
+
+def run_step(step: Step, out: Path, solve: Callable[[], Solved[R]]) -> Outcome[R]:
+    """Solve a step and write its files and report.html into the folder `out`, all or none.
+
+    A FAIL never replaces an earlier usable result: it goes to `OUT-failed`.
+
+    Raises:
+        BeamposeError: as `solve` does, or the folder cannot be written. Nothing is written then.
+    """
+    check_output_folder(out, step.is_ours)
+    solved = solve()
+    level = verdict(solved.findings)
+    folder = keep_good_results(out, level is Level.FAIL, step.good) if step.good else Path(out)
+    key_figures, sections = solved.page()
+    title, made = solved.title or solved.name, provenance(solved.inputs, solved.day)
+    report = CalibrationReport(step.kind, title, level, solved.findings, key_figures, sections, made)
+    with atomic_folder(folder, may_replace=step.is_ours) as work:
+        solved.write(work)
+        write_calibration_report(report, work)
+    s = solved
+    return Outcome(s.name, folder, s.findings, s.result, s.figures, s.advice, step.failed_status)
+
+
+# Date of a calibration and end of its validity.
+
+
+def calibration_date(project: Project, today: datetime.date | None) -> datetime.date:
+    """Date written into the result: `today` if given, else the date of the measurements, else the current date.
+
+    Raises:
+        InputError: if the measurements are dated in the future.
+    """
+    now = today or datetime.date.today()
+    if project.date is not None and project.date > now:
+        raise InputError(
+            f"{project.path}: date: expected the day of the measurements, got {project.date.isoformat()}, after"
+            f" today ({now.isoformat()}); correct the date or the computer's clock"
+        )
+    return today or project.date or now
+
+
+def expiry_date(project: Project, day: datetime.date) -> datetime.date | None:
+    """Last day on which the result is valid; None: no expiry."""
+    return None if project.valid_days is None else day + datetime.timedelta(days=project.valid_days)
+
+
+def expiry_findings(project: Project, day: datetime.date, today: datetime.date | None) -> list[Finding]:
+    """A warning if the result has already expired on the day on which it is written."""
+    until, now = expiry_date(project, day), today or datetime.date.today()
+    if until is None or until >= now:
+        return []
+    what = f"the calibration expired on {until.isoformat()}, {(now - until).days} days ago"
+    return [finding("BP-K07", Level.WARN, what)]
