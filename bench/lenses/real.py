@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 
 from calibration.boards.board_types import parse
-from lab.findings.finding import Level
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics import IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
@@ -22,8 +21,10 @@ from calibration.lens.intrinsics_result import Intrinsics
 from calibration.pair.pair_calibration import PairError, calibrate_pair
 from geometry.arrays import Ints
 from lab.calibrate.camera.camera import corner_table
+from lab.calibrate.camera.camera_findings import findings_of
 from lab.calibrate.camera.photos import find_in_photos
 from lab.calibrate.pair.pair import baseline_sigma
+from lab.findings.finding import Level, verdict
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 _TWO = "charuco_two_cameras/cam_"
@@ -63,9 +64,10 @@ def line(found: Intrinsics | str) -> str:
     """The result in a few words."""
     if isinstance(found, str):
         return f"ERROR {found[:80]}"
-    failed = ",".join(f.code for f in found.findings if f.level is Level.FAIL)
+    findings = findings_of(found)
+    failed = ",".join(f.code for f in findings if f.level is Level.FAIL)
     fx, sigma = found.fit.lens[0], found.sigmas[0]
-    return f"{found.verdict.name:4s} {found.model.title:7s} fx {fx:8.2f} ± {sigma:5.2f} px {failed}"
+    return f"{verdict(findings).name:4s} {found.model.title:7s} fx {fx:8.2f} ± {sigma:5.2f} px {failed}"
 
 
 def plain_opencv(table: CornerTable) -> tuple[float, float]:
@@ -85,7 +87,7 @@ def plain_opencv(table: CornerTable) -> tuple[float, float]:
 
 
 def is_usable(found: Intrinsics | str) -> bool:
-    return not isinstance(found, str) and found.verdict < Level.FAIL
+    return not isinstance(found, str) and verdict(findings_of(found)) < Level.FAIL
 
 
 def spread(values: list[float], sigmas: list[float], shares: list[float], whole: float) -> str:

@@ -16,7 +16,6 @@ import numpy as np
 from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Board, CircleGrid, parse
 from calibration.boards.board_view import BoardView
-from lab.findings.finding import Level
 from calibration.lens.fit.corner_table import CircleAreas, CornerTable
 from calibration.lens.fit.lens_models import LensModel, rational_of_fisheye
 from calibration.lens.intrinsics import IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
@@ -25,6 +24,8 @@ from geometry.arrays import Array
 from geometry.camera import FISHEYE, PERSPECTIVE, Camera
 from geometry.pose import Pose
 from geometry.rotations import exp
+from lab.calibrate.camera.camera_findings import findings_of
+from lab.findings.finding import Level, verdict
 from lab.simulate.board_photo import PhotoSettings, photograph
 from tests.calibration.lens.random_lenses import TrueLens, lens_error
 
@@ -153,14 +154,16 @@ def judged(kind: str, s: RenderedSet) -> Row:
     c = _calibrated(s.table, None)
     seconds = (time.process_time() - start + s.seconds) * 20 / s.table.views
     lost = False
-    if c is None or c.verdict is Level.FAIL:
+    if c is None or verdict(findings_of(c)) is Level.FAIL:
         others = [_calibrated(s.table, m) for m in (LensModel(4), LensModel(5), LensModel(4, FISHEYE))]
-        lost = any(o is not None and o.verdict < Level.FAIL for o in others)
+        lost = any(o is not None and verdict(findings_of(o)) < Level.FAIL for o in others)
     if c is None:
         return Row(kind, "none", "ERROR", lost, np.full(4, np.nan), np.nan, np.nan, seconds)
     e = lens_error(projection(s), c)
     z = (c.fit.lens - s.lens)[:4] / c.sigmas[:4]
-    return Row(kind, c.model.title, c.verdict.name, lost, z, e.error_px / e.stated_px, e.error_px, seconds)
+    return Row(
+        kind, c.model.title, verdict(findings_of(c)).name, lost, z, e.error_px / e.stated_px, e.error_px, seconds
+    )
 
 
 def _calibrated(table: CornerTable, lens: LensModel | None) -> Intrinsics | None:

@@ -26,7 +26,6 @@ from bench.random_scenes.oracle import ask_oracle
 from bench.random_scenes.scene import OUTSIDE, SHINING, Scene, composed
 from geometry.arrays import Array, Bools
 from lab.files.run.results import read_result_table, read_spots, read_summary
-from lab.runs.verdict.verdict_reasons import ReasonKind
 
 LEAST_SNR = 8.0
 WIDEST_PX = 24.0
@@ -213,25 +212,23 @@ def wrong_diagnoses(renderer: Renderer, summary: Mapping[str, Any]) -> tuple[str
     for item in summary.get("verdict", {}).get("evidence", []):
         kind, camera = item["kind"], item.get("numbers", {}).get("camera")
         false = kind in (
-            ReasonKind.NOISE_SCALE,
-            ReasonKind.MODEL,
-            ReasonKind.NOT_ACQUIRED,
-            ReasonKind.FEW_POINTS,
-            ReasonKind.NEVER_FOUND,
-            ReasonKind.INTERNAL,
+            "noise_scale",
+            "model",
+            "not_acquired",
+            "few_points",
+            "never_found",
+            "internal",
         )
-        if kind == ReasonKind.MODEL:
+        if kind == "model":
             false = not _about_noise_or_hidden(item["what"], scene, seen)
         if camera in scene.rig.cameras:
             c = list(scene.rig.cameras).index(camera)
             mine = np.asarray(seen[:, scene.camera_of == c].any(axis=1))
             pictures = scene.has_image[:, c]
             last = item["numbers"].get("empty_at_end", 0) if "in its last" in item["what"] else 0
-            false |= kind == ReasonKind.NOTHING_DETECTED and float(mine[pictures][-last:].mean()) > SEEN
-            false |= kind == ReasonKind.NO_PICTURES and bool(pictures.any())
-            false |= kind in (ReasonKind.CAMERA_LATE, ReasonKind.CAMERA_STOPPED, ReasonKind.MISSING_PICTURES) and bool(
-                pictures.all()
-            )
+            false |= kind == "nothing_detected" and float(mine[pictures][-last:].mean()) > SEEN
+            false |= kind == "no_pictures" and bool(pictures.any())
+            false |= kind in ("camera_late", "camera_stopped", "missing_pictures") and bool(pictures.all())
         if false:
             out.append(f"{kind}: {item['what']}")
     return tuple(out)

@@ -15,7 +15,7 @@ from lab.commands.common import ANY_PATH, FOLDER, NumberRange, complete_codes, p
 @click.argument("files", metavar="[CALIBRATION]...", nargs=-1, type=ANY_PATH)
 @click.option("--out", default=".", type=ANY_PATH, help="Where results will be written: its free space is checked.")
 def doctor(files: tuple[Path, ...], out: Path) -> None:
-    """Check the installation, the machine and calibration files: one line each, OK, WARN or FAIL, with a remedy.
+    """Check the installation, the machine and calibration files: one line each, PASS, WARN or FAIL, with a remedy.
 
     CALIBRATION: any number of rig.yaml, camera.yaml and screens.yaml files, or run folders, whose age and verdict are
     checked. Exit status: 0 without a FAIL; 1: the installation is faulty; 2: a file is wrong; 3: a calibration must
@@ -26,12 +26,12 @@ def doctor(files: tuple[Path, ...], out: Path) -> None:
         beampose doctor sample_runs/huo2015
     """
     from lab.setup.doctor import examine
-    from lab.setup.installation import exit_status
+    from lab.setup.installation import exit_status, line_of
 
-    lines = examine(files, out)
-    for line in lines:
-        show_line(str(line))
-    sys.exit(exit_status(lines))
+    findings = examine(files, out)
+    for finding in findings:
+        show_line(line_of(finding))
+    sys.exit(exit_status(findings))
 
 
 @click.command()

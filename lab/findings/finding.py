@@ -72,6 +72,11 @@ def finding(
     return Finding(level, what, why or entry.meaning, remedy or entry.remedy, code, numbers or {})
 
 
+def clause(sentence: str) -> str:
+    """A sentence as part of another one: without its capital and its full stop."""
+    return f"{sentence[:1].lower()}{sentence[1:]}".rstrip(".")
+
+
 def verdict(findings: Iterable[Finding]) -> Level:
     """The most severe level among the findings; PASS if there are none."""
     return max((f.level for f in findings), default=Level.PASS)

@@ -6,13 +6,14 @@ import datetime
 from collections.abc import Sequence
 from pathlib import Path
 
-from lab.setup.installation import Line, check_installation
+from lab.findings.finding import Finding, Level
+from lab.setup.installation import check_installation
 
 
-def examine(files: Sequence[Path] = (), out: Path = Path()) -> list[Line]:
-    """A line per check. files: calibration files or run folders. out: where results will be written."""
+def examine(files: Sequence[Path] = (), out: Path = Path()) -> list[Finding]:
+    """A finding per check. files: calibration files or run folders. out: where results will be written."""
     lines = check_installation()
-    if any(line.code == "BP-D02" and line.state for line in lines):
+    if any(line.code == "BP-D02" and line.level > Level.PASS for line in lines):
         return lines  # the other checks need the libraries
     from lab.setup.doctor_checks import check_calibration, check_opencv, check_places
 

@@ -12,15 +12,15 @@ import numpy as np
 
 import geometry
 from geometry.compilation.compile_cache import cache_folder, is_empty
-from lab.errors import CalibrationError, InputError
+from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.camera_file import load_camera
 from lab.files.rig.rig_file import load_rig_file
 from lab.files.rig.screens_file import load_screens
 from lab.files.run.run_file import load_run
 from lab.files.text.yaml_text import read_mapping
+from lab.findings.finding import Finding, Level, finding
 from lab.pictures.opencv import load_cv2
-from lab.setup.installation import Line, State
 
 # Checks of the picture and video formats that OpenCV reads here: each is written and read back.
 
@@ -32,24 +32,24 @@ _SIZE = (64, 48)  # width, height, px
 _VIDEO_ERROR = 24  # grey levels, of a smooth picture after lossy compression
 
 
-def check_opencv() -> list[Line]:
+def check_opencv() -> list[Finding]:
     """All checks of this module."""
     cv2 = load_cv2()
     return [check_pictures(cv2), check_videos(cv2), _threads(cv2)]
 
 
-def check_pictures(cv2: Any) -> Line:
+def check_pictures(cv2: Any) -> Finding:
     """The formats of pictures, in memory."""
     missing = [
         f"{suffix} with {bits} bits" for suffix, bits, error in PICTURES if not _read_back(cv2, suffix, bits, error)
     ]
     if missing:
         remedy = "Install OpenCV again: `python -m pip install --force-reinstall opencv-python-headless`"
-        return Line(
-            "BP-D04", State.FAIL, f"pictures: OpenCV {cv2.__version__} cannot read {', '.join(missing)}", remedy
+        return finding(
+            "BP-D04", Level.FAIL, f"pictures: OpenCV {cv2.__version__} cannot read {', '.join(missing)}", remedy=remedy
         )
     names = ", ".join(dict.fromkeys(suffix[1:].upper() for suffix, _, _ in PICTURES))
-    return Line("BP-D04", State.OK, f"pictures: OpenCV {cv2.__version__} reads {names}")
+    return finding("BP-D04", Level.PASS, f"pictures: OpenCV {cv2.__version__} reads {names}")
 
 
 def _ramp(bits: int) -> np.ndarray:
@@ -69,7 +69,7 @@ def _read_back(cv2: Any, suffix: str, bits: int, error: float) -> bool:
     return bool(np.max(np.abs(found.astype(float) - picture)) <= error)
 
 
-def check_videos(cv2: Any) -> Line:
+def check_videos(cv2: Any) -> Finding:
     """The video formats, in a temporary folder. H.264 can be read, but not written, by OpenCV's own packages."""
     missing = []
     with tempfile.TemporaryDirectory(prefix="beampose-") as folder:
@@ -80,8 +80,10 @@ def check_videos(cv2: Any) -> Line:
     text = f"OpenCV's readers: {', '.join(backends)}"
     if missing:
         remedy = "Install OpenCV from PyPI (opencv-python-headless), or convert videos to folders of pictures"
-        return Line("BP-D05", State.WARN, f"videos: {', '.join(missing)} cannot be read back ({text})", remedy)
-    return Line("BP-D05", State.OK, f"videos: {', '.join(codec for codec, _ in VIDEOS)} are read back ({text})")
+        return finding(
+            "BP-D05", Level.WARN, f"videos: {', '.join(missing)} cannot be read back ({text})", remedy=remedy
+        )
+    return finding("BP-D05", Level.PASS, f"videos: {', '.join(codec for codec, _ in VIDEOS)} are read back ({text})")
 
 
 def _video_read_back(cv2: Any, path: Path, codec: str) -> bool:
@@ -103,10 +105,10 @@ def _video_read_back(cv2: Any, path: Path, codec: str) -> bool:
     )
 
 
-def _threads(cv2: Any) -> Line:
+def _threads(cv2: Any) -> Finding:
     count, processors = cv2.getNumThreads(), cv2.getNumberOfCPUs()
-    return Line(
-        "BP-D13", State.OK, f"processors: {processors}; OpenCV uses {count} threads; results do not depend on it"
+    return finding(
+        "BP-D13", Level.PASS, f"processors: {processors}; OpenCV uses {count} threads; results do not depend on it"
     )
 
 
@@ -118,7 +120,7 @@ _GB = 1e9
 _PACKAGES = ("geometry", "tracking", "calibration", "lab")
 
 
-def check_places(out: Path) -> list[Line]:
+def check_places(out: Path) -> list[Finding]:
     """All checks of this module. out: where results will be written."""
     temporary = Path(tempfile.gettempdir())
     return [check_cache(), check_space(existing(out), "results"), check_space(temporary, "temporary files")]
@@ -131,21 +133,26 @@ def compiled_folders() -> list[Path]:
     return sorted({f.parent for f in files if "\n@compiled" in f.read_text("utf-8")})
 
 
-def check_cache() -> Line:
+def check_cache() -> Finding:
     """Whether compiled code can be kept, where, and how much of it is there."""
     folders = compiled_folders()
     kept = [cache_folder(f) for f in folders]
     places = {str(k.parent) for k in kept if k is not None}
     if None in kept:
         remedy = "Make one of these writable for you alone: beampose's own folder, ~/.cache, the temporary folder"
-        return Line("BP-D07", State.WARN, "compiled code: cannot be kept; each run compiles for a minute", remedy)
+        return finding(
+            "BP-D07", Level.WARN, "compiled code: cannot be kept; each run compiles for a minute", remedy=remedy
+        )
     ready = sum(not is_empty(f) for f in folders)
     text = f"compiled code: {ready} of {len(folders)} parts are ready in {', '.join(sorted(places))}"
     if ready < len(folders):
-        return Line(
-            "BP-D07", State.WARN, text, "The next run compiles the rest (a minute), or: `python -m lab.runs.warm_up`"
+        return finding(
+            "BP-D07",
+            Level.WARN,
+            text,
+            remedy="The next run compiles the rest (a minute), or: `python -m lab.runs.warm_up`",
         )
-    return Line("BP-D07", State.OK, text)
+    return finding("BP-D07", Level.PASS, text)
 
 
 def existing(path: Path) -> Path:
@@ -154,17 +161,19 @@ def existing(path: Path) -> Path:
     return next(p for p in (path, *path.parents) if p.exists())
 
 
-def check_space(folder: Path, what: str) -> Line:
+def check_space(folder: Path, what: str) -> Finding:
     """The free space of the disk of a folder."""
     try:
         free = shutil.disk_usage(folder).free
     except OSError as error:
-        return Line("BP-D08", State.FAIL, f"disk: {folder} cannot be read: {error.strerror}", "Choose another folder")
+        return finding(
+            "BP-D08", Level.FAIL, f"disk: {folder} cannot be read: {error.strerror}", remedy="Choose another folder"
+        )
     text = f"disk: {free / _GB:.1f} GB are free for {what} in {folder}"
     if free >= FEW_BYTES:
-        return Line("BP-D08", State.OK, text)
+        return finding("BP-D08", Level.PASS, text)
     remedy = "Free some space, or write to another disk (--out; TMPDIR for temporary files)"
-    return Line("BP-D08", State.WARN if free >= TOO_FEW_BYTES else State.FAIL, text, remedy)
+    return finding("BP-D08", Level.WARN if free >= TOO_FEW_BYTES else Level.FAIL, text, remedy=remedy)
 
 
 # Checks of calibration files: verdict, age and expiry.
@@ -175,14 +184,14 @@ OLD = 365  # days after which a calibration without an expiry date is reported
 _AGAIN = "Confirm it with `beampose calibrate check`, or calibrate again (`beampose calibrate rig`)"
 
 
-def check_calibration(path: Path, today: datetime.date) -> Line:
+def check_calibration(path: Path, today: datetime.date) -> Finding:
     """The calibration of a rig.yaml, camera.yaml or screens.yaml, or of the rig of a run folder."""
     try:
         state = _state_of(Path(path))
     except InputError as error:
         text = str(error).splitlines()[0]
         remedy = "Correct the file: `beampose check` names all its mistakes"
-        return Line("BP-D10", State.FAIL, f"calibration: {text}", remedy, InputError.exit_status)
+        return finding("BP-D10", Level.FAIL, f"calibration: {text}", remedy=remedy)
     return _line(path, state, today)
 
 
@@ -210,30 +219,31 @@ def _state_of_camera(path: Path) -> CalibrationState | None:
     return CalibrationState(date, known.verdict or "PASS", until, known.reasons)
 
 
-def _line(path: Path, state: CalibrationState | None, today: datetime.date) -> Line:
+def _line(path: Path, state: CalibrationState | None, today: datetime.date) -> Finding:
     if state is None:
-        return Line("BP-D09", State.WARN, f"calibration: {path} states no date of calibration", _AGAIN)
+        return finding("BP-D09", Level.WARN, f"calibration: {path} states no date of calibration", remedy=_AGAIN)
     days = (today - state.date).days
     text = f"calibration: {path}: {state.verdict}, {days} days old"
-    failed = CalibrationError.exit_status
     if state.verdict == "FAIL":
         why = f" ({state.reasons[0]})" if state.reasons else ""
-        return Line("BP-D09", State.FAIL, text + why, "Correct the cause and calibrate again", failed)
+        return finding("BP-D09", Level.FAIL, text + why, remedy="Correct the cause and calibrate again")
     if days < 0:
         remedy = "Check the clock of this computer and the date in the file"
-        return Line("BP-D09", State.WARN, f"calibration: {path}: its date {state.date} is in the future", remedy)
+        return finding(
+            "BP-D09", Level.WARN, f"calibration: {path}: its date {state.date} is in the future", remedy=remedy
+        )
     if state.valid_until is None:
         if days > OLD:
-            return Line("BP-D09", State.WARN, f"{text}, without an expiry date", _AGAIN)
+            return finding("BP-D09", Level.WARN, f"{text}, without an expiry date", remedy=_AGAIN)
         text += ", without an expiry date"
     else:
         left = (state.valid_until - today).days
         if left < 0:
-            return Line("BP-D09", State.FAIL, f"{text}, expired on {state.valid_until}", _AGAIN, failed)
+            return finding("BP-D09", Level.FAIL, f"{text}, expired on {state.valid_until}", remedy=_AGAIN)
         text += f", valid until {state.valid_until}"
         if left <= EXPIRES_SOON:
-            return Line("BP-D09", State.WARN, f"{text}, in {left} days", _AGAIN)
+            return finding("BP-D09", Level.WARN, f"{text}, in {left} days", remedy=_AGAIN)
     if state.verdict != "PASS":
         why = f" ({state.reasons[0]})" if state.reasons else ""
-        return Line("BP-D09", State.WARN, text + why, "Read the report beside the file before using it")
-    return Line("BP-D09", State.OK, text)
+        return finding("BP-D09", Level.WARN, text + why, remedy="Read the report beside the file before using it")
+    return finding("BP-D09", Level.PASS, text)

@@ -1,4 +1,4 @@
-"""Checks of `beampose doctor` that need no library: the installation itself. The lines that all checks return."""
+"""Checks of `beampose doctor` that need no library: the installation itself."""
 
 from __future__ import annotations
 
@@ -7,45 +7,30 @@ import os
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from enum import IntEnum
 from importlib import metadata
 from importlib.util import find_spec
 
 from lab.errors import CalibrationError, InputError, RunError
+from lab.findings.finding import Finding, Level, finding
 from lab.versions import versions
 
-# The lines that the checks of `beampose doctor` return.
+_FILE_CODE, _CALIBRATION_CODE = "BP-D10", "BP-D09"
 
 
-class State(IntEnum):
-    """Severity of a line, in ascending order."""
-
-    OK = 0
-    WARN = 1  # works; the user should know
-    FAIL = 2  # some command will not work
+def line_of(f: Finding) -> str:
+    """The line of a check."""
+    remedy = f". {f.remedy} [{f.code}]" if f.level > Level.PASS else ""
+    return f"{f.level.name:<5}{f.what}{remedy}"
 
 
-@dataclass(frozen=True, slots=True)
-class Line:
-    """The result of one check."""
-
-    code: str  # BP-D01 ...: `beampose explain CODE`
-    state: State
-    what: str
-    remedy: str = ""  # what to do; empty for OK
-    exit_status: int = RunError.exit_status  # of the command, if the state is FAIL
-
-    def __str__(self) -> str:
-        remedy = f". {self.remedy} [{self.code}]" if self.state > State.OK else ""
-        return f"{self.state.name:<5}{self.what}{remedy}"
-
-
-def exit_status(lines: Sequence[Line]) -> int:
+def exit_status(findings: Sequence[Finding]) -> int:
     """Exit status of the command: 0 without a FAIL; 2: a file is wrong; 1: the installation is; 3: a calibration."""
-    failed = {line.exit_status for line in lines if line.state is State.FAIL}
-    order = (InputError.exit_status, RunError.exit_status, CalibrationError.exit_status)
-    return next((status for status in order if status in failed), 0)
+    failed = {f.code for f in findings if f.level is Level.FAIL}
+    if _FILE_CODE in failed:
+        return InputError.exit_status
+    if failed - {_CALIBRATION_CODE}:
+        return RunError.exit_status
+    return CalibrationError.exit_status if failed else 0
 
 
 # Checks of Python, of the libraries and of the settings of the environment.
@@ -62,7 +47,7 @@ _OPENCV_VARIABLES = ("OPENCV_IO_MAX_IMAGE_", "OPENCV_FFMPEG_CAPTURE_OPTIONS", "O
 _REQUIREMENT = re.compile(r"^([A-Za-z0-9._-]+)>=([\d.]+)$")
 
 
-def check_installation() -> list[Line]:
+def check_installation() -> list[Finding]:
     """All checks of this module."""
     return [
         check_versions(versions(), requirements()),
@@ -95,7 +80,7 @@ def installed_packages() -> set[str]:
     return found
 
 
-def check_versions(found: Mapping[str, str], lowest: Mapping[str, str]) -> Line:
+def check_versions(found: Mapping[str, str], lowest: Mapping[str, str]) -> Finding:
     """Versions of Python and the libraries. lowest: the declared ones."""
     text = ", ".join(f"{name} {version}" for name, version in found.items())
     old = []
@@ -111,18 +96,18 @@ def check_versions(found: Mapping[str, str], lowest: Mapping[str, str]) -> Line:
             old.append(f"{name} {version} is older than {least}")
     if old:
         remedy = "Install beampose again: `python -m pip install --upgrade beampose`"
-        return Line("BP-D01", State.FAIL, f"versions: {'; '.join(old)}", remedy)
+        return finding("BP-D01", Level.FAIL, f"versions: {'; '.join(old)}", remedy=remedy)
     if not lowest:
         remedy = "Run `make setup`, so that results record the program's version"
-        return Line("BP-D01", State.WARN, f"versions: {text}; beampose is not installed as a package", remedy)
-    return Line("BP-D01", State.OK, f"versions: {text}")
+        return finding("BP-D01", Level.WARN, f"versions: {text}; beampose is not installed as a package", remedy=remedy)
+    return finding("BP-D01", Level.PASS, f"versions: {text}")
 
 
 def _numbers(version: str) -> tuple[int, ...]:
     return tuple(int(n) for n in re.findall(r"\d+", version.split("+")[0])[:3])
 
 
-def check_libraries(modules: Mapping[str, str]) -> Line:
+def check_libraries(modules: Mapping[str, str]) -> Finding:
     """Whether the libraries can be loaded. modules: a module of each package."""
     broken = []
     for package, module in modules.items():
@@ -131,48 +116,52 @@ def check_libraries(modules: Mapping[str, str]) -> Line:
         except Exception as error:  # any: a damaged binary raises what it likes
             broken.append(f"{package} ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''})")
     if not broken:
-        return Line("BP-D02", State.OK, f"libraries: all {len(modules)} can be loaded")
+        return finding("BP-D02", Level.PASS, f"libraries: all {len(modules)} can be loaded")
     names = " ".join(text.split(" ")[0] for text in broken)
     remedy = f"Install them again: `python -m pip install --force-reinstall {names}`"
-    return Line("BP-D02", State.FAIL, f"libraries: cannot be loaded: {'; '.join(broken)}", remedy)
+    return finding("BP-D02", Level.FAIL, f"libraries: cannot be loaded: {'; '.join(broken)}", remedy=remedy)
 
 
-def check_opencv_packages(installed: set[str]) -> Line:
+def check_opencv_packages(installed: set[str]) -> Finding:
     """Several OpenCV packages in one Python overwrite each other's files."""
     if len(installed) < 2:
-        return Line("BP-D03", State.OK, f"OpenCV: one package ({', '.join(installed) or 'none listed'})")
+        return finding("BP-D03", Level.PASS, f"OpenCV: one package ({', '.join(installed) or 'none listed'})")
     names = sorted(installed)
     remedy = (
         f"Keep one: `python -m pip uninstall {' '.join(names)}`, then `python -m pip install opencv-python-headless`"
     )
     what = f"OpenCV: {len(names)} packages share the folder cv2 and overwrite each other: {', '.join(names)}"
-    return Line("BP-D03", State.WARN, what, remedy)
+    return finding("BP-D03", Level.WARN, what, remedy=remedy)
 
 
-def check_variables(environment: Mapping[str, str]) -> Line:
+def check_variables(environment: Mapping[str, str]) -> Finding:
     """Variables that change what OpenCV decodes, or that switch the compiled code off."""
     found = [name for name in environment if name.startswith(_OPENCV_VARIABLES)]
     if environment.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
         found.append("NUMBA_DISABLE_JIT")
     if not found:
-        return Line("BP-D06", State.OK, "environment: no variable changes how pictures are read or code is run")
+        return finding("BP-D06", Level.PASS, "environment: no variable changes how pictures are read or code is run")
     texts = ", ".join(f"{name}={environment[name]}" for name in sorted(found))
-    return Line("BP-D06", State.WARN, f"environment: {texts}", f"Unset them, unless they are meant: `unset {found[0]}`")
+    return finding(
+        "BP-D06", Level.WARN, f"environment: {texts}", remedy=f"Unset them, unless they are meant: `unset {found[0]}`"
+    )
 
 
-def check_encoding(encoding: str) -> Line:
+def check_encoding(encoding: str) -> Finding:
     """The encoding of file names."""
     if encoding.lower().replace("-", "") == "utf8":
-        return Line("BP-D11", State.OK, "file names: UTF-8")
+        return finding("BP-D11", Level.PASS, "file names: UTF-8")
     remedy = "Set it: `export LC_ALL=C.UTF-8`"
-    return Line("BP-D11", State.WARN, f"file names: {encoding}, other letters than those cannot be opened", remedy)
+    return finding(
+        "BP-D11", Level.WARN, f"file names: {encoding}, other letters than those cannot be opened", remedy=remedy
+    )
 
 
-def check_point_clouds() -> Line:
+def check_point_clouds() -> Finding:
     """open3d, which only clouds of points and 3-D views need."""
     if find_spec("open3d") is None:
-        return Line("BP-D12", State.OK, "open3d: not installed; only point clouds and 3-D views need it")
-    return Line("BP-D12", State.OK, f"open3d: {metadata.version(_open3d_package())}")
+        return finding("BP-D12", Level.PASS, "open3d: not installed; only point clouds and 3-D views need it")
+    return finding("BP-D12", Level.PASS, f"open3d: {metadata.version(_open3d_package())}")
 
 
 def _open3d_package() -> str:

@@ -25,7 +25,7 @@ from lab.errors import InputError
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.error_text import suggest_name
 from lab.files.text.range_checks import MAX_COORDINATE_M
-from lab.findings.finding import Finding, Level
+from lab.findings.finding import Finding, Level, finding, passed
 from lab.number_format import format_angle, format_length, format_percent
 
 # Options of a plan: the grid of poses, the noise of a spot, the goals and the expected calibration errors.
@@ -285,7 +285,7 @@ def findings(plan: Plan) -> list[Finding]:
 def _observability(plan: Plan) -> Iterator[Finding]:
     count, measured = len(plan.status), int(plan.measured.sum())
     if measured == count:
-        yield Finding(Level.PASS, f"All {count} poses can be measured.")
+        yield passed(f"All {count} poses can be measured.")
         return
     unobservable, vague = int((~plan.observable).sum()), int((plan.observable & ~plan.measured).sum())
     what = f"{count - measured} of {count} poses ({format_percent(1 - measured / count)}) cannot be measured:"
@@ -293,22 +293,12 @@ def _observability(plan: Plan) -> Iterator[Finding]:
     what += f", {vague} are too uncertain to count as measured" if vague else ""
     where = _where(plan, ~plan.measured)
     if measured == 0:
-        yield Finding(
-            Level.FAIL,
-            what + ".",
-            "At no pose of the grid are enough spots in the pictures.",
-            "Check that the ranges are where the vehicle will be (in world coordinates), and check the poses of the"
-            " cameras and screens with `beampose check`.",
-            code="BP-P01",
-        )
+        yield finding("BP-P01", Level.FAIL, what + ".")
         return
-    yield Finding(
+    yield finding(
+        "BP-P02",
         Level.FAIL if measured < MIN_MEASURED * count else Level.WARN,
         what + (f"; the share is largest at {where}." if where else "."),
-        "A run gives no measured pose there.",
-        "See below which spots leave their pictures; move or turn those cameras, use wider lenses, or add a beam that"
-        " stays in view.",
-        code="BP-P02",
     )
 
 
@@ -331,16 +321,9 @@ def _redundancy(plan: Plan) -> Iterator[Finding]:
     three = plan.measured & (spots <= 3)
     share = float(three.sum() / max(int(plan.measured.sum()), 1))
     if share > 0.05:
-        yield Finding(
-            Level.WARN,
-            f"{format_percent(share)} of the measurable poses have only three spots.",
-            "Three spots fit any labels: a wrong label is not detected.",
-            "Keep a fourth spot in view: use a wider lens, or one more beam.",
-            code="BP-P03",
-        )
+        yield finding("BP-P03", Level.WARN, f"{format_percent(share)} of the measurable poses have only three spots.")
     elif plan.measured.any():
-        yield Finding(
-            Level.PASS,
+        yield passed(
             f"{format_percent(1 - share)} of the measurable poses have four spots or more: a wrong spot is detected.",
         )
 
@@ -349,37 +332,28 @@ def _views(plan: Plan) -> Iterator[Finding]:
     shares = plan.seen.mean(axis=0)
     poor = [i for i in np.argsort(shares).tolist() if shares[i] < MIN_IN_VIEW]
     if not poor:
-        yield Finding(
-            Level.PASS, f"Every spot is in its picture in at least {format_percent(float(shares.min()))} of the poses."
-        )
+        yield passed(f"Every spot is in its picture in at least {format_percent(float(shares.min()))} of the poses.")
         return
     camera, spot = plan.views[poor[0]]
     more = f", and {len(poor) - 1} more views in fewer than {format_percent(MIN_IN_VIEW)}" if len(poor) > 1 else ""
     where = _where(plan, ~plan.seen[:, poor[0]])
-    yield Finding(
-        Level.WARN,
+    what = (
         f"Spot {spot} is in the picture of {camera} in only {format_percent(float(shares[poor[0]]))} of the"
-        f" poses{more}." + (f" It is missing most often at {where}." if where else ""),
-        "The pose then depends on the other spots alone.",
-        f"Turn or move {camera}, or use a wider lens; the table of views shows how far the spot is outside.",
-        code="BP-P04",
+        f" poses{more}." + (f" It is missing most often at {where}." if where else "")
     )
+    yield finding("BP-P04", Level.WARN, what)
 
 
 def _distances(plan: Plan) -> Iterator[Finding]:
     close = plan.closest_px < MERGING_PX
     if close.any():
-        yield Finding(
-            Level.WARN,
+        what = (
             f"Two spots of one picture are within {MERGING_PX:g} px of each other in"
-            f" {format_percent(float(close.mean()))} of"
-            f" the poses (minimum: {plan.closest_px.min():.1f} px).",
-            "Spots that touch are detected as one, and their labels may be swapped.",
-            "Spread the beams, or turn one of them out of the plane of the others.",
-            code="BP-P05",
+            f" {format_percent(float(close.mean()))} of the poses (minimum: {plan.closest_px.min():.1f} px)."
         )
+        yield finding("BP-P05", Level.WARN, what)
     elif np.isfinite(plan.closest_px).any():
-        yield Finding(Level.PASS, f"Spots of one picture are at least {plan.closest_px.min():.0f} px apart.")
+        yield passed(f"Spots of one picture are at least {plan.closest_px.min():.0f} px apart.")
 
 
 def _goals(plan: Plan) -> Iterator[Finding]:
@@ -391,15 +365,9 @@ def _goals(plan: Plan) -> Iterator[Finding]:
         good = int(np.sum(np.nan_to_num(sigma, nan=np.inf) <= goal))
         words = f"The {what} sigma is within {shown[k](goal)} in {format_percent(good / len(sigma))} of the poses"
         if good == len(sigma):
-            yield Finding(Level.PASS, words + ".")
+            yield passed(words + ".")
         else:
-            yield Finding(
-                Level.FAIL if good < MIN_MEASURED * len(sigma) else Level.WARN,
-                words + ".",
-                "The other poses do not reach the goal.",
-                "Improve the largest contribution in the error budget, or narrow the range.",
-                code="BP-P06",
-            )
+            yield finding("BP-P06", Level.FAIL if good < MIN_MEASURED * len(sigma) else Level.WARN, words + ".")
 
 
 def worst_first(plan: Plan, count: int) -> list[int]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from geometry.arrays import Array
 from lab.errors import InputError
-from lab.findings.finding import Finding, Level
+from lab.findings.finding import Finding, Level, finding
 from lab.number_format import format_percent
 from lab.report.calibration.calibration_page import PageTable, Section
 from lab.report.plot.axes import BLUE, VERMILLION
@@ -116,23 +116,19 @@ class DrogueTarget(Target[DrogueFrame]):
         out = []
         if track.measured.any() and (mean := float(_confidences(track)[track.measured].mean())) < GOOD_CONFIDENCE:
             out.append(
-                Finding(
+                finding(
+                    "BP-G06",
                     Level.WARN,
                     f"the mean confidence of the measured frames is {mean:.2f} (usual: {GOOD_CONFIDENCE} and more)",
-                    "That share of the frames is expected to be right.",
-                    "Use frames with a high confidence only, or let the detector check more often (--every).",
-                    code="BP-G06",
                 )
             )
         checks, confirmed = _checks(track)
         if checks >= _LEAST_CHECKS and confirmed < LEAST_CONFIRMED * checks:
             out.append(
-                Finding(
+                finding(
+                    "BP-G07",
                     Level.WARN,
                     f"the detector finds the drogue in {format_percent(confirmed / checks)} of its {checks} checks",
-                    "What is followed may be another object.",
-                    "Look at the overlay (--video).",
-                    code="BP-G07",
                 )
             )
         return out

@@ -30,7 +30,6 @@ from lab.report.plot.axes import (
 )
 from lab.report.plot.series import Band, Line, Shade, time_panel
 from lab.targets.target import F, Target, Track
-from lab.targets.verdict import WORDS
 from lab.versions import versions
 from tracking.statuses import PoseStatus
 
@@ -64,9 +63,9 @@ def write_page(
         "maker": maker,
         "name": name,
         "source": str(source),
-        "status": WORDS[level],
+        "status": level.word,
         "sentence": sentences[level],
-        "findings": [(WORDS[f.level], f) for f in findings],
+        "findings": [(f.level.word, f) for f in findings],
         "key_figures": key_figures,
         "notes": notes,
         "sections": [section_context(s) for s in sections],

@@ -16,7 +16,7 @@ from geometry.arrays import Array
 from lab.errors import InputError
 from lab.files.run.parameter_overrides import with_overrides
 from lab.files.text.csv_text import number_fields
-from lab.findings.finding import Finding, Level
+from lab.findings.finding import Finding, Level, finding
 from lab.number_format import format_number, format_percent
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import PictureSource, open_inputs, pictures_of_frames
@@ -224,35 +224,18 @@ class PointTarget(Target[PointFrame]):
         out = []
         lost = [number for number, f in track.events() if f.event == "lost"]
         if lost:
-            out.append(
-                Finding(
-                    Level.WARN,
-                    f"lost at frame {some_frames(lost)}",
-                    "What is found afterwards has a similar brightness, but can be another target.",
-                    "Check these frames.",
-                    code="BP-N03",
-                )
-            )
+            out.append(finding("BP-N03", Level.WARN, f"lost at frame {some_frames(lost)}"))
         if (nis := _nis_mean(track)) > LARGEST_NIS:
             out.append(
-                Finding(
-                    Level.WARN,
-                    f"the innovations are {np.sqrt(nis):.1f} times as large as their sigmas",
-                    "The target moves less steadily, or its detections scatter more, than the filter assumes.",
-                    "State a larger --set track.sigma_model_px (the target changes its shape) or track.sigma_a_px (it"
-                    " accelerates).",
-                    code="BP-N04",
-                )
+                finding("BP-N04", Level.WARN, f"the innovations are {np.sqrt(nis):.1f} times as large as their sigmas")
             )
         similar = _similar(track)
         if similar > SIMILAR_SHARE and self.settings.track.start_px is None:
             out.append(
-                Finding(
+                finding(
+                    "BP-N05",
                     Level.WARN,
                     f"another target of similar brightness is in view in {format_percent(similar)} of the frames",
-                    "The track starts with the brightest.",
-                    "Choose the target with --start U,V.",
-                    code="BP-N05",
                 )
             )
         return out

@@ -10,12 +10,11 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from lab.errors import QUALITY_GATE_FAILED
-from lab.findings.finding import Finding, Level, unless_pass, verdict
+from lab.findings.finding import Finding, Level, finding, reasons, verdict, worst_first
 from lab.targets.target import F, Target, Track
 from tracking.statuses import Cause
 
 GOOD_MEASURED = 0.95  # a smaller share is reported with its causes
-WORDS = {Level.PASS: "pass", Level.WARN: "check", Level.FAIL: "fail"}
 R = TypeVar("R")
 
 
@@ -24,21 +23,13 @@ def exit_status(findings: Sequence[Finding]) -> int:
     return QUALITY_GATE_FAILED if verdict(findings) is Level.FAIL else 0
 
 
-def reasons(findings: Sequence[Finding]) -> list[str]:
-    """The texts of warnings and failures."""
-    return [f.what for f in findings if f.level > Level.PASS]
-
-
 def verdict_block(findings: Sequence[Finding]) -> dict[str, Any]:
     """The block `verdict` of summary.json."""
     return {
-        "status": WORDS[verdict(findings)],
-        "reasons": reasons(findings),
+        "status": verdict(findings).word,
+        "reasons": list(reasons(findings)),
         "exit_status": exit_status(findings),
-        "evidence": [
-            {"code": f.code, "level": WORDS[f.level], "what": f.what, "why": f.why, "remedy": f.remedy}
-            for f in findings
-        ],
+        "evidence": [f.as_mapping() for f in findings],
     }
 
 
@@ -64,7 +55,7 @@ class Outcome(Generic[R]):
         level = verdict(self.findings)
         texts = "; ".join([*reasons(self.findings), *([self.errors] if self.errors else [])])
         return (
-            f"{self.name}: {WORDS[level].upper()}: {self.measured} of {self.frames} frames measured"
+            f"{self.name}: {level.word.upper()}: {self.measured} of {self.frames} frames measured"
             f"{f' ({texts})' if texts else ''}{f' {self.findings[0].remedy}' if level is Level.FAIL else ''}"
             f" -> {self.out}"
         )
@@ -79,7 +70,7 @@ def findings_of(target: Target[F], track: Track[F]) -> tuple[Finding, ...]:
         *target.findings(track),
         *_missing(target, track),
     ]
-    return tuple(sorted(found, key=lambda f: -f.level))
+    return worst_first(found)
 
 
 def _measured(target: Target[F], track: Track[F]) -> Finding:
@@ -89,14 +80,14 @@ def _measured(target: Target[F], track: Track[F]) -> Finding:
     of_others = ", ".join(f"{count} {cause}" for cause, count in list(causes.items())[:3])
     if not measured:
         what = f"no {target.subject} was found in {n} frames ({of_others})"
-        return Finding(Level.FAIL, what, target.none_found, remedy, code=target.codes.none)
+        return finding(target.codes.none, Level.FAIL, what, why=target.none_found, remedy=remedy)
     what = f"{measured} of {n} frames ({share:.1%}) have a measured {target.subject}"
     level = Level.FAIL if share < least else Level.WARN if share < GOOD_MEASURED else Level.PASS
     if level > Level.PASS:
         gate = f"gate: {100 * least:.3g}%; usual: {GOOD_MEASURED:.0%} and more"
         what += f" ({gate})" + (f"; of the others {of_others}" if of_others else "")
-    why = "Predicted positions have growing sigmas; lost frames have none."
-    return unless_pass(level, what, why, remedy, code=target.codes.few)
+    why = "" if level is Level.PASS else "Predicted positions have growing sigmas; lost frames have none."
+    return finding(target.codes.few, level, what, why=why, remedy=remedy)
 
 
 def _ambiguous(target: Target[F], track: Track[F]) -> list[Finding]:
@@ -107,7 +98,7 @@ def _ambiguous(target: Target[F], track: Track[F]) -> list[Finding]:
     most = max(found for _, found in frames)
     what = f"{len(frames)} frames show {target.several} (first: frame {frames[0][0]}; up to {most})"
     why = "None of them is reported, since the choice would be a guess."
-    return [Finding(Level.WARN, what, why, target.remedies[Cause.AMBIGUOUS], code=target.codes.ambiguous)]
+    return [finding(target.codes.ambiguous, Level.WARN, what, why=why, remedy=target.remedies[Cause.AMBIGUOUS])]
 
 
 def _far_away(target: Target[F], track: Track[F]) -> list[Finding]:
@@ -124,8 +115,7 @@ def _far_away(target: Target[F], track: Track[F]) -> list[Finding]:
         f"{len(far)} reacquisition{' lies' if len(far) == 1 else 's lie'} more than {target.far_words} from the last"
         f" known place (frame {some_frames(far)})"
     )
-    why = "What was found there, or what was followed before, may be another object."
-    return [Finding(Level.WARN, what, why, "Compare these frames in the overlay (--video).", code=target.codes.far)]
+    return [finding(target.codes.far, Level.WARN, what)]
 
 
 def _missing(target: Target[F], track: Track[F]) -> list[Finding]:
@@ -135,7 +125,7 @@ def _missing(target: Target[F], track: Track[F]) -> list[Finding]:
     reason = max(missing, key=lambda r: missing[r])
     what = f"{sum(missing.values())} of {n} frames have no usable picture (most frequent: {reason})"
     why = f"The {target.subject} is predicted there."
-    return [Finding(Level.WARN, what, why, target.remedies[Cause.NO_IMAGE], code=target.codes.missing)]
+    return [finding(target.codes.missing, Level.WARN, what, why=why, remedy=target.remedies[Cause.NO_IMAGE])]
 
 
 def some_frames(frames: Sequence[int]) -> str:

@@ -9,16 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.arrays import Array, Bools
+from lab.findings.finding import Level, verdict
 from lab.number_format import format_angle, format_length, format_number, format_percent
 from lab.report.plot.axes import true_ranges
 from lab.report.run.blocks.model_fit import Methods, MethodsFacts, ModelFit, methods_text
 from lab.report.run.report_data import ReportData
 from tracking.statuses import PoseStatus
 
-GOOD, LOOK, BAD, UNKNOWN = "good", "look", "bad", "unknown"
 _MODEL = "Fit of rig and recording"
 _LARGE = 1.5  # residuals over their stated sigma from which a camera or beam is pointed out
-_LEVELS = {"small": GOOD, "check": LOOK, "fail": BAD}
 _SURE, _MOST, _DOUBTFUL = 0.99, 0.95, 0.9  # probability of a label: sure; share of sure labels; doubtful below
 _AMBIGUOUS = (
     ("tie", "ties of two labellings"),
@@ -32,11 +31,16 @@ _AMBIGUOUS = (
 class Evidence:
     """One line of evidence."""
 
-    level: str  # GOOD, LOOK, BAD or UNKNOWN
+    level: Level | None  # None: not known
     name: str
     text: str
     link: str = ""  # an address within the page that shows the place in the plots
     link_text: str = ""
+
+    @property
+    def word(self) -> str:
+        """The level in the table: pass, check, fail or unknown."""
+        return "unknown" if self.level is None else self.level.word
 
 
 def time_link(m: ReportData, first: int, last: int) -> str:
@@ -55,13 +59,13 @@ def evidence(m: ReportData, fit: ModelFit | None) -> list[Evidence]:
 def _poses(m: ReportData) -> Evidence | None:
     measured = m.poses.has(PoseStatus.MEASURED)
     if not len(measured):
-        return Evidence(BAD, "Poses", "the results have no frames")
+        return Evidence(Level.FAIL, "Poses", "the results have no frames")
     gaps = true_ranges(~measured)
     if not gaps:
-        return Evidence(GOOD, "Poses", f"measured in all {len(measured)} frames")
+        return Evidence(Level.PASS, "Poses", f"measured in all {len(measured)} frames")
     first, stop = max(gaps, key=lambda gap: gap[1] - gap[0])
     words = f"measured in {format_percent(float(measured.mean()))} of the frames; longest gap {_count(stop - first)}"
-    level = BAD if not measured.any() else LOOK if measured.mean() < _SURE else GOOD
+    level = Level.FAIL if not measured.any() else Level.WARN if measured.mean() < _SURE else Level.PASS
     return Evidence(level, "Poses", words, time_link(m, first, stop - 1), f"frame {m.poses.frames[first]}")
 
 
@@ -72,7 +76,7 @@ def _count(n: int) -> str:
 def _calibration(m: ReportData) -> Evidence:
     state = m.summary.calibration
     if not state:
-        return Evidence(UNKNOWN, "Calibration", "date and verdict are not stated in rig.yaml (block `calibration`)")
+        return Evidence(None, "Calibration", "date and verdict are not stated in rig.yaml (block `calibration`)")
     verdict = str(state.get("verdict", "without a verdict"))
     words = f"{verdict}, of {state.get('date', 'an unknown day')}"
     recorded = None if m.run is None else m.run.recorded
@@ -84,7 +88,7 @@ def _calibration(m: ReportData) -> Evidence:
         words += "; its age is unknown, as run.yaml has no `recorded`"
     words += f"; valid until {until.isoformat()}" if until else ""
     late = bool(until and recorded and recorded > until)
-    level = BAD if verdict == "FAIL" or late else GOOD if verdict == "PASS" else LOOK
+    level = Level.FAIL if verdict == "FAIL" or late else Level.PASS if verdict == "PASS" else Level.WARN
     return Evidence(level, "Calibration", words)
 
 
@@ -98,14 +102,15 @@ def _day(value: object) -> datetime.date | None:
 def _model(fit: ModelFit | None) -> Evidence:
     """Whether the residuals agree with the rig as calibrated."""
     if fit is None:
-        return Evidence(UNKNOWN, _MODEL, "the results have no model check")
+        return Evidence(None, _MODEL, "the results have no model check")
     if not fit.tested:
-        return Evidence(UNKNOWN, _MODEL, fit.sentence[:1].lower() + fit.sentence[1:].rstrip("."))
-    levels = [_LEVELS.get(f.level, LOOK) for f in fit.findings]
-    worst = BAD if BAD in levels else LOOK if LOOK in levels else GOOD
+        return Evidence(None, _MODEL, fit.sentence[:1].lower() + fit.sentence[1:].rstrip("."))
+    worst = verdict(fit.findings)
     words = "the residuals agree with the calibrated rig"
-    if levels:
-        words = "deviations within the stated uncertainty" if worst == GOOD else "the residuals do not fit the rig"
+    if fit.findings:
+        words = (
+            "deviations within the stated uncertainty" if worst is Level.PASS else "the residuals do not fit the rig"
+        )
     words += f" ({_count(fit.frames)} tested)" if fit.frames is not None else ""
     found = "; ".join(f.what for f in fit.findings[:2]) + ("; and more" if len(fit.findings) > 2 else "")
     return Evidence(worst, _MODEL, f"{words}: {found}" if found else words)
@@ -114,7 +119,7 @@ def _model(fit: ModelFit | None) -> Evidence:
 def _residuals(m: ReportData) -> list[Evidence]:
     """The residuals by camera and by beam: median, px, and RMS over the size expected from the stated sigmas."""
     if m.residual_px is None or m.run is None or not m.residual_share:
-        return [Evidence(UNKNOWN, "Residuals", "not known without the run folder's rig, or without a measured pose")]
+        return [Evidence(None, "Residuals", "not known without the run folder's rig, or without a measured pose")]
     beams = {name: spot.beam for name, spot in m.run.rig.spots.items()}
     out = []
     for name, groups in (
@@ -130,8 +135,8 @@ def _residuals(m: ReportData) -> list[Evidence]:
                 parts.append(f"{group} {format_number(_median(r), 2)} px ({format_number(ratio, 2)} × expected)")
                 largest = max(largest, ratio)
         if parts:
-            out.append(Evidence(LOOK if largest > _LARGE else GOOD, name, ", ".join(parts)))
-    return out or [Evidence(UNKNOWN, "Residuals", "no frame has a measured pose")]
+            out.append(Evidence(Level.WARN if largest > _LARGE else Level.PASS, name, ", ".join(parts)))
+    return out or [Evidence(None, "Residuals", "no frame has a measured pose")]
 
 
 def _median(r: Array) -> float:
@@ -143,17 +148,21 @@ def _labels(m: ReportData) -> Evidence:
     p = m.spots.label_probability
     given: Bools = np.isfinite(p) & m.spots.measured
     if not given.any():
-        return Evidence(UNKNOWN, "Labels", "the results state no probabilities of labels")
+        return Evidence(None, "Labels", "the results state no probabilities of labels")
     sure = float((p[given] >= _SURE).mean())
     where = np.where(given, p, np.inf)
     k, j = np.unravel_index(int(np.argmin(where)), where.shape)
     words = f"{format_percent(sure)} of {int(given.sum())} are right with a probability of at least {_SURE:g}"
     if p[k, j] >= _SURE:
-        return Evidence(GOOD, "Labels", words)
+        return Evidence(Level.PASS, "Labels", words)
     words += f"; lowest {format_number(float(p[k, j]), 3)}, spot {m.spots.views[j][1]}"
     link = time_link(m, int(k), int(k))
     return Evidence(
-        GOOD if sure >= _MOST and p[k, j] >= _DOUBTFUL else LOOK, "Labels", words, link, f"frame {m.spots.frames[k]}"
+        Level.PASS if sure >= _MOST and p[k, j] >= _DOUBTFUL else Level.WARN,
+        "Labels",
+        words,
+        link,
+        f"frame {m.spots.frames[k]}",
     )
 
 
@@ -164,12 +173,14 @@ def _ambiguous(m: ReportData) -> Evidence:
     counts.append((m.summary.found_again or 0, "times the vehicle was lost and found again"))
     parts = [f"{count} {words}" for count, words in counts if count]
     if not parts:
-        return Evidence(GOOD, "Ambiguous", "nothing")
+        return Evidence(Level.PASS, "Ambiguous", "nothing")
     frames = np.flatnonzero(left_open.any(axis=1))
     if len(frames):
         k = int(frames[0])
-        return Evidence(LOOK, "Ambiguous", "; ".join(parts), time_link(m, k, k), f"first: frame {m.spots.frames[k]}")
-    return Evidence(LOOK, "Ambiguous", "; ".join(parts))
+        return Evidence(
+            Level.WARN, "Ambiguous", "; ".join(parts), time_link(m, k, k), f"first: frame {m.spots.frames[k]}"
+        )
+    return Evidence(Level.WARN, "Ambiguous", "; ".join(parts))
 
 
 def methods(m: ReportData, fit: ModelFit | None) -> Methods:

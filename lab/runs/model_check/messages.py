@@ -13,24 +13,14 @@ from calibration.model_check.fault_identification import FaultDiagnosis, FittedF
 from calibration.model_check.noise_scales import UNEVEN, is_noisy
 from calibration.model_check.unseen import UnseenView
 from geometry.forward_model import SpotModel
-from lab.findings.finding import Finding, Level
+from lab.findings.catalogue import ENTRIES
+from lab.findings.finding import Finding, Level, finding, worst_first
 from lab.number_format import format_number, format_with_sigma
 
 MATTERS_SIGMAS = 0.5  # in stated sigmas of a pose or a spot: a smaller bias is negligible against the stated sigma
 # A larger bias makes the stated sigmas wrong; the limit of the noise scale in lab/runs/verdict/quality.py is the same.
 WRONG_SIGMAS = 5.0
 _WHOLE_FRAME = 0.1  # of a frame interval: a delay this near to a whole number of frames suggests a wrong frame number
-
-_REMEDIES = {
-    f.CAMERA: "Check the mount, focus ring and zoom ring of that camera for a knock or a loose screw; fix it, run"
-    " `calibrate check` to confirm, then calibrate its pose again (`calibrate rig`).",
-    f.SCREEN: "Measure the pose of that screen (`calibrate screen`), then calibrate the rig again.",
-    f.BEAM: "Check that laser's mount on the vehicle, then calibrate the beams again (`calibrate beams`).",
-    f.VIEW: "Check that spot in the pictures for a reflection, the edge of the screen or a wrong label; then check its"
-    " laser.",
-    f.CLOCK: "Check trigger cable, exposure settings and frame numbers of the cameras: pictures with the same number"
-    " must be taken at the same instant.",
-}
 
 
 def why_not_tested(result: ModelCheckResult) -> str:
@@ -62,7 +52,7 @@ def findings_of(result: ModelCheckResult, model: SpotModel) -> tuple[Finding, ..
         if noisy is not None:
             findings.append(noisy)
     findings += [unseen_finding(u, model) for u in result.unseen]
-    return tuple(sorted(findings, key=lambda finding: -finding.level))
+    return worst_first(findings)
 
 
 def level_of(diagnosis: FaultDiagnosis, effects: Sequence[Effect]) -> Level:
@@ -104,27 +94,26 @@ def fault_finding(
         )
     what = f"{where}{text}, p {p_text(suspected.best.change.p_value)}"
     components = list(dict.fromkeys(e.fault.component for e in suspected.explanations))
-    remedy = " ".join(_REMEDIES[c] for c in components) if level > Level.PASS else ""
-    if suspected.alternatives and level > Level.PASS:
+    remedy = " ".join(ENTRIES["BP-M01"].variant(c).remedy for c in components)
+    if suspected.alternatives:
         way = "A new calibration of the beams" if components == [f.BEAM] else "A `calibrate check` with marked points"
         remedy += f" {way} distinguishes the candidates."
-    return Finding(level, what, _consequence(effects, level), remedy, code="BP-M01")
+    return finding("BP-M01", level, what, why=_consequence(effects, level), remedy=remedy)
 
 
 def unexplained_finding(diagnosis: FaultDiagnosis) -> Finding:
     """The finding for residuals that no single fault explains."""
     level = Level.FAIL if _scale_of_faults(diagnosis) > WRONG_SIGMAS else Level.WARN
     beyond = "" if not diagnosis.suspected_faults else " beyond what is named above"
-    return Finding(
-        level,
+    what = (
         f"the residuals do not fit the rig file{beyond}, and no single camera, screen, beam or clock explains it,"
-        f" p {p_text(diagnosis.p_after)}",
-        f"the residuals are {format_number(diagnosis.residual_scale, 2)} times as large as the spots'"
-        " sigmas allow; the stated"
-        " sigmas of the poses do not include this",
-        "Calibrate the rig again; if that does not help, check the lens models and the flatness of the screens.",
-        code="BP-M02",
+        f" p {p_text(diagnosis.p_after)}"
     )
+    why = (
+        f"the residuals are {format_number(diagnosis.residual_scale, 2)} times as large as the spots' sigmas allow; the"
+        " stated sigmas of the poses do not include this"
+    )
+    return finding("BP-M02", level, what, why=why)
 
 
 def noise_finding(result: ModelCheckResult, diagnosis: FaultDiagnosis) -> Finding | None:
@@ -142,38 +131,23 @@ def noise_finding(result: ModelCheckResult, diagnosis: FaultDiagnosis) -> Findin
     each = ", ".join(f"camera `{name}` {format_number(value, 2)}" for name, value in of_cameras.items())
     where = f" ({each})" if uneven else ""
     if diagnosis.is_correlated:
-        return Finding(
-            Level.FAIL if factor > WRONG_SIGMAS else Level.WARN,
+        what = (
             f"the spots' residuals are {size}{where}, are correlated over about {diagnosis.correlation_frames:.0f} of"
-            " the frames used, and no constant change of a camera, screen, beam or clock explains them",
-            "correlated errors do not average out over frames: the stated sigmas of the poses are too small",
-            "Check the lens models, the flatness of the screens and the light (reflections, clipped spots); then"
-            " calibrate the rig again.",
-            code="BP-M03",
+            " the frames used, and no constant change of a camera, screen, beam or clock explains them"
         )
-    return Finding(
-        Level.WARN,
-        f"the spots' residuals are {size}{where}; they are random, and no fault of the rig explains them",
-        "the sigmas of the detections are too small (speckle, vibration within an exposure, or sigmas of another"
-        " program); the covariances of the poses are widened by this factor",
-        "State larger sigmas with the detections, or improve the light: larger or brighter spots, a shorter exposure,"
-        " a matt screen.",
-        code="BP-M04",
-    )
+        return finding("BP-M03", Level.FAIL if factor > WRONG_SIGMAS else Level.WARN, what)
+    what = f"the spots' residuals are {size}{where}; they are random, and no fault of the rig explains them"
+    return finding("BP-M04", Level.WARN, what)
 
 
 def unseen_finding(unseen: UnseenView, model: SpotModel) -> Finding:
     """The finding for a view that is hardly ever measured."""
     camera, spot = model.views[unseen.view]
-    return Finding(
-        Level.WARN,
+    what = (
         f"spot {spot} in camera `{camera}` was measured in {unseen.measured} of {unseen.expected} frames in which the"
-        " pose puts it well inside the picture",
-        "its laser is off or occluded, or its spot is taken for clutter: it is wider than `max_sigma_px`, or far from"
-        " where the rig file puts it; the pose is computed without it",
-        "Check the pictures where that spot should be; then check its laser's mount, or calibrate the beams again.",
-        code="BP-M05",
+        " pose puts it well inside the picture"
     )
+    return finding("BP-M05", Level.WARN, what)
 
 
 def _scale_of_faults(diagnosis: FaultDiagnosis) -> float:

@@ -11,7 +11,7 @@ from geometry.camera import Camera
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.files.run.run_file import Run, VideoFile
-from lab.findings.finding import Finding, Level, verdict
+from lab.findings.finding import Finding, Level, finding, verdict
 from lab.pictures.source import video_at
 from lab.runs.frames.even_sampler import EvenSampler
 from lab.runs.verdict.run_statistics import RunStatistics
@@ -69,14 +69,14 @@ def _parts_of_pictures(rig: Rig, blocks: Sequence[Block]) -> tuple[Finding, ...]
             continue
         (u, v), (width, height) = uv.max(axis=0), camera.image_size_px
         out.append(
-            Finding(
+            finding(
+                "BP-M08",
                 Level.WARN,
                 f"all points of camera `{name}` lie in the upper left part of its picture (u up to {u:.0f} of {width},"
                 f" v up to {v:.0f} of {height}), and the recording does not fit: the pictures may be cropped, or of a"
                 " lower resolution than for the calibration",
-                "pixels of another picture are other directions",
-                "Compare the size of the pictures with image_size_px and with that of the calibration.",
-                code="BP-M08",
+                why="pixels of another picture are other directions",
+                remedy="Compare the size of the pictures with image_size_px and with that of the calibration.",
             )
         )
     return tuple(out)
@@ -110,13 +110,14 @@ def rates_of_videos(run: Run) -> tuple[Finding, ...]:
         return ()
     rates = {n: video_at(source.path).rate_hz for n, source in run.cameras.items() if isinstance(source, VideoFile)}
     return tuple(
-        Finding(
+        finding(
+            "BP-M08",
             Level.WARN,
             f"the header of the video of camera `{name}` states {rate:.6g} pictures per second, run.yaml"
             f" {run.frame_rate_hz:.6g}",
-            "velocities and times scale with the frame rate",
-            "Correct frame_rate_hz in run.yaml; where the header is wrong, give the times in a table `timestamps`.",
-            code="BP-M08",
+            why="velocities and times scale with the frame rate",
+            remedy="Correct frame_rate_hz in run.yaml; where the header is wrong, give the times in a table"
+            " `timestamps`.",
         )
         for name, rate in rates.items()
         if rate is not None and rate not in WRITTEN_BY_DEFAULT and abs(rate / run.frame_rate_hz - 1) > SAME_RATE
@@ -129,13 +130,13 @@ def same_lenses(rig: Rig, names: Sequence[str]) -> tuple[Finding, ...]:
     names: of the cameras with points.
     """
     return tuple(
-        Finding(
+        finding(
+            "BP-M08",
             Level.WARN,
             f"cameras `{a}` and `{b}` have the same lens to the last digit, and the recording does not fit: one of them"
             " may have the wrong camera.yaml",
-            "two calibrations never agree to the last digit",
-            f"Compare camera_matrix and distortion of `{a}` and `{b}` with their camera.yaml.",
-            code="BP-M08",
+            why="two calibrations never agree to the last digit",
+            remedy=f"Compare camera_matrix and distortion of `{a}` and `{b}` with their camera.yaml.",
         )
         for a, b in combinations(names, 2)
         if _lens(rig.cameras[a]) == _lens(rig.cameras[b])
@@ -149,7 +150,7 @@ def _lens(camera: Camera) -> tuple[object, ...]:
 def mistakes_by_themselves(rig: Rig, prior: PosePrior | None) -> tuple[Finding, ...]:
     """Findings on numbers of the files that cannot be those of a lab."""
     return tuple(
-        Finding(Level.FAIL, m.what, "no lab has such numbers", _sentence(m.remedy), code="BP-M06")
+        finding("BP-M06", Level.FAIL, m.what, why="no lab has such numbers", remedy=_sentence(m.remedy))
         for m in possible_mistakes(rig, prior)
         if m.by_itself
     )
@@ -167,7 +168,7 @@ def _findings(compared: Comparison, rig: Rig) -> tuple[Finding, ...]:
         )
         what = ", or ".join(m.what for m, _ in compared.found)
         remedies = dict.fromkeys(m.remedy for m, _ in compared.found)
-        return (Finding(Level.FAIL, what, why, _sentence("; or ".join(remedies)), code="BP-M06"),)
+        return (finding("BP-M06", Level.FAIL, what, why=why, remedy=_sentence("; or ".join(remedies))),)
     if given.good:
         return ()
     names, points = list(rig.cameras), given.points.sum(axis=0)
@@ -178,14 +179,8 @@ def _findings(compared: Comparison, rig: Rig) -> tuple[Finding, ...]:
 
 def unused_finding(camera: str, points: int, pictures: int) -> Finding:
     """The finding on a camera of which no point is ever labelled."""
-    return Finding(
-        Level.WARN,
-        f"camera `{camera}`: none of its {points} points in {pictures} pictures is the spot of a pose",
-        "the poses do not use this camera, and none of the usual mistakes explains it",
-        f"Check that the pictures and camera_matrix, camera_from_world and the screen of `{camera}` belong together"
-        " (`beampose calibrate check`), or leave the camera out.",
-        code="BP-M07",
-    )
+    what = f"camera `{camera}`: none of its {points} points in {pictures} pictures is the spot of a pose"
+    return finding("BP-M07", Level.WARN, what)
 
 
 def _sentence(text: str) -> str:

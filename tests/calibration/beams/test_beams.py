@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calibration.beams.beam_findings import beam_findings, direction_sigmas
 from calibration.beams.beam_start import line_through
 from calibration.beams.beams import StandModel, calibrate_beams
-from lab.findings.finding import Level
 from calibration.least_squares.adjustment import AdjustmentError
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed
+from lab.calibrate.beams.beam_findings import beam_findings
+from lab.findings.finding import Level
 from lab.simulate.rigs import RIGS
 from tests.calibration.beams.bench import (
     ARCSEC,
@@ -88,7 +88,7 @@ def test_opposed_lasers_require_positions_at_different_distances_from_the_screen
     for shift in (0.2, 0.8):
         poses = positions(rng, shift_m=(shift, 0.2, 0.2))
         found = calibrate_beams(rig, recorded(rng, rig, poses), exact(poses))
-        sigma[shift] = np.sqrt(np.mean(direction_sigmas(found) ** 2)) / ARCSEC
+        sigma[shift] = np.sqrt(np.mean(found.direction_sigmas**2)) / ARCSEC
     # 40 positions; in 30 simulations each the errors were 26 and 12 arcsec RMS per axis
     assert sigma[0.2] > 20
     assert sigma[0.8] < 15

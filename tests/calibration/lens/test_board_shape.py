@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lab.findings.finding import Level
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
+from lab.calibrate.camera.camera_findings import findings_of
+from lab.findings.finding import Level, verdict
 from tests.calibration.lens.lens_scenes import TRUTH, Scene, photographs
 
 FIVE = IntrinsicsOptions(lens=LensModel(5))
@@ -34,8 +35,8 @@ def test_a_board_printed_longer_along_x_is_reported_and_does_not_bias_the_lens()
     assert c.board.stretch.corrected
     assert abs(c.board.stretch.stretch - 0.005) < 4 * c.board.stretch.sigma[0]
     assert np.all(errors_in_sigmas(c) < 3.5)
-    assert c.verdict < Level.FAIL
-    about = next(f for f in c.findings if "longer than stated" in f.what)
+    assert verdict(findings_of(c)) < Level.FAIL
+    about = next(f for f in findings_of(c) if "longer than stated" in f.what)
     assert about.level is Level.WARN
     assert "Measure the board" in about.remedy
     taken_as_stated = calibrate_intrinsics(wrong, replace(FIVE, stretch=False))

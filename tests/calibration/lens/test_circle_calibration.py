@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from calibration.boards.board_types import parse
-from lab.findings.finding import Level
 from calibration.lens.fit.corner_table import CircleAreas, CornerTable
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
 from calibration.lens.intrinsics_result import Intrinsics
+from lab.calibrate.camera.camera_findings import findings_of
+from lab.findings.finding import Level
 from tests.calibration.lens.rendered_circles import LENS, CircleScene, table_of
 
 QUICK = IntrinsicsOptions(lens=LensModel(5), warp=False, stretch=False)
@@ -58,7 +59,7 @@ def test_a_stated_size_that_the_pictures_contradict_is_reported_and_not_used():
     assert areas is not None
     c = calibrate_intrinsics(replace(pictures(), circles=replace(areas, diameter_m=0.012)), QUICK)
     assert nees(c) < 2.9
-    about = next(f for f in c.findings if f.what.startswith("The circles have a diameter"))
+    about = next(f for f in findings_of(c) if f.what.startswith("The circles have a diameter"))
     assert about.level is Level.WARN
     assert "against the 12 mm stated" in about.what
 

@@ -9,13 +9,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from lab.findings.finding import Level
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LENS_MODELS, LensModel, named
 from calibration.lens.intrinsics import IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
-from calibration.lens.intrinsics_findings import findings_of
 from calibration.lens.intrinsics_result import Intrinsics
 from geometry.camera import FISHEYE
+from lab.calibrate.camera.camera_findings import findings_of
+from lab.findings.finding import Level, verdict
 from tests.calibration.lens.lens_scenes import SIZE, TRUTH, WIDE, Scene, board_points, photographs
 
 FIVE = IntrinsicsOptions(lens=LensModel(5))
@@ -36,7 +36,7 @@ def errors(result: Intrinsics, lens: tuple[float, ...] = TRUTH) -> np.ndarray:
 
 
 def finding(result: Intrinsics, words: str) -> Level:
-    return next(f.level for f in result.findings if words in f.what)
+    return next(f.level for f in findings_of(result) if words in f.what)
 
 
 def test_the_lens_is_estimated_within_its_sigmas():
@@ -46,7 +46,7 @@ def test_the_lens_is_estimated_within_its_sigmas():
     assert chi2 < 30  # of nine parameters: exceeded with probability 1/2000
     assert c.fit.sigma_px == pytest.approx(0.2, rel=0.05)
     assert c.held_out_rms_px == pytest.approx(0.2, rel=0.08)
-    assert c.verdict < Level.FAIL
+    assert verdict(findings_of(c)) < Level.FAIL
 
 
 @pytest.mark.slow
@@ -163,7 +163,7 @@ def test_an_uncovered_side_of_the_picture_is_a_warning():
 def test_a_stretched_picture_fails_because_of_fx_over_fy():
     c = calibrate_intrinsics(photographs(Scene(views=10, lens=(1000.0, 930.0, *TRUTH[2:])), 10), QUICK)
     assert finding(c, "fx / fy") is Level.FAIL
-    assert c.verdict is Level.FAIL
+    assert verdict(findings_of(c)) is Level.FAIL
 
 
 def test_noisy_corners_fail():
@@ -200,7 +200,7 @@ def test_random_corners_are_rejected():
         result = calibrate_intrinsics(table, QUICK)
     except IntrinsicsError:
         return
-    assert result.verdict is Level.FAIL
+    assert verdict(findings_of(result)) is Level.FAIL
 
 
 def test_every_lens_model_is_found_by_its_title():

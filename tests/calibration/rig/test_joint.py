@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from bench.rig_calibration import as_measured, bench_figures, calibrated, measured_with, parameter_errors
-from lab.findings.finding import Level
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.joint import CORNERS, DOTS, FRAMES, LENSES, RECORDS, SPOTS, calibrate_jointly
-from calibration.rig.joint_findings import joint_findings
 from calibration.rig.rig_figures import central_pose, expected_pose, hold_out, spot_sigma
 from calibration.rig.rig_steps import calibrate_in_steps
 from calibration.screens.screens import calibrate
 from calibration.terms.corners import CornerTerm
 from geometry.pose import Pose
+from lab.calibrate.rig.rig_findings import joint_findings
+from lab.findings.finding import Level
 from lab.simulate.campaign import Campaign, CampaignQuality, draw_campaign, spots_at
 
 SMALL = CampaignQuality(positions=15, dots=(5, 4))

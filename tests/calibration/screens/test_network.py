@@ -7,15 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lab.findings.finding import Level
 from calibration.screens.network import ControlPoints, PointObservations
-from calibration.screens.network_findings import classify_outliers, findings, near_findings
 from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
 from calibration.screens.network_start import NotConnectedError
+from calibration.screens.outliers import classify_outliers
 from calibration.screens.screens import ApproximatePosition, ScreenSetup, calibrate
 from calibration.screens.survey_diagnosis import diagnose_survey, misfit_of, wrong_unit
 from geometry.pose import Pose
 from geometry.rig import Rig
+from lab.calibrate.screens.screen_findings import near_findings, network_findings
+from lab.findings.finding import Level
 from tests.calibration.screens.networks import (
     corners_of,
     fixed_to,
@@ -94,7 +95,7 @@ def test_surfaces_and_cameras_are_known_more_accurately_than_a_single_dot():
     result = calibrate(measured(0), PLAIN)
     assert max(np.max(spot_sigmas(result, k)) for k in range(2)) < 3e-4
     assert max(pointing_sigmas_m(result).values()) < 3e-4
-    assert all(f.level == Level.PASS for f in findings(result))
+    assert all(f.level == Level.PASS for f in network_findings(result))
     assert result.fit.variance_factor == 1.0
 
 
@@ -103,7 +104,7 @@ def test_exchanged_names_are_identified_and_do_not_bias_the_camera():
     of = network.point_observations.point_of.copy()
     of[[2, 5]] = of[[5, 2]]
     result = calibrate(replace(network, point_observations=replace(network.point_observations, point_of=of)), PLAIN)
-    words = [f.what for f in findings(result) if f.level == Level.WARN]
+    words = [f.what for f in network_findings(result) if f.level == Level.WARN]
     assert len(words) == 1
     assert "camera 'left': dots 'L6' and 'L3' are exchanged" in words[0]
     clean = calibrate(network, PLAIN)
@@ -138,7 +139,7 @@ def test_a_dot_surveyed_off_its_screen_is_reported_with_its_height():
     xyz = network.control_points.xyz.copy()
     xyz[3, 0] += 0.02
     result = calibrate(replace(network, control_points=replace(network.control_points, xyz=xyz)), PLAIN)
-    assert any("dot 'L4' is +20" in f.what for f in findings(result))
+    assert any("dot 'L4' is +20" in f.what for f in network_findings(result))
 
 
 def test_sigmas_that_are_too_small_are_increased():
@@ -149,7 +150,7 @@ def test_sigmas_that_are_too_small_are_increased():
     rough = replace(rough, control_points=replace(rough.control_points, covariance=rough.control_points.covariance / 9))
     result = calibrate(rough, PLAIN)
     assert result.fit.variance_factor > 2
-    assert any(f.level >= Level.WARN and "larger than their sigmas" in f.what for f in findings(result))
+    assert any(f.level >= Level.WARN and "larger than their sigmas" in f.what for f in network_findings(result))
 
 
 def test_a_board_seen_by_two_cameras_connects_one_without_dots_to_the_world():

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import yaml
 
-from lab.findings.finding import Level
 from calibration.terms.spot_term import SpotPixels
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
@@ -30,6 +29,7 @@ from lab.files.rig.rig_file import RigFile, as_mapping, covariance_blocks, joint
 from lab.files.rig.screens_file import ScreensFile, save_screens
 from lab.files.run.run_file import save_run
 from lab.files.text.yaml_text import write_mapping
+from lab.findings.finding import Level
 from lab.simulate.rigs import RIGS
 from tests.calibration.beams.bench import ARCSEC, WORLD_FROM_STAND, drawn, errors, positions, recorded
 
@@ -149,7 +149,7 @@ def test_the_tables_hold_the_calibrated_beams_angles_and_residuals(campaign, tmp
     beams = table(tmp_path / "out" / "beams.csv")
     assert [b["beam"] for b in beams] == ["A", "B", "C"]
     direction = np.array([[float(b[k]) for k in ("dx", "dy", "dz")] for b in beams])
-    np.testing.assert_allclose(direction, outcome.calibration.lines.directions, atol=1e-11)
+    np.testing.assert_allclose(direction, outcome.result.lines.directions, atol=1e-11)
     assert all(0 < float(b["sigma_direction_arcsec"]) < 20 for b in beams)
     angles = table(tmp_path / "out" / "angles.csv")
     assert [(a["first"], a["second"]) for a in angles] == [("A", "B"), ("A", "C"), ("B", "C")]
@@ -186,7 +186,7 @@ def test_a_stand_that_only_yaws_fails_with_the_remedy_and_writes_no_rig(tmp_path
     write_poses(tmp_path / "poses.csv", poses)
     project = write_project(tmp_path, rig, rig, None, [{"spots": "spots.csv", "poses": "poses.csv"}])
     outcome = calibrate_beams(project, tmp_path / "out")
-    assert (outcome.level, outcome.exit_status, outcome.rig) == (Level.FAIL, 3, None)
+    assert (outcome.level, outcome.exit_status) == (Level.FAIL, 3)
     (bad,) = [f for f in outcome.findings if f.level == Level.FAIL]
     assert "all beams relative to the stand: a rotation about z" in bad.what
     assert bad.remedy.startswith("add positions turned by 10 deg or more about the stand's x and y")
@@ -336,7 +336,7 @@ def test_an_unlabelled_run_is_labelled_by_the_nominal_beams_and_its_frames_at_re
     recording = {"run": "recorded", "poses": "recorded/poses.csv"}
     project = write_project(tmp_path, rig, nominal, STAND, [recording])
     outcome = calibrate_beams(project, tmp_path / "out")
-    c = outcome.calibration
+    c = outcome.result
     assert len(c.world_from_body.translation) == 20
     assert c.fit.kept.mean() > 0.97
     assert c.fit.scale < 1.3  # the sigmas include the speckle, which is common to the frames
@@ -356,7 +356,7 @@ def test_a_run_without_known_poses_is_labelled_by_the_tracker_and_gives_the_angl
     save_run({"rig": "rig.yaml", "frame_rate_hz": 50.0, "cameras": cameras, "prior": at_start}, tmp_path / "recorded")
     project = write_project(tmp_path, rig, nominal, None, [{"run": "recorded"}])
     outcome = calibrate_beams(project, tmp_path / "out")
-    c = outcome.calibration
+    c = outcome.result
     assert len(c.world_from_body.translation) >= 59  # the tracker may be uncertain in one of its first frames
     off = np.array([a.angle for a in c.angles]) - np.deg2rad([18.0, 41.0, 23.0])
     assert np.all(np.abs(off) < 5 * np.array([a.sigma for a in c.angles]))
@@ -440,14 +440,14 @@ def test_the_project_need_not_repeat_cameras_screens_and_target_of_the_rig(campa
     without_lab = {k: content[k] for k in ("schema", "name", "valid_days", "target", "recordings", "stand")}
     write_mapping(without_lab, lean / "calibration.yaml")
     found = calibrate_beams(lean / "calibration.yaml", tmp_path / "out", tmp_path / "rig.yaml")
-    np.testing.assert_array_equal(found.calibration.lines.directions, whole.calibration.lines.directions)
+    np.testing.assert_array_equal(found.result.lines.directions, whole.result.lines.directions)
     # With the target in the rig, the project need not state it either.
     both = replace(load_rig_file(tmp_path / "rig.yaml"))
     target = load_project(project)
     save_rig(replace(both, rig=replace(both.rig, beams=target.beams, spots=target.spots)), tmp_path / "known.yaml")
     write_mapping({k: v for k, v in without_lab.items() if k != "target"}, lean / "calibration.yaml")
     found = calibrate_beams(lean / "calibration.yaml", tmp_path / "again", tmp_path / "known.yaml")
-    np.testing.assert_allclose(found.calibration.lines.directions, whole.calibration.lines.directions, atol=1e-9)
+    np.testing.assert_allclose(found.result.lines.directions, whole.result.lines.directions, atol=1e-9)
 
 
 def test_a_spot_on_an_unknown_screen_is_reported_by_name(campaign, tmp_path):

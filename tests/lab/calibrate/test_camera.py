@@ -9,18 +9,18 @@ import cv2
 import numpy as np
 import pytest
 
-from lab.findings.finding import Level
 from lab.calibrate.camera.camera import (
     CAMERA,
     CORNER_COLUMNS,
     CORNERS,
     FAILED,
     CameraOptions,
-    CameraOutcome,
+    Outcome,
     calibrate_camera,
 )
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.camera_file import load_camera
+from lab.findings.finding import Level
 from tests.paths import DATA
 
 STEREO = DATA / "chessboard_stereo_opencv"
@@ -30,7 +30,7 @@ needs_stereo = pytest.mark.skipif(not STEREO.is_dir(), reason="the chessboard pa
 
 
 @pytest.fixture(scope="module")
-def left(tmp_path_factory: pytest.TempPathFactory) -> CameraOutcome:
+def left(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
     """The left camera of the stereo pairs, quickly: one lens model, a flat board."""
     if not STEREO.is_dir():
         pytest.skip("the chessboard pairs of OpenCV's samples are not here")
@@ -124,7 +124,7 @@ def test_each_real_set_gets_the_expected_verdict(name, tmp_path):
         pytest.skip(f"{name} is not here")
     outcome = calibrate_camera([DATA / name / f for f in folders], board, tmp_path / name, CameraOptions(), DAY)
     assert outcome.level >= least
-    assert any(words in f.what and f.level >= Level.WARN for f in outcome.result.findings)
+    assert any(words in f.what and f.level >= Level.WARN for f in outcome.findings)
     assert outcome.exit_status == (3 if outcome.level is Level.FAIL else 0)
     # A failed calibration has a file name that no program reads.
     assert (outcome.out / FAILED).is_file() == (outcome.level is Level.FAIL)
@@ -163,7 +163,7 @@ def test_copies_of_one_photograph_count_once(tmp_path):
 @needs_stereo
 def test_photographs_of_two_cameras_in_one_set_are_detected_by_their_names(tmp_path):
     outcome = calibrate_camera([STEREO / "*.jpg"], BOARD, tmp_path / "out", CameraOptions(lens="4", warp="off"))
-    (finding,) = [f for f in outcome.result.findings if "'left' and 'right'" in f.what]
+    (finding,) = [f for f in outcome.findings if "'left' and 'right'" in f.what]
     assert finding.level > Level.PASS
     assert "two cameras" in finding.why
     assert "alibrate" in finding.remedy

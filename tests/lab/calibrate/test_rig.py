@@ -11,16 +11,16 @@ import shutil
 import numpy as np
 import pytest
 
-from lab.findings.finding import Level
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from lab.calibrate.calibration_date import calibration_date, expiry_date, expiry_findings
 from lab.calibrate.rig.rig import calibrate_rig
 from lab.calibrate.rig.rig_tables import COLUMNS
+from lab.calibrate.step import calibration_date, expiry_date, expiry_findings
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import load_project
 from lab.files.rig.rig_file import joint_covariance, load_rig, load_rig_file, save_rig
 from lab.files.run.results import read_poses
+from lab.findings.finding import Level
 from lab.runs.process import process_run
 from lab.simulate.campaign import CampaignQuality, simulate_calibration
 from lab.simulate.write import simulate
@@ -70,7 +70,7 @@ def test_the_rig_file_states_date_expiry_and_verdict(outcome, project, tmp_path)
 
 def test_the_rig_file_reads_back_with_the_same_joint_covariance(outcome):
     file = load_rig_file(outcome.out / "rig.yaml")
-    joint = outcome.steps.joint
+    joint = outcome.result.steps.joint
     back = joint_covariance(file.rig, file.covariances, outcome.out / "rig.yaml")
     assert back.names == joint.covariance.names
     np.testing.assert_allclose(back.matrix, joint.covariance.matrix, rtol=1e-12, atol=0)
@@ -129,7 +129,7 @@ def test_the_table_of_residuals_has_a_row_per_number_with_its_unit(outcome):
     kinds = {r["kind"] for r in rows}
     assert kinds == {"spot", "dot", "survey", "stand"}
     spots = [r for r in rows if r["kind"] == "spot"]
-    assert len(spots) == 2 * len(outcome.steps.measured.spots)
+    assert len(spots) == 2 * len(outcome.result.steps.measured.spots)
     sigmas = np.array([float(r["sigmas"]) for r in spots])
     assert 0.6 < np.sqrt(np.mean(sigmas**2)) < 1.2
     assert all(float(r["residual"]) == pytest.approx(0.054 * float(r["sigmas"]), rel=1e-3) for r in spots)
@@ -215,7 +215,7 @@ def test_a_lens_without_a_covariance_is_assumed_exact_with_a_warning(project, tm
     ended = calibrate_rig(copy, tmp_path / "out", today=DAY)
     warnings = [f.what for f in ended.findings if f.level == Level.WARN]
     assert "camera 'left': camera-left.yaml has no covariance: its lens is assumed exact" in warnings
-    names = ended.steps.joint.covariance.names
+    names = ended.result.steps.joint.covariance.names
     assert "cameras.right.fx" in names
     assert "cameras.left.fx" not in names
 
@@ -231,7 +231,7 @@ def test_recordings_can_be_run_folders_with_unlabelled_spots(tmp_path):
     assert count == 1
     path.write_text(text)
     ended = calibrate_rig(project, tmp_path / "out", today=DAY)
-    assert len(ended.steps.beams.world_from_body.translation) == 60
+    assert len(ended.result.steps.beams.world_from_body.translation) == 60
     assert np.rad2deg(ended.held_out.attitude_rms) < 0.01
     assert ended.held_out.ratio < 1.1
 

@@ -14,7 +14,6 @@ import pytest
 
 from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Charuco, parse
-from lab.findings.finding import Level
 from geometry.pose import Pose
 from lab.calibrate.screens.screen import calibrate_screen
 from lab.calibrate.screens.screen_tables import DOT_COLUMNS, RESIDUAL_COLUMNS
@@ -25,6 +24,7 @@ from lab.files.rig.camera_file import CameraFile, load_camera, save_camera
 from lab.files.rig.rig_file import load_rig_file
 from lab.files.rig.screens_file import load_screens, save_screens
 from lab.files.text.yaml_text import write_mapping
+from lab.findings.finding import Level
 from lab.simulate.board_photo import PhotoSettings, photograph
 from tests.lab.calibrate.screen_projects import truth, write_project
 from tests.lab.files.test_project import TARGET, changed

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.findings.finding import Finding, Level
 from geometry.pose import Pose
 from lab.errors import InputError
+from lab.findings.finding import Finding, Level
 from lab.report.calibration import calibration_charts as charts
 from lab.report.calibration import calibration_drawings as draw
 from lab.report.calibration import calibration_maps as maps

@@ -177,7 +177,7 @@ def test_the_evidence_leads_to_the_longest_gap_and_the_least_certain_label(fake)
     assert m.poses.status[int(np.argmin(np.abs(m.t_s - first)))] != 0
     assert "left" in lines["Residuals by camera"].text
     assert "A " in lines["Residuals by beam"].text
-    assert lines["Calibration"].level == "unknown"
+    assert lines["Calibration"].word == "unknown"
 
 
 @pytest.mark.parametrize(
@@ -186,12 +186,12 @@ def test_the_evidence_leads_to_the_longest_gap_and_the_least_certain_label(fake)
         (
             {"date": "2026-03-01", "verdict": "PASS", "valid_until": "2026-06-01"},
             "2026-03-11",
-            "good",
+            "pass",
             "10 days before",
         ),
-        ({"date": "2026-03-01", "verdict": "WARN"}, "2026-03-11", "look", "WARN"),
-        ({"date": "2026-03-01", "verdict": "PASS", "valid_until": "2026-03-05"}, "2026-03-11", "bad", "valid until"),
-        ({"date": "2026-03-01", "verdict": "PASS"}, None, "good", "age is unknown"),
+        ({"date": "2026-03-01", "verdict": "WARN"}, "2026-03-11", "check", "WARN"),
+        ({"date": "2026-03-01", "verdict": "PASS", "valid_until": "2026-03-05"}, "2026-03-11", "fail", "valid until"),
+        ({"date": "2026-03-01", "verdict": "PASS"}, None, "pass", "age is unknown"),
     ],
 )
 def test_the_age_of_the_calibration_is_counted_to_the_recording(tmp_path: Path, state, recorded, level, words):
@@ -203,7 +203,7 @@ def test_the_age_of_the_calibration_is_counted_to_the_recording(tmp_path: Path, 
         run.write_text(run.read_text() + f"recorded: {recorded}\n")
     m = read_report_data(fake.results, None)
     line = next(e for e in evidence(m, None) if e.name == "Calibration")
-    assert line.level == level
+    assert line.word == level
     assert words in line.text
 
 

@@ -9,11 +9,11 @@ import re
 import numpy as np
 import pytest
 
-from lab.findings.finding import Level
 from calibration.model_check import noise_scales
 from calibration.model_check.effect import Effect
 from calibration.model_check.fault_identification import FaultDiagnosis
 from geometry.pose_prior import PosePrior
+from lab.findings.finding import Level
 from lab.number_format import format_number, format_with_sigma
 from lab.runs.model_check import messages
 from lab.runs.model_check.check import check_model, check_sampled_frames

@@ -6,7 +6,8 @@ from collections import Counter
 
 import pytest
 
-from lab.findings.finding import Finding, Level
+from lab.findings.catalogue import ENTRIES
+from lab.findings.finding import Finding, Level, finding
 from lab.runs.verdict.frame_ranges import FrameRanges
 from lab.runs.verdict.quality import (
     GOOD_MEASURED,
@@ -17,7 +18,6 @@ from lab.runs.verdict.quality import (
     judge,
 )
 from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, Cause, RunStatistics
-from lab.runs.verdict.verdict_reasons import REMEDIES, REMEDIES_BY_CAUSE, ReasonKind
 
 FRAMES = 1000
 
@@ -53,8 +53,8 @@ def statistics_of(
     return statistics
 
 
-def kinds(verdict: Verdict) -> list[ReasonKind]:
-    return [e.kind for e in verdict.reasons]
+def kinds(verdict: Verdict) -> list[str]:
+    return [ENTRIES[e.code].kind for e in verdict.reasons]
 
 
 def test_a_clean_run_passes_and_gives_the_reason():
@@ -86,9 +86,9 @@ def test_only_missed_frames_fail_a_run_and_frames_with_too_few_spots_do_not(caus
     measured = int(FRAMES * LEAST_MEASURED_OF_SHOWN) - 1
     verdict = judge(statistics_of(measured, {cause: FRAMES - measured}))
     assert verdict.status == ("fail" if cause in MISSED else "check")
-    assert kinds(verdict) == [ReasonKind.FEW_MEASURED]
+    assert kinds(verdict) == ["few_measured"]
     assert cause.meaning in verdict.texts[0]
-    assert verdict.reasons[0].remedy == REMEDIES_BY_CAUSE[cause]
+    assert verdict.reasons[0].remedy == ENTRIES["BP-V03"].variant(cause.value).remedy
 
 
 def test_the_share_of_missed_frames_is_relative_to_the_frames_with_enough_spots():
@@ -124,14 +124,14 @@ def never(**changed: object) -> Verdict:
     verdict = judge(statistics_of(0, **arguments))  # type: ignore[arg-type]
     assert verdict.exit_status == 4
     assert verdict.texts[0] == "the vehicle was never found: no frame has a measured pose"
-    assert all(e.fails and e.remedy for e in verdict.reasons)
+    assert all(e.level is Level.FAIL and e.remedy for e in verdict.reasons)
     assert verdict.remedy == verdict.reasons[1].remedy
     return verdict
 
 
 def test_points_that_no_pose_explains_suggest_a_wrong_prior_or_rig():
     verdict = never()
-    assert kinds(verdict) == [ReasonKind.NEVER_FOUND, ReasonKind.NOT_ACQUIRED]
+    assert kinds(verdict) == ["never_found", "not_acquired"]
     assert "3.0 per picture in camera left" in verdict.texts[1]
     assert "prior" in verdict.remedy
 
@@ -139,7 +139,7 @@ def test_points_that_no_pose_explains_suggest_a_wrong_prior_or_rig():
 def test_a_camera_without_any_detection_is_the_only_reason():
     unlit = a_camera(points=0, empty=FRAMES, expected=0, found=0)
     verdict = never(cameras={"left": a_camera(), "right": unlit})
-    assert kinds(verdict) == [ReasonKind.NEVER_FOUND, ReasonKind.NOTHING_DETECTED]
+    assert kinds(verdict) == ["never_found", "nothing_detected"]
     assert verdict.texts[1] == "camera right: nothing was detected in any of its 1000 pictures"
     assert "lens uncovered" in verdict.remedy
 
@@ -147,19 +147,19 @@ def test_a_camera_without_any_detection_is_the_only_reason():
 def test_a_camera_without_any_picture_is_reported():
     gone = CameraStatistics(missing=ranges((0, FRAMES - 1)))
     verdict = never(cameras={"left": a_camera(), "right": gone}, causes={Cause.NO_PICTURE: FRAMES})
-    assert kinds(verdict) == [ReasonKind.NEVER_FOUND, ReasonKind.NO_PICTURES]
+    assert kinds(verdict) == ["never_found", "no_pictures"]
     assert verdict.texts[1] == "camera right has no usable picture at all"
 
 
 def test_too_few_points_are_distinguished_from_points_that_do_not_fit():
     verdict = never(causes={Cause.FEW_POINTS: 950, Cause.UNEXPLAINED: 50})
-    assert kinds(verdict) == [ReasonKind.NEVER_FOUND, ReasonKind.FEW_POINTS]
+    assert kinds(verdict) == ["never_found", "few_points"]
     assert "950 frames of 1000 show fewer than the 4 points" in verdict.texts[1]
 
 
 def test_a_tie_is_reported_with_its_candidates():
     verdict = never(ties=ranges((3, 3)), tie_text="spots 1, 2 or spots 2, 3")
-    assert kinds(verdict) == [ReasonKind.NEVER_FOUND, ReasonKind.AMBIGUOUS]
+    assert kinds(verdict) == ["never_found", "ambiguous"]
     assert verdict.texts[1] == "the spots fit more than one pose: spots 1, 2 or spots 2, 3"
     assert "narrower" in verdict.remedy
 
@@ -172,7 +172,7 @@ def test_frames_that_do_not_determine_the_pose_are_the_reason_without_any_other(
 
 def test_a_run_that_only_the_causal_pass_measured_is_reported_as_not_confirmed():
     verdict = never(causal_measured=98, lost=ranges((0, 999)), found_again=0)
-    assert kinds(verdict)[:2] == [ReasonKind.NEVER_FOUND, ReasonKind.NOT_CONFIRMED]
+    assert kinds(verdict)[:2] == ["never_found", "not_confirmed"]
     assert "98 of 1000 frames" in verdict.texts[1]
     assert not any("found again" in r and "not found again" not in r for r in verdict.texts)
 
@@ -190,33 +190,33 @@ def with_missing(*spans: tuple[int, int]) -> dict[str, CameraStatistics]:
     [
         (
             {"cameras": with_missing((100, 150))},
-            ReasonKind.MISSING_PICTURES,
+            "missing_pictures",
             "camera left has no usable picture in 51 of",
         ),
         (
             {"cameras": with_missing((990, 999))},
-            ReasonKind.CAMERA_STOPPED,
+            "camera_stopped",
             "camera left stopped before the end: it has no picture from frame 990 on (10 frames)",
         ),
         (
             {"cameras": with_missing((0, 0))},
-            ReasonKind.CAMERA_LATE,
+            "camera_late",
             "starts late: it has no picture of the first 1 frame",
         ),
         (
             {"ties": ranges((7, 7)), "tie_text": "A or B"},
-            ReasonKind.AMBIGUOUS,
+            "ambiguous",
             "frame 7 could be explained in more than",
         ),
         (
             {"lost": ranges((10, 12)), "found_again": 1},
-            ReasonKind.LOST,
+            "lost",
             "the vehicle was lost in 3 frames (10 to 12); it was found again",
         ),
-        ({"lost": ranges((990, 999))}, ReasonKind.LOST, "10 frames (990 to 999); it was not found again"),
-        ({"own_spots": ranges((5, 6))}, ReasonKind.CONTRADICTION, "2 frames (5 to 6) contradict their own spots"),
-        ({"causal": ranges((5, 5))}, ReasonKind.CONTRADICTION, "1 frame (5) contradict the causal pass"),
-        ({"invalid": ranges((5, 5))}, ReasonKind.INTERNAL, "covariances of 1 frame (5) are not positive definite"),
+        ({"lost": ranges((990, 999))}, "lost", "10 frames (990 to 999); it was not found again"),
+        ({"own_spots": ranges((5, 6))}, "contradiction", "2 frames (5 to 6) contradict their own spots"),
+        ({"causal": ranges((5, 5))}, "contradiction", "1 frame (5) contradict the causal pass"),
+        ({"invalid": ranges((5, 5))}, "internal", "covariances of 1 frame (5) are not positive definite"),
     ],
 )
 def test_a_point_to_check_has_a_remedy_and_is_not_a_failure(changed, kind, words):
@@ -235,19 +235,21 @@ def test_a_few_missing_pictures_are_not_reported():
 def test_a_camera_without_detections_at_the_end_is_reported_if_spots_are_expected_there():
     empty = {"empty": 100, "empty_at_end": 100}
     seen = judge(statistics_of(cameras={"left": a_camera(**empty, expected_at_end=300), "right": a_camera()}))
-    assert kinds(seen) == [ReasonKind.NOTHING_DETECTED]
+    assert kinds(seen) == ["nothing_detected"]
     assert "in its last 100 pictures, where the pose puts spots inside them" in seen.texts[0]
     nothing_expected = judge(statistics_of(cameras={"left": a_camera(**empty), "right": a_camera()}))
     assert nothing_expected.status == "pass"
 
 
 def test_findings_of_the_model_check_count_by_their_level_and_keep_their_remedy():
-    found = [Finding(level, "camera `right` may have moved", "it turns the pose", "Fix it.") for level in Level]
+    found = [finding("BP-M01", level, "camera `right` may have moved", why="It turns the pose.") for level in Level]
     verdict = judge(statistics_of(), found)
-    assert [(e.kind, e.fails, e.remedy) for e in verdict.reasons] == [
-        (ReasonKind.MODEL, True, "Fix it."),
-        (ReasonKind.MODEL, False, "Fix it."),
+    remedy = ENTRIES["BP-M01"].remedy
+    assert [(e.code, e.level, e.remedy) for e in verdict.reasons] == [
+        ("BP-M01", Level.FAIL, remedy),
+        ("BP-M01", Level.WARN, remedy),
     ]
+    assert kinds(verdict) == ["model", "model"]
     assert verdict.texts[0] == "camera `right` may have moved; it turns the pose"
 
 
@@ -255,33 +257,32 @@ def test_failures_come_before_points_to_check():
     statistics = statistics_of(300, {Cause.UNEXPLAINED: 700}, lost=ranges((100, 999)), own_spots=ranges((7, 7)))
     verdict = judge(statistics, noise_scale=6.0)
     assert verdict.exit_status == 4
-    assert [e.fails for e in verdict.reasons] == [True, True, False, False]
+    assert [e.level is Level.FAIL for e in verdict.reasons] == [True, True, False, False]
     assert [any(word in r for r in verdict.texts) for word in ("only 30%", "6.0 times", "900", "contradict")] == [
         True
     ] * 4
 
 
 def test_every_kind_of_reason_and_every_cause_has_a_remedy():
-    with_own_remedies = {ReasonKind.FEW_MEASURED, ReasonKind.MODEL}
-    assert set(REMEDIES) == set(ReasonKind) - with_own_remedies
-    assert set(REMEDIES_BY_CAUSE) == set(Cause)
+    assert set(ENTRIES["BP-V03"].variants) == {cause.value for cause in Cause}
+    assert all(entry.remedy for entry in ENTRIES.values())
 
 
 def test_a_reason_is_written_as_plain_values():
     (reason,) = judge(statistics_of(cameras=with_missing((990, 999)))).reasons
     mapping = reason.as_mapping()
-    assert list(mapping) == ["kind", "code", "level", "what", "remedy", "numbers"]
+    assert list(mapping) == ["kind", "code", "level", "what", "why", "remedy", "numbers"]
     assert (mapping["kind"], mapping["level"]) == ("camera_stopped", "check")
     assert mapping["numbers"] == {"camera": "left", "missing": [[990, 999]]}
 
 
 def test_the_exit_status_is_4_exactly_for_failures():
-    assert [Verdict(s, ()).exit_status for s in ("pass", "check", "fail")] == [0, 0, 4]
+    assert [Verdict((), (Finding(level, ""),)).exit_status for level in Level] == [0, 0, 4]
 
 
 def test_raw_pictures_of_a_colour_camera_are_a_point_to_check():
     verdict = judge(statistics_of(), mosaics={"left": 0.2})
-    assert (verdict.status, verdict.reasons[0].kind) == ("check", ReasonKind.COLOUR_MOSAIC)
+    assert (verdict.status, kinds(verdict)[0]) == ("check", "colour_mosaic")
     assert "camera left" in verdict.texts[0]
     assert "20%" in verdict.texts[0]
     assert verdict.exit_status == 0
@@ -293,5 +294,5 @@ def test_a_camera_that_moved_during_the_recording_is_a_point_to_check(frames, st
     verdict = judge(statistics_of(cameras=cameras))
     assert verdict.status == status
     if status == "check":
-        assert kinds(verdict) == [ReasonKind.CAMERA_MOVED]
+        assert kinds(verdict) == ["camera_moved"]
         assert "camera left: in 5 frames (500 to 504)" in verdict.texts[0]

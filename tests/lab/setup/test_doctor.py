@@ -8,56 +8,57 @@ from types import SimpleNamespace
 
 import pytest
 
+from lab.findings.finding import Level, finding
 from lab.pictures.opencv import load_cv2
 from lab.setup import doctor_checks, installation
-from lab.setup.installation import Line, State, exit_status
+from lab.setup.installation import exit_status
 from tests.lab.run_folders import RIG, write_run
 
 TODAY = datetime.date(2026, 6, 1)
 
 
 def test_the_installation_that_runs_these_tests_has_no_fault():
-    assert [line for line in installation.check_installation() if line.state is State.FAIL] == []
-    assert [line for line in doctor_checks.check_opencv() if line.state is State.FAIL] == []
+    assert [line for line in installation.check_installation() if line.level is Level.FAIL] == []
+    assert [line for line in doctor_checks.check_opencv() if line.level is Level.FAIL] == []
 
 
 def test_a_library_that_cannot_be_loaded_is_named_with_its_package():
     line = installation.check_libraries({"numpy": "numpy", "no-such-package": "no_such_module"})
-    assert (line.state, line.code) == (State.FAIL, "BP-D02")
+    assert (line.level, line.code) == (Level.FAIL, "BP-D02")
     assert "no-such-package (ModuleNotFoundError" in line.what
     assert "--force-reinstall no-such-package" in line.remedy
 
 
-@pytest.mark.parametrize(("found", "state"), [("1.9.10", State.FAIL), ("1.10", State.OK), ("2.0rc1", State.OK)])
+@pytest.mark.parametrize(("found", "state"), [("1.9.10", Level.FAIL), ("1.10", Level.PASS), ("2.0rc1", Level.PASS)])
 def test_versions_are_compared_as_numbers(found, state):
-    assert installation.check_versions({"numpy": found}, {"numpy": "1.10"}).state is state
+    assert installation.check_versions({"numpy": found}, {"numpy": "1.10"}).level is state
 
 
 def test_a_library_that_is_missing_fails():
-    assert installation.check_versions({"python": "3.11"}, {"no-such-package": "1.0"}).state is State.FAIL
+    assert installation.check_versions({"python": "3.11"}, {"no-such-package": "1.0"}).level is Level.FAIL
 
 
 def test_two_opencv_packages_are_a_warning():
-    assert installation.check_opencv_packages({"opencv-python-headless"}).state is State.OK
+    assert installation.check_opencv_packages({"opencv-python-headless"}).level is Level.PASS
     line = installation.check_opencv_packages({"opencv-python-headless", "opencv-python"})
-    assert (line.state, line.code) == (State.WARN, "BP-D03")
+    assert (line.level, line.code) == (Level.WARN, "BP-D03")
 
 
 @pytest.mark.parametrize(
     ("environment", "state"),
     [
-        ({"HOME": "/"}, State.OK),
-        ({"NUMBA_DISABLE_JIT": "0"}, State.OK),
-        ({"NUMBA_DISABLE_JIT": "1"}, State.WARN),
-        ({"OPENCV_IO_MAX_IMAGE_PIXELS": "1000"}, State.WARN),
+        ({"HOME": "/"}, Level.PASS),
+        ({"NUMBA_DISABLE_JIT": "0"}, Level.PASS),
+        ({"NUMBA_DISABLE_JIT": "1"}, Level.WARN),
+        ({"OPENCV_IO_MAX_IMAGE_PIXELS": "1000"}, Level.WARN),
     ],
 )
 def test_variables_that_change_what_is_read_are_a_warning(environment, state):
-    assert installation.check_variables(environment).state is state
+    assert installation.check_variables(environment).level is state
 
 
 def test_file_names_in_another_encoding_are_a_warning():
-    assert [installation.check_encoding(e).state for e in ("utf-8", "ascii")] == [State.OK, State.WARN]
+    assert [installation.check_encoding(e).level for e in ("utf-8", "ascii")] == [Level.PASS, Level.WARN]
 
 
 class WithoutTiff:
@@ -74,28 +75,28 @@ class WithoutTiff:
 
 def test_a_picture_format_that_opencv_lacks_fails():
     line = doctor_checks.check_pictures(WithoutTiff())
-    assert line.state is State.FAIL
+    assert line.level is Level.FAIL
     assert "cannot read .tiff with 8 bits, .tiff with 16 bits" in line.what
 
 
 def test_a_video_format_that_opencv_lacks_is_a_warning(monkeypatch):
     monkeypatch.setattr(doctor_checks, "VIDEOS", (("MJPG", ".avi"), ("none", ".none")))
     line = doctor_checks.check_videos(load_cv2())
-    assert line.state is State.WARN
+    assert line.level is Level.WARN
     assert line.what.startswith("videos: none cannot be read back")
 
 
-@pytest.mark.parametrize(("free", "state"), [(10**10, State.OK), (10**9, State.WARN), (10**6, State.FAIL)])
+@pytest.mark.parametrize(("free", "state"), [(10**10, Level.PASS), (10**9, Level.WARN), (10**6, Level.FAIL)])
 def test_little_free_space_is_reported(tmp_path, monkeypatch, free, state):
     monkeypatch.setattr(doctor_checks.shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
-    assert doctor_checks.check_space(doctor_checks.existing(tmp_path / "not" / "made"), "results").state is state
+    assert doctor_checks.check_space(doctor_checks.existing(tmp_path / "not" / "made"), "results").level is state
 
 
 def test_all_compiled_code_is_looked_at_and_a_missing_part_is_a_warning(monkeypatch):
     root = doctor_checks.Path(doctor_checks.geometry.__file__).parents[1]
     assert {"geometry", "tracking"} <= {f.relative_to(root).parts[0] for f in doctor_checks.compiled_folders()}
     monkeypatch.setattr(doctor_checks, "is_empty", lambda folder: True)
-    assert doctor_checks.check_cache().state is State.WARN
+    assert doctor_checks.check_cache().level is Level.WARN
     monkeypatch.setattr(doctor_checks, "cache_folder", lambda folder: None)
     assert "cannot be kept" in doctor_checks.check_cache().what
 
@@ -103,33 +104,33 @@ def test_all_compiled_code_is_looked_at_and_a_missing_part_is_a_warning(monkeypa
 @pytest.mark.parametrize(
     ("block", "state", "words"),
     [
-        ("", State.WARN, "states no date"),
-        ("{date: 2026-05-01, verdict: PASS}", State.OK, "31 days old"),
-        ("{date: 2024-05-01, verdict: PASS}", State.WARN, "without an expiry date"),
-        ("{date: 2026-05-01, verdict: WARN, reasons: [few dots]}", State.WARN, "few dots"),
-        ("{date: 2026-05-01, verdict: FAIL, reasons: [bent]}", State.FAIL, "bent"),
-        ("{date: 2026-07-01, verdict: PASS}", State.WARN, "in the future"),
-        ("{date: 2026-05-01, verdict: PASS, valid_until: 2026-05-31}", State.FAIL, "expired on 2026-05-31"),
-        ("{date: 2026-05-01, verdict: PASS, valid_until: 2026-06-10}", State.WARN, "in 9 days"),
-        ("{date: 2026-05-01, verdict: PASS, valid_until: 2026-09-01}", State.OK, "valid until 2026-09-01"),
+        ("", Level.WARN, "states no date"),
+        ("{date: 2026-05-01, verdict: PASS}", Level.PASS, "31 days old"),
+        ("{date: 2024-05-01, verdict: PASS}", Level.WARN, "without an expiry date"),
+        ("{date: 2026-05-01, verdict: WARN, reasons: [few dots]}", Level.WARN, "few dots"),
+        ("{date: 2026-05-01, verdict: FAIL, reasons: [bent]}", Level.FAIL, "bent"),
+        ("{date: 2026-07-01, verdict: PASS}", Level.WARN, "in the future"),
+        ("{date: 2026-05-01, verdict: PASS, valid_until: 2026-05-31}", Level.FAIL, "expired on 2026-05-31"),
+        ("{date: 2026-05-01, verdict: PASS, valid_until: 2026-06-10}", Level.WARN, "in 9 days"),
+        ("{date: 2026-05-01, verdict: PASS, valid_until: 2026-09-01}", Level.PASS, "valid until 2026-09-01"),
     ],
 )
 def test_the_age_of_a_calibration_is_judged(tmp_path: Path, block, state, words):
     path = tmp_path / "rig.yaml"
     path.write_text(RIG + (f"calibration: {block}\n" if block else ""))
     line = doctor_checks.check_calibration(path, TODAY)
-    assert (line.state, line.code) == (state, "BP-D09")
+    assert (line.level, line.code) == (state, "BP-D09")
     assert words in line.what
 
 
 def test_a_run_folder_and_a_camera_file_are_read_too(tmp_path):
-    assert doctor_checks.check_calibration(write_run(tmp_path / "run"), TODAY).state is State.WARN
+    assert doctor_checks.check_calibration(write_run(tmp_path / "run"), TODAY).level is Level.WARN
     camera = "schema: beampose/camera/1\nname: left\nimage_size_px: [64, 48]\n"
     camera += "camera_matrix: {fx: 40, fy: 40, cx: 31, cy: 23}\ncalibration: {date: DAY, verdict: PASS}\n"
     path = tmp_path / "camera.yaml"
-    for day, state in (("2026-05-01", State.OK), ("may", State.FAIL)):
+    for day, state in (("2026-05-01", Level.PASS), ("may", Level.FAIL)):
         path.write_text(camera.replace("DAY", day))
-        assert doctor_checks.check_calibration(path, TODAY).state is state
+        assert doctor_checks.check_calibration(path, TODAY).level is state
 
 
 def test_a_file_that_cannot_be_read_fails_as_a_wrong_file(tmp_path):
@@ -138,8 +139,7 @@ def test_a_file_that_cannot_be_read_fails_as_a_wrong_file(tmp_path):
 
 
 def test_the_exit_status_is_that_of_the_most_basic_fault():
-    def failed(status):
-        return Line("BP-D00", State.FAIL, "", "", status)
-
-    assert exit_status([Line("BP-D00", State.WARN, "")]) == 0
-    assert [exit_status([failed(3), *more]) for more in ([], [failed(1)], [failed(1), failed(2)])] == [3, 1, 2]
+    installation, file, calibration = (finding(f"BP-D{n}", Level.FAIL, "") for n in ("01", "10", "09"))
+    assert exit_status([finding("BP-D01", Level.WARN, "")]) == 0
+    found = [[calibration], [calibration, installation], [calibration, installation, file]]
+    assert [exit_status(f) for f in found] == [3, 1, 2]

@@ -11,12 +11,12 @@ import pytest
 
 from calibration.budget.expected_errors import ExpectedErrors
 from calibration.budget.pose_grid import AXES, NOISE, STATUS, plan_grid, poses_of
-from lab.findings.finding import Level
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose, ypr_sigmas
 from lab.errors import InputError
 from lab.files.rig.camera_block import Covariance
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
+from lab.findings.finding import Level
 from lab.setup.plan import plan_of, plan_rig
 from lab.setup.plan_findings import (
     CORRELATION,

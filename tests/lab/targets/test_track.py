@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from cli import main
-from lab.runs.verdict.verdict_reasons import ReasonKind, VerdictReason
+from lab.findings.finding import Level, finding
 from tests.tracking.drogue_circle.discs import discs
 
 SIZE = (128, 96)
@@ -91,8 +91,8 @@ def test_without_a_target_the_verdict_has_the_shape_of_that_of_a_run(kind, tmp_p
     assert {(r["status"], r["u_px"]) for r in rows} == {("lost", "")}
     assert verdict["status"] == "fail"
     assert verdict["reasons"] == [e["what"] for e in verdict["evidence"]]
-    of_run = VerdictReason(ReasonKind.NEVER_FOUND, True, "what", "remedy").as_mapping()
-    assert {"code", "level", "what", "remedy"} <= of_run.keys() & verdict["evidence"][0].keys()
+    of_run = finding("BP-V02", Level.FAIL, "what").as_mapping()
+    assert of_run.keys() == verdict["evidence"][0].keys()
     assert verdict["evidence"][0]["level"] == of_run["level"] == "fail"
     assert verdict["evidence"][0]["remedy"] in done.output
     page = (tmp_path / "out" / "report.html").read_text("utf-8")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from geometry.arrays import Array
+from lab.findings.finding import Finding, Level, verdict
 from lab.number_format import format_number, format_with_sigma
 from lab.report.plot.axes import (
     BLUE,
@@ -33,18 +34,6 @@ HEADS = (
 _LONGEST = 0.1  # length of the longest arrow, as a share of the image width
 _SIGNIFICANT = 3.0  # sigmas of chance and calibration: radius of the circles
 _TEXTS = ("what", "why", "remedy", "code")
-_LEVELS = {"PASS": "small", "WARN": "check", "FAIL": "fail"}
-
-
-@dataclass(frozen=True, slots=True)
-class FindingRow:
-    """One finding as the report shows it."""
-
-    level: str  # small, check or fail
-    what: str
-    why: str
-    remedy: str
-    code: str = ""  # `beampose explain CODE`; empty in older results
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +41,7 @@ class ModelFit:
     """The content of the section."""
 
     sentence: str  # the answer to the question
-    findings: tuple[FindingRow, ...]
+    findings: tuple[Finding, ...]
     rows: tuple[tuple[str, ...], ...]  # under HEADS: views, then cameras, then beams
     drawings: tuple[str, ...]  # SVG, one per camera
     tested: bool = True
@@ -64,7 +53,7 @@ def model_fit(block: Mapping[str, Any] | None) -> ModelFit | None:
     if block is None:
         return None
     findings = tuple(
-        FindingRow(_LEVELS.get(str(f.get("level")), "check"), *(str(f.get(k) or "") for k in _TEXTS))
+        Finding(Level.__members__.get(str(f.get("level")), Level.WARN), *(str(f.get(k) or "") for k in _TEXTS))
         for f in _mappings(block.get("findings"))
     )
     rows = []
@@ -90,13 +79,13 @@ def model_fit(block: Mapping[str, Any] | None) -> ModelFit | None:
     )
 
 
-def _sentence(block: Mapping[str, Any], findings: tuple[FindingRow, ...]) -> str:
+def _sentence(block: Mapping[str, Any], findings: tuple[Finding, ...]) -> str:
     if not block.get("tested"):
         return f"Not tested: {block.get('why_not') or 'no reason is given'}."
     used = f"{block.get('frames_for_diagnosis')} frames, evenly spaced"
     if not findings:
         return f"Yes: no deviation of a camera, screen, beam or clock was found ({used})."
-    if all(f.level == "small" for f in findings):
+    if verdict(findings) is Level.PASS:
         return f"Nearly: the deviations found are within the stated uncertainty ({used})."
     return f"Probably not ({used}):"
 

@@ -14,8 +14,8 @@ from click.testing import CliRunner
 from cli import main
 from lab.commands.common import command_line
 from lab.errors import CalibrationError, InputError, RunError
-from lab.findings.catalogue import ENTRIES
 from lab.files.text.csv_text import write_table
+from lab.findings.catalogue import ENTRIES
 from lab.runs import process
 from lab.runs.batch import task as module
 from lab.runs.batch.batch import BatchOptions, process_batch

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lab.findings.finding import Level, verdict
 from cli import main
+from lab.findings.finding import Level, verdict
 from lab.targets.point import COLUMNS, PointOptions, PointTarget
 from lab.targets.track import track_target
 from studies.duan2020 import compare_duan2020
