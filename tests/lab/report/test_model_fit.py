@@ -32,7 +32,7 @@ def test_findings_come_first_and_every_spot_camera_and_beam_has_a_row(moved_scre
     fit = model_fit(moved_screen["model_check"])
     assert fit is not None
     assert fit.sentence == "Probably not (300 frames, evenly spaced):"
-    assert [f.level for f in fit.findings] == ["fail"]
+    assert [f.level.word for f in fit.findings] == ["fail"]
     assert "screen `right` may have moved" in fit.findings[0].what
     assert [row[:2] for row in fit.rows[:6]] == [(s, "left" if int(s) < 4 else "right") for s in "123456"]
     assert [row[0] for row in fit.rows[6:]] == [

@@ -53,7 +53,10 @@ def model_fit(block: Mapping[str, Any] | None) -> ModelFit | None:
     if block is None:
         return None
     findings = tuple(
-        Finding(Level.__members__.get(str(f.get("level")), Level.WARN), *(str(f.get(k) or "") for k in _TEXTS))
+        Finding(
+            Level.__members__.get(str(f.get("level")), Level.WARN),
+            **{name: str(f.get(name) or "") for name in _TEXTS},  # type: ignore[arg-type]
+        )
         for f in _mappings(block.get("findings"))
     )
     rows = []
