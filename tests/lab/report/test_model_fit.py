@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lab.findings.finding import Level
 from lab.report.run import trust
 from lab.report.run.blocks.model_fit import HEADS, model_fit
 from lab.report.run.page import write_report
@@ -40,7 +41,7 @@ def test_findings_come_first_and_every_spot_camera_and_beam_has_a_row(moved_scre
     ]  # fmt: skip
     assert all(len(row) == len(HEADS) for row in fit.rows)
     line = trust._model(fit)
-    assert (line.level, line.name) == (trust.BAD, "Fit of rig and recording")
+    assert (line.level, line.name) == (Level.FAIL, "Fit of rig and recording")
     assert line.text.startswith("the residuals do not fit the rig (300 frames tested): spot 6 in camera `right`")
 
 
