@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from lab.errors import CalibrationError, InputError
-from lab.files.project.project_blocks import Project
+from lab.files.project.project import Project
 from lab.files.text.atomic_write import atomic_folder, check_output_folder, keep_good_results
 from lab.findings.finding import Finding, Level, finding, verdict
 from lab.report.calibration.calibration_page import (

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import pydantic
 
 from lab.errors import InputError
-from lab.files.project.project_blocks import ProjectBlock
+from lab.files.project.project import Project
 from lab.files.rig import board_file, camera_file, rig_file, screens_file
 from lab.files.run import run_file
 from lab.files.text import fields
@@ -44,6 +44,9 @@ _OF_VALIDATORS: dict[Callable[..., Any], Schema] = {
 # Validators that belong to one file, by name: what they accept beside or instead of their type.
 _OF_NAMES: dict[str, Schema] = {
     "_paths": {"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}]},
+    "_patterns": {"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}]},
+    "_file": _TEXT,
+    "_run_folder": _TEXT,
     "_board": {"type": "string"},
     "_days": {"type": ["integer", "null"], "minimum": 1},
     "_name": _TEXT,
@@ -75,7 +78,7 @@ def schema_of_block(block: type[Block], commented: type | None = None) -> Schema
             schema = {**schema, "description": comments[name]}
         if field.is_required():
             required.append(key)
-        elif not isinstance(field.default, Block) and field.default not in (None, [], {}, ""):
+        elif not isinstance(field.default, Block) and field.default not in (None, [], {}, (), ""):
             schema = {**schema, "default": field.default}
         properties[key] = schema
     out: Schema = {"type": "object", "properties": properties, "additionalProperties": False}
@@ -141,7 +144,7 @@ BLOCKS: dict[str, tuple[type[Block], str]] = {
     "run": (run_file._RunBlock, "run.yaml: one recording"),
     "camera": (camera_file._CameraFileBlock, "camera.yaml: the lens of a camera"),
     "board": (board_file._BoardBlock, "board.yaml: a calibration board"),
-    "calibration": (ProjectBlock, "calibration.yaml: the measurements of a calibration"),
+    "calibration": (Project, "calibration.yaml: the measurements of a calibration"),
     "screens": (screens_file._ScreensBlock, "screens.yaml: cameras and screens in one frame"),
 }
 

@@ -26,7 +26,7 @@ from geometry.rig import Beam, Rig, Screen
 from geometry.uncertainty.rig_uncertainty import PINHOLE, distortion_names
 from lab.errors import InputError
 from lab.files.project.point_files import POINTS, POSE_SIGMAS, SURVEY, SURVEY_SIGMAS
-from lab.files.project.project_blocks import SCHEMA
+from lab.files.project.project import SCHEMA
 from lab.files.rig.board_file import save_board
 from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera

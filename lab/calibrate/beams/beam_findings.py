@@ -15,7 +15,7 @@ from calibration.rig.rig_figures import FEWEST_POSITIONS
 from geometry.arrays import Ints
 from geometry.rig import Rig
 from lab.calibrate.beams.recordings import Recordings
-from lab.files.project.project_blocks import Project
+from lab.files.project.project import Project
 from lab.findings.catalogue import ENTRIES
 from lab.findings.finding import Finding, Level, finding, passed
 

@@ -20,8 +20,7 @@ from lab.calibrate.beams.recording_check import check_no_duplicates, diagnose_fa
 from lab.calibrate.beams.recordings import read_recordings, stand_of
 from lab.calibrate.step import Outcome, Solved, Step, calibration_date, expiry_date, expiry_findings, run_step
 from lab.errors import CalibrationError, InputError
-from lab.files.project.project import load_project
-from lab.files.project.project_blocks import Project
+from lab.files.project.project import Project, load_project
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance, load_rig_file, save_rig
 from lab.files.rig.screens_file import load_screens

@@ -9,7 +9,7 @@ from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.calibrate.beams.recordings import Recordings, stand_of
 from lab.errors import InputError
-from lab.files.project.project_blocks import Project
+from lab.files.project.project import Project
 
 
 def diagnose_failed_fit(

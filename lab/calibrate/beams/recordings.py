@@ -17,7 +17,7 @@ from geometry.rig import Rig
 from lab.calibrate.beams.stationary_frames import SpotRows, average, positions_at_rest
 from lab.errors import InputError
 from lab.files.project.point_files import StandPoses, read_poses
-from lab.files.project.project_blocks import Project, RecordingEntry
+from lab.files.project.project import Project, RecordingEntry
 from lab.files.text.csv_table import Table
 from lab.files.text.csv_text import read_table
 from lab.files.text.error_text import printable_line, suggest_name
@@ -50,7 +50,7 @@ def stand_of(project: Project, recordings: Recordings) -> StandModel:
     if stand is None or stand.world_from_stand is None:
         return StandModel(recordings.stand_from_body, recordings.pose_sigmas, None, None)
     covariance = np.diag([stand.sigma_m**2] * 3 + [stand.sigma_rad**2] * 3)
-    return StandModel(recordings.stand_from_body, recordings.pose_sigmas, stand.world_from_stand, covariance)
+    return StandModel(recordings.stand_from_body, recordings.pose_sigmas, stand.world_from_stand.pose(), covariance)
 
 
 def read_recordings(project: Project, rig: Rig) -> Recordings:
@@ -126,7 +126,8 @@ def _rows(
     from lab.calibrate.beams.recorded_runs import spots_of_run  # imports detection and tracking
 
     assert recording.run is not None
-    place = None if project.stand is None else project.stand.world_from_stand
+    stand = project.stand
+    place = None if stand is None or stand.world_from_stand is None else stand.world_from_stand.pose()
     rows = spots_of_run(recording.run, rig, known, place)
     if not len(rows.frame):
         raise InputError(

@@ -32,8 +32,7 @@ from lab.calibrate.screens.screen_findings import ScreenLimits, near_findings, n
 from lab.calibrate.screens.screen_inputs import SearchProgress, adjusted_screens, screen_inputs
 from lab.calibrate.step import Outcome, Solved, Step, calibration_date, expiry_date, expiry_findings, run_step
 from lab.errors import CalibrationError, InputError
-from lab.files.project.project import load_project
-from lab.files.project.project_blocks import Project
+from lab.files.project.project import Project, load_project
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import RigFile, covariance_blocks, save_rig
 from lab.findings.finding import Finding, Level, finding, passed, reasons, verdict, worst_first

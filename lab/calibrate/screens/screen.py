@@ -17,8 +17,7 @@ from lab.calibrate.screens.screen_inputs import SearchProgress, adjusted_screens
 from lab.calibrate.screens.screen_page import page_of
 from lab.calibrate.screens.screen_tables import DOTS, RESIDUALS, write_tables
 from lab.calibrate.step import Outcome, Solved, Step, calibration_date, expiry_date, expiry_findings, run_step
-from lab.files.project.project import load_project
-from lab.files.project.project_blocks import Project
+from lab.files.project.project import Project, load_project
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import RigFile, covariance_blocks, save_rig
 from lab.files.rig.screens_file import ScreensFile, save_screens

@@ -19,7 +19,7 @@ from geometry.camera import FISHEYE
 from geometry.rig import Rig
 from lab.calibrate.camera.photos import as_8_bit
 from lab.errors import CalibrationError
-from lab.files.project.project_blocks import FixedBoard, Project
+from lab.files.project.project import FixedBoard, Project
 from lab.pictures.picture_file import MissingPicture, read_picture
 
 START_CORNER_SIGMA_PX = 0.2  # initial value; the adjustment estimates it from the residuals
@@ -89,12 +89,12 @@ def _placements(project: Project) -> list[_Placement]:
     out = [
         _Placement(f"boards.{i}.{p}", shared.board, photos, i)
         for i, shared in enumerate(project.boards)
-        for p, photos in shared.photos.items()
+        for p, photos in shared.placements.items()
     ]
     index = len(project.boards)
-    for k, screen in enumerate(project.screens.values()):
+    for k, (on, screen) in enumerate(project.screens.items()):
         for i, fixed in enumerate(screen.boards):
-            name = f"screens.{screen.name}.boards.{i}"
+            name = f"screens.{on}.boards.{i}"
             out.append(_Placement(name, fixed.board, fixed.photos, index, k, fixed))
             index += 1
     return out

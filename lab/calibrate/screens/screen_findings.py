@@ -13,7 +13,7 @@ from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
 from calibration.screens.outliers import classify_outliers
 from calibration.screens.screens import ApproximatePosition, ScreensResult
 from geometry.arrays import Array
-from lab.files.project.project_blocks import Project
+from lab.files.project.project import Project
 from lab.findings.finding import Finding, Level, finding, level_above, passed
 
 

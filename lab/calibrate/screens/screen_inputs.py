@@ -28,7 +28,7 @@ from lab.calibrate.screens.screen_boards import board_views
 from lab.errors import CalibrationError, InputError
 from lab.files.project.cloud_file import read_point_cloud
 from lab.files.project.point_files import Observations, Survey, read_observations, read_survey
-from lab.files.project.project_blocks import Cloud, Project, ScreenEntry
+from lab.files.project.project import Cloud, Project, ScreenEntry
 from lab.files.text.error_text import suggest_name
 from lab.files.text.range_checks import MAX_SCAN_COORDINATE
 
@@ -95,9 +95,9 @@ def screen_inputs(project: Project) -> ScreenInputs:
     )
     held = None if len(control_points) and len(point_observations) else _held_screen(project)
     scans = {n: _scan(s.cloud, s, survey, project) for n, s in project.screens.items() if s.cloud is not None}
-    setups = tuple(_setup(s, survey, project, scans.get(n)) for n, s in project.screens.items())
+    setups = tuple(_setup(n, s, survey, project, scans.get(n)) for n, s in project.screens.items())
     near = {
-        i: ApproximatePosition(c.near_m, c.within_m)
+        i: ApproximatePosition(np.array(c.near_m), c.within_m)
         for i, c in enumerate(project.cameras.values())
         if c.near_m is not None
     }
@@ -190,14 +190,16 @@ def _held_screen(project: Project) -> int:
     return names.index(with_boards[0])
 
 
-def _setup(entry: ScreenEntry, survey: Survey, project: Project, scan: tuple[Scan, list[str]] | None) -> ScreenSetup:
+def _setup(
+    on: str, entry: ScreenEntry, survey: Survey, project: Project, scan: tuple[Scan, list[str]] | None
+) -> ScreenSetup:
     control_points = None
     if entry.frame is not None:
         for key in ("origin", "x", "y"):
             name = getattr(entry.frame, key)
             if name not in survey.names:
                 raise InputError(
-                    f"{project.path}: screens.{entry.name}.frame.{key}: expected a point of the survey, got {name!r}"
+                    f"{project.path}: screens.{on}.frame.{key}: expected a point of the survey, got {name!r}"
                     f"{suggest_name(name, survey.names)}"[:240]
                 )
         control_points = tuple(survey.names.index(getattr(entry.frame, k)) for k in ("origin", "x", "y"))
@@ -212,7 +214,7 @@ def _setup(entry: ScreenEntry, survey: Survey, project: Project, scan: tuple[Sca
 
 def _scan(cloud: Cloud, entry: ScreenEntry, survey: Survey, project: Project) -> tuple[Scan, list[str]]:
     """The scan of a screen in the world frame, and notes on it."""
-    pose, covariance = cloud.world_from_cloud, None
+    pose, covariance = None if cloud.world_from_cloud is None else cloud.world_from_cloud.pose(), None
     try:
         points, words = _points(cloud)
         if cloud.targets is not None:

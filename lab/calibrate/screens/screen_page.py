@@ -9,7 +9,7 @@ import numpy as np
 from calibration.screens.network_sigmas import camera_sigmas, pointing_sigmas_m, spot_sigmas
 from calibration.screens.screens import ScreensResult
 from geometry.camera import pinhole_numbers
-from lab.files.project.project_blocks import Project
+from lab.files.project.project import Project
 from lab.files.rig.rig_file import covariance_blocks
 from lab.number_format import format_number
 from lab.report.calibration.calibration_drawings import corners_overlay

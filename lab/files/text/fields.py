@@ -219,10 +219,23 @@ def validated(model: type[M], content: Mapping[str, Any], path: Path | str, insi
     Raises:
         FileError: a line for each mistake, in the order of the file.
     """
+    value, mistakes = mistakes_in(model, content, path, inside)
+    if value is None:
+        raise FileError(mistakes)
+    return value
+
+
+def mistakes_in(
+    model: type[M], content: Mapping[str, Any], path: Path | str, inside: str = "", folder: Path | None = None
+) -> tuple[M | None, list[str]]:
+    """As `validated`, with the mistakes as lines; None where there are some.
+
+    folder: the context of the validation, for validators that look for files.
+    """
     try:
-        return model.model_validate(dict(content))
+        return model.model_validate(dict(content), context=folder), []
     except pydantic.ValidationError as error:
-        raise FileError(_line(e, path, inside) for e in error.errors()) from None
+        return None, [_line(e, path, inside) for e in error.errors()]
 
 
 def _line(error: Any, path: Path | str, inside: str) -> str:

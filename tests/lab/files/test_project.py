@@ -55,7 +55,7 @@ def test_a_project_has_the_values_of_its_file(tmp_path):
     assert list(project.beams) == ["A", "B"]
     assert project.spots["1"].sign == -1
     assert project.stand.sigma_rad == pytest.approx(np.radians(0.1))
-    np.testing.assert_array_equal(project.stand.world_from_stand.translation, [0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(project.stand.world_from_stand.pose().translation, [0.1, 0.2, 0.3])
     assert project.recordings[0].poses == tmp_path / "poses.csv"
     tables = {"survey.csv", "points.csv", "spots.csv", "poses.csv"}
     lenses = {"left-camera.yaml", "right-camera.yaml"}

@@ -18,7 +18,7 @@ from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.calibrate.camera.photos import _frames
-from lab.files.project.project_blocks import Cloud
+from lab.files.project.project import Cloud
 from lab.files.rig.rig_file import save_rig
 from lab.pictures.source import pictures, video_at
 from lab.runs.input_check.check import check
@@ -240,7 +240,7 @@ def test_targets_of_a_scan_are_metres_and_its_unit_is_recognised(unit, noted):
     from lab.calibrate.screens.screen_inputs import _in_metres
 
     at = np.array([[0.0, 0, 0], [2, 0, 0], [0, 1, 0.5], [1, 1, 0]])
-    cloud = Cloud(Path("scan.ply"), 0.001, None, Path("targets.csv"), None)
+    cloud = Cloud(file="scan.ply", unit="mm", targets="targets.csv")
     metres, note = _in_metres((at + 3) * unit, at, cloud)
     np.testing.assert_allclose(metres, at + 3)
     assert bool(note) is noted
