@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array
+from tracking.background.behind_lights import LARGEST_PATH_PX, BehindLights
 from tracking.background.mean_pictures import MOST_BYTES, in_steps, means_of, smooth_part, usable
 from tracking.background.places import AROUND_LIGHT, ON_LIGHT, SAME_LIGHT, near_each, number_of_better, places_of
 from tracking.background.slow_lights import ROUNDS, SlowLights, as_pictures_show, light_at
@@ -79,9 +80,15 @@ def _without_slow_lights(
     slow = SlowLights.of(equal, found, holes)
     mean[slow.row, slow.column] = slow.means()
     better = StaticBackground.of_mean(mean, pictures, background.noise, background.parameters)
-    moved, slow = slow.moved, slow[~slow.known]
+    moved, boxes = slow.moved, slow.boxes(slow.everywhere)
+    here = [_spots_at(better, p, boxes[boxes[:, 2] < LARGEST_PATH_PX], shift) for p in pictures]
+    behind = BehindLights.of(equal, here, boxes, background.noise)
+    mean[behind.row, behind.column] = behind.level_dn
+    slow = slow[~slow.known & ~behind.covers(mean.shape)[slow.row, slow.column]]
+    better = StaticBackground.of_mean(mean, pictures, background.noise, background.parameters)
     if len(slow.row):
         better = _behind(better, slow, mean, pictures, shift)
+    better.shares[behind.row, behind.column] = behind.share
     return _with_shifts(better.with_light(pictures), pictures, moved, shift)
 
 
@@ -116,17 +123,15 @@ def _behind(
     shift: TextureShift,
 ) -> StaticBackground:  # fmt: skip
     """This background from a mean (h, w), improved behind lights that are nearly everywhere in all pictures."""
-    better, boxes = background, slow.boxes(np.ones(len(slow.row), dtype=bool))
+    better, boxes = background, slow.boxes(slow.everywhere)
     at = (slow.row, slow.column)
     behind: Array = mean[at].astype(float)
     information = np.zeros(len(behind))
     for k in range(ROUNDS):
-        found = [better.spots_in(p, background.parameters, shift, regions=boxes) for p in pictures]
         if k == 0:
-            found = [
-                as_pictures_show(d, find_spots(p, background.parameters, background.noise, boxes))
-                for d, p in zip(found, pictures, strict=True)
-            ]
+            found = [_spots_at(better, p, boxes, shift) for p in pictures]
+        else:
+            found = [better.spots_in(p, background.parameters, shift, regions=boxes) for p in pictures]
         behind, information = slow.behind(found, behind, background.noise.variance(behind))
         added = better.subtracted.copy()
         added[at] = in_steps(np.asarray(background.level_dn - behind, np.float32), background.steps)
@@ -138,6 +143,12 @@ def _behind(
     better.near_lights[at] |= hidden
     better.blind[at] |= hidden
     return replace(better, unknown=slow.boxes(hidden))
+
+
+def _spots_at(background: StaticBackground, picture: Picture, boxes: Array, shift: TextureShift) -> Detections:
+    """The spots of a picture in boxes (k, 3), whether the background contains some of their light or not."""
+    found = background.spots_in(picture, background.parameters, shift, regions=boxes)
+    return as_pictures_show(found, find_spots(picture, background.parameters, background.noise, boxes))
 
 
 def _better_in(background: StaticBackground, picture: Picture, shift: TextureShift) -> int:

@@ -82,6 +82,11 @@ class SlowLights:
         total = weight.sum(axis=0)
         return np.where(total > 0, (weight * left).sum(axis=0) / np.maximum(total, 1e-9), before), total
 
+    @property
+    def everywhere(self) -> Bools:
+        """(m,): all of the pixels."""
+        return np.ones(len(self.row), dtype=bool)
+
     def boxes(self, pixels: Bools) -> Array:
         """Boxes (k, 3) around the connected parts of these pixels (m,): u, v and half side, px."""
         chosen = np.zeros(self.shape, np.uint8)

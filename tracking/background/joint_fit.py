@@ -1,0 +1,225 @@
+"""A light that moves little, and the background behind it, fitted together to some pictures.
+
+Where a light moves by less than its size it is in all pictures, and no picture shows the background behind it. But the
+background is the same in all of them: of the pictures k at a pixel x,
+
+    g_k(x) = B(x) + (p + q B(x)) G(x - c_k),
+
+with a Gaussian G of peak 1 and one size for all pictures. The light falls on the surface whose own brightness is B, so
+the surface modulates it: q > 0. B is linear in this equation and is eliminated at each pixel; p, q, the size and the
+places c_k are found by Gauss-Newton steps. A bright light is so determined to a few hundredths of a pixel by a motion
+of half its width, on any background. What the motion leaves open is decided by a plane: B differs from it by as much as
+the found background does. Source: ours; the elimination is the variable projection of Golub & Pereyra (1973), SIAM J.
+Numer. Anal. 10, 413, in the approximation of Kaufman (1975), BIT 15, 49.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geometry.arrays import Array
+
+_STEPS, _TRIES = 30, 8
+_CONVERGED = 1e-5  # relative decrease of the cost
+_DAMPING, _LESS, _MORE = 1e-2, 1 / 6, 6.0
+_NO_GAUSSIAN = 0.02  # error of the model, as a share of the peak: lasers flicker, and no light is quite a Gaussian
+_MODULATED, _UNSURE = 0.5, 0.4  # usual share of the light that the brightness of the surface modulates; its sigma
+_ROUNDS = 2  # of the texture's size and the fit
+_LEAST_TEXTURE, _FIRST_TEXTURE = 2.0, 20.0  # DN
+_ALIKE = 2.0  # texture is alike over some pixels: fewer of them are independent
+_LARGEST_CHI2 = 2.0  # per degree of freedom
+_LARGEST_SIGMA = 0.1  # of the mean place, in widths of the light
+_LEAST_SIGMA = 0.01
+_LARGEST_CHANGE = 3.0  # of the width, as a factor, from the start
+
+
+@dataclass(frozen=True, slots=True)
+class JointLight:
+    """A light in n pictures."""
+
+    places: Array  # (n, 2) px
+    shape: Array  # (3,): l11, l21, l22 of the Cholesky factor of the inverse covariance, 1/px
+    plain: float  # p, DN
+    modulated: float  # q, no unit
+    plane: Array  # (3,): the background's, DN and DN per px, about `origin`
+    origin: Array  # (2,) px
+    texture_dn: float  # sigma of the background about the plane
+
+    @property
+    def widths_px(self) -> Array:
+        """(2,): half axes, the larger first."""
+        factor = np.array([[self.shape[0], 0.0], [self.shape[1], self.shape[2]]])
+        return np.asarray(1 / np.sqrt(np.linalg.eigvalsh(factor @ factor.T)))
+
+    def _moved(self, step: Array) -> JointLight:
+        n = len(self.places)
+        return replace(
+            self, plain=self.plain + step[0], modulated=self.modulated + step[1], shape=self.shape + step[2:5],
+            places=self.places + step[5 : 5 + 2 * n].reshape(n, 2), plane=self.plane + step[5 + 2 * n :],
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class _Pixels:
+    """What n pictures show at m pixels."""
+
+    uv: Array  # (m, 2)
+    values: Array  # (n, m), DN
+    variance: Array  # (n, m), DN^2, of the noise
+    usual: float  # DN, of the background
+    height: float  # DN, of the light
+
+    def seen(self, light: JointLight) -> _Seen:
+        """A light in these pixels."""
+        l11, l21, l22 = light.shape
+        du, dv = (self.uv[:, i] - light.places[:, i : i + 1] for i in (0, 1))
+        along, across = l11 * du + l21 * dv, l22 * dv
+        light_of = np.exp(-0.5 * (along**2 + across**2))
+        weight = 1 / (self.variance + (_NO_GAUSSIAN * self.height * light_of) ** 2)
+        slope = 1 + light.modulated * light_of
+        about = self.uv - light.origin
+        plane = light.plane[0] + about @ light.plane[1:]
+        information = (slope**2 * weight).sum(axis=0) + light.texture_dn**-2
+        behind = (slope * weight * (self.values - light.plain * light_of)).sum(axis=0) + plane * light.texture_dn**-2
+        behind /= information
+        root = np.sqrt(weight)
+        residual = np.concatenate([
+            (self.values - slope * behind - light.plain * light_of) * root,
+            ((plane - behind) / light.texture_dn)[None],
+        ])  # fmt: skip
+        # What is known of p and q, so that they stay where the light lies on even ground.
+        modulated = light.modulated * self.usual
+        height = light.plain + modulated
+        usual = np.array([
+            (modulated - _MODULATED * self.height) / (_UNSURE * self.height), 0.5 * (height / self.height - 1),
+        ])  # fmt: skip
+        return _Seen(du, dv, along, across, light_of, root, slope, behind, information, residual, usual)
+
+    def normal(self, light: JointLight, seen: _Seen) -> tuple[Array, Array]:
+        """Normal matrix and right side of the step, with the background eliminated."""
+        (n, m), (l11, l21, l22) = self.values.shape, light.shape
+        size = 5 + 2 * n + 3
+        weighted = (light.plain + light.modulated * seen.behind) * seen.light_of * seen.root
+        slopes = np.zeros((size, n + 1, m))
+        slopes[0, :n], slopes[1, :n] = seen.light_of * seen.root, seen.light_of * seen.behind * seen.root
+        slopes[2, :n] = -weighted * seen.along * seen.du
+        slopes[3, :n] = -weighted * seen.along * seen.dv
+        slopes[4, :n] = -weighted * seen.across * seen.dv
+        each = np.arange(n)
+        slopes[5 + 2 * each, each] = weighted * seen.along * l11
+        slopes[6 + 2 * each, each] = weighted * (seen.along * l21 + seen.across * l22)
+        about = self.uv - light.origin
+        slopes[5 + 2 * n :, n] = -np.stack([np.ones(m), *about.T]) / light.texture_dn
+        by_background = np.concatenate([seen.slope * seen.root, np.full((1, m), 1 / light.texture_dn)])
+        by_background /= np.sqrt(seen.information)
+        slopes -= (slopes * by_background).sum(axis=1)[:, None] * by_background
+        flat = slopes.reshape(size, -1)
+        usual = np.zeros((2, size))
+        usual[0, 1], usual[1, :2] = self.usual / (_UNSURE * self.height), np.array([1, self.usual]) / (2 * self.height)
+        return flat @ flat.T + usual.T @ usual, flat @ seen.residual.ravel() - usual.T @ seen.usual
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    du: Array  # (n, m) px
+    dv: Array
+    along: Array  # (n, m), widths
+    across: Array
+    light_of: Array  # (n, m): of a peak of 1
+    root: Array  # (n, m): of the weights, 1/DN
+    slope: Array  # (n, m): by the background
+    behind: Array  # (m,) DN: the background
+    information: Array  # (m,) 1/DN^2
+    residual: Array  # (n + 1, m), sigmas
+    usual: Array  # (2,), sigmas
+
+    @property
+    def cost(self) -> float:
+        return float(np.sum(self.residual**2) + np.sum(self.usual**2))
+
+
+@dataclass(frozen=True, slots=True)
+class JointFit:
+    """A light of which the fit explains the pictures."""
+
+    light: JointLight
+    share: float  # variance of the mean of its places over that of one of them about the mean
+
+    def behind(self, uv: Array, values: Array, variance: Array) -> tuple[Array, Array, Array]:
+        """The background (m,), DN, its information in pictures (m,), and the light, (m,), highest of all pictures.
+
+        uv (m, 2): pixels; values, variance (n, m): of the pictures there, DN and DN^2.
+        """
+        pixels = _Pixels(uv, values, variance, 1.0, self.light.plain)
+        seen = pixels.seen(self.light)
+        return seen.behind, seen.information * variance.mean(axis=0), seen.light_of.max(axis=0)
+
+
+def fitted(
+    uv: Array, values: Array, variance: Array, places: Array, width_px: float, height_dn: float
+) -> JointFit | None:
+    """A light in n pictures that starts from these places (n, 2), width and height; None: it does not explain them.
+
+    uv (m, 2): pixels around it; values, variance (n, m): of the pictures there, DN and DN^2.
+    """
+    low = np.sort(values, axis=0)[: max(len(values) // 2, 1)].mean(axis=0)
+    usual = float(np.median(low))
+    pixels = _Pixels(uv, values, variance, max(usual, 1.0), height_dn)
+    origin, inverse = uv.mean(axis=0), 1 / width_px
+    light = JointLight(
+        places, np.array([inverse, 0.0, inverse]), (1 - _MODULATED) * height_dn,
+        _MODULATED * height_dn / pixels.usual, np.array([usual, 0.0, 0.0]), origin, _ALIKE * _FIRST_TEXTURE,
+    )  # fmt: skip
+    for _ in range(_ROUNDS):
+        light = _descended(pixels, light)
+        seen = pixels.seen(light)
+        about = seen.behind - light.plane[0] - (uv - origin) @ light.plane[1:]
+        light = replace(light, texture_dn=_ALIKE * max(float(np.std(about)), _LEAST_TEXTURE))
+    light = _descended(pixels, light)
+    return _checked(pixels, light, width_px)
+
+
+def _descended(pixels: _Pixels, light: JointLight) -> JointLight:
+    """Levenberg-Marquardt steps from a light."""
+    damping, seen = _DAMPING, pixels.seen(light)
+    for _ in range(_STEPS):
+        normal, right = pixels.normal(light, seen)
+        for _ in range(_TRIES):
+            step = np.linalg.lstsq(normal + damping * np.diag(normal.diagonal()), right, rcond=None)[0]
+            tried = light._moved(step)
+            after = pixels.seen(tried)
+            if np.isfinite(after.cost) and after.cost < seen.cost:
+                break
+            damping *= _MORE
+        else:
+            return light
+        gained = seen.cost - after.cost
+        light, seen, damping = tried, after, damping * _LESS
+        if gained < _CONVERGED * seen.cost:
+            break
+    return light
+
+
+def _checked(pixels: _Pixels, light: JointLight, width_px: float) -> JointFit | None:
+    """The fit, if it explains the pictures and the mean place is known."""
+    n, m = pixels.values.shape
+    seen = pixels.seen(light)
+    chi2 = float(np.sum(seen.residual[:n] ** 2)) / max(n * m - m - 2 * n, 1)
+    widths = light.widths_px
+    normal, _ = pixels.normal(light, seen)
+    covariance = np.linalg.pinv(normal, hermitian=True)
+    places = covariance[5 : 5 + 2 * n, 5 : 5 + 2 * n].reshape(n, 2, n, 2)
+    common = places.mean(axis=(0, 2)) * max(chi2, 1.0)
+    single = np.einsum("kikj->ij", places) / n - places.mean(axis=(0, 2))
+    lit = seen.light_of.max(axis=0) > 0.1
+    height = (light.plain + light.modulated * seen.behind)[lit]
+    bad = chi2 > _LARGEST_CHI2 or not height.size or float(np.median(height)) <= 0
+    bad |= light.modulated * pixels.usual < -_MODULATED * pixels.height
+    bad |= bool((widths > _LARGEST_CHANGE * width_px).any() or (widths < width_px / _LARGEST_CHANGE).any())
+    bad |= float(np.sqrt(np.trace(common) / 2)) > _LARGEST_SIGMA * float(widths.max())
+    if bad:
+        return None
+    least = (_LEAST_SIGMA * float(widths.max())) ** 2
+    return JointFit(light, float((0.5 * np.trace(common) + least) / max(0.5 * np.trace(single), 1e-9)))
