@@ -235,9 +235,14 @@ def wrong_diagnoses(renderer: Renderer, summary: Mapping[str, Any]) -> tuple[str
 
 
 def _about_noise_or_hidden(what: str, scene: Scene, seen: Bools) -> bool:
-    """The finding of the model check is about sigmas that are too small, or about a barely visible spot."""
+    """The finding is about sigmas that are too small, a barely visible spot, or a camera with such spots alone."""
     if what.startswith("the spots' residuals are"):
         return True
+    never = re.match(r"camera `(.+)`: none of its", what)
+    if never is not None and never[1] in scene.rig.cameras:
+        mine = scene.camera_of == list(scene.rig.cameras).index(never[1])
+        shown = np.count_nonzero(scene.in_view[:, mine] != OUTSIDE)
+        return bool(seen[:, mine].sum() < SEEN * shown)
     named = re.match(r"spot (\S+) in camera `(.+)` was measured in", what)
     if named is None:
         return False

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools, Ints
-from tracking.background.joint_fit import JointFit, fitted
+from tracking.background.joint_fit import UNLIKE, JointFit, Modulation, fitted
 from tracking.background.places import inside
 from tracking.detections import Detections
 from tracking.noise import NoiseModel
 
-LARGEST_PATH_PX = 100.0  # half side of the box around the places of such a light
+LARGEST_PATH_PX = 250.0  # half side of the box around the places of such a light
 _LARGEST_PATH = 12.0  # half side, in widths of the light
 _LEAST_PICTURES, _LEAST_SHARE = 6, 2 / 3  # of the pictures that show the light
 _AROUND = 1.5  # widths beyond the box that are fitted
 _SAMPLES, _MOST_SAMPLES = 3.0, 2500  # pixels that are fitted: per width of the light, and in all
+_LARGEST_SIGMA = 0.1  # of the camera's modulated share
 _LIT = 1e-3  # of the peak: there the background comes from the fit
 
 
@@ -31,17 +32,25 @@ class BehindLights:
     column: Ints  # (m,)
     level_dn: Array  # (m,): the background
     share: Array  # (m,): variance of its errors over that of a picture's noise
+    modulation: Modulation | None  # of the lights by the surface; None: they do not show it
 
     @staticmethod
     def of(
-        pictures: Sequence[NDArray[Any]], found: Sequence[Detections], boxes: Array, noise: NoiseModel
+        pictures: Sequence[NDArray[Any]], found: Sequence[Detections], boxes: Array, noise: NoiseModel, usual_dn: float
     ) -> BehindLights:
-        """From the points found in each picture inside boxes (k, 3): u, v and half side, px."""
-        parts = [part for box in boxes if (part := _behind_one(pictures, found, box, noise)) is not None]
+        """From the points found in each picture inside boxes (k, 3): u, v and half side, px.
+
+        usual_dn: brightness of the surface. The modulation that most lights of a camera show helps with the others.
+        """
+        parts = _behind_each(pictures, found, boxes, noise, None)
+        modulation = _modulation([part.fit for part in parts], usual_dn)
+        if modulation is not None:
+            parts = _behind_each(pictures, found, boxes, noise, modulation)
         if not parts:
-            return BehindLights(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
-        rows, columns, levels, shares = (np.concatenate(x) for x in zip(*parts, strict=True))
-        return BehindLights(rows, columns, levels, shares)
+            return BehindLights(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0), None)
+        row, column = np.concatenate([p.row for p in parts]), np.concatenate([p.column for p in parts])
+        level, share = np.concatenate([p.level_dn for p in parts]), np.concatenate([p.share for p in parts])
+        return BehindLights(row, column, level, share, modulation)
 
     def covers(self, shape: tuple[int, ...]) -> Bools:
         """(h, w): its pixels."""
@@ -50,10 +59,38 @@ class BehindLights:
         return out
 
 
+def _modulation(fits: Sequence[JointFit], level_dn: float) -> Modulation | None:
+    """The modulation of all lights of a camera. Those on even ground do not show it."""
+    share, variance = np.array([fit.modulated_share(level_dn) for fit in fits]).reshape(-1, 2).T
+    information = float(np.sum(1 / (variance + UNLIKE**2)))
+    if information < 1 / (UNLIKE**2 + _LARGEST_SIGMA**2):
+        return None
+    return Modulation(float(np.clip(np.sum(share / (variance + UNLIKE**2)) / information, 0.0, 1.0)), level_dn)
+
+
+class _Part(NamedTuple):
+    """The pixels (m,) behind one light."""
+
+    row: Ints
+    column: Ints
+    level_dn: Array
+    share: Array
+    fit: JointFit
+
+
+def _behind_each(
+    pictures: Sequence[NDArray[Any]], found: Sequence[Detections], boxes: Array, noise: NoiseModel,
+    modulation: Modulation | None,
+) -> list[_Part]:  # fmt: skip
+    parts = [_behind_one(pictures, found, box, noise, modulation) for box in boxes]
+    return [part for part in parts if part is not None]
+
+
 def _behind_one(
-    pictures: Sequence[NDArray[Any]], found: Sequence[Detections], box: Array, noise: NoiseModel
-) -> tuple[Ints, Ints, Array, Array] | None:
-    """Rows, columns, levels and shares of the pixels behind the brightest light in a box; None: no fit."""
+    pictures: Sequence[NDArray[Any]], found: Sequence[Detections], box: Array, noise: NoiseModel,
+    modulation: Modulation | None,
+) -> _Part | None:  # fmt: skip
+    """The pixels behind the brightest light in a box; None: no fit."""
     if box[2] > LARGEST_PATH_PX:
         return None
     here = [d[inside(box[None], d)] for d in found]
@@ -70,19 +107,17 @@ def _behind_one(
     step = max(int(width / _SAMPLES), int(np.ceil(side / np.sqrt(_MOST_SAMPLES))), 1)
     values, uv = _around(some, box, _AROUND * width, step)
     height = float(np.median([d.peak[0] for d in brightest]))
-    fit = fitted(uv, values, noise.variance(values), places, width, height)
+    fit = fitted(uv, values, noise.variance(values), places, width, height, modulation)
     return None if fit is None else _whole(some, box, width, fit, noise)
 
 
-def _whole(
-    pictures: Sequence[NDArray[Any]], box: Array, width: float, fit: JointFit, noise: NoiseModel
-) -> tuple[Ints, Ints, Array, Array]:
-    """What `_behind_one` returns, from all pixels that the light of a fit reaches."""
+def _whole(pictures: Sequence[NDArray[Any]], box: Array, width: float, fit: JointFit, noise: NoiseModel) -> _Part:
+    """All pixels that the light of a fit reaches."""
     values, uv = _around(pictures, box, 2 * _AROUND * width, 1)
     level, information, light = fit.behind(uv, values, noise.variance(values))
     lit = light > _LIT
     column, row = uv[lit].astype(np.int64).T
-    return row, column, level[lit], fit.share + 1 / np.maximum(information[lit], 1e-3)
+    return _Part(row, column, level[lit], fit.share + 1 / np.maximum(information[lit], 1e-3), fit)
 
 
 def _around(pictures: Sequence[NDArray[Any]], box: Array, more: float, step: int) -> tuple[Array, Array]:

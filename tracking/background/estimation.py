@@ -7,7 +7,6 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +30,7 @@ _MOSTLY = 0.7  # share of the pictures with lights that move, above which those 
 # Contrast up to which the structure is that of the screen's surface, and modulates the spots' light in full. Of what is
 # more, prints or objects, the spots show a part: 0.25 to 0.57 where photographs modulate their light by up to 60 %.
 _OF_SURFACE, _OF_OBJECTS = 0.1, 0.5
+_NO_GAUSSIAN = 0.04  # share of a light at rest that a Gaussian leaves in a pixel; it is no structure of the background
 
 
 def static_background(
@@ -82,14 +82,17 @@ def _without_slow_lights(
     better = StaticBackground.of_mean(mean, pictures, background.noise, background.parameters)
     moved, boxes = slow.moved, slow.boxes(slow.everywhere)
     here = [_spots_at(better, p, boxes[boxes[:, 2] < LARGEST_PATH_PX], shift) for p in pictures]
-    behind = BehindLights.of(equal, here, boxes, background.noise)
+    behind = BehindLights.of(equal, here, boxes, background.noise, better.usual_dn())
     mean[behind.row, behind.column] = behind.level_dn
     slow = slow[~slow.known & ~behind.covers(mean.shape)[slow.row, slow.column]]
     better = StaticBackground.of_mean(mean, pictures, background.noise, background.parameters)
     if len(slow.row):
         better = _behind(better, slow, mean, pictures, shift)
     better.shares[behind.row, behind.column] = behind.share
-    return _with_shifts(better.with_light(pictures), pictures, moved, shift)
+    better = better.with_light(pictures)
+    if behind.modulation is not None:
+        better = better.with_modulation(behind.modulation)
+    return _with_shifts(better, pictures, moved, shift)
 
 
 def _with_shifts(
@@ -97,7 +100,10 @@ def _with_shifts(
 ) -> StaticBackground:
     """The background with the errors of lights by its texture, and with those of its lights that stay at rest."""
     found = [background.spots_in(p, background.parameters, shift) for p in pictures[::TRIED]]
+    still = background.lights.found
     widths = np.concatenate([np.sqrt(d.major_px * d.minor_px) for d in found])
+    if not len(widths):  # spots may be at rest
+        widths = np.sqrt(still.major_px * still.minor_px)
     changed = np.array([background.lights.in_picture(p)[1] for p in pictures])
     # Of a light at rest that trembles something is left in the difference: that stays in its place.
     alone = [d[np.asarray(~near_each(d, background.lights.found, ON_LIGHT).any(axis=1))] for d in found]
@@ -106,12 +112,13 @@ def _with_shifts(
     better = replace(background, fixed=np.asarray(~changed.any(axis=0) & moved))
     if not len(widths):
         return better
-    width, still = float(np.median(widths)), background.lights.found
+    width = float(np.median(widths))
     at = row, column = np.nonzero(places_of(still, background.structure.shape, AROUND_LIGHT))
-    rows, columns = background.structure.shape
-    mean = background.structure + cv2.resize(background.smooth, (columns, rows), interpolation=cv2.INTER_LINEAR)
-    mean[at] -= light_at(still, column, row)
+    mean = background.plain()
+    light = light_at(still, column, row)
+    mean[at] -= light
     own = (background.shares * background.noise.variance(mean)).astype(np.float32)
+    own[at] += (_NO_GAUSSIAN * light) ** 2
     share = replace(shift, misfit_share=float("nan")).with_lights(found).misfit_share
     part = 1.0 if background.noise.texture < _OF_SURFACE else _OF_OBJECTS
     shifts_px = np.float32(part) * local_shifts(mean, own, width)

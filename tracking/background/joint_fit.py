@@ -25,7 +25,8 @@ _STEPS, _TRIES = 30, 8
 _CONVERGED = 1e-5  # relative decrease of the cost
 _DAMPING, _LESS, _MORE = 1e-2, 1 / 6, 6.0
 _NO_GAUSSIAN = 0.02  # error of the model, as a share of the peak: lasers flicker, and no light is quite a Gaussian
-_MODULATED, _UNSURE = 0.5, 0.4  # usual share of the light that the brightness of the surface modulates; its sigma
+MODULATED = 0.5, 0.4  # usual share of the light that the brightness of the surface modulates, and its sigma
+UNLIKE = 0.1  # sigma of the modulated share of different places
 _ROUNDS = 2  # of the texture's size and the fit
 _LEAST_TEXTURE, _FIRST_TEXTURE = 2.0, 20.0  # DN
 _ALIKE = 2.0  # texture is alike over some pixels: fewer of them are independent
@@ -33,6 +34,19 @@ _LARGEST_CHI2 = 2.0  # per degree of freedom
 _LARGEST_SIGMA = 0.1  # of the mean place, in widths of the light
 _LEAST_SIGMA = 0.01
 _LARGEST_CHANGE = 3.0  # of the width, as a factor, from the start
+
+
+@dataclass(frozen=True, slots=True)
+class Modulation:
+    """How the brightness of a surface modulates lights: to 1 - share + share B / B0 where it is B instead of B0."""
+
+    share: float
+    level_dn: float  # B0
+
+    def at(self, level_dn: float) -> tuple[float, float]:
+        """The share where the surface has this brightness, and the sigma by which places differ."""
+        more = self.share * level_dn / self.level_dn
+        return more / (1 - self.share + more), UNLIKE
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +84,7 @@ class _Pixels:
     variance: Array  # (n, m), DN^2, of the noise
     usual: float  # DN, of the background
     height: float  # DN, of the light
+    modulated: tuple[float, float] = MODULATED  # expected share of the light, and its sigma
 
     def seen(self, light: JointLight) -> _Seen:
         """A light in these pixels."""
@@ -92,9 +107,8 @@ class _Pixels:
         # What is known of p and q, so that they stay where the light lies on even ground.
         modulated = light.modulated * self.usual
         height = light.plain + modulated
-        usual = np.array([
-            (modulated - _MODULATED * self.height) / (_UNSURE * self.height), 0.5 * (height / self.height - 1),
-        ])  # fmt: skip
+        share, sigma = self.modulated
+        usual = np.array([(modulated - share * height) / sigma, 0.5 * (height - self.height)]) / self.height
         return _Seen(du, dv, along, across, light_of, root, slope, behind, information, residual, usual)
 
     def normal(self, light: JointLight, seen: _Seen) -> tuple[Array, Array]:
@@ -117,7 +131,9 @@ class _Pixels:
         slopes -= (slopes * by_background).sum(axis=1)[:, None] * by_background
         flat = slopes.reshape(size, -1)
         usual = np.zeros((2, size))
-        usual[0, 1], usual[1, :2] = self.usual / (_UNSURE * self.height), np.array([1, self.usual]) / (2 * self.height)
+        share, sigma = self.modulated
+        usual[0, :2] = np.array([-share, (1 - share) * self.usual]) / (sigma * self.height)
+        usual[1, :2] = np.array([1, self.usual]) / (2 * self.height)
         return flat @ flat.T + usual.T @ usual, flat @ seen.residual.ravel() - usual.T @ seen.usual
 
 
@@ -146,6 +162,13 @@ class JointFit:
 
     light: JointLight
     share: float  # variance of the mean of its places over that of one of them about the mean
+    strength_cov: Array  # (2, 2): of p and q
+
+    def modulated_share(self, level_dn: float) -> tuple[float, float]:
+        """The share of the light that the surface's brightness modulates, where that is `level_dn`; its variance."""
+        p, more = self.light.plain, self.light.modulated * level_dn
+        slope = np.array([-more, p * level_dn]) / (p + more) ** 2
+        return more / (p + more), float(slope @ self.strength_cov @ slope)
 
     def behind(self, uv: Array, values: Array, variance: Array) -> tuple[Array, Array, Array]:
         """The background (m,), DN, its information in pictures (m,), and the light, (m,), highest of all pictures.
@@ -158,19 +181,22 @@ class JointFit:
 
 
 def fitted(
-    uv: Array, values: Array, variance: Array, places: Array, width_px: float, height_dn: float
-) -> JointFit | None:
+    uv: Array, values: Array, variance: Array, places: Array, width_px: float, height_dn: float,
+    modulation: Modulation | None = None,
+) -> JointFit | None:  # fmt: skip
     """A light in n pictures that starts from these places (n, 2), width and height; None: it does not explain them.
 
-    uv (m, 2): pixels around it; values, variance (n, m): of the pictures there, DN and DN^2.
+    uv (m, 2): pixels around it; values, variance (n, m): of the pictures there, DN and DN^2. modulation: as other
+    lights show it.
     """
     low = np.sort(values, axis=0)[: max(len(values) // 2, 1)].mean(axis=0)
     usual = float(np.median(low))
-    pixels = _Pixels(uv, values, variance, max(usual, 1.0), height_dn)
+    expected = MODULATED if modulation is None else modulation.at(max(usual, 1.0))
+    pixels = _Pixels(uv, values, variance, max(usual, 1.0), height_dn, expected)
     origin, inverse = uv.mean(axis=0), 1 / width_px
     light = JointLight(
-        places, np.array([inverse, 0.0, inverse]), (1 - _MODULATED) * height_dn,
-        _MODULATED * height_dn / pixels.usual, np.array([usual, 0.0, 0.0]), origin, _ALIKE * _FIRST_TEXTURE,
+        places, np.array([inverse, 0.0, inverse]), (1 - expected[0]) * height_dn,
+        expected[0] * height_dn / pixels.usual, np.array([usual, 0.0, 0.0]), origin, _ALIKE * _FIRST_TEXTURE,
     )  # fmt: skip
     for _ in range(_ROUNDS):
         light = _descended(pixels, light)
@@ -187,8 +213,8 @@ def _descended(pixels: _Pixels, light: JointLight) -> JointLight:
     for _ in range(_STEPS):
         normal, right = pixels.normal(light, seen)
         for _ in range(_TRIES):
-            step = np.linalg.lstsq(normal + damping * np.diag(normal.diagonal()), right, rcond=None)[0]
-            tried = light._moved(step)
+            damped = normal + damping * np.diag(normal.diagonal())
+            tried = light._moved(np.asarray(np.linalg.lstsq(damped, right, rcond=None)[0], dtype=float))
             after = pixels.seen(tried)
             if np.isfinite(after.cost) and after.cost < seen.cost:
                 break
@@ -216,10 +242,11 @@ def _checked(pixels: _Pixels, light: JointLight, width_px: float) -> JointFit | 
     lit = seen.light_of.max(axis=0) > 0.1
     height = (light.plain + light.modulated * seen.behind)[lit]
     bad = chi2 > _LARGEST_CHI2 or not height.size or float(np.median(height)) <= 0
-    bad |= light.modulated * pixels.usual < -_MODULATED * pixels.height
+    bad |= light.modulated * pixels.usual < -MODULATED[0] * pixels.height
     bad |= bool((widths > _LARGEST_CHANGE * width_px).any() or (widths < width_px / _LARGEST_CHANGE).any())
     bad |= float(np.sqrt(np.trace(common) / 2)) > _LARGEST_SIGMA * float(widths.max())
     if bad:
         return None
     least = (_LEAST_SIGMA * float(widths.max())) ** 2
-    return JointFit(light, float((0.5 * np.trace(common) + least) / max(0.5 * np.trace(single), 1e-9)))
+    share = (0.5 * np.trace(common) + least) / max(0.5 * np.trace(single), 1e-9)
+    return JointFit(light, float(share), covariance[:2, :2] * max(chi2, 1.0))

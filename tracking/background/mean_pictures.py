@@ -15,6 +15,7 @@ from tracking.noise import BLOCK, Picture
 
 MOST_BYTES = 150_000_000  # of these pictures
 _CUT = 0.25  # share of the lowest and of the highest grey values of a pixel that is left out
+GAIN_BITS = 8  # binary places of a factor on the difference
 _SMOOTH_BLOCKS = 6.0  # blocks: sigma of the smooth part of the background, which is no structure
 
 
@@ -96,15 +97,20 @@ def in_steps(values: NDArray[np.float32], steps: int) -> NDArray[np.uint16]:
 
 def raised_difference(
     picture: Picture, steps: int, subtracted: NDArray[np.uint16], structure: NDArray[np.float32], more: float,
-    clips: float, top: int,
+    clips: float, top: int, level: int = 0, gain: NDArray[np.uint16] | None = None,
 ) -> NDArray[np.uint16]:  # fmt: skip
     """A picture (h, w) in steps of a fraction of 1 DN, plus `subtracted` and `more` times the structure (h, w).
 
-    Pixels of at least `clips`, DN, become `top`. In one pass: whole pictures in between take most of the time.
+    Pixels of at least `clips`, DN, become `top`. gain (h, w): what is above or below `level` is multiplied by it;
+    256 is 1. In one pass: whole pictures in between take most of the time.
     """
     out = np.empty_like(subtracted)
     most = int(np.iinfo(picture.dtype).max) + 1
-    _raise(picture, steps, subtracted, structure, np.float32(more), min(int(np.ceil(min(clips, most))), most), top, out)
+    limit = min(int(np.ceil(min(clips, most))), most)
+    if gain is None:
+        _raise(picture, steps, subtracted, structure, np.float32(more), limit, top, out)
+    else:
+        _raise_by(picture, steps, subtracted, structure, np.float32(more), limit, top, level, gain, out)
     return out
 
 
@@ -130,5 +136,32 @@ def _raise(
             z = np.int32(added[j]) + np.int32(more * own[j])
             z = z if z > lowest else lowest
             y = x * many + (z if z < most else most)
+            y = y if y < most else most
+            to[j] = np.uint16(y if x < limit else high)
+
+
+@compiled_for_threads
+def _raise_by(
+    picture: NDArray[Any], steps: int, subtracted: NDArray[np.uint16], structure: NDArray[np.float32],
+    more: np.float32, clips: int, top: int, level: int, gain: NDArray[np.uint16], out: NDArray[np.uint16],
+) -> None:  # fmt: skip
+    many, limit, high, base = np.int32(steps), np.int32(clips), np.int32(top), np.int32(level)
+    lowest, most, bits = np.int32(0), np.int32(65535), np.int32(GAIN_BITS)
+    for i in range(out.shape[0]):
+        seen, added, factor, own, to = picture[i], subtracted[i], gain[i], structure[i], out[i]
+        if more == np.float32(0.0):
+            for j in range(to.shape[0]):
+                x = np.int32(seen[j])
+                z = x * many + np.int32(added[j]) - base
+                y = base + ((z * np.int32(factor[j])) >> bits)
+                y = y if y > lowest else lowest
+                y = y if y < most else most
+                to[j] = np.uint16(y if x < limit else high)
+            continue
+        for j in range(to.shape[0]):
+            x = np.int32(seen[j])
+            z = x * many + np.int32(added[j]) + np.int32(more * own[j]) - base
+            y = base + ((z * np.int32(factor[j])) >> bits)
+            y = y if y > lowest else lowest
             y = y if y < most else most
             to[j] = np.uint16(y if x < limit else high)

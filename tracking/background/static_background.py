@@ -16,7 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools
+from tracking.background.joint_fit import Modulation
 from tracking.background.mean_pictures import (
+    GAIN_BITS,
     highest_of_blocks,
     in_steps,
     raised_difference,
@@ -45,6 +47,9 @@ _MEAN_VARIANCE = 1.4  # variance of these means of normal deviates times their n
 _LOW = 0.25  # quantile of the background whose noise the difference is taken to have; brighter places count as uneven
 _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
 _AS_WIDE = 0.7  # of a light at rest: what is in its middle and as wide is that light, brighter than in the mean
+_LEAST_MODULATION = 0.1  # of the light by the surface: less is not undone
+_MODULATION = (0.25, 4.0)  # of the light, at most
+_NOT_UNDONE = 0.2  # share of the modulation's errors
 TRIED = 3  # every such picture shows whether there are further spots
 _WIDE_PX = 4.0  # a narrower light is in few of the sampled pixels
 
@@ -73,6 +78,8 @@ class StaticBackground:
     shifts_px: NDArray[np.float32] | None = None  # (h, w): `local_shifts` of such a light
     fixed: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))  # lights at rest while others move
     misfit_share: float = float("nan")  # of the lights that move, as in TextureShift
+    # (h, w), in 2^-GAIN_BITS: undoes what the brightness of the surface does to a light; None: nothing
+    gain: NDArray[np.uint16] | None = None
 
     def with_light(self, pictures: Sequence[Picture]) -> StaticBackground:
         """The background whose light is 1 in a typical one of the pictures that it is made from."""
@@ -86,6 +93,32 @@ class StaticBackground:
     def _noise_share(self) -> float:
         """Variance of the background's own noise over that of a picture."""
         return _MEAN_VARIANCE / self.pictures
+
+    def with_modulation(self, modulation: Modulation) -> StaticBackground:
+        """The background whose surface modulates the lights that fall on it.
+
+        The light of a spot is brighter on its side on the brighter part of the surface. In the difference this is
+        undone: spots are where their light is, not where the surface is bright. Darker places are noisier then.
+        """
+        share, plain = modulation.share, self.plain()
+        if share < _LEAST_MODULATION:
+            return self
+        factor = 1 / np.clip(1 - share + share * plain / modulation.level_dn, *_MODULATION)
+        gain = np.rint(factor * 2**GAIN_BITS).astype(np.uint16)
+        variance = np.asarray(factor**2 * self.noise.variance(plain), np.float32)
+        more = np.maximum(highest_of_blocks(variance) - float(self.noise.variance(self.low_dn)), 0.0)
+        uneven = np.asarray(np.sqrt(more / 9.0) / (TEXTURE_SHARE * self.level_dn), np.float32)
+        return replace(self, gain=gain, model=replace(self.model, local_texture=uneven))
+
+    def plain(self) -> NDArray[np.float32]:
+        """(h, w), DN: the fixed picture."""
+        rows, columns = self.structure.shape
+        smooth = cv2.resize(self.smooth, (columns, rows), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(self.structure + smooth, np.float32)
+
+    def usual_dn(self) -> float:
+        """The usual brightness of the surface, DN."""
+        return max(float(np.median(self.structure[:: SAMPLE[0], :: SAMPLE[1]] + self.smooth)), 1.0)
 
     @staticmethod
     def of_mean(
@@ -200,7 +233,10 @@ class StaticBackground:
         clips = saturation_of(parameters, picture)
         top = min(int((clips + self.level_dn) * self.steps), np.iinfo(np.uint16).max)
         clipped = np.inf if inverted else clips
-        difference = raised_difference(picture, self.steps, self.subtracted, self.structure, more, clipped, top)
+        level = int(self.level_dn * self.steps)
+        difference = raised_difference(
+            picture, self.steps, self.subtracted, self.structure, more, clipped, top, level, self.gain
+        )
         if inverted:
             difference = np.asarray(
                 cv2.subtract(np.full_like(difference, 2 * int(self.level_dn * self.steps)), difference)
@@ -216,18 +252,22 @@ class StaticBackground:
         spots, row, column, sampled = spots[kept], row[kept], column[kept], (sampled[0][kept], sampled[1][kept])
         if not len(spots):
             return spots
-        spots = replace(spots, flux=spots.flux / self.steps, peak=spots.peak / self.steps)
+        gain = 1.0 if self.gain is None else self.gain[row, column] / 2.0**GAIN_BITS
+        spots = replace(spots, flux=spots.flux / (self.steps * gain), peak=spots.peak / (self.steps * gain))
         bright = self.smooth[sampled] + self.structure[row, column]
         light_of_spot = 0.5 * self.noise.slope_dn * spots.peak
         here, used = (self.noise.variance(at) + light_of_spot for at in (bright, np.full(len(spots), self.low_dn)))
         own = self.shares[row, column]
-        here *= (1 + own) / (1 + self._noise_share)
+        here *= gain**2 * (1 + own) / (1 + self._noise_share)
         spots = replace(spots, cov_px2=spots.cov_px2 * (here / used)[:, None, None])
         # The background's own noise is the same in all pictures.
         fixed = own / (1 + own) * 0.5 * np.trace(spots.cov_px2, axis1=1, axis2=2)
         of_light = replace(shift, background_px=(0.0,) * len(shift.background_px))
         if self.shifts_px is not None:
             of_light = replace(of_light, misfit_share=self.misfit_share)
-        spots = of_light.added_to(spots, self.noise, self._shifts_at(spots))
+        shifts = self._shifts_at(spots)
+        if shifts is not None and self.gain is not None:
+            shifts *= _NOT_UNDONE
+        spots = of_light.added_to(spots, self.noise, shifts)
         place = np.zeros(len(spots)) if spots.place_px2 is None else spots.place_px2
         return replace(spots, place_px2=place + fixed)

@@ -90,3 +90,11 @@ def test_a_light_at_rest_is_marked_if_others_move():
             at = np.hypot(*(d.uv_px - lamp[0, 0]).T) < 1
             assert np.count_nonzero(at) == 1
             assert bool(d.at_rest is not None and d.at_rest[at].any()) == marked
+
+
+@pytest.mark.parametrize(("length_px", "largest_px"), [(3.0, 0.15), (25.0, 0.15)])
+def test_a_board_that_modulates_spots_by_half_does_not_shift_them(length_px, largest_px):
+    paths = over_edges(45, length_px)
+    gap, sigma = errors(found_in_all(board_pictures(paths, 2.0, 0.6, 5)), paths)
+    assert np.sqrt(np.mean(gap**2)) < largest_px
+    assert np.sqrt(np.mean((gap / sigma) ** 2) / 2) < 1.25

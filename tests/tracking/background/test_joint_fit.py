@@ -1,0 +1,83 @@
+"""A light that hardly moves is separated from what stands behind it, and what that does to the light is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from geometry.arrays import Array
+from tracking.background.behind_lights import BehindLights
+from tracking.background.joint_fit import JointFit, Modulation, fitted
+from tracking.detection.detect import find_spots
+from tracking.noise import NoiseModel
+from tracking.parameters import DetectParameters
+
+SIDE, NOISE = 41, 0.8  # px, DN
+MIDDLE = 0.5 * (SIDE - 1)
+Y, X = (x.astype(float) for x in np.mgrid[:SIDE, :SIDE])
+UV = np.column_stack([X.ravel(), Y.ravel()])
+EDGE = 15.0 + 45.0 / (1 + np.exp(-3 * (X + 0.4 * Y - 1.4 * MIDDLE - 1.0)))  # DN, through the middle
+WIDTH, HEIGHT = 2.4, 90.0  # px, DN
+OFF = np.array([0.5, -0.3])  # px: of the places that a search found
+
+
+def places(length_px: float, pictures: int = 15) -> Array:
+    """Places (pictures, 2) about the middle, on a line."""
+    return MIDDLE + np.linspace(-0.5, 0.5, pictures)[:, None] * length_px * np.array([0.6, 0.8])
+
+
+def pictures(at: Array, background: Array, modulated: float, seed: int = 1) -> Array:
+    """(n, h, w), DN: a light whose share is modulated by the background, 1 where that is 60 DN."""
+    rng = np.random.default_rng(seed)
+    response = 1 - modulated + modulated * background / 60.0
+    light = [HEIGHT * np.exp(-0.5 * ((X - u) ** 2 + (Y - v) ** 2) / WIDTH**2) for u, v in at]
+    return np.array([background + response * one + NOISE * rng.standard_normal(X.shape) for one in light])
+
+
+def fit_of(seen: Array, start: Array) -> JointFit | None:
+    values = seen.reshape(len(seen), -1)
+    return fitted(UV, values, np.full(values.shape, NOISE**2), start, 3.0, 0.7 * HEIGHT)
+
+
+@pytest.mark.parametrize("modulated", [0.0, 0.6, 0.9])
+@pytest.mark.parametrize("length_px", [1.5, 5.0, 20.0])
+def test_a_light_that_moves_by_half_its_width_is_separated_from_an_edge_under_it(length_px, modulated):
+    at = places(length_px)
+    seen = pictures(at, EDGE, modulated)
+    fit = fit_of(seen, at + OFF)
+    assert fit is not None
+    behind, _, _ = fit.behind(UV, seen.reshape(len(seen), -1), np.full((len(seen), len(UV)), NOISE**2))
+    assert np.abs(fit.light.places.mean(axis=0) - MIDDLE).max() < 0.1
+    assert np.abs(fit.light.places - at).max() < 0.2
+    assert np.sqrt(np.mean((behind.reshape(X.shape) - EDGE) ** 2)) < 0.7
+    share, variance = fit.modulated_share(60.0)
+    assert abs(share - modulated) < max(3 * np.sqrt(variance), 0.1)
+
+
+def test_a_light_at_rest_on_an_edge_is_not_separated():
+    at = places(0.0)
+    assert fit_of(pictures(at, EDGE, 0.6), at + OFF) is None
+
+
+def test_pictures_without_a_light_give_no_fit():
+    seen = EDGE + NOISE * np.random.default_rng(3).standard_normal((15, SIDE, SIDE))
+    assert fit_of(seen, places(3.0)) is None
+
+
+def test_the_modulation_that_one_light_shows_helps_with_the_others():
+    assert Modulation(0.5, 40.0).at(40.0)[0] == pytest.approx(0.5)
+    assert Modulation(0.5, 40.0).at(10.0)[0] == pytest.approx(0.2)
+    at = places(6.0)
+    seen = np.rint(pictures(at, EDGE, 0.6))
+    noise = NoiseModel(NOISE**2, 0.0, 15.0)
+    even = np.rint(pictures(at, np.full(X.shape, 20.0), 0.6)).astype(np.uint8)
+    found = [find_spots(p, DetectParameters(), noise) for p in even]
+    box = np.array([[MIDDLE, MIDDLE, 9.0]])
+    behind = BehindLights.of(list(seen), found, box, noise, 40.0)
+    expected = 0.6 * 40 / 60 / (0.4 + 0.6 * 40 / 60)
+    assert behind.modulation is not None
+    assert behind.modulation.share == pytest.approx(expected, abs=0.1)
+    assert np.abs(behind.level_dn - EDGE[behind.row, behind.column]).max() < 3.0
+    nowhere = BehindLights.of(list(seen), found, np.array([[3.0, 3.0, 2.0]]), noise, 40.0)
+    assert nowhere.modulation is None
+    assert not nowhere.covers((SIDE, SIDE)).any()
