@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import pandas as pd
 
 from lab.api.results import Results
 from lab.files.run.parameter_overrides import with_overrides
+from lab.progress import Progress
 from lab.runs.process import process_run
 from lab.simulate.scenarios import SCENARIOS
 from lab.simulate.write import simulate
@@ -22,7 +22,7 @@ def process(
     out: Path | str | None = None,
     *,
     causal: bool = False,
-    progress: Callable[[int, int | None, str], None] | None = None,
+    progress: Progress | None = None,
     **settings: Any,
 ) -> Results:
     """Process a run folder as `beampose run` does, and return its results.

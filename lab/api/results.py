@@ -17,7 +17,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.errors import InputError
-from lab.files.run.results import PoseTrack, has_causal, read_poses, read_result_table, read_summary
+from lab.files.run.results import PoseTrack, has_causal, read_poses, read_result_table, read_summary, run_folder_named
 from lab.files.run.run_file import Run, load_run
 from lab.files.text import columns
 from lab.files.text.csv_table import Categorical, Table
@@ -177,9 +177,9 @@ class Results:
     def run_folder(self) -> Path:
         """The run folder that was processed. Raises InputError where it is not there."""
         named = str(self.summary.get("run_folder") or "")
-        for folder in (self._given,) if self._given else (Path(named), self.folder / named) if named else ():
-            if folder is not None and folder.is_dir():
-                return folder
+        folder = self._given or run_folder_named(self.folder, named)
+        if folder is not None and folder.is_dir():
+            return folder
         raise InputError(
             f"{self.folder}: its run folder {self._given or named} is not there; name it: lab.load(folder, run=...)"
         )

@@ -122,8 +122,7 @@ def camera(
         valid_days=valid_days,
     )
     with progress_bar("photos") as progress:
-        shown = None if progress is None else lambda done, total, _: progress(done, total)
-        outcome = calibrate_camera(photos, board, out, options, progress=shown)
+        outcome = calibrate_camera(photos, board, out, options, progress=progress)
     conclude(outcome)
 
 

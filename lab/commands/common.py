@@ -18,6 +18,7 @@ from lab.commands.stop_signals import StoppedBySignal, stopped_by_signals, stops
 from lab.cycle_search import search_rarely
 from lab.errors import BeamposeError
 from lab.files.text.error_text import printable
+from lab.progress import Progress
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
 ANY_PATH = click.Path(path_type=Path)
@@ -204,16 +205,16 @@ set_option = click.option(
 
 
 @contextlib.contextmanager
-def progress_bar(name: str) -> Iterator[Callable[..., None] | None]:
-    """A progress bar on a terminal, None elsewhere. Its arguments: items done, items in all, stage."""
+def progress_bar(name: str) -> Iterator[Progress | None]:
+    """A progress bar on a terminal, None elsewhere."""
     if not sys.stderr.isatty():
         yield None
         return
+    from rich import progress as rich
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*parts, console=Console(stderr=True), transient=True) as bar:
+    shown = rich.TextColumn("{task.description}"), rich.BarColumn(), rich.MofNCompleteColumn()
+    with rich.Progress(*shown, rich.TimeRemainingColumn(), console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(name, total=None)
 
         def update(done: int, total: int | None, stage: str = "") -> None:

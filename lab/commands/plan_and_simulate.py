@@ -100,7 +100,7 @@ def simulate(
             picture_scale=scale,
             rig=rig,
             known_rig=known_rig,
-            progress=None if progress is None else lambda done, total: progress(done, total),
+            progress=progress,
         )
     show_line(f"run: {folder}")
 

@@ -292,8 +292,7 @@ def pair(left: Path, right: Path, board: str, out: Path, names: str, lens: str, 
         raise InputError(f"--names: expected two names with a comma between them, got {names!r}")
     options = PairOptions((both[0], both[1]), lens, valid_days)
     with progress_bar("photos") as progress:
-        shown = None if progress is None else lambda done, total, _: progress(done, total)
-        outcome = calibrate_pair_folder(left, right, board, out, options, progress=shown)
+        outcome = calibrate_pair_folder(left, right, board, out, options, progress=progress)
     conclude(outcome)
 
 

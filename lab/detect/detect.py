@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -22,6 +22,7 @@ from lab.files.text.csv_text import csv_word
 from lab.files.text.json_text import has_schema, write_json
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import PictureSource, Video, open_inputs, pictures, pictures_of_frames
+from lab.progress import Progress
 from lab.runs.frames.sensor_noise import noise_frames
 from lab.runs.tables import detection_rows
 from lab.versions import versions
@@ -30,8 +31,6 @@ from tracking.parameters import DetectParameters, TrackerParameters
 SCHEMA = "beampose/detect/1"
 SHEET = "contact-sheet.png"
 _NAMED = 5  # frames that a note names for each kind of problem
-
-Progress = Callable[[int, int | None], None]  # pictures done, total number of pictures where known
 
 
 @dataclass(frozen=True, slots=True)

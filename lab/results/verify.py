@@ -18,9 +18,10 @@ from lab.files.run.fingerprints import fingerprints
 from lab.files.run.run_file import LiveDevice, Run, load_run
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.json_text import read_json
+from lab.progress import Progress
 from lab.runs.frames.pipeline import Pipeline
 from lab.runs.process import write_tables
-from lab.runs.smoothing_pass import Progress, TrackingAndSmoothing
+from lab.runs.smoothing_pass import TrackingAndSmoothing
 from lab.runs.summary import SUMMARY_SCHEMA
 from lab.versions import versions
 from tracking.parameters import TrackerParameters

@@ -20,12 +20,13 @@ from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.json_text import has_schema, write_json
 from lab.findings.finding import Level
 from lab.findings.finding import verdict as verdict_of
+from lab.progress import Progress
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.model_check.frame_sampler import FrameSampler, stated_covariances, widths
 from lab.runs.run_log import RunLog, listening
 from lab.runs.run_tally import RunTally
 from lab.runs.setup_check.check import mistakes_of_run, pictures_sampler
-from lab.runs.smoothing_pass import Progress, TrackingAndSmoothing
+from lab.runs.smoothing_pass import TrackingAndSmoothing
 from lab.runs.summary import SUMMARY_SCHEMA, RunResults, summary_of
 from lab.runs.tables import TableWriter
 from lab.runs.verdict import quality

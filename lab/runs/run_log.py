@@ -12,7 +12,7 @@ from typing import Any
 from lab.errors import QUALITY_GATE_FAILED
 from lab.files.run.run_file import Run
 from lab.files.text.error_text import printable
-from lab.runs.smoothing_pass import Progress
+from lab.progress import Progress
 from lab.runs.verdict.quality import Verdict
 
 FILE = "run.log"

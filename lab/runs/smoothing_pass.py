@@ -9,16 +9,16 @@ from __future__ import annotations
 import pickle
 import tempfile
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from lab.progress import Progress
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from tracking.smoothing.recording import TrackedRecording
 from tracking.smoothing.smoothed import Smoothed
 from tracking.smoothing.smoother import smooth
 
-Progress = Callable[[int, int | None, str], None]  # frames done, total number of frames where known, stage
 IN_MEMORY = 1000  # frames, of 11 kB each; writing and reading one takes 0.12 ms
 _PROTOCOL = 4  # of pickle: reads arrays in half the time of protocol 5
 TRACKING, SMOOTHING, WRITING = "tracking", "smoothing", "writing"  # the stages

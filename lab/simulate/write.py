@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +19,7 @@ from lab.files.run.run_file import save_run
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import write_table
+from lab.progress import Progress
 from lab.simulate.picture import LaserPowers, Picture, Sensor, laser_powers, make_sensor, render
 from lab.simulate.points import simulate_points
 from lab.simulate.scenarios import LIGHTS, Scenario
@@ -34,8 +35,6 @@ _PNG = (
 )  # fmt: skip
 _VIDEO_CODEC = "FFV1"  # lossless
 _BATCH = 8  # pictures rendered in parallel before they are written to a video
-
-Progress = Callable[[int, int], None]  # pictures done, pictures in all
 
 
 def simulate(

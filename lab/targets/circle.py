@@ -12,11 +12,11 @@ import numpy as np
 from geometry.arrays import Array
 from lab.errors import InputError
 from lab.number_format import format_number, format_percent
+from lab.progress import Progress
 from lab.report.calibration.calibration_page import Section
 from lab.report.plot.axes import BLUE, VERMILLION
 from lab.report.plot.series import Line
 from lab.targets.page import TimeAxis
-from lab.targets.recording import Progress
 from lab.targets.target import Codes, Target, Track, TrackOptions, quantiles, texts, track_pictures
 from tracking.drogue_circle.candidates import CircleDetector
 from tracking.drogue_circle.detectors import classical_detector

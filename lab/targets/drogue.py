@@ -13,11 +13,11 @@ from geometry.arrays import Array
 from lab.errors import InputError
 from lab.findings.finding import Finding, Level, finding
 from lab.number_format import format_percent
+from lab.progress import Progress
 from lab.report.calibration.calibration_page import PageTable, Section
 from lab.report.plot.axes import BLUE, VERMILLION
 from lab.report.plot.series import Line
 from lab.targets.page import TimeAxis
-from lab.targets.recording import Progress
 from lab.targets.target import Codes, Target, Track, TrackOptions, quantiles, texts, track_pictures
 from tracking.learned_detector.detector import learned_detector
 from tracking.light_tracker.frames import DrogueFrame, LightParameters, Source

@@ -20,12 +20,13 @@ from lab.findings.finding import Finding, Level, finding
 from lab.number_format import format_number, format_percent
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import PictureSource, open_inputs, pictures_of_frames
+from lab.progress import Progress
 from lab.report.calibration.calibration_page import Section
 from lab.report.plot.axes import VERMILLION, histogram
 from lab.report.plot.series import Line
 from lab.runs.frames.sensor_noise import CameraNoise, noise_frames
 from lab.targets.page import TimeAxis
-from lab.targets.recording import Progress, every_frame, read_pictures, read_points
+from lab.targets.recording import every_frame, read_pictures, read_points
 from lab.targets.target import Codes, Target, Track, TrackOptions, header_rate
 from lab.targets.verdict import some_frames
 from tracking.detections import UNMATCHED, Detections

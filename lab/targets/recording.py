@@ -19,12 +19,12 @@ from lab.files.text.csv_text import read_table
 from lab.files.text.error_text import name_of_path
 from lab.pictures.picture_file import DROPPED, MissingPicture
 from lab.pictures.source import PictureFiles, PictureSource, Video, pictures
+from lab.progress import Progress
 from tracking.detections import Detections
 
 DEFAULT_RATE_HZ = 25.0  # of a folder of pictures, whose rate is not known
 _COMPLETE_SHARE = 0.98  # of the pictures that a video's header states
 
-Progress = Callable[[int, int | None], None]  # pictures done, total number of pictures where known
 Looked = TypeVar("Looked")
 P = TypeVar("P", bound=np.ndarray)
 

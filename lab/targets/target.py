@@ -15,8 +15,9 @@ from geometry.arrays import Array, Bools
 from lab.findings.finding import Finding
 from lab.pictures.picture_file import GreyPicture
 from lab.pictures.source import PictureSource, Video, open_inputs
+from lab.progress import Progress
 from lab.report.calibration.calibration_page import Section
-from lab.targets.recording import DEFAULT_RATE_HZ, Progress, Recording, every_frame, read_pictures
+from lab.targets.recording import DEFAULT_RATE_HZ, Recording, every_frame, read_pictures
 from tracking.statuses import Cause, PoseStatus
 
 LEAST_MEASURED = 0.5  # share of the frames; with less, the tracker may have followed something else in the others

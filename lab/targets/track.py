@@ -12,9 +12,9 @@ from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import write_table
 from lab.files.text.json_text import has_schema, write_json
 from lab.findings.finding import Finding
+from lab.progress import Progress
 from lab.targets.overlay import write_overlay
 from lab.targets.page import write_target_page
-from lab.targets.recording import Progress
 from lab.targets.target import F, Target, Track
 from lab.targets.verdict import Outcome, findings_of, verdict_block
 from lab.versions import versions

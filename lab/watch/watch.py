@@ -23,10 +23,11 @@ from lab.errors import InputError, RunError
 from lab.files.run.run_file import LiveDevice, Run
 from lab.files.text.atomic_write import atomic_folder
 from lab.pictures.picture_file import GreyPicture
+from lab.progress import Progress
 from lab.runs.frames.pipeline import Pipeline, tracker_of
 from lab.runs.frames.sensor_noise import CameraNoise
 from lab.runs.process import RunOutcome, are_results, ready_run, write_results
-from lab.runs.smoothing_pass import TRACKING, Progress
+from lab.runs.smoothing_pass import TRACKING
 from lab.runs.verdict.frame_checks import FrameChecks
 from lab.watch.live_background import LiveBackground
 from lab.watch.live_frames import LiveFrames, WatchOptions

@@ -24,7 +24,7 @@ from geometry.camera import FISHEYE, PERSPECTIVE
 from lab.calibrate.camera.camera_findings import findings_of, next_photographs
 from lab.calibrate.camera.camera_page import page_of
 from lab.calibrate.camera.corner_tables import TABLE_SUFFIXES, read_corner_table
-from lab.calibrate.camera.photos import PhotoSet, Progress, find_in_photos, origins_of
+from lab.calibrate.camera.photos import PhotoSet, find_in_photos, origins_of
 from lab.calibrate.step import Outcome, Solved, Step, run_step
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.board_file import load_board_or_text
@@ -34,6 +34,7 @@ from lab.files.text.csv_text import write_table
 from lab.files.text.error_text import suggest_name
 from lab.findings.finding import Finding, Level, verdict
 from lab.number_format import format_number
+from lab.progress import Progress
 
 CAMERA, FAILED, CORNERS = "camera.yaml", "camera.failed.yaml", "corners.csv"
 CORNER_COLUMNS = ("view", "id", "u_px", "v_px", "residual_u_px", "residual_v_px", "used")  # measured minus model

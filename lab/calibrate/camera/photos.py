@@ -6,7 +6,7 @@ import glob
 import hashlib
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from calibration.boards.board_view import QUICK_SEARCH_FAILED, BoardView, GreyIm
 from lab.errors import InputError
 from lab.pictures.picture_file import PICTURE_SUFFIXES, UNREADABLE, GreyPicture, MissingPicture, read_picture
 from lab.pictures.source import pictures, video_at
+from lab.progress import Progress
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm")
 VIDEO_PICTURES = 120  # largest number of frames used of one video, evenly spaced: neighbouring frames differ little
@@ -30,8 +31,6 @@ _THOROUGH_SEARCHES = 2
 # 111 frames, 63 of them without the board, takes 6 s instead of 25.
 _REASONS = 10
 _DUPLICATE = "the same picture as "
-
-Progress = Callable[[int, int, str], None]  # pictures processed, number of pictures, name of the last picture
 
 
 @dataclass(frozen=True, slots=True)

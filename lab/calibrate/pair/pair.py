@@ -17,7 +17,7 @@ from calibration.pair.pair_calibration import CalibratedPair, PairError, calibra
 from geometry.arrays import Array
 from lab.calibrate.camera.camera import LENSES, corner_table
 from lab.calibrate.camera.camera_findings import findings_of as lens_findings
-from lab.calibrate.camera.photos import PhotoSet, Progress, find_in_photos
+from lab.calibrate.camera.photos import PhotoSet, find_in_photos
 from lab.calibrate.step import Outcome, Solved, Step, run_step
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.board_file import load_board_or_text
@@ -28,6 +28,7 @@ from lab.files.text.error_text import suggest_name
 from lab.findings.finding import Finding, Level, finding, level_above, verdict
 from lab.number_format import format_length, format_number
 from lab.pictures.source import number_of
+from lab.progress import Progress
 from lab.report.calibration.calibration_page import KeyFigure, PageTable, Section
 from tracking.binocular.marker_model import StereoPair, calibration_jacobian, project
 

@@ -29,13 +29,14 @@ from lab.calibrate.rig.rig_findings import RigLimits, RigResult, joint_findings
 from lab.calibrate.rig.rig_page import page_of
 from lab.calibrate.rig.rig_tables import RESIDUALS, write_residuals
 from lab.calibrate.screens.screen_findings import ScreenLimits, near_findings, network_findings, survey_findings
-from lab.calibrate.screens.screen_inputs import SearchProgress, adjusted_screens, screen_inputs
+from lab.calibrate.screens.screen_inputs import adjusted_screens, screen_inputs
 from lab.calibrate.step import Outcome, Solved, Step, calibration_date, expiry_date, expiry_findings, run_step
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project, load_project
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import RigFile, covariance_blocks, save_rig
 from lab.findings.finding import Finding, Level, finding, passed, reasons, verdict, worst_first
+from lab.progress import Progress
 
 RIG = "rig.yaml"
 FAILED_RIG = "rig.failed.yaml"  # file name if the verdict is FAIL, so that no program reads it by mistake
@@ -50,7 +51,7 @@ def calibrate_rig(
     today: datetime.date | None = None,
     limits: RigLimits | None = None,
     *,
-    progress: SearchProgress | None = None,
+    progress: Progress | None = None,
 ) -> Outcome[RigResult]:
     """Calibrate a whole rig; write rig.yaml, residuals.csv and report.html into the folder `out`.
 
@@ -66,7 +67,7 @@ def calibrate_rig(
 
 
 def _solve(
-    project_path: Path, today: datetime.date | None, limits: RigLimits, progress: SearchProgress | None
+    project_path: Path, today: datetime.date | None, limits: RigLimits, progress: Progress | None
 ) -> Solved[RigResult]:
     project = load_project(project_path)
     day = calibration_date(project, today)

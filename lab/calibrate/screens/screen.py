@@ -13,7 +13,7 @@ from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
 from calibration.screens.screens import ScreensResult
 from geometry.rig import Rig
 from lab.calibrate.screens.screen_findings import near_findings, network_findings, survey_findings
-from lab.calibrate.screens.screen_inputs import SearchProgress, adjusted_screens, screen_inputs
+from lab.calibrate.screens.screen_inputs import adjusted_screens, screen_inputs
 from lab.calibrate.screens.screen_page import page_of
 from lab.calibrate.screens.screen_tables import DOTS, RESIDUALS, write_tables
 from lab.calibrate.step import Outcome, Solved, Step, calibration_date, expiry_date, expiry_findings, run_step
@@ -22,6 +22,7 @@ from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import RigFile, covariance_blocks, save_rig
 from lab.files.rig.screens_file import ScreensFile, save_screens
 from lab.findings.finding import Finding, Level, finding, reasons, verdict
+from lab.progress import Progress
 
 SCREENS, RIG = "screens.yaml", "rig.yaml"
 
@@ -30,7 +31,7 @@ _STEP = Step("Screens", (DOTS, RESIDUALS), SCREENS)
 
 
 def calibrate_screen(
-    project_path: Path, out: Path, today: datetime.date | None = None, *, progress: SearchProgress | None = None
+    project_path: Path, out: Path, today: datetime.date | None = None, *, progress: Progress | None = None
 ) -> Outcome[ScreensResult]:
     """Calibrate the screens and the poses of the cameras of a project.
 
@@ -45,7 +46,7 @@ def calibrate_screen(
     return run_step(_STEP, out, lambda: _solve(Path(project_path), today, progress))
 
 
-def _solve(project_path: Path, today: datetime.date | None, progress: SearchProgress | None) -> Solved[ScreensResult]:
+def _solve(project_path: Path, today: datetime.date | None, progress: Progress | None) -> Solved[ScreensResult]:
     project = load_project(project_path)
     day = calibration_date(project, today)
     inputs = screen_inputs(project)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 
@@ -31,6 +30,7 @@ from lab.files.project.point_files import Observations, Survey, read_observation
 from lab.files.project.project import Cloud, Project, ScreenEntry
 from lab.files.text.error_text import suggest_name
 from lab.files.text.range_checks import MAX_SCAN_COORDINATE
+from lab.progress import Progress
 
 # Reads and checks the tables, boards and scans of a calibration project and builds the network to be adjusted.
 
@@ -289,12 +289,11 @@ def _points(cloud: Cloud) -> tuple[Array, list[str]]:
 # The pixels alone cannot detect a rotated or mirrored world frame; `calibrate screen` and `calibrate rig` start here.
 
 
-SearchProgress: TypeAlias = Callable[[int, int], None]
 _SUSPICIOUS_MISFIT = 4.0  # misfit (see survey_diagnosis.py) above which swapped axes and wrong units are tested
 _ACCEPTED_MISFIT = 2.0  # misfit below which a change to the survey is accepted as the explanation
 
 
-def adjusted_screens(project: Project, inputs: ScreenInputs, progress: SearchProgress | None = None) -> ScreensResult:
+def adjusted_screens(project: Project, inputs: ScreenInputs, progress: Progress | None = None) -> ScreensResult:
     """Adjust cameras and screens to the survey; if they do not fit, find the mistake in the survey.
 
     progress: called with the number of changes to the survey that have been tried, and of all.

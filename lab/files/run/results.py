@@ -50,6 +50,11 @@ def _check_frames(table: Table) -> None:
             raise table.error(i, f"t_s: expected seconds, got {table.found('t_s', i)}; process the run again")
 
 
+def run_folder_named(results: Path, named: str) -> Path | None:
+    """The run folder that summary.json names, from here or from the results; None where it is not there."""
+    return next((p for p in (Path(named), results / named) if named and p.is_dir()), None)
+
+
 @dataclass(frozen=True, slots=True)
 class SpotGrid:
     """spots.csv by frame and view: F frame numbers, V views."""

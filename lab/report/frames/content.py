@@ -23,6 +23,7 @@ from lab.files.run.results import (
     read_result_table,
     read_spots,
     read_summary,
+    run_folder_named,
 )
 from lab.files.run.run_file import FramesFolder, Run, VideoFile, load_run
 from lab.files.text.error_text import name_of_path
@@ -122,7 +123,7 @@ def _run_of(results: Path, given: Path | None, named: str) -> tuple[Run | None, 
     """The run of results and, where it cannot be read, why. Raises InputError for a given folder that is no run."""
     if given is not None:
         return load_run(given), ()
-    folder = next((p for p in (Path(named), results / named) if named and p.is_dir()), None)
+    folder = run_folder_named(results, named)
     if folder is None:
         return None, ("the run folder is not there: no pictures and no beam tracks; name it with --run",)
     try:

@@ -11,7 +11,7 @@ import numpy as np
 from geometry.arrays import Array, Bools
 from geometry.forward_model import SpotModel
 from lab.errors import BeamposeError
-from lab.files.run.results import PoseTrack, SpotGrid, read_summary
+from lab.files.run.results import PoseTrack, SpotGrid, read_summary, run_folder_named
 from lab.files.run.run_file import Run, load_run
 from lab.files.text.error_text import name_of_path
 from lab.report.run.summary import RunSummary, summary_of
@@ -108,8 +108,7 @@ def _reachable(results: Path, run_folder: Path | None, summary: RunSummary) -> P
     """The run folder given or named by summary.json, where it exists."""
     if run_folder is not None:
         return run_folder if run_folder.is_dir() else None
-    named = summary.run_folder
-    return next((p for p in (Path(named), results / named) if named and p.is_dir()), None)
+    return run_folder_named(results, summary.run_folder)
 
 
 def _residuals(spots: SpotGrid, poses: PoseTrack, run: Run) -> tuple[Array | None, float | None]:

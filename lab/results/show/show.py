@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +14,7 @@ from lab.errors import InputError
 from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_bytes
 from lab.files.text.error_text import suggest_name
+from lab.progress import Progress
 from lab.report.frames.canvas import Pixels, png
 from lab.report.frames.content import FrameContent, ResultData, frame_content, read_result_data
 from lab.report.frames.sheet import Layout, sheet
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from lab.runs.frames.pipeline import FrameRecord, Pipeline
 
 
-Progress = Callable[..., None]  # frames done, frames in all, stage
 PICTURE_SUFFIX = ".png"
 
 

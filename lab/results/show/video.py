@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import numpy as np
 from geometry.arrays import Ints
 from lab.errors import InputError
 from lab.pictures.overlay_video import write_overlay_video
+from lab.progress import Progress
 from lab.report.frames.canvas import Pixels
 from lab.report.frames.content import ResultData, frame_content, pictures_of, pose_words, read_result_data
 from lab.report.frames.sheet import Layout, Limits, limits_of, sheet
@@ -38,7 +39,7 @@ def write_video(
     last: int | None = None,
     every: int = 1,
     fps: float = DEFAULT_FPS,
-    progress: Callable[[int, int | None, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> WrittenVideo:
     """Write overlay.mp4 (or .avi) into a results folder; it is complete or as it was before.
 
@@ -69,9 +70,7 @@ def _selected(data: ResultData, first: int | None, last: int | None, every: int)
     return indices
 
 
-def _images(
-    data: ResultData, indices: Ints, progress: Callable[[int, int | None, str], None] | None
-) -> Generator[Pixels, None, None]:
+def _images(data: ResultData, indices: Ints, progress: Progress | None) -> Generator[Pixels, None, None]:
     """The pictures of the video, all of one size with even sides."""
     cameras = list(data.spots.cameras)
     layout = Layout.of([data.sizes_px[c] for c in cameras], small=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import combinations
 
@@ -15,13 +14,13 @@ from lab.files.run.run_file import Run
 from lab.files.run.truth import largest_disagreement_px, load_run_truth
 from lab.pictures.picture_file import DROPPED, UNREADABLE, MissingPicture
 from lab.pictures.source import PictureFiles
+from lab.progress import Progress
 from lab.runs.frames.even_sampler import EvenSampler
 from lab.runs.frames.frames import FrameReader, FrameSet
 from lab.runs.input_check.findings import Findings, table
 from lab.runs.setup_check.check import MOST_KEPT
 from tracking.detections import Detections
 
-Progress = Callable[[int, int | None], None]  # frames done, total number of frames where known
 AGREES_PX = 0.01  # px: truth written with two decimals agrees with the rig to this
 RAGGED_TIMES = 3.0  # a step between timestamps larger or smaller than nominal by this factor is remarked
 

@@ -21,7 +21,7 @@ from lab.files.text.json_text import has_schema, write_json
 from lab.findings.finding import Finding
 from lab.number_format import format_length
 from lab.pictures.picture_file import MissingPicture
-from lab.targets.recording import Progress
+from lab.progress import Progress
 from lab.targets.stereo.findings import findings_of
 from lab.targets.stereo.frames import Content, StereoFrame, stereo_frames
 from lab.targets.stereo.page import write_stereo_page
