@@ -53,6 +53,13 @@ def _track(ctx: click.Context, target: Target[Any], given: Path, out: Path) -> N
     "--min-radius", default=7.0, show_default=True, type=NumberRange(4, 10_000), help="Smallest radius to look for, px."
 )
 @click.option("--max-radius", type=NumberRange(4, 10_000), help="Largest one; default: half of the smaller side.")
+@click.option(
+    "--edge",
+    default="supported",
+    show_default=True,
+    type=click.Choice(["supported", "outer", "inner", "opening"]),
+    help="Which edge, where a target has several: of the rim, of a thin rim's inner side, of the opening inside it.",
+)
 @click.option("--rate", type=NumberRange(0.01, 1e6), help="Frames per second; default: the video's, or 25.")
 @click.option(
     "--form",
@@ -78,6 +85,7 @@ def circle(
     near: tuple[float, float] | None,
     min_radius: float,
     max_radius: float | None,
+    edge: str,
     rate: float | None,
     form: str,
     detector: str,
@@ -95,7 +103,9 @@ def circle(
     """
     from lab.targets.circle import CircleOptions, CircleTarget
 
-    options = CircleOptions(near, min_radius, max_radius, form, detector, rate_hz=rate, overlay=video, limit=limit)
+    options = CircleOptions(
+        near, min_radius, max_radius, form, detector, edge, rate_hz=rate, overlay=video, limit=limit
+    )
     _track(ctx, CircleTarget(options), pictures, out)
 
 

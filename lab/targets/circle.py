@@ -9,6 +9,7 @@ from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
+from calibration.findings import Finding, Level
 from geometry.arrays import Array
 from lab.errors import InputError
 from lab.number_format import format_number, format_percent
@@ -20,7 +21,7 @@ from lab.targets.page import TimeAxis
 from lab.targets.target import Codes, Target, Track, TrackOptions, quantiles, texts, track_pictures
 from tracking.drogue_circle.candidates import CircleDetector
 from tracking.drogue_circle.detectors import classical_detector
-from tracking.drogue_circle.parameters import CircleParameters
+from tracking.drogue_circle.parameters import CircleParameters, Edge
 from tracking.drogue_circle.printed import PrintedTracker
 from tracking.drogue_circle.rim_fit import CircleFrame
 from tracking.drogue_circle.tracker import CircleTracker
@@ -36,6 +37,7 @@ DETECTORS: Mapping[str, Callable[[CircleParameters], CircleDetector]] = {
 }
 SOUND, PRINTED = "sound", "printed"
 FORMS = (SOUND, PRINTED)
+EDGES = tuple(e.value for e in Edge)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +49,7 @@ class CircleOptions(TrackOptions):
     max_radius_px: float | None = None  # None: half of the picture's smaller side
     form: str = SOUND  # of the noise and the measurement: sound, or as printed
     detector: str = "classical"
+    edge: str = Edge.SUPPORTED.value  # of a target with several about one centre
 
     def parameters(self) -> CircleParameters:
         """The parameters of the tracker.
@@ -58,10 +61,11 @@ class CircleOptions(TrackOptions):
             raise InputError(
                 f"--max-radius: expected more than --min-radius ({self.min_radius_px:g} px), got {self.max_radius_px:g}"
             )
-        for option, value, known in (("form", self.form, FORMS), ("detector", self.detector, tuple(DETECTORS))):
+        choices = ("form", self.form, FORMS), ("detector", self.detector, tuple(DETECTORS)), ("edge", self.edge, EDGES)
+        for option, value, known in choices:
             if value not in known:
                 raise InputError(f"--{option}: expected one of {', '.join(known)}, got {value!r}")
-        return CircleParameters(min_radius_px=self.min_radius_px, max_radius_px=self.max_radius_px)
+        return CircleParameters(self.min_radius_px, self.max_radius_px, Edge(self.edge))
 
     def tracker(self) -> Tracker:
         """A tracker before its first picture. Raises InputError as `parameters` does."""
@@ -126,6 +130,21 @@ class CircleTarget(Target[CircleFrame]):
             cells += texts([fit.coverage, fit.rms_px, *fit.circle, radius + away, radius - away, angle])
         return [number, f"{number / rate_hz:.9g}", *cells]
 
+    def findings(self, track: Track[CircleFrame]) -> list[Finding]:
+        """Several edges about one centre, without a choice by the user."""
+        starts = [f for f in track.frames if len(f.edges_px) > 1 and f.measured is not None]
+        if self.options.edge != Edge.SUPPORTED or not starts:
+            return []
+        first = starts[0]
+        radii = ", ".join(f"{r:.1f}" for r in first.edges_px)
+        what = (
+            f"the circle has {len(first.edges_px)} edges about one centre (radii {radii} px); the one of"
+            f" {first.place[2]:.1f} px is tracked, the outermost of the best supported"
+        )
+        why = "The radius is that of another circle if another edge was meant."
+        remedy = "State the edge: --edge outer, inner or opening."
+        return [Finding(Level.WARN, what, why, remedy, code="BP-T06")]
+
     def figures(self, track: Track[CircleFrame]) -> dict[str, Any]:
         fitted, quality = np.isfinite(_fits(track)[:, 0]), _quality(track)
         block = {
@@ -134,6 +153,7 @@ class CircleTarget(Target[CircleFrame]):
             "occlusion": quantiles(quality[:, 0]),
             "coverage": quantiles(quality[:, 1]),
             "rms_px": quantiles(quality[:, 2]),
+            "edges_px": next((list(f.edges_px) for f in track.frames if f.edges_px), []),
         }
         return {"circle": block}
 

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import erf
 
+import cv2
 import numpy as np
 
 from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window
-from tracking.drogue_circle.parameters import CircleParameters
+from tracking.drogue_circle.parameters import CircleParameters, Edge
 from tracking.drogue_circle.rim_fit import RimFit, SmoothCrop, fit_rim, smooth_crop
 
 _MOST_FITTED = 24  # of the whole picture
@@ -17,7 +18,13 @@ _SAME_CENTRE = 0.6  # distance of two centres, as a share of the larger radius, 
 _RIM_SHARE = 0.92  # score of the outermost circle of a target, as a share of the best one's, that makes it the rim
 _LEAST_POINTS = 12  # independent edge points: texture often gives a short arc of a small circle
 _CORRELATED_PX = 3.5  # length of rim that counts as one point, see `rim_fit`
-_LARGEST_RMS = 0.05, 0.35  # of the rim points: share of the radius, and px
+# Residuals of the rim points, RMS: share of the radius, and px. Of plain and ribbed discs they are .10 to .16 px, of
+# textured ones of 27 px .3 px, of the round outlines of clouds, fields and waves .5 to .8 px at 9 to 19 px.
+_LARGEST_RMS = 0.012, 0.15
+_EDGE_SHARE = 0.6  # score of another edge of a target, as a share of the best one's
+_THIN, _OPENING = 0.85, 0.9  # radii of the inner edge of a thin rim and of an opening, as shares of the outer edge's
+_REACH, _MOST_EDGES = 3.2, 10  # of the search for other edges: radii, and number
+_APART = 0.99  # radius of another edge, the same
 # Starts of `_best_near`: shift of the centre and change of the radius, as shares of the radius.
 _SHIFT, _SHIFTS, _GROWTH = 0.12, 6, (0.9, 1.0, 1.1)
 _MOST_SHIFT_PX = 3.0
@@ -41,19 +48,85 @@ class Acquisition:
 
     found: RimFit | None  # None: no circle, or the choice is ambiguous
     circles: tuple[RimFit, ...]  # all separate circles, the best first
+    edges: tuple[RimFit, ...] = ()  # of the best one, the outermost first
 
 
 def acquire(picture: Picture, detector: CircleDetector, p: CircleParameters, wanted: Wanted) -> Acquisition:
-    """Search the whole picture for the circle. Circles about one centre are one target: its outermost is returned."""
+    """Search the whole picture for the circle. Circles about one centre are the edges of one target.
+
+    Where nothing is known about the radius, the edge that `p` asks for is returned.
+    """
     fits = sorted(_fitted(picture, detector(picture, None), p, wanted), key=lambda f: -f.score)
     targets: list[RimFit] = []
+    edges: tuple[RimFit, ...] = ()
     while fits:
         own = [f for f in fits if _is_same(f, fits[0])]
         # The inner circles of a target may be off its centre: those of a drogue lie deeper.
-        targets.append(max((f for f in own if f.score >= _RIM_SHARE * own[0].score), key=lambda f: f.rim.radius_px))
+        targets.append(_supported(own))
+        edges = edges or _edges([*own, *_about(picture, targets[0], p)])
         fits = [f for f in fits if not any(f is o for o in own) and not _is_same(f, targets[-1])]
     clear = len(targets) == 1 or (len(targets) > 1 and targets[1].score < p.ambiguous_share * targets[0].score)
-    return Acquisition(targets[0] if clear else None, tuple(targets))
+    found = None
+    if clear:
+        found = targets[0] if wanted.radius_px is not None else _chosen(edges, targets[0], p.edge)
+    return Acquisition(found, tuple(targets), edges)
+
+
+def _supported(fits: Sequence[RimFit]) -> RimFit:
+    """The outermost of the fits that are supported about as well as the best one."""
+    best = max(f.score for f in fits)
+    return max((f for f in fits if f.score >= _RIM_SHARE * best), key=lambda f: f.rim.radius_px)
+
+
+def _about(picture: Picture, fit: RimFit, p: CircleParameters) -> list[RimFit]:
+    """More edges about the centre of a fit: the steepest places of the mean grey value along its radius.
+
+    The reduced pictures of the search do not show both edges of a thin rim.
+    """
+    u, v, radius = fit.circle
+    reach = min(_REACH * radius, p.max_radius_px or 0.5 * max(picture.shape[:2]))
+    crop = smooth_crop(picture, Window(u, v, reach + 10, 0.0, 0.0, 0.0), p.blur_px)
+    size = (int(2 * (reach + 4)), 256)  # rows are directions, columns half pixels of the radius
+    polar = cv2.warpPolar(crop.values, size, (u - crop.left, v - crop.top), size[0] / 2, cv2.WARP_POLAR_LINEAR)
+    # Directions that leave the picture count as without a slope.
+    slope = np.gradient(polar.astype(float), axis=1).mean(axis=0)
+    steep = np.abs(slope)
+    peaks = 1 + np.flatnonzero((steep[1:-1] >= steep[:-2]) & (steep[1:-1] > steep[2:]))
+    peaks = peaks[peaks >= 2 * p.min_radius_px]
+    fits = []
+    for i in peaks[np.argsort(-steep[peaks])][:_MOST_EDGES].tolist():
+        start = CircleCandidate(u, v, i / 2, 0.0, int(np.sign(slope[i])))
+        edge = fit_rim(crop, start, p.acquire_coverage, sure=True)
+        if edge is not None and is_certain(edge) and _is_same(edge, fit):
+            fits.append(edge)
+    return fits
+
+
+def _edges(own: Sequence[RimFit]) -> tuple[RimFit, ...]:
+    """The separate edges of a target, the outermost first. own: its fits."""
+    edges: list[RimFit] = []
+    own = sorted(own, key=lambda f: -f.score)
+    for f in own:
+        again = any(
+            f.polarity == e.polarity and _APART < f.rim.radius_px / e.rim.radius_px < 1 / _APART for e in edges
+        )
+        if f.score >= _EDGE_SHARE * own[0].score and not again:
+            edges.append(f)
+    return tuple(sorted(edges, key=lambda f: -f.rim.radius_px))
+
+
+def _chosen(edges: Sequence[RimFit], supported: RimFit, edge: Edge) -> RimFit | None:
+    """The wanted edge of a target; None where it does not show."""
+    if edge is Edge.SUPPORTED:
+        return supported
+    outer = edges[0]
+    if edge is Edge.OUTER:
+        return outer
+    share = [(f, f.rim.radius_px / outer.rim.radius_px) for f in edges[1:]]
+    if edge is Edge.INNER:
+        return next((f for f, r in share if r > _THIN and f.polarity != outer.polarity), None)
+    inside = [f for f, r in share if r < _OPENING]
+    return _supported(inside) if inside else None
 
 
 def _fitted(

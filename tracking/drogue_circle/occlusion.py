@@ -24,7 +24,8 @@ _RATE, _FIRST = 0.1, 8  # of the running means; the first frames are averaged
 _NEXT_TO_RIM, _SECTOR_SHARE = 0.75, 0.5  # part of the radius, and least share of its cells in a sector that match
 _USUAL = 0.35  # share of the rays of a sector, below which its edges are left out
 _USUAL_RMS, _LEAST_RMS_PX = 2.0, 0.3
-_CLEAR = 0.2  # coefficient below which a frame updates the appearance
+_CLEAR = 0.2  # coefficient below which the rim of a frame is that of a clear target
+_CHANGED = 1 / 500  # rate at which cells that look different become the appearance: no probe stays for that long
 _RHO = np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)  # cells of equal area
 _THETA = 2 * np.pi * (np.arange(_SECTORS) + 0.5) / _SECTORS
 _X, _Y = np.outer(_RHO, np.cos(_THETA)), np.outer(_RHO, np.sin(_THETA))
@@ -49,15 +50,22 @@ class Appearance:
         return np.asarray(np.mean(self._matching(cells_dn, inside)[outer], axis=0) < _SECTOR_SHARE)
 
     def updated(self, cells_dn: Array, inside: Bools) -> Appearance:
-        """The appearance with one more clear frame."""
-        rate = max(_RATE, 1 / (self.frames + 1)) if self.frames < _FIRST else _RATE
+        """The appearance with one more frame.
+
+        After the first frames only the cells that look as before are averaged, so that a probe that comes slowly does
+        not become part of the appearance; for the same reason the filled share falls slowly.
+        """
+        new = self.frames < _FIRST
+        rate = max(_RATE, 1 / (self.frames + 1)) if new else _RATE
         away = cells_dn - self.mean_dn
-        away = away - median(away[inside])
-        step = np.where(inside, rate, 0.0)
-        fill = self.fill if self.frames < 2 else self.fill + rate * (self._filled(cells_dn, inside) - self.fill)
+        same = self._matching(cells_dn, inside)
+        away = away - median(away[inside & same] if same.any() else away[inside])
+        step = np.where(inside, np.where(same | new, rate, _CHANGED), 0.0)
+        filled = float(np.mean(same)) - self.fill
+        fill = self.fill if self.frames < 2 else self.fill + (rate if filled > 0 or new else _CHANGED) * filled
         return Appearance(
             self.mean_dn + step * (cells_dn - self.mean_dn),
-            self.deviation_dn + step * (np.abs(away) - self.deviation_dn),
+            self.deviation_dn + np.where(same | new, step, 0.0) * (np.abs(away) - self.deviation_dn),
             float(np.clip(fill, 0.3, 1.0)),
             self.frames + 1,
         )

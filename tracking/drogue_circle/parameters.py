@@ -3,6 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Edge(StrEnum):
+    """Which edge of a target with several ones about the same centre is tracked."""
+
+    SUPPORTED = "supported"  # the outermost of those that are supported about equally well
+    OUTER = "outer"  # of the rim
+    INNER = "inner"  # of a thin rim: the other side of its line
+    OPENING = "opening"  # of the basket: clearly inside the rim
 
 
 @dataclass(frozen=True, slots=True)
@@ -11,6 +21,7 @@ class CircleParameters:
 
     min_radius_px: float = 7.0  # of circles searched in the whole picture (the paper: 10)
     max_radius_px: float | None = None  # None: half of the picture's smaller side (the paper: 30)
+    edge: Edge = Edge.SUPPORTED
     blur_px: float = 1.0  # 1 sigma of the Gaussian filter before gradients
     window_radii: float = 4.0  # side of the search window in radii (section 2.3)
     gate_px: float = 8.0  # sigma: largest distance of a centre from the prediction, at least 3 standard deviations

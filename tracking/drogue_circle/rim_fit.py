@@ -388,6 +388,7 @@ class CircleFrame:
     occlusion: float  # gamma; nan where it is unknown
     found: int = 0  # separate circles, where the whole picture was searched
     event: str = ""  # acquired, reacquired, lost, ambiguous
+    edges_px: tuple[float, ...] = ()  # radii of the edges of the target that was acquired, the outermost first
 
     @property
     def place(self) -> Array:

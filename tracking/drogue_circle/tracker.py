@@ -97,8 +97,8 @@ class Track:
     def update(self, fit: RimFit, gamma: float, p: CircleParameters) -> None:
         """Use a measurement: R = R0 / (1 - gamma)^2 with the covariance of the fit as R0."""
         self.bank = self.bank.updated(fit.centre_and_radius, fit.covariance_px2 / (1 - gamma) ** 2, p.forgetting)
+        self.appearance = self.appearance.updated(*self.cells)
         if is_clear(gamma):
-            self.appearance = self.appearance.updated(*self.cells)
             self.habit = self.habit.updated(fit)
         self.fit, self.misses, self.measured = fit, 0, self.measured + 1
 
@@ -217,7 +217,8 @@ class CircleTracker:
             return replace(nothing_known(cause, event), found=len(search.circles))
         self._track, self._searches = Track.started(picture, search.found, self.parameters), 0
         event = "acquired" if self._trusted is None else "reacquired"
-        return self._at_start(self._track, np.full(3, np.nan), len(search.circles), event)
+        out = self._at_start(self._track, np.full(3, np.nan), len(search.circles), event)
+        return replace(out, edges_px=tuple(f.rim.radius_px for f in search.edges))
 
     def _found_elsewhere(self, track: Track, picture: Picture, predicted: Array) -> CircleFrame | None:
         """The circle outside the window, or with a changed appearance: one that is well seen and has its radius."""

@@ -1,0 +1,177 @@
+"""Circles of the second renderer: what the tracker reports where its own renderings do not show it.
+
+python -m bench.related_measurements.second_checks occlusion SEED COUNT     coefficient against the hidden share
+python -m bench.related_measurements.second_checks empty SEED COUNT         100 frames of COUNT scenes without a target
+python -m bench.related_measurements.second_checks edges SEED COUNT         thin rims: which edge is tracked
+python -m bench.related_measurements.second_checks consistency SEED COUNT   errors of centres against their sigmas
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.related_measurements import second_renderer as render
+from geometry.arrays import Array
+from lab.targets.circle import CircleOptions
+from tracking.drogue_circle.candidates import Picture
+from tracking.drogue_circle.parameters import Edge
+from tracking.statuses import Cause, PoseStatus
+
+_CLEAR, _HELD = 30, 20  # frames before a probe comes, and after it has arrived
+_LEAST_CONTRAST = 30.0  # DN between a probe and the greys of the target: another one cannot be seen
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What a picture shows."""
+
+    circle: Array  # (3,) u, v, radius, px
+    hidden: float  # share of the disc
+    hub_hidden: float  # share of the middle of a ribbed target: the tracked circle, where ribs alternate with the sky
+
+
+def motion(rng: np.random.Generator, moving: bool, radius: tuple[float, float] = (30.0, 90.0)) -> Iterator[Array]:
+    """Circles (3,) of one target: at rest, or swaying and coming nearer by a sixth in a hundred frames."""
+    start = np.array([*rng.uniform((200, 180), (440, 300)), rng.uniform(*radius)])
+    amplitude, period = rng.uniform(3, 25, 2), rng.uniform(40, 120, 2)
+    phase = rng.uniform(0, 2 * np.pi, 2)
+    k = 0
+    while True:
+        sway = amplitude * np.sin(2 * np.pi * k / period + phase) if moving else np.zeros(2)
+        yield start + [*sway, start[2] * k / 600 if moving else 0.0]
+        k += 1
+
+
+def probed(seed: int, kind: str) -> Iterator[tuple[Picture, Truth]]:
+    """A target that a probe covers by 10 to 60 % within 1 to 100 frames."""
+    rng = np.random.default_rng(seed)
+    scene, look = render.background(str(rng.choice(["sky", "cloud"])), rng), render.face(kind, rng)
+    share, steps = rng.uniform(0.1, 0.6), round(float(np.exp(rng.uniform(0, np.log(100)))))
+    rod = render.probe(rng, share)
+    greys = np.array([look.bright, look.dark, 0.55 * look.bright + 0.45 * look.dark])
+    while np.abs(rod.grey - greys).min() < _LEAST_CONTRAST:
+        rod = render.probe(rng, share)
+    circles = motion(rng, bool(rng.random() < 0.5))
+    outside = 1.0 + rod.half_width
+    end = rod.covering(share).tip
+    for k in range(_CLEAR + steps + _HELD):
+        part = min(max((k - _CLEAR + 1) / steps, 0), 1)
+        now = None
+        if part > 0:
+            now = render.replace(rod, tip=outside + part * (end - outside))
+        circle = next(circles)
+        shares = (0.0, 0.0) if now is None else (now.share(), now.share(render.HUB))
+        yield render.draw(scene, look, *circle, rng, now), Truth(circle, *shares)
+
+
+def occlusion(seed: int, count: int) -> None:
+    """Mean error of the coefficient, and how often it reports a probe that is not there."""
+    for kind in ("plain", "ribbed"):
+        errors, ends, false, unseen = [], [], [], 0
+        for n in range(count):
+            tracker = CircleOptions(edge="outer").tracker()
+            for k, (picture, truth) in enumerate(probed(1000 * seed + n, kind)):
+                frame = tracker.step(picture)
+                if k < 5:
+                    continue
+                if k == 5:
+                    hub = frame.state[2] < 0.6 * truth.circle[2]
+                hidden = truth.hub_hidden if hub else truth.hidden
+                if not np.isfinite(frame.occlusion):
+                    unseen += 1
+                elif truth.hidden == 0:
+                    false.append(frame.occlusion > 0.1)
+                else:
+                    errors.append(abs(frame.occlusion - hidden))
+            ends.append(abs(frame.occlusion - hidden))
+        print(
+            f"{kind}: mean error {np.mean(errors):.3f}, of the last frames {np.nanmean(ends):.3f}; above .1 without a"
+            f" probe {100 * np.mean(false):.2f} % of {len(false)} frames; unknown in {unseen}"
+        )
+
+
+def empty(seed: int, count: int) -> None:
+    """Frames of drifting scenes without a target that are measured."""
+    for kind in render.BACKGROUNDS:
+        measured, ambiguous, radii = 0, 0, []
+        for n in range(count):
+            rng = np.random.default_rng(1000 * seed + n)
+            wide = render.background(kind, rng, (render.SIZE[0] + 110, render.SIZE[1] + 110))
+            drift = rng.uniform(0, 1, 2)
+            tracker = CircleOptions().tracker()
+            for k in range(100):
+                left, top = np.floor(drift * k).astype(int)
+                scene = wide[top : top + render.SIZE[1], left : left + render.SIZE[0]]
+                frame = tracker.step(render.draw(scene, None, 0, 0, 0, rng))
+                measured += frame.status is PoseStatus.MEASURED
+                ambiguous += frame.cause is Cause.AMBIGUOUS
+                if frame.event in ("acquired", "reacquired"):
+                    radii.append(float(frame.state[2]))
+        print(
+            f"{kind}: {measured} of {100 * count} frames measured, {ambiguous} ambiguous; radii of the acquisitions"
+            f" {np.round(radii, 1).tolist()}"
+        )
+
+
+def edges(seed: int, count: int) -> None:
+    """Thin rims: the error of the radius of the tracked edge, and which one it is."""
+    for edge in Edge:
+        right, reported, frames, n_measured, away = 0, 0, 0, 0, []
+        for n in range(count):
+            rng = np.random.default_rng(1000 * seed + n)
+            scene, look = render.background(str(rng.choice(["sky", "cloud"])), rng), render.face("thin", rng)
+            circles, tracker = motion(rng, n % 2 == 1, (30.0, 120.0)), CircleOptions(edge=edge.value).tracker()
+            for _ in range(30):
+                circle = next(circles)
+                frame = tracker.step(render.draw(scene, look, *circle, rng))
+                reported += len(frame.edges_px) > 1
+                frames += 1
+                if frame.status is PoseStatus.MEASURED:
+                    radii = circle[2] * np.array([1.0, 1 - render.THIN, render.OPENING])
+                    nearest = int(np.argmin(np.abs(radii - frame.state[2])))
+                    n_measured += 1
+                    right += edge is Edge.SUPPORTED or nearest == list(Edge).index(edge) - 1
+                    away.append(frame.state[2] - radii[nearest])
+        print(
+            f"{edge.value}: measured {n_measured} of {frames}, the right edge in {right}; several edges reported in"
+            f" {reported} of {count} videos; radius: bias {np.mean(away):+.3f}, RMS {np.sqrt(np.mean(np.square(away))):.3f} px"
+        )
+
+
+def consistency(seed: int, count: int) -> None:
+    """NEES / 2 of the reported centre by kind: 60 frames of COUNT videos each, the first 10 left out."""
+    for kind in ("plain", "ribbed", "textured", "thin"):
+        nees, errors, sigmas = [], [], []
+        for n in range(count):
+            rng = np.random.default_rng(1000 * seed + n)
+            scene, look = render.background(str(rng.choice(["sky", "cloud"])), rng), render.face(kind, rng)
+            circles, tracker = motion(rng, n % 2 == 1, (30.0, 120.0)), CircleOptions(edge="outer").tracker()
+            own = []
+            for k in range(60):
+                circle = next(circles)
+                frame = tracker.step(render.draw(scene, look, *circle, rng))
+                if k >= 10 and frame.status is PoseStatus.MEASURED:
+                    away = frame.state[:2] - circle[:2]
+                    own.append(away @ np.linalg.solve(frame.covariance[:2, :2], away) / 2)
+                    errors.append(np.hypot(*away))
+                    sigmas.append(np.sqrt(np.trace(frame.covariance[:2, :2])))
+            nees.append(np.mean(own) if own else np.nan)
+        good = np.mean((np.array(nees) > 0.8) & (np.array(nees) < 1.3))
+        print(
+            f"{kind}: NEES/2 mean {np.nanmean(nees):.2f}, of videos {np.round(np.nanpercentile(nees, [5, 50, 95]), 2)},"
+            f" {100 * good:.0f} % within .8 to 1.3; error RMS {np.sqrt(np.mean(np.square(errors))):.4f} px,"
+            f" stated {np.sqrt(np.mean(np.square(sigmas))):.4f}; {len(errors)} frames of {50 * count}"
+        )
+
+
+if __name__ == "__main__":
+    what, *rest = sys.argv[1:] or [""]
+    checks = {"occlusion": occlusion, "empty": empty, "edges": edges, "consistency": consistency}
+    if what in checks and len(rest) == 2:
+        checks[what](int(rest[0]), int(rest[1]))
+    else:
+        sys.exit(__doc__)
