@@ -42,7 +42,7 @@ def motion(rng: np.random.Generator, moving: bool, radius: tuple[float, float] =
     k = 0
     while True:
         sway = amplitude * np.sin(2 * np.pi * k / period + phase) if moving else np.zeros(2)
-        yield start + [*sway, start[2] * k / 600 if moving else 0.0]
+        yield start + np.append(sway, start[2] * k / 600 if moving else 0.0)
         k += 1
 
 
@@ -138,7 +138,8 @@ def edges(seed: int, count: int) -> None:
                     away.append(frame.state[2] - radii[nearest])
         print(
             f"{edge.value}: measured {n_measured} of {frames}, the right edge in {right}; several edges reported in"
-            f" {reported} of {count} videos; radius: bias {np.mean(away):+.3f}, RMS {np.sqrt(np.mean(np.square(away))):.3f} px"
+            f" {reported} of {count} videos; radius: bias {np.mean(away):+.3f} px,"
+            f" RMS {np.sqrt(np.mean(np.square(away))):.3f} px"
         )
 
 

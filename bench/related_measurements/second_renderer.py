@@ -176,7 +176,12 @@ def probe(rng: np.random.Generator, most: float) -> Probe:
 
 
 def draw(
-    scene: Array, look: Face | None, u_px: float, v_px: float, radius_px: float, rng: np.random.Generator,
+    scene: Array,
+    look: Face | None,
+    u_px: float,
+    v_px: float,
+    radius_px: float,
+    rng: np.random.Generator,
     rod: Probe | None = None,
 ) -> NDArray[np.uint8]:
     """One picture of a target, or of the scene alone."""  # fmt: skip

@@ -9,9 +9,9 @@ from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
-from calibration.findings import Finding, Level
 from geometry.arrays import Array
 from lab.errors import InputError
+from lab.findings.finding import Finding, Level, finding
 from lab.number_format import format_number, format_percent
 from lab.progress import Progress
 from lab.report.calibration.calibration_page import Section
@@ -139,11 +139,9 @@ class CircleTarget(Target[CircleFrame]):
         radii = ", ".join(f"{r:.1f}" for r in first.edges_px)
         what = (
             f"the circle has {len(first.edges_px)} edges about one centre (radii {radii} px); the one of"
-            f" {first.place[2]:.1f} px is tracked, the outermost of the best supported"
+            f" {first.place[2]:.1f} px is tracked"
         )
-        why = "The radius is that of another circle if another edge was meant."
-        remedy = "State the edge: --edge outer, inner or opening."
-        return [Finding(Level.WARN, what, why, remedy, code="BP-T06")]
+        return [finding("BP-T06", Level.WARN, what)]
 
     def figures(self, track: Track[CircleFrame]) -> dict[str, Any]:
         fitted, quality = np.isfinite(_fits(track)[:, 0]), _quality(track)

@@ -21,6 +21,7 @@ _CORRELATED_PX = 3.5  # length of rim that counts as one point, see `rim_fit`
 # Residuals of the rim points, RMS: share of the radius, and px. Of plain and ribbed discs they are .10 to .16 px, of
 # textured ones of 27 px .3 px, of the round outlines of clouds, fields and waves .5 to .8 px at 9 to 19 px.
 _LARGEST_RMS = 0.012, 0.15
+_START_RMS = 0.05, 0.35  # the same before `_best_near`: a mixture of rims has larger ones
 _EDGE_SHARE = 0.6  # score of another edge of a target, as a share of the best one's
 _THIN, _OPENING = 0.85, 0.9  # radii of the inner edge of a thin rim and of an opening, as shares of the outer edge's
 _REACH, _MOST_EDGES = 3.2, 10  # of the search for other edges: radii, and number
@@ -87,8 +88,8 @@ def _about(picture: Picture, fit: RimFit, p: CircleParameters) -> list[RimFit]:
     reach = min(_REACH * radius, p.max_radius_px or 0.5 * max(picture.shape[:2]))
     crop = smooth_crop(picture, Window(u, v, reach + 10, 0.0, 0.0, 0.0), p.blur_px)
     size = (int(2 * (reach + 4)), 256)  # rows are directions, columns half pixels of the radius
-    polar = cv2.warpPolar(crop.values, size, (u - crop.left, v - crop.top), size[0] / 2, cv2.WARP_POLAR_LINEAR)
-    # Directions that leave the picture count as without a slope.
+    flags = cv2.WARP_POLAR_LINEAR | cv2.WARP_FILL_OUTLIERS
+    polar = cv2.warpPolar(crop.values, size, (u - crop.left, v - crop.top), size[0] / 2, flags)
     slope = np.gradient(polar.astype(float), axis=1).mean(axis=0)
     steep = np.abs(slope)
     peaks = 1 + np.flatnonzero((steep[1:-1] >= steep[:-2]) & (steep[1:-1] > steep[2:]))
@@ -107,9 +108,7 @@ def _edges(own: Sequence[RimFit]) -> tuple[RimFit, ...]:
     edges: list[RimFit] = []
     own = sorted(own, key=lambda f: -f.score)
     for f in own:
-        again = any(
-            f.polarity == e.polarity and _APART < f.rim.radius_px / e.rim.radius_px < 1 / _APART for e in edges
-        )
+        again = any(f.polarity == e.polarity and _APART < f.rim.radius_px / e.rim.radius_px < 1 / _APART for e in edges)
         if f.score >= _EDGE_SHARE * own[0].score and not again:
             edges.append(f)
     return tuple(sorted(edges, key=lambda f: -f.rim.radius_px))
@@ -145,7 +144,7 @@ def _fitted(
         window = Window(c.u_px, c.v_px, half, p.gate_px, p.min_radius_px, 2 * c.radius_px)
         crop = smooth_crop(picture, window, p.blur_px)
         fit = fit_rim(crop, c, p.acquire_coverage)
-        if fit is not None and is_certain(fit):
+        if fit is not None and is_certain(fit, _START_RMS):
             fit = _best_near(crop, fit, p)
         largest = p.max_radius_px or 0.5 * max(picture.shape[:2])
         if (
@@ -184,10 +183,10 @@ def _clean_share(fit: RimFit) -> float:
     return fit.coverage * erf(near / (np.sqrt(2) * max(fit.rms_px, 1e-3)))
 
 
-def is_certain(fit: RimFit) -> bool:
+def is_certain(fit: RimFit, largest_rms: tuple[float, float] = _LARGEST_RMS) -> bool:
     """Whether a rim has enough precise edge points that texture does not imitate it."""
     points = fit.coverage * 2 * np.pi * fit.rim.radius_px / _CORRELATED_PX
-    return bool(points >= _LEAST_POINTS and fit.rms_px <= _LARGEST_RMS[0] * fit.rim.radius_px + _LARGEST_RMS[1])
+    return bool(points >= _LEAST_POINTS and fit.rms_px <= largest_rms[0] * fit.rim.radius_px + largest_rms[1])
 
 
 def _may_be(c: CircleCandidate, wanted: Wanted) -> bool:

@@ -87,6 +87,17 @@ def test_the_occlusion_coefficient_is_the_hidden_share_of_the_area():
     assert sectors[9:23].all()
 
 
+def test_a_probe_that_comes_slowly_does_not_become_part_of_the_appearance():
+    disc = [(80.0, 60.0, 30.0)]
+    appearance = first_appearance(*disc_cells(discs(disc), 80.0, 60.0, 30.0))
+    for k in range(10):
+        appearance = appearance.updated(*disc_cells(discs(disc, seed=k), 80.0, 60.0, 30.0))
+    for k in range(130):  # half a pixel per frame, then at rest over the left half
+        cells = disc_cells(covered(discs(disc, seed=k), (0, min(50 + k // 2, 80)), (0, 120)), 80.0, 60.0, 30.0)
+        appearance = appearance.updated(*cells)
+    assert appearance.coefficient(*cells) == pytest.approx(0.5, abs=0.06)
+
+
 def test_an_approach_and_a_small_change_of_the_light_are_no_occlusions():
     appearance = first_appearance(*disc_cells(discs([(80.0, 60.0, 30.0)]), 80.0, 60.0, 30.0))
     larger = disc_cells(discs([(80.0, 60.0, 45.0)]), 80.0, 60.0, 45.0)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.stats import norm
 
-from tests.tracking.drogue_circle.discs import covered, discs
+from tests.tracking.drogue_circle.discs import covered, discs, rounded
 from tracking.drogue_circle.acquisition import Wanted, acquire
 from tracking.drogue_circle.candidates import CircleCandidate, Window
 from tracking.drogue_circle.detectors import classical_detector, edge_pixels, radii_of
-from tracking.drogue_circle.parameters import CircleParameters
+from tracking.drogue_circle.parameters import CircleParameters, Edge
 from tracking.drogue_circle.rim_fit import fit_rim, smooth_crop
 
 P = CircleParameters()
@@ -73,6 +76,30 @@ def test_noise_is_no_circle():
 
 def test_a_flat_picture_is_no_circle():
     assert acquire(np.full((120, 160), 50, np.uint8), DETECT, P, Wanted()).circles == ()
+
+
+def test_round_outlines_that_are_no_circles_are_not_acquired():
+    x, y = np.meshgrid(np.arange(160.0), np.arange(120.0))
+    theta = np.arctan2(y - 60, x - 80)
+    for seed in range(10):
+        phase = np.random.default_rng(seed).uniform(0, 6, 3)
+        outline = 12 * (1 + sum(0.05 * np.cos(n * theta + phase[n - 3]) for n in (3, 4, 5)))
+        light = 90 + 90 / (1 + np.exp(np.hypot(x - 80, y - 60) - outline))
+        assert acquire(rounded(light), DETECT, P, Wanted()).circles == ()
+
+
+def test_both_edges_of_a_thin_rim_and_its_opening_are_found_and_one_can_be_chosen():
+    x, y = np.meshgrid(np.arange(160.0), np.arange(120.0))
+    away = np.hypot(x - 80.2, y - 60.4)
+    ring = norm.cdf((away - 40) / 1.2) + norm.cdf((37 - away) / 1.2)  # a dark line of 3 px
+    picture = rounded(60 + 110 * ring - 50 * norm.cdf((28 - away) / 1.2))
+    for edge, radius in ((Edge.OUTER, 40.0), (Edge.INNER, 37.0), (Edge.OPENING, 28.0)):
+        search = acquire(picture, DETECT, replace(P, edge=edge), Wanted())
+        assert [round(f.rim.radius_px) for f in search.edges] == [40, 37, 28]
+        assert search.found is not None
+        assert search.found.rim.radius_px == pytest.approx(radius, abs=0.5)
+    plain = discs([(80.0, 60.0, 30.0)])
+    assert acquire(plain, DETECT, replace(P, edge=Edge.OPENING), Wanted()).found is None
 
 
 def test_votes_of_a_radius_are_divided_by_the_circumference():

@@ -92,6 +92,19 @@ def test_a_video_has_its_own_rate_and_the_same_circle(tmp_path):
     assert not (tmp_path / "out" / "overlay.mp4").exists()
 
 
+def test_several_edges_about_one_centre_are_reported_unless_one_is_chosen(tmp_path):
+    file = video(
+        tmp_path / "ring.avi", [cv2.circle(picture(k), (50 + round(1.5 * k), 45), 40, 20, 3) for k in range(6)]
+    )
+    done = typed(file, "--out", tmp_path / "out")
+    assert "CHECK" in done.output
+    assert "edges about one centre" in done.output
+    evidence = json.loads((tmp_path / "out" / "summary.json").read_text("utf-8"))["verdict"]["evidence"]
+    assert "BP-T06" in {e["code"] for e in evidence}
+    assert "edges about" not in typed(file, "--out", tmp_path / "out", "--edge", "outer").output
+    assert float(rows(tmp_path / "out")[0]["radius_px"]) == pytest.approx(41.5, abs=1.0)
+
+
 def test_the_printed_form_is_another_tracker(folder, tmp_path):
     track_target(CircleTarget(CircleOptions(form="printed")), folder, tmp_path / "out")
     table = rows(tmp_path / "out")
