@@ -102,7 +102,7 @@ def test_several_edges_about_one_centre_are_reported_unless_one_is_chosen(tmp_pa
     evidence = json.loads((tmp_path / "out" / "summary.json").read_text("utf-8"))["verdict"]["evidence"]
     assert "BP-T06" in {e["code"] for e in evidence}
     assert "edges about" not in typed(file, "--out", tmp_path / "out", "--edge", "outer").output
-    assert float(rows(tmp_path / "out")[0]["radius_px"]) == pytest.approx(41.5, abs=1.0)
+    assert float(rows(tmp_path / "out")[0]["radius_px"]) == pytest.approx(41.5, abs=1.2)
 
 
 def test_the_printed_form_is_another_tracker(folder, tmp_path):
