@@ -30,6 +30,12 @@ _ROUNDS = 4  # of solving and separating pairs
 _LIMITS = Limits(steps=200, small_step_sigmas=0.02)
 
 
+_NEXT = (
+    "photograph 15 pairs or more, the board at rest and in both pictures, near and far, tilted by 20 to 45 deg to all"
+    " sides"
+)
+
+
 class PairError(ValueError):
     """The photographs do not determine the pair; the message gives the cause and the remedy."""
 
@@ -65,7 +71,7 @@ def calibrate_pair(
     if len(shared) < FEWEST_PAIRS:
         raise PairError(
             f"expected {FEWEST_PAIRS} pairs of photographs or more with the board in both cameras, got {len(shared)};"
-            " photographs of one instant need the same number in their names"
+            f" photographs of one instant need the same number in their names; {_NEXT}"
         )
     separated: set[int] = set()
     for _ in range(_ROUNDS):
@@ -73,7 +79,7 @@ def calibrate_pair(
         try:
             adjusted = problem.solved()
         except AdjustmentError as error:
-            raise PairError(f"the photographs do not determine the pair: {error}; take more pairs") from None
+            raise PairError(f"the photographs do not determine the pair: {error}; {_NEXT}") from None
         rms = problem.pair_rms(adjusted, shared)
         usual = float(np.nanmedian(rms))
         together = [key for key in shared if key not in separated]
@@ -188,7 +194,7 @@ def _relative_pose(single: tuple[Intrinsics, Intrinsics], numbers: tuple[Sequenc
         if np.isfinite(left.translation).all() and np.isfinite(right.translation).all():
             poses.append(right @ left.inverse())
     if not poses:
-        raise PairError("no photograph has a pose of the board in both cameras; take sharper ones")
+        raise PairError(f"no photograph has a pose of the board in both cameras; {_NEXT}, and sharp")
     scale = float(np.median([np.linalg.norm(p.translation) for p in poses])) + 1e-9
     apart = [sum(min(float(np.linalg.norm(a.minus(b) / ([scale] * 3 + [1.0] * 3))), 1.0) for b in poses) for a in poses]
     return poses[int(np.argmin(apart))]

@@ -36,6 +36,7 @@ from tracking.binocular.marker_model import StereoPair, calibration_jacobian, pr
 
 GOOD_MISFIT, LARGEST_MISFIT = 1.3, 3.0  # joint residuals over those of the cameras by themselves
 GOOD_PAIRS = 8
+_ENOUGH_PAIRS, _FEWEST_MORE = 15, 5  # pairs in all, and at least to add
 GOOD_RANGE_SHARE, LARGEST_RANGE_SHARE = 0.002, 0.02  # sigma of the distance over the distance, at 20 baselines
 BASELINES = (5.0, 10.0, 20.0, 40.0)
 _JUDGED = 20.0
@@ -77,6 +78,21 @@ def findings_of(pair: CalibratedPair, names: tuple[str, str]) -> tuple[Finding, 
             if f.level > Level.PASS
         ]
     return tuple(found)
+
+
+def next_pairs(pair: CalibratedPair, names: tuple[str, str]) -> str:
+    """What to photograph next, in one sentence, from what the pairs lack."""
+    wanted = max(_ENOUGH_PAIRS - len(pair.keys) + len(pair.separated), _FEWEST_MORE)
+    places = [
+        f"near the {' and the '.join(single.coverage.gaps)} of {name}'s picture"
+        for name, single in zip(names, pair.single, strict=True)
+        if single.coverage.gaps
+    ]
+    where = f", {' and '.join(places)}" if places else ""
+    return (
+        f"Photograph next: {wanted} more pairs, the board at rest and in both pictures, near and far{where}, tilted by"
+        " 20 to 45 deg to all sides"
+    )
 
 
 def _misfit(pair: CalibratedPair) -> Finding:
@@ -191,6 +207,7 @@ def _solve(
         page=lambda: page_of(pair, options.names),
         day=day,
         inputs=list(dict.fromkeys(s.paths[name] for s in sets for name, _ in s.views)),
+        advice=next_pairs(pair, options.names),
     )
 
 

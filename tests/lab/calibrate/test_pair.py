@@ -1,0 +1,35 @@
+"""What `calibrate pair` answers if the photographs do not give a pair."""
+
+from __future__ import annotations
+
+import pytest
+
+from calibration.findings import Level, verdict
+from calibration.lens.fit.lens_models import LensModel
+from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
+from calibration.lens.intrinsics_result import Intrinsics
+from calibration.pair.pair_calibration import PairError, calibrate_pair
+from lab.calibrate.pair.pair import findings_of, next_pairs
+from tests.calibration.lens.lens_scenes import Scene, photographs
+
+NAMES = ("left", "right")
+
+
+@pytest.fixture(scope="module")
+def singles() -> tuple[Intrinsics, Intrinsics]:
+    """Two cameras with photographs of different places of the board."""
+    options = IntrinsicsOptions(lens=LensModel(4), warp=False)
+    left, right = (calibrate_intrinsics(photographs(Scene(views=6), seed), options) for seed in (1, 2))
+    return left, right
+
+
+def test_photographs_that_are_not_of_one_instant_fail_with_what_to_photograph_next(singles):
+    numbers = list(range(6))
+    pair = calibrate_pair(NAMES, singles, (numbers, numbers))
+    assert verdict(findings_of(pair, NAMES)) is Level.FAIL
+    assert next_pairs(pair, NAMES).startswith("Photograph next: 9 more pairs, the board at rest and in both pictures")
+
+
+def test_too_few_pairs_are_refused_with_what_to_photograph_next(singles):
+    with pytest.raises(PairError, match=r"got 2;.*photograph 15 pairs or more, the board at rest and in both"):
+        calibrate_pair(NAMES, singles, ([0, 1, 2], [1, 2, 7]))
