@@ -21,6 +21,7 @@ from calibration.lens.fit.lens_fit import LensFit, used_views
 from calibration.lens.fit.lens_parameters import BoardFreedom
 from geometry.arrays import Array, Bools, Ints
 
+_MOST_BY_ONE = 0.8  # share of the information on a direction that comes from one view, as the jackknife counts it
 _UNDETERMINED = 1e-9  # relative size of a pivot below which a direction of the unknowns is not determined
 
 
@@ -129,13 +130,14 @@ class ViewEquations:
 
         The mean of two estimates. Noise times the factor, which is one for all directions of the unknowns, is too small
         for those to which errors common to a photograph are most alike, such as the focal length. The jackknife, from
-        the change by leaving out each photograph (MacKinnon and White 1985, J. Econometrics 29, HC3, with photographs
-        in place of residuals), knows directions, but has only as many squares as there are photographs.
+        the changes by leaving out each photograph (MacKinnon and White 1985, J. Econometrics 29, HC3, with photographs
+        in place of residuals), knows directions, but has only as many squares as there are photographs. A direction
+        that one photograph determines nearly alone counts as determined by it to 80 %: the others leave it open.
         """
-        q = len(self.basis)
-        changes = np.empty((len(self.views), q))
+        changes = np.empty((len(self.views), len(self.basis)))
         for v, (S, g) in enumerate(zip(self.information, self.gradient, strict=True)):
-            changes[v] = self.basis @ np.linalg.solve((1 + _UNDETERMINED) * np.eye(q) - S, g)
+            share, vectors = np.linalg.eigh(S)
+            changes[v] = self.basis @ (vectors @ ((vectors.T @ g) / (1 - np.minimum(share, _MOST_BY_ONE))))
         jackknife = (1 - 1 / len(changes)) * changes.T @ changes
         return (factor**2 * self.basis @ self.basis.T + jackknife) / 2
 
