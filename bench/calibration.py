@@ -57,7 +57,7 @@ def circles(seeds: range) -> Iterator[tuple[str, str, str]]:
             off = (c.fit.lens - truth)[c.model.free]
             z.append(off / c.sigmas)
             error.append(np.nanmean(np.sum((c.map.by_parameter @ off) ** 2, axis=-1)))
-            claim.append(np.nanmean(np.trace(c.map_covariance_px2, axis1=-2, axis2=-1)))
+            claim.append(np.nanmean(np.trace(c.map.covariance_px2(c.covariance), axis1=-2, axis2=-1)))
         inside = 100 * float(np.mean(np.abs(z) < 1))
         each = 100 * np.mean(np.abs(z) < 1, axis=0)
         kind = text.split(":")[0]

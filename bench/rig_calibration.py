@@ -67,9 +67,14 @@ def as_measured(c: Campaign) -> tuple[Network, list[ScreenSetup], StandModel]:
         lens_priors=() if prior is None else (prior,),
         lens_free=free["intrinsics"],
     )
-    known = c.quality.place_known
+    q = c.quality
+    record_sigmas = np.repeat([q.stand_m, np.deg2rad(q.stand_deg)], 3)
+    place_covariance = np.diag(np.repeat([q.place_m, np.deg2rad(q.place_deg)], 3) ** 2)
     stand = StandModel(
-        c.stand_recorded, c.record_sigmas, c.stand_surveyed if known else None, c.place_covariance if known else None
+        c.stand_recorded,
+        record_sigmas,
+        c.stand_surveyed if q.place_known else None,
+        place_covariance if q.place_known else None,
     )
     return network, [ScreenSetup() for _ in rig.screens], stand
 

@@ -15,7 +15,8 @@ import numpy as np
 
 from bench.tracking import Row, Tally, found_in, tally, track
 from geometry.arrays import Array, Bools
-from lab.simulate.points import PointRun, simulate_points, with_occlusions
+from lab.simulate.points import PointRun, simulate_points
+from tests.tracking.rigid_runs import with_occlusions
 from tracking.detections import UNMATCHED
 from tracking.parameters import TrackerParameters
 from tracking.smoothing.recording import TrackedRecording

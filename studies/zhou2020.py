@@ -6,13 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.lens.fit.corner_table import CornerTable
-from calibration.lens.fit.lens_models import LensModel
-from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
-from calibration.pair.pair_calibration import CalibratedPair, calibrate_pair
 from geometry import rotations
-from geometry.arrays import Array, Ints
-from geometry.camera import in_picture
+from geometry.arrays import Array
 from geometry.pose import Pose
 from geometry.rotations import ypr_from_matrix
 from lab.report.plot.axes import (
@@ -145,31 +140,6 @@ def pose_errors(
         rows.append((pose.minus(horn), delta, sigmas, float(delta @ np.linalg.solve(fit.covariance, delta))))
     horns, joints, bounds, nees = zip(*rows, strict=True)
     return PoseErrors(np.array(horns), np.array(joints), np.array(bounds), np.array(nees))
-
-
-def simulated_calibration(rng: np.random.Generator, pairs: int = 20, noise_px: float = 0.1) -> CalibratedPair:
-    """The pair of `distance_errors`, calibrated from corners of a board of 9 x 6 squares of 80 mm at 1.2 to 3.5 m."""
-    true = simulated_pair(FOCAL_PX, SIZE_PX, BASELINE_M)
-    grid = np.array([[x, y, 0.0] for y in range(6) for x in range(9)]) * 0.08
-    middle = grid.mean(axis=0)
-    found: list[list[tuple[Ints, Array]]] = [[], []]
-    numbers: tuple[list[int], list[int]] = ([], [])
-    number = 0
-    while min(map(len, numbers)) < pairs:
-        number += 1
-        depth = rng.uniform(1.2, 3.5)
-        at = np.array([0.25 + rng.uniform(-0.7, 0.7) * depth, rng.uniform(-0.4, 0.4) * depth, depth])
-        turn = rotations.exp(rng.uniform(-0.6, 0.6, 3))
-        board = Pose(turn, at - turn @ middle)
-        pixels = project(true, board.apply(grid))[0]
-        for c, camera in enumerate(true.cameras):
-            inside: Ints = np.flatnonzero(in_picture(pixels[c], np.array(camera.image_size_px), -10.0)).astype(np.int64)
-            if len(inside) >= 20:
-                found[c].append((inside, pixels[c, inside] + rng.normal(0, noise_px, (len(inside), 2))))
-                numbers[c].append(number)
-    options = IntrinsicsOptions(lens=LensModel(5), warp=False, stretch=False)
-    single = [calibrate_intrinsics(CornerTable.of(views, grid, middle, SIZE_PX), options) for views in found]
-    return calibrate_pair(("left", "right"), (single[0], single[1]), numbers)
 
 
 # Rows of `beampose study zhou2020` on the learned detector.

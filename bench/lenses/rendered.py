@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.boards.board_detection import find_board
-from calibration.boards.board_types import Board, CircleGrid, parse
+from calibration.boards.board_types import Board, Charuco, CircleGrid, parse
 from calibration.boards.board_view import BoardView
 from calibration.lens.fit.corner_table import CircleAreas, CornerTable
 from calibration.lens.fit.lens_models import LensModel, rational_of_fisheye
@@ -117,7 +117,16 @@ def _pose(board: Board, f: float, wide: bool, partial: bool, rng: np.random.Gene
 
 def _nearest(board: Board, pixels: Array, view: BoardView) -> Array:
     """The true pixels of the points of a view, in the numbering of a symmetric board that the view has."""
-    return pixels[np.searchsorted(board.ids, view.ids)] if board.symmetry == 1 else _matched(pixels, view.pixels)
+    return pixels[np.searchsorted(board.ids, view.ids)] if not _is_symmetric(board) else _matched(pixels, view.pixels)
+
+
+def _is_symmetric(board: Board) -> bool:
+    """Whether the board looks the same after a rotation in its plane, so that its numbering has several solutions."""
+    if isinstance(board, Charuco):
+        return False
+    if isinstance(board, CircleGrid):
+        return not board.asymmetric or board.rows % 2 == 0
+    return (board.columns + board.rows) % 2 == 0
 
 
 def _matched(truth: Array, found: Array) -> Array:

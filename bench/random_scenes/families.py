@@ -30,7 +30,8 @@ from bench.random_scenes.draw.nuisances import CLEAN_FRAMES
 from bench.random_scenes.projection import spot_pixels
 from bench.random_scenes.scene import Scene, draw_amplitudes, fitted_motion, view_indices
 from geometry.rig import Rig
-from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed, rig_names, split_name
+from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names, split_name
+from tests.geometry.perturbed_rig import perturbed
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """`python -m bench.related_measurements.light_tracker`: the light tracker against the detector in every frame.
 
-Rendered sequences of 640 x 480 (studies/drogue/sequences.py). All methods get the same pictures; each one's process
+Rendered sequences of 640 x 480 (drogue_sequences.py beside it). All methods get the same pictures; each one's process
 time is measured without the rendering. The detector in every frame takes its best candidate, whatever its confidence.
 OpenCV's trackers, those that the installed OpenCV has, start with the true box of the first frame.
 
@@ -22,9 +22,9 @@ import cv2
 import numpy as np
 from scipy.optimize import minimize
 
+from bench.related_measurements.drogue_sequences import SequenceFrame, moving_drogue
 from bench.related_measurements.learned_detector import reliability
 from geometry.arrays import Array, Bools
-from studies.drogue.sequences import SequenceFrame, moving_drogue
 from tracking.learned_detector.detector import find_drogues, learned_detector
 from tracking.light_tracker.frames import FEATURES, RIGHT_SHARE, SIGNS, LightParameters
 from tracking.light_tracker.tracker import DrogueTracker

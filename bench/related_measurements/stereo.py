@@ -13,16 +13,26 @@ import argparse
 
 import numpy as np
 
-from lab.targets.stereo.simulated_recording import drogue_markers
+from calibration.lens.fit.corner_table import CornerTable
+from calibration.lens.fit.lens_models import LensModel
+from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
+from calibration.pair.pair_calibration import CalibratedPair, calibrate_pair
+from geometry import rotations
+from geometry.arrays import Array, Ints
+from geometry.camera import in_picture
+from geometry.pose import Pose
+from lab.targets.stereo.simulated_recording import drogue_markers, simulated_pair
 from studies.zhou2020 import (
+    BASELINE_M,
     DISTANCES_M,
+    FOCAL_PX,
     METHODS,
+    SIZE_PX,
     distance_errors,
     pose_errors,
-    simulated_calibration,
 )
 from tracking.binocular.joint_fit import MarkerObservations, fit_pose
-from tracking.binocular.marker_model import StereoPair, project_markers
+from tracking.binocular.marker_model import StereoPair, project, project_markers
 
 
 def main() -> None:
@@ -50,6 +60,31 @@ def main() -> None:
     print(f"  joint over bound: position {position:.3f}, rotation {rotation:.3f}; NEES/6 {p.nees.mean() / 6:.3f}")
     if given.campaigns:
         _campaigns(given.campaigns, given.seed)
+
+
+def simulated_calibration(rng: np.random.Generator, pairs: int = 20, noise_px: float = 0.1) -> CalibratedPair:
+    """The pair of `distance_errors`, calibrated from corners of a board of 9 x 6 squares of 80 mm at 1.2 to 3.5 m."""
+    true = simulated_pair(FOCAL_PX, SIZE_PX, BASELINE_M)
+    grid = np.array([[x, y, 0.0] for y in range(6) for x in range(9)]) * 0.08
+    middle = grid.mean(axis=0)
+    found: list[list[tuple[Ints, Array]]] = [[], []]
+    numbers: tuple[list[int], list[int]] = ([], [])
+    number = 0
+    while min(map(len, numbers)) < pairs:
+        number += 1
+        depth = rng.uniform(1.2, 3.5)
+        at = np.array([0.25 + rng.uniform(-0.7, 0.7) * depth, rng.uniform(-0.4, 0.4) * depth, depth])
+        turn = rotations.exp(rng.uniform(-0.6, 0.6, 3))
+        board = Pose(turn, at - turn @ middle)
+        pixels = project(true, board.apply(grid))[0]
+        for c, camera in enumerate(true.cameras):
+            inside: Ints = np.flatnonzero(in_picture(pixels[c], np.array(camera.image_size_px), -10.0)).astype(np.int64)
+            if len(inside) >= 20:
+                found[c].append((inside, pixels[c, inside] + rng.normal(0, noise_px, (len(inside), 2))))
+                numbers[c].append(number)
+    options = IntrinsicsOptions(lens=LensModel(5), warp=False, stretch=False)
+    single = [calibrate_intrinsics(CornerTable.of(views, grid, middle, SIZE_PX), options) for views in found]
+    return calibrate_pair(("left", "right"), (single[0], single[1]), numbers)
 
 
 def _campaigns(count: int, seed: int) -> None:

@@ -74,13 +74,6 @@ class Chessboard:
         """Distance of neighbouring points."""
         return self.square_m
 
-    @property
-    def symmetry(self) -> int:
-        """Number of rotations in its plane under which the board looks the same: 1, 2 or 4."""
-        if self.columns == self.rows and self.columns % 2 == 0:
-            return 4
-        return 1 if (self.columns + self.rows) % 2 else 2
-
     def describe(self) -> str:
         """The text that `parse` reads."""
         return f"chessboard:{self.columns}x{self.rows}:{in_mm(self.square_m)}"
@@ -151,13 +144,6 @@ class CircleGrid:
         """Width and height of the printed area."""
         span = np.ptp(self.points, axis=0)
         return float(span[0]) + self.diameter_m, float(span[1]) + self.diameter_m
-
-    @property
-    def symmetry(self) -> int:
-        """Number of rotations in its plane under which the board looks the same: 1, 2 or 4."""
-        if self.asymmetric:
-            return 2 if self.rows % 2 == 0 else 1
-        return 4 if self.columns == self.rows else 2
 
     def describe(self) -> str:
         """The text that `parse` reads."""
@@ -245,11 +231,6 @@ class Charuco:
     def spacing_m(self) -> float:
         """Distance of neighbouring points."""
         return self.square_m
-
-    @property
-    def symmetry(self) -> int:
-        """Number of rotations in its plane under which the board looks the same: 1, because of the markers."""
-        return 1
 
     def describe(self) -> str:
         """The text that `parse` reads."""

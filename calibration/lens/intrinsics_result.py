@@ -69,11 +69,6 @@ class Intrinsics:
         return np.sqrt(np.diagonal(self.covariance))
 
     @property
-    def map_covariance_px2(self) -> Array:
-        """(rows, columns, 2, 2): total covariance of a pixel's direction over the picture."""
-        return self.map.covariance_px2(self.covariance)
-
-    @property
     def rms_px(self) -> float:
         """RMS of the residuals of the used corners, per coordinate."""
         return float(np.sqrt(np.mean(self.fit.residuals[self.fit.used] ** 2)))

@@ -18,15 +18,13 @@ from calibration.lens.fit.lens_fit import LensFit
 from calibration.lens.fit.model_selection import ModelSelection
 from calibration.lens.fit.projection_map import ProjectionMap
 from calibration.lens.fit.residual_cells import beyond_noise, cell_means
-from geometry.arrays import Array, Ints
+from geometry.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)
 class ModelUncertainty:
     """Model error beyond the covariance of the parameters."""
 
-    cell_px: Array  # (rows, columns, 2): mean residual per cell of the picture, projected minus measured; nan: empty
-    cell_count: Ints  # (rows, columns)
     p_value: float  # of mean residuals at least as large, if they are noise
     left_px: float  # RMS per coordinate of correlated residuals beyond noise; 0 where not significant
     between_px: float  # RMS difference to the other models where corners were seen, by their probabilities
@@ -53,4 +51,4 @@ def estimate_model_uncertainty(
     between = selection.chosen.model_error_px
     claimed = float(np.mean(np.trace(at.covariance_px2(covariance)[inside], axis1=-2, axis2=-1))) if inside.any() else 0
     factor = float(np.sqrt(1 + (between**2 + 2 * left**2) / claimed)) if claimed > 0 else 1.0
-    return ModelUncertainty(cells, count, p, left, between, factor)
+    return ModelUncertainty(p, left, between, factor)

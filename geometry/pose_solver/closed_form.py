@@ -105,16 +105,6 @@ def middle_spot(O: Array, A: Array, C: Array, alpha: float, beta: float, world_f
     return _rotated_ray_on_screen(O, OA, OC, alpha / (alpha + beta), world_from_screen)
 
 
-def rotated_spot(O: Array, A: Array, B: Array, alpha: float, beta: float, world_from_screen: Pose) -> Array:
-    """C (..., 3), m, by rotation of OA towards and beyond OB: equal to `outer_spot` to rounding. Source: ours.
-
-    The rotation goes beyond B by exactly beta, so that an error of alpha does not enter, as in eq. (14).
-    """
-    OA, OB = normalised(A - O), normalised(B - O)
-    share = 1 + beta / _angle(OA, OB)
-    return _rotated_ray_on_screen(O, OA, OB, share, world_from_screen)
-
-
 def _rotated_ray_on_screen(O: Array, start: Array, towards: Array, share: Array | float, screen: Pose) -> Array:
     """Intersection (..., 3), m, of a screen with the ray from O; nan if the ray points away from it.
 

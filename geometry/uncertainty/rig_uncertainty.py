@@ -9,7 +9,7 @@ along the beam have no effect.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from geometry.arrays import Array, symmetric
 from geometry.camera import FISHEYE, Camera
 from geometry.forward_model import SpotDerivatives, SpotModel
 from geometry.pose import Pose
-from geometry.rig import Beam, Rig, Screen
+from geometry.rig import Rig
 
 PINHOLE = ("fx", "fy", "cx", "cy")
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
@@ -72,60 +72,6 @@ def is_known(rig: Rig, name: str) -> bool:
     if kind == "screens" and item in rig.screens:
         return parameter in (*POSE, *BOW)
     return kind == "beams" and item in rig.beams and parameter in (*DIRECTION, *POINT)
-
-
-def perturbed(rig: Rig, names: Sequence[str], delta: Array) -> Rig:
-    """The rig with each named parameter changed by delta (p,), in the parameters' units.
-
-    Raises:
-        KeyError: the rig has no parameter of this name.
-    """
-    changes: dict[tuple[str, str], dict[str, float]] = {}
-    for name, value in zip(names, delta, strict=True):
-        if not is_known(rig, name):
-            raise KeyError(name)
-        kind, item, parameter = split_name(name)
-        changes.setdefault((kind, item), {})[parameter] = float(value)
-    cameras, screens, beams = dict(rig.cameras), dict(rig.screens), dict(rig.beams)
-    for (kind, item), change in changes.items():
-        if kind == "cameras":
-            cameras[item] = _perturbed_camera(cameras[item], change)
-        elif kind == "screens":
-            screens[item] = _perturbed_screen(screens[item], change)
-        else:
-            beams[item] = _perturbed_beam(beams[item], change)
-    return Rig(screens, cameras, beams, rig.spots)
-
-
-def _changes_of(change: dict[str, float], names: Sequence[str]) -> Array:
-    """The changes of the named parameters (k,), 0 for those that do not change."""
-    return np.array([change.get(n, 0.0) for n in names])
-
-
-def _perturbed_pose(pose: Pose, change: dict[str, float]) -> Pose:
-    delta = _changes_of(change, POSE)
-    return pose.plus(delta) if delta.any() else pose
-
-
-def _perturbed_camera(camera: Camera, change: dict[str, float]) -> Camera:
-    d = _changes_of(change, PINHOLE)
-    matrix = camera.matrix + np.array([[d[0], 0, d[2]], [0, d[1], d[3]], [0, 0, 0]])
-    distortion = np.array(camera.distortion) + _changes_of(change, distortion_names(camera))
-    return replace(
-        camera,
-        matrix=matrix,
-        distortion=tuple(distortion.tolist()),
-        camera_from_world=_perturbed_pose(camera.camera_from_world, change),
-    )
-
-
-def _perturbed_screen(screen: Screen, change: dict[str, float]) -> Screen:
-    a, b, c = (np.array(screen.bow) + _changes_of(change, BOW)).tolist()
-    return replace(screen, world_from_screen=_perturbed_pose(screen.world_from_screen, change), bow=(a, b, c))
-
-
-def _perturbed_beam(beam: Beam, change: dict[str, float]) -> Beam:
-    return Beam(beam.name, beam.direction + _changes_of(change, DIRECTION), beam.point + _changes_of(change, POINT))
 
 
 class Sensitivity:

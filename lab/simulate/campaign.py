@@ -110,16 +110,6 @@ class Campaign:
     wrong_dots: Bools  # (k,): pixels made outliers
     wrong_spots: Bools  # (n spots,)
 
-    @property
-    def record_sigmas(self) -> Array:
-        """(6,): m, rad of each recorded position."""
-        return np.repeat([self.quality.stand_m, np.deg2rad(self.quality.stand_deg)], 3)
-
-    @property
-    def place_covariance(self) -> Array:
-        """(6, 6) of stand_surveyed."""
-        return np.diag(np.repeat([self.quality.place_m, np.deg2rad(self.quality.place_deg)], 3) ** 2)
-
 
 def draw_campaign(seed: int, rig: str | Rig = "fan", quality: CampaignQuality | None = None) -> Campaign:
     """The truth and the measurements of one campaign, from a seed.

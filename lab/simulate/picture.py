@@ -106,13 +106,13 @@ def laser_powers(scene: Scene) -> LaserPowers:
     return LaserPowers(flux * spread[model.spot_of])
 
 
-def expected_light(scene: Scene, sensor: Sensor, powers: LaserPowers, k: int) -> Floats32:
-    """The light of frame k in one camera, DN above black, before noise, hot pixels and rounding: (h, w)."""
-    return _lit(scene, sensor, powers, k)[0]
+def expected_light(
+    scene: Scene, sensor: Sensor, powers: LaserPowers, k: int
+) -> tuple[Floats32, list[tuple[slice, slice]]]:
+    """The light of frame k in one camera, and the regions of the picture in which it exceeds the background.
 
-
-def _lit(scene: Scene, sensor: Sensor, powers: LaserPowers, k: int) -> tuple[Floats32, list[tuple[slice, slice]]]:
-    """The light, and the regions of the picture in which it exceeds the background."""
+    The light is in DN above black, before noise, hot pixels and rounding: (h, w).
+    """
     light, model = scene.scenario.light, scene.model
     views = np.flatnonzero(model.camera_of == sensor.camera)
     spots = spot_images(model.subset(views), scene.poses[k], light.beam_radius_m / 2, light.blur_px)
@@ -178,7 +178,7 @@ def _speckle(rng: np.random.Generator, shape: tuple[int, int], light: Light) -> 
 
 def render(scene: Scene, sensor: Sensor, powers: LaserPowers, k: int, *, noisy: bool = True) -> Picture:
     """The picture of frame k: (h, w), uint8 up to 8 bits, otherwise uint16."""
-    value, pieces = _lit(scene, sensor, powers, k)
+    value, pieces = expected_light(scene, sensor, powers, k)
     if noisy:
         rng = np.random.Generator(np.random.SFC64([scene.seed, PIXELS, sensor.camera, k]))
         grain = rng.standard_normal(value.shape, dtype=np.float32)

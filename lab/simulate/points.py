@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from lab.simulate.scenarios import PriorRegion, Scenario
-from lab.simulate.scene import OCCLUDED, POINT_NOISE, VISIBLE, compose, with_overrides
+from lab.simulate.scene import POINT_NOISE, VISIBLE, compose, with_overrides
 from tracking.detections import Detections
 
 # Shape and brightness of a laser spot in a picture, and its light integrated over pixels and exposure.
@@ -232,14 +232,3 @@ def simulate_points(
         detections=tuple(detections),
         origin=tuple(origins),
     )
-
-
-def with_occlusions(run: PointRun, hide: Bools) -> PointRun:
-    """The recording with the spots of `hide` (T, n) occluded. False points are not changed."""
-    detections, origins = [], []
-    for k in range(len(run.frame)):
-        keep = [np.array([o == CLUTTER or not hide[k, o] for o in of], dtype=bool) for of in run.origin[k]]
-        detections.append(tuple(d[rows] for d, rows in zip(run.detections[k], keep, strict=True)))
-        origins.append(tuple(of[rows] for of, rows in zip(run.origin[k], keep, strict=True)))
-    in_view = np.where(hide & (run.in_view == VISIBLE), OCCLUDED, run.in_view)
-    return replace(run, in_view=in_view, detections=tuple(detections), origin=tuple(origins))

@@ -267,3 +267,14 @@ def without_pictures(run: PointRun, frames: slice, camera: int) -> PointRun:
     has_image = run.has_image.copy()
     has_image[frames, camera] = False
     return replace(run, has_image=has_image)
+
+
+def with_occlusions(run: PointRun, hide: Bools) -> PointRun:
+    """The recording with the spots of `hide` (T, n) occluded. False points are not changed."""
+    detections, origins = [], []
+    for k in range(len(run.frame)):
+        keep = [np.array([o == CLUTTER or not hide[k, o] for o in of], dtype=bool) for of in run.origin[k]]
+        detections.append(tuple(d[rows] for d, rows in zip(run.detections[k], keep, strict=True)))
+        origins.append(tuple(of[rows] for of, rows in zip(run.origin[k], keep, strict=True)))
+    in_view = np.where(hide & (run.in_view == VISIBLE), OCCLUDED, run.in_view)
+    return replace(run, in_view=in_view, detections=tuple(detections), origin=tuple(origins))

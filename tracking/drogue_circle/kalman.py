@@ -16,7 +16,6 @@ from geometry.arrays import Array, symmetric
 from tracking.kalman import innovation, process_noise, propagate, transition, update
 
 PRINTED_P0 = np.diag([50.0, 20.0, 5.0, 50.0, 20.0, 5.0]) ** 2 / 9  # eq. (3)
-PRINTED_Q, PRINTED_R = 2e-5, 1e-3  # eq. (6): initial values
 
 
 @dataclass(frozen=True, slots=True)

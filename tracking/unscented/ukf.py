@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,18 +81,6 @@ class Space:
 
 
 NUMBERS = Space(np.add, np.subtract)
-
-
-def with_angles(columns: Sequence[int]) -> Space:
-    """Numbers of which some columns are angles, rad: their differences are taken in [-pi, pi)."""
-    index = list(columns)
-
-    def minus(a: Array, b: Array) -> Array:
-        d = np.subtract(a, b)
-        d[..., index] = (d[..., index] + np.pi) % (2 * np.pi) - np.pi
-        return d
-
-    return Space(np.add, minus)
 
 
 def square_root(P: Array) -> Array:

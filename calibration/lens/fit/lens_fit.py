@@ -83,11 +83,6 @@ class LensFit:
         free = self.model.free
         return whole[np.ix_(free, free)] * self.relative_sigma**2
 
-    @property
-    def shape_covariance(self) -> Array:
-        """(5, 5) of warp (1/m) and stretch; 0 for fixed parameters. Raises AdjustmentError."""
-        return self.adjusted.covariance([("warp", 0), ("stretch", 0)]) * self.relative_sigma**2
-
 
 def fit(
     table: CornerTable,

@@ -84,18 +84,13 @@ class Trail:
 
 SceneObject = Frustum | Rectangle | Ray | Marker | Trail
 
-# World directions that point right and up in the drawing. z is up in the world frame of a lab, y is down in a camera.
+# World directions that point right and up in the drawing. z is up in the world frame of a lab.
 VIEWS: dict[str, tuple[Array, Array]] = {
     "seen obliquely": (np.array([0.82, 0.57, 0.0]), np.array([-0.285, 0.41, 0.866])),
     "from above (along −z)": (np.array([1.0, 0, 0]), np.array([0, 1.0, 0])),
     "from the front (along +y)": (np.array([1.0, 0, 0]), np.array([0, 0, 1.0])),
-    "from the side (along −x)": (np.array([0, 1.0, 0]), np.array([0, 0, 1.0])),
-    "obliquely from behind the camera": (np.array([0.82, 0.0, 0.57]), np.array([-0.285, -0.866, 0.41])),
-    "from above the camera": (np.array([1.0, 0, 0]), np.array([0, 0, 1.0])),
-    "from beside the camera": (np.array([0, 0, 1.0]), np.array([0, -1.0, 0])),
 }
-LAB_VIEWS = tuple(VIEWS)[:3]
-CAMERA_VIEWS = tuple(VIEWS)[4:]  # for things in the frame of a camera
+LAB_VIEWS = tuple(VIEWS)
 
 
 def frustum_of(camera: Camera, colour: str = BLUE) -> Frustum:
@@ -149,7 +144,7 @@ def _reach(hits: Array, world_from_screen: Pose, share: float) -> Array:
 def scene_views(
     things: Sequence[SceneObject], title: str = "Cameras, screens and beams", views: Sequence[str] = LAB_VIEWS
 ) -> list[str]:
-    """Several views of the same scene: LAB_VIEWS, or CAMERA_VIEWS for boards in front of a single camera."""
+    """Several views of the same scene."""
     return [scene_view(things, f"{title}, {name}", name) for name in views]
 
 

@@ -14,7 +14,7 @@ from calibration.least_squares.adjustment import AdjustmentError
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.calibrate.beams.beam_findings import beam_findings
 from lab.findings.finding import Level
 from lab.simulate.rigs import RIGS
@@ -30,6 +30,7 @@ from tests.calibration.beams.bench import (
     recorded,
     unknown_place,
 )
+from tests.geometry.perturbed_rig import perturbed
 
 
 @pytest.mark.parametrize("name", RIGS)

@@ -109,13 +109,13 @@ def test_printed_shapes_and_ink_density_agree(text):
         ("charuco:5x7:40mm:20mm:DICT_4X4_50", 1),
     ],
 )
-def test_symmetry_is_the_number_of_rotations_that_preserve_the_pattern(text, symmetry):
+def test_the_printed_pattern_looks_the_same_after_as_many_rotations_as_its_kind_and_size_say(text, symmetry):
     board = parse(text)
     at = np.random.default_rng(1).uniform(-0.6, 0.6, (5000, 2)) * max(board.size_m)
     middle, ink = board.middle[:2], ink_at(board, at + board.middle[:2])
     turns = ([[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]])
     same = sum(np.mean(ink_at(board, at @ np.array(turn).T + middle) == ink) > 0.999 for turn in turns)
-    assert board.symmetry == same == symmetry
+    assert same == symmetry
 
 
 @pytest.mark.parametrize(

@@ -152,7 +152,7 @@ def lens_error(true: TrueLens, c: Intrinsics) -> LensError:
     Pixels that the calibrated lens does not map (it states no error for them) do not count.
     """
     grid = c.map.pixels.reshape(-1, 2)
-    near = within_boards(c, grid) & np.isfinite(c.map_covariance_px2).all(axis=(-2, -1)).ravel()
+    near = within_boards(c, grid) & np.isfinite(c.map.covariance_px2(c.covariance)).all(axis=(-2, -1)).ravel()
     flat = undistorted(grid[near], c.fit.lens, c.model.fisheye)
     rays = np.column_stack([flat, np.ones(len(flat))])
 
@@ -160,5 +160,5 @@ def lens_error(true: TrueLens, c: Intrinsics) -> LensError:
         return (true.project(rays @ exp(turn).T) - grid[near]).ravel()
 
     left = least_squares(off, np.zeros(3), x_scale=1e-3).fun
-    stated = np.trace(c.map_covariance_px2, axis1=-2, axis2=-1).reshape(-1)[near]
+    stated = np.trace(c.map.covariance_px2(c.covariance), axis1=-2, axis2=-1).reshape(-1)[near]
     return LensError(float(np.sqrt(np.sum(left**2) / near.sum())), float(np.sqrt(np.nanmean(stated))))

@@ -13,8 +13,8 @@ from geometry import rotations
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_uncertainty import perturbed
 from lab.simulate.scene import Scene, compose
+from tests.geometry.perturbed_rig import perturbed
 
 SCENES = ("smooth", "sharp-turns", "huo2015", "two-cameras-per-screen", "four-skew-beams")
 NOISE_PX = 0.1

@@ -12,7 +12,8 @@ from geometry.arrays import numeric_jacobian
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed, rig_names
+from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names
+from tests.geometry.perturbed_rig import perturbed
 from tests.geometry.scenes import random_pose, random_rig
 
 POSITIONS = 4

@@ -7,7 +7,8 @@ import numpy as np
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import PoseFit, fit_pose
-from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty, perturbed, rig_names
+from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty, rig_names
+from tests.geometry.perturbed_rig import perturbed
 from tests.geometry.scenes import LENSES, paper_rig
 
 RIG = paper_rig(LENSES[5])

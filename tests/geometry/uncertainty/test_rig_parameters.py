@@ -15,10 +15,10 @@ from geometry.uncertainty.rig_uncertainty import (
     RigUncertainty,
     Sensitivity,
     is_known,
-    perturbed,
     rig_names,
     split_name,
 )
+from tests.geometry.perturbed_rig import perturbed
 from tests.geometry.scenes import LENSES, paper_rig, random_pose, uncommon_rig
 
 seeds = st.integers(0, 2**32 - 1)

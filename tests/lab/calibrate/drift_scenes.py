@@ -12,9 +12,10 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.rotations import exp
-from geometry.uncertainty.rig_uncertainty import camera_names, perturbed
+from geometry.uncertainty.rig_uncertainty import camera_names
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import Covariance, RigFile, save_rig
+from tests.geometry.perturbed_rig import perturbed
 from tests.geometry.scenes import LENSES, paper_rig
 
 DAY = datetime.date(2026, 5, 1)

@@ -16,7 +16,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.rotations import exp
-from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed, rig_names
+from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names
 from lab.calibrate.drift_check.drift_check import COLUMNS, DriftLimits, check_drift
 from lab.calibrate.drift_check.drift_comparison import compare_points
 from lab.calibrate.drift_check.drift_history import read_history
@@ -25,6 +25,7 @@ from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import joint_covariance
 from lab.findings.finding import Level
+from tests.geometry.perturbed_rig import perturbed
 from tests.lab.calibrate import drift_scenes as scenes
 
 RIG, COVARIANCE = scenes.rig_and_covariance()

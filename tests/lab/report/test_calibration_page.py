@@ -91,7 +91,7 @@ def all_drawings() -> dict[str, str]:
                 scene.Rectangle("b", Pose.identity(), (1, 1), faint=True),
             ],
             "a <scene>",
-            scene.CAMERA_VIEWS[0],
+            scene.LAB_VIEWS[0],
         ),
     }
 

@@ -63,7 +63,8 @@ def test_spots_and_dots_agree_with_the_truth_within_their_sigmas(folder):
 
 def test_errors_of_the_recorded_stand_positions_agree_with_their_sigmas():
     c = draw_campaign(3, quality=CampaignQuality(positions=400))
-    errors = c.stand_recorded.minus(c.stand_from_body) / c.record_sigmas
+    sigmas = np.repeat([c.quality.stand_m, np.deg2rad(c.quality.stand_deg)], 3)
+    errors = c.stand_recorded.minus(c.stand_from_body) / sigmas
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(1.0, abs=0.05)
 
 
@@ -165,7 +166,7 @@ def test_a_known_pose_of_the_stand_is_written_with_its_sigmas(tmp_path):
     c = draw_campaign(2, quality=CampaignQuality(place_known=True, positions=3))
     assert stand.world_from_stand is not None
     error = stand.world_from_stand.pose().minus(c.world_from_stand)
-    assert np.all(np.abs(error) < 5 * np.sqrt(np.diagonal(c.place_covariance)))
+    assert np.all(np.abs(error) < 5 * np.repeat([quality.place_m, np.deg2rad(quality.place_deg)], 3))
     assert np.isclose(stand.sigma_m, quality.place_m)
 
 

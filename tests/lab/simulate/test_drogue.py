@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from bench.related_measurements.drogue_sequences import moving_drogue
 from geometry.camera import Camera
 from geometry.pose import Pose
 from studies.drogue.render import render_drogue
@@ -22,7 +23,6 @@ from studies.drogue.scene import (
     Occluder,
     ellipse_through,
 )
-from studies.drogue.sequences import moving_drogue
 
 SIZE, FOCAL = (320, 240), 500.0
 GREY = 60

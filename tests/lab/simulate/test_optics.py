@@ -54,7 +54,7 @@ def errors_px(scene, half, expected_px=None):
     for camera, name in enumerate(scene.model.camera_names):
         sensor = make_sensor(scene, camera)
         for k in scene.frame:
-            picture = expected_light(scene, sensor, powers, k)
+            picture = expected_light(scene, sensor, powers, k)[0]
             inside = scene.rig.cameras[name].sees(scene.uv_px[k], -half - 1.0) & (scene.model.camera_of == camera)
             out.extend(fitted_centre(picture, scene.uv_px[k, i], half) - expected[k, i] for i in np.flatnonzero(inside))
     return np.array(out)

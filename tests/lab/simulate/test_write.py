@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import yaml
 
-from geometry.uncertainty.rig_uncertainty import perturbed
 from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig, save_rig
 from lab.files.run.detections_file import read_detections
@@ -19,6 +18,7 @@ from lab.simulate.points import simulate_points
 from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter, Light, Occlusion
 from lab.simulate.scene import compose
 from lab.simulate.write import simulate
+from tests.geometry.perturbed_rig import perturbed
 
 SMALL = {"picture_scale": 0.25}
 
@@ -143,8 +143,8 @@ def test_only_visible_spots_give_light():
     scene = compose(occluded, 0, 2)
     sensor, powers = make_sensor(scene, 0), laser_powers(scene)
     assert (scene.in_view[1] == 2).all()
-    np.testing.assert_array_equal(expected_light(scene, sensor, powers, 1), sensor.background)
-    lit = expected_light(scene, sensor, powers, 0) - sensor.background
+    np.testing.assert_array_equal(expected_light(scene, sensor, powers, 1)[0], sensor.background)
+    lit = expected_light(scene, sensor, powers, 0)[0] - sensor.background
     for view in np.flatnonzero(scene.model.camera_of == 0):
         u, v = np.round(scene.uv_px[0, view]).astype(int)
         assert lit[v, u] > 50
@@ -158,7 +158,8 @@ def test_speckle_has_the_given_contrast():
         for light in (grainy, even)
     )
     a, b = (
-        expected_light(s, make_sensor(s, 0), laser_powers(s), 0) - make_sensor(s, 0).background for s in (rough, smooth)
+        expected_light(s, make_sensor(s, 0), laser_powers(s), 0)[0] - make_sensor(s, 0).background
+        for s in (rough, smooth)
     )
     ratio = (a / np.maximum(b, 1e-9))[b > 0.3 * b.max()]
     assert ratio.mean() == pytest.approx(1.0, abs=0.02)
@@ -172,7 +173,7 @@ def test_a_wider_beam_has_a_lower_peak_and_the_same_power():
     sums, peaks = zip(
         *(
             (float(light.sum(dtype=np.float64)), float(light.max()))
-            for light in (expected_light(s, sensor, powers, 0) - sensor.background for s in (scene, wide))
+            for light in (expected_light(s, sensor, powers, 0)[0] - sensor.background for s in (scene, wide))
         ),
         strict=True,
     )

@@ -8,8 +8,9 @@ import pytest
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
-from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed, rig_names, split_name
+from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names, split_name
 from lab.simulate.points import PointRun, simulate_points
+from tests.geometry.perturbed_rig import perturbed
 from tests.tracking.rigid_runs import Pooled, assess, smoothed_frames, tracked
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.parameters import TrackerParameters

@@ -12,9 +12,8 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Beam, Rig, Spot
-from lab.simulate.points import with_occlusions
 from lab.simulate.rigs import RIGS, fan, look_at
-from tests.tracking.rigid_runs import RIGID, assess, recording_of, smoothed_frames, tracked
+from tests.tracking.rigid_runs import RIGID, assess, recording_of, smoothed_frames, tracked, with_occlusions
 from tracking.detections import Detections
 from tracking.rigid_body.acquisition import Acquisition
 from tracking.rigid_body.rigid_tracker import RigidTracker

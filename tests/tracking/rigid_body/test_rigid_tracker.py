@@ -16,7 +16,7 @@ from geometry.arrays import Array, numeric_jacobian
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
-from lab.simulate.points import PointRun, simulate_points, with_occlusions
+from lab.simulate.points import PointRun, simulate_points
 from tests.tracking.rigid_runs import (
     RIGID,
     Assessment,
@@ -28,6 +28,7 @@ from tests.tracking.rigid_runs import (
     prior_of,
     selected_frames,
     tracked,
+    with_occlusions,
     without_pictures,
 )
 from tracking.detections import UNMATCHED, Detections

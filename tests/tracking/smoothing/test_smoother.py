@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from geometry.pose import Pose
-from lab.simulate.points import PointRun, simulate_points, with_occlusions
+from lab.simulate.points import PointRun, simulate_points
 from tests.tracking.rigid_runs import (
     RIGID,
     Assessment,
@@ -20,6 +20,7 @@ from tests.tracking.rigid_runs import (
     selected_frames,
     smoothed_frames,
     tracked,
+    with_occlusions,
     without_pictures,
 )
 from tracking.detections import UNMATCHED

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from tracking.unscented.fu2016 import SPREAD, X0, PrintedFilter, bearings, observability, process, selection
 from tracking.unscented.ukf import (
+    Space,
     Spread,
     gated_update,
     predict,
@@ -17,7 +18,6 @@ from tracking.unscented.ukf import (
     student_t_update,
     transform,
     update,
-    with_angles,
 )
 
 SPREADS = [Spread(), Spread(0.55, 2.0, -2.0), Spread(1e-3, 2.0, 0.0)]
@@ -86,8 +86,20 @@ def test_a_square_has_the_mean_and_variance_of_a_chi_square():
     assert variance[0, 0] == pytest.approx(2.0)
 
 
+def with_angles(*columns: int) -> Space:
+    """Numbers of which some columns are angles, rad: their differences are taken in [-pi, pi)."""
+    index = list(columns)
+
+    def minus(a, b):
+        d = np.subtract(a, b)
+        d[..., index] = (d[..., index] + np.pi) % (2 * np.pi) - np.pi
+        return d
+
+    return Space(np.add, minus)
+
+
 def test_angles_on_both_sides_of_180_degrees_are_near_each_other():
-    space = with_angles([0])
+    space = with_angles(0)
     step = update(
         np.array([np.pi - 0.01]), 1e-2 * np.eye(1), np.array([-np.pi + 0.01]), lambda rows: rows, 1e-2 * np.eye(1),
         space=space, of=space,
@@ -125,7 +137,7 @@ def test_the_covariance_of_a_nonlinear_filter_agrees_with_its_errors():
     Q = np.diag([1e-6, 1e-6, 1e-6, 1e-4, 1e-4])
     R = np.diag([0.05, 0.01]) ** 2
     P0 = np.diag([0.5, 0.5, 0.2, 0.2, 0.1]) ** 2
-    space, seen = with_angles([2]), with_angles([1])
+    space, seen = with_angles(2), with_angles(1)
     nees, nis = [], []
     for _ in range(25):
         truth = np.array([3.0, 2.0, 0.3, 1.0, 0.2])

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from bench.related_measurements.drogue_sequences import moving_drogue
 from cli import main
 from geometry.camera import Camera
 from geometry.pose import Pose
@@ -18,7 +19,6 @@ from lab.targets.drogue import DROGUE, DrogueOptions, DrogueTarget
 from lab.targets.track import track_target
 from studies.drogue.render import render_drogue
 from studies.drogue.scene import PICTURE, SKY, DrogueBackground, DrogueScene
-from studies.drogue.sequences import moving_drogue
 
 SIZE, FOCAL = (224, 160), 400.0
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from bench.related_measurements.stereo import simulated_calibration
 from lab.targets.stereo.simulated_recording import simulated_pair
 from studies.comparison import write_comparison
 from studies.zhou2020 import (
@@ -12,7 +13,6 @@ from studies.zhou2020 import (
     SIZE_PX,
     compare_zhou2020,
     distance_errors,
-    simulated_calibration,
 )
 
 
