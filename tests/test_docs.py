@@ -133,11 +133,28 @@ def test_every_path_and_function_that_a_document_names_exists():
     assert {name: wrong for name, wrong in found.items() if wrong} == {}
 
 
+def unclear_answers(line: str, root: Path) -> list[str]:
+    """Paths that a row of the map names twice, and file names that are not beside any path of the row."""
+    paths = PATH.findall(line)
+    beside = {(root / path).parent if Path(path).suffix else root / path for path in paths}
+    names = re.findall(r"`(\w+\.py)`", line)
+    twice = [path for path in set(paths) if paths.count(path) > 1]
+    return twice + [name for name in names if not any((folder / name).exists() for folder in [root, *beside])]
+
+
+@pytest.mark.parametrize(
+    "answer", ["`geometry/lens.py`, `geometry/lens.py`", "`geometry/lens.py`, `prism.py` beside it"]
+)
+def test_an_answer_of_the_map_that_is_repeated_or_not_there_is_found(answer):
+    assert unclear_answers(f"| Where? | {answer} |", ROOT)
+
+
 def test_the_map_answers_a_newcomers_questions_with_paths():
     text = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
     questions = [line for line in text.splitlines() if line.startswith("| ") and "? | " in line]
     assert len(questions) >= 25
     assert all(PATH.search(line) for line in questions)
+    assert [wrong for line in questions for wrong in unclear_answers(line, ROOT)] == []
 
 
 @pytest.mark.parametrize("text", ["`geometry/spots.py`", "`lab/none/`", "`geometry/lens.py`: `no_such_function`"])
