@@ -27,7 +27,8 @@ from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import POSE as POSE_NAMES
-from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty, Sensitivity, perturbed
+from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty, Sensitivity
+from tests.geometry.perturbed_rig import perturbed
 from tests.geometry.scenes import LENSES, paper_rig
 
 SIGMA_PX = 0.1
