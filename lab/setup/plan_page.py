@@ -15,15 +15,12 @@ from calibration.budget.pose_grid import AXES, STATUS, plan_grid, poses_of
 from geometry.arrays import Array
 from lab import number_format
 from lab.files.text.csv_text import write_table
-from lab.findings.finding import Finding, verdict
 from lab.number_format import format_angle, format_length, format_percent
 from lab.report.calibration.calibration_page import (
-    CalibrationReport,
+    KeyFigure,
     PageDrawing,
     PageTable,
     Section,
-    provenance,
-    write_calibration_report,
 )
 from lab.report.calibration.calibration_scene import rig_things, scene_views
 from lab.report.plot.axes import BLUE, number, text
@@ -230,30 +227,21 @@ _FINE = 41  # grid points along each side of a smooth map
 _PLANES = (("yaw_deg", "pitch_deg"), ("x_m", "y_m"), ("x_m", "z_m"))
 
 
-def write_plan_page(plan: Plan, found: Sequence[Finding], rig_path: Path, folder: Path) -> Path:
-    """Write report.html of a plan into a folder; returns its path."""
-    report = CalibrationReport(
-        kind="Plan",
-        name=rig_path.stem if rig_path.stem != "rig" else rig_path.resolve().parent.name,
-        verdict=verdict(found),
-        findings=found,
-        key_figures=_key_figures(plan),
-        sections=[
-            Section("What to improve first", advice(plan) or "No pose is observable: there is no error budget."),
-            _budget(plan),
-            *_maps(plan),
-            _visibility(plan),
-            _worst(plan),
-            _effects(plan),
-            _scene(plan),
-            _assumptions(plan),
-        ],
-        made=provenance([rig_path]),
-    )
-    return write_calibration_report(report, folder)
+def page_of(plan: Plan) -> tuple[list[KeyFigure], list[Section]]:
+    """Key figures and sections of the report."""
+    return _key_figures(plan), [
+        Section("What to improve first", advice(plan) or "No pose is observable: there is no error budget."),
+        _budget(plan),
+        *_maps(plan),
+        _visibility(plan),
+        _worst(plan),
+        _effects(plan),
+        _scene(plan),
+        _assumptions(plan),
+    ]
 
 
-def _key_figures(plan: Plan) -> list[tuple[str, str, str]]:
+def _key_figures(plan: Plan) -> list[KeyFigure]:
     m, deg = median_sigma(plan)
     solved = plan.worst[plan.observable]
     top = solved.max(axis=0).tolist() if len(solved) else [np.nan, np.nan]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -26,7 +26,6 @@ from tracking.drogue_circle.printed import PrintedTracker
 from tracking.drogue_circle.rim_fit import CircleFrame
 from tracking.drogue_circle.tracker import CircleTracker
 from tracking.learned_detector.detector import learned_detector
-from tracking.statuses import Cause
 
 Tracker: TypeAlias = CircleTracker | PrintedTracker
 
@@ -92,16 +91,6 @@ class CircleTarget(Target[CircleFrame]):
     subject, size_name, several = "circle", "radius", "several circles that fit equally well"
     codes = Codes(none="BP-T01", few="BP-T02", missing="BP-T03", ambiguous="BP-T04", far="BP-T05")
     far_sizes, far_words = 0.5, "half a radius"
-    none_found = "There is no target in view, or its rim is not a circle of the searched radii, or several are alike."
-    remedies: ClassVar = {
-        Cause.NO_IMAGE: "Check the camera and the file: pictures are missing or damaged.",
-        Cause.OCCLUDED: "Keep the target free, or use the predicted positions with their sigmas.",
-        Cause.NOT_FOUND: "Look at the overlay (--video): is the rim sharp, and are the radii in the searched range"
-        " (--min-radius, --max-radius)?",
-        Cause.AMBIGUOUS: "State the place of the circle in the first picture (--near), or its range of radii.",
-        Cause.OUT_OF_VIEW: "Keep the target inside the picture.",
-    }
-
     options: CircleOptions
 
     def __init__(self, options: CircleOptions = CircleOptions()) -> None:

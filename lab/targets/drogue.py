@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from lab.targets.target import Codes, Target, Track, TrackOptions, quantiles, te
 from tracking.learned_detector.detector import learned_detector
 from tracking.light_tracker.frames import DrogueFrame, LightParameters, Source
 from tracking.light_tracker.tracker import DrogueTracker
-from tracking.statuses import Cause, PoseStatus
+from tracking.statuses import PoseStatus
 
 GOOD_CONFIDENCE = 0.8  # mean of the measured frames
 LEAST_CONFIRMED = 0.5  # share of the checks in which the detector finds the drogue
@@ -73,17 +73,6 @@ class DrogueTarget(Target[DrogueFrame]):
     subject, size_name, size_radii, several = "drogue", "diameter", 2.0, "several drogues"
     codes = Codes(none="BP-G01", few="BP-G02", missing="BP-G03", ambiguous="BP-G04", far="BP-G05")
     far_sizes, far_words = 1.0, "a diameter"
-    none_found = "There is no drogue in view, it is larger than the picture, or several are alike."
-    remedies: ClassVar = {
-        Cause.NO_IMAGE: "Check the camera and the file: pictures are missing or damaged.",
-        Cause.NOT_FOUND: "Look at the pictures: is the drogue in view, and its diameter in the searched range"
-        " (--min-diameter, --max-diameter)?",
-        Cause.NO_MATCH: "Keep the drogue free, or use the predicted positions with their sigmas.",
-        Cause.UNCERTAIN: "Improve light and contrast, or let the detector check more often (--every).",
-        Cause.AMBIGUOUS: "State the place of the drogue in the first picture (--near), or its range of diameters.",
-        Cause.OUT_OF_VIEW: "Keep the drogue inside the picture.",
-    }
-
     options: DrogueOptions
 
     def __init__(self, options: DrogueOptions = DrogueOptions()) -> None:

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -153,12 +153,6 @@ class PointTarget(Target[PointFrame]):
     subject = "target"
     codes = Codes(none="BP-N01", few="BP-N02", missing="BP-N06", ambiguous="", far="")
     usual_missing = 0.05
-    none_found = "There is no target in view, or none moves steadily over enough consecutive pictures."
-    remedies: ClassVar = {
-        Cause.NO_IMAGE: "Check the camera, its disk and its cable.",
-        Cause.NOT_FOUND: "Look at the pictures: does the detector (--detector) suit the target? Improve light and"
-        " contrast, or lower its threshold.",
-    }
     options: PointOptions
 
     def __init__(self, options: PointOptions = PointOptions()) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
@@ -109,7 +109,7 @@ class Codes(NamedTuple):
     """The codes of the findings that all kinds of targets share; empty where a kind cannot have one."""
 
     none: str  # never found
-    few: str  # few measured frames
+    few: str  # few measured frames; its variants are the causes
     missing: str  # frames without a picture
     ambiguous: str
     far: str  # found again far from the last place
@@ -126,8 +126,6 @@ class Target(ABC, Generic[F]):
     size_radii: ClassVar[float] = 1.0  # that number, in radii of the outline
     several: ClassVar[str] = ""  # what an ambiguous frame shows
     codes: ClassVar[Codes]
-    remedies: ClassVar[Mapping[Cause, str]]
-    none_found: ClassVar[str]  # why there may be none
     far_sizes: ClassVar[float] = np.inf  # a reacquisition farther from the last known place is reported ...
     far_words: ClassVar[str] = ""  # ... in these words
     usual_missing: ClassVar[float] = 0.0  # share of frames without a picture that is not reported

@@ -10,6 +10,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from lab.errors import QUALITY_GATE_FAILED
+from lab.findings.catalogue import ENTRIES
 from lab.findings.finding import Finding, Level, finding, reasons, verdict, worst_first
 from lab.targets.target import F, Target, Track
 from tracking.statuses import Cause
@@ -76,18 +77,18 @@ def findings_of(target: Target[F], track: Track[F]) -> tuple[Finding, ...]:
 def _measured(target: Target[F], track: Track[F]) -> Finding:
     measured, n, causes = int(track.measured.sum()), len(track.frames), track.causes()
     share, least = measured / n, target.least_measured
-    remedy = target.remedies[next(iter(causes))] if causes else ""
+    cause = next(iter(causes)).value if causes else ""
     of_others = ", ".join(f"{count} {cause}" for cause, count in list(causes.items())[:3])
     if not measured:
         what = f"no {target.subject} was found in {n} frames ({of_others})"
-        return finding(target.codes.none, Level.FAIL, what, why=target.none_found, remedy=remedy)
+        remedy = ENTRIES[target.codes.few].variant(cause).remedy
+        return finding(target.codes.none, Level.FAIL, what, remedy=remedy)
     what = f"{measured} of {n} frames ({share:.1%}) have a measured {target.subject}"
     level = Level.FAIL if share < least else Level.WARN if share < GOOD_MEASURED else Level.PASS
     if level > Level.PASS:
         gate = f"gate: {100 * least:.3g}%; usual: {GOOD_MEASURED:.0%} and more"
         what += f" ({gate})" + (f"; of the others {of_others}" if of_others else "")
-    why = "" if level is Level.PASS else "Predicted positions have growing sigmas; lost frames have none."
-    return finding(target.codes.few, level, what, why=why, remedy=remedy)
+    return finding(target.codes.few, level, what, variant=cause)
 
 
 def _ambiguous(target: Target[F], track: Track[F]) -> list[Finding]:
@@ -97,8 +98,7 @@ def _ambiguous(target: Target[F], track: Track[F]) -> list[Finding]:
         return []
     most = max(found for _, found in frames)
     what = f"{len(frames)} frames show {target.several} (first: frame {frames[0][0]}; up to {most})"
-    why = "None of them is reported, since the choice would be a guess."
-    return [finding(target.codes.ambiguous, Level.WARN, what, why=why, remedy=target.remedies[Cause.AMBIGUOUS])]
+    return [finding(target.codes.ambiguous, Level.WARN, what)]
 
 
 def _far_away(target: Target[F], track: Track[F]) -> list[Finding]:
@@ -124,8 +124,7 @@ def _missing(target: Target[F], track: Track[F]) -> list[Finding]:
         return []
     reason = max(missing, key=lambda r: missing[r])
     what = f"{sum(missing.values())} of {n} frames have no usable picture (most frequent: {reason})"
-    why = f"The {target.subject} is predicted there."
-    return [finding(target.codes.missing, Level.WARN, what, why=why, remedy=target.remedies[Cause.NO_IMAGE])]
+    return [finding(target.codes.missing, Level.WARN, what)]
 
 
 def some_frames(frames: Sequence[int]) -> str:
