@@ -8,7 +8,7 @@ import pytest
 
 from lab.calibrate.beams.beam_tables import ANGLE_COLUMNS
 from lab.calibrate.camera.camera import CORNER_COLUMNS
-from lab.calibrate.drift_check import drift_check, drift_history
+from lab.calibrate.drift_check import drift_check, drift_result
 from lab.calibrate.rig import rig_tables
 from lab.calibrate.screens.screen_tables import DOT_COLUMNS
 from lab.files.project.point_files import POINTS, POSE_SIGMAS, SURVEY, SURVEY_SIGMAS
@@ -43,7 +43,7 @@ LISTS = {
     "residuals.csv": rig_tables.COLUMNS,
     "dots.csv": DOT_COLUMNS,
     "angles.csv": ANGLE_COLUMNS,
-    "--history": drift_history.COLUMNS,
+    "--history": drift_result.HISTORY_COLUMNS,
 }
 
 

@@ -74,30 +74,9 @@ def _key_figures(c: BeamCalibration) -> list[KeyFigure]:
 
 def _beams(c: BeamCalibration, nominal: Rig) -> Section:
     off = difference_from_nominal(c, nominal)
-    direction, offset = c.direction_sigmas / ARCSEC, 1e3 * c.offset_sigmas
+    direction, offset = c.direction_sigmas, c.offset_sigmas
     if c.undetermined:
         direction, offset = np.full_like(direction, np.nan), np.full_like(offset, np.nan)
-    ends = {
-        b: "".join(sorted({"+" if s.sign > 0 else "−" for s in c.rig.spots.values() if s.beam == b}))
-        for b in c.rig.beams
-    }
-    rows = [
-        (
-            name,
-            ends[name],
-            _three(c.lines.directions[i], 6),
-            _three(1e3 * c.lines.points[i], 2),
-            float(direction[i]),
-            float(offset[i]),
-            float(np.rad2deg(off[i, 0]) * 60),
-            float(1e3 * off[i, 1]),
-        )
-        for i, name in enumerate(c.rig.beams)
-    ]
-    heads = (
-        "beam", "ends", "direction", "offset (mm)", "sigma direction (arcsec)", "sigma offset (mm)",
-        "off nominal (arcmin)", "off nominal (mm)",
-    )  # fmt: skip
     words = [
         "Each laser in the body frame. The offset is the point of the beam nearest to the body's origin; sigmas are the"
         " RMS over the two axes across the beam.",
@@ -106,7 +85,35 @@ def _beams(c: BeamCalibration, nominal: Rig) -> Section:
     ]
     if c.undetermined:
         words[1] = "The recordings do not determine these numbers: no rig.yaml was written."
-    return Section("Beams", words, (), PageTable(heads, rows))
+    return Section("Beams", words, (), beam_table(c.rig, direction, offset, off))
+
+
+def beam_table(rig: Rig, direction: Array, offset: Array, off_nominal: Array) -> PageTable:
+    """The beams of a rig with the sigmas of direction (k,), rad, and offset (k,), m.
+
+    off_nominal: (k, 2) angle, rad, and distance, m, from the nominal beams.
+    """
+    ends = {
+        b: "".join(sorted({"+" if s.sign > 0 else "−" for s in rig.spots.values() if s.beam == b})) for b in rig.beams
+    }
+    rows = [
+        (
+            name,
+            ends[name],
+            _three(beam.direction, 6),
+            _three(1e3 * beam.point, 2),
+            float(direction[i] / ARCSEC),
+            float(1e3 * offset[i]),
+            float(np.rad2deg(off_nominal[i, 0]) * 60),
+            float(1e3 * off_nominal[i, 1]),
+        )
+        for i, (name, beam) in enumerate(rig.beams.items())
+    ]
+    heads = (
+        "beam", "ends", "direction", "offset (mm)", "sigma direction (arcsec)", "sigma offset (mm)",
+        "off nominal (arcmin)", "off nominal (mm)",
+    )  # fmt: skip
+    return PageTable(heads, rows)
 
 
 def _three(vector: Array, digits: int) -> str:

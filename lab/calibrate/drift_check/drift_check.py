@@ -35,16 +35,18 @@ from lab.calibrate.drift_check.drift_findings import (
     state_findings,
     unchecked_finding,
 )
-from lab.calibrate.drift_check.drift_history import HistoryRow, read_history, write_history
 from lab.calibrate.drift_check.drift_inputs import DriftInputs, read_points, read_still_pose, read_still_spots
 from lab.calibrate.drift_check.drift_page import page_of
 from lab.calibrate.drift_check.drift_result import (
     CameraDrift,
     DriftLimits,
     DriftResult,
+    HistoryRow,
     OtherChange,
     is_weak,
     level_of,
+    read_history,
+    write_history,
 )
 from lab.calibrate.step import Outcome, Solved, Step, run_step
 from lab.files.rig.rig_file import RigFile, joint_covariance, load_rig_file

@@ -10,8 +10,14 @@ import numpy as np
 from geometry.arrays import Array
 from lab.calibrate.drift_check.drift_comparison import PixelComparison
 from lab.calibrate.drift_check.drift_findings import describe_change, size
-from lab.calibrate.drift_check.drift_history import HistoryRow
-from lab.calibrate.drift_check.drift_result import CameraDrift, DriftLimits, DriftResult, OtherChange, is_weak
+from lab.calibrate.drift_check.drift_result import (
+    CameraDrift,
+    DriftLimits,
+    DriftResult,
+    HistoryRow,
+    OtherChange,
+    is_weak,
+)
 from lab.files.rig.rig_file import RigFile
 from lab.number_format import format_number
 from lab.report.calibration.calibration_charts import DriftLine, drift_chart
