@@ -20,8 +20,8 @@ from pathlib import Path
 from threading import Timer
 
 from bench.throughput.folders import run_folder
-from lab.watch.live_frames import WatchOptions
-from lab.watch.watch import watch_run
+from lab.runs.watch.live_frames import WatchOptions
+from lab.runs.watch.watch import watch_run
 
 KEPT = 300  # latest frames kept on disk; older ones are deleted, as in a ring buffer
 

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
-from lab.detect.picture_series import PictureSeries
 from lab.pictures.source import open_inputs, pictures, pictures_of_frames
+from lab.runs.detect.picture_series import PictureSeries
 from lab.runs.frames.sensor_noise import noise_frames
 from tracking.detections import Detections
 from tracking.parameters import DetectParameters

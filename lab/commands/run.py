@@ -95,7 +95,7 @@ def detect(
     Example:
         beampose detect sample_runs/huo2015/frames/left --every 10 --out results/spots
     """
-    from lab.detect.detect import DetectOptions, detect_pictures
+    from lab.runs.detect.detect import DetectOptions, detect_pictures
 
     options = DetectOptions(camera, every, limit, settings)
     with progress_bar("pictures") as progress:
@@ -151,8 +151,8 @@ def watch(
         beampose watch runs/today --out results/today --udp 127.0.0.1:5005
     """
     from lab.commands.common import provenance
-    from lab.watch.live_frames import WatchOptions
-    from lab.watch.watch import stopped_by_ctrl_c, watch_run
+    from lab.runs.watch.live_frames import WatchOptions
+    from lab.runs.watch.watch import stopped_by_ctrl_c, watch_run
 
     with shown(run_folder.name, verbose=verbose, quiet=quiet) as progress, stopped_by_ctrl_c() as stop:
         outcome = watch_run(

@@ -1,7 +1,7 @@
 """One camera's recorded pictures: numbered files, or a video; grey or in colour. All commands read series here.
 
 Orientation flags are not applied: pixels stay in the sensor's order. A video's grey is that of the decoder: the luma of
-YUV videos, all channels of RGB videos. Files are regular files. A camera that is still recording: lab/watch/cameras.py.
+YUV videos, all channels of RGB videos. Files are regular files. Live cameras: lab/runs/watch/cameras.py.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ class Tracker(Protocol):
 
 
 class Frames(Protocol):
-    """The pictures of all cameras, frame by frame: recorded (lab.runs.frames.frames) or live (lab.watch)."""
+    """The pictures of all cameras, frame by frame: recorded (lab.runs.frames.frames) or live (lab.runs.watch)."""
 
     @property
     def notes(self) -> list[str]:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from bench.real_spots import measured
-from lab.detect.detect import DetectOptions, detect_pictures
+from lab.runs.detect.detect import DetectOptions, detect_pictures
 from tests.paths import DATA
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections

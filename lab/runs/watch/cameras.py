@@ -17,8 +17,8 @@ from lab.errors import InputError
 from lab.pictures.opencv import load_cv2, opened
 from lab.pictures.picture_file import UNREADABLE, MissingPicture, read_picture
 from lab.pictures.source import retrieved
-from lab.watch.frame_clock import FolderPoll, FrameClock
-from lab.watch.inbox import Inbox
+from lab.runs.watch.frame_clock import FolderPoll, FrameClock
+from lab.runs.watch.inbox import Inbox
 
 POLL_S = 0.002  # between two polls of a folder ...
 _POLL_IDLE_S = 0.01  # ... and after _IDLE_S without a new picture

@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from lab.detect.contact_sheet import ContactSheet
-from lab.detect.picture_series import PictureSeries
 from lab.errors import InputError
 from lab.files.run.parameter_overrides import with_overrides
 from lab.files.text import columns
@@ -23,6 +21,8 @@ from lab.files.text.json_text import has_schema, write_json
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import PictureSource, Video, open_inputs, pictures, pictures_of_frames
 from lab.progress import Progress
+from lab.runs.detect.contact_sheet import ContactSheet
+from lab.runs.detect.picture_series import PictureSeries
 from lab.runs.frames.sensor_noise import noise_frames
 from lab.runs.tables import detection_rows
 from lab.versions import versions
@@ -97,7 +97,7 @@ def detect_pictures(
         _search_all(inputs, series, sheet, folder / "detections.csv", options, progress)
         _add_notes(series)
         sheet.write(folder / SHEET)
-        from lab.detect.detect_page import write_detect_page  # imports the template engine, needed only here
+        from lab.runs.detect.detect_page import write_detect_page  # imports the template engine, needed only here
 
         write_json(_summary(series, options, time.perf_counter() - started), folder / "summary.json")
         write_detect_page(series, sheet, folder)

@@ -29,9 +29,9 @@ from lab.runs.frames.sensor_noise import CameraNoise
 from lab.runs.process import RunOutcome, are_results, ready_run, write_results
 from lab.runs.smoothing_pass import TRACKING
 from lab.runs.verdict.frame_checks import FrameChecks
-from lab.watch.live_background import LiveBackground
-from lab.watch.live_frames import LiveFrames, WatchOptions
-from lab.watch.live_output import Latency, LiveOutput, UdpLines, is_live_table
+from lab.runs.watch.live_background import LiveBackground
+from lab.runs.watch.live_frames import LiveFrames, WatchOptions
+from lab.runs.watch.live_output import Latency, LiveOutput, UdpLines, is_live_table
 from tracking.background.estimation import PICTURES
 from tracking.detections import Detections
 

@@ -16,9 +16,9 @@ from lab.files.run.detections_file import LONGEST_GAP
 from lab.files.run.run_file import FramesFolder, LiveDevice, Run
 from lab.pictures.picture_file import GreyPicture, MissingPicture
 from lab.runs.frames.frames import FrameSet
-from lab.watch.cameras import DeviceCamera, FolderCamera, LiveCamera, in_thread, open_device
-from lab.watch.frame_clock import FolderPoll
-from lab.watch.inbox import CameraQueue, Inbox, is_complete
+from lab.runs.watch.cameras import DeviceCamera, FolderCamera, LiveCamera, in_thread, open_device
+from lab.runs.watch.frame_clock import FolderPoll
+from lab.runs.watch.inbox import CameraQueue, Inbox, is_complete
 
 FIRST = 6  # pictures of each camera for the estimate of the noise
 _START_S = 0.5  # longest wait for them, or the time of eight frames if that is more

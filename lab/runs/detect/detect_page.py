@@ -11,9 +11,6 @@ import cv2
 import numpy as np
 
 from geometry.arrays import Array, Bools
-from lab.detect.contact_sheet import ContactSheet
-from lab.detect.findings import SizeGroup
-from lab.detect.picture_series import PictureSeries
 from lab.files.text.atomic_write import atomic_write_text
 from lab.number_format import format_number
 from lab.pictures.picture_file import GreyPicture
@@ -38,6 +35,9 @@ from lab.report.plot.axes import (
     ticks,
 )
 from lab.report.plot.series import Line, time_panel
+from lab.runs.detect.contact_sheet import ContactSheet
+from lab.runs.detect.findings import SizeGroup
+from lab.runs.detect.picture_series import PictureSeries
 from lab.versions import versions
 from tracking.noise_estimation.levels import LevelVariances, level_variances
 from tracking.noise_estimation.photon_transfer import NoiseEstimate

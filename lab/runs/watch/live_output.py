@@ -19,7 +19,7 @@ from lab.files.text.json_text import plain_value
 from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.tables import attitude_rows, pose_numbers
 from lab.runs.verdict.frame_checks import FrameChecks
-from lab.watch.live_frames import LiveFrames
+from lab.runs.watch.live_frames import LiveFrames
 
 LIVE_TABLE = "attitude_live.csv"
 

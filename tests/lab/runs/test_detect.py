@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from lab.detect.contact_sheet import MOST, ContactSheet
-from lab.detect.detect import SHEET, DetectOptions, detect_pictures
-from lab.detect.findings import MOST_KEPT, SpotCollection, laser_likeness, matched_snr
 from lab.errors import InputError
 from lab.files.text import columns
+from lab.runs.detect.contact_sheet import MOST, ContactSheet
+from lab.runs.detect.detect import SHEET, DetectOptions, detect_pictures
+from lab.runs.detect.findings import MOST_KEPT, SpotCollection, laser_likeness, matched_snr
 from tests.tracking.rendering import Scene, Spot, expected
 from tracking.detections import Detections
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array
-from lab.detect.findings import SizeGroup, SpotCollection, laser_likeness, matched_snr
 from lab.pictures.picture_file import GreyPicture
+from lab.runs.detect.findings import SizeGroup, SpotCollection, laser_likeness, matched_snr
 from lab.runs.frames.sensor_noise import CameraNoise
 from tracking.detection.detect import overlooked_lights
 from tracking.detections import Detections

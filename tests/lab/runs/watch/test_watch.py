@@ -21,14 +21,14 @@ from lab.files.text import columns
 from lab.pictures.picture_file import MissingPicture, read_picture
 from lab.runs.frames import sensor_noise
 from lab.runs.process import process_run
+from lab.runs.watch import watch
+from lab.runs.watch.cameras import DeviceCamera, FolderCamera
+from lab.runs.watch.frame_clock import FolderPoll, FrameClock
+from lab.runs.watch.inbox import MOST_WAITING, Inbox, is_complete
+from lab.runs.watch.live_frames import FIRST, WatchOptions
+from lab.runs.watch.live_output import LIVE_TABLE
+from lab.runs.watch.watch import WatchOutcome, watch_run
 from lab.simulate.write import simulate
-from lab.watch import watch
-from lab.watch.cameras import DeviceCamera, FolderCamera
-from lab.watch.frame_clock import FolderPoll, FrameClock
-from lab.watch.inbox import MOST_WAITING, Inbox, is_complete
-from lab.watch.live_frames import FIRST, WatchOptions
-from lab.watch.live_output import LIVE_TABLE
-from lab.watch.watch import WatchOutcome, watch_run
 from tracking.detections import Detections
 
 FRAMES = 24
