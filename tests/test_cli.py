@@ -455,9 +455,9 @@ def test_a_signal_within_a_compiled_function_is_no_unexpected_error(tmp_path):
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
 def test_an_error_message_that_cannot_be_written_keeps_its_exit_status(tmp_path):
-    program = shlex.join([sys.executable, "-P", "-c", PROGRAM, "check", "nowhere"])
+    program = shlex.join([sys.executable, "-P", "-c", PROGRAM, "explain", "BP-V99"])
     assert subprocess.run(["sh", "-c", f"{program} 2>/dev/full"], cwd=tmp_path, capture_output=True).returncode == 2
-    program = shlex.join([sys.executable, "-P", "-c", PROGRAM, "run", "nowhere", "--out", "out"])
+    program = shlex.join([sys.executable, "-P", "-c", PROGRAM, "check", "nowhere"])
     assert subprocess.run(["sh", "-c", f"{program} 2>/dev/full"], cwd=tmp_path, capture_output=True).returncode == 2
 
 
@@ -592,7 +592,7 @@ def test_a_foreign_folder_is_not_replaced(tmp_path):
     assert (tmp_path / "thesis/chapter.tex").read_text() == "years"
 
 
-@pytest.mark.parametrize("arguments", [("check", str(SAMPLE)), ("--help",), ("simulate", "list")])
+@pytest.mark.parametrize("arguments", [("check", str(SAMPLE / "rig.yaml")), ("--help",), ("explain",)])
 def test_output_into_a_closed_pipe_ends_quietly_with_the_status_of_a_closed_pipe(arguments, tmp_path):
     command = [sys.executable, "-P", "-c", PROGRAM, *arguments]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as started:
@@ -601,7 +601,7 @@ def test_output_into_a_closed_pipe_ends_quietly_with_the_status_of_a_closed_pipe
     assert (started.returncode, errors) == (PIPE_CLOSED, b"")
 
 
-@pytest.mark.parametrize("arguments", [("rnu",), ("run", "nowhere", "--out", "out")])
+@pytest.mark.parametrize("arguments", [("rnu",), ("explain", "BP-V99")])
 def test_an_error_message_into_a_closed_pipe_ends_quietly_too(arguments, tmp_path):
     command = [sys.executable, "-P", "-c", PROGRAM, *arguments]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as started:
@@ -611,17 +611,17 @@ def test_an_error_message_into_a_closed_pipe_ends_quietly_too(arguments, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("closed", "path", "status"),
+    ("closed", "arguments", "status"),
     [
-        ("2>&-", SAMPLE / "rig.yaml", 0),
-        ("2>&-", "nowhere", 2),
-        (">&-", SAMPLE / "rig.yaml", 0),
-        (">&- 2>&-", "nowhere", 2),
-        ("<&- >&- 2>&-", SAMPLE / "rig.yaml", 0),
+        ("2>&-", ("check", str(SAMPLE / "rig.yaml")), 0),
+        ("2>&-", ("explain", "BP-V99"), 2),
+        (">&-", ("explain", "BP-V03"), 0),
+        (">&- 2>&-", ("check", "nowhere"), 2),
+        ("<&- >&- 2>&-", ("check", str(SAMPLE / "rig.yaml")), 0),
     ],
 )
-def test_closed_standard_streams_change_no_exit_status(closed, path, status, tmp_path):
-    program = shlex.join([sys.executable, "-P", "-c", PROGRAM, "check", str(path)])
+def test_closed_standard_streams_change_no_exit_status(closed, arguments, status, tmp_path):
+    program = shlex.join([sys.executable, "-P", "-c", PROGRAM, *arguments])
     done = subprocess.run(["sh", "-c", f"{program} {closed}"], cwd=tmp_path, capture_output=True, check=False)
     assert (done.returncode, done.stderr) == (status, b"")
 

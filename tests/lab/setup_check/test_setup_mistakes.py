@@ -235,11 +235,12 @@ def test_a_video_with_an_orientation_flag_is_read_the_same_when_calibrating_and_
     assert np.corrcoef(running.ravel(), calibrating.ravel())[0, 1] > 0.99  # one is the luma, the other from BGR
 
 
+@pytest.mark.parametrize("size_m", [2.0, 0.1])
 @pytest.mark.parametrize(("unit", "noted"), [(1.0, False), (1000.0, True)])
-def test_targets_of_a_scan_are_metres_and_its_unit_is_recognised(unit, noted):
+def test_targets_of_a_scan_are_metres_and_its_unit_is_recognised(unit, noted, size_m):
     from lab.calibrate.screens.screen_inputs import _in_metres
 
-    at = np.array([[0.0, 0, 0], [2, 0, 0], [0, 1, 0.5], [1, 1, 0]])
+    at = np.array([[0.0, 0, 0], [2, 0, 0], [0, 1, 0.5], [1, 1, 0]]) * size_m / 2
     cloud = Cloud(file="scan.ply", unit="mm", targets="targets.csv")
     metres, note = _in_metres((at + 3) * unit, at, cloud)
     np.testing.assert_allclose(metres, at + 3)

@@ -132,3 +132,10 @@ def test_the_printed_form_follows_a_clear_disc_to_a_pixel_or_two():
     for k in range(15):
         frame = tracker.step(discs([place(k)], seed=k))
         assert np.hypot(*(frame.state[:2] - place(k)[:2])) < 3.0
+
+
+def test_in_the_printed_form_the_occlusion_of_a_clear_disc_is_the_change_of_its_area():
+    tracker = PrintedTracker(classical_detector(P), P)
+    for k, radius in enumerate([20.0, 20.0, 20.0, 22.0]):
+        frame = tracker.step(discs([(80.0, 60.0, radius)], seed=k))
+    assert frame.occlusion == pytest.approx(1.1**2 - 1, abs=0.01)

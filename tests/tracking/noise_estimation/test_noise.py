@@ -265,9 +265,10 @@ def test_an_empty_list_and_a_model_without_noise_are_rejected():
 def test_the_noise_of_pictures_too_small_for_levels_is_estimated(size):
     rng = np.random.default_rng(5)
     scene = Scene([Spot(size[0] / 2, size[1] / 2, 3000.0, 1, 1)], size=size, background=200.0, read=20.0)
-    model = estimate_noise([photograph(scene, rng, bits=16) for _ in range(2)]).model
+    estimate = estimate_noise([photograph(scene, rng, bits=16) for _ in range(2)])
     true = 20.0**2 + 200.0 / scene.gain
-    assert 1 / 1.6 < float(model.variance(200.0)) / true < 1.6
+    assert 1 / 1.6 < float(estimate.model.variance(200.0)) / true < 1.6
+    assert not estimate.temporal  # no differences in time
 
 
 def test_steps_of_compressed_blocks_are_not_spots():

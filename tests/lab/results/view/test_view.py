@@ -16,7 +16,7 @@ from calibration.open3d_loader import open3d
 from geometry.forward_model import SpotModel
 from lab.errors import InputError
 from lab.files.rig.rig_file import save_rig
-from lab.results.view import render, slider_window
+from lab.results.view import render, slider_window, window
 from lab.results.view import scene as solids
 from lab.results.view import view as view_module
 from lab.results.view.page import Player, scene_data
@@ -275,6 +275,14 @@ def test_where_the_window_with_a_slider_cannot_open_the_other_one_is_tried(conte
 def test_a_window_that_was_open_is_not_followed_by_another(content, monkeypatch):
     monkeypatch.setattr(slider_window, "_show", _opens_and_ends)
     assert slider_window.open_slider_window(view_of(content, None), None)
+
+
+def test_where_the_window_with_a_slider_opens_no_other_one_is_tried(content, monkeypatch):
+    tried = []
+    monkeypatch.setattr(window, "open3d", lambda: tried.append(True))
+    monkeypatch.setattr(window, "open_slider_window", lambda view, index: True)
+    assert window.open_window(view_of(content, None), None)
+    assert tried == []
 
 
 @needs_open3d

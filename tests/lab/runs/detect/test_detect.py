@@ -136,6 +136,15 @@ def test_each_size_and_depth_of_pictures_has_its_own_noise_and_a_note_in_the_rep
     assert "different sizes or depths" in (tmp_path / "out/report.html").read_text("utf-8")
 
 
+@pytest.mark.parametrize(("every", "limit", "expected"), [(1, None, 5), (2, None, 3), (1, 2, 2), (2, 9, 3)])
+def test_progress_counts_the_pictures_that_are_searched(tmp_path, every, limit, expected):
+    told = []
+    folder = write_folder(tmp_path / "series", range(5))
+    options = DetectOptions(every=every, limit=limit)
+    detect_pictures([folder], tmp_path / "out", options, lambda done, total: told.append((done, total)))
+    assert told == [(k + 1, expected) for k in range(expected)]
+
+
 def test_one_picture_is_enough(tmp_path):
     cv2.imwrite(str(tmp_path / "screen.bmp"), picture(0))
     outcome = detect_pictures([tmp_path / "screen.bmp"], tmp_path / "out")
