@@ -46,9 +46,9 @@ def read_picture(path: Path, size_px: tuple[int, int] | None, colour: bool = Fal
         data = _content(path)
     except OSError as error:
         return MissingPicture(f"{UNREADABLE}: {error.strerror}")
-    grey = _decoded(data, size_px)  # its checks find damage that OpenCV passes over
-    if not colour or isinstance(grey, MissingPicture):
-        return grey
+    found = _decoded(data, size_px, colour)  # its checks find damage that OpenCV passes over
+    if not colour or isinstance(found, MissingPicture) or found.ndim == 3:
+        return found
     cv2 = load_cv2()
     picture = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return MissingPicture(f"{UNREADABLE}: damaged, or no picture") if picture is None else picture
@@ -102,7 +102,10 @@ def _wrong_size(width: int, height: int, size_px: tuple[int, int]) -> str:
     return f"wrong size {width}x{height}, the rig says {size_px[0]}x{size_px[1]}"
 
 
-def _decoded(data: NDArray[np.uint8], size_px: tuple[int, int] | None) -> GreyPicture | MissingPicture:
+def _decoded(
+    data: NDArray[np.uint8], size_px: tuple[int, int] | None, colour: bool = False
+) -> GreyPicture | MissingPicture:
+    """Grey; with `colour`, those that are decoded here in one step are (h, w, 3), BGR."""
     if not data.size:
         return MissingPicture(f"{UNREADABLE}: the file is empty")
     try:
@@ -110,7 +113,8 @@ def _decoded(data: NDArray[np.uint8], size_px: tuple[int, int] | None) -> GreyPi
         header.require_sound()
         if size_px is not None and (header.width, header.height) != size_px:
             return MissingPicture(_wrong_size(header.width, header.height, size_px))
-        picture = _DECODERS[header.kind](data, header)
+        decoder = _png_in_colour if colour and header.kind == "png" else _DECODERS[header.kind]
+        picture = decoder(data, header)
     except DamagedError as error:
         return MissingPicture(f"{UNREADABLE}: {error}")
     except MemoryError:
@@ -122,7 +126,18 @@ def _png(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
     from lab.pictures.png import Png  # compiled code: only where there are such pictures
 
     png = Png.read(data)
-    return png.grey() if png.is_simple else _by_opencv(np.frombuffer(png.plain_file(), np.uint8))
+    return png.stored() if png.is_simple else _by_opencv(np.frombuffer(png.plain_file(), np.uint8))
+
+
+def _png_in_colour(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:
+    """Grey and palette pictures as `_png`; RGB of 8 bits as BGR: half the cost of two decodings by OpenCV."""
+    from lab.pictures.png import Png
+
+    png = Png.read(data)
+    if not png.is_rgb:
+        return _png(data, header)
+    cv2 = load_cv2()
+    return cast("NDArray[np.generic]", cv2.cvtColor(png.stored(), cv2.COLOR_RGB2BGR))
 
 
 def _jpeg(data: NDArray[np.uint8], header: Header) -> NDArray[np.generic]:

@@ -22,6 +22,11 @@ class MarkerModel:
     colour: Ints  # (K,) index of the colour range
     radius_m: Array  # (K,), nan where it is not known
     sigma_m: float = 0.0  # of each coordinate of `positions`: how well the markers are surveyed
+    facing: Array = field(init=False, repr=False)  # (K, 3), m: normals of discs, as long as their radii; 0: not known
+
+    def __post_init__(self) -> None:
+        normal = np.linalg.svd(self.positions - self.positions.mean(axis=0))[2][-1]
+        object.__setattr__(self, "facing", np.nan_to_num(self.radius_m)[:, None] * normal)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -109,13 +114,26 @@ class StereoPair:
         return float(np.linalg.norm(left - right))
 
 
-def project(pair: StereoPair, points_world: Array) -> tuple[Array, Array]:
+def project(pair: StereoPair, points_world: Array, facing: Array | None = None) -> tuple[Array, Array]:
     """Distorted pixels (..., 2, K, 2) of world points (..., K, 3), m, in both cameras, and d(pixel)/d(point).
 
-    The derivatives (..., 2, K, 2, 3) are px/m, by the point in world. nan behind a camera or beyond the lens's fold.
+    facing (..., K, 3): normals of discs in world, as long as their radii, m: the pixels are then the centroids of the
+    discs' images. The derivatives (..., 2, K, 2, 3) are px/m, by the point in world. nan behind a camera or beyond the
+    lens's fold.
+
+    Source of the centroids: ours. The near part of a tilted disc is larger in the picture than its far part. Its
+    centroid is the mean of (x, y) / z over the disc, weighted with z^-3, here to second order in radius over distance.
     """
     n = pair.numbers
-    in_cameras = points_world[..., None, :, :] @ np.swapaxes(n.rotation, -1, -2) + n.translation[:, None]
+    turn = np.swapaxes(n.rotation, -1, -2)
+    in_cameras = points_world[..., None, :, :] @ turn + n.translation[:, None]
+    if facing is not None:
+        m = facing[..., None, :, :] @ turn
+        z = in_cameras[..., 2:]
+        flat = np.sum(m * m, axis=-1, keepdims=True) - m[..., 2:] ** 2
+        with np.errstate(invalid="ignore", divide="ignore"):
+            shift = (m[..., :2] * m[..., 2:] + in_cameras[..., :2] / z * flat) / z
+        in_cameras[..., :2] += shift
     pixels, J = project_points(in_cameras, n.pinhole, n.distortion, n.fold_r2, n.fisheye)
     return pixels, J @ n.rotation[:, None]
 
@@ -126,8 +144,9 @@ def project_markers(pair: StereoPair, model: MarkerModel, world_from_body: Pose)
     The pose error is that of section 1 of the file contract: [dt (m, in world), dtheta (rad, in body)].
     """
     R = world_from_body.rotation
-    turned = model.positions @ np.swapaxes(R, -1, -2)
-    pixels, by_point = project(pair, turned + world_from_body.translation[..., None, :])
+    back = np.swapaxes(R, -1, -2)
+    places = model.positions @ back + world_from_body.translation[..., None, :]
+    pixels, by_point = project(pair, places, model.facing @ back)
     # d(R Exp(theta) m)/dtheta = -R [m]_x; with a row w of the derivative by the point, -w R [m]_x = m x (w R).
     in_body = by_point @ R[..., None, None, :, :]
     by_turn = cross(model.positions[:, None, :], in_body)

@@ -16,13 +16,13 @@ class SegmentationParameters:
 
     gamma: float = 0.8  # of the left picture; the paper's value, below 1: brightens low levels
     specify_histogram: bool = True  # right picture to the histogram of the left one
-    median_px: int = 3  # side of the median filter of the mask, odd; 0 or 1: none
-    opening_px: int = 3  # side of the opening, removes specks; 0 or 1: none
-    closing_px: int = 3  # side of the closing, fills holes; 0 or 1: none
-    min_area_px2: float = 6.0  # smaller regions are noise
+    median_px: int = 0  # side of the median filter of the mask, odd; 0 or 1: none; removes markers of 3 px
+    opening_px: int = 0  # side of the opening, removes specks; 0 or 1: none; removes markers of 3 px
+    closing_px: int = 0  # side of the closing, fills holes; 0 or 1: none
+    min_area_px2: float = 1.0  # smaller regions are noise
     max_area_px2: float = 40000.0  # larger regions are background
     centroid: Literal["coverage", "contour"] = "coverage"  # contour: the paper's
-    sigma_floor_px: float = 0.02  # smallest sigma of a centroid: shading and texture of a real marker
+    sigma_floor_px: float = 0.005  # smallest sigma of a centroid: shading and texture of a real marker
     max_markers: int = 40  # per picture, the largest regions first
 
     def __post_init__(self) -> None:

@@ -2,8 +2,10 @@
 
 The paper brightens the left picture by gamma 0.8, gives the right one the histogram of the left, segments in HSV,
 cleans the mask by a median filter, an opening and a closing, and takes the centroid of each contour. Such a centroid
-carries the errors of its pixels' edges. Ours (`coverage`) weights each pixel of the unchanged picture with the share of
-the marker's colour in it, which is linear in the light: partly covered pixels and defocus do not shift it.
+carries the errors of its pixels' edges, and the cleaning removes markers of less than 4 px. Ours (`coverage`) weights
+each pixel of the unchanged picture with the share of the marker's colour in it, which is linear in the light: partly
+covered pixels and defocus do not shift it. Its contrast, in sigmas of the background, decides what is no marker, so the
+mask needs no cleaning.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array, Bools, Ints
 from tracking.binocular.marker_model import MarkerImages
 from tracking.binocular.parameters import SegmentationParameters
 
@@ -26,6 +28,7 @@ _FEWEST_RING = 12  # pixels of background for its colour and its covariance
 _FEWEST_INNER = 9  # pixels inside a marker for the variance of its shading
 _LEAST_VARIANCE_DN2 = 1.0  # of a pixel of the background: rounding and a little noise
 _LEAST_CONTRAST2 = 25.0  # squared distance of marker and background in sigmas of the background
+_MOST_REGIONS = 3  # times the largest number of markers: regions that are measured, the largest first
 _CONTOUR_SIGMA = 0.29  # of the place of an edge that is rounded to whole pixels, px
 
 
@@ -68,32 +71,43 @@ def brightened(picture: Bytes, gamma: float) -> Bytes:
     return np.asarray(cv2.LUT(picture, table), dtype=np.uint8)
 
 
-def specified(picture: Bytes, reference: Bytes) -> Bytes:
-    """A picture (h, w, 3), BGR, whose value channel (HSV) gets the histogram of the reference's.
+def is_grey(picture: Bytes) -> bool:
+    """Whether the three channels of a picture (h, w, 3) are equal."""
+    blue, green, red = cv2.split(picture)
+    return cv2.norm(blue, green, cv2.NORM_INF) == 0 and cv2.norm(green, red, cv2.NORM_INF) == 0
+
+
+def in_hsv(picture: Bytes) -> Bytes:
+    """A picture (h, w, 3), BGR, in OpenCV's HSV (hue 0 to 179)."""
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2HSV), dtype=np.uint8)
+
+
+def specified(hsv: Bytes, reference: Bytes) -> Bytes:
+    """A picture (h, w, 3), HSV, whose value channel gets the histogram of the reference's, HSV.
 
     The printed method does not name the channel. With the value alone, hue and saturation stay, on which the
     segmentation rests.
     """
-    hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
-    own, wanted = (np.cumsum(np.bincount(p.max(axis=2).ravel(), minlength=256)) for p in (picture, reference))
+    own, wanted = (np.cumsum(cv2.calcHist([p], [2], None, [256], [0, 256])) for p in (hsv, reference))
     levels = np.searchsorted(wanted / wanted[-1], own / own[-1] - 1e-12)
-    hsv[..., 2] = cv2.LUT(hsv[..., 2], np.minimum(levels, 255).astype(np.uint8))
-    return np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR), dtype=np.uint8)
+    same = np.arange(256)
+    table = np.stack([same, same, np.minimum(levels, 255)], axis=-1).astype(np.uint8)
+    return np.asarray(cv2.LUT(hsv, table[None]), dtype=np.uint8)
 
 
 def prepared(left: Bytes | None, right: Bytes | None, p: SegmentationParameters) -> tuple[Bytes | None, Bytes | None]:
-    """Both pictures as the segmentation sees them: the left one brightened, the right one with its histogram."""
-    bright = None if left is None else brightened(left, p.gamma)
+    """Both pictures as the segmentation sees them, HSV: the left one brightened, the right one with its histogram."""
+    bright = None if left is None else in_hsv(brightened(left, p.gamma))
     if right is None:
         return bright, None
     if bright is None or not p.specify_histogram:
-        return bright, brightened(right, p.gamma)
-    return bright, specified(right, bright)
+        return bright, in_hsv(brightened(right, p.gamma))
+    return bright, specified(in_hsv(right), bright)
 
 
-def colour_mask(picture: Bytes, colour: ColourRange, p: SegmentationParameters) -> Bytes:
+def colour_mask(hsv: Bytes, colour: ColourRange, p: SegmentationParameters) -> Bytes:
     """The cleaned mask (h, w) of a colour in a prepared picture, 0 or 255."""
-    mask = colour.mask(np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2HSV), dtype=np.uint8))
+    mask = colour.mask(hsv)
     if p.median_px > 1:
         mask = np.asarray(cv2.medianBlur(mask, p.median_px), dtype=np.uint8)
     for size, operation in ((p.opening_px, cv2.MORPH_OPEN), (p.closing_px, cv2.MORPH_CLOSE)):
@@ -112,31 +126,58 @@ def marker_candidates(
     edge of the picture are left out: their centroids are not those of the markers.
     """
     masks = [colour_mask(as_seen, colour, p) for colour in colours]
-    anywhere = np.max(masks, axis=0) > 0
-    rows: list[tuple[float, Array, Array, int]] = []
-    height, width = anywhere.shape
+    anywhere = masks[0] if len(masks) == 1 else np.max(masks, axis=0)
+    regions: list[tuple[float, int, Ints]] = []  # area, colour, outline
     for index, mask in enumerate(masks):
-        _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-        for i in range(1, len(stats)):
-            x, y, w, h, area = (int(v) for v in stats[i])
-            inside = x > 0 and y > 0 and x + w < width and y + h < height
-            if not inside or not p.min_area_px2 <= area <= p.max_area_px2:
-                continue
-            margin = _MARGIN_PX + _RING_PX
-            box = (slice(max(y - margin, 0), y + h + margin), slice(max(x - margin, 0), x + w + margin))
-            own = labels[box] == i
-            measured = None
-            if p.centroid == "coverage":
-                measured = _coverage_centroid(picture[box].astype(float), own, anywhere[box] & ~own)
-            uv, cov, size = _contour_centroid(own) if measured is None else measured
-            uv = uv + np.array([box[1].start, box[0].start])
-            rows.append((size, uv, cov + p.sigma_floor_px**2 * np.eye(2), index))
-    rows.sort(key=lambda row: -row[0])
+        outlines, nested = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+        outer = [] if nested is None else nested[0, :, 3] < 0  # the others are holes
+        for outline in (o for o, is_outer in zip(outlines, outer, strict=True) if is_outer):
+            # Pixels on the outline count in whole: Pick's theorem.
+            area = cv2.contourArea(outline) + 0.5 * len(outline) + 1 if len(outline) > 1 else 1.0
+            if p.min_area_px2 <= area <= p.max_area_px2:
+                regions.append((area, index, outline))
+    regions.sort(key=lambda region: -region[0])
+    rows = [
+        (index, *found)
+        for _, index, outline in regions[: _MOST_REGIONS * p.max_markers]
+        if (found := _measured(picture, anywhere, outline, p)) is not None
+    ]
+    rows.sort(key=lambda row: -row[3])
     rows = rows[: p.max_markers]
     if not rows:
         return MarkerImages.none()
-    areas, uv_px, covariances, colour = zip(*rows, strict=True)
+    colour, uv_px, covariances, areas = zip(*rows, strict=True)
     return MarkerImages(np.array(uv_px), np.array(covariances), np.array(areas), np.array(colour, dtype=np.int64))
+
+
+def _measured(
+    picture: Bytes, anywhere: Bytes, outline: Ints, p: SegmentationParameters
+) -> tuple[Array, Array, float] | None:
+    """Centroid (2,), covariance (2, 2) and area of the region within an outline; None where it is no marker.
+
+    anywhere (h, w): not 0 in the regions of all colours.
+    """
+    x, y, w, h = cv2.boundingRect(outline)
+    height, width = anywhere.shape
+    if x == 0 or y == 0 or x + w == width or y + h == height:
+        return None
+    margin = _MARGIN_PX + _RING_PX
+    left, top = max(x - margin, 0), max(y - margin, 0)
+    box = (slice(top, y + h + margin), slice(left, x + w + margin))
+    filled = np.zeros(anywhere[box].shape, np.uint8)
+    cv2.drawContours(filled, [outline], -1, 1, cv2.FILLED, offset=(-left, -top))
+    own = filled > 0
+    measured = None
+    if p.centroid == "coverage":
+        others = (anywhere[box] > 0) & ~own
+        near = _dilated(own, _MARGIN_PX)
+        ring = ~near & ~_dilated(others, _MARGIN_PX)
+        if ring.sum() >= _FEWEST_RING and not (near & others).any():
+            measured = _coverage_centroid(picture[box].astype(float), own, near, ring)
+            if measured is None:
+                return None
+    uv, cov, size = _contour_centroid(own) if measured is None else measured
+    return uv + np.array([left, top]), cov + p.sigma_floor_px**2 * np.eye(2), size
 
 
 def _contour_centroid(own: Bools) -> tuple[Array, Array, float]:
@@ -153,17 +194,14 @@ def _contour_centroid(own: Bools) -> tuple[Array, Array, float]:
     return np.array([u.mean(), v.mean()]), sigma**2 * np.eye(2), float(len(u))
 
 
-def _coverage_centroid(patch: Array, own: Bools, others: Bools) -> tuple[Array, Array, float] | None:
+def _coverage_centroid(patch: Array, own: Bools, near: Bools, ring: Bools) -> tuple[Array, Array, float] | None:
     """Centroid (2,), covariance (2, 2) and area, px^2, of a region by the share of its colour in each pixel.
 
     patch (h, w, 3): DN. The share is the linear discriminant (Fisher 1936) between the core of the region and a ring of
     background around it: it ignores those changes of colour that occur in the background itself, such as the edge of
-    the target against the sky. None where another region is so close that there is no ring. Source: ours.
+    the target against the sky. near: the region with its partly covered pixels. None where the region does not differ
+    from its background by more than noise. Source: ours.
     """
-    near = _dilated(own, _MARGIN_PX)
-    ring = ~near & ~_dilated(others, _MARGIN_PX)
-    if ring.sum() < _FEWEST_RING or (near & others).any():
-        return None
     core = cv2.erode(own.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     core = own if not core.any() else core
     background = patch[ring].mean(axis=0)

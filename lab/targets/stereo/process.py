@@ -23,7 +23,7 @@ from lab.number_format import format_length
 from lab.pictures.picture_file import MissingPicture
 from lab.progress import Progress
 from lab.targets.stereo.findings import findings_of
-from lab.targets.stereo.frames import Content, StereoFrame, stereo_frames
+from lab.targets.stereo.frames import StereoFrame, stereo_frames
 from lab.targets.stereo.page import write_stereo_page
 from lab.targets.stereo.run import StereoRecord, StereoResults, StereoRun, load_stereo_run, truth_errors
 from lab.targets.stereo.tables import write_tables
@@ -31,7 +31,7 @@ from lab.targets.verdict import Outcome, verdict_block
 from lab.versions import versions
 from tracking.binocular.marker_model import MarkerImages
 from tracking.binocular.pose_tracker import BinocularTracker, FittedFrame, clock_offset
-from tracking.binocular.segmentation import marker_candidates, prepared
+from tracking.binocular.segmentation import is_grey, marker_candidates, prepared
 
 SUMMARY_SCHEMA = "beampose/stereo-summary/1"
 _GREY_CHECKED = 5  # pictures in which a target of saturated colours must have some colour
@@ -70,12 +70,9 @@ def measure(run: StereoRun, progress: Progress | None = None) -> StereoResults:
     """
     results = StereoResults(run)
     tracker = BinocularTracker(run.pair, run.target.model, run.parameters.match)
-    grey = 0
+    colour = _ColourCheck(run)
     for frame in stereo_frames(run):
-        if len(results.records) < _GREY_CHECKED:
-            grey += int(_all_grey(frame))
-            if grey == _GREY_CHECKED:
-                _refuse_grey(run)
+        colour.look(frame)
         candidates = candidates_of(run, frame)
         t_s = float(run.times.t_s(frame.frame))
         missing = [c.reason if isinstance(c, MissingPicture) else "" for c in frame.content]
@@ -119,20 +116,30 @@ def add_truth(results: StereoResults, truth: TruePoses | None) -> None:
         results.errors = truth_errors(results.records, results.run, truth.frame.astype(float), poses)
 
 
-def _all_grey(frame: StereoFrame) -> bool:
-    def grey(content: Content) -> bool:
-        return isinstance(content, np.ndarray) and bool(np.ptp(content, axis=2).max() == 0)
+class _ColourCheck:
+    """Whether the first pictures of each camera have colour. Those too dark to show a marker say nothing about it."""
 
-    return any(grey(c) for c in frame.content)
+    def __init__(self, run: StereoRun) -> None:
+        self._run = run
+        self._looked = [0, 0]  # pictures of each camera
+        self._grey = [0, 0]
+        self._least_light = 255 * min(colour.value[0] for colour in run.target.colours)
+        self._needed = all(colour.saturation[0] > 0 for colour in run.target.colours)
 
-
-def _refuse_grey(run: StereoRun) -> None:
-    """Raises InputError where no colour range can match a grey pixel."""
-    if all(colour.saturation[0] > 0 for colour in run.target.colours):
-        raise InputError(
-            f"{run.path}: cameras: expected colour pictures, got grey ones; for bright lamps in grey pictures set"
-            " saturation: [0, 1] and a high value in target.colours"
-        )
+    def look(self, frame: StereoFrame) -> None:
+        """Raises InputError where a camera's pictures are grey, and no colour range can match a grey pixel."""
+        for c, content in enumerate(frame.content):
+            if not self._needed or not isinstance(content, np.ndarray) or self._looked[c] == _GREY_CHECKED:
+                continue
+            if content.max() <= self._least_light:
+                continue
+            self._looked[c] += 1
+            self._grey[c] += int(is_grey(content))
+            if self._grey[c] == _GREY_CHECKED:
+                raise InputError(
+                    f"{self._run.path}: cameras: expected colour pictures, got grey ones; for bright lamps in grey"
+                    " pictures set saturation: [0, 1] and a high value in target.colours"
+                )
 
 
 def _require_pictures(results: StereoResults) -> None:
