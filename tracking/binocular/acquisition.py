@@ -22,7 +22,9 @@ from tracking.binocular.parameters import MatchParameters
 from tracking.binocular.triangulation import triangulate, undistorted_pixels
 
 _MOST_CANDIDATES = 12  # of a picture, in triples: 1,320 ordered ones
-_MOST_TRIPLES = 8  # of markers
+_FIRST_TRIPLES = 8  # of markers: enough where most of them are seen
+_MOST_TRIPLES = 60  # of markers: all triples of eight
+_MOST_TRIED = 20_000  # ordered triples of candidates times triples of markers, beyond the first triples
 _REFINED, _REFINED_SHARE = 24, 0.6  # best hypotheses that are fitted: at most so many, of this share of the best score
 _CHUNK = 4000  # hypotheses scored at once: 15 MB
 _COARSE_PX, _COARSE_SHARE = 2.0, 0.04  # gate of the scoring: px, and share of the target's size in the picture
@@ -62,8 +64,10 @@ def acquire(pair: StereoPair, model: MarkerModel, images: Images, p: MatchParame
     ranked = [_ranked(images[0], left), _ranked(images[1], right)]
     found: list[LabelledPose] = []
     expected = sum(min(len(model), len(candidates)) for candidates in images)
-    for c in (0, 1):
-        poses = _hypotheses(pair, model, images[c], ranked[c], c)
+    triples = marker_triples(model)
+    # The first triples in both pictures, then the others: any four markers of eight contain four triples.
+    for c, some in [(c, part) for part in (triples[:_FIRST_TRIPLES], triples[_FIRST_TRIPLES:]) for c in (0, 1)]:
+        poses = _hypotheses(pair, model, images[c], ranked[c], c, some)
         found += [
             fitted
             for pose in _best(pair, model, images, poses)
@@ -130,7 +134,7 @@ def _ranked(candidates: MarkerImages, has_partner: Bools) -> Ints:
 
 
 def marker_triples(model: MarkerModel) -> list[tuple[int, int, int]]:
-    """Triples of markers of large area, such that most triples of visible markers contain one of them."""
+    """Triples of markers, those of large area and of different markers first."""
     triples = list(combinations(range(len(model)), 3))
     x = model.positions
     area = {t: float(np.linalg.norm(np.cross(x[t[1]] - x[t[0]], x[t[2]] - x[t[0]]))) for t in triples}
@@ -146,15 +150,22 @@ def marker_triples(model: MarkerModel) -> list[tuple[int, int, int]]:
     return chosen
 
 
-def _hypotheses(pair: StereoPair, model: MarkerModel, found: MarkerImages, ranked: Ints, c: int) -> Pose:
-    """All poses (h), world_from_body, of triples of the ranked candidates of camera c."""
+def _hypotheses(
+    pair: StereoPair,
+    model: MarkerModel,
+    found: MarkerImages,
+    ranked: Ints,
+    c: int,
+    triples: Sequence[tuple[int, int, int]],
+) -> Pose:
+    """All poses (h), world_from_body, of triples of the ranked candidates of camera c and some triples of markers."""
     camera = pair.cameras[c]
-    if len(ranked) < 3:
+    if len(ranked) < 3 or not triples:
         return Pose(np.zeros((0, 3, 3)), np.zeros((0, 3)))
     eye, rays = camera.rays(found.uv_px)
     ordered = np.array(list(permutations(ranked.tolist(), 3)))
     some_rays, some_markers = [], []
-    for triple in marker_triples(model):
+    for triple in triples[: max(_FIRST_TRIPLES, _MOST_TRIED // len(ordered))]:
         fits = np.all(found.colour[ordered] == model.colour[list(triple)], axis=1)
         some_rays.append(rays[ordered[fits]])
         some_markers.append(np.broadcast_to(model.positions[list(triple)], (int(fits.sum()), 3, 3)))
