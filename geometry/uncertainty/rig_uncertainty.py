@@ -8,8 +8,8 @@ along the beam have no effect.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -72,6 +72,21 @@ def is_known(rig: Rig, name: str) -> bool:
     if kind == "screens" and item in rig.screens:
         return parameter in (*POSE, *BOW)
     return kind == "beams" and item in rig.beams and parameter in (*DIRECTION, *POINT)
+
+
+def perturbed_camera(camera: Camera, change: Mapping[str, float]) -> Camera:
+    """The camera with some parameters, by their names without its own, changed by so much."""
+
+    def of(names: Sequence[str]) -> Array:
+        return np.array([change.get(name, 0.0) for name in names])
+
+    d = of(PINHOLE)
+    matrix = camera.matrix + np.array([[d[0], 0, d[2]], [0, d[1], d[3]], [0, 0, 0]])
+    distortion = tuple((np.array(camera.distortion) + of(distortion_names(camera))).tolist())
+    moved = of(POSE)
+    pose = camera.camera_from_world
+    place = pose.plus(moved) if moved.any() else pose
+    return replace(camera, matrix=matrix, distortion=distortion, camera_from_world=place)
 
 
 class Sensitivity:

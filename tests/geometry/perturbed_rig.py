@@ -8,17 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from geometry.arrays import Array
-from geometry.camera import Camera
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen
 from geometry.uncertainty.rig_uncertainty import (
     BOW,
     DIRECTION,
-    PINHOLE,
     POINT,
     POSE,
-    distortion_names,
     is_known,
+    perturbed_camera,
     split_name,
 )
 
@@ -38,7 +36,7 @@ def perturbed(rig: Rig, names: Sequence[str], delta: Array) -> Rig:
     cameras, screens, beams = dict(rig.cameras), dict(rig.screens), dict(rig.beams)
     for (kind, item), change in changes.items():
         if kind == "cameras":
-            cameras[item] = _perturbed_camera(cameras[item], change)
+            cameras[item] = perturbed_camera(cameras[item], change)
         elif kind == "screens":
             screens[item] = _perturbed_screen(screens[item], change)
         else:
@@ -54,18 +52,6 @@ def _changes_of(change: dict[str, float], names: Sequence[str]) -> Array:
 def _perturbed_pose(pose: Pose, change: dict[str, float]) -> Pose:
     delta = _changes_of(change, POSE)
     return pose.plus(delta) if delta.any() else pose
-
-
-def _perturbed_camera(camera: Camera, change: dict[str, float]) -> Camera:
-    d = _changes_of(change, PINHOLE)
-    matrix = camera.matrix + np.array([[d[0], 0, d[2]], [0, d[1], d[3]], [0, 0, 0]])
-    distortion = np.array(camera.distortion) + _changes_of(change, distortion_names(camera))
-    return replace(
-        camera,
-        matrix=matrix,
-        distortion=tuple(distortion.tolist()),
-        camera_from_world=_perturbed_pose(camera.camera_from_world, change),
-    )
 
 
 def _perturbed_screen(screen: Screen, change: dict[str, float]) -> Screen:

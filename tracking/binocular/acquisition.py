@@ -71,7 +71,7 @@ def acquire(pair: StereoPair, model: MarkerModel, images: Images, p: MatchParame
         found += [
             fitted
             for pose in _best(pair, model, images, poses)
-            if (fitted := labelled_pose(pair, model, images, pose, _spread(model, pose), p)) is not None
+            if (fitted := labelled_pose(pair, model, images, pose, near_pose(pose), p)) is not None
         ]
         found = distinct(found)
         if found and (found[0].index >= 0).sum() >= _ENOUGH * expected:
@@ -115,7 +115,7 @@ def mirrored(pair: StereoPair, model: MarkerModel, pose: Pose) -> Pose:
     return Pose(rotation, middle - rotation @ model.positions.mean(axis=0))
 
 
-def _spread(model: MarkerModel, pose: Pose) -> Array:
+def near_pose(pose: Pose) -> Array:
     """Covariance (6, 6) of a pose from three noisy candidates: a few pixels for any focal length."""
     distance = float(np.linalg.norm(pose.translation))
     sideways, turn = 0.002 * distance, 0.03

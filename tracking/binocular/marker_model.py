@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -153,13 +154,14 @@ def project_markers(pair: StereoPair, model: MarkerModel, world_from_body: Pose)
     return pixels, np.concatenate([by_point, by_turn], axis=-1)
 
 
-def calibration_jacobian(pair: StereoPair, points_world: Array) -> Array:
-    """Derivatives (2, K, 2, p) of the pixels of world points (K, 3) by the p parameters of the pair's covariance.
+def calibration_jacobian(pair: StereoPair, points_world: Array, names: Sequence[str] | None = None) -> Array:
+    """Derivatives (2, K, 2, p) of the pixels of world points (K, 3) by p parameters; None: those of the covariance.
 
     Source: ours; the parameters and their errors are those of geometry/uncertainty/rig_uncertainty.py.
     """
-    assert pair.covariance is not None
-    names = pair.covariance.names
+    if names is None:
+        assert pair.covariance is not None
+        names = pair.covariance.names
     out = np.zeros((2, len(points_world), 2, len(names)))
     for c, camera in enumerate(pair.cameras):
         to_camera = camera.camera_from_world

@@ -29,11 +29,14 @@ from lab.targets.stereo.run import StereoRecord, StereoResults, StereoRun, load_
 from lab.targets.stereo.tables import write_tables
 from lab.targets.verdict import Outcome, verdict_block
 from lab.versions import versions
+from tracking.binocular.calibration_check import MOST_FRAMES, LabelledFrame, check_calibration, labelled_by_each
+from tracking.binocular.clock_offset import FittedFrame, clock_offset
 from tracking.binocular.marker_model import MarkerImages
-from tracking.binocular.pose_tracker import BinocularTracker, FittedFrame, clock_offset
+from tracking.binocular.pose_tracker import BinocularTracker
 from tracking.binocular.segmentation import is_grey, marker_candidates, prepared
 
 SUMMARY_SCHEMA = "beampose/stereo-summary/1"
+_ENOUGH = 4  # markers of a picture that determine a pose
 _GREY_CHECKED = 5  # pictures in which a target of saturated colours must have some colour
 
 
@@ -87,12 +90,38 @@ def measure(run: StereoRun, progress: Progress | None = None) -> StereoResults:
         if r.tracked.fit is not None and r.tracked.observed is not None
     ]
     results.clock = clock_offset(run.pair, run.target.model, fitted)
+    results.calibration = check_calibration(run.pair, run.target.model, _labelled(results))
     if run.pair.covariance is None:
         results.notes.append(
             f"{run.pair_path.name} states no covariance: the sigmas contain the noise of the markers, not the errors of"
             " the calibration"
         )
     return results
+
+
+def _labelled(results: StereoResults) -> list[LabelledFrame]:
+    """Some frames with markers in both pictures, evenly spaced: their images, labelled.
+
+    The labels of a measured pose are used where it explains all candidates. Otherwise each picture is labelled alone:
+    an error of the calibration makes a pose refuse images.
+    """
+    run, model = results.run, results.run.target.model
+    both = [r for r in results.records if all(f is not None and len(f) >= _ENOUGH for f in r.candidates)]
+    some = [both[int(i)] for i in np.unique(np.linspace(0, len(both) - 1, MOST_FRAMES).astype(int))] if both else []
+    out = []
+    for record in some:
+        t, (left, right) = record.tracked, record.candidates
+        assert left is not None
+        assert right is not None
+        expected = min(len(left), len(model)) + min(len(right), len(model))
+        if record.measured and t.pose is not None and t.observed is not None and (t.index >= 0).sum() >= expected:
+            out.append(LabelledFrame(t.observed, t.pose))
+            continue
+        start = t.pose if record.measured else None
+        found = labelled_by_each(run.pair, model, (left, right), start, run.parameters.match)
+        if found is not None:
+            out.append(found)
+    return out
 
 
 def candidates_of(run: StereoRun, frame: StereoFrame) -> tuple[MarkerImages | None, MarkerImages | None]:

@@ -49,10 +49,12 @@ from lab.files.text.error_text import name_of_path, suggest_name
 from lab.files.text.fields import Block, Name, Text, Word, number_between, one_of, validated
 from lab.files.text.yaml_text import read_mapping
 from lab.targets.stereo.target_block import Target, load_target
+from tracking.binocular.calibration_check import CalibrationCheck
+from tracking.binocular.clock_offset import ClockOffset
 from tracking.binocular.joint_fit import JointFit
 from tracking.binocular.marker_model import MarkerImages, StereoPair
 from tracking.binocular.parameters import BinocularParameters, MatchParameters, SegmentationParameters
-from tracking.binocular.pose_tracker import BinocularFrame, ClockOffset
+from tracking.binocular.pose_tracker import BinocularFrame
 from tracking.statuses import PoseStatus
 
 SCHEMA = "beampose/stereo/1"
@@ -207,6 +209,7 @@ class StereoResults:
     run: StereoRun
     records: list[StereoRecord] = field(default_factory=list)
     clock: ClockOffset | None = None
+    calibration: CalibrationCheck | None = None
     errors: TruthErrors | None = None
     notes: list[str] = field(default_factory=list)
 
