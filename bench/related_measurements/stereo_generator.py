@@ -167,7 +167,9 @@ def write_recording(
         "name": folder.name,
         "pair": "pair.yaml",
         "frame_rate_hz": 25.0,
-        "cameras": {n: {"frames": f"frames/{n}"} if pictures else {"detections": "points.csv"} for n in ("left", "right")},
+        "cameras": {
+            n: {"frames": f"frames/{n}"} if pictures else {"detections": "points.csv"} for n in ("left", "right")
+        },
         "target": {
             "colours": {"red": {"hue_deg": [340.0, 20.0], "saturation": [0.35, 1.0], "value": [0.2, 1.0]}},
             "markers": {

@@ -3,10 +3,10 @@
 A rigid target of known size that moves through depth determines more than its poses. The distance follows from its size
 in each picture and from the disparity; a wrong baseline scales the disparity, a turned camera or a shifted principal
 point adds to it, and a wrong focal length of one camera scales one picture. Each such error is fitted together with all
-poses, the covariance of the calibration and the survey of the markers as a prior, and compared by its chi-square. Errors
-whose chi-squares are within three sigma of the best are not separated by the recording, and all of them are named: a
-turn about the vertical axis and a shift of a principal point along the rows differ only at the edge of the picture, and
-the same error of both focal lengths is nearly a change of the distance.
+poses, the covariance of the calibration and the survey of the markers as a prior, and compared by its chi-square.
+Errors whose chi-squares are within three sigma of the best are not separated by the recording, and all of them are
+named: a turn about the vertical axis and a shift of a principal point along the rows differ only at the edge of the
+picture, and the same error of both focal lengths is nearly a change of the distance.
 
 Source: ours; a test of single hypotheses by generalised least squares, as in calibration/model_check.
 """
@@ -30,7 +30,7 @@ from tracking.binocular.parameters import MatchParameters
 MOST_FRAMES, FEWEST_FRAMES = 40, 5
 _FEWEST_MARKERS = 4  # of each picture: three have several poses
 _STEPS = 6  # of Gauss-Newton
-_CERTAIN_CHI2 = 30.0  # that an error explains: 5.5 sigma
+_CERTAIN_CHI2 = 20.0  # that an error explains: 4.5 sigma
 _SEPARATED_CHI2 = 9.0  # that the best error explains more than another one: 3 sigma
 
 
@@ -156,8 +156,10 @@ def _hypotheses(pair: StereoPair) -> list[_Hypothesis]:
     out.append(_Hypothesis("focal length of both cameras", "%", focal[0] + focal[1]))
     for camera, longer_focus in zip(pair.cameras, focal, strict=True):
         out.append(_Hypothesis(f"focal length of {camera.name}", "%", longer_focus))
-        for p in ("cx", "cy"):
-            out.append(_Hypothesis(f"principal point {p} of {camera.name}", "px", change(camera.name, {p: 1.0})))
+        out += [
+            _Hypothesis(f"principal point {p} of {camera.name}", "px", change(camera.name, {p: 1.0}))
+            for p in ("cx", "cy")
+        ]
     return out
 
 
@@ -175,9 +177,7 @@ class _Adjustment:
 
     def __init__(self, pair: StereoPair, model: MarkerModel, frames: Sequence[LabelledFrame]) -> None:
         self._pair, self._model, self._names = pair, model, _names(pair)
-        self._start = Pose(
-            np.stack([f.pose.rotation for f in frames]), np.stack([f.pose.translation for f in frames])
-        )
+        self._start = Pose(np.stack([f.pose.rotation for f in frames]), np.stack([f.pose.translation for f in frames]))
         uv = np.stack([f.observed.uv_px for f in frames])
         seen = np.isfinite(uv[..., 0])
         self._uv_px = np.nan_to_num(uv)
@@ -218,7 +218,9 @@ class _Adjustment:
         """Whitened derivatives by the pose (n, m, 6), residuals (n, m) and derivatives by the errors (n, m, e)."""
         n, K = len(self._uv_px), len(self._model)
         pixels, J = project_markers(pair, self._model, poses)
-        points = (self._model.positions @ np.swapaxes(poses.rotation, -1, -2) + poses.translation[:, None]).reshape(-1, 3)
+        points = (self._model.positions @ np.swapaxes(poses.rotation, -1, -2) + poses.translation[:, None]).reshape(
+            -1, 3
+        )
         columns: list[Array] = []
         if hypothesis is not None:
             columns.append(calibration_jacobian(pair, points, self._names) @ hypothesis.per_unit[:, None])
@@ -228,7 +230,9 @@ class _Adjustment:
             columns.append(calibration_jacobian(self._pair, points) @ root)
         by_error = [np.moveaxis(c.reshape(2, n, K, 2, -1), 0, 1) for c in columns]
         if self._model.sigma_m > 0:
-            by_place = J[..., :3] @ poses.rotation[:, None, None] * self._model.sigma_m  # (n, 2, K, 2, 3), of one marker
+            by_place = (
+                J[..., :3] @ poses.rotation[:, None, None] * self._model.sigma_m
+            )  # (n, 2, K, 2, 3), of one marker
             of_marker = np.einsum("nckij,kl->nckilj", by_place, np.eye(K))
             by_error.append(of_marker.reshape(n, 2, K, 2, 3 * K))
         A = np.concatenate(by_error, axis=-1) if by_error else np.zeros((n, 2, K, 2, 0))

@@ -20,6 +20,7 @@ from tracking.binocular.marker_model import MarkerImages, MarkerModel, StereoPai
 from tracking.binocular.parameters import MatchParameters
 
 Images = tuple[MarkerImages, MarkerImages]  # candidates of the left and the right picture
+_LARGEST_PX2 = 1e8  # of the variance of a predicted place: more than any picture
 _ROUNDS = 4  # of labelling and fitting
 _MOST_OUTLIERS = 4  # images that a fit may refuse
 _PARAMETERS_IN_IMAGES = 3  # a pose has as many numbers as three images
@@ -71,13 +72,15 @@ def assign(pair: StereoPair, model: MarkerModel, images: Images, pose: Pose, spr
             continue
         S = (J[c] @ spread @ np.swapaxes(J[c], -1, -2))[:, None] + found.cov_px2[None]
         S = S + 1e-4 * np.eye(2)
+        usable = np.trace(S, axis1=-2, axis2=-1) < _LARGEST_PX2  # not of markers behind the camera, or beside it
+        S = np.where(usable[..., None, None], S, np.eye(2))
         apart = found.uv_px[None] - pixels[c][:, None]
         with np.errstate(invalid="ignore", divide="ignore"):
-            d2 = np.einsum("kni,knij,knj->kn", apart, np.linalg.inv(np.nan_to_num(S, nan=1.0)), apart)
+            d2 = np.einsum("kni,knij,knj->kn", apart, np.linalg.inv(S), apart)
             size = np.abs(np.log(found.area_px2[None] / areas[c][:, None]))
         wrong_size = size > np.log(p.area_factor)  # False for nan: not known
-        allowed = (d2 < p.gate_sigmas**2) & (model.colour[:, None] == found.colour[None]) & ~wrong_size
-        cost = np.where(allowed, d2 + np.linalg.slogdet(np.nan_to_num(S, nan=1.0))[1], 1e6)
+        allowed = (d2 < p.gate_sigmas**2) & (model.colour[:, None] == found.colour[None]) & ~wrong_size & usable
+        cost = np.where(allowed, d2 + np.linalg.slogdet(S)[1], 1e6)
         for k, n in zip(*linear_sum_assignment(cost), strict=True):
             if allowed[k, n]:
                 out[c, k] = n

@@ -142,7 +142,8 @@ def project(pair: StereoPair, points_world: Array, facing: Array | None = None) 
 def project_markers(pair: StereoPair, model: MarkerModel, world_from_body: Pose) -> tuple[Array, Array]:
     """Pixels (..., 2, K, 2) of all markers for poses (...), and their Jacobian (..., 2, K, 2, 6) by the pose error.
 
-    The pose error is that of section 1 of the file contract: [dt (m, in world), dtheta (rad, in body)].
+    The pose error is that of section 1 of the file contract: [dt (m, in world), dtheta (rad, in body)]. The pixels are
+    centroids of discs where radii are known; the derivatives are those of the centres, which differ by less than 1 %.
     """
     R = world_from_body.rotation
     back = np.swapaxes(R, -1, -2)

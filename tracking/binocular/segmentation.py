@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools
 from tracking.binocular.marker_model import MarkerImages
 from tracking.binocular.parameters import SegmentationParameters
 
@@ -127,7 +128,7 @@ def marker_candidates(
     """
     masks = [colour_mask(as_seen, colour, p) for colour in colours]
     anywhere = masks[0] if len(masks) == 1 else np.max(masks, axis=0)
-    regions: list[tuple[float, int, Ints]] = []  # area, colour, outline
+    regions: list[tuple[float, int, NDArray[Any]]] = []  # area, colour, outline
     for index, mask in enumerate(masks):
         outlines, nested = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
         outer = [] if nested is None else nested[0, :, 3] < 0  # the others are holes
@@ -151,7 +152,7 @@ def marker_candidates(
 
 
 def _measured(
-    picture: Bytes, anywhere: Bytes, outline: Ints, p: SegmentationParameters
+    picture: Bytes, anywhere: Bytes, outline: NDArray[Any], p: SegmentationParameters
 ) -> tuple[Array, Array, float] | None:
     """Centroid (2,), covariance (2, 2) and area of the region within an outline; None where it is no marker.
 

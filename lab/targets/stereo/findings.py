@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from lab.findings.finding import Finding, Level, finding, level_above, passed, worst_first
-from lab.number_format import format_number
+from lab.number_format import format_length, format_number
 from lab.targets.stereo.run import StereoResults
 from tracking.binocular.marker_model import MarkerImages
 from tracking.binocular.pose_tracker import AMBIGUOUS
@@ -17,17 +17,18 @@ LEAST_MEASURED, GOOD_MEASURED = 0.1, 0.95  # shares of the frames, as for runs o
 GOOD_PICTURES = 0.95  # share of frames with a usable picture, per camera
 LARGEST_NOISE_SCALE, GOOD_NOISE_SCALE = 5.0, 1.5  # residuals over their sigmas
 _ENOUGH, _FEWEST_SEEN = 4, 3  # markers of a picture that determine a pose, and frames with as many in both
-MOVED_SIGMAS, MOVED_PX = 6.0, 0.1  # rotation of the right camera since the calibration
+LARGEST_NEES = 20.0  # per number, of poses with an error of the calibration: above, the sigmas are of no use
+_MOST_NAMED = 4  # errors of the calibration in a message
 
 
 def findings_of(results: StereoResults) -> tuple[Finding, ...]:
     """All findings, the most severe first."""
     found = [
+        *_calibration(results),
         *_measured(results),
         *_cameras(results),
         *_together(results),
         *_clock(results),
-        *_moved(results),
         *_noise(results),
         *_ambiguous(results),
     ]
@@ -92,6 +93,8 @@ def _clock(results: StereoResults) -> Iterator[Finding]:
     if clock is None:
         return
     offset = f"{1000 * clock.offset_s:.2f} ± {1000 * clock.sigma_s:.2f} ms"
+    if clock.significant and not _is_clock(results):
+        return
     if not clock.significant:
         yield passed(f"the right pictures are taken {offset} after the left ones: synchronised")
         return
@@ -105,17 +108,36 @@ def _clock(results: StereoResults) -> Iterator[Finding]:
     yield finding("BP-W05", Level.FAIL, what)
 
 
-def _moved(results: StereoResults) -> Iterator[Finding]:
-    clock = results.clock
-    if clock is None or clock.significant:
-        return
-    angle = float(np.linalg.norm(clock.rotation_rad))
-    sigmas = float(np.max(np.abs(clock.rotation_rad) / clock.rotation_sigma_rad))
-    shift = angle * float(results.run.pair.cameras[1].matrix[0, 0])
-    if sigmas < MOVED_SIGMAS or shift < MOVED_PX:
-        return
-    what = f"the right camera appears turned by {np.rad2deg(angle):.3f} deg ({shift:.2f} px) against the calibration"
-    yield finding("BP-W06", Level.WARN, what)
+def _calibration(results: StereoResults) -> Iterator[Finding]:
+    """Errors of the pair's calibration; with a pair that states no covariance, the poses have no complete sigmas."""
+    check = results.calibration
+    if check is not None and check.significant and not _is_clock(results):
+        several = " or ".join(
+            f"{s.name} by {s.value:+.{_decimals(s.sigma)}f} ± {s.sigma:.{_decimals(s.sigma)}f} {s.unit}"
+            for s in check.suspects[:_MOST_NAMED]
+        )
+        apart = "; this recording does not separate them" if len(check.suspects) > 1 else ""
+        other = "" if check.left < GOOD_NOISE_SCALE**2 else "; it does not explain all: there is more than one error"
+        what = (
+            f"the markers contradict {results.run.pair_path.name}: to be corrected: {several}{apart}{other}; poses move"
+            f" by {format_length(check.change_m)} RMS"
+        )
+        yield finding("BP-W06", Level.FAIL if check.change_sigmas**2 > LARGEST_NEES else Level.WARN, what)
+    if results.run.pair.covariance is None:
+        yield finding("BP-W10", Level.WARN, f"{results.run.pair_path.name} states no covariance of the calibration")
+
+
+def _is_clock(results: StereoResults) -> bool:
+    """Whether an offset of the clocks explains the residuals, and an error of the calibration does not."""
+    clock, check = results.clock, results.calibration
+    if clock is None or not clock.significant:
+        return False
+    return check is None or not check.significant or check.left > GOOD_NOISE_SCALE**2
+
+
+def _decimals(sigma: float) -> int:
+    """Decimals that show two digits of a sigma."""
+    return int(np.clip(1 - np.floor(np.log10(max(sigma, 1e-9))), 0, 6))
 
 
 def _noise(results: StereoResults) -> Iterator[Finding]:

@@ -205,9 +205,14 @@ def _pair(results: StereoResults) -> Section:
             )
     else:
         rows.append(["synchronisation", "not tested: too few moving frames"])
+    check = results.calibration
+    for s in () if check is None else check.suspects:
+        rows.append([f"error that explains the residuals best: {s.name}", f"{s.value:.4f} ± {s.sigma:.4f} {s.unit}"])
     words = (
         "Synchronisation and rotation are estimated from the residuals of all frames: an offset in time shifts images"
-        " in proportion to their velocity, a rotation shifts them equally in all frames."
+        " in proportion to their velocity, a rotation shifts them equally in all frames. Each single error of the"
+        " calibration is fitted with all poses; those that the recording does not separate are listed, also where none"
+        " is significant."
     )
     drawings = []
     if len(results.measured) > 1:

@@ -91,11 +91,6 @@ def measure(run: StereoRun, progress: Progress | None = None) -> StereoResults:
     ]
     results.clock = clock_offset(run.pair, run.target.model, fitted)
     results.calibration = check_calibration(run.pair, run.target.model, _labelled(results))
-    if run.pair.covariance is None:
-        results.notes.append(
-            f"{run.pair_path.name} states no covariance: the sigmas contain the noise of the markers, not the errors of"
-            " the calibration"
-        )
     return results
 
 
@@ -226,6 +221,7 @@ def _summary(results: StereoResults, findings: tuple[Finding, ...], wall_s: floa
                 "rotation_of_right_rad": clock.rotation_rad.tolist(),
                 "rotation_sigma_rad": clock.rotation_sigma_rad.tolist(),
             },
+            "calibration": None if results.calibration is None else dataclasses.asdict(results.calibration),
         },
         "errors": None if results.errors is None else results.errors.as_mapping(),
         "timings": {"wall_s": wall_s},

@@ -17,6 +17,7 @@ import numpy as np
 from geometry.arrays import Array, Bools
 from geometry.camera import Camera, in_picture
 from geometry.pose import Pose
+from geometry.uncertainty.rig_uncertainty import PINHOLE, POSE, RigCovariance, perturbed_camera
 from lab.errors import InputError
 from lab.files.rig.pair_file import PairFile, save_pair_file
 from lab.files.text import columns
@@ -37,6 +38,8 @@ _SKY, _MARKER, _RIM, _PROBE = (
     np.array(c, dtype=float) for c in ((150, 120, 95), (40, 35, 165), (70, 70, 75), (45, 48, 50))
 )
 _EXPOSURE = (1.0, 1.35)  # of the two cameras: the right one is brighter, as in the paper
+# Sigmas of the calibration in pair.yaml: lens, per 1000 px of focal length; place and turn of the right camera.
+_LENS_SIGMA_PX, _PLACE_SIGMA_M, _TURN_SIGMA_RAD = 0.05, 2e-5, 2e-5
 _READ_DN, _ELECTRONS = 1.2, 60.0  # read noise; electrons per DN
 
 
@@ -140,7 +143,7 @@ def write_stereo_recording(
     view = replace(scene(seed, frames or FRAMES, size, 1100.0 * scale), right_delay_s=right_delay_s)
     rng = np.random.default_rng([seed, 1])
     with atomic_folder(Path(out_folder), lambda _: False) as folder:
-        save_pair_file(PairFile({c.name: c for c in view.pair.cameras}), folder / "pair.yaml")
+        save_pair_file(_calibrated(view.pair, np.random.default_rng([seed, 2])), folder / "pair.yaml")
         if points:
             _write_points(view, noise_px, rng, folder / "detections.csv")
             sources: dict[str, Any] = {c.name: {"detections": "detections.csv"} for c in view.pair.cameras}
@@ -155,6 +158,21 @@ def write_stereo_recording(
         _write_truth(view, folder / "truth")
         write_mapping(_run_mapping(view, sources), folder / "run.yaml")
     return Path(out_folder)
+
+
+def _calibrated(pair: StereoPair, rng: np.random.Generator) -> PairFile:
+    """The pair as a calibration finds it: with errors, and with their covariance."""
+    right = pair.cameras[1].name
+    scale = pair.cameras[0].matrix[0, 0] / 1000
+    sigmas = {f"cameras.{c.name}.{p}": _LENS_SIGMA_PX * scale for c in pair.cameras for p in PINHOLE}
+    sigmas |= {f"cameras.{right}.{p}": _PLACE_SIGMA_M for p in POSE[:3]}
+    sigmas |= {f"cameras.{right}.{p}": _TURN_SIGMA_RAD for p in POSE[3:]}
+    errors = {name: sigma * float(rng.normal()) for name, sigma in sigmas.items()}
+    cameras = {}
+    for c in pair.cameras:
+        own = {name.rsplit(".", 1)[1]: e for name, e in errors.items() if name.startswith(f"cameras.{c.name}.")}
+        cameras[c.name] = perturbed_camera(c, own)
+    return PairFile(cameras, RigCovariance(tuple(sigmas), np.diag(np.square(list(sigmas.values())))))
 
 
 def _run_mapping(view: StereoScene, sources: dict[str, Any]) -> dict[str, Any]:

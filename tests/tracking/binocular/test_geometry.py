@@ -76,9 +76,9 @@ def test_points_behind_the_cameras_are_nan():
 
 
 def test_the_jacobians_are_those_of_differences():
-    pose = pose_at(9, 6)
-    J = project_markers(PAIR, MODEL, pose)[1]
-    numeric = numeric_jacobian(lambda d: project_markers(PAIR, MODEL, pose.plus(d))[0], np.zeros(6))
+    pose, points_only = pose_at(9, 6), replace(MODEL, radius_m=np.full(len(MODEL), np.nan))
+    J = project_markers(PAIR, points_only, pose)[1]
+    numeric = numeric_jacobian(lambda d: project_markers(PAIR, points_only, pose.plus(d))[0], np.zeros(6))
     np.testing.assert_allclose(J, numeric, atol=2e-4)
     names = ("cameras.left.fx", "cameras.right.k1", "cameras.right.x_m", "cameras.right.rot_y_rad")
     pair = StereoPair(PAIR.cameras, RigCovariance(names, np.eye(4)))
@@ -93,6 +93,23 @@ def test_the_jacobians_are_those_of_differences():
         return project(StereoPair(cameras), points)[0]
 
     np.testing.assert_allclose(calibration_jacobian(pair, points), numeric_jacobian(moved, np.zeros(4)), atol=2e-3)
+
+
+def test_the_image_of_a_tilted_disc_is_predicted_at_its_centroid_not_at_its_centre():
+    pose = pose_at(3, 1).plus(np.array([0, 0, 0, 0.5, -0.4, 0]))
+    centred = MODEL.positions - MODEL.positions.mean(axis=0)
+    across = np.linalg.svd(centred)[2][:2]
+    rho, angle = np.meshgrid(0.03 * np.sqrt((np.arange(100) + 0.5) / 100), 2 * np.pi * np.arange(60) / 60)
+    disc = np.stack([rho * np.cos(angle), rho * np.sin(angle)], axis=-1).reshape(-1, 2) @ across
+    for k in range(len(MODEL)):
+        points = pose.apply(MODEL.positions[k] + disc)
+        for c, camera in enumerate(PAIR.cameras):
+            weight = camera.camera_from_world.apply(points)[:, 2] ** -3  # of equal areas of the disc in the picture
+            centroid = weight @ camera.project(points) / weight.sum()
+            predicted = project_markers(PAIR, MODEL, pose)[0][c, k]
+            centre = camera.project(pose.apply(MODEL.positions[k]))
+            assert np.linalg.norm(centroid - centre) > 0.02
+            np.testing.assert_allclose(predicted, centroid, atol=0.002)
 
 
 def test_the_joint_fit_beats_horns_pose_and_states_its_errors():

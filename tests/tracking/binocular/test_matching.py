@@ -1,5 +1,7 @@
 """Markers are labelled by geometry, not by their order; what cannot be decided is not reported as measured."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 
@@ -29,6 +31,31 @@ def test_hidden_and_false_markers_do_not_mislabel_the_others(case):
     assert frame.status is PoseStatus.MEASURED, frame.reason
     assert consistent(pose, frame)
     assert all((frame.index[c, list(case[c])] == -1).all() for c in (0, 1))
+
+
+@pytest.mark.parametrize("distance", [7, pytest.param(16, marks=pytest.mark.slow)])
+def test_any_four_of_seven_markers_are_enough_at_the_start(distance):
+    rng = np.random.default_rng(11)
+    found = 0
+    for i, shown in enumerate(combinations(range(7), 4)):
+        if distance == 7 and i % 3:  # the slow test has all of them
+            continue
+        pose, hidden = pose_at(distance, i), tuple(set(range(7)) - set(shown))
+        frame = BinocularTracker(PAIR, MODEL, P).step(0.0, images(pose, rng, (hidden, hidden)))
+        assert frame.status is PoseStatus.MEASURED or frame.reason == AMBIGUOUS, (shown, frame.reason)
+        assert consistent(pose, frame)
+        found += frame.status is PoseStatus.MEASURED
+    assert found >= 11
+
+
+def test_three_markers_are_enough_for_a_target_that_is_followed():
+    rng, pose = np.random.default_rng(12), pose_at(8, 12)
+    for hidden in ((0, 1, 2, 3), (1, 3, 5, 6), (0, 2, 4, 5)):
+        tracker = BinocularTracker(PAIR, MODEL, P)
+        tracker.step(0.0, images(pose, rng))
+        frame = tracker.step(0.04, images(pose, rng, (hidden, hidden)))
+        assert frame.status is PoseStatus.MEASURED, frame.reason
+        assert consistent(pose, frame)
 
 
 def test_candidates_match_along_the_epipolar_line_only():

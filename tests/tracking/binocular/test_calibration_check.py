@@ -1,0 +1,91 @@
+"""A recording shows which single error of the pair's calibration it contradicts, and which ones it cannot separate."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from geometry.pose import Pose
+from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed_camera
+from tests.tracking.binocular.scenes import MODEL, NOISE_PX, PAIR, images
+from tracking.binocular.calibration_check import LabelledFrame, check_calibration, labelled_by_each
+from tracking.binocular.joint_fit import MarkerObservations
+from tracking.binocular.marker_model import StereoPair, project_markers
+from tracking.binocular.parameters import MatchParameters
+
+LEFT, RIGHT = PAIR.cameras
+
+
+def approach(pair=PAIR, frames=25):
+    """Labelled frames of a target that comes from 16 to 5 m, seen by a pair."""
+    rng, out = np.random.default_rng(5), []
+    for s in np.linspace(0, 1, frames):
+        ypr = np.array([0.3 * np.sin(6 * s), 0.25 * np.cos(5 * s), 0.2 * np.sin(4 * s)])
+        pose = Pose.from_ypr(ypr, np.array([0.25 + 0.3 * np.sin(5 * s), 0.3 * np.cos(7 * s), 16 - 11 * s]))
+        uv = project_markers(pair, MODEL, pose)[0] + rng.normal(0, NOISE_PX, (2, len(MODEL), 2))
+        cov = np.broadcast_to(NOISE_PX**2 * np.eye(2), (2, len(MODEL), 2, 2))
+        out.append(LabelledFrame(MarkerObservations(uv, cov), pose))
+    return out
+
+
+def wrong_pair(camera, **change):
+    """The pair with an error of one camera."""
+    left, right = (perturbed_camera(c, change) if c.name == camera else c for c in PAIR.cameras)
+    return StereoPair((left, right))
+
+
+def turned_right_camera(axis, angle_deg):
+    """The pair with the right camera turned about an axis through its own centre."""
+    turn = Rotation.from_rotvec(np.deg2rad(angle_deg) * np.eye(3)["xyz".index(axis)]).as_matrix()
+    place = RIGHT.camera_from_world
+    return StereoPair((LEFT, replace(RIGHT, camera_from_world=Pose(turn @ place.rotation, turn @ place.translation))))
+
+
+def longer_baseline(share):
+    place = RIGHT.camera_from_world
+    return StereoPair((LEFT, replace(RIGHT, camera_from_world=Pose(place.rotation, (1 + share) * place.translation))))
+
+
+@pytest.mark.parametrize(
+    ("pair", "name", "value", "alone"),
+    [
+        (longer_baseline(0.01), "baseline", -0.99, True),
+        (turned_right_camera("z", 0.3), "roll between the cameras", -0.3, True),
+        (turned_right_camera("y", 0.05), "yaw between the cameras", -0.05, False),
+        (turned_right_camera("x", 0.05), "pitch between the cameras", -0.05, False),
+        (wrong_pair("left", fx=5.5, fy=5.5), "focal length of left", -0.5, False),
+        (wrong_pair("right", fx=-5.5, fy=-5.5), "focal length of right", 0.5, False),
+        (wrong_pair("left", cx=2.0), "principal point cx of left", -2.0, False),
+        (wrong_pair("right", cy=2.0), "principal point cy of right", -2.0, False),
+    ],
+)
+def test_an_error_of_the_calibration_is_named_with_its_size(pair, name, value, alone):
+    check = check_calibration(pair, MODEL, approach())
+    assert check.significant
+    named = {s.name: s for s in check.suspects}
+    assert name in named
+    assert len(named) == 1 or not alone
+    assert named[name].value == pytest.approx(value, abs=5 * named[name].sigma + 0.02 * abs(value))
+    assert check.left < 1.5
+
+
+def test_a_right_calibration_is_not_suspected():
+    assert not check_calibration(PAIR, MODEL, approach()).significant
+
+
+def test_an_error_that_the_covariance_states_is_not_suspected():
+    wrong = wrong_pair("right", rot_y_rad=np.deg2rad(0.05))
+    stated = RigCovariance(("cameras.right.rot_y_rad",), np.array([[np.deg2rad(0.05) ** 2]]))
+    assert not check_calibration(StereoPair(wrong.cameras, stated), MODEL, approach()).significant
+
+
+def test_too_few_frames_are_not_tested():
+    assert check_calibration(PAIR, MODEL, approach(frames=4)) is None
+
+
+def test_markers_are_labelled_in_each_picture_where_the_cameras_contradict_each_other():
+    pose, rng = Pose.from_ypr(np.array([0.2, 0.1, 0.0]), np.array([0.2, 0.1, 8.0])), np.random.default_rng(3)
+    wrong = wrong_pair("right", rot_x_rad=np.deg2rad(0.5))  # 10 px
+    found = labelled_by_each(wrong, MODEL, images(pose, rng), None, MatchParameters())
+    np.testing.assert_allclose(found.observed.uv_px, project_markers(PAIR, MODEL, pose)[0], atol=6 * NOISE_PX)
