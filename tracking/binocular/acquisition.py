@@ -67,6 +67,8 @@ def acquire(pair: StereoPair, model: MarkerModel, images: Images, p: MatchParame
     triples = marker_triples(model)
     # The first triples in both pictures, then the others: any four markers of eight contain four triples.
     for c, some in [(c, part) for part in (triples[:_FIRST_TRIPLES], triples[_FIRST_TRIPLES:]) for c in (0, 1)]:
+        if c == 0 and any(_explains_a_picture(f, model, images) for f in found):
+            break  # a camera that contradicts is not reconciled by other triples
         poses = _hypotheses(pair, model, images[c], ranked[c], c, some)
         found += [
             fitted
@@ -77,6 +79,12 @@ def acquire(pair: StereoPair, model: MarkerModel, images: Images, p: MatchParame
         if found and (found[0].index >= 0).sum() >= _ENOUGH * expected:
             break
     return found
+
+
+def _explains_a_picture(found: LabelledPose, model: MarkerModel, images: Images) -> bool:
+    """Whether a pose explains nearly all candidates of one picture, or all its markers."""
+    explained = (found.index >= 0).sum(axis=1)
+    return any(n >= _ENOUGH * min(len(model), len(own)) > 0 for n, own in zip(explained, images, strict=True))
 
 
 def distinct(found: list[LabelledPose]) -> list[LabelledPose]:

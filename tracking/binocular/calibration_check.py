@@ -27,7 +27,7 @@ from tracking.binocular.labelling import Images, labelled_pose, observations
 from tracking.binocular.marker_model import MarkerImages, MarkerModel, StereoPair, calibration_jacobian, project_markers
 from tracking.binocular.parameters import MatchParameters
 
-MOST_FRAMES, FEWEST_FRAMES = 40, 5
+MOST_FRAMES, FEWEST_FRAMES = 24, 5
 _FEWEST_MARKERS = 4  # of each picture: three have several poses
 _STEPS = 6  # of Gauss-Newton
 _CERTAIN_CHI2 = 20.0  # that an error explains: 4.5 sigma
