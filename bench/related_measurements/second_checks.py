@@ -4,6 +4,7 @@ python -m bench.related_measurements.second_checks occlusion SEED COUNT     coef
 python -m bench.related_measurements.second_checks empty SEED COUNT         100 frames of COUNT scenes without a target
 python -m bench.related_measurements.second_checks edges SEED COUNT         thin rims: which edge is tracked
 python -m bench.related_measurements.second_checks consistency SEED COUNT   errors of centres against their sigmas
+python -m bench.related_measurements.second_checks approaches SEED COUNT    approaching drogues, by the light tracker
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from bench.related_measurements import second_renderer as render
 from geometry.arrays import Array
 from lab.targets.circle import CircleOptions
+from lab.targets.drogue import DrogueOptions
 from tracking.drogue_circle.candidates import Picture
 from tracking.drogue_circle.parameters import Edge
 from tracking.statuses import Cause, PoseStatus
@@ -169,9 +171,56 @@ def consistency(seed: int, count: int) -> None:
         )
 
 
+def approaches(seed: int, count: int) -> None:
+    """Drogues that come from 9 to 120 px in 90 frames; something hides them for six of these."""
+    for kind in ("cloud", "ground"):
+        hidden_measured, hidden_frames, elsewhere, seen, right, errors, nees = 0, 0, [], 0, 0, [], []
+        for n in range(count):
+            rng = np.random.default_rng(1000 * seed + n)
+            scene, look = render.background(kind, rng), render.face("drogue", rng, hose=True)
+            plate = render.Probe(rng.uniform(0, 6), 1.4, 0.0, rng.uniform(60, 200), -1.5)
+            circles, tracker = motion(rng, True, (4.5, 4.5)), DrogueOptions().tracker()
+            away_since, covered = 0, int(rng.integers(25, 70))
+            for k in range(90):
+                circle = next(circles)
+                circle[2] = 4.5 * (120 / 9) ** (k / 89)
+                hidden = covered <= k < covered + 6
+                picture = render.draw(scene, look, *circle, rng, plate if hidden else None)
+                frame = tracker.step(picture)
+                measured = frame.status is PoseStatus.MEASURED
+                if hidden:
+                    hidden_measured, hidden_frames = hidden_measured + measured, hidden_frames + 1
+                    continue
+                away = frame.centre_px - circle[:2]
+                error = float(np.hypot(*away)) / (2 * circle[2])
+                seen, right = seen + 1, right + (measured and error < 0.25)
+                wrong = measured and error > 0.5
+                sure = wrong and any(
+                    c.score > 0.99 and np.hypot(c.u_px - circle[0], c.v_px - circle[1]) < circle[2]
+                    for c in tracker.detector(picture, None)
+                )
+                away_since = away_since + 1 if sure else 0
+                elsewhere.append(away_since)
+                if measured and error < 0.25:
+                    errors.append(error)
+                    nees.append(away @ np.linalg.solve(frame.covariance, away) / 2)
+        print(
+            f"{kind}: right in {right} of {seen} frames; elsewhere while the detector is sure for"
+            f" {max(elsewhere)} frames at most; hidden frames"
+            f" measured {hidden_measured} of {hidden_frames}; error of the centre, RMS"
+            f" {100 * np.sqrt(np.mean(np.square(errors))):.2f} % of the diameter, NEES/2 {np.mean(nees):.2f}"
+        )
+
+
 if __name__ == "__main__":
     what, *rest = sys.argv[1:] or [""]
-    checks = {"occlusion": occlusion, "empty": empty, "edges": edges, "consistency": consistency}
+    checks = {
+        "occlusion": occlusion,
+        "empty": empty,
+        "edges": edges,
+        "approaches": approaches,
+        "consistency": consistency,
+    }
     if what in checks and len(rest) == 2:
         checks[what](int(rest[0]), int(rest[1]))
     else:

@@ -22,6 +22,9 @@ class LightParameters:
     largest_px: float | None = None  # px; None: the picture's smaller side
     acquire_confidence: float = 0.5  # of a detection that starts a track by itself
     elsewhere_confidence: float = 0.8  # of a detection that replaces a track elsewhere in the picture
+    sure_confidence: float = 0.995  # of a detection that competes with a track that the detector confirms, too ...
+    sure_logit: float = 1.5  # ... if its log odds are this much above the mean of the track's checks
+    picture_every: int = 2  # checks, of which the last one is of the whole picture
     confirm_confidence: float = 0.15  # of a detection where the tracker is: two independent ones agree
     ambiguous_logit: float = 2.5  # a second detection whose log odds are less than this below the best: ambiguous
     measured_confidence: float = 0.5  # with less, the frame is predicted
@@ -42,7 +45,7 @@ class LightParameters:
     most_predicted: int = 50  # frames without a measurement after which the drogue is lost
     most_unseen: int = 100  # frames without a detection after which a drogue that is not measured is lost, too
     lost_sigma_diameters: float = 1.0  # 1 sigma of the centre above which the status is lost
-    most_unconfirmed: int = 6  # checks in a row without a detection, after each of which the whole picture is searched
+    most_unconfirmed: int = 2  # checks in a row without a detection, after each of which the whole picture is searched
 
     def __post_init__(self) -> None:
         if self.check_every < 1:

@@ -46,6 +46,7 @@ class Track:
     unconfirmed: int = 0  # checks in a row without a detection
     age: float = 0.0  # frames since the last confirmation
     since_check: int = 0  # frames since the detector searched
+    checks: int = 0
     lost: bool = False  # reported as lost
     trusted: float = 1.0  # confidence of the last measured frame
     misses: int = 0  # frames in a row without a measurement
@@ -134,7 +135,7 @@ class DrogueTracker:
         due = track.since_check >= p.check_every or track.gap > 0
         if match is None or due or confidence < p.hand_back_confidence:
             seen = self._seen(track, picture)
-            searched, found, track.since_check = "window", len(seen), 0
+            searched, found, track.since_check, track.checks = "window", len(seen), 0, track.checks + 1
             best = self._confirming(track, seen, match)
             if best is not None:
                 match = self._confirm(track, picture, best, match)
@@ -153,8 +154,9 @@ class DrogueTracker:
                     predicted, offset=track.motion.offset, offset_variance=track.motion.offset_variance
                 )
             return self._missed(track, picture, cause, match, searched, found, confidence)
-        if track.since_check == 0 and track.unconfirmed and track.unconfirmed % p.most_unconfirmed == 0:
-            again = self._found_elsewhere(track, picture)
+        doubted = track.unconfirmed > 0 and track.unconfirmed % p.most_unconfirmed == 0
+        if track.since_check == 0 and (doubted or track.checks % p.picture_every == 0):
+            again = self._found_elsewhere(track, picture, rivals=not doubted)
             if again is not None:
                 return again
             searched = "both"
@@ -313,19 +315,29 @@ class DrogueTracker:
         correlation = float("nan") if match is None else match.correlation
         return replace(out, correlation=correlation, searched=searched, found=found)
 
-    def _found_elsewhere(self, track: Track, picture: Picture) -> DrogueFrame | None:
-        """One drogue in the whole picture, of about the same size, away from where the track is."""
+    def _found_elsewhere(self, track: Track, picture: Picture, rivals: bool = False) -> DrogueFrame | None:
+        """One drogue in the whole picture, of about the same size, away from where the track is.
+
+        rivals: only one that the detector is surer of than of what is tracked, of any size.
+        """
         motion, p = track.motion, self.parameters
         found = self._in_picture(picture)
-        # A track that few detections confirmed may have a wrong size, and be none.
-        limit = p.size_ratio if track.confirmed >= TRUSTED else np.inf
-        alike = [c for c in found if 1 / limit < 2 * c.radius_px / motion.rim_diameter_px < limit]
+        # A track that few detections confirmed, or the last checks did not, may have a wrong size, and be none.
+        sure = track.confirmed >= TRUSTED and track.unconfirmed < p.most_unconfirmed
+        limit = p.size_ratio if sure else np.inf
+        # The tracked object may be another one that the detector takes for a drogue, with less confidence.
+        lead = max(logit(p.sure_confidence), track.support + p.sure_logit)
+        alike = [
+            c for c in found if 1 / limit < 2 * c.radius_px / motion.rim_diameter_px < limit or logit(c.score) > lead
+        ]
+        if rivals:
+            alike = [c for c in alike if logit(c.score) > lead]
         best, _ = self._chosen(alike)
         doubtful = track.lost and (track.confirmed < TRUSTED or track.misses > LONGEST_GAP)
         if best is None or (best.score < p.elsewhere_confidence and not doubtful):
             return None
         u, v = motion.centre_px.tolist()
-        if track.misses == 0 and np.hypot(best.u_px - u, best.v_px - v) < motion.rim_diameter_px / 2:
+        if (rivals or track.misses == 0) and np.hypot(best.u_px - u, best.v_px - v) < motion.rim_diameter_px / 2:
             return None
         pattern = Pattern.started(picture, best.u_px, best.v_px, 2 * best.radius_px)
         if pattern is None:
