@@ -34,6 +34,9 @@ VIEW = np.dtype(
         ("tilt", np.float64, (3, 3)),  # homography of the sensor's tilt, from the last two distortion numbers
         ("lens", np.int64),  # distortion model; 0: none, 1: polynomial, 2: polynomial and tilt, 3: fisheye
         ("fold_r2", np.float64),
+        # px, added to the pixel: how far the spot moves from the instant of the pose to that of the picture, if they
+        # differ (tracking/rigid_body/models/picture_shifts.py). Trackers set it frame by frame, in a copy.
+        ("shift", np.float64, 2),
     ],
     align=True,
 )
@@ -140,7 +143,8 @@ def _project(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> bool:
     if view["lens"] != 0 and not (x * x + y * y < view["fold_r2"] and xx * yy - xy * yx > 0.0):
         return False
     fx, fy = view["pinhole"][0], view["pinhole"][1]
-    uv[0], uv[1] = fx * bx + view["pinhole"][2], fy * by + view["pinhole"][3]
+    uv[0] = fx * bx + view["pinhole"][2] + view["shift"][0]
+    uv[1] = fy * by + view["pinhole"][3] + view["shift"][1]
     # d(pixel)/d(hit), in world, row by row; the component of the vehicle's motion along the ray has no effect.
     for row in range(2):
         gx, gy = (fx * xx / z, fx * xy / z) if row == 0 else (fy * yx / z, fy * yy / z)

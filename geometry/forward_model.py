@@ -94,8 +94,9 @@ class SpotModel:
         lens = lens_codes(self.distortion, self.fisheye)
         tilt = tilt_matrix(self.distortion[..., 12], self.distortion[..., 13])
         numbers = np.empty(self.point.shape[:-1], VIEW)
+        others = {"lens": lens, "tilt": tilt, "shift": 0.0}
         for name in VIEW.names or ():
-            numbers[name] = lens if name == "lens" else tilt if name == "tilt" else getattr(self, name)
+            numbers[name] = others[name] if name in others else getattr(self, name)
         settings: Any = numba.config
         if settings.DISABLE_JIT:  # compiled code reads fields as attributes; plain Python needs a recarray for that
             numbers = numbers.view(np.recarray)

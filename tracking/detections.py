@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
+from tracking.picture_clock import PictureClock
 
 UNMATCHED = -1  # used instead of the row of a detection: no detection
 
@@ -33,27 +34,28 @@ class Detections:
     chi2: Array | None = field(default=None, kw_only=True)  # (n,) of the fit, per degree of freedom; None: not known
     # (n,) 1: the point is in its place in the whole recording, while others move; None: not known
     at_rest: Array | None = field(default=None, kw_only=True)
+    clock: PictureClock | None = field(default=None, kw_only=True)  # None: exposed at the frame's instant
 
     def __len__(self) -> int:
         return len(self.uv_px)
 
     def __getitem__(self, rows: Ints | Bools | slice) -> Detections:
         """The points of the given rows, in that order."""
-        known: list[Array] = [getattr(self, name)[rows] for name in Detections.__slots__[:-4]]
+        known: list[Array] = [getattr(self, name)[rows] for name in Detections.__slots__[:7]]
         place, misfit, chi2, at_rest = (
             None if x is None else x[rows] for x in (self.place_px2, self.misfit, self.chi2, self.at_rest)
         )
-        return Detections(*known, place_px2=place, misfit=misfit, chi2=chi2, at_rest=at_rest)
+        return Detections(*known, place_px2=place, misfit=misfit, chi2=chi2, at_rest=at_rest, clock=self.clock)
 
     def joined(self, more: Detections, most: int) -> Detections:
         """These and more points of the same picture, brightest first, at most so many; what is unknown becomes 0."""
         if not len(more):
             return self
         values: dict[str, Array] = {}
-        for name in Detections.__slots__:
+        for name in Detections.__slots__[:-1]:
             parts = [(getattr(points, name), len(points)) for points in (self, more)]
             values[name] = np.concatenate([np.zeros(n) if known is None else known for known, n in parts])
-        return Detections(**values)[np.argsort(-values["flux"], kind="stable")[:most]]
+        return Detections(**values, clock=self.clock)[np.argsort(-values["flux"], kind="stable")[:most]]
 
     @staticmethod
     def none() -> Detections:

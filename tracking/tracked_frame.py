@@ -49,3 +49,11 @@ class TrackedFrame:
     predicted_cov_px2: Array | None = None  # (n, 2, 2) of predicted_px, without the detection's own; None: not computed
     motion: MotionEstimate | None = None  # velocity and rate; None: unknown, or the tracker does not estimate them
     pose_systematic: Array | None = None  # (6, 6) the calibration's share of the covariance, the same in every frame
+    # (n, 2) px: by how much uv_px and predicted_px, which are at the instants of the pictures, differ from those at the
+    # instant of the pose. None: the instants are the same
+    shift_px: Array | None = None
+
+    @property
+    def uv_at_pose_px(self) -> Array:
+        """(n, 2): uv_px as they would be at the instant of the pose."""
+        return self.uv_px if self.shift_px is None else self.uv_px - self.shift_px

@@ -156,7 +156,7 @@ def composed(
     detections, origins = [], []
     for k in range(len(uv)):
         points = [
-            _one_picture(rng, c, uv[k], in_view[k], camera_of, sigma_px, sizes[c], false) for c in range(len(sizes))
+            one_picture(rng, c, uv[k], in_view[k], camera_of, sigma_px, sizes[c], false) for c in range(len(sizes))
         ]
         points = [
             p if has_image[k, c] else (Detections.none(), np.zeros(0, dtype=np.int64)) for c, p in enumerate(points)
@@ -182,7 +182,7 @@ def composed(
     )
 
 
-def _one_picture(
+def one_picture(
     rng: np.random.Generator,
     camera: int,
     uv: Array,

@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import datetime
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,9 @@ from lab.files.text.json_text import has_schema, write_json
 from lab.findings.finding import Level
 from lab.findings.finding import verdict as verdict_of
 from lab.progress import Progress
+from lab.runs.frames.clocked_frames import ClockedFrames
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
+from lab.runs.frames.row_records import row_records
 from lab.runs.model_check.frame_sampler import FrameSampler, stated_covariances, widths
 from lab.runs.run_log import RunLog, listening
 from lab.runs.run_tally import RunTally
@@ -30,7 +32,7 @@ from lab.runs.smoothing_pass import TrackingAndSmoothing
 from lab.runs.summary import SUMMARY_SCHEMA, RunResults, summary_of
 from lab.runs.tables import TableWriter
 from lab.runs.verdict import quality
-from lab.runs.verdict.frame_checks import FrameChecks
+from lab.runs.verdict.frame_checks import FrameChecks, Pair
 from lab.runs.verdict.run_statistics import CameraStatistics, RunStatistics
 from lab.versions import versions
 
@@ -187,14 +189,21 @@ def write_tables(
     )
     sampler, pictures = FrameSampler(), pictures_sampler()
     with (
-        TableWriter(work, run.rig, run.covariance is not None, with_causal=not causal) as tables,
+        TableWriter(
+            work, run.rig, run.covariance is not None, with_causal=not causal, with_picture_times=bool(run.clocks)
+        ) as tables,
         contextlib.closing(passes.causal_only() if causal else passes.records()) as records,
     ):
-        for record, in_causal_pass in checks.passed(records):
+
+        def sampled(pairs: Iterable[Pair]) -> Iterator[Pair]:
+            for record, before in pairs:
+                stated = stated_covariances(record.tracked, record.detections, model.camera_of, run.tracker)
+                width = widths(record.tracked, record.detections, model.camera_of)
+                sampler.add_tracked(record.t_s, record.tracked, record.tracked.predicted_cov_px2, stated, width)
+                yield record, before
+
+        for record, in_causal_pass in rows_of(pipeline, sampled(checks.passed(records))):
             tables.write(record, in_causal_pass)
-            stated = stated_covariances(record.tracked, record.detections, model.camera_of, run.tracker)
-            width = widths(record.tracked, record.detections, model.camera_of)
-            sampler.add_tracked(record.t_s, record.tracked, record.tracked.predicted_cov_px2, stated, width)
             statistics.add(record, in_causal_pass)
             found = zip(run.rig.cameras, record.detections, strict=True)
             pictures.add({name: points for name, points in found if points is not None})
@@ -212,6 +221,15 @@ def write_tables(
         others = () if verdict_of(mistakes) is Level.FAIL else model_check.findings
         verdict = quality.judge(statistics, (*mistakes, *others), noise_scale, mosaics)
     return statistics, model_check, verdict
+
+
+def rows_of(pipeline: Pipeline, processed: Iterable[Pair]) -> Iterable[Pair]:
+    """The rows of the tables; where no camera has a clock of its own, each processed frame is one."""
+    reader, run = pipeline.reader, pipeline.run
+    if not isinstance(reader, ClockedFrames):
+        return processed
+    own = [name in run.clocks and run.clocks[name].times is not None for name in run.cameras]
+    return row_records(processed, reader.moments, tuple(run.cameras), own, SpotModel.of(run.rig).camera_of)
 
 
 def are_results(folder: Path) -> bool:

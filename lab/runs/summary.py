@@ -74,6 +74,7 @@ def summary_of(pipeline: Pipeline, results: RunResults, wall_s: float) -> dict[s
             "tracker": dataclasses.asdict(run.tracker),
             "noise": {name: noise.as_mapping() for name, noise in pipeline.noise.items()},
             "prior": _prior_numbers(run),
+            **({"clocks": _clock_numbers(run)} if run.clocks else {}),
         },
         "inputs": fingerprints(run),
         "notes": _notes(pipeline, results.tally),
@@ -144,4 +145,16 @@ def _prior_numbers(run: Run) -> dict[str, Any] | None:
         "yaw_pitch_roll_deg": np.rad2deg(run.prior.centre.ypr).tolist(),
         "within_m": run.prior.within_m,
         "within_deg": float(np.rad2deg(run.prior.within_rad)),
+    }
+
+
+def _clock_numbers(run: Run) -> dict[str, Any]:
+    """By camera: the clocks that run.yaml states."""
+    return {
+        name: {
+            "time_offset_s": clock.offset_s,
+            "row_time_s": clock.row_time_s,
+            "timestamps": None if clock.times_path is None else str(clock.times_path),
+        }
+        for name, clock in run.clocks.items()
     }

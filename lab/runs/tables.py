@@ -39,9 +39,17 @@ class TableWriter:
 
     with_systematic: also systematic.csv, the part of covariance.csv that is due to the calibration's errors.
     with_causal: also attitude_causal.csv and covariance_causal.csv, the poses of the causal pass.
+    with_picture_times: detections.csv has the instant of each picture, t_s.
     """
 
-    def __init__(self, folder: Path, rig: Rig, with_systematic: bool = False, with_causal: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        rig: Rig,
+        with_systematic: bool = False,
+        with_causal: bool = False,
+        with_picture_times: bool = False,
+    ) -> None:
         self._folder = folder
         self._rig = rig
         self._model = SpotModel.of(rig)
@@ -55,6 +63,8 @@ class TableWriter:
             self._files["systematic.csv"] = columns.COVARIANCE
         if with_causal:
             self._files |= {f"{name}{CAUSAL}.csv": _FILES[f"{name}.csv"] for name in ("attitude", "covariance")}
+        if with_picture_times:
+            self._files["detections.csv"] = (*columns.DETECTIONS, columns.PICTURE_TIME)
         self._open: dict[str, TextIO] = {}
         self._waiting: list[FrameRecord] = []
         self._waiting_causal: list[FrameRecord] = []
@@ -107,6 +117,13 @@ class TableWriter:
             for camera, found in zip(self._cameras, record.detections, strict=True)
             if found is not None and len(found)
         ]
+        if records[0].pictures is not None:
+            shown = [p for record in records for p in record.pictures or () if len(p.detections)]
+            pictures = [(p.number, self._cameras[p.camera], p.detections) for p in shown]
+            times = [p.t_s for p in shown for _ in range(len(p.detections))]
+            rows = zip(detection_rows(pictures), times, strict=True)
+            self._open["detections.csv"].writelines(f"{row[:-1]},{_number(t_s)}\n" for row, t_s in rows)
+            return
         self._open["detections.csv"].writelines(detection_rows(pictures))
 
     def _spots(self, records: Sequence[FrameRecord]) -> None:

@@ -116,7 +116,7 @@ def expected_light(
     light, model = scene.scenario.light, scene.model
     views = np.flatnonzero(model.camera_of == sensor.camera)
     spots = spot_images(model.subset(views), scene.poses[k], light.beam_radius_m / 2, light.blur_px)
-    paths, weights = _paths(scene, views, float(scene.t_s[k]), spots.covariance_px2)
+    paths, weights = _paths(scene, views, k, spots.covariance_px2)
     rng = np.random.default_rng([scene.seed, LIGHT, sensor.camera, k + 1])
     picture = sensor.background.copy()
     pieces: list[tuple[slice, slice]] = []
@@ -148,20 +148,27 @@ def expected_light(
     return picture, pieces
 
 
-def _paths(scene: Scene, views: NDArray[np.int64], t_s: float, covariance_px2: Array) -> tuple[Array, Array]:
-    """Centres (m, n, 2) of these views at m instants of the exposure about t_s, and the weights (m,)."""
+def _paths(scene: Scene, views: NDArray[np.int64], k: int, covariance_px2: Array) -> tuple[Array, Array]:
+    """Centres (m, n, 2) of these views at m instants of the exposure of frame k, and the weights (m,).
+
+    With a rolling shutter the rows that one spot covers are taken to be exposed together.
+    """
     half = scene.scenario.light.exposure_s / 2
     model = scene.model.subset(views)
 
-    def at(times: Array) -> Array:
-        return model.project(scene.motion.pose(times))[0]
+    def at(since: Array) -> Array:
+        if not scene.scenario.clocks:
+            return model.project(scene.motion.pose(float(scene.t_s[k]) + since))[0]
+        times = scene.exposed_s[k, views] + since[:, None]  # (m, n)
+        every = model.project(scene.motion.pose(times))[0]  # (m, n, n, 2)
+        return np.asarray(np.diagonal(every, axis1=1, axis2=2).transpose(0, 2, 1))
 
-    ends = at(t_s + half * np.array([-1.0, 1.0]))
+    ends = at(half * np.array([-1.0, 1.0]))
     length = np.linalg.norm(ends[1] - ends[0], axis=-1)
     narrow = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(covariance_px2, nan=1.0))[:, 0])
     longest = int(np.nanargmax(np.nan_to_num(length / narrow)))
     instants, weights = exposure_instants(float(np.nan_to_num(length[longest])), float(narrow[longest]))
-    return at(t_s + 2 * half * instants), weights
+    return at(2 * half * instants), weights
 
 
 def _speckle(rng: np.random.Generator, shape: tuple[int, int], light: Light) -> Array | float:

@@ -169,6 +169,15 @@ class RecordingFault:
 
 
 @dataclass(frozen=True, slots=True)
+class PictureTiming:
+    """When a camera takes its pictures, if not at the instants of the frames."""
+
+    camera: str
+    late_frames: float = 0.0  # its mid-exposure minus the frame's instant
+    row_time_s: float = 0.0  # rolling shutter: by which each row is exposed later than the one above
+
+
+@dataclass(frozen=True, slots=True)
 class PriorRegion:
     """The region of the first pose, as written to run.yaml. The drawn motion starts within it."""
 
@@ -196,6 +205,7 @@ class Scenario:
     clutter: Clutter = Clutter()
     occlusion: Occlusion = Occlusion()
     faults: tuple[RecordingFault, ...] = ()
+    clocks: tuple[PictureTiming, ...] = ()
     light: Light = Light()
 
 
@@ -354,6 +364,12 @@ _ALL = (
         name="blackout",
         summary="As smooth, with all spots occluded for ten frames every 150 frames.",
         occlusion=Occlusion(blackout_every=150, blackout_frames=10),
+    ),
+    replace(
+        _SMOOTH_SCENARIO,
+        name="clocks",
+        summary="As smooth, with rolling shutters (8 us per row left, 5 us right) and a right camera 1.3 frames late.",
+        clocks=(PictureTiming("left", 0.0, 8e-6), PictureTiming("right", 1.3, 5e-6)),
     ),
     replace(
         _SMOOTH_SCENARIO,

@@ -28,6 +28,7 @@ CHECKED_S = 20.0  # period of the motion of every scenario
 _CHECKED_EVERY_S = 0.05
 _MARGIN_PX = 12.0  # distance from the border of a spot in view, so that the whole spot is visible
 _MAX_DRAWS = 3000
+_ROW_STEPS = 10  # towards the row in which a moving spot is exposed
 
 VISIBLE, OCCLUDED, OUTSIDE = 1, 2, 0  # in_view of truth/spots.csv
 
@@ -54,11 +55,12 @@ class Scene:
     frame: Ints  # (T,) 0, 1, ...
     t_s: Array  # (T,) mid-exposure
     poses: Pose  # (T,) world_from_body
-    uv_px: Array  # (T, n, 2) true projection, also outside the picture; nan where there is none
+    uv_px: Array  # (T, n, 2) true projection at mid-exposure, also outside the picture; nan where there is none
     in_view: Ints  # (T, n) SHINING, HIDDEN or OUTSIDE
     has_image: Bools  # (T, cameras) a usable picture exists
     turned: Bools  # (T,) the motion bends between the frame before and this one
     clutter_points: ClutterPoints
+    exposed_s: Array  # (T, n) mid-exposure of each spot: t_s, except with clocks of the cameras' own
 
 
 def scenario_named(scenario: str | Scenario) -> Scenario:
@@ -102,15 +104,33 @@ def compose(
     frame = np.arange(count)
     t_s = frame / scenario.frame_rate_hz
     poses = motion.pose(t_s)
-    uv = model.project(poses)[0]
+    uv, exposed_s = _exposed(scenario, model, motion, t_s, model.project(poses)[0])
     bend_frames = np.floor(motion.bends_s(float(t_s[-1]) + 1.0) * scenario.frame_rate_hz + 1e-6).astype(np.int64)
     turned = np.isin(frame, bend_frames + 1)
     occluded, clutter_points = _occlusions_and_clutter(scenario, model, uv, bend_frames, seed)
     in_view = np.where(model.in_picture(uv), np.where(occluded, OCCLUDED, VISIBLE), OUTSIDE)
     return Scene(
         scenario, seed, rig, model, motion, frame, t_s, poses, uv, in_view,
-        _usable_pictures(scenario, model, count), turned, clutter_points,
+        _usable_pictures(scenario, model, count), turned, clutter_points, exposed_s,
     )  # fmt: skip
+
+
+def _exposed(scenario: Scenario, model: SpotModel, motion: Motion, t_s: Array, uv_px: Array) -> tuple[Array, Array]:
+    """Pixels (T, n, 2) of the spots when their pictures, or the rows of these, are exposed; and those times (T, n), s.
+
+    uv_px (T, n, 2): at the times t_s (T,) of the frames.
+    """
+    exposed_s = np.repeat(t_s[:, None], len(model), axis=1)
+    uv_px = uv_px.copy()
+    for timing in scenario.clocks:
+        late_s = timing.late_frames / scenario.frame_rate_hz
+        for view in np.flatnonzero(model.camera_of == model.camera_names.index(timing.camera)).tolist():
+            one, middle = model.subset(np.array([view])), (model.image_size_px[view, 1] - 1) / 2
+            for _ in range(_ROW_STEPS):
+                row = np.clip(np.nan_to_num(uv_px[:, view, 1], nan=middle), -0.5, 2 * middle + 0.5)
+                exposed_s[:, view] = t_s + late_s + (row - middle) * timing.row_time_s
+                uv_px[:, view] = one.project(motion.pose(exposed_s[:, view]))[0][:, 0]
+    return uv_px, exposed_s
 
 
 def draw_motion(scenario: Scenario, model: SpotModel, seed: int) -> Motion:

@@ -128,7 +128,7 @@ def _run_mapping(scene: Scene, sources: dict[str, dict[str, str]], known: RigFil
         "rig": "rig.yaml",
         "frame_rate_hz": scene.scenario.frame_rate_hz,
         "exposure_s": scene.scenario.light.exposure_s,
-        "cameras": {name: dict(source) for name, source in sources.items()},
+        "cameras": {name: {**source, **_clock(scene.scenario, name)} for name, source in sources.items()},
         "prior": {
             "position_m": list(prior.position_m),
             "yaw_pitch_roll_deg": list(prior.yaw_pitch_roll_deg),
@@ -137,6 +137,18 @@ def _run_mapping(scene: Scene, sources: dict[str, dict[str, str]], known: RigFil
         },
         "notes": f"Simulated, seed {scene.seed}. {scene.scenario.summary}",
     }
+
+
+def _clock(scenario: Scenario, camera: str) -> dict[str, float]:
+    """The clock of a camera for run.yaml; empty where it is the run's."""
+    for timing in scenario.clocks:
+        if timing.camera == camera:
+            stated = {
+                "time_offset_s": timing.late_frames / scenario.frame_rate_hz,
+                "row_time_s": timing.row_time_s,
+            }
+            return {key: value for key, value in stated.items() if value}
+    return {}
 
 
 def write_truth(scene: Scene, folder: Path) -> None:

@@ -24,6 +24,9 @@ from tracking.tracked_frame import Event
 # Sigmas of the motion of a vehicle that has just been found.
 FIRST_SPEED, FIRST_RATE = 4.0, 6.0  # m/s, rad/s
 FIRST_ACCELERATION, FIRST_ANGULAR_ACCELERATION = 30.0, 100.0  # m/s^2, rad/s^2
+# Sigmas of the motion between the pictures of one frame in a search by geometry alone: usual motions, since with the
+# fastest ones no pose could be told from another. px/s where the prior's centre shows no spot.
+SEARCH_SPEED, SEARCH_RATE, SEARCH_PX_S = 1.0, 1.0, 1500.0  # m/s, rad/s
 # Limits of the search around the last pose; beyond the second one a fan of beams looks like itself, turned.
 MAX_DISTANCE_M, MAX_TURN_RAD = 1.5, np.deg2rad(60.0)
 # Spots of two poses nearer than this are the same. A vehicle that is symmetric up to more than this can be measured.
@@ -122,7 +125,8 @@ class Acquisition:
                 continue
             static = frame.log_static[frame.first[c] : frame.first[c + 1]] > STATIC_LOG_DENSITY
             rows[c] = np.arange(len(points)) if static_too else np.flatnonzero(~static)
-            by_camera[name] = points if len(rows[c]) == len(points) else points[rows[c]]
+            some_points = points if len(rows[c]) == len(points) else points[rows[c]]
+            by_camera[name] = self._widened(some_points, prior, c)
         if sum(len(points) for points in by_camera.values()) < p.labels.min_spots:
             return []
         some: list[Labelling] = []
@@ -136,10 +140,21 @@ class Acquisition:
             some = candidate_labellings(
                 self._rig, self._model, by_camera, prior, p.labels, self._calibration, most=MAX_CANDIDATES
             )
-        out = []
+        out: list[Labelling] = []
         for one in some:
             point = one.point_of.copy()
             for v in np.flatnonzero(point != NO_POINT):
                 point[v] = rows[self._model.camera_of[v]][point[v]]
             out.append(replace(one, point_of=point))
         return out
+
+    def _widened(self, points: Detections, prior: PosePrior, camera: int) -> Detections:
+        """The points of a picture with covariances for the unknown motion of the vehicle until it was taken."""
+        if points.clock is None or not len(points):
+            return points
+        J = self._model.project(prior.centre)[1][self._model.camera_of == camera]  # 0 without a projection
+        sigmas = np.repeat([SEARCH_SPEED, SEARCH_RATE], 3)
+        speed2 = 0.5 * np.sum((J * sigmas) ** 2, axis=(1, 2))
+        px_s2 = float(np.median(speed2[speed2 > 0])) if np.any(speed2 > 0) else SEARCH_PX_S**2
+        variance = points.clock.after_s(points.uv_px[:, 1]) ** 2 * px_s2
+        return replace(points, cov_px2=points.cov_px2 + variance[:, None, None] * np.eye(2))

@@ -56,7 +56,7 @@ def summarise(
         for a in range(2):
             uv[i, a] = frame.uv[d, a] if labelled[i] else np.nan
             for b in range(2):
-                cov[i, a, b] = frame.cov[d, a, b] if labelled[i] else np.nan
+                cov[i, a, b] = frame.cov[d, a, b] + obs.shift_cov[i, a, b] if labelled[i] else np.nan
     R1, t1, L, chi2, count = single_frame_pose(views, R, t, use, uv, cov)
     single_frame_cov = inverse(L) if count >= 3 else _infinite(6)
     expected, J, inside = np.empty((n, 2)), np.empty((n, 2, 6)), np.zeros(n, np.bool_)

@@ -13,7 +13,6 @@ from geometry.forward_model import SpotModel
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.association.frame_detections import BLENDED, Observation, distinct_spots
 from tracking.rigid_body.hypotheses.hypothesis_set import Children, Dynamics, Hypotheses
-from tracking.rigid_body.hypotheses.iterated_update import chosen_points
 from tracking.rigid_body.hypotheses.prediction_checks import (
     MAX_CHECKING_SIGMA_PX,
     MAX_THREE_SPOT_SIGMA_PX,
@@ -24,6 +23,7 @@ from tracking.rigid_body.hypotheses.prediction_checks import (
     unchecked_by_prediction,
 )
 from tracking.rigid_body.hypotheses.pruning import unweighted_spread
+from tracking.rigid_body.hypotheses.timed_update import chosen_points
 from tracking.rigid_body.models.information import well_controlled
 from tracking.rigid_body.pose_candidates import predicted_hypothesis
 

@@ -18,6 +18,7 @@ Source: ours.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,7 +33,7 @@ from tracking.detections import Detections
 from tracking.input_validation import UsablePoints, check_step
 from tracking.labelling.first_labels import MIN_EVIDENCE_NATS, NO_POINT, Labelling
 from tracking.parameters import TrackerParameters
-from tracking.rigid_body.acquisition import Acquisition
+from tracking.rigid_body.acquisition import FIRST_RATE, FIRST_SPEED, Acquisition
 from tracking.rigid_body.adaptive_process_noise import AdaptiveProcessNoise
 from tracking.rigid_body.association.frame_detections import (
     DetectionModel,
@@ -44,16 +45,17 @@ from tracking.rigid_body.association.frame_detections import (
 from tracking.rigid_body.frame_result import FrameDecision, is_lost, lost_frame, tracked_frame, undecided_events
 from tracking.rigid_body.frame_summary import FrameSummary, innovation_score, predicted_pixels, summarise
 from tracking.rigid_body.hypotheses.branching import branch
-from tracking.rigid_body.hypotheses.hypothesis_set import Children, Hypotheses, empty_children
-from tracking.rigid_body.hypotheses.iterated_update import chosen_points
+from tracking.rigid_body.hypotheses.hypothesis_set import Children, Hypotheses, State, empty_children, state_of
 from tracking.rigid_body.hypotheses.prediction_checks import (
     MIN_CONFIRMING_SPOTS,
     MIN_REDUNDANT_SPOTS,
 )
 from tracking.rigid_body.hypotheses.pruning import prune_and_merge
+from tracking.rigid_body.hypotheses.timed_update import chosen_points
 from tracking.rigid_body.label_confirmation import FrameHypotheses, LabelConfirmation
 from tracking.rigid_body.models.information import single_frame_pose
 from tracking.rigid_body.models.occlusion import MISSED
+from tracking.rigid_body.models.picture_shifts import clocks_of, has_clocks, picture_shifts
 from tracking.rigid_body.point_statistics import PointStatistics
 from tracking.rigid_body.pose_candidates import (
     P_VISIBLE_AT_START,
@@ -61,6 +63,7 @@ from tracking.rigid_body.pose_candidates import (
     add_pose,
     continued_hypotheses,
     continues,
+    predicted_hypothesis,
     unknown_vehicle,
     without_history,
 )
@@ -141,13 +144,13 @@ class RigidTracker:
         self._last_pose_age_s += dt_s
         self._schedule.next_frame()
         events: list[Event] = []
-        obs = self._observation(found)
+        obs, after_jump = self._observations(found, dt_s)
         if old is None:
             children, count = empty_children(n, self._groups), 0
             predicted_px = np.full((n, 2), np.nan)
         else:
-            children, count = branch(obs, self.process_noise.dynamics, dt_s, old)
-            predicted_px = np.full((n, 2), np.nan) if is_lost(old.P[0]) else predicted_pixels(model.numbers, old, dt_s)
+            children, count = branch(obs, after_jump, self.process_noise.dynamics, dt_s, old)
+            predicted_px = np.full((n, 2), np.nan) if is_lost(old.P[0]) else predicted_pixels(obs.views, old, dt_s)
         best = children.assigned[int(np.argmax(children.hypotheses.log_weight[:count]))] if count else None
         searched: dict[int, str] = {}
         if self._schedule.due(best, found, lambda: is_vague(model, old, dt_s, self.process_noise.dynamics)):
@@ -167,12 +170,48 @@ class RigidTracker:
             dt_s, old, self._hypotheses, children, kept, probability, spread, searched, self._last_pose is None,
             self._evidence,
         )  # fmt: skip
+        if obs.timed:  # what this frame says about the velocities counts for where its spots have moved
+            state = state_of(self._hypotheses, 0)
+            obs = self._moved(obs, state, np.ascontiguousarray(state.P[6:12, 6:12]))
         return self._answer(obs, h, predicted_px, events)
 
-    def _observation(self, found: Sequence[Detections | None]) -> Observation:
-        """The frame's detections together with what their likelihood depends on."""
+    def _observations(self, found: Sequence[Detections | None], dt_s: float) -> tuple[Observation, Observation]:
+        """The frame's detections together with what their likelihood depends on: after steady motion, and after a jump.
+
+        The two differ where pictures have clocks of their own: the spots have moved since the frame's instant, with the
+        predicted velocities.
+        """
         frame = self._points.frame(found, self.noise_scale, self._last_pose is None)
-        return Observation(self.model.numbers, self._view_table, self._detection_model, self._calibration_cov, frame)
+        no_shift = np.zeros_like(self._calibration_cov)
+        obs = Observation(
+            self.model.numbers, self._view_table, self._detection_model, self._calibration_cov, frame, no_shift,
+            clocks_of(found), has_clocks(found),
+        )  # fmt: skip
+        if self._hypotheses is None or not obs.timed:
+            return obs, obs
+        dynamics = self.process_noise.dynamics
+        state = predicted_hypothesis(self._hypotheses, 0, dt_s, dynamics, manoeuvre=False)
+        velocity_P = np.ascontiguousarray(state.P[6:12, 6:12])
+        jump = np.diag(np.repeat(dynamics.velocity_jump, 3))
+        return self._moved(obs, state, velocity_P), self._moved(obs, state, velocity_P + jump)
+
+    def _moved(self, obs: Observation, state: State, velocity_P: Array) -> Observation:
+        """The observation with spots that have moved until their pictures were taken.
+
+        velocity_P (6, 6): covariance of the state's velocities.
+        """
+        camera = self._view_table.camera
+        shift, cov = picture_shifts(self.model.numbers, camera, obs.clocks, state.R, state.t, state.m, velocity_P)
+        views = self.model.numbers.copy()
+        views["shift"] = shift
+        return obs._replace(views=views, calibration_cov=self._calibration_cov + cov, shift_cov=cov)
+
+    def _at_candidate(self, obs: Observation, pose: Pose) -> Observation:
+        """The observation for a vehicle at a pose of whose motion nothing is known."""
+        if not obs.timed:
+            return obs
+        state = State(np.array(pose.rotation, order="C"), np.array(pose.translation), np.zeros(12), np.zeros((18, 18)))
+        return self._moved(obs, state, np.diag(np.repeat([FIRST_SPEED, FIRST_RATE], 3) ** 2))
 
     # -- search for the whole vehicle ---------------------------------------------------------------------------------
 
@@ -200,8 +239,9 @@ class RigidTracker:
         candidates = self._acquisition.labellings(obs.frame, found, prior, first, static_too, events)
         if first and len(candidates) == 1 and candidates[0].fit.dof > 0 and candidates[0].score >= MIN_EVIDENCE_NATS:
             # Later the scale is known, and a misfit shows a wrong answer (a scale of 3 after a screen was occluded).
-            self._raise_variance_factor(obs, candidates[0])
-            obs = self._observation(found)
+            unmoved = self._at_candidate(obs, candidates[0].fit.world_from_body)
+            self._raise_variance_factor(unmoved, candidates[0])
+            obs, _ = self._observations(found, dt_s)
         # A vehicle that was never measured may as well appear now; else it is rarely off all predictions.
         log_weight = 0.0 if self._hypotheses is None else -self._evidence if first else float(np.log(P_NEW))
         starts = [unknown_vehicle(prior, log_weight, len(self.model) + self._groups)]
@@ -223,10 +263,12 @@ class RigidTracker:
         for one in candidates:
             pose = one.fit.world_from_body
             assigned = self._assigned(obs.frame, one)
+            unmoved = self._at_candidate(obs, pose)
             for start in starts:
                 if not start.manoeuvre and continues(children, branched, start.parent, assigned):
                     continue
-                count, place = add_pose(children, count, obs, self.model, start, assigned, pose)
+                here = unmoved if start.parent < 0 else obs
+                count, place = add_pose(children, count, here, self.model, start, assigned, pose)
                 if place >= 0:
                     searched.pop(place, None)
                     if tuple(np.maximum(children.assigned[place], MISSED)) not in known:
@@ -239,10 +281,10 @@ class RigidTracker:
 
     def _raise_variance_factor(self, obs: Observation, one: Labelling) -> None:
         """Raise the variance factor to the misfit of a first labelling, which holds within the model's error."""
-        use, uv, cov = chosen_points(obs.frame, self._assigned(obs.frame, one), self._calibration_cov)
+        use, uv, cov = chosen_points(obs.frame, self._assigned(obs.frame, one), obs.calibration_cov)
         pose = one.fit.world_from_body
         start = np.ascontiguousarray(pose.rotation), np.ascontiguousarray(pose.translation)
-        _, _, _, chi2, count = single_frame_pose(self.model.numbers, *start, use, uv, cov)
+        _, _, _, chi2, count = single_frame_pose(obs.views, *start, use, uv, cov)
         dof = 2 * count - 6
         if dof > 0 and chi2 / dof > MISFIT_LIMIT:
             self.variance_factor.raise_to(chi2 * self.noise_scale**2, dof)
@@ -267,7 +309,7 @@ class RigidTracker:
         if measured and h.first:
             measured = not self._acquisition.is_ambiguous(Pose(now.R[0], now.t[0]), self._last_pose_age_s)
         if measured:
-            self._update_errors(s, now, count)
+            self._update_errors(obs, s, now, count)
         covariance = now.P[0, :6, :6] + checks.spread + self._systematic
         known = measured or (self._last_pose is not None and not is_lost(covariance))
         # After a frame that showed nothing, one or two points may be false: a second such frame must follow.
@@ -280,7 +322,7 @@ class RigidTracker:
                 text = f"spots {h.searched[h.best]} found from the prior alone"
                 events.append(Event(self._kind_of_search(h.dt_s), text))
             elif h.before is not None and h.dt_s > 0 and h.parent >= 0:
-                predicted_cov = self._update_process_noise(s, h)
+                predicted_cov = self._update_process_noise(obs, s, h)
             self._last_pose, self._last_pose_age_s = Pose(now.R[0], now.t[0]), 0.0
             self._acquisition.vehicle_found()
         self._schedule.measured(measured, spots)
@@ -291,7 +333,9 @@ class RigidTracker:
             assigned, h.probability, labelled, known, measured, h.manoeuvre, covariance, self._systematic,
             self._calibration_cov, self.parameters.blend_px,
         )  # fmt: skip
-        return tracked_frame(model, obs.frame, s, now, decision, (predicted_px, predicted_cov), events)
+        out = tracked_frame(model, obs.frame, s, now, decision, (predicted_px, predicted_cov), events)
+        shift = np.asarray(obs.views["shift"])
+        return replace(out, shift_px=shift.copy()) if shift.any() else out
 
     def _kind_of_search(self, dt_s: float) -> str:
         if self._last_pose is None:
@@ -310,7 +354,7 @@ class RigidTracker:
 
     # -- online estimates ---------------------------------------------------------------------------------------------
 
-    def _update_errors(self, s: FrameSummary, h: Hypotheses, count: int) -> None:
+    def _update_errors(self, obs: Observation, s: FrameSummary, h: Hypotheses, count: int) -> None:
         """Update the variance factor and, if the calibration's covariance is known, the effects of its errors.
 
         The factor refers to the stated covariances, not to those that it has already widened: with these it settled at
@@ -321,21 +365,20 @@ class RigidTracker:
             return
         rows = np.flatnonzero(s.use)
         start = Pose(h.R[0], h.t[0])
-        fit = fit_pose(self.model, rows, s.uv[rows], s.cov[rows], start, calibration=self.calibration)
+        uv = s.uv[rows] - obs.views["shift"][rows]
+        fit = fit_pose(self.model, rows, uv, s.cov[rows], start, calibration=self.calibration)
         if fit is not None and fit.observable:
             self._calibration_cov = np.zeros_like(self._calibration_cov) + fit.calibration_px()
             self._systematic = fit.systematic
             self.variance_factor.update(fit.chi2 * self.noise_scale**2, fit.dof, fit.systematic_share)
 
-    def _update_process_noise(self, s: FrameSummary, h: FrameHypotheses) -> Array | None:
+    def _update_process_noise(self, obs: Observation, s: FrameSummary, h: FrameHypotheses) -> Array | None:
         """Update the process noise; returns the covariances (n, 2, 2) of the predicted pixels.
 
         None if the best hypothesis continues another one than that which the predicted pixels are of.
         """
         assert h.before is not None
         jerk = self.process_noise.dynamics.jerk
-        score, predicted_cov = innovation_score(
-            self.model.numbers, h.before, h.parent, h.dt_s, jerk, s.use, s.uv, s.cov
-        )
+        score, predicted_cov = innovation_score(obs.views, h.before, h.parent, h.dt_s, jerk, s.use, s.uv, s.cov)
         self.process_noise.update(h.now.m[0, :6], h.manoeuvre, score)
         return predicted_cov + self._calibration_cov if h.parent == 0 else None

@@ -59,7 +59,7 @@ def _track_stretch(rec: TrackedRecording, motion: SmoothedMotion, first: int, la
     dt = rec.dt_s
     poses, causal = rec.poses, rec.measured
     for k in range(last, first - 1, -1):
-        tracked = tracker.step(float(dt[k + 1]), rec.found(k))
+        tracked = tracker.step(float(dt[k + 1]), rec.found_backward(k))
         out.assigned[k] = assigned_in_one_list(tracked, rec.first(k)[rec.model.camera_of])
         out.measured[k] = tracked.pose_status is PoseStatus.MEASURED
         if out.measured[k] and tracked.pose is not None:

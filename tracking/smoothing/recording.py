@@ -13,7 +13,9 @@ from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
+from tracking.picture_clock import AT_THE_FRAME, PictureClock
 from tracking.rigid_body.association.frame_detections import BLENDED
+from tracking.smoothing.motion.delayed_spots import Delays
 from tracking.smoothing.motion.run_detections import RunDetections
 from tracking.statuses import PoseStatus, SpotStatus
 from tracking.tracked_frame import TrackedFrame
@@ -83,6 +85,7 @@ class TrackedRecording:
         self._pose, self._assigned = _Column((4, 3)), _Column((len(self.model),), np.int64)
         self._uv, self._cov, self._size, self._place = _Column((2,)), _Column((2, 2)), _Column(), _Column()
         self._first, self._has_image = _Column((cameras + 1,), np.int64), _Column((cameras,), bool)
+        self._clock = _Column((cameras, 3))  # of the pictures, as PictureClock.numbers
         self._begin = _Column(dtype=np.int64)  # (T + 1,) where the detections of each frame begin
         self._begin.append(0)
 
@@ -102,6 +105,7 @@ class TrackedRecording:
         self._begin.append(self._begin.values[-1] + first[-1])
         self._first.append(first)
         self._has_image.append([f is not None for f in found])
+        self._clock.append([AT_THE_FRAME if f is None or f.clock is None else f.clock.numbers for f in found])
         self._dt.append(dt_s)
         self._assigned.append(assigned_in_one_list(tracked, first[self.model.camera_of]))
         self._jumped.append(SpotStatus.TURNED in tracked.status)
@@ -136,15 +140,20 @@ class TrackedRecording:
         """(T, n): row in the list of all cameras' detections of the frame, plus BLENDED; -1 without."""
         return self._assigned.values
 
-    def found(self, k: int) -> list[Detections | None]:
-        """Frame k's detections by camera as a tracker's input, None without a picture; without brightness."""
+    def found_backward(self, k: int) -> list[Detections | None]:
+        """Frame k's detections by camera as the input of a tracker that runs backward in time; without brightness.
+
+        None without a picture.
+        """
         begin, first = int(self._begin.values[k]), self.first(k)
         out: list[Detections | None] = []
         for c, there in enumerate(self._has_image.values[k]):
             rows = slice(begin + int(first[c]), begin + int(first[c + 1]))
             points = Detections.at(self._uv.values[rows], self._cov.values[rows])
             size = self._size.values[rows]
-            out.append(replace(points, major_px=size, minor_px=size) if there else None)
+            clock = PictureClock(*self._clock.values[k, c])
+            timed = None if clock.numbers == AT_THE_FRAME else clock.reversed()
+            out.append(replace(points, major_px=size, minor_px=size, clock=timed) if there else None)
         return out
 
     def first(self, k: int) -> Ints:
@@ -154,6 +163,15 @@ class TrackedRecording:
     def place_px2(self) -> Array:
         """(m,): of the variance of a coordinate of each detection of the run, the part that belongs to its place."""
         return self._place.values
+
+    def delays(self) -> Delays | None:
+        """When the detections of the run were exposed; None: all at the instants of their frames."""
+        clocks = self._clock.values
+        if not clocks[..., :2].any():
+            return None
+        per_picture = np.diff(self._first.values, axis=1)  # (T, cameras) detections
+        delay, row_time, middle = (np.repeat(clocks[..., i].ravel(), per_picture.ravel()) for i in range(3))
+        return Delays(delay + (self._uv.values[:, 1] - middle) * row_time, row_time, np.ascontiguousarray(clocks))
 
     def run_detections(self) -> RunDetections:
         """All detections of the run; their arrays are the recording's own."""

@@ -26,7 +26,7 @@ _BLOCK = 4096  # frames whose measured spots are in memory twice
 class ReportedSpots:
     """All views' spots in T frames: measured where they have a label, elsewhere as the pose gives them."""
 
-    uv_px: Array  # (T, n, 2) at mid-exposure; nan where the pose does not project the spot
+    uv_px: Array  # (T, n, 2) at mid-exposure of the picture; nan where the pose does not project the spot
     cov_px2: Array  # (T, n, 2, 2)
     exists: Bools  # (T, n): the pose projects the spot
     inside: Bools  # (T, n): the spot is in the picture
@@ -35,6 +35,7 @@ class ReportedSpots:
     def of(
         model: SpotModel, parameters: TrackerParameters, poses: Pose, covariance: Array, calibration_cov: Array,
         measured: tuple[RunDetections, Array], labels: tuple[Ints, ErrorScale], exposure: tuple[Array, Array],
+        shift_px: Array | None = None,
     ) -> ReportedSpots:  # fmt: skip
         """The spots of T frames from their poses, with covariances (T, 6, 6), and the labelled detections.
 
@@ -42,11 +43,14 @@ class ReportedSpots:
         detections as stated, and the part (m,), px^2, of their variances that belongs to the place. labels: (T, n), as
         `Smoothed.assigned`, and the corrections of the stated covariances. exposure: mean pixel (T, n, 2) of a spot
         over the exposure less that at its middle, and the sigma (T, 6), m and rad, of the unknown part of the pose's.
+        shift_px: as `Smoothed.shift_px`.
         """
         (detections, place_px2), (assigned, errors), (exposure_px, exposure_sigma) = measured, labels, exposure
         R, t, views = poses.rotation, poses.translation, model.numbers
         uv_px, cov_px2 = project_with_covariances(views, R, t, covariance)
         cov_px2 += calibration_cov
+        if shift_px is not None:
+            uv_px += shift_px
         exists = ~np.isnan(uv_px[..., 0])
         of_exposure = np.zeros((0, *cov_px2.shape[1:]))
         if exposure_sigma.any():
@@ -90,6 +94,7 @@ class Smoothed:
     iterations: int  # rounds of motion and labels
     relabelled: int  # labels that differ from the causal ones
     errors: ErrorScale  # corrections of the spots' stated covariances
+    shift_px: Array | None = None  # (T, n, 2) as TrackedFrame.shift_px
 
     @property
     def frames(self) -> int:
@@ -139,6 +144,7 @@ class Smoothed:
             if known
             else None,
             pose_systematic=systematic if known else None,
+            shift_px=None if self.shift_px is None else self.shift_px[k],
         )
 
     def _label_probability(self, k: int, causal: TrackedFrame, known: bool) -> Array | None:

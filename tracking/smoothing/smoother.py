@@ -29,6 +29,7 @@ from tracking.rigid_body.hypotheses.prediction_checks import (
     MIN_REDUNDANT_SPOTS,
     SURE_PROBABILITY,
 )
+from tracking.rigid_body.models.picture_shifts import run_shifts
 from tracking.smoothing.backward import merged, track_backward
 from tracking.smoothing.calibration_errors import calibration_errors
 from tracking.smoothing.error_scale import ErrorScale, usual_sizes
@@ -40,10 +41,11 @@ from tracking.smoothing.labels.neighbouring_frames import brief, connected, isol
 from tracking.smoothing.labels.path_pairs import transfers_between_cameras
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated
 from tracking.smoothing.labels.view_path import PathContext
+from tracking.smoothing.motion.delayed_spots import Steps, moved_detections
 from tracking.smoothing.motion.reference import Reference, straight_between
-from tracking.smoothing.motion.run_detections import controlled_labels
+from tracking.smoothing.motion.run_detections import RunDetections, controlled_labels
 from tracking.smoothing.motion.smoothed_motion import SmoothedMotion, WholeRun
-from tracking.smoothing.motion.velocity_jumps import corner_offsets, jump_sigmas
+from tracking.smoothing.motion.velocity_jumps import corner_offsets, jump_sigmas, jump_variances
 from tracking.smoothing.motion.whole_run import MAX_DISTANCE, estimate
 from tracking.smoothing.place_errors import place_errors
 from tracking.smoothing.recording import TrackedRecording
@@ -106,13 +108,22 @@ class _Smoother:
         self.measured = rec.measured  # (T,) the frame's spots determine its pose
         self.probability = np.where(self.causal >= 0, 1.0, np.nan)
         ref = straight_between(rec.poses, self.measured, np.cumsum(rec.dt_s))
-        every = rec.run_detections()
-        every = every._replace(usual_size_px=usual_sizes(every, self.assigned))
-        self.calibration_cov, self.systematic, self.noise_share = calibration_errors(rec, every, self.assigned, ref)
+        self.delays = rec.delays()
+        # (T,) frames with pictures of other instants: beside a velocity jump they have no pose of their own.
+        self.timed = np.zeros(len(rec), dtype=bool)
+        if self.delays is not None:
+            self.timed = np.asarray(self.delays.clocks[..., :2].any(axis=(1, 2)))
+        seen = rec.run_detections()
+        seen = seen._replace(usual_size_px=usual_sizes(seen, self.assigned))
+        self.calibration_cov, self.systematic, self.noise_share = calibration_errors(rec, seen, self.assigned, ref)
         place_px2 = rec.place_px2()
-        self.errors = ErrorScale.of(model, every, place_px2, self.assigned, self.calibration_cov, ref, self.measured)
-        self.detections = every._replace(
-            cov=self.errors.of_run(every, place_px2) + parameters.sigma_model_px**2 * np.eye(2)
+        every, steady = seen, self.measured
+        if self.delays is not None:
+            every, ref, steady = self._first_motion(seen, ref)
+        self.errors = ErrorScale.of(model, every, place_px2, self.assigned, self.calibration_cov, ref, steady)
+        # Where the pictures show the points, and where these would have been at the instants of the frames.
+        self.seen = self.detections = seen._replace(
+            cov=self.errors.of_run(seen, place_px2) + parameters.sigma_model_px**2 * np.eye(2)
         )
         log_density: Array | None = None
         if not parameters.learn_jerk:
@@ -127,15 +138,44 @@ class _Smoother:
         self.conflicting = np.zeros(len(rec), dtype=bool)  # (T,) forward and backward poses differ
         self.own = SingleFramePoses.unknown(0)  # at the last estimate
 
+    def _first_motion(self, seen: RunDetections, ref: Reference) -> tuple[RunDetections, Reference, Bools]:
+        """The detections at the instants of their frames, by the motion with the stated sigmas; that motion; steady
+        frames.
+
+        Differences of the causal poses would do for neither: between two pictures of one frame they are off by a third
+        of the noise, and by pixels at a velocity jump. Steady frames (T,) are measured and not next to a jump.
+        """
+        rec = self.rec
+        run = WholeRun(self.views, seen, self.calibration_cov, rec.dt_s, rec.exposure_s, True, self.delays)
+        begin = SmoothedMotion.begin(ref, rec.jumped.copy(), None)
+        motion = estimate(run, self.assigned, self.measured, begin, 0, self.measured)
+        turns = motion.jumped | np.append(motion.jumped[1:], False)
+        steady = self.measured & ~turns
+        return self._at_frames(seen, motion), motion.ref, steady if steady.any() else self.measured
+
+    def _at_frames(self, seen: RunDetections, motion: SmoothedMotion) -> RunDetections:
+        """The detections where they would have been at the instants of their frames, given the estimated motion."""
+        if self.delays is None or motion.log_density is None:
+            return seen
+        nowhere = np.zeros(len(self.rec), dtype=bool)
+        jump = jump_variances(motion.ref, nowhere, self.measured, motion.jumped, self.rec.dt_s)
+        steps = Steps(self.rec.dt_s, np.exp(motion.log_density), np.ascontiguousarray(jump))
+        uv, cov = moved_detections(
+            self.views, self.view_table.camera, seen, self.delays, self.assigned, motion.ref, motion.motion_P, steps
+        )
+        return seen._replace(uv=uv, cov=cov)
+
     def estimate(self, max_distance: int) -> None:
         """Estimate the motion given the labels."""
         rec = self.rec
         # A long run's memory is largest here.
         self.motion, self.own = self.motion.without_covariances(), SingleFramePoses.unknown(0)
         run = WholeRun(
-            self.views, self.detections, self.calibration_cov, rec.dt_s, rec.exposure_s, self.parameters.learn_jerk
-        )
+            self.views, self.seen, self.calibration_cov, rec.dt_s, rec.exposure_s, self.parameters.learn_jerk,
+            self.delays,
+        )  # fmt: skip
         self.motion = estimate(run, self.assigned, self.measured, self.motion, max_distance, self.trusted)
+        self.detections = self._at_frames(self.seen, self.motion)
         own = self._single_frame_poses(self.assigned)
         self.measured = own.measured & ~self.conflicting
         self.own = replace(own, measured=self.measured)
@@ -163,6 +203,7 @@ class _Smoother:
         ref, known = self.motion.ref, self.motion.known
         log_static = run_log_static(self.views, self.view_table, self.detections, self.assigned, ref, known)
         self.detections = self.detections._replace(log_static=log_static)
+        self.seen = self.seen._replace(log_static=log_static)
         detection_model = DetectionModel(self.parameters.p_detect, self.parameters.p_blend)
         run = RunObservation(self.views, self.view_table, detection_model, self.calibration_cov, self.detections)
         found, probability, sigma_px = reassociated(
@@ -231,7 +272,7 @@ class _Smoother:
         beside = next_to(self.motion.jumped) | self.motion.jumped
         for _ in range(MAX_REPAIRS):
             limit = np.where(beside, CONTRADICTION_NEXT_TO_JUMP_CHI2, CONTRADICTION_CHI2)
-            wrong = self.own.measured & self.trusted & (self.own.excess > limit)
+            wrong = self.own.measured & self.trusted & (self.own.excess > limit) & ~self.timed
             if not wrong.any():
                 return
             jumped = self.motion.jumped.copy()
@@ -285,15 +326,19 @@ class _Smoother:
             half = 0.5 * np.median(motion.log_density, axis=0)
             jerk = np.exp([half[:3].mean(), half[3:].mean()])
         poses = Pose(final.R, final.t).plus(-pose_shift(self.views, final, offsets))
+        shifts: Array | None = None
+        if self.delays is not None:
+            shifts = run_shifts(self.views, self.view_table.camera, self.delays.clocks, final.R, final.t, final.m)
         spots = ReportedSpots.of(
             self.model, self.parameters, poses, covariance + self.systematic, self.calibration_cov,
-            (self.rec.run_detections(), self.rec.place_px2()), (assigned, self.errors), (offsets, of_spots),
+            (self.rec.run_detections(), self.rec.place_px2()), (assigned, self.errors), (offsets, of_spots), shifts,
         )  # fmt: skip
         return Smoothed(
             model=self.model,
             parameters=self.parameters,
             poses=poses,
             spots=spots,
+            shift_px=shifts,
             velocities=final.m[:, :6],
             covariance=covariance,
             place_share=place_share,
@@ -320,7 +365,7 @@ class _Smoother:
         motion, own = self.motion, self.own
         ref = motion.ref
         R, t, pose_P, motion_P = (a.copy() for a in (ref.R, ref.t, motion.pose_P, motion.motion_P))
-        for k in np.flatnonzero(own.measured & (own.excess > CONTRADICTION_CHI2) & motion.known):
+        for k in np.flatnonzero(own.measured & (own.excess > CONTRADICTION_CHI2) & motion.known & ~self.timed):
             R[k], t[k], pose_P[k] = own.R[k], own.t[k], own.covariance[k]
             d = Pose(own.R[k], own.t[k]).minus(Pose(ref.R[k], ref.t[k]))
             spread = np.diag((d / max(float(np.median(self.rec.dt_s[1:])), 1e-6)) ** 2)

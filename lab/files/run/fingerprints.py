@@ -25,9 +25,7 @@ def fingerprints(run: Run, full: bool = False) -> list[dict[str, Any]]:
     Raises:
         OSError: a file cannot be read.
     """
-    files = [run.path, run.rig_path]
-    if run.times_path is not None:
-        files.append(run.times_path)
+    files = [run.path, run.rig_path, *run.times_paths]
     files += [p for p in (run.folder / "truth" / name for name in ("pose.csv", "spots.csv")) if p.is_file()]
     out = [_of_file(f, full) for f in files]
     done: set[Path] = set()

@@ -39,12 +39,24 @@ def read_result_table(path: Path, required: Iterable[str], optional: Iterable[st
 
 
 def _check_frames(table: Table) -> None:
-    """Raises InputError at a frame that is no whole number or less than the one before, and at a time out of range."""
+    """Raises InputError at a frame that is no whole number or less than the one before, and at a time out of range.
+
+    In detections.csv with the pictures' times the numbers are those of each camera's own pictures.
+    """
     if "frame" in table.numbers:
-        for i in np.flatnonzero(np.diff(table.whole("frame")) < 0)[:1]:
-            frame, before = table.found("frame", i + 1), table.found("frame", i)
-            mistake = f"frame: expected frames in rising order, got {frame} after {before}; process the run again"
-            raise table.error(i + 1, mistake)
+        frames = table.whole("frame")
+        rows = [np.arange(len(frames))]
+        if "camera" in table.words and columns.PICTURE_TIME in table.header and "spot" not in table.header:
+            camera = np.array(table.words["camera"].tolist())
+            rows = [np.flatnonzero(camera == name) for name in np.unique(camera)]
+        for of_camera in rows:
+            for i in np.flatnonzero(np.diff(frames[of_camera]) < 0)[:1]:
+                before, at = of_camera[i : i + 2]
+                mistake = (
+                    f"frame: expected frames in rising order, got {table.found('frame', at)} after"
+                    f" {table.found('frame', before)}; process the run again"
+                )
+                raise table.error(at, mistake)
     if "t_s" in table.numbers:
         for i in np.flatnonzero(np.abs(table.numbers["t_s"]) > MAX_TIME_S)[:1]:
             raise table.error(i, f"t_s: expected seconds, got {table.found('t_s', i)}; process the run again")

@@ -19,6 +19,7 @@ from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState, OptionalDay
 from lab.files.rig.rig_file import joint_covariance, load_rig_file
+from lab.files.run.clocks import CameraClock, load_clock
 from lab.files.run.not_a_run import no_run_error
 from lab.files.run.times import Times, load_times
 from lab.files.text.dataclass_fields import dataclass_from_yaml
@@ -32,6 +33,7 @@ from lab.files.text.fields import (
     Vector3,
     Word,
     field_error,
+    finite_number,
     number_between,
     one_of,
     unexpected_value,
@@ -102,6 +104,7 @@ class Run:
     covariance: RigCovariance | None = None  # of the rig's calibration
     calibration: CalibrationState | None = None  # date and verdict
     recorded: datetime.date | None = None  # the day of the recording
+    clocks: Mapping[str, CameraClock] = dataclasses.field(default_factory=dict)  # of cameras that have one of their own
 
     @property
     def path(self) -> Path:
@@ -109,9 +112,15 @@ class Run:
         return self.folder / "run.yaml"
 
     @property
+    def times_paths(self) -> tuple[Path, ...]:
+        """The timestamps files of the run and of its cameras."""
+        own = (self.times_path, *(clock.times_path for clock in self.clocks.values()))
+        return tuple(dict.fromkeys(p for p in own if p is not None))
+
+    @property
     def paths_outside(self) -> tuple[Path, ...]:
         """The files and folders that run.yaml names and that are not in the run folder, links followed."""
-        named = [self.rig_path, *([] if self.times_path is None else [self.times_path])]
+        named = [self.rig_path, *self.times_paths]
         named += [s.path for s in self.cameras.values() if not isinstance(s, LiveDevice)]
         home = self.folder.resolve()
         return tuple(dict.fromkeys(p for p in named if not p.resolve().is_relative_to(home)))
@@ -153,13 +162,24 @@ def load_run(run_folder: Path) -> Run:
         if name not in rig.cameras
     ]
     sources: dict[str, Source] = {}
+    clocks: dict[str, CameraClock] = {}
     for name in rig.cameras:
         if name not in content.cameras:
             continue
         try:
-            sources[name] = source_of(content.cameras[name], folder, f"{path}: cameras.{name}")
+            block, where = content.cameras[name], f"{path}: cameras.{name}"
+            sources[name] = source_of(block, folder, where)
+            rate_hz, height = content.frame_rate_hz, rig.cameras[name].image_size_px[1]
+            clock = load_clock(block.time_offset_s, block.row_time_s, block.timestamps, folder, where, rate_hz, height)
+            if clock is not None:
+                clocks[name] = clock
         except InputError as error:
             mistakes.append(str(error))
+    if clocks and tracker.method != "rigid":
+        mistakes.append(
+            f"{path}: cameras.{next(iter(clocks))}: expected tracker.method rigid with a clock of its own, got"
+            f" {tracker.method}, which takes all pictures of a frame for those of one instant"
+        )
     if mistakes:
         raise FileError(mistakes)
 
@@ -182,6 +202,7 @@ def load_run(run_folder: Path) -> Run:
         covariance=joint_covariance(in_use, rig_file.covariances, rig_path),
         calibration=rig_file.calibration,
         recorded=content.recorded,
+        clocks=clocks,
     )
 
 
@@ -228,6 +249,23 @@ class SourceBlock(Block):
         return self
 
 
+def _seconds(value: Any) -> float:
+    if value == "estimate":
+        raise field_error(
+            "expected a number of seconds, got 'estimate', which this version does not do; the model check of a run"
+            " states how late a camera is"
+        )
+    return finite_number(value)
+
+
+class _CameraBlock(SourceBlock):
+    """The pictures of one camera in run.yaml, and its clock."""
+
+    time_offset_s: Annotated[float, pydantic.PlainValidator(_seconds)] = 0.0
+    row_time_s: Annotated[float, pydantic.PlainValidator(_seconds)] = 0.0
+    timestamps: Word | None = None
+
+
 def _an_angle_range(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= 180:
         raise unexpected_value("an angle above 0 and up to 180", value)
@@ -254,7 +292,7 @@ class _RunBlock(Block):
     frame_rate_hz: Annotated[float, pydantic.PlainValidator(number_between(*RATE_RANGE_HZ, "Hz"))]
     exposure_s: Positive | None = None
     timestamps: Word | None = None
-    cameras: Annotated[dict[str, SourceBlock], pydantic.BeforeValidator(_some_cameras)]
+    cameras: Annotated[dict[str, _CameraBlock], pydantic.BeforeValidator(_some_cameras)]
     prior: _PriorBlock | None = None
     tracker: Any = None
     recorded: OptionalDay = None

@@ -6,6 +6,7 @@ DETECTIONS = (
     "frame", "camera", "u_px", "v_px", "sigma_u_px", "sigma_v_px", "flux", "peak", "major_px", "minor_px",
     "angle_deg", "cov_uv_px2",
 )  # fmt: skip
+PICTURE_TIME = "t_s"  # after the others, where a camera has a clock of its own: mid-exposure of its middle row
 LIKENESS = "likeness"  # after the others, of single pictures only: see lab.runs.detect.findings.laser_likeness
 SPOTS = (
     "frame", "t_s", "camera", "spot", "u_px", "v_px", "sigma_u_px", "sigma_v_px", "status", "predicted_u_px",

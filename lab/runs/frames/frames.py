@@ -18,6 +18,7 @@ from lab.files.run.run_file import FramesFolder, LiveDevice, Run, VideoFile
 from lab.files.text.error_text import suggest_name
 from lab.pictures.picture_file import DROPPED, UNREADABLE, GreyPicture, MissingPicture
 from lab.pictures.source import PictureFiles, PictureSource, Video, list_folder, pictures, pictures_of_frames, video_at
+from lab.runs.frames.moments import Moment
 from tracking.detections import Detections
 
 Picture: TypeAlias = GreyPicture | Detections | MissingPicture
@@ -32,6 +33,7 @@ class FrameSet:
 
     frame: int
     images: Mapping[str, Picture]  # by camera: grey (h, w) u8 or u16, detected points, or Missing
+    moment: Moment | None = None  # of a run whose cameras have clocks of their own
 
 
 @dataclass(slots=True)
@@ -135,7 +137,8 @@ class FrameReader:
         if name in self._sources:
             size_px = self._run.rig.cameras[name].image_size_px
             return pictures(self._sources[name], size_px, wanted=numbers)
-        return ((frame, _points_at(self._tables[name], name, frame)) for frame in numbers)
+        table = self._tables[name]
+        return ((frame, points_at(table, name, frame, table.first, table.last)) for frame in numbers)
 
     def _span(self) -> tuple[int, int | None]:
         """First and last frame number; the last as far as it is known without reading videos to their end."""
@@ -261,16 +264,6 @@ class FrameReader:
                     missing.first.append(frame)
 
 
-def open_frames(run: Run) -> FrameReader:
-    """The reader of a run's pictures. Single damaged pictures are no error: they are Missing.
-
-    Raises:
-        InputError: a folder is empty or has two pictures of one number, a video or table cannot be read, or a frame has
-            no timestamp.
-    """
-    return FrameReader(run)
-
-
 def recorded_pictures(camera: str, source: FramesFolder | VideoFile) -> PictureSource:
     """The pictures that run.yaml names for a camera. Raises InputError."""
     return video_at(source.path, camera) if isinstance(source, VideoFile) else list_folder(source.path, camera)
@@ -289,13 +282,13 @@ def pictures_at(run: Run, camera: str, frames: Sequence[int]) -> Mapping[int, Pi
     return dict.fromkeys(sorted(set(frames)), MissingPicture(f"no pictures: {kind}"))
 
 
-def _points_at(table: DetectionsFile, camera: str, frame: int) -> Detections | MissingPicture:
+def points_at(table: DetectionsFile, camera: str, frame: int, first: int, last: int) -> Detections | MissingPicture:
     """Points that another program, or an earlier run, has detected in a frame.
 
-    Within the file's range, a frame without rows is a picture without points; a frame whose rows are all invalid is a
-    picture that cannot be read.
+    From the first to the last frame, a frame without rows is a picture without points; a frame whose rows are all
+    invalid is a picture that cannot be read.
     """
-    if not table.first <= frame <= table.last:
+    if not first <= frame <= last:
         return MissingPicture(DROPPED)
     points = table.cameras.get(camera)  # None: no row of this camera
     if points is None:

@@ -13,9 +13,12 @@ from geometry.light_centroid import CentroidOffsets
 from geometry.pose_prior import PosePrior
 from lab.files.run.run_file import DetectionsTable, Run
 from lab.pictures.picture_file import GreyPicture, MissingPicture
-from lab.runs.frames.frames import FrameSet, open_frames
+from lab.runs.frames.frames import FrameSet
+from lab.runs.frames.moments import Moment
+from lab.runs.frames.open_frames import open_frames
 from tracking.detections import Detections
 from tracking.noise import NoiseModel
+from tracking.picture_clock import PictureClock
 from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.tracked_frame import TrackedFrame
 
@@ -52,6 +55,16 @@ class Frames(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class ShownPicture:
+    """The points in one picture of a camera with a clock of its own."""
+
+    number: int
+    t_s: float  # mid-exposure of its middle row
+    camera: int
+    detections: Detections
+
+
+@dataclass(frozen=True, slots=True)
 class FrameRecord:
     """Detections and tracking result of one frame."""
 
@@ -61,6 +74,8 @@ class FrameRecord:
     detections: tuple[Detections | None, ...]  # per camera of the run; None without a usable picture
     missing: tuple[str, ...]  # per camera: the reason why there is no picture; "" where there is one
     tracked: TrackedFrame
+    moment: Moment | None = None  # of a run whose cameras have clocks of their own ...
+    pictures: tuple[ShownPicture, ...] | None = None  # ... and the pictures since the row before; None: one per camera
 
 
 def tracker_of(run: Run) -> Tracker:
@@ -83,6 +98,7 @@ class Timings:
     smoothing: float = 0.0
 
 
+NEGLIGIBLE_S = 1e-9  # between a picture and its moment: rounding of times
 _CLIPPED = 0.85  # of the range above the background: a spot whose peak is higher is taken to be clipped
 
 
@@ -124,14 +140,14 @@ class Pipeline:
         clock = time.perf_counter()
         for frames in self.reader:
             clock = self._spent("waiting", clock)
-            t_s = float(self.run.times.t_s(frames.frame))
+            t_s = float(self.run.times.t_s(frames.frame)) if frames.moment is None else frames.moment.t_s
             found, missing = self._detect(frames)
             clock = self._spent("detection", clock)
             dt_s = 0.0 if previous_s is None else t_s - previous_s
             tracked = self.tracker.step(dt_s, found)
             previous_s = t_s
             self._spent("tracking", clock)
-            record = FrameRecord(frames.frame, t_s, dt_s, found, missing, tracked)
+            record = FrameRecord(frames.frame, t_s, dt_s, found, missing, tracked, frames.moment)
             if self.on_record is not None:
                 self.on_record(record)
             yield record
@@ -171,9 +187,19 @@ class Pipeline:
                 continue
             if isinstance(picture, np.ndarray):
                 picture = self.spots_in(name, picture)
-            found.append(picture)
+            found.append(picture if frames.moment is None else self._timed(name, picture, frames.moment))
             missing.append("")
         return tuple(found), tuple(missing)
+
+    def _timed(self, camera: str, points: Detections, moment: Moment) -> Detections:
+        """The points of a camera's picture with the time between the moment and their exposure."""
+        delay_s = moment.pictures[camera].t_s - moment.t_s
+        clock = self.run.clocks.get(camera)
+        row_time_s = 0.0 if clock is None else clock.row_time_s
+        if abs(delay_s) < NEGLIGIBLE_S and row_time_s == 0.0:
+            return points
+        middle = (self.run.rig.cameras[camera].image_size_px[1] - 1) / 2
+        return replace(points, clock=PictureClock(delay_s, row_time_s, middle))
 
 
 def on_beam_axes(

@@ -19,7 +19,7 @@ from lab.files.rig.calibration_state import CalibrationState, require_valid_cali
 from lab.files.rig.rig_file import joint_covariance, load_rig_file
 from lab.files.run.run_file import Run, load_run
 from lab.progress import Progress
-from lab.runs.frames.frames import open_frames
+from lab.runs.frames.open_frames import open_frames
 from lab.runs.input_check.findings import CheckResult, Findings, table
 from lab.runs.input_check.pictures import check_pictures
 from lab.runs.input_check.setup import check_recording, check_rig

@@ -103,9 +103,11 @@ class FrameSampler:
         cov_px2 = tracked.cov_px2 if stated_cov_px2 is None else stated_cov_px2
         # A predicted pose may be far from the frame's spots without any fault of the rig.
         pose = tracked.pose if tracked.pose_status is PoseStatus.MEASURED else None
+        shift = tracked.shift_px
+        predicted_px = tracked.predicted_px if shift is None else tracked.predicted_px - shift
         self.add(
             SampledFrame(
-                t_s, seen, tracked.uv_px, cov_px2, pose, tracked.predicted_px, predicted_cov_px2,
+                t_s, seen, tracked.uv_at_pose_px, cov_px2, pose, predicted_px, predicted_cov_px2,
                 tracked.pose_covariance, width_px,
             )
         )  # fmt: skip

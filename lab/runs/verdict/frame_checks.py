@@ -97,7 +97,7 @@ class FrameChecks:
         """Agreement of the poses with their own spots; frames without a pose have no spots."""
         poses, covariance = _poses(frames)
         used = np.stack([_used(t) for t in frames])
-        uv, cov = np.stack([t.uv_px for t in frames]), np.stack([t.cov_px2 for t in frames])
+        uv, cov = np.stack([t.uv_at_pose_px for t in frames]), np.stack([t.cov_px2 for t in frames])
         out = against_own_spots(self._model, poses, covariance, used, uv, cov)
         if self._spread is None or not out.contradicts.any():
             return out
@@ -123,7 +123,7 @@ class FrameChecks:
             self.own_spots.add(frame)
             text = f"the pose contradicts its own spots (chi-square {chi2:.0f} of {dof} degrees of freedom)"
             rows = np.flatnonzero(_used(tracked))
-            fit = fit_pose(self._model, rows, tracked.uv_px[rows], tracked.cov_px2[rows], tracked.pose)
+            fit = fit_pose(self._model, rows, tracked.uv_at_pose_px[rows], tracked.cov_px2[rows], tracked.pose)
             if fit is not None and fit.observable:
                 gap = fit.world_from_body.minus(tracked.pose)
                 P = P + np.outer(gap, gap) + fit.covariance

@@ -61,6 +61,12 @@ class LiveFrames:
                 f"{self.run.path}: timestamps: expected none in a run that is watched, since they do not exist yet;"
                 " remove them: t_s is then frame / frame_rate_hz"
             )
+        if self.run.clocks:
+            raise InputError(
+                f"{self.run.path}: cameras.{next(iter(self.run.clocks))}: expected no clocks of single cameras in a run"
+                " that is watched; take out time_offset_s, row_time_s and timestamps, and process the recording with"
+                " `beampose run` when it is complete"
+            )
         self._cameras = {name: self._camera(name) for name in self.run.cameras}
 
     def __enter__(self) -> LiveFrames:

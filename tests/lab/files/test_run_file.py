@@ -145,7 +145,7 @@ BROKEN = [
     (
         "{frames: frames/left}",
         "frames/left",
-        "cameras.left: expected a mapping with frames, detections, device, got 'frames/",
+        "cameras.left: expected a mapping with frames, detections, device, time_offset_s, row_time_s,",
     ),
     ("  left: {", "  lefft: {", "cameras.lefft: expected a camera of rig.yaml, got 'lefft'; did you mean 'left'?"),
     ("position_m: [0.0, 0.0, 0.0]", "position_m: [0.0, 0.0]", "prior.position_m: expected 3 numbers, got 2"),

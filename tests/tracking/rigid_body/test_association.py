@@ -66,7 +66,9 @@ def frame_of(
 
 def observed(frame: FrameDetections, calibration_cov: Array | None = None) -> Observation:
     cov = np.zeros((N, 2, 2)) if calibration_cov is None else calibration_cov
-    return Observation(MODEL.numbers, VIEW_TABLE, DETECTION_MODEL, cov, frame)
+    return Observation(
+        MODEL.numbers, VIEW_TABLE, DETECTION_MODEL, cov, frame, np.zeros_like(cov), np.zeros((2, 3)), False
+    )
 
 
 def search(frame: FrameDetections, P: Array = P_NEAR, pose: Pose = POSE, calibration_cov: Array | None = None) -> Found:

@@ -37,6 +37,7 @@ MODEL = SpotModel.of(RIG)
 N, GROUPS = len(MODEL), 2
 VIEW_TABLE = ViewTable.of(RIG, MODEL)
 NO_CALIBRATION_ERRORS = np.zeros((N, 2, 2))
+NO_CLOCKS = np.zeros((2, 3))
 DETECTION_MODEL = DetectionModel(0.98, 0.01)
 DYNAMICS = Dynamics(np.repeat([400.0, 3600.0], 3), np.array([0.2, 0.5]) ** 2, np.array([2.0, 5.0]) ** 2, 0.02)
 DT, SIGMA_PX = 0.01, 0.1
@@ -60,7 +61,16 @@ def a_frame(uv: Array, seen: Ints) -> FrameDetections:
 
 
 def observed(frame: FrameDetections) -> Observation:
-    return Observation(MODEL.numbers, VIEW_TABLE, DETECTION_MODEL, NO_CALIBRATION_ERRORS, frame)
+    return Observation(
+        MODEL.numbers,
+        VIEW_TABLE,
+        DETECTION_MODEL,
+        NO_CALIBRATION_ERRORS,
+        frame,
+        NO_CALIBRATION_ERRORS,
+        NO_CLOCKS,
+        False,
+    )
 
 
 def rows_in(seen: Ints) -> Ints:
@@ -230,7 +240,8 @@ def branched(jump: Array, seen: Ints = ALL_SEEN) -> tuple[Children, int, Pose]:
     )  # fmt: skip
     uv = MODEL.project(Pose(R, t))[0] + SIGMA_PX * rng.normal(size=(N, 2))
     old = one_hypothesis(pose, m, P_START)
-    out, count = branch(observed(a_frame(uv, seen)), DYNAMICS, DT, old)
+    obs = observed(a_frame(uv, seen))
+    out, count = branch(obs, obs, DYNAMICS, DT, old)
     return out, count, Pose(R, t)
 
 
@@ -271,7 +282,7 @@ def test_views_without_a_picture_are_not_searched():
     uv = MODEL.project(pose)[0] + SIGMA_PX * rng.normal(size=(N, 2))
     frame = a_frame(uv, left)._replace(has_image=np.array([True, False]))
     old = one_hypothesis(pose, np.zeros(12), P_START)
-    out, count = branch(observed(frame), DYNAMICS, DT, old)
+    out, count = branch(observed(frame), observed(frame), DYNAMICS, DT, old)
     best = prune_and_merge(out, count)[1][0]
     assert np.all(out.assigned[best][MODEL.camera_of == 1] == NOT_SEARCHED)
     assert np.all(out.assigned[best][left] >= 0)

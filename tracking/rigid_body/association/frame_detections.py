@@ -65,8 +65,12 @@ class Observation(NamedTuple):
     views: Views  # (n,) for the projection
     view_table: ViewTable
     detection_model: DetectionModel
-    calibration_cov: Array  # (n, 2, 2) px^2: covariance of the expected pixels due to calibration errors
+    # (n, 2, 2) px^2: covariance of the expected pixels due to calibration errors, and to the shift of `views`
+    calibration_cov: Array
     frame: FrameDetections
+    shift_cov: Array  # (n, 2, 2) px^2: the second part alone (models/picture_shifts.py); 0 without pictures' clocks
+    clocks: Array  # (cameras, 3) of the pictures, as PictureClock.numbers
+    timed: bool  # some picture has a clock of its own
 
 
 def distinct_spots(chosen: Bools, spot: Ints) -> Ints:

@@ -27,7 +27,7 @@ from tracking.rigid_body.hypotheses.hypothesis_set import (
     add_child,
     empty_children,
 )
-from tracking.rigid_body.hypotheses.iterated_update import Update, iterated_update
+from tracking.rigid_body.hypotheses.iterated_update import iterated_update
 from tracking.rigid_body.hypotheses.prediction_checks import (
     MAX_CHECKING_SIGMA_PX,
     MAX_THREE_SPOT_SIGMA_PX,
@@ -37,6 +37,7 @@ from tracking.rigid_body.hypotheses.prediction_checks import (
     largest_spot_sigma,
 )
 from tracking.rigid_body.hypotheses.pruning import PRUNE_NATS
+from tracking.rigid_body.hypotheses.timed_update import Update
 from tracking.rigid_body.models.motion import predicted
 from tracking.rigid_body.models.occlusion import MISSED, joint_log_likelihood, marginal, predict, update
 
@@ -69,8 +70,14 @@ class _Step(NamedTuple):
 
 
 @compiled
-def branch(obs: Observation, dynamics: Dynamics, dt: float, old: Hypotheses) -> tuple[Children, int]:
-    """The children of all hypotheses after a frame that comes dt (s) later, and their number."""
+def branch(
+    obs: Observation, after_jump: Observation, dynamics: Dynamics, dt: float, old: Hypotheses
+) -> tuple[Children, int]:
+    """The children of all hypotheses after a frame that comes dt (s) later, and their number.
+
+    after_jump: the observation for manoeuvres. It differs where pictures were not taken at the frame's instant: how far
+    the spots have moved until then is less certain if the velocities have just jumped.
+    """
     n = obs.view_table.camera.shape[0]
     step = _Step(old, dynamics, dt)
     children = empty_children(n, old.p_visible.shape[1] - n)
@@ -82,7 +89,7 @@ def branch(obs: Observation, dynamics: Dynamics, dt: float, old: Hypotheses) -> 
         p_visible = predict(old.p_visible[h], n) if dt > 0.0 else old.p_visible[h]
         count, best, suspected = _branch_steady(obs, step, h, p_visible, children, count, best)
         if suspected:
-            count, best = _branch_manoeuvre(obs, step, h, p_visible, children, count, best)
+            count, best = _branch_manoeuvre(after_jump, step, h, p_visible, children, count, best)
     return children, count
 
 

@@ -26,22 +26,18 @@ from geometry.compiled_linalg import (
     transposed_multiply,
 )
 from geometry.compiled_projection import Views
-from tracking.rigid_body.association.frame_detections import BLENDED, FrameDetections, Observation
+from tracking.rigid_body.association.frame_detections import Observation
 from tracking.rigid_body.hypotheses.hypothesis_set import State
+from tracking.rigid_body.hypotheses.timed_update import (
+    MAX_HALVINGS,
+    MAX_STEPS,
+    MAX_UPDATE_SIGMA,
+    Update,
+    chosen_points,
+    timed_update,
+)
 from tracking.rigid_body.models.information import add_curvature_covariance, frame_information, quadratic_form
 from tracking.rigid_body.models.motion import updated
-
-MAX_STEPS, MAX_HALVINGS = 8, 5  # of Gauss-Newton, and of one step
-MAX_UPDATE_SIGMA = 0.06  # m, rad: a frame that leaves its widest direction less certain does not update the state
-
-
-class Update(NamedTuple):
-    """A state after an update by one assignment."""
-
-    state: State
-    log_likelihood: float  # its Gaussian part, nats
-    chi2: float  # misfit of the spots and of the prior at the optimum
-    spots: int  # number of spots in the update
 
 
 class _Mode(NamedTuple):
@@ -58,28 +54,14 @@ class _Mode(NamedTuple):
 
 
 @compiled
-def chosen_points(frame: FrameDetections, assigned: Ints, calibration_cov: Array) -> tuple[Bools, Array, Array]:
-    """Detections of one assignment (n,): views used in the pose (n,), pixels (n, 2) and covariances (n, 2, 2)."""
-    n = assigned.shape[0]
-    use, uv, cov = np.zeros(n, np.bool_), np.empty((n, 2)), np.empty((n, 2, 2))
-    for i in range(n):
-        d = assigned[i]
-        if 0 <= d < BLENDED:
-            use[i] = True
-            for a in range(2):
-                uv[i, a] = frame.uv[d, a]
-                for b in range(2):
-                    cov[i, a, b] = frame.cov[d, a, b] + calibration_cov[i, a, b]
-    return use, uv, cov
-
-
-@compiled
 def iterated_update(obs: Observation, prior: State, assigned: Ints, R: Array, t: Array) -> Update:
     """Update a predicted state by one assignment (n,); the iteration starts at the pose (R, t).
 
     A spot that the resulting pose does not project makes the likelihood 0. An update that does not converge leaves the
     state as it was, with the misfit that was reached.
     """
+    if obs.timed:
+        return timed_update(obs, prior, assigned, R, t)
     use, uv, cov = chosen_points(obs.frame, assigned, obs.calibration_cov)
     count = 0
     for i in range(use.shape[0]):

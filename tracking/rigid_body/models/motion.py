@@ -70,6 +70,15 @@ def transition(m: Array, dt: float) -> tuple[Array, Array]:
 
 
 @compiled
+def state_after(R: Array, t: Array, m: Array, dt: float) -> tuple[Array, Array, Array]:
+    """Pose and motion after dt (s), which may be negative, with constant accelerations."""
+    turn = np.empty(3)
+    for i in range(3):
+        turn[i] = dt * m[3 + i] + 0.5 * dt * dt * m[9 + i]
+    return propagated(R, t, m, dt, turn)
+
+
+@compiled
 def propagated(R: Array, t: Array, m: Array, dt: float, turn: Array) -> tuple[Array, Array, Array]:
     """Pose and motion after dt (s) with constant accelerations; turn (3,): the step's rotation vector, rad."""
     h = 0.5 * dt * dt

@@ -25,7 +25,8 @@ from tracking.rigid_body.association.frame_detections import (
 from tracking.rigid_body.association.joint_search import associate
 from tracking.rigid_body.association.likelihood import detection_log_likelihood, predicted_pixel
 from tracking.rigid_body.hypotheses.hypothesis_set import State
-from tracking.rigid_body.hypotheses.iterated_update import chosen_points, iterated_update
+from tracking.rigid_body.hypotheses.iterated_update import iterated_update
+from tracking.rigid_body.hypotheses.timed_update import chosen_points
 from tracking.rigid_body.models.information import frame_information, single_frame_pose
 from tracking.rigid_body.models.motion import STATE
 from tracking.rigid_body.models.occlusion import joint_log_likelihood, marginal
@@ -102,7 +103,7 @@ def reassociated(
     groups = 0
     for i in range(n):
         groups = max(groups, run.view_table.group[i] + 1)
-    no_excess = np.zeros(n)
+    no_excess, no_shift, no_clocks = np.zeros(n), np.zeros((n, 2, 2)), np.zeros((detections.has_image.shape[1], 3))
     for k in range(frames):
         P, R, t, sigma_px[k] = _prediction_without(run, assigned, ref, pose_P, weight[k], k)
         if not sigma_px[k] < MAX_PREDICTION_SIGMA_PX:
@@ -113,7 +114,9 @@ def reassociated(
             detections.has_image[k], log_clutter[k], detections.log_static[a:b], detections.size_px[a:b],
             detections.usual_size_px, no_excess,
         )  # fmt: skip
-        obs = Observation(run.views, run.view_table, run.detection_model, run.calibration_cov, frame)
+        obs = Observation(
+            run.views, run.view_table, run.detection_model, run.calibration_cov, frame, no_shift, no_clocks, False
+        )
         p_visible = _visibility_from_neighbours(assigned, run.view_table.group, groups, k)
         current = np.empty(n, np.int64)
         labels = 0

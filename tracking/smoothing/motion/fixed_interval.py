@@ -37,10 +37,14 @@ MOST_FRAMES_AT_ONCE, CHUNK = 8192, 1024
 
 
 class RunInformation(NamedTuple):
-    """Information of T frames' spots about the poses at a reference, and the process noise of the steps."""
+    """Information of T frames' spots about the motion at a reference, and the process noise of the steps.
 
-    information: Array  # (T, 6, 6) normal matrices J^T C^-1 J; 0 without spots
-    vector: Array  # (T, 6) J^T C^-1 (measured - expected)
+    It is about the poses, s = 6, or, where pictures were taken before or after the instants of their frames, about the
+    whole states, s = 18.
+    """
+
+    information: Array  # (T, s, s) normal matrices J^T C^-1 J; 0 without spots
+    vector: Array  # (T, s) J^T C^-1 (measured - expected)
     dt: Array  # (T,) s since the frame before
     velocity_jump: Array  # (T, 2) variances of the velocities' jump in that step, (m/s)^2 and (rad/s)^2
     acceleration_jump: Array  # (T, 2) variances of the accelerations' jump
@@ -90,16 +94,17 @@ def _update(info: RunInformation, k: int, x: Array, P: Array) -> tuple[Array, Ar
     if L[0, 0] == 0.0 and L[3, 3] == 0.0:
         return x, P, 0.0
     out, log_det = posterior(P, L)
-    r = apply(L, x[:6])
+    size = L.shape[0]
+    r = apply(L, x[:size])
     misfit = 0.0
-    for i in range(6):
+    for i in range(size):
         misfit += x[i] * (r[i] - 2 * g[i])
         r[i] = g[i] - r[i]
     x_new = x.copy()
     for i in range(STATE):
-        for j in range(6):
+        for j in range(size):
             x_new[i] += out[i, j] * r[j]
-    for i in range(6):
+    for i in range(size):
         misfit -= r[i] * (x_new[i] - x[i])
     return x_new, out, -0.5 * (log_det + misfit)
 
@@ -178,9 +183,9 @@ def smoothed(ref: Reference, info: RunInformation, jerk: Array) -> Interval:
             P = _combine(out, k, xs[k - begin], Ps[k - begin], Y, y)
             if k == 0:
                 break
-            for a in range(6):
+            for a in range(info.vector.shape[1]):
                 y[a] += info.vector[k, a]
-                for b in range(6):
+                for b in range(info.vector.shape[1]):
                     Y[a, b] += info.information[k, a, b]
             _test_process_noise(info, jerk, k, Y, y, P, out)
             Y, y = _predict_backward(ref, info, jerk, k, Y, y)

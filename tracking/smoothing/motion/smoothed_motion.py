@@ -8,6 +8,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools
 from geometry.compiled_projection import Views
+from tracking.smoothing.motion.delayed_spots import Delays
 from tracking.smoothing.motion.reference import Reference
 from tracking.smoothing.motion.run_detections import RunDetections
 
@@ -22,6 +23,7 @@ class WholeRun:
     dt: Array  # (T,) s
     exposure_s: float
     adapt_jerk: bool  # estimate the strength of the jerk; else it is kept
+    delays: Delays | None = None  # of the detections; None: all are of the instants of their frames
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,7 +73,7 @@ def corner_offsets(ref: Reference, jumped: Bools, exposure_s: float, dt: Array) 
 
 
 def with_error_along(b: Array, information: Array, vector: Array) -> tuple[Array, Array, float]:
-    """Information (6, 6) and vector (6,) of spots with a further common error, of one sigma b (6,); and by how much
+    """Information (s, s) and vector (s,) of spots with a further common error, of one sigma b (s,); and by how much
     their chi-square falls. Source: the Sherman-Morrison formula.
     """
     Lb = information @ b
@@ -88,7 +88,7 @@ def with_errors_along_axes(b: Array, information: Array, vector: Array) -> tuple
     """
     total = 0.0
     for i in np.flatnonzero(b):
-        one = np.zeros(6)
+        one = np.zeros(len(b))
         one[i] = b[i]
         information, vector, less = with_error_along(one, information, vector)
         total += less

@@ -14,6 +14,7 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from tracking.rigid_body.adaptive_process_noise import MANOEUVRE_S, jump_variance
 from tracking.rigid_body.models.motion import STATE, predicted
+from tracking.smoothing.motion.delayed_spots import Steps, delayed_information
 from tracking.smoothing.motion.fixed_interval import Interval, RunInformation, log_likelihood, smoothed
 from tracking.smoothing.motion.predictive_cost import leave_one_out_log_likelihood, motion_cost
 from tracking.smoothing.motion.process_noise import next_log_density
@@ -81,6 +82,7 @@ class _Estimator:
         self.jumped[0] = False
         self.dt = np.ascontiguousarray(run.dt[core])
         self.beside = np.zeros((len(self.dt), 6))  # of corner_offsets, at the reference of the last step
+        self.steps: Steps | None = None  # at that reference; None: before the first step
         self.weak = np.zeros(len(self.dt), dtype=bool)  # (T,) see `jump_variances`
         self.kept: tuple[Reference, tuple[Array, Array, Array]] | None = None  # of the last `_without_corners`
         self.fresh = motion.log_density is None
@@ -94,6 +96,8 @@ class _Estimator:
         out: Interval | None = None
         for number in range(first, first + MAX_PASSES):
             density = self._density(out, interpolating=not adapting)
+            if self.run.delays is not None:
+                self._open_steps(density)
             result, moved = self._step(density)
             if not (np.isfinite(result.x).all() and np.isfinite(result.pose_P).all()):
                 if out is None:
@@ -155,7 +159,7 @@ class _Estimator:
     def _interior(self, out: Interval) -> Bools:
         """(T,): frames farther than twice the smoother's memory from any gap, jump or end."""
         info, _ = self._information(self.ref)
-        share = np.einsum("kij,kji->k", out.pose_P, info.information)[self.measured]
+        share = np.einsum("kij,kji->k", out.pose_P, _of_poses(info.information))[self.measured]
         usual = float(np.median(share)) / 6 if len(share) else 1.0
         memory = int(np.clip(np.ceil(2 / max(usual, 1e-3)), 3, 200))
         edge: Bools = np.concatenate([[True], ~self.measured | self.jumped, [True]])
@@ -183,7 +187,9 @@ class _Estimator:
 
     def _leave_one_out(self, info: RunInformation, offset: float, interior: Bools) -> float:
         out = smoothed(self.ref, info, np.exp(self.log_density + offset * interior[:, None]))
-        value = float(leave_one_out_log_likelihood(out.x, out.pose_P, info))
+        # Of spots that were not exposed at the instant of their frame, what they say about the pose.
+        of_poses = info._replace(information=_of_poses(info.information), vector=_of_poses(info.vector))
+        value = float(leave_one_out_log_likelihood(out.x, out.pose_P, of_poses))
         return value if np.isfinite(value) else -np.inf
 
     # -- Gauss-Newton -------------------------------------------------------------------------------------------------
@@ -242,16 +248,18 @@ class _Estimator:
             for k in corners:
                 # As `corner_offsets`, for a short exposure.
                 b = (ref.m[k + 1, :6] - ref.m[k, :6]) * self.run.exposure_s / 8
-                L[k], g[k], _ = with_error_along(b, L[k], g[k])
+                L[k], g[k], _ = with_error_along(_padded(b, g[k]), L[k], g[k])
         if jumped.any():
             # For all later passes: a frame near the limit would be weak in every second one, and they would never end.
-            self.weak |= weak_frames(L, measured)
+            self.weak |= weak_frames(L if self.run.delays is None else self._undelayed(ref), measured)
         jump = jump_variances(ref, self.weak, measured, jumped, self.dt)
         first = first_variance(ref, self.dt, bool(measured[0]))
         return RunInformation(L, g, self.dt, jump, jump / MANOEUVRE_S**2, first), float(chi2.sum())
 
     def _spot_information(self, ref: Reference) -> tuple[Array, Array, Array]:
-        """Information of the used spots at a reference: normal matrices (T, 6, 6), vectors (T, 6), chi-squares (T,).
+        """Information of the used spots at a reference: normal matrices (T, s, s), vectors (T, s), chi-squares (T,).
+
+        s is 6, or 18 with delays, as in RunInformation.
 
         An exposure with a corner has a further error: the components of `beside`, one sigma, independent of each other.
         """
@@ -260,7 +268,7 @@ class _Estimator:
         if len(corners):
             L, g, chi2 = L.copy(), g.copy(), chi2.copy()
         for k in corners:
-            L[k], g[k], less = with_errors_along_axes(self.beside[k], L[k], g[k])
+            L[k], g[k], less = with_errors_along_axes(_padded(self.beside[k], g[k]), L[k], g[k])
             chi2[k] -= less
         return L, g, chi2
 
@@ -268,10 +276,13 @@ class _Estimator:
         """As `_spot_information`, without the errors of corners. The last reference's is kept."""
         if self.kept is not None and self.kept[0] is ref:
             return self.kept[1]
-        run = self.run
-        L, g, chi2 = spot_information(
-            run.views, run.detections, self.assigned, run.calibration_cov, ref, self.core.start
-        )
+        run, start = self.run, self.core.start
+        if run.delays is None:
+            L, g, chi2 = spot_information(run.views, run.detections, self.assigned, run.calibration_cov, ref, start)
+        else:
+            L, g, chi2 = delayed_information(
+                run.views, run.detections, run.delays, self.assigned, run.calibration_cov, ref, self._steps(), start
+            )
         unused = ~self.used[self.core]
         L[unused], g[unused], chi2[unused] = 0.0, 0.0, 0.0
         # Along a direction that the spots leave open their paths are not straight, with the same sign in every frame.
@@ -279,6 +290,26 @@ class _Estimator:
             a[~self.measured] *= PARTIAL_WEIGHT
         self.kept = ref, (L, g, chi2)
         return L, g, chi2
+
+    def _undelayed(self, ref: Reference) -> Array:
+        """Normal matrices (T, 6, 6) as if all spots were of the instants of their frames.
+
+        A jump makes the spots beside it vague; a frame that counted as weak for that would spread the jump further.
+        """
+        run = self.run
+        L = spot_information(run.views, run.detections, self.assigned, run.calibration_cov, ref, self.core.start)[0]
+        L[~self.used[self.core]] = 0.0
+        return L
+
+    def _steps(self) -> Steps:
+        """What the motion leaves open within each step; nothing before the first pass."""
+        none = np.zeros((len(self.dt), 6))
+        return Steps(self.dt, none, none[:, :2].copy()) if self.steps is None else self.steps
+
+    def _open_steps(self, density: Array) -> None:
+        """Update the steps to jerk densities (T, 6) and to the jumps known so far."""
+        jump = jump_variances(self.ref, self.weak, self.measured, self.jumped, self.dt)
+        self.steps, self.kept = Steps(self.dt, np.ascontiguousarray(density), np.ascontiguousarray(jump)), None
 
     # -- result -------------------------------------------------------------------------------------------------------
 
@@ -320,4 +351,17 @@ class _Estimator:
 
 def _damped(info: RunInformation, damping: float) -> RunInformation:
     """Levenberg's damping: as if each frame's pose had been measured at the reference, with this sigma (m and rad)."""
-    return info._replace(information=info.information + np.eye(6) / damping**2)
+    pose = np.diag(_padded(np.ones(6), info.vector[0]))
+    return info._replace(information=info.information + pose / damping**2)
+
+
+def _of_poses(a: Array) -> Array:
+    """The part (..., 6) or (..., 6, 6) about the poses of vectors (T, s) or matrices (T, s, s)."""
+    if a.shape[1] == 6:
+        return a
+    return np.ascontiguousarray(a[:, :6] if a.ndim == 2 else a[:, :6, :6])
+
+
+def _padded(b: Array, like: Array) -> Array:
+    """A vector of the pose (6,) as one of the numbers that another (s,) is about: the others are 0."""
+    return np.concatenate([b, np.zeros(len(like) - len(b))])

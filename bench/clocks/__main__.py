@@ -1,0 +1,122 @@
+"""`python -m bench.clocks --seeds 1:201`: attitude errors with clocks of the cameras' own over those with one clock.
+
+Each row: kind of clocks, ratio of the RMS attitude errors, NEES/6, wrong labels and found spots of both recordings.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bench.clocks.recording import KINDS, Recording, random_recording, write_recording
+from bench.random_scenes.scene import view_indices
+from geometry.arrays import Array
+from lab.files.run.results import SpotGrid, read_poses, read_spots
+from lab.runs.process import process_run
+from tracking.statuses import PoseStatus
+
+SAME_SPOT_PX, SAME_SPOT_SIGMAS = 3.0, 5.0
+WRONG_POSE = 100.0  # NEES
+EDGE = 3  # frames at both ends that are not compared: not all cameras have pictures there
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Of one run."""
+
+    attitude_deg: Array  # (T,) error of the measured poses; nan elsewhere
+    nees: Array  # (T,) / 6, of all poses
+    wrong: int  # labels
+    found: float  # share of the visible spots that have their label
+    wrong_poses: int
+    status: str
+
+
+def figures(r: Recording, folder: Path) -> Figures:
+    """Write, process and compare one recording."""
+    truth = write_recording(r, folder / "run")
+    outcome = process_run(folder / "run", folder / "out")
+    poses, spots = read_poses(folder / "out"), read_spots(folder / "out")
+    true = r.pose_at(r.rows_s)[poses.frames]
+    known = ~poses.has(PoseStatus.LOST)
+    delta = true.minus(poses.world_from_body)
+    attitude, nees = np.full(len(r.hidden), np.nan), np.full(len(r.hidden), np.nan)
+    measured = poses.has(PoseStatus.MEASURED)
+    attitude[poses.frames[measured]] = np.rad2deg(np.linalg.norm(delta[measured, 3:], axis=1))
+    whole = np.linalg.solve(poses.covariance[known], delta[known][..., None])[..., 0]
+    nees[poses.frames[known]] = np.sum(delta[known] * whole, axis=1) / 6
+    wrong, right, visible = _labels(r, truth, spots)
+    return Figures(
+        attitude, nees, wrong, right / max(visible, 1), int(np.sum(nees > WRONG_POSE / 6)), outcome.verdict.status
+    )
+
+
+def _labels(r: Recording, truth: dict[tuple[int, int], tuple[Array, Array]], spots: SpotGrid) -> tuple[int, int, int]:
+    """Wrong labels, correct labels and visible spots, in the pictures that the rows are about."""
+    camera_of, _ = view_indices(r.rig)
+    views = r.rig.views()
+    wrong = right = visible = 0
+    place = {view: list(spots.views).index(view) for view in views if view in spots.views}
+    for i, frame in enumerate(spots.frames.tolist()):
+        for v, view in enumerate(views):
+            clock = r.clocks[camera_of[v]]
+            number = frame
+            if clock.own:
+                nearest = int(np.argmin(np.abs(clock.instants_s - frame / r.rate_hz)))
+                if abs(clock.instants_s[nearest] - frame / r.rate_hz) > 0.5 / r.rate_hz:
+                    continue
+                number = int(clock.numbers[nearest])
+            if (camera_of[v], number) not in truth or view not in place:
+                continue
+            at, shining = truth[camera_of[v], number]
+            visible += int(shining[v])
+            if not spots.measured[i, place[view]]:
+                continue
+            away = np.linalg.norm(spots.uv_px[i, place[view]] - at[v])
+            good = shining[v] and away <= max(SAME_SPOT_PX, SAME_SPOT_SIGMAS * r.sigma_px[v])
+            right, wrong = right + int(good), wrong + int(not good)
+    return wrong, right, visible
+
+
+def main() -> None:
+    """Run the seeds and print the table."""
+    parser = argparse.ArgumentParser(prog="bench.clocks", description=__doc__)
+    parser.add_argument("--seeds", default="1:201", metavar="A:B")
+    parser.add_argument("--frames", type=int, default=200)
+    a = parser.parse_args()
+    first, _, last = a.seeds.partition(":")
+    seeds = range(int(first), int(last) if last else int(first) + 1)
+    table: dict[str, list[tuple[float, float, float]]] = {}
+    for seed in seeds:
+        r = random_recording(seed, a.frames)
+        with tempfile.TemporaryDirectory() as name:
+            with_clocks = figures(r, Path(name) / "clocks")
+            one = figures(r.with_one_clock(), Path(name) / "one")
+        both = np.isfinite(with_clocks.attitude_deg) & np.isfinite(one.attitude_deg)
+        both[:EDGE] = both[-EDGE:] = False
+        rms = [np.sqrt(np.mean(f.attitude_deg[both] ** 2)) if both.any() else np.nan for f in (with_clocks, one)]
+        nees = [float(np.nanmean(f.nees)) if np.isfinite(f.nees).any() else np.nan for f in (with_clocks, one)]
+        ratio = float(rms[0] / max(rms[1], 1e-12))
+        table.setdefault(KINDS[seed % len(KINDS)], []).append((ratio, nees[0], nees[1]))
+        print(
+            f"{seed}: ratio {ratio:.3f} ({rms[0]:.3g} / {rms[1]:.3g} deg, {both.sum()} of"
+            f" {np.isfinite(one.attitude_deg).sum()}), NEES/6 {nees[0]:.2f} ({nees[1]:.2f}), wrong {with_clocks.wrong}"
+            f" ({one.wrong}), found {with_clocks.found:.4f} ({one.found:.4f}), wrong poses {with_clocks.wrong_poses}"
+            f" ({one.wrong_poses}), {with_clocks.status} ({one.status}): {r.text}",
+            flush=True,
+        )
+    for kind, rows in [*table.items(), ("all", [row for of_kind in table.values() for row in of_kind])]:
+        ratio, nees, nees_one = np.array(rows).T
+        print(
+            f"{kind}: {len(rows)} recordings, ratio median {np.nanmedian(ratio):.3f},"
+            f" 95 % {np.nanquantile(ratio, 0.95):.3f}; NEES/6 mean {np.nanmean(nees):.2f}, median"
+            f" {np.nanmedian(nees):.2f} (one clock {np.nanmean(nees_one):.2f}, {np.nanmedian(nees_one):.2f})"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+"""Clocks of single cameras: pictures before or after the instants of the run's frames, and rolling shutters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from geometry.arrays import Array, Ints
+from lab.errors import InputError
+from lab.files.run.times import Times, load_times
+
+LONGEST_READOUT = 1.05  # of the time between two pictures; above 1 for a rounded row time
+
+
+@dataclass(frozen=True, slots=True)
+class CameraClock:
+    """When a camera takes its pictures. Without times of its own, picture n belongs to frame n of the run."""
+
+    offset_s: float = 0.0  # its mid-exposure minus the frame's instant, or added to its own times
+    row_time_s: float = 0.0  # by which each row is exposed later than the one above
+    times: Times | None = None  # of its own pictures
+    times_path: Path | None = None
+
+    def instants_s(self, run_times: Times, numbers: Ints) -> Array:
+        """Times (m,), s, of pictures (m,) at mid-exposure of their middle rows, on the run's clock."""
+        times = run_times if self.times is None else self.times
+        return np.asarray(times.t_s(numbers) + self.offset_s)
+
+
+def load_clock(
+    offset_s: float, row_time_s: float, timestamps: str | None, folder: Path, where: str, rate_hz: float, height: int
+) -> CameraClock | None:
+    """The clock of a camera as run.yaml states it; None: that of the run.
+
+    timestamps: the file's name, from the run folder. where: of the camera in run.yaml, for messages. rate_hz: of the
+    run; height: of the pictures, px. Raises InputError.
+    """
+    times: Times | None = None
+    path: Path | None = None
+    if timestamps is not None:
+        path = folder / timestamps
+        if not path.is_file():
+            raise InputError(f"{where}.timestamps: expected a table frame,t_s, found none at {path}")
+        times = load_times(path, rate_hz)
+        if times.times_s is not None and times.frames is not None and len(times.frames) > 1:
+            rate_hz = 1 / float(np.median(np.diff(times.times_s) / np.diff(times.frames)))
+    readout_s = abs(row_time_s) * height
+    if readout_s * rate_hz > LONGEST_READOUT:
+        raise InputError(
+            f"{where}.row_time_s: expected {height} rows within the {1 / rate_hz:.6g} s between two pictures, got"
+            f" {readout_s:.6g} s; give seconds for one row, not microseconds and not for the whole picture"
+        )
+    if offset_s == 0.0 and row_time_s == 0.0 and times is None:
+        return None
+    return CameraClock(offset_s, row_time_s, times, path)

@@ -1,0 +1,87 @@
+"""The clocks of single cameras in run.yaml: what is read, and what is refused in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lab.errors import BeamposeError
+from lab.files.run.run_file import load_run
+from lab.runs.frames.open_frames import open_frames
+from tests.lab.run_folders import RIG
+
+FRAMES = 20
+
+
+def run_with(folder: Path, right: str, more: str = "") -> Path:
+    """A run of 20 frames of points whose right camera has these fields."""
+    (folder / "rig.yaml").write_text(RIG)
+    rows = [f"{k},{camera},{20 + k},20,.1,.1" for k in range(FRAMES) for camera in ("left", "right")]
+    (folder / "detections.csv").write_text("frame,camera,u_px,v_px,sigma_u_px,sigma_v_px\n" + "\n".join(rows) + "\n")
+    (folder / "run.yaml").write_text(
+        "schema: beampose/run/1\nrig: rig.yaml\nframe_rate_hz: 100\n" + more + "cameras:\n"
+        "  left: {detections: detections.csv}\n  right: {detections: detections.csv, " + right + "}\n"
+    )
+    return folder
+
+
+def times(folder: Path, t_s: np.ndarray, name: str = "times.csv") -> None:
+    rows = "\n".join(f"{k},{t:.9f}" for k, t in enumerate(t_s))
+    (folder / name).write_text(f"frame,t_s\n{rows}\n")
+
+
+def opened(folder: Path) -> None:
+    open_frames(load_run(folder))
+
+
+def test_a_camera_without_a_clock_of_its_own_has_that_of_the_run(tmp_path):
+    run = load_run(run_with(tmp_path, "time_offset_s: 0, row_time_s: 0"))
+    assert not run.clocks
+
+
+def test_offset_row_time_and_times_are_read(tmp_path):
+    times(tmp_path, 0.011 * np.arange(FRAMES))
+    run = load_run(run_with(tmp_path, "time_offset_s: 0.002, row_time_s: 5.0e-5, timestamps: times.csv"))
+    clock = run.clocks["right"]
+    assert clock.row_time_s == 5e-5
+    np.testing.assert_allclose(clock.instants_s(run.times, np.array([0, 10])), [0.002, 0.112])
+    assert tmp_path / "times.csv" in run.times_paths
+
+
+@pytest.mark.parametrize(
+    ("right", "says"),
+    [
+        ("time_offset_s: estimate", "expected a number of seconds, got 'estimate'"),
+        ("row_time_s: 15", "give seconds for one row, not microseconds"),
+        ("timestamps: none.csv", "expected a table frame,t_s, found none"),
+        ("time_offset_s: 2.1", "expected pictures within the run"),
+        ("time_offset_s: soon", "expected a finite number"),
+    ],
+)
+def test_a_clock_in_other_units_or_without_a_table_is_refused(tmp_path, right, says):
+    with pytest.raises(BeamposeError, match=says) as caught:
+        opened(run_with(tmp_path, right))
+    assert "right" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("t_s", "says"),
+    [
+        (np.r_[0.0:0.1:0.01, 0.05:0.15:0.01], "expected increasing times"),
+        (10.0 * np.arange(FRAMES), "give seconds, not milliseconds"),
+        (0.01 * np.arange(FRAMES) + 60, "expected pictures within the run"),
+        (0.01 * np.arange(FRAMES - 5), "got none for 5 of them"),
+    ],
+    ids=["not monotonic", "milliseconds", "another clock", "too short"],
+)
+def test_times_that_contradict_the_run_are_refused(tmp_path, t_s, says):
+    times(tmp_path, t_s)
+    with pytest.raises(BeamposeError, match=says):
+        opened(run_with(tmp_path, "timestamps: times.csv"))
+
+
+def test_the_spot_tracker_takes_all_pictures_for_those_of_one_instant(tmp_path):
+    with pytest.raises(BeamposeError, match=r"expected tracker\.method rigid"):
+        load_run(run_with(tmp_path, "time_offset_s: 0.002", "tracker: {method: spots}\n"))

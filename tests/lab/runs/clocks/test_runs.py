@@ -1,0 +1,87 @@
+"""A run whose cameras have clocks of their own: late pictures, rolling shutters, other frame rates."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lab.files.run.results import read_poses
+from lab.runs.process import process_run
+from lab.simulate.write import simulate
+
+FRAMES, SEED = 80, 3
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("clocks") / "run"
+    return simulate("clocks", folder, seed=SEED, frames=FRAMES, detections_only=True)
+
+
+@pytest.fixture(scope="module")
+def results(recording, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("results") / "out"
+    process_run(recording, out)
+    return out
+
+
+def attitude_rms_deg(folder: Path) -> float:
+    errors = json.loads((folder / "summary.json").read_text())["errors"]
+    return float(errors["pose"]["measured"]["rotation_deg"]["rms"])
+
+
+def test_the_attitude_is_as_accurate_as_with_one_clock(results, tmp_path):
+    simulate("smooth", tmp_path / "run", seed=SEED, frames=FRAMES, detections_only=True)
+    process_run(tmp_path / "run", tmp_path / "out")
+    assert attitude_rms_deg(results) < 1.3 * attitude_rms_deg(tmp_path / "out")
+
+
+def test_every_row_is_measured_and_the_verdict_passes(results):
+    content = json.loads((results / "summary.json").read_text())
+    assert content["verdict"]["status"] == "pass"
+    assert content["errors"]["spots"]["in_view_identity"] == 1.0
+    assert len(read_poses(results).frames) == FRAMES
+    assert content["parameters"]["clocks"]["right"]["time_offset_s"] == pytest.approx(0.013)
+
+
+def test_without_the_clocks_the_same_recording_fails(recording, tmp_path):
+    shutil.copytree(recording, tmp_path / "run")
+    text = (recording / "run.yaml").read_text()
+    for field in (", row_time_s: 8.0e-06", ", time_offset_s: 0.013000000000000001, row_time_s: 5.0e-06"):
+        assert field in text
+        text = text.replace(field, "")
+    (tmp_path / "run" / "run.yaml").write_text(text)
+    assert process_run(tmp_path / "run", tmp_path / "out").verdict.status != "pass"
+
+
+def test_detections_have_the_pictures_own_numbers_and_instants(results):
+    with (results / "detections.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0])[-1] == "t_s"
+    late = {int(r["frame"]): float(r["t_s"]) for r in rows if r["camera"] == "right"}
+    assert sorted(late) == list(range(FRAMES))
+    np.testing.assert_allclose([late[k] - k / 100 for k in range(FRAMES)], 0.013, atol=1e-9)
+
+
+def test_a_camera_of_another_rate_needs_only_its_times(recording, tmp_path):
+    """The right camera has lost two of three pictures; the numbers of those left are its own."""
+    shutil.copytree(recording, tmp_path / "run")
+    folder = tmp_path / "run"
+    with (recording / "detections.csv").open(newline="") as file:
+        rows = list(csv.reader(file))
+    kept = [r for r in rows[1:] if r[1] == "left" or int(r[0]) % 3 == 0]
+    own = [[str(int(r[0]) // 3), *r[1:]] if r[1] == "right" else r for r in kept]
+    (folder / "detections.csv").write_text("\n".join(",".join(r) for r in [rows[0], *own]) + "\n")
+    stamps = "\n".join(f"{k},{3 * k / 100:.9f}" for k in range((FRAMES + 2) // 3))
+    (folder / "times.csv").write_text(f"frame,t_s\n{stamps}\n")
+    text = (folder / "run.yaml").read_text()
+    (folder / "run.yaml").write_text(text.replace("time_offset_s", "timestamps: times.csv, time_offset_s"))
+    process_run(folder, tmp_path / "out")
+    poses = read_poses(tmp_path / "out")
+    assert len(poses.frames) == FRAMES
+    assert attitude_rms_deg(tmp_path / "out") < 0.1

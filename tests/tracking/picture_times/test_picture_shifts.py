@@ -1,0 +1,66 @@
+"""Spots that are not exposed at their frame's instant: shifts, and what they say about the state."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from geometry.compiled_linalg import pose_plus
+from geometry.forward_model import SpotModel
+from geometry.pose import Pose
+from lab.simulate.rigs import RIGS
+from tracking.picture_clock import PictureClock
+from tracking.rigid_body.models.motion import state_after
+from tracking.rigid_body.models.picture_shifts import exposed_after, picture_shifts, timed_spot
+
+MODEL = SpotModel.of(RIGS["four-skew-beams"]())
+R, T = np.eye(3), np.zeros(3)
+M = np.array([0.5, -0.3, 0.2, 0.4, -0.2, 0.6, 1.0, 2.0, -1.0, 3.0, -2.0, 1.0])
+NO_P = np.zeros((6, 6))
+
+
+def pixels_after(s: float) -> np.ndarray:
+    R_then, t_then, _ = state_after(R, T, M, s)
+    return MODEL.project(Pose(R_then, t_then))[0]
+
+
+def test_a_late_picture_shows_the_spots_where_they_are_then():
+    clocks = np.array([[0.0, 0.0, 0.0], [0.004, 0.0, 511.5]])
+    shift, _ = picture_shifts(MODEL.numbers, MODEL.camera_of, clocks, R, T, M, NO_P)
+    late = MODEL.camera_of == 1
+    np.testing.assert_array_equal(shift[~late], 0.0)
+    np.testing.assert_allclose(shift[late], (pixels_after(0.004) - pixels_after(0.0))[late], atol=1e-9)
+
+
+def test_a_rolling_shutter_shows_each_spot_in_the_row_that_is_exposed_then():
+    clock = PictureClock(0.001, 1.5e-5, 511.5)
+    clocks = np.array([clock.numbers, clock.numbers])
+    shift, _ = picture_shifts(MODEL.numbers, MODEL.camera_of, clocks, R, T, M, NO_P)
+    shown = pixels_after(0.0) + shift
+    for i in range(len(MODEL)):
+        s = exposed_after(clocks[0], shown[i, 1])
+        assert s == pytest.approx(float(clock.after_s(shown[i, 1])))
+        np.testing.assert_allclose(pixels_after(s)[i], shown[i], atol=1e-4)
+
+
+def test_the_covariance_of_a_shift_is_that_of_the_way_in_that_time():
+    clocks = np.array([[0.004, 0.0, 511.5]] * 2)
+    _, cov = picture_shifts(MODEL.numbers, MODEL.camera_of, clocks, R, T, np.zeros(12), np.eye(6) * 0.1**2)
+    J = MODEL.project(Pose(R, T))[1]
+    np.testing.assert_allclose(cov, (0.1 * 0.004) ** 2 * J @ np.swapaxes(J, 1, 2), rtol=1e-9)
+
+
+@pytest.mark.parametrize("after", [-0.006, 0.0, 0.004])
+def test_the_jacobian_by_the_state_is_that_of_finite_differences(after):
+    at, J, H = np.empty(2), np.empty((2, 6)), np.empty((2, 18))
+    for view in (0, len(MODEL) - 1):
+        projected, _ = timed_spot(MODEL.numbers, view, R, T, M, after, at, J, H)
+        assert projected
+        exact, here = H.copy(), np.empty((2, 2))
+        for k in range(18):
+            for side, sign in enumerate((1.0, -1.0)):
+                d = np.zeros(18)
+                d[k] = sign * 1e-5
+                R_k, t_k = pose_plus(R, T, d)
+                timed_spot(MODEL.numbers, view, R_k, t_k, M + d[6:], after, here[side], J, H)
+            np.testing.assert_allclose((here[0] - here[1]) / 2e-5, exact[:, k], rtol=2e-3, atol=2e-2)
