@@ -131,7 +131,7 @@ def _screen_places(camera: Camera, screen: Screen) -> tuple[Light, Light]:
     to_u, to_v = np.meshgrid(np.arange(width) / _NODE_PX + 2, np.arange(height) / _NODE_PX + 2)
     maps = to_u.astype(np.float32), to_v.astype(np.float32)
     x, y = (cv2.remap(hit[..., i].astype(np.float32), *maps, cv2.INTER_CUBIC) for i in (0, 1))
-    return x, y
+    return np.asarray(x, np.float32), np.asarray(y, np.float32)
 
 
 def _surface(rng: np.random.Generator, look: Look, camera: Camera, screen: Screen, x: Light, y: Light) -> Light:

@@ -122,7 +122,7 @@ def answers_in_memory(scene: Scene, parameters: TrackerParameters | None = None)
         work = Path(name)
         tracker = TimedTracker(tracker_of(run))
         # PointReader and TimedTracker have only the members of a reader and a tracker that Pipeline uses.
-        pipeline = Pipeline(run, PointReader(scene), tracker, {})  # type: ignore[arg-type]
+        pipeline = Pipeline(run, PointReader(scene), tracker, {})
         seconds = 0.0
         start = time.process_time()
 

@@ -30,7 +30,7 @@ def draw_camera(
     sizes_px: Sequence[tuple[int, int]] = SIZES_PX,
 ) -> tuple[Camera, str]:
     """A camera that sees a disc on its screen; `centre` (3,), `radius` in m, in base."""
-    width, height = sizes_px[rng.integers(len(sizes_px))]
+    width, height = sizes_px[int(rng.integers(len(sizes_px)))]
     fill = rng.uniform(0.75, 1.15) * 0.45 * min(width, height)  # length of the radius, px
     shortest = max(focal_px[0], 0.5 * max(width, height))  # a field of view of 90 deg
     for _ in range(50):
