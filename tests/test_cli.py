@@ -233,7 +233,7 @@ def test_the_examples_of_calibrate_lead_from_a_campaign_to_a_rig_that_is_checked
         works(*example(f"calibrate {name}"))
     for name in ("points.csv", "survey.csv"):
         (desk / name).write_bytes((desk / "campaign" / name).read_bytes())
-    assert works(*example("calibrate check")).startswith("PASS")
+    assert works(*example("calibrate check")).startswith("drift check: PASS")
     works("check", "results/rig/rig.yaml")
 
 

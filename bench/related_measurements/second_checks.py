@@ -54,7 +54,7 @@ def probed(seed: int, kind: str) -> Iterator[tuple[Picture, Truth]]:
     scene, look = render.background(str(rng.choice(["sky", "cloud"])), rng), render.face(kind, rng)
     share, steps = rng.uniform(0.1, 0.6), round(float(np.exp(rng.uniform(0, np.log(100)))))
     rod = render.probe(rng, share)
-    greys = np.array([look.bright, look.dark, 0.55 * look.bright + 0.45 * look.dark])
+    greys = np.array([look.bright, look.shade, 0.55 * look.bright + 0.45 * look.shade])
     while np.abs(rod.grey - greys).min() < _LEAST_CONTRAST:
         rod = render.probe(rng, share)
     circles = motion(rng, bool(rng.random() < 0.5))

@@ -91,7 +91,7 @@ class Face:
 
     kind: str
     bright: float  # DN
-    dark: float
+    shade: float
     ribs: int
     turn: float  # rad
     light: tuple[float, float]  # side light: share, and direction, rad
@@ -104,19 +104,19 @@ class Face:
         inside = (rho <= 1).astype(float)
         if self.kind == "thin":
             ring = (rho > 1 - THIN) & (rho <= 1)
-            return np.where(rho <= OPENING, self.dark + 25, np.where(ring, self.dark, self.bright)), inside
+            return np.where(rho <= OPENING, self.shade + 25, np.where(ring, self.shade, self.bright)), inside
         grey = np.full(x.shape, self.bright)
         rib = np.cos(self.ribs * theta)
         if self.kind == "ribbed":
-            grey = np.where(rib > 0, self.bright, 0.55 * self.bright + 0.45 * self.dark)
-            grey = np.where(rho < HUB, self.dark, grey)
+            grey = np.where(rib > 0, self.bright, 0.55 * self.bright + 0.45 * self.shade)
+            grey = np.where(rho < HUB, self.shade, grey)
         elif self.kind == "textured":
             n = len(self.texture) - 1
             place = [np.asarray((c + 1.05) / 2.1 * n, np.float32) for c in (x, y)]
             grey = grey + 22 * cv2.remap(self.texture.astype(np.float32), *place, cv2.INTER_LINEAR)
         elif self.kind == "drogue":
-            grey = np.where(rib > -0.3, self.bright, 0.75 * self.bright + 0.25 * self.dark)
-            struts = np.where(rib > 0.75, 0.5 * self.bright + 0.5 * self.dark, self.dark)
+            grey = np.where(rib > -0.3, self.bright, 0.75 * self.bright + 0.25 * self.shade)
+            struts = np.where(rib > 0.75, 0.5 * self.bright + 0.5 * self.shade, self.shade)
             grey = np.where(rho < 0.68, struts, grey)
             grey = np.where(rho < 0.2, 0.8 * self.bright, grey)
         share, towards = self.light
@@ -128,9 +128,9 @@ def face(kind: str, rng: np.random.Generator, hose: bool = False) -> Face:
     texture = field(rng, (64, 64), rng.uniform(8, 24), 3, 0.7)
     light = (rng.uniform(0.05, 0.3) if kind == "drogue" else 0.0, rng.uniform(0, 2 * np.pi))
     bright = rng.uniform(185, 225) if rng.random() < 0.7 or kind in ("drogue", "thin") else rng.uniform(25, 50)
-    dark = rng.uniform(30, 60) if bright > 100 else 120.0
+    shade = rng.uniform(30, 60) if bright > 100 else 120.0
     along = rng.uniform(-2.2, -0.9) if hose else None
-    return Face(kind, bright, dark, int(rng.integers(8, 25)), rng.uniform(0, 6), light, along, texture)
+    return Face(kind, bright, shade, int(rng.integers(8, 25)), rng.uniform(0, 6), light, along, texture)
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +190,7 @@ def draw(
         if look.hose is not None:
             end = np.array([u_px, v_px]) + 900 * np.array([np.cos(look.hose), np.sin(look.hose)])
             line = [np.rint(16 * np.array(p)).astype(int).tolist() for p in ((u_px, v_px), end)]
-            cv2.line(out, *line, 0.6 * look.dark, max(round(0.07 * radius_px), 1), cv2.LINE_8, 4)
+            cv2.line(out, *line, 0.6 * look.shade, max(round(0.07 * radius_px), 1), cv2.LINE_8, 4)
         _compose(out, look, u_px, v_px, radius_px)
     if rod is not None:
         y, x = np.mgrid[: out.shape[0], : out.shape[1]].astype(float)

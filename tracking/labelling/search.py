@@ -181,8 +181,8 @@ def crowd_of_unknown_brightness(
 
 def _reached(plan: RigPlan, prior: PosePrior, places: Array) -> Bools:
     """Which places (m, 3), m, each spot may light under a prior: (spots, m)."""
-    rays = zip(plan.spot_point, plan.spot_ray, strict=True)
-    return np.array([prior.reaches(p, r, places) for p, r in rays], dtype=bool).reshape(-1, len(places))
+    rays = list(zip(plan.spot_point, plan.spot_ray, strict=True))
+    return np.array([prior.reaches(p, r, places) for p, r in rays], dtype=bool).reshape(len(rays), len(places))
 
 
 def _reached_by_any(plan: RigPlan, prior: PosePrior, camera: int, places: Array) -> Bools:

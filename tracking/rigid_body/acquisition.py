@@ -25,7 +25,7 @@ from tracking.tracked_frame import Event
 FIRST_SPEED, FIRST_RATE = 4.0, 6.0  # m/s, rad/s
 FIRST_ACCELERATION, FIRST_ANGULAR_ACCELERATION = 30.0, 100.0  # m/s^2, rad/s^2
 # Sigmas of the motion between the pictures of one frame in a search by geometry alone: usual motions, since with the
-# fastest ones no pose could be told from another. px/s where the prior's centre shows no spot.
+# fastest ones no pose could be distinguished from another. px/s where the prior's centre shows no spot.
 SEARCH_SPEED, SEARCH_RATE, SEARCH_PX_S = 1.0, 1.0, 1500.0  # m/s, rad/s
 # Limits of the search around the last pose; beyond the second one a fan of beams looks like itself, turned.
 MAX_DISTANCE_M, MAX_TURN_RAD = 1.5, np.deg2rad(60.0)

@@ -141,7 +141,7 @@ def add_truth(results: StereoResults, truth: TruePoses | None) -> None:
 
 
 class _ColourCheck:
-    """Whether the first pictures of each camera have colour. Those too dark to show a marker say nothing about it."""
+    """Whether the first pictures of each camera have colour. Black ones, which show no marker, say nothing about it."""
 
     def __init__(self, run: StereoRun) -> None:
         self._run = run

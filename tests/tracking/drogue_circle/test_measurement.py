@@ -91,7 +91,7 @@ def test_round_outlines_that_are_no_circles_are_not_acquired():
 def test_both_edges_of_a_thin_rim_and_its_opening_are_found_and_one_can_be_chosen():
     x, y = np.meshgrid(np.arange(160.0), np.arange(120.0))
     away = np.hypot(x - 80.2, y - 60.4)
-    ring = norm.cdf((away - 40) / 1.2) + norm.cdf((37 - away) / 1.2)  # a dark line of 3 px
+    ring = norm.cdf((away - 40) / 1.2) + norm.cdf((37 - away) / 1.2)  # a black line of 3 px
     picture = rounded(60 + 110 * ring - 50 * norm.cdf((28 - away) / 1.2))
     for edge, radius in ((Edge.OUTER, 40.0), (Edge.INNER, 37.0), (Edge.OPENING, 28.0)):
         search = acquire(picture, DETECT, replace(P, edge=edge), Wanted())

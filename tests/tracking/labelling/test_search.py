@@ -199,6 +199,11 @@ def test_candidates_are_sorted_by_score_and_include_the_truth():
         np.testing.assert_array_equal(np.flatnonzero(c.point_of != NO_POINT), c.fit.rows)
 
 
+def test_pictures_without_any_point_have_no_labelling():
+    rig = RIGS["unequal-fan"]()
+    assert candidate_labellings(rig, SpotModel.of(rig), dict.fromkeys(rig.cameras, Detections.none())) == []
+
+
 def test_no_two_spots_share_a_point():
     rig = RIGS["four-skew-beams"]()
     model, rng = SpotModel.of(rig), np.random.default_rng(9)

@@ -138,11 +138,11 @@ def test_each_size_and_depth_of_pictures_has_its_own_noise_and_a_note_in_the_rep
 
 @pytest.mark.parametrize(("every", "limit", "expected"), [(1, None, 5), (2, None, 3), (1, 2, 2), (2, 9, 3)])
 def test_progress_counts_the_pictures_that_are_searched(tmp_path, every, limit, expected):
-    told = []
+    reported = []
     folder = write_folder(tmp_path / "series", range(5))
     options = DetectOptions(every=every, limit=limit)
-    detect_pictures([folder], tmp_path / "out", options, lambda done, total: told.append((done, total)))
-    assert told == [(k + 1, expected) for k in range(expected)]
+    detect_pictures([folder], tmp_path / "out", options, lambda done, total: reported.append((done, total)))
+    assert reported == [(k + 1, expected) for k in range(expected)]
 
 
 def test_one_picture_is_enough(tmp_path):
