@@ -29,6 +29,24 @@ class CameraClock:
         return np.asarray(times.t_s(numbers) + self.offset_s)
 
 
+def picture_numbers(clock: CameraClock | None, run_times: Times, rows: Ints) -> Ints:
+    """(m,): the number of the camera's picture of each row (m,) of the tables; -1 where it has none.
+
+    Without times of its own it is the row's number, else the picture nearest to the row's instant, within half a row.
+    """
+    rows = np.asarray(rows, dtype=np.int64)
+    if clock is None or clock.times is None or clock.times.frames is None:
+        return rows
+    numbers = clock.times.frames
+    instants, rows_s = clock.instants_s(run_times, numbers), run_times.t_s(rows)
+    after = np.clip(np.searchsorted(instants, rows_s), 1, max(len(instants) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(instants) - 1)
+    nearest = np.where(rows_s - instants[before] <= instants[after] - rows_s, before, after)
+    near = np.abs(instants[nearest] - rows_s) <= 0.5 * (run_times.t_s(rows + 1) - rows_s)
+    return np.where(near, numbers[nearest], -1)
+
+
 def load_clock(
     offset_s: float, row_time_s: float, timestamps: str | None, folder: Path, where: str, rate_hz: float, height: int
 ) -> CameraClock | None:

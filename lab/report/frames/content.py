@@ -14,6 +14,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.uncertainty.spot_tracks import beam_image, pixel_covariance, scatter, uncertainty_tracks, unlimited
 from lab.errors import BeamposeError, InputError
+from lab.files.run.clocks import picture_numbers
 from lab.files.run.results import (
     POSE_STATUSES,
     SPOT_STATUSES,
@@ -364,7 +365,9 @@ def pictures_of(run: Run | None, cameras: Sequence[str], frames: Sequence[int]) 
                 continue
             try:
                 opened, size_px = recorded_pictures(camera, source), run.rig.cameras[camera].image_size_px
-                streams[camera] = stack.enter_context(closing(pictures(opened, size_px, wanted=frames)))
+                numbers = picture_numbers(run.clocks.get(camera), run.times, np.array(frames, dtype=np.int64))
+                wanted = numbers.tolist()
+                streams[camera] = stack.enter_context(closing(pictures(opened, size_px, wanted=wanted)))
             except BeamposeError as error:
                 reason = MissingPicture(str(error))
                 streams[camera] = iter([(frame, reason) for frame in frames])

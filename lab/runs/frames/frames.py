@@ -13,6 +13,7 @@ import numpy as np
 
 from geometry.arrays import Bools, Ints
 from lab.errors import InputError
+from lab.files.run.clocks import picture_numbers
 from lab.files.run.detections_file import CameraPoints, DetectionsFile, is_too_sparse, read_detections, stray_frames
 from lab.files.run.run_file import FramesFolder, LiveDevice, Run, VideoFile
 from lab.files.text.error_text import suggest_name
@@ -270,14 +271,16 @@ def recorded_pictures(camera: str, source: FramesFolder | VideoFile) -> PictureS
 
 
 def pictures_at(run: Run, camera: str, frames: Sequence[int]) -> Mapping[int, Picture]:
-    """Some pictures of one camera, by frame number.
+    """Some pictures of one camera, by the number of the row in the tables.
 
     A video is read from its start, so all pictures should be requested in one call.
     """
     source = run.cameras[camera]
     if isinstance(source, FramesFolder | VideoFile):
         size_px = run.rig.cameras[camera].image_size_px
-        return pictures_of_frames(recorded_pictures(camera, source), frames, size_px)
+        numbers = picture_numbers(run.clocks.get(camera), run.times, np.array(frames, dtype=np.int64)).tolist()
+        found = pictures_of_frames(recorded_pictures(camera, source), numbers, size_px)
+        return {frame: found[number] for frame, number in sorted(zip(frames, numbers, strict=True))}
     kind = "a live camera" if isinstance(source, LiveDevice) else "detected points"
     return dict.fromkeys(sorted(set(frames)), MissingPicture(f"no pictures: {kind}"))
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from lab.errors import BeamposeError
 from lab.files.run.run_file import load_run
+from lab.report.frames.content import pictures_of
+from lab.runs.frames.frames import pictures_at
 from lab.runs.frames.open_frames import open_frames
 from tests.lab.run_folders import RIG
 
@@ -85,3 +88,21 @@ def test_times_that_contradict_the_run_are_refused(tmp_path, t_s, says):
 def test_the_spot_tracker_takes_all_pictures_for_those_of_one_instant(tmp_path):
     with pytest.raises(BeamposeError, match=r"expected tracker\.method rigid"):
         load_run(run_with(tmp_path, "time_offset_s: 0.002", "tracker: {method: spots}\n"))
+
+
+def test_pictures_of_a_camera_with_times_of_its_own_are_those_nearest_to_the_rows(tmp_path):
+    folder = run_with(tmp_path, "timestamps: times.csv")
+    times(folder, 0.003 + np.arange(FRAMES // 2) / 50)  # half as many pictures as rows
+    text = (folder / "run.yaml").read_text().replace("right: {detections: detections.csv", "right: {frames: right")
+    (folder / "run.yaml").write_text(text)
+    (folder / "right").mkdir()
+    run = load_run(folder)
+    width, height = run.rig.cameras["right"].image_size_px
+    for number in range(FRAMES // 2):
+        cv2.imwrite(str(folder / "right" / f"{number:03d}.png"), np.full((height, width), number, np.uint8))
+    shown = pictures_at(run, "right", range(6))
+    values = {row: int(p[0, 0]) for row, p in shown.items() if isinstance(p, np.ndarray)}
+    assert values == {0: 0, 2: 1, 4: 2}
+    assert sorted(shown) == list(range(6))
+    drawn = [found["right"] for found in pictures_of(run, ["right"], range(6))]
+    assert {row: int(p[0, 0]) for row, p in enumerate(drawn) if isinstance(p, np.ndarray)} == values
