@@ -26,7 +26,8 @@ TABLES = {
     "covariance": columns.COVARIANCE,
     "beams": columns.BEAMS,
     "spots": columns.SPOTS,
-    "detections": (*columns.DETECTIONS, columns.LIKENESS),  # the last one only of `detect`
+    # The time only with clocks of single cameras, the likeness only of `detect`.
+    "detections": (*columns.DETECTIONS, columns.PICTURE_TIME, columns.LIKENESS),
     "times": columns.TIMES,
     "truth-pose": columns.TRUTH_POSE,
     "truth-spots": columns.TRUTH_SPOTS,

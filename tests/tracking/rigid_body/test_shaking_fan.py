@@ -57,7 +57,7 @@ def test_an_update_far_from_its_prediction_finds_the_most_probable_pose():
     tracker = RigidTracker(RIG, RIGID, prior_of(run))
     P = np.diag(np.repeat([0.005, 0.2, 1.0, 20.0, 10.0, 500.0], 3) ** 2)
     for k in range(0, 40, 4):
-        obs, near = tracker._observation(found_in(run, k)), run.poses[k].plus(np.full(6, 1e-4))
+        obs, near = tracker._observations(found_in(run, k), 0.0)[0], run.poses[k].plus(np.full(6, 1e-4))
         for turn_deg in ([20.0, 0, 0], [0, -20.0, 5.0], [-12.0, 12.0, 12.0]):
             off = run.poses[k].plus(np.concatenate([np.zeros(3), np.deg2rad(turn_deg)]))
             prior = State(np.ascontiguousarray(off.rotation), off.translation, np.zeros(12), P)
@@ -72,7 +72,7 @@ def test_spots_are_completed_where_the_pose_of_the_others_explains_a_point():
     run = shaking((0, 1), 40, 3)
     tracker = RigidTracker(RIG, RIGID, prior_of(run))
     k = 7
-    obs, pose = tracker._observation(found_in(run, k)), run.poses[k]
+    obs, pose = tracker._observations(found_in(run, k), 0.0)[0], run.poses[k]
     all_six = rows_of(run, k)
     R, P = np.ascontiguousarray(pose.rotation), np.diag(np.repeat([1e-6, 1e-6], 3))
     some = all_six.copy()
