@@ -11,7 +11,7 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.compiled_projection import project_all
 from geometry.forward_model import SpotModel
 from tracking.parameters import TrackerParameters
-from tracking.rigid_body.association.frame_detections import BLENDED, Observation, distinct_spots
+from tracking.rigid_body.association.frame_detections import BLENDED, Observation, chosen_points, distinct_spots
 from tracking.rigid_body.hypotheses.hypothesis_set import Children, Dynamics, Hypotheses
 from tracking.rigid_body.hypotheses.prediction_checks import (
     MAX_CHECKING_SIGMA_PX,
@@ -23,7 +23,6 @@ from tracking.rigid_body.hypotheses.prediction_checks import (
     unchecked_by_prediction,
 )
 from tracking.rigid_body.hypotheses.pruning import unweighted_spread
-from tracking.rigid_body.hypotheses.timed_update import chosen_points
 from tracking.rigid_body.models.information import well_controlled
 from tracking.rigid_body.pose_candidates import predicted_hypothesis
 
@@ -101,7 +100,7 @@ class LabelConfirmation:
         if spots and h.before is not None and h.dt_s > 0 and h.parent >= 0:
             out = self._check_by_motion(obs, h, dynamics, out, spots, sure, doubtful)
         elif h.best in h.searched:
-            use, _, cov = chosen_points(obs.frame, assigned, obs.calibration_cov)
+            use, _, cov = chosen_points(obs.frame.uv, obs.frame.cov, 0, assigned, obs.calibration_cov)
             controlled = well_controlled(model.numbers, h.now.R[0], h.now.t[0], use, cov)
             few = not h.first and distinct_spots(controlled, model.spot_of) < MIN_REDUNDANT_SPOTS
             if few or decisive(model, h.now.R[0], h.now.t[0], use, cov).any():
@@ -143,7 +142,7 @@ class LabelConfirmation:
             return before
         # The motion does not check some label: the frame's other spots must, or it must be beyond doubt.
         least = max(before.min_probability, SURE_PROBABILITY)
-        use, _, cov = chosen_points(obs.frame, assigned, obs.calibration_cov)
+        use, _, cov = chosen_points(obs.frame.uv, obs.frame.cov, 0, assigned, obs.calibration_cov)
         uncontrolled = use & ~well_controlled(model.numbers, h.now.R[0], h.now.t[0], use, cov)
         # A spot that the frame before showed as well confirms itself. A single spot that reappears where it may be
         # anywhere waits for the next frame, as does one that alone determines a direction of the pose.

@@ -40,6 +40,7 @@ from tracking.rigid_body.association.frame_detections import (
     FrameDetections,
     Observation,
     ViewTable,
+    chosen_points,
     distinct_spots,
 )
 from tracking.rigid_body.frame_result import FrameDecision, is_lost, lost_frame, tracked_frame, undecided_events
@@ -51,7 +52,6 @@ from tracking.rigid_body.hypotheses.prediction_checks import (
     MIN_REDUNDANT_SPOTS,
 )
 from tracking.rigid_body.hypotheses.pruning import prune_and_merge
-from tracking.rigid_body.hypotheses.timed_update import chosen_points
 from tracking.rigid_body.label_confirmation import FrameHypotheses, LabelConfirmation
 from tracking.rigid_body.models.information import single_frame_pose
 from tracking.rigid_body.models.occlusion import MISSED
@@ -281,7 +281,8 @@ class RigidTracker:
 
     def _raise_variance_factor(self, obs: Observation, one: Labelling) -> None:
         """Raise the variance factor to the misfit of a first labelling, which holds within the model's error."""
-        use, uv, cov = chosen_points(obs.frame, self._assigned(obs.frame, one), obs.calibration_cov)
+        assigned = self._assigned(obs.frame, one)
+        use, uv, cov = chosen_points(obs.frame.uv, obs.frame.cov, 0, assigned, obs.calibration_cov)
         pose = one.fit.world_from_body
         start = np.ascontiguousarray(pose.rotation), np.ascontiguousarray(pose.translation)
         _, _, _, chi2, count = single_frame_pose(obs.views, *start, use, uv, cov)

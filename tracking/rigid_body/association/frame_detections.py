@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
+from geometry.compilation.jit import compiled
 from geometry.compiled_projection import Views
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
@@ -71,6 +72,28 @@ class Observation(NamedTuple):
     shift_cov: Array  # (n, 2, 2) px^2: the second part alone (models/picture_shifts.py); 0 without pictures' clocks
     clocks: Array  # (cameras, 3) of the pictures, as PictureClock.numbers
     timed: bool  # some picture has a clock of its own
+
+
+@compiled
+def chosen_points(
+    uv: Array, cov: Array, begin: int, assigned: Ints, calibration_cov: Array
+) -> tuple[Bools, Array, Array]:
+    """Detections of one assignment (n,): views used in the pose (n,), pixels (n, 2) and covariances (n, 2, 2).
+
+    uv (m, 2), px, cov (m, 2, 2), px^2: detections, of which those of the assignment's frame begin at row `begin`;
+    calibration_cov (n, 2, 2), px^2: is added.
+    """
+    n = assigned.shape[0]
+    use, of_view, noise = np.zeros(n, np.bool_), np.zeros((n, 2)), np.zeros((n, 2, 2))
+    for i in range(n):
+        if 0 <= assigned[i] < BLENDED:
+            d = begin + assigned[i]
+            use[i] = True
+            for a in range(2):
+                of_view[i, a] = uv[d, a]
+                for b in range(2):
+                    noise[i, a, b] = cov[d, a, b] + calibration_cov[i, a, b]
+    return use, of_view, noise
 
 
 def distinct_spots(chosen: Bools, spot: Ints) -> Ints:

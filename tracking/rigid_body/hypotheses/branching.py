@@ -27,7 +27,7 @@ from tracking.rigid_body.hypotheses.hypothesis_set import (
     add_child,
     empty_children,
 )
-from tracking.rigid_body.hypotheses.iterated_update import iterated_update
+from tracking.rigid_body.hypotheses.iterated_update import Update, iterated_update
 from tracking.rigid_body.hypotheses.prediction_checks import (
     MAX_CHECKING_SIGMA_PX,
     MAX_THREE_SPOT_SIGMA_PX,
@@ -37,7 +37,6 @@ from tracking.rigid_body.hypotheses.prediction_checks import (
     largest_spot_sigma,
 )
 from tracking.rigid_body.hypotheses.pruning import PRUNE_NATS
-from tracking.rigid_body.hypotheses.timed_update import Update
 from tracking.rigid_body.models.motion import predicted
 from tracking.rigid_body.models.occlusion import MISSED, joint_log_likelihood, marginal, predict, update
 

@@ -21,12 +21,12 @@ from tracking.rigid_body.association.frame_detections import (
     FrameDetections,
     Observation,
     ViewTable,
+    chosen_points,
 )
 from tracking.rigid_body.association.joint_search import associate
 from tracking.rigid_body.association.likelihood import detection_log_likelihood, predicted_pixel
 from tracking.rigid_body.hypotheses.hypothesis_set import State
 from tracking.rigid_body.hypotheses.iterated_update import iterated_update
-from tracking.rigid_body.hypotheses.timed_update import chosen_points
 from tracking.rigid_body.models.information import frame_information, single_frame_pose
 from tracking.rigid_body.models.motion import STATE
 from tracking.rigid_body.models.occlusion import joint_log_likelihood, marginal
@@ -217,7 +217,8 @@ def _explanations(case: _Case, P: Array, jump_sigma: Array) -> _Tried:
             for i in range(6):
                 sigma[i] = WRONG_MOTION_M if i < 3 else WRONG_MOTION_RAD
             prior = _widened(case, P, sigma)
-            use, uv, cov = chosen_points(case.obs.frame, case.current, case.obs.calibration_cov)
+            frame = case.obs.frame
+            use, uv, cov = chosen_points(frame.uv, frame.cov, 0, case.current, case.obs.calibration_cov)
             R, t, _, _, _ = single_frame_pose(case.obs.views, case.R, case.t, use, uv, cov)
             count = _try_current(case, prior, np.log(P_WRONG_MOTION), R, t, tried, count)
     return _Tried(tried.assigned[:count], tried.score[:count])

@@ -52,14 +52,22 @@ def _open_variance(steps: Steps, k: int, axis: int, after: float) -> float:
 
 
 @compiled
-def _seen_by_row(cov: Array, speed: Array, row_time: float) -> tuple[float, float, float]:
-    """Covariance (uu, uv, vv), px^2, of a detection less the pixel expected at the instant of its own row.
+def _covariance(
+    cov: Array, J: Array, m: Array, row_time: float, steps: Steps, k: int, after: float
+) -> tuple[float, float, float]:
+    """Covariance (uu, uv, vv), px^2, of a detection less the pixel expected from frame k's state at its own instant.
 
-    cov (2, 2): of the detection; speed (2,), px/s. An error of the row changes that instant, and so the expectation.
+    cov (2, 2): of the detection; J (2, 6), m (12,): of its spot; after: s from the frame to that instant. An error of
+    the row changes that instant, and so the expectation; and the motion between the two is not known exactly.
     """
+    speed = _speed(J, m)
     a, b = -speed[0] * row_time, 1.0 - speed[1] * row_time
     uu = cov[0, 0] + 2 * a * cov[0, 1] + a * a * cov[1, 1]
-    return uu, b * (cov[0, 1] + a * cov[1, 1]), b * b * cov[1, 1]
+    both, vv = b * (cov[0, 1] + a * cov[1, 1]), b * b * cov[1, 1]
+    for i in range(6):
+        more = _open_variance(steps, k, i, after)
+        uu, both, vv = uu + more * J[0, i] ** 2, both + more * J[0, i] * J[1, i], vv + more * J[1, i] ** 2
+    return uu, both, vv
 
 
 @compiled
@@ -100,11 +108,8 @@ def delayed_information(
             projected, m = timed_spot(views, i, ref.R[k], ref.t[k], ref.m[k], after, at, J, H)
             if not projected:
                 continue
-            uu, both, vv = _seen_by_row(noise[i], _speed(J, m), delays.row_time_s[d])
+            uu, both, vv = _covariance(noise[i], J, m, delays.row_time_s[d], steps, k, after)
             uu, both, vv = uu + calibration_cov[i, 0, 0], both + calibration_cov[i, 0, 1], vv + calibration_cov[i, 1, 1]
-            for c in range(6):
-                more = _open_variance(steps, k, c, after)
-                uu, both, vv = uu + more * J[0, c] ** 2, both + more * J[0, c] * J[1, c], vv + more * J[1, c] ** 2
             w0, w1, w2, _ = inverse_2x2(uu, both, vv)
             chi2[k] += add_spot(L[k], g[k], H, w0, w1, w2, uv[i, 0] - at[0], uv[i, 1] - at[1])
     return L, g, chi2
@@ -148,11 +153,7 @@ def moved_detections(
                 if view < 0 or not project_view(views, view, ref.R[k], ref.t[k], here, J):
                     continue
                 project_view(views, view, R, t, there, J)
-                uu, both, vv = _seen_by_row(detections.cov[d], _speed(J, m), delays.row_time_s[d])
-                for i in range(6):
-                    more = _open_variance(steps, k, i, delays.after_s[d])
-                    uu, vv = uu + more * J[0, i] ** 2, vv + more * J[1, i] ** 2
-                    both += more * J[0, i] * J[1, i]
+                uu, both, vv = _covariance(detections.cov[d], J, m, delays.row_time_s[d], steps, k, delays.after_s[d])
                 cov[d, 0, 0], cov[d, 0, 1], cov[d, 1, 0], cov[d, 1, 1] = uu, both, both, vv
                 for a in range(2):
                     uv[d, a] += here[a] - there[a]

@@ -10,7 +10,7 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.compilation.jit import compiled
 from geometry.compiled_linalg import copy_into, copy_matrix_into
 from geometry.compiled_projection import Views
-from tracking.rigid_body.association.frame_detections import BLENDED
+from tracking.rigid_body.association.frame_detections import chosen_points
 from tracking.rigid_body.models.information import frame_information, single_frame_pose, well_controlled
 from tracking.smoothing.motion.reference import Reference
 
@@ -37,17 +37,7 @@ def labelled_points(
     detections: RunDetections, k: int, assigned: Ints, calibration_cov: Array
 ) -> tuple[Bools, Array, Array]:
     """Frame k's labelled detections: views used in the pose (n,), pixels (n, 2) and covariances (n, 2, 2)."""
-    n = assigned.shape[0]
-    use, uv, cov = np.zeros(n, np.bool_), np.zeros((n, 2)), np.zeros((n, 2, 2))
-    for i in range(n):
-        if 0 <= assigned[i] < BLENDED:
-            d = detections.begin[k] + assigned[i]
-            use[i] = True
-            for a in range(2):
-                uv[i, a] = detections.uv[d, a]
-                for b in range(2):
-                    cov[i, a, b] = detections.cov[d, a, b] + calibration_cov[i, a, b]
-    return use, uv, cov
+    return chosen_points(detections.uv, detections.cov, detections.begin[k], assigned, calibration_cov)
 
 
 @compiled
