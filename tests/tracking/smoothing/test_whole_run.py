@@ -10,6 +10,7 @@ from geometry.pose import Pose
 from lab.simulate.rigs import RIGS
 from tests.tracking.rigid_runs import RIGID, dt_of, found_in, recording_of, tracked
 from tracking.smoothing.motion import whole_run
+from tracking.smoothing.motion.fixed_interval import Interval
 from tracking.smoothing.motion.reference import straight_between
 from tracking.smoothing.motion.run_detections import spot_information
 from tracking.smoothing.motion.smoothed_motion import SmoothedMotion, WholeRun
@@ -93,3 +94,18 @@ def test_the_passes_end_where_a_frame_is_at_the_limit_of_weak_ones(monkeypatch):
     monkeypatch.setattr(whole_run, "weak_frames", alternating)
     assert passes_over_a_corner(1.0, monkeypatch) < MAX_PASSES
     assert len(calls) > 2
+
+
+def test_the_passes_end_where_the_memory_lies_between_two_numbers_of_frames(monkeypatch):
+    """A frame that leaves the interior makes the memory shorter, and would be in it again after the next pass."""
+    calls, interior = [], _Estimator._interior
+
+    def alternating(estimator: _Estimator, out: Interval) -> Bools:
+        found = interior(estimator, out)
+        found[15:18] = len(calls) % 2 == 0
+        calls.append(1)
+        return found
+
+    monkeypatch.setattr(_Estimator, "_interior", alternating)
+    monkeypatch.setattr(_Estimator, "_best_interpolation_offset", lambda *_: -4.0)
+    assert passes_over_a_corner(1.0, monkeypatch) < MAX_PASSES

@@ -88,6 +88,7 @@ class _Estimator:
         self.fresh = motion.log_density is None
         self.log_density = self._first_density() if motion.log_density is None else motion.log_density[core].copy()
         self.interpolation_offset = motion.interpolation_offset
+        self.interior = np.ones(len(self.dt), dtype=bool)  # (T,) frames that all passes so far found to be interior
 
     def run_passes(self) -> SmoothedMotion:
         """Passes until nothing changes."""
@@ -154,7 +155,9 @@ class _Estimator:
         """
         if not interpolating or out is None or self.interpolation_offset == 0.0:
             return np.exp(self.log_density)
-        return np.exp(self.log_density + self.interpolation_offset * self._interior(out)[:, None])
+        # Frames only leave: the memory follows from the density, and passes that add and drop frames would never end.
+        self.interior &= self._interior(out)
+        return np.exp(self.log_density + self.interpolation_offset * self.interior[:, None])
 
     def _interior(self, out: Interval) -> Bools:
         """(T,): frames farther than twice the smoother's memory from any gap, jump or end."""
