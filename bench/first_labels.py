@@ -19,10 +19,10 @@ from geometry import rotations
 from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.forward_model import SpotModel
-from geometry.pose import Pose
+from geometry.pose import Pose, look_at
 from geometry.pose_prior import PosePrior
 from geometry.rig import Beam, Rig, Screen, Spot
-from lab.simulate.rigs import DISTORTION, RIGS, look_at
+from lab.simulate.rigs import DISTORTION, RIGS
 from tracking.detections import Detections
 from tracking.labelling.first_labels import NO_POINT, LabelResult, find_labels
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry import rotations
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, cross, normalised
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +79,17 @@ class Pose:
         """The delta (..., 6) for which other.plus(delta) = self."""
         turn = np.swapaxes(other.rotation, -1, -2) @ self.rotation
         return np.concatenate([self.translation - other.translation, rotations.log(turn)], axis=-1)
+
+
+def look_at(position_m: Array, target_m: Array, up: Array | tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Pose:
+    """camera_from_world of a camera at `position_m` (3,) aimed at `target_m` (3,), with `up` (3,) up in its picture.
+
+    The target is not the position, and `up` is not along the line of sight.
+    """
+    z = normalised(np.asarray(target_m, dtype=float) - position_m)
+    x = normalised(cross(z, np.asarray(up, dtype=float)))
+    R = np.stack([x, cross(z, x), z])
+    return Pose(R, -R @ np.asarray(position_m, dtype=float))
 
 
 def ypr_sigmas(pose: Pose, covariance: Array) -> Array:

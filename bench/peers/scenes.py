@@ -23,9 +23,8 @@ import numpy as np
 from bench.peers import motions
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import Camera
-from geometry.pose import Pose
+from geometry.pose import Pose, look_at
 from geometry.rig import Beam, Rig, Screen, Spot
-from lab.simulate.rigs import look_at
 
 FRAME_S = 1 / motions.RATE_HZ
 NOISE_PX = 0.15  # 1 sigma per axis

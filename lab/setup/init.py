@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 import shutil
 import tempfile
 from collections.abc import Mapping
@@ -14,13 +13,13 @@ import numpy as np
 
 from geometry.arrays import Array
 from geometry.camera import Camera
-from geometry.pose import Pose
+from geometry.pose import Pose, look_at
 from geometry.rig import Beam, Rig, Screen, Spot
 from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig, save_rig
 from lab.files.run.run_file import load_run, save_run
 from lab.files.text.atomic_write import atomic_folder, atomic_write_text
-from lab.simulate.rigs import look_at
+from lab.files.text.yaml_text import with_comments
 from lab.simulate.scenarios import SCENARIOS
 from lab.simulate.write import simulate
 
@@ -135,21 +134,21 @@ def _beams_and_spots(count: int, screens: list[str]) -> tuple[dict[str, Beam], d
 EXAMPLE = "example-points.csv"
 FRAMES = 100  # of the simulated points
 
-# A comment before the first line that has this key, by key and indentation.
+# A comment before the first line that has this key.
 _RIG_COMMENTS = {
     "screens": "Screens. The world frame is yours to choose: right-handed, metres. Poses are a_from_b:\n# coordinates"
     " in b to coordinates in a.",
-    "  *.world_from_screen": "Origin and x, y axes of the screen lie in its surface. Measured by `beampose calibrate"
-    " screen`.",
-    "  *.size_m": "Extent along x and y, centred on the origin; leave it out for an unlimited screen.",
+    "screens.*.world_from_screen": "Origin and x, y axes of the screen lie in its surface. Measured by"
+    " `beampose calibrate screen`.",
+    "screens.*.size_m": "Extent along x and y, centred on the origin; leave it out for an unlimited screen.",
     "cameras": "Cameras, each with the screen that it observes.",
-    "  *.image_size_px": "Width, height, in pixels.",
-    "  *.camera_matrix": "Lens, in pixels; (0, 0) is the centre of the top-left pixel. Measured by `beampose calibrate"
-    " camera`.",
-    "  *.camera_from_world": "Pose: x right, y down, z forward. Measured by `beampose calibrate screen`.",
+    "cameras.*.image_size_px": "Width, height, in pixels.",
+    "cameras.*.camera_matrix": "Lens, in pixels; (0, 0) is the centre of the top-left pixel. Measured by"
+    " `beampose calibrate camera`.",
+    "cameras.*.camera_from_world": "Pose: x right, y down, z forward. Measured by `beampose calibrate screen`.",
     "target": "Lasers of the vehicle, in its own (body) frame. Measured by `beampose calibrate beams`.",
-    "  beams": "A beam is a line: a direction and a point on it.",
-    "  spots": "A spot is where one end of a beam (+ along its direction, - against it) meets a screen.",
+    "target.beams": "A beam is a line: a direction and a point on it.",
+    "target.spots": "A spot is where one end of a beam (+ along its direction, - against it) meets a screen.",
 }
 _RUN_COMMENTS = {
     "name": "Shown in reports.",
@@ -232,13 +231,5 @@ def _points(work: Path, frame_rate_hz: float) -> None:
 
 
 def _comment(path: Path, comments: Mapping[str, str], head: str, tail: str) -> None:
-    """Add comments to a YAML file: `key`, or `  *.key` for a key two levels down, stands for its first line."""
-    lines, waiting = [f"# {head}"], dict(comments)
-    for line in path.read_text("utf-8").splitlines():
-        match = re.match(r"^( *)([\w'\"-]+):", line)
-        if match:
-            indent, key = match[1], match[2]
-            names = (f"{indent}{key}", f"{indent[2:]}*.{key}")
-            lines += [f"{indent}# {waiting.pop(name)}" for name in names if name in waiting]
-        lines.append(line)
-    atomic_write_text("\n".join([*lines, tail]), path)
+    """Add comments to a YAML file: by the place of their key, before the file, and behind it."""
+    atomic_write_text("\n".join([f"# {head}", with_comments(path.read_text("utf-8"), comments) + tail]), path)

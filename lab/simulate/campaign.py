@@ -30,7 +30,8 @@ from lab.files.project.project import SCHEMA
 from lab.files.rig.board_file import save_board
 from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
-from lab.files.rig.rig_file import RigFile, as_mapping, load_rig, pose_mapping, save_rig
+from lab.files.rig.pose_block import pose_mapping
+from lab.files.rig.rig_file import RigFile, as_mapping, load_rig, save_rig
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import write_table

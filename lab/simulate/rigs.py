@@ -7,9 +7,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from geometry.arrays import Array, cross, normalised
 from geometry.camera import Camera, SensorNoise
-from geometry.pose import Pose
+from geometry.pose import Pose, look_at
 from geometry.rig import Beam, Rig, Screen, Spot
 
 IMAGE_SIZE_PX = (1280, 1024)  # the paper's, section 5.1
@@ -18,14 +17,6 @@ FOCAL_PX = 1180.0
 # the picture still has pixel coordinates.
 DISTORTION = (-0.12, 0.05, 3e-4, -2e-4, 0.0)
 SCREEN_X_M = 2.5  # distance of either screen from the world's origin
-
-
-def look_at(position_m: Array, target_m: Array) -> Pose:
-    """camera_from_world of a camera at `position_m` (3,) aimed at `target_m` (3,), with world z up in its picture."""
-    z = normalised(np.asarray(target_m, dtype=float) - position_m)
-    x = normalised(cross(z, np.array([0.0, 0.0, 1.0])))
-    R = np.stack([x, cross(z, x), z])
-    return Pose(R, -R @ np.asarray(position_m, dtype=float))
 
 
 def scaled(rig: Rig, scale: float) -> Rig:

@@ -76,7 +76,8 @@ def simulate(
         raise InputError("the pictures of a rig file keep its size: omit the scale or the rig")
     if not 0.05 <= picture_scale <= 4.0:
         raise InputError(f"picture_scale: expected 0.05 to 4, got {picture_scale:g}")
-    true_rig = None if rig is None else load_rig_file(rig).rig
+    true_file = None if rig is None else load_rig_file(rig)
+    true_rig = None if true_file is None else true_file.rig
     known = None if known_rig is None else load_rig_file(known_rig)
     scenario = _with_light(with_overrides(scenario, clutter=clutter, miss_probability=miss_probability), light)
     if video:
@@ -85,7 +86,8 @@ def simulate(
         scene = compose(scenario, seed, frames, picture_scale, true_rig)
         if known is not None and SpotModel.of(known.rig).views != scene.model.views:
             raise InputError(f"{known_rig}: expected the cameras and spots of the rig that is recorded, got others")
-        save_rig(scene.rig if known is None else known, folder / "rig.yaml")
+        forms = {} if true_file is None else true_file.measured_as
+        save_rig(RigFile(scene.rig, measured_as=forms) if known is None else known, folder / "rig.yaml")
         write_truth(scene, folder / "truth")
         if detections_only:
             _write_detections(scene, noise_px, picture_scale, true_rig, folder / "detections.csv")

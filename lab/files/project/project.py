@@ -23,7 +23,8 @@ from lab.files.rig.board_file import load_board
 from lab.files.rig.calibration_state import Day
 from lab.files.rig.camera_file import CameraFile, load_camera
 from lab.files.rig.interchange import read_cameras
-from lab.files.rig.rig_file import PoseBlock, TargetBlock, unknown_name
+from lab.files.rig.pose_block import PoseBlock
+from lab.files.rig.rig_file import TargetBlock, unknown_name
 from lab.files.text.error_text import FileError, name_of_path, suggest_name
 from lab.files.text.fields import (
     Block,

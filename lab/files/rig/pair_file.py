@@ -25,7 +25,8 @@ from lab.files.rig.camera_block import (
     lens_mapping,
 )
 from lab.files.rig.interchange import BEAMPOSE, RIG, read_cameras, recognised_format
-from lab.files.rig.rig_file import PoseBlock, joint_covariance, load_rig_file, pose_mapping
+from lab.files.rig.pose_block import CameraPoseBlock, pose_mapping
+from lab.files.rig.rig_file import joint_covariance, load_rig_file
 from lab.files.text.error_text import suggest_name
 from lab.files.text.fields import Block, Name, one_of, validated
 from lab.files.text.yaml_text import parse_mapping, read_text, write_mapping
@@ -44,7 +45,7 @@ class PairFile:
 
 
 class _CameraBlock(LensBlock):
-    camera_from_world: PoseBlock
+    camera_from_world: CameraPoseBlock
 
 
 class _PairBlock(Block):

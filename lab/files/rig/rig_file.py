@@ -12,9 +12,7 @@ import pydantic
 
 from geometry.arrays import Array, symmetric
 from geometry.camera import Camera, SensorNoise
-from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen, Spot
-from geometry.rotations import quaternion_from_matrix
 from geometry.uncertainty.rig_uncertainty import RigCovariance, is_known, split_name
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState, CalibrationStateBlock, state_mapping
@@ -27,6 +25,7 @@ from lab.files.rig.camera_block import (
     lens_mapping,
     plain_floats,
 )
+from lab.files.rig.pose_block import BeamBlock, CameraPoseBlock, ScreenPoseBlock, measured_forms, pose_mapping
 from lab.files.text.error_text import FileError, suggest_name
 from lab.files.text.fields import (
     Block,
@@ -36,11 +35,8 @@ from lab.files.text.fields import (
     Positive,
     Vector3,
     Word,
-    field_error,
-    numbers,
     one_of,
     positive_numbers,
-    unexpected_value,
     validated,
 )
 from lab.files.text.yaml_text import read_mapping, write_mapping
@@ -107,7 +103,6 @@ def covariance_blocks(covariance: RigCovariance) -> dict[str, Covariance]:
 
 
 SCHEMA = "beampose/rig/1"
-QUATERNION_TOLERANCE = 1e-6  # deviation from length 1 of a quaternion written with seven digits
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +115,9 @@ class RigFile:
     rig: Rig
     covariances: Mapping[str, Covariance] = field(default_factory=dict)
     calibration: CalibrationState | None = None  # None: not stated
+    # How a transform or a beam was stated where not in the form of a written file; by its place, such as
+    # screens.left.world_from_screen. A written file has it as a comment.
+    measured_as: Mapping[str, str] = field(default_factory=dict)
 
 
 def load_rig(path: Path) -> Rig:
@@ -136,7 +134,7 @@ def load_rig_file(path: Path) -> RigFile:
         raise FileError(f"{path}: {m}" for m in mistakes)
     covariances = {where: block.value() for where, block in _covariance_blocks(content)}
     state = None if content.calibration is None else content.calibration.value()
-    return RigFile(_rig_of(content), covariances, state)
+    return RigFile(_rig_of(content), covariances, state, dict(measured_forms(content)))
 
 
 def save_rig(rig: Rig | RigFile, path: Path) -> None:
@@ -150,44 +148,16 @@ def save_rig(rig: Rig | RigFile, path: Path) -> None:
     file = rig if isinstance(rig, RigFile) else RigFile(rig)
     content = as_mapping(file)
     validated(_RigBlock, content, path)
-    write_mapping(content, Path(path))
+    write_mapping(content, Path(path), file.measured_as)
 
 
 # The schema of the file ----------------------------------------------------------------------------------------------
 
 
-def _unit_quaternion(value: Any) -> list[float]:
-    q = numbers(4)(value)
-    length = float(np.linalg.norm(q))
-    if abs(length - 1) > QUATERNION_TOLERANCE:
-        raise field_error(
-            f"expected a quaternion of length 1, got one of length {length:.7g}; divide its numbers by that"
-        )
-    return q
-
-
-def _direction(value: Any) -> list[float]:
-    d = numbers(3)(value)
-    if np.linalg.norm(d) < 1e-9:
-        raise unexpected_value("a direction, not the zero vector", value)
-    return d
-
-
-class PoseBlock(Block):
-    """A transform a_from_b."""
-
-    quaternion_wxyz: Annotated[list[float], pydantic.PlainValidator(_unit_quaternion)]
-    translation_m: Vector3
-
-    def pose(self) -> Pose:
-        """The transform."""
-        return Pose.from_quaternion(np.array(self.quaternion_wxyz), np.array(self.translation_m))
-
-
 class ScreenBlock(Block):
     """A screen of a rig."""
 
-    world_from_screen: PoseBlock
+    world_from_screen: ScreenPoseBlock
     size_m: Annotated[list[float] | None, pydantic.PlainValidator(positive_numbers(2))] = None
     bow_per_m: Vector3 = [0.0, 0.0, 0.0]  # noqa: RUF012 - frozen
     covariance: CovarianceBlock | None = None
@@ -195,7 +165,7 @@ class ScreenBlock(Block):
     def value(self, name: str) -> Screen:
         """The screen."""
         a, b, c = self.bow_per_m
-        size = None if self.size_m is None else (self.size_m[0], self.size_m[1])
+        size = self.world_from_screen.size_m() if self.size_m is None else (self.size_m[0], self.size_m[1])
         return Screen(name, self.world_from_screen.pose(), size, (a, b, c))
 
 
@@ -209,7 +179,7 @@ class CameraBlock(LensBlock):
     """A camera of a rig."""
 
     screen: Word
-    camera_from_world: PoseBlock
+    camera_from_world: CameraPoseBlock
     noise: _NoiseBlock | None = None
     covariance: CovarianceBlock | None = None
 
@@ -228,11 +198,6 @@ class CameraBlock(LensBlock):
         )
 
 
-class _BeamBlock(Block):
-    direction: Annotated[list[float], pydantic.PlainValidator(_direction)]
-    point_m: Vector3
-
-
 class _SpotBlock(Block):
     beam: Word
     end: Annotated[str, pydantic.PlainValidator(one_of(("+", "-")))]
@@ -242,13 +207,13 @@ class _SpotBlock(Block):
 class TargetBlock(Block):
     """The vehicle's beams and spots."""
 
-    beams: dict[Name, _BeamBlock]
+    beams: dict[Name, BeamBlock]
     spots: dict[Name, _SpotBlock]
     covariance: CovarianceBlock | None = None
 
     def beam_values(self) -> dict[str, Beam]:
         """The beams by name."""
-        return {name: Beam(name, np.array(b.direction), np.array(b.point_m)) for name, b in self.beams.items()}
+        return {name: Beam(name, *b.line()) for name, b in self.beams.items()}
 
     def spot_values(self) -> dict[str, Spot]:
         """The spots by name."""
@@ -373,11 +338,3 @@ def camera_mapping(camera: Camera) -> dict[str, Any]:
             "black_dn": float(n.black_dn),
         }
     return out
-
-
-def pose_mapping(pose: Pose) -> dict[str, Any]:
-    """The plain mapping from which a `PoseBlock` reads the same transform, its rotation matrix to 4e-16."""
-    return {
-        "quaternion_wxyz": plain_floats(quaternion_from_matrix(pose.rotation)),
-        "translation_m": plain_floats(pose.translation),
-    }

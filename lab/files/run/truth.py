@@ -15,7 +15,7 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from lab.files.rig.rig_file import QUATERNION_TOLERANCE
+from lab.files.rig.pose_block import QUATERNION_TOLERANCE
 from lab.files.run.run_file import Run
 from lab.files.text import columns
 from lab.files.text.csv_table import Categorical, Table

@@ -7,6 +7,7 @@ import re
 import stat
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import yaml
@@ -257,6 +258,33 @@ _Writer.add_representer(list, _represent_list)
 _Writer.add_representer(dict, _represent_dict)
 
 
-def write_mapping(content: Mapping[str, Any], path: Path) -> None:
-    """Write plain values as YAML, atomically; floats read back to the last bit. Raises InputError."""
-    atomic_write_text(yaml.dump(dict(content), Dumper=_Writer, sort_keys=False, allow_unicode=True, width=120), path)
+def write_mapping(content: Mapping[str, Any], path: Path, comments: Mapping[str, str] = MappingProxyType({})) -> None:
+    """Write plain values as YAML, atomically; floats read back to the last bit. Raises InputError.
+
+    comments: as in `with_comments`.
+    """
+    text = yaml.dump(dict(content), Dumper=_Writer, sort_keys=False, allow_unicode=True, width=120)
+    atomic_write_text(with_comments(text, comments), path)
+
+
+_KEY = re.compile(r"""^( *)('(?:[^']|'')*'|"(?:[^"\\]|\\.)*"|[^\s'"#{}[\]-][^:]*):(?:\s|$)""")
+
+
+def with_comments(text: str, comments: Mapping[str, str]) -> str:
+    """YAML text with comments, each before the first line of a key, by the key's place.
+
+    A place is as cameras.left.screen, or cameras.*.screen for any name.
+    """
+    waiting = {re.compile(re.escape(place).replace(r"\*", "[^.]*")): words for place, words in comments.items()}
+    keys: list[tuple[int, str]] = []
+    lines = []
+    for line in text.splitlines():
+        match = _KEY.match(line) if waiting else None
+        if match:
+            indent = len(match[1])
+            keys = [*(k for k in keys if k[0] < indent), (indent, str(yaml.safe_load(match[2])))]
+            place = ".".join(key for _, key in keys)
+            here = [p for p in waiting if p.fullmatch(place)]
+            lines += [f"{match[1]}# {waiting.pop(pattern)}" for pattern in here]
+        lines.append(line)
+    return "\n".join([*lines, ""])

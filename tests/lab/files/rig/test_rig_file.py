@@ -245,7 +245,8 @@ BROKEN = [
     (
         f"camera_from_world: {{{QUATERNION}, translation_m: [0, 0.4, 0]}}",
         "camera_from_world: [1, 2]",
-        "cameras.left.camera_from_world: expected a mapping with quaternion_wxyz, translation_m, got [1, 2]",
+        "cameras.left.camera_from_world: expected a mapping with quaternion_wxyz, rotation_matrix, yaw_pitch_roll_deg,"
+        " translation_m, look_at, got [1, 2]",
     ),
     (
         "noise: {gain_e_per_dn: 38.0",
@@ -262,8 +263,12 @@ BROKEN = [
         "A: {direction: [0, 0, 0], point_m: [0, 0, 0]}",
         "target.beams.A.direction: expected a direction, not the zero vector",
     ),
-    (BEAM_A, "A: {direction: [1, 0, 0]}", "target.beams.A.point_m: expected a value, got nothing"),
-    (BEAM_A, "A:", "target.beams.A: expected a mapping with direction, point_m, got nothing"),
+    (BEAM_A, "A: {direction: [1, 0, 0]}", "target.beams.A: expected point_m beside direction, got nothing"),
+    (
+        BEAM_A,
+        "A:",
+        "target.beams.A: expected a mapping with direction, azimuth_elevation_deg, points_m, point_m, got nothing",
+    ),
     (BEAM_A, f"{BEAM_A}\n    {BEAM_A}", "expected YAML, found the key 'A' a second time"),
     (
         '"1": {beam: A, end: "-"',
