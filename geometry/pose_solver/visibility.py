@@ -11,10 +11,10 @@ import numpy as np
 from geometry import rotations
 from geometry.arrays import Array, Bools, cross, normalised
 from geometry.forward_model import SpotModel
-from geometry.planes import common_perpendicular
+from geometry.planes import common_perpendicular, intersect_surface
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
-from geometry.pose_solver.gauss_newton import SolveLimits, covariance_of
+from geometry.pose_solver.gauss_newton import SolveLimits, covariance_of, fit_pose
 from geometry.rig import Rig
 
 # Visibility over a range of poses: which spots are in which pictures, and how well they determine the pose.
@@ -22,7 +22,8 @@ from geometry.rig import Rig
 POSES = 2000  # number of poses drawn: a share of 50 % then has a standard deviation of 1 %
 SEED = 0
 NOISE_PX = 0.1  # error of a spot, 1 sigma, to which the pose sigmas refer: that of a clean laser spot
-DEFAULT_RANGE = PosePrior(Pose.identity(), within_m=0.5, within_rad=float(np.deg2rad(30.0)))
+MIN_SPOTS = 3  # that a pose needs
+ASSUMED_M, ASSUMED_RAD = 0.5, float(np.deg2rad(30.0))  # about the middle of the view, where no range is stated
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +40,90 @@ class Visibility:
     spots_in_view: Array  # (n,) number of views in their pictures
     sigma_m: Array  # (n,) standard deviation of the worst direction of position, m, for NOISE_PX; inf: not observable
     sigma_rad: Array  # (n,) standard deviation of the worst axis of attitude, rad
+
+
+def assumed_range(rig: Rig) -> PosePrior:
+    """The range of poses of a rig for which none is stated: about the world's origin, or the middle of its view.
+
+    The origin, unless fewer than MIN_SPOTS are in view there: what a rig with a mistake sees elsewhere means nothing.
+    """
+    model = SpotModel.of(rig)
+    seen = model.spot_of[model.in_picture(model.project(Pose.identity())[0])]
+    centre = Pose.identity() if len(np.unique(seen)) >= MIN_SPOTS else middle_of_view(rig)
+    return PosePrior(centre, ASSUMED_M, ASSUMED_RAD)
+
+
+# Where a rig sees the vehicle: the pose about which it may move most.
+
+_DISTANCES = (0.25, 0.5, 1.0, 2.0)  # of the vehicle from a screen, in distances of its camera
+_ROLLS = 12  # about the mean direction to the screens, which may be all that they determine
+# Motions after which spots are to be in view: half widths of the shifts, in distances of the cameras, and of the turns.
+_MOVED, _TURNED, _MOTIONS = 0.15, float(np.deg2rad(20.0)), 60
+# Views in the pictures that a rotation of 1 rad is worth: the world's axes are usually chosen so that it is small.
+_UPRIGHT = 0.1
+
+
+def middle_of_view(rig: Rig) -> Pose:
+    """The pose (world_from_body) from which a vehicle may move most with its spots in their pictures; ours.
+
+    The identity where that brings all spots into their pictures: then the world's origin is where the vehicle is.
+    Candidates: places between the screens and before each, on either side, with the rotation that aims the beams at
+    what the cameras see in the middle (Kabsch), rolled about the mean direction, and what a fit makes of them.
+    """
+    model = SpotModel.of(rig)
+    if np.all(model.in_picture(model.project(Pose.identity())[0])):
+        return Pose.identity()
+    aims = _aims(rig, model)
+    eyes = np.array([rig.cameras[c].camera_from_world.inverse().translation for c, _ in model.views])
+    distance = np.linalg.norm(eyes - aims, axis=1)
+    middle = (model.image_size_px - 1) / 2
+    wide = model.image_size_px[:, :, None].astype(float) ** 2 * np.eye(2)
+    candidates = []
+    for place in _places(rig, model, aims, distance):
+        aimed = _aimed(model, aims, place)
+        start = aimed[int(np.argmax(np.sum(model.in_picture(model.project(aimed)[0]), axis=-1)))]
+        candidates.append(start)
+        rows = np.flatnonzero(np.isfinite(model.project(start)[0][:, 0]))
+        fit = fit_pose(model, rows, middle[rows], wide[rows], start)
+        candidates += [] if fit is None else [fit.world_from_body]
+    shifts = poses_within(PosePrior(Pose.identity(), _MOVED * float(np.mean(distance)), _TURNED), _MOTIONS)
+
+    def value(pose: Pose) -> float:
+        moved = Pose(pose.rotation @ shifts.rotation, pose.translation + shifts.translation)
+        seen = np.sum(model.in_picture(model.project(moved)[0]), axis=-1)
+        here = np.sum(model.in_picture(model.project(pose)[0]))
+        return float(here + np.mean(seen) - _UPRIGHT * rotations.angle(pose.rotation))
+
+    return max(candidates, key=value)
+
+
+def _aims(rig: Rig, model: SpotModel) -> Array:
+    """Points (n, 3), m, in world, that the cameras of the views see in the middle of their pictures, on the screens."""
+    out = []
+    for camera, _ in model.views:
+        seen_by = rig.cameras[camera]
+        screen = rig.screens[seen_by.screen]
+        origin, ray = seen_by.rays((np.array(seen_by.image_size_px) - 1) / 2)
+        hit = intersect_surface(origin, ray, screen.world_from_screen, screen.bow)
+        out.append(hit if np.all(np.isfinite(hit)) else screen.world_from_screen.translation)
+    return np.array(out)
+
+
+def _places(rig: Rig, model: SpotModel, aims: Array, distance: Array) -> Array:
+    """Places (k, 3), m, in world, between the aims (n, 3) and before each; distance (n,), m, of its camera."""
+    places = [aims.mean(axis=0), np.unique(aims, axis=0).mean(axis=0)]
+    for (camera, _), aim, away in zip(model.views, aims, distance, strict=True):
+        normal = rig.screens[rig.cameras[camera].screen].world_from_screen.rotation[:, 2]
+        places += [aim + side * share * away * normal for side in (-1, 1) for share in _DISTANCES]
+    return np.unique(np.round(places, 6), axis=0)
+
+
+def _aimed(model: SpotModel, aims: Array, place: Array) -> Pose:
+    """Poses (_ROLLS,) of the vehicle at a place (3,) whose beams roughly point to the aims (n, 3)."""
+    u, _, vt = np.linalg.svd(normalised(aims - place + 1e-9).T @ model.ray)
+    aimed = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    rolls = 2 * np.pi * np.arange(_ROLLS) / _ROLLS
+    return Pose(rotations.exp(rolls[:, None] * u[:, 0]) @ aimed, np.tile(place, (_ROLLS, 1)))
 
 
 def poses_within(prior: PosePrior, count: int, seed: int = SEED) -> Pose:

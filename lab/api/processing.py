@@ -57,11 +57,18 @@ def simulate_run(
     noise_px: float = 0.1,
     scale: float = 1.0,
     video: bool = False,
+    rig: Path | str | None = None,
+    trajectory: Path | str | None = None,
+    rate_hz: float | None = None,
+    exposure_s: float | None = None,
+    light: str | None = None,
 ) -> Path:
     """Write a simulated recording with its truth into a new run folder, as `beampose simulate` does; returns it.
 
     scenario: a name of `lab.scenarios()`. frames: default: those of the scenario. points: no pictures, but a
-    detections.csv with a noise of `noise_px`. scale: 0.5: pictures half as wide. video: a video per camera.
+    detections.csv with a noise of `noise_px`. scale: 0.5: pictures half as wide. video: a video per camera. rig: a
+    rig.yaml of one's own; the motion is moved into its view. trajectory: a table of poses (columns of truth/pose.csv)
+    instead of the scenario's motion. rate_hz, exposure_s, light: instead of the scenario's.
 
     >>> made = lab.simulate_run("sharp-turns", new_folder, frames=3, points=True)
     >>> sorted(path.name for path in made.iterdir())
@@ -79,6 +86,11 @@ def simulate_run(
         noise_px=noise_px,
         picture_scale=scale,
         video=video,
+        rig=None if rig is None else Path(rig),
+        trajectory=None if trajectory is None else Path(trajectory),
+        frame_rate_hz=rate_hz,
+        exposure_s=exposure_s,
+        light=light,
     )
 
 

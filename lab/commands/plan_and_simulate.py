@@ -20,6 +20,21 @@ from lab.commands.common import (
 )
 
 
+def _six_numbers(ctx: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
+    """x, y, z (m), yaw, pitch, roll (deg), separated by commas."""
+    if text is None:
+        return None
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 6 or not all(abs(number) < 1e6 for number in numbers):
+        raise click.BadParameter(
+            f"expected six numbers X,Y,Z,YAW,PITCH,ROLL (m and deg), got {text!r}", ctx=ctx, param=parameter
+        )
+    return numbers
+
+
 @click.command()
 @click.argument("scenario", shell_complete=complete_scenarios)
 @click.option("--out", type=FOLDER, help="The run folder to write; it must not exist yet.")
@@ -39,10 +54,16 @@ from lab.commands.common import (
 @click.option("--clutter", type=NumberRange(0, 1), help="Probability of a false spot near each spot.")
 @click.option("--light", help="A preset of light and sensor instead of the scenario's.")
 @click.option("--scale", default=1.0, show_default=True, type=NumberRange(0.1, 1), help="0.5: pictures half as wide.")
-@click.option("--rig", type=ANY_PATH, help="A rig.yaml with the true rig, instead of the scenario's.")
+@click.option(
+    "--rig", type=ANY_PATH, help="A rig.yaml with the true rig; the motion goes to where it sees the vehicle."
+)
 @click.option(
     "--known-rig", type=ANY_PATH, help="The rig.yaml for the run folder, such as a calibration of the true rig."
 )
+@click.option("--start", callback=_six_numbers, help="Middle of the motion: X,Y,Z,YAW,PITCH,ROLL, m and deg.")
+@click.option("--trajectory", type=ANY_PATH, help="A table of poses, as truth/pose.csv, instead of the motion.")
+@click.option("--rate", type=NumberRange(0.1, 1e6), help="Frames per second, instead of those of the scenario.")
+@click.option("--exposure", type=NumberRange(0, 10, min_open=True), help="Exposure time, s, instead of the scenario's.")
 def simulate(
     scenario: str,
     out: Path | None,
@@ -56,6 +77,10 @@ def simulate(
     scale: float,
     rig: Path | None,
     known_rig: Path | None,
+    start: tuple[float, ...] | None,
+    trajectory: Path | None,
+    rate: float | None,
+    exposure: float | None,
 ) -> None:
     """Write a simulated recording with its truth; SCENARIO `list` lists all scenarios.
 
@@ -63,6 +88,9 @@ def simulate(
     Example:
         beampose simulate sharp-turns --frames 50 --out runs/sharp-turns
     """
+    import numpy as np
+
+    from geometry.pose import Pose
     from lab.simulate.scenarios import LIGHTS, SCENARIOS
     from lab.simulate.write import simulate as write_run
     from lab.targets.stereo.simulated_recording import SCENARIO as STEREO
@@ -79,13 +107,17 @@ def simulate(
     if scenario == STEREO:
         from lab.targets.stereo.simulated_recording import write_stereo_recording
 
-        unused = {"--video": video, "--clutter": clutter, "--light": light, "--rig": rig, "--known-rig": known_rig}
+        unused = {
+            "--video": video, "--clutter": clutter, "--light": light, "--rig": rig, "--known-rig": known_rig,
+            "--start": start, "--trajectory": trajectory, "--rate": rate, "--exposure": exposure,
+        }  # fmt: skip
         for option, value in unused.items():
             if value not in (None, False):
                 raise click.UsageError(f"{option}: scenario {STEREO} does not have this option.")
         folder = write_stereo_recording(out, seed=seed, frames=frames, points=points, noise_px=noise_px, scale=scale)
         show_line(f"run: {folder}")
         return
+    notes: list[str] = []
     with progress_bar(scenario) as progress:
         folder = write_run(
             scenario,
@@ -100,8 +132,15 @@ def simulate(
             picture_scale=scale,
             rig=rig,
             known_rig=known_rig,
+            start=None if start is None else Pose.from_ypr(np.deg2rad(start[3:]), np.array(start[:3])),
+            trajectory=trajectory,
+            frame_rate_hz=rate,
+            exposure_s=exposure,
             progress=progress,
+            note=notes.append,
         )
+    for line in notes:
+        show_line(line)
     show_line(f"run: {folder}")
 
 

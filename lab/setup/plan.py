@@ -7,6 +7,7 @@ from pathlib import Path
 
 from calibration.budget.expected_errors import expected_errors
 from calibration.budget.pose_grid import plan_grid
+from geometry.pose_solver.visibility import assumed_range
 from lab.calibrate.step import Outcome, Solved, Step, run_step
 from lab.errors import QUALITY_GATE_FAILED
 from lab.files.rig.rig_file import TARGET, joint_covariance, load_rig_file
@@ -61,4 +62,4 @@ def plan_of(rig_path: Path, options: PlanOptions) -> Plan:
     target = file.covariances.get(TARGET)
     is_joint = target is not None and any(n.startswith(("cameras.", "screens.")) for n in target.parameters)
     errors, sources = expected_errors(file.rig, options.expected, stated, is_joint)
-    return plan_grid(file.rig, errors, sources, options)
+    return plan_grid(file.rig, errors, sources, options.about(assumed_range(file.rig).centre))

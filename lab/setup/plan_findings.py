@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from itertools import product
+from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -21,6 +22,7 @@ from calibration.budget.pose_budget import (
 )
 from calibration.budget.pose_grid import NOISE, GridPlan
 from geometry.arrays import Array, Bools
+from geometry.pose import Pose
 from lab.errors import InputError
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.error_text import suggest_name
@@ -53,16 +55,29 @@ class Range:
         return (self.first + self.last) / 2
 
 
+USUAL: Mapping[str, Range] = MappingProxyType(
+    {
+        "x_m": Range(-0.3, 0.3, 5),
+        "y_m": Range(-0.3, 0.3, 5),
+        "z_m": Range(-0.3, 0.3, 3),
+        "yaw_deg": Range(-20.0, 20.0, 7),
+        "pitch_deg": Range(-20.0, 20.0, 7),
+        "roll_deg": Range(-20.0, 20.0, 3),
+    }
+)
+
+
 @dataclass(frozen=True, slots=True)
 class PlanOptions:
     """Options of a plan."""
 
-    x_m: Range = Range(-0.3, 0.3, 5)  # position of the body's origin in world
-    y_m: Range = Range(-0.3, 0.3, 5)
-    z_m: Range = Range(-0.3, 0.3, 3)
-    yaw_deg: Range = Range(-20.0, 20.0, 7)
-    pitch_deg: Range = Range(-20.0, 20.0, 7)
-    roll_deg: Range = Range(-20.0, 20.0, 3)
+    # Position of the body's origin in world, and attitude. None: USUAL about where the rig sees the vehicle.
+    x_m: Range | None = None
+    y_m: Range | None = None
+    z_m: Range | None = None
+    yaw_deg: Range | None = None
+    pitch_deg: Range | None = None
+    roll_deg: Range | None = None
     sigma_px: float = 0.1  # of a spot's coordinates: 0.05 px for clean spots, 0.1 px with speckle
     edge_px: float = 4.0  # minimum distance to the picture's edge: nearer, a spot of the usual 1 px sigma is truncated
     goal_deg: float | None = None  # required attitude sigma along the worst direction ...
@@ -85,7 +100,17 @@ class PlanOptions:
     @property
     def ranges(self) -> dict[str, Range]:
         """The ranges by name, in the order x, y, z, yaw, pitch, roll."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), Range)}
+        return {name: getattr(self, name) or usual for name, usual in USUAL.items()}
+
+    def about(self, middle: Pose) -> PlanOptions:
+        """The options with the ranges that are not stated moved to a pose."""
+        place = (*middle.translation.tolist(), *np.rad2deg(middle.ypr).tolist())
+        moved: dict[str, Any] = {
+            name: Range(usual.first + by, usual.last + by, usual.count)
+            for (name, usual), by in zip(USUAL.items(), place, strict=True)
+            if getattr(self, name) is None
+        }
+        return replace(self, **moved)
 
     @property
     def count(self) -> int:
@@ -137,7 +162,7 @@ def options_of(
     for name in ranges:
         if name not in default.ranges:
             raise InputError(f"--range: expected a coordinate, got {name!r}{suggest_name(name, default.ranges)}")
-    chosen: dict[str, Any] = {**default.ranges, **{name: Range(*r) for name, r in ranges.items()}}
+    chosen: dict[str, Any] = {name: Range(*r) for name, r in ranges.items()}
     return PlanOptions(
         **chosen,
         sigma_px=default.sigma_px if sigma_px is None else sigma_px,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
@@ -54,12 +55,29 @@ def _unit_wave(shape: str, cycles: Array) -> Array:
     return 2 * (whole + 0.5 * (1 - np.cos(np.pi * moved))) / _STEPS - 1
 
 
+_Sixfold: TypeAlias = tuple[float, float, float, float, float, float]
+
+
+class AnyMotion(Protocol):
+    """A motion of the vehicle as a function of time: waves (Motion), or through stated poses (own_motion.py)."""
+
+    def drawn(self, rng: np.random.Generator, frame_rate_hz: float) -> AnyMotion:
+        """The motion with what is random in it drawn."""
+
+    def pose(self, t_s: Array) -> Pose:
+        """world_from_body, stacked (...), at times (...), s."""
+
+    def bends_s(self, end_s: float) -> Array:
+        """The sorted times (n,) in (0, end_s] at which the velocity jumps."""
+
+
 @dataclass(frozen=True, slots=True)
 class Motion:
     """The sum of waves about a mean pose."""
 
-    middle: tuple[float, float, float, float, float, float]  # x, y, z (m), yaw, pitch, roll (deg)
+    middle: _Sixfold  # x, y, z (m), yaw, pitch, roll (deg)
     waves: tuple[Wave, ...]
+    about_pose: _Sixfold | None = None  # the same: the frame in which the motion is stated; None: the world
 
     def drawn(self, rng: np.random.Generator, frame_rate_hz: float) -> Motion:
         """This motion with the missing phases drawn.
@@ -74,11 +92,17 @@ class Motion:
             if w.shape == "triangle":
                 phase = np.round(phase * frames_per_cycle) / frames_per_cycle
             waves.append(w if w.phase is not None else replace(w, phase=float(phase)))
-        return Motion(self.middle, tuple(waves))
+        return replace(self, waves=tuple(waves))
 
     def faster(self, factor: float) -> Motion:
         """The same path in less time."""
-        return Motion(self.middle, tuple(replace(w, frequency_hz=w.frequency_hz * factor) for w in self.waves))
+        return replace(self, waves=tuple(replace(w, frequency_hz=w.frequency_hz * factor) for w in self.waves))
+
+    def about(self, pose: _Sixfold, size: float) -> Motion:
+        """The same motion in the frame of another pose, with all its distances and angles multiplied by `size`."""
+        x, y, z, yaw, pitch, roll = (size * v for v in self.middle)
+        waves = tuple(replace(w, amplitude=size * w.amplitude) for w in self.waves)
+        return Motion((x, y, z, yaw, pitch, roll), waves, pose)
 
     def at(self, t_s: Array) -> Array:
         """x, y, z (m), yaw, pitch, roll (rad), (..., 6), at times (...), s."""
@@ -92,7 +116,11 @@ class Motion:
     def pose(self, t_s: Array) -> Pose:
         """world_from_body, stacked (...), at times (...), s."""
         q = self.at(t_s)
-        return Pose.from_ypr(q[..., 3:], q[..., :3])
+        pose = Pose.from_ypr(q[..., 3:], q[..., :3])
+        if self.about_pose is None:
+            return pose
+        place = np.array(self.about_pose)
+        return Pose.from_ypr(np.deg2rad(place[3:]), place[:3]) @ pose
 
     def bends_s(self, end_s: float) -> Array:
         """The sorted times (n,) in (0, end_s] of the corners of triangles, where the velocity jumps."""
@@ -194,7 +222,7 @@ class Scenario:
     name: str
     summary: str  # one sentence; also the notes of its run.yaml
     rig: str = "fan"  # a name of lab.simulate.rigs.RIGS
-    motion: Motion
+    motion: AnyMotion
     frames: int = 600
     frame_rate_hz: float = 100.0  # the paper's 10 ms
     prior: PriorRegion = PriorRegion()
@@ -202,6 +230,7 @@ class Scenario:
     all_in_view_at_start: bool = True
     always_in_view: tuple[str, ...] = ()  # spots that never leave the picture of any camera, for any length of run
     leaves_and_returns: tuple[str, ...] = ()  # spots that do so at least once within `frames`
+    spots_in_view: int = 0  # spots, any of them, that are in some picture at any time
     clutter: Clutter = Clutter()
     occlusion: Occlusion = Occlusion()
     faults: tuple[RecordingFault, ...] = ()

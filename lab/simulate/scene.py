@@ -18,7 +18,7 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from lab.errors import InputError
 from lab.simulate.rigs import RIGS, scaled, with_noise
-from lab.simulate.scenarios import SCENARIOS, Motion, Scenario
+from lab.simulate.scenarios import SCENARIOS, AnyMotion, Scenario
 
 # Every random number comes from a generator seeded by (seed, purpose, frame, ...): frame 7 is the same in a recording
 # of ten frames and of a thousand, and the clutter does not depend on the noise.
@@ -28,6 +28,7 @@ CHECKED_S = 20.0  # period of the motion of every scenario
 _CHECKED_EVERY_S = 0.05
 _MARGIN_PX = 12.0  # distance from the border of a spot in view, so that the whole spot is visible
 _MAX_DRAWS = 3000
+_TRIED_DRAWS = 40  # one in 40 makes 3000 draws fail with a probability of 1e-33
 _ROW_STEPS = 10  # towards the row in which a moving spot is exposed
 
 VISIBLE, OCCLUDED, OUTSIDE = 1, 2, 0  # in_view of truth/spots.csv
@@ -51,7 +52,7 @@ class Scene:
     seed: int
     rig: Rig
     model: SpotModel
-    motion: Motion  # with drawn phases
+    motion: AnyMotion  # with drawn phases
     frame: Ints  # (T,) 0, 1, ...
     t_s: Array  # (T,) mid-exposure
     poses: Pose  # (T,) world_from_body
@@ -115,7 +116,7 @@ def compose(
     )  # fmt: skip
 
 
-def _exposed(scenario: Scenario, model: SpotModel, motion: Motion, t_s: Array, uv_px: Array) -> tuple[Array, Array]:
+def _exposed(scenario: Scenario, model: SpotModel, motion: AnyMotion, t_s: Array, uv_px: Array) -> tuple[Array, Array]:
     """Pixels (T, n, 2) of the spots when their pictures, or the rows of these, are exposed; and those times (T, n), s.
 
     uv_px (T, n, 2): at the times t_s (T,) of the frames.
@@ -133,7 +134,20 @@ def _exposed(scenario: Scenario, model: SpotModel, motion: Motion, t_s: Array, u
     return uv_px, exposed_s
 
 
-def draw_motion(scenario: Scenario, model: SpotModel, seed: int) -> Motion:
+def has_motion(scenario: Scenario, model: SpotModel) -> bool:
+    """Whether some draws of phases meet the conditions of the scenario, so that draws of any seed find one."""
+    rng = np.random.default_rng(MOTION)
+    motions = [scenario.motion.drawn(rng, scenario.frame_rate_hz) for _ in range(_TRIED_DRAWS)]
+    return any(_valid_start(scenario, model, m) and _valid_views(scenario, model, m) for m in motions)
+
+
+def spots_in_view(model: SpotModel, pose: Pose) -> list[str]:
+    """The spots that are in some picture at a pose."""
+    seen = model.in_picture(model.project(pose)[0], -_MARGIN_PX)
+    return [name for i, name in enumerate(model.spot_names) if seen[model.spot_of == i].any()]
+
+
+def draw_motion(scenario: Scenario, model: SpotModel, seed: int) -> AnyMotion:
     """The first draw of phases that meets all conditions of the scenario.
 
     Raises:
@@ -147,7 +161,7 @@ def draw_motion(scenario: Scenario, model: SpotModel, seed: int) -> Motion:
     raise InputError(f"scenario {scenario.name!r}: none of {_MAX_DRAWS} motions keeps the spots in view as it requires")
 
 
-def _valid_start(scenario: Scenario, model: SpotModel, motion: Motion) -> bool:
+def _valid_start(scenario: Scenario, model: SpotModel, motion: AnyMotion) -> bool:
     """The first pose lies within the prior, with all spots in the picture if the scenario requires it."""
     prior, start = scenario.prior, motion.pose(np.zeros(()))
     guess = Pose.from_ypr(np.deg2rad(prior.yaw_pitch_roll_deg), np.array(prior.position_m))
@@ -159,7 +173,7 @@ def _valid_start(scenario: Scenario, model: SpotModel, motion: Motion) -> bool:
     return not scenario.all_in_view_at_start or bool(model.in_picture(model.project(start)[0], -_MARGIN_PX).all())
 
 
-def _valid_views(scenario: Scenario, model: SpotModel, motion: Motion) -> bool:
+def _valid_views(scenario: Scenario, model: SpotModel, motion: AnyMotion) -> bool:
     """The spots stay in view, or leave and return, as the scenario requires."""
     spot = np.array([name for _, name in model.views])
     own = np.arange(scenario.frames) / scenario.frame_rate_hz
@@ -168,6 +182,12 @@ def _valid_views(scenario: Scenario, model: SpotModel, motion: Motion) -> bool:
         seen = model.subset(views).in_picture(model.subset(views).project(motion.pose(own[::4]))[0])
         # All spots start in view: one that is out of view and later in view has left and returned.
         if not np.all((~seen).any(axis=0) & (seen & (np.cumsum(~seen, axis=0) > 0)).any(axis=0)):
+            return False
+    if scenario.spots_in_view:
+        t = np.arange(0.0, CHECKED_S, _CHECKED_EVERY_S)
+        seen = model.in_picture(model.project(motion.pose(t))[0], -_MARGIN_PX)
+        spots = np.stack([seen[:, model.spot_of == i].any(axis=1) for i in range(len(model.spot_names))])
+        if spots.sum(axis=0).min() < scenario.spots_in_view:
             return False
     if scenario.always_in_view:
         stay = model.subset(np.isin(spot, scenario.always_in_view))
@@ -235,14 +255,28 @@ def _usable_pictures(scenario: Scenario, model: SpotModel, count: int) -> Bools:
 
 
 def with_overrides(
-    scenario: str | Scenario, *, clutter: float | None = None, miss_probability: float | None = None
+    scenario: str | Scenario,
+    *,
+    clutter: float | None = None,
+    miss_probability: float | None = None,
+    frame_rate_hz: float | None = None,
+    exposure_s: float | None = None,
 ) -> Scenario:
-    """The scenario with another clutter probability per spot, or another probability of a missed spot.
+    """The scenario with another clutter probability per spot, probability of a missed spot, rate or exposure.
 
     Raises:
-        InputError: an unknown scenario, or a probability outside 0 to 1.
+        InputError: an unknown scenario, a probability outside 0 to 1, or an exposure longer than a frame.
     """
     scenario = scenario_named(scenario)
+    if frame_rate_hz is not None:
+        scenario = replace(scenario, frame_rate_hz=frame_rate_hz)
+    if exposure_s is not None:
+        if not 0.0 < exposure_s <= 1 / scenario.frame_rate_hz:
+            raise InputError(
+                f"exposure: expected a time above 0, up to {1 / scenario.frame_rate_hz:g} s (one frame), got"
+                f" {exposure_s:g} s"
+            )
+        scenario = replace(scenario, light=replace(scenario.light, exposure_s=exposure_s))
     if clutter is not None:
         if not 0.0 <= clutter <= 1.0:
             raise InputError(f"clutter: expected a probability per spot and frame, 0 to 1, got {clutter:g}")

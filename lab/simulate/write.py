@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from geometry.forward_model import SpotModel
+from geometry.pose import Pose
 from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
@@ -20,8 +21,10 @@ from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import write_table
 from lab.progress import Progress
+from lab.simulate.own_motion import along, placed
 from lab.simulate.picture import LaserPowers, Picture, Sensor, laser_powers, make_sensor, render
 from lab.simulate.points import simulate_points
+from lab.simulate.rigs import RIGS
 from lab.simulate.scenarios import LIGHTS, Scenario
 from lab.simulate.scene import Scene, compose, with_overrides
 
@@ -55,6 +58,11 @@ def simulate(
     progress: Progress | None = None,
     rig: Path | None = None,
     known_rig: Path | None = None,
+    start: Pose | None = None,
+    trajectory: Path | None = None,
+    frame_rate_hz: float | None = None,
+    exposure_s: float | None = None,
+    note: Callable[[str], None] | None = None,
 ) -> Path:
     """Write one recording of a scenario into a new folder; returns the folder, complete.
 
@@ -66,8 +74,12 @@ def simulate(
     light: a name of LIGHTS instead of the light of the scenario. clutter, miss_probability: as in simulate_points.
     picture_scale: 0.5 gives pictures of half the width and height. noisy: False: no shot and read noise, only rounding.
     threads: number of threads that render and write pictures. progress: called after each picture. rig: a rig.yaml
-    instead of the rig of the scenario. known_rig: the rig.yaml written to the run folder, such as a calibration of
-    that rig; default: the true one.
+    instead of the rig of the scenario: the motion is moved to where that rig sees the vehicle, and as large as keeps
+    half of its spots in view. known_rig: the rig.yaml written to the run folder, such as a calibration of that rig;
+    default: the true one. start: the middle of the motion, instead of that of the rig's view. trajectory: a table of
+    poses (columns of truth/pose.csv) instead of the scenario's motion, with its rate and length. frame_rate_hz,
+    exposure_s: instead of those of the scenario or the trajectory. note: called with a line for each spot that leaves
+    the view of a trajectory.
 
     Raises:
         InputError: an argument is not valid, or the folder exists.
@@ -79,7 +91,18 @@ def simulate(
     true_file = None if rig is None else load_rig_file(rig)
     true_rig = None if true_file is None else true_file.rig
     known = None if known_rig is None else load_rig_file(known_rig)
+    if start is not None and trajectory is not None:
+        raise InputError("a trajectory states where the vehicle is; omit the start or the trajectory")
     scenario = _with_light(with_overrides(scenario, clutter=clutter, miss_probability=miss_probability), light)
+    seen_by = RIGS[scenario.rig]() if true_rig is None else true_rig
+    if trajectory is not None:
+        scenario, notes = along(scenario, Path(trajectory), seen_by, frame_rate_hz)
+        if note is not None:
+            for line in notes:
+                note(line)
+    elif true_rig is not None or start is not None:
+        scenario = placed(scenario, seen_by, start)
+    scenario = with_overrides(scenario, frame_rate_hz=frame_rate_hz, exposure_s=exposure_s)
     if video:
         _check_video(scenario, detections_only)
     with atomic_folder(Path(out_folder), lambda _: False) as folder:

@@ -16,7 +16,7 @@ from geometry.arrays import Array
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
-from geometry.pose_solver.visibility import DEFAULT_RANGE, poses_within
+from geometry.pose_solver.visibility import assumed_range, poses_within
 from geometry.rig import Rig
 from tracking.detections import Detections
 from tracking.labelling.points import NO_POINT
@@ -50,7 +50,7 @@ class Invisible:
 def invisible_mistakes(rig: Rig, prior: PosePrior | None, parameters: LabelParameters) -> Iterator[Invisible]:
     """The mistakes that a rig hides, over the poses of a prior (without one: of a usual range)."""
     model = SpotModel.of(rig)
-    prior = DEFAULT_RANGE if prior is None else prior
+    prior = assumed_range(rig) if prior is None else prior
     poses = poses_within(prior, POSES)
     views = np.count_nonzero(model.in_picture(model.project(poses)[0]).any(axis=0))
     for mistake in possible_mistakes(rig):

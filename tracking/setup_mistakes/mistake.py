@@ -10,8 +10,9 @@ import numpy as np
 
 from geometry.arrays import Array
 from geometry.forward_model import SpotModel
+from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
-from geometry.pose_solver.visibility import DEFAULT_RANGE, poses_within
+from geometry.pose_solver.visibility import assumed_range, poses_within
 from geometry.rig import Rig
 from tracking.detections import Detections
 
@@ -57,7 +58,9 @@ class Mistake:
         """Whether the mistake changes more than names: the pictures, the prior, or the points of some pose."""
         if self.pictures or self.prior is not None or self.by_itself:
             return True
-        return not all(np.array_equal(a, b) for a, b in zip(_points_of(self.rig), _points_of(given), strict=True))
+        poses = poses_within(assumed_range(given), FEW_POSES)
+        frames = zip(_points_of(self.rig, poses), _points_of(given, poses), strict=True)
+        return not all(np.array_equal(a, b) for a, b in frames)
 
     def points(self, block: Block) -> dict[str, Detections]:
         """The points of the frame in the middle of a block, by camera, as they are without the mistake."""
@@ -74,10 +77,10 @@ class Mistake:
         return out
 
 
-def _points_of(rig: Rig) -> list[Array]:
-    """The pixels of some poses by camera and pose, sorted and rounded: which spots they are plays no part."""
+def _points_of(rig: Rig, poses: Pose) -> list[Array]:
+    """The pixels at poses (k,) by camera and pose, sorted and rounded: which spots they are plays no part."""
     model = SpotModel.of(rig)
-    pixels = np.round(model.project(poses_within(DEFAULT_RANGE, FEW_POSES))[0], 6)
+    pixels = np.round(model.project(poses)[0], 6)
     pixels = np.where(model.in_picture(pixels)[..., None], pixels, np.inf)
     keys = np.stack([np.broadcast_to(model.camera_of, pixels.shape[:2]), pixels[..., 0], pixels[..., 1]], axis=-1)
     return [frame[np.lexsort(frame.T)] for frame in keys]

@@ -21,7 +21,7 @@ def check_visibility(findings: Findings, rig: Rig, prior: PosePrior | None, limi
 
     A spot, a camera or a pose that is never visible is a problem with a prior, and a remark without one.
     """
-    span = visibility.DEFAULT_RANGE if prior is None else prior
+    span = visibility.assumed_range(rig) if prior is None else prior
     seen = visibility.visibility_of(rig, span, limits)
     severe = findings.remarks if prior is None else findings.problems
     centre = ", ".join(f"{v + 0.0:.4g}" for v in span.centre.translation)
