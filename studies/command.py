@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lab.commands.common import FOLDER, show_line
+from lab.commands.common import FOLDER, conclude
 
 if TYPE_CHECKING:
     from studies.comparison import Comparison
@@ -66,8 +66,4 @@ def study(name: str, out: Path, seed: int) -> None:
     """
     from studies.comparison import write_comparison
 
-    outcome = write_comparison(STUDIES[name](seed), out)
-    for line in outcome.lines:
-        show_line(line)
-    show_line(f"table: {outcome.table}")
-    show_line(f"report: {outcome.report}")
+    conclude(write_comparison(STUDIES[name](seed), out))

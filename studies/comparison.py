@@ -7,8 +7,9 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from lab.files.text.atomic_write import atomic_folder, atomic_write_text
+from lab.files.text.atomic_write import atomic_folder, atomic_write_text, earlier_results
 from lab.files.text.csv_text import write_table
+from lab.findings.outcome import Done
 from lab.report.html import environment
 
 
@@ -59,34 +60,25 @@ class Comparison:
         return next(row.values[column] for row in self.rows if row.quantity == quantity)
 
 
-@dataclass(frozen=True, slots=True)
-class StudyOutcome:
-    """The files written, and the lines printed."""
-
-    lines: tuple[str, ...]
-    table: Path
-    report: Path
-
-
 def columns(comparison: Comparison) -> tuple[str, ...]:
     """The header of figures.csv."""
     methods = (method.replace(" ", "_").replace("-", "_") for method in comparison.methods)
     return ("quantity", "unit", "paper", *methods, "note")
 
 
-def write_comparison(comparison: Comparison, out: Path) -> StudyOutcome:
+def write_comparison(comparison: Comparison, out: Path) -> Done[Path]:
     """Write figures.csv and report.html into the folder `out`.
 
     Raises:
         InputError: `out` contains other files.
     """
-    with atomic_folder(out, may_replace=lambda folder: (folder / "figures.csv").is_file()) as work:
+    with atomic_folder(out, earlier_results("figures.csv")) as work:
         cells = [[row.quantity, row.unit, row.paper, *row.values, row.note] for row in comparison.rows]
         rows = [["" if v is None else f"{v:.6g}" if isinstance(v, float) else v for v in row] for row in cells]
         write_table(work / "figures.csv", columns(comparison), rows)
         atomic_write_text(_page(comparison), work / "report.html")
     lines = tuple(_line(comparison, row) for row in comparison.rows)
-    return StudyOutcome(lines, Path(out) / "figures.csv", Path(out) / "report.html")
+    return Done(out, (*lines, f"table: {out / 'figures.csv'}", f"report: {out / 'report.html'}"))
 
 
 def _line(comparison: Comparison, row: ComparisonRow) -> str:

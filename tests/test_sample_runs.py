@@ -78,7 +78,7 @@ def test_the_calibrated_rig_is_reproduced_and_its_covariance_is_correct(tmp_path
     ) in fresh.rig.cameras.items():  # on another processor the result may differ by a thousandth of a sigma
         i = known.names.index(f"cameras.{name}.fx")
         assert abs(camera.matrix[0, 0] - kept.rig.cameras[name].matrix[0, 0]) < 0.01 * sigma[i]
-    errors = process_run(FOLDER / "calibrated", tmp_path / "run").errors["pose"]["measured"]
+    errors = process_run(FOLDER / "calibrated", tmp_path / "run").summary["errors"]["pose"]["measured"]
     # All frames share the calibration's errors, so their mean NEES scatters like that of a few frames: 2 to 12 in 98 %.
     assert 2 < errors["nees_mean"] < 12
 
@@ -106,7 +106,7 @@ def test_the_papers_run_passes_with_sigmas_that_agree_with_the_truth(tmp_path):
     outcome = process_run(FOLDER / "huo2015", tmp_path / "run")
     assert outcome.verdict.status == "pass"
     for name in ("pose", "pose_causal"):
-        assert 0.7 < outcome.errors[name]["measured"]["nees_mean"] / 6 < 1.35
+        assert 0.7 < outcome.summary["errors"][name]["measured"]["nees_mean"] / 6 < 1.35
 
 
 def test_the_papers_run_agrees_with_its_readme_line():

@@ -28,9 +28,11 @@ from bench.random_scenes.__main__ import seed_range
 from bench.random_scenes.scene import random_scene
 from bench.random_scenes.write_folder import write_run_folder
 from lab.errors import BeamposeError
+from lab.findings.outcome import Outcome
 from lab.runs.input_check.check import check
-from lab.runs.process import RunOutcome, process_run
+from lab.runs.process import process_run
 from lab.runs.score.score import normalised_squares, pose_errors, read_tables, read_truth
+from lab.runs.verdict.run_statistics import RunStatistics
 from tracking.statuses import PoseStatus
 
 CODES = ("BP-M06", "BP-M07", "BP-M08", "BP-V20")  # of findings on mistakes
@@ -58,7 +60,7 @@ def answer(folder: Path, out: Path, truth: Path | None) -> Answer:
         lines = check(folder).lines
         clock.append(time.process_time())
         try:
-            outcome: RunOutcome | None = process_run(folder, out)
+            outcome: Outcome[RunStatistics] | None = process_run(folder, out)
             refusal = ""
         except BeamposeError as error:
             outcome, refusal = None, str(error)
@@ -77,9 +79,9 @@ def answer(folder: Path, out: Path, truth: Path | None) -> Answer:
         nees = normalised_squares(delta[use], tables.poses.covariance[use] + FLOOR**2 * np.eye(6))
         wrong = int(np.sum(nees > 100))
     verdict = outcome.verdict
-    codes = tuple(str(r.as_mapping()["code"]) for r in verdict.reasons)
+    codes = tuple(str(r.as_mapping()["code"]) for r in verdict.findings)
     texts = "\n".join(verdict.texts)
-    return Answer("\n".join(lines), verdict.status, texts, wrong, outcome.measured, seconds, codes)
+    return Answer("\n".join(lines), verdict.status, texts, wrong, outcome.result.measured, seconds, codes)
 
 
 def outcome_of(case: Case, a: Answer) -> str:

@@ -64,9 +64,9 @@ def flight(path: Path, seed: int) -> None:
             Path(folder) / "points.csv",
             Path(folder) / "track",
         )
-    at = frame - int(outcome.results.recording.numbers[0])
-    inside = (at >= 0) & (at < len(outcome.results.frames))
-    frames = [outcome.results.frames[k] for k in at[inside]]
+    at = frame - int(outcome.result.recording.numbers[0])
+    inside = (at >= 0) & (at < len(outcome.result.frames))
+    frames = [outcome.result.frames[k] for k in at[inside]]
     e = np.array([np.linalg.norm(f.place[:2] - true) for f, true in zip(frames, truth[inside], strict=True)])
     words = np.array([f.status.value for f in frames])
     speed = np.linalg.norm(np.diff(truth, axis=0), axis=1)
@@ -94,9 +94,9 @@ def video(path: Path, published: Path, limit: int | None) -> None:
         )
         with tempfile.TemporaryDirectory() as folder:
             outcome = track_target(PointTarget(options), path, Path(folder) / "track")
-        positions = positions[positions.frame <= len(outcome.results.frames)]
+        positions = positions[positions.frame <= len(outcome.result.frames)]
         # The published table counts frames from 1.
-        estimates = [outcome.results.frames[int(k) - 1] for k in positions.frame]
+        estimates = [outcome.result.frames[int(k) - 1] for k in positions.frame]
         difference = np.array([e.place[:2] for e in estimates]) - positions[["pos_x", "pos_y"]].to_numpy()
         known = np.isfinite(difference[:, 0])
         named = f"  target {name}: {known.sum()} of {len(positions)} published frames have a position"

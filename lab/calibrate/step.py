@@ -13,8 +13,9 @@ from typing import Generic, TypeVar
 
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project
-from lab.files.text.atomic_write import atomic_folder, check_output_folder, keep_good_results
+from lab.files.text.atomic_write import atomic_folder, check_output_folder, earlier_results, keep_good_results
 from lab.findings.finding import Finding, Level, finding, verdict
+from lab.findings.outcome import Outcome, Verdict
 from lab.report.calibration.calibration_page import (
     CalibrationReport,
     KeyFigure,
@@ -24,7 +25,6 @@ from lab.report.calibration.calibration_page import (
 )
 
 R = TypeVar("R")
-R_co = TypeVar("R_co", covariant=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +35,6 @@ class Step:
     own: tuple[str, ...]  # files by which a folder of earlier results is recognised
     good: str = ""  # file of a usable result, which a FAIL does not replace; empty: each result replaces the last one
     failed_status: int = CalibrationError.exit_status  # exit status of a FAIL
-
-    def is_ours(self, folder: Path) -> bool:
-        """Whether a folder holds earlier results of this step."""
-        return all((folder / name).is_file() for name in self.own)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,35 +53,13 @@ class Solved(Generic[R]):
     advice: str = ""  # what to do after a FAIL; empty: the remedy of the worst finding
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome(Generic[R_co]):
-    """Result of a step."""
-
-    name: str
-    out: Path  # folder of the results: `OUT-failed` if a FAIL would have replaced a valid calibration
-    findings: tuple[Finding, ...]
-    result: R_co
-    figures: str
-    advice: str
-    failed_status: int
-
-    @property
-    def level(self) -> Level:
-        """The verdict."""
-        return verdict(self.findings)
-
-    @property
-    def exit_status(self) -> int:
-        """0, or the status of a result that must not be used."""
-        return self.failed_status if self.level is Level.FAIL else 0
-
-    def line(self) -> str:
-        """One line for the terminal: the worst finding, and after a FAIL what to do."""
-        worst = max(self.findings, key=lambda f: f.level)
-        reason = "" if self.level is Level.PASS else f": {worst.what.rstrip('.')}"
-        if self.level is Level.FAIL:
-            reason += f". {(self.advice or worst.remedy).rstrip('.')}"
-        return f"{self.name}: {self.level.name}: {self.figures}{reason} -> {self.out}"
+def _said(solved: Solved[R], level: Level) -> str:
+    """Verdict and key figures; the worst finding, and after a FAIL what to do."""
+    worst = max(solved.findings, key=lambda f: f.level)
+    reason = "" if level is Level.PASS else f": {worst.what.rstrip('.')}"
+    if level is Level.FAIL:
+        reason += f". {(solved.advice or worst.remedy).rstrip('.')}"
+    return f"{level.name}: {solved.figures}{reason}"
 
 
 def run_step(step: Step, out: Path, solve: Callable[[], Solved[R]]) -> Outcome[R]:
@@ -96,18 +70,19 @@ def run_step(step: Step, out: Path, solve: Callable[[], Solved[R]]) -> Outcome[R
     Raises:
         BeamposeError: as `solve` does, or the folder cannot be written. Nothing is written then.
     """
-    check_output_folder(out, step.is_ours)
+    own = earlier_results(*step.own)
+    check_output_folder(out, own)
     solved = solve()
     level = verdict(solved.findings)
     folder = keep_good_results(out, level is Level.FAIL, step.good) if step.good else Path(out)
     key_figures, sections = solved.page()
     title, made = solved.title or solved.name, provenance(solved.inputs, solved.day)
     report = CalibrationReport(step.kind, title, level, solved.findings, key_figures, sections, made)
-    with atomic_folder(folder, may_replace=step.is_ours) as work:
+    with atomic_folder(folder, own) as work:
         solved.write(work)
         write_calibration_report(report, work)
-    s = solved
-    return Outcome(s.name, folder, s.findings, s.result, s.figures, s.advice, step.failed_status)
+    judged = Verdict(solved.findings)
+    return Outcome(solved.name, folder, judged, solved.result, _said(solved, level), failed_status=step.failed_status)
 
 
 # Date of a calibration and end of its validity.

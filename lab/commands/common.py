@@ -10,7 +10,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 import click
 
@@ -19,6 +19,9 @@ from lab.cycle_search import search_rarely
 from lab.errors import BeamposeError
 from lab.files.text.error_text import printable
 from lab.progress import Progress
+
+if TYPE_CHECKING:
+    from lab.findings.outcome import Done, Outcome
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
 ANY_PATH = click.Path(path_type=Path)
@@ -223,9 +226,13 @@ def progress_bar(name: str) -> Iterator[Progress | None]:
         yield update
 
 
-def conclude(outcome: Any) -> None:
-    """Prints an outcome and ends with its exit status."""
-    show_line(outcome.line())
+def conclude(outcome: Outcome[Any] | Done[Any], *, quiet: bool = False, notes: Sequence[str] = ()) -> NoReturn:
+    """Prints an outcome and ends with its exit status. notes: further ones, for standard error."""
+    if not quiet:
+        if line := outcome.line():
+            show_line(line)
+        for note in (*outcome.notes, *notes):
+            complain(note)
     sys.exit(outcome.exit_status)
 
 

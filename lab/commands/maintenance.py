@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, NumberRange, complete_codes, progress_bar, show_line
+from lab.commands.common import ANY_PATH, FOLDER, NumberRange, complete_codes, conclude, progress_bar, show_line
 
 
 @click.command()
@@ -115,10 +115,7 @@ def init(
     layout = Layout(
         int(values["cameras"]), int(values["screens"]), int(values["beams"]), distance, _picture_size(picture)
     )
-    started = start(folder, layout, values["rate"])
-    show_line(f"rig: {started.rig}")
-    show_line(f"run: {started.run}")
-    show_line(f"Next: beampose check {folder}; beampose run {folder} --out {folder / 'results'}")
+    conclude(start(folder, layout, values["rate"]))
 
 
 def _picture_size(text: str) -> tuple[int, int]:
@@ -146,10 +143,8 @@ def verify(results: Path, run_folder: Path | None) -> None:
     from lab.results.verify import verify as verify_results
 
     with progress_bar(results.name) as progress:
-        verification = verify_results(results, run_folder, progress)
-    for line in verification.lines():
-        show_line(line)
-    sys.exit(verification.exit_status)
+        found = verify_results(results, run_folder, progress)
+    conclude(found)
 
 
 @click.command()

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, NumberRange, complain, progress_bar, show_line
+from lab.commands.common import ANY_PATH, FOLDER, NumberRange, complain, conclude, progress_bar, show_line
 from lab.errors import InputError
 
 # `beampose check` and `report`: inputs checked, results shown.
@@ -26,9 +25,7 @@ def check(path: Path) -> None:
 
     with progress_bar(path.name) as progress:
         result = check_path(path, progress)
-    for line in result.lines:
-        show_line(line)
-    sys.exit(result.exit_status)
+    conclude(result)
 
 
 @click.command()
@@ -70,9 +67,7 @@ def report(
             done = write_video(
                 results, run_folder, first=first, last=last, every=every or 1, fps=fps or DEFAULT_FPS, progress=progress
             )
-        show_line(f"video: {done.path} ({done.frames} frames)")
-        for note in done.notes:
-            complain(note)
+        conclude(done)
 
 
 # `beampose compare`: a result against another result of the run, or against a reference.
@@ -142,13 +137,10 @@ def compare(
     """
     from lab.results.compare_page import compare_and_write
 
-    outcome = compare_and_write(
+    found = compare_and_write(
         result, other, reference, out, align=align, offset_s=offset_s, sigma_m=sigma_m, sigma_deg=sigma_deg
     )
-    for line in outcome.lines:
-        show_line(line)
-    if outcome.report is not None:
-        show_line(f"report: {outcome.report}")
+    conclude(found)
 
 
 # `beampose view`: a rig, a run or results in three dimensions.
@@ -177,11 +169,7 @@ def view(path: Path, out: Path | None, frame: int | None, rig: Path | None, sigm
     """
     from lab.results.view.view import show
 
-    done = show(path, out, frame=frame, rig=rig, sigma_scale=sigma_scale)
-    for file in done.files:
-        show_line(str(file))
-    for note in done.notes:
-        complain(note)
+    conclude(show(path, out, frame=frame, rig=rig, sigma_scale=sigma_scale))
 
 
 # `beampose show`: one annotated picture.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,10 @@ from lab.commands.common import (
     ANY_PATH,
     FOLDER,
     NumberRange,
-    complain,
     conclude,
     progress_bar,
     quiet_option,
     set_option,
-    show_line,
     shown,
     verbose_option,
 )
@@ -65,11 +62,8 @@ def run(
     videos = sorted(out.glob("overlay.*"))  # of the earlier results in this folder
     with shown(run_folder.name, verbose=verbose, quiet=quiet) as progress:
         outcome = process_run(run_folder, out, overrides=settings, causal=causal, progress=progress, more=more)
-    if not quiet:
-        show_line(outcome.line())
-        for video in videos:
-            complain(f"{video}: removed with the earlier results; make it again with `beampose report {out} --video`")
-    sys.exit(outcome.exit_status)
+    gone = "removed with the earlier results; make it again with `beampose report"
+    conclude(outcome, quiet=quiet, notes=[f"{video}: {gone} {out} --video`" for video in videos])
 
 
 @click.command()
@@ -166,6 +160,4 @@ def watch(
             stop=stop,
             provenance=provenance(ctx),
         )
-    if not quiet:
-        show_line(outcome.line())
-    sys.exit(outcome.exit_status)
+    conclude(outcome, quiet=quiet)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lab.files.text.atomic_write import atomic_folder, atomic_write_text, check_output_folder
+from lab.files.text.atomic_write import atomic_folder, atomic_write_text, check_output_folder, earlier_results
 from lab.files.text.csv_text import write_table
 from lab.files.text.json_text import write_json
+from lab.findings.outcome import Done
 from lab.number_format import format_number, format_percent, format_with_sigma
 from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section, section_context
 from lab.report.html import environment
@@ -313,14 +313,6 @@ def _decades(lo: float, hi: float) -> np.ndarray:
 # One comparison from folders and files to an output folder.
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What the command prints, and where the report is."""
-
-    lines: tuple[str, ...]
-    report: Path | None  # None without an output folder
-
-
 def compare_and_write(
     result: Path,
     other: Path | None,
@@ -331,23 +323,20 @@ def compare_and_write(
     offset_s: float | None = None,
     sigma_m: float = 0.0,
     sigma_deg: float = 0.0,
-) -> Outcome:
+) -> Done[Comparison]:
     """Compare, and write tables and report where `out` is given. The other arguments: `lab.results.compare.compare`.
 
     Raises:
         InputError: the input cannot be compared, or `out` cannot be written.
     """
+    own = earlier_results(SUMMARY)
     if out is not None:
-        check_output_folder(out, _is_comparison)
+        check_output_folder(out, own)
     found = compare(result, other, reference, align=align, offset_s=offset_s, sigma_m=sigma_m, sigma_deg=sigma_deg)
     lines = tuple(lines_of(found))
     if out is None:
-        return Outcome(lines, None)
-    with atomic_folder(out, _is_comparison) as folder:
+        return Done(found, lines)
+    with atomic_folder(out, own) as folder:
         write_tables(found, folder)
         write_page(found, folder)
-    return Outcome(lines, out / "report.html")
-
-
-def _is_comparison(folder: Path) -> bool:
-    return (folder / SUMMARY).is_file()
+    return Done(found, (*lines, f"report: {out / 'report.html'}"))

@@ -18,6 +18,7 @@ from lab.files.run.fingerprints import fingerprints
 from lab.files.run.run_file import LiveDevice, Run, load_run
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.json_text import read_json
+from lab.findings.outcome import Done
 from lab.progress import Progress
 from lab.runs.frames.pipeline import Pipeline
 from lab.runs.process import write_tables
@@ -235,11 +236,6 @@ class Verification:
         """Whether inputs and tables are the recorded ones."""
         return not self.differences and not self.inputs.changed
 
-    @property
-    def exit_status(self) -> int:
-        """0 if all is the same, else that of a failed quality gate."""
-        return 0 if self.identical else QUALITY_GATE_FAILED
-
     def lines(self) -> list[str]:
         """The outcome for the terminal."""
         same = len(self.tables) - len(self.differences)
@@ -255,7 +251,7 @@ class Verification:
         return out
 
 
-def verify(results: Path, run_folder: Path | None = None, progress: Progress | None = None) -> Verification:
+def verify(results: Path, run_folder: Path | None = None, progress: Progress | None = None) -> Done[Verification]:
     """Compute the tables of a result folder again, from its recorded run folder, settings and parameters.
 
     run_folder: where the run is now, if it has moved. The expiry of the calibration plays no part, since the result was
@@ -281,4 +277,5 @@ def verify(results: Path, run_folder: Path | None = None, progress: Progress | N
         tables = sorted({p.name for p in work.glob("*.csv")} | {n for n in _OPTIONAL if (results / n).is_file()})
         found = [difference_of(results / table, work / table) for table in tables]
     differences = tuple(d for d in found if d is not None)
-    return Verification(results, inputs, tuple(other_versions(recorded)), tuple(tables), differences)
+    same = Verification(results, inputs, tuple(other_versions(recorded)), tuple(tables), differences)
+    return Done(same, tuple(same.lines()), exit_status=0 if same.identical else QUALITY_GATE_FAILED)

@@ -7,7 +7,6 @@ import dataclasses
 import datetime
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +15,10 @@ from lab.files.rig.calibration_state import require_valid_calibration
 from lab.files.run.parameter_overrides import with_overrides
 from lab.files.run.run_file import Run, load_run
 from lab.files.run.truth import load_run_truth
-from lab.files.text.atomic_write import atomic_folder
-from lab.files.text.json_text import has_schema, write_json
+from lab.files.text.atomic_write import atomic_folder, earlier_results
 from lab.findings.finding import Level
 from lab.findings.finding import verdict as verdict_of
+from lab.findings.outcome import Outcome, Verdict
 from lab.progress import Progress
 from lab.runs.frames.clocked_frames import ClockedFrames
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
@@ -29,7 +28,7 @@ from lab.runs.run_log import RunLog, listening
 from lab.runs.run_tally import RunTally
 from lab.runs.setup_check.check import mistakes_of_run, pictures_sampler
 from lab.runs.smoothing_pass import TrackingAndSmoothing
-from lab.runs.summary import SUMMARY_SCHEMA, RunResults, summary_of
+from lab.runs.summary import SUMMARY_SCHEMA, processed_run
 from lab.runs.tables import TableWriter
 from lab.runs.verdict import quality
 from lab.runs.verdict.frame_checks import FrameChecks, Pair
@@ -40,32 +39,6 @@ if TYPE_CHECKING:
     from lab.runs.model_check.check import ModelCheck
 
 
-@dataclass(frozen=True, slots=True)
-class RunOutcome:
-    """The outcome of one run."""
-
-    name: str
-    out: Path
-    verdict: quality.Verdict
-    frames: int
-    measured: int
-    seconds: float
-    errors: Mapping[str, Any] | None  # against truth; None without truth
-
-    @property
-    def exit_status(self) -> int:
-        """0, or 4 where a quality gate failed."""
-        return self.verdict.exit_status
-
-    def line(self) -> str:
-        """One line for the command line; where a gate failed, with the remedy of the first reason."""
-        remedy = f" {self.verdict.remedy}" if self.verdict.remedy else ""
-        return (
-            f"{self.name}: {self.verdict.status.upper()}: {self.measured} of {self.frames} frames measured"
-            f" ({'; '.join(self.verdict.texts)}){remedy} -> {self.out}"
-        )
-
-
 def process_run(
     run_folder: Path,
     out: Path,
@@ -74,7 +47,7 @@ def process_run(
     causal: bool = False,
     progress: Progress | None = None,
     more: Callable[[Run], Mapping[str, Any]] | None = None,
-) -> RunOutcome:
+) -> Outcome[RunStatistics]:
     """Process one run folder into the folder `out`: the tables, summary.json and report.html.
 
     overrides: tracker parameters that replace those of run.yaml. causal: the tables hold the causal estimates and
@@ -121,7 +94,7 @@ def write_results(
     causal: bool = False,
     progress: Progress | None = None,
     more: Callable[[], Mapping[str, Any]] = dict,
-) -> RunOutcome:
+) -> Outcome[RunStatistics]:
     """Process a pipeline's frames into the folder `work`, which will become `out`.
 
     started: time.perf_counter() at the start of the command. more: additional content of summary.json, called last.
@@ -139,7 +112,7 @@ def _write_results(
     causal: bool,
     progress: Progress | None,
     more: Callable[[], Mapping[str, Any]],
-) -> RunOutcome:
+) -> Outcome[RunStatistics]:
     run = pipeline.run
     log.start(run, versions())
     tally = RunTally(tuple(run.rig.cameras), tuple(f"{c}/{s}" for c, s in SpotModel.of(run.rig).views))
@@ -151,17 +124,17 @@ def _write_results(
 
     tables, added = against_truth(read_tables(work), run.folder), more()
     verdict = quality.against_truth(verdict, tables.errors)
-    results = RunResults(tally, statistics, model_check, verdict, passes.smoothing, tables.errors)
-    content = summary_of(pipeline, results, time.perf_counter() - started)
-    write_json({**content, **added}, work / "summary.json")
-    from lab.report.run.page import write_report  # imports the template engine, which only the report needs
 
-    log.info("stage: report")
-    write_report(work, run.folder, run, tables)
-    seconds = time.perf_counter() - started
-    log.conclude(verdict, content, seconds)
-    log.write(work)
-    return RunOutcome(run.name, out, verdict, statistics.frames, statistics.measured, seconds, tables.errors)
+    def page(folder: Path, content: Mapping[str, Any]) -> None:
+        from lab.report.run.page import write_report  # imports the template engine, which only the report needs
+
+        log.info("stage: report")
+        write_report(folder, run.folder, run, tables)
+        log.conclude(verdict, content, time.perf_counter() - started)
+        log.write(folder)
+
+    done = processed_run(pipeline, tally, statistics, model_check, verdict, passes.smoothing, tables.errors, page)
+    return done.write(work, out, started, added)
 
 
 def write_tables(
@@ -171,7 +144,7 @@ def write_tables(
     *,
     causal: bool = False,
     on_frame: Callable[[FrameRecord, FrameRecord | None], None],
-) -> tuple[RunStatistics, ModelCheck, quality.Verdict]:
+) -> tuple[RunStatistics, ModelCheck, Verdict]:
     """Track a run, write its tables into `work`, and compute the verdict.
 
     on_frame: called with each frame as it is written and, unless `causal`, the same frame of the causal pass.
@@ -232,6 +205,4 @@ def rows_of(pipeline: Pipeline, processed: Iterable[Pair]) -> Iterable[Pair]:
     return row_records(processed, reader.moments, tuple(run.cameras), own, SpotModel.of(run.rig).camera_of)
 
 
-def are_results(folder: Path) -> bool:
-    """Whether a folder holds a run's results, which a new run may replace."""
-    return has_schema(folder, SUMMARY_SCHEMA)
+are_results = earlier_results(SUMMARY_SCHEMA)  # of a run, which a new run may replace

@@ -9,11 +9,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from lab.errors import QUALITY_GATE_FAILED
 from lab.files.run.run_file import Run
 from lab.files.text.error_text import printable
+from lab.findings.outcome import Verdict
 from lab.progress import Progress
-from lab.runs.verdict.quality import Verdict
 
 FILE = "run.log"
 LOGGER = logging.getLogger("beampose.run")  # `--verbose` shows its lines while the run is processed
@@ -71,8 +70,7 @@ class RunLog(logging.Handler):
             self._add(
                 "ERROR" if reason["level"] == "fail" else "WARNING", f"{reason['code']} {reason['what']}.{remedy}"
             )
-        status = QUALITY_GATE_FAILED if verdict.status == "fail" else 0
-        self.info(f"end: {verdict.status.upper()}, {seconds:.1f} s, exit status {status}")
+        self.info(f"end: {verdict.status.upper()}, {seconds:.1f} s, exit status {verdict.exit_status}")
 
     def write(self, folder: Path) -> None:
         """Write run.log."""

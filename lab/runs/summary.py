@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,12 +14,12 @@ from geometry.rotations import log
 from lab.files.rig.calibration_state import state_mapping
 from lab.files.run.fingerprints import fingerprints
 from lab.files.run.run_file import Run
+from lab.findings.outcome import Verdict
 from lab.runs.frames.pipeline import Pipeline
+from lab.runs.processed import Processed
 from lab.runs.run_tally import MOST_EVENTS, RunTally
 from lab.runs.smoothing_pass import SmoothingSummary
-from lab.runs.verdict.quality import Verdict
 from lab.runs.verdict.run_statistics import RunStatistics
-from lab.versions import versions
 
 if TYPE_CHECKING:
     from lab.runs.model_check.check import ModelCheck
@@ -27,74 +27,60 @@ if TYPE_CHECKING:
 SUMMARY_SCHEMA = "beampose/summary/1"
 
 
-@dataclass(frozen=True, slots=True)
-class RunResults:
-    """The results of a run beside its tables."""
-
-    tally: RunTally
-    statistics: RunStatistics
-    model_check: ModelCheck
-    verdict: Verdict
-    smoothing: SmoothingSummary | None  # None: causal only
-    errors: Mapping[str, Any] | None  # against truth; None without truth
-
-
-def summary_of(pipeline: Pipeline, results: RunResults, wall_s: float) -> dict[str, Any]:
-    """The content of summary.json, plain values. wall_s: duration of the processing."""
-    run = pipeline.run
-    smoothing, timings = results.smoothing, pipeline.timings
-    return {
-        "schema": SUMMARY_SCHEMA,
-        "name": run.name,
-        "run_folder": str(run.folder.resolve()),
-        "rig": str(run.rig_path.resolve()),
-        "calibration": None if run.calibration is None else state_mapping(run.calibration),
-        "notes_of_run": run.notes,
-        "attitude": "causal" if smoothing is None else "smoothed",
-        "smoother": None if smoothing is None else dataclasses.asdict(smoothing),
-        "verdict": _verdict(results.verdict),
-        "counts": _counts(results.tally, results.statistics),
-        "rates": {
-            "measured_share": results.statistics.measured / max(results.statistics.frames, 1),
-            "frame_rate_hz": run.frame_rate_hz,
-            "processed_frames_per_s": results.statistics.frames / wall_s if wall_s > 0 else None,
-            "noise_scale": pipeline.tracker.noise_scale,
-        },
-        "model_check": results.model_check.as_mapping(),
-        "errors": results.errors,
-        "timings": {
-            "waiting_for_pictures_s": timings.waiting,
-            "detection_s": timings.detection,
-            "tracking_s": timings.tracking,
-            "smoothing_s": timings.smoothing,
-            "wall_s": wall_s,
-        },
-        "versions": versions(),
-        "parameters": {
+def processed_run(
+    pipeline: Pipeline,
+    tally: RunTally,
+    statistics: RunStatistics,
+    model_check: ModelCheck,
+    verdict: Verdict,
+    smoothing: SmoothingSummary | None,
+    errors: Mapping[str, Any] | None,
+    page: Callable[[Path, Mapping[str, Any]], object],
+) -> Processed[RunStatistics]:
+    """A run whose tables are written. smoothing: None: causal only. errors: against truth; None without truth."""
+    run, timings = pipeline.run, pipeline.timings
+    return Processed(
+        schema=SUMMARY_SCHEMA,
+        name=run.name,
+        result=statistics,
+        verdict=verdict,
+        frames=statistics.frames,
+        measured=statistics.measured,
+        frame_rate_hz=run.frame_rate_hz,
+        parameters={
             "tracker": dataclasses.asdict(run.tracker),
             "noise": {name: noise.as_mapping() for name, noise in pipeline.noise.items()},
             "prior": _prior_numbers(run),
             **({"clocks": _clock_numbers(run)} if run.clocks else {}),
         },
-        "inputs": fingerprints(run),
-        "notes": _notes(pipeline, results.tally),
-        "events": [dataclasses.asdict(event) for event in results.tally.events],
-    }
-
-
-def _verdict(verdict: Verdict) -> dict[str, Any]:
-    return {
-        "status": verdict.status,
-        "reasons": list(verdict.texts),
-        "exit_status": verdict.exit_status,
-        "evidence": [r.as_mapping() for r in verdict.reasons],
-    }
+        inputs=fingerprints(run),
+        notes=_notes(pipeline, tally),
+        blocks={
+            "run_folder": str(run.folder.resolve()),
+            "rig": str(run.rig_path.resolve()),
+            "calibration": None if run.calibration is None else state_mapping(run.calibration),
+            "notes_of_run": run.notes,
+            "attitude": "causal" if smoothing is None else "smoothed",
+            "smoother": None if smoothing is None else dataclasses.asdict(smoothing),
+            "counts": _counts(tally, statistics),
+            "rates": {"noise_scale": pipeline.tracker.noise_scale},
+            "model_check": model_check.as_mapping(),
+            "errors": errors,
+            "timings": {
+                "waiting_for_pictures_s": timings.waiting,
+                "detection_s": timings.detection,
+                "tracking_s": timings.tracking,
+                "smoothing_s": timings.smoothing,
+            },
+            "events": [dataclasses.asdict(event) for event in tally.events],
+        },
+        page=page,
+    )
 
 
 def _counts(tally: RunTally, statistics: RunStatistics) -> dict[str, Any]:
     frames, cameras = max(statistics.frames, 1), statistics.cameras
     return {
-        "frames": statistics.frames,
         "spot_status": {v: dict(c) for v, c in zip(tally.views, tally.spot_status, strict=False)},
         "pose_status": dict(statistics.pose),
         "detections_per_frame": {c: tally.detections[c] / frames for c in tally.cameras},

@@ -20,6 +20,7 @@ from lab.files.rig.rig_file import load_rig, save_rig
 from lab.files.run.run_file import load_run, save_run
 from lab.files.text.atomic_write import atomic_folder, atomic_write_text
 from lab.files.text.yaml_text import with_comments
+from lab.findings.outcome import Done
 from lab.simulate.scenarios import SCENARIOS
 from lab.simulate.write import simulate
 
@@ -171,16 +172,7 @@ _OPTIONAL_RUN = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Started:
-    """The files written."""
-
-    folder: Path
-    rig: Path
-    run: Path
-
-
-def start(folder: Path, layout: Layout, frame_rate_hz: float) -> Started:
+def start(folder: Path, layout: Layout, frame_rate_hz: float) -> Done[Path]:
     """Write rig.yaml, run.yaml and simulated points into a new or empty folder.
 
     Raises:
@@ -211,7 +203,8 @@ def start(folder: Path, layout: Layout, frame_rate_hz: float) -> Started:
         _comment(save_run(run, work), _RUN_COMMENTS, "One recording.", _OPTIONAL_RUN)
         load_rig(rig_path)
         load_run(work)
-    return Started(folder, folder / "rig.yaml", folder / "run.yaml")
+    following = f"Next: beampose check {folder}; beampose run {folder} --out {folder / 'results'}"
+    return Done(folder, (f"rig: {folder / 'rig.yaml'}", f"run: {folder / 'run.yaml'}", following))
 
 
 def _points(work: Path, frame_rate_hz: float) -> None:

@@ -8,9 +8,10 @@ from pathlib import Path
 from calibration.budget.expected_errors import expected_errors
 from calibration.budget.pose_grid import plan_grid
 from geometry.pose_solver.visibility import assumed_range
-from lab.calibrate.step import Outcome, Solved, Step, run_step
+from lab.calibrate.step import Solved, Step, run_step
 from lab.errors import QUALITY_GATE_FAILED
 from lab.files.rig.rig_file import TARGET, joint_covariance, load_rig_file
+from lab.findings.outcome import Outcome
 from lab.number_format import format_angle, format_length, format_percent
 from lab.setup.plan_findings import Plan, PlanOptions, findings, median_sigma
 from lab.setup.plan_page import page_of, write_effects, write_plan

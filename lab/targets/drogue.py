@@ -17,8 +17,9 @@ from lab.progress import Progress
 from lab.report.calibration.calibration_page import PageTable, Section
 from lab.report.plot.axes import BLUE, VERMILLION
 from lab.report.plot.series import Line
+from lab.runs.processed import quantiles
 from lab.targets.page import TimeAxis
-from lab.targets.target import Codes, Target, Track, TrackOptions, quantiles, texts, track_pictures
+from lab.targets.target import Codes, Target, Track, TrackOptions, texts, track_pictures
 from tracking.learned_detector.detector import learned_detector
 from tracking.light_tracker.frames import DrogueFrame, LightParameters, Source
 from tracking.light_tracker.tracker import DrogueTracker

@@ -195,11 +195,3 @@ def header_rate(source: PictureSource) -> float | None:
 def texts(values: Iterable[float], decimals: int = 4) -> list[str]:
     """Fields of a table; empty for nan. Four decimals of a pixel are as many as a measurement resolves."""
     return [f"{v:.{decimals}f}" if np.isfinite(v) else "" for v in values]
-
-
-def quantiles(values: Array) -> dict[str, float] | None:
-    """5 %, median and 95 % of the finite values; None without one."""
-    values = values[np.isfinite(values)]
-    if not len(values):
-        return None
-    return dict(zip(("p5", "median", "p95"), np.percentile(values, [5, 50, 95]).tolist(), strict=True))

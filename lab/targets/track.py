@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from lab.files.run.fingerprints import fingerprints_of
-from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import write_table
-from lab.files.text.json_text import has_schema, write_json
-from lab.findings.finding import Finding
+from lab.findings.outcome import Outcome, Verdict
 from lab.progress import Progress
+from lab.runs.processed import Processed, write_processed
 from lab.targets.overlay import write_overlay
 from lab.targets.page import write_target_page
 from lab.targets.target import F, Target, Track
-from lab.targets.verdict import Outcome, findings_of, verdict_block
-from lab.versions import versions
+from lab.targets.verdict import findings_of
 
 MOST_EVENTS = 500  # listed in summary.json; of the others the number is reported
 
@@ -33,49 +30,43 @@ def track_target(
         InputError: the input or an option cannot be used, or no picture can be read; `out` is then unchanged.
         RunError: OpenCV cannot write the video.
     """
-    started = time.perf_counter()
-    with atomic_folder(out, may_replace=lambda folder: has_schema(folder, target.schema)) as folder:
-        track = target.read(given, progress)
-        findings = findings_of(target, track)
-        write_table(folder / target.table, target.columns, (target.row(track, k) for k in range(len(track.frames))))
-        if target.options.overlay:
-            write_overlay(target, track, folder)
-        summary = _summary(target, track, findings, time.perf_counter() - started)
-        write_json({**summary, **(more or {})}, folder / "summary.json")
-        write_target_page(target, track, findings, folder)
-    measured = int(track.measured.sum())
-    return Outcome(track.recording.name, Path(out), len(track.frames), measured, findings, track)
+    return write_processed(out, target.schema, lambda folder: _tracked(target, given, folder, progress), more)
 
 
-def _summary(target: Target[F], track: Track[F], findings: Sequence[Finding], wall_s: float) -> dict[str, Any]:
-    recording, events = track.recording, track.events()
-    content: dict[str, Any] = {
-        "schema": target.schema,
-        "name": recording.name,
+def _tracked(target: Target[F], given: Path, folder: Path, progress: Progress | None) -> Processed[Track[F]]:
+    """The track through a recording, whose table and video are written into a folder."""
+    track = target.read(given, progress)
+    recording, events, findings = track.recording, track.events(), findings_of(target, track)
+    write_table(folder / target.table, target.columns, (target.row(track, k) for k in range(len(track.frames))))
+    if target.options.overlay:
+        write_overlay(target, track, folder)
+    blocks: dict[str, Any] = {
         "source": str(recording.path.resolve()),
-        "verdict": verdict_block(findings),
         "counts": {
-            "frames": len(track.frames),
             "pictures": recording.pictures,
             "status": track.statuses(),
             "not_measured": {cause.value: count for cause, count in track.causes().items()},
             "no_image_reasons": recording.missing,
             "events": len(events),
         },
-        "rates": {
-            "measured_share": float(track.measured.mean()),
-            "frame_rate_hz": recording.rate_hz,
-            "processed_frames_per_s": len(track.frames) / wall_s if wall_s > 0 else None,
-        },
-        "timings": {"tracking_process_s": track.tracking_s, "wall_s": wall_s},
-        "versions": versions(),
-        "parameters": target.parameters(),
-        "inputs": fingerprints_of((), (recording.path,)),
-        "notes": recording.notes,
+        "timings": {"tracking_process_s": track.tracking_s},
         "events": [
             {"frame": number, "kind": f.event, f"{target.subject}s": f.found} for number, f in events[:MOST_EVENTS]
         ],
     }
     for name, value in target.figures(track).items():
-        content[name] = {**content.get(name, {}), **value} if isinstance(value, Mapping) else value
-    return content
+        blocks[name] = {**blocks.get(name, {}), **value} if isinstance(value, Mapping) else value
+    return Processed(
+        schema=target.schema,
+        name=recording.name,
+        result=track,
+        verdict=Verdict(findings),
+        frames=len(track.frames),
+        measured=int(track.measured.sum()),
+        frame_rate_hz=recording.rate_hz,
+        parameters=target.parameters(),
+        inputs=fingerprints_of((), (recording.path,)),
+        notes=recording.notes,
+        blocks=blocks,
+        page=lambda work, _: write_target_page(target, track, findings, work),
+    )

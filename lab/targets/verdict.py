@@ -1,65 +1,17 @@
-"""The verdict on a tracked target: the findings that all kinds share, and the outcome of a call."""
+"""The findings that all kinds of tracked targets share."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from lab.errors import QUALITY_GATE_FAILED
 from lab.findings.catalogue import ENTRIES
-from lab.findings.finding import Finding, Level, finding, reasons, verdict, worst_first
+from lab.findings.finding import Finding, Level, finding, worst_first
 from lab.targets.target import F, Target, Track
 from tracking.statuses import Cause
 
 GOOD_MEASURED = 0.95  # a smaller share is reported with its causes
-R = TypeVar("R")
-
-
-def exit_status(findings: Sequence[Finding]) -> int:
-    """0, or 4 where a quality gate failed."""
-    return QUALITY_GATE_FAILED if verdict(findings) is Level.FAIL else 0
-
-
-def verdict_block(findings: Sequence[Finding]) -> dict[str, Any]:
-    """The block `verdict` of summary.json."""
-    return {
-        "status": verdict(findings).word,
-        "reasons": list(reasons(findings)),
-        "exit_status": exit_status(findings),
-        "evidence": [f.as_mapping() for f in findings],
-    }
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome(Generic[R]):
-    """The outcome of one call: the results R of a target in one camera or in two."""
-
-    name: str
-    out: Path
-    frames: int
-    measured: int
-    findings: tuple[Finding, ...]  # failures first
-    results: R
-    errors: str = ""  # against truth, in words
-
-    @property
-    def exit_status(self) -> int:
-        """0, or 4 where a quality gate failed."""
-        return exit_status(self.findings)
-
-    def line(self) -> str:
-        """One line for the command line; where a gate failed, with the remedy."""
-        level = verdict(self.findings)
-        texts = "; ".join([*reasons(self.findings), *([self.errors] if self.errors else [])])
-        return (
-            f"{self.name}: {level.word.upper()}: {self.measured} of {self.frames} frames measured"
-            f"{f' ({texts})' if texts else ''}{f' {self.findings[0].remedy}' if level is Level.FAIL else ''}"
-            f" -> {self.out}"
-        )
 
 
 def findings_of(target: Target[F], track: Track[F]) -> tuple[Finding, ...]:

@@ -52,12 +52,12 @@ def test_only_the_recognition_rate_of_the_paper_counts_out_of_view_estimates_as_
 
 def test_the_files_of_a_study_are_complete(tmp_path, study):
     outcome = write_comparison(comparison_of(study), tmp_path / "study")
-    with outcome.table.open(encoding="utf-8") as file:
+    with (outcome.result / "figures.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == ["quantity", "unit", "paper", "conventional", "curve_switching", "beampose", "note"]
     assert [r["quantity"] for r in rows] == [r.quantity for r in study.rows]
     assert float(rows[0]["conventional"]) == pytest.approx(study.rows[0].values[0], rel=1e-5)
-    page = outcome.report.read_text("utf-8")
+    page = (outcome.result / "report.html").read_text("utf-8")
     assert page.rstrip().endswith("</html>")
     assert "65.97" in page
     assert not any(word in page for word in ("http://", "https://", "nan"))

@@ -18,7 +18,7 @@ from lab.calibrate.beams.beam_tables import BEAMS, write_tables
 from lab.calibrate.beams.beams_page import page_of
 from lab.calibrate.beams.recording_check import check_no_duplicates, diagnose_failed_fit
 from lab.calibrate.beams.recordings import read_recordings, stand_of
-from lab.calibrate.step import Outcome, Solved, Step, calibration_date, expiry_date, expiry_findings, run_step
+from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expiry_findings, run_step
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project, load_project
 from lab.files.rig.calibration_state import CalibrationState
@@ -27,6 +27,7 @@ from lab.files.rig.screens_file import load_screens
 from lab.files.text.error_text import suggest_name
 from lab.files.text.yaml_text import read_mapping
 from lab.findings.finding import Finding, Level, finding, passed, reasons, verdict
+from lab.findings.outcome import Outcome
 
 RIG = "rig.yaml"
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from calibration.boards.board_types import Board, Charuco
@@ -13,6 +12,7 @@ from lab.errors import InputError
 from lab.files.rig.board_file import load_board, load_board_or_text, save_board
 from lab.files.text.atomic_write import atomic_folder, atomic_write_bytes
 from lab.files.text.error_text import suggest_name
+from lab.findings.outcome import Done
 
 FORMATS = ("pdf", "svg", "png")
 DESCRIPTION = "board.yaml"
@@ -22,35 +22,13 @@ DESCRIPTION = "board.yaml"
 MIN_RIM_MODULES = 0.7
 
 
-@dataclass(frozen=True, slots=True)
-class BoardOutcome:
-    """Result of `write_board`: the board, the files written and the page format."""
-
-    board: Board
-    files: tuple[Path, ...]
-    page: str
-
-    def line(self) -> str:
-        """One line for the terminal."""
-        names = ", ".join(path.name for path in self.files)
-        return (
-            f"{self.board.describe()} on {self.page}: {names} in {self.files[0].parent};"
-            " print at 100 % and measure the bar of 100 mm"
-        )
-
-    @property
-    def exit_status(self) -> int:
-        """Always 0: a board that cannot be written raises InputError."""
-        return 0
-
-
 def write_board(
     board: Board | str | Path,
     out: Path,
     formats: Sequence[str] = FORMATS,
     page: str = "A4",
     dpi: float = 300.0,
-) -> BoardOutcome:
+) -> Done[Board]:
     """Write board.pdf, board.svg, board.png and board.yaml into the folder `out`.
 
     If `out` names a file with one of these suffixes, only that format and its description are written. All files are
@@ -88,12 +66,18 @@ def write_board(
         out.parent.mkdir(parents=True, exist_ok=True)
         atomic_write_bytes(contents[single], out)
         save_board(board, description)
-        return BoardOutcome(board, (out, description), layout.name)
+        return _done(board, (out, description), layout.name)
     with atomic_folder(out, _holds_boards_only) as work:
         for name, data in contents.items():
             (work / f"board.{name}").write_bytes(data)
         save_board(board, work / DESCRIPTION)
-    return BoardOutcome(board, (*(out / f"board.{name}" for name in contents), out / DESCRIPTION), layout.name)
+    return _done(board, (*(out / f"board.{name}" for name in contents), out / DESCRIPTION), layout.name)
+
+
+def _done(board: Board, files: Sequence[Path], page: str) -> Done[Board]:
+    names, folder = ", ".join(path.name for path in files), files[0].parent
+    line = f"{board.describe()} on {page}: {names} in {folder}; print at 100 % and measure the bar of 100 mm"
+    return Done(board, (line,))
 
 
 def _is_number(suffix: str) -> bool:

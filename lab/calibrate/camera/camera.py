@@ -25,7 +25,7 @@ from lab.calibrate.camera.camera_findings import findings_of, next_photographs
 from lab.calibrate.camera.camera_page import page_of
 from lab.calibrate.camera.corner_tables import TABLE_SUFFIXES, read_corner_table
 from lab.calibrate.camera.photos import PhotoSet, find_in_photos, origins_of
-from lab.calibrate.step import Outcome, Solved, Step, run_step
+from lab.calibrate.step import Solved, Step, run_step
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.board_file import load_board_or_text
 from lab.files.rig.camera_block import Covariance
@@ -33,6 +33,7 @@ from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
 from lab.files.text.csv_text import write_table
 from lab.files.text.error_text import suggest_name
 from lab.findings.finding import Finding, Level, verdict
+from lab.findings.outcome import Outcome
 from lab.number_format import format_number
 from lab.progress import Progress
 

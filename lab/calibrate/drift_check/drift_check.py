@@ -48,10 +48,11 @@ from lab.calibrate.drift_check.drift_result import (
     read_history,
     write_history,
 )
-from lab.calibrate.step import Outcome, Solved, Step, run_step
+from lab.calibrate.step import Solved, Step, run_step
 from lab.files.rig.rig_file import RigFile, joint_covariance, load_rig_file
 from lab.files.text.csv_text import write_table
 from lab.findings.finding import Finding, Level, finding, passed
+from lab.findings.outcome import Outcome
 
 TABLE = "drift.csv"
 COLUMNS = (

@@ -30,12 +30,13 @@ from lab.calibrate.rig.rig_page import page_of
 from lab.calibrate.rig.rig_tables import RESIDUALS, write_residuals
 from lab.calibrate.screens.screen_findings import ScreenLimits, near_findings, network_findings, survey_findings
 from lab.calibrate.screens.screen_inputs import adjusted_screens, screen_inputs
-from lab.calibrate.step import Outcome, Solved, Step, calibration_date, expiry_date, expiry_findings, run_step
+from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expiry_findings, run_step
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project, load_project
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import RigFile, covariance_blocks, save_rig
 from lab.findings.finding import Finding, Level, finding, passed, reasons, verdict, worst_first
+from lab.findings.outcome import Outcome
 from lab.progress import Progress
 
 RIG = "rig.yaml"

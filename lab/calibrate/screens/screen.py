@@ -16,12 +16,13 @@ from lab.calibrate.screens.screen_findings import near_findings, network_finding
 from lab.calibrate.screens.screen_inputs import adjusted_screens, screen_inputs
 from lab.calibrate.screens.screen_page import page_of
 from lab.calibrate.screens.screen_tables import DOTS, RESIDUALS, write_tables
-from lab.calibrate.step import Outcome, Solved, Step, calibration_date, expiry_date, expiry_findings, run_step
+from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expiry_findings, run_step
 from lab.files.project.project import Project, load_project
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import RigFile, covariance_blocks, save_rig
 from lab.files.rig.screens_file import ScreensFile, save_screens
 from lab.findings.finding import Finding, Level, finding, reasons, verdict
+from lab.findings.outcome import Outcome
 from lab.progress import Progress
 
 SCREENS, RIG = "screens.yaml", "rig.yaml"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
@@ -21,6 +20,7 @@ from lab.files.rig.rig_file import RigFile, load_rig_file
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.error_text import suggest_name
 from lab.files.text.yaml_text import parse_mapping, read_text
+from lab.findings.outcome import Done
 
 BEAMPOSE, RIG = "beampose", "beampose-rig"
 _FOREIGN: Mapping[str, ModuleType] = {m.NAME: m for m in (opencv_yaml, kalibr, ros, colmap, mrcal)}
@@ -38,33 +38,13 @@ _LABELS = {
 ROUND_TRIP_TOLERANCE = 1e-12  # relative tolerance between a camera and the camera that is read from the written file
 
 
-@dataclass(frozen=True, slots=True)
-class ConvertOutcome:
-    """What was converted."""
-
-    source: Path
-    destination: Path
-    from_format: str
-    to_format: str
-    cameras: tuple[str, ...]
-    notes: tuple[str, ...]  # what the destination does not contain, a line each
-
-    exit_status = 0
-
-    def line(self) -> str:
-        """For the command line: the conversion, and below it a line for each note."""
-        names = ", ".join(self.cameras)
-        first = f"{names}: {_LABELS[self.from_format]} -> {_LABELS[self.to_format]}, {self.destination}"
-        return "\n".join([first, *(f"  note: {note}" for note in self.notes)])
-
-
 def convert(
     source: Path,
     destination: Path,
     from_format: str | None = None,
     to_format: str | None = None,
     camera: str | None = None,
-) -> ConvertOutcome:
+) -> Done[tuple[CameraModel, ...]]:
     """Write the cameras of one file into another.
 
     Formats: beampose (camera.yaml), opencv, kalibr, ros, colmap, mrcal, and as a source beampose-rig (rig.yaml). By
@@ -86,7 +66,8 @@ def convert(
         notes = found.notes + _write(models, covariances, destination, target)
     except FormatError as error:
         raise InputError(f"{source}: {error}") from None
-    return ConvertOutcome(source, destination, origin, target, tuple(m.name for m in models), notes)
+    line = f"{', '.join(m.name for m in models)}: {_LABELS[origin]} -> {_LABELS[target]}, {destination}"
+    return Done(tuple(models), (line, *(f"  note: {note}" for note in notes)))
 
 
 def read_cameras(path: Path, from_format: str | None = None) -> tuple[CameraModel, ...]:

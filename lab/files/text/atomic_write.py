@@ -16,6 +16,7 @@ from pathlib import Path
 from lab.errors import InputError
 from lab.files.output.folder_lock import folder_lock, is_at, lock
 from lab.files.output.part_folder import part_folder, recover, removed_at_the_end, replace_folder
+from lab.files.text.json_text import has_schema
 
 _REMEDIES = {
     IsADirectoryError: "; name a file in it",
@@ -102,6 +103,11 @@ def check_output_folder(target: Path, may_replace: Callable[[Path], bool]) -> No
         )
     if target.is_dir() and any(target.iterdir()) and not may_replace(target):
         raise InputError(f"{target}: the folder holds something other than earlier results; choose another --out")
+
+
+def earlier_results(*marks: str) -> Callable[[Path], bool]:
+    """Whether a folder holds earlier results of a command: all of these files, or schemas (with /) of summary.json."""
+    return lambda folder: all(has_schema(folder, m) if "/" in m else (folder / m).is_file() for m in marks)
 
 
 @contextmanager

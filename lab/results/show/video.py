@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from geometry.arrays import Ints
 from lab.errors import InputError
+from lab.findings.outcome import Done
 from lab.pictures.overlay_video import write_overlay_video
 from lab.progress import Progress
 from lab.report.frames.canvas import Pixels
@@ -22,15 +22,6 @@ _SAME_LIMITS = 50  # frames for which the grey values that are shown as black an
 _MOST_TEXTS = 500  # poses whose texts are measured for the height of the head
 
 
-@dataclass(frozen=True, slots=True)
-class WrittenVideo:
-    """A video, and what could not be shown."""
-
-    path: Path
-    frames: int
-    notes: tuple[str, ...]
-
-
 def write_video(
     results: Path,
     run_folder: Path | None = None,
@@ -40,7 +31,7 @@ def write_video(
     every: int = 1,
     fps: float = DEFAULT_FPS,
     progress: Progress | None = None,
-) -> WrittenVideo:
+) -> Done[Path]:
     """Write overlay.mp4 (or .avi) into a results folder; it is complete or as it was before.
 
     first, last: frame numbers. every: show each so many frames. fps: frames per second of the video. The memory of
@@ -57,7 +48,7 @@ def write_video(
         path, notes = write_overlay_video(results, images, fps)
     finally:
         images.close()  # with its files and threads
-    return WrittenVideo(path, len(indices), (*data.notes, *notes))
+    return Done(path, (f"video: {path} ({len(indices)} frames)",), (*data.notes, *notes))
 
 
 def _selected(data: ResultData, first: int | None, last: int | None, every: int) -> Ints:

@@ -5,25 +5,17 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from calibration.open3d_loader import MissingOpen3DError, open3d
 from lab.errors import InputError
+from lab.findings.outcome import Done
 from lab.report.calibration.calibration_scene import LAB_VIEWS
 from lab.results.view.page import write_page
 from lab.results.view.scene import Mesh, View, mesh_of, read_content, view_of, write_glb
 
 DEFAULT_OUT = Path("results", "view")
 _PICTURES = dict(zip(LAB_VIEWS, ("view-oblique.png", "view-above.png", "view-front.png"), strict=True))
-
-
-@dataclass(frozen=True, slots=True)
-class ViewOutcome:
-    """The files that were written, and what could not be done."""
-
-    files: tuple[Path, ...]
-    notes: tuple[str, ...] = field(default=())
 
 
 def has_display() -> bool:
@@ -55,7 +47,7 @@ def show(
     frame: int | None = None,
     rig: Path | None = None,
     sigma_scale: float | None = None,
-) -> ViewOutcome:
+) -> Done[tuple[Path, ...]]:
     """Show a rig.yaml, a run folder or results in a window; without a display, or with `out`, write files.
 
     frame: of the beams and spots; None: the middle one. sigma_scale: of the ellipsoids; None: a round number that makes
@@ -73,14 +65,14 @@ def show(
 
         try:
             if open_window(view, index):
-                return ViewOutcome(())
+                return Done((), ())
             notes = ("no window could be opened; files are written instead",)
         except MissingOpen3DError as error:
             notes = (f"no window: {error}",)
     return write_files(view, index, out or DEFAULT_OUT, notes)
 
 
-def write_files(view: View, index: int | None, out: Path, notes: tuple[str, ...] = ()) -> ViewOutcome:
+def write_files(view: View, index: int | None, out: Path, notes: tuple[str, ...] = ()) -> Done[tuple[Path, ...]]:
     """view.html and scene.glb, and where Open3D can be loaded scene.ply and pictures.
 
     Raises:
@@ -95,9 +87,10 @@ def write_files(view: View, index: int | None, out: Path, notes: tuple[str, ...]
     write_glb(mesh, out / "scene.glb")
     files = [out / "view.html", out / "scene.glb"]
     try:
-        return ViewOutcome((*files, *_by_open3d(mesh, out)), notes)
+        files += _by_open3d(mesh, out)
     except MissingOpen3DError as error:
-        return ViewOutcome(tuple(files), (*notes, f"no scene.ply and no rendered pictures: {error}"))
+        notes = (*notes, f"no scene.ply and no rendered pictures: {error}")
+    return Done(tuple(files), tuple(map(str, files)), notes)
 
 
 def _by_open3d(mesh: Mesh, out: Path) -> list[Path]:

@@ -20,7 +20,7 @@ from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_text
 from lab.runs.batch.resumption import fingerprint_of, finished_summary
 from lab.runs.batch.run_folders import displayed
-from lab.runs.process import RunOutcome, process_run
+from lab.runs.process import process_run
 from lab.runs.run_log import collected_lines
 
 COLUMNS = (
@@ -90,10 +90,10 @@ def perform(task: Task) -> TaskOutcome:
     code = ""
     with collected_lines() as log:
         try:
-            row, skipped = _row(task, _processed(task, fingerprint)), False
+            row, skipped = _processed(task, fingerprint), False
         except _AlreadyDone as done:
             try:
-                row, skipped = _row_of_summary(task, done.summary), True
+                row, skipped = _row(task, done.summary), True
             except (KeyError, TypeError, AttributeError, ValueError):
                 damaged = "summary.json of the earlier results is damaged; delete the folder"
                 row, skipped, code = failed_row(task, damaged), False, RunError.code
@@ -104,14 +104,16 @@ def perform(task: Task) -> TaskOutcome:
     return TaskOutcome(row, skipped, code, tuple(log))
 
 
-def _processed(task: Task, more: Callable[[Run], Mapping[str, Any]]) -> RunOutcome:
-    """Process the run; waits while another process writes to its result folder. Raises as `process_run`."""
+def _processed(task: Task, more: Callable[[Run], Mapping[str, Any]]) -> dict[str, Any]:
+    """The row of a processed run; waits while another process writes to its result folder. Raises as `process_run`."""
     waited = 0.0
     while True:
         try:
-            return process_run(
+            started = time.perf_counter()
+            outcome = process_run(
                 task.folder, task.out / task.results, overrides=task.overrides, causal=task.causal, more=more
             )
+            return {**_row(task, outcome.summary), "seconds": round(time.perf_counter() - started, 3)}
         except FolderInUseError:
             if waited >= task.patience_s:
                 raise
@@ -132,45 +134,24 @@ def failed_row(task: Task, message: str, exit_status: int = RunError.exit_status
     }
 
 
-def _row(task: Task, outcome: RunOutcome) -> dict[str, Any]:
-    return {
-        "run": displayed(task.folder),
-        "name": _as_text(outcome.name),
-        "folder": task.place,
-        "status": outcome.verdict.status,
-        "exit_status": outcome.exit_status,
-        "frames": outcome.frames,
-        "measured_frames": outcome.measured,
-        "measured_share": _share(outcome.measured, outcome.frames),
-        "seconds": round(outcome.seconds, 3),
-        "results": task.results,
-        "message": _as_text("; ".join(outcome.verdict.texts)),
-        "report": f"{task.results}/{REPORT}",
-    }
-
-
-def _row_of_summary(task: Task, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """The row of results that were written earlier."""
+def _row(task: Task, summary: Mapping[str, Any]) -> dict[str, Any]:
+    """The row of a run with results."""
     verdict, counts = summary["verdict"], summary["counts"]
     frames, measured = int(counts["frames"]), int(counts["pose_status"].get("measured", 0))
     return {
         "run": displayed(task.folder),
-        "name": str(summary["name"]),
+        "name": _as_text(str(summary["name"])),
         "folder": task.place,
         "status": str(verdict["status"]),
         "exit_status": int(verdict["exit_status"]),
         "frames": frames,
         "measured_frames": measured,
-        "measured_share": _share(measured, frames),
+        "measured_share": round(measured / frames, 6) if frames else 0.0,
         "seconds": round(float(summary["timings"]["wall_s"]), 3),
         "results": task.results,
-        "message": "; ".join(verdict["reasons"]),
+        "message": _as_text("; ".join(verdict["reasons"])),
         "report": f"{task.results}/{REPORT}",
     }
-
-
-def _share(measured: int, frames: int) -> float:
-    return round(measured / frames, 6) if frames else 0.0
 
 
 def _as_text(text: str) -> str:

@@ -15,15 +15,17 @@ import numpy as np
 from lab.errors import InputError
 from lab.files.run.parameter_overrides import with_overrides
 from lab.files.text import columns
-from lab.files.text.atomic_write import atomic_folder
+from lab.files.text.atomic_write import atomic_folder, earlier_results
 from lab.files.text.csv_text import csv_word
-from lab.files.text.json_text import has_schema, write_json
+from lab.files.text.json_text import write_json
+from lab.findings.outcome import Done
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import PictureSource, Video, open_inputs, pictures, pictures_of_frames
 from lab.progress import Progress
 from lab.runs.detect.contact_sheet import ContactSheet
 from lab.runs.detect.picture_series import PictureSeries
 from lab.runs.frames.sensor_noise import noise_frames
+from lab.runs.processed import quantiles
 from lab.runs.tables import detection_rows
 from lab.versions import versions
 from tracking.parameters import DetectParameters, TrackerParameters
@@ -57,27 +59,9 @@ class DetectOptions:
         return with_overrides(TrackerParameters(), self.overrides).detect
 
 
-@dataclass(frozen=True, slots=True)
-class DetectOutcome:
-    """The outcome of one call."""
-
-    camera: str
-    out: Path
-    pictures: int
-    unreadable: int
-    spots: int
-    exit_status: int = 0
-
-    def line(self) -> str:
-        """One line for the command line."""
-        bad = f" ({self.unreadable} more cannot be read)" if self.unreadable else ""
-        each = self.spots / max(self.pictures, 1)
-        return f"{self.camera}: {self.spots} spots in {_counted(self.pictures)}{bad}, {each:.3g} each -> {self.out}"
-
-
 def detect_pictures(
     given: list[Path], out: Path, options: DetectOptions = DetectOptions(), progress: Progress | None = None
-) -> DetectOutcome:
+) -> Done[PictureSeries]:
     """Search pictures for spots, and write detections.csv, a contact sheet, report.html and summary.json into `out`.
 
     Positions are centroids of the light: without a rig they cannot be corrected to the beams' axes.
@@ -90,7 +74,7 @@ def detect_pictures(
     inputs = open_inputs(given, options.camera)
     source = str(inputs.path if isinstance(inputs, Video) else given[0] if len(given) == 1 else f"{len(given)} files")
     series = PictureSeries(inputs.camera, source, parameters, notes=list(inputs.notes))
-    with atomic_folder(out, may_replace=are_detections) as folder:
+    with atomic_folder(out, earlier_results(SCHEMA)) as folder:
         first = pictures_of_frames(inputs, noise_frames(inputs)).values()
         series.estimate_noise([p for p in first if not isinstance(p, MissingPicture)])
         sheet = ContactSheet(_total(inputs, options))
@@ -102,12 +86,10 @@ def detect_pictures(
         write_json(_summary(series, options, time.perf_counter() - started), folder / "summary.json")
         write_detect_page(series, sheet, folder)
     bad = sum(map(len, series.unreadable.values()))
-    return DetectOutcome(series.camera, Path(out), series.pictures, bad, series.spots.total)
-
-
-def are_detections(folder: Path) -> bool:
-    """Whether a folder holds the results of an earlier call."""
-    return has_schema(folder, SCHEMA)
+    unread = f" ({bad} more cannot be read)" if bad else ""
+    each = series.spots.total / max(series.pictures, 1)
+    found = f"{series.camera}: {series.spots.total} spots in {_counted(series.pictures)}{unread}, {each:.3g} each"
+    return Done(series, (f"{found} -> {out}",))
 
 
 def _search_all(
@@ -168,11 +150,6 @@ def _add_notes(series: PictureSeries) -> None:
 def _summary(series: PictureSeries, options: DetectOptions, wall_s: float) -> dict[str, Any]:
     table = series.spots.table()
     counts = np.array([n for _, n in series.spots.per_frame])
-
-    def quantiles(values: np.ndarray) -> dict[str, float] | None:
-        if not len(values):
-            return None
-        return dict(zip(("p5", "median", "p95"), np.percentile(values, [5, 50, 95]).tolist(), strict=True))
 
     return {
         "schema": SCHEMA,

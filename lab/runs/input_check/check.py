@@ -18,16 +18,17 @@ from lab.errors import CalibrationError, InputError
 from lab.files.rig.calibration_state import CalibrationState, require_valid_calibration
 from lab.files.rig.rig_file import joint_covariance, load_rig_file
 from lab.files.run.run_file import Run, load_run
+from lab.findings.outcome import Done
 from lab.progress import Progress
 from lab.runs.frames.open_frames import open_frames
-from lab.runs.input_check.findings import CheckResult, Findings, table
+from lab.runs.input_check.findings import Findings, table
 from lab.runs.input_check.pictures import check_pictures
 from lab.runs.input_check.setup import check_recording, check_rig
 from lab.runs.input_check.visibility import check_visibility
 from tracking.parameters import LabelParameters
 
 
-def check(path: Path, progress: Progress | None = None) -> CheckResult:
+def check(path: Path, progress: Progress | None = None) -> Done[None]:
     """Check a rig.yaml, or a run folder with all its pictures, which are decoded one by one.
 
     Errors of the input become lines of the result.
@@ -49,7 +50,7 @@ def check(path: Path, progress: Progress | None = None) -> CheckResult:
     return findings.result()
 
 
-def _check_run(folder: Path, progress: Progress | None) -> CheckResult:
+def _check_run(folder: Path, progress: Progress | None) -> Done[None]:
     findings = Findings(str(folder))
     try:
         run = load_run(folder)

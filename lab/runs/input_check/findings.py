@@ -7,14 +7,7 @@ from dataclasses import dataclass, field
 
 from lab.errors import CalibrationError, InputError
 from lab.files.text.error_text import FileError
-
-
-@dataclass(frozen=True, slots=True)
-class CheckResult:
-    """The output of `beampose check`."""
-
-    lines: tuple[str, ...]
-    exit_status: int  # 0: can be processed; 2: something must be corrected first; 3: that is the calibration alone
+from lab.findings.outcome import Done
 
 
 @dataclass(slots=True)
@@ -31,8 +24,8 @@ class Findings:
         """Add the lines of an input error to the problems."""
         self.problems += error.lines if isinstance(error, FileError) else str(error).splitlines()
 
-    def result(self) -> CheckResult:
-        """The findings as lines, with the exit status."""
+    def result(self) -> Done[None]:
+        """The findings as lines. Exit status 2: something must be corrected first; 3: that is the calibration alone."""
         counts = [
             f"{len(lines)} {word}{'s' if len(lines) > 1 else ''}"
             for word, lines in (("problem", self.problems + self.unusable), ("remark", self.remarks))
@@ -46,7 +39,7 @@ class Findings:
         if self.facts:
             lines += ["", *self.facts]
         status = InputError.exit_status if self.problems else CalibrationError.exit_status if self.unusable else 0
-        return CheckResult(tuple(lines), status)
+        return Done(None, tuple(lines), exit_status=status)
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -8,13 +8,12 @@ occlusions, few spots in view, a camera that stopped) has wide sigmas and does n
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
-from lab.errors import QUALITY_GATE_FAILED
 from lab.findings.finding import Finding, Level, clause, finding, level_above, worst_first
-from lab.findings.finding import verdict as level_of
+from lab.findings.outcome import Verdict
 from lab.runs.verdict.frame_ranges import FrameRanges
 from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, Cause, RunStatistics
 
@@ -38,35 +37,6 @@ LONG_EMPTY = (
 MOST_WRONG = 0.005  # share of the measured poses beyond 10 sigmas from the truth, up to which the run does not fail
 LEAST_DISPLACED = 5  # frames in which none of a camera's spots fits the others' pose, from which on it is reported
 _FEW_FOUND = 0.2  # measured share of the expected spots, below which a mostly empty camera is reported
-_NEVER_FOUND = "BP-V02"  # its remedy refers to the other reasons
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """What can be said of a run as a whole."""
-
-    texts: tuple[str, ...]
-    reasons: tuple[Finding, ...] = ()  # in the order of the texts, failures first; a run that passes has none
-
-    @property
-    def level(self) -> Level:
-        """PASS; WARN: usable, but something needs a check by the user; FAIL: a quality gate failed."""
-        return level_of(self.reasons)
-
-    @property
-    def status(self) -> str:
-        """The level as in summary.json: pass, check or fail."""
-        return self.level.word
-
-    @property
-    def exit_status(self) -> int:
-        """The command's exit status, section 5 of the files' contract."""
-        return QUALITY_GATE_FAILED if self.level is Level.FAIL else 0
-
-    @property
-    def remedy(self) -> str:
-        """The remedy of the first failure with one of its own; empty where nothing failed."""
-        return next((r.remedy for r in self.reasons if r.level is Level.FAIL and r.code != _NEVER_FOUND), "")
 
 
 def judge(
@@ -94,12 +64,13 @@ def judge(
     if found:
         return _of(found)
     share = statistics.measured / statistics.frames
-    return Verdict((f"{share:.1%} of the frames have a measured pose, and the residuals agree with the stated sigmas",))
+    return Verdict(
+        (), f"{share:.1%} of the frames have a measured pose, and the residuals agree with the stated sigmas"
+    )
 
 
 def _of(found: Iterable[Finding]) -> Verdict:
-    reasons = worst_first(found)
-    return Verdict(tuple(f.what for f in reasons), reasons)
+    return Verdict(worst_first(found))
 
 
 def against_truth(verdict: Verdict, errors: Mapping[str, Any] | None) -> Verdict:
@@ -114,7 +85,7 @@ def against_truth(verdict: Verdict, errors: Mapping[str, Any] | None) -> Verdict
     )
     level = Level.FAIL if wrong > MOST_WRONG * measured["rows"] else Level.WARN
     numbers = {"wrong": wrong, "rows": measured["rows"]}
-    return _of((finding("BP-V20", level, what, numbers=numbers), *verdict.reasons))
+    return _of((finding("BP-V20", level, what, numbers=numbers), *verdict.findings))
 
 
 def _mosaics(mosaics: Mapping[str, float]) -> list[Finding]:
@@ -137,7 +108,7 @@ def _measured(statistics: RunStatistics) -> list[Finding]:
     if measured == 0:
         what = "the vehicle was never found: no frame has a measured pose"
         return [
-            finding(_NEVER_FOUND, Level.FAIL, what, numbers=numbers),
+            finding("BP-V02", Level.FAIL, what, numbers=numbers),
             *_cameras(statistics),
             *_why_never(statistics),
         ]

@@ -76,14 +76,14 @@ class Latency:
             out["largest_at_start"] = max(self.start)
         return out
 
-    def line(self) -> str:
-        """One line of text; empty without a frame."""
+    def lines(self) -> tuple[str, ...]:
+        """For the terminal; empty without a frame."""
         if not self.steady:
-            return ""
+            return ()
         median, p95, p99 = np.percentile(self.steady, [50, 95, 99])
         return (
             f"latency: median {median:.1f} ms, 95 % within {p95:.1f} ms, 99 % within {p99:.1f} ms, largest"
-            f" {max(self.steady):.1f} ms ({len(self.steady)} frames)"
+            f" {max(self.steady):.1f} ms ({len(self.steady)} frames)",
         )
 
 

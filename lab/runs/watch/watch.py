@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,38 +22,23 @@ from geometry.pose import Pose
 from lab.errors import InputError, RunError
 from lab.files.run.run_file import LiveDevice, Run
 from lab.files.text.atomic_write import atomic_folder
+from lab.findings.outcome import Outcome
 from lab.pictures.picture_file import GreyPicture
 from lab.progress import Progress
 from lab.runs.frames.pipeline import Pipeline, tracker_of
 from lab.runs.frames.sensor_noise import CameraNoise
-from lab.runs.process import RunOutcome, are_results, ready_run, write_results
+from lab.runs.process import are_results, ready_run, write_results
 from lab.runs.smoothing_pass import TRACKING
 from lab.runs.verdict.frame_checks import FrameChecks
+from lab.runs.verdict.run_statistics import RunStatistics
 from lab.runs.watch.live_background import LiveBackground
 from lab.runs.watch.live_frames import LiveFrames, WatchOptions
-from lab.runs.watch.live_output import Latency, LiveOutput, UdpLines, is_live_table
+from lab.runs.watch.live_output import LiveOutput, UdpLines, is_live_table
 from tracking.background.estimation import PICTURES
 from tracking.detections import Detections
 
 _log = logging.getLogger("beampose")
 _SWITCH_INTERVAL_S = 0.0005
-
-
-@dataclass(frozen=True, slots=True)
-class WatchOutcome:
-    """The outcome of a watched run."""
-
-    run: RunOutcome
-    latency: Latency
-
-    @property
-    def exit_status(self) -> int:
-        """The exit status of the finished run."""
-        return self.run.exit_status
-
-    def line(self) -> str:
-        """The line of the finished run, and the latency of its poses."""
-        return "\n".join(filter(None, (self.run.line(), self.latency.line())))
 
 
 def watch_run(
@@ -67,7 +52,7 @@ def watch_run(
     progress: Progress | None = None,
     stop: threading.Event | None = None,
     provenance: Mapping[str, Any] | None = None,
-) -> WatchOutcome:
+) -> Outcome[RunStatistics]:
     """Process a run folder whose cameras are folders that are being filled, or devices.
 
     During the recording `out` contains attitude_live.csv: a row per frame by the causal tracker, flushed at once. udp:
@@ -109,7 +94,7 @@ def watch_run(
                 return {**(provenance or {}), **output.finish(work)}
 
             outcome = write_results(pipeline, work, Path(out), started, progress=progress, more=more)
-    return WatchOutcome(outcome, output.latency)
+    return replace(outcome, more=output.latency.lines())
 
 
 def _started(run: Run, frames: LiveFrames, output: LiveOutput) -> tuple[Pipeline, dict[str, _Finder]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -16,19 +15,16 @@ from lab.errors import InputError
 from lab.files.rig.calibration_state import require_valid_calibration, state_mapping
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.run.truth import TruePoses, read_true_poses
-from lab.files.text.atomic_write import atomic_folder
-from lab.files.text.json_text import has_schema, write_json
-from lab.findings.finding import Finding
+from lab.findings.outcome import Outcome, Verdict
 from lab.number_format import format_length
 from lab.pictures.picture_file import MissingPicture
 from lab.progress import Progress
+from lab.runs.processed import Processed, write_processed
 from lab.targets.stereo.findings import findings_of
 from lab.targets.stereo.frames import StereoFrame, stereo_frames
 from lab.targets.stereo.page import write_stereo_page
 from lab.targets.stereo.run import StereoRecord, StereoResults, StereoRun, load_stereo_run, truth_errors
 from lab.targets.stereo.tables import write_tables
-from lab.targets.verdict import Outcome, verdict_block
-from lab.versions import versions
 from tracking.binocular.calibration_check import MOST_FRAMES, LabelledFrame, check_calibration, labelled_by_each
 from tracking.binocular.clock_offset import FittedFrame, clock_offset
 from tracking.binocular.marker_model import MarkerImages
@@ -47,22 +43,48 @@ def process_stereo_run(run_folder: Path, out: Path, progress: Progress | None = 
         BeamposeError: the run cannot be processed (CalibrationError: its pair's calibration must not be used); `out` is
             then unchanged.
     """
-    started = time.perf_counter()
+    return write_processed(out, SUMMARY_SCHEMA, lambda work: _processed(run_folder, work, progress))
+
+
+def _processed(run_folder: Path, work: Path, progress: Progress | None) -> Processed[StereoResults]:
+    """The run, whose tables are written into the folder `work`."""
     run = load_stereo_run(run_folder)
     recorded = datetime.date.today() if run.recorded is None else run.recorded
     require_valid_calibration(run.calibration, run.pair_path, recorded)
     truth_path = run.folder / "truth" / "pose.csv"
     truth = read_true_poses(truth_path) if truth_path.is_file() else None
-    with atomic_folder(out, may_replace=lambda folder: has_schema(folder, SUMMARY_SCHEMA)) as work:
-        results = measure(run, progress)
-        add_truth(results, truth)
-        findings = findings_of(results)
-        write_tables(results, work)
-        write_json(_summary(results, findings, time.perf_counter() - started), work / "summary.json")
-        write_stereo_page(results, findings, work)
-    errors = None if results.errors is None else results.errors.as_mapping()["position_rms_m"]
-    words = "" if errors is None else f"position error {format_length(errors)} RMS"
-    return Outcome(run.name, Path(out), len(results.records), len(results.measured), findings, results, words)
+    results = measure(run, progress)
+    add_truth(results, truth)
+    findings = findings_of(results)
+    write_tables(results, work)
+    errors = None if results.errors is None else results.errors.as_mapping()
+    words = () if errors is None else (f"position error {format_length(errors['position_rms_m'])} RMS",)
+    files = [run.path, run.pair_path, *(p for p in (run.target_path, run.times_path) if p is not None)]
+    files += [p for p in (run.folder / "truth" / name for name in ("pose.csv", "spots.csv")) if p.is_file()]
+    return Processed(
+        schema=SUMMARY_SCHEMA,
+        name=run.name,
+        result=results,
+        verdict=Verdict(findings),
+        frames=len(results.records),
+        measured=len(results.measured),
+        frame_rate_hz=run.frame_rate_hz,
+        parameters=dataclasses.asdict(run.parameters),
+        inputs=fingerprints_of(files, [s.path for s in run.cameras.values()]),
+        notes=results.notes,
+        blocks={
+            "run_folder": str(run.folder.resolve()),
+            "pair": str(run.pair_path.resolve()),
+            "calibration": None if run.calibration is None else state_mapping(run.calibration),
+            "notes_of_run": run.notes,
+            "counts": _counts(results),
+            "rates": {"noise_scale": results.noise_scale},
+            "pair_check": _pair_check(results),
+            "errors": errors,
+        },
+        page=lambda folder, _: write_stereo_page(results, findings, folder),
+        errors=words,
+    )
 
 
 def measure(run: StereoRun, progress: Progress | None = None) -> StereoResults:
@@ -178,55 +200,33 @@ def _require_pictures(results: StereoResults) -> None:
             )
 
 
-def _summary(results: StereoResults, findings: tuple[Finding, ...], wall_s: float) -> dict[str, Any]:
-    run, records = results.run, results.records
-    status = Counter(r.tracked.status.value for r in records)
-    files = [run.path, run.pair_path, *(p for p in (run.target_path, run.times_path) if p is not None)]
-    files += [p for p in (run.folder / "truth" / name for name in ("pose.csv", "spots.csv")) if p.is_file()]
+def _counts(results: StereoResults) -> dict[str, Any]:
+    records = results.records
+    return {
+        "pose_status": dict(Counter(r.tracked.status.value for r in records)),
+        "not_measured": dict(Counter(r.tracked.reason for r in records if not r.measured)),
+        "no_image": {name: sum(1 for r in records if r.missing[c]) for c, name in enumerate(results.run.cameras)},
+        "candidates_per_frame": {
+            name: float(np.mean([0 if f is None else len(f) for f in (r.candidates[c] for r in records)]))
+            for c, name in enumerate(results.run.cameras)
+        },
+    }
+
+
+def _pair_check(results: StereoResults) -> dict[str, Any]:
     clock = results.clock
     return {
-        "schema": SUMMARY_SCHEMA,
-        "name": run.name,
-        "run_folder": str(run.folder.resolve()),
-        "pair": str(run.pair_path.resolve()),
-        "calibration": None if run.calibration is None else state_mapping(run.calibration),
-        "notes_of_run": run.notes,
-        "verdict": verdict_block(findings),
-        "counts": {
-            "frames": len(records),
-            "pose_status": dict(status),
-            "not_measured": dict(Counter(r.tracked.reason for r in records if not r.measured)),
-            "no_image": {name: sum(1 for r in records if r.missing[c]) for c, name in enumerate(run.cameras)},
-            "candidates_per_frame": {
-                name: float(np.mean([0 if f is None else len(f) for f in (r.candidates[c] for r in records)]))
-                for c, name in enumerate(run.cameras)
-            },
+        "baseline_m": results.run.pair.baseline_m,
+        "clock": None
+        if clock is None
+        else {
+            "offset_s": clock.offset_s,
+            "sigma_s": clock.sigma_s,
+            "jitter_s": clock.jitter_s,
+            "shift_px": clock.shift_px,
+            "significant": clock.significant,
+            "rotation_of_right_rad": clock.rotation_rad.tolist(),
+            "rotation_sigma_rad": clock.rotation_sigma_rad.tolist(),
         },
-        "rates": {
-            "measured_share": status["measured"] / max(len(records), 1),
-            "frame_rate_hz": run.frame_rate_hz,
-            "processed_frames_per_s": len(records) / wall_s if wall_s > 0 else None,
-            "noise_scale": results.noise_scale,
-        },
-        "pair_check": {
-            "baseline_m": run.pair.baseline_m,
-            "clock": None
-            if clock is None
-            else {
-                "offset_s": clock.offset_s,
-                "sigma_s": clock.sigma_s,
-                "jitter_s": clock.jitter_s,
-                "shift_px": clock.shift_px,
-                "significant": clock.significant,
-                "rotation_of_right_rad": clock.rotation_rad.tolist(),
-                "rotation_sigma_rad": clock.rotation_sigma_rad.tolist(),
-            },
-            "calibration": None if results.calibration is None else dataclasses.asdict(results.calibration),
-        },
-        "errors": None if results.errors is None else results.errors.as_mapping(),
-        "timings": {"wall_s": wall_s},
-        "versions": versions(),
-        "parameters": dataclasses.asdict(run.parameters),
-        "inputs": fingerprints_of(files, [s.path for s in run.cameras.values()]),
-        "notes": results.notes,
+        "calibration": None if results.calibration is None else dataclasses.asdict(results.calibration),
     }

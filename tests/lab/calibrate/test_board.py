@@ -29,12 +29,12 @@ def test_a_printed_picture_shows_the_board_at_its_size(tmp_path, text, dpi):
     per_metre, same, unit = struct.unpack(">IIB", data[at + 4 : at + 13])
     assert (per_metre, unit) == (same, 1)
     image = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
-    view = find_board(image, outcome.board)
+    view = find_board(image, outcome.result)
     assert isinstance(view, BoardView)
-    assert len(view) == len(outcome.board.ids)
+    assert len(view) == len(outcome.result.ids)
     mm = 1000 * view.pixels / per_metre
-    np.testing.assert_allclose(mm - mm[0], 1000 * outcome.board.points[:, :2], atol=0.02)  # a printer's own error
-    assert load_board(tmp_path / "b" / "board.yaml") == outcome.board
+    np.testing.assert_allclose(mm - mm[0], 1000 * outcome.result.points[:, :2], atol=0.02)  # a printer's own error
+    assert load_board(tmp_path / "b" / "board.yaml") == outcome.result
     assert outcome.exit_status == 0
     assert "measure the bar of 100 mm" in outcome.line()
 
@@ -70,7 +70,7 @@ def test_a_board_too_large_for_the_page_is_refused_with_the_remedy(tmp_path):
     with pytest.raises(InputError, match=r"300 x 210 mm do not fit on A4; use A3 .*, or reduce the 30 mm to 25\.1 mm"):
         write_board("chessboard:9x6:30mm", tmp_path / "b")
     assert list(tmp_path.iterdir()) == []
-    assert write_board("chessboard:9x6:30mm", tmp_path / "b", page="fit").page == "fit"
+    assert " on fit: " in write_board("chessboard:9x6:30mm", tmp_path / "b", page="fit").line()
 
 
 def test_a_folder_with_something_else_in_it_is_left_alone(tmp_path):

@@ -44,21 +44,21 @@ def copy(made: Path, tmp_path: Path) -> Path:
 
 def test_an_unchanged_result_is_the_same(made):
     found = verify(made / "out")
-    assert (found.identical, found.exit_status, found.versions) == (True, 0, ())
-    assert {"attitude.csv", "attitude_causal.csv", "spots.csv", "covariance.csv"} <= set(found.tables)
-    assert found.lines()[0].startswith(f"SAME: {len(found.tables)} of {len(found.tables)} tables")
+    assert (found.result.identical, found.exit_status, found.result.versions) == (True, 0, ())
+    assert {"attitude.csv", "attitude_causal.csv", "spots.csv", "covariance.csv"} <= set(found.result.tables)
+    assert found.lines[0].startswith(f"SAME: {len(found.result.tables)} of {len(found.result.tables)} tables")
 
 
 def test_a_causal_result_is_computed_without_smoothing(made, tmp_path):
     arguments = ["run", str(made / "run"), "--out", str(tmp_path / "out"), "--causal", "--full-hash"]
     assert CliRunner().invoke(main, arguments).exit_code == 0
     found = verify(tmp_path / "out")
-    assert found.identical
-    assert "attitude_causal.csv" not in found.tables
+    assert found.result.identical
+    assert "attitude_causal.csv" not in found.result.tables
 
 
 def test_a_run_that_has_moved_is_compared_too(copy):
-    assert verify(copy / "out", copy / "run").identical
+    assert verify(copy / "out", copy / "run").result.identical
 
 
 def test_a_changed_digit_is_named_with_its_row_and_column(copy):
@@ -69,8 +69,8 @@ def test_a_changed_digit_is_named_with_its_row_and_column(copy):
     lines[8] = ",".join(fields)
     path.write_text("".join(lines))
     found = verify(copy / "out")
-    assert (found.exit_status, len(found.differences)) == (4, 1)
-    text = str(found.differences[0])
+    assert (found.exit_status, len(found.result.differences)) == (4, 1)
+    text = str(found.result.differences[0])
     assert text.startswith("attitude.csv: line 9 (frame 7): z_m: recorded '7', computed ")
     assert text.endswith(f"(1 of {len(lines)} lines differ)")
 
@@ -78,7 +78,7 @@ def test_a_changed_digit_is_named_with_its_row_and_column(copy):
 def test_a_table_that_is_missing_or_not_computed_any_more_is_a_difference(copy):
     (copy / "out" / "beams.csv").unlink()
     (copy / "out" / "systematic.csv").write_text("frame\n")
-    texts = [str(d) for d in verify(copy / "out").differences]
+    texts = [str(d) for d in verify(copy / "out").result.differences]
     assert texts == [
         "beams.csv: is missing in the results",
         "systematic.csv: is in the results, but is not computed any more",
@@ -89,7 +89,7 @@ def test_changed_inputs_are_named(copy):
     path = copy / "run" / "detections.csv"
     path.write_text(path.read_text().replace("\n0,left,", "\n0,left,0", 1))
     found = verify(copy / "out", copy / "run")
-    assert [t.split(": ")[0] for t in found.inputs.changed] == [str(path)]
+    assert [t.split(": ")[0] for t in found.result.inputs.changed] == [str(path)]
     assert found.exit_status == 4
 
 
@@ -99,7 +99,7 @@ def test_an_input_that_was_not_recorded_is_not_compared_and_a_lost_one_is_a_chan
     content["inputs"] = [i for i in content["inputs"] if not i["path"].endswith("rig.yaml")]
     content["inputs"].append({"path": "times.csv", "sha256": "0", "bytes": 1, "covers": "contents"})
     path.write_text(json.dumps(content))
-    found = verify(copy / "out").inputs
+    found = verify(copy / "out").result.inputs
     assert [t.split(": ")[1] for t in found.not_compared] == ["no fingerprint was recorded"]
     assert found.changed == ("times.csv: was an input, is none now",)
 
@@ -110,8 +110,8 @@ def test_other_versions_are_named_and_are_no_difference(copy):
     content["versions"]["numpy"] = "1.0"
     path.write_text(json.dumps(content))
     found = verify(copy / "out")
-    assert found.identical
-    assert [v.split(",")[0] for v in found.versions] == ["numpy 1.0"]
+    assert found.result.identical
+    assert [v.split(",")[0] for v in found.result.versions] == ["numpy 1.0"]
 
 
 def test_the_parameters_of_the_command_line_are_those_of_the_recomputation(made):

@@ -20,7 +20,7 @@ from lab.files.run.results import POSE_STATUSES, read_poses, read_spots
 from lab.files.run.run_file import load_run
 from lab.files.text import columns
 from lab.files.text.json_text import plain_value
-from lab.runs import process, smoothing_pass
+from lab.runs import process, processed, smoothing_pass
 from lab.runs.batch.batch import process_batch
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.process import are_results, process_run
@@ -238,7 +238,7 @@ def test_without_truth_there_are_no_errors(tmp_path):
         file.unlink()
     (folder / "truth").rmdir()
     outcome = process_run(folder, tmp_path / "out")
-    assert outcome.errors is None
+    assert outcome.summary["errors"] is None
     assert json.loads((tmp_path / "out/summary.json").read_text())["errors"] is None
 
 
@@ -249,7 +249,7 @@ def test_the_outcome_its_line_and_the_summary_agree(tmp_path):
     folder = points_run(tmp_path / "run")
     outcome = process_run(folder, tmp_path / "out")
     summary = json.loads((tmp_path / "out/summary.json").read_text())
-    assert (outcome.frames, outcome.measured) == (12, summary["counts"]["pose_status"]["measured"])
+    assert (outcome.result.frames, outcome.result.measured) == (12, summary["counts"]["pose_status"]["measured"])
     assert outcome.verdict.status == summary["verdict"]["status"] == "pass"
     assert outcome.exit_status == summary["verdict"]["exit_status"] == 0
     assert outcome.line() == (
@@ -262,7 +262,7 @@ def test_a_run_in_which_the_vehicle_is_never_found_fails_the_gate_and_has_all_it
     folder = write_run(tmp_path / "run")
     outcome = process_run(folder, tmp_path / "out")
     assert outcome.exit_status == 4
-    assert outcome.measured == 0
+    assert outcome.result.measured == 0
     assert "never found" in outcome.line()
     assert names(tmp_path / "out") == sorted(FILES)
     attitude = rows_of(tmp_path / "out/attitude.csv")
@@ -288,13 +288,13 @@ def reasons_of(out: Path) -> dict[str, dict]:
 
 def test_a_run_without_spots_in_nearly_all_of_its_frames_fails_the_gate(tmp_path):
     outcome = process_run(lit(tmp_path / "run", int(40 * LEAST_MEASURED) - 2), tmp_path / "out")
-    assert outcome.frames == 40
+    assert outcome.result.frames == 40
     assert outcome.exit_status == 4
 
 
 def test_a_run_without_spots_in_half_of_its_frames_does_not_fail(tmp_path):
     outcome = process_run(lit(tmp_path / "run", 18), tmp_path / "out")
-    assert (outcome.measured, outcome.verdict.status, outcome.exit_status) == (19, "check", 0)
+    assert (outcome.result.measured, outcome.verdict.status, outcome.exit_status) == (19, "check", 0)
     few = reasons_of(tmp_path / "out")["few_measured"]
     assert few["numbers"]["causes"] == {"hidden": 21}
     assert few["remedy"]
@@ -637,7 +637,7 @@ def test_a_run_that_fails_leaves_earlier_results_unchanged(tmp_path, monkeypatch
     def fail(*_):
         raise RunError("the disk is full")
 
-    monkeypatch.setattr(process, "write_json", fail)
+    monkeypatch.setattr(processed, "write_json", fail)
     with pytest.raises(RunError):
         process_run(folder, out)
     assert {p.name: p.read_bytes() for p in out.iterdir()} == before

@@ -104,7 +104,7 @@ def test_a_calibrated_run_whose_vehicle_is_never_found_fails_and_has_its_tables(
     lines = points.read_text("utf-8").splitlines(keepends=True)
     points.write_text("".join(line for line in lines if ",left," not in line), "utf-8")
     outcome = process_run(run_folder, tmp_path / "out")
-    assert (outcome.verdict.exit_status, outcome.measured) == (4, 0)
+    assert (outcome.verdict.exit_status, outcome.result.measured) == (4, 0)
     assert np.isnan(read_poses(tmp_path / "out").systematic).all()
 
 

@@ -8,13 +8,13 @@ import pytest
 
 from lab.findings.catalogue import ENTRIES
 from lab.findings.finding import Finding, Level, finding
+from lab.findings.outcome import Verdict
 from lab.runs.verdict.frame_ranges import FrameRanges
 from lab.runs.verdict.quality import (
     GOOD_MEASURED,
     LEAST_DISPLACED,
     LEAST_MEASURED,
     LEAST_MEASURED_OF_SHOWN,
-    Verdict,
     judge,
 )
 from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, Cause, RunStatistics
@@ -54,12 +54,12 @@ def statistics_of(
 
 
 def kinds(verdict: Verdict) -> list[str]:
-    return [ENTRIES[e.code].kind for e in verdict.reasons]
+    return [ENTRIES[e.code].kind for e in verdict.findings]
 
 
 def test_a_clean_run_passes_and_gives_the_reason():
     verdict = judge(statistics_of())
-    assert (verdict.status, verdict.exit_status, verdict.reasons) == ("pass", 0, ())
+    assert (verdict.status, verdict.exit_status, verdict.findings) == ("pass", 0, ())
     assert verdict.texts == (
         "100.0% of the frames have a measured pose, and the residuals agree with the stated sigmas",
     )
@@ -88,7 +88,7 @@ def test_only_missed_frames_fail_a_run_and_frames_with_too_few_spots_do_not(caus
     assert verdict.status == ("fail" if cause in MISSED else "check")
     assert kinds(verdict) == ["few_measured"]
     assert cause.meaning in verdict.texts[0]
-    assert verdict.reasons[0].remedy == ENTRIES["BP-V03"].variant(cause.value).remedy
+    assert verdict.findings[0].remedy == ENTRIES["BP-V03"].variant(cause.value).remedy
 
 
 def test_the_share_of_missed_frames_is_relative_to_the_frames_with_enough_spots():
@@ -124,8 +124,8 @@ def never(**changed: object) -> Verdict:
     verdict = judge(statistics_of(0, **arguments))  # type: ignore[arg-type]
     assert verdict.exit_status == 4
     assert verdict.texts[0] == "the vehicle was never found: no frame has a measured pose"
-    assert all(e.level is Level.FAIL and e.remedy for e in verdict.reasons)
-    assert verdict.remedy == verdict.reasons[1].remedy
+    assert all(e.level is Level.FAIL and e.remedy for e in verdict.findings)
+    assert verdict.remedy == verdict.findings[1].remedy
     return verdict
 
 
@@ -224,7 +224,7 @@ def test_a_point_to_check_has_a_remedy_and_is_not_a_failure(changed, kind, words
     assert (verdict.status, verdict.exit_status) == ("check", 0)
     assert kinds(verdict) == [kind]
     assert words in verdict.texts[0]
-    assert verdict.reasons[0].remedy
+    assert verdict.findings[0].remedy
     assert verdict.remedy == ""  # nothing failed
 
 
@@ -245,7 +245,7 @@ def test_findings_of_the_model_check_count_by_their_level_and_keep_their_remedy(
     found = [finding("BP-M01", level, "camera `right` may have moved", why="It turns the pose.") for level in Level]
     verdict = judge(statistics_of(), found)
     remedy = ENTRIES["BP-M01"].remedy
-    assert [(e.code, e.level, e.remedy) for e in verdict.reasons] == [
+    assert [(e.code, e.level, e.remedy) for e in verdict.findings] == [
         ("BP-M01", Level.FAIL, remedy),
         ("BP-M01", Level.WARN, remedy),
     ]
@@ -257,7 +257,7 @@ def test_failures_come_before_points_to_check():
     statistics = statistics_of(300, {Cause.UNEXPLAINED: 700}, lost=ranges((100, 999)), own_spots=ranges((7, 7)))
     verdict = judge(statistics, noise_scale=6.0)
     assert verdict.exit_status == 4
-    assert [e.level is Level.FAIL for e in verdict.reasons] == [True, True, False, False]
+    assert [e.level is Level.FAIL for e in verdict.findings] == [True, True, False, False]
     assert [any(word in r for r in verdict.texts) for word in ("only 30%", "6.0 times", "900", "contradict")] == [
         True
     ] * 4
@@ -269,7 +269,7 @@ def test_every_kind_of_reason_and_every_cause_has_a_remedy():
 
 
 def test_a_reason_is_written_as_plain_values():
-    (reason,) = judge(statistics_of(cameras=with_missing((990, 999)))).reasons
+    (reason,) = judge(statistics_of(cameras=with_missing((990, 999)))).findings
     mapping = reason.as_mapping()
     assert list(mapping) == ["kind", "code", "level", "what", "why", "remedy", "numbers"]
     assert (mapping["kind"], mapping["level"]) == ("camera_stopped", "check")
@@ -277,7 +277,7 @@ def test_a_reason_is_written_as_plain_values():
 
 
 def test_the_exit_status_is_4_exactly_for_failures():
-    assert [Verdict((), (Finding(level, ""),)).exit_status for level in Level] == [0, 0, 4]
+    assert [Verdict((Finding(level, ""),)).exit_status for level in Level] == [0, 0, 4]
 
 
 def test_raw_pictures_of_a_colour_camera_are_a_point_to_check():

@@ -29,7 +29,7 @@ LAYOUTS = [
 @pytest.mark.parametrize("layout", LAYOUTS, ids=str)
 def test_the_files_pass_the_check_without_a_remark(tmp_path, layout):
     started = start(tmp_path / "lab", layout, 50.0)
-    for path in (started.folder, started.rig):
+    for path in (started.result, started.result / "rig.yaml"):
         result = check(path)
         assert (result.exit_status, result.lines[0].rsplit(": ", 1)[1]) == (0, "fine")
 
@@ -47,18 +47,18 @@ def test_the_rig_has_what_was_asked_for():
 
 def test_the_files_are_commented_and_read_as_the_same_rig(tmp_path):
     started = start(tmp_path / "lab", Layout(), 50.0)
-    for path, least in ((started.rig, 10), (started.run, 8)):
+    for path, least in ((started.result / "rig.yaml", 10), (started.result / "run.yaml", 8)):
         text = path.read_text("utf-8")
         assert len(re.findall(r"^ *# ", text, re.MULTILINE)) >= least
         assert max(map(len, text.splitlines())) <= 140
-    rig, wanted = load_rig(started.rig), rig_of(Layout())
+    rig, wanted = load_rig(started.result / "rig.yaml"), rig_of(Layout())
     for name, beam in wanted.beams.items():
         assert rig.beams[name].direction == pytest.approx(beam.direction, abs=1e-12)
 
 
 def test_the_simulated_points_are_processed_and_pass(tmp_path):
     started = start(tmp_path / "lab", Layout(), 100.0)
-    assert process_run(started.folder, tmp_path / "out").verdict.status == "pass"
+    assert process_run(started.result, tmp_path / "out").verdict.status == "pass"
 
 
 def test_a_folder_with_files_is_left_alone(tmp_path):

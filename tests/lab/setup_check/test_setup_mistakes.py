@@ -131,7 +131,7 @@ def test_a_mistake_that_the_recording_shows_is_a_problem_at_check(recording, tmp
 def test_a_mistake_fails_the_run_and_is_its_only_explanation(recording, tmp_path, name):
     outcome = process_run(with_mistake(name, recording, tmp_path / "run"), tmp_path / "out")
     assert outcome.exit_status == 4
-    codes = [r.as_mapping()["code"] for r in outcome.verdict.reasons]
+    codes = [r.as_mapping()["code"] for r in outcome.verdict.findings]
     assert codes.count("BP-M06") == 1
     assert "BP-M01" not in codes  # the deviations of a rig with a mistake are its consequences
 
@@ -150,7 +150,7 @@ def test_poses_that_contradict_the_truth_fail_the_run(symmetric, tmp_path):
     shutil.copytree(symmetric / "truth", run / "truth")
     outcome = process_run(run, tmp_path / "out")
     assert outcome.exit_status == 4
-    assert [r.as_mapping()["code"] for r in outcome.verdict.reasons] == ["BP-V20"]
+    assert [r.as_mapping()["code"] for r in outcome.verdict.findings] == ["BP-V20"]
     assert "contradict the truth of the run by more than 10 of their sigmas" in outcome.line()
 
 
@@ -209,7 +209,7 @@ def test_a_frame_rate_that_the_header_of_a_video_contradicts_is_reported(tmp_pat
     text, _ = checked(run)
     assert "the header of the video of camera `left` states 100 pictures per second, run.yaml 7" in text
     outcome = process_run(run, tmp_path / "out")
-    assert "BP-M08" in [r.as_mapping()["code"] for r in outcome.verdict.reasons]
+    assert "BP-M08" in [r.as_mapping()["code"] for r in outcome.verdict.findings]
 
 
 def test_a_frame_rate_that_programs_write_by_default_is_no_contradiction(tmp_path):

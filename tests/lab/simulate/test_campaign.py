@@ -172,7 +172,7 @@ def test_a_known_pose_of_the_stand_is_written_with_its_sigmas(tmp_path):
 
 def test_a_campaign_and_a_recording_of_a_rig_of_your_own(tmp_path):
     """The rig that `beampose init` writes has no spots that leave the picture, as most scenarios require."""
-    designed = start(tmp_path / "lab", Layout(cameras=2, screens=2, beams=3), 100.0).rig
+    designed = start(tmp_path / "lab", Layout(cameras=2, screens=2, beams=3), 100.0).result / "rig.yaml"
     folder = simulate_calibration(tmp_path / "campaign", rig=str(designed), positions=4)
     assert set(load_project(folder).cameras) == set(load_rig(designed).cameras)
     true = folder / "truth" / "rig.yaml"

@@ -133,7 +133,7 @@ def test_the_pictures_and_detections_of_the_run_are_shown(tmp_path):
     assert all(c.picture is not None and c.picture.shape == c.size_px[::-1] for c in shown.content.cameras)
     assert all(len(c.detections) > 0 for c in shown.content.cameras)
     assert shown.notes == ()
-    pictures = played(write_video(fake.results, fake.run_folder).path)
+    pictures = played(write_video(fake.results, fake.run_folder).result)
     assert len(pictures) == 3
     assert pictures[0][200:-100].max() > 200
 
@@ -186,8 +186,9 @@ def played(path):
 
 def test_a_video_has_the_selected_frames_with_tails(fake):
     written = write_video(fake.results, fake.run_folder, first=10, last=40, every=10)
-    pictures = played(written.path)
-    assert (written.frames, len(pictures), written.path.name) == (4, 4, "overlay.mp4")
+    pictures = played(written.result)
+    assert (len(pictures), written.result.name) == (4, "overlay.mp4")
+    assert "(4 frames)" in written.line()
     assert np.abs(pictures[0].astype(int) - pictures[-1]).max() > 50
     assert len({p.shape for p in pictures}) == 1
     assert [p.name for p in fake.results.iterdir() if p.name.startswith(".")] == []
@@ -203,7 +204,7 @@ def test_where_a_codec_is_missing_the_next_one_is_used_and_named(fake, monkeypat
     monkeypatch.setattr(overlay_video, "CODECS", (("????", ".avi"), ("MJPG", ".avi")))
     written = write_video(fake.results, fake.run_folder, last=2)
     assert "cannot write ???? videos" in written.notes[-1]
-    assert len(played(written.path)) == 3
+    assert len(played(written.result)) == 3
 
 
 def test_where_no_codec_works_nothing_is_left(fake, monkeypatch):

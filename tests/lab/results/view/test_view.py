@@ -138,9 +138,9 @@ def test_files_are_written_without_a_display(fake, tmp_path, monkeypatch):
     monkeypatch.setattr(view_module, "has_display", lambda: False)
     monkeypatch.chdir(tmp_path)
     done = show(fake.results, None)
-    names = {path.name for path in done.files}
+    names = {path.name for path in done.result}
     assert {"view.html", "scene.glb", "scene.ply"} <= names
-    assert all(path.stat().st_size > 1000 for path in done.files)
+    assert all(path.stat().st_size > 1000 for path in done.result)
     mesh = open3d().io.read_triangle_mesh(str(tmp_path / "results" / "view" / "scene.ply"))
     assert len(mesh.triangles) > 1000
     for name in names & {"view-oblique.png", "view-above.png", "view-front.png"}:  # none where nothing can draw
@@ -159,7 +159,7 @@ def test_a_display_that_does_not_answer_is_none(monkeypatch):
 def test_without_open3d_the_page_and_the_glb_are_written_and_the_reason_is_said(fake, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     done = show(fake.results, tmp_path / "out")
-    assert [path.name for path in done.files] == ["view.html", "scene.glb"]
+    assert [path.name for path in done.result] == ["view.html", "scene.glb"]
     assert "no scene.ply and no rendered pictures: this needs Open3D" in done.notes[0]
 
 

@@ -69,7 +69,7 @@ def test_a_beam_wider_than_the_limit_is_named_with_the_value_that_reports_it(tmp
 def test_the_spots_of_a_folder_have_their_true_positions_and_sizes(tmp_path):
     folder = write_folder(tmp_path / "left", range(7, 19))
     outcome = detect_pictures([folder], tmp_path / "out")
-    assert (outcome.pictures, outcome.spots, outcome.exit_status) == (12, 36, 0)
+    assert (outcome.result.pictures, outcome.result.spots.total, outcome.exit_status) == (12, 36, 0)
     found = rows(tmp_path / "out")
     assert tuple(found[0]) == (*columns.DETECTIONS, columns.LIKENESS)
     assert {r["camera"] for r in found} == {"left"}
@@ -123,8 +123,8 @@ def test_each_size_and_depth_of_pictures_has_its_own_noise_and_a_note_in_the_rep
     write_folder(folder, range(3, 6), ".tif", bits=16)
     write_folder(folder, range(6, 8), size=(200, 130))
     outcome = detect_pictures([folder], tmp_path / "out")
-    assert outcome.pictures == 8
-    assert outcome.spots == 24
+    assert outcome.result.pictures == 8
+    assert outcome.result.spots.total == 24
     written = summary(tmp_path / "out")
     assert {(*n["size_px"], n["bits"]): n["pictures"] for n in written["noise"]} == {
         (160, 120, 8): 3,
@@ -148,13 +148,13 @@ def test_progress_counts_the_pictures_that_are_searched(tmp_path, every, limit, 
 def test_one_picture_is_enough(tmp_path):
     cv2.imwrite(str(tmp_path / "screen.bmp"), picture(0))
     outcome = detect_pictures([tmp_path / "screen.bmp"], tmp_path / "out")
-    assert (outcome.camera, outcome.pictures, outcome.spots) == ("screen", 1, 3)
+    assert (outcome.result.camera, outcome.result.pictures, outcome.result.spots.total) == ("screen", 1, 3)
 
 
 def test_files_are_numbered_by_their_names_or_else_alphabetically(tmp_path):
     folder = write_folder(tmp_path / "shots", range(4, 8))
     files = sorted(folder.iterdir())
-    assert detect_pictures(files[::-1], tmp_path / "a").camera == "shots"
+    assert detect_pictures(files[::-1], tmp_path / "a").result.camera == "shots"
     assert [int(r["frame"]) for r in rows(tmp_path / "a")] == sorted(3 * [4, 5, 6, 7])
     detect_pictures([folder / "img_*.png"], tmp_path / "pattern")
     assert rows(tmp_path / "pattern") == rows(tmp_path / "a")
@@ -169,7 +169,11 @@ def test_a_damaged_picture_does_not_affect_the_others(tmp_path):
     whole = (folder / "img_0002.png").read_bytes()
     (folder / "img_0002.png").write_bytes(whole[: len(whole) // 2])
     outcome = detect_pictures([folder], tmp_path / "out")
-    assert (outcome.pictures, outcome.unreadable, outcome.exit_status) == (4, 1, 0)
+    assert (outcome.result.pictures, sum(map(len, outcome.result.unreadable.values())), outcome.exit_status) == (
+        4,
+        1,
+        0,
+    )
     assert "1 more cannot be read" in outcome.line()
     assert any("cut short (frame 2)" in note for note in summary(tmp_path / "out")["notes"])
 
@@ -179,7 +183,7 @@ def test_pictures_without_a_spot_are_no_error(tmp_path):
         grey = np.random.default_rng(frame).normal(20, 1, (60, 80))
         cv2.imwrite(str(tmp_path / f"{frame}.png"), np.round(grey).astype(np.uint8))
     outcome = detect_pictures(sorted(tmp_path.glob("*.png")), tmp_path / "out")
-    assert (outcome.spots, outcome.exit_status) == (0, 0)
+    assert (outcome.result.spots.total, outcome.exit_status) == (0, 0)
     assert "No spot was found" in (tmp_path / "out/report.html").read_text("utf-8")
 
 
@@ -210,7 +214,7 @@ def test_a_parameter_that_does_not_belong_to_the_detection_is_an_error(tmp_path)
 def test_a_higher_threshold_finds_fewer(tmp_path):
     folder = write_folder(tmp_path / "cam", range(2))
     high = DetectOptions(overrides={"detect.threshold_sigma": 700.0})
-    assert detect_pictures([folder], tmp_path / "out", high).spots < 6
+    assert detect_pictures([folder], tmp_path / "out", high).result.spots.total < 6
 
 
 def test_earlier_results_are_replaced_and_other_folders_are_not(tmp_path):

@@ -18,16 +18,18 @@ import yaml
 from lab.errors import InputError, RunError
 from lab.files.run.run_file import LiveDevice, load_run
 from lab.files.text import columns
+from lab.findings.outcome import Outcome
 from lab.pictures.picture_file import MissingPicture, read_picture
 from lab.runs.frames import sensor_noise
 from lab.runs.process import process_run
+from lab.runs.verdict.run_statistics import RunStatistics
 from lab.runs.watch import watch
 from lab.runs.watch.cameras import DeviceCamera, FolderCamera
 from lab.runs.watch.frame_clock import FolderPoll, FrameClock
 from lab.runs.watch.inbox import MOST_WAITING, Inbox, is_complete
 from lab.runs.watch.live_frames import FIRST, WatchOptions
 from lab.runs.watch.live_output import LIVE_TABLE
-from lab.runs.watch.watch import WatchOutcome, watch_run
+from lab.runs.watch.watch import watch_run
 from lab.simulate.write import simulate
 from tracking.detections import Detections
 
@@ -84,7 +86,7 @@ def feed(recorded: Path, run: Path, given: Callable[[str, int], bool] = lambda c
         time.sleep(0.005)
 
 
-def watched(run: Path, out: Path, feeder: Callable[[], None], **options: object) -> WatchOutcome:
+def watched(run: Path, out: Path, feeder: Callable[[], None], **options: object) -> Outcome[RunStatistics]:
     """Watch a run while a thread writes its pictures."""
     thread = threading.Thread(target=feeder)
     thread.start()
@@ -206,7 +208,7 @@ def test_stopping_ends_the_recording_and_writes_the_results(recorded, tmp_path):
     patient = WatchOptions(idle_s=60.0)
     outcome = watched(run, tmp_path / "out", feeder, options=patient, stop=stop)
     assert all_there == [True]  # each frame is in the live table at once, not when a buffer is full
-    assert outcome.run.frames == FRAMES
+    assert outcome.result.frames == FRAMES
     assert (tmp_path / "out/report.html").is_file()
 
 
@@ -227,7 +229,7 @@ def test_only_the_live_table_of_a_killed_watch_may_be_replaced(recorded, tmp_pat
     feed(recorded, run)
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / LIVE_TABLE).write_text("frame\n")
-    assert watch_run(run, tmp_path / "out", options=FAST).run.frames == FRAMES
+    assert watch_run(run, tmp_path / "out", options=FAST).result.frames == FRAMES
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis/chapter.tex").write_text("years")
     with pytest.raises(InputError, match="something other than earlier results"):
@@ -242,7 +244,7 @@ def test_a_device_with_an_end_has_the_results_of_its_pictures(tmp_path):
         camera["device"] = str(recorded / camera.pop("frames"))
     (recorded / "run.yaml").write_text(yaml.safe_dump(content))
     outcome = watch_run(recorded, tmp_path / "out", options=FAST)
-    assert (outcome.run.out / "attitude.csv").read_bytes() == (ordinary / "attitude.csv").read_bytes()
+    assert (outcome.out / "attitude.csv").read_bytes() == (ordinary / "attitude.csv").read_bytes()
     with pytest.raises(InputError, match="a live camera; use `beampose watch`"):
         process_run(recorded, tmp_path / "again")
 

@@ -19,7 +19,7 @@ def test_the_study_has_our_figures_beside_the_papers(tmp_path):
     still = "centre of a still, 40 % hidden: median error"
     assert comparison.value(still, "beampose") < 0.2 < comparison.value(still, "HoughCircles")
     outcome = write_comparison(comparison, tmp_path / "study")
-    page = outcome.report.read_text("utf-8")
+    page = (outcome.result / "report.html").read_text("utf-8")
     assert page.rstrip().endswith("</html>")
     assert ">nan<" not in page
 

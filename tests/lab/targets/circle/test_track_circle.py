@@ -87,7 +87,7 @@ def test_a_folder_of_pictures_gives_all_files(folder, tmp_path):
 def test_a_video_has_its_own_rate_and_the_same_circle(tmp_path):
     file = video(tmp_path / "drogue.avi", [picture(k) for k in range(6)])
     outcome = track_target(CircleTarget(), file, tmp_path / "out")
-    assert (outcome.frames, outcome.measured, outcome.exit_status) == (6, 6, 0)
+    assert (len(outcome.result.frames), outcome.result.measured.sum(), outcome.exit_status) == (6, 6, 0)
     assert float(rows(tmp_path / "out")[5]["t_s"]) == pytest.approx(0.1)
     assert not (tmp_path / "out" / "overlay.mp4").exists()
 

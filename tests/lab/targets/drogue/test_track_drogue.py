@@ -115,7 +115,7 @@ def test_a_video_has_its_own_rate_and_the_same_drogue(tmp_path, pictures):
     outcome = track_target(
         DrogueTarget(DrogueOptions(check_every=2)), video(tmp_path / "drogue.avi", pictures[:6]), tmp_path / "out"
     )
-    assert (outcome.frames, outcome.measured, outcome.exit_status) == (6, 6, 0)
+    assert (len(outcome.result.frames), outcome.result.measured.sum(), outcome.exit_status) == (6, 6, 0)
     assert float(rows(tmp_path / "out")[5]["t_s"]) == pytest.approx(0.1)
 
 

@@ -96,7 +96,7 @@ def test_a_plain_table_is_tracked_and_irregular_times_count(tmp_path):
     table = tmp_path / "points.csv"
     table.write_text("frame,t_s,u_px,v_px,sigma_u_px,sigma_v_px\n" + "\n".join(lines) + "\n")
     outcome = track_target(PointTarget(), table, tmp_path / "out")
-    assert outcome.results.statuses() == {"measured": 57, "predicted": 3, "lost": 0}
+    assert outcome.result.statuses() == {"measured": 57, "predicted": 3, "lost": 0}
     last = rows_of(tmp_path / "out")[-1]
     assert float(last["velocity_u_px_s"]) == pytest.approx(100, abs=3)
     assert tuple(rows_of(tmp_path / "out")[0]) == COLUMNS
@@ -137,7 +137,7 @@ def test_two_similar_targets_are_reported_and_one_can_be_chosen(tmp_path):
     assert "BP-N05" in [f.code for f in track_target(PointTarget(), table, tmp_path / "out").findings]
     chosen = track_target(PointTarget(PointOptions(start_px=(345.0, 60.0))), table, tmp_path / "other")
     assert verdict(chosen.findings) is Level.PASS
-    assert chosen.results.frames[-1].place[0] == pytest.approx(path_of(19)[0] + 300, abs=0.1)
+    assert chosen.result.frames[-1].place[0] == pytest.approx(path_of(19)[0] + 300, abs=0.1)
 
 
 @pytest.mark.parametrize(
@@ -260,7 +260,7 @@ def test_a_video_that_ends_early_is_noted(tmp_path):
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
     outcome = track_target(PointTarget(PointOptions("darker")), path, tmp_path / "out")
-    assert any(f"of the {FRAMES} pictures that its header states" in note for note in outcome.results.recording.notes)
+    assert any(f"of the {FRAMES} pictures that its header states" in note for note in outcome.result.recording.notes)
 
 
 def test_a_gate_above_the_usual_share_of_measured_frames_counts_too(tmp_path):

@@ -31,7 +31,7 @@ def test_the_study_shows_smaller_errors_than_the_paper_at_every_distance(tmp_pat
         assert row.values[2] < row.paper
     assert study.value("centroid of a marker, RMS", "joint fit") < 0.05
     assert study.value("seven markers: rotation, RMS", "joint fit") < 0.5
-    assert write_comparison(study, tmp_path / "out").report.is_file()
+    assert (write_comparison(study, tmp_path / "out").result / "report.html").is_file()
 
 
 @pytest.mark.slow

@@ -104,7 +104,7 @@ def test_unsynchronised_pictures_fail_the_run_and_say_by_how_much(tmp_path):
     run = write_stereo_recording(tmp_path / "run", seed=5, frames=25, points=True, noise_px=0.03, right_delay_s=0.0015)
     outcome = process_stereo_run(run, tmp_path / "out")
     assert outcome.exit_status == 4
-    clock = outcome.results.clock
+    clock = outcome.result.clock
     assert clock.offset_s == pytest.approx(0.0015, abs=5 * clock.sigma_s)
     assert any(f.code == "BP-W05" for f in outcome.findings)
 
@@ -128,11 +128,11 @@ def test_markers_that_are_not_where_run_yaml_says_are_reported(drogue, tmp_path)
     target = yaml.safe_load((drogue / "run.yaml").read_text(encoding="utf-8"))["target"]
     target["markers"]["3"]["position_m"][0] += 0.02
     outcome = process_stereo_run(changed(drogue, tmp_path / "run", target=target), tmp_path / "out")
-    assert [r for r in outcome.results.records if r.measured and (r.tracked.index[:, 2] >= 0).all()] == []
+    assert [r for r in outcome.result.records if r.measured and (r.tracked.index[:, 2] >= 0).all()] == []
     stated = {**target, "sigma_m": 0.02}
     outcome = process_stereo_run(changed(drogue, tmp_path / "known", target=stated), tmp_path / "again")
-    assert len(outcome.results.measured) == 24
-    assert outcome.results.errors.nees.mean() < 15  # the survey's error is part of the covariance
+    assert len(outcome.result.measured) == 24
+    assert outcome.result.errors.nees.mean() < 15  # the survey's error is part of the covariance
 
 
 def test_two_cameras_exchanged_give_no_confident_pose(tmp_path):
@@ -144,7 +144,7 @@ def test_two_cameras_exchanged_give_no_confident_pose(tmp_path):
     (run / "pair.yaml").write_text(yaml.safe_dump(pair), encoding="utf-8")
     outcome = process_stereo_run(run, tmp_path / "out")
     assert outcome.exit_status == 4
-    assert outcome.results.measured == []
+    assert outcome.result.measured == []
 
 
 @pytest.mark.parametrize(
@@ -250,4 +250,4 @@ def test_colour_videos_give_the_markers_that_their_pictures_show(tmp_path):
     (run / "run.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
     done = process_stereo_run(run, tmp_path / "out")
     assert len(rows(done.out, "detections.csv")) >= 10
-    assert np.abs(done.results.errors.range_m).max() < 0.3
+    assert np.abs(done.result.errors.range_m).max() < 0.3
