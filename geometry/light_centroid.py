@@ -50,8 +50,7 @@ class CentroidOffsets:
         a spot, the more weight its wings have in the fit. clip (n,): height at which the sensor clips over that of the
         Gaussian, 1 and more for whole spots; the fit leaves out what is clipped, and the wings are shifted farther.
         """
-        shifts = np.array([_centre_shifts(float(r), float(c)) for r, c in zip(brightness, clip, strict=True)])
-        shifts = shifts.reshape(-1, 2)
+        shifts = _centre_shifts(np.asarray(brightness, float), np.asarray(clip, float))
         return _offsets(self._curvature, self._size, np.ascontiguousarray(uv_px), shape_px2, shifts)
 
 
@@ -117,11 +116,14 @@ def map_curvature(camera: Camera, screen: Screen, uv_px: Array) -> Array:
     return np.asarray(np.linalg.solve(np.where(good, J, np.eye(2)).astype(float), curvature))
 
 
-def _centre_shifts(brightness: float, clip: float) -> tuple[float, float]:
-    """Shifts, in sigmas, of the fitted centre of a unit Gaussian G to which g1^3 G, or g1 g2^2 G, is added."""
-    steps = 0 if not np.isfinite(brightness) or brightness <= 0 else round(2 * np.log2(1 + brightness))
-    clipped = 0 if not 0 < clip < 1 else round(-_CLIP_STEPS * np.log2(clip))
-    return _fitted_shifts(min(max(steps, 0), 24), min(clipped, 4 * _CLIP_STEPS))
+def _centre_shifts(brightness: Array, clip: Array) -> Array:
+    """Shifts (n, 2), in sigmas, of the fitted centre of a unit Gaussian G to which g1^3 G, or g1 g2^2 G, is added."""
+    bright = np.where(np.isfinite(brightness), np.maximum(brightness, 0.0), 0.0)
+    steps = np.minimum(np.rint(2 * np.log2(1 + bright)), 24)
+    whole = np.where((clip > 0) & (clip < 1), clip, 1.0)
+    clipped = np.minimum(np.rint(-_CLIP_STEPS * np.log2(whole)), 4 * _CLIP_STEPS)
+    shifts = [_fitted_shifts(int(s), int(c)) for s, c in zip(steps.tolist(), clipped.tolist(), strict=True)]
+    return np.array(shifts).reshape(-1, 2)
 
 
 @lru_cache(maxsize=512)

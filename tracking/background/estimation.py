@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array
 from tracking.background.behind_lights import LARGEST_PATH_PX, BehindLights
-from tracking.background.mean_pictures import MOST_BYTES, in_steps, means_of, smooth_part, usable
+from tracking.background.mean_pictures import MOST_BYTES, means_of, smooth_part, usable
 from tracking.background.places import AROUND_LIGHT, ON_LIGHT, SAME_LIGHT, near_each, number_of_better, places_of
+from tracking.background.shown_light import Shown
 from tracking.background.slow_lights import ROUNDS, SlowLights, as_pictures_show, light_at
 from tracking.background.static_background import TRIED, StaticBackground
 from tracking.detection.detect import find_spots
@@ -30,6 +31,7 @@ _MOSTLY = 0.7  # share of the pictures with lights that move, above which those 
 # Contrast up to which the structure is that of the screen's surface, and modulates the spots' light in full. Of what is
 # more, prints or objects, the spots show a part: 0.25 to 0.57 where photographs modulate their light by up to 60 %.
 _OF_SURFACE, _OF_OBJECTS = 0.1, 0.5
+_SETTLED = 0.01  # sigmas of a pixel: the background behind a light that changes by less is the last one
 _NO_GAUSSIAN = 0.04  # share of a light at rest that a Gaussian leaves in a pixel; it is no structure of the background
 
 
@@ -75,19 +77,26 @@ def _without_slow_lights(
     A light that moves slowly, or rests for a part of the recording, is in the mean of the pictures. Where it is in
     some of them the others count; where its absence leaves a hole, those with the hole.
     """
-    found = [_searched(background, p, shift) for p in pictures]
-    holes = [background.spots_in(p, background.parameters, shift, inverted=True) for p in pictures]
+    fits = [background.shown.in_picture(p) for p in pictures]
+    found = [_searched(background, p, shift, fit) for p, fit in zip(pictures, fits, strict=True)]
+    holes = [
+        background.spots_in(p, background.parameters, shift, inverted=True, fit=fit)
+        for p, fit in zip(pictures, fits, strict=True)
+    ]
     slow = SlowLights.of(equal, found, holes)
     mean[slow.row, slow.column] = slow.means()
-    better = StaticBackground.of_mean(mean, pictures, background.noise, background.parameters)
+    better = background.with_mean(slow.row, slow.column, mean[slow.row, slow.column])
     moved, boxes = slow.moved, slow.boxes(slow.everywhere)
-    here = [_spots_at(better, p, boxes[boxes[:, 2] < LARGEST_PATH_PX], shift) for p in pictures]
+    paths = boxes[boxes[:, 2] < LARGEST_PATH_PX]
+    here = [_spots_at(better, p, paths, shift, fit) for p, fit in zip(pictures, fits, strict=True)]
     behind = BehindLights.of(equal, here, boxes, background.noise, better.usual_dn())
     mean[behind.row, behind.column] = behind.level_dn
     slow = slow[~slow.known & ~behind.covers(mean.shape)[slow.row, slow.column]]
-    better = StaticBackground.of_mean(mean, pictures, background.noise, background.parameters)
     if len(slow.row):
-        better = _behind(better, slow, mean, pictures, shift)
+        hidden = better.with_mean(behind.row, behind.column, behind.level_dn)
+        better = _behind(hidden, slow, mean, pictures, fits, shift)
+    else:
+        better = StaticBackground.of_mean(mean, pictures, background.noise, background.parameters)
     better.shares[behind.row, behind.column] = behind.share
     better = better.with_light(pictures)
     if behind.modulation is not None:
@@ -127,22 +136,29 @@ def _with_shifts(
 
 def _behind(
     background: StaticBackground, slow: SlowLights, mean: NDArray[np.float32], pictures: Sequence[Picture],
-    shift: TextureShift,
+    fits: Sequence[Shown | None], shift: TextureShift,
 ) -> StaticBackground:  # fmt: skip
-    """This background from a mean (h, w), improved behind lights that are nearly everywhere in all pictures."""
+    """The background from a mean (h, w), improved behind lights that are nearly everywhere in all pictures.
+
+    background: the one so far; fits: what it shows of itself in the pictures.
+    """
     better, boxes = background, slow.boxes(slow.everywhere)
     at = (slow.row, slow.column)
     behind: Array = mean[at].astype(float)
     information = np.zeros(len(behind))
     for k in range(ROUNDS):
         if k == 0:
-            found = [_spots_at(better, p, boxes, shift) for p in pictures]
+            found = [_spots_at(better, p, boxes, shift, fit) for p, fit in zip(pictures, fits, strict=True)]
         else:
-            found = [better.spots_in(p, background.parameters, shift, regions=boxes) for p in pictures]
-        behind, information = slow.behind(found, behind, background.noise.variance(behind))
-        added = better.subtracted.copy()
-        added[at] = in_steps(np.asarray(background.level_dn - behind, np.float32), background.steps)
-        better = replace(better, subtracted=added)
+            found = [
+                better.spots_in(p, background.parameters, shift, regions=boxes, fit=fit)
+                for p, fit in zip(pictures, fits, strict=True)
+            ]
+        before, variance = behind, background.noise.variance(behind)
+        behind, information = slow.behind(found, before, variance)
+        better = better.with_mean(*at, behind)
+        if float(np.max(np.abs(behind - before) / np.sqrt(variance), initial=0.0)) < _SETTLED:
+            break
     mean[at] = behind
     better = StaticBackground.of_mean(mean, pictures, background.noise, background.parameters)
     better.shares[at] = 1 / np.maximum(information, 1e-3)
@@ -152,9 +168,11 @@ def _behind(
     return replace(better, unknown=slow.boxes(hidden))
 
 
-def _spots_at(background: StaticBackground, picture: Picture, boxes: Array, shift: TextureShift) -> Detections:
+def _spots_at(
+    background: StaticBackground, picture: Picture, boxes: Array, shift: TextureShift, fit: Shown | None
+) -> Detections:
     """The spots of a picture in boxes (k, 3), whether the background contains some of their light or not."""
-    found = background.spots_in(picture, background.parameters, shift, regions=boxes)
+    found = background.spots_in(picture, background.parameters, shift, regions=boxes, fit=fit)
     return as_pictures_show(found, find_spots(picture, background.parameters, background.noise, boxes))
 
 
@@ -164,9 +182,9 @@ def _better_in(background: StaticBackground, picture: Picture, shift: TextureShi
     return number_of_better(background.spots_in(picture, background.parameters, shift), in_picture)
 
 
-def _searched(background: StaticBackground, picture: Picture, shift: TextureShift) -> Detections:
+def _searched(background: StaticBackground, picture: Picture, shift: TextureShift, fit: Shown | None) -> Detections:
     """The points of a picture that move or have changed; all points of one that does not fit."""
-    parts = background.parts(picture, background.parameters, shift)
+    parts = background.parts(picture, background.parameters, shift, fit)
     if parts is not None:
         return parts[0]
     return shift.added_to(find_spots(picture, background.parameters, background.noise), background.noise)

@@ -64,23 +64,58 @@ class RestingLights:
             np.maximum(used - _PARAMETERS, 1.0), inverse, flux_of,
         )  # fmt: skip
 
-    def in_picture(self, picture: Picture) -> tuple[Detections, Bools, Bools]:
+    def in_picture(self, picture: Picture, fixed: Bools | None = None) -> tuple[Detections, Bools, Bools]:
         """The lights (n,) in a picture (h, w), which of them have changed, and which are passed by another light.
 
+        fixed (n,): lights that stay where they are; they are measured only in pictures that differ from the mean there.
         Those that have changed are not measured correctly. Where there is more light than in the mean and nowhere less,
         something else passes over an unchanged light: that is in the difference from the mean, and the light stays
         where the mean shows it.
         """
-        if not len(self.found):
-            return self.found, np.zeros(0, dtype=bool), np.zeros(0, dtype=bool)
+        found, (changed, passed) = self.found, np.zeros((2, len(self.found)), dtype=bool)
+        if not len(found):
+            return found, changed, passed
         residual = picture.ravel()[self.pixels].astype(np.float32) - self.mean
+        if fixed is not None and fixed.any():
+            chi2 = np.add.reduceat(residual * residual * self.weight, self.starts)
+            differs = np.flatnonzero(~fixed | (chi2 > self._largest_chi2))
+            if len(differs):
+                some, rows = self._some(differs)
+                measured, changed[differs], passed[differs] = some._measured(residual[rows])
+                uv_px, flux = found.uv_px.copy(), found.flux.copy()
+                uv_px[differs], flux[differs] = measured.uv_px, measured.flux
+                found = replace(found, uv_px=uv_px, flux=flux)
+            return found, changed, passed
+        return self._measured(residual)
+
+    @property
+    def _largest_chi2(self) -> Array:
+        """(n,): of an unchanged light."""
+        return np.asarray(_MISFIT * (1.0 + _MISFIT_SIGMAS * np.sqrt(2.0 / self.free)) * self.free)
+
+    @property
+    def _ends(self) -> Ints:
+        """(n,), of the windows."""
+        return np.append(self.starts[1:], len(self.pixels))
+
+    def _some(self, lights: Ints) -> tuple[RestingLights, Ints]:
+        """Some of the lights, and the rows of their pixels."""
+        rows = np.concatenate([np.arange(self.starts[i], self._ends[i]) for i in lights])
+        counts = (self._ends - self.starts)[lights]
+        return RestingLights(
+            self.found[lights], self.half_px[lights], self.pixels[rows], self.mean[rows], self.weight[rows],
+            self.slopes[:, rows], np.cumsum(counts) - counts, self.free[lights], self.inverse[lights],
+            self.flux_of[lights],
+        ), rows  # fmt: skip
+
+    def _measured(self, residual: NDArray[np.float32]) -> tuple[Detections, Bools, Bools]:
+        """As `in_picture`, from what a picture shows more than the mean, (N,) DN."""
         weighted = residual * self.weight
-        right = np.add.reduceat(self.slopes * weighted, self.starts, axis=1).T
+        right = np.array([self.slopes[:, a:b] @ weighted[a:b] for a, b in zip(self.starts, self._ends, strict=True)])
         step = np.einsum("nij,nj->ni", self.inverse, right)
         chi2 = np.add.reduceat(residual * weighted, self.starts) - np.einsum("ni,ni->n", step, right)
         more = np.einsum("ni,ni->n", self.flux_of, step)
-        allowed = _MISFIT * (1.0 + _MISFIT_SIGMAS * np.sqrt(2.0 / self.free))
-        misfit = chi2 > allowed * self.free
+        misfit = chi2 > self._largest_chi2
         less = (residual < 0) & (self.weight > 0)
         darker = np.maximum(np.add.reduceat(less, self.starts, dtype=float), 1.0)
         allowed = _MISFIT * (1.0 + _MISFIT_SIGMAS * np.sqrt(2.0 / darker))

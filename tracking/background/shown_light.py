@@ -56,7 +56,8 @@ class ShownLight:
         rows, columns = SAMPLE
         plain = (~near_lights[::rows, ::columns]).astype(np.float32)
         own = structure[::rows, ::columns]
-        seen = np.where(plain > 0, _about_means(own, plain), np.float32(0.0))
+        about = own - cv2.blur(own * plain, _SMOOTH) / np.maximum(cv2.blur(plain, _SMOOTH), np.float32(1e-3))
+        seen = np.where(plain > 0, about, np.float32(0.0))
         power = _sums(seen * seen)
         first = ShownLight(
             structure.shape, smooth, smooth + own, own, plain, power >= np.median(power), noise, noise_share,
@@ -103,7 +104,8 @@ class ShownLight:
         sigmas = 6 * np.sqrt(variance)
         # Wide lights are in the means around them.
         even = self.plain * (np.abs(above - more - self.own) < sigmas + np.abs(self.own))
-        above, structure = _about_means(above, even), _about_means(self.own, even)
+        around = np.maximum(cv2.blur(even, _SMOOTH), np.float32(1e-3))
+        above, structure = (x - cv2.blur(x * even, _SMOOTH) / around for x in (above, self.own))
         clear = (self.plain > 0) & (np.abs(above) < sigmas + 4 * np.abs(structure))
         seen = clear * structure
         share = _sums(seen * above)[self.showing] / np.maximum(_sums(seen * seen)[self.showing], np.float32(1e-12))
@@ -118,12 +120,6 @@ def fits_around(clear: Bools, left2: _Values) -> Bools:
     count = _sums(clear.astype(np.float32))
     least = _LARGEST_MISFIT**2 * count + _BY_CHANCE * np.sqrt(2 * count)
     return np.asarray(_sums(np.where(clear, np.minimum(left2, np.float32(_MOST_LEFT**2)), np.float32(0.0))) <= least)
-
-
-def _about_means(values: _Values, weights: _Values) -> _Values:
-    """Values on the sample less the weighted means around them."""
-    means = cv2.blur(values * weights, _SMOOTH) / np.maximum(cv2.blur(weights, _SMOOTH), np.float32(1e-3))
-    return np.asarray(values - means, np.float32)
 
 
 def _sums(values: _Values) -> _Values:

@@ -89,6 +89,8 @@ class SlowLights:
 
     def boxes(self, pixels: Bools) -> Array:
         """Boxes (k, 3) around the connected parts of these pixels (m,): u, v and half side, px."""
+        if not pixels.any():
+            return np.zeros((0, 3))
         chosen = np.zeros(self.shape, np.uint8)
         chosen[self.row[pixels], self.column[pixels]] = 1
         _, _, places, _ = cv2.connectedComponentsWithStats(chosen)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array, Bools, Ints
 from tracking.background.joint_fit import Modulation
 from tracking.background.mean_pictures import (
     GAIN_BITS,
@@ -80,6 +80,7 @@ class StaticBackground:
     misfit_share: float = float("nan")  # of the lights that move, as in TextureShift
     # (h, w), in 2^-GAIN_BITS: undoes what the brightness of the surface does to a light; None: nothing
     gain: NDArray[np.uint16] | None = None
+    known: dict[TextureShift, Detections] = field(init=False, repr=False, compare=False, default_factory=dict)
 
     def with_light(self, pictures: Sequence[Picture]) -> StaticBackground:
         """The background whose light is 1 in a typical one of the pictures that it is made from."""
@@ -109,6 +110,12 @@ class StaticBackground:
         more = np.maximum(highest_of_blocks(variance) - float(self.noise.variance(self.low_dn)), 0.0)
         uneven = np.asarray(np.sqrt(more / 9.0) / (TEXTURE_SHARE * self.level_dn), np.float32)
         return replace(self, gain=gain, model=replace(self.model, local_texture=uneven))
+
+    def with_mean(self, row: Ints, column: Ints, mean: Array | NDArray[np.float32]) -> StaticBackground:
+        """The background that subtracts these means (m,), DN, at some pixels; all else of it stays."""
+        subtracted = self.subtracted.copy()
+        subtracted[row, column] = in_steps(np.asarray(self.level_dn - mean, np.float32), self.steps)
+        return replace(self, subtracted=subtracted)
 
     def plain(self) -> NDArray[np.float32]:
         """(h, w), DN: the fixed picture."""
@@ -172,34 +179,43 @@ class StaticBackground:
         return None if parts is None else parts[0].joined(parts[1], parameters.max_detections)
 
     def parts(
-        self, picture: Picture, parameters: DetectParameters, shift: TextureShift
+        self, picture: Picture, parameters: DetectParameters, shift: TextureShift, fit: Shown | None = None
     ) -> tuple[Detections, Detections] | None:
-        """The points of a picture that move or have changed, and the lights at rest that have not."""
-        fit = self.shown.in_picture(picture)
+        """The points of a picture that move or have changed, and the lights at rest that have not.
+
+        fit: what `self.shown` has found in the picture, if it is known.
+        """
+        fit = fit or self.shown.in_picture(picture)
         if fit is None:
             return None
         spots = self._moving(picture, parameters, shift, fit)
-        lights, changed, passed = self.lights.in_picture(picture)
+        lights, changed, passed = self.lights.in_picture(picture, self.fixed)
         # A lamp that flickers is in the difference, too.
-        same = lights[~changed & ~passed]
-        as_wide = spots.major_px[:, None] > _AS_WIDE * same.major_px
-        spots = spots[np.asarray(~(near_each(spots, same, SAME_LIGHT) & as_wide).any(axis=1))]
-        boxes = np.column_stack([self.lights.found.uv_px, self.lights.half_px])[changed]
-        boxes = np.concatenate([self.unknown, boxes])
-        there = ~changed & ~inside(boxes, lights)
-        rest = lights[there]
-        # The error of the mean picture's fit is the same in all pictures.
-        fixed = 0.5 * self._noise_share * np.trace(rest.cov_px2, axis1=1, axis2=2)
-        rest = shift.added_to(rest, self.noise, self._shifts_at(rest))
-        place = np.zeros(len(rest)) if rest.place_px2 is None else rest.place_px2
-        at_rest = self.fixed[there].astype(float) if len(self.fixed) else None
-        rest = replace(rest, cov_px2=(1 + self._noise_share) * rest.cov_px2, place_px2=place + fixed, at_rest=at_rest)
-        found = spots[~inside(boxes, spots)]
-        if len(boxes):
-            again = find_spots(picture, parameters, self.noise, boxes)
-            again = shift.added_to(again, self.noise, self._shifts_at(again))
-            found = found.joined(again, parameters.max_detections)
-        return found, rest
+        as_wide = spots.major_px[:, None] > _AS_WIDE * lights.major_px
+        same = near_each(spots, lights, SAME_LIGHT) & as_wide & ~changed & ~passed
+        apart = np.asarray(~same.any(axis=1))
+        known = self._known(shift)
+        rest = replace(lights, cov_px2=known.cov_px2, place_px2=known.place_px2, at_rest=known.at_rest)
+        boxes = np.concatenate([self.unknown, np.column_stack([self.lights.found.uv_px, self.lights.half_px])[changed]])
+        if not len(boxes):
+            return spots[apart], rest
+        again = find_spots(picture, parameters, self.noise, boxes)
+        again = shift.added_to(again, self.noise, self._shifts_at(again))
+        found = spots[apart & ~inside(boxes, spots)].joined(again, parameters.max_detections)
+        return found, rest[~changed & ~inside(boxes, rest)]
+
+    def _known(self, shift: TextureShift) -> Detections:
+        """The lights at rest in the mean picture, with the errors that they have in each picture."""
+        if shift not in self.known:
+            lights = self.lights.found
+            # The error of the mean picture's fit is the same in all pictures.
+            common = 0.5 * self._noise_share * np.trace(lights.cov_px2, axis1=1, axis2=2)
+            lights = shift.added_to(lights, self.noise, self._shifts_at(lights))
+            place = np.zeros(len(lights)) if lights.place_px2 is None else lights.place_px2
+            at_rest = self.fixed.astype(float) if len(self.fixed) else None
+            covariance = (1 + self._noise_share) * lights.cov_px2
+            self.known[shift] = replace(lights, cov_px2=covariance, place_px2=place + common, at_rest=at_rest)
+        return self.known[shift]
 
     def _shifts_at(self, points: Detections) -> Array | None:
         """(n,): `local_shifts` of points; None: not known."""
@@ -210,14 +226,14 @@ class StaticBackground:
 
     def spots_in(
         self, picture: Picture, parameters: DetectParameters, shift: TextureShift, inverted: bool = False,
-        regions: NDArray[np.float64] | None = None,
+        regions: NDArray[np.float64] | None = None, fit: Shown | None = None,
     ) -> Detections:  # fmt: skip
         """The spots in the difference of a picture (h, w) from the background, where that shows them.
 
         shift: errors of spots by the texture; the part that the background causes is subtracted with it. inverted: the
-        holes of the difference instead. regions: of `find_spots`.
+        holes of the difference instead. regions: of `find_spots`. fit: as in `parts`.
         """
-        fit = self.shown.in_picture(picture)
+        fit = fit or self.shown.in_picture(picture)
         return Detections.none() if fit is None else self._moving(picture, parameters, shift, fit, inverted, regions)
 
     def _moving(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from geometry.arrays import Array
 
 _TILE = 32  # px: side of the squares in which the texture is measured
+_SPARSE = 7  # every such pixel of a tile shows its level, which is smooth
 _LARGEST_SHARE = 0.05  # of full scale: usual black levels are between 0 and this
 _LEAST_LIGHT = 0.35  # of the level
 _UNEVEN = 0.25  # relative scatter of a tile's variance: texture is not the same everywhere
@@ -38,10 +39,10 @@ def level_over_light(
     rows, columns = (n // _TILE for n in texture_dn.shape)
     if rows * columns < 4:
         return 1.0
-    square = _tiles(texture_dn.astype(np.float64) ** 2, rows, columns)
-    middle = np.median(square, axis=1) / _MEDIAN_SQUARE
-    variance = np.minimum(square, _OUTLIER * middle[:, None]).mean(axis=1) - white_dn2
-    level = np.median(_tiles(level_dn, rows, columns), axis=1).astype(float)
+    square = _tiles(texture_dn, rows, columns) ** 2
+    middle = np.median(square, axis=1) / np.float32(_MEDIAN_SQUARE)
+    variance = np.minimum(square, np.float32(_OUTLIER) * middle[:, None]).mean(axis=1, dtype=np.float64) - white_dn2
+    level = np.median(_tiles(level_dn, rows, columns)[:, ::_SPARSE], axis=1).astype(float)
     usual = float(np.median(level))
     used = (level > 0) & (level < 2 * usual)
     if not used.any() or usual <= 0:

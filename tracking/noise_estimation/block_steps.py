@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,7 +44,8 @@ def block_step(pictures: Sequence[Picture]) -> float:
 def _changes(change: NDArray[np.float32]) -> NDArray[np.float32]:
     """Absolute changes of the means of the blocks in which nothing moves, about their median."""
     rows, columns = (n // _SIDE for n in change.shape)
-    blocks = change[: rows * _SIDE, : columns * _SIDE].reshape(rows, _SIDE, columns, _SIDE)
-    mean, within = blocks.mean(axis=(1, 3)), blocks.var(axis=(1, 3))
+    whole = change[: rows * _SIDE, : columns * _SIDE]
+    mean, square = (cv2.resize(x, (columns, rows), interpolation=cv2.INTER_AREA) for x in (whole, whole * whole))
+    within = square - mean * mean
     quiet = mean[within <= _QUIET * np.median(within) + _LEAST_VARIANCE]
     return np.abs(quiet - np.median(quiet)) if quiet.size else np.zeros(0, np.float32)

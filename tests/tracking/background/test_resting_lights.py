@@ -80,6 +80,19 @@ def test_a_light_that_moves_far_or_dims_or_is_covered_has_changed():
         assert lamps.in_picture(picture)[1].all()
 
 
+def test_lamps_that_stay_in_their_places_are_measured_only_where_a_picture_differs():
+    lamps, fixed = lamps_of(pictures(along(40), 3)), np.array([True, True, True, True, False])
+    picture = pictures(along(1), 6)[0]
+    found, changed, passed = lamps.in_picture(picture, fixed)
+    assert np.array_equal(found.uv_px[fixed], lamps.found.uv_px[fixed])
+    assert not (changed | passed).any()
+    np.testing.assert_allclose(found.uv_px[~fixed], lamps.in_picture(picture)[0].uv_px[~fixed], atol=1e-4)
+    rows, columns = slice(30, 72), slice(40, 82)  # the first lamp fails
+    picture[rows, columns] = 20
+    for known in (fixed, None):
+        assert lamps.in_picture(picture, known)[1].tolist() == [True, False, False, False, False]
+
+
 def test_a_spot_that_passes_a_lamp_is_found_in_each_picture_and_the_lamps_stay():
     path = np.column_stack([np.full(45, 200.1), np.linspace(20, 300, 45)])  # over the second lamp
     seen = pictures(path, 6)
