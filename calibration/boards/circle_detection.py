@@ -52,13 +52,15 @@ def find_circles(image: GreyImage, board: CircleGrid, thorough: bool = True) -> 
     """
     blobs = np.empty((0, 3))
     for scale in scales(image):
+        small = scaled(image, scale)
         for light in (False, True):
-            small = scaled(image, scale)
-            found = _grid(small if not light else 255 - small, board)
+            seen = _blobs(255 - small if light else small)
+            found = _grid(seen, board)
             if found is not None:
-                return _measured(image if not light else 255 - image, at_full_size(found, scale), board, light)
-        if scale == 1.0:
-            blobs = _blobs(image)
+                at_full = np.column_stack([at_full_size(seen[:, :2], scale), seen[:, 2] / scale])
+                return _measured(255 - image if light else image, at_full_size(found, scale), at_full, board, light)
+            if scale == 1.0 and not light:
+                blobs = seen
     return _why_not(image, board, blobs) if thorough else QUICK_SEARCH_FAILED
 
 
@@ -81,15 +83,22 @@ def _blobs(image: GreyImage) -> Array:
     return np.array([[*k.pt, k.size] for k in _detector(image).detect(image)]).reshape(-1, 3)
 
 
-def _grid(image: GreyImage, board: CircleGrid, size: tuple[int, int] | None = None) -> Array | None:
-    """Approximate centres (rows, columns, 2), px, in OpenCV's order, or None."""
+def _grid(blobs: Array, board: CircleGrid, size: tuple[int, int] | None = None) -> Array | None:
+    """Approximate centres (rows, columns, 2), px, of blobs (n, 3) in OpenCV's order, or None."""
     columns, rows = size or (board.columns, board.rows)
-    blobs = _blobs(image)
     if not columns * rows <= len(blobs) <= 3 * columns * rows + _STRAY or _lattice_share(blobs) < _LATTICE:
         return None
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
     for how in (0, cv2.CALIB_CB_CLUSTERING):
-        found, centres = cv2.findCirclesGrid(image, (columns, rows), flags=kind | how, blobDetector=_detector(image))
+        points = blobs[:, :2].astype(np.float32).reshape(-1, 1, 2)
+        # Without a blob detector, the points are the candidates; the stubs do not know this.
+        found, centres = cv2.findCirclesGrid(
+            points,
+            (columns, rows),
+            kind | how,
+            None,
+            cv2.CirclesGridFinderParameters(),  # type: ignore[call-overload]
+        )
         if found and centres is not None and centres.size == 2 * columns * rows:
             return np.asarray(centres, dtype=float).reshape(rows, columns, 2)
     return None
@@ -108,11 +117,10 @@ def _lattice_share(blobs: Array) -> float:
     return float(np.mean(np.asarray(tree.query(opposite)[0]) < 0.25 * distance))
 
 
-def _measured(image: GreyImage, grid: Array, board: CircleGrid, light: bool) -> BoardView | NotFound:
+def _measured(image: GreyImage, grid: Array, blobs: Array, board: CircleGrid, light: bool) -> BoardView | NotFound:
     ordered = _ordered(grid, board)
     if isinstance(ordered, NotFound):
         return ordered
-    blobs = _blobs(image)
     more = _goes_on(ordered, board, blobs)
     if more:
         return NotFound(
@@ -324,14 +332,14 @@ def _why_not(image: GreyImage, board: CircleGrid, blobs: Array) -> NotFound:
             " wholly in the picture, before a plain background"
         )
     other = CircleGrid(board.columns, board.rows, board.spacing_m, not board.asymmetric)
-    if _grid(image, other) is not None:
+    if _grid(blobs, other) is not None:
         return NotFound(
             f"the circles are {'in shifted rows' if other.asymmetric else 'in straight columns'}: write {other.kind}"
             f" instead of {board.kind}"
         )
     for count in range(len(blobs), max(len(blobs) - 3, 8), -1):
         for columns in range(3, count // 3 + 1):
-            if count % columns == 0 and _grid(image, board, (columns, count // columns)) is not None:
+            if count % columns == 0 and _grid(blobs, board, (columns, count // columns)) is not None:
                 wide, high = sorted((columns, count // columns), reverse=board.columns >= board.rows)
                 return NotFound(
                     f"a grid of {wide}x{high} circles, not {board.columns}x{board.rows}: part of the"

@@ -3,11 +3,12 @@
 One set of photographs of one board hardly separates an error of the board from one of the lens model: both are in all
 photographs, so that held-out photographs do not separate them either. A deviation is therefore solved for together
 with the lens only if each half of the photographs shows it. Scale and single points, which errors of lenses and of
-corners imitate more easily than a bend, must in addition explain the residuals: what is left must be noise. Where a
-significant deviation is not solved for, the result says by how much it would change the lens. The absolute size of the
-board cannot be determined from photographs. Bend has three parameters and scale two; the displacements of single points
-follow Strobl and Hirzinger (2011), "More accurate pinhole camera calibration with imperfect planar target", ICCV
-workshops, with their common shift, rotation and scale fixed by wide priors instead of by three chosen points.
+corners imitate more easily than a bend, must in addition explain the residuals: what is left must be noise, and with
+free points directions must be known as well as before. Where a significant deviation is not solved for, the result says
+by how much it would change the lens. The absolute size of the board cannot be determined from photographs. Bend has
+three parameters and scale two; the displacements of single points follow Strobl and Hirzinger (2011), "More accurate
+pinhole camera calibration with imperfect planar target", ICCV workshops, with their common shift, rotation and scale
+fixed by wide priors instead of by three chosen points.
 """
 
 from __future__ import annotations
@@ -19,12 +20,13 @@ from scipy.stats import chi2
 
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.lens.fit.corner_table import CornerTable
+from calibration.lens.fit.coverage import seen_at
 from calibration.lens.fit.lens_adjustment import term_of
 from calibration.lens.fit.lens_fit import LensFit, fit
 from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, Values, board_as_stated
-from calibration.lens.fit.model_selection import difference_px
+from calibration.lens.fit.model_selection import EQUAL, difference_px
 from calibration.lens.fit.projection_map import projection_map
-from calibration.lens.fit.view_equations import Scatter, ViewEquations
+from calibration.lens.fit.view_equations import Scatter, ViewEquations, scattered
 from geometry.arrays import Array, Bools
 
 SIGNIFICANT = 1e-3  # p-value below which a deviation from the stated board is significant
@@ -254,9 +256,13 @@ def _points(
     try:
         freed = fit(table, found.used, found.model, found.values, board)
         left = ViewEquations.of(table, freed, AS_STATED).scatter()
+        worse = _direction_sigma_px(table, freed) > EQUAL * _direction_sigma_px(table, found)
     except AdjustmentError as problem:
         return PointsTest(nothing, p, False, f"significant, but they cannot be solved for: {problem}"), found
     off = np.where((seen > 0)[:, None], _without_similarity(table.board_points, freed.printed), 0.0)
+    if worse and options.stretch is None:
+        why = "significant in both halves of the photographs, but with them directions are less well known"
+        return PointsTest(off, p, False, why, _change_px(table, found, freed)), found
     if left.p_value < EXPLAINED and options.stretch is None:
         why = (
             f"significant in both halves of the photographs, but they do not explain them: they still scatter"
@@ -265,6 +271,14 @@ def _points(
         return PointsTest(off, p, False, why, _change_px(table, found, freed)), found
     why = "significant in both halves of the photographs, and they explain them"
     return PointsTest(off, p, True, why, _change_px(table, found, freed)), freed
+
+
+def _direction_sigma_px(table: CornerTable, found: LensFit) -> float:
+    """Median sigma of directions where corners were seen, from noise and the scatter between photographs."""
+    equations = ViewEquations.of(table, found, AS_STATED)
+    at = projection_map(found.model, found.lens, table.image_size_px, 1.0)
+    sigmas = at.sigma_px(scattered(found, equations, max(1.0, equations.scatter().factor)))
+    return float(np.nanmedian(sigmas[seen_at(table, found.used, at.pixels)]))
 
 
 def _p_of_points(table: CornerTable, found: LensFit, factor: float, used: Bools) -> float:

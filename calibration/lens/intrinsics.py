@@ -19,7 +19,7 @@ from calibration.lens.fit.lens_parameters import AS_STATED, BOARD_BLOCKS, BoardF
 from calibration.lens.fit.lens_start import StartError, start
 from calibration.lens.fit.model_selection import RATIONAL, ModelCandidate, inliers_of_rich_models, select_model
 from calibration.lens.fit.projection_map import Difference, ProjectionMap, difference, projection_map
-from calibration.lens.fit.view_equations import ViewEquations
+from calibration.lens.fit.view_equations import ViewEquations, scattered
 from calibration.lens.intrinsics_result import Intrinsics, Origins
 from calibration.lens.model_uncertainty import estimate_model_uncertainty
 from geometry.arrays import Array, Bools
@@ -88,9 +88,7 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     noise = max(1.0, spread.factor) if spread.p_value < SCATTER_SIGNIFICANT else 1.0
     distance = options.distance_m or _typical_depth(table, found)
     pixel_map = projection_map(found.model, found.lens, table.image_size_px, distance)
-    covariance = found.covariance
-    if noise > 1:
-        covariance = equations.scattered_covariance(noise)[: equations.lens, : equations.lens]
+    covariance = scattered(found, equations, noise) if noise > 1 else found.covariance
     covariance = covariance + _by_unsolved_bend(table, found, shape, options)
     model_uncertainty = estimate_model_uncertainty(table, found, selection, pixel_map, covariance, noise)
     return Intrinsics(

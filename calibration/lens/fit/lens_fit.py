@@ -10,7 +10,7 @@ import numpy as np
 from calibration.least_squares.adjustment import Adjusted, Cauchy, Limits
 from calibration.least_squares.parameter_blocks import Poses, Vectors
 from calibration.lens.fit.corner_table import CornerTable
-from calibration.lens.fit.lens_adjustment import CONVERGED, FitSettings, adjust, term_of, with_circle_radius
+from calibration.lens.fit.lens_adjustment import BRIEF, CONVERGED, FitSettings, adjust, term_of, with_circle_radius
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.fit.lens_parameters import BoardFreedom, Values, array_of, lens_of
 from geometry.arrays import Array, Bools, Ints
@@ -125,7 +125,7 @@ def robust_fit(table: CornerTable, model: LensModel, values: Values, board: Boar
     values, _ = with_circle_radius(table, candidates, model, values)
     sigma = _spread(_residuals(table, candidates, model, values)[candidates])
     for _ in range(2):  # the scale of the loss is from residuals, which the first round reduces
-        adjusted = adjust(table, candidates, model, values, board, FitSettings(sigma, Cauchy()))
+        adjusted = adjust(table, candidates, model, values, board, FitSettings(sigma, Cauchy(), BRIEF))
         values = adjusted.values
         residuals = _residuals(table, candidates, model, values)
         smaller = _spread(residuals[candidates])

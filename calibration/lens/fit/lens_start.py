@@ -13,7 +13,7 @@ import numpy as np
 
 from calibration.least_squares.adjustment import AdjustmentError, Cauchy
 from calibration.lens.fit.corner_table import CornerTable
-from calibration.lens.fit.lens_adjustment import FitSettings, adjust, term_of
+from calibration.lens.fit.lens_adjustment import BRIEF, FitSettings, adjust, term_of
 from calibration.lens.fit.lens_fit import FEWEST_CORNERS
 from calibration.lens.fit.lens_models import LensModel, folds_in_picture, undistorted
 from calibration.lens.fit.lens_parameters import AS_STATED, Values, lens_of, values_of
@@ -113,7 +113,7 @@ def _short_solve(table: CornerTable, used: Bools, model: LensModel, values: Valu
     for lens_free in (few_parameters, model.free):
         term = term_of(table, used, model.fisheye)
         sigma = max(float(np.median(np.linalg.norm(term.project(values) - term.pixels, axis=1))), 0.05)
-        values = adjust(table, used, model, values, AS_STATED, FitSettings(sigma, Cauchy()), lens_free).values
+        values = adjust(table, used, model, values, AS_STATED, FitSettings(sigma, Cauchy(), BRIEF), lens_free).values
     return values
 
 

@@ -4,10 +4,11 @@ Residuals decrease with every coefficient, and held-out photographs share the bo
 What a lens is used for are directions. Their expected squared error has two parts: the variance that the photographs
 leave, which grows with the coefficients, and the difference to the other models, weighted with the probability that
 these are right. The chosen model has the smallest sum where corners were seen, and leaves no part of the picture
-unknown. The sum is the variance of Bayesian model averaging (Hoeting et al. 1999, Statistical Science 14) about one of
-the models, with probabilities from the errors in held-out photographs (Yao et al. 2018, Bayesian Analysis 13, pseudo
-averaging), whose noise is raised by the scatter between photographs. Its use as a criterion is ours, after the focused
-information criterion (Claeskens and Hjort 2003, JASA 98).
+unknown; of models with about the same sum, it is of the more probable kind, perspective or fisheye. The sum is the
+variance of Bayesian model averaging (Hoeting et al. 1999, Statistical Science 14) about one of the models, with
+probabilities from the errors in held-out photographs (Yao et al. 2018, Bayesian Analysis 13, pseudo averaging), whose
+noise is raised by the scatter between photographs. Its use as a criterion is ours, after the focused information
+criterion (Claeskens and Hjort 2003, JASA 98).
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.least_squares.adjustment import AdjustmentError, Limits
+from calibration.least_squares.adjustment import AdjustmentError
 from calibration.least_squares.parameter_blocks import Vectors
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import seen_at
+from calibration.lens.fit.lens_adjustment import BRIEF
 from calibration.lens.fit.lens_fit import CORNER_GATE, LensFit, fit, robust_fit
 from calibration.lens.fit.lens_models import (
     LENS_MODELS,
@@ -42,9 +44,7 @@ _COMMON = 0.9  # share of the covered picture over which errors are averaged: at
 OVERFIT = 3.0  # error in held-out photographs over the noise from which on a model depends on single photographs
 EQUAL = 1.1  # ratio of expected errors up to which the model with fewer coefficients is chosen ...
 PLAUSIBLE = 0.01  # ... if its probability is not smaller
-# Models with parameters that the views hardly determine converge very slowly along a valley. They are stopped early: a
-# twentieth of a sigma is negligible against the differences between models.
-_BRIEF = Limits(steps=40, small_step_sigmas=0.05)
+PLAUSIBLE_NOISE = 0.05  # p-value of mean residuals above which models of 8 and 12 coefficients are not tried
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +92,9 @@ def select_model(
     fitted: list[ModelCandidate] = []
     below: LensFit | None = None
     for model in LENS_MODELS if only is None else (only,):
+        if model.coefficients >= RATIONAL.coefficients and any(_is_enough(table, c) for c in fitted):
+            fitted.append(ModelCandidate(model, None, refused="a smaller model leaves no correlated residuals"))
+            continue
         starts = [f for f in rich if f.model.fisheye == model.fisheye and f.model.coefficients <= model.coefficients]
         starts = starts or [f for f in rich if f.model.fisheye == model.fisheye]
         if below is not None and not model.fisheye and model.coefficients >= RATIONAL.coefficients:
@@ -99,10 +102,27 @@ def select_model(
         elif len(starts) > 1:
             starts = starts[:1]  # the best of them
         candidate = _best_start(table, used, model, [{**f.values, **shape} for f in starts] or [None], board)
-        if candidate.fit is not None and not model.fisheye and model.coefficients:
+        if (
+            candidate.fit is None
+            and below is not None
+            and not model.fisheye
+            and model.coefficients < RATIONAL.coefficients
+        ):
+            # A rich lens that folds beyond the corners may fold before them without its last coefficients.
+            candidate = _best_start(table, used, model, [{**below.values, **shape}], board)
+        if candidate.fit is not None and not model.fisheye:
             below = candidate.fit
         fitted.append(candidate)
     return choose(table, fitted)
+
+
+def _is_enough(table: CornerTable, candidate: ModelCandidate) -> bool:
+    """Whether the residuals of a candidate are noise over the picture, so that more coefficients have nothing to fit.
+
+    They would take most of the time: what the photographs do not determine converges slowly.
+    """
+    found = candidate.fit
+    return found is not None and beyond_noise(*cell_means(table, found), found.sigma_px)[0] >= PLAUSIBLE_NOISE
 
 
 def _best_start(
@@ -114,9 +134,10 @@ def _best_start(
 
 
 def choose(table: CornerTable, candidates: Sequence[ModelCandidate]) -> ModelSelection:
-    """Of candidates in ascending order, the first with about the smallest expected error that leaves none unknown.
+    """The candidate with about the smallest expected error that leaves no directions unknown.
 
-    If all leave directions unknown, the one that leaves the least is chosen: findings report it.
+    Of several with about the same error: of the more probable kind of lens, perspective or fisheye, the first. If all
+    leave directions unknown, the one with the smallest error where corners were seen is chosen: findings report it.
 
     Raises:
         AdjustmentError: no candidate can be used.
@@ -147,17 +168,16 @@ def choose(table: CornerTable, candidates: Sequence[ModelCandidate]) -> ModelSel
     usable = [c for c in out if c.fit is not None and not c.refused]
     if usable:
         least = min(usable, key=lambda c: c.error_px)
-        chosen = next(
+        equal = [
             c for c in usable if c is least or (c.error_px <= EQUAL * least.error_px and c.probability >= PLAUSIBLE)
-        )
+        ]
+        fisheye = max(equal, key=lambda c: c.probability).model.fisheye
+        chosen = next(c for c in equal if c.model.fisheye == fisheye)
         why = f"its directions have the smallest expected error where corners were seen ({chosen.error_px:.2g} px)"
     else:
-        models = {
-            j.candidate.model: (j.folds, np.hypot(j.unknown_px * raised, done[j.candidate.model].model_error_px))
-            for j in solved
-        }
-        chosen = done[min(models, key=lambda m: models[m])]
-        why = "every model leaves directions unknown, this one in the smallest part of the picture"
+        folding = {j.candidate.model for j in solved if j.folds}
+        chosen = min(done.values(), key=lambda c: (c.model in folding or c.error_px > UNKNOWN_PX, c.error_px))
+        why = "every model leaves directions unknown; where corners were seen, this one has the smallest error"
     return ModelSelection(out, chosen, "as requested" if len(candidates) == 1 else why)
 
 
@@ -255,7 +275,7 @@ def _fitted(
     if start is None:
         return ModelCandidate(model, None, refused="no focal length and no pose of the board explain the corners")
     try:
-        found = fit(table, used, model, start, board, limits=_BRIEF)
+        found = fit(table, used, model, start, board, limits=BRIEF)
     except AdjustmentError as error:
         return ModelCandidate(model, None, refused=f"it cannot be solved: {error}")
     return ModelCandidate(model, found)

@@ -161,6 +161,15 @@ class ViewEquations:
         return Scatter(float(np.sqrt(ratio)), float(chi2.sf(ratio * dof, dof)))
 
 
+def scattered(found: LensFit, equations: ViewEquations, factor: float) -> Array:
+    """Covariance (p, p) of the lens where photographs scatter by this factor on the sigmas; see `scattered_covariance`.
+
+    What scatter adds is added to the covariance of the fit, which alone contains that of displaced points.
+    """
+    raised = equations.scattered_covariance(factor) - equations.basis @ equations.basis.T
+    return found.covariance + raised[: equations.lens, : equations.lens]
+
+
 def _shared(parts: dict[str, Array], free: Bools, board: BoardFreedom, circles: bool) -> Array:
     """Derivatives (N, 2, q) by the lens, the shape of the board and, last, the radius of its circles."""
     names = [n for n, is_free in (("warp", board.warp), ("stretch", board.stretch), ("radius", circles)) if is_free]

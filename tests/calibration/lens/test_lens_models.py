@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from calibration.lens.fit.lens_fit import robust_fit
-from calibration.lens.fit.lens_models import LENS_MODELS, LensModel, folds_in_picture
-from calibration.lens.fit.lens_parameters import AS_STATED
-from calibration.lens.fit.lens_start import start
+from calibration.lens.fit.lens_models import LENS_MODELS, LensModel, folds_in_picture, rational_of_fisheye
+from calibration.lens.fit.lens_parameters import AS_STATED, values_of
+from calibration.lens.fit.lens_start import board_poses, start
 from calibration.lens.fit.projection_map import difference, projection_map
 from calibration.lens.intrinsics import calibrate_intrinsics
 from geometry.arrays import Array
@@ -35,6 +35,16 @@ def test_a_model_that_folds_in_the_picture_is_not_chosen():
         folding = [c for c in selection.candidates if c.fit and folds_in_picture(c.fit.lens, c.model.fisheye, SIZE)]
         assert selection.chosen not in folding
         assert all("folds" in c.refused for c in folding)
+
+
+def test_the_weak_prior_on_a_rational_lens_does_not_move_a_wide_one():
+    """A lens of 140 deg, whose denominator is large at the picture's corners: fx was several sigmas too small."""
+    true = rational_of_fisheye(lens_of((400.0, 401, 624, 511, 0.02, -0.005)), np.deg2rad(72))
+    table = photographs(Scene(tuple(true[:12]), views=14, sigma_px=0.03, tilt_rad=0.6, distance_m=(0.1, 0.2)), 3)
+    values = values_of(true, board_poses(table, true, False), len(table.board_points))
+    found = robust_fit(table, LensModel(8), values, AS_STATED)
+    z = (found.lens - true)[:12] / np.sqrt(np.diagonal(found.covariance))
+    assert np.max(np.abs(z)) < 3
 
 
 def test_a_radial_mapping_that_decreases_before_the_corner_folds_in_the_picture():
