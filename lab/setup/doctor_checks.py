@@ -13,7 +13,7 @@ import numpy as np
 import geometry
 from geometry.compilation.compile_cache import cache_folder, is_empty
 from lab.errors import InputError
-from lab.files.rig.calibration_state import CalibrationState
+from lab.files.rig.calibration_state import CalibrationState, iso_date
 from lab.files.rig.camera_file import load_camera
 from lab.files.rig.rig_file import load_rig_file
 from lab.files.rig.screens_file import load_screens
@@ -209,14 +209,7 @@ def _state_of_camera(path: Path) -> CalibrationState | None:
     known = load_camera(path).calibration
     if known is None or not known.date:
         return None
-    try:
-        date = datetime.datetime.fromisoformat(known.date).date()
-        until = datetime.datetime.fromisoformat(known.valid_until).date() if known.valid_until else None
-    except ValueError:
-        raise InputError(
-            f"{path}: calibration: expected dates such as 2026-03-14, got {known.date!r}, {known.valid_until!r}"
-        ) from None
-    return CalibrationState(date, known.verdict or "PASS", until, known.reasons)
+    return CalibrationState(iso_date(known.date), known.verdict or "PASS", known.last_day, known.reasons)
 
 
 def _line(path: Path, state: CalibrationState | None, today: datetime.date) -> Finding:
@@ -224,26 +217,23 @@ def _line(path: Path, state: CalibrationState | None, today: datetime.date) -> F
         return finding("BP-D09", Level.WARN, f"calibration: {path} states no date of calibration", remedy=_AGAIN)
     days = (today - state.date).days
     text = f"calibration: {path}: {state.verdict}, {days} days old"
-    if state.verdict == "FAIL":
-        why = f" ({state.reasons[0]})" if state.reasons else ""
-        return finding("BP-D09", Level.FAIL, text + why, remedy="Correct the cause and calibrate again")
+    if state.failed:
+        return finding("BP-D09", Level.FAIL, text + state.reason, remedy="Correct the cause and calibrate again")
     if days < 0:
         remedy = "Check the clock of this computer and the date in the file"
         return finding(
             "BP-D09", Level.WARN, f"calibration: {path}: its date {state.date} is in the future", remedy=remedy
         )
-    if state.valid_until is None:
-        if days > OLD:
-            return finding("BP-D09", Level.WARN, f"{text}, without an expiry date", remedy=_AGAIN)
-        text += ", without an expiry date"
-    else:
-        left = (state.valid_until - today).days
-        if left < 0:
-            return finding("BP-D09", Level.FAIL, f"{text}, expired on {state.valid_until}", remedy=_AGAIN)
-        text += f", valid until {state.valid_until}"
-        if left <= EXPIRES_SOON:
-            return finding("BP-D09", Level.WARN, f"{text}, in {left} days", remedy=_AGAIN)
+    left = state.days_left(today)
+    if left is not None and left < 0:
+        return finding("BP-D09", Level.FAIL, f"{text}, expired on {state.valid_until}", remedy=_AGAIN)
+    text += f", {state.validity}"
+    if left is None and days > OLD:
+        return finding("BP-D09", Level.WARN, text, remedy=_AGAIN)
+    if left is not None and left <= EXPIRES_SOON:
+        return finding("BP-D09", Level.WARN, f"{text}, in {left} days", remedy=_AGAIN)
     if state.verdict != "PASS":
-        why = f" ({state.reasons[0]})" if state.reasons else ""
-        return finding("BP-D09", Level.WARN, text + why, remedy="Read the report beside the file before using it")
+        return finding(
+            "BP-D09", Level.WARN, text + state.reason, remedy="Read the report beside the file before using it"
+        )
     return finding("BP-D09", Level.PASS, text)

@@ -20,22 +20,20 @@ def state_findings(state: CalibrationState | None, today: datetime.date, warning
         what = "rig.yaml does not state when it was calibrated (no block `calibration`)"
         return [finding("BP-C01", Level.WARN, what)]
     out = []
-    if state.verdict == "FAIL":
+    if state.failed:
         why = state.reasons[0] if state.reasons else "no reason given"
         out.append(finding("BP-C02", Level.FAIL, f"the calibration of {state.date} failed: {why}"))
     if state.date > today:
         out.append(finding("BP-C03", Level.WARN, f"the calibration is dated {state.date}, after today ({today})"))
-    if state.valid_until is None:
-        return [*out, passed(f"calibrated on {state.date}, without an expiry date")]
-    left = (state.valid_until - today).days
-    if left < 0:
+    left = state.days_left(today)
+    if left is not None and left < 0:
         what = f"the calibration expired on {state.valid_until}, {_days(-left)} ago"
         out.append(finding("BP-C04", Level.FAIL, what))
-    elif left <= warning_days:
+    elif left is not None and left <= warning_days:
         what = f"the calibration expires on {state.valid_until}, in {_days(left)}"
         out.append(finding("BP-C05", Level.WARN, what))
     else:
-        out.append(passed(f"calibrated on {state.date}, valid until {state.valid_until}"))
+        out.append(passed(f"calibrated on {state.date}, {state.validity}"))
     return out
 
 

@@ -55,10 +55,8 @@ def _key_figures(
             state = f"weak check: shifts below {format_number(c.detectable_px, 2)} px are not detected"
         out.append((f"drift of camera {c.camera}", value, state))
     if file.calibration is not None:
-        until = file.calibration.valid_until
-        left = "no expiry date" if until is None else f"valid until {until}"
-        if until is not None:
-            days = (until - today).days
+        left, days = file.calibration.validity, file.calibration.days_left(today)
+        if days is not None:
             left += f", {days} days left" if days >= 0 else f", expired {-days} days ago"
         out.append(("calibrated on", file.calibration.date.isoformat(), left))
     out.append(("limits", f"{limits.warn_mm:g} / {limits.fail_mm:g} mm", "warning / failure, at the screen"))

@@ -171,7 +171,7 @@ def _lens_findings(project: Project, day: datetime.date) -> list[Finding]:
             why = f": {state.reasons[0]}" if state.reasons else ""
             what = f"camera {name!r}: the lens calibration {file} has the verdict FAIL{why}"
             out.append(finding("BP-K04", Level.FAIL, what))
-        if state is not None and state.valid_until and state.valid_until < day.isoformat():
+        if state is not None and state.last_day is not None and state.last_day < day:
             what = f"camera {name!r}: the lens calibration {file} expired on {state.valid_until}"
             out.append(finding("BP-K05", Level.WARN, what))
         if camera.lens.covariance is None:

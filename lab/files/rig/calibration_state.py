@@ -25,6 +25,25 @@ class CalibrationState:
     reasons: tuple[str, ...] = ()  # a line for each finding that is not a PASS
     notes: str = ""
 
+    def days_left(self, day: datetime.date) -> int | None:
+        """Days of validity after `day`: negative after its end, None without one."""
+        return None if self.valid_until is None else (self.valid_until - day).days
+
+    @property
+    def validity(self) -> str:
+        """The end of the validity in words."""
+        return "without an expiry date" if self.valid_until is None else f"valid until {self.valid_until}"
+
+    @property
+    def failed(self) -> bool:
+        """Whether the verdict is FAIL: it must not be used."""
+        return self.verdict == "FAIL"
+
+    @property
+    def reason(self) -> str:
+        """The first reason of the verdict, such as ` (RMS 3 px)`; empty without one."""
+        return f" ({self.reasons[0]})" if self.reasons else ""
+
 
 def iso_date(value: Any) -> datetime.date:
     """A date written as 2026-03-14; a time of day after it is ignored."""
@@ -40,6 +59,11 @@ def _day_or_none(value: Any) -> datetime.date | None:
     return None if value in (None, "") else iso_date(value)
 
 
+def _text_of_day(value: Any) -> str:
+    return "" if value in (None, "") or not iso_date(value) else str(value)
+
+
+DayText = Annotated[str, pydantic.PlainValidator(_text_of_day)]  # kept as written, with a time if it has one
 Day = Annotated[datetime.date, pydantic.PlainValidator(iso_date)]
 OptionalDay = Annotated[datetime.date | None, pydantic.PlainValidator(_day_or_none)]
 
@@ -82,16 +106,15 @@ def require_valid_calibration(
     """
     if state is None:
         return
-    if state.verdict == "FAIL":
-        why = f" ({state.reasons[0]})" if state.reasons else ""
+    if state.failed:
         raise CalibrationError(
-            f"{path}: calibration.verdict: FAIL{why}: this calibration must not be used; correct the cause and"
+            f"{path}: calibration.verdict: FAIL{state.reason}: this calibration must not be used; correct the cause and"
             " calibrate again (`beampose calibrate rig`)"
         )
-    if state.valid_until is not None and on > state.valid_until:
-        days = (on - state.valid_until).days
+    left = state.days_left(on)
+    if left is not None and left < 0:
         raise CalibrationError(
-            f"{path}: calibration.valid_until: {state.valid_until.isoformat()} was {days} day{'s' if days > 1 else ''}"
+            f"{path}: calibration.valid_until: {state.valid_until} was {-left} day{'s' if left < -1 else ''}"
             f" before {on.isoformat()} ({what}): the calibration is out of date; calibrate again, or confirm it with"
             " `beampose calibrate check` and set a new date"
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +14,7 @@ from geometry.arrays import Array
 from geometry.camera import PERSPECTIVE, Camera
 from geometry.pose import Pose
 from geometry.uncertainty.rig_uncertainty import PINHOLE, distortion_names
-from lab.files.rig.calibration_state import VERDICTS
+from lab.files.rig.calibration_state import VERDICTS, DayText, iso_date
 from lab.files.rig.camera_block import (
     Covariance,
     CovarianceBlock,
@@ -58,6 +59,11 @@ class CameraCalibration:
     reasons: tuple[str, ...] = ()  # a line for each finding that is not a PASS
     figures: Mapping[str, float] = field(default_factory=dict)  # further figures, with their unit in the name
     notes: str = ""
+
+    @property
+    def last_day(self) -> datetime.date | None:
+        """The last valid day; None: no limit."""
+        return iso_date(self.valid_until) if self.valid_until else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +153,7 @@ def _calibration_mapping(calibration: CameraCalibration) -> dict[str, Any]:
 
 
 class _CalibrationBlock(Block):
-    date: Text = ""
+    date: DayText = ""
     verdict: Annotated[str, pydantic.PlainValidator(one_of((*VERDICTS, "")))] = ""
     rms_px: NonNegative | None = None
     sigma_px: NonNegative | None = None
@@ -156,7 +162,7 @@ class _CalibrationBlock(Block):
     corners: Integer | None = None
     board: Text = ""
     distance_m: Positive | None = None
-    valid_until: Text = ""
+    valid_until: DayText = ""
     reasons: Lines = []  # noqa: RUF012 - frozen
     figures: dict[str, Number] = {}  # noqa: RUF012 - frozen
     notes: Text = ""

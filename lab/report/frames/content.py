@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,6 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.uncertainty.spot_tracks import beam_image, pixel_covariance, scatter, uncertainty_tracks, unlimited
 from lab.errors import BeamposeError, InputError
-from lab.files.run.clocks import picture_numbers
 from lab.files.run.results import (
     POSE_STATUSES,
     SPOT_STATUSES,
@@ -28,9 +28,8 @@ from lab.files.run.results import (
 )
 from lab.files.run.run_file import FramesFolder, Run, VideoFile, load_run
 from lab.files.text.error_text import name_of_path
-from lab.pictures.picture_file import DROPPED, GreyPicture, MissingPicture
-from lab.pictures.source import pictures
-from lab.runs.frames.frames import Picture, recorded_pictures
+from lab.pictures.picture_file import GreyPicture, MissingPicture
+from lab.runs.frames.frames import Picture, pictures_of_rows
 from tracking.detections import Detections
 from tracking.statuses import PoseStatus, SpotStatus
 
@@ -355,22 +354,20 @@ def _beam(data: ResultData, j: int, world_from_body: Pose) -> Array:
 def pictures_of(run: Run | None, cameras: Sequence[str], frames: Sequence[int]) -> Iterator[dict[str, Picture]]:
     """For each of the rising frame numbers the pictures of the cameras; those of points are left out.
 
-    A camera whose pictures cannot be opened has none, with the reason. Memory does not grow with the number of frames.
+    A camera whose pictures cannot be read has none, with the reason. Memory does not grow with the number of frames.
     """
+    recorded = {} if run is None else {n: s for n, s in run.cameras.items() if isinstance(s, FramesFolder | VideoFile)}
     with ExitStack() as stack:
-        streams: dict[str, Iterator[tuple[int, Picture]]] = {}
-        for camera in cameras if run is not None else ():
-            source = run.cameras.get(camera) if run is not None else None
-            if run is None or not isinstance(source, FramesFolder | VideoFile):
-                continue
-            try:
-                opened, size_px = recorded_pictures(camera, source), run.rig.cameras[camera].image_size_px
-                numbers = picture_numbers(run.clocks.get(camera), run.times, np.array(frames, dtype=np.int64))
-                wanted = numbers.tolist()
-                streams[camera] = stack.enter_context(closing(pictures(opened, size_px, wanted=wanted)))
-            except BeamposeError as error:
-                reason = MissingPicture(str(error))
-                streams[camera] = iter([(frame, reason) for frame in frames])
-        for frame in frames:
-            ended = (frame, MissingPicture(DROPPED))
-            yield {camera: next(stream, ended)[1] for camera, stream in streams.items()}
+        streams: dict[str, Iterator[Picture]] = {}
+        for camera in cameras:
+            if run is not None and camera in recorded:
+                streams[camera] = stack.enter_context(closing(pictures_of_rows(run, camera, frames)))
+        for _ in frames:
+            shown: dict[str, Picture] = {}
+            for camera, stream in streams.items():
+                try:
+                    shown[camera] = next(stream)
+                except BeamposeError as error:
+                    shown[camera] = MissingPicture(str(error))
+                    streams[camera] = repeat(shown[camera])
+            yield shown

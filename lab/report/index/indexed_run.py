@@ -20,7 +20,7 @@ from geometry.arrays import Array
 from lab.errors import BeamposeError
 from lab.files.run.results import read_result_table, read_summary
 from lab.files.text.yaml_text import read_mapping
-from lab.report.run.summary import VERDICTS, valid
+from lab.report.run.summary import VERDICTS, day_of, valid
 from tracking.statuses import PoseStatus
 
 NAME = ("name", "run", "run_folder")  # keys of a row, in order of preference
@@ -100,7 +100,7 @@ def indexed_run(row: Mapping[str, Any], out: Path) -> IndexedRun:
         sigma_position_m=medians[2],
         mean_residual_px=_mean_residual(summary),
         recorded=_recorded(row, summary),
-        calibrated=_day(_at(summary, "calibration", "date")),
+        calibrated=day_of(_at(summary, "calibration", "date")),
         angles_deg=angles,
         position_m=position,
     )
@@ -147,21 +147,14 @@ def _number(value: object) -> float | None:
     return number if number is not None and np.isfinite(number) else None
 
 
-def _day(value: object) -> datetime.date | None:
-    try:
-        return datetime.date.fromisoformat(str(value).strip()[:10])
-    except ValueError:
-        return None
-
-
 def _recorded(row: Mapping[str, Any], summary: Mapping[str, Any]) -> datetime.date | None:
     """The day of the recording, from summary.json or else from the run.yaml that can be reached."""
-    if stated := _day(summary.get("recorded")):
+    if stated := day_of(summary.get("recorded")):
         return stated
     for folder in (first_of(row, FOLDER), valid(str, summary.get("run_folder"))):
         path = Path(folder or "") / "run.yaml"
         try:
-            if folder and path.is_file() and (stated := _day(read_mapping(path).get("recorded"))):
+            if folder and path.is_file() and (stated := day_of(read_mapping(path).get("recorded"))):
                 return stated
         except (BeamposeError, OSError, ValueError):
             continue

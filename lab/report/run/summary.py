@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -144,6 +145,14 @@ def valid(kind: type[T], value: object) -> T | None:
 @cache
 def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
+
+
+def day_of(value: object) -> datetime.date | None:
+    """The day of a date or time as text; None where it is none."""
+    try:
+        return datetime.date.fromisoformat(str(value).strip()[:10])
+    except ValueError:
+        return None
 
 
 def _mapping(value: object) -> Mapping[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -14,6 +13,7 @@ from lab.number_format import format_angle, format_length, format_number, format
 from lab.report.plot.axes import true_ranges
 from lab.report.run.blocks.model_fit import Methods, MethodsFacts, ModelFit, methods_text
 from lab.report.run.report_data import ReportData
+from lab.report.run.summary import day_of
 from tracking.statuses import PoseStatus
 
 _MODEL = "Fit of rig and recording"
@@ -80,7 +80,7 @@ def _calibration(m: ReportData) -> Evidence:
     verdict = str(state.get("verdict", "without a verdict"))
     words = f"{verdict}, of {state.get('date', 'an unknown day')}"
     recorded = None if m.run is None else m.run.recorded
-    day, until = _day(state.get("date")), _day(state.get("valid_until"))
+    day, until = day_of(state.get("date")), day_of(state.get("valid_until"))
     if day and recorded:
         age = (recorded - day).days
         words += f", {abs(age)} days {'before' if age >= 0 else 'after'} the recording"
@@ -90,13 +90,6 @@ def _calibration(m: ReportData) -> Evidence:
     late = bool(until and recorded and recorded > until)
     level = Level.FAIL if verdict == "FAIL" or late else Level.PASS if verdict == "PASS" else Level.WARN
     return Evidence(level, "Calibration", words)
-
-
-def _day(value: object) -> datetime.date | None:
-    try:
-        return datetime.date.fromisoformat(str(value)[:10])
-    except ValueError:
-        return None
 
 
 def _model(fit: ModelFit | None) -> Evidence:

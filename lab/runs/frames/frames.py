@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from itertools import count
@@ -18,7 +18,7 @@ from lab.files.run.detections_file import CameraPoints, DetectionsFile, is_too_s
 from lab.files.run.run_file import FramesFolder, LiveDevice, Run, VideoFile
 from lab.files.text.error_text import suggest_name
 from lab.pictures.picture_file import DROPPED, UNREADABLE, GreyPicture, MissingPicture
-from lab.pictures.source import PictureFiles, PictureSource, Video, list_folder, pictures, pictures_of_frames, video_at
+from lab.pictures.source import PictureFiles, PictureSource, Video, list_folder, pictures, video_at
 from lab.runs.frames.moments import Moment
 from tracking.detections import Detections
 
@@ -270,19 +270,28 @@ def recorded_pictures(camera: str, source: FramesFolder | VideoFile) -> PictureS
     return video_at(source.path, camera) if isinstance(source, VideoFile) else list_folder(source.path, camera)
 
 
-def pictures_at(run: Run, camera: str, frames: Sequence[int]) -> Mapping[int, Picture]:
-    """Some pictures of one camera, by the number of the row in the tables.
-
-    A video is read from its start, so all pictures should be requested in one call.
-    """
+def pictures_of_rows(run: Run, camera: str, rows: Sequence[int]) -> Generator[Picture, None, None]:
+    """One camera's picture of each of these rising rows of the tables, a few read ahead; a video from its start."""
     source = run.cameras[camera]
-    if isinstance(source, FramesFolder | VideoFile):
-        size_px = run.rig.cameras[camera].image_size_px
-        numbers = picture_numbers(run.clocks.get(camera), run.times, np.array(frames, dtype=np.int64)).tolist()
-        found = pictures_of_frames(recorded_pictures(camera, source), numbers, size_px)
-        return {frame: found[number] for frame, number in sorted(zip(frames, numbers, strict=True))}
-    kind = "a live camera" if isinstance(source, LiveDevice) else "detected points"
-    return dict.fromkeys(sorted(set(frames)), MissingPicture(f"no pictures: {kind}"))
+    if not isinstance(source, FramesFolder | VideoFile):
+        kind = "a live camera" if isinstance(source, LiveDevice) else "detected points"
+        yield from [MissingPicture(f"no pictures: {kind}")] * len(rows)
+        return
+    opened, size_px = recorded_pictures(camera, source), run.rig.cameras[camera].image_size_px
+    numbers = picture_numbers(run.clocks.get(camera), run.times, np.array(rows, dtype=np.int64))
+    with closing(pictures(opened, size_px, wanted=np.unique(numbers[numbers >= 0]).tolist())) as stream:
+        at = -1
+        picture: Picture = MissingPicture(DROPPED)
+        for number in numbers.tolist():
+            while at < number:
+                at, picture = next(stream, (number, MissingPicture(DROPPED)))
+            yield picture if number == at >= 0 else MissingPicture(DROPPED)
+
+
+def pictures_at(run: Run, camera: str, rows: Iterable[int]) -> dict[int, Picture]:
+    """Some pictures of one camera, by the number of the row in the tables."""
+    rising = sorted(set(rows))
+    return dict(zip(rising, pictures_of_rows(run, camera, rising), strict=True))
 
 
 def points_at(table: DetectionsFile, camera: str, frame: int, first: int, last: int) -> Detections | MissingPicture:

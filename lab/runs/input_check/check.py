@@ -96,7 +96,7 @@ def _describe_calibration(
         findings.unusable += str(error).splitlines()
     text = "the rig file does not state when it was calibrated"
     if state is not None:
-        until = "" if state.valid_until is None else f", valid until {state.valid_until.isoformat()}"
+        until = "" if state.valid_until is None else f", {state.validity}"
         text = f"calibrated {state.date.isoformat()}: {state.verdict}{until}"
     known = "no covariance: sigmas will include the noise only"
     if covariance is not None:
