@@ -77,6 +77,13 @@ class NoiseModel:
         c = self.correlation
         return replace(self, floor_dn2=c * self.floor_dn2, slope_dn=c * self.slope_dn, correlation=1.0)
 
+    def in_steps(self, steps: float) -> NoiseModel:
+        """The model of pictures in so many steps per DN."""
+        return replace(
+            self, floor_dn2=self.floor_dn2 * steps**2, slope_dn=self.slope_dn * steps, black_dn=self.black_dn * steps,
+            banding_dn=self.banding_dn * steps, compression_dn2=self.compression_dn2 * steps**2,
+        )  # fmt: skip
+
     def texture_of_blocks(self, rows: int, columns: int) -> NDArray[np.float32] | float:
         """The texture of each block of a picture of so many blocks; the same for all if it is not known for each."""
         local = self.local_texture

@@ -21,6 +21,7 @@ _LEAST_PICTURES, _LEAST_SHARE = 6, 2 / 3  # of the pictures that show the light
 _AROUND = 1.5  # widths beyond the box that are fitted
 _SAMPLES, _MOST_SAMPLES = 3.0, 2500  # pixels that are fitted: per width of the light, and in all
 _LARGEST_SIGMA = 0.1  # of the camera's modulated share
+_LACKS = 0.5  # of the height, by which a picture without the light is darker
 _LIT = 1e-3  # of the peak: there the background comes from the fit
 
 
@@ -101,20 +102,39 @@ def _behind_one(
     width = float(np.median([np.sqrt(d.major_px[0] * d.minor_px[0]) for d in brightest]))
     if box[2] > _LARGEST_PATH * width:
         return None
-    some = [pictures[k] for k in shown]
     places = np.concatenate([d.uv_px for d in brightest])
+    height, middle = float(np.median([d.peak[0] for d in brightest])), np.median(places, axis=0)
+    lacks = _lacking(pictures, shown, middle, width) > _LACKS * height
+    # What is found in the middle although the light has left is an edge.
+    true = ~(lacks[shown] & (np.linalg.norm(places - middle, axis=1) < width))
+    some, places = [pictures[k] for k, there in zip(shown, true, strict=True) if there], places[true]
+    empty = [p for k, p in enumerate(pictures) if lacks[k] and k not in shown]
     side = 2 * (box[2] + _AROUND * width)
     step = max(int(width / _SAMPLES), int(np.ceil(side / np.sqrt(_MOST_SAMPLES))), 1)
     values, uv = _around(some, box, _AROUND * width, step)
-    height = float(np.median([d.peak[0] for d in brightest]))
-    fit = fitted(uv, values, noise.variance(values), places, width, height, modulation)
-    return None if fit is None else _whole(some, box, width, fit, noise)
+    without = _around(empty, box, _AROUND * width, step)[0] if empty else np.zeros((0, len(uv)))
+    fit = fitted(uv, values, noise.variance(values), places, width, height, without, modulation)
+    return None if fit is None else _whole(some, empty, box, width, fit, noise)
 
 
-def _whole(pictures: Sequence[NDArray[Any]], box: Array, width: float, fit: JointFit, noise: NoiseModel) -> _Part:
-    """All pixels that the light of a fit reaches."""
+def _lacking(pictures: Sequence[NDArray[Any]], shown: Sequence[int], place: Array, width: float) -> Array:
+    """(n,), DN: by how much less light of this width each picture has at a place than most of those shown.
+
+    Where a vehicle rests for a part of the recording, the other pictures show the background behind its lights.
+    """
+    values, uv = _around(pictures, np.array([*place, width]), width, 1)
+    light = np.exp(-0.5 * np.sum((uv - place) ** 2, axis=1) / width**2)
+    return np.asarray((np.median(values[shown], axis=0) - values) @ light / np.sum(light**2))
+
+
+def _whole(
+    pictures: Sequence[NDArray[Any]], empty: Sequence[NDArray[Any]], box: Array, width: float, fit: JointFit,
+    noise: NoiseModel,
+) -> _Part:  # fmt: skip
+    """All pixels that the light of a fit reaches. empty: pictures without it."""
     values, uv = _around(pictures, box, 2 * _AROUND * width, 1)
-    level, information, light = fit.behind(uv, values, noise.variance(values))
+    without = _around(empty, box, 2 * _AROUND * width, 1)[0] if empty else np.zeros((0, len(uv)))
+    level, information, light = fit.behind(uv, values, noise.variance(values), without)
     lit = light > _LIT
     column, row = uv[lit].astype(np.int64).T
     return _Part(row, column, level[lit], fit.share + 1 / np.maximum(information[lit], 1e-3), fit)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array
 from tracking.background.behind_lights import LARGEST_PATH_PX, BehindLights
+from tracking.background.joint_fit import Modulation
 from tracking.background.mean_pictures import MOST_BYTES, means_of, smooth_part, usable
 from tracking.background.places import AROUND_LIGHT, ON_LIGHT, SAME_LIGHT, near_each, number_of_better, places_of
 from tracking.background.shown_light import Shown
@@ -63,7 +64,8 @@ def static_background(
         background = StaticBackground.of_mean(lower, some, model, parameters).with_light(some)
     tried = some[::TRIED]
     few = len(background.lights.found) < _MANY_LIGHTS
-    if few and sum(_better_in(background, p, shift) for p in tried) < max(_LEAST_FOUND * len(tried), 2):
+    moving = few and any(len(background.spots_in(p, parameters, shift)) for p in tried)
+    if moving and sum(_better_in(background, p, shift) for p in tried) < max(_LEAST_FOUND * len(tried), 2):
         return None
     return _without_slow_lights(background, mean, some, equal, shift)
 
@@ -89,6 +91,7 @@ def _without_slow_lights(
     moved, boxes = slow.moved, slow.boxes(slow.everywhere)
     paths = boxes[boxes[:, 2] < LARGEST_PATH_PX]
     here = [_spots_at(better, p, paths, shift, fit) for p, fit in zip(pictures, fits, strict=True)]
+    known = slow[slow.known]
     behind = BehindLights.of(equal, here, boxes, background.noise, better.usual_dn())
     mean[behind.row, behind.column] = behind.level_dn
     slow = slow[~slow.known & ~behind.covers(mean.shape)[slow.row, slow.column]]
@@ -97,27 +100,34 @@ def _without_slow_lights(
         better = _behind(hidden, slow, mean, pictures, fits, shift)
     else:
         better = StaticBackground.of_mean(mean, pictures, background.noise, background.parameters)
+    better.shares[known.row, known.column] = 1 / known.count
     better.shares[behind.row, behind.column] = behind.share
     better = better.with_light(pictures)
     if behind.modulation is not None:
         better = better.with_modulation(behind.modulation)
-    return _with_shifts(better, pictures, moved, shift)
+    return _with_shifts(better, mean, pictures, moved, shift, behind.modulation)
 
 
 def _with_shifts(
-    background: StaticBackground, pictures: Sequence[Picture], moved: bool, shift: TextureShift
-) -> StaticBackground:
-    """The background with the errors of lights by its texture, and with those of its lights that stay at rest."""
+    background: StaticBackground, mean: NDArray[np.float32], pictures: Sequence[Picture], moved: bool,
+    shift: TextureShift, modulation: Modulation | None,
+) -> StaticBackground:  # fmt: skip
+    """The background with the errors of lights by its texture, and with those of its lights that stay at rest.
+
+    mean (h, w), DN: it is made from. modulation: of the lights by its surface, if known.
+    """
     found = [background.spots_in(p, background.parameters, shift) for p in pictures[::TRIED]]
+    # Of a light at rest that trembles something is left in the difference: that stays in its place.
+    alone = [d[np.asarray(~near_each(d, background.lights.found, ON_LIGHT).any(axis=1))] for d in found]
+    gone = [bool((~near_each(d, later, SAME_LIGHT).any(axis=1)).any()) for d, later in pairwise(alone)]
+    moved = moved and float(np.mean(gone)) > _MOSTLY
+    if not moved:
+        background = background.with_lights_on_edges(mean, modulation)
     still = background.lights.found
     widths = np.concatenate([np.sqrt(d.major_px * d.minor_px) for d in found])
     if not len(widths):  # spots may be at rest
         widths = np.sqrt(still.major_px * still.minor_px)
     changed = np.array([background.lights.in_picture(p)[1] for p in pictures])
-    # Of a light at rest that trembles something is left in the difference: that stays in its place.
-    alone = [d[np.asarray(~near_each(d, background.lights.found, ON_LIGHT).any(axis=1))] for d in found]
-    gone = [bool((~near_each(d, later, SAME_LIGHT).any(axis=1)).any()) for d, later in pairwise(alone)]
-    moved = moved and float(np.mean(gone)) > _MOSTLY
     better = replace(background, fixed=np.asarray(~changed.any(axis=0) & moved))
     if not len(widths):
         return better

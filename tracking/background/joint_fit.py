@@ -84,7 +84,9 @@ class _Pixels:
     variance: Array  # (n, m), DN^2, of the noise
     usual: float  # DN, of the background
     height: float  # DN, of the light
-    modulated: tuple[float, float] = MODULATED  # expected share of the light, and its sigma
+    modulated: tuple[float, float]  # expected share of the light, and its sigma
+    empty: Array  # (m,) DN, of pictures without the light: their mean, and the information of that, 1/DN^2
+    empty_information: Array  # (m,)
 
     def seen(self, light: JointLight) -> _Seen:
         """A light in these pixels."""
@@ -96,13 +98,15 @@ class _Pixels:
         slope = 1 + light.modulated * light_of
         about = self.uv - light.origin
         plane = light.plane[0] + about @ light.plane[1:]
-        information = (slope**2 * weight).sum(axis=0) + light.texture_dn**-2
+        information = (slope**2 * weight).sum(axis=0) + light.texture_dn**-2 + self.empty_information
         behind = (slope * weight * (self.values - light.plain * light_of)).sum(axis=0) + plane * light.texture_dn**-2
+        behind += self.empty_information * self.empty
         behind /= information
         root = np.sqrt(weight)
         residual = np.concatenate([
             (self.values - slope * behind - light.plain * light_of) * root,
             ((plane - behind) / light.texture_dn)[None],
+            ((self.empty - behind) * np.sqrt(self.empty_information))[None],
         ])  # fmt: skip
         # What is known of p and q, so that they stay where the light lies on even ground.
         modulated = light.modulated * self.usual
@@ -116,7 +120,7 @@ class _Pixels:
         (n, m), (l11, l21, l22) = self.values.shape, light.shape
         size = 5 + 2 * n + 3
         weighted = (light.plain + light.modulated * seen.behind) * seen.light_of * seen.root
-        slopes = np.zeros((size, n + 1, m))
+        slopes = np.zeros((size, n + 2, m))
         slopes[0, :n], slopes[1, :n] = seen.light_of * seen.root, seen.light_of * seen.behind * seen.root
         slopes[2, :n] = -weighted * seen.along * seen.du
         slopes[3, :n] = -weighted * seen.along * seen.dv
@@ -126,7 +130,9 @@ class _Pixels:
         slopes[6 + 2 * each, each] = weighted * (seen.along * l21 + seen.across * l22)
         about = self.uv - light.origin
         slopes[5 + 2 * n :, n] = -np.stack([np.ones(m), *about.T]) / light.texture_dn
-        by_background = np.concatenate([seen.slope * seen.root, np.full((1, m), 1 / light.texture_dn)])
+        by_background = np.concatenate([
+            seen.slope * seen.root, np.full((1, m), 1 / light.texture_dn), np.sqrt(self.empty_information)[None],
+        ])  # fmt: skip
         by_background /= np.sqrt(seen.information)
         slopes -= (slopes * by_background).sum(axis=1)[:, None] * by_background
         flat = slopes.reshape(size, -1)
@@ -148,7 +154,7 @@ class _Seen:
     slope: Array  # (n, m): by the background
     behind: Array  # (m,) DN: the background
     information: Array  # (m,) 1/DN^2
-    residual: Array  # (n + 1, m), sigmas
+    residual: Array  # (n + 2, m), sigmas
     usual: Array  # (2,), sigmas
 
     @property
@@ -170,29 +176,39 @@ class JointFit:
         slope = np.array([-more, p * level_dn]) / (p + more) ** 2
         return more / (p + more), float(slope @ self.strength_cov @ slope)
 
-    def behind(self, uv: Array, values: Array, variance: Array) -> tuple[Array, Array, Array]:
+    def behind(
+        self, uv: Array, values: Array, variance: Array, empty: Array | None = None
+    ) -> tuple[Array, Array, Array]:
         """The background (m,), DN, its information in pictures (m,), and the light, (m,), highest of all pictures.
 
-        uv (m, 2): pixels; values, variance (n, m): of the pictures there, DN and DN^2.
+        uv (m, 2): pixels; values, variance (n, m): of the pictures there, DN and DN^2; empty (k, m): of pictures
+        without the light.
         """
-        pixels = _Pixels(uv, values, variance, 1.0, self.light.plain)
+        pixels = _Pixels(uv, values, variance, 1.0, self.light.plain, MODULATED, *_mean_of(empty, variance))
         seen = pixels.seen(self.light)
         return seen.behind, seen.information * variance.mean(axis=0), seen.light_of.max(axis=0)
 
 
+def _mean_of(empty: Array | None, variance: Array) -> tuple[Array, Array]:
+    """The mean (m,) of pictures (k, m) without the light, and its information, given variances (n, m) of others."""
+    if empty is None or not len(empty):
+        return np.zeros(variance.shape[1]), np.zeros(variance.shape[1])
+    return empty.mean(axis=0), len(empty) / variance.min(axis=0)
+
+
 def fitted(
     uv: Array, values: Array, variance: Array, places: Array, width_px: float, height_dn: float,
-    modulation: Modulation | None = None,
+    empty: Array | None = None, modulation: Modulation | None = None,
 ) -> JointFit | None:  # fmt: skip
     """A light in n pictures that starts from these places (n, 2), width and height; None: it does not explain them.
 
-    uv (m, 2): pixels around it; values, variance (n, m): of the pictures there, DN and DN^2. modulation: as other
-    lights show it.
+    uv (m, 2): pixels around it; values, variance (n, m): of the pictures there, DN and DN^2; empty (k, m): of pictures
+    without the light. modulation: as other lights show it.
     """
     low = np.sort(values, axis=0)[: max(len(values) // 2, 1)].mean(axis=0)
     usual = float(np.median(low))
     expected = MODULATED if modulation is None else modulation.at(max(usual, 1.0))
-    pixels = _Pixels(uv, values, variance, max(usual, 1.0), height_dn, expected)
+    pixels = _Pixels(uv, values, variance, max(usual, 1.0), height_dn, expected, *_mean_of(empty, variance))
     origin, inverse = uv.mean(axis=0), 1 / width_px
     light = JointLight(
         places, np.array([inverse, 0.0, inverse]), (1 - expected[0]) * height_dn,

@@ -40,6 +40,7 @@ class RestingLights:
     free: Array  # (n,), degrees of freedom
     inverse: Array  # (n, 9, 9), of the normal matrices
     flux_of: Array  # (n, 9): relative flux by the parameters
+    clips_dn: float  # of the sensor
 
     @staticmethod
     def of(mean: NDArray[Any], found: Detections, noise: NoiseModel, saturation_dn: float) -> RestingLights:
@@ -61,7 +62,7 @@ class RestingLights:
         flux_of = np.array([w.flux_of for w in windows]).reshape(-1, _PARAMETERS)
         return RestingLights(
             found, half, pixels, light.astype(np.float32), weight.astype(np.float32), slopes.astype(np.float32), starts,
-            np.maximum(used - _PARAMETERS, 1.0), inverse, flux_of,
+            np.maximum(used - _PARAMETERS, 1.0), inverse, flux_of, saturation_dn,
         )  # fmt: skip
 
     def in_picture(self, picture: Picture, fixed: Bools | None = None) -> tuple[Detections, Bools, Bools]:
@@ -105,7 +106,7 @@ class RestingLights:
         return RestingLights(
             self.found[lights], self.half_px[lights], self.pixels[rows], self.mean[rows], self.weight[rows],
             self.slopes[:, rows], np.cumsum(counts) - counts, self.free[lights], self.inverse[lights],
-            self.flux_of[lights],
+            self.flux_of[lights], self.clips_dn,
         ), rows  # fmt: skip
 
     def _measured(self, residual: NDArray[np.float32]) -> tuple[Detections, Bools, Bools]:

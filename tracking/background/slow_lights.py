@@ -60,14 +60,18 @@ class SlowLights:
         )
 
     @property
+    def count(self) -> Ints:
+        """(m,): number of pictures without a light."""
+        return np.asarray(np.count_nonzero(self.clear, axis=0), np.int64)
+
+    @property
     def known(self) -> Bools:
         """(m,): pixels that enough pictures show without a light."""
-        return np.asarray(np.count_nonzero(self.clear, axis=0) >= LEAST_CLEAR)
+        return np.asarray(self.count >= LEAST_CLEAR)
 
     def means(self) -> Array:
         """(m,): of the clear pictures; where these are too few, nearly the lowest value."""
-        count = np.count_nonzero(self.clear, axis=0)
-        mean = (self.values * self.clear).sum(axis=0) / np.maximum(count, 1)
+        mean = (self.values * self.clear).sum(axis=0) / np.maximum(self.count, 1)
         return np.where(self.known, mean, np.sort(self.values, axis=0)[1])
 
     def behind(self, found: Sequence[Detections], before: Array, variance: Array) -> tuple[Array, Array]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools, Ints
 from tracking.background.joint_fit import Modulation
+from tracking.background.lights_on_edges import with_lights_on_edges
 from tracking.background.mean_pictures import (
     GAIN_BITS,
     highest_of_blocks,
@@ -90,6 +91,15 @@ class StaticBackground:
         )  # fmt: skip
         return replace(self, shown=shown)
 
+    def with_lights_on_edges(self, mean: NDArray[np.float32], modulation: Modulation | None) -> StaticBackground:
+        """The background with the lights at rest on its edges; mean (h, w), DN: it is made from."""
+        found = with_lights_on_edges(
+            mean, self.lights.found, self.noise, self.parameters, self.steps, self.lights.clips_dn, modulation
+        )
+        near_lights = self.near_lights | places_of(found, mean.shape, AROUND_LIGHT)
+        lights = RestingLights.of(mean, found, self.noise, self.lights.clips_dn)
+        return replace(self, lights=lights, near_lights=near_lights)
+
     @property
     def _noise_share(self) -> float:
         """Variance of the background's own noise over that of a picture."""
@@ -141,11 +151,7 @@ class StaticBackground:
         while steps > 1 and (max(int(p.max()) for p in pictures) + level) * steps > most:
             steps //= 2
         level = min(level, 0.5 * most / steps)
-        floor, slope = model.floor_dn2 * steps**2, model.slope_dn * steps
-        once = replace(
-            model, floor_dn2=floor, slope_dn=slope, black_dn=model.black_dn * steps,
-            banding_dn=model.banding_dn * steps, compression_dn2=model.compression_dn2 * steps**2,
-        )  # fmt: skip
+        once = model.in_steps(steps)
         clips = saturation_of(parameters, pictures[0])
         at_rest = find_spots(in_steps(mean, steps), replace(parameters, saturation_dn=(clips - 0.5) * steps), once)
         at_rest = replace(at_rest, flux=at_rest.flux / steps, peak=at_rest.peak / steps)
@@ -155,9 +161,8 @@ class StaticBackground:
         uneven = np.asarray(np.sqrt(brighter / 9.0) / (TEXTURE_SHARE * level), np.float32)
         black = level - max(low - model.black_dn, 0.0)
         of_difference = replace(
-            model, floor_dn2=floor * (1 + share), slope_dn=slope, black_dn=black * steps, texture=0.0,
-            local_texture=uneven, banding_dn=model.banding_dn * steps, compression_dn2=model.compression_dn2 * steps**2,
-        )  # fmt: skip
+            once, floor_dn2=once.floor_dn2 * (1 + share), black_dn=black * steps, texture=0.0, local_texture=uneven
+        )
         rows, columns = SAMPLE
         blind = cv2.dilate(mean - np.minimum(plain, level), np.ones((3, 3))) > 1 / steps
         near_lights = places_of(at_rest, mean.shape, AROUND_LIGHT) | blind

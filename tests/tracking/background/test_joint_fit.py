@@ -34,9 +34,9 @@ def pictures(at: Array, background: Array, modulated: float, seed: int = 1) -> A
     return np.array([background + response * one + NOISE * rng.standard_normal(X.shape) for one in light])
 
 
-def fit_of(seen: Array, start: Array) -> JointFit | None:
+def fit_of(seen: Array, start: Array, empty: Array | None = None) -> JointFit | None:
     values = seen.reshape(len(seen), -1)
-    return fitted(UV, values, np.full(values.shape, NOISE**2), start, 3.0, 0.7 * HEIGHT)
+    return fitted(UV, values, np.full(values.shape, NOISE**2), start, 3.0, 0.7 * HEIGHT, empty)
 
 
 @pytest.mark.parametrize("modulated", [0.0, 0.6, 0.9])
@@ -54,9 +54,15 @@ def test_a_light_that_moves_by_half_its_width_is_separated_from_an_edge_under_it
     assert abs(share - modulated) < max(3 * np.sqrt(variance), 0.1)
 
 
-def test_a_light_at_rest_on_an_edge_is_not_separated():
+def test_a_light_at_rest_on_an_edge_is_not_separated_unless_some_pictures_show_the_edge_without_it():
     at = places(0.0)
-    assert fit_of(pictures(at, EDGE, 0.6), at + OFF) is None
+    seen = pictures(at, EDGE, 0.6)
+    assert fit_of(seen, at + OFF) is None
+    empty = EDGE.ravel() + NOISE * np.random.default_rng(4).standard_normal((4, SIDE * SIDE))
+    fit = fit_of(seen, at + OFF, empty)
+    assert fit is not None
+    assert np.abs(fit.light.places.mean(axis=0) - MIDDLE).max() < 0.05
+    assert abs(fit.modulated_share(60.0)[0] - 0.6) < 0.1
 
 
 def test_pictures_without_a_light_give_no_fit():

@@ -98,3 +98,14 @@ def test_a_board_that_modulates_spots_by_half_does_not_shift_them(length_px, lar
     gap, sigma = errors(found_in_all(board_pictures(paths, 2.0, 0.6, 5)), paths)
     assert np.sqrt(np.mean(gap**2)) < largest_px
     assert np.sqrt(np.mean((gap / sigma) ** 2) / 2) < 1.25
+
+
+@pytest.mark.parametrize("away_px", [2.5, 5.0, 8.0])
+@pytest.mark.parametrize("angle_deg", [0, 90])
+def test_a_spot_that_rests_beside_an_edge_is_found_although_nothing_moves(away_px, angle_deg):
+    """The only light of the recording, in its middle between two corners of the board; on its white and black side."""
+    at = [80.0 + away_px, 60.0] if angle_deg == 0 else [60.0, 80.0 + away_px]
+    paths = np.broadcast_to(np.array([at]), (15, 1, 2))
+    gap, sigma = errors(found_in_all(board_pictures(paths, 2.0, 0.3, 5)), paths)
+    assert gap.max() < 0.5
+    assert (gap / sigma).max() < 4.0
