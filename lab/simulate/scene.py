@@ -28,7 +28,6 @@ CHECKED_S = 20.0  # period of the motion of every scenario
 _CHECKED_EVERY_S = 0.05
 _MARGIN_PX = 12.0  # distance from the border of a spot in view, so that the whole spot is visible
 _MAX_DRAWS = 3000
-_TRIED_DRAWS = 40  # one in 40 makes 3000 draws fail with a probability of 1e-33
 _ROW_STEPS = 10  # towards the row in which a moving spot is exposed
 
 VISIBLE, OCCLUDED, OUTSIDE = 1, 2, 0  # in_view of truth/spots.csv
@@ -134,10 +133,10 @@ def _exposed(scenario: Scenario, model: SpotModel, motion: AnyMotion, t_s: Array
     return uv_px, exposed_s
 
 
-def has_motion(scenario: Scenario, model: SpotModel) -> bool:
-    """Whether some draws of phases meet the conditions of the scenario, so that draws of any seed find one."""
+def has_motion(scenario: Scenario, model: SpotModel, draws: int) -> bool:
+    """Whether one of so many draws of phases meets the conditions of the scenario."""
     rng = np.random.default_rng(MOTION)
-    motions = [scenario.motion.drawn(rng, scenario.frame_rate_hz) for _ in range(_TRIED_DRAWS)]
+    motions = (scenario.motion.drawn(rng, scenario.frame_rate_hz) for _ in range(draws))
     return any(_valid_start(scenario, model, m) and _valid_views(scenario, model, m) for m in motions)
 
 

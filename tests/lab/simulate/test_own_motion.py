@@ -63,9 +63,10 @@ def test_a_scenario_is_recorded_by_a_rig_that_stands_elsewhere(name, scenario, t
     assert prior.contains(Pose.from_quaternion(truth.pose.quaternion_wxyz[0], truth.pose.position_m[0]))
 
 
-def test_a_rig_that_allows_the_scenario_as_it_is_keeps_it(tmp_path):
-    own = simulate("smooth", tmp_path / "own", seed=4, frames=5, detections_only=True)
-    again = simulate("smooth", tmp_path / "again", seed=4, frames=5, detections_only=True, rig=own / "rig.yaml")
+@pytest.mark.parametrize("name", ["smooth", "four-skew-beams"])
+def test_a_rig_that_allows_the_scenario_as_it_is_keeps_it(name, tmp_path):
+    own = simulate(name, tmp_path / "own", seed=4, frames=5, detections_only=True)
+    again = simulate(name, tmp_path / "again", seed=4, frames=5, detections_only=True, rig=own / "rig.yaml")
     one, two = files_of(own), files_of(again)
     del one["rig.yaml"], two["rig.yaml"]  # directions are scaled to length 1 once more
     assert one == two
