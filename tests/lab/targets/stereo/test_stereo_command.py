@@ -60,15 +60,15 @@ def test_the_tables_have_the_columns_of_the_contract_and_a_row_per_frame(result)
 
 def test_the_pose_errors_agree_with_the_stated_covariance(result):
     assert result.exit_status == 0
-    nees = result.results.errors.nees
+    nees = result.result.errors.nees
     assert 3.5 < nees.mean() < 9.5  # 6 expected; sigma of the mean: 0.7
-    assert np.abs(result.results.errors.range_m).max() < 0.05
+    assert np.abs(result.result.errors.range_m).max() < 0.05
 
 
 def test_the_triangulated_points_are_where_the_pose_puts_the_markers(result):
-    record = result.results.records[0]
+    record = result.result.records[0]
     points = {r["spot"]: r for r in rows(result.out, "points.csv") if r["frame"] == "0"}
-    model = result.results.run.target.model
+    model = result.result.run.target.model
     for name, x in zip(model.names, record.tracked.pose.apply(model.positions), strict=True):
         if name in points:
             at, sigma = (np.array([float(points[name][f"{p}{a}_m"]) for a in "xyz"]) for p in ("", "sigma_"))
