@@ -58,6 +58,12 @@ def right_jacobian(rotvec: Array) -> Array:
     return np.eye(3) - a[..., None, None] * K + b[..., None, None] * (K @ K)
 
 
+def nearest_rotation(matrix: Array) -> Array:
+    """The rotation (3, 3) nearest to a matrix (3, 3) in the sum of squares, by its singular values."""
+    U, _, Vt = np.linalg.svd(matrix)
+    return np.asarray(U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt)
+
+
 def quaternion_from_matrix(rotation: Array) -> Array:
     """Unit quaternions (..., 4), order w, x, y, z with w >= 0, of rotation matrices (..., 3, 3).
 

@@ -52,12 +52,7 @@ _OF_NAMES: dict[str, Schema] = {
     "_name": _TEXT,
     "unit_quaternion": {"type": "array", "items": {"type": "number"}, "minItems": 4, "maxItems": 4},
     "nonzero_vector": {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3},
-    "rotation_rows": {
-        "type": "array",
-        "items": {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3},
-        "minItems": 3,
-        "maxItems": 3,
-    },
+    "rotation_rows": {"type": "array", "items": _OF_VALIDATORS[fields.vector3], "minItems": 3, "maxItems": 3},
     "_image_size": {"type": "array", "items": {"type": "integer", "minimum": 1}, "minItems": 2, "maxItems": 2},
     "_distortion": {"type": "array", "items": {"type": "number"}, "maxItems": 14},
     "_a_device": {"type": ["integer", "string"]},
@@ -132,6 +127,9 @@ def _of_validator(function: Callable[..., Any], hint: Any) -> Schema:
     inner = inspect.getclosurevars(function).nonlocals
     if {"least", "largest"} <= inner.keys():  # number_between
         return {"type": "number", "minimum": inner["least"], "maximum": inner["largest"]}
+    if "points" in inner:  # points of a screen or a beam
+        points = inner["points"]
+        return {"type": "array", "items": _OF_VALIDATORS[fields.vector3], "minItems": points, "maxItems": points}
     if "allowed" in inner:  # one_of
         return {"enum": list(inner["allowed"])}
     if "count" in inner:  # numbers, positive_numbers

@@ -22,6 +22,7 @@ from lab.simulate.scene import has_motion, spots_in_view
 _SMALLER = 0.8  # each further size of a motion, until it keeps the spots in view
 _SIZES = 15  # the last one has a twentieth of the amplitude
 _LEAST_SPOTS = 3  # that a pose needs
+_NEAR_FIRST_M, _NEAR_FIRST_DEG = 0.3, 15.0  # the prior of a trajectory: what an engineer knows of the first pose
 _DRAWS = 1000  # of a motion as it is; one in 75 suits the rig of "four-skew-beams", the least of all scenarios
 _DRAWS_OF_A_SIZE = 40  # one in 40 is enough for the 3000 draws of any seed to find one
 
@@ -46,8 +47,7 @@ def placed(scenario: Scenario, rig: Rig, start: Pose | None = None) -> Scenario:
             f" {_in_words(middle)}, got {', '.join(seen) if seen else 'none'}; `beampose check` says where each"
             " spot is in view"
         )
-    p, ypr = middle.translation.tolist(), np.rad2deg(middle.ypr).tolist()
-    prior = replace(scenario.prior, position_m=(p[0], p[1], p[2]), yaw_pitch_roll_deg=(ypr[0], ypr[1], ypr[2]))
+    prior = _about(middle, scenario.prior.within_m, scenario.prior.within_deg)
     base = scenario.motion
     if not isinstance(base, Motion):
         raise InputError("start: a recorded motion has its own; omit the start")
@@ -73,7 +73,6 @@ def placed(scenario: Scenario, rig: Rig, start: Pose | None = None) -> Scenario:
 class RecordedMotion:
     """The motion through stated poses: a cubic spline of the position, and one of the rotation."""
 
-    name: str
     duration_s: float
     position: CubicSpline
     rotation: RotationSpline
@@ -112,15 +111,13 @@ def along(scenario: Scenario, path: Path, rig: Rig, frame_rate_hz: float | None 
     t = table.t_s - table.t_s[0]
     rate = 1 / float(np.median(steps)) if frame_rate_hz is None else frame_rate_hz
     turns = Rotation.from_quat(table.quaternion_wxyz[:, [1, 2, 3, 0]])
-    motion = RecordedMotion(path.name, float(t[-1]), CubicSpline(t, table.position_m), RotationSpline(t, turns))
-    first = motion.pose(np.zeros(()))
-    p, ypr = first.translation.tolist(), np.rad2deg(first.ypr).tolist()
+    motion = RecordedMotion(float(t[-1]), CubicSpline(t, table.position_m), RotationSpline(t, turns))
     out = replace(
         scenario,
         motion=motion,
         frames=int(np.floor(t[-1] * rate + 1e-6)) + 1,
         frame_rate_hz=rate,
-        prior=PriorRegion((p[0], p[1], p[2]), (ypr[0], ypr[1], ypr[2]), 0.3, 15.0),
+        prior=_about(motion.pose(np.zeros(())), _NEAR_FIRST_M, _NEAR_FIRST_DEG),
         all_in_view_at_start=False,
         always_in_view=(),
         leaves_and_returns=(),
@@ -147,6 +144,12 @@ def _leaving(model: SpotModel, motion: RecordedMotion, frames: int, rate: float,
             k = int(np.argmin(views))
             out.append(f"spot {name}: out of view in frame {k} ({t[k]:.3g} s) and {100 * np.mean(~views):.0f} % of all")
     return out
+
+
+def _about(pose: Pose, within_m: float, within_deg: float) -> PriorRegion:
+    """The region of the first pose about a pose."""
+    (x, y, z), (yaw, pitch, roll) = pose.translation.tolist(), np.rad2deg(pose.ypr).tolist()
+    return PriorRegion((x, y, z), (yaw, pitch, roll), within_m, within_deg)
 
 
 def _in_words(pose: Pose) -> str:

@@ -296,16 +296,11 @@ def _turn(moved: Array, seen: Array, noise: float, near: Array | None = None) ->
     good = gap <= 3 * np.median(gap) + 1e-12  # lengths do not depend on A: outliers show before A is known
     M = seen[good].T @ moved[good]
     M = M + (1e-3 * float(np.sum(moved[good] ** 2)) + 10 * noise + 1e-12) * (np.eye(3) if near is None else near)
-    return _nearest_rotation(M)
+    return rotations.nearest_rotation(M)
 
 
 def _mean_rotation(stack: Array) -> Array:
     """A rotation in the middle of a stack (n, 3, 3), robust: the mean of the half nearest to the plain mean."""
-    mean = _nearest_rotation(stack.mean(axis=0))
+    mean = rotations.nearest_rotation(stack.mean(axis=0))
     away = rotations.angle(mean.T @ stack)
-    return _nearest_rotation(stack[away <= np.median(away)].mean(axis=0))
-
-
-def _nearest_rotation(matrix: Array) -> Array:
-    U, _, Vt = np.linalg.svd(matrix)
-    return np.asarray(U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt)
+    return rotations.nearest_rotation(stack[away <= np.median(away)].mean(axis=0))

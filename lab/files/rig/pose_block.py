@@ -7,15 +7,15 @@ a comment (`measured_forms`).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import pydantic
 import yaml
 
-from geometry.arrays import Array
+from geometry.arrays import Array, cross, normalised
 from geometry.pose import Pose, look_at
-from geometry.rotations import matrix_from_ypr, quaternion_from_matrix
+from geometry.rotations import matrix_from_ypr, nearest_rotation, quaternion_from_matrix
 from lab.files.rig.camera_block import plain_floats
 from lab.files.text.error_text import describe_value
 from lab.files.text.fields import Block, Vector3, field_error, numbers, unexpected_value, vector3
@@ -27,7 +27,6 @@ MIN_SINE = 1e-3  # between two directions that state an orientation
 # Deviation from 90 deg of an angle between measured corners. 5 mm on a side of 1 m make .3 deg; a wrong order of the
 # corners, or a wrong corner, makes much more.
 MAX_CORNER_DEVIATION_DEG = 2.0
-UP = (0.0, 0.0, 1.0)
 
 
 def unit_quaternion(value: Any) -> list[float]:
@@ -62,33 +61,30 @@ def nonzero_vector(value: Any) -> list[float]:
     return d
 
 
-def _points(count: int) -> Callable[[Any], list[list[float]]]:
-    """A validator of lists of `count` points."""
+def _points(points: int) -> Callable[[Any], list[list[float]]]:
+    """A validator of lists of `points` points."""
 
     def check(value: Any) -> list[list[float]]:
-        if not isinstance(value, list) or len(value) != count:
-            raise unexpected_value(f"a list of {count} points of three numbers each", value)
+        if not isinstance(value, list) or len(value) != points:
+            raise unexpected_value(f"a list of {points} points of three numbers each", value)
         return [vector3(point) for point in value]
 
-    check.__name__ = f"points_{count}"
     return check
 
 
 class _Forms(Block):
     """A mapping that is written in one of several forms."""
 
+    forms: ClassVar[tuple[str, ...]]  # keys, first that of the form in which files are written
+
     def form(self) -> str:
         """The key of the form that is used."""
-        return next(name for name in self._forms() if getattr(self, name) is not None)
-
-    @classmethod
-    def _forms(cls) -> tuple[str, ...]:
-        raise NotImplementedError
+        return next(name for name in self.forms if getattr(self, name) is not None)
 
     @pydantic.model_validator(mode="after")
     def _one_form(self) -> Any:
-        used = [name for name in self._forms() if getattr(self, name) is not None]
-        words = ", ".join(self._forms()[:-1]) + f" or {self._forms()[-1]}"
+        used = [name for name in self.forms if getattr(self, name) is not None]
+        words = ", ".join(self.forms[:-1]) + f" or {self.forms[-1]}"
         if not used:
             raise field_error(f"expected {words}, got none of them; add one")
         if len(used) > 1:
@@ -101,26 +97,23 @@ class _Forms(Block):
 
     def in_words(self) -> str | None:
         """The form as it stands in the file, on one line; None for the one in which files are written."""
-        if self.form() == self._forms()[0]:
+        if self.form() == self.forms[0]:
             return None
-        content = self.model_dump(exclude_unset=True, exclude={"covariance"})
+        content = self.model_dump(exclude_unset=True)
         return yaml.safe_dump(content, default_flow_style=True, sort_keys=False, width=1_000_000).strip()
 
 
 class PoseBlock(_Forms):
     """A transform a_from_b."""
 
+    forms: ClassVar[tuple[str, ...]] = ("quaternion_wxyz", "rotation_matrix", "yaw_pitch_roll_deg")
     quaternion_wxyz: Annotated[list[float] | None, pydantic.PlainValidator(unit_quaternion)] = None
     rotation_matrix: Annotated[list[list[float]] | None, pydantic.PlainValidator(rotation_rows)] = None  # rows
     yaw_pitch_roll_deg: Vector3 | None = None  # R = Rz(yaw) Ry(pitch) Rx(roll)
     translation_m: Vector3 | None = None
 
-    @classmethod
-    def _forms(cls) -> tuple[str, ...]:
-        return ("quaternion_wxyz", "rotation_matrix", "yaw_pitch_roll_deg")
-
     def _check(self) -> None:
-        if (self.translation_m is None) == (self.form() in PoseBlock._forms()):
+        if (self.translation_m is None) == (self.form() in PoseBlock.forms):
             if self.translation_m is None:
                 raise field_error(f"expected translation_m beside {self.form()}, got nothing; add it")
             raise field_error(f"expected no translation_m beside {self.form()}, which has the position; remove it")
@@ -131,24 +124,21 @@ class PoseBlock(_Forms):
         if self.quaternion_wxyz is not None:
             return Pose.from_quaternion(np.array(self.quaternion_wxyz), t)
         if self.rotation_matrix is not None:
-            return Pose(_nearest_rotation(np.array(self.rotation_matrix)), t)
+            return Pose(nearest_rotation(np.array(self.rotation_matrix)), t)
         return Pose(matrix_from_ypr(np.deg2rad(np.array(self.yaw_pitch_roll_deg))), t)
 
 
 class _LookAtBlock(Block):
     eye_m: Vector3  # centre of projection, in world
     target_m: Vector3  # a point in the middle of the picture
-    up: Annotated[list[float], pydantic.PlainValidator(nonzero_vector)] = list(UP)  # noqa: RUF012 - frozen
+    up: Annotated[list[float], pydantic.PlainValidator(nonzero_vector)] = [0.0, 0.0, 1.0]  # noqa: RUF012 - frozen
 
 
 class CameraPoseBlock(PoseBlock):
     """The transform camera_from_world of a camera."""
 
+    forms: ClassVar[tuple[str, ...]] = (*PoseBlock.forms, "look_at")
     look_at: _LookAtBlock | None = None  # where the camera is, and what is in the middle of its picture
-
-    @classmethod
-    def _forms(cls) -> tuple[str, ...]:
-        return (*PoseBlock._forms(), "look_at")
 
     def _check(self) -> None:
         super()._check()
@@ -173,13 +163,10 @@ class CameraPoseBlock(PoseBlock):
 class ScreenPoseBlock(PoseBlock):
     """The transform world_from_screen of a screen."""
 
+    forms: ClassVar[tuple[str, ...]] = (*PoseBlock.forms, "corner_m")
     # Three corners in world: the one at -x -y of the screen, the next along x, the next along y. They are the ends of
     # the screen, which is centred on them.
     corner_m: Annotated[list[list[float]] | None, pydantic.PlainValidator(_points(3))] = None
-
-    @classmethod
-    def _forms(cls) -> tuple[str, ...]:
-        return (*PoseBlock._forms(), "corner_m")
 
     def _check(self) -> None:
         super()._check()
@@ -211,26 +198,20 @@ class ScreenPoseBlock(PoseBlock):
         if self.corner_m is None:
             return super().pose()
         x, y = self._sides()
-        ex, ey = x / np.linalg.norm(x), y / np.linalg.norm(y)
-        along, across = ex + ey, ex - ey
-        along, across = along / np.linalg.norm(along), across / np.linalg.norm(across)
-        ex, ey = (along + across) / np.sqrt(2), (along - across) / np.sqrt(2)
-        return Pose(np.stack([ex, ey, np.cross(ex, ey)], axis=1), np.array(self.corner_m[0]) + (x + y) / 2)
+        axes = np.stack([normalised(x), normalised(y), normalised(cross(x, y))], axis=1)
+        return Pose(nearest_rotation(axes), np.array(self.corner_m[0]) + (x + y) / 2)
 
 
 class BeamBlock(_Forms):
     """A beam of the vehicle, in its body frame."""
 
+    forms: ClassVar[tuple[str, ...]] = ("direction", "azimuth_elevation_deg", "points_m")
     direction: Annotated[list[float] | None, pydantic.PlainValidator(nonzero_vector)] = None
     # From the x axis towards y, and up from the x-y plane towards z.
     azimuth_elevation_deg: Annotated[list[float] | None, pydantic.PlainValidator(numbers(2))] = None
     # Two points of the beam; its + end lies beyond the second.
     points_m: Annotated[list[list[float]] | None, pydantic.PlainValidator(_points(2))] = None
     point_m: Vector3 | None = None
-
-    @classmethod
-    def _forms(cls) -> tuple[str, ...]:
-        return ("direction", "azimuth_elevation_deg", "points_m")
 
     def _check(self) -> None:
         if self.points_m is None and self.point_m is None:
@@ -277,12 +258,6 @@ def measured_forms(content: Block, where: str = "") -> Iterator[tuple[str, str]]
                     yield place, f"measured as {words}"
             elif isinstance(entry, Block):
                 yield from measured_forms(entry, place)
-
-
-def _nearest_rotation(matrix: Array) -> Array:
-    """The rotation nearest to a matrix (3, 3) that is one up to its rounding."""
-    u, _, vt = np.linalg.svd(matrix)
-    return np.asarray(u @ vt)
 
 
 def _sine(a: Any, b: Any) -> float:

@@ -35,6 +35,13 @@ def contents() -> dict[str, dict[str, Any]]:
     """A file of every kind, and more of those that samples have."""
     out = {p.relative_to(ROOT).as_posix(): read_mapping(p) for p in SAMPLES}
     out |= {"rig": parse_mapping(RIG, "rig"), "run": parse_mapping(RUN, "run")}
+    out["rig in measured forms"] = measured = copy.deepcopy(out["rig"])
+    measured["screens"]["left"]["world_from_screen"] = {"corner_m": [[0, 0, 0], [1, 0, 0], [0, 1, 0]]}
+    turned = {"rotation_matrix": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "translation_m": [0, 0, 0]}
+    measured["screens"]["right"]["world_from_screen"] = turned
+    measured["cameras"]["left"]["camera_from_world"] = {"look_at": {"eye_m": [0, 0, 0], "target_m": [1, 0, 0]}}
+    measured["target"]["beams"]["A"] = {"points_m": [[0, 0, 0], [1, 0, 0]]}
+    measured["target"]["beams"]["B"] = {"azimuth_elevation_deg": [20, 0], "point_m": [0, 0, 0]}
     out["run with settings"] = {**out["run"], "tracker": {"r1_px": 12, "detect": {"threshold_sigma": 5}}}
     for name, example in board_types.EXAMPLES.items():
         out[f"board {name}"] = board_file.as_mapping(board_types.parse(example.split(" ")[0]))
