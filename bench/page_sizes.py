@@ -12,9 +12,8 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from lab.report.index.index import write_index
-from lab.runs.batch.batch import process_batch
-from lab.runs.batch.table import read_rows
+from lab.report.index import write_index
+from lab.runs.batch.batch import process_batch, read_rows
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
 

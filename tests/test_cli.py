@@ -439,7 +439,7 @@ def test_a_run_that_is_stopped_by_a_signal_leaves_nothing_and_says_so(tmp_path, 
 def test_a_signal_within_a_compiled_function_is_no_unexpected_error(tmp_path):
     """numba turns an exception that a signal raises within its code into a SystemError."""
     program = (
-        "import os, signal, lab.runs.input_check.check as check\n"
+        "import os, signal, lab.runs.input_check as check\n"
         "def fails(*_):\n"
         "    try:\n"
         "        os.kill(os.getpid(), signal.SIGHUP)\n"

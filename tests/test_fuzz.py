@@ -63,7 +63,7 @@ def test_an_exception_that_leaves_the_program_is_a_fault(monkeypatch):
     def breaks(*_):
         raise ZeroDivisionError("x")
 
-    monkeypatch.setattr("lab.runs.input_check.check.check", breaks)
+    monkeypatch.setattr("lab.runs.input_check.check", breaks)
     status, _, err, fault = run_command(["check", "nowhere"])
     assert "ZeroDivisionError" in fault + err
     assert fault or fault_of_lines(status, "", err)

@@ -9,7 +9,7 @@ import pytest
 
 from lab.calibrate.rig.rig import calibrate_rig
 from lab.files.rig.rig_file import joint_covariance, load_rig_file
-from lab.runs.input_check.check import check
+from lab.runs.input_check import check
 from lab.runs.process import process_run
 from lab.simulate.scene import compose
 from tests.paths import ROOT

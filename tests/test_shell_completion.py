@@ -7,7 +7,7 @@ from click.shell_completion import ShellComplete
 from click.testing import CliRunner
 
 from cli import main
-from lab.findings.catalogue import ENTRIES
+from lab.findings.finding import ENTRIES
 from lab.simulate.rigs import RIGS
 from lab.simulate.scenarios import SCENARIOS
 from tests.paths import ROOT

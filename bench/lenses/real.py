@@ -23,7 +23,7 @@ from geometry.arrays import Ints
 from lab.calibrate.camera.camera import corner_table
 from lab.calibrate.camera.camera_findings import findings_of
 from lab.calibrate.camera.photos import find_in_photos
-from lab.calibrate.pair.pair import baseline_sigma
+from lab.calibrate.pair import baseline_sigma
 from lab.findings.finding import Level, verdict
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"

@@ -29,9 +29,9 @@ from bench.random_scenes.scene import random_scene
 from bench.random_scenes.write_folder import write_run_folder
 from lab.errors import BeamposeError
 from lab.findings.outcome import Outcome
-from lab.runs.input_check.check import check
+from lab.runs.input_check import check
 from lab.runs.process import process_run
-from lab.runs.score.score import normalised_squares, pose_errors, read_tables, read_truth
+from lab.runs.score import normalised_squares, pose_errors, read_tables, read_truth
 from lab.runs.verdict.run_statistics import RunStatistics
 from tracking.statuses import PoseStatus
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from docs.website.text import cell
-from lab.findings.catalogue import SECTIONS
+from lab.findings.finding import SECTIONS
 
 _HEAD = """# Codes
 

@@ -22,7 +22,7 @@ from lab.files.run.run_file import Run, load_run
 from lab.files.text import columns
 from lab.files.text.csv_table import Categorical, Table
 from lab.report.frames.canvas import Pixels, png
-from lab.results.show.show import show_frame, write_picture
+from lab.results.show import show_frame, write_picture
 from lab.runs.process import are_results
 
 _EVENT_COLUMNS = ("frame", "last_frame", "kind", "camera", "spot", "text")

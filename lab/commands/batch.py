@@ -31,7 +31,7 @@ Shown = Callable[[int, int, int], None]
 
 def _shard(ctx: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
     """The text, checked: it is also part of the recorded command."""
-    from lab.runs.batch.run_folders import shard_of
+    from lab.runs.batch.task import shard_of
 
     try:
         shard_of(value or "1/1")
@@ -95,7 +95,7 @@ def batch(
     check_verbosity(verbose=verbose, quiet=quiet)
     from lab.commands.common import provenance
     from lab.runs.batch.batch import BatchOptions, process_batch
-    from lab.runs.batch.run_folders import shard_of
+    from lab.runs.batch.task import shard_of
 
     part = shard_of(shard or "1/1")
     options = BatchOptions(settings, causal, jobs, force, part, full_hash, parquet, dask, provenance(ctx))

@@ -59,7 +59,7 @@ def board(board: str, out: Path, page: str, dpi: float) -> None:
     Example:
         beampose calibrate board charuco:5x7:36mm:18mm:DICT_4X4_50 --out board
     """
-    from lab.calibrate.board.board import write_board
+    from lab.calibrate.board import write_board
 
     conclude(write_board(board, out, page=page, dpi=dpi))
 

@@ -45,9 +45,9 @@ def explain(codes: tuple[str, ...]) -> None:
     Example:
         beampose explain BP-V03
     """
-    from lab.findings import catalogue
+    from lab.findings import finding
 
-    texts = [catalogue.explain(code) for code in codes] if codes else catalogue.listed()
+    texts = [finding.explain(code) for code in codes] if codes else finding.listed()
     show_line(("\n\n" if codes else "\n").join(texts))
 
 

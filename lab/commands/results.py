@@ -21,7 +21,7 @@ def check(path: Path) -> None:
     Example:
         beampose check sample_runs/huo2015
     """
-    from lab.runs.input_check.check import check as check_path
+    from lab.runs.input_check import check as check_path
 
     with progress_bar(path.name) as progress:
         result = check_path(path, progress)
@@ -61,7 +61,7 @@ def report(
         raise InputError(f"{results}: expected a folder that `beampose run` wrote, found no summary.json of one")
     show_line(f"report: {write_report(results, run_folder)}")
     if video:
-        from lab.results.show.video import DEFAULT_FPS, write_video
+        from lab.results.show import DEFAULT_FPS, write_video
 
         with progress_bar(results.name) as progress:
             done = write_video(
@@ -192,7 +192,7 @@ def show(path: Path, frame: int, camera: str | None, out: Path | None, run_folde
     Example:
         beampose show results/huo2015 --frame 11 --out results/frame-11.png
     """
-    from lab.results.show.show import show_frame, write_picture
+    from lab.results.show import show_frame, write_picture
 
     with progress_bar(path.name) as progress:
         shown = show_frame(path, frame, camera=camera, run_folder=run_folder, progress=progress)

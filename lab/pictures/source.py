@@ -23,7 +23,7 @@ import numpy as np
 from geometry.arrays import Ints
 from lab.errors import InputError
 from lab.files.text.error_text import is_formula, name_of_path
-from lab.files.text.regular_file import require_regular_file
+from lab.files.text.json_text import require_regular_file
 from lab.pictures.opencv import load_cv2, opened
 from lab.pictures.picture_file import (
     DROPPED,

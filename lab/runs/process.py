@@ -26,7 +26,7 @@ from lab.runs.frames.row_records import row_records
 from lab.runs.model_check.frame_sampler import FrameSampler, stated_covariances, widths
 from lab.runs.run_log import RunLog, listening
 from lab.runs.run_tally import RunTally
-from lab.runs.setup_check.check import mistakes_of_run, pictures_sampler
+from lab.runs.setup_check import mistakes_of_run, pictures_sampler
 from lab.runs.smoothing_pass import TrackingAndSmoothing
 from lab.runs.summary import SUMMARY_SCHEMA, processed_run
 from lab.runs.tables import TableWriter
@@ -120,7 +120,7 @@ def _write_results(
     statistics, model_check, verdict = write_tables(
         pipeline, passes, work, causal=causal, on_frame=lambda record, _: tally.add(record)
     )
-    from lab.runs.score.score import against_truth, read_tables
+    from lab.runs.score import against_truth, read_tables
 
     tables, added = against_truth(read_tables(work), run.folder), more()
     verdict = quality.against_truth(verdict, tables.errors)

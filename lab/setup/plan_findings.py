@@ -24,9 +24,9 @@ from calibration.budget.pose_grid import NOISE, GridPlan
 from geometry.arrays import Array, Bools
 from geometry.pose import Pose
 from lab.errors import InputError
+from lab.files.text.csv_text import MAX_COORDINATE_M
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.error_text import suggest_name
-from lab.files.text.range_checks import MAX_COORDINATE_M
 from lab.findings.finding import Finding, Level, finding, passed
 from lab.number_format import format_angle, format_length, format_percent
 

@@ -28,7 +28,7 @@ from lab.runs.frames.sensor_noise import CameraNoise, noise_frames
 from lab.targets.page import TimeAxis
 from lab.targets.recording import every_frame, read_pictures, read_points
 from lab.targets.target import Codes, Target, Track, TrackOptions, header_rate
-from lab.targets.verdict import some_frames
+from lab.targets.track import some_frames
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import DetectParameters
 from tracking.single_target.blobs import find_blobs

@@ -10,9 +10,7 @@ import pytest
 
 from lab import errors
 from lab.errors import InputError
-from lab.findings import catalogue
-from lab.findings.catalogue import ENTRIES, SECTIONS
-from lab.findings.finding import Finding, Level, finding
+from lab.findings.finding import ENTRIES, SECTIONS, Finding, Level, explain, finding, listed
 from tests.paths import ROOT
 
 CODE = re.compile(r"BP-[A-Z]\d\d")
@@ -49,7 +47,7 @@ def codes_in_use() -> set[str]:
     return {code for _, text in sources() for code in CODE.findall(text)}
 
 
-FROM_SUMMARIES = {"lab/report/run/blocks/model_fit.py"}  # reads findings that were written with their codes
+FROM_SUMMARIES = {"lab/report/run/model_fit.py"}  # reads findings that were written with their codes
 
 
 def test_every_finding_that_may_be_a_warning_has_a_code():
@@ -112,16 +110,16 @@ def test_a_code_belongs_to_one_section_and_has_all_texts():
 
 @pytest.mark.parametrize("typed", ["BP-V03", "bp-v03", "V03", "v3"])
 def test_a_code_is_explained_however_it_is_typed(typed):
-    assert catalogue.explain(typed).startswith("BP-V03  Few frames with a measured pose\n")
+    assert explain(typed).startswith("BP-V03  Few frames with a measured pose\n")
 
 
 def test_a_code_that_does_not_exist_is_an_input_error():
     with pytest.raises(InputError, match="expected a code such as BP-V03, got 'BP-V99'"):
-        catalogue.explain("BP-V99")
+        explain("BP-V99")
 
 
 def test_the_list_has_every_code():
-    assert set(CODE.findall("\n".join(catalogue.listed()))) == set(ENTRIES)
+    assert set(CODE.findall("\n".join(listed()))) == set(ENTRIES)
 
 
 def test_a_finding_has_the_texts_of_its_code_or_variant_unless_others_are_given():

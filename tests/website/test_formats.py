@@ -6,11 +6,11 @@ import re
 
 import pytest
 
-from lab.calibrate.beams.beam_tables import ANGLE_COLUMNS
+from lab.calibrate.beams.beams_page import ANGLE_COLUMNS
 from lab.calibrate.camera.camera import CORNER_COLUMNS
-from lab.calibrate.drift_check import drift_check, drift_result
-from lab.calibrate.rig import rig_tables
-from lab.calibrate.screens.screen_tables import DOT_COLUMNS
+from lab.calibrate.drift_check import drift_check, drift_comparison
+from lab.calibrate.rig import rig
+from lab.calibrate.screens.screen import DOT_COLUMNS
 from lab.files.project.point_files import POINTS, POSE_SIGMAS, SURVEY, SURVEY_SIGMAS
 from lab.files.text import columns
 from lab.files.text.yaml_text import parse_mapping
@@ -41,10 +41,10 @@ TABLES = {
 }
 LISTS = {
     "corners.csv": CORNER_COLUMNS,
-    "residuals.csv": rig_tables.COLUMNS,
+    "residuals.csv": rig.COLUMNS,
     "dots.csv": DOT_COLUMNS,
     "angles.csv": ANGLE_COLUMNS,
-    "--history": drift_result.HISTORY_COLUMNS,
+    "--history": drift_comparison.HISTORY_COLUMNS,
 }
 
 

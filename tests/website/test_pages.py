@@ -17,7 +17,7 @@ from docs.website.navigation import expanded
 from docs.website.network import network_addresses
 from docs.website.pages import GENERATED
 from docs.website.text import cell
-from lab.findings.catalogue import ENTRIES
+from lab.findings.finding import ENTRIES
 from lab.setup.schema import BLOCKS
 from tests.paths import ROOT
 from tracking.parameters import DetectParameters, LabelParameters, TrackerParameters

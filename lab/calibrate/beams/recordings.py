@@ -1,27 +1,209 @@
-"""Labelled spots at positions of a stand, from tables or run folders; frames at rest are averaged."""
+"""Labelled spots at positions of a stand, from tables or run folders; frames at rest are averaged.
+
+Frames of a vehicle at rest: grouping by stand position, and mean with covariance.
+
+Labelled spots from a run folder that was recorded for a beam calibration.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from calibration.beams.beams import StandModel
 from calibration.terms.spot_term import SpotPixels
 from geometry.arrays import Array, Ints
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
-from lab.calibrate.beams.stationary_frames import SpotRows, average, positions_at_rest
 from lab.errors import InputError
 from lab.files.project.point_files import StandPoses, read_poses
 from lab.files.project.project import Project, RecordingEntry
+from lab.files.run.run_file import Run, load_run
 from lab.files.text.csv_table import Table
-from lab.files.text.csv_text import read_table
+from lab.files.text.csv_text import SIGMA_RANGE_PX, check_pixels, check_sigmas, read_table
 from lab.files.text.error_text import printable_line, suggest_name
-from lab.files.text.range_checks import SIGMA_RANGE_PX, check_pixels, check_sigmas
+from lab.runs.frames.pipeline import FrameRecord, Pipeline
+from tracking.detections import Detections
+from tracking.statuses import SpotStatus
+
+AT_REST = 1e-7  # m and rad: poses that differ by less than this, or by less than half their sigma, are one position
+
+
+@dataclass(frozen=True, slots=True)
+class SpotRows:
+    """n labelled spots, each from one frame."""
+
+    frame: Ints  # (n,)
+    view: Ints  # (n,) in the order of Rig.views()
+    pixels: Array  # (n, 2)
+    covariance: Array  # (n, 2, 2)
+
+
+def positions_at_rest(stand_from_body: Pose, sigmas: Array) -> Ints:
+    """Index (n,) of the stand position of each of n frames; a new position starts where the recorded pose changes.
+
+    sigmas: (n, 6), m and rad, of each recorded pose. Frames of one position share the stand's error and count as one
+    measurement of the stand.
+    """
+    out = np.zeros(len(sigmas), dtype=np.int64)
+    start = 0
+    for k in range(1, len(out)):
+        change = np.abs(stand_from_body[k].minus(stand_from_body[start]))
+        moved = bool(np.any(change > np.maximum(AT_REST, 0.5 * sigmas[k])))
+        out[k] = out[k - 1] + moved
+        start = k if moved else start
+    return out
+
+
+def average(rows: SpotRows, position: Ints) -> SpotPixels:
+    """Average the rows of each stand position and view.
+
+    rows: n rows; position: (n,) index of the stand position of each row. Averaging reduces only the part of the noise
+    that varies between frames, and less so where successive frames are correlated. The rest of the stated covariance
+    (speckle, pixel locking, blooming, which are constant while the vehicle is at rest) remains.
+    """
+    keys, which = np.unique(np.stack([position, rows.view], axis=1), axis=0, return_inverse=True)
+    pixels, covariance = np.empty((len(keys), 2)), np.empty((len(keys), 2, 2))
+    for k in range(len(keys)):
+        here = np.flatnonzero(which.ravel() == k)
+        here = here[np.argsort(rows.frame[here], kind="stable")]
+        pixels[k], covariance[k] = mean_of_frames(rows.pixels[here], rows.covariance[here])
+    return SpotPixels(keys[:, 0], keys[:, 1], pixels, covariance)
+
+
+def mean_of_frames(pixels: Array, covariance: Array) -> tuple[Array, Array]:
+    """Mean (2,) of a spot at rest and its covariance (2, 2).
+
+    pixels: (n, 2) in the order of the frames; covariance: (n, 2, 2), stated for each frame. Ours.
+    """
+    n = len(pixels)
+    stated = covariance.mean(axis=0)
+    if n < 3:
+        return pixels.mean(axis=0), stated
+    # Exclude single outliers, such as a hand in front of the camera.
+    distance = np.linalg.norm(pixels - np.median(pixels, axis=0), axis=1)
+    inlier = distance <= max(5 * float(np.median(distance)), 5 * float(np.sqrt(np.trace(stated))))
+    used = pixels[inlier]
+    n = len(used)
+    residual = used - used.mean(axis=0)
+    scatter = residual.T @ residual / max(n - 1, 1)
+    variance = float(np.trace(scatter))
+    lag_one = float(np.sum(residual[1:] * residual[:-1])) / max(float(np.sum(residual**2)), 1e-30)
+    rho = float(np.clip(lag_one + 1 / n, 0.0, 0.95))  # subtracting the mean biases the autocorrelation by -1 / n
+    varying = scatter * (1 + rho) / (1 - rho) / n
+    common = stated * max(1.0 - variance / float(np.trace(stated)), 0.0)
+    return used.mean(axis=0), varying + common
+
+
+# Largest difference of a beam from its nominal line for which its spots are found: together 64 mm on a screen at 2.5 m
+# from the vehicle. Spots of different beams closer than this may be confused; the robust fit then excludes them.
+MAX_NOMINAL_ERROR_RAD = np.deg2rad(1.0)
+MAX_NOMINAL_ERROR_M = 0.02
+Labelled = list[tuple[int, Array, Array]]  # view, pixel (2,), covariance (2, 2)
+_MEASURED = (SpotStatus.MATCHED, SpotStatus.TURNED)
+
+
+def spots_of_run(folder: Path, rig: Rig, known: StandPoses | None, world_from_stand: Pose | None) -> SpotRows:
+    """Labelled spots of all frames of a run.
+
+    rig: calibrated cameras and screens with nominal beams, used in place of the rig in run.yaml. If the stand's place
+    and its poses are known, each detection gets the label of the nearest spot predicted by the nominal beams.
+    Otherwise the tracker labels the detections, starting from the run's own prior. Frames without a pose are skipped.
+
+    Raises:
+        InputError: if the run cannot be read or has a camera that is not in `rig`.
+    """
+    run = load_run(folder)
+    missing = [c for c in run.cameras if c not in rig.cameras]
+    if missing:
+        raise InputError(
+            f"{run.path}: cameras.{missing[0]}: expected a camera of the calibration, got {missing[0]!r}; it has"
+            f" {', '.join(rig.cameras)}"
+        )
+    rig_of_run = dataclasses.replace(rig, cameras={n: c for n, c in rig.cameras.items() if n in run.cameras})
+    run = dataclasses.replace(run, rig=rig_of_run, covariance=None)
+    view_index = {view: i for i, view in enumerate(rig.views())}
+    model = SpotModel.of(rig_of_run)
+    view_of = np.array([view_index[v] for v in model.views], dtype=np.int64)
+    poses: dict[int, Pose] = {}
+    if known is not None:
+        poses = {int(f): known.stand_from_body[i] for i, f in enumerate(known.frames)}
+        if world_from_stand is not None:
+            run = _starting_at(run, world_from_stand @ known.stand_from_body[0])
+    frame, view, pixels, covariance = [], [], [], []
+    for number, found in _labelled(Pipeline.of(run), model, poses, world_from_stand):
+        if known is not None and number not in poses:
+            continue
+        for v, uv, cov in found:
+            frame.append(number)
+            view.append(view_of[v])
+            pixels.append(uv)
+            covariance.append(cov)
+    return SpotRows(
+        np.array(frame, dtype=np.int64),
+        np.array(view, dtype=np.int64),
+        np.array(pixels, dtype=float).reshape(-1, 2),
+        np.array(covariance, dtype=float).reshape(-1, 2, 2),
+    )
+
+
+def label(model: SpotModel, world_from_body: Pose, detections: tuple[Detections | None, ...]) -> Labelled:
+    """Assign detections (one entry per camera) to the spots that the nominal beams predict at a pose.
+
+    Returns view, pixel and covariance of each assigned detection. The assignment of a camera has the least total
+    distance, where each distance is divided by the largest error that its spot may have from the nominal beam.
+    """
+    d = model.derivatives(world_from_body)
+    gate_px = np.hypot(
+        MAX_NOMINAL_ERROR_RAD * np.linalg.norm(d.direction, axis=(-2, -1)),
+        MAX_NOMINAL_ERROR_M * np.linalg.norm(d.point, axis=(-2, -1)),
+    )
+    out = []
+    for c, found in enumerate(detections):
+        views = np.flatnonzero((model.camera_of == c) & np.isfinite(d.pixels).all(axis=1))
+        if found is None or not len(found) or not len(views):
+            continue
+        distance = np.linalg.norm(found.uv_px[None] - d.pixels[views][:, None], axis=2) / gate_px[views][:, None]
+        # Distances are capped well above the gate: pairs outside of it are assigned last, and dropped below.
+        rows, columns = linear_sum_assignment(np.minimum(distance, 1e3))
+        out += [
+            (int(views[r]), found.uv_px[k], found.cov_px2[k])
+            for r, k in zip(rows, columns, strict=True)
+            if distance[r, k] <= 1.0
+        ]
+    return out
+
+
+def _labelled(
+    pipeline: Pipeline, model: SpotModel, poses: dict[int, Pose], world_from_stand: Pose | None
+) -> Iterator[tuple[int, Labelled]]:
+    """Frame numbers with their labelled spots: from known poses, else from the tracker."""
+    if poses and world_from_stand is not None:
+        for number, detections in pipeline.detections():
+            if number in poses:
+                yield number, label(model, world_from_stand @ poses[number], detections)
+    else:
+        for record in pipeline.records():
+            yield record.frame, _tracked(record)
+
+
+def _tracked(record: FrameRecord) -> Labelled:
+    t = record.tracked
+    return [(v, t.uv_px[v], t.cov_px2[v]) for v, s in enumerate(t.status) if s in _MEASURED]
+
+
+def _starting_at(run: Run, world_from_body: Pose) -> Run:
+    """The run with its tracker's prior replaced by a pose (sigma 0.1 m, 10 deg)."""
+    return dataclasses.replace(run, prior=PosePrior(world_from_body, 0.1, float(np.deg2rad(10.0))))
+
 
 if TYPE_CHECKING:
     pass
@@ -123,7 +305,7 @@ def _rows(
                     f"{f' and {len(without) - 1} more' if len(without) > 1 else ''}"
                 )
         return rows
-    from lab.calibrate.beams.recorded_runs import spots_of_run  # imports detection and tracking
+    from lab.calibrate.beams.recordings import spots_of_run  # imports detection and tracking
 
     assert recording.run is not None
     stand = project.stand

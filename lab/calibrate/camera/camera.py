@@ -23,8 +23,7 @@ from calibration.lens.intrinsics_result import Intrinsics
 from geometry.camera import FISHEYE, PERSPECTIVE
 from lab.calibrate.camera.camera_findings import findings_of, next_photographs
 from lab.calibrate.camera.camera_page import page_of
-from lab.calibrate.camera.corner_tables import TABLE_SUFFIXES, read_corner_table
-from lab.calibrate.camera.photos import PhotoSet, find_in_photos, origins_of
+from lab.calibrate.camera.photos import TABLE_SUFFIXES, PhotoSet, find_in_photos, origins_of, read_corner_table
 from lab.calibrate.step import Solved, Step, run_step
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.board_file import load_board_or_text

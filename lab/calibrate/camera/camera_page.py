@@ -14,9 +14,8 @@ from lab.calibrate.camera.photos import VIDEO_SUFFIXES, PhotoSet, as_8_bit
 from lab.number_format import format_number
 from lab.pictures.opencv import opened
 from lab.pictures.picture_file import MissingPicture, read_picture
-from lab.report.calibration.calibration_charts import lens_model_chart, residual_histogram
+from lab.report.calibration.calibration_charts import correlation_matrix, lens_model_chart, residual_histogram
 from lab.report.calibration.calibration_drawings import corners_overlay, coverage_map, residual_field, tilt_polar
-from lab.report.calibration.calibration_maps import correlation_matrix
 from lab.report.calibration.calibration_page import (
     KeyFigure,
     PageDrawing,

@@ -28,25 +28,28 @@ from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.planes import intersect_plane
 from geometry.rig import Rig
-from lab.calibrate.drift_check.drift_comparison import PixelComparison, check_at_rest, compare_points, compare_still
-from lab.calibrate.drift_check.drift_findings import (
-    camera_findings,
-    other_findings,
-    state_findings,
-    unchecked_finding,
-)
-from lab.calibrate.drift_check.drift_inputs import DriftInputs, read_points, read_still_pose, read_still_spots
-from lab.calibrate.drift_check.drift_page import page_of
-from lab.calibrate.drift_check.drift_result import (
+from lab.calibrate.drift_check.drift_comparison import (
     CameraDrift,
     DriftLimits,
     DriftResult,
     HistoryRow,
     OtherChange,
+    PixelComparison,
+    check_at_rest,
+    compare_points,
+    compare_still,
     is_weak,
     level_of,
     read_history,
     write_history,
+)
+from lab.calibrate.drift_check.drift_inputs import DriftInputs, read_points, read_still_pose, read_still_spots
+from lab.calibrate.drift_check.drift_page import (
+    camera_findings,
+    other_findings,
+    page_of,
+    state_findings,
+    unchecked_finding,
 )
 from lab.calibrate.step import Solved, Step, run_step
 from lab.files.rig.rig_file import RigFile, joint_covariance, load_rig_file

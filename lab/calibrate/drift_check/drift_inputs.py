@@ -15,9 +15,8 @@ from lab.errors import InputError
 from lab.files.run.results import read_poses, read_spots
 from lab.files.run.truth import read_true_poses
 from lab.files.text.csv_table import Table
-from lab.files.text.csv_text import read_table
+from lab.files.text.csv_text import SIGMA_RANGE_PX, check_pixels, check_sigmas, read_table
 from lab.files.text.error_text import suggest_name
-from lab.files.text.range_checks import SIGMA_RANGE_PX, check_pixels, check_sigmas
 
 PIXELS = ("camera", "point", "u_px", "v_px")
 PLACES = ("x_m", "y_m", "z_m", "sigma_x_m", "sigma_y_m", "sigma_z_m")

@@ -11,8 +11,7 @@ from calibration.rig.joint import DOTS, P_MISFIT, RECORDS, SPOTS, Joint
 from calibration.rig.rig_figures import ExpectedPose, HoldOut, in_degrees, in_mm
 from calibration.rig.rig_steps import RigCalibration
 from lab.calibrate.beams.beam_findings import bad_positions, first_names
-from lab.findings.catalogue import ENTRIES
-from lab.findings.finding import Finding, Level, finding, level_above, passed
+from lab.findings.finding import ENTRIES, Finding, Level, finding, level_above, passed
 
 _MISFIT = "BP-R02"  # its variants: the kinds of measurements
 

@@ -19,9 +19,8 @@ from lab.calibrate.beams.beam_findings import ARCSEC
 from lab.calibrate.beams.beams_page import beam_table
 from lab.calibrate.rig.rig_findings import RigResult
 from lab.number_format import format_number
-from lab.report.calibration.calibration_charts import residual_histogram
+from lab.report.calibration.calibration_charts import correlation_matrix, flatness_map, residual_histogram
 from lab.report.calibration.calibration_drawings import residual_field
-from lab.report.calibration.calibration_maps import correlation_matrix, flatness_map
 from lab.report.calibration.calibration_page import (
     KeyFigure,
     PageDrawing,

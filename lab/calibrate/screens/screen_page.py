@@ -12,8 +12,8 @@ from geometry.camera import pinhole_numbers
 from lab.files.project.project import Project
 from lab.files.rig.rig_file import covariance_blocks
 from lab.number_format import format_number
+from lab.report.calibration.calibration_charts import correlation_matrix, flatness_map
 from lab.report.calibration.calibration_drawings import corners_overlay
-from lab.report.calibration.calibration_maps import correlation_matrix, flatness_map
 from lab.report.calibration.calibration_page import (
     KeyFigure,
     PageDrawing,

@@ -44,7 +44,7 @@ from lab.files.text.fields import (
     unexpected_value,
     word,
 )
-from lab.files.text.regular_file import text_of_file
+from lab.files.text.json_text import text_of_file
 from lab.files.text.yaml_text import read_mapping
 
 SCHEMA = "beampose/calibration/1"

@@ -15,9 +15,8 @@ from lab.errors import InputError
 from lab.files.text import columns
 from lab.files.text.columns import CAUSAL
 from lab.files.text.csv_table import Categorical, Table
-from lab.files.text.csv_text import read_table
+from lab.files.text.csv_text import MAX_TIME_S, read_table
 from lab.files.text.json_text import read_json
-from lab.files.text.range_checks import MAX_TIME_S
 from tracking.statuses import PoseStatus, SpotStatus
 
 SPOT_STATUSES = tuple(SpotStatus)

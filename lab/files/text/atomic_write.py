@@ -14,8 +14,15 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from lab.errors import InputError
-from lab.files.output.folder_lock import folder_lock, is_at, lock
-from lab.files.output.part_folder import part_folder, recover, removed_at_the_end, replace_folder
+from lab.files.output.part_folder import (
+    folder_lock,
+    is_at,
+    lock,
+    part_folder,
+    recover,
+    removed_at_the_end,
+    replace_folder,
+)
 from lab.files.text.json_text import has_schema
 
 _REMEDIES = {

@@ -7,7 +7,7 @@ DETECTIONS = (
     "angle_deg", "cov_uv_px2",
 )  # fmt: skip
 PICTURE_TIME = "t_s"  # after the others, where a camera has a clock of its own: mid-exposure of its middle row
-LIKENESS = "likeness"  # after the others, of single pictures only: see lab.runs.detect.findings.laser_likeness
+LIKENESS = "likeness"  # after the others, of single pictures only: see lab.runs.detect.picture_series.laser_likeness
 SPOTS = (
     "frame", "t_s", "camera", "spot", "u_px", "v_px", "sigma_u_px", "sigma_v_px", "status", "predicted_u_px",
     "predicted_v_px", "gain", "cov_uv_px2", "label_probability",

@@ -18,7 +18,7 @@ from markupsafe import Markup
 from geometry.arrays import Array
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
-from lab.files.text.regular_file import bytes_of_file
+from lab.files.text.json_text import bytes_of_file
 from lab.findings.finding import Finding, Level, worst_first
 from lab.number_format import format_number
 from lab.report.html import environment

@@ -1,29 +1,94 @@
-"""The report of one run: a single self-contained HTML file."""
+"""The report of one run: a single self-contained HTML file.
+
+The scene of a run in three dimensions: two drawings, and data for a scene that turns and follows the cursor.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
+from geometry.rig import Rig
 from lab.errors import InputError
+from lab.files.run.results import PoseTrack
 from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_text
-from lab.report.failure import Failure, files_beside, write_failure_report
-from lab.report.html import environment
+from lab.report.calibration.calibration_scene import LAB_VIEWS, scene_views
+from lab.report.html import Failure, environment, files_beside, write_failure_report
 from lab.report.plot.axes import POSE_COLOURS, SPOT_COLOURS
-from lab.report.run import figures, pose_curves, tables, trust
-from lab.report.run.blocks.model_fit import HEADS as MODEL_FIT_HEADS
-from lab.report.run.blocks.model_fit import model_fit
-from lab.report.run.blocks.scene import scene_of
-from lab.report.run.events import ShownEvent, events, selected
-from lab.report.run.pictures import pictures
+from lab.report.run import figures, tables, trust
+from lab.report.run.events import ShownEvent, events, pictures, selected
+from lab.report.run.figures import timeline_figure, tracks_figure, zoom_data
+from lab.report.run.model_fit import HEADS as MODEL_FIT_HEADS
+from lab.report.run.model_fit import model_fit
 from lab.report.run.report_data import ReportData, read_report_data
-from lab.report.run.tracks import timeline_figure, tracks_figure, zoom_data
-from lab.runs.score.score import ResultTables
+from lab.results.view.page import as_script, scene_data
+from lab.results.view.scene import content_of_poses, view_of
+from lab.runs.score import ResultTables
 from tracking.statuses import PoseStatus, SpotStatus
+
+_MOMENTS, _POINTS = 40, 160  # of the playback and of the trajectory: together 9 kB
+_DIGITS = 3  # of coordinates in m
+
+
+@dataclass(frozen=True, slots=True)
+class ReportScene:
+    """What the template shows."""
+
+    stills: list[Markup]
+    data: Markup
+    frame: int  # of the drawings
+    moments: int
+    poses: int
+
+
+def scene_of(name: str, rig: Rig | None, poses: PoseTrack) -> ReportScene | None:
+    """The scene of a run; None without its rig, or without a pose."""
+    if rig is None or not poses.known.any():
+        return None
+    content = content_of_poses(name, rig, poses)
+    index = content.at_frame(None)
+    assert index is not None  # a pose is known
+    view = view_of(content, index, most_points=_POINTS, most_ellipsoids=0)
+    known = int(np.count_nonzero(content.known))
+    data = _packed(scene_data(view, index, _MOMENTS, _DIGITS))
+    stills = scene_views([*view.fixed, *view.moving(index)], "Screens, cameras and beams", LAB_VIEWS[:2])
+    return ReportScene(
+        [Markup(s) for s in stills], as_script(data), int(content.frames[index]), len(data["packed"]), known
+    )
+
+
+def _packed(data: dict[str, Any]) -> dict[str, Any]:
+    """The data of `scene_data` in a quarter of the bytes, which view.js expands: whole mm, and each spot's name once.
+
+    A moment is frame, time, whether measured, place of the vehicle, and for each spot its number, its place and, where
+    its beam does not start at the vehicle, that start.
+    """
+    lines = [{**line, "p": [p and _mm(p) for p in line["p"]]} for line in data["lines"]]
+    names: list[str] = []
+    packed = []
+    for moment in data["moments"]:
+        *spots, vehicle = moment["s"]
+        origin = _mm(vehicle[2:])
+        parts = []
+        for (name, _, *place), (start, _) in zip(spots, moment["r"], strict=True):
+            if name not in names:
+                names.append(name)
+            begin = _mm(start)
+            parts.append([names.index(name), *_mm(place), *([] if begin == origin else begin)])
+        packed.append([moment["k"], moment["t"], int(moment["m"]), origin, parts])
+    return {"first": data["first"], "lines": lines, "names": names, "packed": packed}
+
+
+def _mm(place: Sequence[float]) -> list[int]:
+    """A place (3,) in m as whole mm."""
+    return [round(1000 * v) for v in place]
+
 
 FILE_NAME = "report.html"
 _MOST_EVENTS = 200
@@ -74,8 +139,8 @@ def page(m: ReportData, results: Path) -> str:
         "truth_keys": tables.truth_figures(m.errors),
         "pixel_rows": tables.pixel_rows(m.errors),
         "run_line": _run_line(m),
-        "pose_figure": Markup(pose_curves.pose_figure(m, zoom)),
-        "motion_figure": Markup(pose_curves.motion_figure(m, zoom)),
+        "pose_figure": Markup(figures.pose_figure(m, zoom)),
+        "motion_figure": Markup(figures.motion_figure(m, zoom)),
         "smoothed": m.causal is not None,
         "method": method,
         "budget_heads": tables.HEADS,

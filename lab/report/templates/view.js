@@ -3,7 +3,7 @@
   const source = document.getElementById("scene-data");
   if (!source) return;
   const data = JSON.parse(source.textContent);
-  if (data.packed) { // of a report: whole mm (lab/report/run/blocks/scene.py)
+  if (data.packed) { // of a report: whole mm (lab/report/run/page.py)
     const metres = p => p && p.map(v => v / 1000);
     for (const line of data.lines) line.p = line.p.map(metres);
     data.moments = data.packed.map(([k, t, m, at, spots]) => {

@@ -1,18 +1,90 @@
-"""`beampose view`: a window where a display exists, else files."""
+"""`beampose view`: a window where a display exists, else files.
+
+A window of Open3D with keys alone, for systems on which the one with a slider cannot open.
+
+It shows the scene, with the vehicle, its beams and spots at a moment that keys change.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import os
 import sys
+import time
 from pathlib import Path
+from typing import Any
 
 from calibration.open3d_loader import MissingOpen3DError, open3d
 from lab.errors import InputError
 from lab.findings.outcome import Done
-from lab.report.calibration.calibration_scene import LAB_VIEWS
-from lab.results.view.page import write_page
+from lab.report.calibration.calibration_scene import LAB_VIEWS, VIEWS
+from lab.results.view.page import Player, write_page
 from lab.results.view.scene import Mesh, View, mesh_of, read_content, view_of, write_glb
+from lab.results.view.slider_window import as_open3d, look_along, open_slider_window
+
+KEYS = (
+    "space: play or pause; right, left: next, previous frame; up, down: a twentieth of the run; home, end: first,"
+    " last; drag: turn; wheel: zoom; Q: close"
+)
+_SPACE, _LEFT, _RIGHT, _DOWN, _UP, _HOME, _END = 32, 263, 262, 264, 265, 268, 269  # GLFW's numbers
+
+
+def open_window(view: View, index: int | None) -> bool:
+    """Show the view until the window is closed, with a slider if possible. False: no window could be opened."""
+    if open_slider_window(view, index):
+        return True
+    o3d = open3d()
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        window = o3d.visualization.VisualizerWithKeyCallback()
+        if not window.create_window(f"beampose: {view.content.name}", 1280, 900):
+            return False
+        fill(window, view, Player(view, index))
+        window.run()
+        window.destroy_window()
+    return True
+
+
+def fill(window: Any, view: View, player: Player) -> None:
+    """Add the scene to a window, and what keys and time do."""
+    window.add_geometry(as_open3d(mesh_of(view.fixed, view.ellipsoids, view.reach_m, view.extent_m)))
+    shown: list[Any] = []
+
+    def show(first: bool = False) -> bool:
+        for old in shown:
+            window.remove_geometry(old, reset_bounding_box=False)
+        shown.clear()
+        things = view.moving(player.index)
+        if things:
+            shown.append(as_open3d(mesh_of(things, [], view.reach_m, view.extent_m)))
+            window.add_geometry(shown[0], reset_bounding_box=first)
+        return True
+
+    def key(action: Any) -> Any:
+        def pressed(_: Any) -> bool:
+            action()
+            return show()
+
+        return pressed
+
+    def tick(_: Any) -> bool:
+        return show() if player.advance(time.monotonic()) else False
+
+    show(first=True)
+    window.get_render_option().mesh_show_back_face = True
+    look_along(window.get_view_control(), *next(iter(VIEWS.values())))
+    last = len(player.known)
+    for number, action in (
+        (_SPACE, lambda: player.toggle(time.monotonic())),
+        (_RIGHT, lambda: player.step(1)),
+        (_LEFT, lambda: player.step(-1)),
+        (_UP, lambda: player.leap(0.05)),
+        (_DOWN, lambda: player.leap(-0.05)),
+        (_HOME, lambda: player.step(-last)),
+        (_END, lambda: player.step(last)),
+    ):
+        window.register_key_callback(number, key(action))
+    window.register_animation_callback(tick)
+
 
 DEFAULT_OUT = Path("results", "view")
 _PICTURES = dict(zip(LAB_VIEWS, ("view-oblique.png", "view-above.png", "view-front.png"), strict=True))
@@ -61,7 +133,7 @@ def show(
     view = view_of(content, index, sigma_scale)
     notes: tuple[str, ...] = ()
     if out is None and has_display():
-        from lab.results.view.window import open_window
+        from lab.results.view.view import open_window
 
         try:
             if open_window(view, index):
@@ -95,7 +167,7 @@ def write_files(view: View, index: int | None, out: Path, notes: tuple[str, ...]
 
 def _by_open3d(mesh: Mesh, out: Path) -> list[Path]:
     """scene.ply, and the pictures that could be rendered; view.html has drawings in any case."""
-    from lab.results.view.render import as_open3d, render
+    from lab.results.view.slider_window import as_open3d, render
 
     part, ply = out / ".scene.part.ply", out / "scene.ply"
     if not open3d().io.write_triangle_mesh(str(part), as_open3d(mesh)):

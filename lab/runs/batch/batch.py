@@ -1,25 +1,248 @@
-"""Processes many runs: a result folder each, batch.csv and index.html. Work that is done already is skipped."""
+"""Processes many runs: a result folder each, batch.csv and index.html. Work that is done already is skipped.
+
+batch.csv and index.html: the rows of all batches into one folder, merged under a lock.
+
+The tables of all runs of a batch as Parquet data sets: a file per run, with the run's result folder as a column.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import csv
+import io
 import os
+import tempfile
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import filelock
+
 from lab.errors import QUALITY_GATE_FAILED, BeamposeError, CalibrationError, InputError, RunError
 from lab.files.run.parameter_overrides import with_overrides
-from lab.runs.batch.parquet import require_pyarrow, update_data_sets
-from lab.runs.batch.resumption import fingerprint_of, finished_summary
-from lab.runs.batch.run_folders import allotted, listed_runs, moved_runs
-from lab.runs.batch.table import BatchTable, locked, read_rows
-from lab.runs.batch.task import Task, TaskOutcome, concluded, failed_row, perform
+from lab.files.text.csv_text import WORD_COLUMNS, text_of_field, write_table
+from lab.files.text.json_text import read_json, require_regular_file, text_of_file
+from lab.runs.batch.task import (
+    COLUMNS,
+    Task,
+    TaskOutcome,
+    allotted,
+    concluded,
+    failed_row,
+    fingerprint_of,
+    finished_summary,
+    listed_runs,
+    moved_runs,
+    perform,
+)
 from lab.runs.batch.workers import performed
 from lab.runs.process import ready_run
 from tracking.parameters import TrackerParameters
+
+LOCK_SECONDS = 120.0  # the lock is held for milliseconds: longer waiting means a broken file system
+FILE_NAME, LOCK_NAME = "batch.csv", ".batch.lock"
+
+
+@contextlib.contextmanager
+def locked(out: Path) -> Iterator[None]:
+    """Only one process at a time is in this block for a batch's folder.
+
+    Raises:
+        InputError: the lock cannot be had.
+    """
+    lock = filelock.FileLock(out / LOCK_NAME, timeout=LOCK_SECONDS)
+    try:
+        lock.acquire()
+    except filelock.Timeout:
+        raise InputError(f"{out / LOCK_NAME}: another program has locked this file for {LOCK_SECONDS:.0f} s") from None
+    except (OSError, NotImplementedError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{out / LOCK_NAME}: cannot be locked: {reason}; choose another --out") from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+class BatchTable:
+    """The table of a folder of batches; `add` puts rows of this batch into it, and rows of other batches stay."""
+
+    def __init__(self, out: Path, places: Sequence[str]) -> None:
+        """places: the `folder` of each run of this batch, in order. Raises InputError: batch.csv is another table."""
+        self.path = out / FILE_NAME
+        self._out, self._order = out, {place: i for i, place in enumerate(places)}
+        self._own: dict[str, Mapping[str, Any]] = {}  # rows of this batch that are not yet in the file
+        self._skipped: set[str] = set()
+        read_rows(self.path)
+
+    def add(self, row: Mapping[str, Any], skipped: bool = False) -> None:
+        """Remember a row of this batch for the next `write`. skipped: it was made from earlier results."""
+        self._own[row["folder"]] = row
+        if skipped:
+            self._skipped.add(row["folder"])
+
+    def write(self, index: bool = False) -> None:
+        """Merge the rows added since into batch.csv, and with `index` write index.html.
+
+        Raises:
+            InputError: a file cannot be written. The rows are kept for the next attempt.
+        """
+        with locked(self._out):
+            there = read_rows(self.path)
+            for row in there:  # the time of the processing is better known than from the results
+                own = self._own.get(row["folder"])
+                if own and row["folder"] in self._skipped and row["results"] == own["results"] and row.get("seconds"):
+                    self._own[row["folder"]] = {**own, "seconds": row["seconds"]}
+            rows = merged(there, self._own, self._order)
+            extra = [c for c in dict.fromkeys(c for row in rows for c in row) if c not in COLUMNS]
+            header = [*COLUMNS, *extra]
+            write_table(self.path, header, [[row.get(c, "") for c in header] for row in rows])
+            self._own.clear()
+            if index:
+                from lab.report.index import write_index
+
+                write_index([dict(row) for row in rows], self._out)
+
+
+def merged(
+    there: Sequence[Mapping[str, Any]], own: Mapping[str, Mapping[str, Any]], order: Mapping[str, int]
+) -> list[Mapping[str, Any]]:
+    """Rows of a table with this batch's rows in place of older ones; new ones at the end.
+
+    The rows of this batch's runs are in the order of its runs, whatever the order in which they ended. A row whose
+    results another run has taken over is dropped.
+    """
+    taken = {row["results"]: place for place, row in own.items() if row["results"]}
+    rows: dict[str, Mapping[str, Any]] = {
+        row["folder"]: row for row in there if taken.get(row["results"], row["folder"]) == row["folder"]
+    }
+    rows |= {place: {**rows.get(place, {}), **row} for place, row in own.items()}
+    in_order = iter(sorted((p for p in rows if p in order), key=order.__getitem__))
+    return [rows[next(in_order) if place in order else place] for place in rows]
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """The rows of batch.csv; none where there is no such file. Rows of older versions get their `folder`.
+
+    Raises:
+        InputError: the file is not a table of a batch.
+    """
+    try:
+        text = text_of_file(path)
+        rows = list(csv.DictReader(io.StringIO(text, newline=""), restval="", strict=True))
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, csv.Error):
+        rows = [{}]
+    for row in rows:
+        row.pop(None, None)  # fields beyond the header
+        if not {"run", "status", "results"} <= set(row):
+            raise InputError(
+                f"{path}: expected the table of a batch, found another file; move it or choose another --out"
+            )
+        row.update({name: text_of_field(field) for name, field in row.items() if isinstance(field, str)})
+        row["folder"] = row.get("folder") or str(Path(row["run"]).absolute())
+    return rows
+
+
+FOLDER = "parquet"
+TABLES = ("attitude", "spots")
+
+
+def require_pyarrow() -> None:
+    """Raises InputError where pyarrow is not installed: to be called before long work."""
+    try:
+        import pyarrow  # noqa: F401
+    except ImportError:
+        raise InputError(
+            "--parquet: expected the package pyarrow (the extra `parquet`), which is not installed: pip install pyarrow"
+        ) from None
+
+
+def update_data_sets(rows: Iterable[Mapping[str, Any]], out: Path) -> Path:
+    """Write out/parquet/attitude/ and out/parquet/spots/, a file per run; returns out/parquet.
+
+    rows: of batch.csv. A file that was made from the same results stays; that of a run without results is removed.
+    `frame` is an integer, names and statuses are text, all other columns are numbers, null where the table is empty.
+
+    Raises:
+        InputError: pyarrow is not installed, a table of the results is damaged, or a file cannot be written.
+    """
+    require_pyarrow()
+    root = Path(out) / FOLDER
+    kept: dict[str, set[str]] = {name: set() for name in TABLES}
+    try:
+        for row in rows:
+            if not row["results"]:
+                continue
+            results = Path(out) / row["results"]
+            for name in TABLES:
+                file = root / name / f"{row['results']}.parquet"
+                kept[name].add(file.name)
+                _update(results, name, file)
+        for name in TABLES:
+            for file in (root / name).glob("*.parquet"):
+                if file.name not in kept[name]:
+                    file.unlink()
+    except OSError as error:
+        raise InputError(f"{error.filename or root}: cannot be written: {error.strerror}") from None
+    return root
+
+
+def _update(results: Path, name: str, file: Path) -> None:
+    import pyarrow as pa
+    from pyarrow import csv, parquet
+
+    source = results / f"{name}.csv"
+    made_from = _identity(results, source)
+    if file.is_file():
+        try:
+            if (parquet.read_schema(file).metadata or {}).get(b"made_from") == made_from:
+                return
+        except (pa.ArrowException, OSError):
+            pass  # a damaged file is written again
+    require_regular_file(source)
+    try:
+        with source.open(encoding="utf-8") as text:
+            header = text.readline().strip().split(",")
+        types = {c: pa.int64() if c == "frame" else pa.string() if c in WORD_COLUMNS else pa.float64() for c in header}
+        table = csv.read_csv(source, convert_options=csv.ConvertOptions(column_types=types, null_values=["", "nan"]))
+    except (pa.ArrowException, ValueError) as error:
+        reason = (str(error).splitlines() or [""])[0]
+        raise InputError(f"{source}: expected a table of results, got another file: {reason}") from None
+    run = pa.array([results.name] * len(table)).dictionary_encode()
+    table = table.add_column(0, "run", run).replace_schema_metadata({b"made_from": made_from})
+    file.parent.mkdir(parents=True, exist_ok=True)
+    handle, part = tempfile.mkstemp(dir=file.parent, prefix=".", suffix=".part")
+    os.close(handle)
+    try:
+        parquet.write_table(table, part)
+        os.chmod(part, 0o666 & ~_umask())
+        os.replace(part, file)
+    except BaseException:
+        Path(part).unlink(missing_ok=True)
+        raise
+
+
+def _identity(results: Path, source: Path) -> bytes:
+    """Identifies the contents of a table: the fingerprint of its run, its size and time."""
+    try:
+        fingerprint = read_json(results / "summary.json").get("fingerprint")
+    except (ValueError, AttributeError):
+        fingerprint = None
+    state = source.stat()
+    return f"{fingerprint} {state.st_size} {state.st_mtime_ns}".encode()
+
+
+def _umask() -> int:
+    mask = os.umask(0o022)
+    os.umask(mask)
+    return mask
+
 
 INDEX_SECONDS = 60.0  # between two versions of index.html in a long batch
 _INDEX_SHARE = 0.02  # of the time, at most, is spent on them: that of 2,000 runs takes several seconds

@@ -23,9 +23,7 @@ from typing import TYPE_CHECKING, Any
 from lab.errors import InputError, RunError
 from lab.files.output.part_folder import removed_at_the_end
 from lab.files.text.atomic_write import atomic_write_text
-from lab.runs.batch.resumption import program_digest
-from lab.runs.batch.run_folders import displayed
-from lab.runs.batch.task import Task, TaskOutcome, failed_row, perform
+from lab.runs.batch.task import Task, TaskOutcome, displayed, failed_row, perform, program_digest
 from lab.versions import versions
 
 if TYPE_CHECKING:

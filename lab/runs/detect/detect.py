@@ -22,7 +22,7 @@ from lab.findings.outcome import Done
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import PictureSource, Video, open_inputs, pictures, pictures_of_frames
 from lab.progress import Progress
-from lab.runs.detect.contact_sheet import ContactSheet
+from lab.runs.detect.detect_page import ContactSheet
 from lab.runs.detect.picture_series import PictureSeries
 from lab.runs.frames.sensor_noise import noise_frames
 from lab.runs.processed import quantiles

@@ -1,4 +1,7 @@
-"""Detection over a series of pictures: noise by size and depth, the spots, and the unreadable pictures."""
+"""Detection over a series of pictures: noise by size and depth, the spots, and the unreadable pictures.
+
+Sizes, brightnesses and positions of the spots of many pictures, in bounded memory.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,94 @@ import numpy as np
 
 from geometry.arrays import Array
 from lab.pictures.picture_file import GreyPicture
-from lab.runs.detect.findings import SizeGroup, SpotCollection, laser_likeness, matched_snr
 from lab.runs.frames.sensor_noise import CameraNoise
 from tracking.detection.detect import overlooked_lights
 from tracking.detections import Detections
 from tracking.parameters import DetectParameters
+
+_DISC = 3.2  # sigmas: radius of the disc in which the light is compared; beyond it a Gaussian is below 1 %
+_PIXEL = 1 / 12  # px^2: variance of the light within a pixel
+MOST_KEPT = 400_000  # spots kept for figures; beyond that every second one is dropped, repeatedly
+
+
+def matched_snr(found: Detections, background_dn: float) -> Array:
+    """Signal-to-noise ratio (n,) of spots after a matched filter, which decides whether a faint spot is found.
+
+    background_dn: noise of a background pixel, 1 sigma. A Gaussian of flux F and axes a, b has F / (2 sqrt(pi a b)
+    sigma); shot noise of the spot itself is not included. Source: Turin (1960), "An introduction to matched filters",
+    IRE Trans. IT-6, for a two-dimensional Gaussian in white noise.
+    """
+    area = np.maximum(found.major_px * found.minor_px, 1e-12)
+    return np.asarray(found.flux / (2 * np.sqrt(np.pi * area) * background_dn))
+
+
+def laser_likeness(picture: GreyPicture, found: Detections, saturation_dn: float) -> Array:
+    """How much each point (n,) of a picture (h, w) looks like the spot of a laser, 0 to 1.
+
+    The share of the light's variance in a disc that a round Gaussian of the point's area explains, times the ratio of
+    the axes, times the brightest of the 4x4 pixels about the centre over the grey value at which the sensor clips.
+    Reflections, letters and corners of objects have other shapes and are seldom as bright as the laser. Source: ours,
+    chosen with four photographs of rooms (tests/tracking/detection/test_real_pictures.py).
+    """
+    out = np.zeros(len(found))
+    for i, (u, v) in enumerate(found.uv_px):
+        variance = found.major_px[i] * found.minor_px[i] + _PIXEL
+        reach = _DISC * np.sqrt(variance) + 1.0
+        top, left = max(int(v - reach), 0), max(int(u - reach), 0)
+        own = picture[top : int(v + reach) + 2, left : int(u + reach) + 2].astype(float)
+        y, x = np.mgrid[: own.shape[0], : own.shape[1]] + np.array([top - v, left - u])[:, None, None]
+        inside, core = x * x + y * y <= reach**2, np.maximum(np.abs(x), np.abs(y)) < 2.0
+        if not core.any() or np.ptp(own[inside]) <= 0.0:
+            continue
+        A = np.stack([np.exp(-0.5 * (x * x + y * y) / variance), np.ones_like(x), x, y], axis=-1)[inside]
+        light = own[inside]
+        left_over = light - A @ np.linalg.lstsq(A, light, rcond=None)[0]
+        explained = 1.0 - np.sum(left_over**2) / np.sum((light - light.mean()) ** 2)
+        round_ = found.minor_px[i] / max(found.major_px[i], 1e-12)
+        out[i] = explained * round_ * min(own[core].max() / saturation_dn, 1.0)
+    return out
+
+
+@dataclass(slots=True)
+class SizeGroup:
+    """Pictures of one size and depth, which share a noise model."""
+
+    size_px: tuple[int, int]  # width, height
+    bits: int  # of the data type: 8 or 16
+    noise: CameraNoise
+    pictures: int = 0
+
+    def text(self) -> str:
+        """`1280x1024, 8 bit`."""
+        return f"{self.size_px[0]}x{self.size_px[1]}, {self.bits} bit"
+
+
+@dataclass(slots=True)
+class SpotCollection:
+    """Spots of many pictures; columns frame, u, v, major, minor, snr, peak, likeness."""
+
+    total: int = 0
+    per_frame: list[tuple[int, int]] = field(default_factory=list)  # frame, number of its spots
+    _kept: list[Array] = field(default_factory=list)
+    _rows: int = 0
+    _stride: int = 1
+
+    def add(self, frame: int, found: Detections, snr: Array, likeness: Array) -> None:
+        """Add the spots of one picture. snr, likeness: (n,)."""
+        self.per_frame.append((frame, len(found)))
+        self.total += len(found)
+        shape = (found.uv_px, found.major_px, found.minor_px, snr, found.peak, likeness)
+        rows = np.column_stack([np.full(len(found), float(frame)), *shape])[:: self._stride]
+        self._kept.append(rows)
+        self._rows += len(rows)
+        if self._rows > MOST_KEPT:
+            self._kept = [self.table()[::2]]
+            self._rows = len(self._kept[0])
+            self._stride *= 2
+
+    def table(self) -> Array:
+        """(n, 8): the columns of the kept spots."""
+        return np.concatenate([np.zeros((0, 8)), *self._kept])
 
 
 class WideLight(NamedTuple):

@@ -1,21 +1,361 @@
-"""The model check of a run: whether its rig file fits what was recorded, as findings and for summary.json."""
+"""The model check of a run: whether its rig file fits what was recorded, as findings and for summary.json.
+
+Position-dependent errors on the screen, in the model check: over a vehicle at rest they would look like faults.
+
+The model check's result as plain values for summary.json.
+
+Findings of the model check: which component is wrong, by how much, the effect on the pose, and the remedy.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
-from calibration.model_check.check import ModelCheckResult, NotTested, evaluate_model
+import numpy as np
+
+from calibration.model_check import faults as f
+from calibration.model_check.check import FEWEST_FRAMES, FEWEST_SPOTS, ModelCheckResult, NotTested, evaluate_model
+from calibration.model_check.effect import Effect
+from calibration.model_check.fault_identification import FaultDiagnosis, FittedFault, SuspectedFault
+from calibration.model_check.noise_scales import UNEVEN, is_noisy
 from calibration.model_check.recording import ModelCheckRecording
+from calibration.model_check.statistics import GroupStatistics, Statistics
+from calibration.model_check.unseen import UnseenView
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
-from lab.findings.finding import Finding, Level, verdict
+from lab.findings.finding import ENTRIES, Finding, Level, finding, verdict, worst_first
+from lab.number_format import format_number, format_with_sigma
 from lab.runs.model_check.frame_sampler import FrameSampler
-from lab.runs.model_check.messages import findings_of, why_not_tested
-from lab.runs.model_check.place import with_place_errors
-from lab.runs.model_check.summary import result_mapping
+from tracking.smoothing.error_scale import LARGEST_WIDTH_SHARE
+from tracking.smoothing.place_errors import correlation, place_errors
+
+_CHUNK = 500  # frames that are compared with each other at once
+
+
+def with_place_errors(recording: ModelCheckRecording, model: SpotModel) -> ModelCheckRecording:
+    """The recording with covariances that include such errors, for tests that sum over its frames.
+
+    Frames in which a spot is at the same place share the same error. Adding to each covariance the place's variance
+    times the number of such frames gives the correct uncertainty of a sum over them. Errors that are the same at all
+    places of a spot are not included. Where the widths of the spots are unknown (points of another program), the stated
+    covariances are used unchanged.
+    """
+    if recording.width_px is None or not np.isfinite(recording.width_px).any():
+        return recording
+    uv, _ = model.project(recording.poses)
+    usable = recording.usable & np.isfinite(uv).all(axis=-1)
+    size2 = 0.5 * np.trace(recording.cov_px2, axis1=-2, axis2=-1)
+    residual = np.where(usable[..., None], (recording.uv_px - uv) / np.sqrt(size2)[..., None], np.nan)
+    frames, n = usable.shape
+    found = place_errors(residual, recording.uv_px, recording.width_px, np.ones(frames), np.zeros(n))
+    share = max(found.share - found.elsewhere, 0.0)
+    if share == 0.0:
+        return recording
+    added = np.zeros(usable.shape)
+    for view in range(n):
+        rows = np.flatnonzero(usable[:, view])
+        if not len(rows):
+            continue
+        width = recording.width_px[view] if np.isfinite(recording.width_px[view]) else np.nanmedian(recording.width_px)
+        square = np.mean(np.sum((recording.uv_px[rows, view] - uv[rows, view]) ** 2, axis=-1)) / 2
+        # An error larger than texture and speckle can cause is a displacement.
+        place = min(share * max(square, size2[rows, view].mean()), (LARGEST_WIDTH_SHARE * width) ** 2)
+        for some in np.array_split(rows, len(rows) // _CHUNK + 1):
+            at = recording.uv_px[some, view]
+            rho = correlation(np.linalg.norm(at[:, None] - at[None], axis=-1), found.reach_px[view])
+            # The other chunks are assumed to be like this one.
+            added[some, view] = place * rho.sum(axis=1) * len(rows) / len(some)
+    return replace(recording, cov_px2=recording.cov_px2 + added[..., None, None] * np.eye(2))
+
+
+def result_mapping(result: ModelCheckResult) -> dict[str, Any]:
+    """Counts, diagnosis and statistics; the keys are described in lab.runs.model_check.check."""
+    out: dict[str, Any] = {
+        "frames_used": result.frames_used,
+        "frames_for_diagnosis": result.frames_for_diagnosis,
+    }
+    diagnosis = result.diagnosis
+    if diagnosis is not None:
+        out |= {
+            "residual_scale": diagnosis.residual_scale,
+            "noise_scale": diagnosis.noise_scale,
+            "noise_of_cameras": dict(result.noise_of_cameras),
+            "correlation_frames": diagnosis.correlation_frames,
+            "p_before": diagnosis.p_before,
+            "p_after": diagnosis.p_after,
+            "suspected_faults": [
+                _suspected_fault(suspected, effects)
+                for suspected, effects in zip(diagnosis.suspected_faults, result.effects, strict=True)
+            ],
+        }
+    if result.statistics is not None:
+        out |= _statistics(result.statistics)
+    return out
+
+
+def _statistics(statistics: Statistics) -> dict[str, Any]:
+    groups = {"views": statistics.views, "cameras": statistics.cameras, "beams": statistics.beams}
+    return {kind: [_group(g) for g in of_kind] for kind, of_kind in groups.items()}
+
+
+def _group(group: GroupStatistics) -> dict[str, Any]:
+    nis = None if group.nis is None else {"mean": group.nis.mean, "low": group.nis.low, "high": group.nis.high}
+    return {
+        "name": group.name,
+        "frames": group.frames,
+        "mean_px": group.mean_px.tolist(),
+        "sigma_of_mean_px": group.sigma_of_mean_px.tolist(),
+        "mean_sigmas": group.mean_sigmas.tolist(),
+        "calibration_px": group.calibration_px.tolist(),
+        "scatter": group.scatter,
+        "nis": nis,
+        "outliers": group.outliers,
+        "place_px": group.place_px.tolist(),
+    }
+
+
+def _suspected_fault(suspected: SuspectedFault, effects: tuple[Effect, ...]) -> dict[str, Any]:
+    best, *others = (_fitted_fault(e, effect) for e, effect in zip(suspected.explanations, effects, strict=True))
+    return {**best, "alternatives": others}
+
+
+def _fitted_fault(fitted: FittedFault, effect: Effect) -> dict[str, Any]:
+    change, fault = fitted.change, fitted.fault
+    return {
+        "component": fault.component,
+        "name": fault.name,
+        "kind": fault.kind,
+        "delta": change.delta.tolist(),
+        "sigma": np.sqrt(np.maximum(np.diagonal(change.covariance), 0.0)).tolist(),
+        "explained": change.explained,
+        "p": change.p_value,
+        "off_px": effect.off_px,
+        "off_sigmas": effect.off_sigmas,
+        "attitude_deg": effect.attitude_deg,
+        "position_mm": effect.position_mm,
+        "pose_sigmas": effect.pose_sigmas,
+    }
+
+
+MATTERS_SIGMAS = 0.5  # in stated sigmas of a pose or a spot: a smaller bias is negligible against the stated sigma
+# A larger bias makes the stated sigmas wrong; the limit of the noise scale in lab/runs/verdict/quality.py is the same.
+WRONG_SIGMAS = 5.0
+_WHOLE_FRAME = 0.1  # of a frame interval: a delay this near to a whole number of frames suggests a wrong frame number
+
+
+def why_not_tested(result: ModelCheckResult) -> str:
+    """Why a recording was not tested; empty where it was."""
+    match result.not_tested:
+        case NotTested.NO_FRAMES:
+            return "there is no frame"
+        case NotTested.FEW_FRAMES:
+            return (
+                f"{result.frames_used} frames have {FEWEST_SPOTS} and more spots measured; the test needs"
+                f" {FEWEST_FRAMES}"
+            )
+        case NotTested.NO_REDUNDANCY:
+            return "no frame has more spots measured than its pose needs"
+        case None:
+            return ""
+
+
+def findings_of(result: ModelCheckResult, model: SpotModel) -> tuple[Finding, ...]:
+    """All findings, the most severe first."""
+    findings = []
+    diagnosis = result.diagnosis
+    if diagnosis is not None:
+        for suspected, effects in zip(diagnosis.suspected_faults, result.effects, strict=True):
+            findings.append(fault_finding(suspected, effects, diagnosis, model, result.frame_interval_s))
+        if diagnosis.unexplained:
+            findings.append(unexplained_finding(diagnosis))
+        noisy = noise_finding(result, diagnosis)
+        if noisy is not None:
+            findings.append(noisy)
+    findings += [unseen_finding(u, model) for u in result.unseen]
+    return worst_first(findings)
+
+
+def level_of(diagnosis: FaultDiagnosis, effects: Sequence[Effect]) -> Level:
+    """How severe a significant fault is. effects: of all its possible explanations.
+
+    Explanations that cannot be distinguished fail only if each of them would, and pass only if each of them would.
+    """
+
+    def above(sigmas: float) -> list[bool]:
+        return [e.pose_sigmas > sigmas or e.off_sigmas > sigmas for e in effects]
+
+    if _scale_of_faults(diagnosis) > WRONG_SIGMAS or all(above(WRONG_SIGMAS)):
+        return Level.FAIL
+    return Level.WARN if any(above(MATTERS_SIGMAS)) else Level.PASS
+
+
+def fault_finding(
+    suspected: SuspectedFault,
+    effects: Sequence[Effect],
+    diagnosis: FaultDiagnosis,
+    model: SpotModel,
+    frame_interval_s: float,
+) -> Finding:
+    """The finding for one suspected fault. effects: of its explanations, in order."""
+    level, effect = level_of(diagnosis, effects), effects[0]
+    descriptions = [_description(e, model, frame_interval_s) for e in suspected.explanations]
+    text = descriptions[0]
+    if len(descriptions) > 1:
+        count = suspected.more_alternatives
+        more = f"; or one of {count} more" if count > 1 else "; or one more" if count else ""
+        text = f"{'; or '.join(descriptions)}{more}: this recording does not distinguish them"
+    where = ""
+    if effect.axis >= 0:
+        camera, spot = model.views[effect.view]
+        where = (
+            f"spot {spot} in camera `{camera}` lies {format_number(effect.off_sigmas, 2)} sigma"
+            f" ({format_number(effect.off_px, 2)} px)"
+            f" off in {'uv'[effect.axis]} against the other spots: "
+        )
+    what = f"{where}{text}, p {p_text(suspected.best.change.p_value)}"
+    components = list(dict.fromkeys(e.fault.component for e in suspected.explanations))
+    remedy = " ".join(ENTRIES["BP-M01"].variant(c).remedy for c in components)
+    if suspected.alternatives:
+        way = "A new calibration of the beams" if components == [f.BEAM] else "A `calibrate check` with marked points"
+        remedy += f" {way} distinguishes the candidates."
+    return finding("BP-M01", level, what, why=_consequence(effects, level), remedy=remedy)
+
+
+def unexplained_finding(diagnosis: FaultDiagnosis) -> Finding:
+    """The finding for residuals that no single fault explains."""
+    level = Level.FAIL if _scale_of_faults(diagnosis) > WRONG_SIGMAS else Level.WARN
+    beyond = "" if not diagnosis.suspected_faults else " beyond what is named above"
+    what = (
+        f"the residuals do not fit the rig file{beyond}, and no single camera, screen, beam or clock explains it,"
+        f" p {p_text(diagnosis.p_after)}"
+    )
+    why = (
+        f"the residuals are {format_number(diagnosis.residual_scale, 2)} times as large as the spots' sigmas allow; the"
+        " stated sigmas of the poses do not include this"
+    )
+    return finding("BP-M02", level, what, why=why)
+
+
+def noise_finding(result: ModelCheckResult, diagnosis: FaultDiagnosis) -> Finding | None:
+    """The finding for errors that are larger than stated and that no fault of the rig explains; None where none are.
+
+    Random noise widens the poses' covariances, which stay correct, so it is a warning whatever its size. Errors that
+    are correlated over frames do not average out as noise does, so they fail beyond WRONG_SIGMAS.
+    """
+    of_cameras = result.noise_of_cameras
+    factor = max(of_cameras.values())
+    if not is_noisy(factor, result.stated_residual_scale):
+        return None
+    size = f"{format_number(factor, 2)} times as large as the sigmas of the detections"
+    uneven = factor > UNEVEN * min(of_cameras.values())
+    each = ", ".join(f"camera `{name}` {format_number(value, 2)}" for name, value in of_cameras.items())
+    where = f" ({each})" if uneven else ""
+    if diagnosis.is_correlated:
+        what = (
+            f"the spots' residuals are {size}{where}, are correlated over about {diagnosis.correlation_frames:.0f} of"
+            " the frames used, and no constant change of a camera, screen, beam or clock explains them"
+        )
+        return finding("BP-M03", Level.FAIL if factor > WRONG_SIGMAS else Level.WARN, what)
+    what = f"the spots' residuals are {size}{where}; they are random, and no fault of the rig explains them"
+    return finding("BP-M04", Level.WARN, what)
+
+
+def unseen_finding(unseen: UnseenView, model: SpotModel) -> Finding:
+    """The finding for a view that is hardly ever measured."""
+    camera, spot = model.views[unseen.view]
+    what = (
+        f"spot {spot} in camera `{camera}` was measured in {unseen.measured} of {unseen.expected} frames in which the"
+        " pose puts it well inside the picture"
+    )
+    return finding("BP-M05", Level.WARN, what)
+
+
+def _scale_of_faults(diagnosis: FaultDiagnosis) -> float:
+    """Residual scale over noise scale: the part that the rig, not the detections, is responsible for."""
+    return diagnosis.residual_scale / diagnosis.excess_noise
+
+
+def _consequence(effects: Sequence[Effect], level: Level) -> str:
+    known = [e for e in effects if np.isfinite(e.attitude_deg)]
+    if not known:
+        return "no frame alone determines its pose, so the effect on the poses is unknown"
+    bias = f"{_range([e.attitude_deg for e in known])} deg and {_range([e.position_mm for e in known])} mm"
+    sigmas = [e.pose_sigmas for e in known if np.isfinite(e.pose_sigmas)]
+    of = f", {_range(sigmas)} of its stated sigmas" if sigmas else ""
+    if level == Level.PASS:
+        return f"it is significant but small: it rotates and shifts the pose by {bias}{of}"
+    return f"it rotates and shifts the pose by about {bias}{of}; averaging over frames does not reduce it"
+
+
+def _range(values: Sequence[float]) -> str:
+    """`0.31`, or `0.31 to 0.64` where they differ by more than a tenth."""
+    low, high = min(values), max(values)
+    return format_number(high, 2) if high <= 1.1 * low else f"{format_number(low, 2)} to {format_number(high, 2)}"
+
+
+def _description(e: FittedFault, model: SpotModel, frame_interval_s: float) -> str:
+    """`camera `right` may have turned, by 0.35 ± 0.02 mrad`."""
+    fault, delta = e.fault, e.change.delta
+    sigma = np.sqrt(np.maximum(np.diagonal(e.change.covariance), 0.0))
+
+    def size(part: slice, unit: str, factor: float) -> str:
+        length = float(np.linalg.norm(delta[part]))
+        along = delta[part] / max(length, 1e-300)
+        of = float(np.sqrt(along**2 @ sigma[part] ** 2))
+        return f"{format_with_sigma(factor * length, factor * of)} {unit}"
+
+    every = slice(None)
+    subject = f"{fault.component} `{fault.name}`"
+    match fault.kind:
+        case f.TURNED:
+            return f"{subject} may have turned, by {size(every, 'mrad', 1e3)}"
+        case f.SHIFTED:
+            return f"{subject} may have moved: its picture is shifted by {size(every, 'px', 1.0)}"
+        case f.ZOOMED:
+            return f"the focal length of {subject} may have changed, by {size(every, '%', 100.0)}"
+        case f.MOVED:
+            turn, move = size(slice(3), "mrad", 1e3), size(slice(3, 6), "mm", 1e3)
+            return f"{subject} may have moved, by {move} and {turn}"
+        case f.ALONG_NORMAL:
+            return f"{subject} may have moved, by {size(every, 'mm', 1e3)} along its normal"
+        case f.TILTED:
+            turn, move = size(slice(1, 3), "mrad", 1e3), size(slice(1), "mm", 1e3)
+            return f"{subject} may have moved, by {move} along its normal, and tilted by {turn}"
+        case f.DIRECTION_WRONG:
+            return f"the direction of {subject} may be wrong, by {size(every, 'deg', float(np.rad2deg(1.0)))}"
+        case f.POINT_WRONG:
+            return f"{subject} may have shifted sideways, by {size(every, 'mm', 1e3)}"
+        case f.LASER_MOVED:
+            turn, move = size(slice(2), "deg", float(np.rad2deg(1.0))), size(slice(2, 4), "mm", 1e3)
+            return f"{subject} may have moved, by {move} and {turn}"
+        case f.LATE:
+            return _delay(fault.name, float(delta[0]), float(sigma[0]), model, frame_interval_s)
+        case _:
+            camera, spot = fault.name.rsplit("/", 1)
+            return f"spot {spot} has a constant offset in camera `{camera}`, of {size(every, 'px', 1.0)}"
+
+
+def _delay(name: str, late_s: float, sigma_s: float, model: SpotModel, frame_interval_s: float) -> str:
+    """Of two cameras, names the later one; of more, the one that is late or early against the others."""
+    filming = [c for i, c in enumerate(model.camera_names) if (model.camera_of == i).any()]
+    others, word = "the others", "late" if late_s > 0 else "early"
+    if len(filming) == 2:
+        other = next(c for c in filming if c != name)
+        name, others, word = (name, f"camera `{other}`", "late") if late_s > 0 else (other, f"camera `{name}`", "late")
+    size = f"{format_with_sigma(1e3 * abs(late_s), 1e3 * sigma_s)} ms"
+    text = f"camera `{name}` is about {size} {word} against {others}"
+    count = round(abs(late_s) / frame_interval_s) if frame_interval_s > 0 else 0
+    if count and abs(abs(late_s) / frame_interval_s - count) < _WHOLE_FRAME:
+        text += f" (that is {count} frame{'s' if count != 1 else ''}: its pictures may be numbered wrongly)"
+    return text
+
+
+def p_text(p: float) -> str:
+    """`= 3e-09`, `below 1e-12`."""
+    return "below 1e-12" if p < 1e-12 else f"= {p:.0e}"
 
 
 @dataclass(frozen=True, slots=True)

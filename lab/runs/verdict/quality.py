@@ -14,7 +14,7 @@ from typing import Any
 
 from lab.findings.finding import Finding, Level, clause, finding, level_above, worst_first
 from lab.findings.outcome import Verdict
-from lab.runs.verdict.frame_ranges import FrameRanges
+from lab.runs.verdict.frame_checks import FrameRanges
 from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, Cause, RunStatistics
 
 # Share of the frames with enough visible spots: where the tracker missed more than half of them, it may not have
@@ -74,7 +74,7 @@ def _of(found: Iterable[Finding]) -> Verdict:
 
 
 def against_truth(verdict: Verdict, errors: Mapping[str, Any] | None) -> Verdict:
-    """The verdict with what the truth of the run says; errors: as lab.runs.score.score gives them."""
+    """The verdict with what the truth of the run says; errors: as lab.runs.score gives them."""
     measured: Mapping[str, Any] = ((errors or {}).get("pose") or {}).get("measured") or {}
     wrong = measured.get("beyond_10_sigmas", 0)
     if not wrong:

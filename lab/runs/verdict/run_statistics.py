@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from lab.runs.frames.pipeline import FrameRecord
-from lab.runs.verdict.frame_checks import CONTRADICTION
-from lab.runs.verdict.frame_ranges import FrameRanges
+from lab.runs.verdict.frame_checks import CONTRADICTION, FrameRanges
 from tracking.detections import UNMATCHED
 from tracking.statuses import PoseStatus, SpotStatus
 

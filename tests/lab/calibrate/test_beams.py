@@ -19,8 +19,14 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names
 from lab.calibrate.beams.beams import calibrate_beams
-from lab.calibrate.beams.recordings import limit_frames, read_recordings
-from lab.calibrate.beams.stationary_frames import SpotRows, average, mean_of_frames, positions_at_rest
+from lab.calibrate.beams.recordings import (
+    SpotRows,
+    average,
+    limit_frames,
+    mean_of_frames,
+    positions_at_rest,
+    read_recordings,
+)
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import load_project
 from lab.files.rig.calibration_state import CalibrationState

@@ -13,8 +13,7 @@ import pytest
 from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import parse
 from calibration.boards.board_view import BoardView
-from lab.calibrate.board.board import write_board
-from lab.calibrate.board.board_page import as_pdf, lay_out
+from lab.calibrate.board import as_pdf, lay_out, write_board
 from lab.errors import InputError
 from lab.files.rig.board_file import load_board, load_board_or_text
 

@@ -12,7 +12,7 @@ from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
 from geometry.camera import project_points_full
 from geometry.rotations import exp
 from lab.calibrate.camera.camera import CameraOptions, calibrate_camera, corner_table
-from lab.calibrate.camera.corner_tables import read_corner_table
+from lab.calibrate.camera.photos import read_corner_table
 from lab.errors import InputError
 from tests.calibration.lens.lens_scenes import SIZE, Scene, board_points, photographs
 from tests.paths import DATA

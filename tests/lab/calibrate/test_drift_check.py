@@ -18,9 +18,8 @@ from geometry.rig import Rig
 from geometry.rotations import exp
 from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names
 from lab.calibrate.drift_check.drift_check import COLUMNS, DriftLimits, check_drift
-from lab.calibrate.drift_check.drift_comparison import compare_points
+from lab.calibrate.drift_check.drift_comparison import compare_points, read_history
 from lab.calibrate.drift_check.drift_inputs import DriftInputs, read_points
-from lab.calibrate.drift_check.drift_result import read_history
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import joint_covariance

@@ -13,8 +13,7 @@ import pytest
 
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from lab.calibrate.rig.rig import calibrate_rig
-from lab.calibrate.rig.rig_tables import COLUMNS
+from lab.calibrate.rig.rig import COLUMNS, calibrate_rig
 from lab.calibrate.step import calibration_date, expiry_date, expiry_findings
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import load_project

@@ -15,10 +15,9 @@ import pytest
 from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Charuco, parse
 from geometry.pose import Pose
-from lab.calibrate.screens.screen import calibrate_screen
-from lab.calibrate.screens.screen_tables import DOT_COLUMNS, RESIDUAL_COLUMNS
+from lab.calibrate.screens.screen import DOT_COLUMNS, RESIDUAL_COLUMNS, calibrate_screen
 from lab.errors import CalibrationError, InputError
-from lab.files.project.cloud_file import read_point_cloud
+from lab.files.project.point_files import read_point_cloud
 from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraFile, load_camera, save_camera
 from lab.files.rig.rig_file import load_rig_file

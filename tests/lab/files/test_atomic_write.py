@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from lab.errors import InputError
-from lab.files.output import folder_lock, part_folder
+from lab.files.output import part_folder
 from lab.files.text.atomic_write import atomic_folder, atomic_write_text, check_output_folder, keep_good_results
 
 
@@ -249,7 +249,7 @@ def test_a_file_system_without_locks_is_used_without_them_and_nothing_is_swept(t
     def unsupported(*_):
         raise OSError(errno.ENOLCK, "No locks available")
 
-    monkeypatch.setattr(folder_lock.fcntl, "flock", unsupported)
+    monkeypatch.setattr(part_folder.fcntl, "flock", unsupported)
     (tmp_path / ".results.part-00ff").mkdir()  # perhaps of a living process: it cannot be known
     with atomic_folder(tmp_path / "results", never) as work:
         (work / "a.csv").write_text("1")
@@ -275,7 +275,7 @@ def test_part_files_of_killed_processes_are_removed_and_those_of_living_ones_kep
     for path in (dead, alive, other):
         path.write_text("half")
     with alive.open("rb") as file:
-        assert folder_lock.lock(file.fileno())
+        assert part_folder.lock(file.fileno())
         atomic_write_text("1", target)
         assert names(tmp_path) == sorted([alive.name, other.name, target.name])
     atomic_write_text("2", target)
@@ -291,7 +291,7 @@ def test_a_part_file_that_another_process_took_for_a_left_one_is_written_again(t
         if answer is not None:
             raise answer
 
-    monkeypatch.setattr(folder_lock.fcntl, "flock", taken_once)
+    monkeypatch.setattr(part_folder.fcntl, "flock", taken_once)
     atomic_write_text("1", tmp_path / "a.csv")
     assert (tmp_path / "a.csv").read_text() == "1"
     assert names(tmp_path) == ["a.csv"]

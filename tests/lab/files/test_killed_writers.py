@@ -26,7 +26,7 @@ for name in ("SIGTERM", "SIGHUP", "SIGINT"):  # the tests may have been started 
     if hasattr(signal, name):
         signal.signal(getattr(signal, name), signal.default_int_handler if name == "SIGINT" else signal.SIG_DFL)
 from pathlib import Path
-from lab.commands.stop_signals import stopped_by_signals
+from lab.commands.common import stopped_by_signals
 from lab.files.output import part_folder
 from lab.files.text.atomic_write import atomic_folder, atomic_write_text
 if sys.argv[1] == "two renames":
@@ -195,7 +195,7 @@ def test_an_ignored_signal_stays_ignored(tmp_path):
     program = f"""
 import os, signal, sys
 sys.path.insert(0, {str(ROOT)!r})
-from lab.commands.stop_signals import stopped_by_signals
+from lab.commands.common import stopped_by_signals
 signal.signal(signal.SIGHUP, signal.SIG_IGN)
 with stopped_by_signals():
     os.kill(os.getpid(), signal.SIGHUP)

@@ -9,7 +9,7 @@ import time
 import pytest
 
 from lab.errors import InputError
-from lab.files.project.cloud_file import read_point_cloud
+from lab.files.project.point_files import read_point_cloud
 from lab.files.rig.rig_file import load_rig
 from lab.files.run.results import read_summary
 from lab.files.run.run_file import load_run
@@ -19,8 +19,8 @@ from lab.files.text.error_text import is_formula, name_of_path, printable
 from lab.files.text.json_text import has_schema
 from lab.files.text.yaml_text import parse_mapping, parse_value, read_mapping
 from lab.pictures.source import open_video
-from lab.runs.batch.run_folders import allotted, listed_runs
-from lab.runs.batch.table import read_rows
+from lab.runs.batch.batch import read_rows
+from lab.runs.batch.task import allotted, listed_runs
 from lab.setup.plan_findings import options_of
 from tests.paths import ROOT
 

@@ -10,7 +10,7 @@ from lab.errors import InputError
 from lab.files.project.point_files import read_observations, read_poses, read_survey
 from lab.files.project.project import load_project, placement_of
 from lab.files.rig.board_file import save_board
-from lab.files.text.range_checks import MAX_SCAN_COORDINATE
+from lab.files.text.csv_text import MAX_SCAN_COORDINATE
 from lab.files.text.yaml_text import read_mapping, write_mapping
 from tests.lab.calibrate.screen_projects import write_project
 

@@ -14,7 +14,7 @@ from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig
 from lab.files.run.run_file import load_run
 from lab.files.run.truth import largest_disagreement_px, load_run_truth, load_truth
-from lab.runs.input_check.check import check
+from lab.runs.input_check import check
 from lab.runs.process import ready_run
 from tests.lab.run_folders import edit, write_run
 

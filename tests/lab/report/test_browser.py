@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lab.report.index.index import write_index
+from lab.report.index import write_index
 from lab.report.run.page import write_report
 from lab.results.view.scene import View, read_content, view_of
 from lab.results.view.view import write_files

@@ -15,8 +15,8 @@ from geometry.pose import Pose
 from lab.errors import InputError
 from lab.findings.finding import Finding, Level
 from lab.report.calibration import calibration_charts as charts
+from lab.report.calibration import calibration_charts as maps
 from lab.report.calibration import calibration_drawings as draw
-from lab.report.calibration import calibration_maps as maps
 from lab.report.calibration import calibration_scene as scene
 from lab.report.calibration.calibration_page import (
     LARGEST_BYTES,

@@ -19,10 +19,9 @@ from lab import number_format
 from lab.errors import InputError
 from lab.files.run.results import read_poses
 from lab.report.frames.canvas import Canvas, bgr
-from lab.report.index.index import write_index
+from lab.report.index import write_index
 from lab.report.plot import axes
-from lab.report.plot.axes import BLUE, SPOT_COLOURS, line_path, tick_texts, ticks
-from lab.report.plot.image import grey_limits, stretched
+from lab.report.plot.axes import BLUE, SPOT_COLOURS, grey_limits, line_path, stretched, tick_texts, ticks
 from lab.report.plot.series import Line, Shade, time_panel
 from lab.report.run.events import MOST_PICTURES, events, selected
 from lab.report.run.page import write_report

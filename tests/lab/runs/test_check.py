@@ -16,7 +16,7 @@ from geometry.pose_solver import visibility
 from geometry.pose_solver.gauss_newton import SolveLimits
 from lab.files.rig.rig_file import load_rig
 from lab.files.text.error_text import FileError
-from lab.runs.input_check.check import check
+from lab.runs.input_check import check
 from tests.lab.files.test_truth import write_truth
 from tests.lab.run_folders import edit, picture_of, write_run
 

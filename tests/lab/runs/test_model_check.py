@@ -15,7 +15,7 @@ from calibration.model_check.fault_identification import FaultDiagnosis
 from geometry.pose_prior import PosePrior
 from lab.findings.finding import Level
 from lab.number_format import format_number, format_with_sigma
-from lab.runs.model_check import messages
+from lab.runs.model_check import check
 from lab.runs.model_check.check import check_model, check_sampled_frames
 from lab.runs.model_check.frame_sampler import FrameSampler, SampledFrame, stated_covariances
 from lab.runs.verdict import quality
@@ -77,18 +77,18 @@ def test_a_finding_states_that_a_recording_does_not_distinguish_faults():
 def test_indistinguishable_faults_fail_only_if_each_would_and_pass_only_if_each_would():
     small, middle, large = (Effect(0, 0, 0.0, 0.0, 0.1, 0.1, sigmas) for sigmas in (0.1, 2.0, 9.0))
     diagnosis = FaultDiagnosis((), 0.0, 1.0, 30, 1.0, 1.0, 1.0, False, np.ones(6))
-    assert messages.level_of(diagnosis, [small, small]) == Level.PASS
-    assert messages.level_of(diagnosis, [small, middle]) == Level.WARN
-    assert messages.level_of(diagnosis, [middle, large]) == Level.WARN
-    assert messages.level_of(diagnosis, [large, large]) == Level.FAIL
-    assert messages.level_of(dataclasses.replace(diagnosis, residual_scale=5.1), [small]) == Level.FAIL
+    assert check.level_of(diagnosis, [small, small]) == Level.PASS
+    assert check.level_of(diagnosis, [small, middle]) == Level.WARN
+    assert check.level_of(diagnosis, [middle, large]) == Level.WARN
+    assert check.level_of(diagnosis, [large, large]) == Level.FAIL
+    assert check.level_of(dataclasses.replace(diagnosis, residual_scale=5.1), [small]) == Level.FAIL
 
 
 def test_noise_alone_does_not_make_a_small_fault_a_failure():
     small = [Effect(0, 0, 0.0, 0.2, 0.1, 0.1, 0.1)]
     for noise, level in ((1.0, Level.FAIL), (8.0, Level.PASS)):
         diagnosis = FaultDiagnosis((), 0.0, 1.0, 30, 8.0, noise, 1.0, False, np.ones(6))
-        assert messages.level_of(diagnosis, small) == level
+        assert check.level_of(diagnosis, small) == level
 
 
 def test_a_significant_but_small_fault_is_no_alarm():
@@ -146,7 +146,7 @@ def test_large_correlated_errors_are_not_noise_and_fail():
 
 
 def test_the_limits_of_the_findings_are_those_of_the_verdict():
-    assert messages.MATTERS_SIGMAS < messages.WRONG_SIGMAS == quality.LARGEST_NOISE_SCALE
+    assert check.MATTERS_SIGMAS < check.WRONG_SIGMAS == quality.LARGEST_NOISE_SCALE
     assert noise_scales.NOISY == quality.GOOD_NOISE_SCALE
 
 

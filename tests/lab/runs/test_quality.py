@@ -6,10 +6,9 @@ from collections import Counter
 
 import pytest
 
-from lab.findings.catalogue import ENTRIES
-from lab.findings.finding import Finding, Level, finding
+from lab.findings.finding import ENTRIES, Finding, Level, finding
 from lab.findings.outcome import Verdict
-from lab.runs.verdict.frame_ranges import FrameRanges
+from lab.runs.verdict.frame_checks import FrameRanges
 from lab.runs.verdict.quality import (
     GOOD_MEASURED,
     LEAST_DISPLACED,

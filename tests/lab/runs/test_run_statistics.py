@@ -9,8 +9,7 @@ import pytest
 
 from geometry.pose import Pose
 from lab.runs.frames.pipeline import FrameRecord
-from lab.runs.verdict.frame_checks import CONTRADICTION
-from lab.runs.verdict.frame_ranges import FrameRanges
+from lab.runs.verdict.frame_checks import CONTRADICTION, FrameRanges
 from lab.runs.verdict.run_statistics import CameraStatistics, Cause, RunStatistics
 from tracking.detections import Detections
 from tracking.statuses import PoseStatus, SpotStatus

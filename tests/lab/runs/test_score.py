@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 from geometry.pose import Pose
 from lab.errors import InputError
 from lab.files.run.results import ABSENT, SPOT_STATUSES, SpotGrid, read_poses, read_spots
-from lab.runs.score.motion_score import differenced
-from lab.runs.score.score import (
+from lab.runs.score import (
     TruthArrays,
     _returns,
     against_truth,
+    differenced,
     normalised_squares,
     read_tables,
     read_truth,

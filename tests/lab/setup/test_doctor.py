@@ -10,7 +10,7 @@ import pytest
 
 from lab.findings.finding import Level, finding
 from lab.pictures.opencv import load_cv2
-from lab.setup import doctor_checks, installation
+from lab.setup import doctor, installation
 from lab.setup.installation import exit_status
 from tests.lab.run_folders import RIG, write_run
 
@@ -19,7 +19,7 @@ TODAY = datetime.date(2026, 6, 1)
 
 def test_the_installation_that_runs_these_tests_has_no_fault():
     assert [line for line in installation.check_installation() if line.level is Level.FAIL] == []
-    assert [line for line in doctor_checks.check_opencv() if line.level is Level.FAIL] == []
+    assert [line for line in doctor.check_opencv() if line.level is Level.FAIL] == []
 
 
 def test_a_library_that_cannot_be_loaded_is_named_with_its_package():
@@ -74,31 +74,31 @@ class WithoutTiff:
 
 
 def test_a_picture_format_that_opencv_lacks_fails():
-    line = doctor_checks.check_pictures(WithoutTiff())
+    line = doctor.check_pictures(WithoutTiff())
     assert line.level is Level.FAIL
     assert "cannot read .tiff with 8 bits, .tiff with 16 bits" in line.what
 
 
 def test_a_video_format_that_opencv_lacks_is_a_warning(monkeypatch):
-    monkeypatch.setattr(doctor_checks, "VIDEOS", (("MJPG", ".avi"), ("none", ".none")))
-    line = doctor_checks.check_videos(load_cv2())
+    monkeypatch.setattr(doctor, "VIDEOS", (("MJPG", ".avi"), ("none", ".none")))
+    line = doctor.check_videos(load_cv2())
     assert line.level is Level.WARN
     assert line.what.startswith("videos: none cannot be read back")
 
 
 @pytest.mark.parametrize(("free", "state"), [(10**10, Level.PASS), (10**9, Level.WARN), (10**6, Level.FAIL)])
 def test_little_free_space_is_reported(tmp_path, monkeypatch, free, state):
-    monkeypatch.setattr(doctor_checks.shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
-    assert doctor_checks.check_space(doctor_checks.existing(tmp_path / "not" / "made"), "results").level is state
+    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
+    assert doctor.check_space(doctor.existing(tmp_path / "not" / "made"), "results").level is state
 
 
 def test_all_compiled_code_is_looked_at_and_a_missing_part_is_a_warning(monkeypatch):
-    root = doctor_checks.Path(doctor_checks.geometry.__file__).parents[1]
-    assert {"geometry", "tracking"} <= {f.relative_to(root).parts[0] for f in doctor_checks.compiled_folders()}
-    monkeypatch.setattr(doctor_checks, "is_empty", lambda folder: True)
-    assert doctor_checks.check_cache().level is Level.WARN
-    monkeypatch.setattr(doctor_checks, "cache_folder", lambda folder: None)
-    assert "cannot be kept" in doctor_checks.check_cache().what
+    root = doctor.Path(doctor.geometry.__file__).parents[1]
+    assert {"geometry", "tracking"} <= {f.relative_to(root).parts[0] for f in doctor.compiled_folders()}
+    monkeypatch.setattr(doctor, "is_empty", lambda folder: True)
+    assert doctor.check_cache().level is Level.WARN
+    monkeypatch.setattr(doctor, "cache_folder", lambda folder: None)
+    assert "cannot be kept" in doctor.check_cache().what
 
 
 @pytest.mark.parametrize(
@@ -118,23 +118,23 @@ def test_all_compiled_code_is_looked_at_and_a_missing_part_is_a_warning(monkeypa
 def test_the_age_of_a_calibration_is_judged(tmp_path: Path, block, state, words):
     path = tmp_path / "rig.yaml"
     path.write_text(RIG + (f"calibration: {block}\n" if block else ""))
-    line = doctor_checks.check_calibration(path, TODAY)
+    line = doctor.check_calibration(path, TODAY)
     assert (line.level, line.code) == (state, "BP-D09")
     assert words in line.what
 
 
 def test_a_run_folder_and_a_camera_file_are_read_too(tmp_path):
-    assert doctor_checks.check_calibration(write_run(tmp_path / "run"), TODAY).level is Level.WARN
+    assert doctor.check_calibration(write_run(tmp_path / "run"), TODAY).level is Level.WARN
     camera = "schema: beampose/camera/1\nname: left\nimage_size_px: [64, 48]\n"
     camera += "camera_matrix: {fx: 40, fy: 40, cx: 31, cy: 23}\ncalibration: {date: DAY, verdict: PASS}\n"
     path = tmp_path / "camera.yaml"
     for day, state in (("2026-05-01", Level.PASS), ("may", Level.FAIL)):
         path.write_text(camera.replace("DAY", day))
-        assert doctor_checks.check_calibration(path, TODAY).level is state
+        assert doctor.check_calibration(path, TODAY).level is state
 
 
 def test_a_file_that_cannot_be_read_fails_as_a_wrong_file(tmp_path):
-    line = doctor_checks.check_calibration(tmp_path / "none.yaml", TODAY)
+    line = doctor.check_calibration(tmp_path / "none.yaml", TODAY)
     assert (line.code, exit_status([line])) == ("BP-D10", 2)
 
 

@@ -11,7 +11,7 @@ import pytest
 from lab.commands import maintenance
 from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig
-from lab.runs.input_check.check import check
+from lab.runs.input_check import check
 from lab.runs.process import process_run
 from lab.setup.init import Layout, rig_of, start
 

@@ -21,7 +21,7 @@ from lab.calibrate.camera.photos import _frames
 from lab.files.project.project import Cloud
 from lab.files.rig.rig_file import save_rig
 from lab.pictures.source import pictures, video_at
-from lab.runs.input_check.check import check
+from lab.runs.input_check import check
 from lab.runs.process import process_run
 from lab.simulate.rigs import fan, unequal_fan
 from lab.simulate.write import simulate

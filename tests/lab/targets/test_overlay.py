@@ -8,10 +8,10 @@ import pytest
 
 from lab.targets.circle import CircleTarget
 from lab.targets.drogue import DrogueTarget
-from lab.targets.overlay import drawn
 from lab.targets.point import PointFrame, PointTarget
 from lab.targets.recording import Recording
 from lab.targets.target import Track
+from lab.targets.track import drawn
 from tracking.drogue_circle import rim_fit as circles
 from tracking.light_tracker import frames as drogues
 from tracking.single_target.point_tracker import NOTHING

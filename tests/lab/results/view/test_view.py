@@ -16,14 +16,13 @@ from calibration.open3d_loader import open3d
 from geometry.forward_model import SpotModel
 from lab.errors import InputError
 from lab.files.rig.rig_file import save_rig
-from lab.results.view import render, slider_window, window
 from lab.results.view import scene as solids
+from lab.results.view import slider_window, view
 from lab.results.view import view as view_module
 from lab.results.view.page import Player, scene_data
 from lab.results.view.scene import read_content, view_of, write_glb
 from lab.results.view.slider_window import Controls
-from lab.results.view.view import show
-from lab.results.view.window import fill
+from lab.results.view.view import fill, show
 from tests.lab.fake_results import make
 from tests.open3d_marker import needs_open3d
 
@@ -230,14 +229,14 @@ class Window:
 @needs_open3d
 def test_a_key_moves_the_beams_of_the_window(content):
     view = view_of(content, None)
-    window, player = Window(), Player(view, None)
-    fill(window, view, player)
-    assert len(window.shown) == 2
-    before = np.asarray(window.shown[1].vertices).copy()
-    assert window.keys[269](window)  # end
-    assert len(window.shown) == 2
-    assert np.abs(np.asarray(window.shown[1].vertices) - before).max() > 1e-3
-    assert not window.tick(window)  # nothing plays
+    view, player = Window(), Player(view, None)
+    fill(view, view, player)
+    assert len(view.shown) == 2
+    before = np.asarray(view.shown[1].vertices).copy()
+    assert view.keys[269](view)  # end
+    assert len(view.shown) == 2
+    assert np.abs(np.asarray(view.shown[1].vertices) - before).max() > 1e-3
+    assert not view.tick(view)  # nothing plays
 
 
 @needs_open3d
@@ -279,15 +278,15 @@ def test_a_window_that_was_open_is_not_followed_by_another(content, monkeypatch)
 
 def test_where_the_window_with_a_slider_opens_no_other_one_is_tried(content, monkeypatch):
     tried = []
-    monkeypatch.setattr(window, "open3d", lambda: tried.append(True))
-    monkeypatch.setattr(window, "open_slider_window", lambda view, index: True)
-    assert window.open_window(view_of(content, None), None)
+    monkeypatch.setattr(view, "open3d", lambda: tried.append(True))
+    monkeypatch.setattr(view, "open_slider_window", lambda view, index: True)
+    assert view.open_window(view_of(content, None), None)
     assert tried == []
 
 
 @needs_open3d
 def test_a_renderer_that_hangs_or_fails_gives_no_pictures(content, tmp_path, monkeypatch):
-    monkeypatch.setattr(render, "_SECONDS", 0.05)
+    monkeypatch.setattr(slider_window, "_SECONDS", 0.05)
     view = view_of(content, None)
     mesh = solids.mesh_of(view.fixed, [], view.reach_m, view.extent_m)
-    assert render.render(mesh, {"from above (along −z)": tmp_path / "a.png"}) == []
+    assert slider_window.render(mesh, {"from above (along −z)": tmp_path / "a.png"}) == []

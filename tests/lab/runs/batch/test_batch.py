@@ -15,11 +15,10 @@ from cli import main
 from lab.commands.common import command_line
 from lab.errors import CalibrationError, InputError, RunError
 from lab.files.text.csv_text import write_table
-from lab.findings.catalogue import ENTRIES
+from lab.findings.finding import ENTRIES
 from lab.runs import process
 from lab.runs.batch import task as module
-from lab.runs.batch.batch import BatchOptions, process_batch
-from lab.runs.batch.table import read_rows
+from lab.runs.batch.batch import BatchOptions, process_batch, read_rows
 from lab.runs.batch.task import COLUMNS
 from lab.simulate.write import simulate
 from tests.lab.run_folders import write_run

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from lab.errors import InputError, RunError
-from lab.files.output.folder_lock import FolderInUseError
+from lab.files.output.part_folder import FolderInUseError
 from lab.runs.batch import cluster as module
 from lab.runs.batch import task as task_module
 from lab.runs.batch.batch import BatchOptions, process_batch

@@ -13,8 +13,7 @@ import pytest
 
 from lab.errors import InputError
 from lab.runs.batch import task
-from lab.runs.batch.batch import BatchOptions, process_batch
-from lab.runs.batch.table import BatchTable
+from lab.runs.batch.batch import BatchOptions, BatchTable, process_batch
 from lab.simulate.write import simulate
 from tests.lab.run_folders import edit
 from tests.lab.runs.batch.test_batch import points_run, rows_of
@@ -162,7 +161,7 @@ def test_rows_are_in_the_order_of_the_batch_whatever_ends_first_and_others_stay(
 
 
 def test_a_row_that_could_not_be_written_is_written_with_the_next(tmp_path, monkeypatch):
-    from lab.runs.batch import table as module
+    from lab.runs.batch import batch as module
 
     def full(*_):
         raise InputError("No space left on device")

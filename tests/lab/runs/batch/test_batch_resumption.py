@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from lab.runs.batch import resumption
+from lab.runs.batch import task
 from lab.runs.batch.batch import BatchOptions, process_batch
 from lab.simulate.write import simulate
 from tests.lab.run_folders import edit, write_run
@@ -66,9 +66,9 @@ def test_any_changed_input_or_version_is_a_reason_to_process_again(done, tmp_pat
         case "summary":
             (tmp_path / "out/run/summary.json").write_text('{"schema": "beampose/summary/1"}')
         case "program":
-            monkeypatch.setattr(resumption, "program_digest", lambda: "another version")
+            monkeypatch.setattr(task, "program_digest", lambda: "another version")
         case "library":
-            monkeypatch.setattr(resumption, "versions", lambda: {"numpy": "0"})
+            monkeypatch.setattr(task, "versions", lambda: {"numpy": "0"})
     assert again(done) == 0
     assert again(done) == 1
 

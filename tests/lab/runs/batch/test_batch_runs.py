@@ -10,7 +10,7 @@ import pytest
 from lab.commands.batch import pace
 from lab.errors import InputError
 from lab.runs.batch.batch import BatchOptions, process_batch
-from lab.runs.batch.run_folders import listed_runs, shard_of
+from lab.runs.batch.task import listed_runs, shard_of
 from tests.lab.runs.batch.test_batch import points_run, rows_of
 
 

@@ -13,9 +13,9 @@ import pytest
 
 from lab.errors import InputError
 from lab.files.text import columns
-from lab.runs.detect.contact_sheet import MOST, ContactSheet
 from lab.runs.detect.detect import SHEET, DetectOptions, detect_pictures
-from lab.runs.detect.findings import MOST_KEPT, SpotCollection, laser_likeness, matched_snr
+from lab.runs.detect.detect_page import MOST, ContactSheet
+from lab.runs.detect.picture_series import MOST_KEPT, SpotCollection, laser_likeness, matched_snr
 from tests.tracking.rendering import Scene, Spot, expected
 from tracking.detections import Detections
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lab.runs.frames.sensor_noise import VIDEO_FRAMES, CameraNoise
-from lab.runs.watch.live_background import LiveBackground
+from lab.runs.watch.watch import LiveBackground
 from tests.tracking.background.test_static_background import USUAL, Recording, path
 from tracking.noise import Picture
 

@@ -1,1 +1,0 @@
-"""`beampose calibrate board`: printable calibration boards."""

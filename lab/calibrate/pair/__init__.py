@@ -1,1 +1,0 @@
-"""`calibrate pair`: calibrates two cameras and their relative pose from photographs of a board."""

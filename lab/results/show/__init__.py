@@ -1,1 +1,0 @@
-"""Pictures of single frames and videos with what a run found drawn over them."""

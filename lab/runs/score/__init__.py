@@ -1,1 +1,0 @@
-"""Errors of a run's results against truth."""
