@@ -293,7 +293,7 @@ def test_simulate_lists_every_scenario(works):
         ("init sample_runs --beams 3", "expected a new or empty folder, found files"),
         ("init r --beams 2 --screens 1", "expected at least 3 for 1 screen, got 2"),
         ("init r --cameras 1 --screens 2", "expected at least one per screen (2), got 1"),
-        ("init r --picture large", "expected WIDTHxHEIGHT in pixels such as 1280x1024, got 'large'"),
+        ("init r --picture large", "expected width and height in px such as 1920x1080, got 'large'"),
         ("compare sample_runs --out r", "expected a second result folder or --reference"),
         ("compare sample_runs sample_runs --out r", "found no summary.json"),
         ("study nothing --out r", "'nothing' is not"),

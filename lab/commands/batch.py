@@ -63,19 +63,14 @@ def _shard(ctx: click.Context, parameter: click.Parameter, value: str | None) ->
 @click.pass_context
 def batch(
     ctx: click.Context,
+    /,
     runs: tuple[Path, ...],
     lists: tuple[Path, ...],
     out: Path,
-    jobs: int,
-    dask: str | None,
-    force: bool,
     shard: str | None,
-    full_hash: bool,
-    parquet: bool,
-    causal: bool,
     verbose: bool,
     quiet: bool,
-    settings: dict[str, Any],
+    **chosen: Any,
 ) -> None:
     """Process many run folders; a run that fails does not stop the others.
 
@@ -90,15 +85,14 @@ def batch(
     """
     if not runs and not lists:
         raise click.UsageError("Missing argument 'RUN...'.", ctx)
-    if dask is not None and ctx.get_parameter_source("jobs") is ParameterSource.COMMANDLINE:
+    if chosen["dask"] is not None and ctx.get_parameter_source("jobs") is ParameterSource.COMMANDLINE:
         raise click.UsageError("expected --jobs or --dask, got both", ctx)
     check_verbosity(verbose=verbose, quiet=quiet)
     from lab.commands.common import provenance
     from lab.runs.batch.batch import BatchOptions, process_batch
     from lab.runs.batch.task import shard_of
 
-    part = shard_of(shard or "1/1")
-    options = BatchOptions(settings, causal, jobs, force, part, full_hash, parquet, dask, provenance(ctx))
+    options = BatchOptions(shard=shard_of(shard or "1/1"), provenance=provenance(ctx), **chosen)
     line = _printer()
 
     def log(text: str) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -11,24 +11,15 @@ from lab.commands.common import (
     ANY_PATH,
     FOLDER,
     Commands,
+    ImageSize,
     NumberRange,
     complete_rigs,
     conclude,
     progress_bar,
+    seed_option,
     show_line,
+    valid_days_option,
 )
-
-
-class ImageSize(click.ParamType[tuple[int, int]]):
-    """Width and height of a picture as WxH."""
-
-    name = "size"
-
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        match = re.fullmatch(r"(\d{1,6})[xX](\d{1,6})", str(value))
-        if match is None or min(int(match[1]), int(match[2])) < 1:
-            self.fail(f"expected width and height in px such as 1920x1080, got {value!r}", param, ctx)
-        return int(match[1]), int(match[2])
 
 
 @click.group(cls=Commands)
@@ -82,26 +73,11 @@ def board(board: str, out: Path, page: str, dpi: float) -> None:
     show_default=True,
     help="auto, on, off: whether the ratio of the board's x and y scales is solved for.",
 )
-@click.option("--image-size", type=ImageSize(), metavar="WxH", help="Of the pictures of a table of corners, px.")
 @click.option(
-    "--valid-days",
-    default=365,
-    show_default=True,
-    type=click.IntRange(min=1),
-    help="Validity of the calibration, days.",
+    "--image-size", "image_size_px", type=ImageSize(), metavar="WxH", help="Of the pictures of a table of corners, px."
 )
-def camera(
-    photos: tuple[Path, ...],
-    board: str,
-    out: Path,
-    name: str | None,
-    distance_m: float | None,
-    lens: str,
-    warp: str,
-    stretch: str,
-    image_size: tuple[int, int] | None,
-    valid_days: int,
-) -> None:
+@valid_days_option
+def camera(photos: tuple[Path, ...], board: str, out: Path, name: str | None, **options: Any) -> None:
     """Calibrate a camera's lens from photos of a board: files, folders, patterns or a video.
 
     Or from a table of corners: mrcal's corners.vnl, or a CSV with view,id,u_px,v_px; --image-size is then required.
@@ -112,17 +88,9 @@ def camera(
     """
     from lab.calibrate.camera.camera import CameraOptions, calibrate_camera
 
-    options = CameraOptions(
-        name=name or out.resolve().name,
-        distance_m=distance_m,
-        lens=lens,
-        warp=warp,
-        stretch=stretch,
-        image_size_px=image_size,
-        valid_days=valid_days,
-    )
+    chosen = CameraOptions(name=name or out.resolve().name, **options)
     with progress_bar("photos") as progress:
-        outcome = calibrate_camera(photos, board, out, options, progress=progress)
+        outcome = calibrate_camera(photos, board, out, chosen, progress=progress)
     conclude(outcome)
 
 
@@ -184,18 +152,10 @@ def rig(project: Path, out: Path) -> None:
 @click.option("--out", required=True, type=FOLDER, help="Gets drift.csv and report.html.")
 @click.option("--points", type=ANY_PATH, help="Pixels of known points: camera,point,u_px,v_px[,sigma_px].")
 @click.option("--survey", type=ANY_PATH, help="Coordinates of the points: point,x_m,y_m,z_m[,sigmas].")
-@click.option("--run", "run_folder", type=ANY_PATH, help="Or a recording of a vehicle at rest, or its results ...")
+@click.option("--run", type=ANY_PATH, help="Or a recording of a vehicle at rest, or its results ...")
 @click.option("--pose", type=ANY_PATH, help="... at a known pose: a CSV like truth/pose.csv.")
 @click.option("--history", type=ANY_PATH, help="A CSV to which this check is added, for the trend.")
-def check(
-    rig: Path,
-    out: Path,
-    points: Path | None,
-    survey: Path | None,
-    run_folder: Path | None,
-    pose: Path | None,
-    history: Path | None,
-) -> None:
+def check(rig: Path, out: Path, history: Path | None, **inputs: Path | None) -> None:
     """Check whether a calibration still holds: drift per camera in px and mm; exit status 3: do not use it.
 
     \b
@@ -205,7 +165,7 @@ def check(
     from lab.calibrate.drift_check.drift_check import check_drift
     from lab.calibrate.drift_check.drift_inputs import DriftInputs
 
-    conclude(check_drift(rig, out, DriftInputs(points, run_folder, survey, pose), history=history))
+    conclude(check_drift(rig, out, DriftInputs(**inputs), history=history))
 
 
 @calibrate.command()
@@ -235,9 +195,7 @@ def convert(source: Path, destination: Path, origin: str | None, target: str | N
     shell_complete=complete_rigs,
     help="A rig.yaml as designed, or fan, unequal-fan, two-cameras-per-screen, four-skew-beams.",
 )
-@click.option(
-    "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="The same seed gives the same bytes."
-)
+@seed_option
 @click.option(
     "--positions", default=40, show_default=True, type=click.IntRange(min=3), help="Number of stand positions."
 )

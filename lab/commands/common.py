@@ -9,6 +9,7 @@ import contextlib
 import logging
 import math
 import os
+import re
 import shlex
 import signal
 import sys
@@ -116,6 +117,21 @@ class NumberRange(click.FloatRange):
         if not math.isfinite(number):
             self.fail(f"expected a finite number, got {value}.", param, ctx)
         return number
+
+
+class ImageSize(click.ParamType[tuple[int, int]]):
+    """Width and height of a picture as WxH, each at least so many px."""
+
+    name = "size"
+
+    def __init__(self, least: int = 1) -> None:
+        self._least = least
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        match = re.fullmatch(r"(\d{1,6})[xX](\d{1,6})", str(value))
+        if match is None or min(int(match[1]), int(match[2])) < self._least:
+            self.fail(f"expected width and height in px such as 1920x1080, got {value!r}", param, ctx)
+        return int(match[1]), int(match[2])
 
 
 def show_line(text: str) -> None:
@@ -278,11 +294,23 @@ def read_settings(ctx: click.Context, parameter: click.Parameter, values: Sequen
 
 set_option = click.option(
     "--set",
-    "settings",
+    "overrides",
     multiple=True,
     metavar="NAME=VALUE",
     callback=read_settings,
     help="A tracker parameter in place of run.yaml's, e.g. --set r1_px=12 or --set detect.threshold_sigma=5.",
+)
+
+
+valid_days_option = click.option(
+    "--valid-days",
+    default=365,
+    show_default=True,
+    type=click.IntRange(min=1),
+    help="Validity of the calibration, days.",
+)
+seed_option = click.option(
+    "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="The same seed gives the same bytes."
 )
 
 

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from pathlib import Path
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, NumberRange, complete_codes, conclude, progress_bar, show_line
+from lab.commands.common import (
+    ANY_PATH,
+    FOLDER,
+    ImageSize,
+    NumberRange,
+    complete_codes,
+    conclude,
+    progress_bar,
+    show_line,
+)
 
 
 @click.command()
@@ -69,7 +77,8 @@ def _asked(given: dict[str, float | None]) -> dict[str, float]:
     """The values that were not given: asked for on a terminal, else the default; a camera per screen at least."""
     ask = _on_a_terminal()
     out: dict[str, float] = {}
-    for name, value in given.items():
+    for name in _QUESTIONS:
+        value = given[name]
         default = max(_DEFAULTS[name], out["screens"]) if name == "cameras" else _DEFAULTS[name]
         if name == "beams" and out["screens"] != 2:
             default = 3 if out["screens"] == 1 else 4
@@ -90,15 +99,19 @@ def _asked(given: dict[str, float | None]) -> dict[str, float]:
 @click.option(
     "--distance", default=2.5, show_default=True, type=NumberRange(0.2, 100), help="From vehicle to screens, m."
 )
-@click.option("--picture", default="1280x1024", show_default=True, help="Picture size, WIDTHxHEIGHT in pixels.")
+@click.option(
+    "--picture",
+    default="1280x1024",
+    show_default=True,
+    type=ImageSize(10),
+    metavar="WxH",
+    help="Picture size, width and height in pixels.",
+)
 def init(
     folder: Path,
-    screens: int | None,
-    cameras: int | None,
-    beams: int | None,
-    rate: float | None,
     distance: float,
-    picture: str,
+    picture: tuple[int, int],
+    **given: float | None,
 ) -> None:
     """Write a commented rig.yaml and run.yaml to start from, with simulated points to try them.
 
@@ -111,20 +124,9 @@ def init(
     """
     from lab.setup.init import Layout, start
 
-    values = _asked({"screens": screens, "cameras": cameras, "beams": beams, "rate": rate})
-    layout = Layout(
-        int(values["cameras"]), int(values["screens"]), int(values["beams"]), distance, _picture_size(picture)
-    )
+    values = _asked(given)
+    layout = Layout(int(values["cameras"]), int(values["screens"]), int(values["beams"]), distance, picture)
     conclude(start(folder, layout, values["rate"]))
-
-
-def _picture_size(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d{2,5})[xX](\d{2,5})", text.strip())
-    if match is None:
-        raise click.BadParameter(
-            f"expected WIDTHxHEIGHT in pixels such as 1280x1024, got {text!r}", param_hint="--picture"
-        )
-    return int(match[1]), int(match[2])
 
 
 @click.command()

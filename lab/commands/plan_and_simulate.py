@@ -16,6 +16,7 @@ from lab.commands.common import (
     conclude,
     progress_bar,
     read_settings,
+    seed_option,
     show_line,
 )
 
@@ -38,9 +39,7 @@ def _six_numbers(ctx: click.Context, parameter: click.Parameter, text: str | Non
 @click.command()
 @click.argument("scenario", shell_complete=complete_scenarios)
 @click.option("--out", type=FOLDER, help="The run folder to write; it must not exist yet.")
-@click.option(
-    "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="The same seed gives the same bytes."
-)
+@seed_option
 @click.option("--frames", type=click.IntRange(min=1), help="Number of frames; default: that of the scenario.")
 @click.option("--video", is_flag=True, help="One lossless video per camera instead of PNG files.")
 @click.option("--points", is_flag=True, help="No pictures: a detections.csv with noise of --noise-px.")
@@ -62,25 +61,18 @@ def _six_numbers(ctx: click.Context, parameter: click.Parameter, text: str | Non
 )
 @click.option("--start", callback=_six_numbers, help="Middle of the motion: X,Y,Z,YAW,PITCH,ROLL, m and deg.")
 @click.option("--trajectory", type=ANY_PATH, help="A table of poses, as truth/pose.csv, instead of the motion.")
-@click.option("--rate", type=NumberRange(0.1, 1e6), help="Frames per second, instead of those of the scenario.")
-@click.option("--exposure", type=NumberRange(0, 10, min_open=True), help="Exposure time, s, instead of the scenario's.")
+@click.option(
+    "--rate", "frame_rate_hz", type=NumberRange(0.1, 1e6), help="Frames per second, instead of those of the scenario."
+)
+@click.option(
+    "--exposure",
+    "exposure_s",
+    type=NumberRange(0, 10, min_open=True),
+    help="Exposure time, s, instead of the scenario's.",
+)
+@click.pass_context
 def simulate(
-    scenario: str,
-    out: Path | None,
-    seed: int,
-    frames: int | None,
-    video: bool,
-    points: bool,
-    noise_px: float,
-    clutter: float | None,
-    light: str | None,
-    scale: float,
-    rig: Path | None,
-    known_rig: Path | None,
-    start: tuple[float, ...] | None,
-    trajectory: Path | None,
-    rate: float | None,
-    exposure: float | None,
+    ctx: click.Context, /, scenario: str, out: Path | None, points: bool, scale: float, start: Any, **options: Any
 ) -> None:
     """Write a simulated recording with its truth; SCENARIO `list` lists all scenarios.
 
@@ -107,14 +99,11 @@ def simulate(
     if scenario == STEREO:
         from lab.targets.stereo.simulated_recording import write_stereo_recording
 
-        unused = {
-            "--video": video, "--clutter": clutter, "--light": light, "--rig": rig, "--known-rig": known_rig,
-            "--start": start, "--trajectory": trajectory, "--rate": rate, "--exposure": exposure,
-        }  # fmt: skip
-        for option, value in unused.items():
-            if value not in (None, False):
-                raise click.UsageError(f"{option}: scenario {STEREO} does not have this option.")
-        folder = write_stereo_recording(out, seed=seed, frames=frames, points=points, noise_px=noise_px, scale=scale)
+        known = {name: options.pop(name) for name in ("seed", "frames", "noise_px")}
+        for parameter in ctx.command.params:
+            if {"start": start, **options}.get(str(parameter.name)) not in (None, False):
+                raise click.UsageError(f"{parameter.opts[0]}: scenario {STEREO} does not have this option.")
+        folder = write_stereo_recording(out, points=points, scale=scale, **known)
         show_line(f"run: {folder}")
         return
     notes: list[str] = []
@@ -122,22 +111,12 @@ def simulate(
         folder = write_run(
             scenario,
             out,
-            seed=seed,
-            frames=frames,
-            video=video,
             detections_only=points,
-            light=light,
-            clutter=clutter,
-            noise_px=noise_px,
             picture_scale=scale,
-            rig=rig,
-            known_rig=known_rig,
             start=None if start is None else Pose.from_ypr(np.deg2rad(start[3:]), np.array(start[:3])),
-            trajectory=trajectory,
-            frame_rate_hz=rate,
-            exposure_s=exposure,
             progress=progress,
             note=notes.append,
+            **options,
         )
     for line in notes:
         show_line(line)
@@ -177,7 +156,7 @@ def _ranges(
 @click.option("--goal-mm", type=NumberRange(min=0, min_open=True), help="The position sigma to reach.")
 @click.option(
     "--expect",
-    "settings",
+    "expected",
     multiple=True,
     metavar="NAME=VALUE",
     callback=read_settings,
@@ -187,10 +166,8 @@ def plan(
     rig: Path,
     out: Path,
     ranges: dict[str, tuple[float, float, int]],
-    sigma_px: float | None,
-    goal_deg: float | None,
     goal_mm: float | None,
-    settings: dict[str, Any],
+    **options: Any,
 ) -> None:
     """Predict which spots a planned rig will see, and how well it will measure.
 
@@ -202,5 +179,4 @@ def plan(
     from lab.setup.plan_findings import options_of
 
     goal_m = None if goal_mm is None else goal_mm / 1000
-    options = options_of(ranges, sigma_px=sigma_px, goal_deg=goal_deg, goal_m=goal_m, expected=settings)
-    conclude(plan_rig(rig, out, options))
+    conclude(plan_rig(rig, out, options_of(ranges, goal_m=goal_m, **options)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -36,15 +37,7 @@ def check(path: Path) -> None:
 @click.option("--to", "last", type=int, help="With --video: last frame number.")
 @click.option("--every", type=click.IntRange(min=1), help="With --video: only each so many frames.")
 @click.option("--fps", type=NumberRange(1, 240), help="With --video: its frames per second; default: 25.")
-def report(
-    results: Path,
-    run_folder: Path | None,
-    video: bool,
-    first: int | None,
-    last: int | None,
-    every: int | None,
-    fps: float | None,
-) -> None:
+def report(results: Path, run_folder: Path | None, video: bool, **shown: Any) -> None:
     """Write report.html of a result folder again, with --video also a video of its pictures.
 
     \b
@@ -52,7 +45,8 @@ def report(
         beampose report results/huo2015
         beampose report results/huo2015 --video --from 0 --to 30
     """
-    if not video and (first, last, every, fps) != (None, None, None, None):
+    given = {name: value for name, value in shown.items() if value is not None}
+    if not video and given:
         raise click.UsageError("--from, --to, --every and --fps are of the video; add --video")
     from lab.report.run.page import write_report
     from lab.runs.process import are_results
@@ -61,12 +55,10 @@ def report(
         raise InputError(f"{results}: expected a folder that `beampose run` wrote, found no summary.json of one")
     show_line(f"report: {write_report(results, run_folder)}")
     if video:
-        from lab.results.show import DEFAULT_FPS, write_video
+        from lab.results.show import write_video
 
         with progress_bar(results.name) as progress:
-            done = write_video(
-                results, run_folder, first=first, last=last, every=every or 1, fps=fps or DEFAULT_FPS, progress=progress
-            )
+            done = write_video(results, run_folder, progress=progress, **given)
         conclude(done)
 
 
@@ -116,16 +108,7 @@ def _read_align(ctx: click.Context, parameter: click.Parameter, value: str | Non
 @click.option(
     "--sigma-deg", type=NumberRange(0, 1e6), default=0.0, help="Sigma of the reference's angles, if it has none."
 )
-def compare(
-    result: Path,
-    other: Path | None,
-    reference: Path | None,
-    out: Path | None,
-    align: tuple[str, ...] | None,
-    offset_s: float | None,
-    sigma_m: float,
-    sigma_deg: float,
-) -> None:
+def compare(result: Path, other: Path | None, reference: Path | None, out: Path | None, **options: Any) -> None:
     """Compare a result with another one, or with a reference.
 
     The time offset, the clock rate and the frames of the reference are estimated. What the motion does not determine is
@@ -137,10 +120,7 @@ def compare(
     """
     from lab.results.compare_page import compare_and_write
 
-    found = compare_and_write(
-        result, other, reference, out, align=align, offset_s=offset_s, sigma_m=sigma_m, sigma_deg=sigma_deg
-    )
-    conclude(found)
+    conclude(compare_and_write(result, other, reference, out, **options))
 
 
 # `beampose view`: a rig, a run or results in three dimensions.

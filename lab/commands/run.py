@@ -37,13 +37,13 @@ causal_option = click.option(
 @click.pass_context
 def run(
     ctx: click.Context,
+    /,
     run_folder: Path,
     out: Path,
-    causal: bool,
     full_hash: bool,
     verbose: bool,
     quiet: bool,
-    settings: dict[str, Any],
+    **options: Any,
 ) -> None:
     """Process one run folder: tables, summary.json, report.html and run.log.
 
@@ -61,7 +61,7 @@ def run(
 
     videos = sorted(out.glob("overlay.*"))  # of the earlier results in this folder
     with shown(run_folder.name, verbose=verbose, quiet=quiet) as progress:
-        outcome = process_run(run_folder, out, overrides=settings, causal=causal, progress=progress, more=more)
+        outcome = process_run(run_folder, out, progress=progress, more=more, **options)
     gone = "removed with the earlier results; make it again with `beampose report"
     conclude(outcome, quiet=quiet, notes=[f"{video}: {gone} {out} --video`" for video in videos])
 
@@ -73,14 +73,7 @@ def run(
 @click.option("--every", default=1, show_default=True, type=click.IntRange(min=1), help="Use every N-th picture only.")
 @click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
 @set_option
-def detect(
-    pictures: tuple[Path, ...],
-    out: Path,
-    camera: str | None,
-    every: int,
-    limit: int | None,
-    settings: dict[str, Any],
-) -> None:
+def detect(pictures: tuple[Path, ...], out: Path, **options: Any) -> None:
     """Find the spots in pictures or a video, without a rig: table, contact sheet, noise, sizes and signal.
 
     A folder of pictures, picture files, a pattern such as 'shots/*.png', or one video.
@@ -91,9 +84,8 @@ def detect(
     """
     from lab.runs.detect.detect import DetectOptions, detect_pictures
 
-    options = DetectOptions(camera, every, limit, settings)
     with progress_bar("pictures") as progress:
-        outcome = detect_pictures(list(pictures), out, options, progress)
+        outcome = detect_pictures(list(pictures), out, DetectOptions(**options), progress)
     conclude(outcome)
 
 
@@ -124,15 +116,14 @@ def detect(
 @click.pass_context
 def watch(
     ctx: click.Context,
+    /,
     run_folder: Path,
     out: Path,
-    udp: str | None,
     idle: float,
     timeout: float,
-    reprocess: bool,
     verbose: bool,
     quiet: bool,
-    settings: dict[str, Any],
+    **options: Any,
 ) -> None:
     """Process a run while it is recorded: the pose of every frame as it arrives.
 
@@ -149,15 +140,6 @@ def watch(
     from lab.runs.watch.watch import stopped_by_ctrl_c, watch_run
 
     with shown(run_folder.name, verbose=verbose, quiet=quiet) as progress, stopped_by_ctrl_c() as stop:
-        outcome = watch_run(
-            run_folder,
-            out,
-            udp=udp,
-            reprocess=reprocess,
-            options=WatchOptions(idle, timeout),
-            overrides=settings,
-            progress=progress,
-            stop=stop,
-            provenance=provenance(ctx),
-        )
+        waiting, typed = WatchOptions(idle, timeout), provenance(ctx)
+        outcome = watch_run(run_folder, out, options=waiting, progress=progress, stop=stop, provenance=typed, **options)
     conclude(outcome, quiet=quiet)

@@ -16,6 +16,7 @@ from lab.commands.common import (
     progress_bar,
     provenance,
     read_settings,
+    valid_days_option,
 )
 
 if TYPE_CHECKING:
@@ -48,11 +49,20 @@ def _track(ctx: click.Context, target: Target[Any], given: Path, out: Path) -> N
 @track.command()
 @click.argument("pictures", metavar="VIDEO_OR_FOLDER", type=ANY_PATH)
 @click.option("--out", required=True, type=FOLDER, help="Gets circle.csv, summary.json and report.html.")
-@click.option("--near", type=(_PIXEL, _PIXEL), metavar="U V", help="Centre of the first circle, px, within 20 px.")
 @click.option(
-    "--min-radius", default=7.0, show_default=True, type=NumberRange(4, 10_000), help="Smallest radius to look for, px."
+    "--near", "near_px", type=(_PIXEL, _PIXEL), metavar="U V", help="Centre of the first circle, px, within 20 px."
 )
-@click.option("--max-radius", type=NumberRange(4, 10_000), help="Largest one; default: half of the smaller side.")
+@click.option(
+    "--min-radius",
+    "min_radius_px",
+    default=7.0,
+    show_default=True,
+    type=NumberRange(4, 10_000),
+    help="Smallest radius to look for, px.",
+)
+@click.option(
+    "--max-radius", "max_radius_px", type=NumberRange(4, 10_000), help="Largest one; default: half of the smaller side."
+)
 @click.option(
     "--edge",
     default="supported",
@@ -60,7 +70,7 @@ def _track(ctx: click.Context, target: Target[Any], given: Path, out: Path) -> N
     type=click.Choice(["supported", "outer", "inner", "opening"]),
     help="Which edge, where a target has several: of the rim, of a thin rim's inner side, of the opening inside it.",
 )
-@click.option("--rate", type=NumberRange(0.01, 1e6), help="Frames per second; default: the video's, or 25.")
+@click.option("--rate", "rate_hz", type=NumberRange(0.01, 1e6), help="Frames per second; default: the video's, or 25.")
 @click.option(
     "--form",
     default="sound",
@@ -76,22 +86,11 @@ def _track(ctx: click.Context, target: Target[Any], given: Path, out: Path) -> N
     help="What proposes circles: votes of gradients, or a network that was trained on rendered drogues.",
 )
 @click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
-@click.option("--video", is_flag=True, help="Also write overlay.mp4: the pictures with the circle drawn into them.")
+@click.option(
+    "--video", "overlay", is_flag=True, help="Also write overlay.mp4: the pictures with the circle drawn into them."
+)
 @click.pass_context
-def circle(
-    ctx: click.Context,
-    pictures: Path,
-    out: Path,
-    near: tuple[float, float] | None,
-    min_radius: float,
-    max_radius: float | None,
-    edge: str,
-    rate: float | None,
-    form: str,
-    detector: str,
-    limit: int | None,
-    video: bool,
-) -> None:
+def circle(ctx: click.Context, /, pictures: Path, out: Path, **options: Any) -> None:
     """Track a circle (the rim of a drogue, a ring, a disc): centre, radius, rates, sigmas and occlusion.
 
     The circle is found by itself in the first pictures. Where several circles fit equally well, none is chosen: state
@@ -103,10 +102,7 @@ def circle(
     """
     from lab.targets.circle import CircleOptions, CircleTarget
 
-    options = CircleOptions(
-        near, min_radius, max_radius, form, detector, edge, rate_hz=rate, overlay=video, limit=limit
-    )
-    _track(ctx, CircleTarget(options), pictures, out)
+    _track(ctx, CircleTarget(CircleOptions(**options)), pictures, out)
 
 
 # `beampose track drogue`: a refuelling drogue, by the learned detector and the light tracker.
@@ -115,9 +111,12 @@ def circle(
 @click.command()
 @click.argument("pictures", metavar="VIDEO_OR_FOLDER", type=ANY_PATH)
 @click.option("--out", required=True, type=FOLDER, help="Gets drogue.csv, summary.json and report.html.")
-@click.option("--near", type=(_PIXEL, _PIXEL), metavar="U V", help="Centre of the first drogue, px, within 20 px.")
+@click.option(
+    "--near", "near_px", type=(_PIXEL, _PIXEL), metavar="U V", help="Centre of the first drogue, px, within 20 px."
+)
 @click.option(
     "--every",
+    "check_every",
     default=5,
     show_default=True,
     type=click.IntRange(1, 1000),
@@ -125,28 +124,25 @@ def circle(
 )
 @click.option(
     "--min-diameter",
+    "smallest_px",
     default=8.0,
     show_default=True,
     type=NumberRange(8, 10_000),
     help="Smallest diameter to look for, px.",
 )
-@click.option("--max-diameter", type=NumberRange(8, 10_000), help="Largest one; default: the picture's smaller side.")
-@click.option("--rate", type=NumberRange(0.01, 1e6), help="Frames per second; default: the video's, or 25.")
+@click.option(
+    "--max-diameter",
+    "largest_px",
+    type=NumberRange(8, 10_000),
+    help="Largest one; default: the picture's smaller side.",
+)
+@click.option("--rate", "rate_hz", type=NumberRange(0.01, 1e6), help="Frames per second; default: the video's, or 25.")
 @click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
-@click.option("--video", is_flag=True, help="Also write overlay.mp4: the pictures with the drogue drawn into them.")
+@click.option(
+    "--video", "overlay", is_flag=True, help="Also write overlay.mp4: the pictures with the drogue drawn into them."
+)
 @click.pass_context
-def drogue(
-    ctx: click.Context,
-    pictures: Path,
-    out: Path,
-    near: tuple[float, float] | None,
-    every: int,
-    min_diameter: float,
-    max_diameter: float | None,
-    rate: float | None,
-    limit: int | None,
-    video: bool,
-) -> None:
+def drogue(ctx: click.Context, /, pictures: Path, out: Path, **options: Any) -> None:
     """Track a refuelling drogue: centre, diameter, sigmas and confidence.
 
     A learned detector finds the drogue in the whole picture and checks it every few frames; in between, a light tracker
@@ -159,8 +155,7 @@ def drogue(
     """
     from lab.targets.drogue import DrogueOptions, DrogueTarget
 
-    options = DrogueOptions(near, every, min_diameter, max_diameter, rate_hz=rate, overlay=video, limit=limit)
-    _track(ctx, DrogueTarget(options), pictures, out)
+    _track(ctx, DrogueTarget(DrogueOptions(**options)), pictures, out)
 
 
 # `beampose track point`: the centre of one target.
@@ -192,10 +187,18 @@ def _place(ctx: click.Context, parameter: click.Parameter, value: str | None) ->
 )
 @click.option("--colour", metavar="NAME", help="Of a coloured target: red, orange, yellow, green, cyan, blue, magenta,"
               " or #rrggbb.")  # fmt: skip
-@click.option("--start", metavar="U,V", callback=_place, help="Where the target is at the start, px; default: the"
-              " brightest one.")  # fmt: skip
 @click.option(
-    "--frame-rate", type=NumberRange(min=1e-6, max=1e6), help="Pictures per second; default: that of the video or t_s."
+    "--start",
+    "start_px",
+    metavar="U,V",
+    callback=_place,
+    help="Where the target is at the start, px; default: the brightest one.",
+)
+@click.option(
+    "--frame-rate",
+    "rate_hz",
+    type=NumberRange(min=1e-6, max=1e6),
+    help="Pictures per second; default: that of the video or t_s.",
 )
 @click.option("--camera", help="The camera, for a table with several.")
 @click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
@@ -209,27 +212,14 @@ def _place(ctx: click.Context, parameter: click.Parameter, value: str | None) ->
 @click.option("--overlay", is_flag=True, help="Also write overlay.mp4: the pictures with the track.")
 @click.option(
     "--set",
-    "settings",
+    "overrides",
     multiple=True,
     metavar="NAME=VALUE",
     callback=read_settings,
     help="A parameter, e.g. --set track.sigma_model_px=0.5, detect.threshold_sigma=5 or blobs.max_size_px=100.",
 )
 @click.pass_context
-def point(
-    ctx: click.Context,
-    source: Path,
-    out: Path,
-    detector: str,
-    colour: str | None,
-    start: tuple[float, float] | None,
-    frame_rate: float | None,
-    camera: str | None,
-    limit: int | None,
-    min_measured: float,
-    overlay: bool,
-    settings: dict[str, Any],
-) -> None:
+def point(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     """Track the centre of one target: position, velocity and covariance in every frame.
 
     A video, a folder of pictures, or a CSV table with frame,u_px,v_px (such as detections.csv). A constant-velocity
@@ -241,10 +231,7 @@ def point(
     """
     from lab.targets.point import PointOptions, PointTarget
 
-    options = PointOptions(
-        detector, start, camera, min_measured, settings, colour, rate_hz=frame_rate, overlay=overlay, limit=limit
-    )
-    _track(ctx, PointTarget(options), source, out)
+    _track(ctx, PointTarget(PointOptions(**options)), source, out)
 
 
 # `beampose stereo`: the pose of a target with coloured markers from a pair of cameras.
@@ -278,13 +265,7 @@ def stereo(run_folder: Path, out: Path) -> None:
 @click.option("--out", required=True, type=FOLDER, help="Gets pair.yaml, pairs.csv and report.html.")
 @click.option("--names", default="left,right", show_default=True, help="Names of the two cameras.")
 @click.option("--lens", default="auto", show_default=True, help="0, 4, 5, 8, 12 or fisheye; auto: by views held out.")
-@click.option(
-    "--valid-days",
-    default=365,
-    show_default=True,
-    type=click.IntRange(min=1),
-    help="Validity of the calibration, days.",
-)
+@valid_days_option
 def pair(left: Path, right: Path, board: str, out: Path, names: str, lens: str, valid_days: int) -> None:
     """Calibrate two cameras and their relative pose from photos of a board, for `beampose stereo`.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -314,17 +313,9 @@ def _decades(lo: float, hi: float) -> np.ndarray:
 
 
 def compare_and_write(
-    result: Path,
-    other: Path | None,
-    reference: Path | None,
-    out: Path | None,
-    *,
-    align: Sequence[str] | None = None,
-    offset_s: float | None = None,
-    sigma_m: float = 0.0,
-    sigma_deg: float = 0.0,
+    result: Path, other: Path | None, reference: Path | None, out: Path | None, **options: Any
 ) -> Done[Comparison]:
-    """Compare, and write tables and report where `out` is given. The other arguments: `lab.results.compare.compare`.
+    """Compare, and write tables and report where `out` is given. The options: `lab.results.compare.compare`.
 
     Raises:
         InputError: the input cannot be compared, or `out` cannot be written.
@@ -332,7 +323,7 @@ def compare_and_write(
     own = earlier_results(SUMMARY)
     if out is not None:
         check_output_folder(out, own)
-    found = compare(result, other, reference, align=align, offset_s=offset_s, sigma_m=sigma_m, sigma_deg=sigma_deg)
+    found = compare(result, other, reference, **options)
     lines = tuple(lines_of(found))
     if out is None:
         return Done(found, lines)
