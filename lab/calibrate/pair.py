@@ -30,7 +30,7 @@ from lab.findings.outcome import Outcome
 from lab.number_format import format_length, format_number
 from lab.pictures.source import number_of
 from lab.progress import Progress
-from lab.report.calibration.calibration_page import KeyFigure, PageTable, Section
+from lab.report.page import KeyFigure, PageTable, Section
 from tracking.binocular.marker_model import StereoPair, calibration_jacobian, project
 
 # Findings of a pair's calibration, and the uncertainty of distances that it leaves.
@@ -126,7 +126,7 @@ def _range(pair: CalibratedPair) -> Finding:
 
 PAIR, FAILED, PAIRS = "pair.yaml", "pair.failed.yaml", "pairs.csv"
 PAIR_COLUMNS = ("number", "rms_px", "separated")
-_STEP = Step("Pair", (PAIRS,), PAIR)
+_STEP = Step("pair", (PAIRS,), PAIR)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ The runner checks the folder, solves, judges by the findings, keeps earlier good
 from __future__ import annotations
 
 import datetime
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,27 +15,29 @@ from typing import Generic, TypeVar
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project
 from lab.files.text.atomic_write import atomic_folder, check_output_folder, earlier_results, keep_good_results
+from lab.files.text.json_text import bytes_of_file
 from lab.findings.finding import Finding, Level, finding, verdict
 from lab.findings.outcome import Outcome, Verdict
-from lab.report.calibration.calibration_page import (
-    CalibrationReport,
-    KeyFigure,
-    Section,
-    provenance,
-    write_calibration_report,
-)
+from lab.report.page import KeyFigure, Page, Section, made_with, write_page
+from lab.report.page import Verdict as PageVerdict
 
 R = TypeVar("R")
+_SENTENCES = (
+    "The result may be used.",
+    "The result may be used; note the warnings below.",
+    "The result must not be used.",
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
     """What all calibrations of one kind share."""
 
-    kind: str  # of the report, one of its KINDS
+    kind: str  # of the report
     own: tuple[str, ...]  # files by which a folder of earlier results is recognised
     good: str = ""  # file of a usable result, which a FAIL does not replace; empty: each result replaces the last one
     failed_status: int = CalibrationError.exit_status  # exit status of a FAIL
+    sentences: tuple[str, str, str] = _SENTENCES  # of the verdict, by level
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,13 +79,32 @@ def run_step(step: Step, out: Path, solve: Callable[[], Solved[R]]) -> Outcome[R
     level = verdict(solved.findings)
     folder = keep_good_results(out, level is Level.FAIL, step.good) if step.good else Path(out)
     key_figures, sections = solved.page()
-    title, made = solved.title or solved.name, provenance(solved.inputs, solved.day)
-    report = CalibrationReport(step.kind, title, level, solved.findings, key_figures, sections, made)
+    judgement = PageVerdict(level, step.sentences[level], solved.findings, ("PASS", "WARN", "FAIL"))
+    page = Page(
+        f"calibration · {step.kind}", solved.title or solved.name, f"{solved.day.isoformat()} · {judgement.counted}",
+        sections, key_figures, made=made_of(solved.inputs, solved.day), verdict=judgement,
+    )  # fmt: skip
     with atomic_folder(folder, own) as work:
         solved.write(work)
-        write_calibration_report(report, work)
+        write_page(page, work)
     judged = Verdict(solved.findings)
     return Outcome(solved.name, folder, judged, solved.result, _said(solved, level), failed_status=step.failed_status)
+
+
+def made_of(inputs: Sequence[Path], day: datetime.date) -> list[tuple[str, str]]:
+    """The date, the version of the program and the SHA-256 of the input files.
+
+    Raises:
+        InputError: for an input that cannot be read.
+    """
+    lines = [("date", day.isoformat()), made_with()]
+    for path in inputs:
+        try:
+            digest = hashlib.sha256(bytes_of_file(Path(path))).hexdigest()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+        lines.append(("" if len(lines) > 2 else "inputs", f"{Path(path).name}  sha256 {digest[:16]}"))
+    return lines
 
 
 # Date of a calibration and end of its validity.

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from lab.files.text.atomic_write import atomic_folder, atomic_write_text, check_output_folder, earlier_results
+from lab.files.text.atomic_write import atomic_folder, check_output_folder, earlier_results
 from lab.files.text.csv_text import write_table
 from lab.files.text.json_text import write_json
 from lab.findings.outcome import Done
 from lab.number_format import format_number, format_percent, format_with_sigma
-from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section, section_context
-from lab.report.html import environment
+from lab.report.page import Page, PageDrawing, PageTable, Section, made_with
+from lab.report.page import write_page as write_report
 from lab.report.plot.axes import (
     BLUE,
     GREEN,
@@ -140,22 +140,17 @@ _COLOURS = (BLUE, ORANGE, GREEN)
 def write_page(comparison: Comparison, folder: Path) -> Path:
     """Write report.html into a folder. Returns its path."""
     sections = [_alignment(comparison), _curves(comparison), _table(comparison), _allan(comparison.still)]
-    own = versions()
-    context: dict[str, Any] = {
-        "name": f"{comparison.result.name} and {comparison.other.name}",
-        "source": "result against a reference" if comparison.is_reference else "two results",
-        "key_figures": _key_figures(comparison),
-        "notes": [*undetermined_lines(comparison.estimate), *comparison.notes],
-        "sections": [section_context(s) for s in sections if s is not None],
-        "made": [
-            ("result", str(comparison.result)),
-            ("reference" if comparison.is_reference else "other result", str(comparison.other)),
-            ("beampose", f"{own['beampose']}, numpy {own['numpy']}, scipy {own['scipy']}"),
-        ],
-    }
-    path = folder / "report.html"
-    atomic_write_text(environment().get_template("compare.html.j2").render(context), path)
-    return path
+    of_two = "reference" if comparison.is_reference else "other result"
+    page = Page(
+        "comparison",
+        f"{comparison.result.name} and {comparison.other.name}",
+        "result against a reference" if comparison.is_reference else "two results",
+        [s for s in sections if s is not None],
+        _key_figures(comparison),
+        [*undetermined_lines(comparison.estimate), *comparison.notes],
+        [("result", str(comparison.result)), (of_two, str(comparison.other)), made_with("numpy", "scipy")],
+    )
+    return write_report(page, folder)
 
 
 def _key_figures(comparison: Comparison) -> list[tuple[str, str, str]]:

@@ -19,7 +19,12 @@ from lab.setup.plan_page import page_of, write_effects, write_plan
 TABLE, EFFECTS = "plan.csv", "effects.csv"
 
 
-_STEP = Step("Plan", (TABLE,), failed_status=QUALITY_GATE_FAILED)
+_SENTENCES = (
+    "This rig suits the range of poses.",
+    "This rig can be built; note the warnings below.",
+    "This rig does not suit the range of poses.",
+)
+_STEP = Step("plan", (TABLE,), failed_status=QUALITY_GATE_FAILED, sentences=_SENTENCES)
 
 
 def plan_rig(rig_path: Path, out: Path, options: PlanOptions | None = None) -> Outcome[Plan]:

@@ -16,13 +16,13 @@ from geometry.arrays import Array
 from lab import number_format
 from lab.files.text.csv_text import write_table
 from lab.number_format import format_angle, format_length, format_percent
-from lab.report.calibration.calibration_page import (
+from lab.report.calibration.calibration_scene import rig_things, scene_views
+from lab.report.page import (
     KeyFigure,
     PageDrawing,
     PageTable,
     Section,
 )
-from lab.report.calibration.calibration_scene import rig_things, scene_views
 from lab.report.plot.axes import BLUE, number, text
 from lab.report.plot.maps import colours, heat_map, hex_colour
 from lab.setup.plan_findings import (

@@ -14,7 +14,7 @@ from lab.errors import InputError
 from lab.findings.finding import Finding, Level, finding
 from lab.number_format import format_percent
 from lab.progress import Progress
-from lab.report.calibration.calibration_page import PageTable, Section
+from lab.report.page import PageTable, Section
 from lab.report.plot.axes import BLUE, VERMILLION
 from lab.report.plot.series import Line
 from lab.runs.processed import quantiles

@@ -1,4 +1,4 @@
-"""report.html of a target: the page of verdict, key figures and sections, and what all targets in one camera show."""
+"""report.html of a target in one camera: what all kinds of targets show."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from geometry.arrays import Array
-from lab.files.text.atomic_write import atomic_write_text
-from lab.findings.finding import Finding, Level, verdict
+from lab.findings.finding import Finding, verdict
 from lab.number_format import format_number, format_percent
-from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section, section_context
-from lab.report.html import environment
+from lab.report.page import Page, PageDrawing, PageTable, Section, Verdict, made_with, write_page
 from lab.report.plot.axes import (
     BLUE,
     SKY,
@@ -30,7 +28,6 @@ from lab.report.plot.axes import (
 )
 from lab.report.plot.series import Band, Line, Shade, time_panel
 from lab.targets.target import F, Target, Track
-from lab.versions import versions
 from tracking.statuses import PoseStatus
 
 _EVENTS = {
@@ -42,58 +39,23 @@ _MOST_EVENTS = 60  # rows of the table
 _MOST_DOTS = 6000
 
 
-def write_page(
-    folder: Path,
-    maker: str,
-    name: str,
-    source: Path,
-    findings: Sequence[Finding],
-    sentences: tuple[str, str, str],
-    key_figures: Sequence[tuple[str, str, str]],
-    notes: Sequence[str],
-    sections: Sequence[Section],
-    method: str,
-) -> Path:
-    """Write report.html into a folder. Returns its path.
-
-    maker: what the results are, such as "tracked circle"; sentences: of a verdict PASS, CHECK and FAIL.
-    """
-    level, own = verdict(findings), versions()
-    context = {
-        "maker": maker,
-        "name": name,
-        "source": str(source),
-        "status": level.word,
-        "sentence": sentences[level],
-        "findings": [(f.level.word, f) for f in findings],
-        "key_figures": key_figures,
-        "notes": notes,
-        "sections": [section_context(s) for s in sections],
-        "made": [
-            ("method", method),
-            ("beampose", f"{own['beampose']}, numpy {own['numpy']}, OpenCV {own['opencv-python-headless']}"),
-        ],
-    }
-    path = folder / "report.html"
-    atomic_write_text(environment().get_template("target.html.j2").render(context), path)
-    return path
-
-
 def write_target_page(target: Target[F], track: Track[F], findings: Sequence[Finding], folder: Path) -> Path:
     """Write the page of a target in one camera into a folder. Returns its path."""
-    sentences = {
-        Level.PASS: f"The {target.subject} was followed.",
-        Level.WARN: f"The {target.subject} was followed; note the warnings below.",
-        Level.FAIL: "The results must not be used as they are.",
-    }
+    level = verdict(findings)
+    sentence = (
+        f"The {target.subject} was followed.",
+        f"The {target.subject} was followed; note the warnings below.",
+        "The results must not be used as they are.",
+    )[level]
     own = target.key_figures(track) if track.measured.any() else []
     sections = [_motion(target, track), *target.sections(track), *_path(track), *_events(target, track)]
     recording = track.recording
-    return write_page(
-        folder, f"tracked {target.subject}", recording.name, recording.path, findings,
-        (sentences[Level.PASS], sentences[Level.WARN], sentences[Level.FAIL]), [*_key_figures(target, track), *own],
-        recording.notes, sections, target.method(),
+    made = ("method", target.method()), made_with("numpy", "opencv-python-headless")
+    page = Page(
+        f"tracked {target.subject}", recording.name, str(recording.path), sections,
+        [*_key_figures(target, track), *own], recording.notes, made, Verdict(level, sentence, findings),
     )  # fmt: skip
+    return write_page(page, folder)
 
 
 def _key_figures(target: Target[F], track: Track[F]) -> list[tuple[str, str, str]]:

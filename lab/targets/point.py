@@ -21,7 +21,7 @@ from lab.number_format import format_number, format_percent
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import PictureSource, open_inputs, pictures_of_frames
 from lab.progress import Progress
-from lab.report.calibration.calibration_page import Section
+from lab.report.page import Section
 from lab.report.plot.axes import VERMILLION, histogram
 from lab.report.plot.series import Line
 from lab.runs.frames.sensor_noise import CameraNoise, noise_frames

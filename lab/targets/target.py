@@ -16,7 +16,7 @@ from lab.findings.finding import Finding
 from lab.pictures.picture_file import GreyPicture
 from lab.pictures.source import PictureSource, Video, open_inputs
 from lab.progress import Progress
-from lab.report.calibration.calibration_page import Section
+from lab.report.page import Section
 from lab.targets.recording import DEFAULT_RATE_HZ, Recording, every_frame, read_pictures
 from tracking.statuses import Cause, PoseStatus
 

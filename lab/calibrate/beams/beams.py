@@ -37,7 +37,7 @@ from lab.findings.outcome import Outcome
 RIG = "rig.yaml"
 
 
-_STEP = Step("Beams", (BEAMS,), RIG)
+_STEP = Step("beams", (BEAMS,), RIG)
 
 
 def calibrate_beams(

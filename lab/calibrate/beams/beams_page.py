@@ -22,13 +22,13 @@ from lab.files.text.csv_text import csv_text
 from lab.number_format import format_number
 from lab.report.calibration.calibration_charts import residual_histogram
 from lab.report.calibration.calibration_drawings import coverage_map, residual_field
-from lab.report.calibration.calibration_page import (
+from lab.report.calibration.calibration_scene import rig_things, scene_views
+from lab.report.page import (
     KeyFigure,
     PageDrawing,
     PageTable,
     Section,
 )
-from lab.report.calibration.calibration_scene import rig_things, scene_views
 
 BEAMS, ANGLES, RESIDUALS = "beams.csv", "angles.csv", "residuals.csv"
 BEAM_COLUMNS = (

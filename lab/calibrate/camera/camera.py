@@ -40,7 +40,7 @@ CAMERA, FAILED, CORNERS = "camera.yaml", "camera.failed.yaml", "corners.csv"
 CORNER_COLUMNS = ("view", "id", "u_px", "v_px", "residual_u_px", "residual_v_px", "used")  # measured minus model
 LENSES = ("auto", *(m.title for m in LENS_MODELS))
 WARPS = {"auto": None, "on": True, "off": False}
-_STEP = Step("Camera", (CORNERS,), CAMERA)
+_STEP = Step("camera", (CORNERS,), CAMERA)
 
 
 @dataclass(frozen=True, slots=True)

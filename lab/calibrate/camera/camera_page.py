@@ -16,12 +16,11 @@ from lab.pictures.opencv import opened
 from lab.pictures.picture_file import MissingPicture, read_picture
 from lab.report.calibration.calibration_charts import correlation_matrix, lens_model_chart, residual_histogram
 from lab.report.calibration.calibration_drawings import corners_overlay, coverage_map, residual_field, tilt_polar
-from lab.report.calibration.calibration_page import (
+from lab.report.page import (
     KeyFigure,
     PageDrawing,
     PageTable,
     Section,
-    representative_views,
 )
 from lab.report.plot.maps import heat_map
 
@@ -204,6 +203,22 @@ def _residuals(r: Intrinsics, photos: PhotoSet) -> Section:
         " excluded."
     )
     return Section("Residuals", words, drawings)
+
+
+def representative_views(rms_px: Array, worst: int = 4) -> list[tuple[int, str]]:
+    """Indices of the views to show as pictures, each with its rank: the worst ones, the median and the best.
+
+    rms_px (n,): nan for an unused view, which is never shown. worst: number of the worst views.
+    """
+    rms = np.asarray(rms_px, dtype=float)
+    order = [int(i) for i in np.argsort(rms, kind="stable") if np.isfinite(rms[i])]
+    named = [(i, "worst" if k == 0 else f"{k + 1}. worst") for k, i in enumerate(order[::-1][:worst])]
+    if order:
+        named += [(order[len(order) // 2], "median"), (order[0], "best")]
+    shown: dict[int, str] = {}
+    for i, word in named:
+        shown.setdefault(i, word)
+    return list(shown.items())
 
 
 def _rms_per_view(r: Intrinsics) -> Array:

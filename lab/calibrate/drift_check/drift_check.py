@@ -76,7 +76,7 @@ class CheckData:
     pose_free: bool  # whether the vehicle's pose was fitted
 
 
-_STEP = Step("Drift check", (TABLE,))
+_STEP = Step("drift check", (TABLE,))
 
 
 def check_drift(

@@ -28,8 +28,8 @@ from lab.findings.finding import Finding, Level, finding, passed
 from lab.number_format import format_number
 from lab.report.calibration.calibration_charts import DriftLine, drift_chart
 from lab.report.calibration.calibration_drawings import corners_overlay
-from lab.report.calibration.calibration_page import KeyFigure, PageDrawing, PageTable, Section
 from lab.report.calibration.calibration_scene import Marker, rig_things, scene_views
+from lab.report.page import KeyFigure, PageDrawing, PageTable, Section
 
 
 def state_findings(state: CalibrationState | None, today: datetime.date, warning_days: int) -> list[Finding]:

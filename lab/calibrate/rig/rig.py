@@ -121,7 +121,7 @@ def _records(term: RecordTerm, joint: Joint, positions: Sequence[str]) -> Iterat
 
 RIG = "rig.yaml"
 FAILED_RIG = "rig.failed.yaml"  # file name if the verdict is FAIL, so that no program reads it by mistake
-_STEP = Step("Rig", (RESIDUALS,), RIG)
+_STEP = Step("rig", (RESIDUALS,), RIG)
 _NO_FIT_LIMITS = ScreenLimits(np.inf, np.inf, factor_warn=np.inf, factor_fail=np.inf)
 _NO_SIGMA_LIMITS = BeamGoals(direction=np.inf, direction_unusable=np.inf, wrong_share=np.inf, noise_scale=np.inf)
 

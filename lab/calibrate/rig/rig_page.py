@@ -21,13 +21,13 @@ from lab.calibrate.rig.rig_findings import RigResult
 from lab.number_format import format_number
 from lab.report.calibration.calibration_charts import correlation_matrix, flatness_map, residual_histogram
 from lab.report.calibration.calibration_drawings import residual_field
-from lab.report.calibration.calibration_page import (
+from lab.report.calibration.calibration_scene import rig_things, scene_views
+from lab.report.page import (
     KeyFigure,
     PageDrawing,
     PageTable,
     Section,
 )
-from lab.report.calibration.calibration_scene import rig_things, scene_views
 
 _GAUGE_SIGMA = 3e-6  # m, rad: parameters with smaller sigmas are fixed by convention, not measured
 _TABLE_ROWS = 10  # held-out positions in the table

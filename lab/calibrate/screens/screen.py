@@ -78,7 +78,7 @@ def write_tables(result: ScreensResult, folder: Path) -> None:
 SCREENS, RIG = "screens.yaml", "rig.yaml"
 
 
-_STEP = Step("Screens", (DOTS, RESIDUALS), SCREENS)
+_STEP = Step("screens", (DOTS, RESIDUALS), SCREENS)
 
 
 def calibrate_screen(

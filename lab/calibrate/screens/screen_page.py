@@ -14,13 +14,13 @@ from lab.files.rig.rig_file import covariance_blocks
 from lab.number_format import format_number
 from lab.report.calibration.calibration_charts import correlation_matrix, flatness_map
 from lab.report.calibration.calibration_drawings import corners_overlay
-from lab.report.calibration.calibration_page import (
+from lab.report.calibration.calibration_scene import LAB_VIEWS, Marker, Rectangle, SceneObject, frustum_of, scene_views
+from lab.report.page import (
     KeyFigure,
     PageDrawing,
     PageTable,
     Section,
 )
-from lab.report.calibration.calibration_scene import LAB_VIEWS, Marker, Rectangle, SceneObject, frustum_of, scene_views
 
 _MAX_ROWS = 400  # rows in the table of observations; residuals.csv has all
 

@@ -9,18 +9,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from geometry.arrays import Array, Bools
-from lab.files.text.atomic_write import atomic_write_text
 from lab.number_format import format_number
 from lab.pictures.picture_file import GreyPicture
-from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section, section_context
 from lab.report.frames.canvas import PAPER, SOFT, Box, Canvas, Pixels, ground, png, text_size, write
-from lab.report.html import environment
+from lab.report.page import Page, PageDrawing, PageTable, Section, made_with, write_page
 from lab.report.plot.axes import (
     BLUE,
     ORANGE,
@@ -43,7 +40,6 @@ from lab.report.plot.axes import (
 )
 from lab.report.plot.series import Line, time_panel
 from lab.runs.detect.picture_series import PictureSeries, SizeGroup
-from lab.versions import versions
 from tracking.detections import Detections
 from tracking.noise_estimation.levels import LevelVariances, level_variances
 from tracking.noise_estimation.photon_transfer import NoiseEstimate
@@ -278,17 +274,11 @@ def write_detect_page(series: PictureSeries, sheet: ContactSheet, folder: Path) 
         *([_most_alike(table), _places(table, groups)] if len(table) else []),
         _noise(series, groups),
     ]
-    context: dict[str, Any] = {
-        "name": series.camera,
-        "source": series.source,
-        "key_figures": _key_figures(series, table, groups),
-        "notes": series.notes,
-        "sections": [section_context(section) for section in sections],
-        "made": _made(series),
-    }
-    path = folder / "report.html"
-    atomic_write_text(environment().get_template("detect.html.j2").render(context), path)
-    return path
+    page = Page(
+        "spots in pictures", series.camera, series.source, sections, _key_figures(series, table, groups), series.notes,
+        _made(series),
+    )  # fmt: skip
+    return write_page(page, folder)
 
 
 def _key_figures(series: PictureSeries, table: Array, groups: list[SizeGroup]) -> list[tuple[str, str, str]]:
@@ -458,8 +448,5 @@ def _with_sigma(value: float, relative: float) -> str:
 
 def _made(series: PictureSeries) -> list[tuple[str, str]]:
     p = series.parameters
-    own = versions()
-    return [
-        ("detection", f"threshold {p.threshold_sigma:g} sigma, at most {p.max_detections} spots in a picture"),
-        ("beampose", f"{own['beampose']}, numpy {own['numpy']}, OpenCV {own['opencv-python-headless']}"),
-    ]
+    searched = f"threshold {p.threshold_sigma:g} sigma, at most {p.max_detections} spots in a picture"
+    return [("detection", searched), made_with("numpy", "opencv-python-headless")]

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from geometry.arrays import Array, Ints
-from lab.findings.finding import Finding
+from lab.findings.finding import Finding, verdict
 from lab.number_format import format_angle, format_length, format_number
-from lab.report.calibration.calibration_page import PageDrawing, PageTable, Section
+from lab.report.page import Page, PageDrawing, PageTable, Section, Verdict, made_with, write_page
 from lab.report.plot.axes import BLUE, GREEN, ORANGE, VERMILLION, padded_range
 from lab.report.plot.series import Band, Line, time_panel
 from lab.runs.tables import pose_numbers
-from lab.targets.page import TimeAxis, write_page
+from lab.targets.page import TimeAxis
 from lab.targets.stereo.frames import annotated_pictures
 from lab.targets.stereo.run import StereoResults, TruthErrors
 
@@ -32,10 +32,12 @@ def write_stereo_page(results: StereoResults, findings: tuple[Finding, ...], fol
         sections.insert(1, _truth(results, results.errors))
     run = results.run
     notes = [*results.notes, *([run.notes] if run.notes else [])]
-    return write_page(
-        folder, "pose from two cameras", run.name, run.folder, findings, _SENTENCES, _key_figures(results), notes,
-        sections, _method(results),
-    )  # fmt: skip
+    level, made = verdict(findings), [("method", _method(results)), made_with("numpy", "opencv-python-headless")]
+    judgement = Verdict(level, _SENTENCES[level], findings)
+    page = Page(
+        "pose from two cameras", run.name, str(run.folder), sections, _key_figures(results), notes, made, judgement
+    )
+    return write_page(page, folder)
 
 
 def _key_figures(results: StereoResults) -> list[tuple[str, str, str]]:

@@ -1,4 +1,4 @@
-"""A calibration's report is one self-contained file of limited size with all findings; its drawings are well-formed."""
+"""A report of sections is one self-contained file of limited size with all findings; its drawings are well-formed."""
 
 from __future__ import annotations
 
@@ -12,24 +12,15 @@ import numpy as np
 import pytest
 
 from geometry.pose import Pose
+from lab.calibrate.camera.camera_page import representative_views
+from lab.calibrate.step import made_of
 from lab.errors import InputError
 from lab.findings.finding import Finding, Level
 from lab.report.calibration import calibration_charts as charts
 from lab.report.calibration import calibration_charts as maps
 from lab.report.calibration import calibration_drawings as draw
 from lab.report.calibration import calibration_scene as scene
-from lab.report.calibration.calibration_page import (
-    LARGEST_BYTES,
-    CalibrationReport,
-    PageDrawing,
-    PageTable,
-    Section,
-    cell,
-    page,
-    provenance,
-    representative_views,
-    write_calibration_report,
-)
+from lab.report.page import LARGEST_BYTES, Page, PageDrawing, PageTable, Section, Verdict, cell, html_of, write_page
 from lab.report.plot.maps import contour_levels, contour_lines, heat_map, value_range
 from tests.geometry.scenes import paper_rig
 
@@ -99,11 +90,12 @@ def all_drawings() -> dict[str, str]:
 DRAWINGS = all_drawings()
 
 
-def report(sections: list[Section], findings: list[Finding] | None = None) -> CalibrationReport:
+def report(sections: list[Section], findings: list[Finding] | None = None) -> Page:
     findings = findings if findings is not None else [Finding(Level.PASS, "fine")]
     level = max(f.level for f in findings)
     figures = [("RMS <&>", "0.2 px", "0.5 mm")]
-    return CalibrationReport("Camera", "left <b>", level, findings, figures, sections)
+    verdict = Verdict(level, "as it is", findings)
+    return Page("camera", "left <b>", verdict.counted, sections, figures, verdict=verdict)
 
 
 @pytest.mark.parametrize("name", DRAWINGS)
@@ -151,7 +143,7 @@ class _Tags(HTMLParser):
 
 def test_the_page_is_balanced_and_loads_no_external_resource():
     table = PageTable(("a", "b (px)"), [("x", 1.5), ("y", float("nan"))])
-    html = page(report([Section("s", ["w"], [*map(PageDrawing, DRAWINGS.values()), "<p>plain</p>"], table)]))
+    html = html_of(report([Section("s", ["w"], [*map(PageDrawing, DRAWINGS.values()), "<p>plain</p>"], table)]))
     tags = _Tags()
     tags.feed(html)
     assert tags.open == []
@@ -167,7 +159,7 @@ def test_all_findings_are_shown_with_reason_and_remedy_the_worst_first():
         Finding(Level.WARN, "what-warn", "why-warn", "remedy-warn"),
         Finding(Level.FAIL, "what-fail", "why-fail", "remedy-fail"),
     ]
-    html = page(report([], findings))
+    html = html_of(report([], findings))
     places = [
         html.index(w)
         for w in ("what-fail", "why-fail", "remedy-fail", "what-warn", "why-warn", "remedy-warn", "what-pass")
@@ -181,8 +173,9 @@ def test_all_names_and_texts_are_escaped():
     evil = "<script>alert(1)</script>"
     finding = Finding(Level.WARN, evil, evil, evil)
     section = Section(evil, evil, [PageDrawing("<svg></svg>", evil)], PageTable((evil,), [(evil,)]))
-    whole = CalibrationReport("Rig", evil, Level.WARN, [finding], [(evil, evil, evil)], [section])
-    assert "<script" not in page(whole)
+    verdict = Verdict(Level.WARN, evil, [finding])
+    whole = Page(evil, evil, evil, [section], [(evil, evil, evil)], [evil], [(evil, evil)], verdict)
+    assert "<script" not in html_of(whole)
 
 
 def test_a_report_of_400_views_stays_below_5_mb_and_keeps_its_table():
@@ -190,7 +183,7 @@ def test_a_report_of_400_views_stays_below_5_mb_and_keeps_its_table():
     one = draw.corners_overlay((1280, 1024), CORNERS, RESIDUALS, "view", picture=photograph)
     views = [PageDrawing(one, f"view {i}") for i in range(400)]
     rows = [(f"photograph-{i}", 0.2) for i in range(400)]
-    html = page(report([Section("views", (), views, PageTable(("view", "RMS (px)"), rows))]))
+    html = html_of(report([Section("views", (), views, PageTable(("view", "RMS (px)"), rows))]))
     assert len(html.encode()) <= LARGEST_BYTES
     assert html.count("Picture omitted") > 100
     assert "<svg" in html  # some pictures remain
@@ -207,9 +200,8 @@ def test_the_representative_views_are_the_worst_the_median_and_the_best():
 def test_the_file_is_written_atomically_and_lists_its_inputs(tmp_path: Path):
     data = tmp_path / "photo.png"
     data.write_bytes(b"123")
-    made = provenance([data], datetime.date(2026, 5, 1))
-    whole = CalibrationReport("Beams", "x", Level.PASS, [], [], [], made)
-    path = write_calibration_report(whole, tmp_path)
+    made = made_of([data], datetime.date(2026, 5, 1))
+    path = write_page(Page("beams", "x", "", [], made=made), tmp_path)
     assert path == tmp_path / "report.html"
     text = path.read_text(encoding="utf-8")
     assert "photo.png" in text
@@ -217,12 +209,10 @@ def test_the_file_is_written_atomically_and_lists_its_inputs(tmp_path: Path):
     assert "2026-05-01" in text
     assert [p.name for p in tmp_path.iterdir() if p.name.endswith(".part")] == []
     with pytest.raises(InputError, match="cannot be read"):
-        provenance([tmp_path / "missing.png"])
+        made_of([tmp_path / "missing.png"], datetime.date(2026, 5, 1))
 
 
-def test_an_unknown_kind_of_report_and_an_uneven_table_are_refused():
-    with pytest.raises(ValueError, match="kind of report"):
-        CalibrationReport("Kamera", "x", Level.PASS, [], [], [])
+def test_an_uneven_table_is_refused():
     with pytest.raises(ValueError, match="2 cells"):
         PageTable(("a",), [("b", "c")])
 

@@ -1,0 +1,171 @@
+"""A report in one self-contained HTML file: verdict, findings, key figures, and sections with drawings and tables.
+
+Calibrations, plans, tracked targets, comparisons and detections are shown by it; the report of a run has its own page.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from markupsafe import Markup
+
+from lab.files.text.atomic_write import atomic_write_text
+from lab.findings.finding import Finding, Level, worst_first
+from lab.number_format import format_number
+from lab.report.html import environment
+from lab.versions import versions
+
+FILE_NAME = "report.html"
+KeyFigure: TypeAlias = tuple[str, str, str]  # label, value with unit (px and mm), note
+LARGEST_BYTES = 5_000_000  # limit for e-mail, and for a browser to open the report without delay
+_LONG_TABLE = 40  # number of rows above which a table is collapsed
+
+
+@dataclass(frozen=True, slots=True)
+class PageTable:
+    """A table. Cells are text or numbers; numbers are shown with four significant digits, nan as a dash."""
+
+    heads: Sequence[str]  # with units: "drift (px)"
+    rows: Sequence[Sequence[object]]  # each as long as heads
+
+    def __post_init__(self) -> None:
+        for i, row in enumerate(self.rows):
+            if len(row) != len(self.heads):
+                raise ValueError(f"row {i} has {len(row)} cells, the table {len(self.heads)} heads")
+
+
+@dataclass(frozen=True, slots=True)
+class PageDrawing:
+    """A drawing as SVG or HTML text, which is not escaped, with its caption."""
+
+    picture: str
+    caption: str = ""
+    wide: bool = False  # full width of the page instead of half
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """One section of a report: text, then drawings, then a table."""
+
+    title: str
+    words: str | Sequence[str] = ()  # one paragraph or several; plain text
+    drawings: Sequence[PageDrawing | str] = ()
+    table: PageTable | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What a page says at its top about the results as a whole."""
+
+    level: Level
+    sentence: str
+    findings: Sequence[Finding]
+    words: tuple[str, str, str] = ("PASS", "CHECK", "FAIL")  # by level
+
+    @property
+    def counted(self) -> str:
+        """`2 failed, 1 warning, 5 passed`."""
+        count = {level: sum(f.level == level for f in self.findings) for level in Level}
+        warnings = f"{count[Level.WARN]} warning{'s' if count[Level.WARN] != 1 else ''}"
+        return f"{count[Level.FAIL]} failed, {warnings}, {count[Level.PASS]} passed"
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """Content of a report."""
+
+    maker: str  # what the results are, such as "tracked circle"
+    name: str
+    line: str  # below the name: the source, or the date
+    sections: Sequence[Section]
+    key_figures: Sequence[KeyFigure] = ()
+    notes: Sequence[str] = ()
+    made: Sequence[tuple[str, str]] = ()  # with what the results were made: name and value
+    verdict: Verdict | None = None  # None: nothing is judged
+
+
+def made_with(*libraries: str) -> tuple[str, str]:
+    """A line of `made`: the versions of the program and of these libraries."""
+    own = versions()
+    shown = [f"{name.removesuffix('-python-headless').replace('opencv', 'OpenCV')} {own[name]}" for name in libraries]
+    return "beampose", ", ".join([own["beampose"], *shown])
+
+
+def write_page(page: Page, folder: Path) -> Path:
+    """Write report.html into a folder atomically; return its path.
+
+    If it would exceed 5 MB, its largest pictures are each replaced by a note.
+    """
+    path = Path(folder) / FILE_NAME
+    atomic_write_text(html_of(page), path)
+    return path
+
+
+def html_of(page: Page) -> str:
+    """HTML text of a report, at most 5 MB unless its tables alone are larger."""
+    drawn = [[d if isinstance(d, PageDrawing) else PageDrawing(d) for d in s.drawings] for s in page.sections]
+    html = _rendered(page, drawn)
+    by_size = sorted(
+        ((len(d.picture.encode()), i, k) for i, section in enumerate(drawn) for k, d in enumerate(section)),
+        reverse=True,
+    )
+    excess = len(html.encode("utf-8", "replace")) - LARGEST_BYTES
+    if excess <= 0:
+        return html
+    for size, i, k in by_size:
+        if excess <= 0:
+            break
+        note = '<p class="empty">Picture omitted: the report would have exceeded 5 MB.</p>'
+        drawn[i][k] = replace(drawn[i][k], picture=note)
+        excess -= size - len(note)
+    return _rendered(page, drawn)
+
+
+def _rendered(page: Page, drawn: list[list[PageDrawing]]) -> str:
+    verdict = page.verdict
+    findings = () if verdict is None else worst_first(verdict.findings)
+    sections = [_section(s, d) for s, d in zip(page.sections, drawn, strict=True)]
+    template = environment().get_template("page.html.j2")
+    return template.render(page=page, verdict=verdict, findings=findings, sections=sections)
+
+
+def _section(section: Section, drawings: list[PageDrawing]) -> dict[str, Any]:
+    table = section.table
+    return {
+        "title": section.title,
+        "words": [section.words] if isinstance(section.words, str) else list(section.words),
+        "drawings": [{"picture": Markup(d.picture), "caption": d.caption, "wide": d.wide} for d in drawings],
+        "table": None if table is None else {"heads": table.heads, "rows": [[cell(c) for c in r] for r in table.rows]},
+        "numeric": [] if table is None else _numeric(table),
+        "long": table is not None and len(table.rows) > _LONG_TABLE,
+    }
+
+
+def cell(value: object) -> str:
+    """A cell as text: numbers with four significant digits, None and nan as a dash."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, int | np.integer):
+        return str(value)
+    if isinstance(value, float | np.floating):
+        return format_number(float(value), 4) if math.isfinite(value) else "–" if math.isnan(value) else "∞"
+    return str(value)
+
+
+_NUMBER_TEXT = re.compile(r"^[-+−±]?[\d.,]+(\s*[×%°].*)?(\s*±.*)?$|^[–∞]?$")
+
+
+def _numeric(table: PageTable) -> list[bool]:
+    """Whether each column holds only numbers, which are aligned to the right."""
+    return [
+        bool(table.rows) and all(_NUMBER_TEXT.match(cell(row[k])) is not None for row in table.rows)
+        for k in range(len(table.heads))
+    ]
