@@ -18,6 +18,7 @@ from lab.report.plot.axes import (
     BLUE,
     GREEN,
     ORANGE,
+    axes,
     dots,
     frame,
     line_path,
@@ -27,9 +28,6 @@ from lab.report.plot.axes import (
     segments,
     svg_of,
     text,
-    vertical_text,
-    x_ticks,
-    y_ticks,
 )
 from lab.report.plot.series import Band, Line, Shade, time_panel
 from lab.results.compare import (
@@ -274,13 +272,8 @@ def _allan_chart(still: StillStand) -> str:
     x0, x1 = np.log10([taus.min() / 1.3, taus.max() * 1.3]).tolist()
     y0, y1 = np.log10([values.min() / 1.3, values.max() * 1.3]).tolist()
     p = plot_area((x0, x1), (y0, y1), width=720, height=320)
-    out = [text(p.box[0], 15, title, "title")]
-    xs, ys = _decades(x0, x1), _decades(y0, y1)
-    out.append(x_ticks(p, xs, [f"{10**v:.3g}" for v in xs.tolist()], grid=True))
-    out.append(y_ticks(p, ys, [f"{10**v:.3g}" for v in ys.tolist()], grid=True))
-    left, top, wide, high = p.box
-    out.append(text(left + wide / 2, top + high + 30, "averaging time (s)", "mid"))
-    out.append(vertical_text(12, top + high / 2, "deviation (mdeg)"))
+    out = [*axes(p, title, "averaging time (s)", "deviation (mdeg)", x_log=True, y_log=True)]
+    left, top, wide, _ = p.box
     for i, (name, a) in enumerate(still.of_result):
         good = a.low > 0
         x = np.log10(a.tau_s[good])
@@ -294,14 +287,6 @@ def _allan_chart(still: StillStand) -> str:
         out.append(text(left + wide - 8, top + 16 + 16 * i, name, "end", f"fill:{colour};font-weight:600"))
     out.append(note(p, "bars: 95 % confidence limits"))
     return svg_of(p, title, [*out, frame(p)])
-
-
-def _decades(lo: float, hi: float) -> np.ndarray:
-    """Logarithms of 1, 2 and 5 times powers of ten between two logarithms."""
-    powers = np.arange(np.floor(lo), np.ceil(hi) + 1)
-    steps = [1.0] if hi - lo > 3 else [1.0, 2.0, 5.0]
-    values = np.sort(np.log10(np.outer(10.0**powers, steps)).ravel())
-    return np.asarray(values[(values >= lo) & (values <= hi)])
 
 
 # One comparison from folders and files to an output folder.

@@ -21,11 +21,12 @@ from lab.report.plot.axes import (
     Scale,
     axes,
     dots,
+    filled,
     frame,
     image_area,
+    image_uri,
     note,
     number,
-    picture_uri,
     polyline,
     round_size,
     segments,
@@ -37,7 +38,6 @@ _MOST_VECTORS = 2000  # in a residual field: more cover each other
 _ARROW = 24.0  # drawing units: length of the 95th percentile of the residuals
 _LONGEST = 70.0  # drawing units: longer vectors are cut
 _PICTURE_WIDTH = 720  # px of an embedded photograph
-_JPEG_QUALITY = 72
 
 
 def corners_overlay(
@@ -251,14 +251,7 @@ def _photograph(p: PlotArea, picture: np.ndarray) -> str:
         shrink = _PICTURE_WIDTH / picture.shape[1]
         size = (_PICTURE_WIDTH, max(1, round(picture.shape[0] * shrink)))
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    done, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    if not done:
-        raise ValueError(f"a picture of shape {picture.shape} cannot be written as JPEG")
-    left, top_y, wide, high = p.box
-    return (
-        f'<image x="{left:.1f}" y="{top_y:.1f}" width="{wide:.1f}" height="{high:.1f}" preserveAspectRatio="none"'
-        f' href="{picture_uri(data.tobytes(), "jpeg")}"/>'
-    )
+    return filled(p, image_uri(picture, "jpeg"))
 
 
 def _in_the_middle(p: PlotArea, words: str) -> str:

@@ -308,18 +308,41 @@ def svg_of(p: PlotArea, title: str, parts: list[str], css: str = "plot") -> str:
     return figure(p.width, p.height, title, parts, css=css)
 
 
-def axes(p: PlotArea, title: str, x_name: str, y_name: str, *, grid: bool = True) -> list[str]:
-    """Title, ticks with labels, names of both axes; grid lines, or short ticks without `grid`."""
+def axes(
+    p: PlotArea,
+    title: str,
+    x_name: str,
+    y_name: str,
+    *,
+    grid: bool = True,
+    x_log: bool = False,
+    y_log: bool = False,
+) -> list[str]:
+    """Title, ticks with labels, names of both axes; grid lines, or short ticks without `grid`.
+
+    x_log, y_log: the scale is one of decimal logarithms.
+    """
     left, top, wide, high = p.box
-    xs = ticks(min(p.X.lo, p.X.hi), max(p.X.lo, p.X.hi), max(3, int(wide / 75)))
-    ys = ticks(min(p.Y.lo, p.Y.hi), max(p.Y.lo, p.Y.hi), max(3, int(high / 45)))
+    x_range = min(p.X.lo, p.X.hi), max(p.X.lo, p.X.hi)
+    y_range = min(p.Y.lo, p.Y.hi), max(p.Y.lo, p.Y.hi)
+    xs = ticks(*x_range, max(3, int(wide / 75)))
+    ys = ticks(*y_range, max(3, int(high / 45)))
     return [
         heading(p, title),
-        x_ticks(p, xs, tick_texts(xs), grid=grid),
-        y_ticks(p, ys, tick_texts(ys), grid=grid),
+        x_ticks(p, *(log_ticks(*x_range) if x_log else (xs, tick_texts(xs))), grid=grid),
+        y_ticks(p, *(log_ticks(*y_range) if y_log else (ys, tick_texts(ys))), grid=grid),
         text(left + wide / 2, top + high + 30, x_name, "mid"),
         vertical_text(12, top + high / 2, y_name),
     ]
+
+
+def log_ticks(lo: float, hi: float) -> tuple[Array, list[str]]:
+    """Ticks and labels between two decimal logarithms: powers of ten and, where there is room, numbers between."""
+    steps = [1.0] if hi - lo > 3 else [1.0, 2.0, 5.0] if hi - lo > 0.6 else [1.0, 1.5, 2.0, *range(3, 10)]
+    powers = 10.0 ** np.arange(np.floor(lo), np.ceil(hi) + 1)
+    values = np.sort(np.outer(powers, steps).ravel())
+    values = values[(np.log10(values) >= lo) & (np.log10(values) <= hi)]
+    return np.log10(values), [f"{v:.4g}" if v < 8000 else f"{v:.0f}" for v in values.tolist()]
 
 
 def heading(p: PlotArea, title: str) -> str:
@@ -443,3 +466,10 @@ def image_uri(picture: Bytes, kind: str) -> str:
     if not done:
         raise ValueError(f"an image of shape {picture.shape} cannot be written as {kind}")
     return picture_uri(data.tobytes(), kind)
+
+
+def filled(p: PlotArea, uri: str) -> str:
+    """An image, as a data URI, over the whole area inside the axes."""
+    left, top, wide, high = p.box
+    box = f'x="{left:.1f}" y="{top:.1f}" width="{wide:.1f}" height="{high:.1f}"'
+    return f'<image {box} preserveAspectRatio="none" href="{uri}"/>'

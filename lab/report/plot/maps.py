@@ -13,10 +13,11 @@ from lab.report.plot.axes import (
     PlotArea,
     Scale,
     axes,
+    filled,
     frame,
+    image_uri,
     note,
     number,
-    picture_uri,
     plot_area,
     polyline,
     svg_of,
@@ -191,12 +192,7 @@ def _image(p: PlotArea, values: Array, lo: float, hi: float, diverging: bool) ->
     """The colours of values (rows, columns) over the plot area as an embedded PNG, transparent at nan."""
     rgb = colours((values - lo) / (hi - lo), diverging)
     alpha = np.where(np.isfinite(values), 255, 0).astype(np.uint8)
-    done, data = cv2.imencode(".png", np.dstack([rgb[..., ::-1], alpha]), [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    if not done:
-        raise ValueError(f"a map of shape {values.shape} cannot be written as PNG")
-    left, top, wide, high = p.box
-    box = f'x="{left:.1f}" y="{top:.1f}" width="{wide:.1f}" height="{high:.1f}"'
-    return f'<image {box} preserveAspectRatio="none" href="{picture_uri(data.tobytes(), "png")}"/>'
+    return filled(p, image_uri(np.dstack([rgb[..., ::-1], alpha]), "png"))
 
 
 def _enlarged(values: Array) -> Array:

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from geometry.arrays import Array, Bools
@@ -22,21 +21,19 @@ from lab.report.plot.axes import (
     BLUE,
     ORANGE,
     VERMILLION,
-    PlotArea,
     axes,
     dots,
     frame,
     grey_limits,
     image_area,
+    image_uri,
     line_path,
     note,
-    picture_uri,
     plot_area,
     polyline,
     stretched,
     svg_of,
     text,
-    ticks,
 )
 from lab.report.plot.series import Line, time_panel
 from lab.runs.detect.picture_series import PictureSeries, SizeGroup
@@ -156,7 +153,7 @@ def counts_chart(series: Sequence[tuple[str, Array]], title: str, x_name: str, *
     counts = [np.histogram(np.clip(np.log10(v), lo, hi), edges)[0].astype(float) for _, v in good]
     p = plot_area((lo, hi), (0.0, max(float(c.max()) for c in counts) * 1.08), height=250)
     base = float(p.Y(np.array(0.0)))
-    out = _log_axes(p, title, x_name)
+    out = axes(p, title, x_name, "spots", x_log=True)
     for (name, _), count, colour in zip(good, counts, _COLOURS, strict=False):
         steps = "".join(f"V{y:.1f}H{x:.1f}" for y, x in zip(p.Y(count), p.X(edges[1:]), strict=True))
         d = f"M{float(p.X(edges[0])):.1f} {base:.1f}{steps}V{base:.1f}"
@@ -233,29 +230,6 @@ def noise_chart(estimate: NoiseEstimate, measured: LevelVariances | None, name: 
     return svg_of(p, title, [*out, frame(p)])
 
 
-def _log_axes(p: PlotArea, title: str, x_name: str) -> list[str]:
-    """Axes whose horizontal values are decimal logarithms."""
-    left, top, wide, high = p.box
-    bottom = top + high
-    out = [text(left, 15, title, "title")]
-    ys = np.unique(np.round(ticks(0.0, max(p.Y.lo, p.Y.hi), 5)))
-    out.append(f'<path class="grid" d="{"".join(f"M{left:.1f} {y:.1f}h{wide:.1f}" for y in p.Y(ys))}"/>')
-    out += [text(left - 6, float(p.Y(y)) + 3.5, f"{abs(y):.0f}", "end") for y in ys.tolist()]
-    decades = np.arange(np.floor(p.X.lo), np.ceil(p.X.hi) + 1)
-    span = p.X.hi - p.X.lo
-    steps = [1.0] if span > 2.5 else [1.0, 2.0, 5.0] if span > 0.6 else [1.0, 1.5, 2.0, *range(3, 10)]
-    values = np.log10(np.outer(10.0**decades, steps).ravel())
-    values = values[(values >= p.X.lo) & (values <= p.X.hi)]
-    out.append(f'<path class="grid" d="{"".join(f"M{x:.1f} {top:.1f}v{high + 4:.1f}" for x in p.X(values))}"/>')
-    out += [
-        text(float(p.X(v)), bottom + 14, f"{10.0**v:.4g}" if v < 3.9 else f"{10.0**v:.0f}", "mid")
-        for v in values.tolist()
-    ]
-    out.append(text(left + wide / 2, bottom + 29, x_name, "mid"))
-    out.append(f'<text x="0" y="0" class="mid" transform="translate(12 {top + high / 2:.1f}) rotate(-90)">spots</text>')
-    return out
-
-
 # The page of `beampose detect`: contact sheet, spots over frames, positions, sizes, signal to noise, sensor noise.
 
 
@@ -319,8 +293,9 @@ def _key_figures(series: PictureSeries, table: Array, groups: list[SizeGroup]) -
 
 
 def _sheet(sheet: ContactSheet) -> Section:
-    jpeg = cv2.imencode(".jpg", sheet.drawn(), [cv2.IMWRITE_JPEG_QUALITY, 82])[1].tobytes()
-    picture = f'<img src="{picture_uri(jpeg, "jpeg")}" alt="contact sheet: pictures with the spots found in them">'
+    picture = (
+        f'<img src="{image_uri(sheet.drawn(), "jpeg")}" alt="contact sheet: pictures with the spots found in them">'
+    )
     caption = (
         "Evenly spaced pictures with stretched grey values. Rings: detected spots, numbered by brightness, in the order"
         " of the rows of a frame in detections.csv. Without compression loss: contact-sheet.png."
