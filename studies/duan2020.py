@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geometry.arrays import Array, Bools
-from lab.report.plot.axes import BLUE, GREEN, ORANGE, VERMILLION
 from lab.report.plot.series import Line, Shade, time_panel
+from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION
 from studies.comparison import Comparison, ComparisonRow, Figure
 from tracking import kalman
 from tracking.detections import Detections

@@ -8,8 +8,8 @@ import numpy as np
 
 from geometry.arrays import Array
 from lab.number_format import format_number
-from lab.report.plot.axes import BLUE, GREEN, ORANGE, VERMILLION, robust_range
 from lab.report.plot.series import Line, Shade, time_panel
+from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION, robust_range
 from studies.comparison import Comparison, ComparisonRow, Figure
 from studies.fu2016_experiments import (
     DISTURBANCES,

@@ -15,8 +15,8 @@ from geometry.camera import Camera
 from geometry.pose import Pose
 from geometry.pose_solver.marker_model import MarkerModel
 from geometry.rotations import ypr_jacobian
-from lab.report.plot.axes import ORANGE, VERMILLION, picture_uri
 from lab.report.plot.series import Line, Shade, time_panel
+from lab.report.plot.svg import ORANGE, VERMILLION, picture_uri
 from studies.comparison import ComparisonRow, Figure
 from tracking.corner_markers.matching import MarkerMatch, MatchParameters, harris_corners, match_markers
 from tracking.detections import UNMATCHED

@@ -10,20 +10,7 @@ from geometry.arrays import Array, Bools
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import fit_pose
-from lab.report.plot.axes import (
-    BLUE,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILLION,
-    axes,
-    line_path,
-    plot_area,
-    robust_range,
-    svg_of,
-    text,
-)
+from lab.report.plot import svg
 from lab.report.plot.series import Line, Shade, time_panel
 from lab.simulate.points import PointRun, simulate_points
 from studies.comparison import Comparison, ComparisonRow, Figure
@@ -323,8 +310,8 @@ def _outside_rms(run: PointRun, t: TrackedRun) -> float:
 # Section 5.1 of Huo (2015): the table beside the published figures, and the curves.
 
 
-U_COLOUR, V_COLOUR = BLUE, VERMILLION
-_TRACK_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
+U_COLOUR, V_COLOUR = svg.BLUE, svg.VERMILLION
+_TRACK_COLOURS = (svg.BLUE, svg.VERMILLION, svg.GREEN, svg.PURPLE, svg.ORANGE, svg.SKY)
 
 
 def compare_huo2015(seed: int = 1, frames: int = 600) -> Comparison:
@@ -356,7 +343,7 @@ def _figures(study: Study) -> list[tuple[str, str, str]]:
     spot_1 = next(i for i, (_, spot) in enumerate(n.views) if spot == "1")
     for name in ("stiff", "loose"):
         errors = [study.prediction_errors[f"{kind}, {name}"][:, spot_1] for kind in ("conventional", "curve switching")]
-        y_range = robust_range(np.concatenate(errors), 0.5)
+        y_range = svg.robust_range(np.concatenate(errors), 0.5)
         panels = [
             _panel(t, f"{kind}, {name}: predicted − true, spot 1", e, shade, y_range)
             for kind, e in zip(("conventional", "curve switching"), errors, strict=True)
@@ -400,7 +387,7 @@ def _figures(study: Study) -> list[tuple[str, str, str]]:
     for i, (camera, spot) in enumerate(n.views):
         e = study.trackers["beampose"].uv_px[:, i] - study.run.uv_px[:, i]
         outside = (Shade(study.run.in_view[:, i] == 0, "outside", "out of view"),)
-        panels.append(_panel(t, f"spot {spot} ({camera}): estimate − true", e, outside, robust_range(e, 0.5)))
+        panels.append(_panel(t, f"spot {spot} ({camera}): estimate − true", e, outside, svg.robust_range(e, 0.5)))
     out.append(("Tracking error (Figs. 9 and 13)", "Measured in view, solved out of view (shaded).", "".join(panels)))
     return out
 
@@ -417,16 +404,16 @@ def _tracks(study: Study, camera: int) -> str:
     size = np.array(model.image_size_px[views[0]], dtype=float)
     lo = np.minimum(np.nanmin(uv[:, views], axis=(0, 1)), 0.0) - 20
     hi = np.maximum(np.nanmax(uv[:, views], axis=(0, 1)), size) + 20
-    p = plot_area((lo[0], hi[0]), (lo[1], hi[1]), equal=True, y_down=True, bottom=38)
+    p = svg.plot_area((lo[0], hi[0]), (lo[1], hi[1]), equal=True, y_down=True, bottom=38)
     title = f"camera {model.camera_names[camera]}"
-    out = axes(p, title, "u (px)", "v (px)", grid=False)
+    out = svg.axes(p, title, "u (px)", "v (px)", grid=False)
     (x0, y0), (x1, y1) = p.at(np.array([[0.0, 0.0], size])).tolist()
     box = f'x="{x0:.1f}" y="{y0:.1f}" width="{x1 - x0:.1f}" height="{y1 - y0:.1f}"'
     out.append(f'<rect {box} fill="none" stroke="currentColor" stroke-width="1"/>')
     for v in views:
         colour = _TRACK_COLOURS[int(model.spot_of[v]) % len(_TRACK_COLOURS)]
         at = p.at(uv[:, v])
-        out.append(f'<path d="{line_path(at[:, 0], at[:, 1])}" fill="none" stroke="{colour}" stroke-width="1.3"/>')
+        out.append(f'<path d="{svg.line_path(at[:, 0], at[:, 1])}" fill="none" stroke="{colour}" stroke-width="1.3"/>')
         x, y = at[int(np.flatnonzero(~np.isnan(at[:, 0]))[0])].tolist()
-        out.append(text(x + 5, y - 5, model.views[v][1], "", f"fill:{colour}"))
-    return svg_of(p, f"tracks of {title}", out)
+        out.append(svg.text(x + 5, y - 5, model.views[v][1], "", f"fill:{colour}"))
+    return svg.svg_of(p, f"tracks of {title}", out)

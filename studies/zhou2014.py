@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array
-from lab.report.plot.axes import BLUE, GREEN, VERMILLION, axes, frame, line_path, plot_area, svg_of, text
 from lab.report.plot.series import Line, Shade, time_panel
+from lab.report.plot.svg import BLUE, GREEN, VERMILLION, axes, frame, line_path, plot_area, svg_of, text
 from lab.targets.circle import CircleOptions
 from studies.comparison import Comparison, ComparisonRow, Figure
 from studies.zhou2014_lights import PAPER_PERCENT, LightResult, followed

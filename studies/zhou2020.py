@@ -10,20 +10,7 @@ from geometry import rotations
 from geometry.arrays import Array
 from geometry.pose import Pose
 from geometry.rotations import ypr_from_matrix
-from lab.report.plot.axes import (
-    BLUE,
-    GREEN,
-    ORANGE,
-    VERMILLION,
-    axes,
-    dots,
-    frame,
-    line_path,
-    note,
-    plot_area,
-    svg_of,
-    text,
-)
+from lab.report.plot import svg
 from lab.targets.stereo.simulated_recording import drogue_markers, occluded, render, scene, simulated_pair, true_pixels
 from studies.comparison import Comparison, ComparisonRow, Figure
 from studies.learned_detector.samples import draw_sample
@@ -285,25 +272,25 @@ def _figure(distances: list[DistanceErrors]) -> tuple[str, str, str]:
     paper = np.array([(one + two) / 2 - true for true, one, two in TABLE_3])
     rms, bound = np.array([e.rms for e in distances]), np.array([e.bound for e in distances])
     curves = (
-        ("paper, table 3", paper, VERMILLION, ""),
-        ("single points", rms[:, 1], ORANGE, ""),
-        ("their bound", bound[:, 1], ORANGE, "5 4"),
-        ("joint fit", rms[:, 2], BLUE, ""),
-        ("its bound", bound[:, 2], GREEN, "5 4"),
+        ("paper, table 3", paper, svg.VERMILLION, ""),
+        ("single points", rms[:, 1], svg.ORANGE, ""),
+        ("their bound", bound[:, 1], svg.ORANGE, "5 4"),
+        ("joint fit", rms[:, 2], svg.BLUE, ""),
+        ("its bound", bound[:, 2], svg.GREEN, "5 4"),
     )
-    p = plot_area((0.0, 32.0), (0.0, 1.08 * float(max(c[1].max() for c in curves))), height=300)
-    out = axes(p, "Error of a distance", "distance (m)", "error (m)")
+    p = svg.plot_area((0.0, 32.0), (0.0, 1.08 * float(max(c[1].max() for c in curves))), height=300)
+    out = svg.axes(p, "Error of a distance", "distance (m)", "error (m)")
     for i, (name, y, colour, dash) in enumerate(curves):
         at = p.at(np.stack([d, y], axis=1))
         style = f' stroke-dasharray="{dash}"' if dash else ""
         out.append(
-            f'<path d="{line_path(at[:, 0], at[:, 1])}" fill="none" stroke="{colour}" stroke-width="1.6"{style}/>'
+            f'<path d="{svg.line_path(at[:, 0], at[:, 1])}" fill="none" stroke="{colour}" stroke-width="1.6"{style}/>'
         )
         if not dash:
-            out.append(f'<path d="{dots(at, 3.0)}" fill="{colour}"/>')
-        out.append(text(p.box[0] + 10, p.box[1] + 16 + 15 * i, name, "", f"fill:{colour};font-weight:600"))
-    out.append(note(p, f"{len(drogue_markers())} markers, {NOISE_PX:g} px noise"))
-    drawing = svg_of(p, "Error of a distance", [*out, frame(p)])
+            out.append(f'<path d="{svg.dots(at, 3.0)}" fill="{colour}"/>')
+        out.append(svg.text(p.box[0] + 10, p.box[1] + 16 + 15 * i, name, "", f"fill:{colour};font-weight:600"))
+    out.append(svg.note(p, f"{len(drogue_markers())} markers, {NOISE_PX:g} px noise"))
+    drawing = svg.svg_of(p, "Error of a distance", [*out, svg.frame(p)])
     words = (
         "The paper's errors (mean of two markers), the RMS errors of single points and of the joint fit, and the"
         " smallest possible RMS from the same information."

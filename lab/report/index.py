@@ -29,22 +29,7 @@ from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.yaml_text import read_mapping
 from lab.number_format import format_number
 from lab.report.html import environment
-from lab.report.plot.axes import (
-    PlotArea,
-    Scale,
-    envelope,
-    frame,
-    heading,
-    line_path,
-    number,
-    svg_of,
-    text,
-    tick_texts,
-    ticks,
-    true_ranges,
-    x_ticks,
-    y_ticks,
-)
+from lab.report.plot import svg
 from lab.report.run.summary import VERDICTS, day_of, valid
 from tracking.statuses import PoseStatus
 
@@ -245,7 +230,9 @@ def thumbnail(values: Array, names: tuple[str, str, str], unit: str, least: floa
         return ""
     scale = (HEIGHT - 2 * _MARGIN) / max(least, *(high - low for low, high in known))
     words = ", ".join(
-        f"{name} {number(span[0])} to {number(span[1])}" for name, span in zip(names, spans, strict=True) if span
+        f"{name} {svg.number(span[0])} to {svg.number(span[1])}"
+        for name, span in zip(names, spans, strict=True)
+        if span
     )
     paths = "".join(
         f'<path class="{css}" d="{_thumbnail_path(values[:, k], span, scale, points)}"/>'
@@ -265,11 +252,11 @@ def _span(y: Array) -> tuple[float, float] | None:
 def _thumbnail_path(y: Array, span: tuple[float, float], scale: float, points: int) -> str:
     """The `d` of a curve, in whole viewBox units relative to the point before."""
     n = len(y)
-    x, y = envelope(np.arange(n, dtype=float), y, max(points // 2, 1))
+    x, y = svg.envelope(np.arange(n, dtype=float), y, max(points // 2, 1))
     xs = np.rint(x * ((WIDTH - 1) / max(n - 1, 1)))
     ys = np.rint(HEIGHT / 2 - (y - (span[0] + span[1]) / 2) * scale)
     out = []
-    for start, stop in true_ranges(np.isfinite(ys)):
+    for start, stop in svg.true_ranges(np.isfinite(ys)):
         dx, dy = np.diff(xs[start:stop]).astype(int), np.diff(ys[start:stop]).astype(int)
         out.append(f"M{xs[start]:.0f} {ys[start]:.0f}{_steps(dx.tolist(), dy.tolist())}")
     return "".join(out)
@@ -334,12 +321,12 @@ def _trend(
     day: Array, values: Array, statuses: Sequence[str], limits: tuple[float, float], title: str, unit: str
 ) -> str:
     lo, hi = _value_range(values, unit)
-    p = PlotArea(Scale(*limits, 54.0, _WIDTH - 10.0), Scale(lo, hi, _HEIGHT - 24.0, 22.0), _WIDTH, _HEIGHT)
-    marks = ticks(lo, hi, 4)
-    out = [y_ticks(p, marks, tick_texts(marks), grid=True), x_ticks(p, *date_ticks(*limits))]
+    p = svg.PlotArea(svg.Scale(*limits, 54.0, _WIDTH - 10.0), svg.Scale(lo, hi, _HEIGHT - 24.0, 22.0), _WIDTH, _HEIGHT)
+    marks = svg.ticks(lo, hi, 4)
+    out = [svg.y_ticks(p, marks, svg.tick_texts(marks), grid=True), svg.x_ticks(p, *date_ticks(*limits))]
     days, medians = _medians(day, values)
     if len(days) >= _LEAST_DAYS_OF_A_MEDIAN:
-        d = line_path(p.X(days), p.Y(np.clip(medians, lo, hi)))
+        d = svg.line_path(p.X(days), p.Y(np.clip(medians, lo, hi)))
         out.append(f'<path class="line median" d="{d}"><title>Median of the runs of each day</title></path>')
     status = np.array(statuses)
     for name in dict.fromkeys(statuses):
@@ -350,9 +337,9 @@ def _trend(
         css = name if name in ("pass", "check", "fail") else "error"
         out.append(f'<path class="dots {css}" d="{d}"/>')
     if np.nanmax(values) > hi:
-        out.append(text(p.X.b, 14, f"▲ up to {format_number(float(np.nanmax(values)))} {unit}", "end"))
-    out.append(heading(p, f"{title} ({unit})"))
-    return svg_of(p, title, [*out, frame(p, closed=False)])
+        out.append(svg.text(p.X.b, 14, f"▲ up to {format_number(float(np.nanmax(values)))} {unit}", "end"))
+    out.append(svg.heading(p, f"{title} ({unit})"))
+    return svg.svg_of(p, title, [*out, svg.frame(p, closed=False)])
 
 
 def _value_range(values: Array, unit: str) -> tuple[float, float]:

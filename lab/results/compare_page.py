@@ -14,21 +14,7 @@ from lab.findings.outcome import Done
 from lab.number_format import format_number, format_percent, format_with_sigma
 from lab.report.page import Page, PageDrawing, PageTable, Section, made_with
 from lab.report.page import write_page as write_report
-from lab.report.plot.axes import (
-    BLUE,
-    GREEN,
-    ORANGE,
-    axes,
-    dots,
-    frame,
-    line_path,
-    note,
-    plot_area,
-    robust_range,
-    segments,
-    svg_of,
-    text,
-)
+from lab.report.plot import svg
 from lab.report.plot.series import Band, Line, Shade, time_panel
 from lab.results.compare import (
     AxisStatistic,
@@ -132,7 +118,7 @@ def _alignment_row(comparison: Comparison) -> dict[str, Any] | None:
 # The report of a comparison.
 
 
-_COLOURS = (BLUE, ORANGE, GREEN)
+_COLOURS = (svg.BLUE, svg.ORANGE, svg.GREEN)
 
 
 def write_page(comparison: Comparison, folder: Path) -> Path:
@@ -206,7 +192,7 @@ def _curve(comparison: Comparison, axis: AxisStatistic, k: int, shades: tuple[Sh
         bands = (Band(-2 * axis.sigmas, 2 * axis.sigmas, "#8a8f98", "two stated sigmas"),)
         middle = 2 * float(np.nanmedian(axis.sigmas)) * np.ones(1)
         limits = np.concatenate([used, middle])
-    low, high = robust_range(limits)
+    low, high = svg.robust_range(limits)
     bands = tuple(Band(np.clip(b.low, low, high), np.clip(b.high, low, high), b.colour, b.name) for b in bands)
     lines = (Line(axis.values, _COLOURS[k % 3], axis.name),)
     return time_panel(
@@ -271,22 +257,24 @@ def _allan_chart(still: StillStand) -> str:
         return ""
     x0, x1 = np.log10([taus.min() / 1.3, taus.max() * 1.3]).tolist()
     y0, y1 = np.log10([values.min() / 1.3, values.max() * 1.3]).tolist()
-    p = plot_area((x0, x1), (y0, y1), width=720, height=320)
-    out = [*axes(p, title, "averaging time (s)", "deviation (mdeg)", x_log=True, y_log=True)]
+    p = svg.plot_area((x0, x1), (y0, y1), width=720, height=320)
+    out = [*svg.axes(p, title, "averaging time (s)", "deviation (mdeg)", x_log=True, y_log=True)]
     left, top, wide, _ = p.box
     for i, (name, a) in enumerate(still.of_result):
         good = a.low > 0
         x = np.log10(a.tau_s[good])
         places = p.at(np.stack([x, np.log10(1e3 * a.deviation[good])], -1))
-        whiskers = segments(
+        whiskers = svg.segments(
             p.at(np.stack([x, np.log10(1e3 * a.low[good])], -1)), p.at(np.stack([x, np.log10(1e3 * a.high[good])], -1))
         )
         colour = _COLOURS[i]
-        out.append(f'<path class="line" d="{line_path(places[:, 0], places[:, 1])}" stroke="{colour}"/>')
-        out.append(f'<path d="{whiskers}" stroke="{colour}" fill="none"/><path d="{dots(places, 3)}" fill="{colour}"/>')
-        out.append(text(left + wide - 8, top + 16 + 16 * i, name, "end", f"fill:{colour};font-weight:600"))
-    out.append(note(p, "bars: 95 % confidence limits"))
-    return svg_of(p, title, [*out, frame(p)])
+        out.append(f'<path class="line" d="{svg.line_path(places[:, 0], places[:, 1])}" stroke="{colour}"/>')
+        out.append(
+            f'<path d="{whiskers}" stroke="{colour}" fill="none"/><path d="{svg.dots(places, 3)}" fill="{colour}"/>'
+        )
+        out.append(svg.text(left + wide - 8, top + 16 + 16 * i, name, "end", f"fill:{colour};font-weight:600"))
+    out.append(svg.note(p, "bars: 95 % confidence limits"))
+    return svg.svg_of(p, title, [*out, svg.frame(p)])
 
 
 # One comparison from folders and files to an output folder.

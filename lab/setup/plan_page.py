@@ -23,8 +23,8 @@ from lab.report.page import (
     PageTable,
     Section,
 )
-from lab.report.plot.axes import BLUE, number, text
 from lab.report.plot.maps import colours, heat_map, hex_colour
+from lab.report.plot.svg import BLUE, number, text
 from lab.setup.plan_findings import (
     CORRELATION,
     TOTAL_CALIBRATION,

@@ -15,8 +15,8 @@ from lab.findings.finding import Finding, Level, finding
 from lab.number_format import format_number, format_percent
 from lab.progress import Progress
 from lab.report.page import Section
-from lab.report.plot.axes import BLUE, VERMILLION
 from lab.report.plot.series import Line
+from lab.report.plot.svg import BLUE, VERMILLION
 from lab.runs.processed import quantiles
 from lab.targets.page import TimeAxis
 from lab.targets.target import Codes, Target, Track, TrackOptions, texts, track_pictures

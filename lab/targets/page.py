@@ -12,20 +12,7 @@ from geometry.arrays import Array
 from lab.findings.finding import Finding, verdict
 from lab.number_format import format_number, format_percent
 from lab.report.page import Page, PageDrawing, PageTable, Section, Verdict, made_with, write_page
-from lab.report.plot.axes import (
-    BLUE,
-    SKY,
-    VERMILLION,
-    axes,
-    dots,
-    frame,
-    image_area,
-    line_path,
-    note,
-    padded_range,
-    plot_area,
-    svg_of,
-)
+from lab.report.plot import svg
 from lab.report.plot.series import Band, Line, Shade, time_panel
 from lab.targets.target import F, Target, Track
 from tracking.statuses import PoseStatus
@@ -116,8 +103,8 @@ def _motion(target: Target[F], track: Track[F]) -> Section:
     panels, axis = [], TimeAxis.of(track)
     for i, name in enumerate(names):
         values = track.places[:, i]
-        band = Band.about(values, track.sigmas[:, i], 3.0, SKY, "3 sigma", 0.5)
-        panels.append(axis.panel(name, "px", Line(values, BLUE, name), bands=(band,), height=150))
+        band = Band.about(values, track.sigmas[:, i], 3.0, svg.SKY, "3 sigma", 0.5)
+        panels.append(axis.panel(name, "px", Line(values, svg.BLUE, name), bands=(band,), height=150))
     words = (
         "Place after each frame, with a band of 3 sigma. Shaded: frames without a measurement (predicted), and frames"
         " in which nothing is known (lost)."
@@ -132,20 +119,20 @@ def _path(track: Track[F]) -> list[Section]:
     if not known.any():
         return []
     if track.recording.size_px is not None:
-        p = image_area(track.recording.size_px)
+        p = svg.image_area(track.recording.size_px)
     else:
-        ranges = [padded_range(uv[known, i]) for i in range(2)]
+        ranges = [svg.padded_range(uv[known, i]) for i in range(2)]
         half = 0.5 * max(*(high - low for low, high in ranges), 1.0)
         (u0, u1), (v0, v1) = ((low + high) / 2 + np.array([-half, half]) for low, high in ranges)
-        p = plot_area((u0, u1), (v0, v1), equal=True, y_down=True)
-    out = axes(p, "Path of the centre", "u (px)", "v (px)", grid=False)
+        p = svg.plot_area((u0, u1), (v0, v1), equal=True, y_down=True)
+    out = svg.axes(p, "Path of the centre", "u (px)", "v (px)", grid=False)
     at = p.at(uv)
-    out.append(f'<path d="{line_path(at[:, 0], at[:, 1])}" fill="none" stroke="{BLUE}" stroke-width="1.1"/>')
+    out.append(f'<path d="{svg.line_path(at[:, 0], at[:, 1])}" fill="none" stroke="{svg.BLUE}" stroke-width="1.1"/>')
     if predicted.any():
         some = at[predicted][:: 1 + int(predicted.sum()) // _MOST_DOTS]
-        out.append(f'<path d="{dots(some, 1.8)}" fill="{VERMILLION}"/>')
-    out.append(note(p, "line: all frames; dots: predicted ones"))
-    return [Section("Path", (), [PageDrawing(svg_of(p, "Path of the centre", [*out, frame(p)]))])]
+        out.append(f'<path d="{svg.dots(some, 1.8)}" fill="{svg.VERMILLION}"/>')
+    out.append(svg.note(p, "line: all frames; dots: predicted ones"))
+    return [Section("Path", (), [PageDrawing(svg.svg_of(p, "Path of the centre", [*out, svg.frame(p)]))])]
 
 
 def _events(target: Target[F], track: Track[F]) -> list[Section]:

@@ -22,8 +22,8 @@ from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import PictureSource, open_inputs, pictures_of_frames
 from lab.progress import Progress
 from lab.report.page import Section
-from lab.report.plot.axes import VERMILLION, histogram
 from lab.report.plot.series import Line
+from lab.report.plot.svg import VERMILLION, histogram
 from lab.runs.frames.sensor_noise import CameraNoise, noise_frames
 from lab.targets.page import TimeAxis
 from lab.targets.recording import every_frame, read_pictures, read_points

@@ -26,7 +26,7 @@ from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import open_inputs
 from lab.progress import Progress
 from lab.report.frames.canvas import Canvas, Pixels
-from lab.report.plot.axes import grey_limits, stretched
+from lab.report.plot.svg import grey_limits, stretched
 from lab.runs.processed import Processed, write_processed
 from lab.targets.page import write_target_page
 from lab.targets.recording import DEFAULT_RATE_HZ, every_frame

@@ -25,25 +25,8 @@ from lab.files.rig.camera_file import CameraFile, load_camera
 from lab.files.rig.interchange import read_cameras
 from lab.files.rig.pose_block import PoseBlock
 from lab.files.rig.rig_file import TargetBlock, unknown_name
+from lab.files.text import fields
 from lab.files.text.error_text import FileError, name_of_path, suggest_name
-from lab.files.text.fields import (
-    Block,
-    NonNegative,
-    Number,
-    Positive,
-    Text,
-    Vector3,
-    Word,
-    boolean,
-    field_error,
-    mistakes_in,
-    numbers,
-    one_of,
-    positive_numbers,
-    printable_name,
-    unexpected_value,
-    word,
-)
 from lab.files.text.json_text import text_of_file
 from lab.files.text.yaml_text import read_mapping
 
@@ -70,8 +53,8 @@ def load_project(path: Path, lab_known: bool = False) -> Project:
         path = path / "calibration.yaml"
     content = read_mapping(path)
     # Without a folder, files are not looked for: the form of the file and the names in it are reported beside them.
-    form, mistakes = mistakes_in(Project, content, path)
-    project, with_files = mistakes_in(Project, content, path, folder=path.parent)
+    form, mistakes = fields.mistakes_in(Project, content, path)
+    project, with_files = fields.mistakes_in(Project, content, path, folder=path.parent)
     mistakes += [m for m in with_files if m not in mistakes]
     if form is not None:
         mistakes += [f"{path}: {m}" for m in _broken_references(form, lab_known)]
@@ -85,16 +68,16 @@ def load_project(path: Path, lab_known: bool = False) -> Project:
 
 
 def _file(value: Any, info: pydantic.ValidationInfo) -> Path:
-    name = word(value)
+    name = fields.word(value)
     if info.context is None:
         return Path(name)
     path: Path = info.context / name
     if path.is_dir():
-        raise field_error(f"expected a file, found a folder at {path}; name a file in it")
+        raise fields.field_error(f"expected a file, found a folder at {path}; name a file in it")
     if not path.is_file():
         near = suggest_name(path.name, [p.name for p in path.parent.glob("*")] if path.parent.is_dir() else [])
         hint = near if "did you mean" in near else "; paths start at this file's folder"
-        raise field_error(f"expected a file, found none at {path}{hint}")
+        raise fields.field_error(f"expected a file, found none at {path}{hint}")
     return path
 
 
@@ -111,7 +94,7 @@ def _paths(value: Any, info: pydantic.ValidationInfo) -> tuple[Path, ...]:
 def _names(value: Any) -> list[str]:
     values = [value] if isinstance(value, str) else value
     if not isinstance(values, list) or not all(isinstance(v, str) and v.strip() for v in values):
-        raise unexpected_value("a file or a list of files", value)
+        raise fields.unexpected_value("a file or a list of files", value)
     return values
 
 
@@ -124,7 +107,7 @@ def _patterns(value: Any, info: pydantic.ValidationInfo) -> tuple[Path, ...]:
             continue
         found = sorted(info.context.glob(name))
         if not found:
-            raise field_error(f"expected photographs, found none for {name!r} in {info.context}")
+            raise fields.field_error(f"expected photographs, found none for {name!r} in {info.context}")
         out += found
     return tuple(out)
 
@@ -132,7 +115,7 @@ def _patterns(value: Any, info: pydantic.ValidationInfo) -> tuple[Path, ...]:
 def _board(value: Any, info: pydantic.ValidationInfo) -> Board:
     """A board.yaml, or a text such as chessboard:9x6:25mm."""
     if not isinstance(value, str) or not value.strip():
-        raise unexpected_value(f"a board such as {board_types.EXAMPLES['chessboard']}", value)
+        raise fields.unexpected_value(f"a board such as {board_types.EXAMPLES['chessboard']}", value)
     try:
         if not value.lower().endswith((".yaml", ".yml")):
             return board_types.parse(value)
@@ -140,15 +123,15 @@ def _board(value: Any, info: pydantic.ValidationInfo) -> Board:
             return board_types.Chessboard(3, 3, 1.0)  # not used
         return load_board(info.context / value)
     except InputError as error:
-        raise field_error(str(error)) from None
+        raise fields.field_error(str(error)) from None
     except ValueError as error:
-        raise field_error(str(error).removeprefix(f"board {value!r}: ")) from None
+        raise fields.field_error(str(error).removeprefix(f"board {value!r}: ")) from None
 
 
 def _run_folder(value: Any, info: pydantic.ValidationInfo) -> Path:
-    path: Path = (info.context or Path()) / word(value)
+    path: Path = (info.context or Path()) / fields.word(value)
     if info.context is not None and not (path / "run.yaml").is_file():
-        raise field_error(f"expected a run folder, found no run.yaml in {path}")
+        raise fields.field_error(f"expected a run folder, found no run.yaml in {path}")
     return path
 
 
@@ -156,14 +139,14 @@ def _days(value: Any) -> int | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise unexpected_value("a whole number of days, 1 or more", value)
+        raise fields.unexpected_value("a whole number of days, 1 or more", value)
     return value
 
 
 def _name(value: Any) -> str:
-    text = printable_name(value)
+    text = fields.printable_name(value)
     if any(c in text for c in "/\\"):
-        raise unexpected_value("a name without / and \\", value)
+        raise fields.unexpected_value("a name without / and \\", value)
     return text
 
 
@@ -173,14 +156,23 @@ _Photos = Annotated[tuple[Path, ...], pydantic.PlainValidator(_patterns)]
 _BoardText = Annotated[Board, pydantic.PlainValidator(_board)]
 
 
-class CameraEntry(Block):
+_Pair = Annotated[tuple[float, float], pydantic.PlainValidator(fields.numbers(2)), pydantic.AfterValidator(tuple)]
+
+
+_Metres = fields.Number
+_Sigma = fields.Positive | None
+_Two = Annotated[tuple[float, float], pydantic.PlainValidator(fields.numbers(2)), pydantic.AfterValidator(tuple)]
+_Bow = Annotated[str, pydantic.PlainValidator(fields.one_of(BOW))]
+
+
+class CameraEntry(fields.Block):
     """A camera of the project: its calibrated lens, and its approximate position."""
 
     lens_path: _File = pydantic.Field(alias="intrinsics")
-    screen: Word  # the screen that it observes
-    camera: Word | None = None  # the camera, where the file has several
-    near_m: Vector3 | None = None  # in world: position by tape measure
-    within_m: Positive = 0.5  # largest distance from near_m
+    screen: fields.Word  # the screen that it observes
+    camera: fields.Word | None = None  # the camera, where the file has several
+    near_m: fields.Vector3 | None = None  # in world: position by tape measure
+    within_m: fields.Positive = 0.5  # largest distance from near_m
     _lens: CameraFile = pydantic.PrivateAttr()
 
     @pydantic.model_validator(mode="after")
@@ -189,7 +181,7 @@ class CameraEntry(Block):
             try:
                 self._lens = load_lens(self.lens_path, self.camera)
             except InputError as error:
-                raise field_error(f"intrinsics: {error}") from None
+                raise fields.field_error(f"intrinsics: {error}") from None
         return self
 
     @property
@@ -198,14 +190,14 @@ class CameraEntry(Block):
         return self._lens
 
 
-class FixedBoard(Block):
+class FixedBoard(fields.Block):
     """A board fixed to a screen, printed side towards the cameras."""
 
     board: _BoardText
     photos: dict[str, _File]  # photograph of the fixed board by camera
-    offset_m: Number = 0.0  # from the printed side into the board to the receiving surface; negative: it is in front
-    sigma_m: Positive = 0.0002  # of offset_m
-    tilt_sigma_deg: Positive = 0.05  # of the angle between board and surface
+    offset_m: _Metres = 0.0  # from the printed side into the board to the receiving surface; negative: it is in front
+    sigma_m: fields.Positive = 0.0002  # of offset_m
+    tilt_sigma_deg: fields.Positive = 0.05  # of the angle between board and surface
 
     @property
     def tilt_sigma_rad(self) -> float:
@@ -213,20 +205,20 @@ class FixedBoard(Block):
         return float(np.radians(self.tilt_sigma_deg))
 
 
-class Cloud(Block):
+class Cloud(fields.Block):
     """A scanned point cloud of a screen, possibly with its surroundings."""
 
     path: _File = pydantic.Field(alias="file")
     also: list[_File] = []  # noqa: RUF012 - frozen  # further scans in the same unit, aligned by what they share
-    unit: Annotated[str, pydantic.PlainValidator(one_of(tuple(CLOUD_UNITS)))] = "m"
+    unit: Annotated[str, pydantic.PlainValidator(fields.one_of(tuple(CLOUD_UNITS)))] = "m"
     world_from_cloud: PoseBlock | None = None  # without it, from the targets
     targets: _File | None = None  # points in both scan and survey: point,x_m,y_m,z_m in the cloud's frame
-    point_sigma_m: Positive | None = None  # of one scanned point; without it, from the scatter of the cloud
+    point_sigma_m: fields.Positive | None = None  # of one scanned point; without it, from the scatter of the cloud
 
     @pydantic.model_validator(mode="after")
     def _one_of_them(self) -> Cloud:
         if self.world_from_cloud is not None and self.targets is not None:
-            raise field_error("expected world_from_cloud or targets, got both; keep one")
+            raise fields.field_error("expected world_from_cloud or targets, got both; keep one")
         return self
 
     @property
@@ -235,32 +227,29 @@ class Cloud(Block):
         return CLOUD_UNITS[self.unit]
 
 
-class ScreenFrame(Block):
+class ScreenFrame(fields.Block):
     """Dots that define the frame of a screen: origin, a dot on the x axis, and a dot on the side of positive y."""
 
-    origin: Word
-    x: Word
-    y: Word
-    origin_at_m: Annotated[tuple[float, float], pydantic.PlainValidator(numbers(2)), pydantic.AfterValidator(tuple)] = (
-        0.0,
-        0.0,
-    )  # position of the dot `origin` in the screen's frame
+    origin: fields.Word
+    x: fields.Word
+    y: fields.Word
+    origin_at_m: _Two = (0.0, 0.0)  # position of the dot `origin` in the screen's frame
 
 
-class ScreenEntry(Block):
+class ScreenEntry(fields.Block):
     """A screen of the project and its measurements, except the dots of the survey."""
 
     size_m: Annotated[
-        tuple[float, float] | None, pydantic.PlainValidator(positive_numbers(2)), pydantic.AfterValidator(tuple)
+        tuple[float, float] | None, pydantic.PlainValidator(fields.positive_numbers(2)), pydantic.AfterValidator(tuple)
     ] = None  # extent along x and y, about the origin
     frame: ScreenFrame | None = None  # without it, from the extent of the dots
-    surface_sigma_m: Positive | None = None  # deviation of the surface from its shape; without it, from the survey
-    bow: Annotated[str, pydantic.PlainValidator(one_of(BOW))] = "auto"  # whether the surface is modelled as curved
+    surface_sigma_m: _Sigma = None  # deviation of the surface from its shape; without it, from the survey
+    bow: _Bow = "auto"  # whether the surface is modelled as curved
     boards: list[FixedBoard] = []  # noqa: RUF012 - frozen
     cloud: Cloud | None = None
 
 
-class SharedBoard(Block):
+class SharedBoard(fields.Block):
     """A board in several placements, each photographed by several cameras at once."""
 
     board: _BoardText
@@ -273,7 +262,7 @@ class SharedBoard(Block):
             for path in photos:
                 first = seen.setdefault(placement_of(path), path)
                 if first is not path:
-                    raise field_error(
+                    raise fields.field_error(
                         f"photos.{camera}: expected one photograph per placement, got {first.name} and {path.name} for"
                         f" {placement_of(path)!r}; the last number of a name is the placement"
                     )
@@ -289,20 +278,20 @@ class SharedBoard(Block):
         return dict(sorted(out.items()))
 
 
-class Stand(Block):
+class Stand(fields.Block):
     """The turntable or stand that carries the vehicle."""
 
     world_from_stand: PoseBlock | None = None  # without it, unknown
-    position_sigma_m: NonNegative | None = pydantic.Field(None, alias="sigma_m")  # each axis of world
-    attitude_sigma_deg: NonNegative | None = pydantic.Field(None, alias="sigma_deg")  # each axis
-    pose_sigma_m: NonNegative = 0.0  # of the stand's poses, where their table has no sigma
-    pose_sigma_deg: NonNegative = 0.0
+    position_sigma_m: fields.NonNegative | None = pydantic.Field(None, alias="sigma_m")  # each axis of world
+    attitude_sigma_deg: fields.NonNegative | None = pydantic.Field(None, alias="sigma_deg")  # each axis
+    pose_sigma_m: fields.NonNegative = 0.0  # of the stand's poses, where their table has no sigma
+    pose_sigma_deg: fields.NonNegative = 0.0
 
     @pydantic.model_validator(mode="after")
     def _known_or_not(self) -> Stand:
         sigmas = self.position_sigma_m, self.attitude_sigma_deg
         if self.world_from_stand is None and sigmas != (None, None):
-            raise field_error(
+            raise fields.field_error(
                 "sigma_m, sigma_deg: expected world_from_stand with them, got none; add it or leave them out"
             )
         return self
@@ -323,22 +312,24 @@ class Stand(Block):
         return float(np.radians(self.pose_sigma_deg))
 
 
-class RecordingEntry(Block):
+class RecordingEntry(fields.Block):
     """Spots recorded at poses of the stand, static or moving."""
 
     run: Annotated[Path | None, pydantic.PlainValidator(_run_folder)] = None  # a run folder, or ...
     spots: _File | None = None  # ... a spots.csv
     stated_poses: _File | None = pydantic.Field(None, alias="poses")  # columns of truth/pose.csv, optionally sigmas
-    use_truth: Annotated[bool, pydantic.PlainValidator(boolean)] = False  # the run's own truth/pose.csv
+    use_truth: Annotated[bool, pydantic.PlainValidator(fields.boolean)] = False  # the run's own truth/pose.csv
 
     @pydantic.model_validator(mode="after")
     def _one_of_them(self, info: pydantic.ValidationInfo) -> RecordingEntry:
         if (self.run is None) == (self.spots is None):
-            raise field_error(f"expected run or spots, got {'both; keep one' if self.run else 'neither'}")
+            raise fields.field_error(f"expected run or spots, got {'both; keep one' if self.run else 'neither'}")
         if self.use_truth and (self.run is None or self.stated_poses is not None):
-            raise field_error("use_truth: expected with a run and without poses: it means the run's own truth/pose.csv")
+            raise fields.field_error(
+                "use_truth: expected with a run and without poses: it means the run's own truth/pose.csv"
+            )
         if self.use_truth and info.context is not None and not (self.poses or Path()).is_file():
-            raise field_error(f"use_truth: expected a file, found none at {self.poses}")
+            raise fields.field_error(f"use_truth: expected a file, found none at {self.poses}")
         return self
 
     @property
@@ -347,10 +338,10 @@ class RecordingEntry(Block):
         return self.run / "truth" / "pose.csv" if self.use_truth and self.run else self.stated_poses
 
 
-class Project(Block):
+class Project(fields.Block):
     """The content of a calibration.yaml."""
 
-    schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
+    schema_: Annotated[str, pydantic.PlainValidator(fields.one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
     stated_name: Annotated[str | None, pydantic.PlainValidator(lambda v: None if v is None else _name(v))] = (
         pydantic.Field(None, alias="name")
     )
@@ -361,11 +352,11 @@ class Project(Block):
     survey: _Files = ()  # point,x_m,y_m,z_m[,sigma_x_m,sigma_y_m,sigma_z_m][,screen]
     points: _Files = ()  # camera,point,u_px,v_px[,sigma_px]
     boards: list[SharedBoard] = []  # noqa: RUF012 - frozen
-    world: Word | None = None  # the screen whose frame is the world frame; without it, the frame of the survey
+    world: fields.Word | None = None  # the screen whose frame is the world frame; without it, the frame of the survey
     target: TargetBlock | None = None  # as designed: start values of the calibration
     stand: Stand | None = None
     recordings: list[RecordingEntry] = []  # noqa: RUF012 - frozen
-    notes: Text = ""
+    notes: fields.Text = ""
     _place: Path = pydantic.PrivateAttr(Path("calibration.yaml"))
 
     @property

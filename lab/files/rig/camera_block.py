@@ -11,17 +11,7 @@ import pydantic
 from geometry import lens
 from geometry.arrays import Array, symmetric
 from geometry.camera import FISHEYE, LENSES, PERSPECTIVE
-from lab.files.text.fields import (
-    Block,
-    Number,
-    Positive,
-    field_error,
-    finite_number,
-    numbers,
-    one_of,
-    unexpected_value,
-    whole_number,
-)
+from lab.files.text import fields
 
 # Tolerance of symmetry and of eigenvalues, relative to the diagonal: rounding of sums in double precision.
 COVARIANCE_TOLERANCE = 1e-6
@@ -36,35 +26,35 @@ class Covariance:
 
 
 def _image_size(value: Any) -> list[int]:
-    numbers(2)(value)
-    size = [whole_number(v) for v in value]
+    fields.numbers(2)(value)
+    size = [fields.whole_number(v) for v in value]
     if min(size) < 1:
-        raise unexpected_value("a width and a height of at least 1 pixel", value)
+        raise fields.unexpected_value("a width and a height of at least 1 pixel", value)
     return size
 
 
 def _distortion(value: Any) -> list[float]:
     words = "0, 4, 5, 8, 12 or 14 numbers"
     if not isinstance(value, list):
-        raise unexpected_value(f"a list of {words}", value)
+        raise fields.unexpected_value(f"a list of {words}", value)
     if len(value) not in lens.ALLOWED_LENGTHS:
-        raise field_error(f"expected {words}, got {len(value)}")
-    return [finite_number(v) for v in value]
+        raise fields.field_error(f"expected {words}, got {len(value)}")
+    return [fields.finite_number(v) for v in value]
 
 
 def _parameter_names(value: Any) -> list[str]:
     if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-        raise unexpected_value("a list of parameter names", value)
+        raise fields.unexpected_value("a list of parameter names", value)
     return value
 
 
 def _matrix(value: Any) -> list[list[float]]:
     if not isinstance(value, list) or not all(isinstance(row, list) and len(row) == len(value) for row in value):
-        raise unexpected_value("a square matrix, as a list of rows", value)
-    return [[finite_number(v) for v in row] for row in value]
+        raise fields.unexpected_value("a square matrix, as a list of rows", value)
+    return [[fields.finite_number(v) for v in row] for row in value]
 
 
-class CovarianceBlock(Block):
+class CovarianceBlock(fields.Block):
     """A covariance matrix and the ordered names of its parameters."""
 
     parameters: Annotated[list[str], pydantic.PlainValidator(_parameter_names)]
@@ -73,7 +63,7 @@ class CovarianceBlock(Block):
     @pydantic.model_validator(mode="after")
     def _same_size(self) -> CovarianceBlock:
         if len(self.matrix) != len(self.parameters):
-            raise field_error(
+            raise fields.field_error(
                 f"expected a matrix row for each of {len(self.parameters)} parameters, got {len(self.matrix)}"
             )
         return self
@@ -106,25 +96,25 @@ def covariance_error(covariance: Covariance) -> str:
     return ""
 
 
-class _MatrixBlock(Block):
-    fx: Positive
-    fy: Positive
-    cx: Number
-    cy: Number
+class _MatrixBlock(fields.Block):
+    fx: fields.Positive
+    fy: fields.Positive
+    cx: fields.Number
+    cy: fields.Number
 
 
-class LensBlock(Block):
+class LensBlock(fields.Block):
     """The lens of a camera: picture size, camera matrix, distortion and lens model."""
 
     image_size_px: Annotated[list[int], pydantic.PlainValidator(_image_size)]
     camera_matrix: _MatrixBlock
     distortion: Annotated[list[float], pydantic.PlainValidator(_distortion)] = []  # noqa: RUF012 - frozen
-    lens: Annotated[str, pydantic.PlainValidator(one_of(LENSES))] = PERSPECTIVE
+    lens: Annotated[str, pydantic.PlainValidator(fields.one_of(LENSES))] = PERSPECTIVE
 
     @pydantic.model_validator(mode="after")
     def _numbers_of_the_model(self) -> LensBlock:
         if self.lens == FISHEYE and len(self.distortion) not in (0, 4):
-            raise field_error(
+            raise fields.field_error(
                 f"expected 4 distortion numbers (or none) for lens {FISHEYE!r}, got {len(self.distortion)}"
             )
         return self

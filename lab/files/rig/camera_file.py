@@ -23,20 +23,8 @@ from lab.files.rig.camera_block import (
     covariance_mapping,
     lens_mapping,
 )
+from lab.files.text import fields
 from lab.files.text.error_text import suggest_name
-from lab.files.text.fields import (
-    Block,
-    Integer,
-    Lines,
-    Name,
-    NonNegative,
-    Number,
-    Positive,
-    Text,
-    field_error,
-    one_of,
-    validated,
-)
 from lab.files.text.yaml_text import read_mapping, write_mapping
 
 SCHEMA = "beampose/camera/1"
@@ -92,7 +80,7 @@ class CameraFile:
 def load_camera(path: Path) -> CameraFile:
     """The camera of a camera.yaml. Raises InputError: one line for each mistake, with file and field."""
     path = Path(path)
-    content = validated(_CameraFileBlock, read_mapping(path), path)
+    content = fields.validated(_CameraFileBlock, read_mapping(path), path)
     return CameraFile(
         name=content.name,
         image_size_px=content.size(),
@@ -111,7 +99,7 @@ def save_camera(file: CameraFile, path: Path) -> None:
         InputError: the camera could not be loaded again, or the file cannot be written; an old file stays as it was.
     """
     content = as_mapping(file)
-    validated(_CameraFileBlock, content, path)
+    fields.validated(_CameraFileBlock, content, path)
     write_mapping(content, Path(path))
 
 
@@ -152,20 +140,20 @@ def _calibration_mapping(calibration: CameraCalibration) -> dict[str, Any]:
 # The schema of the file ----------------------------------------------------------------------------------------------
 
 
-class _CalibrationBlock(Block):
+class _CalibrationBlock(fields.Block):
     date: DayText = ""
-    verdict: Annotated[str, pydantic.PlainValidator(one_of((*VERDICTS, "")))] = ""
-    rms_px: NonNegative | None = None
-    sigma_px: NonNegative | None = None
-    hold_out_rms_px: NonNegative | None = None
-    views: Integer | None = None
-    corners: Integer | None = None
-    board: Text = ""
-    distance_m: Positive | None = None
+    verdict: Annotated[str, pydantic.PlainValidator(fields.one_of((*VERDICTS, "")))] = ""
+    rms_px: fields.NonNegative | None = None
+    sigma_px: fields.NonNegative | None = None
+    hold_out_rms_px: fields.NonNegative | None = None
+    views: fields.Integer | None = None
+    corners: fields.Integer | None = None
+    board: fields.Text = ""
+    distance_m: fields.Positive | None = None
     valid_until: DayText = ""
-    reasons: Lines = []  # noqa: RUF012 - frozen
-    figures: dict[str, Number] = {}  # noqa: RUF012 - frozen
-    notes: Text = ""
+    reasons: fields.Lines = []  # noqa: RUF012 - frozen
+    figures: dict[str, fields.Number] = {}  # noqa: RUF012 - frozen
+    notes: fields.Text = ""
 
     def value(self) -> CameraCalibration:
         """The block as a value."""
@@ -174,8 +162,8 @@ class _CalibrationBlock(Block):
 
 
 class _CameraFileBlock(LensBlock):
-    schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
-    name: Name
+    schema_: Annotated[str, pydantic.PlainValidator(fields.one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
+    name: fields.Name
     covariance: CovarianceBlock | None = None
     calibration: _CalibrationBlock | None = None
 
@@ -188,11 +176,13 @@ class _CameraFileBlock(LensBlock):
         seen: set[str] = set()
         for name in self.covariance.parameters:
             if name not in known:
-                raise field_error(f"covariance.parameters: unknown parameter {name!r}{suggest_name(name, known)}")
+                raise fields.field_error(
+                    f"covariance.parameters: unknown parameter {name!r}{suggest_name(name, known)}"
+                )
             if name in seen:
-                raise field_error(f"covariance.parameters: expected each name once, got {name!r} a second time")
+                raise fields.field_error(f"covariance.parameters: expected each name once, got {name!r} a second time")
             seen.add(name)
         mistake = covariance_error(self.covariance.value())
         if mistake:
-            raise field_error(f"covariance.matrix: {mistake}")
+            raise fields.field_error(f"covariance.matrix: {mistake}")
         return self

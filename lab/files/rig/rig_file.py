@@ -26,19 +26,8 @@ from lab.files.rig.camera_block import (
     plain_floats,
 )
 from lab.files.rig.pose_block import BeamBlock, CameraPoseBlock, ScreenPoseBlock, measured_forms, pose_mapping
+from lab.files.text import fields
 from lab.files.text.error_text import FileError, suggest_name
-from lab.files.text.fields import (
-    Block,
-    Name,
-    NonNegative,
-    Number,
-    Positive,
-    Vector3,
-    Word,
-    one_of,
-    positive_numbers,
-    validated,
-)
 from lab.files.text.yaml_text import read_mapping, write_mapping
 
 # The covariance blocks of a rig.yaml as one joint covariance of the rig's parameters.
@@ -128,7 +117,7 @@ def load_rig(path: Path) -> Rig:
 def load_rig_file(path: Path) -> RigFile:
     """The rig of a rig.yaml with its covariance blocks and the state of its calibration. Raises InputError."""
     path = Path(path)
-    content = validated(_RigBlock, read_mapping(path), path)
+    content = fields.validated(_RigBlock, read_mapping(path), path)
     mistakes = _broken_references(content)
     if mistakes:
         raise FileError(f"{path}: {m}" for m in mistakes)
@@ -147,19 +136,19 @@ def save_rig(rig: Rig | RigFile, path: Path) -> None:
     """
     file = rig if isinstance(rig, RigFile) else RigFile(rig)
     content = as_mapping(file)
-    validated(_RigBlock, content, path)
+    fields.validated(_RigBlock, content, path)
     write_mapping(content, Path(path), file.measured_as)
 
 
 # The schema of the file ----------------------------------------------------------------------------------------------
 
 
-class ScreenBlock(Block):
+class ScreenBlock(fields.Block):
     """A screen of a rig."""
 
     world_from_screen: ScreenPoseBlock
-    size_m: Annotated[list[float] | None, pydantic.PlainValidator(positive_numbers(2))] = None
-    bow_per_m: Vector3 = [0.0, 0.0, 0.0]  # noqa: RUF012 - frozen
+    size_m: Annotated[list[float] | None, pydantic.PlainValidator(fields.positive_numbers(2))] = None
+    bow_per_m: fields.Vector3 = [0.0, 0.0, 0.0]  # noqa: RUF012 - frozen
     covariance: CovarianceBlock | None = None
 
     def value(self, name: str) -> Screen:
@@ -169,16 +158,16 @@ class ScreenBlock(Block):
         return Screen(name, self.world_from_screen.pose(), size, (a, b, c))
 
 
-class _NoiseBlock(Block):
-    gain_e_per_dn: Positive
-    read_noise_e: NonNegative
-    black_dn: Number = 0.0
+class _NoiseBlock(fields.Block):
+    gain_e_per_dn: fields.Positive
+    read_noise_e: fields.NonNegative
+    black_dn: fields.Number = 0.0
 
 
 class CameraBlock(LensBlock):
     """A camera of a rig."""
 
-    screen: Word
+    screen: fields.Word
     camera_from_world: CameraPoseBlock
     noise: _NoiseBlock | None = None
     covariance: CovarianceBlock | None = None
@@ -198,17 +187,17 @@ class CameraBlock(LensBlock):
         )
 
 
-class _SpotBlock(Block):
-    beam: Word
-    end: Annotated[str, pydantic.PlainValidator(one_of(("+", "-")))]
-    screen: Word
+class _SpotBlock(fields.Block):
+    beam: fields.Word
+    end: Annotated[str, pydantic.PlainValidator(fields.one_of(("+", "-")))]
+    screen: fields.Word
 
 
-class TargetBlock(Block):
+class TargetBlock(fields.Block):
     """The vehicle's beams and spots."""
 
-    beams: dict[Name, BeamBlock]
-    spots: dict[Name, _SpotBlock]
+    beams: dict[fields.Name, BeamBlock]
+    spots: dict[fields.Name, _SpotBlock]
     covariance: CovarianceBlock | None = None
 
     def beam_values(self) -> dict[str, Beam]:
@@ -243,10 +232,10 @@ class TargetBlock(Block):
         return out
 
 
-class _RigBlock(Block):
-    schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
-    screens: dict[Name, ScreenBlock]
-    cameras: dict[Name, CameraBlock]
+class _RigBlock(fields.Block):
+    schema_: Annotated[str, pydantic.PlainValidator(fields.one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
+    screens: dict[fields.Name, ScreenBlock]
+    cameras: dict[fields.Name, CameraBlock]
     target: TargetBlock
     calibration: CalibrationStateBlock | None = None
 

@@ -22,23 +22,9 @@ from lab.files.rig.rig_file import joint_covariance, load_rig_file
 from lab.files.run.clocks import CameraClock, load_clock
 from lab.files.run.not_a_run import no_run_error
 from lab.files.run.times import Times, load_times
+from lab.files.text import fields
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.error_text import FileError, name_of_path, suggest_name
-from lab.files.text.fields import (
-    Block,
-    Name,
-    NonNegative,
-    Positive,
-    Text,
-    Vector3,
-    Word,
-    field_error,
-    finite_number,
-    number_between,
-    one_of,
-    unexpected_value,
-    validated,
-)
 from lab.files.text.yaml_text import read_mapping, write_mapping
 from lab.pictures.picture_file import PICTURE_SUFFIXES
 from tracking.parameters import TrackerParameters
@@ -146,7 +132,7 @@ def load_run(run_folder: Path) -> Run:
     """
     folder = folder_of_run(run_folder)
     path = folder / "run.yaml"
-    content = validated(_RunBlock, read_mapping(path), path)
+    content = fields.validated(_RunBlock, read_mapping(path), path)
     tracker = dataclass_from_yaml(TrackerParameters, content.tracker, path, "tracker")
 
     rig_path = folder / content.rig
@@ -213,7 +199,7 @@ def save_run(content: Mapping[str, Any], run_folder: Path) -> Path:
     """
     path = Path(run_folder) / "run.yaml"
     full = {"schema": SCHEMA, **content}
-    block = validated(_RunBlock, full, path)
+    block = fields.validated(_RunBlock, full, path)
     dataclass_from_yaml(TrackerParameters, block.tracker, path, "tracker")
     write_mapping(full, path)
     return path
@@ -227,35 +213,37 @@ def _a_device(value: Any) -> int | str:
         return value
     if isinstance(value, str) and value.strip():
         return value
-    raise unexpected_value("a camera's number from 0, or the name of a device", value)
+    raise fields.unexpected_value("a camera's number from 0, or the name of a device", value)
 
 
-class SourceBlock(Block):
+class SourceBlock(fields.Block):
     """The pictures of one camera in run.yaml."""
 
-    frames: Word | None = None
-    detections: Word | None = None
+    frames: fields.Word | None = None
+    detections: fields.Word | None = None
     device: Annotated[int | str | None, pydantic.PlainValidator(_a_device)] = None
 
     @pydantic.model_validator(mode="after")
     def _one_of_them(self) -> SourceBlock:
         given = [n for n in ("frames", "detections", "device") if getattr(self, n) is not None]
         if "device" in given and len(given) > 1:
-            raise field_error(f"expected one of frames, detections and device, got {' and '.join(given)}; keep one")
+            raise fields.field_error(
+                f"expected one of frames, detections and device, got {' and '.join(given)}; keep one"
+            )
         if len(given) > 1:
-            raise field_error("expected frames or detections, got both; keep one")
+            raise fields.field_error("expected frames or detections, got both; keep one")
         if not given:
-            raise field_error("expected frames or detections, got neither")
+            raise fields.field_error("expected frames or detections, got neither")
         return self
 
 
 def _seconds(value: Any) -> float:
     if value == "estimate":
-        raise field_error(
+        raise fields.field_error(
             "expected a number of seconds, got 'estimate', which this version does not do; the model check of a run"
             " states how late a camera is"
         )
-    return finite_number(value)
+    return fields.finite_number(value)
 
 
 class _CameraBlock(SourceBlock):
@@ -263,45 +251,45 @@ class _CameraBlock(SourceBlock):
 
     time_offset_s: Annotated[float, pydantic.PlainValidator(_seconds)] = 0.0
     row_time_s: Annotated[float, pydantic.PlainValidator(_seconds)] = 0.0
-    timestamps: Word | None = None
+    timestamps: fields.Word | None = None
 
 
 def _an_angle_range(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= 180:
-        raise unexpected_value("an angle above 0 and up to 180", value)
+        raise fields.unexpected_value("an angle above 0 and up to 180", value)
     return float(value)
 
 
-class _PriorBlock(Block):
-    position_m: Vector3
-    yaw_pitch_roll_deg: Vector3
-    within_m: NonNegative
+class _PriorBlock(fields.Block):
+    position_m: fields.Vector3
+    yaw_pitch_roll_deg: fields.Vector3
+    within_m: fields.NonNegative
     within_deg: Annotated[float, pydantic.PlainValidator(_an_angle_range)]
 
 
 def _some_cameras(value: Any) -> Any:
     if isinstance(value, dict) and not value:
-        raise field_error("expected one or more cameras, got none")
+        raise fields.field_error("expected one or more cameras, got none")
     return value
 
 
-class _RunBlock(Block):
-    schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
-    name: Name | None = None
-    rig: Word
-    frame_rate_hz: Annotated[float, pydantic.PlainValidator(number_between(*RATE_RANGE_HZ, "Hz"))]
-    exposure_s: Positive | None = None
-    timestamps: Word | None = None
+class _RunBlock(fields.Block):
+    schema_: Annotated[str, pydantic.PlainValidator(fields.one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
+    name: fields.Name | None = None
+    rig: fields.Word
+    frame_rate_hz: Annotated[float, pydantic.PlainValidator(fields.number_between(*RATE_RANGE_HZ, "Hz"))]
+    exposure_s: fields.Positive | None = None
+    timestamps: fields.Word | None = None
     cameras: Annotated[dict[str, _CameraBlock], pydantic.BeforeValidator(_some_cameras)]
     prior: _PriorBlock | None = None
     tracker: Any = None
     recorded: OptionalDay = None
-    notes: Text = ""
+    notes: fields.Text = ""
 
     @pydantic.model_validator(mode="after")
     def _exposure_within_a_frame(self) -> _RunBlock:
         if self.exposure_s is not None and self.exposure_s * self.frame_rate_hz > LONGEST_EXPOSURE:
-            raise field_error(
+            raise fields.field_error(
                 f"exposure_s: expected at most the {1 / self.frame_rate_hz:.6g} s between two frames"
                 f" ({self.frame_rate_hz:g} Hz), got {self.exposure_s:g}; give seconds, not milliseconds"
             )
@@ -318,7 +306,7 @@ def _prior_of(block: _PriorBlock) -> PosePrior:
 
 def prior_from(content: Mapping[str, Any], place: str) -> PosePrior:
     """The prior region that the `prior` block of a run.yaml states. place: in messages. Raises InputError."""
-    return _prior_of(validated(_PriorBlock, dict(content), place))
+    return _prior_of(fields.validated(_PriorBlock, dict(content), place))
 
 
 def source_of(block: SourceBlock, folder: Path, where: str) -> Source:

@@ -13,20 +13,8 @@ from typing import Annotated, Any, TypeVar
 import pydantic
 
 from lab.errors import InputError
+from lab.files.text import fields
 from lab.files.text.error_text import describe_value
-from lab.files.text.fields import (
-    Block,
-    Integer,
-    Number,
-    Word,
-    boolean,
-    field_error,
-    finite_number,
-    numbers,
-    one_of,
-    unexpected_value,
-    validated,
-)
 
 T = TypeVar("T")
 
@@ -41,7 +29,9 @@ def dataclass_from_yaml(cls: type[T], mapping: Any, path: Path | str, inside: st
         FileError: unknown keys, wrong types, and values that the dataclass itself refuses.
     """
     model = block_of(typing.cast(Any, cls))
-    return _value_of(cls, validated(model, {} if mapping is None else _as_mapping(mapping, path, inside), path, inside))
+    return _value_of(
+        cls, fields.validated(model, {} if mapping is None else _as_mapping(mapping, path, inside), path, inside)
+    )
 
 
 def _as_mapping(value: Any, path: Path | str, inside: str) -> Mapping[str, Any]:
@@ -51,10 +41,10 @@ def _as_mapping(value: Any, path: Path | str, inside: str) -> Mapping[str, Any]:
 
 
 @cache
-def block_of(cls: type) -> type[Block]:
+def block_of(cls: type) -> type[fields.Block]:
     """A strict pydantic model with the fields of a parameter dataclass, see `dataclass_from_yaml`."""
     hints = typing.get_type_hints(cls)
-    fields: dict[str, Any] = {}
+    kinds: dict[str, Any] = {}
     for field in dataclasses.fields(cls):
         if not field.init:
             continue
@@ -64,15 +54,15 @@ def block_of(cls: type) -> type[Block]:
             default = field.default_factory()
         else:
             default = ...
-        fields[field.name] = (_kind_of(hints[field.name]), default)
-    made = pydantic.create_model(cls.__name__, __base__=Block, **fields)
+        kinds[field.name] = (_kind_of(hints[field.name]), default)
+    made = pydantic.create_model(cls.__name__, __base__=fields.Block, **kinds)
 
-    def build(self: Block) -> Any:
+    def build(self: fields.Block) -> Any:
         """The dataclass's own checks, run while pydantic knows the position in the file."""
         try:
             _value_of(cls, self)
         except ValueError as error:
-            raise field_error(str(error)) from None
+            raise fields.field_error(str(error)) from None
         return self
 
     return pydantic.create_model(
@@ -88,18 +78,18 @@ def _kind_of(hint: Any) -> Any:
         inner = next(a for a in arguments if a is not type(None))
         return Annotated[_kind_of(inner) | None, pydantic.WrapValidator(_nothing_or)]
     if origin is typing.Literal:
-        return Annotated[Any, pydantic.PlainValidator(one_of(arguments))]
+        return Annotated[Any, pydantic.PlainValidator(fields.one_of(arguments))]
     if origin is tuple:
         if arguments[-1] is Ellipsis:
             return Annotated[Any, pydantic.PlainValidator(_number_tuple)]
-        return Annotated[Any, pydantic.PlainValidator(lambda v: tuple(numbers(len(arguments))(v)))]
+        return Annotated[Any, pydantic.PlainValidator(lambda v: tuple(fields.numbers(len(arguments))(v)))]
     if dataclasses.is_dataclass(hint):
         return block_of(typing.cast(type, hint))
     kinds: dict[Any, Any] = {
-        float: Number,
-        int: Integer,
-        bool: Annotated[bool, pydantic.PlainValidator(boolean)],
-        str: Word,
+        float: fields.Number,
+        int: fields.Integer,
+        bool: Annotated[bool, pydantic.PlainValidator(fields.boolean)],
+        str: fields.Word,
     }
     if hint not in kinds:
         raise TypeError(f"a parameter of type {hint} cannot be read from a file")
@@ -112,17 +102,17 @@ def _nothing_or(value: Any, inner: Any) -> Any:
 
 def _number_tuple(value: Any) -> tuple[float, ...]:
     if not isinstance(value, list):
-        raise unexpected_value("a list of numbers", value)
-    return tuple(finite_number(v) for v in value)
+        raise fields.unexpected_value("a list of numbers", value)
+    return tuple(fields.finite_number(v) for v in value)
 
 
-def _value_of(cls: type[T], block: Block) -> T:
+def _value_of(cls: type[T], block: fields.Block) -> T:
     """The dataclass of a validated block."""
     hints = typing.get_type_hints(cls)
     values = {}
     for name in type(block).model_fields:
         value = getattr(block, name)
-        if isinstance(value, Block):
+        if isinstance(value, fields.Block):
             inner = [a for a in (hints[name], *typing.get_args(hints[name])) if dataclasses.is_dataclass(a)]
             value = _value_of(typing.cast(type, inner[0]), value)
         values[name] = value

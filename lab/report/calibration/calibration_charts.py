@@ -13,33 +13,7 @@ from html import escape
 import numpy as np
 
 from geometry.arrays import Array
-from lab.report.plot.axes import (
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILLION,
-    PlotArea,
-    Scale,
-    axes,
-    dots,
-    frame,
-    heading,
-    histogram,
-    line_path,
-    note,
-    number,
-    plot_area,
-    polyline,
-    svg_of,
-    text,
-    tick_texts,
-    ticks,
-    x_ticks,
-    y_ticks,
-)
+from lab.report.plot import svg
 from lab.report.plot.maps import BAR_WIDTH, colour_bar, colours, contour_lines, hex_colour, label_place, value_range
 
 
@@ -66,21 +40,21 @@ def flatness_map(
     if size_m is not None:
         half = np.array(size_m) / 2
         lo, hi = np.minimum(lo, -half), np.maximum(hi, half)
-    p = plot_area((lo[0], hi[0]), (lo[1], hi[1]), equal=True, right=BAR_WIDTH)
+    p = svg.plot_area((lo[0], hi[0]), (lo[1], hi[1]), equal=True, right=BAR_WIDTH)
     limits = value_range(mm, True)
-    out = axes(p, title, "x of the screen (m)", "y of the screen (m)")
+    out = svg.axes(p, title, "x of the screen (m)", "y of the screen (m)")
     if bow is not None:
         a, b, c = bow
         X, Y = np.meshgrid(np.linspace(lo[0], hi[0], 60), np.linspace(lo[1], hi[1], 45))
         offset = float(np.mean(a * xy[:, 0] ** 2 + b * xy[:, 0] * xy[:, 1] + c * xy[:, 1] ** 2)) if len(xy) else 0.0
         surface = 1e3 * (a * X**2 + b * X * Y + c * Y**2 - offset)
-        for level in ticks(limits[0], limits[1], 7):
+        for level in svg.ticks(limits[0], limits[1], 7):
             lines = [p.at(line) for line in contour_lines(surface, X[0], Y[:, 0], float(level))]
             if lines:
-                d = "".join(map(polyline, lines))
+                d = "".join(map(svg.polyline, lines))
                 out.append(f'<path d="{d}" stroke="var(--soft)" stroke-width="1" stroke-dasharray="4 3" fill="none"/>')
                 if place := label_place(p, lines):
-                    out.append(text(place[0], place[1] - 2, number(float(level)), "mid"))
+                    out.append(svg.text(place[0], place[1] - 2, svg.number(float(level)), "mid"))
     if size_m is not None:
         corner, opposite = p.at(-half).tolist(), p.at(half).tolist()
         x, y = corner[0], opposite[1]
@@ -94,17 +68,19 @@ def flatness_map(
     for key in np.unique(keys):
         some = keys == key
         fill = hex_colour(fills[some][0])
-        out.append(f'<path d="{dots(places[some], radius)}" fill="{fill}" stroke="var(--ink)" stroke-width="0.35"/>')
+        out.append(
+            f'<path d="{svg.dots(places[some], radius)}" fill="{fill}" stroke="var(--ink)" stroke-width="0.35"/>'
+        )
     out.append(colour_bar(p, *limits, "mm", True))
     if len(mm):
-        words = f"{len(mm)} points, RMS {number(float(np.sqrt(np.mean(mm**2))))} mm,"
-        words += f" largest {number(float(mm[np.argmax(np.abs(mm))]))} mm"
+        words = f"{len(mm)} points, RMS {svg.number(float(np.sqrt(np.mean(mm**2))))} mm,"
+        words += f" largest {svg.number(float(mm[np.argmax(np.abs(mm))]))} mm"
         if sigma_m is not None:
-            words += f"; sigma of one point {number(1e3 * sigma_m)} mm"
+            words += f"; sigma of one point {svg.number(1e3 * sigma_m)} mm"
         if bow is not None:
             words += "; dashed: the bow"
-        out.append(note(p, words))
-    return svg_of(p, title, [*out, frame(p)])
+        out.append(svg.note(p, words))
+    return svg.svg_of(p, title, [*out, svg.frame(p)])
 
 
 def correlation_matrix(names: Sequence[str], covariance: Array, title: str = "Correlations of the parameters") -> str:
@@ -120,15 +96,15 @@ def correlation_matrix(names: Sequence[str], covariance: Array, title: str = "Co
     left, top = min(28 + 6.0 * max((len(w) for w in names), default=0), 190.0), 24.0
     side = min(26.0, (540 - left - BAR_WIDTH) / max(n, 1))
     wide = side * n
-    p = PlotArea(Scale(0, n, left, left + wide), Scale(0, n, top, top + wide), 540, top + wide + left - 16)
-    out = [text(8, 15, title, "title")]
+    p = svg.PlotArea(svg.Scale(0, n, left, left + wide), svg.Scale(0, n, top, top + wide), 540, top + wide + left - 16)
+    out = [svg.text(8, 15, title, "title")]
     size = f"font-size:{min(11.0, max(side * 0.95, 5.0)):.1f}px"
     for i, name in enumerate(names):
         middle = top + (i + 0.5) * side
-        out.append(text(left - 5, middle + 0.33 * min(11, side), name, "end", size))
+        out.append(svg.text(left - 5, middle + 0.33 * min(11, side), name, "end", size))
         x = left + (i + 0.5) * side
         turned = f'transform="translate({x + 3:.1f} {top + wide + 6:.1f}) rotate(-90)"'
-        out.append(f"<g {turned}>{text(0, 0, name, 'end', size)}</g>")
+        out.append(f"<g {turned}>{svg.text(0, 0, name, 'end', size)}</g>")
         for k in range(n):
             r = correlation[i, k]
             fill = hex_colour(colours(np.array((r + 1) / 2), True)) if np.isfinite(r) else "var(--line)"
@@ -140,13 +116,13 @@ def correlation_matrix(names: Sequence[str], covariance: Array, title: str = "Co
                 digits = f"{abs(r):.2f}"[1:] if abs(r) < 0.995 else "1"
                 value = ("−" if r < 0 else "") + digits
                 style = f"font-size:{side * 0.4:.1f}px;fill:{ink}"
-                out.append(text(left + (k + 0.5) * side, middle + side * 0.14, value, "mid", style))
+                out.append(svg.text(left + (k + 0.5) * side, middle + side * 0.14, value, "mid", style))
     if n:
         out.append(colour_bar(p, -1.0, 1.0, "", True))
-    return svg_of(p, title, out)
+    return svg.svg_of(p, title, out)
 
 
-SERIES = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION)
+SERIES = (svg.BLUE, svg.ORANGE, svg.GREEN, svg.PURPLE, svg.SKY, svg.VERMILLION)
 
 
 def residual_histogram(
@@ -162,12 +138,12 @@ def residual_histogram(
     robust = 1.4826 * float(np.median(np.abs(values))) if values.size else 1.0
     spread = max(sigma if sigma is not None else robust, 1e-12)
     beyond = int((np.abs(values) > 5 * spread).sum())
-    rms = number(float(np.sqrt(np.mean(values**2)))) if values.size else "–"
-    words = f"{len(values)} values, RMS {rms} {unit}; curve: sigma {number(float(spread))} {unit}"
-    words += "" if sigma is None else f" (robust spread {number(robust)})"
+    rms = svg.number(float(np.sqrt(np.mean(values**2)))) if values.size else "–"
+    words = f"{len(values)} values, RMS {rms} {unit}; curve: sigma {svg.number(float(spread))} {unit}"
+    words += "" if sigma is None else f" (robust spread {svg.number(robust)})"
     words += f"; beyond 5 sigma: {beyond}" + (f" (normal: {5.7e-7 * len(values):.1g})" if beyond else "")
     limits = -5 * spread, 5 * spread
-    return histogram(values, limits, title, f"residual ({unit})", sigma=spread, footnote=words)
+    return svg.histogram(values, limits, title, f"residual ({unit})", sigma=spread, footnote=words)
 
 
 def lens_model_chart(
@@ -188,19 +164,19 @@ def lens_model_chart(
     top = max(min(float(finite.max()), 4 * float(finite.min())) * 1.15 if finite.size else 1.0, 1e-9)
     row, left = 26.0, min(20 + 6.4 * max((len(n) for n in names), default=0), 200.0)
     low = 28 + row * len(names)
-    p = PlotArea(Scale(0, top, left, 470), Scale(0, len(names), 28, low), 540, low + 38)
-    marks = ticks(0, top, 6)
-    out = [text(8, 15, title, "title"), x_ticks(p, marks, tick_texts(marks), grid=True)]
-    out.append(text((left + 470) / 2, low + 30, "expected error (px)", "mid"))
+    p = svg.PlotArea(svg.Scale(0, top, left, 470), svg.Scale(0, len(names), 28, low), 540, low + 38)
+    marks = svg.ticks(0, top, 6)
+    out = [svg.text(8, 15, title, "title"), svg.x_ticks(p, marks, svg.tick_texts(marks), grid=True)]
+    out.append(svg.text((left + 470) / 2, low + 30, "expected error (px)", "mid"))
     for i, name in enumerate(names):
         y = float(p.Y(np.array(i + 0.5)))
         bold = "font-weight:600;fill:var(--ink)" if i == chosen else ""
-        out.append(text(left - 6, y + 4, name, "end", bold))
+        out.append(svg.text(left - 6, y + 4, name, "end", bold))
         if not np.isfinite(rms[i]):
-            out.append(text(left + 6, y + 4, "did not fit"))
+            out.append(svg.text(left + 6, y + 4, "did not fit"))
             continue
         long = float(p.X(np.array(min(rms[i], top)))) - left
-        fill = BLUE if i == chosen else GREY
+        fill = svg.BLUE if i == chosen else svg.GREY
         out.append(
             f'<rect x="{left:.1f}" y="{y - 8:.1f}" width="{long:.1f}" height="16" fill="{fill}" fill-opacity="0.85">'
             f"<title>{escape(name)}: {rms[i]:.4g} px</title></rect>"
@@ -208,14 +184,14 @@ def lens_model_chart(
         if noise_px is not None and np.isfinite(noise_px[i]):
             x = float(p.X(np.array(min(noise_px[i], top))))
             out.append(
-                f'<path d="M{x:.1f} {y - 11:.1f}v22" stroke="{ORANGE}" stroke-width="2.5">'
+                f'<path d="M{x:.1f} {y - 11:.1f}v22" stroke="{svg.ORANGE}" stroke-width="2.5">'
                 f"<title>noise: {noise_px[i]:.4g} px</title></path>"
             )
-        words = number(float(rms[i])) + (" ✓" if i == chosen else "") + (" ▸" if rms[i] > top else "")
-        out.append(text(476, y + 4, words, "", bold))
+        words = svg.number(float(rms[i])) + (" ✓" if i == chosen else "") + (" ▸" if rms[i] > top else "")
+        out.append(svg.text(476, y + 4, words, "", bold))
     if noise_px is not None:
-        out.append(text(532, low + 30, "orange: noise", "end"))
-    return svg_of(p, title, [*out, frame(p, closed=False)])
+        out.append(svg.text(532, low + 30, "orange: noise", "end"))
+    return svg.svg_of(p, title, [*out, svg.frame(p, closed=False)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,15 +222,15 @@ def drift_chart(
     if expires is not None and expires.toordinal() <= last + max(2 * (last - first), 30):
         last = max(last, expires.toordinal())
     pad = max(0.03 * (last - first), 0.6)
-    p = plot_area((first - pad, last + pad), (0, top * 1.12), height=250)
+    p = svg.plot_area((first - pad, last + pad), (0, top * 1.12), height=250)
     left, over, wide, high = p.box
-    marks, dated = ticks(0, p.Y.hi, 5), _day_ticks(first, last)
+    marks, dated = svg.ticks(0, p.Y.hi, 5), _day_ticks(first, last)
     out = [
-        heading(p, f"{title} ({unit})"),
-        y_ticks(p, marks, tick_texts(marks), grid=True),
-        x_ticks(p, np.array(dated, dtype=float), [date.fromordinal(d).isoformat() for d in dated]),
+        svg.heading(p, f"{title} ({unit})"),
+        svg.y_ticks(p, marks, svg.tick_texts(marks), grid=True),
+        svg.x_ticks(p, np.array(dated, dtype=float), [date.fromordinal(d).isoformat() for d in dated]),
     ]
-    for limit, colour, words in ((warn, ORANGE, "warning"), (fail, VERMILLION, "not to be used")):
+    for limit, colour, words in ((warn, svg.ORANGE, "warning"), (fail, svg.VERMILLION, "not to be used")):
         if limit is not None:
             y = float(p.Y(np.array(limit)))
             out.append(
@@ -263,34 +239,34 @@ def drift_chart(
             )
             # One label at each end: the limits are often too close for two lines of text.
             x, side = (left + 4, "") if limit == warn else (left + wide - 4, "end")
-            out.append(text(x, y - 4, f"{words} {number(limit)}", side))
+            out.append(svg.text(x, y - 4, f"{words} {svg.number(limit)}", side))
     if expires is not None and expires.toordinal() <= last:
         x = float(p.X(np.array(float(expires.toordinal()))))
-        out.append(f'<path d="M{x:.1f} {over:.1f}v{high:.1f}" stroke="{VERMILLION}" stroke-width="1.3"/>')
-        out.append(text(x - 4, over + high - 6, "expires", "end"))  # at the bottom, away from the limits
+        out.append(f'<path d="M{x:.1f} {over:.1f}v{high:.1f}" stroke="{svg.VERMILLION}" stroke-width="1.3"/>')
+        out.append(svg.text(x - 4, over + high - 6, "expires", "end"))  # at the bottom, away from the limits
     at = left
     for i, (name, line) in enumerate(lines.items()):
         out += _drift_line(p, name, line, SERIES[i % len(SERIES)], at)
         at += 34 + 6.4 * len(name)
-    return svg_of(p, title, [*out, frame(p)])
+    return svg.svg_of(p, title, [*out, svg.frame(p)])
 
 
-def _drift_line(p: PlotArea, name: str, line: DriftLine, colour: str, legend_x: float) -> list[str]:
+def _drift_line(p: svg.PlotArea, name: str, line: DriftLine, colour: str, legend_x: float) -> list[str]:
     """One camera's values over the days with their sigmas, and its entry in the legend."""
     order = np.argsort([d.toordinal() for d in line.dates], kind="stable")
     x = p.X(np.array([line.dates[k].toordinal() for k in order], dtype=float))
     v = np.asarray(line.values, dtype=float)[order]
     y = p.Y(v)
-    out = [f'<path class="line" d="{line_path(x, y)}" stroke="{colour}" stroke-width="1.6"/>']
+    out = [f'<path class="line" d="{svg.line_path(x, y)}" stroke="{colour}" stroke-width="1.6"/>']
     if line.sigmas is not None:
         s = np.asarray(line.sigmas, dtype=float)[order]
         low, up = p.Y(np.maximum(v - s, 0)), p.Y(v + s)
         d = "".join(f"M{a:.1f} {b:.1f}V{c:.1f}" for a, b, c in zip(x, low, up, strict=True) if np.isfinite(b + c))
         out.append(f'<path d="{d}" stroke="{colour}" stroke-width="1" stroke-opacity="0.7"/>')
-    d = dots(np.stack([x, y], axis=-1), 3)
+    d = svg.dots(np.stack([x, y], axis=-1), 3)
     out.append(f'<path d="{d}" fill="{colour}" stroke="var(--paper)" stroke-width="0.7"/>')
     out.append(f'<path d="M{legend_x:.1f} {p.height - 6:.1f}h16" stroke="{colour}" stroke-width="3"/>')
-    out.append(text(legend_x + 20, p.height - 2, name))
+    out.append(svg.text(legend_x + 20, p.height - 2, name))
     return out
 
 

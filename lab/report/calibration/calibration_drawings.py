@@ -12,27 +12,7 @@ import cv2
 import numpy as np
 
 from geometry.arrays import Array, Bools
-from lab.report.plot.axes import (
-    BLUE,
-    INK,
-    ORANGE,
-    VERMILLION,
-    PlotArea,
-    Scale,
-    axes,
-    dots,
-    filled,
-    frame,
-    image_area,
-    image_uri,
-    note,
-    number,
-    polyline,
-    round_size,
-    segments,
-    svg_of,
-    text,
-)
+from lab.report.plot import svg
 
 _MOST_VECTORS = 2000  # in a residual field: more cover each other
 _ARROW = 24.0  # drawing units: length of the 95th percentile of the residuals
@@ -56,8 +36,8 @@ def corners_overlay(
     or (height, width, 3): the photograph, embedded beneath as a smaller JPEG. rejected (n,): corners that were not
     used. labels (n,): names of the corners, if any.
     """
-    p = image_area(size_px)
-    out = axes(p, title, "u (px)", "v (px)", grid=picture is None)
+    p = svg.image_area(size_px)
+    out = svg.axes(p, title, "u (px)", "v (px)", grid=picture is None)
     if picture is not None:
         out.append(_photograph(p, np.asarray(picture)))
     found, residual = np.asarray(found_px, dtype=float), np.asarray(residual_px, dtype=float)
@@ -65,18 +45,18 @@ def corners_overlay(
     stretch, bar = _magnification(residual[~bad])
     starts = p.at(found)
     ends = starts + _capped(residual * stretch)
-    for colour, some, radius in ((BLUE, ~bad, 2.2), (VERMILLION, bad, 3.0)):
-        vectors, places = segments(starts[some], ends[some]), dots(starts[some], radius)
+    for colour, some, radius in ((svg.BLUE, ~bad, 2.2), (svg.VERMILLION, bad, 3.0)):
+        vectors, places = svg.segments(starts[some], ends[some]), svg.dots(starts[some], radius)
         # A light line beneath keeps the coloured line visible on any photograph.
         out.append(f'<path d="{vectors}" stroke="#fff" stroke-width="3.4" stroke-opacity="0.75" fill="none"/>')
-        out.append(f'<path d="{vectors}" stroke="{ORANGE}" stroke-width="1.6" fill="none"/>')
+        out.append(f'<path d="{vectors}" stroke="{svg.ORANGE}" stroke-width="1.6" fill="none"/>')
         out.append(f'<path d="{places}" fill="{colour}" stroke="#fff" stroke-width="0.7"/>')
     for place, label in zip(starts.tolist(), labels or (), strict=labels is not None):
-        out.append(text(place[0] - 5, place[1] + 13, label, "end"))
+        out.append(svg.text(place[0] - 5, place[1] + 13, label, "end"))
     out.append(_scale_bar(p, stretch, bar))
     if bad.any():
-        out.append(note(p, f"{bad.sum()} corners not used (red); their vectors are cut"))
-    return svg_of(p, title, [*out, frame(p)])
+        out.append(svg.note(p, f"{bad.sum()} corners not used (red); their vectors are cut"))
+    return svg.svg_of(p, title, [*out, svg.frame(p)])
 
 
 def residual_field(
@@ -97,10 +77,10 @@ def residual_field(
     found, residual = np.asarray(found_px, dtype=float), np.asarray(residual_px, dtype=float)
     good = np.isfinite(found).all(axis=1) & np.isfinite(residual).all(axis=1)
     found, residual = found[good], residual[good]
-    p = image_area(size_px)
-    out = axes(p, title, "u (px)", "v (px)")
+    p = svg.image_area(size_px)
+    out = svg.axes(p, title, "u (px)", "v (px)")
     if not len(found):
-        return svg_of(p, title, [*out, frame(p), _in_the_middle(p, f"no {things}")])
+        return svg.svg_of(p, title, [*out, svg.frame(p), _in_the_middle(p, f"no {things}")])
     stretch, bar = _magnification(residual)
     kept = np.arange(len(found))
     if len(found) > _MOST_VECTORS:
@@ -108,18 +88,18 @@ def residual_field(
         largest = np.argsort(np.linalg.norm(residual, axis=1))[-_MOST_VECTORS // 10 :]
         kept = np.union1d(np.linspace(0, len(found) - 1, _MOST_VECTORS).astype(np.int64), largest)
     starts = p.at(found)
-    d = segments(starts[kept], starts[kept] + _capped(residual[kept] * stretch))
-    out.append(f'<path d="{d}" stroke="{BLUE}" stroke-width="0.7" stroke-opacity="0.55" fill="none"/>')
+    d = svg.segments(starts[kept], starts[kept] + _capped(residual[kept] * stretch))
+    out.append(f'<path d="{d}" stroke="{svg.BLUE}" stroke-width="0.7" stroke-opacity="0.55" fill="none"/>')
     middle, mean, _ = cell_means(size_px, found, residual, cells)
     tips = p.at(middle) + mean * stretch * 2
-    d = segments(p.at(middle), tips)
+    d = svg.segments(p.at(middle), tips)
     out.append(f'<path d="{d}" stroke="var(--paper)" stroke-width="4" fill="none"/>')
-    out.append(f'<path d="{d}" stroke="{VERMILLION}" stroke-width="2" stroke-linecap="round" fill="none"/>')
-    out.append(f'<path d="{dots(p.at(middle), 1.7)}" fill="{VERMILLION}"/>')
+    out.append(f'<path d="{d}" stroke="{svg.VERMILLION}" stroke-width="2" stroke-linecap="round" fill="none"/>')
+    out.append(f'<path d="{svg.dots(p.at(middle), 1.7)}" fill="{svg.VERMILLION}"/>')
     out.append(_scale_bar(p, stretch, bar))
     counted = f"{len(found)} {things}" + (f", {len(kept)} drawn" if len(kept) < len(found) else "")
-    out.append(note(p, f"blue: {counted}; red: mean of a cell, twice as long"))
-    return svg_of(p, title, [*out, frame(p)])
+    out.append(svg.note(p, f"blue: {counted}; red: mean of a cell, twice as long"))
+    return svg.svg_of(p, title, [*out, svg.frame(p)])
 
 
 def cell_means(
@@ -154,8 +134,8 @@ def coverage_map(
     """
     corners = np.asarray(corners_px, dtype=float)
     corners = corners[np.isfinite(corners).all(axis=1)]
-    p = image_area(size_px)
-    out = axes(p, title, "u (px)", "v (px)", grid=False)
+    p = svg.image_area(size_px)
+    out = svg.axes(p, title, "u (px)", "v (px)", grid=False)
     middle, _, count = cell_means(size_px, corners, np.zeros((len(corners), 1)), cells, 0)
     side = np.array([size_px[0] / cells, size_px[1] * cells / len(count)])
     most = max(float(count.max()), 1.0)
@@ -165,22 +145,22 @@ def coverage_map(
         box = f'x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}" height="{low - top:.1f}"'
         if n:
             # The square root, so that a cell with 5 corners beside one with 500 does not look empty.
-            out.append(f'<rect {box} fill="{BLUE}" fill-opacity="{0.12 + 0.8 * np.sqrt(n / most):.2f}"/>')
+            out.append(f'<rect {box} fill="{svg.BLUE}" fill-opacity="{0.12 + 0.8 * np.sqrt(n / most):.2f}"/>')
         else:
             slope = f"M{left:.1f} {low:.1f}L{right:.1f} {top:.1f}M{left:.1f} {top:.1f}L{right:.1f} {low:.1f}"
-            out.append(f'<path d="{slope}" stroke="{VERMILLION}" stroke-width="1" stroke-opacity="0.8"/>')
+            out.append(f'<path d="{slope}" stroke="{svg.VERMILLION}" stroke-width="1" stroke-opacity="0.8"/>')
         if n or most > 1:
             words = f"{n:.0f}"
             style = "font-size:9.5px;fill:#fff;paint-order:stroke;stroke:#0008;stroke-width:2px" if n else "fill:none"
-            out.append(text((left + right) / 2, (top + low) / 2 + 3.5, words, "mid", style))
+            out.append(svg.text((left + right) / 2, (top + low) / 2 + 3.5, words, "mid", style))
     step = max(1, -(-len(outlines_px or []) // 60))
     for outline in (outlines_px or [])[::step]:
-        d = polyline(p.at(outline), closed=True)
-        out.append(f'<path d="{d}" fill="none" stroke="{ORANGE}" stroke-width="0.8" stroke-opacity="0.7"/>')
+        d = svg.polyline(p.at(outline), closed=True)
+        out.append(f'<path d="{d}" fill="none" stroke="{svg.ORANGE}" stroke-width="0.8" stroke-opacity="0.7"/>')
     share = float((count > 0).mean())
     words = f"{len(corners)} {things} in {100 * share:.0f} % of the cells of the sensor; crossed out: none"
-    out.append(note(p, words))
-    return svg_of(p, title, [*out, frame(p)])
+    out.append(svg.note(p, words))
+    return svg.svg_of(p, title, [*out, svg.frame(p)])
 
 
 def tilt_polar(
@@ -194,8 +174,8 @@ def tilt_polar(
     tilts, azimuths = np.asarray(tilts_deg, dtype=float), np.radians(np.asarray(azimuths_deg, dtype=float))
     finite = tilts[np.isfinite(tilts)]
     outer = max(60.0, float(finite.max()) * 1.05 if finite.size else 0.0)
-    p = PlotArea(Scale(-outer, outer, 95, 445), Scale(-outer, outer, 30, 380), 540, 412)
-    out = [text(58, 15, title, "title")]
+    p = svg.PlotArea(svg.Scale(-outer, outer, 95, 445), svg.Scale(-outer, outer, 30, 380), 540, 412)
+    out = [svg.text(58, 15, title, "title")]
     at = p.at(np.zeros(2))
     per_degree = 175 / outer
     for ring in range(20, int(outer) + 1, 20):
@@ -203,19 +183,18 @@ def tilt_polar(
             f'<circle class="ring" cx="{at[0]}" cy="{at[1]}" r="{ring * per_degree:.1f}" fill="none"'
             f' stroke="var(--line)" stroke-width="0.8"/>'
         )
-        out.append(text(float(at[0]) + 3, float(at[1]) - ring * per_degree - 2, f"{ring}°"))
+        out.append(svg.text(float(at[0]) + 3, float(at[1]) - ring * per_degree - 2, f"{ring}°"))
     out.append(
-        f'<circle cx="{at[0]}" cy="{at[1]}" r="{wanted_deg * per_degree:.1f}" fill="{ORANGE}" fill-opacity="0.16"/>'
+        f'<circle cx="{at[0]}" cy="{at[1]}" r="{wanted_deg * per_degree:.1f}" fill="{svg.ORANGE}" fill-opacity="0.16"/>'
     )
     out.append('<path class="grid" d="M95 205H445M270 30V380"/>')
-    out += [text(449, 209, "+u"), text(270, 394, "+v", "mid")]
+    out += [svg.text(449, 209, "+u"), svg.text(270, 394, "+v", "mid")]
     places = p.at(np.stack([tilts * np.cos(azimuths), tilts * np.sin(azimuths)], axis=-1))
-    out.append(
-        f'<path d="{dots(places, 3.6)}" fill="{BLUE}" fill-opacity="0.75" stroke="var(--paper)" stroke-width="0.7"/>'
-    )
+    style = f'fill="{svg.BLUE}" fill-opacity="0.75" stroke="var(--paper)" stroke-width="0.7"'
+    out.append(f'<path d="{svg.dots(places, 3.6)}" {style}/>')
     few = int((finite > wanted_deg).sum())
-    out.append(text(58, 408, f"{few} of {finite.size} views are tilted by more than {wanted_deg:g}°"))
-    return svg_of(p, title, out)
+    out.append(svg.text(58, 408, f"{few} of {finite.size} views are tilted by more than {wanted_deg:g}°"))
+    return svg.svg_of(p, title, out)
 
 
 def _magnification(residual: Array) -> tuple[float, float]:
@@ -223,7 +202,7 @@ def _magnification(residual: Array) -> tuple[float, float]:
     size = np.linalg.norm(residual, axis=1)
     size = size[np.isfinite(size)]
     usual = max(float(np.percentile(size, 95)) if size.size else 0.0, 1e-6)
-    return _ARROW / usual, round_size(usual * 1.5)
+    return _ARROW / usual, svg.round_size(usual * 1.5)
 
 
 def _capped(vectors: Array) -> Array:
@@ -232,17 +211,17 @@ def _capped(vectors: Array) -> Array:
     return vectors * np.minimum(1.0, _LONGEST / np.maximum(length, 1e-9))
 
 
-def _scale_bar(p: PlotArea, stretch: float, bar: float) -> str:
+def _scale_bar(p: svg.PlotArea, stretch: float, bar: float) -> str:
     left, top, wide, _ = p.box
     long = bar * stretch
     x, y = left + wide - 8, top - 8
-    words = f"residual of {number(bar)} px"
+    words = f"residual of {svg.number(bar)} px"
     line = f'<path d="M{x - long:.1f} {y:.1f}h{long:.1f}m0 -3v6m{-long:.1f} 0v-6"'
-    line += f' stroke="{INK}" stroke-width="1.3" fill="none"/>'
-    return line + text(x - long - 6, y + 4, words, "end")
+    line += f' stroke="{svg.INK}" stroke-width="1.3" fill="none"/>'
+    return line + svg.text(x - long - 6, y + 4, words, "end")
 
 
-def _photograph(p: PlotArea, picture: np.ndarray) -> str:
+def _photograph(p: svg.PlotArea, picture: np.ndarray) -> str:
     """The photograph inside the axes, as JPEG."""
     if picture.dtype != np.uint8:
         top = max(float(picture.max()), 1.0)
@@ -251,9 +230,9 @@ def _photograph(p: PlotArea, picture: np.ndarray) -> str:
         shrink = _PICTURE_WIDTH / picture.shape[1]
         size = (_PICTURE_WIDTH, max(1, round(picture.shape[0] * shrink)))
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    return filled(p, image_uri(picture, "jpeg"))
+    return svg.filled(p, svg.image_uri(picture, "jpeg"))
 
 
-def _in_the_middle(p: PlotArea, words: str) -> str:
+def _in_the_middle(p: svg.PlotArea, words: str) -> str:
     left, top, wide, high = p.box
-    return text(left + wide / 2, top + high / 2, words, "mid")
+    return svg.text(left + wide / 2, top + high / 2, words, "mid")

@@ -13,23 +13,7 @@ from geometry.camera import Camera, pinhole_numbers
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from lab.report.plot.axes import (
-    BLUE,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    VERMILLION,
-    PlotArea,
-    Scale,
-    dots,
-    line_path,
-    number,
-    polyline,
-    round_size,
-    segments,
-    svg_of,
-    text,
-)
+from lab.report.plot import svg
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +23,7 @@ class Frustum:
     name: str
     camera_from_world: Pose
     half_width: tuple[float, float]  # tangents of half the angle of view, horizontal and vertical
-    colour: str = BLUE
+    colour: str = svg.BLUE
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +34,7 @@ class Rectangle:
     world_from_rectangle: Pose
     size_m: tuple[float, float]
     centred: bool = True  # whether its origin is its centre, else a corner
-    colour: str = GREEN
+    colour: str = svg.GREEN
     faint: bool = False  # thin and without a name, for one of many boards
 
 
@@ -61,7 +45,7 @@ class Ray:
     name: str
     start: Array  # (3,), m, in world
     end: Array  # (3,), m, in world
-    colour: str = VERMILLION
+    colour: str = svg.VERMILLION
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +54,7 @@ class Marker:
 
     name: str
     place: Array  # (3,), m, in world
-    colour: str = ORANGE
+    colour: str = svg.ORANGE
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +63,7 @@ class Trail:
 
     name: str
     places: Array  # (n, 3), m, in world; interrupted at nan
-    colour: str = PURPLE
+    colour: str = svg.PURPLE
 
 
 SceneObject = Frustum | Rectangle | Ray | Marker | Trail
@@ -93,7 +77,7 @@ VIEWS: dict[str, tuple[Array, Array]] = {
 LAB_VIEWS = tuple(VIEWS)
 
 
-def frustum_of(camera: Camera, colour: str = BLUE) -> Frustum:
+def frustum_of(camera: Camera, colour: str = svg.BLUE) -> Frustum:
     """The field of view of a calibrated camera; its distortion is neglected."""
     fx, fy, _, _ = pinhole_numbers(camera)
     half = (0.5 * camera.image_size_px[0] / fx, 0.5 * camera.image_size_px[1] / fy)
@@ -130,7 +114,7 @@ def rig_things(rig: Rig, world_from_body: Pose | None = None, others: Pose | Non
             drawn.add(spot)
             start = world_from_body.apply(rig.beams[rig.spots[spot].beam].point)
             things += [Ray(rig.spots[spot].beam, start, hits[i]), Marker(spot, hits[i])]
-        things.append(Marker("vehicle", world_from_body.translation, PURPLE))
+        things.append(Marker("vehicle", world_from_body.translation, svg.PURPLE))
     return things
 
 
@@ -162,29 +146,29 @@ def scene_view(things: Sequence[SceneObject], title: str, view: str = LAB_VIEWS[
     scale = min(440 / span[0], 360 / span[1])
     high = span[1] * scale
     x0 = (540 - span[0] * scale) / 2
-    p = PlotArea(
-        Scale(lo[0], lo[0] + span[0], x0, x0 + span[0] * scale),
-        Scale(lo[1], lo[1] + span[1], 44 + high, 44),
+    p = svg.PlotArea(
+        svg.Scale(lo[0], lo[0] + span[0], x0, x0 + span[0] * scale),
+        svg.Scale(lo[1], lo[1] + span[1], 44 + high, 44),
         540,
         high + 92,
     )
     nearness = np.cross(to_drawing[0], to_drawing[1])
     far_first = sorted(range(len(things)), key=lambda i: float(np.nanmean(outlines[i] @ nearness)))
-    out, labels = [text(8, 15, title, "title")], []
+    out, labels = [svg.text(8, 15, title, "title")], []
     for i in far_first:
         parts, label = _drawn(things[i], p, p.at(flat[i]))
         out.append(parts)
         labels += [label] if label else []
     out += _placed(labels, p)
     out += _axis_cross(p, to_drawing)
-    long = round_size(0.3 * float(span.max()))
+    long = svg.round_size(0.3 * float(span.max()))
     width = long * scale
     y = p.height - 12
     out.append(
         f'<path d="M{524 - width:.1f} {y:.1f}h{width:.1f}m0 -4v8m{-width:.1f} 0v-8" stroke="var(--ink)" fill="none"/>'
     )
-    out.append(text(524 - width - 6, y + 4, f"{number(long)} m", "end"))
-    return svg_of(p, title, out)
+    out.append(svg.text(524 - width - 6, y + 4, f"{svg.number(long)} m", "end"))
+    return svg.svg_of(p, title, out)
 
 
 def frustum_length(things: Sequence[SceneObject]) -> float:
@@ -215,29 +199,27 @@ def outline(thing: SceneObject, reach: float) -> Array:
     return np.asarray(thing.place, dtype=float).reshape(1, 3)
 
 
-def _drawn(thing: SceneObject, p: PlotArea, at: Array) -> tuple[str, tuple[float, float, str, str] | None]:
+def _drawn(thing: SceneObject, p: svg.PlotArea, at: Array) -> tuple[str, tuple[float, float, str, str] | None]:
     """SVG of a thing, and its label: x, y, text, colour."""
     c = thing.colour
     tip = f"<title>{escape(thing.name)}</title>"
     if isinstance(thing, Frustum):
-        d = polyline(at[1:], closed=True) + segments(np.repeat(at[:1], 4, axis=0), at[1:])
+        d = svg.polyline(at[1:], closed=True) + svg.segments(np.repeat(at[:1], 4, axis=0), at[1:])
         shape = f'<path d="{d}" fill="{c}" fill-opacity="0.13" stroke="{c}" stroke-width="1.3">{tip}</path>'
-        return shape + f'<path d="{dots(at[:1], 3)}" fill="{c}"/>', (*_pair(at[0]), thing.name, c)
+        return shape + f'<path d="{svg.dots(at[:1], 3)}" fill="{c}"/>', (*_pair(at[0]), thing.name, c)
     if isinstance(thing, Rectangle):
         width, opacity = (0.6, 0.03) if thing.faint else (1.5, 0.12)
-        d = polyline(at, closed=True)
+        d = svg.polyline(at, closed=True)
         shape = f'<path d="{d}" fill="{c}" fill-opacity="{opacity}" stroke="{c}" stroke-width="{width}">{tip}</path>'
         topmost = at[int(np.argmin(at[:, 1]))]
         return shape, None if thing.faint else (*_pair(topmost), thing.name, c)
     if isinstance(thing, Ray):
-        return (
-            f'<path d="{segments(at[:1], at[1:])}" stroke="{c}" stroke-width="1.1" stroke-opacity="0.85">{tip}</path>',
-            None,
-        )
+        d = svg.segments(at[:1], at[1:])
+        return f'<path d="{d}" stroke="{c}" stroke-width="1.1" stroke-opacity="0.85">{tip}</path>', None
     if isinstance(thing, Trail):
-        line = line_path(at[:, 0], at[:, 1])
+        line = svg.line_path(at[:, 0], at[:, 1])
         return f'<path d="{line}" fill="none" stroke="{c}" stroke-width="1.1">{tip}</path>', None
-    shape = f'<path d="{dots(at, 3.2)}" fill="{c}" stroke="var(--paper)" stroke-width="0.6">{tip}</path>'
+    shape = f'<path d="{svg.dots(at, 3.2)}" fill="{c}" stroke="var(--paper)" stroke-width="0.6">{tip}</path>'
     return shape, (*_pair(at[0]), thing.name, c)
 
 
@@ -245,7 +227,7 @@ def _pair(at: Array) -> tuple[float, float]:
     return float(at[0]), float(at[1])
 
 
-def _placed(labels: list[tuple[float, float, str, str]], p: PlotArea) -> list[str]:
+def _placed(labels: list[tuple[float, float, str, str]], p: svg.PlotArea) -> list[str]:
     """Labels beside their things, shifted vertically so that none overlap; labels without a free place are omitted."""
     out: list[str] = []
     taken: list[tuple[float, float, float, float]] = []
@@ -259,12 +241,12 @@ def _placed(labels: list[tuple[float, float, str, str]], p: PlotArea) -> list[st
             if all(box[2] < t[0] or box[0] > t[2] or box[3] < t[1] or box[1] > t[3] for t in taken):
                 taken.append(box)
                 style = "fill:var(--ink);paint-order:stroke;stroke:var(--paper);stroke-width:3px"
-                out.append(text(start, y + shift, words, "", style))
+                out.append(svg.text(start, y + shift, words, "", style))
                 break
     return out
 
 
-def _axis_cross(p: PlotArea, to_drawing: Array) -> list[str]:
+def _axis_cross(p: svg.PlotArea, to_drawing: Array) -> list[str]:
     """Directions of the world's axes, bottom left; an axis along the line of sight is omitted."""
     out = []
     origin = np.array([34.0, p.height - 30.0])
@@ -273,7 +255,7 @@ def _axis_cross(p: PlotArea, to_drawing: Array) -> list[str]:
         if np.linalg.norm(flat) < 0.1:
             continue
         tip = origin + 24 * flat * [1, -1]
-        out.append(f'<path d="{segments(origin[None], tip[None])}" stroke="var(--ink)" stroke-width="1.4"/>')
+        out.append(f'<path d="{svg.segments(origin[None], tip[None])}" stroke="var(--ink)" stroke-width="1.4"/>')
         beyond = origin + 32 * flat * [1, -1]
-        out.append(text(float(beyond[0]), float(beyond[1]) + 4, name, "mid", "fill:var(--ink)"))
+        out.append(svg.text(float(beyond[0]), float(beyond[1]) + 4, name, "mid", "fill:var(--ink)"))
     return out

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools
-from lab.report.plot.axes import true_ranges
+from lab.report.plot.svg import true_ranges
 
 Pixels: TypeAlias = NDArray[np.uint8]  # (h, w, 3), BGR
 Colour: TypeAlias = tuple[int, int, int]  # BGR

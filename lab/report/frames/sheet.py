@@ -28,7 +28,7 @@ from lab.report.frames.canvas import (
     write,
 )
 from lab.report.frames.content import SIGMAS, CameraFrame, FrameContent, SpotMark
-from lab.report.plot.axes import GREY, POSE_COLOURS, SPOT_COLOURS, YELLOW, grey_limits, stretched
+from lab.report.plot.svg import GREY, POSE_COLOURS, SPOT_COLOURS, YELLOW, grey_limits, stretched
 from tracking.statuses import SpotStatus
 
 Limits: TypeAlias = tuple[float, float]  # grey values shown as black and as white

@@ -9,22 +9,7 @@ import numpy as np
 from contourpy import contour_generator
 
 from geometry.arrays import Array
-from lab.report.plot.axes import (
-    PlotArea,
-    Scale,
-    axes,
-    filled,
-    frame,
-    image_uri,
-    note,
-    number,
-    plot_area,
-    polyline,
-    svg_of,
-    text,
-    tick_texts,
-    ticks,
-)
+from lab.report.plot import svg
 
 # Colours for values: sequential and diverging maps, their range, and the bar beside a plot.
 
@@ -78,7 +63,7 @@ def value_range(values: Array, diverging: bool) -> tuple[float, float]:
     return lo, max(hi, lo + max(abs(lo), 1e-12) * 1e-3)
 
 
-def colour_bar(p: PlotArea, lo: float, hi: float, unit: str, diverging: bool) -> str:
+def colour_bar(p: svg.PlotArea, lo: float, hi: float, unit: str, diverging: bool) -> str:
     """The colours with their values, to the right of the axes."""
     left, top, wide, high = p.box
     high = max(high, 40.0)
@@ -90,12 +75,12 @@ def colour_bar(p: PlotArea, lo: float, hi: float, unit: str, diverging: bool) ->
         out.append(
             f'<rect x="{x:.1f}" y="{y:.1f}" width="12" height="{high / n + 0.6:.1f}" fill="{hex_colour(fills[i])}"/>'
         )
-    scale = Scale(lo, hi, top + high, top)
-    marks = ticks(lo, hi, 5)
-    for at, words in zip(scale(marks), tick_texts(marks), strict=True):
-        out.append(f'<path class="grid" d="M{x + 12:.1f} {at:.1f}h4"/>{text(x + 18, float(at) + 3.5, words)}')
+    scale = svg.Scale(lo, hi, top + high, top)
+    marks = svg.ticks(lo, hi, 5)
+    for at, words in zip(scale(marks), svg.tick_texts(marks), strict=True):
+        out.append(f'<path class="grid" d="M{x + 12:.1f} {at:.1f}h4"/>{svg.text(x + 18, float(at) + 3.5, words)}')
     if unit:
-        out.append(text(x + 2, top - 6, unit))
+        out.append(svg.text(x + 2, top - 6, unit))
     return "".join(out)
 
 
@@ -125,8 +110,8 @@ def heat_map(
     values = np.asarray(values, dtype=float)
     lo, hi = limits or value_range(values, diverging)
     x0, x1, y0, y1 = extent
-    p = plot_area((x0, x1), (y0, y1), equal=equal, y_down=y_down, right=BAR_WIDTH)
-    out = [*axes(p, title, x_name, y_name, grid=False), _hatched(*p.box)]
+    p = svg.plot_area((x0, x1), (y0, y1), equal=equal, y_down=y_down, right=BAR_WIDTH)
+    out = [*svg.axes(p, title, x_name, y_name, grid=False), _hatched(*p.box)]
     out.append(_image(p, _enlarged(values if y_down else values[::-1]), lo, hi, diverging))
     marks = np.asarray(levels, dtype=float) if levels is not None else contour_levels(lo, hi)
     grid_x, grid_y = np.linspace(x0, x1, values.shape[1]), np.linspace(y0, y1, values.shape[0])
@@ -134,18 +119,18 @@ def heat_map(
         lines = [p.at(line) for line in contour_lines(values, grid_x, grid_y, level)]
         if not lines:
             continue
-        d = "".join(map(polyline, lines))
+        d = "".join(map(svg.polyline, lines))
         out.append(f'<path d="{d}" stroke="#000" stroke-opacity="0.35" stroke-width="2.4" fill="none"/>')
         out.append(f'<path d="{d}" stroke="#fff" stroke-width="1.1" fill="none"/>')
         if place := label_place(p, lines):
             style = "fill:#fff;font-weight:600;paint-order:stroke;stroke:#000a;stroke-width:2.6px"
-            out.append(text(place[0], place[1] + 3.5, number(level), "mid", style))
+            out.append(svg.text(place[0], place[1] + 3.5, svg.number(level), "mid", style))
     finite = values[np.isfinite(values)]
     out.append(colour_bar(p, lo, hi, unit, diverging))
     if finite.size:
-        spread = f"{number(float(finite.min()))} to {number(float(finite.max()))} {unit}"
-        out.append(note(p, f"{spread}, median {number(float(np.median(finite)))}"))
-    return svg_of(p, title, [*out, frame(p)])
+        spread = f"{svg.number(float(finite.min()))} to {svg.number(float(finite.max()))} {unit}"
+        out.append(svg.note(p, f"{spread}, median {svg.number(float(np.median(finite)))}"))
+    return svg.svg_of(p, title, [*out, svg.frame(p)])
 
 
 def contour_levels(lo: float, hi: float) -> Array:
@@ -158,7 +143,7 @@ def contour_levels(lo: float, hi: float) -> Array:
         powers = 10.0 ** np.arange(np.floor(np.log10(lo)), np.ceil(np.log10(hi)) + 1)
         steps = (powers[:, None] * [1, 2, 5]).ravel()
         return steps[(steps > lo) & (steps < hi)]
-    return ticks(lo, hi, 5)
+    return svg.ticks(lo, hi, 5)
 
 
 def contour_lines(values: Array, x: Array, y: Array, level: float) -> list[Array]:
@@ -172,7 +157,7 @@ def contour_lines(values: Array, x: Array, y: Array, level: float) -> list[Array
     return [np.asarray(line) for line in generator.lines(level)]
 
 
-def label_place(p: PlotArea, lines: list[Array]) -> tuple[float, float] | None:
+def label_place(p: svg.PlotArea, lines: list[Array]) -> tuple[float, float] | None:
     """The place for the label of contour lines, drawing coordinates: their point nearest the diagonal of the plot.
 
     This spreads the labels of different levels. None where all points are too close to the edge for a label.
@@ -188,11 +173,11 @@ def label_place(p: PlotArea, lines: list[Array]) -> tuple[float, float] | None:
     return x, y
 
 
-def _image(p: PlotArea, values: Array, lo: float, hi: float, diverging: bool) -> str:
+def _image(p: svg.PlotArea, values: Array, lo: float, hi: float, diverging: bool) -> str:
     """The colours of values (rows, columns) over the plot area as an embedded PNG, transparent at nan."""
     rgb = colours((values - lo) / (hi - lo), diverging)
     alpha = np.where(np.isfinite(values), 255, 0).astype(np.uint8)
-    return filled(p, image_uri(np.dstack([rgb[..., ::-1], alpha]), "png"))
+    return svg.filled(p, svg.image_uri(np.dstack([rgb[..., ::-1], alpha]), "png"))
 
 
 def _enlarged(values: Array) -> Array:

@@ -14,24 +14,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from lab.number_format import format_number
-from lab.report.plot.axes import (
-    PlotArea,
-    Scale,
-    area_path,
-    band_envelope,
-    envelope,
-    figure,
-    frame,
-    heading,
-    line_path,
-    padded_range,
-    text,
-    tick_texts,
-    ticks,
-    true_shares,
-    x_ticks,
-    y_ticks,
-)
+from lab.report.plot import svg
 
 # The series behind a page's time plots, compact enough to embed: cursor.js draws parts of them when a user zooms.
 #
@@ -223,39 +206,39 @@ def time_panel(
     values = np.concatenate(
         [np.zeros(0), *(line.y for line in lines), *(b.low for b in bands), *(b.high for b in bands)]
     )
-    lo, hi = y_range or padded_range(values)
+    lo, hi = y_range or svg.padded_range(values)
     bottom = height - (30.0 if with_time else 8.0)
-    p = PlotArea(time_scale(t, 54.0, width - 10.0), Scale(lo, hi, bottom, 20.0), width, height)
+    p = svg.PlotArea(time_scale(t, 54.0, width - 10.0), svg.Scale(lo, hi, bottom, 20.0), width, height)
     bins = max(int(_BINS_PER_UNIT * (p.X.b - p.X.a)), 1)
-    marks = ticks(lo, hi, max(5, int((bottom - 20.0) / 22)))
-    out = ['<g class="whole">', *_shaded(p, shades, len(t)), y_ticks(p, marks, tick_texts(marks), grid=True)]
+    marks = svg.ticks(lo, hi, max(5, int((bottom - 20.0) / 22)))
+    out = ['<g class="whole">', *_shaded(p, shades, len(t)), svg.y_ticks(p, marks, svg.tick_texts(marks), grid=True)]
     out.append(time_ticks(p, time_name if with_time else ""))
     for band in bands:
-        x, low, high = band_envelope(t, band.low, band.high, bins)
-        d = area_path(p.X(x), p.Y(np.clip(low, lo, hi)), p.Y(np.clip(high, lo, hi)))
+        x, low, high = svg.band_envelope(t, band.low, band.high, bins)
+        d = svg.area_path(p.X(x), p.Y(np.clip(low, lo, hi)), p.Y(np.clip(high, lo, hi)))
         out.append(
             f'<path d="{d}" fill="{band.colour}" opacity="{band.opacity}"{_band_data(zoom, band, fit)}>'
             f"<title>{escape(band.name)}</title></path>"
         )
     beyond = 0.0
     for line in lines:
-        x, y = envelope(t, line.y, bins)
+        x, y = svg.envelope(t, line.y, bins)
         dash = f' stroke-dasharray="{line.dash}"' if line.dash else ""
         out.append(
-            f'<path class="line" d="{line_path(p.X(x), p.Y(np.clip(y, lo, hi)))}" stroke="{line.colour}"'
+            f'<path class="line" d="{svg.line_path(p.X(x), p.Y(np.clip(y, lo, hi)))}" stroke="{line.colour}"'
             f' stroke-width="{line.width}"{dash}{_line_data(zoom, line, fit)}><title>{escape(line.name)}</title></path>'
         )
         out.append(_marks_beyond(p, x, y, line.colour))
         outside = line.y[(line.y < lo) | (line.y > hi)]
         beyond = max(beyond, float(np.abs(outside).max()) if outside.size else 0.0)
     if beyond:
-        out.append(text(p.X.b, 12, f"▲▼ up to {format_number(beyond)} {unit}", "end"))
-    out += ["</g>", heading(p, f"{title} ({unit})" if unit else title)]
+        out.append(svg.text(p.X.b, 12, f"▲▼ up to {format_number(beyond)} {unit}", "end"))
+    out += ["</g>", svg.heading(p, f"{title} ({unit})" if unit else title)]
     data = time_data(p.X)
     if zoom is not None and len(t) == zoom.n:
         data += f' data-y="{lo!r} {hi!r} {bottom} 20.0" data-u="{escape(unit, quote=True)}" data-row="{row}"'
         data += f' data-name="{escape(time_name) if with_time else ""}"' + (' data-fit="1"' if fit else "")
-    return figure(width, height, title, [*out, frame(p, closed=False)], data=data)
+    return svg.figure(width, height, title, [*out, svg.frame(p, closed=False)], data=data)
 
 
 def _line_data(zoom: ZoomData | None, line: Line, fine: bool) -> str:
@@ -276,35 +259,35 @@ def _band_data(zoom: ZoomData | None, band: Band, fine: bool) -> str:
     return "" if None in names else f' data-b="{" ".join(map(str, names))}"'
 
 
-def time_scale(t: Array, left: float, right: float, margin: float = 0.0) -> Scale:
+def time_scale(t: Array, left: float, right: float, margin: float = 0.0) -> svg.Scale:
     """A scale for times (n,) between two drawing coordinates; margin: time added at both ends."""
     lo, hi = float(t[0]), float(t[-1])
     if hi <= lo:
         lo, hi = lo - 0.5, hi + 0.5
-    return Scale(lo - margin, hi + margin, left, right)
+    return svg.Scale(lo - margin, hi + margin, left, right)
 
 
-def time_data(X: Scale) -> str:
+def time_data(X: svg.Scale) -> str:
     """The attribute from which cursor.js knows the time axis of a drawing."""
     return f' data-t="{X.lo!r} {X.hi!r} {X.a} {X.b}"'
 
 
-def time_ticks(p: PlotArea, name: str) -> str:
+def time_ticks(p: svg.PlotArea, name: str) -> str:
     """Ticks of a time axis; with a name also the labels and, at the right end, the name."""
-    values = ticks(p.X.lo, p.X.hi, 6)
+    values = svg.ticks(p.X.lo, p.X.hi, 6)
     free = p.X(values) < p.X.b - _NAME_WIDTH
-    labels = [label if name and ok else "" for label, ok in zip(tick_texts(values), free.tolist(), strict=True)]
+    labels = [label if name and ok else "" for label, ok in zip(svg.tick_texts(values), free.tolist(), strict=True)]
     _, top, _, high = p.box
-    return x_ticks(p, values, labels) + (text(p.X.b, top + high + 15, name, "end") if name else "")
+    return svg.x_ticks(p, values, labels) + (svg.text(p.X.b, top + high + 15, name, "end") if name else "")
 
 
-def _shaded(p: PlotArea, shades: tuple[Shade, ...], n: int) -> list[str]:
+def _shaded(p: svg.PlotArea, shades: tuple[Shade, ...], n: int) -> list[str]:
     """Rectangles behind the intervals, each from half a frame before its first to half a frame after its last frame."""
     left, top, wide, high = p.box
     half = 0.5 / max(n - 1, 1)
     out = []
     for shade in shades:
-        for start, stop in true_shares(shade.where, int(wide)):
+        for start, stop in svg.true_shares(shade.where, int(wide)):
             x0 = left + wide * max(start * (1 + 2 * half) - half, 0.0)
             x1 = left + wide * min(stop * (1 + 2 * half) - half, 1.0)
             out.append(
@@ -314,7 +297,7 @@ def _shaded(p: PlotArea, shades: tuple[Shade, ...], n: int) -> list[str]:
     return out
 
 
-def _marks_beyond(p: PlotArea, x: Array, y: Array, colour: str) -> str:
+def _marks_beyond(p: svg.PlotArea, x: Array, y: Array, colour: str) -> str:
     """Small triangles where a line leaves the axes, at most one in five units of width."""
     out = []
     for outside, edge, tip in ((y > p.Y.hi, p.Y.b, -5), (y < p.Y.lo, p.Y.a, 5)):

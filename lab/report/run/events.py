@@ -14,8 +14,8 @@ from geometry.forward_model import SpotModel
 from lab.errors import BeamposeError
 from lab.files.run.run_file import DetectionsTable, LiveDevice, VideoFile
 from lab.report.frames.content import CameraFrame, SpotMark, frame_content, result_data
-from lab.report.plot import axes
-from lab.report.plot.axes import image_uri, true_ranges
+from lab.report.plot import svg
+from lab.report.plot.svg import image_uri, true_ranges
 from lab.report.run.report_data import ReportData
 from lab.runs.frames.frames import Picture, pictures_at
 from tracking.statuses import PoseStatus, SpotStatus
@@ -165,7 +165,7 @@ def _drawing(m: ReportData, event: ShownEvent, camera: CameraFrame) -> str:
     grey = grey_picture(camera)
     whole = panel(camera, grey, round(_FINE * _SHOWN_WIDTH), _FINE, _FINE * _LINE)
     out = [
-        axes.text(0, 12, head, "title") + axes.text(0, 27, text),
+        svg.text(0, 12, head, "title") + svg.text(0, 27, text),
         f'<image x="0" y="34" width="{_SHOWN_WIDTH}" height="{tall:.1f}" href="{image_uri(whole, "jpeg")}"/>',
     ]
     focus = _focus(event, camera)
@@ -175,7 +175,7 @@ def _drawing(m: ReportData, event: ShownEvent, camera: CameraFrame) -> str:
         out.append(f'<image x="408" y="34" width="{_CUT_SHOWN}" height="{high:.1f}" href="{image_uri(part, "png")}"/>')
     height = max(tall, _CUT_SHOWN + 40) + 36
     data = f' data-at="{float(m.t_s[event.index])!r}" data-frame="{frame}"'
-    return axes.figure(540, height, f"{head}: {text}", out, css="plot shot", data=data)
+    return svg.figure(540, height, f"{head}: {text}", out, css="plot shot", data=data)
 
 
 def _focus(event: ShownEvent, camera: CameraFrame) -> SpotMark | None:

@@ -16,35 +16,13 @@ from geometry import rotations
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from lab.files.run.results import POSE_STATUSES, SPOT_STATUSES, PoseTrack
-from lab.report.plot.axes import (
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    POSE_COLOURS,
-    PURPLE,
-    SKY,
-    SPOT_COLOURS,
-    VERMILLION,
-    PlotArea,
-    Scale,
-    axes,
-    figure,
-    frame,
-    histogram,
-    line_path,
-    padded_range,
-    plot_area,
-    robust_range,
-    text,
-)
+from lab.report.plot import svg
 from lab.report.plot.series import Band, Line, Shade, ZoomData, time_data, time_panel, time_scale, time_ticks
 from lab.report.run.report_data import ReportData
 from lab.runs.score import differenced, normalised_squares
 from tracking.statuses import PoseStatus, SpotStatus
 
-U_COLOUR, V_COLOUR = BLUE, VERMILLION
+U_COLOUR, V_COLOUR = svg.BLUE, svg.VERMILLION
 _RMS_HEIGHT = 180
 
 
@@ -73,8 +51,8 @@ def nees_figure(m: ReportData, zoom: ZoomData | None = None) -> str:
         t,
         "NEES: squared pose error over its covariance; mean 6 if the stated uncertainty is correct, band: 95 %",
         "",
-        lines=(Line(nees, BLUE, "NEES", 0.8), Line(6.0 * n, GREEN, "6, the expected mean", 1.4, "6 4")),
-        bands=(Band(1.237 * n, 14.449 * n, GREEN, "95 % of the frames if the covariance is correct", 0.15),),
+        lines=(Line(nees, svg.BLUE, "NEES", 0.8), Line(6.0 * n, svg.GREEN, "6, the expected mean", 1.4, "6 4")),
+        bands=(Band(1.237 * n, 14.449 * n, svg.GREEN, "95 % of the frames if the covariance is correct", 0.15),),
         shades=pose_shades(m),
         y_range=(0.0, top),
         width=1090,
@@ -98,7 +76,7 @@ def error_grid(
     """A row of panels for each view: u and v of the named errors (F, V, 2), px, over time; one y scale per column."""
     out = []
     shown = [j for j in range(len(m.spots.views)) if any(np.isfinite(e[:, j]).any() for _, e in columns)]
-    ranges = [robust_range(e[:, shown], at_least_px) if shown else (-1.0, 1.0) for _, e in columns]
+    ranges = [svg.robust_range(e[:, shown], at_least_px) if shown else (-1.0, 1.0) for _, e in columns]
     for j in shown:
         camera, spot = m.spots.views[j]
         last = j == shown[-1]
@@ -153,7 +131,7 @@ def rms_figure(m: ReportData, zoom: ZoomData | None = None) -> str:
         t,
         "residual of the pose, RMS over the spots used",
         "px",
-        lines=(Line(p.rms_px, BLUE, "rms_px of attitude.csv", 0.9),),
+        lines=(Line(p.rms_px, svg.BLUE, "rms_px of attitude.csv", 0.9),),
         shades=pose_shades(m),
         y_range=(0.0, max(top, 1e-6)),
         height=_RMS_HEIGHT,
@@ -174,7 +152,7 @@ def _counts(values: Array, limits: tuple[float, float], title: str, x_name: str,
     finite = values[np.isfinite(values)]
     beyond = int(((finite < limits[0]) | (finite > limits[1])).sum())
     words = f"{finite.size} values, {beyond} of them beyond the axis"
-    return histogram(values, limits, title, x_name, sigma=sigma, footnote=words, bins=50, height=_RMS_HEIGHT)
+    return svg.histogram(values, limits, title, x_name, sigma=sigma, footnote=words, bins=50, height=_RMS_HEIGHT)
 
 
 _CAUSAL_WIDTH = 0.6
@@ -283,11 +261,11 @@ def _row(m: ReportData, zoom: ZoomData | None, c: _Curve, measured: Bools, last:
         t,
         c.name,
         c.unit,
-        lines=(Line(c.value, BLUE, c.name, 1.3),),
-        bands=(Band.about(c.value, c.sigma, 3.0, SKY, "\u00b13\u03c3", 0.45),),
+        lines=(Line(c.value, svg.BLUE, c.name, 1.3),),
+        bands=(Band.about(c.value, c.sigma, 3.0, svg.SKY, "\u00b13\u03c3", 0.45),),
         shades=shades,
         # Only the bands of measured poses set the range: that of a long prediction would flatten the rest.
-        y_range=padded_range(
+        y_range=svg.padded_range(
             np.concatenate([c.value, (c.value - 3 * c.sigma)[measured], (c.value + 3 * c.sigma)[measured]])
         ),
         height=height,
@@ -299,25 +277,25 @@ def _row(m: ReportData, zoom: ZoomData | None, c: _Curve, measured: Bools, last:
     )
     shown = c.sigma[measured] if measured.any() else c.sigma
     unit, factor = (c.unit, 1.0) if np.nanmax(shown, initial=0.0) > c.large else (c.small_unit, 1000.0)
-    limit = 1.25 * robust_range(3 * factor * shown)[1]
+    limit = 1.25 * svg.robust_range(3 * factor * shown)[1]
     lines: list[Line] = []
     reference = "truth" if c.error is not None else "smoothed"
     for errors, colour, width, name in (
-        (c.causal, GREY, _CAUSAL_WIDTH, f"{c.name}: causal minus {reference}"),
-        (c.error, VERMILLION, 0.9, f"{c.name}: estimate minus truth"),
+        (c.causal, svg.GREY, _CAUSAL_WIDTH, f"{c.name}: causal minus {reference}"),
+        (c.error, svg.VERMILLION, 0.9, f"{c.name}: estimate minus truth"),
     ):
         if errors is not None:
             lines.append(Line(factor * errors, colour, name, width))
             if np.isfinite(errors[measured]).any():
-                limit = max(limit, robust_range(factor * errors[measured])[1])
+                limit = max(limit, svg.robust_range(factor * errors[measured])[1])
     uncertainty = time_panel(
         t,
         f"{c.name}: \u00b1\u03c3, \u00b13\u03c3" + (" and error" if c.error is not None else ""),
         unit,
         lines=tuple(lines),
         bands=(
-            Band.about(0.0, c.sigma, 3 * factor, SKY, "\u00b13\u03c3", 0.35),
-            Band.about(0.0, c.sigma, factor, BLUE, "\u00b1\u03c3", 0.35),
+            Band.about(0.0, c.sigma, 3 * factor, svg.SKY, "\u00b13\u03c3", 0.35),
+            Band.about(0.0, c.sigma, factor, svg.BLUE, "\u00b1\u03c3", 0.35),
         ),
         shades=shades,
         y_range=(-limit, limit),
@@ -330,7 +308,7 @@ def _row(m: ReportData, zoom: ZoomData | None, c: _Curve, measured: Bools, last:
     return value + uncertainty
 
 
-TRACK_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, "#6b4c9a", "#7a5c2e")
+TRACK_COLOURS = (svg.BLUE, svg.VERMILLION, svg.GREEN, svg.PURPLE, svg.ORANGE, svg.SKY, "#6b4c9a", "#7a5c2e")
 _BEYOND = 0.75  # how far outside the picture tracks are drawn, in picture sizes
 _MOST_POINTS = 3000  # of a drawn track
 _MOST_TURNS = 60  # marked turns of a spot
@@ -369,12 +347,12 @@ def tracks_figure(m: ReportData, camera: str, zoom: ZoomData | None = None) -> s
     low, high_uv = np.array([p.X.lo, p.Y.lo]), np.array([p.X.hi, p.Y.hi])
     beyond = bool(np.any(np.isfinite(uv) & ((uv < low) | (uv > high_uv))))
     words = f"camera {camera}" + (" (parts of the tracks lie outside this drawing)" if beyond else "")
-    out += [*axes(p, words, "u (px)", "v (px)", grid=False), frame(p, closed=False)]
+    out += [*svg.axes(p, words, "u (px)", "v (px)", grid=False), svg.frame(p, closed=False)]
     data = "" if zoom is None else _track_data(p, uv, zoom)
-    return figure(p.width, p.height, f"Tracks of the spots in the picture of camera {camera}", out, data=data)
+    return svg.figure(p.width, p.height, f"Tracks of the spots in the picture of camera {camera}", out, data=data)
 
 
-def _track_data(p: PlotArea, uv: Array, zoom: ZoomData) -> str:
+def _track_data(p: svg.PlotArea, uv: Array, zoom: ZoomData) -> str:
     """The attributes from which cursor.js marks the places of the spots at the cursor: uv (F, n, 2), px."""
     names = [zoom.add(uv[:, i, axis]) for i in range(uv.shape[1]) for axis in (0, 1)]
     if None in names:
@@ -387,7 +365,7 @@ def _track_data(p: PlotArea, uv: Array, zoom: ZoomData) -> str:
     )
 
 
-def _track_plane(uv: Array, measured: Bools, size: tuple[int, int] | None) -> tuple[PlotArea, Array]:
+def _track_plane(uv: Array, measured: Bools, size: tuple[int, int] | None) -> tuple[svg.PlotArea, Array]:
     """The plot area for positions (F, n, 2), px, and the corners (2, 2) of the picture.
 
     Without a rig (size None) the edge of the picture is unknown, and the measured positions stand for it.
@@ -399,7 +377,7 @@ def _track_plane(uv: Array, measured: Bools, size: tuple[int, int] | None) -> tu
     margin = _BEYOND * (hi - lo) + 1.0
     low = np.maximum(np.minimum(np.nanmin(uv, axis=(0, 1)), lo), lo - margin) - 0.03 * (hi - lo) - 1.0
     high = np.minimum(np.maximum(np.nanmax(uv, axis=(0, 1)), hi), hi + margin) + 0.03 * (hi - lo) + 1.0
-    p = plot_area((low[0], high[0]), (low[1], high[1]), equal=True, y_down=True, bottom=38, tallest=420)
+    p = svg.plot_area((low[0], high[0]), (low[1], high[1]), equal=True, y_down=True, bottom=38, tallest=420)
     return p, np.stack([lo, hi])
 
 
@@ -453,7 +431,7 @@ def _thinned_path(x: Array, y: Array, where: Bools) -> str:
             else:
                 keep.append(s)
         x, y = x[keep], y[keep]
-    return line_path(x, y)
+    return svg.line_path(x, y)
 
 
 def _labels(labels: list[tuple[float, float, str, str]]) -> list[str]:
@@ -467,15 +445,15 @@ def _labels(labels: list[tuple[float, float, str, str]]) -> list[str]:
         placed.append((lx, ly))
         out.append(
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{colour}"><title>first position</title></circle>'
-            + text(lx, ly, spot, "label", f"fill:{INK}")
+            + svg.text(lx, ly, spot, "label", f"fill:{svg.INK}")
         )
     return out
 
 
 def _status_rows(m: ReportData) -> list[tuple[str, Ints, list[tuple[str, str]]]]:
     """Name, status codes (F,), and the words and colours of the codes: of the pose, and of each view."""
-    pose_words = [(str(s), POSE_COLOURS[s]) for s in POSE_STATUSES]
-    spot_words = [(str(s), SPOT_COLOURS[s]) for s in SPOT_STATUSES]
+    pose_words = [(str(s), svg.POSE_COLOURS[s]) for s in POSE_STATUSES]
+    spot_words = [(str(s), svg.SPOT_COLOURS[s]) for s in SPOT_STATUSES]
     rows: list[tuple[str, Ints, list[tuple[str, str]]]] = []
     if len(m.poses.frames) == len(m.spots.frames):
         rows.append(("pose", m.poses.status, pose_words))
@@ -505,7 +483,7 @@ def timeline_figure(m: ReportData) -> str:
     tops = []
     for name, status, words in rows:
         tops.append(f"{y:.0f}")
-        names.append(text(left - 8, y + 13, name if len(name) <= 20 else name[:19] + "…", "end"))
+        names.append(svg.text(left - 8, y + 13, name if len(name) <= 20 else name[:19] + "…", "end"))
         measured = int(np.isin(status, [0] if name == "pose" else [0, 1]).sum())
         below = np.zeros(n_columns)
         for code, (word, colour) in enumerate(words):
@@ -516,15 +494,15 @@ def timeline_figure(m: ReportData) -> str:
                 title = escape(f"{name}: {word} in {count.sum()} of {n} frames")
                 out.append(f'<path d="{d}" fill="{colour}"><title>{title}</title></path>')
             below += share
-        names.append(text(right + 8, y + 13, f"{100 * measured / max(n, 1):.1f} % measured"))
+        names.append(svg.text(right + 8, y + 13, f"{100 * measured / max(n, 1):.1f} % measured"))
         y += row + (6 if name == "pose" else 0)
     X = time_scale(m.t_s, left, right)
     X = time_scale(m.t_s, left, right, 0.5 * (X.hi - X.lo) / max(n - 1, 1))
-    p = PlotArea(X, Scale(0, 1, y + 1, 8), 1110, y + 24)
+    p = svg.PlotArea(X, svg.Scale(0, 1, y + 1, 8), 1110, y + 24)
     out += [time_ticks(p, m.time_name), "</g>", *names]
     data = f'{time_data(X)} data-tops="{" ".join(tops)}" data-high="{row - 4:.0f}" data-name="{m.time_name}"'
     data += f' data-y="0 1 {y + 1:.0f} 8"'
-    return figure(p.width, p.height, "Status of the pose and of every spot over time", out, data=data)
+    return svg.figure(p.width, p.height, "Status of the pose and of every spot over time", out, data=data)
 
 
 def _strip(share: Array, below: Array, left: float, wide: float, top: float, height: float) -> str:

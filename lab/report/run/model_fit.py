@@ -12,20 +12,7 @@ import numpy as np
 from geometry.arrays import Array
 from lab.findings.finding import Finding, Level, verdict
 from lab.number_format import format_number, format_with_sigma
-from lab.report.plot.axes import (
-    BLUE,
-    VERMILLION,
-    dots,
-    frame,
-    heading,
-    image_area,
-    note,
-    number,
-    round_size,
-    segments,
-    svg_of,
-    text,
-)
+from lab.report.plot import svg
 
 HEADS = (
     "spot", "camera", "frames", "mean u (px)", "mean v (px)", "u, v in σ", "calibration sigma (px)", "scatter",
@@ -141,13 +128,13 @@ def _drawing(index: int, camera: str, size: Any, views: list[Mapping[str, Any]])
     known = np.isfinite(place).all(axis=1) & np.isfinite(mean).all(axis=1)
     if not known.any() or not (isinstance(size, list) and len(size) == 2):
         return ""
-    plane = image_area((int(size[0]), int(size[1])))
+    plane = svg.image_area((int(size[0]), int(size[1])))
     longest = float(np.linalg.norm(mean[known], axis=1).max())
-    factor = round_size(_LONGEST * float(size[0]) / max(longest, 1e-6))
+    factor = svg.round_size(_LONGEST * float(size[0]) / max(longest, 1e-6))
     left, top, wide, high = plane.box
     clip = f"clip-residuals-{index}"
     parts = [
-        heading(plane, f"camera {camera}: mean residual of each spot"),
+        svg.heading(plane, f"camera {camera}: mean residual of each spot"),
         f'<clipPath id="{clip}"><rect x="{left:.1f}" y="{top:.1f}" width="{wide:.1f}" height="{high:.1f}"/></clipPath>',
         f'<g clip-path="url(#{clip})">',
     ]
@@ -157,19 +144,20 @@ def _drawing(index: int, camera: str, size: Any, views: list[Mapping[str, Any]])
             continue
         radius = _SIGNIFICANT * float(np.sqrt(np.mean(s**2)))
         start, end = plane.at(at[None]), plane.at((at + factor * r)[None])
-        colour = VERMILLION if np.linalg.norm(r) > radius else BLUE
+        colour = svg.VERMILLION if np.linalg.norm(r) > radius else svg.BLUE
         spot = str(v.get("name")).rpartition("/")[2]
         words = escape(f"spot {spot}: {_signed(r[0])}, {_signed(r[1])} px")
         parts.append(
             f'<g><title>{words}</title><circle cx="{start[0, 0]:.1f}" cy="{start[0, 1]:.1f}"'
             f' r="{min(radius * factor * scale, 2000.0):.1f}" fill="none" stroke="var(--soft)" stroke-dasharray="3 3"/>'
-            f'<path d="{segments(start, end)}" stroke="{colour}" stroke-width="2"/>'
-            f'<path d="{dots(start, 3)}" fill="{colour}"/>{text(start[0, 0] + 7, start[0, 1] - 7, spot, "label")}</g>'
+            f'<path d="{svg.segments(start, end)}" stroke="{colour}" stroke-width="2"/>'
+            f'<path d="{svg.dots(start, 3)}" fill="{colour}"/>'
+            f"{svg.text(start[0, 0] + 7, start[0, 1] - 7, spot, 'label')}</g>"
         )
-    times = f"{factor:,.0f}".replace(",", "\u202f") if factor >= 1 else number(factor)
-    parts += ["</g>", frame(plane)]
-    parts.append(note(plane, f"arrows magnified {times} times; longest {format_number(longest, 2)} px"))
-    return svg_of(plane, f"mean residuals in camera {camera}", parts)
+    times = f"{factor:,.0f}".replace(",", "\u202f") if factor >= 1 else svg.number(factor)
+    parts += ["</g>", svg.frame(plane)]
+    parts.append(svg.note(plane, f"arrows magnified {times} times; longest {format_number(longest, 2)} px"))
+    return svg.svg_of(plane, f"mean residuals in camera {camera}", parts)
 
 
 # The methods of a run in sentences with citations, to paste into a paper.

@@ -9,7 +9,7 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.rotations import ypr_jacobian
 from lab.number_format import format_angle, format_length, format_number, format_percent
-from lab.report.plot.axes import true_ranges
+from lab.report.plot.svg import true_ranges
 from lab.report.run.report_data import MotionErrors, PoseSpread, ReportData, SpotErrors, TruthErrors, ViewErrors
 from tracking.statuses import PoseStatus, SpotStatus
 

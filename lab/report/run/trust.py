@@ -10,7 +10,7 @@ import numpy as np
 from geometry.arrays import Array, Bools
 from lab.findings.finding import Level, verdict
 from lab.number_format import format_angle, format_length, format_number, format_percent
-from lab.report.plot.axes import true_ranges
+from lab.report.plot.svg import true_ranges
 from lab.report.run.model_fit import Methods, MethodsFacts, ModelFit, methods_text
 from lab.report.run.report_data import ReportData
 from lab.report.run.summary import day_of

@@ -14,7 +14,7 @@ from geometry.forward_model import SpotModel
 from lab.files.text.atomic_write import atomic_write_text
 from lab.report.calibration.calibration_scene import Rectangle, scene_views
 from lab.report.html import environment
-from lab.report.plot.axes import ORANGE, PURPLE
+from lab.report.plot.svg import ORANGE, PURPLE
 from lab.results.view.scene import Content, View, edges, thinned
 
 # Which pose a window of `beampose view` shows, and how keys, a slider and the clock change it.

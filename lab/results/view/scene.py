@@ -30,7 +30,7 @@ from lab.report.calibration.calibration_scene import (
     outline,
     rig_things,
 )
-from lab.report.plot.axes import GREY, PURPLE, round_size
+from lab.report.plot.svg import GREY, PURPLE, round_size
 from tracking.statuses import PoseStatus
 
 # What `beampose view` shows: a rig, and the poses of a run's truth or of results.

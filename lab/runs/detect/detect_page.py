@@ -17,24 +17,7 @@ from lab.number_format import format_number
 from lab.pictures.picture_file import GreyPicture
 from lab.report.frames.canvas import PAPER, SOFT, Box, Canvas, Pixels, ground, png, text_size, write
 from lab.report.page import Page, PageDrawing, PageTable, Section, made_with, write_page
-from lab.report.plot.axes import (
-    BLUE,
-    ORANGE,
-    VERMILLION,
-    axes,
-    dots,
-    frame,
-    grey_limits,
-    image_area,
-    image_uri,
-    line_path,
-    note,
-    plot_area,
-    polyline,
-    stretched,
-    svg_of,
-    text,
-)
+from lab.report.plot import svg
 from lab.report.plot.series import Line, time_panel
 from lab.runs.detect.picture_series import PictureSeries, SizeGroup
 from tracking.detections import Detections
@@ -115,7 +98,7 @@ def _tile(one: _Kept, width: int, height: int) -> Pixels:
     h, w = one.picture.shape
     scale = min(width / w, height / h, _LARGEST_ZOOM)
     size = (max(round(w * scale), 1), max(round(h * scale), 1))
-    grey = stretched(one.picture, *grey_limits(one.picture))
+    grey = svg.stretched(one.picture, *svg.grey_limits(one.picture))
     canvas = Canvas(ground(grey, size, scale), np.array([-0.5, -0.5]), scale, 1.0)
     small = width < 400
     taken: list[Box] = []
@@ -133,7 +116,7 @@ def _tile(one: _Kept, width: int, height: int) -> Pixels:
 
 _BINS = 48
 _MOST_DOTS = 6000
-_COLOURS = (BLUE, ORANGE)
+_COLOURS = (svg.BLUE, svg.ORANGE)
 
 
 def counts_chart(series: Sequence[tuple[str, Array]], title: str, x_name: str, *, mark: float | None = None) -> str:
@@ -151,9 +134,9 @@ def counts_chart(series: Sequence[tuple[str, Array]], title: str, x_name: str, *
     lo, hi = float(middle - half), float(middle + half)
     edges = np.linspace(lo, hi, _BINS + 1)
     counts = [np.histogram(np.clip(np.log10(v), lo, hi), edges)[0].astype(float) for _, v in good]
-    p = plot_area((lo, hi), (0.0, max(float(c.max()) for c in counts) * 1.08), height=250)
+    p = svg.plot_area((lo, hi), (0.0, max(float(c.max()) for c in counts) * 1.08), height=250)
     base = float(p.Y(np.array(0.0)))
-    out = axes(p, title, x_name, "spots", x_log=True)
+    out = svg.axes(p, title, x_name, "spots", x_log=True)
     for (name, _), count, colour in zip(good, counts, _COLOURS, strict=False):
         steps = "".join(f"V{y:.1f}H{x:.1f}" for y, x in zip(p.Y(count), p.X(edges[1:]), strict=True))
         d = f"M{float(p.X(edges[0])):.1f} {base:.1f}{steps}V{base:.1f}"
@@ -161,25 +144,27 @@ def counts_chart(series: Sequence[tuple[str, Array]], title: str, x_name: str, *
         out.append(f'<path d="{d}" fill="none" stroke="{colour}" stroke-width="1.4"><title>{name}</title></path>')
     if mark is not None:
         x = float(p.X(np.log10(mark)))
-        out.append(f'<path d="M{x:.1f} {base:.1f}V{p.box[1]:.1f}" stroke="{VERMILLION}" stroke-dasharray="5 3"/>')
+        out.append(f'<path d="M{x:.1f} {base:.1f}V{p.box[1]:.1f}" stroke="{svg.VERMILLION}" stroke-dasharray="5 3"/>')
     right = p.box[0] + p.box[2]
     if len(good) > 1:
         for i, ((name, _), colour) in enumerate(zip(good, _COLOURS, strict=False)):
-            out.append(text(right - 8, p.box[1] + 14 + 15 * i, name, "end", f"fill:{colour};font-weight:600"))
+            out.append(svg.text(right - 8, p.box[1] + 14 + 15 * i, name, "end", f"fill:{colour};font-weight:600"))
     medians = "; ".join(f"{name}: median {format_number(float(np.median(v)))}" for name, v in good)
-    out.append(note(p, f"{len(good[0][1])} spots; {medians}"))
-    return svg_of(p, title, [*out, frame(p)])
+    out.append(svg.note(p, f"{len(good[0][1])} spots; {medians}"))
+    return svg.svg_of(p, title, [*out, svg.frame(p)])
 
 
 def places_chart(uv_px: Array, size_px: tuple[int, int]) -> str:
     """Positions of spots (n, 2) in the picture; evenly thinned if there are very many."""
-    p = image_area(size_px)
+    p = svg.image_area(size_px)
     shown = uv_px[:: max(1, -(-len(uv_px) // _MOST_DOTS))]
-    out = axes(p, "Positions of the spots", "u (px)", "v (px)", grid=False)
-    out.append(f'<path d="{dots(p.at(shown), 1.6 if len(shown) > 300 else 2.6)}" fill="{BLUE}" fill-opacity="0.45"/>')
+    out = svg.axes(p, "Positions of the spots", "u (px)", "v (px)", grid=False)
+    out.append(
+        f'<path d="{svg.dots(p.at(shown), 1.6 if len(shown) > 300 else 2.6)}" fill="{svg.BLUE}" fill-opacity="0.45"/>'
+    )
     some = "" if len(shown) == len(uv_px) else f", {len(shown)} of them shown"
-    out.append(note(p, f"{len(uv_px)} spots{some}"))
-    return svg_of(p, "Positions of the spots", [*out, frame(p)])
+    out.append(svg.note(p, f"{len(uv_px)} spots{some}"))
+    return svg.svg_of(p, "Positions of the spots", [*out, svg.frame(p)])
 
 
 def noise_chart(estimate: NoiseEstimate, measured: LevelVariances | None, name: str) -> str:
@@ -203,15 +188,15 @@ def noise_chart(estimate: NoiseEstimate, measured: LevelVariances | None, name: 
     if measured is not None and len(measured.variance):
         # Variances far above the line come from light that changed between the pictures, such as spots that moved.
         highest = max(highest, float(np.minimum(measured.variance + measured.sigma, 2 * highest).max()) * 1.08)
-    p = plot_area((bottom, top), (0.0, highest), height=280)
+    p = svg.plot_area((bottom, top), (0.0, highest), height=280)
     title = f"Variance of a pixel: {name}"
-    out = axes(p, title, "grey value (DN)", "variance (DN²)")
+    out = svg.axes(p, title, "grey value (DN)", "variance (DN²)")
     band = np.concatenate(
         [np.stack([level, np.minimum(above, highest)], -1), np.stack([level, np.minimum(below, highest)], -1)[::-1]]
     )
-    out.append(f'<path d="{polyline(p.at(band), closed=True)}" fill="{BLUE}" fill-opacity="0.18"/>')
+    out.append(f'<path d="{svg.polyline(p.at(band), closed=True)}" fill="{svg.BLUE}" fill-opacity="0.18"/>')
     x, y = p.at(np.stack([level, line], -1)).T
-    out.append(f'<path class="line" d="{line_path(x, y)}" stroke="{BLUE}" stroke-width="1.5"/>')
+    out.append(f'<path class="line" d="{svg.line_path(x, y)}" stroke="{svg.BLUE}" stroke-width="1.5"/>')
     inside: Bools = np.ones(0, dtype=bool)
     if measured is not None and len(measured.level):
         ends = p.at(np.stack([measured.level, np.maximum(measured.variance - measured.sigma, 0.0)], -1))
@@ -221,13 +206,13 @@ def noise_chart(estimate: NoiseEstimate, measured: LevelVariances | None, name: 
         whiskers = "".join(
             f"M{a:.1f} {b:.1f}V{c:.1f}" for (a, b), (_, c) in zip(ends.tolist(), tops.tolist(), strict=True)
         )
-        out.append(f'<path d="{whiskers}" stroke="{VERMILLION}" fill="none"/>')
+        out.append(f'<path d="{whiskers}" stroke="{svg.VERMILLION}" fill="none"/>')
         places = p.at(np.stack([measured.level, measured.variance], -1)[inside])
         above_all = p.at(np.stack([measured.level, np.full(len(measured.level), highest)], -1)[~inside])
         marks = "".join(f"M{x - 4:.1f} {y + 8:.1f}h8l-4 -7z" for x, y in above_all.tolist())
-        out.append(f'<path d="{marks}" fill="none" stroke="{VERMILLION}"/>' if marks else "")
-        out.append(f'<path d="{dots(places, 2.6)}" fill="{VERMILLION}"/>')
-    return svg_of(p, title, [*out, frame(p)])
+        out.append(f'<path d="{marks}" fill="none" stroke="{svg.VERMILLION}"/>' if marks else "")
+        out.append(f'<path d="{svg.dots(places, 2.6)}" fill="{svg.VERMILLION}"/>')
+    return svg.svg_of(p, title, [*out, svg.frame(p)])
 
 
 # The page of `beampose detect`: contact sheet, spots over frames, positions, sizes, signal to noise, sensor noise.
@@ -294,7 +279,7 @@ def _key_figures(series: PictureSeries, table: Array, groups: list[SizeGroup]) -
 
 def _sheet(sheet: ContactSheet) -> Section:
     picture = (
-        f'<img src="{image_uri(sheet.drawn(), "jpeg")}" alt="contact sheet: pictures with the spots found in them">'
+        f'<img src="{svg.image_uri(sheet.drawn(), "jpeg")}" alt="contact sheet: pictures with the spots found in them">'
     )
     caption = (
         "Evenly spaced pictures with stretched grey values. Rings: detected spots, numbered by brightness, in the order"
@@ -310,7 +295,7 @@ def _spots(series: PictureSeries, table: Array) -> Section:
         drawings.append(
             PageDrawing(
                 time_panel(
-                    frame, "Spots in each picture", "", lines=(Line(count, BLUE, "spots"),),
+                    frame, "Spots in each picture", "", lines=(Line(count, svg.BLUE, "spots"),),
                     y_range=(0.0, max(float(count.max()) * 1.1, 1.0)), width=1100, height=150, time_name="frame",
                 ),
                 wide=True,

@@ -17,7 +17,7 @@ from lab.files.run.run_file import DetectionsTable
 from lab.pictures.picture_file import DROPPED, ColourPicture, MissingPicture
 from lab.pictures.source import pictures
 from lab.report.frames.canvas import INK, Box, Canvas, bgr, light
-from lab.report.plot.axes import GREEN, ORANGE, image_uri
+from lab.report.plot.svg import GREEN, ORANGE, image_uri
 from lab.runs.frames.frames import recorded_pictures
 from lab.targets.stereo.run import Source, StereoRecord, StereoResults, StereoRun
 from tracking.binocular.marker_model import MarkerImages, project_markers

@@ -10,8 +10,8 @@ from geometry.arrays import Array, Ints
 from lab.findings.finding import Finding, verdict
 from lab.number_format import format_angle, format_length, format_number
 from lab.report.page import Page, PageDrawing, PageTable, Section, Verdict, made_with, write_page
-from lab.report.plot.axes import BLUE, GREEN, ORANGE, VERMILLION, padded_range
 from lab.report.plot.series import Band, Line, time_panel
+from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION, padded_range
 from lab.runs.tables import pose_numbers
 from lab.targets.page import TimeAxis
 from lab.targets.stereo.frames import annotated_pictures

@@ -47,22 +47,9 @@ from lab.files.run.run_file import (
     source_of,
 )
 from lab.files.run.times import Times, load_times
+from lab.files.text import fields
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.error_text import name_of_path, suggest_name
-from lab.files.text.fields import (
-    Block,
-    Name,
-    NonNegative,
-    Positive,
-    Text,
-    Vector3,
-    Word,
-    field_error,
-    number_between,
-    numbers,
-    one_of,
-    validated,
-)
 from lab.files.text.yaml_text import read_mapping
 from tracking.binocular.calibration_check import CalibrationCheck
 from tracking.binocular.clock_offset import ClockOffset
@@ -85,17 +72,17 @@ class Target:
     colours: tuple[ColourRange, ...]
 
 
-class _ColourBlock(Block):
-    hue_deg: Annotated[list[float], pydantic.PlainValidator(numbers(2))]
-    saturation: Annotated[list[float], pydantic.PlainValidator(numbers(2))] = [0.35, 1.0]  # noqa: RUF012 - frozen
-    value: Annotated[list[float], pydantic.PlainValidator(numbers(2))] = [0.2, 1.0]  # noqa: RUF012 - frozen
+class _ColourBlock(fields.Block):
+    hue_deg: Annotated[list[float], pydantic.PlainValidator(fields.numbers(2))]
+    saturation: Annotated[list[float], pydantic.PlainValidator(fields.numbers(2))] = [0.35, 1.0]  # noqa: RUF012 - frozen
+    value: Annotated[list[float], pydantic.PlainValidator(fields.numbers(2))] = [0.2, 1.0]  # noqa: RUF012 - frozen
 
     @pydantic.model_validator(mode="after")
     def _in_range(self) -> _ColourBlock:
         try:
             self.named("")
         except ValueError as error:
-            raise field_error(str(error)) from None
+            raise fields.field_error(str(error)) from None
         return self
 
     def named(self, name: str) -> ColourRange:
@@ -104,18 +91,18 @@ class _ColourBlock(Block):
         return ColourRange(name, (h[0], h[1]), (s[0], s[1]), (v[0], v[1]))
 
 
-class _MarkerBlock(Block):
-    position_m: Vector3
-    colour: Word
-    radius_m: Positive | None = None
+class _MarkerBlock(fields.Block):
+    position_m: fields.Vector3
+    colour: fields.Word
+    radius_m: fields.Positive | None = None
 
 
-class TargetBlock(Block):
+class TargetBlock(fields.Block):
     """Colours and markers."""
 
-    colours: dict[Name, _ColourBlock]
-    markers: dict[Name, _MarkerBlock]
-    sigma_m: NonNegative = 0.0
+    colours: dict[fields.Name, _ColourBlock]
+    markers: dict[fields.Name, _MarkerBlock]
+    sigma_m: fields.NonNegative = 0.0
 
 
 def load_target(given: Any, folder: Path, path: Path) -> Target:
@@ -128,7 +115,9 @@ def load_target(given: Any, folder: Path, path: Path) -> Target:
         given = read_mapping(where)
     if not isinstance(given, dict):
         raise InputError(f"{path}: target: expected a mapping with colours and markers, or the name of a file")
-    return _target_of(validated(TargetBlock, given, where, inside), f"{where}: {inside}." if inside else f"{where}: ")
+    return _target_of(
+        fields.validated(TargetBlock, given, where, inside), f"{where}: {inside}." if inside else f"{where}: "
+    )
 
 
 def _target_of(block: TargetBlock, where: str) -> Target:
@@ -221,18 +210,18 @@ class StereoRun:
         return self.folder / "run.yaml"
 
 
-class _StereoRunBlock(Block):
-    schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
-    name: Name | None = None
-    pair: Word
-    frame_rate_hz: Annotated[float, pydantic.PlainValidator(number_between(*RATE_RANGE_HZ, "Hz"))]
-    timestamps: Word | None = None
+class _StereoRunBlock(fields.Block):
+    schema_: Annotated[str, pydantic.PlainValidator(fields.one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
+    name: fields.Name | None = None
+    pair: fields.Word
+    frame_rate_hz: Annotated[float, pydantic.PlainValidator(fields.number_between(*RATE_RANGE_HZ, "Hz"))]
+    timestamps: fields.Word | None = None
     cameras: dict[str, SourceBlock]
     target: Any
     segmentation: Any = None
     match: Any = None
     recorded: OptionalDay = None
-    notes: Text = ""
+    notes: fields.Text = ""
 
 
 def load_stereo_run(run_folder: Path) -> StereoRun:
@@ -244,7 +233,7 @@ def load_stereo_run(run_folder: Path) -> StereoRun:
         raise InputError(
             f"{path}: schema: expected {SCHEMA!r}, got a run of laser spots; process it with `beampose run`"
         )
-    content = validated(_StereoRunBlock, mapping, path)
+    content = fields.validated(_StereoRunBlock, mapping, path)
     names = list(content.cameras)
     if len(names) != 2:
         what = f"the single camera {names[0]}" if len(names) == 1 else f"{len(names)} cameras"

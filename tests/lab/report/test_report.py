@@ -20,9 +20,9 @@ from lab.errors import InputError
 from lab.files.run.results import read_poses
 from lab.report.frames.canvas import Canvas, bgr
 from lab.report.index import write_index
-from lab.report.plot import axes
-from lab.report.plot.axes import BLUE, SPOT_COLOURS, grey_limits, line_path, stretched, tick_texts, ticks
+from lab.report.plot import svg
 from lab.report.plot.series import Line, Shade, time_panel
+from lab.report.plot.svg import BLUE, SPOT_COLOURS, grey_limits, line_path, stretched, tick_texts, ticks
 from lab.report.run.events import MOST_PICTURES, events, selected
 from lab.report.run.page import write_report
 from lab.report.run.report_data import read_report_data
@@ -364,7 +364,7 @@ class TestDrawing:
     def test_a_spike_of_one_frame_survives_thinning(self):
         t, y = np.arange(100_000.0), np.zeros(100_000)
         y[51_234] = 7.0
-        x, thin = axes.envelope(t, y, 500)
+        x, thin = svg.envelope(t, y, 500)
         assert len(x) <= 1000
         assert x[np.argmax(thin)] == 51_234
         assert thin.max() == 7.0
@@ -373,7 +373,7 @@ class TestDrawing:
     def test_a_gap_survives_thinning(self):
         t, y = np.arange(10_000.0), np.ones(10_000)
         y[4000:6000] = np.nan
-        x, thin = axes.envelope(t, y, 100)
+        x, thin = svg.envelope(t, y, 100)
         assert np.isnan(thin[(x > 4200) & (x < 5800)]).all()
         assert np.isfinite(thin[(x < 3900) | (x > 6100)]).all()
 
@@ -381,7 +381,7 @@ class TestDrawing:
         t = np.arange(10_000.0)
         low, high = -np.ones(10_000), np.ones(10_000)
         high[777], low[778] = 5.0, -6.0
-        _, thin_low, thin_high = axes.band_envelope(t, low, high, 100)
+        _, thin_low, thin_high = svg.band_envelope(t, low, high, 100)
         assert (thin_low.min(), thin_high.max()) == (-6.0, 5.0)
 
     def test_a_plot_of_a_hundred_thousand_frames_stays_small(self):

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.report.plot.axes import BLUE, area_path, line_path
 from lab.report.plot.series import Band, Line, ZoomData, time_panel
+from lab.report.plot.svg import BLUE, area_path, line_path
 from lab.report.run.page import write_report
 from lab.report.run.report_data import read_report_data
 from lab.report.run.trust import evidence, time_link

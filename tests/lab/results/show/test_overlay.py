@@ -18,7 +18,7 @@ from lab.report.frames import canvas
 from lab.report.frames.canvas import bgr
 from lab.report.frames.content import frame_content, pose_words, read_result_data
 from lab.report.frames.sheet import Layout, sheet
-from lab.report.plot.axes import SPOT_COLOURS
+from lab.report.plot.svg import SPOT_COLOURS
 from lab.results.show import show_frame, write_picture, write_video
 from lab.runs.process import process_run
 from lab.simulate.write import simulate

@@ -1,4 +1,4 @@
-"""Axes, scales, SVG elements and histograms of the reports, and long series reduced to what a screen can show.
+"""SVG of the reports: elements, scales, areas with axes, histograms, long series reduced to what a screen shows.
 
 Embedded images: grey values brought to eight bits and encoded.
 """
