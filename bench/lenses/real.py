@@ -22,8 +22,8 @@ from calibration.pair.pair_calibration import PairError, calibrate_pair
 from geometry.arrays import Ints
 from lab.calibrate.camera.camera import corner_table
 from lab.calibrate.camera.camera_findings import findings_of
+from lab.calibrate.camera.pair import baseline_sigma
 from lab.calibrate.camera.photos import find_in_photos
-from lab.calibrate.pair import baseline_sigma
 from lab.findings.finding import Level, verdict
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"

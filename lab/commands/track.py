@@ -275,7 +275,7 @@ def pair(left: Path, right: Path, board: str, out: Path, names: str, lens: str, 
     Example:
         beampose calibrate pair boards/left boards/right --board chessboard:9x6:25mm --out results/pair
     """
-    from lab.calibrate.pair import PairOptions, calibrate_pair_folder
+    from lab.calibrate.camera.pair import PairOptions, calibrate_pair_folder
     from lab.errors import InputError
 
     both = [name.strip() for name in names.split(",")]

@@ -95,13 +95,13 @@ def test_a_pipe_in_place_of_a_file_that_the_program_wrote_or_lists_is_refused_to
 def test_files_of_users_are_read_through_the_helpers_that_refuse_pipes():
     """Reading a pipe waits for ever. The others read what the program itself holds, or have asked for a file before."""
     asked = {
-        "findings/catalogue.py",
+        "findings/finding.py",
         "results/compare.py",
-        "setup/doctor_checks.py",
-        "files/project/cloud_file.py",
+        "setup/doctor.py",
+        "files/project/point_files.py",
         "setup/init.py",
         "runs/batch/cluster.py",
-        "runs/batch/resumption.py",
+        "runs/batch/task.py",
     }
     found = {
         path.relative_to(ROOT / "lab").as_posix()

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from calibration.boards.board_detection import find_board
-from lab.calibrate.pair import calibrate_pair_folder
+from lab.calibrate.camera.pair import calibrate_pair_folder
 from lab.files.rig.board_file import load_board_or_text
 from lab.files.rig.pair_file import load_pair_file
 from lab.pictures.picture_file import read_picture
