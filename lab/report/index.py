@@ -30,7 +30,7 @@ from lab.files.text.yaml_text import read_mapping
 from lab.number_format import format_number
 from lab.report.html import environment
 from lab.report.plot import svg
-from lab.report.run.summary import VERDICTS, day_of, valid
+from lab.report.summary import VERDICTS, day_of, valid
 from tracking.statuses import PoseStatus
 
 NAME = ("name", "run", "run_folder")  # keys of a row, in order of preference

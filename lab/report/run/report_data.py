@@ -19,7 +19,7 @@ from lab.errors import BeamposeError
 from lab.files.run.results import PoseTrack, SpotGrid, read_summary, run_folder_named
 from lab.files.run.run_file import Run, load_run
 from lab.files.text.error_text import name_of_path
-from lab.report.run.summary import RunSummary, summary_of, valid
+from lab.report.summary import RunSummary, summary_of, valid
 from lab.runs.score import ResultTables, TruthArrays, against_truth, pose_errors, read_tables
 from tracking.statuses import PoseStatus
 

@@ -13,7 +13,7 @@ from lab.number_format import format_angle, format_length, format_number, format
 from lab.report.plot.svg import true_ranges
 from lab.report.run.model_fit import Methods, MethodsFacts, ModelFit, methods_text
 from lab.report.run.report_data import ReportData
-from lab.report.run.summary import day_of
+from lab.report.summary import day_of
 from tracking.statuses import PoseStatus
 
 _MODEL = "Fit of rig and recording"

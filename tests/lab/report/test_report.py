@@ -26,7 +26,7 @@ from lab.report.plot.svg import BLUE, SPOT_COLOURS, grey_limits, line_path, stre
 from lab.report.run.events import MOST_PICTURES, events, selected
 from lab.report.run.page import write_report
 from lab.report.run.report_data import read_report_data
-from lab.report.run.summary import summary_of, verdict_of
+from lab.report.summary import summary_of, verdict_of
 from tests.lab.fake_results import Fake, make, without_added_columns
 from tracking.statuses import PoseStatus, SpotStatus
 
