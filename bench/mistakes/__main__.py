@@ -31,8 +31,8 @@ from lab.errors import BeamposeError
 from lab.findings.outcome import Outcome
 from lab.runs.input_check import check
 from lab.runs.process import process_run
-from lab.runs.score import normalised_squares, pose_errors, read_tables, read_truth
 from lab.runs.verdict.run_statistics import RunStatistics
+from lab.runs.verdict.score import normalised_squares, pose_errors, read_tables, read_truth
 from tracking.statuses import PoseStatus
 
 CODES = ("BP-M06", "BP-M07", "BP-M08", "BP-V20")  # of findings on mistakes

@@ -1,7 +1,7 @@
 """The output for a scene compared with its truth: identity, wrong labels, covariances, and the class of a failure.
 
 A label is correct if its point is that of the spot, or lies within SAME_SPOT_PX or SAME_SPOT_SIGMAS of its true
-position and no other spot is nearer (the rule of lab/runs/score.py). Identity counts visible spots with a
+position and no other spot is nearer (the rule of lab/runs/verdict/score.py). Identity counts visible spots with a
 picture, except where another point lies within TOGETHER_SIGMAS of the true position, since either may be the spot.
 
 A pose is confidently wrong if its Mahalanobis distance from the truth is above 10 (NEES above 100; with 6 degrees of

@@ -84,7 +84,7 @@ class RunSummary:
     no_image: dict[str, list[tuple[int, int]]]  # by camera: first and last frame number of each range
     inputs: tuple[InputFile, ...]
     details: dict[str, list[tuple[str, str]]]  # the blocks of DETAILS: dotted names and plain values
-    errors: Mapping[str, Any] | None  # of the score against truth, as lab.runs.score writes it
+    errors: Mapping[str, Any] | None  # of the score against truth, as lab.runs.verdict.score writes it
     model_check: Mapping[str, Any] | None
     calibration: Mapping[str, Any] | None  # date, verdict, valid_until; None where the rig states none
 

@@ -120,7 +120,7 @@ def _write_results(
     statistics, model_check, verdict = write_tables(
         pipeline, passes, work, causal=causal, on_frame=lambda record, _: tally.add(record)
     )
-    from lab.runs.score import against_truth, read_tables
+    from lab.runs.verdict.score import against_truth, read_tables
 
     tables, added = against_truth(read_tables(work), run.folder), more()
     verdict = quality.against_truth(verdict, tables.errors)

@@ -19,7 +19,7 @@ from lab.files.run.results import POSE_STATUSES, SPOT_STATUSES, PoseTrack
 from lab.report.plot import svg
 from lab.report.plot.series import Band, Line, Shade, ZoomData, time_data, time_panel, time_scale, time_ticks
 from lab.report.run.report_data import ReportData
-from lab.runs.score import differenced, normalised_squares
+from lab.runs.verdict.score import differenced, normalised_squares
 from tracking.statuses import PoseStatus, SpotStatus
 
 U_COLOUR, V_COLOUR = svg.BLUE, svg.VERMILLION

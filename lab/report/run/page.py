@@ -29,7 +29,7 @@ from lab.report.run.model_fit import model_fit
 from lab.report.run.report_data import ReportData, read_report_data
 from lab.results.view.page import as_script, scene_data
 from lab.results.view.scene import content_of_poses, view_of
-from lab.runs.score import ResultTables
+from lab.runs.verdict.score import ResultTables
 from tracking.statuses import PoseStatus, SpotStatus
 
 _MOMENTS, _POINTS = 40, 160  # of the playback and of the trajectory: together 9 kB

@@ -20,7 +20,7 @@ from lab.files.run.results import PoseTrack, SpotGrid, read_summary, run_folder_
 from lab.files.run.run_file import Run, load_run
 from lab.files.text.error_text import name_of_path
 from lab.report.summary import RunSummary, summary_of, valid
-from lab.runs.score import ResultTables, TruthArrays, against_truth, pose_errors, read_tables
+from lab.runs.verdict.score import ResultTables, TruthArrays, against_truth, pose_errors, read_tables
 from tracking.statuses import PoseStatus
 
 
@@ -123,7 +123,7 @@ class TruthErrors:
 
 
 def errors_of(score: Mapping[str, Any] | None) -> TruthErrors | None:
-    """The typed form of what `score_against` of lab/runs/score.py returns; None where there is no score."""
+    """The typed form of what `score_against` of lab/runs/verdict/score.py returns; None where there is no score."""
     return valid(TruthErrors, score)
 
 

@@ -74,7 +74,7 @@ def _of(found: Iterable[Finding]) -> Verdict:
 
 
 def against_truth(verdict: Verdict, errors: Mapping[str, Any] | None) -> Verdict:
-    """The verdict with what the truth of the run says; errors: as lab.runs.score gives them."""
+    """The verdict with what the truth of the run says; errors: as lab.runs.verdict.score gives them."""
     measured: Mapping[str, Any] = ((errors or {}).get("pose") or {}).get("measured") or {}
     wrong = measured.get("beyond_10_sigmas", 0)
     if not wrong:

@@ -25,9 +25,9 @@ from lab.runs.batch.batch import process_batch
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.process import are_results, process_run
 from lab.runs.run_tally import RunTally
-from lab.runs.score import normalised_squares
 from lab.runs.smoothing_pass import SMOOTHING, TRACKING, WRITING, TrackingAndSmoothing
 from lab.runs.verdict.quality import LEAST_MEASURED
+from lab.runs.verdict.score import normalised_squares
 from lab.simulate.scenarios import SCENARIOS, RecordingFault
 from lab.simulate.write import simulate
 from tests.lab.run_folders import write_run

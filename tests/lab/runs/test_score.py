@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from geometry.pose import Pose
 from lab.errors import InputError
 from lab.files.run.results import ABSENT, SPOT_STATUSES, SpotGrid, read_poses, read_spots
-from lab.runs.score import (
+from lab.runs.verdict.score import (
     TruthArrays,
     _returns,
     against_truth,
