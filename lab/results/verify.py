@@ -273,7 +273,7 @@ def verify(results: Path, run_folder: Path | None = None, progress: Progress | N
         work = Path(name)
         pipeline = Pipeline.of(run)
         passes = TrackingAndSmoothing(pipeline, work, progress)
-        write_tables(pipeline, passes, work, causal=recorded.causal, on_frame=lambda record, causal: None)
+        write_tables(pipeline, passes, work, causal=recorded.causal)
         tables = sorted({p.name for p in work.glob("*.csv")} | {n for n in _OPTIONAL if (results / n).is_file()})
         found = [difference_of(results / table, work / table) for table in tables]
     differences = tuple(d for d in found if d is not None)

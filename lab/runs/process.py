@@ -25,7 +25,6 @@ from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.frames.row_records import row_records
 from lab.runs.model_check.frame_sampler import FrameSampler, stated_covariances, widths
 from lab.runs.run_log import RunLog, listening
-from lab.runs.run_tally import RunTally
 from lab.runs.setup_check import mistakes_of_run, pictures_sampler
 from lab.runs.smoothing_pass import TrackingAndSmoothing
 from lab.runs.summary import SUMMARY_SCHEMA, processed_run
@@ -115,11 +114,8 @@ def _write_results(
 ) -> Outcome[RunStatistics]:
     run = pipeline.run
     log.start(run, versions())
-    tally = RunTally(tuple(run.rig.cameras), tuple(f"{c}/{s}" for c, s in SpotModel.of(run.rig).views))
     passes = TrackingAndSmoothing(pipeline, work, log.progress(progress))
-    statistics, model_check, verdict = write_tables(
-        pipeline, passes, work, causal=causal, on_frame=lambda record, _: tally.add(record)
-    )
+    statistics, model_check, verdict = write_tables(pipeline, passes, work, causal=causal)
     from lab.runs.verdict.score import against_truth, read_tables
 
     tables, added = against_truth(read_tables(work), run.folder), more()
@@ -133,7 +129,7 @@ def _write_results(
         log.conclude(verdict, content, time.perf_counter() - started)
         log.write(folder)
 
-    done = processed_run(pipeline, tally, statistics, model_check, verdict, passes.smoothing, tables.errors, page)
+    done = processed_run(pipeline, statistics, model_check, verdict, passes.smoothing, tables.errors, page)
     return done.write(work, out, started, added)
 
 
@@ -143,7 +139,7 @@ def write_tables(
     work: Path,
     *,
     causal: bool = False,
-    on_frame: Callable[[FrameRecord, FrameRecord | None], None],
+    on_frame: Callable[[FrameRecord, FrameRecord | None], None] | None = None,
 ) -> tuple[RunStatistics, ModelCheck, Verdict]:
     """Track a run, write its tables into `work`, and compute the verdict.
 
@@ -154,7 +150,7 @@ def write_tables(
     checks = FrameChecks(run.rig, run.covariance)
     statistics = RunStatistics(
         {name: CameraStatistics() for name in run.rig.cameras},
-        tuple(model.camera_of.tolist()),
+        model.views,
         run.tracker.labels.min_spots,
         own_spots=checks.own_spots,
         causal=checks.causal,
@@ -180,7 +176,8 @@ def write_tables(
             statistics.add(record, in_causal_pass)
             found = zip(run.rig.cameras, record.detections, strict=True)
             pictures.add({name: points for name, points in found if points is not None})
-            on_frame(record, in_causal_pass)
+            if on_frame is not None:
+                on_frame(record, in_causal_pass)
     from lab.runs.model_check.check import check_sampled_frames  # deferred: only needed at the end of a run
 
     model_check = check_sampled_frames(run.rig, sampler, run.covariance)

@@ -17,9 +17,8 @@ from lab.files.run.run_file import Run
 from lab.findings.outcome import Verdict
 from lab.runs.frames.pipeline import Pipeline
 from lab.runs.processed import Processed
-from lab.runs.run_tally import MOST_EVENTS, RunTally
 from lab.runs.smoothing_pass import SmoothingSummary
-from lab.runs.verdict.run_statistics import RunStatistics
+from lab.runs.verdict.run_statistics import MOST_EVENTS, RunStatistics
 
 if TYPE_CHECKING:
     from lab.runs.model_check.check import ModelCheck
@@ -29,7 +28,6 @@ SUMMARY_SCHEMA = "beampose/summary/1"
 
 def processed_run(
     pipeline: Pipeline,
-    tally: RunTally,
     statistics: RunStatistics,
     model_check: ModelCheck,
     verdict: Verdict,
@@ -54,7 +52,7 @@ def processed_run(
             **({"clocks": _clock_numbers(run)} if run.clocks else {}),
         },
         inputs=fingerprints(run),
-        notes=_notes(pipeline, tally),
+        notes=_notes(pipeline, statistics),
         blocks={
             "run_folder": str(run.folder.resolve()),
             "rig": str(run.rig_path.resolve()),
@@ -62,7 +60,7 @@ def processed_run(
             "notes_of_run": run.notes,
             "attitude": "causal" if smoothing is None else "smoothed",
             "smoother": None if smoothing is None else dataclasses.asdict(smoothing),
-            "counts": _counts(tally, statistics),
+            "counts": _counts(statistics),
             "rates": {"noise_scale": pipeline.tracker.noise_scale},
             "model_check": model_check.as_mapping(),
             "errors": errors,
@@ -72,22 +70,22 @@ def processed_run(
                 "tracking_s": timings.tracking,
                 "smoothing_s": timings.smoothing,
             },
-            "events": [dataclasses.asdict(event) for event in tally.events],
+            "events": [dataclasses.asdict(event) for event in statistics.events.listed],
         },
         page=page,
     )
 
 
-def _counts(tally: RunTally, statistics: RunStatistics) -> dict[str, Any]:
+def _counts(statistics: RunStatistics) -> dict[str, Any]:
     frames, cameras = max(statistics.frames, 1), statistics.cameras
     return {
-        "spot_status": {v: dict(c) for v, c in zip(tally.views, tally.spot_status, strict=False)},
+        "spot_status": {"/".join(view): dict(c) for view, c in statistics.spot_status.items()},
         "pose_status": dict(statistics.pose),
-        "detections_per_frame": {c: tally.detections[c] / frames for c in tally.cameras},
+        "detections_per_frame": {name: c.points / frames for name, c in cameras.items()},
         "no_image": {name: c.missing.ranges for name, c in cameras.items() if len(c.missing)},
-        "no_image_reasons": {name: dict(reasons) for name, reasons in tally.missing_reasons.items()},
-        "events": dict(tally.event_kinds),
-        "labels_left_open": tally.labels_left_open,
+        "no_image_reasons": {name: dict(c.missing_reasons) for name, c in cameras.items() if len(c.missing)},
+        "events": dict(statistics.events.kinds),
+        "labels_left_open": statistics.labels_left_open,
         "causal_measured": statistics.causal_measured,
         "not_measured": {cause.value: count for cause, count in statistics.causes.items()},
         "found_again": statistics.found_again,
@@ -97,13 +95,13 @@ def _counts(tally: RunTally, statistics: RunStatistics) -> dict[str, Any]:
     }
 
 
-def _notes(pipeline: Pipeline, tally: RunTally) -> list[str]:
+def _notes(pipeline: Pipeline, statistics: RunStatistics) -> list[str]:
     notes = pipeline.notes
     if pipeline.run.left_out:
         notes.append(f"cameras of the rig without data in this run: {', '.join(pipeline.run.left_out)}")
-    if tally.unlisted:
-        notes.append(f"events: the first {MOST_EVENTS} of {MOST_EVENTS + tally.unlisted} are listed")
-    if away := _away_from_prior(pipeline.run, tally.first_pose):
+    if unlisted := statistics.events.unlisted:
+        notes.append(f"events: the first {MOST_EVENTS} of {MOST_EVENTS + unlisted} are listed")
+    if away := _away_from_prior(pipeline.run, statistics.first_pose):
         notes.append(away)
     if outside := pipeline.run.paths_outside:
         notes.append(f"read from outside the run folder: {', '.join(map(str, outside))}")

@@ -1,21 +1,26 @@
-"""Statistics of a run, counted frame by frame: the basis of the verdict. Memory does not grow with the run's length."""
+"""Statistics of a run, counted frame by frame, for verdict and summary. Memory does not grow with the run's length."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
 import numpy as np
 
+from geometry.pose import Pose
 from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.verdict.frame_checks import CONTRADICTION, FrameRanges
 from tracking.detections import UNMATCHED
 from tracking.statuses import PoseStatus, SpotStatus
+from tracking.tracked_frame import Event, TrackedFrame
 
 FEWEST_SPOTS = 3  # a pose needs this many
+MOST_EVENTS = 500  # listed one by one; of the others the number is reported
+# Events that may continue in the next frame: listed once, with their last frame.
+LASTING = ("undecided", "changed", CONTRADICTION, "not_a_covariance")
 _USUAL_CLUTTER = 0.95  # quantile, over the measured frames, of the unlabelled points that count as usual clutter
 _MOST_POINTS = 50  # larger numbers of unlabelled points are counted as this number
 
@@ -64,6 +69,7 @@ class CameraStatistics:
     empty_at_end: int = 0  # pictures since the last one that has a point of light
     expected_at_end: int = 0  # spots that the pose puts inside those
     missing: FrameRanges = field(default_factory=FrameRanges)  # frames without a usable picture
+    missing_reasons: Counter[str] = field(default_factory=Counter)
     # Measured frames in which this camera's spots have labels and none of them fits the pose of the other cameras.
     displaced: FrameRanges = field(default_factory=FrameRanges)
 
@@ -82,11 +88,46 @@ class CameraStatistics:
 
 
 @dataclass(slots=True)
+class ListedEvent:
+    """An event as summary.json lists it; one that continues in the next frames has a later last frame."""
+
+    frame: int
+    last_frame: int
+    kind: str
+    camera: str | None
+    spot: str | None
+    text: str
+
+
+@dataclass(slots=True)
+class Events:
+    """The events of a run: the first ones listed, and the number of each kind."""
+
+    listed: list[ListedEvent] = field(default_factory=list)
+    kinds: Counter[str] = field(default_factory=Counter)
+    unlisted: int = 0  # events beyond MOST_EVENTS
+    _lasting: dict[tuple[str, int | None], ListedEvent] = field(default_factory=dict)  # the latest, by kind and view
+
+    def add(self, frame: int, event: Event, views: Sequence[tuple[str, str]]) -> None:
+        """Add an event of the next frame."""
+        self.kinds[event.kind] += 1
+        same = self._lasting.get((event.kind, event.view))
+        if event.kind in LASTING and same is not None and same.last_frame == frame - 1:
+            same.last_frame = frame
+        elif len(self.listed) < MOST_EVENTS:
+            camera, spot = (None, None) if event.view is None else views[event.view]
+            self.listed.append(ListedEvent(frame, frame, event.kind, camera, spot, event.text))
+            self._lasting[event.kind, event.view] = self.listed[-1]
+        else:
+            self.unlisted += 1
+
+
+@dataclass(slots=True)
 class RunStatistics:
     """Counts of one run. Frames are added in order, as they are written."""
 
     cameras: dict[str, CameraStatistics]
-    camera_of: tuple[int, ...] = ()  # of each view, index into cameras
+    views: tuple[tuple[str, str], ...] = ()  # camera and spot
     min_spots: int = 4  # points that a first pose needs
     frames: int = 0
     first_frame: int = 0
@@ -100,6 +141,10 @@ class RunStatistics:
     own_spots: FrameRanges = field(default_factory=FrameRanges)  # see lab.runs.verdict.frame_checks.FrameChecks
     causal: FrameRanges = field(default_factory=FrameRanges)
     invalid: FrameRanges = field(default_factory=FrameRanges)
+    spot_status: dict[tuple[str, str], Counter[str]] = field(default_factory=dict)  # by view: SpotStatus -> frames
+    labels_left_open: int = 0  # rows of spots.csv with a detection whose label is too uncertain
+    events: Events = field(default_factory=Events)
+    first_pose: Pose | None = None  # of the first frame, if it is measured
     _found: bool = False  # whether a pose has been found
     _causes: Counter[tuple[Cause, int]] = field(default_factory=Counter)  # with the number of unlabelled points
     _surplus: Counter[int] = field(default_factory=Counter)  # unlabelled points of measured frames
@@ -112,13 +157,20 @@ class RunStatistics:
     def add(self, record: FrameRecord, causal: FrameRecord | None = None) -> None:
         """Add the next frame, as it is written and as it is in the causal pass."""
         tracked = record.tracked
-        self.first_frame = record.frame if self.frames == 0 else self.first_frame
+        if self.frames == 0:
+            self.first_frame = record.frame
+            self.first_pose = tracked.pose if tracked.pose_status is PoseStatus.MEASURED else None
         self.last_frame = record.frame
         self.frames += 1
         self.pose[tracked.pose_status.value] += 1
         if causal is not None:
             measured = causal.tracked.pose_status is PoseStatus.MEASURED
             self.causal_measured = (self.causal_measured or 0) + measured
+        for view, status in zip(self.views, tracked.status, strict=True):
+            self.spot_status.setdefault(view, Counter())[status.value] += 1
+        self.labels_left_open += _labels_left_open(tracked)
+        for event in tracked.events:
+            self.events.add(record.frame, event, self.views)
         self._add_cameras(record)
         if tracked.pose_status is PoseStatus.LOST:
             if self._found:
@@ -140,10 +192,13 @@ class RunStatistics:
 
     def _add_cameras(self, record: FrameRecord) -> None:
         status, used = record.tracked.status, record.tracked.used_in_pose
-        for c, (camera, found) in enumerate(zip(self.cameras.values(), record.detections, strict=True)):
+        pictures = zip(self.cameras.items(), record.detections, record.missing, strict=True)
+        for (name, camera), found, reason in pictures:
             if found is None:
                 camera.missing.add(record.frame)
+                camera.missing_reasons[reason] += 1
                 continue
+            views = [v for v, (of, _) in enumerate(self.views) if of == name]
             camera.pictures += 1
             camera.empty += len(found) == 0
             camera.points += len(found)
@@ -152,12 +207,12 @@ class RunStatistics:
             else:
                 camera.empty_at_end += 1
             if record.tracked.pose is not None:
-                own = [s for s, index in zip(status, self.camera_of, strict=True) if index == c]
+                own = [status[v] for v in views]
                 camera.found += sum(s.measured for s in own)
                 expected = sum(s.measured or s is SpotStatus.OCCLUDED for s in own)
                 camera.expected += expected
                 camera.expected_at_end += expected if camera.empty_at_end else 0
-                labelled = [v for v, index in enumerate(self.camera_of) if index == c and status[v].measured]
+                labelled = [v for v in views if status[v].measured]
                 measured = record.tracked.pose_status is PoseStatus.MEASURED
                 if labelled and measured and used is not None and not used[labelled].any():
                     camera.displaced.add(record.frame)
@@ -169,8 +224,7 @@ class RunStatistics:
         if any(event.kind == CONTRADICTION for event in tracked.events):
             return Cause.CONTRADICTION
         given = np.array([s.measured for s in tracked.status])
-        p = tracked.label_probability
-        left_open = 0 if p is None else int(np.count_nonzero(~given & np.isfinite(p)))
+        left_open = _labels_left_open(tracked)
         if left_open and given.sum() + left_open >= FEWEST_SPOTS:
             return Cause.LABELS_OPEN
         if tracked.pose is None:
@@ -204,3 +258,11 @@ class RunStatistics:
         """Number of frames with enough visible spots but without a measured pose."""
         causes = self.causes
         return sum(causes.get(cause, 0) for cause in MISSED)
+
+
+def _labels_left_open(tracked: TrackedFrame) -> int:
+    """Spots with a detection whose label is too uncertain."""
+    if tracked.label_probability is None:
+        return 0
+    measured = np.array([s.measured for s in tracked.status])
+    return int(np.count_nonzero(~measured & np.isfinite(tracked.label_probability)))

@@ -24,9 +24,9 @@ from lab.runs import process, processed, smoothing_pass
 from lab.runs.batch.batch import process_batch
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.process import are_results, process_run
-from lab.runs.run_tally import RunTally
 from lab.runs.smoothing_pass import SMOOTHING, TRACKING, WRITING, TrackingAndSmoothing
 from lab.runs.verdict.quality import LEAST_MEASURED
+from lab.runs.verdict.run_statistics import CameraStatistics, RunStatistics
 from lab.runs.verdict.score import normalised_squares
 from lab.simulate.scenarios import SCENARIOS, RecordingFault
 from lab.simulate.write import simulate
@@ -582,18 +582,19 @@ def test_no_temporary_file_is_left_when_the_iteration_stops(tmp_path):
 
 
 def test_consecutive_frames_with_an_uncertain_label_are_one_event():
-    tally = RunTally(("left",), ("left/1", "left/2"))
+    statistics = RunStatistics({"left": CameraStatistics()}, (("left", "1"), ("left", "2")))
     tracked = replace(a_tracked_frame(2), label_probability=np.array([0.6, np.nan]))
     for frame in (3, 4, 5, 9):
         events = (Event("undecided", "label left open", 0), Event("dropped", "contradicts", 1))
-        tally.add(FrameRecord(frame, 0.0, 0.0, (None,), ("dropped",), replace(tracked, events=events)))
-    listed = [(e.frame, e.last_frame, e.kind, e.spot) for e in tally.events]
+        statistics.add(FrameRecord(frame, 0.0, 0.0, (None,), ("dropped",), replace(tracked, events=events)))
+    listed = [(e.frame, e.last_frame, e.kind, e.spot) for e in statistics.events.listed]
     assert listed == [
         (3, 5, "undecided", "1"), (3, 3, "dropped", "2"), (4, 4, "dropped", "2"), (5, 5, "dropped", "2"),
         (9, 9, "undecided", "1"), (9, 9, "dropped", "2"),
     ]  # fmt: skip
-    assert tally.event_kinds == {"undecided": 4, "dropped": 4}
-    assert tally.labels_left_open == 4
+    assert statistics.events.kinds == {"undecided": 4, "dropped": 4}
+    assert statistics.labels_left_open == 4
+    assert statistics.cameras["left"].missing_reasons == {"dropped": 4}
 
 
 # -- complete or absent -----------------------------------------------------------------------------------------------

@@ -43,8 +43,11 @@ def a_record(
     return FrameRecord(frame, 0.01 * frame, 0.01, found, ("", ""), tracked)
 
 
+VIEWS = tuple((camera, spot) for camera in ("left", "right") for spot in "123")
+
+
 def statistics_of(*records: FrameRecord, causal: list[FrameRecord] | None = None) -> RunStatistics:
-    statistics = RunStatistics({"left": CameraStatistics(), "right": CameraStatistics()}, (0, 0, 0, 1, 1, 1))
+    statistics = RunStatistics({"left": CameraStatistics(), "right": CameraStatistics()}, VIEWS)
     for k, record in enumerate(records):
         statistics.add(record, None if causal is None else causal[k])
     return statistics
