@@ -1,7 +1,4 @@
-"""All checks of `beampose doctor`.
-
-Checks of `beampose doctor` that need the libraries: picture formats, places on disk, calibration files.
-"""
+"""The checks of `beampose doctor`: installation, picture formats, places on disk, calibration files."""
 
 from __future__ import annotations
 
@@ -197,7 +194,8 @@ def check_calibration(path: Path, today: datetime.date) -> Finding:
         text = str(error).splitlines()[0]
         remedy = "Correct the file: `beampose check` names all its mistakes"
         return finding("BP-D10", Level.FAIL, f"calibration: {text}", remedy=remedy)
-    return _line(path, state, today)
+    level, text, remedy = _judged(state, today)
+    return finding("BP-D09", level, f"calibration: {path}{text}", remedy=remedy)
 
 
 def _state_of(path: Path) -> CalibrationState | None:
@@ -217,31 +215,27 @@ def _state_of_camera(path: Path) -> CalibrationState | None:
     return CalibrationState(iso_date(known.date), known.verdict or "PASS", known.last_day, known.reasons)
 
 
-def _line(path: Path, state: CalibrationState | None, today: datetime.date) -> Finding:
+def _judged(state: CalibrationState | None, today: datetime.date) -> tuple[Level, str, str]:
+    """Level, words and remedy of a calibration."""
     if state is None:
-        return finding("BP-D09", Level.WARN, f"calibration: {path} states no date of calibration", remedy=_AGAIN)
-    days = (today - state.date).days
-    text = f"calibration: {path}: {state.verdict}, {days} days old"
+        return Level.WARN, " states no date of calibration", _AGAIN
+    days, left = (today - state.date).days, state.days_left(today)
+    text = f": {state.verdict}, {days} days old"
     if state.failed:
-        return finding("BP-D09", Level.FAIL, text + state.reason, remedy="Correct the cause and calibrate again")
+        return Level.FAIL, text + state.reason, "Correct the cause and calibrate again"
     if days < 0:
         remedy = "Check the clock of this computer and the date in the file"
-        return finding(
-            "BP-D09", Level.WARN, f"calibration: {path}: its date {state.date} is in the future", remedy=remedy
-        )
-    left = state.days_left(today)
+        return Level.WARN, f": its date {state.date} is in the future", remedy
     if left is not None and left < 0:
-        return finding("BP-D09", Level.FAIL, f"{text}, expired on {state.valid_until}", remedy=_AGAIN)
+        return Level.FAIL, f"{text}, expired on {state.valid_until}", _AGAIN
     text += f", {state.validity}"
     if left is None and days > OLD:
-        return finding("BP-D09", Level.WARN, text, remedy=_AGAIN)
+        return Level.WARN, text, _AGAIN
     if left is not None and left <= EXPIRES_SOON:
-        return finding("BP-D09", Level.WARN, f"{text}, in {left} days", remedy=_AGAIN)
+        return Level.WARN, f"{text}, in {left} days", _AGAIN
     if state.verdict != "PASS":
-        return finding(
-            "BP-D09", Level.WARN, text + state.reason, remedy="Read the report beside the file before using it"
-        )
-    return finding("BP-D09", Level.PASS, text)
+        return Level.WARN, text + state.reason, "Read the report beside the file before using it"
+    return Level.PASS, text, ""
 
 
 def examine(files: Sequence[Path] = (), out: Path = Path()) -> list[Finding]:
@@ -249,7 +243,5 @@ def examine(files: Sequence[Path] = (), out: Path = Path()) -> list[Finding]:
     lines = check_installation()
     if any(line.code == "BP-D02" and line.level > Level.PASS for line in lines):
         return lines  # the other checks need the libraries
-    from lab.setup.doctor import check_calibration, check_opencv, check_places
-
     today = datetime.date.today()
     return [*lines, *check_opencv(), *check_places(out), *(check_calibration(f, today) for f in files)]

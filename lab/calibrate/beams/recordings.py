@@ -1,9 +1,4 @@
-"""Labelled spots at positions of a stand, from tables or run folders; frames at rest are averaged.
-
-Frames of a vehicle at rest: grouping by stand position, and mean with covariance.
-
-Labelled spots from a run folder that was recorded for a beam calibration.
-"""
+"""Labelled spots at positions of a stand, from tables or run folders; frames at rest are averaged."""
 
 from __future__ import annotations
 
@@ -11,7 +6,6 @@ import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -205,9 +199,6 @@ def _starting_at(run: Run, world_from_body: Pose) -> Run:
     return dataclasses.replace(run, prior=PosePrior(world_from_body, 0.1, float(np.deg2rad(10.0))))
 
 
-if TYPE_CHECKING:
-    pass
-
 SPOTS = ("camera", "spot", "u_px", "v_px")
 DEFAULT_SPOT_SIGMA_PX = 0.1  # px, if the table states none: a laser spot on a matt screen, speckle included
 MAX_UNKNOWN_POSES = 200  # positions without a pose that are used: each adds six unknowns, more add little information
@@ -305,8 +296,6 @@ def _rows(
                     f"{f' and {len(without) - 1} more' if len(without) > 1 else ''}"
                 )
         return rows
-    from lab.calibrate.beams.recordings import spots_of_run  # imports detection and tracking
-
     assert recording.run is not None
     stand = project.stand
     place = None if stand is None or stand.world_from_stand is None else stand.world_from_stand.pose()

@@ -171,8 +171,6 @@ def _fitting(words: str, width: int, size: float) -> str:
     return words
 
 
-__all__ = ["Layout", "Limits", "limits_of", "sheet"]
-
 _GAP = 10  # px between parts
 _LINE = 16.0  # px, height of a line of text
 # Width of each camera's picture, px, by the number of cameras: small pictures are enlarged to the first,

@@ -18,9 +18,9 @@ from calibration.open3d_loader import MissingOpen3DError, open3d
 from lab.errors import InputError
 from lab.findings.outcome import Done
 from lab.report.calibration.calibration_scene import LAB_VIEWS, VIEWS
-from lab.results.view.page import Player, write_page
+from lab.results.view.page import write_page
 from lab.results.view.scene import Mesh, View, mesh_of, read_content, view_of, write_glb
-from lab.results.view.slider_window import as_open3d, look_along, open_slider_window
+from lab.results.view.slider_window import Player, as_open3d, look_along, open_slider_window, render
 
 KEYS = (
     "space: play or pause; right, left: next, previous frame; up, down: a twentieth of the run; home, end: first,"
@@ -133,8 +133,6 @@ def show(
     view = view_of(content, index, sigma_scale)
     notes: tuple[str, ...] = ()
     if out is None and has_display():
-        from lab.results.view.view import open_window
-
         try:
             if open_window(view, index):
                 return Done((), ())
@@ -167,8 +165,6 @@ def write_files(view: View, index: int | None, out: Path, notes: tuple[str, ...]
 
 def _by_open3d(mesh: Mesh, out: Path) -> list[Path]:
     """scene.ply, and the pictures that could be rendered; view.html has drawings in any case."""
-    from lab.results.view.slider_window import as_open3d, render
-
     part, ply = out / ".scene.part.ply", out / "scene.ply"
     if not open3d().io.write_triangle_mesh(str(part), as_open3d(mesh)):
         raise InputError(f"{ply}: cannot be written; choose another --out")

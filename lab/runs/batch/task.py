@@ -390,7 +390,7 @@ def concluded(task: Task, outcome: TaskOutcome) -> TaskOutcome:
     if outcome.row["status"] != "error":
         _remove_error_files(task)
         return outcome
-    from lab.report.html import Failure, write_failure_report  # imports the template engine
+    from lab.report.failure import Failure, write_failure_report  # imports the template engine
 
     row, saved = outcome.row, task.error_file
     failure = Failure(

@@ -19,9 +19,9 @@ from lab.files.rig.rig_file import save_rig
 from lab.results.view import scene as solids
 from lab.results.view import slider_window, view
 from lab.results.view import view as view_module
-from lab.results.view.page import Player, scene_data
+from lab.results.view.page import scene_data
 from lab.results.view.scene import read_content, view_of, write_glb
-from lab.results.view.slider_window import Controls
+from lab.results.view.slider_window import Controls, Player
 from lab.results.view.view import fill, show
 from tests.lab.fake_results import make
 from tests.open3d_marker import needs_open3d
@@ -228,15 +228,15 @@ class Window:
 
 @needs_open3d
 def test_a_key_moves_the_beams_of_the_window(content):
-    view = view_of(content, None)
-    view, player = Window(), Player(view, None)
-    fill(view, view, player)
-    assert len(view.shown) == 2
-    before = np.asarray(view.shown[1].vertices).copy()
-    assert view.keys[269](view)  # end
-    assert len(view.shown) == 2
-    assert np.abs(np.asarray(view.shown[1].vertices) - before).max() > 1e-3
-    assert not view.tick(view)  # nothing plays
+    scene = view_of(content, None)
+    window, player = Window(), Player(scene, None)
+    fill(window, scene, player)
+    assert len(window.shown) == 2
+    before = np.asarray(window.shown[1].vertices).copy()
+    assert window.keys[269](window)  # end
+    assert len(window.shown) == 2
+    assert np.abs(np.asarray(window.shown[1].vertices) - before).max() > 1e-3
+    assert not window.tick(window)  # nothing plays
 
 
 @needs_open3d
