@@ -25,6 +25,7 @@ from lab.report.plot.svg import POSE_COLOURS, SPOT_COLOURS
 from lab.report.run import figures, tables, trust
 from lab.report.run.events import ShownEvent, events, pictures, selected
 from lab.report.run.figures import timeline_figure, tracks_figure, zoom_data
+from lab.report.run.methods import methods
 from lab.report.run.model_fit import HEADS as MODEL_FIT_HEADS
 from lab.report.run.model_fit import model_fit
 from lab.report.run.report_data import ReportData, read_report_data
@@ -135,7 +136,7 @@ def page(m: ReportData, results: Path) -> str:
         "name": m.name,
         "verdict": m.summary.verdict,
         "evidence": trust.evidence(m, fit),
-        "methods": trust.methods(m, fit),
+        "methods": methods(m, fit),
         "keys": tables.key_figures(m),
         "truth_keys": tables.truth_figures(m.errors),
         "pixel_rows": tables.pixel_rows(m.errors),

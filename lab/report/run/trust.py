@@ -1,4 +1,4 @@
-"""Can this run be trusted? The evidence in a few lines; and the facts of the text on the methods."""
+"""Can this run be trusted? The evidence in a few lines."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from geometry.arrays import Array, Bools
 from lab.findings.finding import Level, verdict
 from lab.number_format import format_angle, format_length, format_number, format_percent
 from lab.report.plot.svg import true_ranges
-from lab.report.run.model_fit import Methods, MethodsFacts, ModelFit, methods_text
+from lab.report.run.model_fit import ModelFit
 from lab.report.run.report_data import ReportData
 from lab.report.summary import day_of
 from tracking.statuses import PoseStatus
@@ -174,48 +174,3 @@ def _ambiguous(m: ReportData) -> Evidence:
             Level.WARN, "Ambiguous", "; ".join(parts), time_link(m, k, k), f"first: frame {m.spots.frames[k]}"
         )
     return Evidence(Level.WARN, "Ambiguous", "; ".join(parts))
-
-
-def methods(m: ReportData, fit: ModelFit | None) -> Methods:
-    """The text on the methods, with the run's own numbers."""
-    p, measured = m.poses, m.poses.has(PoseStatus.MEASURED)
-    sizes, versions = m.picture_sizes, dict(m.summary.details["versions"])
-    cameras = [f"{c}, {sizes[c][0]} \u00d7 {sizes[c][1]} px" if c in sizes else c for c in m.spots.cameras]
-    state, span = m.summary.calibration, float(m.t_s[-1] - m.t_s[0]) if len(m.t_s) else 0.0
-    known = bool(measured.any())
-
-    def medians(values: Array, written: Callable[[float | None], str]) -> str:
-        return ", ".join(written(float(np.nanmedian(values[measured, i]))) for i in range(3))
-
-    rms = p.rms_px[measured & np.isfinite(p.rms_px)]
-    return methods_text(
-        MethodsFacts(
-            version=versions.get("beampose", ""),
-            method=m.summary.method,
-            smoothed=m.causal is not None,
-            cameras=tuple(cameras),
-            spots=len(dict.fromkeys(spot for _, spot in m.spots.views)),
-            beams=None if m.run is None else len(m.run.rig.beams),
-            frames=len(m.spots.frames),
-            rate_hz=None if m.run is None else m.run.frame_rate_hz,
-            duration_s=span if m.time_name != "frame" and span > 0 else None,
-            calibration=f"was calibrated on {state['date']}" if state and "date" in state else "",
-            calibration_sigmas=bool(np.isfinite(p.systematic).any()),
-            measured=format_percent(float(measured.mean()) if len(measured) else 0.0),
-            predicted=int(p.has(PoseStatus.PREDICTED).sum()),
-            lost=int(p.has(PoseStatus.LOST).sum()),
-            sigma_angles=medians(p.sigma_ypr_deg, format_angle) if known else "",
-            sigma_position=medians(p.sigma_position_m, format_length) if known else "",
-            residual=f"{format_number(float(np.median(rms)))} px" if len(rms) else "",
-            model_check=_model_words(fit),
-            verdict=m.summary.verdict.word,
-        )
-    )
-
-
-def _model_words(fit: ModelFit | None) -> str:
-    if fit is None or not fit.tested:
-        return ""
-    if not fit.findings:
-        return "No deviation of a camera, screen, beam or clock from the calibrated rig was found in the residuals."
-    return f"Deviations from the calibrated rig found in the residuals: {'; '.join(f.what for f in fit.findings)}."
