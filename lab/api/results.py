@@ -13,20 +13,28 @@ import numpy as np
 import pandas as pd
 
 from geometry.arrays import Array, Bools, Ints
-from geometry.forward_model import SpotModel
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.errors import InputError
-from lab.files.run.results import PoseTrack, has_causal, read_poses, read_result_table, read_summary, run_folder_named
+from lab.files.run.results import (
+    PoseTrack,
+    has_causal,
+    read_poses,
+    read_result_table,
+    read_spots,
+    read_summary,
+    run_folder_named,
+)
 from lab.files.run.run_file import Run, load_run
 from lab.files.text import columns
 from lab.files.text.csv_table import Categorical, Table
 from lab.report.frames.canvas import Pixels, png
+from lab.report.run.report_data import pose_residuals
 from lab.results.show import show_frame, write_picture
 from lab.runs.process import are_results
+from tracking.statuses import PoseStatus
 
 _EVENT_COLUMNS = ("frame", "last_frame", "kind", "camera", "spot", "text")
-_AT_ONCE = 2000  # poses projected at once, which bounds the memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +145,7 @@ class Results:
     @property
     def measured(self) -> Bools:
         """(n,): whether the pose is measured from the spots of the frame."""
-        return np.asarray(self.attitude["status"] == "measured")
+        return self._poses.has(PoseStatus.MEASURED)
 
     @property
     def positions(self) -> Array:
@@ -191,25 +199,20 @@ class Results:
         Projected from the pose of the frame, where that is measured. Raises InputError where the run folder is not
         there.
         """
-        model = SpotModel.of(self.rig)
-        spots = self.spots[self.spots["status"].isin(["matched", "turned"])]
-        row = np.searchsorted(self.frames, spots["frame"].to_numpy())
-        spots = spots[self.measured[row]]
-        row = row[self.measured[row]]
-        place = {view: i for i, view in enumerate(model.views)}
-        view = np.array([place.get(v, -1) for v in zip(spots["camera"], spots["spot"], strict=True)], dtype=np.int64)
-        if (view < 0).any():
+        spots = read_spots(self.folder)
+        residual = pose_residuals(spots, self._poses, self._run)[0]
+        if residual is None:
             raise InputError(f"{self.run_folder}: expected the cameras and spots of {self.folder}, found another rig")
-        projected = np.full((len(row), 2), np.nan)
-        for start in range(0, len(self.frames), _AT_ONCE):
-            here = np.flatnonzero((row >= start) & (row < start + _AT_ONCE))
-            part = np.unique(row[here])
-            if len(part):
-                uv = model.project(self._poses.world_from_body[part])[0]
-                projected[here] = uv[np.searchsorted(part, row[here]), view[here]]
-        out = spots[["frame", "t_s", "camera", "spot"]].reset_index(drop=True)
-        return out.assign(
-            du_px=spots["u_px"].to_numpy() - projected[:, 0], dv_px=spots["v_px"].to_numpy() - projected[:, 1]
+        frame, view = np.nonzero(spots.measured & self._poses.has(PoseStatus.MEASURED)[:, None])
+        names = {"camera": [camera for camera, _ in spots.views], "spot": [spot for _, spot in spots.views]}
+        return pd.DataFrame(
+            {
+                "frame": spots.frames[frame],
+                "t_s": spots.t_s[frame],
+                **{name: pd.Categorical(np.array(of, dtype=str)[view]) for name, of in names.items()},
+                "du_px": residual[frame, view, 0],
+                "dv_px": residual[frame, view, 1],
+            }
         )
 
     def show(self, frame: int, camera: str | None = None) -> AnnotatedPicture:

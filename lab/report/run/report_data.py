@@ -194,7 +194,7 @@ def read_report_data(
             run = load_run(folder)
     spots, poses = tables.spots, tables.poses
     times_known = bool(len(spots.t_s)) and bool(np.isfinite([*spots.t_s, *poses.t_s]).all())
-    residual_px, residual_share = (None, None) if run is None else _residuals(spots, poses, run)
+    residual_px, residual_share = (None, None) if run is None else pose_residuals(spots, poses, run)
     return ReportData(
         name=summary.name or name_of_path(results),
         summary=summary,
@@ -219,7 +219,7 @@ def _reachable(results: Path, run_folder: Path | None, summary: RunSummary) -> P
     return run_folder_named(results, summary.run_folder)
 
 
-def _residuals(spots: SpotGrid, poses: PoseTrack, run: Run) -> tuple[Array | None, float | None]:
+def pose_residuals(spots: SpotGrid, poses: PoseTrack, run: Run) -> tuple[Array | None, float | None]:
     """(F, V, 2): measured pixel minus projection from the frame's measured pose, or nan; and `residual_share`.
 
     The residual of a measurement with covariance R that was used for a pose of covariance P has the covariance

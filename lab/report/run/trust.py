@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from geometry.arrays import Array, Bools
 from lab.findings.finding import Level, verdict
-from lab.number_format import format_angle, format_length, format_number, format_percent
+from lab.number_format import format_number, format_percent
 from lab.report.plot.svg import true_ranges
 from lab.report.run.model_fit import ModelFit
 from lab.report.run.report_data import ReportData
