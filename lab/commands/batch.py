@@ -18,6 +18,7 @@ from lab.commands.common import (
     FOLDER,
     check_verbosity,
     complain,
+    provenance,
     quiet_option,
     set_option,
     show_line,
@@ -88,7 +89,6 @@ def batch(
     if chosen["dask"] is not None and ctx.get_parameter_source("jobs") is ParameterSource.COMMANDLINE:
         raise click.UsageError("expected --jobs or --dask, got both", ctx)
     check_verbosity(verbose=verbose, quiet=quiet)
-    from lab.commands.common import provenance
     from lab.runs.batch.batch import BatchOptions, process_batch
     from lab.runs.batch.task import shard_of
 

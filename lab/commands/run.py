@@ -13,6 +13,7 @@ from lab.commands.common import (
     NumberRange,
     conclude,
     progress_bar,
+    provenance,
     quiet_option,
     set_option,
     shown,
@@ -51,7 +52,6 @@ def run(
     Example:
         beampose run sample_runs/huo2015 --out results/huo2015
     """
-    from lab.commands.common import provenance
     from lab.files.run.fingerprints import fingerprints
     from lab.files.run.run_file import Run
     from lab.runs.process import process_run
@@ -135,7 +135,6 @@ def watch(
     Example:
         beampose watch runs/today --out results/today --udp 127.0.0.1:5005
     """
-    from lab.commands.common import provenance
     from lab.runs.watch.live_frames import WatchOptions
     from lab.runs.watch.watch import stopped_by_ctrl_c, watch_run
 

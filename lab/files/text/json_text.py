@@ -94,6 +94,8 @@ def plain_value(value: Any) -> Any:
     """The value with Python numbers instead of numpy's, and None for nan and infinity, which JSON does not have."""
     if isinstance(value, Mapping):
         return {str(k): plain_value(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
     if isinstance(value, list | tuple):
         return [plain_value(v) for v in value]
     if isinstance(value, np.generic):

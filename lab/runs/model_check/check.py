@@ -10,7 +10,7 @@ Findings of the model check: which component is wrong, by how much, the effect o
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,11 +21,11 @@ from calibration.model_check.effect import Effect
 from calibration.model_check.fault_identification import FaultDiagnosis, FittedFault, SuspectedFault
 from calibration.model_check.noise_scales import UNEVEN, is_noisy
 from calibration.model_check.recording import ModelCheckRecording
-from calibration.model_check.statistics import GroupStatistics, Statistics
 from calibration.model_check.unseen import UnseenView
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
+from lab.files.text.json_text import plain_value
 from lab.findings.finding import ENTRIES, Finding, Level, finding, verdict, worst_first
 from lab.number_format import format_number, format_with_sigma
 from lab.runs.model_check.frame_sampler import FrameSampler
@@ -92,29 +92,8 @@ def result_mapping(result: ModelCheckResult) -> dict[str, Any]:
             ],
         }
     if result.statistics is not None:
-        out |= _statistics(result.statistics)
+        out |= plain_value(asdict(result.statistics))
     return out
-
-
-def _statistics(statistics: Statistics) -> dict[str, Any]:
-    groups = {"views": statistics.views, "cameras": statistics.cameras, "beams": statistics.beams}
-    return {kind: [_group(g) for g in of_kind] for kind, of_kind in groups.items()}
-
-
-def _group(group: GroupStatistics) -> dict[str, Any]:
-    nis = None if group.nis is None else {"mean": group.nis.mean, "low": group.nis.low, "high": group.nis.high}
-    return {
-        "name": group.name,
-        "frames": group.frames,
-        "mean_px": group.mean_px.tolist(),
-        "sigma_of_mean_px": group.sigma_of_mean_px.tolist(),
-        "mean_sigmas": group.mean_sigmas.tolist(),
-        "calibration_px": group.calibration_px.tolist(),
-        "scatter": group.scatter,
-        "nis": nis,
-        "outliers": group.outliers,
-        "place_px": group.place_px.tolist(),
-    }
 
 
 def _suspected_fault(suspected: SuspectedFault, effects: tuple[Effect, ...]) -> dict[str, Any]:
@@ -132,11 +111,7 @@ def _fitted_fault(fitted: FittedFault, effect: Effect) -> dict[str, Any]:
         "sigma": np.sqrt(np.maximum(np.diagonal(change.covariance), 0.0)).tolist(),
         "explained": change.explained,
         "p": change.p_value,
-        "off_px": effect.off_px,
-        "off_sigmas": effect.off_sigmas,
-        "attitude_deg": effect.attitude_deg,
-        "position_mm": effect.position_mm,
-        "pose_sigmas": effect.pose_sigmas,
+        **{name: value for name, value in asdict(effect).items() if name not in ("view", "axis")},
     }
 
 
