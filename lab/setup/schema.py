@@ -15,12 +15,11 @@ from typing import Annotated, Any
 
 import pydantic
 
-from lab.errors import InputError
 from lab.files.project.project import Project
 from lab.files.rig import board_file, camera_file, rig_file, screens_file
 from lab.files.run import run_file
 from lab.files.text import fields
-from lab.files.text.atomic_write import atomic_write_text
+from lab.files.text.atomic_write import atomic_write_text, made_folder
 from lab.files.text.dataclass_fields import block_of
 from lab.files.text.fields import Block
 from tracking.parameters import TrackerParameters
@@ -191,10 +190,7 @@ def write(names: list[str], out: Path) -> list[Path]:
     Raises:
         InputError: the folder cannot be made, or a file cannot be written.
     """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out}: the folder cannot be made: {error.strerror}; choose another --out") from None
+    made_folder(out)
     paths = [out / f"{name}.schema.json" for name in names]
     for name, path in zip(names, paths, strict=True):
         atomic_write_text(as_text(name), path)

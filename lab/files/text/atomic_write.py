@@ -84,6 +84,17 @@ def _remove_left_parts(path: Path) -> None:
                     part.unlink()
 
 
+def made_folder(folder: Path) -> Path:
+    """A folder, made where it does not exist. Raises InputError."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder for the results, found a file; choose another --out")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: the folder cannot be made: {error.strerror}; choose another --out") from None
+    return folder
+
+
 def check_output_folder(target: Path, may_replace: Callable[[Path], bool]) -> None:
     """Raises InputError where results cannot be written to the folder `target`. Creates nothing.
 

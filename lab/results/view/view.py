@@ -16,6 +16,7 @@ from typing import Any
 
 from calibration.open3d_loader import MissingOpen3DError, open3d
 from lab.errors import InputError
+from lab.files.text.atomic_write import made_folder
 from lab.findings.outcome import Done
 from lab.report.calibration.calibration_scene import LAB_VIEWS, VIEWS
 from lab.results.view.page import write_page
@@ -148,10 +149,7 @@ def write_files(view: View, index: int | None, out: Path, notes: tuple[str, ...]
     Raises:
         InputError: a file cannot be written.
     """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out}: the folder cannot be made: {error.strerror}; choose another --out") from None
+    made_folder(out)
     write_page(view, index, out / "view.html")
     mesh = mesh_of([*view.fixed, *view.moving(index)], view.ellipsoids, view.reach_m, view.extent_m)
     write_glb(mesh, out / "scene.glb")

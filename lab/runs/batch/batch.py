@@ -11,7 +11,6 @@ import contextlib
 import csv
 import io
 import os
-import tempfile
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ import filelock
 
 from lab.errors import QUALITY_GATE_FAILED, BeamposeError, CalibrationError, InputError, RunError
 from lab.files.run.parameter_overrides import with_overrides
+from lab.files.text.atomic_write import atomic_write_bytes, made_folder
 from lab.files.text.csv_text import WORD_COLUMNS, text_of_field, write_table
 from lab.files.text.json_text import read_json, require_regular_file, text_of_file
 from lab.runs.batch.task import (
@@ -216,16 +216,10 @@ def _update(results: Path, name: str, file: Path) -> None:
         raise InputError(f"{source}: expected a table of results, got another file: {reason}") from None
     run = pa.array([results.name] * len(table)).dictionary_encode()
     table = table.add_column(0, "run", run).replace_schema_metadata({b"made_from": made_from})
-    file.parent.mkdir(parents=True, exist_ok=True)
-    handle, part = tempfile.mkstemp(dir=file.parent, prefix=".", suffix=".part")
-    os.close(handle)
-    try:
-        parquet.write_table(table, part)
-        os.chmod(part, 0o666 & ~_umask())
-        os.replace(part, file)
-    except BaseException:
-        Path(part).unlink(missing_ok=True)
-        raise
+    content = pa.BufferOutputStream()
+    parquet.write_table(table, content)
+    made_folder(file.parent)
+    atomic_write_bytes(content.getvalue().to_pybytes(), file)
 
 
 def _identity(results: Path, source: Path) -> bytes:
@@ -236,12 +230,6 @@ def _identity(results: Path, source: Path) -> bytes:
         fingerprint = None
     state = source.stat()
     return f"{fingerprint} {state.st_size} {state.st_mtime_ns}".encode()
-
-
-def _umask() -> int:
-    mask = os.umask(0o022)
-    os.umask(mask)
-    return mask
 
 
 INDEX_SECONDS = 60.0  # between two versions of index.html in a long batch
@@ -309,7 +297,7 @@ def process_batch(
     if options.parquet:
         require_pyarrow()
     folders = listed_runs(runs, lists)
-    _make_folder(out)
+    made_folder(out)
     tasks = _tasks(folders, out, options)
     table = BatchTable(out, [task.place for task in tasks])
     number, count = options.shard
@@ -356,15 +344,6 @@ def _written(table: BatchTable) -> Iterator[Callable[[TaskOutcome], None]]:
         yield add
     finally:
         table.write(index=True)
-
-
-def _make_folder(out: Path) -> None:
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out}: expected a folder for the results, found a file; choose another --out")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out}: the folder cannot be made: {error.strerror}") from None
 
 
 def _tasks(folders: Sequence[Path], out: Path, options: BatchOptions) -> list[Task]:

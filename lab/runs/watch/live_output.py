@@ -80,10 +80,10 @@ class Latency:
         """For the terminal; empty without a frame."""
         if not self.steady:
             return ()
-        median, p95, p99 = np.percentile(self.steady, [50, 95, 99])
+        known = self.as_mapping()
         return (
-            f"latency: median {median:.1f} ms, 95 % within {p95:.1f} ms, 99 % within {p99:.1f} ms, largest"
-            f" {max(self.steady):.1f} ms ({len(self.steady)} frames)",
+            f"latency: median {known['median']:.1f} ms, 95 % within {known['p95']:.1f} ms, 99 % within"
+            f" {known['p99']:.1f} ms, largest {known['largest']:.1f} ms ({known['frames']} frames)",
         )
 
 

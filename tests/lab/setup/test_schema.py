@@ -154,7 +154,7 @@ def test_the_schemas_are_written_into_a_folder(tmp_path: Path):
     assert [p.name for p in paths] == [f"{name}.schema.json" for name in BLOCKS]
     assert all(json.loads(p.read_text("utf-8"))["type"] == "object" for p in paths)
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="the folder cannot be made"):
+    with pytest.raises(InputError, match="found a file"):
         files.write(["rig"], tmp_path / "file")
 
 
