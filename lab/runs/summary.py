@@ -11,7 +11,6 @@ import numpy as np
 
 from geometry.pose import Pose
 from geometry.rotations import log
-from lab.files.rig.calibration_state import state_mapping
 from lab.files.run.fingerprints import fingerprints
 from lab.files.run.run_file import Run
 from lab.findings.outcome import Verdict
@@ -56,7 +55,7 @@ def processed_run(
         blocks={
             "run_folder": str(run.folder.resolve()),
             "rig": str(run.rig_path.resolve()),
-            "calibration": None if run.calibration is None else state_mapping(run.calibration),
+            "calibration": None if run.calibration is None else run.calibration.as_mapping(),
             "notes_of_run": run.notes,
             "attitude": "causal" if smoothing is None else "smoothed",
             "smoother": None if smoothing is None else dataclasses.asdict(smoothing),

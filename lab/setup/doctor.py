@@ -14,7 +14,7 @@ import numpy as np
 import geometry
 from geometry.compilation.compile_cache import cache_folder, is_empty
 from lab.errors import InputError
-from lab.files.rig.calibration_state import CalibrationState, iso_date
+from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.camera_file import load_camera
 from lab.files.rig.rig_file import load_rig_file
 from lab.files.rig.screens_file import load_screens
@@ -212,7 +212,9 @@ def _state_of_camera(path: Path) -> CalibrationState | None:
     known = load_camera(path).calibration
     if known is None or not known.date:
         return None
-    return CalibrationState(iso_date(known.date), known.verdict or "PASS", known.last_day, known.reasons)
+    return CalibrationState(
+        date=known.date, verdict=known.verdict or "PASS", valid_until=known.last_day, reasons=known.reasons
+    )
 
 
 def _judged(state: CalibrationState | None, today: datetime.date) -> tuple[Level, str, str]:

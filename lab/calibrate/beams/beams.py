@@ -169,5 +169,11 @@ def _rig_file(
 ) -> RigFile:
     lab = file.calibration  # of cameras and screens: the new rig.yaml expires no later than they do
     expiry = [d for d in (lab.valid_until if lab is not None else None, expiry_date(project, day)) if d is not None]
-    state = CalibrationState(day, verdict(findings).name, min(expiry, default=None), reasons(findings), project.notes)
+    state = CalibrationState(
+        date=day,
+        verdict=verdict(findings).name,
+        valid_until=min(expiry, default=None),
+        reasons=reasons(findings),
+        notes=project.notes,
+    )
     return RigFile(c.rig, covariance_blocks(c.covariance), state)

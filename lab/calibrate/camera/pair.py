@@ -247,7 +247,9 @@ def _file_of(pair: CalibratedPair, findings: Sequence[Finding], day: datetime.da
     until = None if level is Level.FAIL else day + datetime.timedelta(options.valid_days)
     why = tuple(f"{f.level.name}: {f.what}" for f in findings if f.level > Level.PASS)
     cameras = dict(zip(options.names, pair.cameras, strict=True))
-    return PairFile(cameras, pair.covariance, CalibrationState(day, level.name, until, why))
+    return PairFile(
+        cameras, pair.covariance, CalibrationState(date=day, verdict=level.name, valid_until=until, reasons=why)
+    )
 
 
 def page_of(pair: CalibratedPair, names: tuple[str, str]) -> tuple[list[KeyFigure], list[Section]]:

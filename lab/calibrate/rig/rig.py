@@ -262,5 +262,7 @@ def _lens_findings(project: Project, day: datetime.date) -> list[Finding]:
 
 def _rig_file(joint: Joint, findings: Sequence[Finding], project: Project, day: datetime.date) -> RigFile:
     until, why = expiry_date(project, day), reasons(worst_first(findings))
-    state = CalibrationState(day, verdict(findings).name, until, why, project.notes)
+    state = CalibrationState(
+        date=day, verdict=verdict(findings).name, valid_until=until, reasons=why, notes=project.notes
+    )
     return RigFile(joint.rig, covariance_blocks(joint.covariance), state)

@@ -142,7 +142,9 @@ def _save(
     project: Project, result: ScreensResult, findings: Sequence[Finding], day: datetime.date, folder: Path
 ) -> None:
     level, why, fit = verdict(findings), reasons(findings), result.fit
-    state = CalibrationState(day, level.name, expiry_date(project, day), why, project.notes)
+    state = CalibrationState(
+        date=day, verdict=level.name, valid_until=expiry_date(project, day), reasons=why, notes=project.notes
+    )
     rig = fit.rig
     for k, (name, screen) in enumerate(rig.screens.items()):
         scan = None if project.screens[name].cloud is None else result.screens[k]
@@ -152,6 +154,6 @@ def _save(
     save_screens(ScreensFile(project.name, rig, fit.covariance, state), folder / SCREENS)
     if project.beams:
         note = "the beams are nominal, not calibrated: run `beampose calibrate beams`"
-        state = replace(state, verdict=max(level, Level.WARN).name, reasons=(note, *why))
+        state = state.model_copy(update={"verdict": max(level, Level.WARN).name, "reasons": [note, *why]})
         whole = Rig(rig.screens, rig.cameras, project.beams, project.spots)
         save_rig(RigFile(whole, covariance_blocks(fit.covariance), state), folder / RIG)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,38 +14,10 @@ from lab.files.text.fields import Block, Lines, Text, one_of, unexpected_value
 VERDICTS = ("PASS", "WARN", "FAIL")
 
 
-@dataclass(frozen=True, slots=True)
-class CalibrationState:
-    """Date, verdict and validity of a calibration."""
-
-    date: datetime.date
-    verdict: str  # one of VERDICTS
-    valid_until: datetime.date | None = None  # the last valid day; None: no limit
-    reasons: tuple[str, ...] = ()  # a line for each finding that is not a PASS
-    notes: str = ""
-
-    def days_left(self, day: datetime.date) -> int | None:
-        """Days of validity after `day`: negative after its end, None without one."""
-        return None if self.valid_until is None else (self.valid_until - day).days
-
-    @property
-    def validity(self) -> str:
-        """The end of the validity in words."""
-        return "without an expiry date" if self.valid_until is None else f"valid until {self.valid_until}"
-
-    @property
-    def failed(self) -> bool:
-        """Whether the verdict is FAIL: it must not be used."""
-        return self.verdict == "FAIL"
-
-    @property
-    def reason(self) -> str:
-        """The first reason of the verdict, such as ` (RMS 3 px)`; empty without one."""
-        return f" ({self.reasons[0]})" if self.reasons else ""
-
-
 def iso_date(value: Any) -> datetime.date:
-    """A date written as 2026-03-14; a time of day after it is ignored."""
+    """A date, or one written as 2026-03-14; a time of day after it is ignored."""
+    if isinstance(value, datetime.date):
+        return value
     if isinstance(value, str):
         try:
             return datetime.datetime.fromisoformat(value.strip()).date()
@@ -68,30 +39,38 @@ Day = Annotated[datetime.date, pydantic.PlainValidator(iso_date)]
 OptionalDay = Annotated[datetime.date | None, pydantic.PlainValidator(_day_or_none)]
 
 
-class CalibrationStateBlock(Block):
-    """The block `calibration:` of a rig.yaml."""
+class CalibrationState(Block):
+    """Date, verdict and validity of a calibration: the block `calibration:` of a rig.yaml."""
 
     date: Day
     verdict: Annotated[str, pydantic.PlainValidator(one_of(VERDICTS))]
-    valid_until: OptionalDay = None
-    reasons: Lines = []  # noqa: RUF012 - frozen
+    valid_until: OptionalDay = None  # the last valid day; without it, no limit
+    reasons: Lines = []  # noqa: RUF012 - frozen  # a line for each finding that is not a PASS
     notes: Text = ""
 
-    def value(self) -> CalibrationState:
-        """The block as a value."""
-        return CalibrationState(self.date, self.verdict, self.valid_until, tuple(self.reasons), self.notes)
+    def days_left(self, day: datetime.date) -> int | None:
+        """Days of validity after `day`: negative after its end, None without one."""
+        return None if self.valid_until is None else (self.valid_until - day).days
 
+    @property
+    def validity(self) -> str:
+        """The end of the validity in words."""
+        return "without an expiry date" if self.valid_until is None else f"valid until {self.valid_until}"
 
-def state_mapping(state: CalibrationState) -> dict[str, Any]:
-    """The plain mapping from which a `CalibrationStateBlock` reads the same value."""
-    out: dict[str, Any] = {"date": state.date.isoformat(), "verdict": state.verdict}
-    if state.valid_until is not None:
-        out["valid_until"] = state.valid_until.isoformat()
-    if state.reasons:
-        out["reasons"] = list(state.reasons)
-    if state.notes:
-        out["notes"] = state.notes
-    return out
+    @property
+    def failed(self) -> bool:
+        """Whether the verdict is FAIL: it must not be used."""
+        return self.verdict == "FAIL"
+
+    @property
+    def reason(self) -> str:
+        """The first reason of the verdict, such as ` (RMS 3 px)`; empty without one."""
+        return f" ({self.reasons[0]})" if self.reasons else ""
+
+    def as_mapping(self) -> dict[str, Any]:
+        """The plain mapping from which the same value is read."""
+        content = self.model_dump(exclude_defaults=True)
+        return {key: v.isoformat() if isinstance(v, datetime.date) else v for key, v in content.items()}
 
 
 def require_valid_calibration(

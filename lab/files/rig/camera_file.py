@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,23 +29,23 @@ from lab.files.text.yaml_text import read_mapping, write_mapping
 SCHEMA = "beampose/camera/1"
 
 
-@dataclass(frozen=True, slots=True)
-class CameraCalibration:
+class CameraCalibration(fields.Block):
     """Origin and quality of a camera's calibration. Unknown values are None or empty."""
 
-    date: str = ""  # ISO 8601: 2026-03-14, with a time if wanted
-    verdict: str = ""  # PASS, WARN or FAIL; empty without a verdict, such as for converted cameras
-    rms_px: float | None = None  # of the corners' residuals, per axis
-    sigma_px: float | None = None  # of one corner's coordinate, estimated by the solve
-    hold_out_rms_px: float | None = None  # of corners not used by the solve
-    views: int | None = None  # photographs used
-    corners: int | None = None  # corners used
-    board: str = ""  # description of the board, or its file
-    distance_m: float | None = None  # distance for figures in millimetres
-    valid_until: str = ""  # ISO 8601; empty: no limit
-    reasons: tuple[str, ...] = ()  # a line for each finding that is not a PASS
-    figures: Mapping[str, float] = field(default_factory=dict)  # further figures, with their unit in the name
-    notes: str = ""
+    date: DayText = ""  # ISO 8601: 2026-03-14, with a time if wanted
+    # PASS, WARN or FAIL; empty without a verdict, such as for converted cameras
+    verdict: Annotated[str, pydantic.PlainValidator(fields.one_of((*VERDICTS, "")))] = ""
+    rms_px: fields.NonNegative | None = None  # of the corners' residuals, per axis
+    sigma_px: fields.NonNegative | None = None  # of one corner's coordinate, estimated by the solve
+    hold_out_rms_px: fields.NonNegative | None = None  # of corners not used by the solve
+    views: fields.Integer | None = None  # photographs used
+    corners: fields.Integer | None = None  # corners used
+    board: fields.Text = ""  # description of the board, or its file
+    distance_m: fields.Positive | None = None  # distance for figures in millimetres
+    valid_until: DayText = ""  # ISO 8601; empty: no limit
+    reasons: fields.Lines = []  # noqa: RUF012 - frozen  # a line for each finding that is not a PASS
+    figures: dict[str, fields.Number] = {}  # noqa: RUF012 - frozen  # further figures, with their unit in the name
+    notes: fields.Text = ""
 
     @property
     def last_day(self) -> datetime.date | None:
@@ -88,7 +87,7 @@ def load_camera(path: Path) -> CameraFile:
         distortion=tuple(content.distortion),
         lens=content.lens,
         covariance=None if content.covariance is None else content.covariance.value(),
-        calibration=None if content.calibration is None else content.calibration.value(),
+        calibration=content.calibration,
     )
 
 
@@ -113,59 +112,18 @@ def as_mapping(file: CameraFile) -> dict[str, Any]:
     if file.covariance is not None:
         content["covariance"] = covariance_mapping(file.covariance)
     if file.calibration is not None:
-        content["calibration"] = _calibration_mapping(file.calibration)
+        content["calibration"] = file.calibration.model_dump(exclude_defaults=True)
     return content
 
 
-def _calibration_mapping(calibration: CameraCalibration) -> dict[str, Any]:
-    """The fields that differ from their default."""
-    default = CameraCalibration()
-    out: dict[str, Any] = {}
-    for name in CameraCalibration.__slots__:
-        value = getattr(calibration, name)
-        if value == getattr(default, name):
-            continue
-        if name == "reasons":
-            value = list(value)
-        elif name == "figures":
-            value = {key: float(v) for key, v in value.items()}
-        elif name in ("views", "corners"):
-            value = int(value)
-        elif not isinstance(value, str):
-            value = float(value)
-        out[name] = value
-    return out
-
-
 # The schema of the file ----------------------------------------------------------------------------------------------
-
-
-class _CalibrationBlock(fields.Block):
-    date: DayText = ""
-    verdict: Annotated[str, pydantic.PlainValidator(fields.one_of((*VERDICTS, "")))] = ""
-    rms_px: fields.NonNegative | None = None
-    sigma_px: fields.NonNegative | None = None
-    hold_out_rms_px: fields.NonNegative | None = None
-    views: fields.Integer | None = None
-    corners: fields.Integer | None = None
-    board: fields.Text = ""
-    distance_m: fields.Positive | None = None
-    valid_until: DayText = ""
-    reasons: fields.Lines = []  # noqa: RUF012 - frozen
-    figures: dict[str, fields.Number] = {}  # noqa: RUF012 - frozen
-    notes: fields.Text = ""
-
-    def value(self) -> CameraCalibration:
-        """The block as a value."""
-        values = {name: getattr(self, name) for name in CameraCalibration.__slots__}
-        return CameraCalibration(**{**values, "reasons": tuple(self.reasons)})
 
 
 class _CameraFileBlock(LensBlock):
     schema_: Annotated[str, pydantic.PlainValidator(fields.one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
     name: fields.Name
     covariance: CovarianceBlock | None = None
-    calibration: _CalibrationBlock | None = None
+    calibration: CameraCalibration | None = None
 
     @pydantic.model_validator(mode="after")
     def _covariance_of_this_camera(self) -> _CameraFileBlock:

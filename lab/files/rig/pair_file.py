@@ -15,7 +15,7 @@ from geometry.camera import Camera
 from geometry.pose import Pose
 from geometry.uncertainty.rig_uncertainty import RigCovariance, camera_names
 from lab.errors import InputError
-from lab.files.rig.calibration_state import CalibrationState, CalibrationStateBlock, state_mapping
+from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.camera_block import (
     Covariance,
     CovarianceBlock,
@@ -52,7 +52,7 @@ class _PairBlock(Block):
     schema_: Annotated[str, pydantic.PlainValidator(one_of((SCHEMA,)))] = pydantic.Field(alias="schema")
     cameras: dict[Name, _CameraBlock]
     covariance: CovarianceBlock | None = None
-    calibration: CalibrationStateBlock | None = None
+    calibration: CalibrationState | None = None
 
 
 def load_pair_file(path: Path) -> PairFile:
@@ -112,7 +112,7 @@ def _own(content: _PairBlock, path: Path) -> PairFile:
         if mistake:
             raise InputError(f"{path}: covariance.matrix: {mistake}")
         covariance = RigCovariance(block.parameters, symmetric(block.matrix))
-    return PairFile(cameras, covariance, None if content.calibration is None else content.calibration.value())
+    return PairFile(cameras, covariance, content.calibration)
 
 
 def save_pair_file(file: PairFile, path: Path) -> None:
@@ -130,7 +130,7 @@ def save_pair_file(file: PairFile, path: Path) -> None:
     if file.covariance is not None:
         content["covariance"] = covariance_mapping(Covariance(file.covariance.names, file.covariance.matrix))
     if file.calibration is not None:
-        content["calibration"] = state_mapping(file.calibration)
+        content["calibration"] = file.calibration.as_mapping()
     validated(_PairBlock, content, path)
     write_mapping(content, Path(path))
 

@@ -15,7 +15,7 @@ from geometry.camera import Camera, SensorNoise
 from geometry.rig import Beam, Rig, Screen, Spot
 from geometry.uncertainty.rig_uncertainty import RigCovariance, is_known, split_name
 from lab.errors import InputError
-from lab.files.rig.calibration_state import CalibrationState, CalibrationStateBlock, state_mapping
+from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.camera_block import (
     Covariance,
     CovarianceBlock,
@@ -122,8 +122,7 @@ def load_rig_file(path: Path) -> RigFile:
     if mistakes:
         raise FileError(f"{path}: {m}" for m in mistakes)
     covariances = {where: block.value() for where, block in _covariance_blocks(content)}
-    state = None if content.calibration is None else content.calibration.value()
-    return RigFile(_rig_of(content), covariances, state, dict(measured_forms(content)))
+    return RigFile(_rig_of(content), covariances, content.calibration, dict(measured_forms(content)))
 
 
 def save_rig(rig: Rig | RigFile, path: Path) -> None:
@@ -237,7 +236,7 @@ class _RigBlock(fields.Block):
     screens: dict[fields.Name, ScreenBlock]
     cameras: dict[fields.Name, CameraBlock]
     target: TargetBlock
-    calibration: CalibrationStateBlock | None = None
+    calibration: CalibrationState | None = None
 
 
 def _broken_references(content: _RigBlock) -> list[str]:
@@ -298,7 +297,7 @@ def as_mapping(file: RigFile) -> dict[str, Any]:
             block = block[key]
         block["covariance"] = covariance_mapping(covariance)
     if file.calibration is not None:
-        content["calibration"] = state_mapping(file.calibration)
+        content["calibration"] = file.calibration.as_mapping()
     return content
 
 

@@ -10,7 +10,7 @@ import pydantic
 
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
-from lab.files.rig.calibration_state import CalibrationState, CalibrationStateBlock, state_mapping
+from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.camera_block import Covariance, CovarianceBlock, covariance_mapping
 from lab.files.rig.rig_file import (
     TARGET,
@@ -44,7 +44,7 @@ class _ScreensBlock(Block):
     screens: dict[str, ScreenBlock]
     cameras: dict[str, CameraBlock]
     covariance: CovarianceBlock | None = None
-    calibration: CalibrationStateBlock | None = None
+    calibration: CalibrationState | None = None
 
 
 def load_screens(path: Path) -> ScreensFile:
@@ -66,8 +66,7 @@ def load_screens(path: Path) -> ScreensFile:
     )
     block = content.covariance
     covariance = None if block is None else joint_covariance(rig, {TARGET: block.value()}, path)
-    state = None if content.calibration is None else content.calibration.value()
-    return ScreensFile(content.name, rig, covariance, state)
+    return ScreensFile(content.name, rig, covariance, content.calibration)
 
 
 def save_screens(file: ScreensFile, path: Path) -> None:
@@ -81,6 +80,6 @@ def save_screens(file: ScreensFile, path: Path) -> None:
     if file.covariance is not None:
         content["covariance"] = covariance_mapping(Covariance(file.covariance.names, file.covariance.matrix))
     if file.calibration is not None:
-        content["calibration"] = state_mapping(file.calibration)
+        content["calibration"] = file.calibration.as_mapping()
     validated(_ScreensBlock, content, path)
     write_mapping(content, Path(path))

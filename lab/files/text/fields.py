@@ -129,9 +129,9 @@ def free_text(value: Any) -> str:
 
 def lines_of_text(value: Any) -> list[str]:
     """A list of lines of text."""
-    if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+    if not isinstance(value, list | tuple) or not all(isinstance(v, str) for v in value):
         raise unexpected_value("a list of lines of text", value)
-    return value
+    return list(value)
 
 
 def numbers(count: int) -> Callable[[Any], list[float]]:

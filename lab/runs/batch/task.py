@@ -26,7 +26,6 @@ from urllib.parse import quote
 
 from lab.errors import BeamposeError, InputError, RunError
 from lab.files.output.part_folder import FolderInUseError
-from lab.files.rig.calibration_state import state_mapping
 from lab.files.run.fingerprints import fingerprints
 from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_text
@@ -199,7 +198,7 @@ def fingerprint_of(run: Run, causal: bool, full: bool = False) -> str:
         "cameras": {name: type(source).__name__ for name, source in run.cameras.items()},
         "tracker": dataclasses.asdict(run.tracker),
         "causal": causal,
-        "calibration": None if run.calibration is None else state_mapping(run.calibration),
+        "calibration": None if run.calibration is None else run.calibration.as_mapping(),
         "versions": versions(),
         "program": program_digest(),
     }

@@ -16,7 +16,7 @@ import numpy as np
 
 from geometry.pose import Pose
 from lab.errors import InputError
-from lab.files.rig.calibration_state import require_valid_calibration, state_mapping
+from lab.files.rig.calibration_state import require_valid_calibration
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.run.truth import TruePoses, read_true_poses
 from lab.findings.finding import Finding, Level, finding, level_above, passed, worst_first
@@ -219,7 +219,7 @@ def _processed(run_folder: Path, work: Path, progress: Progress | None) -> Proce
         blocks={
             "run_folder": str(run.folder.resolve()),
             "pair": str(run.pair_path.resolve()),
-            "calibration": None if run.calibration is None else state_mapping(run.calibration),
+            "calibration": None if run.calibration is None else run.calibration.as_mapping(),
             "notes_of_run": run.notes,
             "counts": _counts(results),
             "rates": {"noise_scale": results.noise_scale},

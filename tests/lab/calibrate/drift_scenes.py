@@ -19,7 +19,7 @@ from tests.geometry.perturbed_rig import perturbed
 from tests.geometry.scenes import LENSES, paper_rig
 
 DAY = datetime.date(2026, 5, 1)
-STATE = CalibrationState(datetime.date(2026, 3, 1), "PASS", datetime.date(2026, 9, 1))
+STATE = CalibrationState(date=datetime.date(2026, 3, 1), verdict="PASS", valid_until=datetime.date(2026, 9, 1))
 POINT_SIGMA_M = 1e-4
 
 

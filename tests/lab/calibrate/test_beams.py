@@ -417,7 +417,12 @@ def test_positions_and_views_are_averaged_separately():
 def test_warnings_and_expiry_of_screens_yaml_go_into_the_rig(campaign, tmp_path):
     rig, project = campaign
     lab = replace(rig, beams={}, spots={})
-    state = CalibrationState(date(2026, 3, 1), "WARN", date(2026, 4, 1), ("the left screen is bent by 2 mm",))
+    state = CalibrationState(
+        date=date(2026, 3, 1),
+        verdict="WARN",
+        valid_until=date(2026, 4, 1),
+        reasons=("the left screen is bent by 2 mm",),
+    )
     save_screens(ScreensFile("the lab", lab, lab_covariance(rig), state), tmp_path / "screens.yaml")
     outcome = calibrate_beams(project, tmp_path / "out", tmp_path / "screens.yaml", date(2026, 3, 14))
     assert outcome.level == Level.WARN

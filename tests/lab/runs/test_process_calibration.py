@@ -63,14 +63,19 @@ def test_the_calibrations_covariance_is_in_its_own_table_and_in_the_total(run_fo
 
 
 def test_an_expired_calibration_stops_a_run_and_leaves_nothing(run_folder, tmp_path):
-    change_rig(run_folder, calibration=CalibrationState(DAY, "PASS", DAY))
+    change_rig(run_folder, calibration=CalibrationState(date=DAY, verdict="PASS", valid_until=DAY))
     with pytest.raises(CalibrationError, match="out of date"):
         process_run(run_folder, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_the_day_of_the_recording_counts_where_the_run_states_it(run_folder, tmp_path):
-    change_rig(run_folder, calibration=CalibrationState(DAY, "WARN", DAY, ("a corner of the picture was not covered",)))
+    change_rig(
+        run_folder,
+        calibration=CalibrationState(
+            date=DAY, verdict="WARN", valid_until=DAY, reasons=("a corner of the picture was not covered",)
+        ),
+    )
     path = run_folder / "run.yaml"
     content = yaml.safe_load(path.read_text())
     path.write_text(yaml.safe_dump({**content, "recorded": "2026-03-14"}))
@@ -82,7 +87,10 @@ def test_the_day_of_the_recording_counts_where_the_run_states_it(run_folder, tmp
 
 def test_a_batch_with_an_expired_calibration_ends_with_status_3(run_folder, tmp_path):
     good = simulate("smooth", tmp_path / "good", seed=6, frames=8, detections_only=True)
-    change_rig(run_folder, calibration=CalibrationState(DAY, "FAIL", None, ("the stand did not roll",)))
+    change_rig(
+        run_folder,
+        calibration=CalibrationState(date=DAY, verdict="FAIL", valid_until=None, reasons=("the stand did not roll",)),
+    )
     outcome = process_batch([good, run_folder], tmp_path / "out")
     assert outcome.exit_status == 3
     assert (tmp_path / "out" / "good" / "report.html").exists()

@@ -40,7 +40,7 @@ def test_a_camera_has_the_values_of_its_file(tmp_path):
     assert camera.covariance.parameters == ("fx", "fy", "k1")
     assert camera.covariance.matrix[2, 2] == 1e-8
     assert camera.calibration == CameraCalibration(
-        "2026-03-14", "PASS", 0.15, views=24, corners=1800, board="chessboard 9x6"
+        date="2026-03-14", verdict="PASS", rms_px=0.15, views=24, corners=1800, board="chessboard 9x6"
     )
 
 
@@ -78,8 +78,9 @@ def test_saving_and_loading_changes_no_bit(seed, count, judged, tmp_path_factory
         camera.lens,
         Covariance(names, (covariance + covariance.T) / 2),
         CameraCalibration(
-            "2026-01-02T03:04:05", "WARN", rng.uniform(), rng.uniform(), None, 7, 99, "on: 1e3", 2.5, "",
-            ("too few: 3", "- tilt"), {"focal_sigma_px": rng.uniform()}, "#1",
+            date="2026-01-02T03:04:05", verdict="WARN", rms_px=rng.uniform(), sigma_px=rng.uniform(), views=7,
+            corners=99, board="on: 1e3", distance_m=2.5, reasons=("too few: 3", "- tilt"),
+            figures={"focal_sigma_px": rng.uniform()}, notes="#1",
         ) if judged else None,
     )  # fmt: skip
     path = tmp_path_factory.mktemp("cameras") / "camera.yaml"

@@ -71,7 +71,11 @@ def test_state_bow_and_joint_covariance_are_saved_and_loaded(tmp_path):
     bent = dataclasses.replace(RIG.screens["left"], bow=(0.001, -0.0002, 0.0005))
     rig = dataclasses.replace(RIG, screens={**RIG.screens, "left": bent})
     state = CalibrationState(
-        datetime.date(2026, 3, 14), "WARN", datetime.date(2026, 9, 14), ("the left screen is bent",), "by night"
+        date=datetime.date(2026, 3, 14),
+        verdict="WARN",
+        valid_until=datetime.date(2026, 9, 14),
+        reasons=("the left screen is bent",),
+        notes="by night",
     )
     save_rig(RigFile(rig, {"target": Covariance(names, A @ A.T)}, state), tmp_path / "rig.yaml")
     again = load_rig_file(tmp_path / "rig.yaml")
@@ -84,7 +88,7 @@ DAY = datetime.date(2026, 3, 14)
 
 
 def test_a_calibration_may_be_used_up_to_its_last_day_and_not_after(tmp_path):
-    state = CalibrationState(DAY, "PASS", DAY + datetime.timedelta(90))
+    state = CalibrationState(date=DAY, verdict="PASS", valid_until=DAY + datetime.timedelta(90))
     require_valid_calibration(state, tmp_path / "rig.yaml", DAY + datetime.timedelta(90))
     words = r"valid_until: 2026-06-12 was 1 day before 2026-06-13 \(today\)"
     with pytest.raises(CalibrationError, match=words) as caught:
@@ -94,19 +98,19 @@ def test_a_calibration_may_be_used_up_to_its_last_day_and_not_after(tmp_path):
 
 
 def test_a_failed_calibration_is_refused_with_the_reason(tmp_path):
-    state = CalibrationState(DAY, "FAIL", None, ("the stand did not roll",))
+    state = CalibrationState(date=DAY, verdict="FAIL", valid_until=None, reasons=("the stand did not roll",))
     with pytest.raises(CalibrationError, match=r"FAIL \(the stand did not roll\)"):
         require_valid_calibration(state, tmp_path / "rig.yaml", DAY)
 
 
 def test_a_rig_without_a_calibration_state_may_be_used(tmp_path):
     require_valid_calibration(None, tmp_path / "rig.yaml", DAY)
-    require_valid_calibration(CalibrationState(DAY, "WARN"), tmp_path / "rig.yaml", DAY)
+    require_valid_calibration(CalibrationState(date=DAY, verdict="WARN"), tmp_path / "rig.yaml", DAY)
 
 
 @pytest.mark.parametrize("date", ["yesterday", "14.3.2026", "2026-13-01", "7"])
 def test_an_invalid_date_is_refused(tmp_path, date):
-    save_rig(RigFile(RIG, {}, CalibrationState(DAY, "PASS")), tmp_path / "rig.yaml")
+    save_rig(RigFile(RIG, {}, CalibrationState(date=DAY, verdict="PASS")), tmp_path / "rig.yaml")
     text = (tmp_path / "rig.yaml").read_text().replace("2026-03-14", date)
     (tmp_path / "rig.yaml").write_text(text)
     with pytest.raises(InputError, match=r"calibration.date: expected a date such as 2026-03-14"):
