@@ -279,8 +279,6 @@ def _steps(dx: list[int], dy: list[int]) -> str:
 
 
 _WIDTH, _HEIGHT = 540.0, 150.0
-_DAYS = (1, 2, 5, 10)  # steps between ticks
-_MONTHS = (1, 2, 3, 6, 12, 24, 60, 120, 240, 600, 1200, 2400, 6000, 12000)
 _LEAST_DAYS_OF_A_MEDIAN = 4
 QUANTITIES: tuple[tuple[str, str, Callable[[IndexedRun], float | None]], ...] = (
     ("Residual rms, median of the run", "px", lambda run: run.rms_px),
@@ -323,7 +321,7 @@ def _trend(
     lo, hi = _value_range(values, unit)
     p = svg.PlotArea(svg.Scale(*limits, 54.0, _WIDTH - 10.0), svg.Scale(lo, hi, _HEIGHT - 24.0, 22.0), _WIDTH, _HEIGHT)
     marks = svg.ticks(lo, hi, 4)
-    out = [svg.y_ticks(p, marks, svg.tick_texts(marks), grid=True), svg.x_ticks(p, *date_ticks(*limits))]
+    out = [svg.y_ticks(p, marks, svg.tick_texts(marks), grid=True), svg.x_ticks(p, *svg.date_ticks(*limits))]
     days, medians = _medians(day, values)
     if len(days) >= _LEAST_DAYS_OF_A_MEDIAN:
         d = svg.line_path(p.X(days), p.Y(np.clip(medians, lo, hi)))
@@ -358,23 +356,6 @@ def _medians(day: Array, values: Array) -> tuple[Array, Array]:
     """The days with a value, rising, and the median of each."""
     days = np.unique(day[np.isfinite(values)])
     return days, np.array([np.nanmedian(values[day == d]) for d in days])
-
-
-def date_ticks(lo: float, hi: float, about: int = 6) -> tuple[Array, list[str]]:
-    """Days (ordinals) between two ordinals, roughly `about` of them, and their labels: a day, a month or a year."""
-    span = hi - lo
-    first, last = (datetime.date.fromordinal(int(max(1, edge))) for edge in (np.ceil(lo), np.floor(hi)))
-    for step in _DAYS:
-        if span / step <= about + 1 and span < 60:
-            start = -(-first.toordinal() // step) * step
-            places = range(start, last.toordinal() + 1, step)
-            return np.array(places, dtype=float), [datetime.date.fromordinal(p).isoformat() for p in places]
-    months = next((m for m in _MONTHS if span / 30.4 / m <= about + 1), _MONTHS[-1])
-    count = range(-(-(first.year * 12 + first.month - 1) // months) * months, last.year * 12 + last.month, months)
-    begun = [datetime.date(m // 12, m % 12 + 1, 1) for m in count if m >= 12]
-    begun = [day for day in begun if first <= day <= last]
-    labels = [f"{day.year:04d}" if months >= 12 else f"{day:%Y-%m}" for day in begun]
-    return np.array([day.toordinal() for day in begun], dtype=float), labels
 
 
 # The index of a batch: one row per run with a link to its report, the worst runs first.

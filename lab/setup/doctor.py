@@ -14,7 +14,7 @@ import numpy as np
 import geometry
 from geometry.compilation.compile_cache import cache_folder, is_empty
 from lab.errors import InputError
-from lab.files.rig.calibration_state import CalibrationState
+from lab.files.rig.calibration_state import CalibrationState, iso_date
 from lab.files.rig.camera_file import load_camera
 from lab.files.rig.rig_file import load_rig_file
 from lab.files.rig.screens_file import load_screens
@@ -213,7 +213,7 @@ def _state_of_camera(path: Path) -> CalibrationState | None:
     if known is None or not known.date:
         return None
     return CalibrationState(
-        date=known.date, verdict=known.verdict or "PASS", valid_until=known.last_day, reasons=known.reasons
+        date=iso_date(known.date), verdict=known.verdict or "PASS", valid_until=known.last_day, reasons=known.reasons
     )
 
 

@@ -154,6 +154,6 @@ def _save(
     save_screens(ScreensFile(project.name, rig, fit.covariance, state), folder / SCREENS)
     if project.beams:
         note = "the beams are nominal, not calibrated: run `beampose calibrate beams`"
-        state = state.model_copy(update={"verdict": max(level, Level.WARN).name, "reasons": [note, *why]})
+        state = state.model_copy(update={"verdict": max(level, Level.WARN).name, "reasons": (note, *why)})
         whole = Rig(rig.screens, rig.cameras, project.beams, project.spots)
         save_rig(RigFile(whole, covariance_blocks(fit.covariance), state), folder / RIG)

@@ -45,7 +45,7 @@ class CalibrationState(Block):
     date: Day
     verdict: Annotated[str, pydantic.PlainValidator(one_of(VERDICTS))]
     valid_until: OptionalDay = None  # the last valid day; without it, no limit
-    reasons: Lines = []  # noqa: RUF012 - frozen  # a line for each finding that is not a PASS
+    reasons: Lines = ()  # a line for each finding that is not a PASS
     notes: Text = ""
 
     def days_left(self, day: datetime.date) -> int | None:
@@ -66,11 +66,6 @@ class CalibrationState(Block):
     def reason(self) -> str:
         """The first reason of the verdict, such as ` (RMS 3 px)`; empty without one."""
         return f" ({self.reasons[0]})" if self.reasons else ""
-
-    def as_mapping(self) -> dict[str, Any]:
-        """The plain mapping from which the same value is read."""
-        content = self.model_dump(exclude_defaults=True)
-        return {key: v.isoformat() if isinstance(v, datetime.date) else v for key, v in content.items()}
 
 
 def require_valid_calibration(

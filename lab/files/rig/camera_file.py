@@ -43,7 +43,7 @@ class CameraCalibration(fields.Block):
     board: fields.Text = ""  # description of the board, or its file
     distance_m: fields.Positive | None = None  # distance for figures in millimetres
     valid_until: DayText = ""  # ISO 8601; empty: no limit
-    reasons: fields.Lines = []  # noqa: RUF012 - frozen  # a line for each finding that is not a PASS
+    reasons: fields.Lines = ()  # a line for each finding that is not a PASS
     figures: dict[str, fields.Number] = {}  # noqa: RUF012 - frozen  # further figures, with their unit in the name
     notes: fields.Text = ""
 
@@ -112,7 +112,7 @@ def as_mapping(file: CameraFile) -> dict[str, Any]:
     if file.covariance is not None:
         content["covariance"] = covariance_mapping(file.covariance)
     if file.calibration is not None:
-        content["calibration"] = file.calibration.model_dump(exclude_defaults=True)
+        content["calibration"] = file.calibration.as_mapping()
     return content
 
 

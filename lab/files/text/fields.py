@@ -6,6 +6,7 @@ pydantic walks the file and collects all mistakes. Every check is one of these v
 
 from __future__ import annotations
 
+import datetime
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -127,11 +128,11 @@ def free_text(value: Any) -> str:
     return "" if value is None else value if value == "" else word(value)
 
 
-def lines_of_text(value: Any) -> list[str]:
+def lines_of_text(value: Any) -> tuple[str, ...]:
     """A list of lines of text."""
     if not isinstance(value, list | tuple) or not all(isinstance(v, str) for v in value):
         raise unexpected_value("a list of lines of text", value)
-    return list(value)
+    return tuple(value)
 
 
 def numbers(count: int) -> Callable[[Any], list[float]]:
@@ -193,13 +194,17 @@ Word = Annotated[str, _plain(word)]
 Text = Annotated[str, _plain(free_text)]
 Name = Annotated[str, _plain(printable_name)]
 Vector3 = Annotated[list[float], _plain(vector3)]
-Lines = Annotated[list[str], _plain(lines_of_text)]
+Lines = Annotated[tuple[str, ...], _plain(lines_of_text)]
 
 
 class Block(pydantic.BaseModel):
     """A mapping in a file. Unknown keys are mistakes, as are known keys without a value."""
 
     model_config = pydantic.ConfigDict(frozen=True, arbitrary_types_allowed=True, defer_build=True)
+
+    def as_mapping(self) -> dict[str, Any]:
+        """The plain mapping from which the same block is read, without what has its default."""
+        return {key: _plain_value(value) for key, value in self.model_dump(exclude_defaults=True).items()}
 
     @pydantic.model_validator(mode="before")
     @classmethod
@@ -211,6 +216,12 @@ class Block(pydantic.BaseModel):
             if key not in names:
                 raise field_error(f"unknown key {key!r}{suggest_name(key, names)}")
         return value
+
+
+def _plain_value(value: Any) -> Any:
+    if isinstance(value, datetime.date):
+        return value.isoformat()
+    return list(value) if isinstance(value, tuple) else value
 
 
 def validated(model: type[M], content: Mapping[str, Any], path: Path | str, inside: str = "") -> M:

@@ -224,11 +224,11 @@ def drift_chart(
     pad = max(0.03 * (last - first), 0.6)
     p = svg.plot_area((first - pad, last + pad), (0, top * 1.12), height=250)
     left, over, wide, high = p.box
-    marks, dated = svg.ticks(0, p.Y.hi, 5), _day_ticks(first, last)
+    marks = svg.ticks(0, p.Y.hi, 5)
     out = [
         svg.heading(p, f"{title} ({unit})"),
         svg.y_ticks(p, marks, svg.tick_texts(marks), grid=True),
-        svg.x_ticks(p, np.array(dated, dtype=float), [date.fromordinal(d).isoformat() for d in dated]),
+        svg.x_ticks(p, *svg.date_ticks(first - pad, last + pad, 4)),
     ]
     for limit, colour, words in ((warn, svg.ORANGE, "warning"), (fail, svg.VERMILLION, "not to be used")):
         if limit is not None:
@@ -268,9 +268,3 @@ def _drift_line(p: svg.PlotArea, name: str, line: DriftLine, colour: str, legend
     out.append(f'<path d="M{legend_x:.1f} {p.height - 6:.1f}h16" stroke="{colour}" stroke-width="3"/>')
     out.append(svg.text(legend_x + 20, p.height - 2, name))
     return out
-
-
-def _day_ticks(first: int, last: int) -> list[int]:
-    """At most 5 days, evenly spaced."""
-    count = min(5, last - first + 1)
-    return sorted({round(float(d)) for d in np.linspace(first, last, count)})

@@ -6,6 +6,7 @@ Embedded images: grey values brought to eight bits and encoded.
 from __future__ import annotations
 
 import base64
+import datetime
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -343,6 +344,27 @@ def log_ticks(lo: float, hi: float) -> tuple[Array, list[str]]:
     values = np.sort(np.outer(powers, steps).ravel())
     values = values[(np.log10(values) >= lo) & (np.log10(values) <= hi)]
     return np.log10(values), [f"{v:.4g}" if v < 8000 else f"{v:.0f}" for v in values.tolist()]
+
+
+_DAYS = (1, 2, 5, 10)  # steps between ticks
+_MONTHS = (1, 2, 3, 6, 12, 24, 60, 120, 240, 600, 1200, 2400, 6000, 12000)
+
+
+def date_ticks(lo: float, hi: float, about: int = 6) -> tuple[Array, list[str]]:
+    """Days (ordinals) between two ordinals, roughly `about` of them, and their labels: a day, a month or a year."""
+    span = hi - lo
+    first, last = (datetime.date.fromordinal(int(max(1, edge))) for edge in (np.ceil(lo), np.floor(hi)))
+    for step in _DAYS:
+        if span / step <= about + 1 and span < 60:
+            start = -(-first.toordinal() // step) * step
+            places = range(start, last.toordinal() + 1, step)
+            return np.array(places, dtype=float), [datetime.date.fromordinal(p).isoformat() for p in places]
+    months = next((m for m in _MONTHS if span / 30.4 / m <= about + 1), _MONTHS[-1])
+    count = range(-(-(first.year * 12 + first.month - 1) // months) * months, last.year * 12 + last.month, months)
+    begun = [datetime.date(m // 12, m % 12 + 1, 1) for m in count if m >= 12]
+    begun = [day for day in begun if first <= day <= last]
+    labels = [f"{day.year:04d}" if months >= 12 else f"{day:%Y-%m}" for day in begun]
+    return np.array([day.toordinal() for day in begun], dtype=float), labels
 
 
 def heading(p: PlotArea, title: str) -> str:
