@@ -172,10 +172,10 @@ def test_a_stop_whose_exception_is_lost_ends_the_process_all_the_same(tmp_path):
 import signal, sys, time
 sys.path.insert(0, {str(ROOT)!r})
 from pathlib import Path
-from lab.commands import stop_signals
+from lab.commands import common
 from lab.files.text.atomic_write import atomic_folder
-stop_signals._GRACE_S = 0.2
-with stop_signals.stopped_by_signals(), atomic_folder(Path(sys.argv[1]), lambda _: True) as work:
+common._GRACE_S = 0.2
+with common.stopped_by_signals(), atomic_folder(Path(sys.argv[1]), lambda _: True) as work:
     while True:
         try:
             print("ready", flush=True)

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import pytest
 
+from lab.pictures.inflate import decompress
 from lab.pictures.picture_file import MissingPicture, decode, read_picture
-from lab.pictures.picture_headers import decompress
 from tests.lab.pictures.picture_files import chunk, png, tiff
 
 SIZE = (37, 29)
