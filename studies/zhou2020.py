@@ -27,12 +27,18 @@ from lab.report.plot.axes import (
 from lab.targets.stereo.simulated_recording import drogue_markers, occluded, render, scene, simulated_pair, true_pixels
 from studies.comparison import Comparison, ComparisonRow, Figure
 from studies.learned_detector.samples import draw_sample
-from tracking.binocular.first_fit import first_fit
-from tracking.binocular.joint_fit import MarkerObservations, bound
+from tracking.binocular.acquisition import first_fit
+from tracking.binocular.joint_fit import (
+    MarkerObservations,
+    bound,
+    linear_points,
+    pose_of_points,
+    triangulate,
+    undistorted_pixels,
+)
 from tracking.binocular.marker_model import StereoPair, project, project_markers
 from tracking.binocular.parameters import SegmentationParameters
 from tracking.binocular.segmentation import ColourRange, marker_candidates, prepared
-from tracking.binocular.triangulation import linear_points, pose_of_points, triangulate, undistorted_pixels
 from tracking.learned_detector.detector import find_drogues
 
 # Monte Carlo of the binocular measurement: distances from 5 to 30 m, and the pose of seven markers at 10 m.

@@ -16,7 +16,7 @@ import numpy as np
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
-from calibration.pair.pair_calibration import CalibratedPair, calibrate_pair
+from calibration.pair import CalibratedPair, calibrate_pair
 from geometry import rotations
 from geometry.arrays import Array, Ints
 from geometry.camera import in_picture

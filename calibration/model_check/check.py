@@ -21,14 +21,24 @@ from enum import StrEnum
 
 import numpy as np
 
-from calibration.model_check.effect import Effect, EffectContext, effect_of
-from calibration.model_check.fault_identification import FaultDiagnosis
+from calibration.model_check.fault_identification import (
+    Effect,
+    EffectContext,
+    FaultDiagnosis,
+    WeightedDiagnosis,
+    diagnose_with_noise_of_cameras,
+    effect_of,
+)
 from calibration.model_check.faults import FaultParameters, possible_faults
-from calibration.model_check.linearised_frames import LinearisedFrames, linearise
-from calibration.model_check.noise_scales import WeightedDiagnosis, diagnose_with_noise_of_cameras
-from calibration.model_check.recording import ModelCheckRecording, evenly_spaced
+from calibration.model_check.linearised_frames import (
+    LinearisedFrames,
+    ModelCheckRecording,
+    UnseenView,
+    evenly_spaced,
+    linearise,
+    unseen_views,
+)
 from calibration.model_check.statistics import Statistics, calibration_sigmas_px, statistics
-from calibration.model_check.unseen import UnseenView, unseen_views
 from geometry.arrays import Ints
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig

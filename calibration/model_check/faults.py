@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.drift import PriorSizes
-from calibration.model_check.linearised_frames import LinearisedFrames
-from calibration.model_check.recording import ModelCheckRecording, finite
+from calibration.model_check.linearised_frames import LinearisedFrames, ModelCheckRecording, finite
 from geometry.arrays import Array, Bools, Ints, normalised, skew
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.model_check.linearised_frames import LinearisedFrames
-from calibration.model_check.recording import ModelCheckRecording, finite, whitening
+from calibration.model_check.linearised_frames import LinearisedFrames, ModelCheckRecording, finite, whitening
 from geometry.arrays import Array, Ints
 from geometry.forward_model import SpotModel
 from geometry.uncertainty.chi_square import gamma_quantile

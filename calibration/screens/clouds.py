@@ -12,10 +12,8 @@ import numpy as np
 from scipy import ndimage
 
 from calibration.open3d_loader import open3d
-from calibration.screens.flatness import assess_flatness
-from calibration.screens.screen_frame import frame_of_extent
-from calibration.screens.screens import Scan, moved_to_surface, pose_covariance
-from calibration.screens.survey_diagnosis import wrong_unit
+from calibration.screens.flatness import assess_flatness, frame_of_extent
+from calibration.screens.screens import Scan, moved_to_surface, pose_covariance, wrong_unit
 from geometry.arrays import Array, Bools, skew
 from geometry.pose import Pose
 

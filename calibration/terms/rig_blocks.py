@@ -10,9 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.least_squares.adjustment import At, Values
-from calibration.least_squares.parameter_blocks import Lines, Poses, Stack, Vectors
-from calibration.least_squares.priors import Prior
+from calibration.least_squares.adjustment import At, Lines, Poses, Prior, Stack, Values, Vectors
 from calibration.terms.surveyed import array_of, pose_of
 from geometry.arrays import Array, Bools
 from geometry.camera import Camera, pinhole_numbers

@@ -28,7 +28,7 @@ NEAR_M, NEAR_RAD = 0.05, np.deg2rad(1.0)
 
 
 class PoseModel(Protocol):
-    """A forward model of n views: geometry/forward_model.py for spots, marker_model.py for markers on the body."""
+    """A forward model of n views: geometry/forward_model.py, of spots or of markers on the body."""
 
     def project(self, world_from_body: Pose) -> tuple[Array, Array]:
         """Pixels (n, 2) and their Jacobian (n, 2, 6) by the pose error; nan where there is no projection."""

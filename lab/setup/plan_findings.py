@@ -17,10 +17,11 @@ from calibration.budget.pose_budget import (
     BEAM_POINTS,
     CAMERA_POSES,
     INTRINSICS,
+    NOISE,
     SCREEN_POSES,
     SCREEN_SHAPES,
+    GridPlan,
 )
-from calibration.budget.pose_grid import NOISE, GridPlan
 from geometry.arrays import Array, Bools
 from geometry.pose import Pose
 from lab.errors import InputError

@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 
 from calibration.boards import board_types as boards
-from calibration.least_squares.adjustment import solve
-from calibration.least_squares.parameter_blocks import Poses, Stack, Vectors
+from calibration.least_squares.adjustment import Poses, Stack, Vectors, solve
 from calibration.terms.corners import single_camera
 from calibration.terms.spot_term import SpotPixels
 from geometry.arrays import Array, Bools, Ints

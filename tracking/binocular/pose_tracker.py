@@ -11,9 +11,16 @@ from geometry.camera import in_picture
 from geometry.pose import Pose
 from geometry.uncertainty.chi_square import chi2_tail
 from tracking import kalman
-from tracking.binocular.acquisition import acquire, distinct, mirrored
+from tracking.binocular.acquisition import (
+    Images,
+    LabelledPose,
+    acquire,
+    distinct,
+    labelled_pose,
+    mirrored,
+    observations,
+)
 from tracking.binocular.joint_fit import JointFit, MarkerObservations
-from tracking.binocular.labelling import Images, LabelledPose, labelled_pose, observations
 from tracking.binocular.marker_model import MarkerImages, MarkerModel, StereoPair, project_markers
 from tracking.binocular.parameters import MatchParameters
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, PoseStatus

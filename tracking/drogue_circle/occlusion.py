@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from geometry.arrays import Array, Bools
-from tracking.drogue_circle.candidates import Picture
+from tracking.drogue_circle.detectors import Picture
 from tracking.drogue_circle.rim_fit import SECTORS, RimFit, median
 
 _RINGS, _SECTORS = 10, SECTORS

@@ -17,11 +17,12 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.compilation.jit import compiled
 from geometry.compiled_projection import inside, project_view
 from geometry.pose_solver.three_spots import pose_of_lengths, spot_lengths
-from tracking.labelling.points import NO_POINT, PointsOnScreens
-from tracking.labelling.problem import (
+from tracking.labelling.points import (
     GATE,
     LOG_2PI,
+    NO_POINT,
     LabelProblem,
+    PointsOnScreens,
     PoseWorkspace,
     add_information,
     allowed,

@@ -18,12 +18,18 @@ from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking.detections import Detections
 from tracking.labelling.candidates import BestCandidates, generate
-from tracking.labelling.completion import complete_all
-from tracking.labelling.evidence import SHARES
-from tracking.labelling.points import NO_POINT, Points, PointsOnScreens, on_screens, points_of
-from tracking.labelling.problem import LabelLimits, LabelProblem, SpotGeometry
-from tracking.labelling.triples import covering
-from tracking.labelling.visible_poses import VisiblePoses
+from tracking.labelling.completion import SHARES, complete_all
+from tracking.labelling.points import (
+    NO_POINT,
+    LabelLimits,
+    LabelProblem,
+    Points,
+    PointsOnScreens,
+    SpotGeometry,
+    on_screens,
+    points_of,
+)
+from tracking.labelling.visible_poses import VisiblePoses, covering
 from tracking.parameters import LabelParameters
 
 # The largest model error considered, as a multiple of `model_sigma_px`: the evidence is the mean over several sizes up

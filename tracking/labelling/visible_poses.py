@@ -1,9 +1,9 @@
-"""The poses in which a rig sees enough of its spots: their volume, by importance sampling.
+"""The poses in which a rig sees enough of its spots, and the sets of three spots for candidate poses.
 
 Three spots at random pixels of their pictures give poses in closed form. A pose is sampled with a density proportional
 to |det J|, the Jacobian of the three spots' six pixels, and by every set of three views that sees it; its weight is the
 inverse. Poses drawn uniformly from the lab's space would hardly ever show a spot to a long lens (one in 1e6 at
-f = 6000 px). Source: ours.
+f = 6000 px). Any set of visible spots contains enough of the selected sets of three. Source: ours.
 """
 
 from __future__ import annotations
@@ -21,6 +21,43 @@ from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.three_spots import poses_from_three_spots
 from geometry.rig import Rig
+
+TIMES = 2  # triples in any set of visible spots, if it has that many that determine the pose: noise may affect one
+MOST_SETS = 5000  # sets of one size that are considered: a random sample if there are more (above 12 spots)
+
+
+def covering(
+    triples: dict[tuple[int, int, int], float], spots: Sequence[int], least: int
+) -> tuple[Ints, dict[int, int]]:
+    """Triples (k, 3) such that any set of at least `least` spots contains TIMES of them, if possible; and stages.
+
+    triples: the quality with which each determines the pose. The larger sets of spots are covered first: the first
+    `stages[m]` triples cover all sets of m or more spots. Greedy set cover: the next triple is the one that covers most
+    of the sets that still lack one; of equals the one with the best quality.
+    """
+    names = list(triples)
+    quality = np.array([triples[t] for t in names])
+    rng = np.random.default_rng(0)
+    chosen: list[int] = []
+    stages: dict[int, int] = {}
+    for size in range(len(spots), least - 1, -1):
+        sets = [frozenset(s) for s in combinations(spots, size)]
+        if len(sets) > MOST_SETS:
+            sets = [sets[i] for i in rng.choice(len(sets), MOST_SETS, replace=False)]
+        covers: Array = np.array([[s.issuperset(t) for s in sets] for t in names], dtype=float).reshape(-1, len(sets))
+        lacking = np.minimum(covers.sum(axis=0), TIMES)
+        lacking = np.maximum(lacking - covers[chosen].sum(axis=0), 0.0)
+        while lacking.any():
+            covered = covers @ np.minimum(lacking, 1.0)
+            covered[chosen] = 0.0
+            best = int(np.argmax(covered + 0.5 * quality / quality.max()))
+            if not covered[best] > 0:
+                break
+            chosen.append(best)
+            lacking = np.maximum(lacking - covers[best], 0.0)
+        stages[size] = len(chosen)
+    return np.array([names[i] for i in chosen], dtype=np.int64).reshape(-1, 3), stages
+
 
 DRAWN = 4000  # sets of three pixels; the relative error of the volume is then 0.1 to 0.2
 FIXES = 1e-4  # least ratio of the singular values of three spots' Jacobian; collinear spots have 1e-12

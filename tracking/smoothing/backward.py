@@ -14,10 +14,10 @@ from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from tracking.rigid_body.acquisition import FIRST_ACCELERATION, FIRST_ANGULAR_ACCELERATION
 from tracking.rigid_body.association.frame_detections import distinct_spots
-from tracking.rigid_body.hypotheses.prediction_checks import MIN_REDUNDANT_SPOTS
+from tracking.rigid_body.hypotheses.hypothesis_set import MIN_REDUNDANT_SPOTS
 from tracking.rigid_body.models.motion import STATE
 from tracking.rigid_body.rigid_tracker import RigidTracker
-from tracking.smoothing.motion.smoothed_motion import SmoothedMotion
+from tracking.smoothing.motion.run_detections import SmoothedMotion
 from tracking.smoothing.recording import TrackedRecording, assigned_in_one_list
 from tracking.statuses import PoseStatus
 

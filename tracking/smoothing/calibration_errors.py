@@ -9,8 +9,7 @@ from geometry.compiled_projection import project_all
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import covariance_of
 from geometry.uncertainty.rig_uncertainty import share_without_calibration
-from tracking.smoothing.motion.reference import Reference
-from tracking.smoothing.motion.run_detections import RunDetections, labelled_points
+from tracking.smoothing.motion.run_detections import Reference, RunDetections, labelled_points
 from tracking.smoothing.recording import TrackedRecording
 
 

@@ -7,8 +7,8 @@ import numpy as np
 from geometry.arrays import Array, Bools
 from geometry.compiled_projection import Views, project_all
 from geometry.pose import Pose
-from tracking.smoothing.motion.reference import Reference
-from tracking.smoothing.motion.velocity_jumps import SHORT_EXPOSURE, corner_offsets
+from tracking.smoothing.motion.process_noise import SHORT_EXPOSURE, corner_offsets
+from tracking.smoothing.motion.run_detections import Reference
 
 
 def exposure_offsets(views: Views, motion: Reference, exposure_s: float, steady: Bools) -> Array:

@@ -11,12 +11,10 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty
-from tracking.detections import UNMATCHED, Detections
+from tracking.detections import AT_THE_FRAME, UNMATCHED, Detections, PictureClock
 from tracking.parameters import TrackerParameters
-from tracking.picture_clock import AT_THE_FRAME, PictureClock
 from tracking.rigid_body.association.frame_detections import BLENDED
-from tracking.smoothing.motion.delayed_spots import Delays
-from tracking.smoothing.motion.run_detections import RunDetections
+from tracking.smoothing.motion.run_detections import Delays, RunDetections
 from tracking.statuses import PoseStatus, SpotStatus
 from tracking.tracked_frame import TrackedFrame
 

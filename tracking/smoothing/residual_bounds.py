@@ -16,8 +16,7 @@ from geometry.arrays import Array, Bools, Ints, evenly_spread
 from geometry.compiled_projection import Views, project_all
 from geometry.uncertainty.chi_square import gamma_quantile
 from tracking.rigid_body.association.frame_detections import BLENDED
-from tracking.smoothing.motion.reference import Reference
-from tracking.smoothing.motion.run_detections import RunDetections, fit_frames
+from tracking.smoothing.motion.run_detections import Reference, RunDetections, fit_frames
 from tracking.smoothing.place_errors import frames_with_same_error, usable_widths
 
 _REACH = 2.0  # widths of the spot: assumed correlation length of the errors

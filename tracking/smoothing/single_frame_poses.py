@@ -10,8 +10,7 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.compiled_projection import Views, project_all
 from geometry.pose_solver.gauss_newton import SolveLimits, covariances_of
 from tracking.rigid_body.association.frame_detections import BLENDED
-from tracking.smoothing.motion.reference import Reference
-from tracking.smoothing.motion.run_detections import RunDetections, fit_frames
+from tracking.smoothing.motion.run_detections import Reference, RunDetections, fit_frames
 
 _BLOCK = 4096  # frames whose fits are in memory at once
 

@@ -24,28 +24,33 @@ from geometry.compiled_projection import project_all, project_with_covariances
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import SolveLimits
 from tracking.rigid_body.association.frame_detections import BLENDED, DetectionModel, ViewTable, distinct_spots
-from tracking.rigid_body.hypotheses.prediction_checks import (
+from tracking.rigid_body.hypotheses.hypothesis_set import (
     MAX_CHECKING_SIGMA_PX,
     MIN_REDUNDANT_SPOTS,
     SURE_PROBABILITY,
 )
-from tracking.rigid_body.models.picture_shifts import run_shifts
+from tracking.rigid_body.models.information import run_shifts
 from tracking.smoothing.backward import merged, track_backward
 from tracking.smoothing.calibration_errors import calibration_errors
 from tracking.smoothing.error_scale import ErrorScale, usual_sizes
 from tracking.smoothing.exposure import exposure_offsets, exposure_sigmas, pose_shift
 from tracking.smoothing.labels.clutter import run_log_clutter, run_log_static
-from tracking.smoothing.labels.continuity import continued
+from tracking.smoothing.labels.continuity import continued, transfers_between_cameras
 from tracking.smoothing.labels.displaced_camera import displaced
 from tracking.smoothing.labels.neighbouring_frames import brief, connected, isolated, next_to
-from tracking.smoothing.labels.path_pairs import transfers_between_cameras
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated
 from tracking.smoothing.labels.view_path import PathContext
-from tracking.smoothing.motion.delayed_spots import Steps, moved_detections
-from tracking.smoothing.motion.reference import Reference, straight_between
-from tracking.smoothing.motion.run_detections import RunDetections, controlled_labels
-from tracking.smoothing.motion.smoothed_motion import SmoothedMotion, WholeRun
-from tracking.smoothing.motion.velocity_jumps import corner_offsets, jump_sigmas, jump_variances
+from tracking.smoothing.motion.process_noise import corner_offsets, jump_sigmas, jump_variances
+from tracking.smoothing.motion.run_detections import (
+    Reference,
+    RunDetections,
+    SmoothedMotion,
+    Steps,
+    WholeRun,
+    controlled_labels,
+    moved_detections,
+    straight_between,
+)
 from tracking.smoothing.motion.whole_run import MAX_DISTANCE, estimate
 from tracking.smoothing.place_errors import place_errors
 from tracking.smoothing.recording import TrackedRecording

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calibration.model_check.recording import ModelCheckRecording
+from calibration.model_check.linearised_frames import ModelCheckRecording
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from lab.runs.frames.even_sampler import EvenSampler

@@ -64,14 +64,12 @@ from lab.files.text.fields import (
     validated,
 )
 from lab.files.text.yaml_text import read_mapping
-from tracking.binocular.calibration_check import CalibrationCheck
-from tracking.binocular.clock_offset import ClockOffset
-from tracking.binocular.joint_fit import JointFit
+from tracking.binocular.calibration_check import CalibrationCheck, ClockOffset
+from tracking.binocular.joint_fit import JointFit, pose_of_points
 from tracking.binocular.marker_model import MarkerImages, MarkerModel, StereoPair
 from tracking.binocular.parameters import BinocularParameters, MatchParameters, SegmentationParameters
 from tracking.binocular.pose_tracker import BinocularFrame
 from tracking.binocular.segmentation import ColourRange
-from tracking.binocular.triangulation import pose_of_points
 from tracking.statuses import PoseStatus
 
 _SYMMETRIC = 0.03  # share of the target's size within which turned markers count as the same

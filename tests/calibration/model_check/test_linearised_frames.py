@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from calibration.model_check.faults import FaultParameters, possible_faults
-from calibration.model_check.linearised_frames import linearise
-from calibration.model_check.recording import evenly_spaced
+from calibration.model_check.linearised_frames import evenly_spaced, linearise
 from calibration.model_check.statistics import correlation_time, nis_band
 from geometry.forward_model import SpotModel
 from geometry.pose_solver.gauss_newton import fit_pose

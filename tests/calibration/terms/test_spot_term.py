@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.least_squares.parameter_blocks import Poses
+from calibration.least_squares.adjustment import Poses
 from calibration.terms.rig_blocks import named_errors, prior_of, rig_of, stacks_of
 from calibration.terms.spot_term import SpotPixels, SpotTerm
 from geometry.arrays import numeric_jacobian

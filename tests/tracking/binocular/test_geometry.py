@@ -11,16 +11,17 @@ from geometry.rotations import ypr_from_matrix
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from studies.zhou2020 import PRINTED_ROTATION, pose_errors
 from tests.tracking.binocular.scenes import MODEL, NOISE_PX, PAIR, pose_at
-from tracking.binocular.first_fit import first_fit
-from tracking.binocular.joint_fit import MarkerObservations, fit_pose
-from tracking.binocular.marker_model import StereoPair, calibration_jacobian, project, project_markers
-from tracking.binocular.triangulation import (
+from tracking.binocular.acquisition import first_fit
+from tracking.binocular.joint_fit import (
+    MarkerObservations,
+    fit_pose,
     linear_points,
     pose_of_points,
     quaternion_matrix,
     triangulate,
     undistorted_pixels,
 )
+from tracking.binocular.marker_model import StereoPair, calibration_jacobian, project, project_markers
 
 COV = np.broadcast_to(NOISE_PX**2 * np.eye(2), (2, len(MODEL), 2, 2))
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tracking.curve_switching.gains import combined, direction_and_speed, nearness, picture_scale, smoothness
+from tracking.curve_switching.matching import combined, direction_and_speed, nearness, picture_scale, smoothness
 
 FLOOR_PX = 1.0
 WEIGHTS = (0.6, 0.2, 0.2)

@@ -7,12 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tracking.unscented.fu2016 import SPREAD, X0, PrintedFilter, bearings, observability, process, selection
-from tracking.unscented.ukf import (
+from tracking.unscented import (
+    SPREAD,
+    X0,
+    PrintedFilter,
     Space,
     Spread,
+    bearings,
     gated_update,
+    observability,
     predict,
+    process,
+    selection,
     sigma_points,
     square_root,
     student_t_update,

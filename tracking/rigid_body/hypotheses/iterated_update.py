@@ -30,9 +30,8 @@ from geometry.compiled_linalg import (
 )
 from tracking.rigid_body.association.frame_detections import Observation, chosen_points
 from tracking.rigid_body.hypotheses.hypothesis_set import State
-from tracking.rigid_body.models.information import add_curvature_covariance, frame_information
+from tracking.rigid_body.models.information import add_curvature_covariance, frame_information, timed_information
 from tracking.rigid_body.models.motion import STATE, updated
-from tracking.rigid_body.models.picture_shifts import timed_information
 
 MAX_STEPS, MAX_HALVINGS = 8, 5  # of Gauss-Newton, and of one step
 MAX_UPDATE_SIGMA = 0.06  # m, rad: a frame that leaves its widest direction less certain does not update the state

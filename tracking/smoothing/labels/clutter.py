@@ -9,9 +9,8 @@ from geometry.compilation.jit import compiled
 from geometry.compiled_projection import Views, inside, project_all, project_view
 from geometry.forward_model import SpotModel
 from tracking.rigid_body.association.frame_detections import BLENDED, CLUTTER_RADIUS_PX, ViewTable
-from tracking.rigid_body.static_points import PicturePoints, no_places, static_log_density, update_places
-from tracking.smoothing.motion.reference import Reference
-from tracking.smoothing.motion.run_detections import RunDetections
+from tracking.rigid_body.point_statistics import PicturePoints, no_places, static_log_density, update_places
+from tracking.smoothing.motion.run_detections import Reference, RunDetections
 
 
 @compiled

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.arrays import Bools, Ints
-from tracking.rigid_body.hypotheses.prediction_checks import MIN_CONFIRMING_SPOTS
+from tracking.rigid_body.hypotheses.hypothesis_set import MIN_CONFIRMING_SPOTS
 
 # Of the frames at most AROUND away from a label: in so many at most the spot is seen, in so many at least missed.
 AROUND, BRIEF_FRAMES, ABSENT_FRAMES = 3, 2, 4

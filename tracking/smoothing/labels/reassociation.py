@@ -22,16 +22,16 @@ from tracking.rigid_body.association.frame_detections import (
     Observation,
     ViewTable,
     chosen_points,
+    detection_log_likelihood,
+    predicted_pixel,
 )
 from tracking.rigid_body.association.joint_search import associate
-from tracking.rigid_body.association.likelihood import detection_log_likelihood, predicted_pixel
 from tracking.rigid_body.hypotheses.hypothesis_set import State
 from tracking.rigid_body.hypotheses.iterated_update import iterated_update
 from tracking.rigid_body.models.information import frame_information, single_frame_pose
 from tracking.rigid_body.models.motion import STATE
 from tracking.rigid_body.models.occlusion import joint_log_likelihood, marginal
-from tracking.smoothing.motion.reference import Reference
-from tracking.smoothing.motion.run_detections import RunDetections, labelled_points
+from tracking.smoothing.motion.run_detections import Reference, RunDetections, labelled_points
 
 # Probability that a spot is not occluded if its screen is visible, by the neighbouring frames in which the screen was
 # visible: the spot was labelled in none of them, in one of two, in all.

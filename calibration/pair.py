@@ -12,8 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.least_squares.adjustment import Adjusted, AdjustmentError, Limits, solve
-from calibration.least_squares.parameter_blocks import Poses, Vectors
+from calibration.least_squares.adjustment import Adjusted, AdjustmentError, Limits, Poses, Vectors, solve
 from calibration.lens.fit.lens_adjustment import coefficient_prior
 from calibration.lens.fit.lens_parameters import Values
 from calibration.lens.intrinsics_result import Intrinsics

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
+from geometry.forward_model import MarkerModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import PoseFit, fit_pose
-from geometry.pose_solver.marker_model import MarkerModel
 from tracking.detections import UNMATCHED
 from tracking.noise import Picture
 
