@@ -29,8 +29,7 @@ from tracking.detections import Detections
 from tracking.labelling.first_labels import NO_POINT, find_labels
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.rigid_tracker import RigidTracker
-from tracking.statuses import PoseStatus, SpotStatus
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import PoseStatus, SpotStatus, TrackedFrame
 
 FIRST_SEED = 9000
 START_FRAMES = 2  # the rate is not yet known, so there is no prediction

@@ -33,8 +33,7 @@ from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.curve_switching.vehicle import BENT_NIS
 from tracking.labelling.first_labels import NO_POINT
 from tracking.parameters import TrackerParameters
-from tracking.statuses import SpotStatus
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import SpotStatus, TrackedFrame
 
 NOISE_PX = 0.1  # not stated in the paper; its prediction error of 0.68 px is consistent with 0.1 to 0.3
 STIFF_PX_S2, LOOSE_PX_S2 = 300.0, 5000.0  # small and large process noise of the filter

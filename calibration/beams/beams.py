@@ -30,8 +30,18 @@ from calibration.least_squares.adjustment import (
     independent,
     solve,
 )
-from calibration.terms.rig_blocks import BEAMS, POSES, STAND, lines_in, named_errors, prior_of, rig_of, stacks_of
-from calibration.terms.spot_term import SpotPixels, SpotTerm
+from calibration.terms.rig_blocks import (
+    BEAMS,
+    POSES,
+    STAND,
+    SpotPixels,
+    SpotTerm,
+    lines_in,
+    named_errors,
+    prior_of,
+    rig_of,
+    stacks_of,
+)
 from calibration.terms.surveyed import pose_of
 from geometry.arrays import Array, Bools, normalised
 from geometry.forward_model import SpotModel

@@ -16,7 +16,7 @@ import numpy as np
 from calibration.beams.beams import StandModel, calibrate_beams
 from calibration.beams.spot_fit import body_poses, stand_of
 from calibration.least_squares.adjustment import AdjustmentError, Poses
-from calibration.terms.spot_term import SpotPixels
+from calibration.terms.rig_blocks import SpotPixels
 from geometry.arrays import Array, Ints
 from geometry.pose import Pose
 from geometry.rig import Rig

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from calibration.least_squares.adjustment import Adjusted, AdjustmentError, Cauchy, Free, Limits, Term, Values, solve
-from calibration.terms.spot_term import SpotPixels, SpotTerm
+from calibration.terms.rig_blocks import SpotPixels, SpotTerm
 from geometry.arrays import Array, Bools, Ints, normalised
 from geometry.forward_model import SpotModel
 from geometry.planes import intersect_plane, screen_to_world

@@ -2,7 +2,7 @@
 
 The recording is reduced to normal equations over all parameters that may be wrong, with the poses of all frames
 eliminated. They are equivalent to a few uncorrelated pixels y = X theta + noise, one per observable direction of theta;
-`ExcessResidual` (calibration/excess_residual.py) computes evidence, size and significance from these. The
+`ExcessResidual` (calibration/changes.py) computes evidence, size and significance from these. The
 calibration's own covariance is part of the noise: a deviation that it allows is no fault.
 """
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.excess_residual import Change, ChangeCandidate, ExcessResidual
+from calibration.changes import Change, ChangeCandidate, ExcessResidual
 from calibration.model_check.faults import PIXEL_OFFSET, VIEW, FaultParameters, PossibleFault
 from calibration.model_check.linearised_frames import LinearisedFrames, ModelCheckRecording, linearise
 from calibration.model_check.statistics import correlation_time

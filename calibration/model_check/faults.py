@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.drift import PriorSizes
+from calibration.changes import PriorSizes
 from calibration.model_check.linearised_frames import LinearisedFrames, ModelCheckRecording, finite
 from geometry.arrays import Array, Bools, Ints, normalised, skew
 from geometry.forward_model import SpotModel

@@ -18,8 +18,19 @@ from calibration.beams.beams import StandModel
 from calibration.least_squares.adjustment import Adjusted, At, Cauchy, Free, Limits, Poses, Prior, Term, Values, solve
 from calibration.screens.flatness import smallest_scatter
 from calibration.screens.network import Network, NetworkFit, flat_boards, normalised_residuals
-from calibration.terms.rig_blocks import BEAMS, BOWS, CAMERAS, INTRINSICS, POSES, SCREENS, STAND, named_errors, rig_of
-from calibration.terms.spot_term import SpotPixels, SpotTerm
+from calibration.terms.rig_blocks import (
+    BEAMS,
+    BOWS,
+    CAMERAS,
+    INTRINSICS,
+    POSES,
+    SCREENS,
+    STAND,
+    SpotPixels,
+    SpotTerm,
+    named_errors,
+    rig_of,
+)
 from calibration.terms.surveyed import (
     FrameTerm,
     PointTerm,

@@ -14,8 +14,7 @@ from calibration.beams.mean_rotation import mean_rotation
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.joint import SPOTS, Joint, Measured, calibrate_jointly, jacobian, shares
 from calibration.screens.screens import ScreensResult
-from calibration.terms.rig_blocks import BEAMS, POSES, STAND, named_errors
-from calibration.terms.spot_term import SpotPixels, SpotTerm
+from calibration.terms.rig_blocks import BEAMS, POSES, STAND, SpotPixels, SpotTerm, named_errors
 from calibration.terms.surveyed import pose_of
 from geometry.arrays import Array, Ints, symmetric
 from geometry.forward_model import SpotModel

@@ -9,8 +9,7 @@ import numpy as np
 
 from geometry.pose import Pose
 from lab.runs.frames.pipeline import FrameRecord
-from tracking.statuses import PoseStatus
-from tracking.tracked_frame import Event
+from tracking.statuses import Event, PoseStatus
 
 MOST_EVENTS = 500  # listed one by one; of the others the number is reported
 # Events that may continue in the next frame: listed once, with their last frame.

@@ -11,8 +11,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from calibration.budget.expected_errors import ExpectedErrors
-from calibration.budget.pose_budget import (
+from calibration.budget import (
     BEAM_DIRECTIONS,
     BEAM_POINTS,
     CAMERA_POSES,
@@ -20,6 +19,7 @@ from calibration.budget.pose_budget import (
     NOISE,
     SCREEN_POSES,
     SCREEN_SHAPES,
+    ExpectedErrors,
     GridPlan,
 )
 from geometry.arrays import Array, Bools

@@ -17,8 +17,7 @@ from geometry.compiled_projection import project_all
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
-from geometry.pose_solver.alternative_poses import alternative_poses
-from geometry.pose_solver.visibility import symmetries
+from geometry.pose_solver.visibility import alternative_poses, symmetries
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking.detections import Detections
@@ -47,7 +46,7 @@ from tracking.rigid_body.hypotheses.hypothesis_set import (
 from tracking.rigid_body.hypotheses.iterated_update import iterated_update
 from tracking.rigid_body.models.motion import predicted
 from tracking.rigid_body.models.occlusion import MISSED, joint_log_likelihood, marginal, predict, update
-from tracking.tracked_frame import Event
+from tracking.statuses import Event
 
 # Sigmas of the motion of a vehicle that has just been found.
 FIRST_SPEED, FIRST_RATE = 4.0, 6.0  # m/s, rad/s

@@ -27,8 +27,16 @@ from tracking.rigid_body.association.frame_detections import (
 from tracking.rigid_body.hypotheses.hypothesis_set import Hypotheses
 from tracking.rigid_body.models.information import frame_information, single_frame_pose
 from tracking.rigid_body.models.motion import predicted
-from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, PoseStatus, SpotStatus, view_statuses
-from tracking.tracked_frame import Event, MotionEstimate, TrackedFrame
+from tracking.statuses import (
+    LOST_SIGMA_M,
+    LOST_SIGMA_RAD,
+    Event,
+    MotionEstimate,
+    PoseStatus,
+    SpotStatus,
+    TrackedFrame,
+    view_statuses,
+)
 
 # Pivot of a scaled normal matrix below which the pose is not observable; exact degeneracies give 1e-16.
 RANK_TOLERANCE = 1e-12

@@ -9,8 +9,8 @@ picture, missing pictures and re-acquisition therefore need no cases of their ow
    the answers, and mirror solutions of three spots, become children as well.
 3. Prune and merge the children (hypotheses/hypothesis_set.py).
 4. Decide which labels are confirmed (label_confirmation.py) and whether the frame's spots determine the pose.
-5. Update the online estimates: process noise and variance factor (online_estimates.py), and
-   clutter, static points and spot sizes (point_statistics.py).
+5. Update the online estimates: process noise, variance factor, clutter, static points and spot sizes
+   (online_estimates.py).
 
 Source: ours.
 """
@@ -82,9 +82,8 @@ from tracking.rigid_body.hypotheses.hypothesis_set import (
 from tracking.rigid_body.label_confirmation import FrameHypotheses, LabelConfirmation
 from tracking.rigid_body.models.information import clocks_of, has_clocks, picture_shifts, single_frame_pose
 from tracking.rigid_body.models.occlusion import MISSED
-from tracking.rigid_body.online_estimates import AdaptiveProcessNoise, VarianceFactor
-from tracking.rigid_body.point_statistics import PointStatistics
-from tracking.tracked_frame import Event, TrackedFrame
+from tracking.rigid_body.online_estimates import AdaptiveProcessNoise, PointStatistics, VarianceFactor
+from tracking.statuses import Event, TrackedFrame
 
 P_NEW = 1e-3  # probability per frame that the vehicle is not where any hypothesis predicts it
 MAX_EVIDENCE, MIN_EVIDENCE = 50.0, -5.0  # nats; a first hypothesis with less evidence is dropped

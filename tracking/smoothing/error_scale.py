@@ -14,7 +14,7 @@ from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.rigid_body.models.information import single_frame_pose
 from tracking.rigid_body.online_estimates import DEADBAND
 from tracking.smoothing.motion.run_detections import Reference, RunDetections, labelled_points
-from tracking.smoothing.residual_bounds import VarianceFactors, residual_bounds
+from tracking.smoothing.single_frame_poses import VarianceFactors, residual_bounds
 
 # Largest shift of a spot's centre by texture, speckle and its shape, as a share of its width (1 sigma): 4 % texture
 # makes 0.04, speckle of contrast 0.3 up to 0.16.

@@ -16,8 +16,7 @@ from tracking.parameters import TrackerParameters
 from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.smoothing.error_scale import ErrorScale
 from tracking.smoothing.motion.run_detections import RunDetections
-from tracking.statuses import PoseStatus, SpotStatus, view_statuses
-from tracking.tracked_frame import Event, MotionEstimate, TrackedFrame
+from tracking.statuses import Event, MotionEstimate, PoseStatus, SpotStatus, TrackedFrame, view_statuses
 
 _BLOCK = 4096  # frames whose measured spots are in memory twice
 

@@ -1,14 +1,14 @@
 """The smoothing pass: labels revised and motion estimated with the whole run known.
 
 1. Estimate the most probable motion given the causal labels (motion/whole_run.py).
-2. Track stretches of doubtful frames backward in time (backward.py).
+2. Track stretches of doubtful frames backward in time (recording.py).
 3. Assign each frame's detections again from the motion that all other frames give (labels/reassociation.py), and
    estimate the motion again, until no label changes. The last of these rounds ends with the motion, so that labels and
    poses belong together.
 4. Compare each pose with that of the frame's own spots. Where they contradict each other a velocity jump is assumed and
    the motion estimated again; if the contradiction remains, the frame's own spots decide.
 5. Add labels by continuity where the pose is uncertain (labels/continuity.py), and those of a camera that was knocked
-   (labels/displaced_camera.py).
+   (labels/neighbouring_frames.py).
 
 lab/runs/verdict/frame_checks.py tests the result once more, against the spots and the causal pose. Source: ours.
 """
@@ -30,15 +30,10 @@ from tracking.rigid_body.hypotheses.hypothesis_set import (
     SURE_PROBABILITY,
 )
 from tracking.rigid_body.models.information import run_shifts
-from tracking.smoothing.backward import merged, track_backward
-from tracking.smoothing.calibration_errors import calibration_errors
 from tracking.smoothing.error_scale import ErrorScale, usual_sizes
-from tracking.smoothing.exposure import exposure_offsets, exposure_sigmas, pose_shift
-from tracking.smoothing.labels.clutter import run_log_clutter, run_log_static
 from tracking.smoothing.labels.continuity import continued, transfers_between_cameras
-from tracking.smoothing.labels.displaced_camera import displaced
-from tracking.smoothing.labels.neighbouring_frames import brief, connected, isolated, next_to
-from tracking.smoothing.labels.reassociation import RunObservation, reassociated
+from tracking.smoothing.labels.neighbouring_frames import brief, connected, displaced, isolated, next_to
+from tracking.smoothing.labels.reassociation import RunObservation, reassociated, run_log_clutter, run_log_static
 from tracking.smoothing.labels.view_path import PathContext
 from tracking.smoothing.motion.process_noise import corner_offsets, jump_sigmas, jump_variances
 from tracking.smoothing.motion.run_detections import (
@@ -53,9 +48,10 @@ from tracking.smoothing.motion.run_detections import (
 )
 from tracking.smoothing.motion.whole_run import MAX_DISTANCE, estimate
 from tracking.smoothing.place_errors import place_errors
-from tracking.smoothing.recording import TrackedRecording
+from tracking.smoothing.recording import TrackedRecording, merged, track_backward
 from tracking.smoothing.single_frame_poses import SingleFramePoses, rms_residuals, single_frame_poses
 from tracking.smoothing.smoothed import ReportedSpots, Smoothed
+from tracking.smoothing.systematic_errors import calibration_errors, exposure_offsets, exposure_sigmas, pose_shift
 
 MAX_ROUNDS = 4  # of motion and labels
 BRIEF_PROBABILITY = 0.9999  # least one of a label of a spot that is occluded before and after

@@ -14,16 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.drift import (
+from calibration.changes import (
     CAMERA_KINDS,
     TURNED_ZOOMED,
+    Change,
     FoundChanges,
     PriorSizes,
     expected_rms,
     find_changes,
     rms_length,
 )
-from calibration.excess_residual import Change
 from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.planes import intersect_plane

@@ -13,14 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.drift import (
+from calibration.changes import (
     LASER_MOVED,
     WRONG_POINT,
     CameraColumns,
+    Change,
+    ChangeCandidate,
+    ExcessResidual,
     PriorSizes,
     camera_columns,
 )
-from calibration.excess_residual import Change, ChangeCandidate, ExcessResidual
 from geometry.arrays import Array, Ints, skew
 from geometry.camera import FISHEYE, Camera, Projected, pinhole_numbers, project_points_full
 from geometry.forward_model import SpotDerivatives, SpotModel

@@ -16,10 +16,9 @@ from calibration.boards.board_types import Board
 from calibration.boards.board_view import BoardView, NotFound
 from calibration.least_squares.adjustment import AdjustmentError, Prior
 from calibration.open3d_loader import MissingOpen3DError
-from calibration.screens.clouds import FEWEST, scan_of
+from calibration.screens.clouds import FEWEST, align, on_surfaces, register, scan_of
 from calibration.screens.network import ControlPoints, Network, PointObservations
 from calibration.screens.network_start import NotConnectedError
-from calibration.screens.registration import align, on_surfaces, register
 from calibration.screens.screens import (
     ApproximatePosition,
     Scan,

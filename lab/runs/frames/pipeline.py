@@ -19,7 +19,7 @@ from lab.runs.frames.open_frames import open_frames
 from tracking.detections import Detections, PictureClock
 from tracking.noise import NoiseModel
 from tracking.rigid_body.rigid_tracker import RigidTracker
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import TrackedFrame
 
 if TYPE_CHECKING:
     from lab.runs.frames.sensor_noise import CameraNoise

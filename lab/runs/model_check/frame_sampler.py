@@ -13,8 +13,7 @@ from geometry.pose import Pose
 from lab.runs.frames.even_sampler import EvenSampler
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
-from tracking.statuses import PoseStatus
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import PoseStatus, TrackedFrame
 
 MOST_KEPT = 2000  # frames; as many as the statistics use
 

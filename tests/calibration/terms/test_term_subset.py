@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibration.least_squares.adjustment import Cauchy, Poses
-from calibration.terms.spot_term import SpotTerm
+from calibration.terms.rig_blocks import SpotTerm
 from calibration.terms.surveyed import RecordTerm, picked, rows_of, widened
 from geometry.pose import Pose
 from tests.calibration.terms import test_corners, test_spot_term, test_surveyed

@@ -23,8 +23,7 @@ from tests.calibration.model_check.test_check import suspects, with_slow_errors
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import Detections
 from tracking.parameters import TrackerParameters
-from tracking.statuses import PoseStatus, SpotStatus
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import PoseStatus, SpotStatus, TrackedFrame
 
 
 def test_a_correct_set_up_has_no_findings():

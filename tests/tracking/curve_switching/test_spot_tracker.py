@@ -17,8 +17,7 @@ from tracking.curve_switching.pose_filter import CoplanarViews, quadratic_positi
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
-from tracking.statuses import PoseStatus, SpotStatus
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import PoseStatus, SpotStatus, TrackedFrame
 
 PAPER = TrackerParameters(rigid_check=False, estimate="prediction", out_of_view="quadratic")  # the paper's method
 START_FRAMES = 2  # frames before the first rate is known

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geometry.pose import Pose
-from geometry.pose_solver.alternative_poses import alternative_poses
+from geometry.pose_solver.visibility import alternative_poses
 from lab.simulate.points import PointRun, simulate_points
 from lab.simulate.rigs import RIGS, scaled
 from lab.simulate.scenarios import PriorRegion

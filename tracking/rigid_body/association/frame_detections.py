@@ -21,7 +21,7 @@ from tracking.rigid_body.models.information import inverse_2x2
 NOT_SEARCHED = -2  # the camera has no picture, or the spot is not expected in it; see also occlusion.MISSED
 # Added to the row of a detection that has merged with a neighbour: it is labelled but excluded from the pose.
 BLENDED = 1 << 20
-# px: radius of the disc around an expected spot in which false points are counted (point_statistics.py).
+# px: radius of the disc around an expected spot in which false points are counted (online_estimates.py).
 CLUTTER_RADIUS_PX = 15.0
 
 
