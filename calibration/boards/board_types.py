@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -104,8 +105,29 @@ _MOST = 200
 _INK = 0.5
 
 
+class _Points(ABC):
+    """Points of a board, numbered from 0 row by row (OpenCV's order)."""
+
+    __slots__ = ()
+
+    @property
+    @abstractmethod
+    def points(self) -> Array:
+        """(N, 3), m, in the board's frame."""
+
+    @property
+    def ids(self) -> Ints:
+        """(N,): 0, 1, ... row by row."""
+        return np.arange(len(self.points))
+
+    @property
+    def middle(self) -> Array:
+        """(3,), m: origin of the warp polynomial."""
+        return (self.points.min(axis=0) + self.points.max(axis=0)) / 2
+
+
 @dataclass(frozen=True, slots=True)
-class Chessboard:
+class Chessboard(_Points):
     """A plain chessboard. The square above and left of the first inner corner is black.
 
     This determines the first corner if columns + rows is odd. If it is even, the board looks the same after half a turn
@@ -126,16 +148,6 @@ class Chessboard:
         return _lattice(self.columns, self.rows, self.square_m)
 
     @property
-    def ids(self) -> Ints:
-        """(N,): 0, 1, ... row by row."""
-        return np.arange(self.columns * self.rows)
-
-    @property
-    def middle(self) -> Array:
-        """(3,), m: origin of the warp polynomial."""
-        return _middle(self.points)
-
-    @property
     def size_m(self) -> tuple[float, float]:
         """Width and height of the printed squares."""
         return (self.columns + 1) * self.square_m, (self.rows + 1) * self.square_m
@@ -151,7 +163,7 @@ class Chessboard:
 
 
 @dataclass(frozen=True, slots=True)
-class CircleGrid:
+class CircleGrid(_Points):
     """Black circles on white, in rows and columns, or asymmetric: every second row shifted by half a step.
 
     spacing_m is the distance of neighbours, or for an asymmetric grid that of two ROWS; circles of one row are then
@@ -191,16 +203,6 @@ class CircleGrid:
         return points
 
     @property
-    def ids(self) -> Ints:
-        """(N,): 0, 1, ... row by row."""
-        return np.arange(self.columns * self.rows)
-
-    @property
-    def middle(self) -> Array:
-        """(3,), m: origin of the warp polynomial."""
-        return _middle(self.points)
-
-    @property
     def neighbours_m(self) -> float:
         """Distance of the nearest centres."""
         return self.spacing_m * (math.sqrt(2) if self.asymmetric else 1.0)
@@ -223,7 +225,7 @@ class CircleGrid:
 
 
 @dataclass(frozen=True, slots=True)
-class Charuco:
+class Charuco(_Points):
     """A chessboard with an ArUco marker in each white square; its points are the inner chessboard corners.
 
     The markers identify the corners, so that a part of the board is sufficient and there is no symmetry.
@@ -282,16 +284,6 @@ class Charuco:
     def points(self) -> Array:
         """Inner corners ((columns - 1) * (rows - 1), 3), m, in the board's frame, row by row."""
         return _lattice(self.columns - 1, self.rows - 1, self.square_m)
-
-    @property
-    def ids(self) -> Ints:
-        """(N,): OpenCV's numbers of the corners, row by row."""
-        return np.arange((self.columns - 1) * (self.rows - 1))
-
-    @property
-    def middle(self) -> Array:
-        """(3,), m: origin of the warp polynomial."""
-        return _middle(self.points)
 
     @property
     def size_m(self) -> tuple[float, float]:
@@ -382,7 +374,3 @@ def _check_length(kind: str, what: str, length_m: float) -> None:
 def _lattice(columns: int, rows: int, step: float) -> Array:
     j, i = np.meshgrid(np.arange(columns), np.arange(rows))
     return np.stack([j.ravel() * step, i.ravel() * step, np.zeros(columns * rows)], axis=1)
-
-
-def _middle(points: Array) -> Array:
-    return (points.min(axis=0) + points.max(axis=0)) / 2
