@@ -53,12 +53,6 @@ def direction_and_speed(last: Array, predicted: Array, candidates: Array, min_ve
     return direction, speed
 
 
-def smoothness(last: Array, predicted: Array, candidates: Array, alpha: float, min_vector_px: float) -> Array:
-    """g2, eq. (8), (...): the direction term weighted by alpha, the speed term by 1 - alpha. Points (..., 2), px."""
-    direction, speed = direction_and_speed(last, predicted, candidates, min_vector_px)
-    return alpha * direction + (1 - alpha) * speed
-
-
 def combined(
     last: Array,
     predicted: Array,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -27,6 +26,7 @@ from tracking.curve_switching import pose_filter
 from tracking.curve_switching.pose_filter import RigidMotion
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
+from tracking.rigid_body.online_estimates import VarianceFactor
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, Event, PoseStatus
 
 # The Kalman filters of all views and their history.
@@ -132,8 +132,6 @@ class Tracks:
 
 
 CLUTTER_NEAR_SPOTS = 2e-4  # 1/px^2: the paper's 20 % of false points within 15 px of a spot
-VARIANCE_FACTOR_MEMORY = 100  # frames: memory of the variance factor, which scales stated covariances ...
-VARIANCE_FACTOR_DEADBAND = 1.3  # ... once it exceeds this: with correct sigmas it scatters by 0.06 about 1
 ACCELERATION_RATE = 0.03  # relative change of the estimated accelerations per excess of one normalised innovation
 ACCELERATION_RANGE = (0.02, 2000.0)  # m/s^2 and rad/s^2: limits of the estimated accelerations
 BENT = 100.0  # squared sigmas per axis: beyond it the pose filter restarts, because the velocities are no longer valid
@@ -150,9 +148,7 @@ class Vehicle:
         self.anchor_age_s = 0.0  # time since that pose
         self._accelerations = np.array([parameters.pose_sigma_a_m_s2, parameters.pose_sigma_a_rad_s2])
         self._fastest = np.zeros(2)  # m/s and rad/s: the largest speeds observed so far
-        self._variance_factor = 1.0  # running mean of chi2 / dof
-        self._recent: deque[float] = deque(maxlen=9)  # chi2 / dof of the last frames
-        self._deadband = VARIANCE_FACTOR_DEADBAND
+        self._variance_factor = VarianceFactor()
         # Contributions of the calibration's errors at the last measured pose.
         self._systematic = np.zeros((6, 6))  # to the pose's covariance
         self._systematic_px: Array | float = 0.0  # (n, 2, 2) to the expected pixels' covariances, px^2
@@ -160,8 +156,8 @@ class Vehicle:
 
     @property
     def noise_scale(self) -> float:
-        """Ratio of the spots' actual to their stated sigmas; 1 while the variance factor is within its deadband."""
-        return float(np.sqrt(self._variance_factor)) if self._variance_factor > self._deadband else 1.0
+        """Ratio of the spots' errors to their stated sigmas."""
+        return self._variance_factor.noise_scale
 
     @property
     def known(self) -> bool:
@@ -208,10 +204,7 @@ class Vehicle:
         covariance = (fit.noise if same_spots else fit.covariance) * self.noise_scale**2
         self._rows, self._systematic = fit.rows, fit.systematic * self.noise_scale**2
         self._systematic_px = fit.calibration_px()
-        if fit.dof > 0:
-            self._update_variance_factor(fit.chi2 / fit.dof)
-            # A calibration has one set of errors for the whole run: averaging does not reduce their share of chi2.
-            self._deadband = VARIANCE_FACTOR_DEADBAND + 3 * fit.systematic_share * np.sqrt(2 / fit.dof)
+        self._variance_factor.update(fit.chi2, fit.dof, fit.systematic_share)
         if self.motion is None:
             self.motion = pose_filter.begin(fit.world_from_body, covariance)
         else:
@@ -276,20 +269,6 @@ class Vehicle:
         extra = np.repeat(self._accelerations**2, 3) * (OCCLUDED_FACTOR**2 - 1)
         P[i, i] += extra * min(self.anchor_age_s, 0.1) ** 2 / 4
         return replace(motion, P=P)
-
-    def _update_variance_factor(self, chi2_per_dof: float) -> None:
-        """Update the running mean of chi2 / dof.
-
-        One frame counts at most three times the mean, so a merged spot now and then has little effect. If most of the
-        recent frames exceed three times the mean, the mean jumps to their median.
-        """
-        self._recent.append(chi2_per_dof)
-        median = float(np.median(self._recent))
-        if len(self._recent) == self._recent.maxlen and median > 3 * max(self._variance_factor, 1.0):
-            self._variance_factor = median
-        change = (min(chi2_per_dof / self._variance_factor, 3.0) - 1) / VARIANCE_FACTOR_MEMORY
-        self._variance_factor *= 1 + change
-        self._variance_factor = max(self._variance_factor, 0.1)
 
 
 # The pose from the matched spots, and the check of every match against it: drop false matches, add missed ones.
