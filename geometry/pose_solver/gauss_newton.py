@@ -34,6 +34,13 @@ class PoseModel(Protocol):
         """Pixels (n, 2) and their Jacobian (n, 2, 6) by the pose error; nan where there is no projection."""
 
 
+class CommonErrors(Protocol):
+    """Errors of the pixels that are the same in every frame: of a calibration, of surveyed markers."""
+
+    def at(self, world_from_body: Pose) -> Array:
+        """Their covariance (2n, 2n), px^2, for all views at a pose."""
+
+
 @dataclass(frozen=True, slots=True)
 class SolveLimits:
     """Conditions under which the pose of one frame counts as measured."""
@@ -120,7 +127,7 @@ def fit_pose(
     start: Pose,
     *,
     prior: tuple[Pose, Array] | None = None,
-    calibration: RigUncertainty | None = None,
+    calibration: CommonErrors | None = None,
     max_iterations: int = 25,
 ) -> PoseFit | None:
     """The least-squares pose of the spots of views `rows` (m,) at `pixels` (m, 2), with covariances (m, 2, 2), px^2.

@@ -12,11 +12,11 @@ from scipy.optimize import linear_sum_assignment
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import in_picture
 from geometry.pose import Pose
+from geometry.pose_solver.gauss_newton import PoseFit
 from geometry.pose_solver.three_spots import poses_from_three_spots
 from geometry.rotations import angle
 from geometry.uncertainty.chi_square import chi2_tail
 from tracking.binocular.joint_fit import (
-    JointFit,
     MarkerObservations,
     fit_pose,
     pose_of_points,
@@ -44,7 +44,7 @@ class LabelledPose:
     """A pose with the candidates that it explains."""
 
     index: Ints  # (2, K): the candidate of each marker in each picture, -1: none
-    fit: JointFit
+    fit: PoseFit
     score: float  # nats: log likelihood against "all candidates are false"
     evidence: float  # nats: the score without what six free numbers explain by chance
 
@@ -113,49 +113,48 @@ def labelled_pose(
         fit = fit_pose(pair, model, observations(images, index), pose)
         if fit is None or not fit.observable:
             return None
-        pose, spread = fit.pose, fit.covariance
+        pose, spread = fit.world_from_body, fit.covariance
     index, fit = _without_outliers(pair, model, images, index, fit, p)
     if fit is None or not fit.observable:
         return None
-    score, chance = _score(pair, model, images, index, fit, p)
+    score, chance = _score(pair, images, index, fit, p)
     return LabelledPose(index, fit, score, score - chance)
 
 
 def _without_outliers(
-    pair: StereoPair, model: MarkerModel, images: Images, index: Ints, fit: JointFit | None, p: MatchParameters
-) -> tuple[Ints, JointFit | None]:
+    pair: StereoPair, model: MarkerModel, images: Images, index: Ints, fit: PoseFit | None, p: MatchParameters
+) -> tuple[Ints, PoseFit | None]:
     """Removes images whose residual contradicts the others, the worst one first."""
     for _ in range(_MOST_OUTLIERS):
         if fit is None or fit.dof < 2:
             return index, fit
-        chi2 = _image_chi2(pair, model, images, index, fit)
+        chi2 = _image_chi2(images, index, fit)
         worst = np.unravel_index(int(np.argmax(chi2)), chi2.shape)
         if chi2[worst] < p.outlier_chi2:
             return index, fit
         index = index.copy()
         index[worst] = -1
-        fit = fit_pose(pair, model, observations(images, index), fit.pose)
+        fit = fit_pose(pair, model, observations(images, index), fit.world_from_body)
     return index, fit
 
 
-def _image_chi2(pair: StereoPair, model: MarkerModel, images: Images, index: Ints, fit: JointFit) -> Array:
+def _image_chi2(images: Images, index: Ints, fit: PoseFit) -> Array:
     """Squared residuals (2, K) in sigmas of their images, with the part that the pose covariance allows; 0: not seen.
 
     The variance of a residual is at most that of its image plus that of the prediction, so that calibration errors do
     not make outliers.
     """
-    J = project_markers(pair, model, fit.pose)[1]
-    S = observations(images, index).cov_px2 + J @ fit.systematic @ np.swapaxes(J, -1, -2)
-    r = np.nan_to_num(fit.residuals_px)
+    observed = observations(images, index)
+    J = fit.jacobian.reshape(*observed.uv_px.shape, 6)
+    S = observed.cov_px2 + J @ fit.systematic @ np.swapaxes(J, -1, -2)
+    r = np.nan_to_num(observed.uv_px - fit.projected_px.reshape(observed.uv_px.shape))
     return np.asarray(np.einsum("cki,ckij,ckj->ck", r, np.linalg.inv(S), r))
 
 
-def _score(
-    pair: StereoPair, model: MarkerModel, images: Images, index: Ints, fit: JointFit, p: MatchParameters
-) -> tuple[float, float]:
+def _score(pair: StereoPair, images: Images, index: Ints, fit: PoseFit, p: MatchParameters) -> tuple[float, float]:
     """Score of a labelling, and the part of it that three images of a free pose reach by chance, nats."""
-    pixels = project_markers(pair, model, fit.pose)[0]
     observed = observations(images, index)
+    pixels = fit.projected_px.reshape(observed.uv_px.shape)
     score, gains = -0.5 * fit.chi2, []
     for c, (camera, found) in enumerate(zip(pair.cameras, images, strict=True)):
         if not len(found):
@@ -246,7 +245,7 @@ def distinct(found: list[LabelledPose]) -> list[LabelledPose]:
     """The different poses, the best first."""
     kept: list[LabelledPose] = []
     for candidate in sorted(found, key=lambda f: -f.score):
-        if not any(same_pose(candidate.fit.pose, other.fit.pose) for other in kept):
+        if not any(same_pose(candidate.fit.world_from_body, other.fit.world_from_body) for other in kept):
             kept.append(candidate)
     return kept
 
@@ -394,10 +393,10 @@ _TRIPLES = 4
 _PLAUSIBLE_P, _CLEAR_CHI2 = 1e-3, 25.0  # misfit of a right pose, and how much larger that of a wrong one is
 
 
-def first_fit(pair: StereoPair, model: MarkerModel, observed: MarkerObservations) -> JointFit | None:
+def first_fit(pair: StereoPair, model: MarkerModel, observed: MarkerObservations) -> PoseFit | None:
     """The pose with the least misfit; None where no start leads to one."""
     both = np.flatnonzero(observed.seen.all(axis=0))
-    found: list[JointFit] = []
+    found: list[PoseFit] = []
     if len(both) >= 3:
         points = triangulate(pair, observed.uv_px[:, both], observed.cov_px2[:, both])
         if np.isfinite(points.points).all():
@@ -408,18 +407,18 @@ def first_fit(pair: StereoPair, model: MarkerModel, observed: MarkerObservations
     return min(found, key=lambda fit: fit.chi2, default=None)
 
 
-def _fits(pair: StereoPair, model: MarkerModel, observed: MarkerObservations, start: Pose) -> list[JointFit]:
+def _fits(pair: StereoPair, model: MarkerModel, observed: MarkerObservations, start: Pose) -> list[PoseFit]:
     """The fits from a pose and from the one with the normal reflected."""
     fits = (fit_pose(pair, model, observed, pose) for pose in (start, mirrored(pair, model, start)))
     return [fit for fit in fits if fit is not None and fit.observable]
 
 
-def _clear(found: list[JointFit]) -> bool:
+def _clear(found: list[PoseFit]) -> bool:
     """Whether the best of two fits is plausible and the other one is another pose, much worse."""
     if len(found) < 2:
         return False
     best, other = sorted(found, key=lambda fit: fit.chi2)
-    same = same_pose(best.pose, other.pose)
+    same = same_pose(best.world_from_body, other.world_from_body)
     plausible = best.dof > 0 and chi2_tail(best.chi2, best.dof) > _PLAUSIBLE_P
     return plausible and not same and other.chi2 - best.chi2 > _CLEAR_CHI2
 

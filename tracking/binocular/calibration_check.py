@@ -20,9 +20,10 @@ import numpy as np
 
 from geometry.arrays import Array, Bools
 from geometry.pose import Pose
+from geometry.pose_solver.gauss_newton import PoseFit
 from geometry.uncertainty.rig_uncertainty import POSE, perturbed_camera, split_name
 from tracking.binocular.acquisition import Images, acquire, labelled_pose, near_pose, observations
-from tracking.binocular.joint_fit import JointFit, MarkerObservations
+from tracking.binocular.joint_fit import MarkerObservations
 from tracking.binocular.marker_model import (
     MarkerImages,
     MarkerModel,
@@ -93,7 +94,7 @@ def labelled_by_each(
         if found is None or found.markers < _FEWEST_MARKERS:
             return None
         index[c] = found.index[c]
-        start = found.fit.pose
+        start = found.fit.world_from_body
     assert start is not None
     return LabelledFrame(observations(images, index), start)
 
@@ -272,7 +273,7 @@ class FittedFrame:
     """One frame with a fitted pose."""
 
     t_s: float
-    fit: JointFit
+    fit: PoseFit
     observed: MarkerObservations
 
 
@@ -301,7 +302,7 @@ def clock_offset(pair: StereoPair, model: MarkerModel, frames: Sequence[FittedFr
     N, b = np.zeros((_UNKNOWNS, _UNKNOWNS)), np.zeros(_UNKNOWNS)
     left, dof, used = 0.0, 0, []
     for before, frame, after in zip(frames, frames[1:], frames[2:], strict=False):
-        rate = after.fit.pose.minus(before.fit.pose) / (after.t_s - before.t_s)
+        rate = after.fit.world_from_body.minus(before.fit.world_from_body) / (after.t_s - before.t_s)
         part = _reduced(pair, model, frame, rate)
         if part is None:
             continue
@@ -347,13 +348,15 @@ def _reduced(
 
     Whitened, and without the directions that a change of the pose explains.
     """
-    seen: Bools = frame.observed.seen & np.isfinite(frame.fit.residuals_px[..., 0])
+    uv = frame.observed.uv_px
+    residuals = uv - frame.fit.projected_px.reshape(uv.shape)
+    seen: Bools = np.isfinite(residuals[..., 0])
     if seen[0].sum() < 2 or seen[1].sum() < 2:
         return None
-    J = project_markers(pair, model, frame.fit.pose)[1]
+    J = frame.fit.jacobian.reshape(*uv.shape, 6)
     velocity = J[1] @ rate
     camera = pair.cameras[1].camera_from_world
-    world = frame.fit.pose.apply(model.positions)
+    world = frame.fit.world_from_body.apply(model.positions)
     by_point = project(pair, world)[1][1]
     by_turn = np.cross(camera.apply(world)[:, None, :], by_point @ camera.rotation.T)  # Exp(theta) x in the camera
     A = np.zeros((2, len(model), 2, _UNKNOWNS))
@@ -361,7 +364,7 @@ def _reduced(
     W = np.linalg.inv(np.linalg.cholesky(frame.observed.cov_px2[seen]))
     J_w = (W @ J[seen]).reshape(-1, 6)
     A_w = (W @ A[seen]).reshape(-1, _UNKNOWNS)
-    r_w = (W @ frame.fit.residuals_px[seen][..., None]).reshape(-1)
+    r_w = (W @ residuals[seen][..., None]).reshape(-1)
     Q = np.linalg.qr(J_w)[0]
     free = len(r_w) - 6
     if free < 1:

@@ -12,10 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, Ints, symmetric
+from geometry.arrays import Array, Bools, symmetric
 from geometry.camera import Camera
 from geometry.planes import common_perpendicular
 from geometry.pose import Pose
+from geometry.pose_solver import gauss_newton
+from geometry.pose_solver.gauss_newton import PoseFit, covariance_of
 from tracking.binocular.marker_model import MarkerModel, StereoPair, calibration_jacobian, project, project_markers
 
 # Pose from points in two frames by unit quaternions: Zhou (2020), equations (10) to (18); Horn (1987).
@@ -135,10 +137,7 @@ def _solved(H: Array, JtW: Array, residual: Array) -> Array:
     return step[..., 0]
 
 
-_FIT_STEPS = 40
-_CONVERGED = 1e-6  # squared length of the last step, in sigmas
-_LEAST_DAMPING = 1e-9  # keeps the equations regular where the images determine five numbers only
-_RANK = 1e-9  # smallest singular value over the largest of the whitened Jacobian with scaled columns
+FEWEST = 3  # images of markers that a pose needs
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,52 +154,39 @@ class MarkerObservations:
 
 
 @dataclass(frozen=True, slots=True)
-class JointFit:
-    """A fitted pose."""
+class _Views:
+    """The images of K markers in both cameras as 2 K views of one pose: the left camera's first."""
 
-    pose: Pose  # world_from_body
-    covariance: Array  # (6, 6): of noise, calibration and marker survey
-    systematic: Array  # (6, 6): the part of the calibration and the marker survey
-    residuals_px: Array  # (2, K, 2), measured minus predicted; nan where not seen
-    chi2: float
-    dof: int  # 2 x images - 6
-    observable: bool  # the images determine all six numbers
+    pair: StereoPair
+    model: MarkerModel
 
-    @property
-    def rms_px(self) -> float:
-        """RMS of the residuals per coordinate; nan without images."""
-        used = self.residuals_px[np.isfinite(self.residuals_px)]
-        return float(np.sqrt(np.mean(used**2))) if used.size else float("nan")
+    def project(self, world_from_body: Pose) -> tuple[Array, Array]:
+        """Pixels (2 K, 2) and their Jacobian (2 K, 2, 6)."""
+        pixels, J = project_markers(self.pair, self.model, world_from_body)
+        return pixels.reshape(-1, 2), J.reshape(-1, 2, 6)
+
+    def at(self, world_from_body: Pose) -> Array:
+        """Covariance (4 K, 4 K), px^2, due to the calibration and the survey of the markers; nan without an image."""
+        by_point = self.project(world_from_body)[1][..., :3].reshape(-1, 3) * self.model.sigma_m
+        marker = np.tile(np.repeat(np.arange(len(self.model)), 2), 2)
+        out = (by_point @ by_point.T) * (marker[:, None] == marker)  # errors of one marker, in both cameras
+        if self.pair.covariance is not None:
+            J = calibration_jacobian(self.pair, world_from_body.apply(self.model.positions))
+            J = J.reshape(-1, J.shape[-1])
+            out += J @ self.pair.covariance.matrix @ J.T
+        return out
 
 
-def fit_pose(pair: StereoPair, model: MarkerModel, observed: MarkerObservations, start: Pose) -> JointFit | None:
-    """The most likely pose near `start`, by Levenberg-Marquardt; None where it does not converge.
+def fit_pose(pair: StereoPair, model: MarkerModel, observed: MarkerObservations, start: Pose) -> PoseFit | None:
+    """The most likely pose near `start`; None where it does not converge, and with fewer than three images of markers.
 
-    With fewer than three images of markers, or where they do not determine the pose, `observable` is False and the
-    covariance is infinite.
+    Rows of the result: 2 K views, the left camera's first.
     """
-    rows: Ints = np.flatnonzero(np.repeat(observed.seen.ravel(), 2)).astype(np.int64)
-    if len(rows) < 6:
+    views, rows = _Views(pair, model), np.flatnonzero(observed.seen.ravel())
+    if len(rows) < FEWEST or not np.isfinite(views.project(start)[0][rows]).all():
         return None
-    whitening = _whitening(pair, model, observed, start, rows)
-    if whitening is None:
-        return None
-    found = _minimised(pair, model, observed.uv_px, start, rows, whitening)
-    if found is None:
-        return None
-    again = _whitening(pair, model, observed, found, rows)  # the calibration's part, at the solution
-    if again is None:
-        return None
-    r, J = _whitened(pair, model, observed.uv_px, found, rows, again)
-    residuals = np.full(observed.uv_px.shape, np.nan)
-    pixels = project_markers(pair, model, found)[0]
-    residuals[observed.seen] = (observed.uv_px - pixels)[observed.seen]
-    covariance, observable = _covariance(J)
-    systematic = np.zeros((6, 6))
-    if observable:
-        gain: Array = covariance @ J.T @ again
-        systematic = symmetric(gain @ _common_errors(pair, model, found, rows) @ gain.T)
-    return JointFit(found, covariance, systematic, residuals, float(r @ r), len(rows) - 6, observable)
+    uv, cov = observed.uv_px.reshape(-1, 2)[rows], observed.cov_px2.reshape(-1, 2, 2)[rows]
+    return gauss_newton.fit_pose(views, rows, uv, cov, start, calibration=views)
 
 
 def bound(pair: StereoPair, model: MarkerModel, pose: Pose, cov_px2: Array, seen: Bools) -> Array:
@@ -211,90 +197,4 @@ def bound(pair: StereoPair, model: MarkerModel, pose: Pose, cov_px2: Array, seen
     J = project_markers(pair, model, pose)[1]
     weight = np.linalg.inv(cov_px2[seen])
     H = np.einsum("nij,nik,nkl->jl", J[seen], weight, J[seen])
-    scale = 1 / np.sqrt(np.maximum(np.diagonal(H), 1e-300))
-    values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
-    if values[0] < _RANK**2 * values[-1]:
-        return np.full((6, 6), np.inf)
-    return symmetric((vectors / values) @ vectors.T) * np.outer(scale, scale)
-
-
-def _minimised(
-    pair: StereoPair, model: MarkerModel, uv_px: Array, start: Pose, rows: Ints, whitening: Array
-) -> Pose | None:
-    pose, damping = start, 1e-3
-    r, J = _whitened(pair, model, uv_px, pose, rows, whitening)
-    if not np.isfinite(r).all():
-        return None
-    cost = float(r @ r)
-    for _ in range(_FIT_STEPS):
-        H, g = J.T @ J, J.T @ r
-        scale = 1 / np.sqrt(np.maximum(np.diagonal(H), 1e-300))
-        scaled = H * np.outer(scale, scale) + damping * np.eye(6)
-        step: Array = scale * np.linalg.solve(scaled, scale * g)
-        trial = pose.plus(step)
-        t_r, t_J = _whitened(pair, model, uv_px, trial, rows, whitening)
-        t_cost = float(t_r @ t_r)
-        if np.isfinite(t_cost) and t_cost <= cost:
-            small = cost - t_cost < 1e-6 * (1 + cost) and float(step @ H @ step) < _CONVERGED
-            pose, r, J, cost, damping = trial, t_r, t_J, t_cost, max(damping / 10, _LEAST_DAMPING)
-            if small:
-                return pose
-        else:
-            damping *= 10
-            if damping > 1e10:
-                return pose  # no descent: at the minimum to rounding
-    return None
-
-
-def _whitened(
-    pair: StereoPair, model: MarkerModel, uv_px: Array, pose: Pose, rows: Ints, whitening: Array
-) -> tuple[Array, Array]:
-    """Residuals (m,) in sigmas and the derivatives (m, 6) of the prediction."""
-    pixels, J = project_markers(pair, model, pose)
-    both = np.column_stack([(uv_px - pixels).reshape(-1)[rows], J.reshape(-1, 6)[rows]])
-    if not np.isfinite(both).all():
-        return np.full(len(rows), np.nan), np.full((len(rows), 6), np.nan)
-    white = whitening @ both
-    return white[:, 0], white[:, 1:]
-
-
-def _common_errors(pair: StereoPair, model: MarkerModel, pose: Pose, rows: Ints) -> Array:
-    """Covariance (m, m), px^2, of pixel coordinates due to the calibration and the survey of the markers."""
-    out = np.zeros((len(rows), len(rows)))
-    if pair.covariance is not None:
-        J = calibration_jacobian(pair, pose.apply(model.positions))
-        J = J.reshape(-1, J.shape[-1])[rows]
-        out += J @ pair.covariance.matrix @ J.T
-    if model.sigma_m > 0:
-        by_point = project_markers(pair, model, pose)[1][..., :3].reshape(-1, 3)[rows] * model.sigma_m
-        marker = np.tile(np.repeat(np.arange(len(model)), 2), 2)[rows]
-        out += (by_point @ by_point.T) * (marker[:, None] == marker)  # errors of one marker, in both cameras
-    return out
-
-
-def _whitening(
-    pair: StereoPair, model: MarkerModel, observed: MarkerObservations, pose: Pose, rows: Ints
-) -> Array | None:
-    """W (m, m) with W C W^T = I for the covariance C of the m pixel coordinates; None where a marker has no image."""
-    blocks = observed.cov_px2[observed.seen]
-    C = np.zeros((len(rows), len(rows)))
-    at = np.arange(0, len(rows), 2)
-    for i in range(2):
-        for j in range(2):
-            C[at + i, at + j] = blocks[:, i, j]
-    C += _common_errors(pair, model, pose, rows)
-    if not np.isfinite(C).all():
-        return None
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(C)))
-
-
-def _covariance(J: Array) -> tuple[Array, bool]:
-    """Covariance (6, 6) from a whitened Jacobian (m, 6), and whether that has full rank; infinite if not."""
-    scale = np.linalg.norm(J, axis=0)
-    if np.any(scale == 0):
-        return np.full((6, 6), np.inf), False
-    _, values, vectors = np.linalg.svd(J / scale, full_matrices=False)
-    if len(values) < 6 or values[-1] < _RANK * values[0]:
-        return np.full((6, 6), np.inf), False
-    root = (vectors.T / values) / scale[:, None]
-    return symmetric(root @ root.T), True
+    return covariance_of(H)[0]

@@ -9,6 +9,7 @@ import numpy as np
 from geometry.arrays import Array, Ints, symmetric
 from geometry.camera import in_picture
 from geometry.pose import Pose
+from geometry.pose_solver.gauss_newton import PoseFit
 from geometry.uncertainty.chi_square import chi2_tail
 from tracking import kalman
 from tracking.binocular.acquisition import (
@@ -20,7 +21,7 @@ from tracking.binocular.acquisition import (
     mirrored,
     observations,
 )
-from tracking.binocular.joint_fit import JointFit, MarkerObservations
+from tracking.binocular.joint_fit import MarkerObservations
 from tracking.binocular.marker_model import MarkerImages, MarkerModel, StereoPair, project_markers
 from tracking.binocular.parameters import MatchParameters
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, PoseStatus
@@ -96,7 +97,7 @@ class BinocularFrame:
     reason: str  # why it is not measured; empty if it is
     pose: Pose | None  # world_from_body
     covariance: Array | None  # (6, 6)
-    fit: JointFit | None  # of the images of this frame, also where it is no measurement
+    fit: PoseFit | None  # of the images of this frame, also where it is no measurement
     observed: MarkerObservations | None  # the images of that fit
     index: Ints  # (2, K) candidates of the markers, -1: none
     predicted_px: Array  # (2, K, 2), before the pictures were used; nan without a prediction
@@ -142,7 +143,7 @@ class BinocularTracker:
         if reason:
             return self._unmeasured(reason, ahead, best)
         self._last_measured = self._count
-        pose, covariance = best.fit.pose, best.fit.covariance
+        pose, covariance = best.fit.world_from_body, best.fit.covariance
         self._motion = Motion.at_rest(t_s, pose, covariance) if ahead is None else ahead.updated(pose, covariance)
         return self._result(PoseStatus.MEASURED, "", pose, covariance, best, ahead)
 
@@ -162,7 +163,7 @@ class BinocularTracker:
         if not found or not self._convincing(found[0], images):
             found += acquire(self._pair, self._model, images, self._p)
         for candidate in found[:2]:
-            start = mirrored(self._pair, self._model, candidate.fit.pose)
+            start = mirrored(self._pair, self._model, candidate.fit.world_from_body)
             other = labelled_pose(self._pair, self._model, images, start, candidate.fit.covariance, self._p)
             found = found if other is None else [*found, other]
         return distinct(found)
@@ -176,7 +177,7 @@ class BinocularTracker:
         """Log density of a candidate under the prediction, up to a constant and limited."""
         if ahead is None:
             return 0.0
-        apart = candidate.fit.pose.minus(ahead.pose)
+        apart = candidate.fit.world_from_body.minus(ahead.pose)
         d2 = float(apart @ np.linalg.solve(ahead.pose_covariance + candidate.fit.covariance, apart))
         return -min(0.5 * d2, _MOST_PRIOR_NATS)
 
@@ -199,7 +200,7 @@ class BinocularTracker:
 
     def _contradicted(self, best: LabelledPose) -> bool:
         """Whether a camera sees candidates, but hardly one where the pose puts markers: cameras exchanged, or moved."""
-        pixels = project_markers(self._pair, self._model, best.fit.pose)[0]
+        pixels = project_markers(self._pair, self._model, best.fit.world_from_body)[0]
         for c, (camera, found) in enumerate(zip(self._pair.cameras, self._images, strict=True)):
             expected = int(in_picture(pixels[c], np.array(camera.image_size_px)).sum())
             confirmed = int((best.index[c] >= 0).sum())
@@ -212,10 +213,10 @@ class BinocularTracker:
     ) -> BinocularFrame:
         """The best of several poses with a covariance that covers all of them."""
         w = weights / weights.sum()
-        pose = best.fit.pose
+        pose = best.fit.world_from_body
         covariance = np.zeros((6, 6))
         for weight, one in zip(w, [best, *rivals], strict=True):
-            apart = one.fit.pose.minus(pose)
+            apart = one.fit.world_from_body.minus(pose)
             covariance += weight * (one.fit.covariance + np.outer(apart, apart))
         if np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > LOST_SIGMA_M:
             return self._unmeasured(AMBIGUOUS, ahead, best)

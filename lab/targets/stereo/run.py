@@ -33,6 +33,7 @@ import pydantic
 from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.pose import Pose
+from geometry.pose_solver.gauss_newton import PoseFit
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState, OptionalDay
 from lab.files.rig.pair_file import REMEDY, load_pair_file, of_two_cameras
@@ -65,7 +66,7 @@ from lab.files.text.fields import (
 )
 from lab.files.text.yaml_text import read_mapping
 from tracking.binocular.calibration_check import CalibrationCheck, ClockOffset
-from tracking.binocular.joint_fit import JointFit, pose_of_points
+from tracking.binocular.joint_fit import pose_of_points
 from tracking.binocular.marker_model import MarkerImages, MarkerModel, StereoPair
 from tracking.binocular.parameters import BinocularParameters, MatchParameters, SegmentationParameters
 from tracking.binocular.pose_tracker import BinocularFrame
@@ -351,7 +352,7 @@ class StereoResults:
         return [r for r in self.records if r.measured]
 
     @property
-    def fits(self) -> list[JointFit | None]:
+    def fits(self) -> list[PoseFit | None]:
         """The fits of all frames; None of a frame without a measured pose."""
         return [r.tracked.fit if r.measured else None for r in self.records]
 
