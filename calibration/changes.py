@@ -248,12 +248,10 @@ def camera_columns(points_camera: Array, d_point: Array, d_pinhole: Array, focal
 
 @dataclass(frozen=True, slots=True)
 class FoundChanges:
-    """The changes that were found, and the tests that support them."""
+    """The changes that were found, and what they leave."""
 
     changes: tuple[Change, ...]  # in the order in which they were found
     left: ExcessResidual  # residual that they leave
-    p_values: Mapping[str, float]  # per camera, p-value before any change is fitted
-    p_rest: float  # the same of the residual that no camera explains
     unexplained: bool  # whether `left` is still significant
 
 
@@ -279,7 +277,6 @@ def find_changes(
         rest = left.with_free(np.concatenate(models, axis=1)) if models else left
         return {n: left.p_value_of(cameras[n].model) for n in names}, rest.p_value
 
-    p_values, p_rest = tests(misfit, list(cameras))
     # With more wrong points than a third of all, nothing can be concluded.
     max_changes = max(1, len(cameras) + len(misfit.white) // 6)
     changes: list[Change] = []
@@ -290,7 +287,7 @@ def find_changes(
         significant = min(of_cameras.values(), default=1.0) < each or of_rest < p_false_alarm / 2
         more = _best(misfit, changes, cameras, others, sizes) if significant and len(changes) < max_changes else None
         if more is None:
-            return FoundChanges(tuple(changes), left, p_values, p_rest, significant)
+            return FoundChanges(tuple(changes), left, significant)
         changes = _reselected(misfit, [*changes, more], cameras, others, sizes)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -50,15 +50,7 @@ PAPER = TrackerParameters(
     learn_sigma_a=False,
     sigma_a_px_s2=STIFF_PX_S2,
 )
-CONVENTIONAL = TrackerParameters(
-    method="spots",
-    rigid_check=False,
-    estimate="prediction",
-    out_of_view="quadratic",
-    learn_sigma_a=False,
-    sigma_a_px_s2=STIFF_PX_S2,
-    curve_switch=False,
-)
+CONVENTIONAL = replace(PAPER, curve_switch=False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -93,7 +93,7 @@ def distance_errors(
         points = triangulate(pair, uv, cov)
         fit = first_fit(pair, model, MarkerObservations(uv, cov))
         assert fit is not None
-        found = (linear_points(pair, flat)[0], points.points[0], fit.pose.apply(model.positions[0]))
+        found = (linear_points(pair, flat)[0], points.points[0], fit.world_from_body.apply(model.positions[0]))
         far = float(np.linalg.norm(marker))
         errors.append([float(np.linalg.norm(x)) - far for x in found])
         sight = marker / far
@@ -141,7 +141,7 @@ def pose_errors(
         horn = pose_of_points(model.positions, linear_points(pair, flat))
         fit = first_fit(pair, model, MarkerObservations(uv, cov))
         assert fit is not None
-        delta = pose.minus(fit.pose)
+        delta = pose.minus(fit.world_from_body)
         sigmas = np.sqrt(np.diagonal(bound(pair, model, pose, cov, seen)))
         rows.append((pose.minus(horn), delta, sigmas, float(delta @ np.linalg.solve(fit.covariance, delta))))
     horns, joints, bounds, nees = zip(*rows, strict=True)

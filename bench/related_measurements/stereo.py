@@ -115,7 +115,7 @@ def _calibrated_nees(pair: StereoPair, rng: np.random.Generator) -> float:
     uv = project_markers(true, model, pose)[0] + rng.normal(0, 0.1, (2, len(model), 2))
     fit = fit_pose(pair, model, MarkerObservations(uv, cov), pose)
     assert fit is not None
-    delta = pose.minus(fit.pose)
+    delta = pose.minus(fit.world_from_body)
     return float(delta @ np.linalg.solve(fit.covariance, delta))
 
 

@@ -78,7 +78,6 @@ class ScreensResult:
     network: Network
     fit: NetworkFit
     screens: tuple[ScreenResult, ...]
-    poses_by_camera: Mapping[int, CameraOnDots] = field(default_factory=dict)
     # camera -> a second pose that fits nearly as well
     second_poses: Mapping[int, ResectedPose] = field(default_factory=dict)
 
@@ -125,7 +124,7 @@ def calibrate(
         for r in [_second_pose(found, chosen.get(c), near.get(c))]
         if r is not None
     }
-    return ScreensResult(complete, fit, tuple(results), poses_by_camera, second_poses)
+    return ScreensResult(complete, fit, tuple(results), second_poses)
 
 
 def _screen_starts(

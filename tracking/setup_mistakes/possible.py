@@ -183,32 +183,26 @@ def _pictures(rig: Rig) -> Iterator[Mistake]:
 
 def _camera_poses(rig: Rig) -> Iterator[Mistake]:
     """Transforms in the wrong direction, and quaternions in another order."""
-    for words, names in _each_and_all(rig.cameras):
-        yield Mistake(
-            "pose",
-            f"camera_from_world of {words} is world_from_camera: the inverse",
-            "invert the rotation and the translation in rig.yaml",
-            _with_camera_poses(rig, {n: rig.cameras[n].camera_from_world.inverse() for n in names}),
-        )
-        yield Mistake(
-            "pose",
-            f"the quaternion of camera_from_world of {words} is in the order x, y, z, w",
-            "write quaternion_wxyz in rig.yaml with w first",
-            _with_camera_poses(rig, {n: _reordered(rig.cameras[n].camera_from_world) for n in names}),
-        )
-    for words, names in _each_and_all(rig.screens, "screen"):
-        yield Mistake(
-            "pose",
-            f"world_from_screen of {words} is screen_from_world: the inverse",
-            "invert the rotation and the translation in rig.yaml",
-            _with_screen_poses(rig, {n: rig.screens[n].world_from_screen.inverse() for n in names}),
-        )
-        yield Mistake(
-            "pose",
-            f"the quaternion of world_from_screen of {words} is in the order x, y, z, w",
-            "write quaternion_wxyz in rig.yaml with w first",
-            _with_screen_poses(rig, {n: _reordered(rig.screens[n].world_from_screen) for n in names}),
-        )
+    kinds = (
+        ("camera_from_world", "world_from_camera", {n: c.camera_from_world for n, c in rig.cameras.items()}),
+        ("world_from_screen", "screen_from_world", {n: s.world_from_screen for n, s in rig.screens.items()}),
+    )
+    for (name, inverse, poses), word, changed in zip(
+        kinds, ("camera", "screen"), (_with_camera_poses, _with_screen_poses), strict=True
+    ):
+        for words, names in _each_and_all(poses, word):
+            yield Mistake(
+                "pose",
+                f"{name} of {words} is {inverse}: the inverse",
+                "invert the rotation and the translation in rig.yaml",
+                changed(rig, {n: poses[n].inverse() for n in names}),
+            )
+            yield Mistake(
+                "pose",
+                f"the quaternion of {name} of {words} is in the order x, y, z, w",
+                "write quaternion_wxyz in rig.yaml with w first",
+                changed(rig, {n: _reordered(poses[n]) for n in names}),
+            )
     every = _with_camera_poses(rig, {n: _reordered(c.camera_from_world) for n, c in rig.cameras.items()})
     every = _with_screen_poses(every, {n: _reordered(s.world_from_screen) for n, s in rig.screens.items()})
     yield Mistake(
