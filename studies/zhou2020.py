@@ -36,8 +36,7 @@ from tracking.binocular.joint_fit import (
     triangulate,
     undistorted_pixels,
 )
-from tracking.binocular.marker_model import StereoPair, project, project_markers
-from tracking.binocular.parameters import SegmentationParameters
+from tracking.binocular.marker_model import SegmentationParameters, StereoPair, project, project_markers
 from tracking.binocular.segmentation import ColourRange, marker_candidates, prepared
 from tracking.learned_detector.detector import find_drogues
 

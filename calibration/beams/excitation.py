@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag
 
-from calibration.beams.mean_rotation import mean_rotation
 from calibration.least_squares.adjustment import Linearised, Lines, Loss, Part, Values
 from calibration.terms.rig_blocks import BEAMS, lines_in
 from geometry import rotations
 from geometry.arrays import Array, cross, normalised
 from geometry.pose import Pose
+from geometry.rotations import mean_rotation
 
 _SHARE = 0.98  # of a direction's length that a motion of the whole target must explain
 _TURN_RMS = np.deg2rad(2.0)  # about an axis: smaller rotations do not excite it

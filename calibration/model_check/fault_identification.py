@@ -15,8 +15,7 @@ import numpy as np
 
 from calibration.changes import Change, ChangeCandidate, ExcessResidual
 from calibration.model_check.faults import PIXEL_OFFSET, VIEW, FaultParameters, PossibleFault
-from calibration.model_check.linearised_frames import LinearisedFrames, ModelCheckRecording, linearise
-from calibration.model_check.statistics import correlation_time
+from calibration.model_check.linearised_frames import LinearisedFrames, ModelCheckRecording, correlation_time, linearise
 from geometry.arrays import Array, Bools
 from geometry.forward_model import SpotModel
 

@@ -271,3 +271,32 @@ def unseen_views(model: SpotModel, recording: ModelCheckRecording, frames: Ints)
         for i in range(len(model))
         if expected[i] >= FEWEST_FRAMES and measured[i] < MOSTLY_UNSEEN * expected[i]
     )
+
+
+_FEWEST_FRAMES = 8  # with fewer, a scatter or an autocorrelation is meaningless
+
+
+def correlation_time(series: Array) -> float:
+    """Number of consecutive samples that count as one: 1 + 2 sum of autocorrelations, at least 1.
+
+    series (N, m), mean removed, is pooled over its m columns; nan is ignored. The sum ends at the first pair of
+    neighbouring autocorrelations that is not positive (Geyer 1992, Practical Markov chain Monte Carlo, Stat. Sci. 7,
+    sec. 3.3: initial positive sequence).
+    """
+    N = len(series)
+    known = np.isfinite(series)
+    x = np.where(known, series, 0.0)
+    power = float(np.sum(x * x))
+    if N < _FEWEST_FRAMES or power <= 0:
+        return 1.0
+    size = 2 ** int(np.ceil(np.log2(2 * N)))
+
+    def lagged(values: Array) -> Array:
+        return np.asarray(np.fft.irfft(np.abs(np.fft.rfft(values, size, axis=0)) ** 2, size, axis=0)[:N].sum(axis=1))
+
+    pairs = np.maximum(lagged(known.astype(float)), 1.0)
+    rho = (lagged(x) / pairs) / (power / max(int(known.sum()), 1))
+    rho[pairs < _FEWEST_FRAMES] = 0.0
+    half = rho[: 2 * (N // 2)].reshape(-1, 2).sum(axis=1)
+    ends = np.flatnonzero(half <= 0)
+    return float(max(1.0, 2 * half[: ends[0] if ends.size else len(half)].sum() - 1))

@@ -10,7 +10,6 @@ from scipy.stats import chi2 as chi2_distribution
 
 from calibration.beams.beams import BeamCalibration, StandModel, calibrate_beams
 from calibration.beams.excitation import StandMotion, summary_of
-from calibration.beams.mean_rotation import mean_rotation
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.joint import SPOTS, Joint, Measured, calibrate_jointly, jacobian, shares
 from calibration.screens.screens import ScreensResult
@@ -20,6 +19,7 @@ from geometry.arrays import Array, Ints, symmetric
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
+from geometry.rotations import mean_rotation
 from geometry.uncertainty.rig_uncertainty import Sensitivity
 
 # Positions required for a trustworthy result. Without a fifth of eight, six remain, the number of parameters of a pose;

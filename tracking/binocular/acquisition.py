@@ -23,8 +23,7 @@ from tracking.binocular.joint_fit import (
     triangulate,
     undistorted_pixels,
 )
-from tracking.binocular.marker_model import MarkerImages, MarkerModel, StereoPair, project_markers
-from tracking.binocular.parameters import MatchParameters
+from tracking.binocular.marker_model import MarkerImages, MarkerModel, MatchParameters, StereoPair, project_markers
 
 # Which candidate in each picture is which marker, for a pose that is roughly known; the fit and its evidence.
 #

@@ -27,12 +27,12 @@ from tracking.binocular.joint_fit import MarkerObservations
 from tracking.binocular.marker_model import (
     MarkerImages,
     MarkerModel,
+    MatchParameters,
     StereoPair,
     calibration_jacobian,
     project,
     project_markers,
 )
-from tracking.binocular.parameters import MatchParameters
 
 MOST_FRAMES, FEWEST_FRAMES = 24, 5
 _FEWEST_MARKERS = 4  # of each picture: three have several poses

@@ -22,8 +22,7 @@ from tracking.binocular.acquisition import (
     observations,
 )
 from tracking.binocular.joint_fit import MarkerObservations
-from tracking.binocular.marker_model import MarkerImages, MarkerModel, StereoPair, project_markers
-from tracking.binocular.parameters import MatchParameters
+from tracking.binocular.marker_model import MarkerImages, MarkerModel, MatchParameters, StereoPair, project_markers
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, PoseStatus
 
 # Constant-velocity prediction of the target's pose: for matching, and for frames without a measurement. Ours.

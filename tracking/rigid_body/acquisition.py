@@ -42,8 +42,8 @@ from tracking.rigid_body.hypotheses.hypothesis_set import (
     Hypotheses,
     State,
     add_child,
+    iterated_update,
 )
-from tracking.rigid_body.hypotheses.iterated_update import iterated_update
 from tracking.rigid_body.models.motion import predicted
 from tracking.rigid_body.models.occlusion import MISSED, joint_log_likelihood, marginal, predict, update
 from tracking.statuses import Event

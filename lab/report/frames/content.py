@@ -13,7 +13,7 @@ import numpy as np
 from geometry.arrays import Array, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from geometry.uncertainty.spot_tracks import beam_image, pixel_covariance, scatter, uncertainty_tracks, unlimited
+from geometry.uncertainty.rig_uncertainty import beam_image, pixel_covariance, scatter, uncertainty_tracks, unlimited
 from lab.errors import BeamposeError, InputError
 from lab.files.run.results import (
     POSE_STATUSES,

@@ -16,7 +16,15 @@ from typing import Any
 import numpy as np
 
 from calibration.model_check import faults as f
-from calibration.model_check.check import FEWEST_FRAMES, FEWEST_SPOTS, ModelCheckResult, NotTested, evaluate_model
+from calibration.model_check.check import (
+    FEWEST_FRAMES,
+    FEWEST_SPOTS,
+    GroupStatistics,
+    ModelCheckResult,
+    NotTested,
+    Statistics,
+    evaluate_model,
+)
 from calibration.model_check.fault_identification import (
     UNEVEN,
     Effect,
@@ -26,7 +34,6 @@ from calibration.model_check.fault_identification import (
     is_noisy,
 )
 from calibration.model_check.linearised_frames import ModelCheckRecording, UnseenView
-from calibration.model_check.statistics import GroupStatistics, Statistics
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance

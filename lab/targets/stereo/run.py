@@ -67,8 +67,14 @@ from lab.files.text.fields import (
 from lab.files.text.yaml_text import read_mapping
 from tracking.binocular.calibration_check import CalibrationCheck, ClockOffset
 from tracking.binocular.joint_fit import pose_of_points
-from tracking.binocular.marker_model import MarkerImages, MarkerModel, StereoPair
-from tracking.binocular.parameters import BinocularParameters, MatchParameters, SegmentationParameters
+from tracking.binocular.marker_model import (
+    BinocularParameters,
+    MarkerImages,
+    MarkerModel,
+    MatchParameters,
+    SegmentationParameters,
+    StereoPair,
+)
 from tracking.binocular.pose_tracker import BinocularFrame
 from tracking.binocular.segmentation import ColourRange
 from tracking.statuses import PoseStatus

@@ -9,7 +9,7 @@ import pytest
 
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from geometry.uncertainty.spot_tracks import (
+from geometry.uncertainty.rig_uncertainty import (
     beam_image,
     pixel_covariance,
     scatter,

@@ -28,9 +28,9 @@ from tracking.rigid_body.hypotheses.hypothesis_set import (
     State,
     add_child,
     empty_children,
+    iterated_update,
     prune_and_merge,
 )
-from tracking.rigid_body.hypotheses.iterated_update import iterated_update
 from tracking.rigid_body.models.motion import STATE, predicted
 from tracking.rigid_body.models.occlusion import MISSED
 

@@ -33,11 +33,12 @@ from tracking.rigid_body.hypotheses.hypothesis_set import (
     Dynamics,
     Hypotheses,
     State,
+    Update,
     add_child,
     empty_children,
+    iterated_update,
     largest_spot_sigma,
 )
-from tracking.rigid_body.hypotheses.iterated_update import Update, iterated_update
 from tracking.rigid_body.models.motion import predicted
 from tracking.rigid_body.models.occlusion import MISSED, joint_log_likelihood, marginal, predict, update
 

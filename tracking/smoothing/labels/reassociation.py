@@ -28,8 +28,7 @@ from tracking.rigid_body.association.frame_detections import (
     predicted_pixel,
 )
 from tracking.rigid_body.association.joint_search import associate
-from tracking.rigid_body.hypotheses.hypothesis_set import State
-from tracking.rigid_body.hypotheses.iterated_update import iterated_update
+from tracking.rigid_body.hypotheses.hypothesis_set import State, iterated_update
 from tracking.rigid_body.models.information import frame_information, single_frame_pose
 from tracking.rigid_body.models.motion import STATE
 from tracking.rigid_body.models.occlusion import joint_log_likelihood, marginal

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.beams.mean_rotation import mean_rotation
 from geometry import rotations
+from geometry.rotations import mean_rotation
 
 
 def test_the_mean_is_the_rotation_nearest_to_the_mean_matrix():
