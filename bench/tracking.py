@@ -23,7 +23,7 @@ from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import fit_pose
 from lab.simulate.points import PointRun, simulate_points
 from lab.simulate.rigs import RIGS
-from tracking.curve_switching.pose_filter import CoplanarViews, quadratic_positions
+from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import Detections
 from tracking.labelling.first_labels import NO_POINT, find_labels

@@ -28,7 +28,7 @@ from lab.report.plot.series import Line, Shade, time_panel
 from lab.simulate.points import PointRun, simulate_points
 from studies.comparison import Comparison, ComparisonRow, Figure
 from tracking import kalman
-from tracking.curve_switching.pose_filter import CoplanarViews, quadratic_positions
+from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.curve_switching.vehicle import BENT_NIS
 from tracking.labelling.first_labels import NO_POINT

@@ -20,7 +20,7 @@ from geometry.pose_solver.gauss_newton import PoseFit, SolveLimits, is_measureme
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty
 from tracking.curve_switching.matching import match
-from tracking.curve_switching.pose_filter import CoplanarViews, quadratic_positions
+from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
 from tracking.curve_switching.vehicle import RigidCheck, Tracks, Vehicle, matched_pixels, outside_first_search
 from tracking.detections import UNMATCHED, Detections
 from tracking.input_validation import check_step

@@ -22,9 +22,8 @@ from geometry.pose_solver.gauss_newton import (
 )
 from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking import kalman
-from tracking.curve_switching import pose_filter
-from tracking.curve_switching.pose_filter import RigidMotion
 from tracking.detections import UNMATCHED, Detections
+from tracking.kalman import RigidMotion
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.online_estimates import VarianceFactor
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, Event, PoseStatus
@@ -177,7 +176,7 @@ class Vehicle:
         self.anchor_age_s += dt_s
         if self.motion is not None:
             a = self._accelerations
-            self.motion = pose_filter.predict(self.motion, dt_s, float(a[0]), float(a[1]))
+            self.motion = self.motion.predicted(dt_s, float(a[0]), float(a[1]))
 
     def search_prior(self, first: PosePrior) -> PosePrior:
         """The prior for a new search: around the last measured pose, as far as the vehicle may have moved since.
@@ -206,14 +205,14 @@ class Vehicle:
         self._systematic_px = fit.calibration_px()
         self._variance_factor.update(fit.chi2, fit.dof, fit.systematic_share)
         if self.motion is None:
-            self.motion = pose_filter.begin(fit.world_from_body, covariance)
+            self.motion = RigidMotion.at_rest(fit.world_from_body, covariance)
         else:
-            after, y, S = pose_filter.update_with_pose(self.motion, fit.world_from_body, covariance)
+            after, y, S = self.motion.updated_with_pose(fit.world_from_body, covariance)
             nis = np.array([y[i] @ np.linalg.solve(S[i, i], y[i]) / 3 for i in (slice(0, 3), slice(3, 6))])
             if self.anchor_age_s <= 1.5 * dt_s:
                 change = np.exp(ACCELERATION_RATE * (np.clip(nis, 0, 6) - 1))
                 self._accelerations = np.clip(self._accelerations * change, *ACCELERATION_RANGE)
-            self.motion = pose_filter.begin(fit.world_from_body, covariance) if nis.max() > BENT else after
+            self.motion = RigidMotion.at_rest(fit.world_from_body, covariance) if nis.max() > BENT else after
         if self.anchor is not None and self.anchor_age_s > 0:
             displacement = fit.world_from_body.minus(self.anchor)
             speeds = np.array([np.linalg.norm(displacement[:3]), np.linalg.norm(displacement[3:])]) / self.anchor_age_s
@@ -242,7 +241,7 @@ class Vehicle:
                 R = np.zeros((2 * good.sum(), 2 * good.sum()))
                 for k, block in enumerate(C[good]):
                     R[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = block
-                motion, _ = pose_filter.update(motion, y[good].ravel(), J[rows[good]].reshape(-1, 6), R)
+                motion, _ = motion.updated(y[good].ravel(), J[rows[good]].reshape(-1, 6), R)
         self.motion = motion
         return good
 

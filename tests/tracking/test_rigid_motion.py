@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from geometry import rotations
 from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose
-from tracking.curve_switching import pose_filter
-from tracking.curve_switching.pose_filter import RigidMotion
+from tracking.kalman import RigidMotion
 
 DT = 0.01
 
@@ -38,7 +37,7 @@ def test_constant_velocity_and_rate_are_followed_exactly():
     rng = np.random.default_rng(1)
     motion = start = some_motion(rng)
     for _ in range(300):
-        motion = pose_filter.predict(motion, DT, 0.0, 0.0)
+        motion = motion.predicted(DT, 0.0, 0.0)
     turned = Rotation.from_matrix(start.world_from_body.rotation) * Rotation.from_rotvec(3.0 * start.rate)
     np.testing.assert_allclose(motion.world_from_body.rotation, turned.as_matrix(), atol=1e-10)
     np.testing.assert_allclose(motion.world_from_body.translation,
@@ -47,7 +46,7 @@ def test_constant_velocity_and_rate_are_followed_exactly():
 
 def test_a_step_of_zero_changes_nothing():
     motion = some_motion(np.random.default_rng(2))
-    same = pose_filter.predict(motion, 0.0, 3.0, 6.0)
+    same = motion.predicted(0.0, 3.0, 6.0)
     np.testing.assert_allclose(minus(same, motion), 0.0, atol=1e-15)
     np.testing.assert_allclose(same.P, motion.P, atol=1e-15)
 
@@ -57,14 +56,14 @@ def test_a_step_of_zero_changes_nothing():
 def test_the_covariance_is_propagated_by_the_numerical_jacobian_of_the_prediction(rate, dt):
     rng = np.random.default_rng(3)
     motion = some_motion(rng, rate)
-    ahead = pose_filter.predict(motion, dt, 0.0, 0.0)
-    F = numeric_jacobian(lambda e: minus(pose_filter.predict(plus(motion, e), dt, 0.0, 0.0), ahead), np.zeros(12), 1e-5)
+    ahead = motion.predicted(dt, 0.0, 0.0)
+    F = numeric_jacobian(lambda e: minus(plus(motion, e).predicted(dt, 0.0, 0.0), ahead), np.zeros(12), 1e-5)
     np.testing.assert_allclose(ahead.P, F @ motion.P @ F.T, atol=1e-9)
 
 
 def test_process_noise_is_that_of_accelerations_constant_within_a_step():
     still = RigidMotion(Pose.identity(), np.zeros(3), np.zeros(3), np.zeros((12, 12)))
-    P = pose_filter.predict(still, DT, 2.0, 5.0).P
+    P = still.predicted(DT, 2.0, 5.0).P
     for axis, a in ((0, 2.0), (3, 5.0)):
         assert P[axis, axis] == pytest.approx(a**2 * DT**4 / 4)
         assert P[axis, axis + 6] == pytest.approx(a**2 * DT**3 / 2)
@@ -74,7 +73,7 @@ def test_process_noise_is_that_of_accelerations_constant_within_a_step():
 def test_twist_times_a_pixel_jacobian_is_the_pixels_rate():
     """d(pose)/dt in error coordinates: after a short time dt the pose is `plus(twist dt)`."""
     motion = some_motion(np.random.default_rng(4))
-    ahead = pose_filter.predict(motion, 1e-4, 0.0, 0.0)
+    ahead = motion.predicted(1e-4, 0.0, 0.0)
     np.testing.assert_allclose(ahead.world_from_body.minus(motion.world_from_body) / 1e-4, motion.twist, atol=1e-7)
 
 
@@ -82,7 +81,7 @@ def test_a_measured_pose_without_noise_becomes_the_pose():
     rng = np.random.default_rng(5)
     motion = some_motion(rng)
     measured = motion.world_from_body.plus(rng.normal(0, 1e-3, 6))
-    after, y, S = pose_filter.update_with_pose(motion, measured, 1e-18 * np.eye(6))
+    after, y, S = motion.updated_with_pose(measured, 1e-18 * np.eye(6))
     assert np.abs(after.world_from_body.minus(measured)).max() < 1e-7
     np.testing.assert_allclose(motion.world_from_body.plus(y).rotation, measured.rotation, atol=1e-12)
     np.testing.assert_allclose(S, motion.covariance, atol=1e-12)
@@ -91,12 +90,12 @@ def test_a_measured_pose_without_noise_becomes_the_pose():
 def test_velocities_are_estimated_from_poses_alone():
     truth = RigidMotion(Pose.identity(), np.array([0.5, -0.2, 0.1]), np.array([0.3, 0.4, -0.5]), np.zeros((12, 12)))
     C = 1e-6 * np.eye(6)
-    motion = pose_filter.begin(truth.world_from_body, C)
+    motion = RigidMotion.at_rest(truth.world_from_body, C)
     assert np.all(motion.twist == 0)
     for _ in range(100):
-        truth = pose_filter.predict(truth, DT, 0.0, 0.0)
-        motion = pose_filter.predict(motion, DT, 0.1, 0.1)
-        motion, _, _ = pose_filter.update_with_pose(motion, truth.world_from_body, C)
+        truth = truth.predicted(DT, 0.0, 0.0)
+        motion = motion.predicted(DT, 0.1, 0.1)
+        motion, _, _ = motion.updated_with_pose(truth.world_from_body, C)
     np.testing.assert_allclose(motion.velocity, truth.velocity, atol=0.01)
     np.testing.assert_allclose(motion.rate, truth.rate, atol=0.01)
 
@@ -108,16 +107,16 @@ def test_the_covariance_is_correct_over_many_motions():
     sigma = np.array([2e-3] * 3 + [1e-3] * 3)
     for _ in range(200):
         truth = some_motion(rng, 1.0)
-        motion = pose_filter.begin(
+        motion = RigidMotion.at_rest(
             truth.world_from_body.plus(-sigma * rng.standard_normal(6)), np.diag(sigma**2), 1.0, 1.0
         )
         for _ in range(20):
             a = np.concatenate([3.0 * rng.standard_normal(3), 6.0 * rng.standard_normal(3)])
             moved = truth.world_from_body.plus(truth.twist * DT + a * DT**2 / 2)
             truth = RigidMotion(moved, truth.velocity + a[:3] * DT, truth.rate + a[3:] * DT, truth.P)
-            motion = pose_filter.predict(motion, DT, 3.0, 6.0)
+            motion = motion.predicted(DT, 3.0, 6.0)
             measured = truth.world_from_body.plus(-sigma * rng.standard_normal(6))
-            motion, _, _ = pose_filter.update_with_pose(motion, measured, np.diag(sigma**2))
+            motion, _, _ = motion.updated_with_pose(measured, np.diag(sigma**2))
         error = minus(truth, motion)
         nees.append(error @ np.linalg.solve(motion.P, error))
     assert np.mean(nees) == pytest.approx(12.0, abs=1.5)
@@ -125,10 +124,10 @@ def test_the_covariance_is_correct_over_many_motions():
 
 def test_an_update_changes_only_the_observed_variances():
     """A measurement of x alone: all other variances stay exactly the same."""
-    motion = pose_filter.begin(Pose.identity(), 0.01 * np.eye(6))
+    motion = RigidMotion.at_rest(Pose.identity(), 0.01 * np.eye(6))
     H = np.zeros((1, 6))
     H[0, 0] = 100.0  # px per m
-    after, S = pose_filter.update(motion, np.array([3.0]), H, np.array([[0.01]]))
+    after, S = motion.updated(np.array([3.0]), H, np.array([[0.01]]))
     assert S[0, 0] == pytest.approx(100.0**2 * 0.01 + 0.01)
     assert after.P[0, 0] == pytest.approx(1 / (1 / 0.01 + 100.0**2 / 0.01))
     assert after.world_from_body.translation[0] == pytest.approx(0.03, rel=1e-3)
@@ -138,7 +137,7 @@ def test_an_update_changes_only_the_observed_variances():
 def test_rotation_matrices_stay_orthonormal_over_a_long_run():
     motion = some_motion(np.random.default_rng(7), 10.0)
     for _ in range(5000):
-        motion = pose_filter.predict(motion, DT, 1.0, 1.0)
+        motion = motion.predicted(DT, 1.0, 1.0)
     R = motion.world_from_body.rotation
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
     assert rotations.angle(R) <= np.pi
