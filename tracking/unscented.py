@@ -121,17 +121,6 @@ def deviations(values: Array, n: int, spread: Spread, space: Space = NUMBERS) ->
     return space.plus(values[0], mean[None])[0], D
 
 
-def transform(
-    x: Array, P: Array, function: Function, spread: Spread = USUAL, space: Space = NUMBERS, of: Space = NUMBERS
-) -> tuple[Array, Array]:
-    """Mean (p,) and covariance (m, m) of a function of a random vector with mean x and covariance P (n, n).
-
-    function: (2n + 1, ...) rows to (2n + 1, p) rows. space, of: those of x and of the values.
-    """
-    mean, D = deviations(function(sigma_points(x, P, spread, space)), len(P), spread, of)
-    return mean, D.T @ D
-
-
 # Robust updates of the unscented Kalman filter: a Mahalanobis gate and Student's t noise.
 #
 # Both take the place of `ukf.update` and have no memory of their own.
