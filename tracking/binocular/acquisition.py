@@ -16,13 +16,7 @@ from geometry.pose_solver.gauss_newton import PoseFit
 from geometry.pose_solver.three_spots import poses_from_three_spots
 from geometry.rotations import angle
 from geometry.uncertainty.chi_square import chi2_tail
-from tracking.binocular.joint_fit import (
-    MarkerObservations,
-    fit_pose,
-    pose_of_points,
-    triangulate,
-    undistorted_pixels,
-)
+from tracking.binocular.joint_fit import MarkerObservations, fit_pose, pose_of_points, triangulate, undistorted_pixels
 from tracking.binocular.marker_model import MarkerImages, MarkerModel, MatchParameters, StereoPair, project_markers
 
 # Which candidate in each picture is which marker, for a pose that is roughly known; the fit and its evidence.

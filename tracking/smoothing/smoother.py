@@ -28,11 +28,7 @@ from geometry.pose_solver.gauss_newton import SolveLimits
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.association.frame_detections import BLENDED, DetectionModel, ViewTable, distinct_spots
-from tracking.rigid_body.hypotheses.hypothesis_set import (
-    MAX_CHECKING_SIGMA_PX,
-    MIN_REDUNDANT_SPOTS,
-    SURE_PROBABILITY,
-)
+from tracking.rigid_body.hypotheses.hypothesis_set import MAX_CHECKING_SIGMA_PX, MIN_REDUNDANT_SPOTS, SURE_PROBABILITY
 from tracking.rigid_body.models.information import run_shifts
 from tracking.smoothing.error_scale import ErrorScale, usual_sizes
 from tracking.smoothing.labels.continuity import continued, transfers_between_cameras
