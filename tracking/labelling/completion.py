@@ -8,9 +8,8 @@ from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled
 from geometry.compiled_linalg import best_first, pose_plus
 from geometry.compiled_projection import inside, project_view
-from tracking.labelling.candidates import BestCandidates
+from tracking.labelling.candidates import BestCandidates, best_point_of
 from tracking.labelling.points import (
-    GATE,
     LOG_2PI,
     NO_POINT,
     LabelProblem,
@@ -299,7 +298,6 @@ def _add_points(
         if not ok:
             return R, t, False
         chosen, smallest = -1, np.inf
-        a = b = c = 0.0
         for v in range(n):
             if (
                 labels[v] != NO_POINT
@@ -308,47 +306,16 @@ def _add_points(
                 or not inside(work.uv[v], spots.size[v])
             ):
                 continue
-            a_, b_, c_ = predicted_spread(work.H, work.J[v], work.left)
-            if a_ + c_ < smallest:
-                chosen, smallest, a, b, c = v, a_ + c_, a_, b_, c_
+            a, _, c = predicted_spread(work.H, work.J[v], work.left)
+            if a + c < smallest:
+                chosen, smallest = v, a + c
         if chosen < 0:
             return R, t, True
-        p = _nearest(problem, labels, chosen, work.uv[chosen], a, b, c)
+        _, p = best_point_of(problem, chosen, work, True, labels)
         if p == NO_POINT:
             without_point[chosen] = True
         else:
             labels[chosen] = p
-
-
-@compiled
-def _nearest(problem: LabelProblem, labels: Ints, v: int, uv: Array, a: float, b: float, c: float) -> int:
-    """The free point that best explains a view with the predicted covariance (a, b, c); NO_POINT if a miss is likelier.
-
-    uv (2,), px: the predicted position.
-    """
-    points, spots, limits = problem.points, problem.spots, problem.limits
-    camera = spots.camera[v]
-    best, chosen = (
-        np.log(1 - limits.p_detect) - np.log(limits.p_detect) + points.log_density[camera] + LOG_2PI,
-        NO_POINT,
-    )
-    for p in range(points.first[camera], points.first[camera + 1]):
-        free = True
-        for other in range(labels.shape[0]):
-            if labels[other] == p:
-                free = False
-        if not free:
-            continue
-        du, dv = points.uv[p, 0] - uv[0], points.uv[p, 1] - uv[1]
-        A = a + points.cov[p, 0, 0] + spots.model_cov[v, 0, 0]
-        B = b + points.cov[p, 0, 1] + spots.model_cov[v, 0, 1]
-        C = c + points.cov[p, 1, 1] + spots.model_cov[v, 1, 1]
-        det = A * C - B * B
-        d2 = (C * du * du - 2 * B * du * dv + A * dv * dv) / det
-        value = -0.5 * (np.log(det) + d2)
-        if d2 < GATE and value > best:
-            best, chosen = value, p
-    return chosen
 
 
 @compiled

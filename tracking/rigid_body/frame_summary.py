@@ -12,7 +12,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.compilation.jit import compiled
-from geometry.compiled_linalg import block, hstack, multiply, pose_plus, solve
+from geometry.compiled_linalg import block, cholesky, hstack, multiply, pose_plus, solve
 from geometry.compiled_projection import Views, project_view
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
@@ -137,17 +137,10 @@ def inverse(L: Array) -> Array:
             scaled[i, j] = L[i, j] / np.sqrt(L[i, i] * L[j, j])
         eye[i, i] = 1.0
     # The pivots of the Cholesky factorisation show the rank.
-    root = scaled.copy()
+    root = cholesky(scaled)
     for j in range(n):
-        for k in range(j):
-            root[j, j] -= root[j, k] * root[j, k]
-        if not root[j, j] > RANK_TOLERANCE:
+        if not root[j, j] * root[j, j] > RANK_TOLERANCE:
             return _infinite(n)
-        root[j, j] = np.sqrt(root[j, j])
-        for i in range(j + 1, n):
-            for k in range(j):
-                root[i, j] -= root[i, k] * root[j, k]
-            root[i, j] /= root[j, j]
     out, _ = solve(scaled, eye)
     for i in range(n):
         for j in range(n):
