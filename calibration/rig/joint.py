@@ -107,11 +107,6 @@ class GroupFit:
 LEAST_REDUNDANCY = 2.0  # below it, residuals do not determine sigmas
 
 
-def joint_covariance(adjusted: Adjusted, unknowns: Unknowns) -> Array:
-    """(size, size); 0 for fixed parameters. Raises AdjustmentError if something is undetermined."""
-    return adjusted.covariance(unknowns.at)
-
-
 def jacobian(term: Term, values: Values, unknowns: Unknowns) -> tuple[Array, sparse.csr_array]:
     """Residuals (m,) of a term, and their derivatives (m, size) by all unknowns."""
     line = term.linearise(values)

@@ -92,7 +92,7 @@ class PoseFit:
             return 0.0
         n = len(self.jacobian)
         left = np.eye(2 * n)
-        left[:, _coordinates(self.rows)] -= np.nan_to_num(self.jacobian.reshape(2 * n, 6)) @ self._gain
+        left[:, coordinates_of(self.rows)] -= np.nan_to_num(self.jacobian.reshape(2 * n, 6)) @ self._gain
         joint = (left @ self._common @ left.T).reshape(n, 2, n, 2)
         return np.asarray(joint[np.arange(n), :, np.arange(n)])
 
@@ -168,7 +168,7 @@ def _fit(
         W = whiten(covariances)
         log_det = -2 * float(np.sum(np.log(W[:, [0, 1], [0, 1]])))
     else:
-        root = np.linalg.cholesky(_blocks(covariances) + common[np.ix_(_coordinates(rows), _coordinates(rows))])
+        root = np.linalg.cholesky(_blocks(covariances) + common[np.ix_(coordinates_of(rows), coordinates_of(rows))])
         W = np.linalg.inv(root)
         log_det = 2 * float(np.sum(np.log(np.diagonal(root))))
     pose, damping = start, 0.0
@@ -200,7 +200,7 @@ def _fit(
     dof = 2 * len(rows) - 6 + (6 if prior is not None else 0)
     K, systematic, share = np.zeros((6, 2 * len(rows))), np.zeros((6, 6)), 0.0
     if common is not None and observable:
-        S = common[np.ix_(_coordinates(rows), _coordinates(rows))]
+        S = common[np.ix_(coordinates_of(rows), coordinates_of(rows))]
         A = W @ J[rows].reshape(-1, 6)
         K = covariance @ A.T @ W
         systematic = symmetric(K @ S @ K.T)
@@ -224,7 +224,7 @@ def _fit(
     )
 
 
-def _coordinates(rows: Ints) -> Ints:
+def coordinates_of(rows: Ints) -> Ints:
     """Indices (2m,) of u and v of m views among the coordinates of all views."""
     return np.ravel(2 * rows[:, None] + np.arange(2))
 

@@ -227,15 +227,6 @@ def unlimited(model: SpotModel) -> SpotModel:
     return replace(model, half_size=np.full_like(model.half_size, np.inf))
 
 
-def pixel_covariance(model: SpotModel, world_from_body: Pose, covariance: Array) -> Array:
-    """Covariance (n, 2, 2), px^2, of the places of n views, to first order; nan where there is no projection.
-
-    covariance (6, 6): of the pose error, section 1 of the file contract.
-    """
-    J = model.project(world_from_body)[1]
-    return J @ covariance @ np.swapaxes(J, -1, -2)
-
-
 def uncertainty_tracks(
     model: SpotModel, world_from_body: Pose, covariance: Array, sigmas: float = 3.0, steps: int = 61
 ) -> Array:

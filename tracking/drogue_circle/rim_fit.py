@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import erf
 
 import cv2
@@ -203,7 +203,7 @@ def fit_rim(
     so that the wider passes are left out.
     """
     if coarse.polarity == 0:
-        both = [fit_rim(crop, _with_polarity(coarse, p), min_coverage, hidden) for p in (1, -1)]
+        both = [fit_rim(crop, replace(coarse, polarity=p), min_coverage, hidden) for p in (1, -1)]
         return max((f for f in both if f is not None), key=lambda f: f.score, default=None)
     rim = Rim(coarse.u_px, coarse.v_px, coarse.radius_px)
     least = 0.7 * min_coverage
@@ -230,10 +230,6 @@ def fit_rim(
         if oblique is not None:
             rim, points, weight = oblique
     return _described(rim, points, weight, coarse, min_coverage)
-
-
-def _with_polarity(coarse: CircleCandidate, polarity: int) -> CircleCandidate:
-    return CircleCandidate(coarse.u_px, coarse.v_px, coarse.radius_px, coarse.score, polarity)
 
 
 def _is_near(rim: Rim, coarse: CircleCandidate) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.compiled_projection import Views, project_all
 from geometry.pose import Pose
-from geometry.pose_solver.gauss_newton import covariance_of
+from geometry.pose_solver.gauss_newton import coordinates_of, covariance_of
 from geometry.uncertainty.rig_uncertainty import share_without_calibration
 from tracking.smoothing.motion.process_noise import SHORT_EXPOSURE, corner_offsets
 from tracking.smoothing.motion.run_detections import Reference, RunDetections, labelled_points
@@ -99,7 +99,7 @@ def calibration_errors(
         if gain is not None and C is not None:
             rows, G = gain
             residual = np.eye(2 * n)
-            residual[:, _coordinates(rows)] -= J[k].reshape(2 * n, 6) @ G
+            residual[:, coordinates_of(rows)] -= J[k].reshape(2 * n, 6) @ G
             joint = (residual @ C @ residual.T).reshape(n, 2, n, 2)
             total += joint[np.arange(n), :, np.arange(n)]
             count += 1
@@ -111,17 +111,12 @@ def calibration_errors(
         gain = gains[k] if weighted[k] is None else weighted[k]
         if gain is not None and C is not None:
             rows, G = gain
-            both = _coordinates(rows)
+            both = coordinates_of(rows)
             latest = G @ C[np.ix_(both, both)] @ G.T
             _, _, cov = labelled_points(detections, k, assigned[k], np.zeros_like(calibration_cov))
             share[k] = share_without_calibration(J[k][rows], cov[rows], calibration_cov[rows])
         systematic[k] = latest
     return calibration_cov, systematic, share
-
-
-def _coordinates(rows: Ints) -> Ints:
-    """Indices (2 m,) of both coordinates of views (m,) in a vector of all pixels."""
-    return np.stack([2 * rows, 2 * rows + 1], axis=-1).ravel()
 
 
 def _gains(
