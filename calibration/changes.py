@@ -207,6 +207,9 @@ class PriorSizes:
     laser_m: float = 1e-3  # shift of such a laser
 
 
+USUAL_SIZES = PriorSizes()
+
+
 @dataclass(frozen=True, slots=True)
 class CameraColumns:
     """Derivatives of m pixel coordinates by changes of one camera, px per unit; 0 for those of other cameras."""
@@ -220,11 +223,11 @@ class CameraColumns:
         """The columns (m, 4) that the test for drift uses: turn and zoom, a similarity of the picture."""
         return np.concatenate([self.turn, self.zoom], axis=1)
 
-    def kinds(self, sizes: PriorSizes) -> dict[str, ChangeCandidate]:
+    def kinds(self) -> dict[str, ChangeCandidate]:
         """The possible changes of a camera, by kind."""
-        turn = ChangeCandidate(self.turn, np.full(3, sizes.turn_rad))
-        move = ChangeCandidate(self.move, np.full(3, sizes.move_m))
-        zoom = ChangeCandidate(self.zoom, np.full(1, sizes.zoom))
+        turn = ChangeCandidate(self.turn, np.full(3, USUAL_SIZES.turn_rad))
+        move = ChangeCandidate(self.move, np.full(3, USUAL_SIZES.move_m))
+        zoom = ChangeCandidate(self.zoom, np.full(1, USUAL_SIZES.zoom))
         return {
             TURNED: turn,
             ZOOMED: zoom,
@@ -260,7 +263,6 @@ def find_changes(
     cameras: Mapping[str, CameraColumns],
     others: Mapping[tuple[str, str], ChangeCandidate],
     p_false_alarm: float,
-    sizes: PriorSizes | None = None,
 ) -> FoundChanges:
     """The changes that explain a residual, added one by one, the most probable first.
 
@@ -269,7 +271,6 @@ def find_changes(
     is divided evenly among the cameras, half goes to the residual that no camera explains. Changes are added only while
     a test is significant.
     """
-    sizes = sizes or PriorSizes()
     each = p_false_alarm / 2 / max(len(cameras), 1)
 
     def tests(left: ExcessResidual, names: list[str]) -> tuple[dict[str, float], float]:
@@ -285,10 +286,10 @@ def find_changes(
         taken = {c.subject for c in changes if c.kind in CAMERA_KINDS}
         of_cameras, of_rest = tests(left, [n for n in cameras if n not in taken])
         significant = min(of_cameras.values(), default=1.0) < each or of_rest < p_false_alarm / 2
-        more = _best(misfit, changes, cameras, others, sizes) if significant and len(changes) < max_changes else None
+        more = _best(misfit, changes, cameras, others) if significant and len(changes) < max_changes else None
         if more is None:
             return FoundChanges(tuple(changes), left, significant)
-        changes = _reselected(misfit, [*changes, more], cameras, others, sizes)
+        changes = _reselected(misfit, [*changes, more], cameras, others)
 
 
 def _reselected(
@@ -296,7 +297,6 @@ def _reselected(
     changes: list[Change],
     cameras: Mapping[str, CameraColumns],
     others: Mapping[tuple[str, str], ChangeCandidate],
-    sizes: PriorSizes,
 ) -> list[Change]:
     """The changes, each selected and fitted again with the others free: the first was selected without the others.
 
@@ -305,7 +305,7 @@ def _reselected(
     for _ in range(3):
         before = [(c.kind, c.subject) for c in changes]
         for i in range(len(changes)):
-            best = _best(misfit, changes[:i] + changes[i + 1 :], cameras, others, sizes)
+            best = _best(misfit, changes[:i] + changes[i + 1 :], cameras, others)
             if best is not None:
                 changes = [*changes[:i], best, *changes[i + 1 :]]
         if before == [(c.kind, c.subject) for c in changes]:
@@ -318,7 +318,6 @@ def _best(
     known: list[Change],
     cameras: Mapping[str, CameraColumns],
     others: Mapping[tuple[str, str], ChangeCandidate],
-    sizes: PriorSizes,
 ) -> Change | None:
     """The most probable change beside the known ones; None if no further change is more probable.
 
@@ -330,7 +329,7 @@ def _best(
     for name, columns in cameras.items():
         if name in taken:
             continue
-        for kind, candidate in columns.kinds(sizes).items():
+        for kind, candidate in columns.kinds().items():
             change = left.fit(kind, name, candidate)
             scored.append((change.evidence - 2 * np.log(len(cameras)), change))
     for (kind, name), candidate in others.items():

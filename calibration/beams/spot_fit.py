@@ -90,10 +90,10 @@ def line_through(points: Array) -> tuple[Array, Array] | None:
     return centre, np.linalg.svd(near - centre)[2][0]
 
 
-def body_poses(rig: Rig, spots: SpotPixels, count: int, world_from_body: Pose | None = None) -> list[PoseFit | None]:
+def body_poses(rig: Rig, spots: SpotPixels, count: int) -> list[PoseFit | None]:
     """world_from_body at each of the stand's `count` positions, fitted with the rig's beams; None where it fails.
 
-    world_from_body: start values (P,), if known. Spots are not checked for outliers; a wrong one affects its position.
+    Spots are not checked for outliers; a wrong one affects its position.
     """
     model = SpotModel.of(rig)
     points = world_points(rig, spots)
@@ -102,8 +102,7 @@ def body_poses(rig: Rig, spots: SpotPixels, count: int, world_from_body: Pose | 
     for k in range(count):
         rows = np.flatnonzero(spots.position == k)
         here = spots.pick(rows)
-        starts = [] if world_from_body is None else [world_from_body[k]]
-        starts += [p for p in (_pose_from_whole_beams(rig, here, points[rows]), last) if p is not None]
+        starts = [p for p in (_pose_from_whole_beams(rig, here, points[rows]), last) if p is not None]
         fit = _best(model, here, starts)
         if fit is None or not fit.observable or (last is None and fit.dof > 0 and fit.chi2 > 1e3 * fit.dof):
             middle = np.mean([s.world_from_screen.translation for s in rig.screens.values()], axis=0)

@@ -179,20 +179,17 @@ class RigCalibration:
     joint: Joint  # the joint adjustment
 
 
-def calibrate_in_steps(
-    screens: ScreensResult, spots: SpotPixels, stand: StandModel, *, nominal: bool = True
-) -> RigCalibration:
+def calibrate_in_steps(screens: ScreensResult, spots: SpotPixels, stand: StandModel) -> RigCalibration:
     """Calibrate screens, then beams, then all together.
 
-    screens: of screens/screens.py, the first step; its network's rig holds nominal beams and the spots too. nominal:
-    as in beams/beams.py.
+    screens: of screens/screens.py, the first step; its network's rig holds nominal beams and the spots too.
 
     Raises:
         AdjustmentError: the spots are inconsistent, or a parameter is undetermined.
         ValueError: as raised by the steps.
     """
     try:
-        beams = calibrate_beams(screens.fit.rig, spots, stand, screens.fit.covariance, nominal=nominal)
+        beams = calibrate_beams(screens.fit.rig, spots, stand, screens.fit.covariance)
     except AdjustmentError as error:
         # The iteration may diverge along an undetermined direction.
         motion = StandMotion.of(stand.stand_from_body)

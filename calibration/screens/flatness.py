@@ -28,17 +28,14 @@ def plane_through(points: Array) -> tuple[Array, Array, Array]:
     return middle, normal, extents
 
 
-def frame_of_extent(points: Array, seen_from: Array | None = None, up: Array | None = None) -> Pose:
-    """world_from_screen from points (n, 3), m, of the screen; z towards `seen_from` (3,) if given.
-
-    up (3,): direction of y, projected into the plane; None: the world's z.
-    """
+def frame_of_extent(points: Array, seen_from: Array | None = None) -> Pose:
+    """world_from_screen from points (n, 3), m, of the screen; z towards `seen_from` (3,) if given, y close to world's z."""
     middle, normal, _ = plane_through(points)
     if seen_from is not None:
         normal = normal if normal @ (seen_from - middle) >= 0 else -normal
     elif normal[np.argmax(np.abs(normal))] < 0:
         normal = -normal
-    upward = np.array([0.0, 0.0, 1.0]) if up is None else up
+    upward = np.array([0.0, 0.0, 1.0])
     if abs(normal @ upward) > 0.9:  # within 26 deg of horizontal the world's z hardly defines a direction
         upward = np.array([0.0, 1.0, 0.0])
     y = normalised(upward - (upward @ normal) * normal)
