@@ -29,7 +29,7 @@ def plane_through(points: Array) -> tuple[Array, Array, Array]:
 
 
 def frame_of_extent(points: Array, seen_from: Array | None = None) -> Pose:
-    """world_from_screen from points (n, 3), m, of the screen; z towards `seen_from` (3,) if given, y close to world's z."""
+    """world_from_screen from points (n, 3), m, of a screen; z towards `seen_from` (3,), if given."""
     middle, normal, _ = plane_through(points)
     if seen_from is not None:
         normal = normal if normal @ (seen_from - middle) >= 0 else -normal
