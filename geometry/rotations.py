@@ -64,16 +64,6 @@ def nearest_rotation(matrix: Array) -> Array:
     return np.asarray(U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt)
 
 
-def mean_rotation(matrices: Array) -> Array:
-    """The rotation (3, 3) with the least sum of squared chordal distances to the rotations (n, 3, 3), n >= 1.
-
-    Source: Markley, Cheng, Crassidis & Oshman (2007), "Averaging quaternions", equation (13), as scipy computes it.
-    """
-    from scipy.spatial.transform import Rotation  # imported here because the import takes 0.1 s
-
-    return np.asarray(Rotation.from_matrix(matrices).mean().as_matrix())
-
-
 def quaternion_from_matrix(rotation: Array) -> Array:
     """Unit quaternions (..., 4), order w, x, y, z with w >= 0, of rotation matrices (..., 3, 3).
 

@@ -18,7 +18,7 @@ from calibration.terms.rig_blocks import BEAMS, lines_in
 from geometry import rotations
 from geometry.arrays import Array, cross, normalised
 from geometry.pose import Pose
-from geometry.rotations import mean_rotation
+from geometry.rotations import nearest_rotation
 
 _SHARE = 0.98  # of a direction's length that a motion of the whole target must explain
 _TURN_RMS = np.deg2rad(2.0)  # about an axis: smaller rotations do not excite it
@@ -36,7 +36,7 @@ class StandMotion:
     def of(stand_from_body: Pose) -> StandMotion:
         """The variation of positions (P,)."""
         shifts = np.sqrt(np.mean((stand_from_body.translation - stand_from_body.translation.mean(axis=0)) ** 2, axis=0))
-        turns = rotations.log(stand_from_body.rotation @ mean_rotation(stand_from_body.rotation).T)
+        turns = rotations.log(stand_from_body.rotation @ nearest_rotation(stand_from_body.rotation.mean(axis=0)).T)
         return StandMotion(np.sqrt(np.mean(turns**2, axis=0)), shifts)
 
     def __str__(self) -> str:

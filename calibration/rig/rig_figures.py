@@ -19,7 +19,7 @@ from geometry.arrays import Array, Ints, symmetric
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
-from geometry.rotations import mean_rotation
+from geometry.rotations import nearest_rotation
 from geometry.uncertainty.rig_uncertainty import Sensitivity
 
 # Positions required for a trustworthy result. Without a fifth of eight, six remain, the number of parameters of a pose;
@@ -80,7 +80,7 @@ class HoldOut:
 def central_pose(joint: Joint) -> Pose:
     """world_from_body at the centre of the stand's positions."""
     poses = pose_of(joint.values, POSES)
-    middle = Pose(mean_rotation(poses.rotation), poses.translation.mean(axis=0))
+    middle = Pose(nearest_rotation(poses.rotation.mean(axis=0)), poses.translation.mean(axis=0))
     return pose_of(joint.values, STAND)[0] @ middle
 
 
