@@ -20,7 +20,7 @@ from scipy.linalg import block_diag
 
 from calibration.beams.beams import StandModel
 from calibration.rig.joint import Joint
-from calibration.rig.rig_steps import RigCalibration, calibrate_in_steps
+from calibration.rig.rig_figures import RigCalibration, calibrate_in_steps
 from calibration.screens.network import ControlPoints, Network, PointObservations
 from calibration.screens.screens import ScreenSetup, calibrate
 from calibration.terms.rig_blocks import prior_of, stacks_of

@@ -21,7 +21,7 @@ from tracking.detections import UNMATCHED
 from tracking.parameters import TrackerParameters
 from tracking.smoothing.recording import TrackedRecording
 from tracking.smoothing.smoother import smooth
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import TrackedFrame
 
 FIRST_SEED = 9100
 CLEAN_FRAMES = 10  # at the start: the velocities are not yet known

@@ -23,14 +23,13 @@ from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import fit_pose
 from lab.simulate.points import PointRun, simulate_points
 from lab.simulate.rigs import RIGS
-from tracking.curve_switching.pose_filter import CoplanarViews, quadratic_positions
+from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import Detections
 from tracking.labelling.first_labels import NO_POINT, find_labels
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.rigid_tracker import RigidTracker
-from tracking.statuses import PoseStatus, SpotStatus
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import PoseStatus, SpotStatus, TrackedFrame
 
 FIRST_SEED = 9000
 START_FRAMES = 2  # the rate is not yet known, so there is no prediction

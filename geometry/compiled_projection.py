@@ -35,7 +35,7 @@ VIEW = np.dtype(
         ("lens", np.int64),  # distortion model; 0: none, 1: polynomial, 2: polynomial and tilt, 3: fisheye
         ("fold_r2", np.float64),
         # px, added to the pixel: how far the spot moves from the instant of the pose to that of the picture, if they
-        # differ (tracking/rigid_body/models/picture_shifts.py). Trackers set it frame by frame, in a copy.
+        # differ (tracking/rigid_body/models/information.py). Trackers set it frame by frame, in a copy.
         ("shift", np.float64, 2),
     ],
     align=True,

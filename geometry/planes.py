@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from geometry.arrays import Array, cross, normalised
+from geometry.arrays import Array, Bools, cross, normalised
 from geometry.pose import Pose
 
 # Straight lines in space: where two are closest, and the point nearest to many.
@@ -50,14 +50,20 @@ def intersect_plane(origin: Array, direction: Array, world_from_screen: Pose) ->
 
     origin, direction: (..., 3), m and no unit, in world. nan where the ray is parallel to the plane or points away.
     """
+    p, d, along, t = _to_plane(origin, direction, world_from_screen)
+    hit = p[..., :2] + t[..., None] * d[..., :2]
+    return np.where((along & (t > 0))[..., None], hit, np.nan)
+
+
+def _to_plane(origin: Array, direction: Array, world_from_screen: Pose) -> tuple[Array, Array, Bools, Array]:
+    """Rays in the screen frame: origins and directions (..., 3), which are not parallel to it, and lengths to it."""
     screen_from_world = world_from_screen.inverse()
     p = screen_from_world.apply(np.asarray(origin, dtype=float))
     d = screen_from_world.turn(np.asarray(direction, dtype=float))
     p, d = np.broadcast_arrays(p, d)
     along = np.abs(d[..., 2]) > 1e-12 * np.linalg.norm(d, axis=-1)
     t = -p[..., 2] / np.where(along, d[..., 2], 1.0)
-    hit = p[..., :2] + t[..., None] * d[..., :2]
-    return np.where((along & (t > 0))[..., None], hit, np.nan)
+    return p, d, np.asarray(along, dtype=np.bool_), t
 
 
 def screen_to_world(points: Array, world_from_screen: Pose) -> Array:
@@ -78,12 +84,7 @@ def intersect_surface(origin: Array, direction: Array, world_from_screen: Pose, 
     origin, direction: (..., 3), m and no unit, in world. bow: a, b, c, 1/m, of the surface z = a x^2 + b x y + c y^2 in
     the screen frame; all 0: flat.
     """
-    screen_from_world = world_from_screen.inverse()
-    p = screen_from_world.apply(np.asarray(origin, dtype=float))
-    d = screen_from_world.turn(np.asarray(direction, dtype=float))
-    p, d = np.broadcast_arrays(p, d)
-    along = np.abs(d[..., 2]) > 1e-12 * np.linalg.norm(d, axis=-1)
-    t = -p[..., 2] / np.where(along, d[..., 2], 1.0)
+    p, d, along, t = _to_plane(origin, direction, world_from_screen)
     a, b, c = bow
     if a or b or c:
         for _ in range(NEWTON_STEPS):

@@ -13,8 +13,7 @@ from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION
 from studies.comparison import Comparison, ComparisonRow, Figure
 from tracking import kalman
 from tracking.detections import Detections
-from tracking.single_target.parameters import PointParameters
-from tracking.single_target.point_tracker import track_point
+from tracking.single_target.point_tracker import PointParameters, track_point
 
 # Simulated targets for the filter of Duan (2020): the paper shows pictures of a tracked car, but no figure.
 #

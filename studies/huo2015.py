@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,13 +15,12 @@ from lab.report.plot.series import Line, Shade, time_panel
 from lab.simulate.points import PointRun, simulate_points
 from studies.comparison import Comparison, ComparisonRow, Figure
 from tracking import kalman
-from tracking.curve_switching.pose_filter import CoplanarViews, quadratic_positions
+from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.curve_switching.vehicle import BENT_NIS
 from tracking.labelling.first_labels import NO_POINT
 from tracking.parameters import TrackerParameters
-from tracking.statuses import SpotStatus
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import SpotStatus, TrackedFrame
 
 NOISE_PX = 0.1  # not stated in the paper; its prediction error of 0.68 px is consistent with 0.1 to 0.3
 STIFF_PX_S2, LOOSE_PX_S2 = 300.0, 5000.0  # small and large process noise of the filter
@@ -38,15 +37,7 @@ PAPER = TrackerParameters(
     learn_sigma_a=False,
     sigma_a_px_s2=STIFF_PX_S2,
 )
-CONVENTIONAL = TrackerParameters(
-    method="spots",
-    rigid_check=False,
-    estimate="prediction",
-    out_of_view="quadratic",
-    learn_sigma_a=False,
-    sigma_a_px_s2=STIFF_PX_S2,
-    curve_switch=False,
-)
+CONVENTIONAL = replace(PAPER, curve_switch=False)
 
 
 @dataclass(frozen=True, slots=True)

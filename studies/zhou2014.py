@@ -3,28 +3,164 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from geometry.arrays import Array
+from geometry.camera import Camera
+from geometry.pose import Pose
 from lab.report.plot.series import Line, Shade, time_panel
 from lab.report.plot.svg import BLUE, GREEN, VERMILLION, axes, frame, line_path, plot_area, svg_of, text
 from lab.targets.circle import CircleOptions
 from studies.comparison import Comparison, ComparisonRow, Figure
-from studies.zhou2014_lights import PAPER_PERCENT, LightResult, followed
-from tracking.drogue_circle.candidates import CircleCandidate, Picture, Window
-from tracking.drogue_circle.detectors import classical_detector
-from tracking.drogue_circle.parameters import CircleParameters
+from studies.drogue.render import render_drogue, rim_of
+from studies.drogue.scene import LIGHTS, DrogueBackground, DrogueScene, Occluder, ellipse_through
+from tracking.drogue_circle.detectors import CircleCandidate, CircleParameters, Picture, Window, classical_detector
 from tracking.drogue_circle.printed import printed_measurement
 from tracking.drogue_circle.rim_fit import RimFit, fit_rim, smooth_crop
+from tracking.statuses import PoseStatus
+
+# The experiment of Zhou (2014), section 4, with rendered drogues: an approach from 10 m in three lights.
+#
+# Nobody publishes pictures of a refuelling drogue, so they are rendered. A drogue has several circles: the rim of the
+# canopy, its inner edge and the opening of the basket. The tracker follows the one that it acquires; the truth is the
+# image of that circle.
+
+PAPER_PERCENT = {"front": 92.2, "side": 96.7, "overcast": 96.7}  # table 1
+RADIUS_M, FAR_M, NEAR_M = 0.3, 10.0, 2.0
+FOCAL_PX, SIZE = 600.0, (640, 512)
+RATE_HZ, EXPOSURE_S = 25.0, 0.004
+TRACKED = 0.1  # largest error of the centre, as a share of the radius of the rim, of a tracked frame
+_PERIOD, _PROBE = 120, 24  # frames: the probe enters once in each period, for this long
+_TILT_DEG = 8.0
+_LEAST_FRAMES = 150  # of the whole approach: in fewer frames it would be a jump
+
+
+@dataclass(frozen=True, slots=True)
+class DrogueFrame:
+    """One rendered picture and its circles."""
+
+    picture: NDArray[np.uint8]  # (h, w) grey
+    circles: Array  # (3, 3): u, v and semi-major axis of the rim, the inner edge of the canopy, the basket's opening
+    hidden: float  # share of the rim
+
+
+@dataclass(frozen=True, slots=True)
+class LightResult:
+    """A tracker on the frames of one light."""
+
+    light: str
+    frames: int
+    tracked: int  # measured or predicted, with a centre within a tenth of the radius
+    measured: int
+    errors_px: Array  # (m,) of the tracked frames
+
+    @property
+    def percent(self) -> float:
+        """Share of tracked frames."""
+        return 100 * self.tracked / self.frames
+
+
+def approach(seed: int, light: str, frames: int, scale: int = 1) -> Iterator[DrogueFrame]:
+    """A drogue that comes nearer, sways and tilts, before moving clouds; a probe covers a part of it at times.
+
+    scale: 2 renders pictures of twice the width, with twice the focal length.
+    """
+    width, height, focal = scale * SIZE[0], scale * SIZE[1], scale * FOCAL_PX
+    rng = np.random.default_rng([seed, 4, sorted(LIGHTS).index(light)])
+    camera = Camera(
+        name="camera", screen="", image_size_px=(width, height),
+        matrix=np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]]),
+        distortion=(), camera_from_world=Pose(np.eye(3), np.zeros(3)),
+    )  # fmt: skip
+    phase = rng.uniform(0, 2 * np.pi, 7)
+    kind = ("sky", "clouds", "ground")[int(rng.integers(3))]
+    look = int(rng.integers(2**31))
+    drift = rng.uniform(-1.5, 1.5, 2)
+    side = rng.uniform(0, 2 * np.pi, frames // _PERIOD + 1)
+    for k in range(frames):
+        pose, rate = _pose(k / RATE_HZ, k / max(frames, _LEAST_FRAMES), phase)
+        distance = float(pose.translation[2])
+        moved = focal / distance * rate[:2] * EXPOSURE_S
+        # The texture is mirrored at its edges: the background moves to and fro.
+        shift = 60 * np.sin(drift * k / 60)
+        scene = DrogueScene(
+            camera, pose, RADIUS_M, light=LIGHTS[light], blur_px=0.8, noise_dn=3.0,
+            background=DrogueBackground(kind, look, (float(shift[0]), float(shift[1]))),
+            motion_px=(float(moved[0]), float(moved[1])),
+            occluders=_probe(camera, pose, k, float(side[k // _PERIOD])),
+        )  # fmt: skip
+        drawn = render_drogue(scene, rng)
+        grey = cv2.cvtColor(drawn.image, cv2.COLOR_BGR2GRAY).astype(np.uint8, copy=False)
+        yield DrogueFrame(grey, _circles(scene), drawn.hidden)
+
+
+def _pose(t_s: float, share: float, phase: Array) -> tuple[Pose, Array]:
+    """The drogue in the camera's frame, and its velocity, m/s. share: part of the approach that is done."""
+    turn = 2 * np.pi * np.array([0.2, 0.17, 0.6, 0.55])
+    size = np.array([0.25, 0.15, 0.02, 0.02])
+    angle = turn * t_s + phase[:4]
+    sway, rate = size * np.sin(angle), size * turn * np.cos(angle)
+    distance = FAR_M * (NEAR_M / FAR_M) ** share
+    tilt = np.radians(_TILT_DEG) * np.sin(2 * np.pi * np.array([0.25, 0.21, 0.1]) * t_s + phase[4:])
+    place = np.array([sway[0] + sway[2], sway[1] + sway[3], distance])
+    velocity = np.array([rate[0] + rate[2], rate[1] + rate[3], 0.0])
+    return Pose(Rotation.from_rotvec(tilt).as_matrix(), place), velocity
+
+
+def _probe(camera: Camera, pose: Pose, k: int, side_rad: float) -> tuple[Occluder, ...]:
+    """The probe: once in each period it covers up to about a fifth of the drogue, from one side."""
+    into = k % _PERIOD - (_PERIOD - _PROBE)
+    if into < 0:
+        return ()
+    u, v = camera.project(pose.translation)
+    radius = float(camera.matrix[0, 0]) * RADIUS_M / float(pose.translation[2])
+    depth = np.sin(np.pi * (into + 0.5) / _PROBE)  # how far it reaches in: to half of the radius
+    along = np.array([np.cos(side_rad), np.sin(side_rad)])
+    end, start = [u, v] + (1.3 - 0.8 * depth) * radius * along, [u, v] + 900 * along
+    return (Occluder((float(end[0]), float(end[1])), 0.35 * radius, (float(start[0]), float(start[1]))),)
+
+
+def _circles(scene: DrogueScene) -> Array:
+    look = scene.look
+    opening = look.canopy_inner + (look.rear - look.canopy_inner) * look.lining_from
+    places = ((1.0, 0.0), (look.canopy_inner, 0.0), (opening, look.lining_from * look.depth))
+    ellipses = [ellipse_through(rim_of(scene, r * scene.radius_m, z * scene.radius_m)) for r, z in places]
+    return np.array([[*e.centre_px, e.major_px] for e in ellipses])
+
+
+def followed(seed: int, light: str, frames: int, forms: tuple[str, ...] = ("sound", "printed")) -> list[LightResult]:
+    """Track the approach with each form of the tracker; both get the same pictures and no place of the first circle."""
+    trackers = [CircleOptions(form=form, min_radius_px=10.0).tracker() for form in forms]
+    own = [0] * len(forms)
+    errors: list[list[float]] = [[] for _ in forms]
+    measured = [0] * len(forms)
+    for drawn in approach(seed, light, frames):
+        for i, tracker in enumerate(trackers):
+            frame = tracker.step(drawn.picture)
+            if not np.isfinite(frame.state[:3]).all():
+                errors[i].append(np.inf)
+                continue
+            if frame.event:  # acquired: which circle it follows from here on
+                own[i] = int(np.argmin(np.abs(drawn.circles - frame.state[:3]).sum(axis=1)))
+            error = float(np.hypot(*(frame.state[:2] - drawn.circles[own[i], :2])))
+            errors[i].append(error if error < TRACKED * drawn.circles[0, 2] else np.inf)
+            measured[i] += frame.status is PoseStatus.MEASURED
+    out = []
+    for own_errors, count in zip(errors, measured, strict=True):
+        good = np.array([e for e in own_errors if np.isfinite(e)])
+        out.append(LightResult(light, len(own_errors), len(good), count, good))
+    return out
+
 
 # Pictures of a ring with known centre, partly behind a straight edge: what the detectors are compared on.
 
-SIZE = (240, 200)  # width, height, px
+STILL_SIZE = (240, 200)  # width, height, px
 _SAMPLES = 4  # per pixel and axis
 _TEXTURE = ((3.0, 8.0), (12.0, 16.0), (40.0, 20.0))  # sigma (px) and amplitude (DN) of the background
 
@@ -61,14 +197,14 @@ def ring_still(
     The occluder is a plain rectangle on one side: the hardest case for the centre, since all that is left of the rim
     lies on the other side.
     """
-    width, height = SIZE
+    width, height = STILL_SIZE
     if centre_px is None:
         centre_px = (width / 2 + float(rng.uniform(-8, 8)), height / 2 + float(rng.uniform(-8, 8)))
     u, v = centre_px
     x = ((np.arange(width * _SAMPLES) + 0.5) / _SAMPLES - 0.5 - u).astype(np.float32)[None, :]
     y = ((np.arange(height * _SAMPLES) + 0.5) / _SAMPLES - 0.5 - v).astype(np.float32)[:, None]
     distance = np.hypot(x, y)
-    below = textured(rng, SIZE) if background is None else background
+    below = textured(rng, STILL_SIZE) if background is None else background
     fine = cv2.resize(below, None, fx=_SAMPLES, fy=_SAMPLES, interpolation=cv2.INTER_LINEAR)
     outer = radius_px * (1 + float(rng.uniform(0.25, 0.5)))
     ribs = np.float32(rng.uniform(170, 230)) + 10 * np.cos(16 * np.arctan2(y, x))
@@ -80,7 +216,7 @@ def ring_still(
         across = y * np.cos(angle) - x * np.sin(angle)
         covered = (along > radius_px * np.cos(np.pi * hidden)) & (np.abs(across) < 2.2 * radius_px)
         fine = np.where(covered, np.float32(rng.uniform(60, 200)), fine)
-    coarse = cv2.resize(np.asarray(fine, np.float32), SIZE, interpolation=cv2.INTER_AREA)
+    coarse = cv2.resize(np.asarray(fine, np.float32), STILL_SIZE, interpolation=cv2.INTER_AREA)
     seen = cv2.GaussianBlur(coarse, (0, 0), blur_px) + rng.normal(0, noise_dn, (height, width))
     return Still(np.clip(np.rint(seen), 0, 255).astype(np.uint8), np.array([u, v, radius_px]))
 
@@ -196,15 +332,15 @@ class HiddenRun:
 def hidden_run(seed: int, frames: int = 60, first: int = 40, count: int = 8) -> HiddenRun:
     """A ring on a smooth path, behind a plate for `count` frames."""
     rng = np.random.default_rng([seed, 2])
-    background = textured(rng, SIZE)
+    background = textured(rng, STILL_SIZE)
     phase, radius = rng.uniform(0, 2 * np.pi, 4), float(rng.uniform(16, 30))
     trackers = [CircleOptions(form=form).tracker() for form in ("sound", "printed")]
     look = int(rng.integers(2**31))
     errors = np.full((frames, 2), np.nan)
     for k in range(frames):
         t = k / 25  # s; a pendulum of 4 s and a faster sway; a slow approach
-        u = SIZE[0] / 2 + 18 * np.sin(2 * np.pi * 0.25 * t + phase[0]) + np.sin(2 * np.pi * 0.6 * t + phase[1])
-        v = SIZE[1] / 2 + 12 * np.sin(2 * np.pi * 0.2 * t + phase[2]) + np.sin(2 * np.pi * 0.5 * t + phase[3])
+        u = STILL_SIZE[0] / 2 + 18 * np.sin(2 * np.pi * 0.25 * t + phase[0]) + np.sin(2 * np.pi * 0.6 * t + phase[1])
+        v = STILL_SIZE[1] / 2 + 12 * np.sin(2 * np.pi * 0.2 * t + phase[2]) + np.sin(2 * np.pi * 0.5 * t + phase[3])
         still = ring_still(
             np.random.default_rng(look), radius * (1 + 0.004 * k), 0.0, centre_px=(u, v), background=background
         )
@@ -255,13 +391,13 @@ def _large_pictures(seed: int, count: int = 24) -> list[NDArray[np.uint8]]:
     below = textured(rng, _LARGE)
     look, radius = int(rng.integers(2**31)), float(rng.uniform(*RADII_PX))
     left, top = 500, 400
-    patch = below[top : top + SIZE[1], left : left + SIZE[0]]
+    patch = below[top : top + STILL_SIZE[1], left : left + STILL_SIZE[0]]
     out = []
     for k in range(count):
-        centre = (SIZE[0] / 2 + 0.5 * k, SIZE[1] / 2 + 0.3 * k)
+        centre = (STILL_SIZE[0] / 2 + 0.5 * k, STILL_SIZE[1] / 2 + 0.3 * k)
         still = ring_still(np.random.default_rng(look), radius, 0.0, centre_px=centre, background=patch)
         picture = np.clip(np.rint(below + rng.normal(0, 2.0, below.shape)), 0, 255).astype(np.uint8)
-        picture[top : top + SIZE[1], left : left + SIZE[0]] = still.picture
+        picture[top : top + STILL_SIZE[1], left : left + STILL_SIZE[0]] = still.picture
         out.append(picture)
     return out
 

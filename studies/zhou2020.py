@@ -14,12 +14,17 @@ from lab.report.plot import svg
 from lab.targets.stereo.simulated_recording import drogue_markers, occluded, render, scene, simulated_pair, true_pixels
 from studies.comparison import Comparison, ComparisonRow, Figure
 from studies.learned_detector.samples import draw_sample
-from tracking.binocular.first_fit import first_fit
-from tracking.binocular.joint_fit import MarkerObservations, bound
-from tracking.binocular.marker_model import StereoPair, project, project_markers
-from tracking.binocular.parameters import SegmentationParameters
+from tracking.binocular.acquisition import first_fit
+from tracking.binocular.joint_fit import (
+    MarkerObservations,
+    bound,
+    linear_points,
+    pose_of_points,
+    triangulate,
+    undistorted_pixels,
+)
+from tracking.binocular.marker_model import SegmentationParameters, StereoPair, project, project_markers
 from tracking.binocular.segmentation import ColourRange, marker_candidates, prepared
-from tracking.binocular.triangulation import linear_points, pose_of_points, triangulate, undistorted_pixels
 from tracking.learned_detector.detector import find_drogues
 
 # Monte Carlo of the binocular measurement: distances from 5 to 30 m, and the pose of seven markers at 10 m.
@@ -74,7 +79,7 @@ def distance_errors(
         points = triangulate(pair, uv, cov)
         fit = first_fit(pair, model, MarkerObservations(uv, cov))
         assert fit is not None
-        found = (linear_points(pair, flat)[0], points.points[0], fit.pose.apply(model.positions[0]))
+        found = (linear_points(pair, flat)[0], points.points[0], fit.world_from_body.apply(model.positions[0]))
         far = float(np.linalg.norm(marker))
         errors.append([float(np.linalg.norm(x)) - far for x in found])
         sight = marker / far
@@ -122,7 +127,7 @@ def pose_errors(
         horn = pose_of_points(model.positions, linear_points(pair, flat))
         fit = first_fit(pair, model, MarkerObservations(uv, cov))
         assert fit is not None
-        delta = pose.minus(fit.pose)
+        delta = pose.minus(fit.world_from_body)
         sigmas = np.sqrt(np.diagonal(bound(pair, model, pose, cov, seen)))
         rows.append((pose.minus(horn), delta, sigmas, float(delta @ np.linalg.solve(fit.covariance, delta))))
     horns, joints, bounds, nees = zip(*rows, strict=True)

@@ -15,7 +15,7 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.compilation.jit import compiled
 from tracking.detections import UNMATCHED, Detections
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import TrackedFrame
 
 # Two points of one picture nearer than this are one spot detected twice: two different spots a few px wide and so near
 # to each other merge into one detection.

@@ -1,32 +1,45 @@
-"""The statuses of spots, poses and targets with their meanings, which report and documentation read here."""
+"""The statuses of spots, poses and targets with their meanings, and the results of a tracker for one frame.
+
+Report and documentation read the meanings here.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import StrEnum
+from typing import Self
 
 import numpy as np
 
-from geometry.arrays import Bools
+from geometry.arrays import Array, Bools, Ints
+from geometry.pose import Pose
 
 LOST_SIGMA_M, LOST_SIGMA_RAD = 1.0, np.deg2rad(60.0)  # a predicted pose with larger sigmas is `lost`
 
 
-class SpotStatus(StrEnum):
+class Word(StrEnum):
+    """A word of the tables with its meaning: a sentence for the user. Members are pairs of both."""
+
+    meaning: str
+
+    def __new__(cls, word: str, meaning: str) -> Self:
+        """A member that equals its word."""
+        member = str.__new__(cls, word)
+        member._value_, member.meaning = word, meaning
+        return member
+
+
+class SpotStatus(Word):
     """The status of one spot in one picture."""
 
-    MATCHED = "matched"
-    TURNED = "turned"
-    OCCLUDED = "occluded"
-    OUT_OF_VIEW = "out_of_view"
-    OFF_SCREEN = "off_screen"
-    NO_IMAGE = "no_image"
-    LOST = "lost"
-
-    @property
-    def meaning(self) -> str:
-        """One sentence for the user, true for both tracker methods."""
-        return _SPOT_MEANINGS[self]
+    MATCHED = "matched", "a detection of this image has this spot's label"
+    TURNED = "turned", "a detection has this spot's label, and the trajectory bends: it is not where it was predicted"
+    OCCLUDED = "occluded", "should be in view, but no detection is accepted: the position is estimated"
+    OUT_OF_VIEW = "out_of_view", "outside the image: the position follows from the other spots"
+    OFF_SCREEN = "off_screen", "the beam is known, but misses its screen or cannot be projected"
+    NO_IMAGE = "no_image", "this camera has no usable image for this frame: the position is estimated"
+    LOST = "lost", "nothing is known"
 
     def meaning_for(self, method: str) -> str:
         """One sentence for the user, as the tracker `method` (`rigid` or `spots`) assigns this status.
@@ -44,57 +57,26 @@ class SpotStatus(StrEnum):
         return self in (SpotStatus.MATCHED, SpotStatus.TURNED)
 
 
-class PoseStatus(StrEnum):
+class PoseStatus(Word):
     """The status of the vehicle's pose in one frame."""
 
-    MEASURED = "measured"
-    PREDICTED = "predicted"
-    LOST = "lost"
-
-    @property
-    def meaning(self) -> str:
-        """One sentence for the user."""
-        return _POSE_MEANINGS[self]
+    MEASURED = "measured", "the pose is observable from this frame's matched spots"
+    PREDICTED = "predicted", "not observable in this frame: predicted by the motion model, with a larger covariance"
+    LOST = "lost", "nothing is known"
 
 
-class Cause(StrEnum):
+class Cause(Word):
     """Why a frame has no measured target of one camera (a circle, a drogue, a point); empty where it has one."""
 
-    NONE = ""
-    NO_IMAGE = "no_image"
-    OCCLUDED = "occluded"
-    NOT_FOUND = "not_found"
-    NO_MATCH = "no_match"
-    UNCERTAIN = "uncertain"
-    AMBIGUOUS = "ambiguous"
-    OUT_OF_VIEW = "out_of_view"
+    NONE = "", "the target is measured"
+    NO_IMAGE = "no_image", "there is no usable picture"
+    OCCLUDED = "occluded", "half of the target or more is hidden"
+    NOT_FOUND = "not_found", "nothing in the picture is found that can be the target"
+    NO_MATCH = "no_match", "nothing in the window looks like the target: it is hidden or moved away"
+    UNCERTAIN = "uncertain", "the match has a low confidence"
+    AMBIGUOUS = "ambiguous", "several targets fit equally well"
+    OUT_OF_VIEW = "out_of_view", "the predicted centre is outside the picture"
 
-    @property
-    def meaning(self) -> str:
-        """One sentence for the user."""
-        return _CAUSE_MEANINGS[self]
-
-
-_CAUSE_MEANINGS = {
-    Cause.NONE: "the target is measured",
-    Cause.NO_IMAGE: "there is no usable picture",
-    Cause.OCCLUDED: "half of the target or more is hidden",
-    Cause.NOT_FOUND: "nothing in the picture is found that can be the target",
-    Cause.NO_MATCH: "nothing in the window looks like the target: it is hidden or moved away",
-    Cause.UNCERTAIN: "the match has a low confidence",
-    Cause.AMBIGUOUS: "several targets fit equally well",
-    Cause.OUT_OF_VIEW: "the predicted centre is outside the picture",
-}
-
-_SPOT_MEANINGS = {
-    SpotStatus.MATCHED: "a detection of this image has this spot's label",
-    SpotStatus.TURNED: "a detection has this spot's label, and the trajectory bends: it is not where it was predicted",
-    SpotStatus.OCCLUDED: "should be in view, but no detection is accepted: the position is estimated",
-    SpotStatus.OUT_OF_VIEW: "outside the image: the position follows from the other spots",
-    SpotStatus.OFF_SCREEN: "the beam is known, but misses its screen or cannot be projected",
-    SpotStatus.NO_IMAGE: "this camera has no usable image for this frame: the position is estimated",
-    SpotStatus.LOST: "nothing is known",
-}
 
 # Huo, Yang & Yang 2015, section 4.1.2, for `spots`.
 _MEANINGS_BY_METHOD = {
@@ -111,12 +93,6 @@ _MEANINGS_BY_METHOD = {
         SpotStatus.OCCLUDED: "should be in view, no detection accepted: the estimate is used (step 3)",
         SpotStatus.OUT_OF_VIEW: "outside the image: solved from the other beams",
     },
-}
-
-_POSE_MEANINGS = {
-    PoseStatus.MEASURED: "the pose is observable from this frame's matched spots",
-    PoseStatus.PREDICTED: "not observable in this frame: predicted by the motion model, with a larger covariance",
-    PoseStatus.LOST: "nothing is known",
 }
 
 
@@ -141,3 +117,53 @@ def view_statuses(
         else:
             out.append(SpotStatus.OCCLUDED if inside[i] else SpotStatus.OUT_OF_VIEW)
     return tuple(out)
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """An event for the report."""
+
+    # labelled | tie | relabelled (after a frame with a pose) | reacquired (after frames without one) | dropped
+    kind: str
+    text: str
+    view: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class MotionEstimate:
+    """The vehicle's velocities at one instant."""
+
+    velocity: Array  # (3,), m/s, of the body origin, in world
+    rate: Array  # (3,), rad/s, about the body's axes
+    covariance: Array  # (6, 6) of both, (m/s)^2 and (rad/s)^2
+
+
+@dataclass(frozen=True, slots=True)
+class TrackedFrame:
+    """The results of a tracker for one frame. n views, in the order of the SpotModel."""
+
+    uv_px: Array  # (n, 2), nan if unknown
+    cov_px2: Array  # (n, 2, 2)
+    status: tuple[SpotStatus, ...]  # (n,)
+    predicted_px: Array  # (n, 2): the prediction from earlier frames alone; nan without a track
+    gain: Array  # (n,): g3 of the match; nan without
+    point: Ints  # (n,): row of the detection in its camera's list, or UNMATCHED
+    pose_status: PoseStatus
+    pose: Pose | None
+    pose_covariance: Array | None  # (6, 6)
+    spots_used: int
+    rms_px: float
+    events: tuple[Event, ...]
+    label_probability: Array | None = None  # (n,) that the label is right; nan without a label. None: not computed
+    used_in_pose: Bools | None = None  # (n,): used in the pose; a merged detection is labelled but not used. None: all
+    predicted_cov_px2: Array | None = None  # (n, 2, 2) of predicted_px, without the detection's own; None: not computed
+    motion: MotionEstimate | None = None  # velocity and rate; None: unknown, or the tracker does not estimate them
+    pose_systematic: Array | None = None  # (6, 6) the calibration's share of the covariance, the same in every frame
+    # (n, 2) px: by how much uv_px and predicted_px, which are at the instants of the pictures, differ from those at the
+    # instant of the pose. None: the instants are the same
+    shift_px: Array | None = None
+
+    @property
+    def uv_at_pose_px(self) -> Array:
+        """(n, 2): uv_px as they would be at the instant of the pose."""
+        return self.uv_px if self.shift_px is None else self.uv_px - self.shift_px

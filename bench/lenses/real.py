@@ -18,7 +18,7 @@ from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics import IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
 from calibration.lens.intrinsics_result import Intrinsics
-from calibration.pair.pair_calibration import PairError, calibrate_pair
+from calibration.pair import PairError, calibrate_pair
 from geometry.arrays import Ints
 from lab.calibrate.camera.camera import corner_table
 from lab.calibrate.camera.camera_findings import findings_of

@@ -18,7 +18,7 @@ from tracking.parameters import TrackerParameters
 from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.smoothing.recording import TrackedRecording
 from tracking.smoothing.smoother import smooth
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import TrackedFrame
 
 PRIOR = PosePrior(Pose.identity(), within_m=1.0, within_rad=float(np.deg2rad(35.0)))
 

@@ -25,8 +25,7 @@ from lab.runs.frames.pipeline import FrameRecord, Pipeline, Tracker, tracker_of
 from lab.runs.smoothing_pass import TrackingAndSmoothing
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
-from tracking.statuses import PoseStatus
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import PoseStatus, TrackedFrame
 
 LOST, PREDICTED, MEASURED = range(3)
 _STATUS = {PoseStatus.LOST: LOST, PoseStatus.PREDICTED: PREDICTED, PoseStatus.MEASURED: MEASURED}

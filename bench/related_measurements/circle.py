@@ -16,11 +16,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from studies.zhou2014 import HIDDEN, cost_ratio, hidden_run, still_errors
-from studies.zhou2014_lights import PAPER_PERCENT, approach, followed
-from tracking.drogue_circle.acquisition import Wanted, acquire
-from tracking.drogue_circle.detectors import classical_detector
-from tracking.drogue_circle.parameters import CircleParameters
+from studies.zhou2014 import HIDDEN, PAPER_PERCENT, approach, cost_ratio, followed, hidden_run, still_errors
+from tracking.drogue_circle.detectors import CircleParameters, classical_detector
+from tracking.drogue_circle.tracker import Wanted, acquire
 
 
 def stills(seed: int, count: int) -> None:

@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from geometry.arrays import Array
 from tracking.comparison.estimation import estimate_alignment
-from tracking.comparison.frame_alignment import residuals
-from tracking.comparison.motion import Motion
+from tracking.comparison.frame_alignment import Motion, residuals
 
 BLOCK_S = 10.0
 SIGMA_M, SIGMA_DEG = 0.002, 0.2  # of the camera's poses, for the weights of positions and attitudes

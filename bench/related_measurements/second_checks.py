@@ -19,8 +19,7 @@ from bench.related_measurements import second_renderer as render
 from geometry.arrays import Array
 from lab.targets.circle import CircleOptions
 from lab.targets.drogue import DrogueOptions
-from tracking.drogue_circle.candidates import Picture
-from tracking.drogue_circle.parameters import Edge
+from tracking.drogue_circle.detectors import Edge, Picture
 from tracking.statuses import Cause, PoseStatus
 
 _CLEAR, _HELD = 30, 20  # frames before a probe comes, and after it has arrived

@@ -16,7 +16,7 @@ import numpy as np
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
-from calibration.pair.pair_calibration import CalibratedPair, calibrate_pair
+from calibration.pair import CalibratedPair, calibrate_pair
 from geometry import rotations
 from geometry.arrays import Array, Ints
 from geometry.camera import in_picture
@@ -115,7 +115,7 @@ def _calibrated_nees(pair: StereoPair, rng: np.random.Generator) -> float:
     uv = project_markers(true, model, pose)[0] + rng.normal(0, 0.1, (2, len(model), 2))
     fit = fit_pose(pair, model, MarkerObservations(uv, cov), pose)
     assert fit is not None
-    delta = pose.minus(fit.pose)
+    delta = pose.minus(fit.world_from_body)
     return float(delta @ np.linalg.solve(fit.covariance, delta))
 
 

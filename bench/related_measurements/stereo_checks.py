@@ -39,8 +39,7 @@ from geometry.pose import Pose
 from lab.files.run.truth import read_true_poses
 from lab.targets.stereo.process import add_truth, measure
 from lab.targets.stereo.run import StereoResults, load_stereo_run
-from tracking.binocular.marker_model import MarkerImages, MarkerModel, StereoPair
-from tracking.binocular.parameters import MatchParameters
+from tracking.binocular.marker_model import MarkerImages, MarkerModel, MatchParameters, StereoPair
 from tracking.binocular.pose_tracker import BinocularTracker
 from tracking.statuses import PoseStatus
 

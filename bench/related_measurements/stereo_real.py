@@ -21,8 +21,8 @@ from scipy.spatial import cKDTree
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import Camera
 from geometry.pose import Pose
+from tracking.binocular.joint_fit import triangulate
 from tracking.binocular.marker_model import StereoPair
-from tracking.binocular.triangulation import triangulate
 
 SIZE_PX, PITCH_MM = (1280, 1024), 0.012
 INDEX_GLASS, INDEX_WATER, GLASS_MM = 1.46, 1.33, 6.0  # parameters/ptv.par

@@ -15,7 +15,7 @@ import sys
 
 import numpy as np
 
-from studies.fu2016_experiments import DISTURBANCES, estimate, peaks, quiet_rms, run_pictures, simulate
+from studies.fu2016 import DISTURBANCES, estimate, peaks, quiet_rms, run_pictures, simulate
 
 LARGEST_PEAK_RATIO, LARGEST_QUIET_RATIO = 0.2, 1.2
 

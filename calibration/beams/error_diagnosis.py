@@ -13,11 +13,10 @@ from itertools import combinations
 
 import numpy as np
 
-from calibration.beams.beam_start import body_poses, stand_of
 from calibration.beams.beams import StandModel, calibrate_beams
-from calibration.least_squares.adjustment import AdjustmentError
-from calibration.least_squares.parameter_blocks import Poses
-from calibration.terms.spot_term import SpotPixels
+from calibration.beams.spot_fit import body_poses, stand_of
+from calibration.least_squares.adjustment import AdjustmentError, Poses
+from calibration.terms.rig_blocks import SpotPixels
 from geometry.arrays import Array, Ints
 from geometry.pose import Pose
 from geometry.rig import Rig

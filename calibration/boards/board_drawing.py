@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from calibration.boards.board_types import Board, Charuco, CircleGrid
-from calibration.boards.marker_dictionaries import DICTIONARIES
+from calibration.boards.board_types import DICTIONARIES, Board, Charuco, CircleGrid
 from geometry.arrays import Array, Bools, Ints
 
 

@@ -1,23 +1,95 @@
-"""The types of calibration boards.
-
-All boards use the same kind of frame: the origin is the first point, x points along the columns to the last point of
-the first row, y down the rows, and z = x cross y INTO the board, away from a viewer of its printed side (OpenCV's
-convention). All points have z = 0. Seen from the front with the first point at the top left, x points right and y down.
-"""
+"""The types of calibration boards, with OpenCV's dictionaries of markers and the text that describes a board."""
 
 from __future__ import annotations
 
 import difflib
 import math
+import re
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import cv2
 import numpy as np
 
-from calibration.boards.board_text import in_mm, read_count, read_length
-from calibration.boards.marker_dictionaries import DICTIONARIES, DictionaryError, dictionary_name, dictionary_size
 from geometry.arrays import Array, Ints
+
+
+def read_count(text: str) -> tuple[int, int]:
+    """Columns and rows from a text such as 9x6.
+
+    Raises:
+        ValueError: the text is not valid.
+    """
+    found = re.fullmatch(r"(\d{1,4})\s*[xX×]\s*(\d{1,4})", text)
+    if found is None:
+        raise ValueError(f"expected columns x rows such as 9x6, got {text!r}")
+    return int(found[1]), int(found[2])
+
+
+def read_length(text: str) -> float:
+    """A length in m from a text with a unit, such as 25mm.
+
+    Raises:
+        ValueError: the text is not valid.
+    """
+    found = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*(mm|cm|m)", text, flags=re.IGNORECASE)
+    if found is None:
+        raise ValueError(f"expected a length with its unit such as 25mm, got {text!r}")
+    # By division: 25 / 1000 is the double nearest to 0.025, and 25 * 0.001 is not.
+    return float(found[1]) / {"mm": 1000.0, "cm": 100.0, "m": 1.0}[found[2].lower()]
+
+
+def in_mm(length_m: float) -> str:
+    """The text of a length, which `read_length` reads: 25mm."""
+    return f"{round(length_m * 1000, 9):.12g}mm"
+
+
+_FAMILIES = "DICT_4X4_50 (_100, _250, _1000), likewise DICT_5X5_, DICT_6X6_ and DICT_7X7_, and DICT_APRILTAG_36h11"
+
+
+class DictionaryError(ValueError):
+    """An unknown dictionary of markers."""
+
+
+def _dictionaries() -> dict[str, int]:
+    """OpenCV's predefined dictionaries by name; of names for the same one (36H11, 36h11), the lower case."""
+    by_number: dict[int, str] = {}
+    for name in sorted(n for n in dir(cv2.aruco) if n.startswith("DICT_")):  # upper case sorts first
+        by_number[int(getattr(cv2.aruco, name))] = name
+    return {by_number[number]: number for number in sorted(by_number)}
+
+
+DICTIONARIES = _dictionaries()  # name -> OpenCV's number, in OpenCV's order
+
+
+def dictionary_name(text: str) -> str:
+    """OpenCV's name of a dictionary of ArUco markers, from a name in any case.
+
+    Raises:
+        ValueError: there is no such dictionary; the message gives similar names.
+    """
+    by_lower = {name.lower(): name for name in DICTIONARIES}
+    if text.lower() in by_lower:
+        return by_lower[text.lower()]
+    if f"dict_{text.lower()}" in by_lower:
+        return by_lower[f"dict_{text.lower()}"]
+    near = difflib.get_close_matches(text.lower(), by_lower, n=2, cutoff=0.6)
+    hint = f"did you mean {' or '.join(by_lower[n] for n in near)}? " if near else ""
+    raise DictionaryError(f"expected one of OpenCV's dictionaries, got {text!r}; {hint}there are {_FAMILIES}")
+
+
+def dictionary_size(name: str) -> int:
+    """Number of markers of a dictionary."""
+    return len(cv2.aruco.getPredefinedDictionary(DICTIONARIES[name]).bytesList)
+
+
+# The types of calibration boards.
+#
+# All boards use the same kind of frame: the origin is the first point, x points along the columns to the last point of
+# the first row, y down the rows, and z = x cross y INTO the board, away from a viewer of its printed side (OpenCV's
+# convention). All points have z = 0. Seen from the front with the first point at the top left, x points right and y
+# down.
 
 EXAMPLES = {
     "chessboard": "chessboard:9x6:25mm (inner corners, side of a square)",
@@ -33,8 +105,29 @@ _MOST = 200
 _INK = 0.5
 
 
+class _Points(ABC):
+    """Points of a board, numbered from 0 row by row (OpenCV's order)."""
+
+    __slots__ = ()
+
+    @property
+    @abstractmethod
+    def points(self) -> Array:
+        """(N, 3), m, in the board's frame."""
+
+    @property
+    def ids(self) -> Ints:
+        """(N,): 0, 1, ... row by row."""
+        return np.arange(len(self.points))
+
+    @property
+    def middle(self) -> Array:
+        """(3,), m: origin of the warp polynomial."""
+        return (self.points.min(axis=0) + self.points.max(axis=0)) / 2
+
+
 @dataclass(frozen=True, slots=True)
-class Chessboard:
+class Chessboard(_Points):
     """A plain chessboard. The square above and left of the first inner corner is black.
 
     This determines the first corner if columns + rows is odd. If it is even, the board looks the same after half a turn
@@ -55,16 +148,6 @@ class Chessboard:
         return _lattice(self.columns, self.rows, self.square_m)
 
     @property
-    def ids(self) -> Ints:
-        """(N,): 0, 1, ... row by row."""
-        return np.arange(self.columns * self.rows)
-
-    @property
-    def middle(self) -> Array:
-        """(3,), m: origin of the warp polynomial."""
-        return _middle(self.points)
-
-    @property
     def size_m(self) -> tuple[float, float]:
         """Width and height of the printed squares."""
         return (self.columns + 1) * self.square_m, (self.rows + 1) * self.square_m
@@ -80,7 +163,7 @@ class Chessboard:
 
 
 @dataclass(frozen=True, slots=True)
-class CircleGrid:
+class CircleGrid(_Points):
     """Black circles on white, in rows and columns, or asymmetric: every second row shifted by half a step.
 
     spacing_m is the distance of neighbours, or for an asymmetric grid that of two ROWS; circles of one row are then
@@ -120,16 +203,6 @@ class CircleGrid:
         return points
 
     @property
-    def ids(self) -> Ints:
-        """(N,): 0, 1, ... row by row."""
-        return np.arange(self.columns * self.rows)
-
-    @property
-    def middle(self) -> Array:
-        """(3,), m: origin of the warp polynomial."""
-        return _middle(self.points)
-
-    @property
     def neighbours_m(self) -> float:
         """Distance of the nearest centres."""
         return self.spacing_m * (math.sqrt(2) if self.asymmetric else 1.0)
@@ -152,7 +225,7 @@ class CircleGrid:
 
 
 @dataclass(frozen=True, slots=True)
-class Charuco:
+class Charuco(_Points):
     """A chessboard with an ArUco marker in each white square; its points are the inner chessboard corners.
 
     The markers identify the corners, so that a part of the board is sufficient and there is no symmetry.
@@ -211,16 +284,6 @@ class Charuco:
     def points(self) -> Array:
         """Inner corners ((columns - 1) * (rows - 1), 3), m, in the board's frame, row by row."""
         return _lattice(self.columns - 1, self.rows - 1, self.square_m)
-
-    @property
-    def ids(self) -> Ints:
-        """(N,): OpenCV's numbers of the corners, row by row."""
-        return np.arange((self.columns - 1) * (self.rows - 1))
-
-    @property
-    def middle(self) -> Array:
-        """(3,), m: origin of the warp polynomial."""
-        return _middle(self.points)
 
     @property
     def size_m(self) -> tuple[float, float]:
@@ -311,7 +374,3 @@ def _check_length(kind: str, what: str, length_m: float) -> None:
 def _lattice(columns: int, rows: int, step: float) -> Array:
     j, i = np.meshgrid(np.arange(columns), np.arange(rows))
     return np.stack([j.ravel() * step, i.ravel() * step, np.zeros(columns * rows)], axis=1)
-
-
-def _middle(points: Array) -> Array:
-    return (points.min(axis=0) + points.max(axis=0)) / 2

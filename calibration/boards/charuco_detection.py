@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from calibration.boards import corner_refinement
-from calibration.boards.board_types import Charuco
+from calibration.boards.board_types import DICTIONARIES, Charuco, dictionary_size
 from calibration.boards.board_view import (
     BLUR_LIMIT,
     QUICK_SEARCH_FAILED,
@@ -18,7 +18,6 @@ from calibration.boards.board_view import (
     low_contrast,
     too_blurred,
 )
-from calibration.boards.marker_dictionaries import DICTIONARIES, dictionary_size
 from calibration.boards.pyramid import scaled, scales
 from geometry.arrays import Array, Ints
 

@@ -1,7 +1,7 @@
 """Detection of grids of circles: centres and areas of the ellipses in the picture.
 
 A centre is the centroid of the blob, not the image of the circle's centre. The two differ by tenths of a pixel; the
-observation equation of the calibration contains this difference (calibration/terms/circle_images.py) and requires the
+observation equation of the calibration contains this difference (calibration/terms/corners.py) and requires the
 areas.
 """
 

@@ -10,16 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from calibration.formats.model import (
-    CameraModel,
-    FormatError,
-    Read,
-    Written,
-    exact,
-    fitted,
-    lost_poses,
-    picture_size,
-)
+from calibration.formats.model import CameraModel, FormatError, Read, Written, exact, fitted, lost_poses, picture_size
 from geometry.camera import FISHEYE, PERSPECTIVE
 
 NAME = "colmap"

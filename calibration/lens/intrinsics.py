@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.least_squares.adjustment import AdjustmentError
-from calibration.least_squares.parameter_blocks import Poses
+from calibration.least_squares.adjustment import AdjustmentError, Poses
 from calibration.lens.board_shape import BoardShapeOptions, BoardTest, board_test
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import coverage_of, spread_deg

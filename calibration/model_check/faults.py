@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.drift import PriorSizes
-from calibration.model_check.linearised_frames import LinearisedFrames
-from calibration.model_check.recording import ModelCheckRecording, finite
+from calibration.changes import USUAL_SIZES
+from calibration.model_check.linearised_frames import LinearisedFrames, ModelCheckRecording, finite
 from geometry.arrays import Array, Bools, Ints, normalised, skew
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
@@ -25,7 +24,6 @@ ALONG_NORMAL, TILTED = "moved along its normal", "moved and tilted"
 DIRECTION_WRONG, POINT_WRONG, LASER_MOVED = "direction wrong", "shifted sideways", "moved and direction wrong"
 PIXEL_OFFSET, LATE = "constant pixel offset", "not synchronous"
 
-USUAL = PriorSizes()
 USUAL_SHIFT_PX = 2.0  # shift of a sensor or a lens in its mount
 USUAL_LATE_S = 3e-3  # delay without a common trigger or clock
 _NEAR_FRAMES = 1.5  # in usual frame intervals: a velocity is estimated from neighbours no farther away in time
@@ -140,13 +138,13 @@ def _camera_faults(rig: Rig, model: SpotModel, index: dict[str, int]) -> list[Po
         turn = _directions(index, f"cameras.{name}", POSE, np.concatenate([-skew(t), R.T]))
         move = _directions(index, f"cameras.{name}", POSE[:3], np.eye(3))
         focal = np.array([[camera.matrix[0, 0]], [camera.matrix[1, 1]]])
-        turn_size, move_size = np.full(3, USUAL.turn_rad), np.full(3, USUAL.move_m)
+        turn_size, move_size = np.full(3, USUAL_SIZES.turn_rad), np.full(3, USUAL_SIZES.move_m)
         shift = _directions(index, f"cameras.{name}", ("cx", "cy"), np.eye(2))
         zoom = _directions(index, f"cameras.{name}", ("fx", "fy"), focal)
         for kind, directions, size in (
             (TURNED, turn, turn_size),
             (SHIFTED, shift, np.full(2, USUAL_SHIFT_PX)),
-            (ZOOMED, zoom, np.full(1, USUAL.zoom)),
+            (ZOOMED, zoom, np.full(1, USUAL_SIZES.zoom)),
             (MOVED, np.concatenate([turn, move], axis=1), np.concatenate([turn_size, move_size])),
         ):
             faults.append(PossibleFault(CAMERA, name, kind, directions, size, views))
@@ -175,7 +173,7 @@ def _screen_faults(rig: Rig, model: SpotModel, index: dict[str, int]) -> list[Po
         views = np.array([s == name for s in screen_of])
         forward = _directions(index, f"screens.{name}", POSE[:3], screen.world_from_screen.rotation[:, 2:])
         tilt = _directions(index, f"screens.{name}", POSE[3:5], np.eye(2))
-        sizes = np.array([USUAL.move_m, USUAL.turn_rad, USUAL.turn_rad])
+        sizes = np.array([USUAL_SIZES.move_m, USUAL_SIZES.turn_rad, USUAL_SIZES.turn_rad])
         faults.append(PossibleFault(SCREEN, name, ALONG_NORMAL, forward, sizes[:1], views))
         faults.append(PossibleFault(SCREEN, name, TILTED, np.concatenate([forward, tilt], axis=1), sizes, views))
     return faults
@@ -189,7 +187,7 @@ def _beam_faults(rig: Rig, model: SpotModel, index: dict[str, int]) -> list[Poss
         across = _perpendicular(beam.direction)
         aim = _directions(index, f"beams.{name}", DIRECTION, across)
         sideways = _directions(index, f"beams.{name}", POINT, across)
-        aim_size, sideways_size = np.full(2, USUAL.laser_rad), np.full(2, USUAL.laser_m)
+        aim_size, sideways_size = np.full(2, USUAL_SIZES.laser_rad), np.full(2, USUAL_SIZES.laser_m)
         faults.append(PossibleFault(BEAM, name, DIRECTION_WRONG, aim, aim_size, views))
         faults.append(PossibleFault(BEAM, name, POINT_WRONG, sideways, sideways_size, views))
         both, size = np.concatenate([aim, sideways], axis=1), np.concatenate([aim_size, sideways_size])
@@ -203,7 +201,7 @@ def _view_faults(model: SpotModel, index: dict[str, int]) -> list[PossibleFault]
         name = f"{camera_name}/{spot}"
         directions = _directions(index, f"view.{name}", ("u", "v"), np.eye(2))
         only = np.arange(len(model)) == i
-        faults.append(PossibleFault(VIEW, name, PIXEL_OFFSET, directions, np.full(2, USUAL.point_px), only))
+        faults.append(PossibleFault(VIEW, name, PIXEL_OFFSET, directions, np.full(2, USUAL_SIZES.point_px), only))
     return faults
 
 

@@ -1,4 +1,4 @@
-"""Linearised residuals of a recording with a free pose per frame, and leave-one-out residuals of its spots.
+"""The spots and poses of a recording, linearised with a free pose per frame; leave-one-out residuals; unseen spots.
 
 In a least-squares fit one wrong spot also shifts the pose and thereby the residuals of its neighbours. The residual of
 a spot against a fit without it does not have this problem. It follows in closed form from the one fit with all spots:
@@ -14,10 +14,71 @@ from math import prod
 
 import numpy as np
 
-from calibration.model_check.recording import ModelCheckRecording, finite, whitening
 from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from geometry.pose_solver.gauss_newton import whiten
+
+
+@dataclass(frozen=True, slots=True)
+class ModelCheckRecording:
+    """T frames of n views, in the order of SpotModel.views. Values of spots that were not measured may be nan."""
+
+    t_s: Array  # (T,) increasing
+    seen: Bools  # (T, n) whether the spot was measured
+    uv_px: Array  # (T, n, 2) measured
+    cov_px2: Array  # (T, n, 2, 2) stated covariance of the measurement alone
+    poses: Pose  # (T,) world_from_body, any good estimate; nan without one
+    predicted_px: Array | None = None  # (T, n, 2) one-step predictions, made before the frame was processed
+    predicted_cov_px2: Array | None = None  # (T, n, 2, 2) stated covariance of the predicted spot position
+    pose_covariance: Array | None = None  # (T, 6, 6) stated by the run, [m in world, rad in body]
+    width_px: Array | None = None  # (n,) usual sigma of each view's intensity profile; nan or None: unknown
+
+    def __post_init__(self) -> None:
+        T, n = self.seen.shape
+        expected = {
+            "t_s": (T,),
+            "uv_px": (T, n, 2),
+            "cov_px2": (T, n, 2, 2),
+            "predicted_px": (T, n, 2),
+            "predicted_cov_px2": (T, n, 2, 2),
+            "pose_covariance": (T, 6, 6),
+            "width_px": (n,),
+        }
+        for name, shape in expected.items():
+            value = getattr(self, name)
+            if value is not None and value.shape != shape:
+                raise ValueError(f"{name}: expected shape {shape} as `seen` has {(T, n)}, got {value.shape}")
+        if self.poses.translation.shape != (T, 3):
+            raise ValueError(f"poses: expected {T} poses, got shape {self.poses.translation.shape}")
+
+    @property
+    def usable(self) -> Bools:
+        """(T, n): measured, with finite pixels, a positive definite covariance and a pose of its frame."""
+        a, b, c = self.cov_px2[..., 0, 0], self.cov_px2[..., 0, 1], self.cov_px2[..., 1, 1]
+        known = finite(self.poses.translation, -1) & finite(self.poses.rotation, (-1, -2))
+        with np.errstate(invalid="ignore"):
+            positive = (a > 0) & (a * c - b * b > 0) & np.isfinite(a + b + c)
+        return np.asarray(self.seen & finite(self.uv_px, -1) & positive & known[:, None])
+
+
+def finite(values: Array, axes: int | tuple[int, ...]) -> Bools:
+    """Whether all values along these axes are finite."""
+    return np.asarray(np.isfinite(values).all(axis=axes), dtype=np.bool_)
+
+
+def evenly_spaced(candidates: Ints, most: int) -> Ints:
+    """At most `most` of the given frames, evenly spaced, including the first and the last."""
+    if len(candidates) <= most:
+        return candidates
+    return candidates[np.unique(np.round(np.linspace(0, len(candidates) - 1, most)).astype(np.int64))]
+
+
+def whitening(covariances: Array, where: Bools) -> Array:
+    """W (..., 2, 2) with W C W^T = I where `where` (...) is true; 0 elsewhere."""
+    safe = np.where(where[..., None, None], covariances, np.eye(2))
+    return np.where(where[..., None, None], whiten(safe), 0.0)
+
 
 _RANK = 1e-12  # eigenvalues below this share of the largest (columns scaled to one) are rounding errors
 _LARGEST_STEP = np.array([0.1] * 3 + [0.05] * 3)  # m, rad: a pose that would move farther is not linearised again
@@ -176,3 +237,66 @@ def _worst_of_frame(lin: LinearisedFrames) -> Bools:
     worst = np.zeros_like(known)
     worst[np.arange(len(worst)), largest.argmax(axis=-1)] = True
     return np.asarray(worst & (largest > OUTLIER_SIGMAS))
+
+
+# Spots that should be in the picture but are hardly ever measured.
+#
+# A beam that points far away from where the rig file says leaves no residual: the tracker takes its spot for clutter,
+# and the expected spot counts as occluded. Measured: a beam with a single spot, wrong by 0.1 deg, had no other symptom.
+
+MOSTLY_UNSEEN = 0.2  # a view measured in less than this share of the frames is reported
+FEWEST_FRAMES = 30  # in which it is expected: a shorter occlusion is no fault
+_INSIDE_PX = (
+    20.0  # distance from the picture's edge at which a whole spot is visible, even if its position is not exact
+)
+
+
+@dataclass(frozen=True, slots=True)
+class UnseenView:
+    """A view that is hardly ever measured."""
+
+    view: int
+    measured: int  # frames
+    expected: int  # frames in which the pose puts it well inside the picture
+
+
+def unseen_views(model: SpotModel, recording: ModelCheckRecording, frames: Ints) -> tuple[UnseenView, ...]:
+    """The unseen views over the given frames (K,), each of which has a pose from other spots."""
+    pixels = model.project(recording.poses[frames])[0]
+    inside = model.in_picture(pixels, -_INSIDE_PX)
+    expected = inside.sum(axis=0)
+    measured = (inside & recording.seen[frames]).sum(axis=0)
+    return tuple(
+        UnseenView(i, int(measured[i]), int(expected[i]))
+        for i in range(len(model))
+        if expected[i] >= FEWEST_FRAMES and measured[i] < MOSTLY_UNSEEN * expected[i]
+    )
+
+
+_FEWEST_FRAMES = 8  # with fewer, a scatter or an autocorrelation is meaningless
+
+
+def correlation_time(series: Array) -> float:
+    """Number of consecutive samples that count as one: 1 + 2 sum of autocorrelations, at least 1.
+
+    series (N, m), mean removed, is pooled over its m columns; nan is ignored. The sum ends at the first pair of
+    neighbouring autocorrelations that is not positive (Geyer 1992, Practical Markov chain Monte Carlo, Stat. Sci. 7,
+    sec. 3.3: initial positive sequence).
+    """
+    N = len(series)
+    known = np.isfinite(series)
+    x = np.where(known, series, 0.0)
+    power = float(np.sum(x * x))
+    if N < _FEWEST_FRAMES or power <= 0:
+        return 1.0
+    size = 2 ** int(np.ceil(np.log2(2 * N)))
+
+    def lagged(values: Array) -> Array:
+        return np.asarray(np.fft.irfft(np.abs(np.fft.rfft(values, size, axis=0)) ** 2, size, axis=0)[:N].sum(axis=1))
+
+    pairs = np.maximum(lagged(known.astype(float)), 1.0)
+    rho = (lagged(x) / pairs) / (power / max(int(known.sum()), 1))
+    rho[pairs < _FEWEST_FRAMES] = 0.0
+    half = rho[: 2 * (N // 2)].reshape(-1, 2).sum(axis=1)
+    ends = np.flatnonzero(half <= 0)
+    return float(max(1.0, 2 * half[: ends[0] if ends.size else len(half)].sum() - 1))

@@ -1,4 +1,4 @@
-"""Quality figures of a jointly calibrated rig: expected pose uncertainty by source, and hold-out of positions."""
+"""A rig calibrated in steps, then jointly; its expected pose uncertainty by source, and hold-out of positions."""
 
 from __future__ import annotations
 
@@ -8,16 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
-from calibration.beams.mean_rotation import mean_rotation
-from calibration.rig.joint import SPOTS, Joint, Measured, calibrate_jointly
-from calibration.rig.measurement_groups import jacobian, shares
-from calibration.terms.rig_blocks import POSES, STAND, named_errors
-from calibration.terms.spot_term import SpotPixels, SpotTerm
+from calibration.beams.beams import BeamCalibration, StandModel, calibrate_beams
+from calibration.beams.excitation import StandMotion, summary_of
+from calibration.least_squares.adjustment import AdjustmentError
+from calibration.rig.joint import SPOTS, Joint, Measured, calibrate_jointly, jacobian, shares
+from calibration.screens.screens import ScreensResult
+from calibration.terms.rig_blocks import BEAMS, POSES, STAND, SpotPixels, SpotTerm, named_errors
 from calibration.terms.surveyed import pose_of
 from geometry.arrays import Array, Ints, symmetric
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
+from geometry.rotations import nearest_rotation
 from geometry.uncertainty.rig_uncertainty import Sensitivity
 
 # Positions required for a trustworthy result. Without a fifth of eight, six remain, the number of parameters of a pose;
@@ -78,7 +80,7 @@ class HoldOut:
 def central_pose(joint: Joint) -> Pose:
     """world_from_body at the centre of the stand's positions."""
     poses = pose_of(joint.values, POSES)
-    middle = Pose(mean_rotation(poses.rotation), poses.translation.mean(axis=0))
+    middle = Pose(nearest_rotation(poses.rotation.mean(axis=0)), poses.translation.mean(axis=0))
     return pose_of(joint.values, STAND)[0] @ middle
 
 
@@ -165,3 +167,40 @@ def hold_out(measured: Measured, joint: Joint, seed: int = 0) -> HoldOut | None:
         dof,
         float(chi2_distribution.sf(chi2, dof)),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class RigCalibration:
+    """Results of the steps."""
+
+    screens: ScreensResult  # lenses, cameras, screens, control points and boards: all but the spots
+    beams: BeamCalibration  # from the spots and the result of the first step
+    measured: Measured
+    joint: Joint  # the joint adjustment
+
+
+def calibrate_in_steps(screens: ScreensResult, spots: SpotPixels, stand: StandModel) -> RigCalibration:
+    """Calibrate screens, then beams, then all together.
+
+    screens: of screens/screens.py, the first step; its network's rig holds nominal beams and the spots too.
+
+    Raises:
+        AdjustmentError: the spots are inconsistent, or a parameter is undetermined.
+        ValueError: as raised by the steps.
+    """
+    try:
+        beams = calibrate_beams(screens.fit.rig, spots, stand, screens.fit.covariance)
+    except AdjustmentError as error:
+        # The iteration may diverge along an undetermined direction.
+        motion = StandMotion.of(stand.stand_from_body)
+        if not motion.flat:
+            raise
+        raise AdjustmentError(f"{error}; the stand's positions do not suffice ({motion}): {motion.remedy()}") from None
+    if beams.undetermined:
+        raise AdjustmentError(
+            f"the stand's positions leave undetermined: {summary_of(beams.undetermined)}: {beams.motion.remedy()}"
+        )
+    found = beams.fit.adjusted.values
+    starts = {n: found[n] for n in (BEAMS, STAND, POSES)}
+    measured = Measured(screens.network, screens.fit, spots, stand, starts)
+    return RigCalibration(screens, beams, measured, calibrate_jointly(measured))

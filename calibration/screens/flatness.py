@@ -1,9 +1,4 @@
-"""Flatness of a screen: a plane or a bent surface fitted to measured points, with the residual scatter.
-
-In a frame nearly in the plane of the screen, a surface is a polynomial of the height z over x and y, and its fit is
-linear: z = h + p x + q y [+ a x^2 + b x y + c y^2]. Ours; scatter in excess of the points' sigmas is estimated as in
-Paule and Mandel (1982), "Consensus values and weighting factors", J. Res. NBS 87(5), eq. 8.
-"""
+"""The frame of a screen and its surface: origin and axes, flatness, residual scatter."""
 
 from __future__ import annotations
 
@@ -13,7 +8,68 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import chi2, f
 
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array, Bools, cross, normalised
+from geometry.pose import Pose
+
+# Definition of a screen's frame: its origin and axes.
+#
+# It is defined by named dots. Without them the origin is the centre of the dots' extent, z points to the side of the
+# cameras that observe the screen, y as close to the world's z as the plane allows (to its y if the screen is
+# horizontal), and x = y x z.
+
+
+def plane_through(points: Array) -> tuple[Array, Array, Array]:
+    """Middle (3,), unit normal (3,) and RMS extents (3,) along the three axes, largest first, m, of points (n, 3)."""
+    middle = points.mean(axis=0)
+    _, s, axes = np.linalg.svd(points - middle, full_matrices=False)
+    extents = np.zeros(3)
+    extents[: len(s)] = s / np.sqrt(len(points))
+    normal = axes[2] if len(axes) > 2 else cross(axes[0], axes[1])
+    return middle, normal, extents
+
+
+def frame_of_extent(points: Array, seen_from: Array | None = None) -> Pose:
+    """world_from_screen from points (n, 3), m, of a screen; z towards `seen_from` (3,), if given."""
+    middle, normal, _ = plane_through(points)
+    if seen_from is not None:
+        normal = normal if normal @ (seen_from - middle) >= 0 else -normal
+    elif normal[np.argmax(np.abs(normal))] < 0:
+        normal = -normal
+    upward = np.array([0.0, 0.0, 1.0])
+    if abs(normal @ upward) > 0.9:  # within 26 deg of horizontal the world's z hardly defines a direction
+        upward = np.array([0.0, 1.0, 0.0])
+    y = normalised(upward - (upward @ normal) * normal)
+    R = np.stack([cross(y, normal), y, normal], axis=1)
+    flat = (points - middle) @ R[:, :2]
+    centre = (flat.min(axis=0) + flat.max(axis=0)) / 2
+    return Pose(R, middle + R[:, :2] @ centre)
+
+
+def frame_of_dots(points: Array, origin: Array, along_x: Array, on_y_side: Array, origin_at: Array) -> Pose:
+    """world_from_screen from three named dots (3,) each, m: `origin` has the coordinates `origin_at` (2,), m.
+
+    x points from it towards `along_x`; y is positive on the side of `on_y_side`.
+
+    Raises:
+        ValueError: the three dots are collinear.
+    """
+    _, normal, _ = plane_through(points)
+    x = along_x - origin
+    x = x - (x @ normal) * normal
+    side = on_y_side - origin
+    across = side - (side @ normal) * normal - (side @ normalised(x)) * normalised(x)
+    if np.linalg.norm(across) < 0.02 * np.linalg.norm(x) or np.linalg.norm(x) < 1e-6:
+        raise ValueError("the three dots of the frame lie on one line")
+    x, y = normalised(x), normalised(across)
+    R = np.stack([x, y, cross(x, y)], axis=1)
+    return Pose(R, origin - R[:, :2] @ origin_at)
+
+
+# Flatness of a screen: a plane or a bent surface fitted to measured points, with the residual scatter.
+#
+# In a frame nearly in the plane of the screen, a surface is a polynomial of the height z over x and y, and its fit is
+# linear: z = h + p x + q y [+ a x^2 + b x y + c y^2]. Ours; scatter in excess of the points' sigmas is estimated as in
+# Paule and Mandel (1982), "Consensus values and weighting factors", J. Res. NBS 87(5), eq. 8.
 
 SIGNIFICANT = 0.01  # p-value below which a screen is bent, or a survey is worse than its sigmas
 OUTLIER_SIGMAS = 5.0  # of a point's own sigma and the surface's, above which the point is not on the screen

@@ -1,21 +1,29 @@
-"""Calibration of screens and cameras: start values, frames, flatness, then the joint adjustment."""
+"""Calibration of screens and cameras: start values, frames, flatness, then the joint adjustment and its diagnosis."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calibration.least_squares.parameter_blocks import Poses, Vectors
-from calibration.least_squares.priors import Prior
-from calibration.screens.flatness import Flatness, Surface, assess_flatness
+from calibration.least_squares.adjustment import AdjustmentError, Poses, Prior, Vectors
+from calibration.screens.flatness import Flatness, Surface, assess_flatness, frame_of_dots, frame_of_extent
 from calibration.screens.network import Network, NetworkFit, adjust
-from calibration.screens.network_start import CameraOnDots, ChainedPoses, boards_seen, camera_on_dots, chain, start_of
-from calibration.screens.resection import ResectedPose
-from calibration.screens.screen_frame import frame_of_dots, frame_of_extent
-from geometry.arrays import Array, Bools, Ints
+from calibration.screens.network_start import (
+    CameraOnDots,
+    ChainedPoses,
+    NotConnectedError,
+    ResectedPose,
+    boards_seen,
+    camera_on_dots,
+    chain,
+    start_of,
+)
+from geometry.arrays import Array, Bools, Ints, skew
 from geometry.pose import Pose
+from geometry.uncertainty.rig_uncertainty import BOW, POSE
 
 WITHIN_PX = 8.0  # largest reprojection error of an inlier in the start: lenses are calibrated
 GAUGE = 1e-6  # m and rad: sigma of the gauge constraint of a screen's axes within its plane, as in FrameTerm
@@ -70,7 +78,6 @@ class ScreensResult:
     network: Network
     fit: NetworkFit
     screens: tuple[ScreenResult, ...]
-    poses_by_camera: Mapping[int, CameraOnDots] = field(default_factory=dict)
     # camera -> a second pose that fits nearly as well
     second_poses: Mapping[int, ResectedPose] = field(default_factory=dict)
 
@@ -117,7 +124,7 @@ def calibrate(
         for r in [_second_pose(found, chosen.get(c), near.get(c))]
         if r is not None
     }
-    return ScreensResult(complete, fit, tuple(results), poses_by_camera, second_poses)
+    return ScreensResult(complete, fit, tuple(results), second_poses)
 
 
 def _screen_starts(
@@ -293,3 +300,161 @@ def _in_final_frame(result: ScreenResult, network: Network, fit: NetworkFit, scr
     world_from_screen = list(fit.rig.screens.values())[screen].world_from_screen
     xyz = world_from_screen.inverse().apply(network.control_points.xyz[list(result.control_points)])
     return replace(result, xyz=xyz)
+
+
+def spot_sigmas(result: ScreensResult, screen: int) -> Array:
+    """Sigma, m, of the screen's surface along its normal at its points (m,)."""
+    name = list(result.network.rig.screens)[screen]
+    C, names = result.fit.covariance.matrix, result.fit.covariance.names
+    xyz = result.screens[screen].xyz
+    if not len(xyz):
+        size = result.network.rig.screens[name].size_m or (1.0, 1.0)
+        xyz = np.array([[sx * size[0] / 2, sy * size[1] / 2, 0.0] for sx in (-1, 0, 1) for sy in (-1, 0, 1)])
+    R = result.fit.rig.screens[name].world_from_screen.rotation
+    x, y = xyz[:, 0], xyz[:, 1]
+    J = np.zeros((len(xyz), len(names)))
+    for k, p in enumerate(("x_m", "y_m", "z_m")):
+        J[:, names.index(f"screens.{name}.{p}")] = R[k, 2]
+    J[:, names.index(f"screens.{name}.rot_x_rad")] = y
+    J[:, names.index(f"screens.{name}.rot_y_rad")] = -x
+    for p, shape in zip(BOW, (x * x, x * y, y * y), strict=True):
+        if f"screens.{name}.{p}" in names:
+            J[:, names.index(f"screens.{name}.{p}")] = shape
+    return np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", J, C, J), 0.0))
+
+
+def camera_sigmas(result: ScreensResult) -> dict[str, tuple[float, float]]:
+    """Sigmas of each camera's position (m) and attitude (rad), each the root of the sum over three axes."""
+    names, C = result.fit.covariance.names, np.diagonal(result.fit.covariance.matrix)
+    out = {}
+    for camera in result.network.rig.cameras:
+        at = [names.index(f"cameras.{camera}.{p}") for p in POSE]
+        out[camera] = (float(np.sqrt(C[at[:3]].sum())), float(np.sqrt(C[at[3:]].sum())))
+    return out
+
+
+def pointing_sigmas_m(result: ScreensResult) -> dict[str, float]:
+    """Displacement, m (1 sigma, RMS of both directions), of the centre of each camera's screen by the pose's error."""
+    out = {}
+    names, C = result.fit.covariance.names, result.fit.covariance.matrix
+    for name, camera in result.fit.rig.cameras.items():
+        screen = result.fit.rig.screens[camera.screen]
+        X = screen.world_from_screen.translation
+        x_c = camera.camera_from_world.apply(X)
+        at = [names.index(f"cameras.{name}.{p}") for p in POSE]
+        R = camera.camera_from_world.rotation
+        J = np.concatenate([np.eye(3), -R @ skew(X)], axis=1)
+        across = np.eye(3) - np.outer(x_c, x_c) / (x_c @ x_c)
+        moved = across @ J @ C[np.ix_(at, at)] @ J.T @ across.T
+        out[name] = float(np.sqrt(max(np.trace(moved) / 2, 0.0)))
+    return out
+
+
+# Diagnosis of surveys with exchanged axes or a wrong unit, by trying changes to the survey.
+#
+# Pixels alone do not determine everything. Coplanar dots look like their mirror image from the other side; the scale of
+# a survey is determined only by boards, a screen's size or a camera's approximate position. All mirrored surveys differ
+# by a rotation only: which axes were exchanged is determined only if the world is known otherwise.
+
+UNITS: Mapping[float, str] = {
+    1e-3: "metres were expected and millimetres written",
+    1e-2: "metres were expected and centimetres written",
+    0.0254: "metres were expected and inches written",
+    0.3048: "metres were expected and feet written",
+    1e3: "the numbers were divided by 1000 too often (kilometres, or metres taken for millimetres)",
+}
+_UNIT_MATCH = 0.2  # tolerance of the logarithm of a ratio of sizes
+
+
+def wrong_unit(extent_m: float, expected_m: float) -> str:
+    """The wrong unit that explains an extent other than the expected one; empty if there is none."""
+    ratio = expected_m / extent_m
+    for factor, words in UNITS.items():
+        if abs(np.log(ratio / factor)) < _UNIT_MATCH:
+            return words
+    return ""
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyError:
+    """A change to the survey that makes the measurements consistent."""
+
+    words: str  # the correction of the survey
+    factor: float  # residuals over their sigmas after the correction
+
+
+def diagnose_survey(
+    network: Network,
+    setups: Sequence[ScreenSetup],
+    near: Mapping[int, ApproximatePosition],
+    held_screen: int | None,
+    current: float,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[SurveyError]:
+    """Changes with which the measurements fit much better than with the survey as it is, the best first.
+
+    current: present misfit (inf if there is no solution). progress: called with the changes tried and their number.
+    """
+    out = []
+    changes = _changes(network)
+    for done, (words, change) in enumerate(changes):
+        if progress is not None:
+            progress(done, len(changes))
+        trial = replace(network, control_points=replace(network.control_points, xyz=change(network.control_points.xyz)))
+        misfit_now = misfit(trial, setups, near, held_screen)
+        if misfit_now < 0.3 * current:
+            out.append(SurveyError(words, misfit_now))
+    return sorted(out, key=lambda s: s.factor)
+
+
+def misfit(
+    network: Network, setups: Sequence[ScreenSetup], near: Mapping[int, ApproximatePosition], held_screen: int | None
+) -> float:
+    """Misfit of a network: residuals over sigmas, outliers and distances from approximate positions; inf on failure."""
+    try:
+        result = calibrate(network, setups, near, held_screen)
+    except (AdjustmentError, NotConnectedError, ValueError):
+        return float("inf")
+    return misfit_of(result, near)
+
+
+def misfit_of(result: ScreensResult, near: Mapping[int, ApproximatePosition]) -> float:
+    """Misfit of a result, as in `misfit`."""
+    out = float(np.sqrt(result.fit.variance_factor))
+    if len(result.fit.used):
+        out += 20.0 * float(np.mean(~result.fit.used))
+    for c, n in near.items():
+        centre = list(result.fit.rig.cameras.values())[c].camera_from_world.inverse().translation
+        out += 10.0 * max(float(np.linalg.norm(centre - n.position_m)) / n.within_m - 1.0, 0.0)
+    return out
+
+
+def _changes(network: Network) -> list[tuple[str, Callable[[Array], Array]]]:
+    """Common mistakes in a survey's columns, for the whole survey and for the dots of one screen."""
+    axes = "xyz"
+    out: list[tuple[str, Callable[[Array], Array]]] = []
+    screens = list(network.rig.screens)
+    wholes: list[tuple[str, Bools]] = [("the survey", np.ones(len(network.control_points), dtype=bool))]
+    if len(screens) > 1:
+        wholes += [(f"the dots of screen {n!r}", network.control_points.screen_of == k) for k, n in enumerate(screens)]
+    for whose, some in wholes:
+        if not some.any():
+            continue
+        for order in itertools.permutations(range(3)):
+            if order == (0, 1, 2):
+                continue
+            words = f"{whose} with its columns in the order {', '.join(axes[o] for o in order)}"
+            if sum(a == b for a, b in enumerate(order)) == 1:
+                i, j = (k for k, o in enumerate(order) if k != o)
+                words = f"{whose} with its columns {axes[i]} and {axes[j]} exchanged"
+            out.append((words, _changed(some, np.eye(3)[list(order)])))
+        for k in range(3):
+            turned = np.diag(np.where(np.arange(3) == k, -1.0, 1.0))
+            out.append((f"{whose} with the sign of {axes[k]} reversed", _changed(some, turned)))
+        for factor, unit in UNITS.items():
+            out.append((f"{whose} times {factor:g} ({unit})", _changed(some, factor * np.eye(3))))
+    return out
+
+
+def _changed(some: Bools, matrix: Array) -> Callable[[Array], Array]:
+    return lambda xyz: np.where(some[:, None], xyz @ matrix.T, xyz)

@@ -1,21 +1,54 @@
-"""Surveyed points as terms of an adjustment: their pixels, the screens on which they lie, their surveyed coordinates.
+"""Surveyed points, boards fixed to screens, and recorded poses as terms of an adjustment; subsets of terms.
 
 Stacks: "intrinsics" (fx, fy, cx, cy, px, and 14 distortion coefficients), "cameras" (camera_from_world), "screens"
-(world_from_screen), "bow" (1/m), "points" (world, m). All Jacobians are by the errors that these stacks define.
+(world_from_screen), "bow" (1/m), "points" (world, m), "boards" (world_from_board). All Jacobians are by the errors that
+these stacks define.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol, Self, cast
 
 import numpy as np
 
-from calibration.least_squares.adjustment import Linearised, Loss, Part, Values
-from calibration.least_squares.parameter_blocks import Poses, Vectors
-from geometry import lens
+from calibration.least_squares.adjustment import Linearised, Loss, Part, Poses, Term, Values, Vectors
+from geometry import lens, rotations
 from geometry.arrays import Array, Bools, Ints, skew
 from geometry.camera import project_points_full
 from geometry.pose import Pose
+
+
+class ScalableTerm(Term, Protocol):
+    """A term whose sigmas may be too small."""
+
+    def widened(self, scale: float) -> Self:
+        """The same term with all its sigmas multiplied."""
+
+
+class MeasurementTerm(ScalableTerm, Protocol):
+    """A term with one row per measurement, of which outliers can be left out."""
+
+    def __len__(self) -> int:
+        """Number of measurements."""
+
+    def pick(self, rows: Bools, loss: Loss | None = None) -> Self:
+        """Some of the measurements, with this loss."""
+
+
+def rows_of(term: Term) -> int:
+    """Number of measurements of a term."""
+    return len(cast(MeasurementTerm, term))
+
+
+def picked(term: Term, rows: Bools, loss: Loss | None = None) -> Term:
+    """Some rows of a term, with this loss."""
+    return cast(MeasurementTerm, term).pick(rows, loss)
+
+
+def widened(term: Term, scale: float) -> Term:
+    """A term with all its sigmas multiplied; with a scale of 1 any term."""
+    return term if scale == 1.0 else cast(ScalableTerm, term).widened(scale)
 
 
 def pose_of(values: Values, stack: str) -> Pose:
@@ -196,3 +229,93 @@ def surface_slope(on_screen: Array, bow: Array) -> Array:
     a, b, c = np.moveaxis(bow, -1, 0)
     x, y = on_screen[..., 0], on_screen[..., 1]
     return np.stack([-(2 * a * x + b * y), -(b * x + 2 * c * y), np.ones_like(x)], axis=-1)
+
+
+@dataclass(frozen=True, slots=True)
+class BoardOnScreenTerm:
+    """n boards, each flat on its screen with the printed side outwards: the board's z axis points into the screen."""
+
+    screen_of: Ints  # (n,) index into "screens" and "bow"
+    placement_of: Ints  # (n,) index into "boards"
+    middle: Array  # (n, 3), m, in the board's frame: the point at which the offset holds
+    offset_m: Array  # (n,): height of the printed side above the screen's surface
+    sigma_m: Array  # (n,): sigma of the offset
+    tilt_sigma_rad: Array  # (n,): sigma of the angle between board and surface, about each axis of the board
+    loss: Loss | None = None
+
+    def linearise(self, values: Values) -> Linearised:
+        """Height minus offset, and the slopes of the board's x and y axes against the surface: (n, 3), in sigmas."""
+        world_from_screen = pose_of(values, "screens")[self.screen_of]
+        world_from_board = pose_of(values, "boards")[self.placement_of]
+        bow = array_of(values, "bow")[self.screen_of]
+        screen_from_board = world_from_screen.inverse() @ world_from_board
+        p = screen_from_board.apply(self.middle)
+        axes = np.swapaxes(screen_from_board.rotation[..., :2], -1, -2)  # (n, 2, 3): the board's x, y
+        g = surface_slope(p, bow)
+        residuals = np.concatenate(
+            [(surface_heights(p, bow) - self.offset_m)[:, None], (axes @ g[..., None])[..., 0]], axis=1
+        )
+        # p and the axes, in the screen's frame, depend on the board's pose and on the screen's.
+        curve = np.zeros((*g.shape, 3))  # d(g)/d(p)
+        a, b, c = np.moveaxis(bow, -1, 0)
+        curve[:, 0, 0], curve[:, 0, 1], curve[:, 1, 0], curve[:, 1, 1] = -2 * a, -b, -b, -2 * c
+        by_p = np.concatenate([g[:, None, :], axes @ curve], axis=1)  # (n, 3, 3)
+        R_t = np.swapaxes(world_from_screen.rotation, -1, -2)
+        R = screen_from_board.rotation
+        by_board = np.concatenate([by_p @ R_t, -by_p @ R @ skew(self.middle)], axis=-1)
+        by_screen = np.concatenate([-by_p @ R_t, by_p @ skew(p)], axis=-1)
+        for k in range(2):
+            # A rotation theta of the board changes its axis by R (theta x e), one of the screen by -theta x axis.
+
+            e = np.broadcast_to(np.eye(3)[k], p.shape)
+            by_board[:, 1 + k, 3:] += (-g[:, None, :] @ R @ skew(e))[:, 0]
+            by_screen[:, 1 + k, 3:] += (g[:, None, :] @ skew(axes[:, k]))[:, 0]
+        x, y = p[:, 0], p[:, 1]
+        by_bow = np.zeros((len(p), 3, 3))
+        by_bow[:, 0] = -bow_shape(p)
+        for k in range(2):
+            X, Y = axes[:, k, 0], axes[:, k, 1]
+            by_bow[:, 1 + k] = -np.stack([2 * x * X, y * X + x * Y, 2 * y * Y], axis=-1)
+        sigma = np.stack([self.sigma_m, self.tilt_sigma_rad, self.tilt_sigma_rad], axis=1)
+        whiten = 1.0 / sigma[..., None]
+        return Linearised(
+            residuals / sigma,
+            [
+                Part("screens", self.screen_of, by_screen * whiten),
+                Part("bow", self.screen_of, by_bow * whiten),
+                Part("boards", self.placement_of, by_board * whiten),
+            ],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class RecordTerm:
+    """n recorded transforms of a stack of poses, each number with its own sigma."""
+
+    stack: str
+    index: Ints  # (n,) index into the stack
+    recorded: Pose  # (n,)
+    sigmas: Array  # (n, 6), m and rad, of the error [dt, dtheta]; inf: not recorded; 0 only for numbers held fixed
+    loss: Loss | None = None
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def pick(self, rows: Bools, loss: Loss | None = None) -> RecordTerm:
+        """Some of the records, with this loss."""
+        return RecordTerm(self.stack, self.index[rows], self.recorded[rows], self.sigmas[rows], loss)
+
+    def widened(self, scale: float) -> RecordTerm:
+        """The same records with all sigmas multiplied."""
+        return replace(self, sigmas=self.sigmas * scale)
+
+    def linearise(self, values: Values) -> Linearised:
+        """Pose minus record (n, 6), in sigmas; 0 for numbers that are not recorded or held fixed."""
+        delta = pose_of(values, self.stack)[self.index].minus(self.recorded)
+        used = np.isfinite(self.sigmas) & (self.sigmas > 0)
+        per_sigma = np.where(used, 1.0 / np.where(used, self.sigmas, 1.0), 0.0)
+        J = np.zeros((len(self.index), 6, 6))
+        J[:, :3, :3] = np.eye(3)
+        # d(log(R_0^T R Exp(theta))) / d(theta) is the inverse of the right Jacobian at the difference.
+        J[:, 3:, 3:] = np.linalg.inv(rotations.right_jacobian(delta[:, 3:]))
+        return Linearised(delta * per_sigma, [Part(self.stack, self.index, per_sigma[..., None] * J)])

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.budget.expected_errors import ExpectedErrors
+from calibration.budget import ExpectedErrors
 from docs.website.text import cell, code, table
 from tracking.parameters import DetectParameters, LabelParameters, TrackerParameters
 

@@ -28,10 +28,17 @@ NEAR_M, NEAR_RAD = 0.05, np.deg2rad(1.0)
 
 
 class PoseModel(Protocol):
-    """A forward model of n views: geometry/forward_model.py for spots, marker_model.py for markers on the body."""
+    """A forward model of n views: geometry/forward_model.py, of spots or of markers on the body."""
 
     def project(self, world_from_body: Pose) -> tuple[Array, Array]:
         """Pixels (n, 2) and their Jacobian (n, 2, 6) by the pose error; nan where there is no projection."""
+
+
+class CommonErrors(Protocol):
+    """Errors of the pixels that are the same in every frame: of a calibration, of surveyed markers."""
+
+    def at(self, world_from_body: Pose) -> Array:
+        """Their covariance (2n, 2n), px^2, for all views at a pose."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +92,7 @@ class PoseFit:
             return 0.0
         n = len(self.jacobian)
         left = np.eye(2 * n)
-        left[:, _coordinates(self.rows)] -= np.nan_to_num(self.jacobian.reshape(2 * n, 6)) @ self._gain
+        left[:, coordinates_of(self.rows)] -= np.nan_to_num(self.jacobian.reshape(2 * n, 6)) @ self._gain
         joint = (left @ self._common @ left.T).reshape(n, 2, n, 2)
         return np.asarray(joint[np.arange(n), :, np.arange(n)])
 
@@ -120,7 +127,7 @@ def fit_pose(
     start: Pose,
     *,
     prior: tuple[Pose, Array] | None = None,
-    calibration: RigUncertainty | None = None,
+    calibration: CommonErrors | None = None,
     max_iterations: int = 25,
 ) -> PoseFit | None:
     """The least-squares pose of the spots of views `rows` (m,) at `pixels` (m, 2), with covariances (m, 2, 2), px^2.
@@ -161,7 +168,7 @@ def _fit(
         W = whiten(covariances)
         log_det = -2 * float(np.sum(np.log(W[:, [0, 1], [0, 1]])))
     else:
-        root = np.linalg.cholesky(_blocks(covariances) + common[np.ix_(_coordinates(rows), _coordinates(rows))])
+        root = np.linalg.cholesky(_blocks(covariances) + common[np.ix_(coordinates_of(rows), coordinates_of(rows))])
         W = np.linalg.inv(root)
         log_det = 2 * float(np.sum(np.log(np.diagonal(root))))
     pose, damping = start, 0.0
@@ -193,7 +200,7 @@ def _fit(
     dof = 2 * len(rows) - 6 + (6 if prior is not None else 0)
     K, systematic, share = np.zeros((6, 2 * len(rows))), np.zeros((6, 6)), 0.0
     if common is not None and observable:
-        S = common[np.ix_(_coordinates(rows), _coordinates(rows))]
+        S = common[np.ix_(coordinates_of(rows), coordinates_of(rows))]
         A = W @ J[rows].reshape(-1, 6)
         K = covariance @ A.T @ W
         systematic = symmetric(K @ S @ K.T)
@@ -217,7 +224,7 @@ def _fit(
     )
 
 
-def _coordinates(rows: Ints) -> Ints:
+def coordinates_of(rows: Ints) -> Ints:
     """Indices (2m,) of u and v of m views among the coordinates of all views."""
     return np.ravel(2 * rows[:, None] + np.arange(2))
 

@@ -29,7 +29,7 @@ from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.rigid_tracker import RigidTracker
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import TrackedFrame
 
 Prior: TypeAlias = PosePrior | Mapping[str, Any] | None
 Points: TypeAlias = pd.DataFrame | ArrayLike | None

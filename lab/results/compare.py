@@ -19,19 +19,20 @@ from lab.files.text.csv_text import read_table
 from lab.files.text.error_text import name_of_path
 from lab.number_format import format_number, format_percent, format_with_sigma
 from lab.runs.process import are_results
-from tracking.comparison.allan import LEAST_READINGS, AllanDeviation, allan_deviation
 from tracking.comparison.differences import (
+    LEAST_READINGS,
+    AllanDeviation,
     ChiSquare,
     Differences,
     Statistic,
+    allan_deviation,
     chi_square,
     differences,
     longest_still,
     statistic,
 )
 from tracking.comparison.estimation import Estimate, Free, NotComparableError, estimate_alignment
-from tracking.comparison.frame_alignment import BODY, LEVER, TRANSLATION, WORLD, Alignment
-from tracking.comparison.motion import GAP, Motion
+from tracking.comparison.frame_alignment import BODY, GAP, LEVER, TRANSLATION, WORLD, Alignment, Motion
 from tracking.statuses import PoseStatus
 
 # Reads the motion of a reference: a TUM file (`t x y z qx qy qz qw`) or a CSV table with named columns.

@@ -47,9 +47,8 @@ from lab.runs.frames.open_frames import open_frames
 from lab.runs.setup_check import FRAMES, MOST_KEPT, mistakes_by_themselves, rates_of_videos, recorded_mistakes
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters
-from tracking.setup_mistakes.invisible import Invisible, invisible_mistakes
-from tracking.setup_mistakes.mistake import SHOWN_BY, Block
-from tracking.setup_mistakes.possible import possible_mistakes
+from tracking.setup_mistakes.evidence import Invisible, invisible_mistakes
+from tracking.setup_mistakes.possible import SHOWN_BY, Block, possible_mistakes
 
 
 @dataclass(slots=True)

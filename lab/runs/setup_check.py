@@ -17,8 +17,7 @@ from lab.runs.frames.even_sampler import EvenSampler
 from lab.runs.verdict.run_statistics import RunStatistics
 from tracking.detections import Detections
 from tracking.setup_mistakes.evidence import LEAST_FITTING, LEAST_POINTS, Comparison, Frames, compare
-from tracking.setup_mistakes.mistake import HERE, Block
-from tracking.setup_mistakes.possible import possible_mistakes
+from tracking.setup_mistakes.possible import HERE, Block, possible_mistakes
 
 FRAMES = 6  # of a recording, with which mistakes are tested
 MOST_KEPT = 90  # frames from which they are chosen

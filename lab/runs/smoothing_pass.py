@@ -16,8 +16,7 @@ from pathlib import Path
 from lab.progress import Progress
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from tracking.smoothing.recording import TrackedRecording
-from tracking.smoothing.smoothed import Smoothed
-from tracking.smoothing.smoother import smooth
+from tracking.smoothing.smoother import Smoothed, smooth
 
 IN_MEMORY = 1000  # frames, of 11 kB each; writing and reading one takes 0.12 ms
 _PROTOCOL = 4  # of pickle: reads arrays in half the time of protocol 5

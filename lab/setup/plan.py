@@ -5,8 +5,7 @@ from __future__ import annotations
 import datetime
 from pathlib import Path
 
-from calibration.budget.expected_errors import expected_errors
-from calibration.budget.pose_grid import plan_grid
+from calibration.budget import expected_errors, plan_grid
 from geometry.pose_solver.visibility import assumed_range
 from lab.calibrate.step import Solved, Step, run_step
 from lab.errors import QUALITY_GATE_FAILED

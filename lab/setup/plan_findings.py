@@ -11,16 +11,17 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from calibration.budget.expected_errors import ExpectedErrors
-from calibration.budget.pose_budget import (
+from calibration.budget import (
     BEAM_DIRECTIONS,
     BEAM_POINTS,
     CAMERA_POSES,
     INTRINSICS,
+    NOISE,
     SCREEN_POSES,
     SCREEN_SHAPES,
+    ExpectedErrors,
+    GridPlan,
 )
-from calibration.budget.pose_grid import NOISE, GridPlan
 from geometry.arrays import Array, Bools
 from geometry.pose import Pose
 from lab.errors import InputError

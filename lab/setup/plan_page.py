@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.budget.pose_budget import group_of
-from calibration.budget.pose_grid import AXES, STATUS, plan_grid, poses_of
+from calibration.budget import AXES, STATUS, group_of, plan_grid, poses_of
 from geometry.arrays import Array
 from lab import number_format
 from lab.files.text.csv_text import write_table

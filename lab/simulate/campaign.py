@@ -13,10 +13,9 @@ import cv2
 import numpy as np
 
 from calibration.boards import board_types as boards
-from calibration.least_squares.adjustment import solve
-from calibration.least_squares.parameter_blocks import Poses, Stack, Vectors
+from calibration.least_squares.adjustment import Poses, Stack, Vectors, solve
 from calibration.terms.corners import single_camera
-from calibration.terms.spot_term import SpotPixels
+from calibration.terms.rig_blocks import SpotPixels
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import FISHEYE, Camera, in_picture, pinhole_numbers
 from geometry.forward_model import SpotModel

@@ -20,9 +20,7 @@ from lab.report.plot.svg import BLUE, VERMILLION
 from lab.runs.processed import quantiles
 from lab.targets.page import TimeAxis
 from lab.targets.target import Codes, Target, Track, TrackOptions, texts, track_pictures
-from tracking.drogue_circle.candidates import CircleDetector
-from tracking.drogue_circle.detectors import classical_detector
-from tracking.drogue_circle.parameters import CircleParameters, Edge
+from tracking.drogue_circle.detectors import CircleDetector, CircleParameters, Edge, classical_detector
 from tracking.drogue_circle.printed import PrintedTracker
 from tracking.drogue_circle.rim_fit import CircleFrame
 from tracking.drogue_circle.tracker import CircleTracker

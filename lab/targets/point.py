@@ -31,10 +31,8 @@ from lab.targets.target import Codes, Target, Track, TrackOptions, header_rate
 from lab.targets.track import some_frames
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import DetectParameters
-from tracking.single_target.blobs import find_blobs
-from tracking.single_target.colour import HUES, find_coloured, has_colour, hue_of
-from tracking.single_target.parameters import BlobParameters, PointParameters
-from tracking.single_target.point_tracker import PointEstimate, track_point
+from tracking.single_target.blobs import HUES, BlobParameters, find_blobs, find_coloured, has_colour, hue_of
+from tracking.single_target.point_tracker import PointEstimate, PointParameters, track_point
 from tracking.statuses import Cause, PoseStatus
 
 COLOUR = "colour"

@@ -9,9 +9,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.least_squares.adjustment import AdjustmentError, Cauchy, Linearised, Loss, Part, Values, solve
-from calibration.least_squares.parameter_blocks import Lines, Poses, Vectors
-from calibration.least_squares.priors import Prior, independent
+from calibration.least_squares.adjustment import (
+    AdjustmentError,
+    Cauchy,
+    Linearised,
+    Lines,
+    Loss,
+    Part,
+    Poses,
+    Prior,
+    Values,
+    Vectors,
+    independent,
+    solve,
+)
 from geometry.arrays import normalised, numeric_jacobian
 from geometry.pose import Pose
 from tests.geometry.scenes import random_pose

@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from calibration.drift import (
+from calibration.changes import (
     LASER_MOVED,
     MOVED,
     TURNED,
     TURNED_ZOOMED,
     WRONG_POINT,
     ZOOMED,
+    ChangeCandidate,
+    ExcessResidual,
     camera_columns,
     find_changes,
 )
-from calibration.excess_residual import ChangeCandidate, ExcessResidual
 from geometry.camera import pinhole_numbers, project_points_full
 from geometry.lens import padded
 from geometry.rotations import exp

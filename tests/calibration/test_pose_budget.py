@@ -10,15 +10,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from calibration.budget.expected_errors import ExpectedErrors, dots_on_screen, expected_errors
-from calibration.budget.pose_budget import (
+from calibration.budget import (
     BEAM_DIRECTIONS,
     CAMERA_POSES,
     INTRINSICS,
     SCREEN_POSES,
+    ExpectedErrors,
     PoseBudget,
     RigErrors,
     along,
+    dots_on_screen,
+    expected_errors,
     group_of,
     worst_direction,
 )

@@ -152,3 +152,12 @@ def test_a_stack_gives_the_same_as_each_element_alone():
         )
         for f in of_matrix:
             np.testing.assert_allclose(f(R)[i, j], f(R[i, j]), atol=1e-13)
+
+
+def test_the_rotation_nearest_to_a_mean_matrix_is_the_mean_of_scipy_and_turns_with_the_rotations():
+    matrices = rotations.exp(np.random.default_rng(3).normal(0.0, 0.5, (40, 3)))
+    mean = rotations.nearest_rotation(matrices.mean(axis=0))
+    np.testing.assert_allclose(mean, Rotation.from_matrix(matrices).mean().as_matrix(), atol=1e-14)
+    turn = rotations.exp(np.array([2.0, -1.0, 0.5]))
+    np.testing.assert_allclose(rotations.nearest_rotation((turn @ matrices).mean(axis=0)), turn @ mean, atol=1e-14)
+    np.testing.assert_allclose(rotations.nearest_rotation(matrices[0]), matrices[0], atol=1e-15)

@@ -21,8 +21,7 @@ from tracking.detections import UNMATCHED, Detections
 from tracking.input_validation import DUPLICATE_PX, usable_rows
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.rigid_tracker import RigidTracker
-from tracking.statuses import PoseStatus
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import PoseStatus, TrackedFrame
 
 NEES = 6.0  # limit of a pose's squared Mahalanobis error divided by six: exceeded once in 300000 correct poses
 BAD = 20  # the first modified frame

@@ -11,7 +11,7 @@ import sys
 
 import pytest
 
-from calibration.budget.expected_errors import ExpectedErrors
+from calibration.budget import ExpectedErrors
 from docs.website import codes, commands, parameters, study_tables, yaml_files
 from docs.website.navigation import expanded
 from docs.website.network import network_addresses

@@ -1,25 +1,172 @@
-"""The pose without a prediction: poses of three markers (P3P), tested against all candidates of both pictures.
-
-Three candidates of one picture and three markers have up to four poses. Each is scored by the markers that it explains
-in both pictures; the best ones are labelled and fitted. Candidates with an epipolar partner of the same colour in the
-other picture come first. Source: ours, with the compiled solver geometry/pose_solver/three_spots.py.
-"""
+"""Which candidate is which marker, at a pose that is roughly known and without one; the fit of labelled markers."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations, permutations
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from geometry.arrays import Array, Bools, Ints
+from geometry.camera import in_picture
 from geometry.pose import Pose
+from geometry.pose_solver.gauss_newton import PoseFit
 from geometry.pose_solver.three_spots import poses_from_three_spots
 from geometry.rotations import angle
-from tracking.binocular.labelling import Images, LabelledPose, labelled_pose
-from tracking.binocular.marker_model import MarkerImages, MarkerModel, StereoPair
-from tracking.binocular.parameters import MatchParameters
-from tracking.binocular.triangulation import triangulate, undistorted_pixels
+from geometry.uncertainty.chi_square import chi2_tail
+from tracking.binocular.joint_fit import MarkerObservations, fit_pose, pose_of_points, triangulate, undistorted_pixels
+from tracking.binocular.marker_model import MarkerImages, MarkerModel, MatchParameters, StereoPair, project_markers
+
+# Which candidate in each picture is which marker, for a pose that is roughly known; the fit and its evidence.
+#
+# Left and right images of a marker are matched through the marker model, the epipolar geometry, colour and size. The
+# order of the candidates is not used: the paper's (section 3) fails as soon as a marker is hidden or a false one
+# appears. Source: ours.
+
+Images = tuple[MarkerImages, MarkerImages]  # candidates of the left and the right picture
+_LARGEST_PX2 = 1e8  # of the variance of a predicted place: more than any picture
+_ROUNDS = 4  # of labelling and fitting
+_MOST_OUTLIERS = 4  # images that a fit may refuse
+_PARAMETERS_IN_IMAGES = 3  # a pose has as many numbers as three images
+
+
+@dataclass(frozen=True, slots=True)
+class LabelledPose:
+    """A pose with the candidates that it explains."""
+
+    index: Ints  # (2, K): the candidate of each marker in each picture, -1: none
+    fit: PoseFit
+    score: float  # nats: log likelihood against "all candidates are false"
+    evidence: float  # nats: the score without what six free numbers explain by chance
+
+    @property
+    def markers(self) -> int:
+        """Number of different markers seen."""
+        return int((self.index >= 0).any(axis=0).sum())
+
+
+def observations(images: Images, index: Ints) -> MarkerObservations:
+    """The labelled images (2, K)."""
+    uv = np.full((*index.shape, 2), np.nan)
+    cov = np.zeros((*index.shape, 2, 2))
+    cov[..., :, :] = np.eye(2)
+    for c, found in enumerate(images):
+        seen = index[c] >= 0
+        uv[c, seen], cov[c, seen] = found.uv_px[index[c, seen]], found.cov_px2[index[c, seen]]
+    return MarkerObservations(uv, cov)
+
+
+def expected_areas(pair: StereoPair, model: MarkerModel, pose: Pose) -> Array:
+    """Areas (2, K), px^2, of round markers seen from the front; nan where a radius is not known."""
+    out = []
+    for camera in pair.cameras:
+        depth = camera.camera_from_world.apply(pose.apply(model.positions))[:, 2]
+        focal = camera.matrix[0, 0] * camera.matrix[1, 1]
+        out.append(np.pi * model.radius_m**2 * focal / np.where(depth > 0, depth, np.nan) ** 2)
+    return np.array(out)
+
+
+def assign(pair: StereoPair, model: MarkerModel, images: Images, pose: Pose, spread: Array, p: MatchParameters) -> Ints:
+    """The candidates (2, K) of all markers at a pose of covariance `spread` (6, 6); -1 where none fits."""
+    pixels, J = project_markers(pair, model, pose)
+    areas = expected_areas(pair, model, pose)
+    out = np.full((2, len(model)), -1, dtype=np.int64)
+    for c, found in enumerate(images):
+        if not len(found):
+            continue
+        S = (J[c] @ spread @ np.swapaxes(J[c], -1, -2))[:, None] + found.cov_px2[None]
+        S = S + 1e-4 * np.eye(2)
+        usable = np.trace(S, axis1=-2, axis2=-1) < _LARGEST_PX2  # not of markers behind the camera, or beside it
+        S = np.where(usable[..., None, None], S, np.eye(2))
+        apart = found.uv_px[None] - pixels[c][:, None]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            d2 = np.einsum("kni,knij,knj->kn", apart, np.linalg.inv(S), apart)
+            size = np.abs(np.log(found.area_px2[None] / areas[c][:, None]))
+        wrong_size = size > np.log(p.area_factor)  # False for nan: not known
+        allowed = (d2 < p.gate_sigmas**2) & (model.colour[:, None] == found.colour[None]) & ~wrong_size & usable
+        cost = np.where(allowed, d2 + np.linalg.slogdet(S)[1], 1e6)
+        for k, n in zip(*linear_sum_assignment(cost), strict=True):
+            if allowed[k, n]:
+                out[c, k] = n
+    return out
+
+
+def labelled_pose(
+    pair: StereoPair, model: MarkerModel, images: Images, start: Pose, spread: Array, p: MatchParameters
+) -> LabelledPose | None:
+    """The pose and labels near a start with covariance `spread` (6, 6); None where fewer than three images fit."""
+    index, pose, fit = np.full((2, len(model)), -1, dtype=np.int64), start, None
+    for _ in range(_ROUNDS):
+        following = assign(pair, model, images, pose, spread, p)
+        if np.array_equal(following, index):
+            break
+        index = following
+        fit = fit_pose(pair, model, observations(images, index), pose)
+        if fit is None or not fit.observable:
+            return None
+        pose, spread = fit.world_from_body, fit.covariance
+    index, fit = _without_outliers(pair, model, images, index, fit, p)
+    if fit is None or not fit.observable:
+        return None
+    score, chance = _score(pair, images, index, fit, p)
+    return LabelledPose(index, fit, score, score - chance)
+
+
+def _without_outliers(
+    pair: StereoPair, model: MarkerModel, images: Images, index: Ints, fit: PoseFit | None, p: MatchParameters
+) -> tuple[Ints, PoseFit | None]:
+    """Removes images whose residual contradicts the others, the worst one first."""
+    for _ in range(_MOST_OUTLIERS):
+        if fit is None or fit.dof < 2:
+            return index, fit
+        chi2 = _image_chi2(images, index, fit)
+        worst = np.unravel_index(int(np.argmax(chi2)), chi2.shape)
+        if chi2[worst] < p.outlier_chi2:
+            return index, fit
+        index = index.copy()
+        index[worst] = -1
+        fit = fit_pose(pair, model, observations(images, index), fit.world_from_body)
+    return index, fit
+
+
+def _image_chi2(images: Images, index: Ints, fit: PoseFit) -> Array:
+    """Squared residuals (2, K) in sigmas of their images, with the part that the pose covariance allows; 0: not seen.
+
+    The variance of a residual is at most that of its image plus that of the prediction, so that calibration errors do
+    not make outliers.
+    """
+    observed = observations(images, index)
+    J = fit.jacobian.reshape(*observed.uv_px.shape, 6)
+    S = observed.cov_px2 + J @ fit.systematic @ np.swapaxes(J, -1, -2)
+    r = np.nan_to_num(observed.uv_px - fit.projected_px.reshape(observed.uv_px.shape))
+    return np.asarray(np.einsum("cki,ckij,ckj->ck", r, np.linalg.inv(S), r))
+
+
+def _score(pair: StereoPair, images: Images, index: Ints, fit: PoseFit, p: MatchParameters) -> tuple[float, float]:
+    """Score of a labelling, and the part of it that three images of a free pose reach by chance, nats."""
+    observed = observations(images, index)
+    pixels = fit.projected_px.reshape(observed.uv_px.shape)
+    score, gains = -0.5 * fit.chi2, []
+    for c, (camera, found) in enumerate(zip(pair.cameras, images, strict=True)):
+        if not len(found):
+            continue  # a blind camera says nothing about hidden markers
+        density = max(len(found), 1) / float(np.prod(camera.image_size_px))
+        seen = index[c] >= 0
+        volume = 2 * np.pi * np.sqrt(np.linalg.det(observed.cov_px2[c, seen]))
+        gain = np.log(p.detection_probability / (density * volume))
+        gains += gain.tolist()
+        inside = in_picture(pixels[c], np.array(camera.image_size_px))
+        score += float(gain.sum()) + float(np.sum(inside & ~seen)) * np.log(1 - p.detection_probability)
+    return score, _PARAMETERS_IN_IMAGES * float(np.mean(gains)) if gains else 0.0
+
+
+# The pose without a prediction: poses of three markers (P3P), tested against all candidates of both pictures.
+#
+# Three candidates of one picture and three markers have up to four poses. Each is scored by the markers that it
+# explains in both pictures; the best ones are labelled and fitted. Candidates with an epipolar partner of the same
+# colour in the other picture come first. Source: ours, with the compiled solver geometry/pose_solver/three_spots.py.
 
 _MOST_CANDIDATES = 12  # of a picture, in triples: 1,320 ordered ones
 _FIRST_TRIPLES = 8  # of markers: enough where most of them are seen
@@ -91,7 +238,7 @@ def distinct(found: list[LabelledPose]) -> list[LabelledPose]:
     """The different poses, the best first."""
     kept: list[LabelledPose] = []
     for candidate in sorted(found, key=lambda f: -f.score):
-        if not any(same_pose(candidate.fit.pose, other.fit.pose) for other in kept):
+        if not any(same_pose(candidate.fit.world_from_body, other.fit.world_from_body) for other in kept):
             kept.append(candidate)
     return kept
 
@@ -227,3 +374,63 @@ def _coarse(pair: StereoPair, model: MarkerModel, flat: Sequence[Array], images:
                 nearest[:, own] = np.nan_to_num((apart * apart).sum(axis=-1).min(axis=2), nan=np.inf)
         score += np.maximum(0.0, 1 - nearest / gate2).sum(axis=1)
     return score
+
+
+# The pose of labelled markers without a start: Horn's pose of the triangulated points, then the joint fit.
+#
+# Far away the triangulated points give a poor attitude, and a flat target has two. The fit starts from Horn's pose and
+# from poses of three markers each (P3P), each also with the normal reflected, and keeps the least misfit. Source: ours.
+
+_STARTS = 3  # poses of three markers that are tried
+_TRIPLES = 4
+_PLAUSIBLE_P, _CLEAR_CHI2 = 1e-3, 25.0  # misfit of a right pose, and how much larger that of a wrong one is
+
+
+def first_fit(pair: StereoPair, model: MarkerModel, observed: MarkerObservations) -> PoseFit | None:
+    """The pose with the least misfit; None where no start leads to one."""
+    both = np.flatnonzero(observed.seen.all(axis=0))
+    found: list[PoseFit] = []
+    if len(both) >= 3:
+        points = triangulate(pair, observed.uv_px[:, both], observed.cov_px2[:, both])
+        if np.isfinite(points.points).all():
+            found = _fits(pair, model, observed, pose_of_points(model.positions[both], points.points))
+    if not _clear(found):
+        for start in _three_marker_poses(pair, model, observed):
+            found += _fits(pair, model, observed, start)
+    return min(found, key=lambda fit: fit.chi2, default=None)
+
+
+def _fits(pair: StereoPair, model: MarkerModel, observed: MarkerObservations, start: Pose) -> list[PoseFit]:
+    """The fits from a pose and from the one with the normal reflected."""
+    fits = (fit_pose(pair, model, observed, pose) for pose in (start, mirrored(pair, model, start)))
+    return [fit for fit in fits if fit is not None and fit.observable]
+
+
+def _clear(found: list[PoseFit]) -> bool:
+    """Whether the best of two fits is plausible and the other one is another pose, much worse."""
+    if len(found) < 2:
+        return False
+    best, other = sorted(found, key=lambda fit: fit.chi2)
+    same = same_pose(best.world_from_body, other.world_from_body)
+    plausible = best.dof > 0 and chi2_tail(best.chi2, best.dof) > _PLAUSIBLE_P
+    return plausible and not same and other.chi2 - best.chi2 > _CLEAR_CHI2
+
+
+def _three_marker_poses(pair: StereoPair, model: MarkerModel, observed: MarkerObservations) -> list[Pose]:
+    """Poses of triples that one camera sees, those with the smallest residuals of all markers."""
+    poses: list[Pose] = []
+    for c, camera in enumerate(pair.cameras):
+        triples = [t for t in marker_triples(model) if observed.seen[c, list(t)].all()][:_TRIPLES]
+        for triple in triples:
+            eye, rays = camera.rays(observed.uv_px[c, list(triple)])
+            if not np.isfinite(rays).all():
+                continue
+            solved = poses_from_three_spots(np.broadcast_to(eye, (3, 3)), rays, model.positions[list(triple)])
+            good = np.isfinite(solved.translation).all(axis=-1)
+            poses += [solved[int(i)].inverse() for i in np.flatnonzero(good)]
+    if not poses:
+        return []
+    stack = Pose(np.stack([p.rotation for p in poses]), np.stack([p.translation for p in poses]))
+    apart = np.nan_to_num(project_markers(pair, model, stack)[0] - observed.uv_px, nan=0.0)
+    order = np.argsort((apart**2).sum(axis=(1, 2, 3)))
+    return [poses[int(i)] for i in order[:_STARTS]]

@@ -9,54 +9,23 @@ import numpy as np
 from geometry.arrays import Array, Ints, symmetric
 from geometry.camera import in_picture
 from geometry.pose import Pose
+from geometry.pose_solver.gauss_newton import PoseFit
 from geometry.uncertainty.chi_square import chi2_tail
-from tracking import kalman
-from tracking.binocular.acquisition import acquire, distinct, mirrored
-from tracking.binocular.joint_fit import JointFit, MarkerObservations
-from tracking.binocular.labelling import Images, LabelledPose, labelled_pose, observations
-from tracking.binocular.marker_model import MarkerImages, MarkerModel, StereoPair, project_markers
-from tracking.binocular.parameters import MatchParameters
+from tracking.binocular.acquisition import (
+    Images,
+    LabelledPose,
+    acquire,
+    distinct,
+    labelled_pose,
+    mirrored,
+    observations,
+)
+from tracking.binocular.joint_fit import MarkerObservations
+from tracking.binocular.marker_model import MarkerImages, MarkerModel, MatchParameters, StereoPair, project_markers
+from tracking.kalman import RigidMotion
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, PoseStatus
 
-# Constant-velocity prediction of the target's pose: for matching, and for frames without a measurement. Ours.
-
 FIRST_SPEED_M_S, FIRST_RATE_RAD_S = 5.0, 2.0  # 1 sigma of the unknown velocity after the first pose
-
-
-@dataclass(frozen=True, slots=True)
-class Motion:
-    """A pose with its velocity: error [dt (m, world), dtheta (rad, body), dv (m/s), domega (rad/s, body)]."""
-
-    t_s: float
-    pose: Pose
-    velocity: Array  # (6,): m/s in world, rad/s in body
-    covariance: Array  # (12, 12)
-
-    @staticmethod
-    def at_rest(t_s: float, pose: Pose, covariance: Array) -> Motion:
-        """The first measured pose, covariance (6, 6), of unknown velocity."""
-        P = np.zeros((12, 12))
-        P[:6, :6] = covariance
-        P[6:, 6:] = np.diag([FIRST_SPEED_M_S**2] * 3 + [FIRST_RATE_RAD_S**2] * 3)
-        return Motion(t_s, pose, np.zeros(6), P)
-
-    def predicted(self, t_s: float, acceleration: float, turn: float) -> Motion:
-        """At a later time, with accelerations of these sigmas, m/s^2 and rad/s^2, constant between two times."""
-        dt = t_s - self.t_s
-        Q = kalman.process_noise(np.repeat([acceleration, turn], 3), dt)
-        pose = self.pose.plus(dt * self.velocity)
-        _, P = kalman.propagate(np.zeros(12), self.covariance, kalman.transition(dt, 6), Q)
-        return Motion(t_s, pose, self.velocity, P)
-
-    def updated(self, pose: Pose, covariance: Array) -> Motion:
-        """With a measured pose of covariance (6, 6)."""
-        change, P = kalman.update(np.zeros(12), self.covariance, pose.minus(self.pose), covariance)
-        return Motion(self.t_s, self.pose.plus(change[:6]), self.velocity + change[6:], P)
-
-    @property
-    def pose_covariance(self) -> Array:
-        """(6, 6)."""
-        return self.covariance[:6, :6]
 
 
 # The pose of the target in each frame of a sequence; the previous frames help to label, not to measure.
@@ -89,7 +58,7 @@ class BinocularFrame:
     reason: str  # why it is not measured; empty if it is
     pose: Pose | None  # world_from_body
     covariance: Array | None  # (6, 6)
-    fit: JointFit | None  # of the images of this frame, also where it is no measurement
+    fit: PoseFit | None  # of the images of this frame, also where it is no measurement
     observed: MarkerObservations | None  # the images of that fit
     index: Ints  # (2, K) candidates of the markers, -1: none
     predicted_px: Array  # (2, K, 2), before the pictures were used; nan without a prediction
@@ -106,7 +75,8 @@ class BinocularTracker:
 
     def __init__(self, pair: StereoPair, model: MarkerModel, parameters: MatchParameters) -> None:
         self._pair, self._model, self._p = pair, model, parameters
-        self._motion: Motion | None = None
+        self._motion: RigidMotion | None = None  # at the last measured pose, at time ...
+        self._t_s = 0.0
         self._images: Images = (MarkerImages.none(), MarkerImages.none())  # of the current frame
         self._last_measured: int = -1
         self._count = -1
@@ -135,27 +105,29 @@ class BinocularTracker:
         if reason:
             return self._unmeasured(reason, ahead, best)
         self._last_measured = self._count
-        pose, covariance = best.fit.pose, best.fit.covariance
-        self._motion = Motion.at_rest(t_s, pose, covariance) if ahead is None else ahead.updated(pose, covariance)
+        pose, covariance = best.fit.world_from_body, best.fit.covariance
+        first = RigidMotion.at_rest(pose, covariance, FIRST_SPEED_M_S, FIRST_RATE_RAD_S)
+        self._motion = first if ahead is None else ahead.updated_with_pose(pose, covariance)[0]
+        self._t_s = t_s
         return self._result(PoseStatus.MEASURED, "", pose, covariance, best, ahead)
 
-    def _prediction(self, t_s: float) -> Motion | None:
+    def _prediction(self, t_s: float) -> RigidMotion | None:
         if self._motion is None or self._count - self._last_measured > self._p.max_predicted_frames:
             return None
-        ahead = self._motion.predicted(t_s, self._p.acceleration_m_s2, self._p.turn_rad_s2)
-        worst = np.sqrt([np.linalg.eigvalsh(ahead.pose_covariance[s, s])[-1] for s in (slice(0, 3), slice(3, 6))])
+        ahead = self._motion.predicted(t_s - self._t_s, self._p.acceleration_m_s2, self._p.turn_rad_s2)
+        worst = np.sqrt([np.linalg.eigvalsh(ahead.covariance[s, s])[-1] for s in (slice(0, 3), slice(3, 6))])
         return ahead if worst[0] <= LOST_SIGMA_M and worst[1] <= LOST_SIGMA_RAD else None
 
-    def _candidates(self, images: Images, ahead: Motion | None) -> list[LabelledPose]:
+    def _candidates(self, images: Images, ahead: RigidMotion | None) -> list[LabelledPose]:
         """Poses that explain the images: near the prediction, and from scratch where that is not convincing."""
         found: list[LabelledPose] = []
         if ahead is not None:
-            near = labelled_pose(self._pair, self._model, images, ahead.pose, ahead.pose_covariance, self._p)
+            near = labelled_pose(self._pair, self._model, images, ahead.world_from_body, ahead.covariance, self._p)
             found = [] if near is None else [near]
         if not found or not self._convincing(found[0], images):
             found += acquire(self._pair, self._model, images, self._p)
         for candidate in found[:2]:
-            start = mirrored(self._pair, self._model, candidate.fit.pose)
+            start = mirrored(self._pair, self._model, candidate.fit.world_from_body)
             other = labelled_pose(self._pair, self._model, images, start, candidate.fit.covariance, self._p)
             found = found if other is None else [*found, other]
         return distinct(found)
@@ -165,12 +137,12 @@ class BinocularTracker:
         expected = min(2 * len(self._model), len(images[0]) + len(images[1]))
         return chi2_tail(found.fit.chi2, max(found.fit.dof, 1)) > _TRUSTED_P and explained >= _TRUSTED_SHARE * expected
 
-    def _prior_nats(self, candidate: LabelledPose, ahead: Motion | None) -> float:
+    def _prior_nats(self, candidate: LabelledPose, ahead: RigidMotion | None) -> float:
         """Log density of a candidate under the prediction, up to a constant and limited."""
         if ahead is None:
             return 0.0
-        apart = candidate.fit.pose.minus(ahead.pose)
-        d2 = float(apart @ np.linalg.solve(ahead.pose_covariance + candidate.fit.covariance, apart))
+        apart = candidate.fit.world_from_body.minus(ahead.world_from_body)
+        d2 = float(apart @ np.linalg.solve(ahead.covariance + candidate.fit.covariance, apart))
         return -min(0.5 * d2, _MOST_PRIOR_NATS)
 
     def _doubt(self, best: LabelledPose, rivals: list[LabelledPose]) -> str:
@@ -192,7 +164,7 @@ class BinocularTracker:
 
     def _contradicted(self, best: LabelledPose) -> bool:
         """Whether a camera sees candidates, but hardly one where the pose puts markers: cameras exchanged, or moved."""
-        pixels = project_markers(self._pair, self._model, best.fit.pose)[0]
+        pixels = project_markers(self._pair, self._model, best.fit.world_from_body)[0]
         for c, (camera, found) in enumerate(zip(self._pair.cameras, self._images, strict=True)):
             expected = int(in_picture(pixels[c], np.array(camera.image_size_px)).sum())
             confirmed = int((best.index[c] >= 0).sum())
@@ -201,23 +173,23 @@ class BinocularTracker:
         return False
 
     def _both(
-        self, best: LabelledPose, rivals: list[LabelledPose], weights: Array, ahead: Motion | None
+        self, best: LabelledPose, rivals: list[LabelledPose], weights: Array, ahead: RigidMotion | None
     ) -> BinocularFrame:
         """The best of several poses with a covariance that covers all of them."""
         w = weights / weights.sum()
-        pose = best.fit.pose
+        pose = best.fit.world_from_body
         covariance = np.zeros((6, 6))
         for weight, one in zip(w, [best, *rivals], strict=True):
-            apart = one.fit.pose.minus(pose)
+            apart = one.fit.world_from_body.minus(pose)
             covariance += weight * (one.fit.covariance + np.outer(apart, apart))
         if np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > LOST_SIGMA_M:
             return self._unmeasured(AMBIGUOUS, ahead, best)
         return self._result(PoseStatus.PREDICTED, AMBIGUOUS, pose, symmetric(covariance), best, ahead)
 
-    def _unmeasured(self, reason: str, ahead: Motion | None, found: LabelledPose | None = None) -> BinocularFrame:
+    def _unmeasured(self, reason: str, ahead: RigidMotion | None, found: LabelledPose | None = None) -> BinocularFrame:
         if ahead is None:
             return self._result(PoseStatus.LOST, reason, None, None, found, ahead)
-        return self._result(PoseStatus.PREDICTED, reason, ahead.pose, ahead.pose_covariance, found, ahead)
+        return self._result(PoseStatus.PREDICTED, reason, ahead.world_from_body, ahead.covariance, found, ahead)
 
     def _result(
         self,
@@ -226,13 +198,13 @@ class BinocularTracker:
         pose: Pose | None,
         covariance: Array | None,
         found: LabelledPose | None,
-        ahead: Motion | None,
+        ahead: RigidMotion | None,
     ) -> BinocularFrame:
         count = len(self._model)
         pixels, cov = np.full((2, count, 2), np.nan), np.full((2, count, 2, 2), np.nan)
         if ahead is not None:
-            pixels, J = project_markers(self._pair, self._model, ahead.pose)
-            cov = J @ ahead.pose_covariance @ np.swapaxes(J, -1, -2)
+            pixels, J = project_markers(self._pair, self._model, ahead.world_from_body)
+            cov = J @ ahead.covariance @ np.swapaxes(J, -1, -2)
         used = found is not None and (status is PoseStatus.MEASURED or reason == AMBIGUOUS)
         index = found.index if found is not None and used else np.full((2, count), -1, dtype=np.int64)
         fit = None if found is None else found.fit

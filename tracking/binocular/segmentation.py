@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools
-from tracking.binocular.marker_model import MarkerImages
-from tracking.binocular.parameters import SegmentationParameters
+from tracking.binocular.marker_model import MarkerImages, SegmentationParameters
 
 Bytes = NDArray[np.uint8]
 _MARGIN_PX = 3  # around a region: partly covered pixels, with defocus up to a sigma of 1.5 px

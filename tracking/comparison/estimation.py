@@ -12,18 +12,20 @@ from geometry.arrays import Array, Bools, symmetric
 from geometry.uncertainty.chi_square import chi2_limit
 from tracking.comparison.frame_alignment import (
     BODY,
+    GAP,
     LEVER,
     PARAMETERS,
     TIME,
     TRANSLATION,
     WORLD,
     Alignment,
+    Motion,
     Residuals,
     first_alignment,
     jacobians,
+    rates,
     residuals,
 )
-from tracking.comparison.motion import GAP, Motion, rates
 
 # Candidates of the time offset between two motions, from the speeds, which do not depend on the frames.
 

@@ -2,7 +2,7 @@
 
 Source: Huo, Yang & Yang 2015, fig. 1: predict, eqs. (1) and (2); recognise, spots in view by matching (section 4.1)
 and spots out of view by solving from the other beams (section 4.2); modify, eqs. (3) to (6). Ours: the pose from the
-matched spots checks every match (rigid_check.py) and predicts the spots that are not matched (vehicle.py).
+matched spots checks every match and predicts the spots that are not matched (vehicle.py).
 """
 
 from __future__ import annotations
@@ -20,15 +20,13 @@ from geometry.pose_solver.gauss_newton import PoseFit, SolveLimits, is_measureme
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty
 from tracking.curve_switching.matching import match
-from tracking.curve_switching.pose_filter import CoplanarViews, quadratic_positions
-from tracking.curve_switching.rigid_check import RigidCheck, matched_pixels, outside_first_search
-from tracking.curve_switching.vehicle import Tracks, Vehicle
+from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
+from tracking.curve_switching.vehicle import RigidCheck, Tracks, Vehicle, matched_pixels, outside_first_search
 from tracking.detections import UNMATCHED, Detections
 from tracking.input_validation import check_step
 from tracking.labelling.first_labels import NO_POINT, find_labels
 from tracking.parameters import TrackerParameters
-from tracking.statuses import SpotStatus
-from tracking.tracked_frame import Event, TrackedFrame
+from tracking.statuses import Event, SpotStatus, TrackedFrame
 
 EAGER_SEARCHES = 10  # frames without a pose in which the labels are searched every time, and then only ...
 SEARCH_EVERY = 5  # ... in every fifth: a search that has failed for long is likely to fail again

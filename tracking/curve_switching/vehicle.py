@@ -1,8 +1,8 @@
-"""The trackers of all spots of a vehicle: filters and history of each view, and the frame that they share."""
+"""The trackers of all spots of a vehicle, the pose that they share, and the check of every match against it."""
 
 from __future__ import annotations
 
-from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,12 +11,22 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
-from geometry.pose_solver.gauss_newton import PoseFit, pixel_covariance
+from geometry.pose_solver.gauss_newton import (
+    EXPECTED_GATE,
+    PoseFit,
+    SolveLimits,
+    fit_pose,
+    fit_pose_robust,
+    is_measurement,
+    pixel_covariance,
+)
+from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking import kalman
-from tracking.curve_switching import pose_filter
-from tracking.curve_switching.pose_filter import RigidMotion
+from tracking.detections import UNMATCHED, Detections
+from tracking.kalman import RigidMotion
 from tracking.parameters import TrackerParameters
-from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, PoseStatus
+from tracking.rigid_body.online_estimates import VarianceFactor
+from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, Event, PoseStatus
 
 # The Kalman filters of all views and their history.
 
@@ -121,8 +131,6 @@ class Tracks:
 
 
 CLUTTER_NEAR_SPOTS = 2e-4  # 1/px^2: the paper's 20 % of false points within 15 px of a spot
-VARIANCE_FACTOR_MEMORY = 100  # frames: memory of the variance factor, which scales stated covariances ...
-VARIANCE_FACTOR_DEADBAND = 1.3  # ... once it exceeds this: with correct sigmas it scatters by 0.06 about 1
 ACCELERATION_RATE = 0.03  # relative change of the estimated accelerations per excess of one normalised innovation
 ACCELERATION_RANGE = (0.02, 2000.0)  # m/s^2 and rad/s^2: limits of the estimated accelerations
 BENT = 100.0  # squared sigmas per axis: beyond it the pose filter restarts, because the velocities are no longer valid
@@ -139,9 +147,7 @@ class Vehicle:
         self.anchor_age_s = 0.0  # time since that pose
         self._accelerations = np.array([parameters.pose_sigma_a_m_s2, parameters.pose_sigma_a_rad_s2])
         self._fastest = np.zeros(2)  # m/s and rad/s: the largest speeds observed so far
-        self._variance_factor = 1.0  # running mean of chi2 / dof
-        self._recent: deque[float] = deque(maxlen=9)  # chi2 / dof of the last frames
-        self._deadband = VARIANCE_FACTOR_DEADBAND
+        self._variance_factor = VarianceFactor()
         # Contributions of the calibration's errors at the last measured pose.
         self._systematic = np.zeros((6, 6))  # to the pose's covariance
         self._systematic_px: Array | float = 0.0  # (n, 2, 2) to the expected pixels' covariances, px^2
@@ -149,8 +155,8 @@ class Vehicle:
 
     @property
     def noise_scale(self) -> float:
-        """Ratio of the spots' actual to their stated sigmas; 1 while the variance factor is within its deadband."""
-        return float(np.sqrt(self._variance_factor)) if self._variance_factor > self._deadband else 1.0
+        """Ratio of the spots' errors to their stated sigmas."""
+        return self._variance_factor.noise_scale
 
     @property
     def known(self) -> bool:
@@ -170,7 +176,7 @@ class Vehicle:
         self.anchor_age_s += dt_s
         if self.motion is not None:
             a = self._accelerations
-            self.motion = pose_filter.predict(self.motion, dt_s, float(a[0]), float(a[1]))
+            self.motion = self.motion.predicted(dt_s, float(a[0]), float(a[1]))
 
     def search_prior(self, first: PosePrior) -> PosePrior:
         """The prior for a new search: around the last measured pose, as far as the vehicle may have moved since.
@@ -197,19 +203,16 @@ class Vehicle:
         covariance = (fit.noise if same_spots else fit.covariance) * self.noise_scale**2
         self._rows, self._systematic = fit.rows, fit.systematic * self.noise_scale**2
         self._systematic_px = fit.calibration_px()
-        if fit.dof > 0:
-            self._update_variance_factor(fit.chi2 / fit.dof)
-            # A calibration has one set of errors for the whole run: averaging does not reduce their share of chi2.
-            self._deadband = VARIANCE_FACTOR_DEADBAND + 3 * fit.systematic_share * np.sqrt(2 / fit.dof)
+        self._variance_factor.update(fit.chi2, fit.dof, fit.systematic_share)
         if self.motion is None:
-            self.motion = pose_filter.begin(fit.world_from_body, covariance)
+            self.motion = RigidMotion.at_rest(fit.world_from_body, covariance)
         else:
-            after, y, S = pose_filter.update_with_pose(self.motion, fit.world_from_body, covariance)
+            after, y, S = self.motion.updated_with_pose(fit.world_from_body, covariance)
             nis = np.array([y[i] @ np.linalg.solve(S[i, i], y[i]) / 3 for i in (slice(0, 3), slice(3, 6))])
             if self.anchor_age_s <= 1.5 * dt_s:
                 change = np.exp(ACCELERATION_RATE * (np.clip(nis, 0, 6) - 1))
                 self._accelerations = np.clip(self._accelerations * change, *ACCELERATION_RANGE)
-            self.motion = pose_filter.begin(fit.world_from_body, covariance) if nis.max() > BENT else after
+            self.motion = RigidMotion.at_rest(fit.world_from_body, covariance) if nis.max() > BENT else after
         if self.anchor is not None and self.anchor_age_s > 0:
             displacement = fit.world_from_body.minus(self.anchor)
             speeds = np.array([np.linalg.norm(displacement[:3]), np.linalg.norm(displacement[3:])]) / self.anchor_age_s
@@ -238,7 +241,7 @@ class Vehicle:
                 R = np.zeros((2 * good.sum(), 2 * good.sum()))
                 for k, block in enumerate(C[good]):
                     R[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = block
-                motion, _ = pose_filter.update(motion, y[good].ravel(), J[rows[good]].reshape(-1, 6), R)
+                motion, _ = motion.updated(y[good].ravel(), J[rows[good]].reshape(-1, 6), R)
         self.motion = motion
         return good
 
@@ -266,16 +269,171 @@ class Vehicle:
         P[i, i] += extra * min(self.anchor_age_s, 0.1) ** 2 / 4
         return replace(motion, P=P)
 
-    def _update_variance_factor(self, chi2_per_dof: float) -> None:
-        """Update the running mean of chi2 / dof.
 
-        One frame counts at most three times the mean, so a merged spot now and then has little effect. If most of the
-        recent frames exceed three times the mean, the mean jumps to their median.
+# The pose from the matched spots, and the check of every match against it: drop false matches, add missed ones.
+#
+# Source: ours (`TrackerParameters.rigid_check`). The paper matches every spot by itself.
+
+RIGID_GATE = 20.0  # squared sigmas: a detection this near to a spot's place in the pose is that spot (p = 5e-5)
+
+
+def matched_pixels(model: SpotModel, found: Sequence[Detections | None], point: Ints) -> tuple[Array, Array]:
+    """Positions (n, 2), px, and covariances (n, 2, 2), px^2, of the detections `point` (n,); nan where UNMATCHED."""
+    n = len(model)
+    uv, cov = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
+    for c, points in enumerate(found):
+        rows = np.flatnonzero((model.camera_of == c) & (point != UNMATCHED))
+        if points is not None and len(rows):
+            uv[rows], cov[rows] = points.uv_px[point[rows]], points.cov_px2[point[rows]]
+    return uv, cov
+
+
+def outside_first_search(model: SpotModel, tracks: Tracks, r1_px: float, uv_px: Array) -> Bools:
+    """Which matched views (n,), uv_px (n, 2), lie outside their first search region or have no track: `turned`."""
+    gap = np.linalg.norm(uv_px - tracks.x[:, :2], axis=-1)
+    return ~np.isnan(uv_px[:, 0]) & ~(tracks.alive & (gap <= r1_px))
+
+
+@dataclass(frozen=True, slots=True)
+class RigidCheck:
+    """The pose fit to matched spots, for one tracker."""
+
+    model: SpotModel
+    parameters: TrackerParameters
+    limits: SolveLimits
+    calibration: RigUncertainty | None
+
+    def pose_of_matches(
+        self,
+        found: Sequence[Detections | None],
+        point: Ints,
+        turned: Bools,
+        tracks: Tracks,
+        vehicle: Vehicle,
+        start: Pose,
+        events: list[Event],
+    ) -> tuple[PoseFit | None, Ints, Bools]:
+        """The pose from the matches, and the corrected `point` (n,) and `turned` (n,). None: not observable.
+
+        start: the pose at which the fit begins. With `rigid_check` false matches are dropped, with an event each, and
+        missed spots are added.
         """
-        self._recent.append(chi2_per_dof)
-        median = float(np.median(self._recent))
-        if len(self._recent) == self._recent.maxlen and median > 3 * max(self._variance_factor, 1.0):
-            self._variance_factor = median
-        change = (min(chi2_per_dof / self._variance_factor, 3.0) - 1) / VARIANCE_FACTOR_MEMORY
-        self._variance_factor *= 1 + change
-        self._variance_factor = max(self._variance_factor, 0.1)
+        rows = np.flatnonzero(point != UNMATCHED)
+        if len(rows) < 3:
+            return None, point, turned
+        uv, cov = matched_pixels(self.model, found, point)
+        fit = self.robust_fit(rows, uv, cov, start, vehicle, expected=vehicle.expected)
+        if fit is None:
+            fit = self._merged_fit(rows, uv, cov, start, vehicle)
+        if fit is None or not is_measurement(fit, self.limits):
+            return None, point, turned
+        if len(rows) < 4 and not _agrees_with_motion(fit, vehicle):
+            return None, point, turned
+        if not self.parameters.rigid_check:
+            return fit, point, turned
+        matched, point = point, point.copy()
+        left_out = np.setdiff1d(rows, fit.rows)
+        point[left_out] = UNMATCHED
+        fit, point, turned = self._with_missed_spots(found, point, turned, tracks, vehicle, fit)
+        for view in left_out[point[left_out] == UNMATCHED]:
+            taken = np.any((point == matched[view]) & (self.model.camera_of == self.model.camera_of[view]))
+            if not taken and np.linalg.norm(uv[view] - fit.projected_px[view]) < self.parameters.blend_px:
+                # A neighbour that merges with a spot shifts its centre by a pixel or two: the detection stays labelled
+                # but is excluded from the pose.
+                point[view] = matched[view]
+            else:
+                events.append(Event("dropped", "contradicts the other spots: not this spot", int(view)))
+        return fit, point, turned & (point != UNMATCHED)
+
+    def robust_fit(
+        self,
+        rows: Ints,
+        uv: Array,
+        cov: Array,
+        start: Pose,
+        vehicle: Vehicle,
+        expected: tuple[Pose, Array] | None = None,
+    ) -> PoseFit | None:
+        """The robust fit to the views `rows` of uv (n, 2) and cov (n, 2, 2), near the pose `expected` if given."""
+        return fit_pose_robust(
+            self.model,
+            rows,
+            uv[rows],
+            cov[rows],
+            start,
+            expected=expected,
+            limits=self.limits,
+            noise_scale=vehicle.noise_scale,
+            calibration=self.calibration,
+        )
+
+    def widened_fit(self, rows: Ints, uv: Array, cov: Array, start: Pose, vehicle: Vehicle) -> PoseFit | None:
+        """The fit to all views `rows`, its covariance scaled by the frame's own chi2 / dof where that is larger."""
+        fit = fit_pose(self.model, rows, uv[rows], cov[rows], start, calibration=self.calibration)
+        return None if fit is None else _widened(fit, vehicle)
+
+    def _merged_fit(self, rows: Ints, uv: Array, cov: Array, start: Pose, vehicle: Vehicle) -> PoseFit | None:
+        """The widened fit to all spots, if all lie near their places but no single spot can be excluded."""
+        fit = fit_pose(self.model, rows, uv[rows], cov[rows], start, calibration=self.calibration)
+        if fit is None or fit.dof <= 0 or np.linalg.norm(fit.residuals_px, axis=-1).max() > self.parameters.blend_px:
+            return None
+        # At a bend nothing confirms such a set of matches: the search for labels decides.
+        return _widened(fit, vehicle) if _agrees_with_motion(fit, vehicle) else None
+
+    def _with_missed_spots(
+        self,
+        found: Sequence[Detections | None],
+        point: Ints,
+        turned: Bools,
+        tracks: Tracks,
+        vehicle: Vehicle,
+        fit: PoseFit,
+    ) -> tuple[PoseFit, Ints, Bools]:
+        """The fit, `point` and `turned` with the missed spots, as far as the fit with them is consistent."""
+        point, new = self._add_missed(found, point, vehicle, fit)
+        if not new:
+            return fit, point, turned
+        rows = np.union1d(fit.rows, new)
+        uv, cov = matched_pixels(self.model, found, point)
+        wider = fit_pose(self.model, rows, uv[rows], cov[rows], fit.world_from_body, calibration=self.calibration)
+        if wider is None or not wider.consistent(self.limits.p_false_alarm):
+            point[new] = UNMATCHED
+            return fit, point, turned
+        far = outside_first_search(self.model, tracks, self.parameters.r1_px, uv)
+        return wider, point, np.where(np.isin(np.arange(len(point)), new), far, turned)
+
+    def _add_missed(
+        self, found: Sequence[Detections | None], point: Ints, vehicle: Vehicle, fit: PoseFit
+    ) -> tuple[Ints, list[int]]:
+        """Enter the nearest free detection within the gate for every view that has none; also the views added."""
+        uv, fit_cov = fit.projected_px, fit.spot_covariances()
+        new: list[int] = []
+        open_views = np.flatnonzero((point == UNMATCHED) & self.model.in_picture(uv, self.parameters.image_margin_px))
+        for view in open_views:
+            c = int(self.model.camera_of[view])
+            points = found[c]
+            if points is None or not len(points):
+                continue
+            taken = point[(self.model.camera_of == c) & (point != UNMATCHED)]
+            gap = points.uv_px - uv[view]
+            S = points.cov_px2 * vehicle.noise_scale**2 + fit_cov[view]
+            d2 = np.sum(gap * np.linalg.solve(S, gap[..., None])[..., 0], axis=-1)
+            d2[taken] = np.inf
+            best = int(np.argmin(d2))
+            if d2[best] < RIGID_GATE:
+                point[view] = best
+                new.append(int(view))
+        return point, new
+
+
+def _agrees_with_motion(fit: PoseFit, vehicle: Vehicle) -> bool:
+    """Whether the predicted motion allows the pose. Needed for three spots, which fit any labels."""
+    expected = vehicle.expected
+    if expected is None:
+        return False
+    gap = fit.world_from_body.minus(expected[0])
+    return float(gap @ np.linalg.solve(expected[1] + fit.covariance, gap)) < EXPECTED_GATE
+
+
+def _widened(fit: PoseFit, vehicle: Vehicle) -> PoseFit:
+    return fit.widened(max(1.0, fit.chi2 / fit.dof / vehicle.noise_scale**2)) if fit.dof > 0 else fit

@@ -11,13 +11,19 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from geometry.arrays import Array
-from tracking.drogue_circle.acquisition import Wanted, acquire
-from tracking.drogue_circle.candidates import CircleDetector, Picture, Window, crop_bounds
-from tracking.drogue_circle.detectors import centre_votes, centres, edge_pixels
+from tracking.drogue_circle.detectors import (
+    CircleDetector,
+    CircleParameters,
+    Picture,
+    Window,
+    centre_votes,
+    centres,
+    crop_bounds,
+    edge_pixels,
+)
 from tracking.drogue_circle.kalman import PRINTED_P0, printed_coefficient, printed_step
-from tracking.drogue_circle.occlusion import Appearance, disc_cells, first_appearance
-from tracking.drogue_circle.parameters import CircleParameters
-from tracking.drogue_circle.rim_fit import CircleFrame, nothing_known
+from tracking.drogue_circle.rim_fit import Appearance, CircleFrame, disc_cells, first_appearance, nothing_known
+from tracking.drogue_circle.tracker import Wanted, acquire
 from tracking.kalman import transition
 from tracking.statuses import Cause, PoseStatus
 

@@ -17,11 +17,12 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.compilation.jit import compiled
 from geometry.compiled_projection import inside, project_view
 from geometry.pose_solver.three_spots import pose_of_lengths, spot_lengths
-from tracking.labelling.points import NO_POINT, PointsOnScreens
-from tracking.labelling.problem import (
+from tracking.labelling.points import (
     GATE,
     LOG_2PI,
+    NO_POINT,
     LabelProblem,
+    PointsOnScreens,
     PoseWorkspace,
     add_information,
     allowed,
@@ -193,7 +194,7 @@ def _score(problem: LabelProblem, candidate: Candidate, work: PoseWorkspace) -> 
     for v in range(n):
         if labels[v] != NO_POINT or not spots.has_image[v] or not inside(uv[v], spots.size[v]):
             continue
-        best, best_point = _best_point(problem, v, work)
+        best, best_point = best_point_of(problem, v, work, False, labels)
         if best_point == NO_POINT:
             score += missed
             continue
@@ -216,8 +217,13 @@ def _score(problem: LabelProblem, candidate: Candidate, work: PoseWorkspace) -> 
 
 
 @compiled
-def _best_point(problem: LabelProblem, v: int, work: PoseWorkspace) -> tuple[float, int]:
-    """The log-likelihood gained by the best point of a view, and that point; NO_POINT if a miss is more likely."""
+def best_point_of(
+    problem: LabelProblem, v: int, work: PoseWorkspace, only_free: bool, labels: Ints
+) -> tuple[float, int]:
+    """The log-likelihood gained by the best point of a view, and that point; NO_POINT if a miss is more likely.
+
+    only_free: without the points that have a label in `labels` (n,).
+    """
     points, spots = problem.points, problem.spots
     found, missed = np.log(problem.limits.p_detect), np.log(1 - problem.limits.p_detect)
     a, b, c = predicted_spread(work.H, work.J[v], work.left)
@@ -225,11 +231,15 @@ def _best_point(problem: LabelProblem, v: int, work: PoseWorkspace) -> tuple[flo
     camera = spots.camera[v]
     best, best_point = missed, NO_POINT
     for p in range(points.first[camera], points.first[camera + 1]):
+        free = True
+        if only_free:
+            for other in range(labels.shape[0]):
+                free &= labels[other] != p
         du, dv = points.uv[p, 0] - work.uv[v, 0], points.uv[p, 1] - work.uv[v, 1]
         A, B, C = a + points.cov[p, 0, 0], b + points.cov[p, 0, 1], c + points.cov[p, 1, 1]
         det = A * C - B * B
         d2 = (C * du * du - 2 * B * du * dv + A * dv * dv) / det
-        if not d2 < GATE:
+        if not free or not d2 < GATE:
             continue
         value = found - points.log_density[camera] - LOG_2PI - 0.5 * (np.log(det) + d2)
         if value > best:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 
 from geometry.arrays import Array
-from tracking.statuses import Cause, PoseStatus
+from tracking.statuses import Cause, PoseStatus, Word
 
 # Parameters of the light tracker and of the hand-over between it and the detector. Times are frames.
 
@@ -64,26 +63,13 @@ USUAL = LightParameters()
 # The drogue in one frame: status, cause, place, size, confidence and who measured it.
 
 
-class Source(StrEnum):
+class Source(Word):
     """What measured the drogue."""
 
-    NONE = ""
-    DETECTOR = "detector"
-    LIGHT = "light"
-    BOTH = "both"
-
-    @property
-    def meaning(self) -> str:
-        """One sentence for the user."""
-        return _SOURCES[self]
-
-
-_SOURCES = {
-    Source.NONE: "nothing",
-    Source.DETECTOR: "the detector alone: an acquisition",
-    Source.LIGHT: "the light tracker",
-    Source.BOTH: "the light tracker, and the detector confirms it",
-}
+    NONE = "", "nothing"
+    DETECTOR = "detector", "the detector alone: an acquisition"
+    LIGHT = "light", "the light tracker"
+    BOTH = "both", "the light tracker, and the detector confirms it"
 
 
 @dataclass(frozen=True, slots=True)

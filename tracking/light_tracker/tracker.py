@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geometry.arrays import Array
-from tracking.drogue_circle.candidates import CircleCandidate, CircleDetector, Picture, Window
+from tracking.drogue_circle.detectors import CircleCandidate, CircleDetector, Picture, Window
 from tracking.light_tracker.frames import (
     ABSENT_LOGIT,
     USUAL,
@@ -22,9 +22,7 @@ from tracking.light_tracker.frames import (
     probability,
     within,
 )
-from tracking.light_tracker.known import Known, is_clear, is_similar
-from tracking.light_tracker.motion import WHOLE, Motion
-from tracking.light_tracker.pattern import Match, Pattern, unexplained
+from tracking.light_tracker.pattern import WHOLE, Known, Match, Motion, Pattern, is_clear, is_similar, unexplained
 from tracking.statuses import Cause, PoseStatus
 
 # What is known of a drogue while it is followed.

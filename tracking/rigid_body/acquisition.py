@@ -1,25 +1,52 @@
-"""Search of one frame for the whole vehicle: where it may be, and the labellings that explain the frame's points."""
+"""Search of a frame for the whole vehicle: when, where it may be, which labellings explain the frame's points.
+
+The answers, and mirror solutions of three spots, become children of the hypotheses and are scored like all others.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
-from geometry.arrays import Array
+from geometry.arrays import Array, Ints
+from geometry.compiled_projection import project_all
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
-from geometry.pose_solver.visibility import symmetries
+from geometry.pose_solver.visibility import alternative_poses, symmetries
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking.detections import Detections
 from tracking.labelling.first_labels import NO_POINT, Labelling, candidate_labellings, find_labels
 from tracking.parameters import TrackerParameters
-from tracking.rigid_body.association.frame_detections import FrameDetections
-from tracking.tracked_frame import Event
+from tracking.rigid_body.association.frame_detections import (
+    BLENDED,
+    NOT_SEARCHED,
+    FrameDetections,
+    Observation,
+    detection_log_likelihood,
+    distinct_spots,
+    log_clutter_ratio,
+)
+from tracking.rigid_body.frame_summary import is_lost
+from tracking.rigid_body.hypotheses.hypothesis_set import (
+    MAX_TRACKING_SIGMA_PX,
+    MIN_CONFIRMING_SPOTS,
+    MIN_REDUNDANT_SPOTS,
+    Children,
+    Dynamics,
+    Hypotheses,
+    State,
+    add_child,
+    iterated_update,
+)
+from tracking.rigid_body.models.motion import predicted
+from tracking.rigid_body.models.occlusion import MISSED, joint_log_likelihood, marginal, predict, update
+from tracking.statuses import Event
 
 # Sigmas of the motion of a vehicle that has just been found.
 FIRST_SPEED, FIRST_RATE = 4.0, 6.0  # m/s, rad/s
@@ -158,3 +185,272 @@ class Acquisition:
         px_s2 = float(np.median(speed2[speed2 > 0])) if np.any(speed2 > 0) else SEARCH_PX_S**2
         variance = points.clock.after_s(points.uv_px[:, 1]) ** 2 * px_s2
         return replace(points, cov_px2=points.cov_px2 + variance[:, None, None] * np.eye(2))
+
+
+P_VISIBLE_AT_START = 0.95  # of each spot and each screen
+MAX_LINKED = 3  # hypotheses that a search's answers continue, and children whose mirror solutions are added
+DOUBT_NATS = 7.0  # by so much an answer must explain a frame better than a doubted track, both without their history
+ALTERNATIVE_NATS = 8.0  # mirror solutions are added to children that are at most this much less likely than the best
+
+
+class Start(NamedTuple):
+    """A predicted state that a pose is to update."""
+
+    state: State
+    p_visible: Array  # (n + groups,)
+    log_weight: float
+    parent: int  # index of the hypothesis of the frame before; -1: none
+    manoeuvre: bool  # the state may have jumped, or is unknown
+
+
+def unknown_vehicle(prior: PosePrior, log_weight: float, visibilities: int) -> Start:
+    """A vehicle that is somewhere in the search region and of whose motion nothing is known."""
+    where = (min(prior.within_m, 10.0) / np.sqrt(3), prior.within_rad / np.sqrt(3))
+    sigmas = [*where, FIRST_SPEED, FIRST_RATE, FIRST_ACCELERATION, FIRST_ANGULAR_ACCELERATION]
+    R, t = np.ascontiguousarray(prior.centre.rotation), np.array(prior.centre.translation)
+    state = State(R, t, np.zeros(12), np.diag(np.repeat(sigmas, 3) ** 2))
+    return Start(state, np.full(visibilities, P_VISIBLE_AT_START), log_weight, -1, True)
+
+
+def predicted_hypothesis(h: Hypotheses, k: int, dt_s: float, dynamics: Dynamics, manoeuvre: bool) -> State:
+    """Hypothesis k of the frame before, predicted over dt_s."""
+    none = np.zeros(2)
+    jumps = (dynamics.velocity_jump, dynamics.acceleration_jump) if manoeuvre else (none, none)
+    R, t, m, P, _ = predicted(h.R[k], h.t[k], h.m[k], h.P[k], dt_s, dynamics.jerk, *jumps)
+    return State(R, t, m, P)
+
+
+def continued_hypotheses(h: Hypotheses, dt_s: float, dynamics: Dynamics, n: int, manoeuvre: bool) -> list[Start]:
+    """The likeliest hypotheses of the frame before, predicted with or without a manoeuvre; n: number of views."""
+    out = []
+    for k in np.argsort(-h.log_weight)[:MAX_LINKED].tolist():
+        p = dynamics.p_manoeuvre if manoeuvre else 1 - dynamics.p_manoeuvre
+        state = predicted_hypothesis(h, k, dt_s, dynamics, manoeuvre)
+        out.append(Start(state, predict(h.p_visible[k], n), float(h.log_weight[k] + np.log(p)), k, manoeuvre))
+    return out
+
+
+def without_history(
+    children: Children, count: int, obs: Observation, model: SpotModel, start: Start
+) -> tuple[int, Start]:
+    """An unknown vehicle's start whose answers compete with the best child as if that had no history either.
+
+    Where the track itself is doubted, its narrow prediction must not count for it: a wrong pose that has been followed
+    for some frames predicts its few points better than an unknown vehicle predicts all of its spots. Also returns the
+    number of children, to which the best child's labels of this start are added.
+    """
+    if count == 0:
+        return count, start
+    best = int(np.argmax(children.hypotheses.log_weight[:count]))
+    pose = Pose(children.hypotheses.R[best].copy(), children.hypotheses.t[best].copy())
+    weight = float(children.hypotheses.log_weight[best])
+    count, place = add_pose(children, count, obs, model, start, children.assigned[best].copy(), pose)
+    if place < 0:
+        return count, start
+    history = weight - float(children.hypotheses.log_weight[place]) - DOUBT_NATS
+    return count, start._replace(log_weight=start.log_weight + max(history, 0.0))
+
+
+def continues(children: Children, count: int, parent: int, assigned: Ints) -> bool:
+    """Whether one of the first `count` children continues a hypothesis steadily with the same labels (n,)."""
+    labels = np.maximum(children.assigned[:count], MISSED) == np.maximum(assigned, MISSED)
+    steady = (children.parent[:count] == parent) & ~children.manoeuvre[:count]
+    return bool((labels.all(axis=1) & steady).any())
+
+
+def add_pose(
+    children: Children, count: int, obs: Observation, model: SpotModel, start: Start, assigned: Ints, pose: Pose
+) -> tuple[int, int]:
+    """Add the update of a state by an assignment (n,) near a pose; see `add_child` for the result."""
+    group, p_detect = obs.view_table.group, obs.detection_model.p_detect
+    state, log_likelihood, _, _ = iterated_update(
+        obs, start.state, assigned, np.array(pose.rotation, order="C"), np.array(pose.translation)
+    )
+    uv, _ = project_all(obs.views, state.R[None], state.t[None])
+    inside = model.in_picture(uv[0]) & obs.frame.has_image[model.camera_of]
+    assigned = np.where((assigned < 0) & ~inside, NOT_SEARCHED, assigned)
+    log_weight = start.log_weight
+    log_weight += log_likelihood + log_clutter_ratio(obs, state.R, state.t, state.P)
+    log_weight += detection_log_likelihood(obs, marginal(start.p_visible, group), assigned, state.R, state.t)
+    log_weight += joint_log_likelihood(start.p_visible, group, assigned, p_detect)
+    if not np.isfinite(log_weight):
+        return count, -1
+    after = update(start.p_visible, group, assigned, p_detect)
+    return add_child(children, count, state, log_weight, after, assigned, False, start.parent)
+
+
+def add_mirror_solutions(
+    children: Children,
+    count: int,
+    obs: Observation,
+    model: SpotModel,
+    old: Hypotheses,
+    dynamics: Dynamics,
+    dt_s: float,
+) -> int:
+    """Add the other poses that three labelled spots allow to the children; returns the number of children.
+
+    Three spots determine a pose up to a few solutions, and only the motion can distinguish them. Each solution gets
+    children of its own, so that one to which the vehicle may have changed remains among the hypotheses.
+    """
+    w = children.hypotheses.log_weight[:count]
+    for c in np.argsort(-w)[:MAX_LINKED].tolist():
+        assigned = children.assigned[c].copy()
+        exact = (assigned >= 0) & (assigned < BLENDED)
+        parent = int(children.parent[c])
+        if (
+            w[c] < w.max() - ALTERNATIVE_NATS
+            or parent < 0
+            or distinct_spots(exact, model.spot_of) != MIN_CONFIRMING_SPOTS
+        ):
+            continue
+        pose = Pose(children.hypotheses.R[c].copy(), children.hypotheses.t[c].copy())
+        others = alternative_poses(model, pose, np.flatnonzero(exact))
+        manoeuvre = bool(children.manoeuvre[c])
+        p = dynamics.p_manoeuvre
+        log_weight = float(old.log_weight[parent]) + float(np.log(p if manoeuvre else 1 - p))
+        state = predicted_hypothesis(old, parent, dt_s, dynamics, manoeuvre)
+        for i in range(len(others.translation)):
+            start = Start(state, predict(old.p_visible[parent], len(model)), log_weight, parent, manoeuvre)
+            count, _ = add_pose(children, count, obs, model, start, assigned, others[i])
+    return count
+
+
+LONG_UNMEASURED = 10  # frames without a measured pose, after which two missing spots are enough to contradict
+SEARCH_AT = (2, 4, 8, 14)  # frames in a row that contradict the best hypothesis, at which a search is made
+ASTRAY = 15  # frames without a measured pose, after which a contradicted vehicle is searched anywhere
+MISSING_TO_DOUBT = 2  # spots of one camera; an answer must explain so many more than the doubted track
+CONTRADICTED_INTERVAL = 20  # frames: and after that at each multiple of it
+FEW_SPOTS_INTERVAL = 50  # frames in a row with few, uncontradicted labels between two searches
+JUST_FOUND = 5  # frames after a successful search: until then the velocities may be almost unknown
+# Searches in a row without success, from which on only every so many frames are searched. A failing search of twelve
+# spots costs 0.4 s, and an occluded screen may stay so for minutes. More points than before are searched at once.
+INTERVALS = ((0, 1), (20, 2), (100, 5), (300, 10), (1000, 20))
+
+
+def is_vague(model: SpotModel, h: Hypotheses | None, dt_s: float, dynamics: Dynamics) -> bool:
+    """Whether the best hypothesis predicts some spot worse than MAX_TRACKING_SIGMA_PX, or no spot at all."""
+    if h is None:
+        return True
+    R, t, _, P = predicted_hypothesis(h, 0, dt_s, dynamics, manoeuvre=False)
+    _, J = project_all(model.numbers, R[None], t[None])
+    cov = J[0] @ P[:6, :6] @ np.swapaxes(J[0], -1, -2)
+    projected = J[0].any(axis=(1, 2))  # project_all gives 0 where there is no projection
+    if is_lost(P) or not projected.any():
+        return True
+    return bool(np.sqrt(np.max(cov[projected][:, [0, 1], [0, 1]])) > MAX_TRACKING_SIGMA_PX)
+
+
+def _due(frames: int) -> bool:
+    """Whether to search after so many frames in a row that give a reason for it."""
+    return frames in SEARCH_AT or frames % CONTRADICTED_INTERVAL == 0
+
+
+class SearchSchedule:
+    """Counters over the frames that decide about searches."""
+
+    def __init__(self, model: SpotModel, min_spots: int) -> None:
+        """min_spots: points that a frame needs for a search."""
+        self._model, self._min_spots = model, min_spots
+        self.searches = 0  # in a row without success
+        self._since_found = 0  # frames since a search found the vehicle
+        self._unmeasured = 0  # frames in a row without a measured pose
+        self._contradicted = 0  # frames in a row that contradict the best hypothesis
+        self._doubted = 0  # frames in a row whose labels explain the pose, but few of a camera's points
+        self._few_spots = 0  # frames in a row that label fewer than MIN_REDUNDANT_SPOTS
+        self._points_before = 0  # of all cameras, in the frame before
+
+    @property
+    def just_found(self) -> bool:
+        """Whether a search has found the vehicle a few frames ago."""
+        return self._since_found <= JUST_FOUND
+
+    @property
+    def doubted(self) -> bool:
+        """Whether the last measured pose may be wrong."""
+        return self._doubted > 0
+
+    @property
+    def astray(self) -> bool:
+        """Whether the vehicle is probably not near the place where it is followed: it moved faster than ever before."""
+        return self._contradicted > 0 and self._unmeasured >= ASTRAY
+
+    def next_frame(self) -> None:
+        """Count a frame."""
+        self._since_found += 1
+
+    def found(self) -> None:
+        """A search has given this frame's best hypothesis; the next frame is searched too, to confirm or refute it."""
+        self.searches = self._since_found = 0
+
+    def measured(self, whether: bool, spots: int) -> None:
+        """Whether this frame's pose is measured, and from how many spots."""
+        self._unmeasured = 0 if whether else self._unmeasured + 1
+        if whether and spots >= MIN_REDUNDANT_SPOTS:
+            self.searches = 0
+
+    def due(
+        self, best: Ints | None, found: Sequence[Detections | None], prediction_is_vague: Callable[[], bool]
+    ) -> bool:
+        """Whether to search this frame: there are enough points, and no hypothesis explains them with certainty.
+
+        best (n,): assignment of the likeliest child; None without one. prediction_is_vague: whether the best hypothesis
+        predicts some spot too badly to track it.
+        """
+        points, before = sum(len(f) for f in found if f is not None), self._points_before
+        self._points_before = points
+        doubted, self._doubted = self._doubted, 0
+        if points < self._min_spots:
+            return False
+        if best is not None:
+            explained = distinct_spots(best >= 0, self._model.spot_of) >= MIN_REDUNDANT_SPOTS
+            vague = (self.just_found or not explained) and prediction_is_vague()
+            if explained and not vague:
+                self._few_spots = 0
+                self._doubted = doubted + 1 if self._doubtful(best, found) else 0
+                return self._doubted > 0 and _due(self._doubted)
+            if not vague:
+                self._few_spots += 1
+                if self._contradicts(best, found):
+                    return _due(self._contradicted)
+                # Few spots of a well predicted vehicle mean that the others are occluded; rarely that they are false.
+                return self._few_spots % FEW_SPOTS_INTERVAL == 0
+        # At once when spots reappear, then less and less often: a search that keeps failing will fail again.
+        self.searches += 1
+        more = points > before + 1
+        interval = next(frames for least, frames in reversed(INTERVALS) if self.searches > least)
+        return more or self.searches % interval == 0
+
+    def _doubtful(self, best: Ints, found: Sequence[Detections | None]) -> bool:
+        """Whether most spots of a camera are missing although it has as many other points.
+
+        A reflection may pass for the only spot of a screen: with the spots of another one, it determines a wrong pose.
+        """
+        for c, f in enumerate(found):
+            mine = best[self._model.camera_of == c]
+            missing, labelled = int(np.count_nonzero(mine == MISSED)), int(np.count_nonzero(mine >= 0))
+            if f is not None and missing >= max(MISSING_TO_DOUBT, labelled + 1) and len(f) >= missing + labelled:
+                return True
+        return False
+
+    def _contradicts(self, best: Ints, found: Sequence[Detections | None]) -> bool:
+        """Whether a camera has enough points, but none where several spots are expected; counts such frames.
+
+        After some frames without a measured pose the spots of all cameras count together: one or two labels agree with
+        almost any pose.
+        """
+        missed, labelled = best == MISSED, best >= 0
+        long = self._unmeasured >= LONG_UNMEASURED
+        least, elsewhere = 2 if long else MIN_CONFIRMING_SPOTS, 0
+        contradicts = False
+        for c, f in enumerate(found):
+            if f is None:
+                continue
+            mine = self._model.camera_of == c
+            missing = int(np.count_nonzero(missed & mine))
+            spare = len(f) - int(np.count_nonzero(labelled & mine))
+            contradicts |= missing >= least and len(f) >= missing
+            elsewhere += min(missing, max(spare, 0))
+        contradicts |= long and elsewhere >= MISSING_TO_DOUBT
+        self._contradicted = self._contradicted + 1 if contradicts else 0
+        return contradicts

@@ -11,20 +11,22 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.compiled_projection import project_all
 from geometry.forward_model import SpotModel
 from tracking.parameters import TrackerParameters
+from tracking.rigid_body.acquisition import predicted_hypothesis
 from tracking.rigid_body.association.frame_detections import BLENDED, Observation, chosen_points, distinct_spots
-from tracking.rigid_body.hypotheses.hypothesis_set import Children, Dynamics, Hypotheses
-from tracking.rigid_body.hypotheses.prediction_checks import (
+from tracking.rigid_body.hypotheses.hypothesis_set import (
     MAX_CHECKING_SIGMA_PX,
     MAX_THREE_SPOT_SIGMA_PX,
     MIN_CONFIRMING_SPOTS,
     MIN_REDUNDANT_SPOTS,
     SURE_PROBABILITY,
+    Children,
+    Dynamics,
+    Hypotheses,
     largest_spot_sigma,
     unchecked_by_prediction,
+    unweighted_spread,
 )
-from tracking.rigid_body.hypotheses.pruning import unweighted_spread
 from tracking.rigid_body.models.information import well_controlled
-from tracking.rigid_body.pose_candidates import predicted_hypothesis
 
 MANY_SPOTS = 6  # with so many, an uncontrolled spot concerns only its own label
 # Of a first acquisition against "all points are false"; false points reach it with exp(-7) = 1e-3 per frame.

@@ -5,12 +5,12 @@ accelerations, and all spots of a frame are assigned jointly. Corners of the mot
 picture, missing pictures and re-acquisition therefore need no cases of their own. A frame takes these steps:
 
 1. Predict every hypothesis and branch it over assignments and manoeuvres (hypotheses/branching.py).
-2. Search the frame for the whole vehicle where the hypotheses do not explain it (search_schedule.py, acquisition.py);
-   the answers, and mirror solutions of three spots, become children as well (pose_candidates.py).
-3. Prune and merge the children (hypotheses/pruning.py).
+2. Search the frame for the whole vehicle where the hypotheses do not explain it (acquisition.py);
+   the answers, and mirror solutions of three spots, become children as well.
+3. Prune and merge the children (hypotheses/hypothesis_set.py).
 4. Decide which labels are confirmed (label_confirmation.py) and whether the frame's spots determine the pose.
-5. Update the online estimates: process noise (adaptive_process_noise.py), variance factor (variance_factor.py), and
-   clutter, static points and spot sizes (point_statistics.py).
+5. Update the online estimates: process noise, variance factor, clutter, static points and spot sizes
+   (online_estimates.py).
 
 Source: ours.
 """
@@ -33,8 +33,22 @@ from tracking.detections import Detections
 from tracking.input_validation import UsablePoints, check_step
 from tracking.labelling.first_labels import MIN_EVIDENCE_NATS, NO_POINT, Labelling
 from tracking.parameters import TrackerParameters
-from tracking.rigid_body.acquisition import FIRST_RATE, FIRST_SPEED, Acquisition
-from tracking.rigid_body.adaptive_process_noise import AdaptiveProcessNoise
+from tracking.rigid_body.acquisition import (
+    FIRST_RATE,
+    FIRST_SPEED,
+    MISSING_TO_DOUBT,
+    P_VISIBLE_AT_START,
+    Acquisition,
+    SearchSchedule,
+    add_mirror_solutions,
+    add_pose,
+    continued_hypotheses,
+    continues,
+    is_vague,
+    predicted_hypothesis,
+    unknown_vehicle,
+    without_history,
+)
 from tracking.rigid_body.association.frame_detections import (
     DetectionModel,
     FrameDetections,
@@ -43,33 +57,33 @@ from tracking.rigid_body.association.frame_detections import (
     chosen_points,
     distinct_spots,
 )
-from tracking.rigid_body.frame_result import FrameDecision, is_lost, lost_frame, tracked_frame, undecided_events
-from tracking.rigid_body.frame_summary import FrameSummary, innovation_score, predicted_pixels, summarise
+from tracking.rigid_body.frame_summary import (
+    FrameDecision,
+    FrameSummary,
+    innovation_score,
+    is_lost,
+    lost_frame,
+    predicted_pixels,
+    summarise,
+    tracked_frame,
+    undecided_events,
+)
 from tracking.rigid_body.hypotheses.branching import branch
-from tracking.rigid_body.hypotheses.hypothesis_set import Children, Hypotheses, State, empty_children, state_of
-from tracking.rigid_body.hypotheses.prediction_checks import (
+from tracking.rigid_body.hypotheses.hypothesis_set import (
     MIN_CONFIRMING_SPOTS,
     MIN_REDUNDANT_SPOTS,
+    Children,
+    Hypotheses,
+    State,
+    empty_children,
+    prune_and_merge,
+    state_of,
 )
-from tracking.rigid_body.hypotheses.pruning import prune_and_merge
 from tracking.rigid_body.label_confirmation import FrameHypotheses, LabelConfirmation
-from tracking.rigid_body.models.information import single_frame_pose
+from tracking.rigid_body.models.information import clocks_of, has_clocks, picture_shifts, single_frame_pose
 from tracking.rigid_body.models.occlusion import MISSED
-from tracking.rigid_body.models.picture_shifts import clocks_of, has_clocks, picture_shifts
-from tracking.rigid_body.point_statistics import PointStatistics
-from tracking.rigid_body.pose_candidates import (
-    P_VISIBLE_AT_START,
-    add_mirror_solutions,
-    add_pose,
-    continued_hypotheses,
-    continues,
-    predicted_hypothesis,
-    unknown_vehicle,
-    without_history,
-)
-from tracking.rigid_body.search_schedule import MISSING_TO_DOUBT, SearchSchedule, is_vague
-from tracking.rigid_body.variance_factor import VarianceFactor
-from tracking.tracked_frame import Event, TrackedFrame
+from tracking.rigid_body.online_estimates import AdaptiveProcessNoise, PointStatistics, VarianceFactor
+from tracking.statuses import Event, TrackedFrame
 
 P_NEW = 1e-3  # probability per frame that the vehicle is not where any hypothesis predicts it
 MAX_EVIDENCE, MIN_EVIDENCE = 50.0, -5.0  # nats; a first hypothesis with less evidence is dropped

@@ -1,20 +1,110 @@
-"""The list of possible mistakes for a rig."""
+"""The possible mistakes of setting up a rig: each one as the rig, the pictures and the prior without it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import combinations, permutations
+from types import MappingProxyType
 
 import numpy as np
 
 from geometry.arrays import Array
 from geometry.camera import FISHEYE, Camera
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
+from geometry.pose_solver.visibility import assumed_range, poses_within
 from geometry.rig import Rig
 from geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
-from tracking.setup_mistakes.mistake import Mistake, PictureChange
+from tracking.detections import Detections
+
+FEW_POSES = 40
+# The points of consecutive pictures by camera: of the frame before, the frame itself and the frame after. A camera
+# without a picture is absent.
+Block = Sequence[Mapping[str, Detections]]
+HERE = 1  # index of the frame itself
+
+
+@dataclass(frozen=True, slots=True)
+class PictureChange:
+    """How the picture that a camera of the rig took follows from a recorded one: uv_px = turn @ recorded + shift."""
+
+    source: str  # the camera under whose name it is recorded
+    turn: Array = field(default_factory=lambda: np.eye(2))  # (2, 2)
+    shift: Array = field(default_factory=lambda: np.zeros(2))  # (2,) px
+    later: int = 0  # frames: the number under which it is recorded minus its own; -1, 0 or 1
+
+    def of(self, found: Detections) -> Detections:
+        """The points of the camera's picture, from those of the recorded one."""
+        uv = found.uv_px @ self.turn.T + self.shift
+        return replace(found, uv_px=uv, cov_px2=self.turn @ found.cov_px2 @ self.turn.T)
+
+    def recorded(self, uv_px: Array) -> Array:
+        """Recorded pixels (..., 2) of pixels of the camera's picture."""
+        return np.asarray((uv_px - self.shift) @ np.linalg.inv(self.turn).T)
+
+
+@dataclass(frozen=True, slots=True)
+class Mistake:
+    """A mistake that may have been made."""
+
+    kind: str  # a key of SHOWN_BY
+    what: str
+    remedy: str
+    rig: Rig  # as it is without the mistake
+    pictures: Mapping[str, PictureChange] = field(default_factory=dict)  # by camera; others are as recorded
+    prior: PosePrior | None = None  # as it is without the mistake; None: as given
+    by_itself: bool = False  # numbers of the files show it, without a recording
+
+    def has_effect(self, given: Rig) -> bool:
+        """Whether the mistake changes more than names: the pictures, the prior, or the points of some pose."""
+        if self.pictures or self.prior is not None or self.by_itself:
+            return True
+        poses = poses_within(assumed_range(given), FEW_POSES)
+        frames = zip(_points_of(self.rig, poses), _points_of(given, poses), strict=True)
+        return not all(np.array_equal(a, b) for a, b in frames)
+
+    def points(self, block: Block) -> dict[str, Detections]:
+        """The points of the frame in the middle of a block, by camera, as they are without the mistake."""
+        out = {}
+        for name in self.rig.cameras:
+            change = self.pictures.get(name)
+            if change is None:
+                found = block[HERE].get(name)
+            else:
+                found = block[HERE + change.later].get(change.source)
+                found = None if found is None else change.of(found)
+            if found is not None:
+                out[name] = found
+        return out
+
+
+def _points_of(rig: Rig, poses: Pose) -> list[Array]:
+    """The pixels at poses (k,) by camera and pose, sorted and rounded: which spots they are plays no part."""
+    model = SpotModel.of(rig)
+    pixels = np.round(model.project(poses)[0], 6)
+    pixels = np.where(model.in_picture(pixels)[..., None], pixels, np.inf)
+    keys = np.stack([np.broadcast_to(model.camera_of, pixels.shape[:2]), pixels[..., 0], pixels[..., 1]], axis=-1)
+    return [frame[np.lexsort(frame.T)] for frame in keys]
+
+
+# What shows a mistake of each kind that a recording cannot show, because the set-up is symmetric.
+SHOWN_BY = MappingProxyType(
+    {
+        "exchanged": "cover the lens of one camera for some frames: the pictures of that camera must be empty",
+        "turned": "film a page of text on the screen: it must be readable and upright as in the room",
+        "size": "compare the size of the pictures with `image_size_px`, and both with those of the calibration",
+        "pose": "measure the distance from that camera to two points of its screen with a tape",
+        "unit": "measure the distance between two cameras with a tape",
+        "focal": "compute the focal length in pixels: millimetres of the lens / millimetres of a pixel",
+        "numbers": "film one flash with all cameras: it must be in the pictures of the same number",
+        "target": "cover one beam at the vehicle: the spots of that beam must disappear",
+        "lens": "photograph a board with that camera (`beampose calibrate camera`)",
+        "prior": "measure the first pose with a tape",
+    }
+)
+
 
 FAR_M = 100.0  # a camera or screen farther from the others is not in a lab ...
 FAR_ON_TARGET_M = 10.0  # ... and a point of a beam farther from the body's origin is not on a vehicle model
@@ -93,32 +183,26 @@ def _pictures(rig: Rig) -> Iterator[Mistake]:
 
 def _camera_poses(rig: Rig) -> Iterator[Mistake]:
     """Transforms in the wrong direction, and quaternions in another order."""
-    for words, names in _each_and_all(rig.cameras):
-        yield Mistake(
-            "pose",
-            f"camera_from_world of {words} is world_from_camera: the inverse",
-            "invert the rotation and the translation in rig.yaml",
-            _with_camera_poses(rig, {n: rig.cameras[n].camera_from_world.inverse() for n in names}),
-        )
-        yield Mistake(
-            "pose",
-            f"the quaternion of camera_from_world of {words} is in the order x, y, z, w",
-            "write quaternion_wxyz in rig.yaml with w first",
-            _with_camera_poses(rig, {n: _reordered(rig.cameras[n].camera_from_world) for n in names}),
-        )
-    for words, names in _each_and_all(rig.screens, "screen"):
-        yield Mistake(
-            "pose",
-            f"world_from_screen of {words} is screen_from_world: the inverse",
-            "invert the rotation and the translation in rig.yaml",
-            _with_screen_poses(rig, {n: rig.screens[n].world_from_screen.inverse() for n in names}),
-        )
-        yield Mistake(
-            "pose",
-            f"the quaternion of world_from_screen of {words} is in the order x, y, z, w",
-            "write quaternion_wxyz in rig.yaml with w first",
-            _with_screen_poses(rig, {n: _reordered(rig.screens[n].world_from_screen) for n in names}),
-        )
+    kinds = (
+        ("camera_from_world", "world_from_camera", {n: c.camera_from_world for n, c in rig.cameras.items()}),
+        ("world_from_screen", "screen_from_world", {n: s.world_from_screen for n, s in rig.screens.items()}),
+    )
+    for (name, inverse, poses), word, changed in zip(
+        kinds, ("camera", "screen"), (_with_camera_poses, _with_screen_poses), strict=True
+    ):
+        for words, names in _each_and_all(poses, word):
+            yield Mistake(
+                "pose",
+                f"{name} of {words} is {inverse}: the inverse",
+                "invert the rotation and the translation in rig.yaml",
+                changed(rig, {n: poses[n].inverse() for n in names}),
+            )
+            yield Mistake(
+                "pose",
+                f"the quaternion of {name} of {words} is in the order x, y, z, w",
+                "write quaternion_wxyz in rig.yaml with w first",
+                changed(rig, {n: _reordered(poses[n]) for n in names}),
+            )
     every = _with_camera_poses(rig, {n: _reordered(c.camera_from_world) for n, c in rig.cameras.items()})
     every = _with_screen_poses(every, {n: _reordered(s.world_from_screen) for n, s in rig.screens.items()})
     yield Mistake(

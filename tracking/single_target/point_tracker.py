@@ -1,9 +1,4 @@
-"""The tracker of one target: a constant-velocity Kalman filter with gate, prediction through misses, re-acquisition.
-
-Source: Duan, Yuan, Wang & Huangfu, "Target tracking system of UAV based on Kalman filter", Intelligent Computer and
-Applications 10(10), 92 (2020), eqs. (1) to (9). Gate, confirmation, estimated process noise and statuses are ours. The
-filter's equations are those of tracking/kalman.py with the time step 1 of the paper (one frame).
-"""
+"""The tracker of one target: a constant-velocity Kalman filter with gate, prediction through misses, acquisition."""
 
 from __future__ import annotations
 
@@ -12,13 +7,142 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geometry.arrays import Array
+from geometry.arrays import Array, Bools
 from geometry.uncertainty.chi_square import chi2_limit
 from tracking import kalman
 from tracking.detections import UNMATCHED, Detections
-from tracking.single_target.candidate_tracks import CandidateTracks, Step, nearest
-from tracking.single_target.parameters import USUAL, PointParameters
 from tracking.statuses import PoseStatus
+
+
+@dataclass(frozen=True, slots=True)
+class PointParameters:
+    """Tracking of one target. Units: px and frames, as in the paper (time step 1)."""
+
+    sigma_a_px: float = 1.0  # px/frame^2: 1-sigma white acceleration; the initial value if estimated
+    learn_sigma_a: bool = True  # estimate it from the innovations
+    sigma_model_px: float = 0.1  # px: added to every detection's own sigma, for a target that changes its shape
+    p_gate: float = 1e-4  # probability that the target's own detection lies outside the gate
+    max_speed_px: float = 60.0  # px/frame: largest first vector of an acquisition
+    confirm: int = 3  # consecutive detections that agree with one motion before a track starts; the paper: 2
+    most_candidates: int = 12  # detections per picture from which tracks may start; the brightest
+    max_size_ratio: float = 4.0  # a track that was lost is found again only with a brightness within this ratio
+    max_predicted: int = 50  # frames without a detection after which the track is lost ...
+    lost_sigma_px: float = 40.0  # px: ... or as soon as the position's sigma exceeds this
+    start_px: tuple[float, float] | None = None  # u, v: the target that is nearest to this place at the start
+    start_within_px: float = 50.0  # px: largest distance from it
+
+    def __post_init__(self) -> None:
+        for name in ("sigma_a_px", "max_speed_px", "lost_sigma_px", "start_within_px"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: expected a number above 0, got {getattr(self, name)}")
+        if not (self.sigma_model_px >= 0 and self.max_size_ratio > 1):
+            raise ValueError("sigma_model_px: expected 0 or more; max_size_ratio: expected more than 1")
+        if not 0 < self.p_gate < 1:
+            raise ValueError(f"p_gate: expected a number between 0 and 1, got {self.p_gate}")
+        if not (self.confirm >= 2 and self.most_candidates >= 1 and self.max_predicted >= 0):
+            raise ValueError("confirm: expected 2 or more; most_candidates: 1 or more; max_predicted: 0 or more")
+
+
+USUAL = PointParameters()
+
+
+# Acquisition: motions that start with two detections of consecutive pictures and agree with the following ones.
+#
+# Source: eq. (9) of Duan (2020) for the first vector; the confirmation is ours.
+
+_MOST_TRACKS = 200  # candidate motions that are followed at once
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A detection of a candidate motion and the filter after it."""
+
+    x: Array  # (4,) u, v, px, and their rates, px/frame; the first one has rates nan
+    P: Array  # (4, 4)
+    row: int  # of the detection in its picture
+    flux: float  # nan where the detections have none
+
+
+@dataclass(slots=True)
+class CandidateTracks:
+    """The candidate motions up to the last picture, and its detections that may start further ones."""
+
+    parameters: PointParameters
+    _tracks: list[tuple[Step, ...]]
+    _last: list[Step]  # the detections of the last picture
+
+    @staticmethod
+    def none(parameters: PointParameters) -> CandidateTracks:
+        """The state before the first picture."""
+        return CandidateTracks(parameters, [], [])
+
+    def step(
+        self, dt: float, found: Detections, cov: Array, may_start: Bools, near: Array | None = None
+    ) -> tuple[Step, ...] | None:
+        """Continue with a picture's detections; cov (n, 2, 2), px^2. Returns the steps of a confirmed motion, or None.
+
+        dt: frames since the last picture. may_start (n,): detections where a motion may begin. Of several motions that
+        are confirmed, the brightest is chosen, or the one that is nearest to the place `near` (2,).
+        """
+        p, kept = self.parameters, min(len(found), self.parameters.most_candidates)
+        continued = [c for track in self._tracks if (c := self._continued(track, dt, found, cov)) is not None]
+        started = [
+            (first, _second(first, found, cov, row, dt))
+            for first in self._last
+            for row in range(kept)
+            if np.linalg.norm(found.uv_px[row] - first.x[:2]) <= p.max_speed_px * dt
+        ]
+        self._tracks = (continued + started)[:_MOST_TRACKS]
+        self._last = [_first(found, cov, row) for row in np.flatnonzero(may_start[:kept]).tolist()]
+        confirmed = [track for track in self._tracks if len(track) >= p.confirm]
+        if not confirmed:
+            return None
+        if near is None:
+            return _brightest(confirmed)
+        return min(confirmed, key=lambda track: float(np.linalg.norm(track[-1].x[:2] - near)))
+
+    def _continued(self, track: tuple[Step, ...], dt: float, found: Detections, cov: Array) -> tuple[Step, ...] | None:
+        """A motion with the nearest detection in its gate; None: there is none."""
+        p, last = self.parameters, track[-1]
+        x, P = kalman.predict(last.x, last.P, dt, np.asarray(p.sigma_a_px))
+        row, _ = nearest(x, P, found.uv_px, cov, p.p_gate)
+        if row is None:
+            return None
+        x, P = kalman.update(x, P, found.uv_px[row], cov[row])
+        return (*track, Step(x, P, row, float(found.flux[row])))
+
+
+def nearest(x: Array, P: Array, uv_px: Array, cov_px2: Array, p_gate: float) -> tuple[int | None, float]:
+    """The detection (n, 2) with the smallest normalised innovation, and that number; None where the gate is empty."""
+    if not len(uv_px):
+        return None, float("nan")
+    _, _, nis = kalman.innovation(x, P, uv_px, cov_px2)
+    row = int(np.argmin(nis))
+    return (row if nis[row] <= chi2_limit(p_gate, 2) else None), float(nis[row])
+
+
+def _first(found: Detections, cov: Array, row: int) -> Step:
+    P = np.full((4, 4), np.nan)
+    P[:2, :2] = cov[row]
+    return Step(np.array([*found.uv_px[row], np.nan, np.nan]), P, row, float(found.flux[row]))
+
+
+def _second(first: Step, found: Detections, cov: Array, row: int, dt: float) -> Step:
+    """Eq. (9): the first vector from two pictures; its covariance from both positions."""
+    x, P = kalman.restart(found.uv_px[row], cov[row], first.x[:2], first.P[:2, :2], dt)
+    return Step(x, P, row, float(found.flux[row]))
+
+
+def _brightest(tracks: Sequence[tuple[Step, ...]]) -> tuple[Step, ...]:
+    """The motion whose faintest detection is brightest; without brightness the first detections of the table."""
+    return max(tracks, key=lambda t: (min(float(np.nan_to_num(s.flux)) for s in t), -max(s.row for s in t)))
+
+
+# The tracker of one target: a constant-velocity Kalman filter with gate, prediction through misses, re-acquisition.
+#
+# Source: Duan, Yuan, Wang & Huangfu, "Target tracking system of UAV based on Kalman filter", Intelligent Computer and
+# Applications 10(10), 92 (2020), eqs. (1) to (9). Gate, confirmation, estimated process noise and statuses are ours.
+# The filter's equations are those of tracking/kalman.py with the time step 1 of the paper (one frame).
 
 SIGMA_A_RANGE = (0.05, 1e3)  # limits of the estimated acceleration, in initial values: a target at rest may start
 SIGMA_A_RATE = 0.05  # relative change of the estimated acceleration per excess of one normalised innovation

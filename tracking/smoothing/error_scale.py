@@ -12,10 +12,9 @@ from geometry.compiled_projection import Views
 from geometry.forward_model import SpotModel
 from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.rigid_body.models.information import single_frame_pose
-from tracking.rigid_body.variance_factor import DEADBAND
-from tracking.smoothing.motion.reference import Reference
-from tracking.smoothing.motion.run_detections import RunDetections, labelled_points
-from tracking.smoothing.residual_bounds import VarianceFactors, residual_bounds
+from tracking.rigid_body.online_estimates import DEADBAND
+from tracking.smoothing.motion.run_detections import Reference, RunDetections, labelled_points
+from tracking.smoothing.single_frame_poses import VarianceFactors, residual_bounds
 
 # Largest shift of a spot's centre by texture, speckle and its shape, as a share of its width (1 sigma): 4 % texture
 # makes 0.04, speckle of contrast 0.3 up to 0.16.

@@ -8,9 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from calibration.least_squares.adjustment import Adjusted, Limits, Loss, Term, solve
-from calibration.least_squares.parameter_blocks import Poses, Vectors
-from calibration.least_squares.priors import Anchors, independent
+from calibration.least_squares.adjustment import (
+    Adjusted,
+    Anchors,
+    Limits,
+    Loss,
+    Poses,
+    Term,
+    Vectors,
+    independent,
+    solve,
+)
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, Values, array_of, lens_of

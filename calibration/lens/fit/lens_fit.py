@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calibration.least_squares.adjustment import Adjusted, Cauchy, Limits
-from calibration.least_squares.parameter_blocks import Poses, Vectors
+from calibration.least_squares.adjustment import Adjusted, Cauchy, Limits, Poses, Vectors
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_adjustment import BRIEF, CONVERGED, FitSettings, adjust, term_of, with_circle_radius
 from calibration.lens.fit.lens_models import LensModel

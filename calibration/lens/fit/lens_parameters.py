@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.least_squares.parameter_blocks import Poses, Stack, Vectors
+from calibration.least_squares.adjustment import Poses, Stack, Vectors
 from geometry.arrays import Array
 from geometry.pose import Pose
 

@@ -18,8 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.least_squares.adjustment import AdjustmentError
-from calibration.least_squares.parameter_blocks import Vectors
+from calibration.least_squares.adjustment import AdjustmentError, Vectors
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import seen_at
 from calibration.lens.fit.lens_adjustment import BRIEF

@@ -12,10 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.beams.beam_figures import CollinearityTest
-from calibration.beams.beams import BeamCalibration
+from calibration.beams.beams import BeamCalibration, CollinearityTest
 from calibration.beams.error_diagnosis import diagnose_error
-from calibration.beams.label_swaps import swapped_pairs
+from calibration.beams.spot_fit import swapped_pairs
 from calibration.rig.rig_figures import FEWEST_POSITIONS
 from geometry.arrays import Ints
 from geometry.rig import Rig

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.beams.beam_start import world_points
 from calibration.beams.beams import BeamCalibration
+from calibration.beams.spot_fit import world_points
 from geometry.arrays import Array, Bools
 from geometry.pose import ypr_sigmas
 from geometry.rig import Rig

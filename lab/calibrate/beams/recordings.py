@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from calibration.beams.beams import StandModel
-from calibration.terms.spot_term import SpotPixels
+from calibration.terms.rig_blocks import SpotPixels
 from geometry.arrays import Array, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose

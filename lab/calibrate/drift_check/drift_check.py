@@ -14,16 +14,15 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.drift import (
+from calibration.changes import (
     CAMERA_KINDS,
     TURNED_ZOOMED,
+    Change,
     FoundChanges,
-    PriorSizes,
     expected_rms,
     find_changes,
     rms_length,
 )
-from calibration.excess_residual import Change
 from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.planes import intersect_plane
@@ -187,7 +186,7 @@ def _camera_drift(
     own = next((c for c in verdicts.changes if c.kind in CAMERA_KINDS and c.subject == name), None)
     # The figures are computed after removing all other changes.
     misfit = one.misfit.without(c for c in verdicts.changes if c is not own)
-    fit = misfit.fit(TURNED_ZOOMED, name, one.columns[name].kinds(PriorSizes())[TURNED_ZOOMED])
+    fit = misfit.fit(TURNED_ZOOMED, name, one.columns[name].kinds()[TURNED_ZOOMED])
     drift = (own or fit).displacement[of_rows].reshape(-1, 2)
     mean = model[of_rows].reshape(-1, 2, 4).mean(axis=0)
     sigmas = np.sqrt(np.maximum(np.diagonal(fit.covariance), 0))

@@ -13,14 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.drift import (
+from calibration.changes import (
     LASER_MOVED,
+    USUAL_SIZES,
     WRONG_POINT,
     CameraColumns,
-    PriorSizes,
+    Change,
+    ChangeCandidate,
+    ExcessResidual,
     camera_columns,
 )
-from calibration.excess_residual import Change, ChangeCandidate, ExcessResidual
 from geometry.arrays import Array, Ints, skew
 from geometry.camera import FISHEYE, Camera, Projected, pinhole_numbers, project_points_full
 from geometry.forward_model import SpotDerivatives, SpotModel
@@ -296,7 +298,7 @@ def _one_point(n: int, i: int) -> ChangeCandidate:
     """The change that moves only pixel i of n."""
     out = np.zeros((2 * n, 2))
     out[2 * i, 0] = out[2 * i + 1, 1] = 1.0
-    return ChangeCandidate(out, np.full(2, PriorSizes().point_px))
+    return ChangeCandidate(out, np.full(2, USUAL_SIZES.point_px))
 
 
 def _by_parameters(
@@ -415,7 +417,7 @@ def _changes_of_spots(rig: Rig, part: SpotModel, d: SpotDerivatives) -> dict[tup
     """The candidates besides the cameras: one wrong spot, or one moved laser."""
     n = len(part)
     changes = {(WRONG_POINT, f"{s} ({c})"): _one_point(n, i) for i, (c, s) in enumerate(part.views)}
-    laser = np.repeat([PriorSizes().laser_rad, PriorSizes().laser_m], 3)
+    laser = np.repeat([USUAL_SIZES.laser_rad, USUAL_SIZES.laser_m], 3)
     for b, beam in enumerate(rig.beams):
         on_beam = (part.beam_of == b)[:, None, None]
         moves = np.concatenate([d.direction * on_beam, d.point * on_beam], axis=-1).reshape(2 * n, 6)

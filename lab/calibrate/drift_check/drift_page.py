@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.drift import ALL_CHANGED, LASER_MOVED, TURNED, TURNED_ZOOMED, ZOOMED
+from calibration.changes import ALL_CHANGED, LASER_MOVED, TURNED, TURNED_ZOOMED, ZOOMED
 from geometry.arrays import Array
 from lab.calibrate.drift_check.drift_comparison import (
     CameraDrift,

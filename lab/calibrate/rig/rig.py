@@ -15,6 +15,8 @@ import numpy as np
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.joint import CORNERS, DOTS, RECORDS, SPOTS, Joint
 from calibration.rig.rig_figures import (
+    RigCalibration,
+    calibrate_in_steps,
     central_pose,
     expected_pose,
     hold_out,
@@ -22,11 +24,9 @@ from calibration.rig.rig_figures import (
     in_mm,
     spot_sigma,
 )
-from calibration.rig.rig_steps import RigCalibration, calibrate_in_steps
 from calibration.screens.screens import ScreensResult
 from calibration.terms.corners import CornerTerm
-from calibration.terms.pose_records import RecordTerm
-from calibration.terms.surveyed import array_of
+from calibration.terms.surveyed import RecordTerm, array_of
 from geometry.arrays import Array
 from geometry.rig import Rig
 from lab.calibrate.beams.beam_findings import (

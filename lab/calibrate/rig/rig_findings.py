@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.rig.joint import DOTS, P_MISFIT, RECORDS, SPOTS, Joint
-from calibration.rig.rig_figures import ExpectedPose, HoldOut, in_degrees, in_mm
-from calibration.rig.rig_steps import RigCalibration
+from calibration.rig.rig_figures import ExpectedPose, HoldOut, RigCalibration, in_degrees, in_mm
 from lab.calibrate.beams.beam_findings import bad_positions, first_names
 from lab.findings.finding import ENTRIES, Finding, Level, finding, level_above, passed
 

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.rig.joint import DOTS, FRAMES, LOST, SPOTS, Joint
-from calibration.rig.measurement_groups import LEAST_REDUNDANCY
+from calibration.rig.joint import DOTS, FRAMES, LEAST_REDUNDANCY, LOST, SPOTS, Joint
 from calibration.rig.rig_figures import in_degrees, in_mm
 from calibration.terms.rig_blocks import POSES, STAND, lines_in, stacks_of
 from calibration.terms.surveyed import pose_of

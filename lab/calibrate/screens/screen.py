@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
-from calibration.screens.screens import ScreensResult
+from calibration.screens.screens import ScreensResult, pointing_sigmas_m, spot_sigmas
 from geometry.rig import Rig
 from lab.calibrate.screens.screen_findings import near_findings, network_findings, survey_findings
 from lab.calibrate.screens.screen_inputs import adjusted_screens, screen_inputs

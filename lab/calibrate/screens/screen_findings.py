@@ -9,9 +9,8 @@ from itertools import combinations
 
 import numpy as np
 
-from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
-from calibration.screens.outliers import classify_outliers
-from calibration.screens.screens import ApproximatePosition, ScreensResult
+from calibration.screens.network import classify_outliers
+from calibration.screens.screens import ApproximatePosition, ScreensResult, pointing_sigmas_m, spot_sigmas
 from geometry.arrays import Array
 from lab.files.project.project import Project
 from lab.findings.finding import Finding, Level, finding, level_above, passed

@@ -14,20 +14,25 @@ import numpy as np
 from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Board
 from calibration.boards.board_view import BoardView, NotFound
-from calibration.least_squares.adjustment import AdjustmentError
-from calibration.least_squares.priors import Prior
+from calibration.least_squares.adjustment import AdjustmentError, Prior
 from calibration.open3d_loader import MissingOpen3DError
-from calibration.screens.clouds import FEWEST, scan_of
+from calibration.screens.clouds import FEWEST, align, on_surfaces, register, scan_of
 from calibration.screens.network import ControlPoints, Network, PointObservations
 from calibration.screens.network_start import NotConnectedError
-from calibration.screens.registration import register
-from calibration.screens.scan_alignment import align, on_surfaces
-from calibration.screens.screens import ApproximatePosition, Scan, ScreenSetup, ScreensResult, calibrate
-from calibration.screens.survey_diagnosis import SurveyError, diagnose_survey, misfit_of, wrong_unit
-from calibration.terms.board_on_screen import BoardOnScreenTerm
-from calibration.terms.circle_images import radius_by_areas
-from calibration.terms.corners import CornerTerm
+from calibration.screens.screens import (
+    ApproximatePosition,
+    Scan,
+    ScreenSetup,
+    ScreensResult,
+    SurveyError,
+    calibrate,
+    diagnose_survey,
+    misfit_of,
+    wrong_unit,
+)
+from calibration.terms.corners import CornerTerm, radius_by_areas
 from calibration.terms.rig_blocks import prior_of
+from calibration.terms.surveyed import BoardOnScreenTerm
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import FISHEYE
 from geometry.pose import Pose
@@ -457,7 +462,9 @@ def _points(cloud: Cloud) -> tuple[Array, list[str]]:
 # The pixels alone cannot detect a rotated or mirrored world frame; `calibrate screen` and `calibrate rig` start here.
 
 
-_SUSPICIOUS_MISFIT = 4.0  # misfit (see survey_diagnosis.py) above which swapped axes and wrong units are tested
+_SUSPICIOUS_MISFIT = (
+    4.0  # misfit (see calibration/screens/screens.py) above which swapped axes and wrong units are tested
+)
 _ACCEPTED_MISFIT = 2.0  # misfit below which a change to the survey is accepted as the explanation
 
 

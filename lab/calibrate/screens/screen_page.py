@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.screens.network_sigmas import camera_sigmas, pointing_sigmas_m, spot_sigmas
-from calibration.screens.screens import ScreensResult
+from calibration.screens.screens import ScreensResult, camera_sigmas, pointing_sigmas_m, spot_sigmas
 from geometry.camera import pinhole_numbers
 from lab.files.project.project import Project
 from lab.files.rig.rig_file import covariance_blocks

@@ -13,7 +13,8 @@ import numpy as np
 from geometry.arrays import Array, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from geometry.uncertainty.spot_tracks import beam_image, pixel_covariance, scatter, uncertainty_tracks, unlimited
+from geometry.pose_solver.gauss_newton import pixel_covariance
+from geometry.uncertainty.rig_uncertainty import beam_image, scatter, uncertainty_tracks, unlimited
 from lab.errors import BeamposeError, InputError
 from lab.files.run.results import (
     POSE_STATUSES,
@@ -295,7 +296,7 @@ def _marks(data: ResultData, index: int, near: int | None, tail: int) -> list[Sp
                 hidden = model.subset(rows)
                 found = uncertainty_tracks(hidden, pose, P, SIGMAS)
                 tracks = np.full((len(spots.views), *found.shape[1:]), np.nan)
-                tracks[rows], covariance[rows] = found, pixel_covariance(hidden, pose, P)
+                tracks[rows], covariance[rows] = found, pixel_covariance(hidden.project(pose)[1], P)
     out = []
     for j, (_, spot) in enumerate(spots.views):
         code = int(spots.status[index, j])

@@ -16,11 +16,10 @@ from lab.pictures.picture_file import GreyPicture, MissingPicture
 from lab.runs.frames.frames import FrameSet
 from lab.runs.frames.moments import Moment
 from lab.runs.frames.open_frames import open_frames
-from tracking.detections import Detections
+from tracking.detections import Detections, PictureClock
 from tracking.noise import NoiseModel
-from tracking.picture_clock import PictureClock
 from tracking.rigid_body.rigid_tracker import RigidTracker
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import TrackedFrame
 
 if TYPE_CHECKING:
     from lab.runs.frames.sensor_noise import CameraNoise

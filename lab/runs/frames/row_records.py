@@ -16,7 +16,7 @@ import numpy as np
 from geometry.arrays import Array, Ints
 from lab.runs.frames.moments import Moment
 from lab.runs.frames.pipeline import FrameRecord, ShownPicture
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import TrackedFrame
 
 Pair: TypeAlias = tuple[FrameRecord, FrameRecord | None]  # a frame, and the same in the causal pass
 

@@ -17,11 +17,15 @@ import numpy as np
 
 from calibration.model_check import faults as f
 from calibration.model_check.check import FEWEST_FRAMES, FEWEST_SPOTS, ModelCheckResult, NotTested, evaluate_model
-from calibration.model_check.effect import Effect
-from calibration.model_check.fault_identification import FaultDiagnosis, FittedFault, SuspectedFault
-from calibration.model_check.noise_scales import UNEVEN, is_noisy
-from calibration.model_check.recording import ModelCheckRecording
-from calibration.model_check.unseen import UnseenView
+from calibration.model_check.fault_identification import (
+    UNEVEN,
+    Effect,
+    FaultDiagnosis,
+    FittedFault,
+    SuspectedFault,
+    is_noisy,
+)
+from calibration.model_check.linearised_frames import ModelCheckRecording, UnseenView
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance

@@ -7,14 +7,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calibration.model_check.recording import ModelCheckRecording
+from calibration.model_check.linearised_frames import ModelCheckRecording
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from lab.runs.frames.even_sampler import EvenSampler
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
-from tracking.statuses import PoseStatus
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import PoseStatus, TrackedFrame
 
 MOST_KEPT = 2000  # frames; as many as the statistics use
 

@@ -31,8 +31,7 @@ from tracking.consistency import (
     finite,
     is_covariance,
 )
-from tracking.statuses import PoseStatus, SpotStatus
-from tracking.tracked_frame import Event, TrackedFrame
+from tracking.statuses import Event, PoseStatus, SpotStatus, TrackedFrame
 
 
 @dataclass(slots=True)

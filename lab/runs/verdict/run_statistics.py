@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,7 @@ from geometry.pose import Pose
 from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.verdict.frame_checks import CONTRADICTION, FrameRanges
 from tracking.detections import UNMATCHED
-from tracking.statuses import PoseStatus, SpotStatus
-from tracking.tracked_frame import Event, TrackedFrame
+from tracking.statuses import Event, PoseStatus, SpotStatus, TrackedFrame, Word
 
 FEWEST_SPOTS = 3  # a pose needs this many
 MOST_EVENTS = 500  # listed one by one; of the others the number is reported
@@ -25,34 +23,19 @@ _USUAL_CLUTTER = 0.95  # quantile, over the measured frames, of the unlabelled p
 _MOST_POINTS = 50  # larger numbers of unlabelled points are counted as this number
 
 
-class Cause(StrEnum):
-    """Why a frame has no measured pose: the first that applies."""
+class Cause(Word):
+    """Why a frame has no measured pose: the first that applies. Meaning: text that follows a number of such frames."""
 
-    NO_PICTURE = "no_picture"
-    CONTRADICTION = "contradiction"
-    UNEXPLAINED = "unexplained"
-    LABELS_OPEN = "labels_open"
-    FEW_POINTS = "few_points"
-    OUT_OF_VIEW = "out_of_view"
-    NOT_DETERMINED = "not_determined"
-    HIDDEN = "hidden"
-
-    @property
-    def meaning(self) -> str:
-        """Text that follows a number of such frames."""
-        return _MEANINGS[self]
+    NO_PICTURE = "no_picture", "without a picture of some camera"
+    CONTRADICTION = "contradiction", "whose pose contradicts its spots or the causal pass"
+    UNEXPLAINED = "unexplained", "with enough points of light, which no pose explains"
+    LABELS_OPEN = "labels_open", "with spots whose labels are uncertain"
+    FEW_POINTS = "few_points", "with too few points of light"
+    OUT_OF_VIEW = "out_of_view", f"with fewer than {FEWEST_SPOTS} spots inside the pictures"
+    NOT_DETERMINED = "not_determined", "whose spots do not determine the pose"
+    HIDDEN = "hidden", "with hidden spots"
 
 
-_MEANINGS = {
-    Cause.NO_PICTURE: "without a picture of some camera",
-    Cause.CONTRADICTION: "whose pose contradicts its spots or the causal pass",
-    Cause.UNEXPLAINED: "with enough points of light, which no pose explains",
-    Cause.LABELS_OPEN: "with spots whose labels are uncertain",
-    Cause.FEW_POINTS: "with too few points of light",
-    Cause.OUT_OF_VIEW: f"with fewer than {FEWEST_SPOTS} spots inside the pictures",
-    Cause.NOT_DETERMINED: "whose spots do not determine the pose",
-    Cause.HIDDEN: "with hidden spots",
-}
 # Frames with enough visible spots: the tracker, not the recording, is the reason.
 MISSED = (Cause.CONTRADICTION, Cause.UNEXPLAINED, Cause.LABELS_OPEN)
 

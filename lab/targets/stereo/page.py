@@ -159,7 +159,7 @@ def _residuals(results: StereoResults) -> Section:
     residuals = np.full((n, 2, K, 2), np.nan)
     for i, fit in enumerate(results.fits):
         if fit is not None:
-            residuals[i] = fit.residuals_px
+            residuals[i].reshape(-1, 2)[fit.rows] = fit.residuals_px
     drawings = []
     for c, camera in enumerate(results.run.pair.cameras):
         seen = np.isfinite(residuals[:, c]).any(axis=(1, 2))

@@ -29,8 +29,14 @@ from lab.targets.stereo.frames import StereoFrame, stereo_frames
 from lab.targets.stereo.page import write_stereo_page
 from lab.targets.stereo.run import StereoRecord, StereoResults, StereoRun, load_stereo_run, truth_errors
 from lab.targets.stereo.tables import write_tables
-from tracking.binocular.calibration_check import MOST_FRAMES, LabelledFrame, check_calibration, labelled_by_each
-from tracking.binocular.clock_offset import FittedFrame, clock_offset
+from tracking.binocular.calibration_check import (
+    MOST_FRAMES,
+    FittedFrame,
+    LabelledFrame,
+    check_calibration,
+    clock_offset,
+    labelled_by_each,
+)
 from tracking.binocular.marker_model import MarkerImages
 from tracking.binocular.pose_tracker import AMBIGUOUS, BinocularTracker
 from tracking.binocular.segmentation import is_grey, marker_candidates, prepared

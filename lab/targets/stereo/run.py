@@ -33,6 +33,7 @@ import pydantic
 from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.pose import Pose
+from geometry.pose_solver.gauss_newton import PoseFit
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState, OptionalDay
 from lab.files.rig.pair_file import REMEDY, load_pair_file, of_two_cameras
@@ -51,14 +52,18 @@ from lab.files.text import fields
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.error_text import name_of_path, suggest_name
 from lab.files.text.yaml_text import read_mapping
-from tracking.binocular.calibration_check import CalibrationCheck
-from tracking.binocular.clock_offset import ClockOffset
-from tracking.binocular.joint_fit import JointFit
-from tracking.binocular.marker_model import MarkerImages, MarkerModel, StereoPair
-from tracking.binocular.parameters import BinocularParameters, MatchParameters, SegmentationParameters
+from tracking.binocular.calibration_check import CalibrationCheck, ClockOffset
+from tracking.binocular.joint_fit import pose_of_points
+from tracking.binocular.marker_model import (
+    BinocularParameters,
+    MarkerImages,
+    MarkerModel,
+    MatchParameters,
+    SegmentationParameters,
+    StereoPair,
+)
 from tracking.binocular.pose_tracker import BinocularFrame
 from tracking.binocular.segmentation import ColourRange
-from tracking.binocular.triangulation import pose_of_points
 from tracking.statuses import PoseStatus
 
 _SYMMETRIC = 0.03  # share of the target's size within which turned markers count as the same
@@ -342,7 +347,7 @@ class StereoResults:
         return [r for r in self.records if r.measured]
 
     @property
-    def fits(self) -> list[JointFit | None]:
+    def fits(self) -> list[PoseFit | None]:
         """The fits of all frames; None of a frame without a measured pose."""
         return [r.tracked.fit if r.measured else None for r in self.records]
 

@@ -12,8 +12,8 @@ from lab.files.text import columns
 from lab.files.text.csv_text import number_fields, write_table
 from lab.runs.tables import pose_numbers
 from lab.targets.stereo.run import StereoRecord, StereoResults, StereoRun
+from tracking.binocular.joint_fit import triangulate
 from tracking.binocular.marker_model import project_markers
-from tracking.binocular.triangulation import triangulate
 from tracking.statuses import view_statuses
 
 POINTS = (

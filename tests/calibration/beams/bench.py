@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.beams.beams import StandModel
-from calibration.terms.rig_blocks import lines_in, stacks_of
-from calibration.terms.spot_term import SpotPixels
+from calibration.terms.rig_blocks import SpotPixels, lines_in, stacks_of
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Spot

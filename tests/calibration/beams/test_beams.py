@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calibration.beams.beam_start import line_through
 from calibration.beams.beams import StandModel, calibrate_beams
+from calibration.beams.spot_fit import line_through
 from calibration.least_squares.adjustment import AdjustmentError
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose

@@ -9,10 +9,8 @@ import pytest
 from scipy.stats import chi2
 
 from calibration.beams.beams import at_feet, calibrate_beams, self_calibrate
-from calibration.beams.body_gauge import BodyGauge
-from calibration.beams.excitation import body_motion, without_frame
-from calibration.least_squares.adjustment import AdjustmentError
-from calibration.least_squares.parameter_blocks import Lines
+from calibration.beams.excitation import BodyGauge, body_motion, without_frame
+from calibration.least_squares.adjustment import AdjustmentError, Lines
 from calibration.terms.rig_blocks import lines_in, stacks_of
 from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose

@@ -15,7 +15,7 @@ from calibration.boards import charuco_detection, chessboard_detection, corner_r
 from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Board, CircleGrid, parse
 from calibration.boards.board_view import QUICK_SEARCH_FAILED, BoardView, NotFound
-from calibration.terms.circle_images import radius_by_areas
+from calibration.terms.corners import radius_by_areas
 from geometry import rotations
 from geometry.camera import FISHEYE, PERSPECTIVE, Camera
 from geometry.pose import Pose

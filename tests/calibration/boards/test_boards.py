@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibration.boards.board_drawing import draw, ink_at
-from calibration.boards.board_types import Charuco, Chessboard, CircleGrid, parse
-from calibration.boards.marker_dictionaries import DICTIONARIES
+from calibration.boards.board_types import DICTIONARIES, Charuco, Chessboard, CircleGrid, parse
 
 mm = 1e-3
 TEXTS = [

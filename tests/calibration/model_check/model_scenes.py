@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 
-from calibration.model_check.recording import ModelCheckRecording
+from calibration.model_check.linearised_frames import ModelCheckRecording
 from geometry import rotations
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from calibration.model_check.check import ModelCheckResult, NotTested, evaluate_model
-from calibration.model_check.fault_identification import P_FALSE_ALARM
-from calibration.model_check.noise_scales import is_noisy
-from calibration.model_check.recording import ModelCheckRecording
+from calibration.model_check.fault_identification import P_FALSE_ALARM, is_noisy
+from calibration.model_check.linearised_frames import ModelCheckRecording
 from geometry.forward_model import SpotModel
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig

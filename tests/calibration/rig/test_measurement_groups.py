@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calibration.least_squares.adjustment import Linearised, Part, solve
-from calibration.least_squares.parameter_blocks import Vectors
-from calibration.rig.measurement_groups import Unknowns, group_fit, information, shares
+from calibration.least_squares.adjustment import Linearised, Part, Vectors, solve
+from calibration.rig.joint import Unknowns, group_fit, information, shares
 
 
 class Lines:

@@ -8,8 +8,8 @@ import numpy as np
 
 from calibration.boards.board_types import Charuco
 from calibration.screens.network import ControlPoints, Network, PointObservations
-from calibration.terms.board_on_screen import BoardOnScreenTerm
 from calibration.terms.corners import CornerTerm
+from calibration.terms.surveyed import BoardOnScreenTerm
 from geometry.camera import Camera
 from geometry.pose import Pose
 from geometry.rig import Rig, Screen

@@ -7,12 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.screens.network import ControlPoints, PointObservations
-from calibration.screens.network_sigmas import pointing_sigmas_m, spot_sigmas
+from calibration.screens.network import ControlPoints, PointObservations, classify_outliers
 from calibration.screens.network_start import NotConnectedError
-from calibration.screens.outliers import classify_outliers
-from calibration.screens.screens import ApproximatePosition, ScreenSetup, calibrate
-from calibration.screens.survey_diagnosis import diagnose_survey, misfit_of, wrong_unit
+from calibration.screens.screens import (
+    ApproximatePosition,
+    ScreenSetup,
+    calibrate,
+    diagnose_survey,
+    misfit_of,
+    pointing_sigmas_m,
+    spot_sigmas,
+    wrong_unit,
+)
 from geometry.pose import Pose
 from geometry.rig import Rig
 from lab.calibrate.screens.screen_findings import near_findings, network_findings

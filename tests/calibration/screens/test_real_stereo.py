@@ -13,8 +13,8 @@ from calibration.boards.board_types import Chessboard
 from calibration.boards.board_view import BoardView
 from calibration.screens.network import ControlPoints, Network, PointObservations
 from calibration.screens.screens import ScreenSetup, calibrate
-from calibration.terms.board_on_screen import BoardOnScreenTerm
 from calibration.terms.corners import CornerTerm
+from calibration.terms.surveyed import BoardOnScreenTerm
 from geometry.camera import Camera
 from geometry.pose import Pose
 from geometry.rig import Rig, Screen

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.screens.scan_alignment import align, on_surfaces
+from calibration.screens.clouds import align, on_surfaces
 from geometry.pose import Pose
 from geometry.rotations import exp
 from tests.open3d_marker import needs_open3d

@@ -10,10 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibration.screens import clouds
-from calibration.screens.flatness import assess_flatness, fit_surface
-from calibration.screens.registration import register
-from calibration.screens.resection import resect
-from calibration.screens.screen_frame import frame_of_dots, frame_of_extent
+from calibration.screens.clouds import register
+from calibration.screens.flatness import assess_flatness, fit_surface, frame_of_dots, frame_of_extent
+from calibration.screens.network_start import resect
 from calibration.screens.screens import ScreenSetup, facing, moved_to_surface, pose_covariance, screen_of_dots
 from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose

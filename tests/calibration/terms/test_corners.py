@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.least_squares.parameter_blocks import Poses, Vectors
+from calibration.least_squares.adjustment import Poses, Vectors
 from calibration.terms.corners import CornerTerm
 from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose

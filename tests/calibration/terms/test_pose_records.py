@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.least_squares.parameter_blocks import Poses
-from calibration.terms.pose_records import RecordTerm
+from calibration.least_squares.adjustment import Poses
+from calibration.terms.surveyed import RecordTerm
 from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.least_squares.parameter_blocks import Poses
-from calibration.terms.rig_blocks import named_errors, prior_of, rig_of, stacks_of
-from calibration.terms.spot_term import SpotPixels, SpotTerm
+from calibration.least_squares.adjustment import Poses
+from calibration.terms.rig_blocks import SpotPixels, SpotTerm, named_errors, prior_of, rig_of, stacks_of
 from geometry.arrays import numeric_jacobian
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose

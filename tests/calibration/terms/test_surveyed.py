@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.least_squares.parameter_blocks import Poses, Vectors
-from calibration.terms.board_on_screen import BoardOnScreenTerm
-from calibration.terms.surveyed import FrameTerm, PointTerm, SurfaceTerm, SurveyTerm, whitening
+from calibration.least_squares.adjustment import Poses, Vectors
+from calibration.terms.surveyed import BoardOnScreenTerm, FrameTerm, PointTerm, SurfaceTerm, SurveyTerm, whitening
 from geometry.arrays import numeric_jacobian
 from geometry.camera import Camera
 from geometry.pose import Pose

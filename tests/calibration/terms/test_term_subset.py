@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.least_squares.adjustment import Cauchy
-from calibration.least_squares.parameter_blocks import Poses
-from calibration.terms.pose_records import RecordTerm
-from calibration.terms.spot_term import SpotTerm
-from calibration.terms.term_subset import picked, rows_of, widened
+from calibration.least_squares.adjustment import Cauchy, Poses
+from calibration.terms.rig_blocks import SpotTerm
+from calibration.terms.surveyed import RecordTerm, picked, rows_of, widened
 from geometry.pose import Pose
 from tests.calibration.terms import test_corners, test_spot_term, test_surveyed
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from calibration.terms.spot_term import SpotPixels
+from calibration.terms.rig_blocks import SpotPixels
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from calibration.drift import TURNED, WRONG_POINT, ZOOMED, find_changes
+from calibration.changes import TURNED, WRONG_POINT, ZOOMED, find_changes
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig

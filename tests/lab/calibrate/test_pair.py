@@ -7,7 +7,7 @@ import pytest
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
 from calibration.lens.intrinsics_result import Intrinsics
-from calibration.pair.pair_calibration import PairError, calibrate_pair
+from calibration.pair import PairError, calibrate_pair
 from lab.calibrate.camera.pair import findings_of, next_pairs
 from lab.findings.finding import Level, verdict
 from tests.calibration.lens.lens_scenes import Scene, photographs

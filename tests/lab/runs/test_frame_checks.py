@@ -14,8 +14,7 @@ from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.verdict.frame_checks import CONTRADICTION, NOT_A_COVARIANCE, FrameChecks
 from tests.geometry.scenes import paper_rig
 from tracking.detections import Detections
-from tracking.statuses import PoseStatus, SpotStatus
-from tracking.tracked_frame import MotionEstimate, TrackedFrame
+from tracking.statuses import MotionEstimate, PoseStatus, SpotStatus, TrackedFrame
 
 RIG = paper_rig()
 MODEL = SpotModel.of(RIG)

@@ -9,9 +9,7 @@ import re
 import numpy as np
 import pytest
 
-from calibration.model_check import noise_scales
-from calibration.model_check.effect import Effect
-from calibration.model_check.fault_identification import FaultDiagnosis
+from calibration.model_check.fault_identification import NOISY, Effect, FaultDiagnosis
 from geometry.pose_prior import PosePrior
 from lab.findings.finding import Level
 from lab.number_format import format_number, format_with_sigma
@@ -25,8 +23,7 @@ from tests.calibration.model_check.test_check import suspects, with_slow_errors
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import Detections
 from tracking.parameters import TrackerParameters
-from tracking.statuses import PoseStatus, SpotStatus
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import PoseStatus, SpotStatus, TrackedFrame
 
 
 def test_a_correct_set_up_has_no_findings():
@@ -147,7 +144,7 @@ def test_large_correlated_errors_are_not_noise_and_fail():
 
 def test_the_limits_of_the_findings_are_those_of_the_verdict():
     assert check.MATTERS_SIGMAS < check.WRONG_SIGMAS == quality.LARGEST_NOISE_SCALE
-    assert noise_scales.NOISY == quality.GOOD_NOISE_SCALE
+    assert NOISY == quality.GOOD_NOISE_SCALE
 
 
 def test_too_few_frames_are_not_tested_and_the_reason_is_given():

@@ -12,8 +12,7 @@ from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.verdict.frame_checks import CONTRADICTION, FrameRanges
 from lab.runs.verdict.run_statistics import CameraStatistics, Cause, RunStatistics
 from tracking.detections import Detections
-from tracking.statuses import PoseStatus, SpotStatus
-from tracking.tracked_frame import Event, TrackedFrame
+from tracking.statuses import Event, PoseStatus, SpotStatus, TrackedFrame
 
 N = 6  # views: three in each of two cameras
 SEEN, HIDDEN, OUT = SpotStatus.MATCHED, SpotStatus.OCCLUDED, SpotStatus.OUT_OF_VIEW

@@ -18,8 +18,7 @@ from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.tables import TableWriter, csv_word, pose_numbers
 from tests.geometry.scenes import paper_rig, random_pose
 from tracking.detections import Detections
-from tracking.statuses import PoseStatus, SpotStatus
-from tracking.tracked_frame import MotionEstimate, TrackedFrame
+from tracking.statuses import MotionEstimate, PoseStatus, SpotStatus, TrackedFrame
 
 HEADERS = {
     "detections.csv": columns.DETECTIONS,

@@ -9,8 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.budget.expected_errors import ExpectedErrors
-from calibration.budget.pose_grid import AXES, NOISE, STATUS, plan_grid, poses_of
+from calibration.budget import AXES, NOISE, STATUS, ExpectedErrors, plan_grid, poses_of
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose, ypr_sigmas
 from lab.errors import InputError
@@ -236,7 +235,7 @@ def test_nothing_is_written_for_an_invalid_rig_or_into_another_folder(rig_path, 
 
 def test_the_plan_does_not_depend_on_the_number_of_poses_computed_at_once(rig_path, monkeypatch):
     whole = plan_of(rig_path, SMALL)
-    monkeypatch.setattr("calibration.budget.pose_grid._POSES_AT_ONCE", 7)
+    monkeypatch.setattr("calibration.budget._POSES_AT_ONCE", 7)
     pieces = plan_grid(whole.rig, whole.errors, whole.sources, SMALL)
     for name in ("sigma", "parts", "worst_parts", "effect_median", "thing_largest", "margin_px"):
         np.testing.assert_allclose(getattr(pieces, name), getattr(whole, name), rtol=1e-5, atol=1e-12)

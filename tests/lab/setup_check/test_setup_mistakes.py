@@ -27,7 +27,7 @@ from lab.simulate.rigs import fan, unequal_fan
 from lab.simulate.write import simulate
 from tests.lab.run_folders import edit, write_run
 from tracking.parameters import LabelParameters
-from tracking.setup_mistakes.invisible import invisible_mistakes
+from tracking.setup_mistakes.evidence import invisible_mistakes
 from tracking.setup_mistakes.possible import possible_mistakes
 
 FRAMES = 45

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from studies.fu2016 import compare_fu2016
-from studies.fu2016_experiments import DISTURBANCES, estimate, peaks, quiet_rms, simulate
+from studies.fu2016 import DISTURBANCES, compare_fu2016, estimate, peaks, quiet_rms, simulate
 
 
 @pytest.fixture(scope="module")

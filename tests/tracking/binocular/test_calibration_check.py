@@ -11,8 +11,7 @@ from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed_camera
 from tests.tracking.binocular.scenes import MODEL, NOISE_PX, PAIR, images
 from tracking.binocular.calibration_check import LabelledFrame, check_calibration, labelled_by_each
 from tracking.binocular.joint_fit import MarkerObservations
-from tracking.binocular.marker_model import StereoPair, project_markers
-from tracking.binocular.parameters import MatchParameters
+from tracking.binocular.marker_model import MatchParameters, StereoPair, project_markers
 
 LEFT, RIGHT = PAIR.cameras
 

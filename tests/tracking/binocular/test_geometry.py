@@ -11,16 +11,17 @@ from geometry.rotations import ypr_from_matrix
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from studies.zhou2020 import PRINTED_ROTATION, pose_errors
 from tests.tracking.binocular.scenes import MODEL, NOISE_PX, PAIR, pose_at
-from tracking.binocular.first_fit import first_fit
-from tracking.binocular.joint_fit import MarkerObservations, fit_pose
-from tracking.binocular.marker_model import StereoPair, calibration_jacobian, project, project_markers
-from tracking.binocular.triangulation import (
+from tracking.binocular.acquisition import first_fit
+from tracking.binocular.joint_fit import (
+    MarkerObservations,
+    fit_pose,
     linear_points,
     pose_of_points,
     quaternion_matrix,
     triangulate,
     undistorted_pixels,
 )
+from tracking.binocular.marker_model import StereoPair, calibration_jacobian, project, project_markers
 
 COV = np.broadcast_to(NOISE_PX**2 * np.eye(2), (2, len(MODEL), 2, 2))
 
@@ -137,7 +138,7 @@ def test_a_calibration_error_within_its_covariance_is_within_the_covariance_of_t
         uv = project_markers(PAIR, MODEL, pose)[0] + rng.normal(0, NOISE_PX, (2, len(MODEL), 2))
         pair = StereoPair((left, wrong), RigCovariance(names, np.diag(sigma**2)))
         fit = fit_pose(pair, MODEL, MarkerObservations(uv, COV), pose)
-        delta = pose.minus(fit.pose)
+        delta = pose.minus(fit.world_from_body)
         nees.append(delta @ np.linalg.solve(fit.covariance, delta))
         assert np.linalg.eigvalsh(fit.covariance - fit.systematic)[0] > 0
     assert 0.75 < np.mean(nees) / 6 < 1.3  # without the calibration's part: 16
@@ -149,7 +150,7 @@ def test_the_first_fit_finds_the_pose_of_a_far_target_from_labels_alone():
         pose = pose_at(25, i)
         uv = project_markers(PAIR, MODEL, pose)[0] + rng.normal(0, 0.05, (2, len(MODEL), 2))
         fit = first_fit(PAIR, MODEL, MarkerObservations(uv, COV))
-        delta = pose.minus(fit.pose)
+        delta = pose.minus(fit.world_from_body)
         assert delta @ np.linalg.solve(fit.covariance, delta) < 30
 
 

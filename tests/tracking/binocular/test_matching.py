@@ -9,9 +9,8 @@ from geometry.pose import Pose
 from studies.zhou2020 import random_pose
 from tests.tracking.binocular.scenes import MODEL, PAIR, images, pose_at
 from tracking.binocular.acquisition import matching_pairs, mirrored
-from tracking.binocular.clock_offset import FittedFrame, clock_offset
-from tracking.binocular.marker_model import MarkerImages, MarkerModel, project_markers
-from tracking.binocular.parameters import MatchParameters
+from tracking.binocular.calibration_check import FittedFrame, clock_offset
+from tracking.binocular.marker_model import MarkerImages, MarkerModel, MatchParameters, project_markers
 from tracking.binocular.pose_tracker import AMBIGUOUS, NO_PICTURES, TOO_FEW, BinocularTracker
 from tracking.statuses import PoseStatus
 

@@ -6,8 +6,7 @@ import numpy as np
 
 from geometry import rotations
 from geometry.arrays import Array
-from tracking.comparison.frame_alignment import Alignment
-from tracking.comparison.motion import Motion
+from tracking.comparison.frame_alignment import Alignment, Motion
 
 TRUTH = Alignment(
     offset_s=0.137,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tracking.comparison.allan import allan_deviation
+from tracking.comparison.differences import allan_deviation
 
 
 def test_white_noise_falls_with_the_root_of_the_averaging_time():

@@ -10,8 +10,17 @@ import pytest
 from geometry import rotations
 from tests.tracking.comparison.motions import TRUTH, recordings, smooth
 from tracking.comparison.estimation import Free, NotComparableError, estimate_alignment
-from tracking.comparison.frame_alignment import BODY, LEVER, TIME, TRANSLATION, WORLD, Alignment, jacobians, residuals
-from tracking.comparison.motion import Motion
+from tracking.comparison.frame_alignment import (
+    BODY,
+    LEVER,
+    TIME,
+    TRANSLATION,
+    WORLD,
+    Alignment,
+    Motion,
+    jacobians,
+    residuals,
+)
 
 
 def nees(found: list, truth: Alignment = TRUTH) -> float:

@@ -8,7 +8,7 @@ import pytest
 from geometry import rotations
 from tests.tracking.comparison.motions import TRUTH, recordings, smooth
 from tracking.comparison.differences import chi_square, differences, longest_still, statistic
-from tracking.comparison.motion import Motion, interpolate, rates
+from tracking.comparison.frame_alignment import Motion, interpolate, rates
 
 
 def exact(t):

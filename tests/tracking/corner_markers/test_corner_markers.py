@@ -9,8 +9,8 @@ import pytest
 
 from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose
-from studies.fu2016_experiments import CLEAR, GUST, MARKERS, Difficulty, marker_model, pose_of, render
-from tracking.corner_markers.matching import MatchParameters, harris_corners, harris_response, match_markers
+from studies.fu2016 import CLEAR, GUST, MARKERS, Difficulty, marker_model, pose_of, render
+from tracking.corner_markers import MatchParameters, harris_corners, harris_response, match_markers
 from tracking.detections import UNMATCHED
 
 STATE = np.array([21.0, 6.0, 0.5, 0, 0, 0, 0.1, 0.05])

@@ -14,8 +14,7 @@ from tests.geometry.perturbed_rig import perturbed
 from tests.tracking.rigid_runs import Pooled, assess, smoothed_frames, tracked
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.parameters import TrackerParameters
-from tracking.statuses import PoseStatus
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import PoseStatus, TrackedFrame
 
 # 1 sigma of each kind of parameter in a careful calibration. These errors shift the spots by some tenths of a pixel,
 # several times their noise.

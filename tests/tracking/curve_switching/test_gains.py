@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tracking.curve_switching.gains import combined, direction_and_speed, nearness, picture_scale, smoothness
+from tracking.curve_switching.matching import combined, direction_and_speed, nearness, picture_scale
 
 FLOOR_PX = 1.0
 WEIGHTS = (0.6, 0.2, 0.2)
@@ -17,7 +17,7 @@ pixel = st.tuples(st.floats(-2000, 2000), st.floats(-2000, 2000)).map(np.array)
 @given(last=pixel, predicted=pixel, candidate=pixel, alpha=st.floats(0, 1))
 def test_direction_speed_and_smoothness_lie_between_0_and_1(last, predicted, candidate, alpha):
     direction, speed = direction_and_speed(last, predicted, candidate, FLOOR_PX)
-    g2 = smoothness(last, predicted, candidate, alpha, FLOOR_PX)
+    g2 = combined(last, predicted, candidate, (0.0, alpha, 1 - alpha), 1.0, FLOOR_PX)
     for g in (direction, speed, g2):
         assert -1e-12 <= g <= 1 + 1e-12
 
@@ -34,7 +34,7 @@ def test_all_gains_lie_between_0_and_1_within_the_search_radius(last, predicted,
 @given(last=pixel, predicted=pixel)
 def test_at_the_prediction_every_gain_is_1(last, predicted):
     assert nearness(predicted, predicted, 10.0) == 1
-    assert smoothness(last, predicted, predicted, 0.5, FLOOR_PX) == pytest.approx(1, abs=1e-12)
+    assert combined(last, predicted, predicted, (0.0, 0.5, 1 - 0.5), 1.0, FLOOR_PX) == pytest.approx(1, abs=1e-12)
     assert combined(last, predicted, predicted, WEIGHTS, 10.0, FLOOR_PX) == pytest.approx(1, abs=1e-12)
 
 
@@ -64,7 +64,9 @@ def test_equations_7_to_9_agree_with_a_hand_calculation():
     last, predicted, candidate = np.zeros(2), np.array([4.0, 0]), np.array([4.0, 3.0])
     g1, direction, speed = 1 - 3 / 10, 0.5 + 0.5 * 0.8, 2 * np.sqrt(20) / 9
     assert nearness(predicted, candidate, 10.0) == pytest.approx(g1)
-    assert smoothness(last, predicted, candidate, 0.3, FLOOR_PX) == pytest.approx(0.3 * direction + 0.7 * speed)
+    assert combined(last, predicted, candidate, (0.0, 0.3, 1 - 0.3), 1.0, FLOOR_PX) == pytest.approx(
+        0.3 * direction + 0.7 * speed
+    )
     g3 = combined(last, predicted, candidate, WEIGHTS, 10.0, FLOOR_PX)
     assert g3 == pytest.approx(0.6 * g1 + 0.2 * direction + 0.2 * speed)
 
@@ -82,7 +84,7 @@ def test_a_zero_displacement_gives_a_finite_gain(point, other):
     for last, predicted, candidate in ((point, point, point), (point, point, other), (point, other, point)):
         g = combined(last, predicted, candidate, WEIGHTS, 10.0, FLOOR_PX)
         assert np.isfinite(g)
-        assert np.isfinite(smoothness(last, predicted, candidate, 0.5, FLOOR_PX))
+        assert np.isfinite(combined(last, predicted, candidate, (0.0, 0.5, 1 - 0.5), 1.0, FLOOR_PX))
 
 
 def test_the_direction_of_noise_does_not_affect_a_spot_at_rest():

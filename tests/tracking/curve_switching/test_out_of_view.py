@@ -11,7 +11,7 @@ from geometry.forward_model import SpotModel
 from geometry.rig import Beam
 from lab.simulate.rigs import RIGS
 from tests.geometry.scenes import random_pose
-from tracking.curve_switching.pose_filter import CoplanarViews, quadratic_positions
+from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
 
 EXACT_PX = 1e-6
 

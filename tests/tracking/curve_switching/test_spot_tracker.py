@@ -13,12 +13,11 @@ from geometry.pose_prior import PosePrior
 from lab.simulate.points import PointRun, simulate_points
 from lab.simulate.rigs import RIGS
 from lab.simulate.scenarios import SCENARIOS, Clutter, Occlusion
-from tracking.curve_switching.pose_filter import CoplanarViews, quadratic_positions
+from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
-from tracking.statuses import PoseStatus, SpotStatus
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import PoseStatus, SpotStatus, TrackedFrame
 
 PAPER = TrackerParameters(rigid_check=False, estimate="prediction", out_of_view="quadratic")  # the paper's method
 START_FRAMES = 2  # frames before the first rate is known

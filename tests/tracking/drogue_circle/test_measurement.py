@@ -9,11 +9,17 @@ import pytest
 from scipy.stats import norm
 
 from tests.tracking.drogue_circle.discs import covered, discs, rounded
-from tracking.drogue_circle.acquisition import Wanted, acquire
-from tracking.drogue_circle.candidates import CircleCandidate, Window
-from tracking.drogue_circle.detectors import classical_detector, edge_pixels, radii_of
-from tracking.drogue_circle.parameters import CircleParameters, Edge
+from tracking.drogue_circle.detectors import (
+    CircleCandidate,
+    CircleParameters,
+    Edge,
+    Window,
+    classical_detector,
+    edge_pixels,
+    radii_of,
+)
 from tracking.drogue_circle.rim_fit import fit_rim, smooth_crop
+from tracking.drogue_circle.tracker import Wanted, acquire
 
 P = CircleParameters()
 DETECT = classical_detector(P)

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from tests.tracking.drogue_circle.discs import covered, discs
-from tracking.drogue_circle.candidates import CircleCandidate
-from tracking.drogue_circle.detectors import classical_detector
-from tracking.drogue_circle.parameters import CircleParameters
+from tracking.drogue_circle.detectors import CircleCandidate, CircleParameters, classical_detector
 from tracking.drogue_circle.printed import PrintedTracker
 from tracking.drogue_circle.tracker import CircleTracker
 from tracking.statuses import Cause, PoseStatus

@@ -27,9 +27,7 @@ from tests.tracking.labelling.test_first_labels import (
 from tracking.detections import Detections
 from tracking.labelling.first_labels import NO_POINT, candidate_labellings, find_labels
 from tracking.labelling.points import points_of
-from tracking.labelling.search import RigPlan
-from tracking.labelling.triples import TIMES, covering
-from tracking.labelling.visible_poses import VisiblePoses
+from tracking.labelling.search import TIMES, RigPlan, VisiblePoses, covering
 from tracking.parameters import LabelParameters
 
 WIDE = PosePrior(Pose.identity(), 1.0, np.deg2rad(30))

@@ -7,7 +7,7 @@ import pytest
 
 from bench.related_measurements.learned_detector import calibration, is_right, recall_at, reliability
 from studies.learned_detector.samples import draw_sample
-from tracking.drogue_circle.candidates import Window
+from tracking.drogue_circle.detectors import Window
 from tracking.learned_detector import detector
 from tracking.learned_detector.detector import DrogueCandidate, find_drogues, learned_detector
 

@@ -9,9 +9,9 @@ from geometry.compiled_linalg import pose_plus
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from lab.simulate.rigs import RIGS
-from tracking.picture_clock import PictureClock
+from tracking.detections import PictureClock
+from tracking.rigid_body.models.information import exposed_after, picture_shifts, timed_spot
 from tracking.rigid_body.models.motion import state_after
-from tracking.rigid_body.models.picture_shifts import exposed_after, picture_shifts, timed_spot
 
 MODEL = SpotModel.of(RIGS["four-skew-beams"]())
 R, T = np.eye(3), np.zeros(3)

@@ -17,8 +17,7 @@ from tests.tracking.rigid_runs import RIGID, assess, recording_of, smoothed_fram
 from tracking.detections import Detections
 from tracking.rigid_body.acquisition import Acquisition
 from tracking.rigid_body.rigid_tracker import RigidTracker
-from tracking.statuses import PoseStatus
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import PoseStatus, TrackedFrame
 
 ANGLES_DEG = (-5.0, 5.0)
 

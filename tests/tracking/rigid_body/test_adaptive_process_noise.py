@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tracking.parameters import TrackerParameters
-from tracking.rigid_body.adaptive_process_noise import MAX_P, MIN_P, RANGE, AdaptiveProcessNoise
-from tracking.rigid_body.variance_factor import VarianceFactor
+from tracking.rigid_body.online_estimates import MAX_P, MIN_P, RANGE, AdaptiveProcessNoise, VarianceFactor
 
 RESTING = np.zeros(6)
 

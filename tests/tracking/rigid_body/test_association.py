@@ -22,9 +22,11 @@ from tracking.rigid_body.association.frame_detections import (
     Observation,
     ViewTable,
     distinct_spots,
+    is_blended,
+    log_clutter_ratio,
+    p_in_picture,
 )
 from tracking.rigid_body.association.joint_search import GATE_CHI2, WIDE_PRUNE_NATS, associate
-from tracking.rigid_body.association.likelihood import is_blended, log_clutter_ratio, p_in_picture
 from tracking.rigid_body.models.occlusion import MISSED
 
 RIG = RIGS["fan"]()

@@ -7,7 +7,7 @@ import pytest
 
 from lab.simulate.points import simulate_points
 from tests.tracking.rigid_runs import assess, smoothed_frames, tracked, without_pictures
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import TrackedFrame
 
 FRAMES = 120
 

@@ -20,15 +20,17 @@ from tracking.rigid_body.association.frame_detections import (
 from tracking.rigid_body.hypotheses.branching import branch
 from tracking.rigid_body.hypotheses.hypothesis_set import (
     MAX_CHILDREN,
+    MAX_HYPOTHESES,
+    PRUNE_NATS,
     Children,
     Dynamics,
     Hypotheses,
     State,
     add_child,
     empty_children,
+    iterated_update,
+    prune_and_merge,
 )
-from tracking.rigid_body.hypotheses.iterated_update import iterated_update
-from tracking.rigid_body.hypotheses.pruning import MAX_HYPOTHESES, PRUNE_NATS, prune_and_merge
 from tracking.rigid_body.models.motion import STATE, predicted
 from tracking.rigid_body.models.occlusion import MISSED
 

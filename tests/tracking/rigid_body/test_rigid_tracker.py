@@ -34,8 +34,7 @@ from tests.tracking.rigid_runs import (
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.rigid_tracker import RigidTracker
-from tracking.statuses import PoseStatus, SpotStatus
-from tracking.tracked_frame import TrackedFrame
+from tracking.statuses import PoseStatus, SpotStatus, TrackedFrame
 
 
 @cache

@@ -7,8 +7,8 @@ import numpy as np
 from geometry.forward_model import SpotModel
 from lab.simulate.rigs import RIGS
 from tracking.detections import Detections
+from tracking.rigid_body.acquisition import ASTRAY, LONG_UNMEASURED, SEARCH_AT, SearchSchedule
 from tracking.rigid_body.models.occlusion import MISSED
-from tracking.rigid_body.search_schedule import ASTRAY, LONG_UNMEASURED, SEARCH_AT, SearchSchedule
 
 MODEL = SpotModel.of(RIGS["fan"]())
 N = len(MODEL)

@@ -11,10 +11,9 @@ from geometry.pose import Pose
 from lab.simulate.points import PointRun
 from lab.simulate.rigs import fan
 from tests.tracking.rigid_runs import RIGID, assess, found_in, prior_of, recording_of, smoothed_frames, tracked
-from tracking.rigid_body.association.completion import complete
 from tracking.rigid_body.association.frame_detections import BLENDED
-from tracking.rigid_body.hypotheses.hypothesis_set import State
-from tracking.rigid_body.hypotheses.iterated_update import iterated_update
+from tracking.rigid_body.association.joint_search import complete
+from tracking.rigid_body.hypotheses.hypothesis_set import State, iterated_update
 from tracking.rigid_body.models.occlusion import MISSED
 from tracking.rigid_body.rigid_tracker import RigidTracker
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geometry.arrays import Array
-from tracking.rigid_body.static_points import (
+from tracking.rigid_body.online_estimates import (
     DECAY,
     MIN_SEEN,
     PicturePoints,

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tracking.single_target.blobs import find_blobs
-from tracking.single_target.parameters import BlobParameters
+from tracking.single_target.blobs import BlobParameters, find_blobs
 
 
 def disc(centre, radius, size=(240, 180), ground=140.0, ink=40.0, noise=1.5, seed=0):

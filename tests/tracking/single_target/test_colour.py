@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from tests.paths import DATA
-from tracking.single_target.colour import HUES, find_coloured, has_colour, hue_of, share_of_hue
-from tracking.single_target.parameters import BlobParameters
+from tracking.single_target.blobs import HUES, BlobParameters, find_coloured, has_colour, hue_of, share_of_hue
 
 
 def scene(bgr, centre=(100.3, 80.6), radius=9.0, light=1.0, noise=2.0, seed=0):

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from tracking.detections import Detections
-from tracking.single_target.parameters import PointParameters
-from tracking.single_target.point_tracker import PointTracker, track_point
+from tracking.single_target.point_tracker import PointParameters, PointTracker, track_point
 from tracking.statuses import PoseStatus
 
 SIGMA = 0.2

@@ -6,9 +6,9 @@ import pytest
 from geometry.compiled_projection import project_all
 from geometry.pose import Pose
 from lab.simulate.points import simulate_points
-from tracking.smoothing.exposure import exposure_offsets, pose_shift
-from tracking.smoothing.motion.reference import Reference
-from tracking.smoothing.motion.velocity_jumps import with_error_along, with_errors_along_axes
+from tracking.smoothing.motion.process_noise import with_error_along, with_errors_along_axes
+from tracking.smoothing.motion.run_detections import Reference
+from tracking.smoothing.systematic_errors import exposure_offsets, pose_shift
 
 EXPOSURE_S = 0.02
 

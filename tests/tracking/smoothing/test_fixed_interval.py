@@ -11,10 +11,14 @@ from geometry.arrays import Array
 from geometry.pose import Pose
 from tracking.rigid_body.models.motion import STATE, predicted, updated
 from tracking.smoothing.motion import fixed_interval
-from tracking.smoothing.motion.fixed_interval import RunInformation, log_likelihood, smoothed
-from tracking.smoothing.motion.predictive_cost import leave_one_out_log_likelihood
-from tracking.smoothing.motion.reference import Reference, shifted
-from tracking.smoothing.motion.velocity_jumps import SHOCK_SEPARATION
+from tracking.smoothing.motion.fixed_interval import (
+    RunInformation,
+    leave_one_out_log_likelihood,
+    log_likelihood,
+    smoothed,
+)
+from tracking.smoothing.motion.process_noise import SHOCK_SEPARATION
+from tracking.smoothing.motion.run_detections import Reference, shifted
 
 DT = 0.01
 JERK = np.repeat([20.0, 60.0], 3) ** 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tracking.smoothing.residual_bounds import most_of_places
+from tracking.smoothing.single_frame_poses import most_of_places
 
 
 @pytest.mark.parametrize("factor", [0.02, 0.2, 1.0])

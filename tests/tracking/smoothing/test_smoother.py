@@ -26,10 +26,8 @@ from tests.tracking.rigid_runs import (
 from tracking.detections import UNMATCHED
 from tracking.parameters import TrackerParameters
 from tracking.smoothing.recording import TrackedRecording
-from tracking.smoothing.smoothed import Smoothed
-from tracking.smoothing.smoother import smooth
-from tracking.statuses import PoseStatus, SpotStatus
-from tracking.tracked_frame import TrackedFrame
+from tracking.smoothing.smoother import Smoothed, smooth
+from tracking.statuses import PoseStatus, SpotStatus, TrackedFrame
 
 Passes = tuple[PointRun, list[TrackedFrame], list[TrackedFrame], Smoothed]
 

@@ -11,9 +11,7 @@ from lab.simulate.rigs import RIGS
 from tests.tracking.rigid_runs import RIGID, dt_of, found_in, recording_of, tracked
 from tracking.smoothing.motion import whole_run
 from tracking.smoothing.motion.fixed_interval import Interval
-from tracking.smoothing.motion.reference import straight_between
-from tracking.smoothing.motion.run_detections import spot_information
-from tracking.smoothing.motion.smoothed_motion import SmoothedMotion, WholeRun
+from tracking.smoothing.motion.run_detections import SmoothedMotion, WholeRun, spot_information, straight_between
 from tracking.smoothing.motion.whole_run import MAX_PASSES, _Estimator, estimate
 from tracking.smoothing.recording import TrackedRecording
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
-from tracking.smoothing.motion.windows import largest_near, window_mean
+from tracking.smoothing.motion.process_noise import largest_near, window_mean
 
 
 @pytest.mark.parametrize("frames", [1, 2, 7, 50, 301])

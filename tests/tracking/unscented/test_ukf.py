@@ -7,16 +7,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tracking.unscented.fu2016 import SPREAD, X0, PrintedFilter, bearings, observability, process, selection
-from tracking.unscented.ukf import (
+from tracking.unscented import (
+    SPREAD,
+    X0,
+    PrintedFilter,
     Space,
     Spread,
+    bearings,
     gated_update,
+    observability,
     predict,
+    process,
+    selection,
     sigma_points,
     square_root,
     student_t_update,
-    transform,
     update,
 )
 
@@ -74,14 +79,14 @@ def test_covariances_are_positive_semidefinite_for_any_function(seed, which):
 def test_the_covariance_equals_the_usual_weighted_sum():
     rng = np.random.default_rng(8)
     x, P = rng.normal(size=8), random_covariance(rng, 8)
-    mean, covariance = transform(x, P, np.sin, SPREAD)
+    mean, covariance = predict(x, P, np.sin, np.zeros((8, 8)), SPREAD)
     values, (wm, wc) = np.sin(sigma_points(x, P, SPREAD)), SPREAD.weights(8)
     np.testing.assert_allclose(mean, wm @ values, atol=1e-10)
     np.testing.assert_allclose(covariance, (values - mean).T @ (wc[:, None] * (values - mean)), atol=1e-9)
 
 
 def test_a_square_has_the_mean_and_variance_of_a_chi_square():
-    mean, variance = transform(np.zeros(1), np.eye(1), np.square)
+    mean, variance = predict(np.zeros(1), np.eye(1), np.square, np.zeros((1, 1)))
     assert mean[0] == pytest.approx(1.0)
     assert variance[0, 0] == pytest.approx(2.0)
 

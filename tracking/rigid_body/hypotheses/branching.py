@@ -15,28 +15,30 @@ import numpy as np
 from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled
 from geometry.compiled_linalg import block, copy_into, copy_matrix_into
-from tracking.rigid_body.association.completion import complete, explainable
-from tracking.rigid_body.association.frame_detections import BLENDED, Observation
-from tracking.rigid_body.association.joint_search import associate, is_taken
-from tracking.rigid_body.association.likelihood import detection_log_likelihood, log_clutter_ratio
-from tracking.rigid_body.hypotheses.hypothesis_set import (
-    Children,
-    Dynamics,
-    Hypotheses,
-    State,
-    add_child,
-    empty_children,
+from tracking.rigid_body.association.frame_detections import (
+    BLENDED,
+    Observation,
+    detection_log_likelihood,
+    log_clutter_ratio,
 )
-from tracking.rigid_body.hypotheses.iterated_update import Update, iterated_update
-from tracking.rigid_body.hypotheses.prediction_checks import (
+from tracking.rigid_body.association.joint_search import associate, complete, explainable, is_taken
+from tracking.rigid_body.hypotheses.hypothesis_set import (
     MAX_CHECKING_SIGMA_PX,
     MAX_THREE_SPOT_SIGMA_PX,
     MAX_TRACKING_SIGMA_PX,
     MIN_CONFIRMING_SPOTS,
     MIN_REDUNDANT_SPOTS,
+    PRUNE_NATS,
+    Children,
+    Dynamics,
+    Hypotheses,
+    State,
+    Update,
+    add_child,
+    empty_children,
+    iterated_update,
     largest_spot_sigma,
 )
-from tracking.rigid_body.hypotheses.pruning import PRUNE_NATS
 from tracking.rigid_body.models.motion import predicted
 from tracking.rigid_body.models.occlusion import MISSED, joint_log_likelihood, marginal, predict, update
 

@@ -1,4 +1,4 @@
-"""Fixed-interval smoother, compiled: the motion at each frame given the whole run.
+"""Fixed-interval smoother, compiled: the motion at each frame given the whole run, its cost and its predictions.
 
 A two-filter smoother. Deviations (18) from a reference motion are filtered forward; an information filter runs
 backward; each frame's result combines the two. Every covariance is a product of triangular factors
@@ -18,8 +18,13 @@ from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from geometry.compiled_linalg import (
     apply,
+    block,
+    cholesky,
+    column,
     copy_into,
     copy_matrix_into,
+    hstack,
+    multiply,
     pose_minus,
     posterior,
     solve,
@@ -28,8 +33,59 @@ from geometry.compiled_linalg import (
     transposed_multiply,
 )
 from tracking.rigid_body.models.motion import STATE, predicted, process_noise, propagated, transition
-from tracking.smoothing.motion.axis_noise import noise_root, subtract_noise
-from tracking.smoothing.motion.reference import Reference
+from tracking.smoothing.motion.run_detections import Reference
+
+
+@compiled
+def noise_root(dt: float, jerk: float, velocity_jump: float, acceleration_jump: float) -> Array:
+    """Lower triangular root (3, 3) of one axis' process noise."""
+    Q = np.empty((3, 3))
+    Q[0, 0], Q[0, 1], Q[0, 2], Q[1, 1], Q[1, 2], Q[2, 2] = process_noise(dt, jerk, velocity_jump, acceleration_jump)
+    Q[1, 0], Q[2, 0], Q[2, 1] = Q[0, 1], Q[0, 2], Q[1, 2]
+    return cholesky(Q)
+
+
+@compiled
+def subtract_noise(Y: Array, y: Array, axis: int, root: Array) -> None:
+    """Information about x - w from that about x, in place: (Y^-1 + Q)^-1, Q = root root^T of one axis of noise w."""
+    n = Y.shape[0]
+    Z, A, b = np.zeros((n, 3)), np.zeros((3, 3)), np.zeros((3, 1))
+    for a in range(3):
+        row = axis + 6 * a
+        for c in range(a + 1):
+            q = root[a, c]
+            if q != 0.0:
+                b[c, 0] += q * y[row]
+                for i in range(n):
+                    Z[i, c] += Y[i, row] * q
+    for a in range(3):
+        row = axis + 6 * a
+        for c in range(a + 1):
+            for e in range(3):
+                A[c, e] += root[a, c] * Z[row, e]
+    for c in range(3):
+        A[c, c] += 1.0
+        for e in range(c):
+            A[c, e] = 0.5 * (A[c, e] + A[e, c])
+            A[e, c] = A[c, e]
+    # With W W^T = A, subtract Z W^-T (Z W^-T)^T.
+    W = cholesky(A)
+    for c in range(3):
+        for e in range(c):
+            w = W[c, e]
+            for i in range(n):
+                Z[i, c] -= Z[i, e] * w
+            b[c, 0] -= b[e, 0] * w
+        for i in range(n):
+            Z[i, c] /= W[c, c]
+        b[c, 0] /= W[c, c]
+    for i in range(n):
+        z0, z1, z2 = Z[i, 0], Z[i, 1], Z[i, 2]
+        y[i] -= z0 * b[0, 0] + z1 * b[1, 0] + z2 * b[2, 0]
+        for j in range(i + 1):
+            Y[i, j] -= z0 * Z[j, 0] + z1 * Z[j, 1] + z2 * Z[j, 2]
+            Y[j, i] = Y[i, j]
+
 
 # Frames whose covariances are in memory at once, 2.7 kB each: the whole of a shorter run, else a chunk. With chunks the
 # forward filter, a fifth of a pass, runs once more over those before the last one.
@@ -342,4 +398,59 @@ def _chi_square(L: Array, x: Array) -> float:
     total = 0.0
     for i in range(6):
         total += b[i, 0] * z[i, 0]
+    return total
+
+
+@compiled
+def motion_cost(ref: Reference, info: RunInformation, jerk: Array) -> float:
+    """Half the squared Mahalanobis length of the process noise that a reference motion needs, nats."""
+    total = 0.0
+    w = np.empty(3)
+    for k in range(1, info.dt.shape[0]):
+        _, turn = transition(ref.m[k - 1], info.dt[k])
+        R, t, m = propagated(ref.R[k - 1], ref.t[k - 1], ref.m[k - 1], info.dt[k], turn)
+        d = pose_minus(ref.R[k], ref.t[k], R, t)
+        for i in range(6):
+            root = noise_root(info.dt[k], jerk[k, i], info.velocity_jump[k, i // 3], info.acceleration_jump[k, i // 3])
+            w[0], w[1], w[2] = d[i], ref.m[k, i] - m[i], ref.m[k, 6 + i] - m[6 + i]
+            for a in range(3):
+                s = w[a]
+                for b in range(a):
+                    s -= root[a, b] * w[b]
+                w[a] = s / root[a, a]
+                total += 0.5 * w[a] * w[a]
+    return total
+
+
+@compiled
+def leave_one_out_log_likelihood(x: Array, P: Array, info: RunInformation) -> float:
+    """Sum of the log-likelihoods of each frame's measurement given all other frames, nats, up to a constant.
+
+    x (T, 18), P (T, 6, 6): smoothed deviations and their poses' covariances. The leave-one-out predictive likelihood
+    (Geisser & Eddy 1979) measures how well the motion between frames is known, which is the purpose of a smoother.
+    """
+    total = 0.0
+    r = np.empty((6, 1))
+    for k in range(info.dt.shape[0]):
+        L, g = info.information[k], info.vector[k]
+        if L[0, 0] == 0.0:
+            continue
+        # Remove the frame's own information: (I - P L)^-1 of P and of the deviation.
+        A, d = multiply(P[k], L), apply(P[k], g)
+        for i in range(6):
+            for j in range(6):
+                A[i, j] = (1.0 if i == j else 0.0) - A[i, j]
+            d[i] = x[k, i] - d[i]
+        alone, _ = solve(A, hstack(P[k], d))
+        d, P_alone = column(alone, 6), block(alone, 6)
+        Ld, B = apply(L, d), multiply(L, P_alone)
+        for i in range(6):
+            r[i, 0] = g[i] - Ld[i]
+            B[i, i] += 1.0
+        w, log_det = solve(B, r)
+        step = multiply(P_alone, w)
+        misfit = 0.0
+        for i in range(6):
+            misfit += d[i] * (Ld[i] - 2 * g[i]) - r[i, 0] * step[i, 0]
+        total -= 0.5 * (log_det + misfit)
     return total

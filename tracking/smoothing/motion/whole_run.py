@@ -1,7 +1,7 @@
 """Most probable motion given all labelled spots of a run, with its covariance and its process noise.
 
 Gauss-Newton on the whole run (fixed_interval.py) with Levenberg's damping; the true cost decides which steps are taken.
-Between the steps the strength of the jerk (process_noise.py) and the velocity jumps (velocity_jumps.py) are estimated.
+Between the steps the strength of the jerk and the velocity jumps (process_noise.py) are estimated.
 Source: ours.
 """
 
@@ -12,24 +12,37 @@ from dataclasses import replace
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from tracking.rigid_body.adaptive_process_noise import MANOEUVRE_S, jump_variance
 from tracking.rigid_body.models.motion import STATE, predicted
-from tracking.smoothing.motion.delayed_spots import Steps, delayed_information
-from tracking.smoothing.motion.fixed_interval import Interval, RunInformation, log_likelihood, smoothed
-from tracking.smoothing.motion.predictive_cost import leave_one_out_log_likelihood, motion_cost
-from tracking.smoothing.motion.process_noise import next_log_density
-from tracking.smoothing.motion.reference import Reference, first_variance, shifted, speeds
-from tracking.smoothing.motion.run_detections import spot_information
-from tracking.smoothing.motion.smoothed_motion import SmoothedMotion, WholeRun
-from tracking.smoothing.motion.velocity_jumps import (
+from tracking.rigid_body.online_estimates import MANOEUVRE_S, jump_variance
+from tracking.smoothing.motion.fixed_interval import (
+    Interval,
+    RunInformation,
+    leave_one_out_log_likelihood,
+    log_likelihood,
+    motion_cost,
+    smoothed,
+)
+from tracking.smoothing.motion.process_noise import (
     corner_offsets,
     jump_variances,
+    largest_near,
     new_jumps,
+    next_log_density,
     weak_frames,
     with_error_along,
     with_errors_along_axes,
 )
-from tracking.smoothing.motion.windows import largest_near
+from tracking.smoothing.motion.run_detections import (
+    Reference,
+    SmoothedMotion,
+    Steps,
+    WholeRun,
+    delayed_information,
+    first_variance,
+    shifted,
+    speeds,
+    spot_information,
+)
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD
 
 MAX_PASSES = 25

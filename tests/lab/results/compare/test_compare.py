@@ -19,7 +19,7 @@ from lab.results.compare import UNDETERMINED, alignment_rows, compare, read_refe
 from lab.results.compare_page import DIFFERENCES, compare_and_write
 from lab.runs.summary import SUMMARY_SCHEMA
 from tests.tracking.comparison.motions import TRUTH, recordings, smooth
-from tracking.comparison.motion import Motion
+from tracking.comparison.frame_alignment import Motion
 
 SIMPLE = replace(TRUTH, rate=0.0)
 

@@ -5,10 +5,9 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from studies.zhou2014_lights import approach
-from tracking.drogue_circle.acquisition import Wanted, acquire
-from tracking.drogue_circle.detectors import classical_detector
-from tracking.drogue_circle.parameters import CircleParameters
+from studies.zhou2014 import approach
+from tracking.drogue_circle.detectors import CircleParameters, classical_detector
+from tracking.drogue_circle.tracker import Wanted, acquire
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from studies.comparison import write_comparison
-from studies.zhou2014 import compare_zhou2014, hidden_run
-from studies.zhou2014_lights import followed
+from studies.zhou2014 import compare_zhou2014, followed, hidden_run
 
 
 @pytest.mark.slow

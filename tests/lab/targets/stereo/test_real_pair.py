@@ -10,8 +10,8 @@ from lab.files.rig.board_file import load_board_or_text
 from lab.files.rig.pair_file import load_pair_file
 from lab.pictures.picture_file import read_picture
 from tests.paths import DATA
+from tracking.binocular.joint_fit import triangulate
 from tracking.binocular.marker_model import StereoPair
-from tracking.binocular.triangulation import triangulate
 
 PHOTOS = DATA / "chessboard_stereo_opencv"
 SQUARE_M = 0.025

@@ -9,7 +9,7 @@ from geometry.arrays import Array
 from tests.tracking.smoothing.labels.path_recordings import FRAMES, GAP, context, filmed, without
 from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.smoothing.labels.continuity import MIN_SINGLE_CHAIN, continued
-from tracking.smoothing.labels.path_prediction import MAX_AHEAD
+from tracking.smoothing.labels.view_path import MAX_AHEAD
 
 
 def paths(jump_at: int | None = None) -> Array:

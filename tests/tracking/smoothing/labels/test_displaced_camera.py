@@ -8,7 +8,7 @@ import pytest
 from geometry.arrays import Array, Bools
 from tests.tracking.smoothing.labels.path_recordings import FRAMES, filmed
 from tracking.rigid_body.association.frame_detections import BLENDED
-from tracking.smoothing.labels.displaced_camera import MAX_SHIFT_PX, MIN_FRAMES, displaced
+from tracking.smoothing.labels.neighbouring_frames import MAX_SHIFT_PX, MIN_FRAMES, displaced
 
 KNOCKED = np.arange(FRAMES) >= 60  # (T,)
 

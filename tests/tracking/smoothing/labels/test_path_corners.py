@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geometry.arrays import Array, Ints
-from tracking.smoothing.labels.path_corners import MAX_SIGMA_PX, ROW_FRAMES, Limits, Line, after_corner
+from tracking.smoothing.labels.view_path import MAX_SIGMA_PX, ROW_FRAMES, Limits, Line, after_corner
 
 SIGMA_PX = 0.1
 LIMITS = Limits(SIGMA_PX, speed_px=30.0)

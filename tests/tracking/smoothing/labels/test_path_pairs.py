@@ -10,7 +10,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from lab.simulate.rigs import RIGS
 from tests.tracking.smoothing.labels.path_recordings import FRAMES, GAP, context, filmed, without
-from tracking.smoothing.labels.path_pairs import pair_labels, transfers_between_cameras
+from tracking.smoothing.labels.continuity import pair_labels, transfers_between_cameras
 
 BOTH = np.ones((FRAMES, 2), dtype=bool)
 

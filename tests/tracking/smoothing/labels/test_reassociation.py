@@ -10,7 +10,7 @@ from lab.simulate.points import simulate_points
 from tests.tracking.rigid_runs import RIGID, dt_of, found_in, tracked
 from tracking.rigid_body.association.frame_detections import DetectionModel, ViewTable
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated
-from tracking.smoothing.motion.reference import Reference
+from tracking.smoothing.motion.run_detections import Reference
 from tracking.smoothing.recording import TrackedRecording
 
 SIGMA = np.repeat([1e-5, 1e-4], 3)  # m, rad: of the prediction from the other frames

@@ -1,1 +1,0 @@
-"""Expected errors and error budget of a rig before it is built."""

@@ -1,1 +1,0 @@
-"""Calibration of a pair of cameras from photographs of a board that both see."""
