@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from geometry.arrays import Array, cross, normalised
+from geometry.arrays import Array, Bools, cross, normalised
 from geometry.pose import Pose
 
 # Straight lines in space: where two are closest, and the point nearest to many.
@@ -55,15 +55,15 @@ def intersect_plane(origin: Array, direction: Array, world_from_screen: Pose) ->
     return np.where((along & (t > 0))[..., None], hit, np.nan)
 
 
-def _to_plane(origin: Array, direction: Array, world_from_screen: Pose) -> tuple[Array, Array, Array, Array]:
-    """Rays in the screen frame: origins and directions (..., 3), which are not parallel to it, lengths (...) to it."""
+def _to_plane(origin: Array, direction: Array, world_from_screen: Pose) -> tuple[Array, Array, Bools, Array]:
+    """Rays in the screen frame: origins and directions (..., 3), which are not parallel to it, and lengths to it."""
     screen_from_world = world_from_screen.inverse()
     p = screen_from_world.apply(np.asarray(origin, dtype=float))
     d = screen_from_world.turn(np.asarray(direction, dtype=float))
     p, d = np.broadcast_arrays(p, d)
     along = np.abs(d[..., 2]) > 1e-12 * np.linalg.norm(d, axis=-1)
     t = -p[..., 2] / np.where(along, d[..., 2], 1.0)
-    return p, d, along, t
+    return p, d, np.asarray(along, dtype=np.bool_), t
 
 
 def screen_to_world(points: Array, world_from_screen: Pose) -> Array:

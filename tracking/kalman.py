@@ -143,7 +143,7 @@ class RigidMotion:
         """
         PH = self.P[:, :6] @ H.T
         S = H @ PH[:6] + R
-        K = np.linalg.solve(S, PH.T).T
+        K = np.asarray(np.linalg.solve(S, PH.T).T, dtype=float)
         d = K @ y
         P = _joseph(self.P, K, K @ H, R)
         return RigidMotion(self.world_from_body.plus(d[:6]), self.velocity + d[6:9], self.rate + d[9:], P), S
