@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import shutil
 import subprocess
@@ -51,11 +52,23 @@ def test_every_command_shown_has_valid_options(page):
     assert [wrong for shown in PAGES[page] if (wrong := problem(shown.command))] == []
 
 
-@pytest.mark.parametrize("name", ["README.md", "sample_runs/README.md"])
-def test_every_command_in_the_readmes_has_valid_options(name):
-    lines = indented_commands((ROOT / name).read_text(encoding="utf-8"))
+def test_every_command_of_the_sample_runs_readme_has_valid_options():
+    lines = indented_commands((ROOT / "sample_runs/README.md").read_text(encoding="utf-8"))
     assert len(lines) >= 5
     assert [wrong for line in lines if (wrong := problem(line.split(" #")[0]))] == []
+
+
+def test_the_readme_shows_at_most_ten_commands_that_read_only_what_a_clone_holds_or_an_earlier_one_wrote():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    shown = [shlex.split(command.command) for command in PAGES["README.md"]]
+    assert all(words[0] == "beampose" for words in shown)
+    assert 5 <= len(shown) <= 10 - len(re.findall(r"^make \w+$", text, re.MULTILINE)) - text.count("`source ")
+    written: set[str] = set()
+    for words in shown:
+        out = words.index("--out") + 1 if "--out" in words else len(words)
+        for path in (word for k, word in enumerate(words) if "/" in word and k != out):
+            assert (ROOT / path).exists() or any(f"{path}/".startswith(f"{folder}/") for folder in written), path
+        written |= set(words[out : out + 1])
 
 
 def test_the_pages_of_the_user_show_commands():
