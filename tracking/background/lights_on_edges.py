@@ -122,7 +122,7 @@ def _along_edges(search: _Search, spots: Detections) -> Detections:
     mean = np.einsum("kn,kni->ni", weight, uv)
     place = 0.5 * np.einsum("kn,kni->n", weight, (uv - mean) ** 2)
     before = np.zeros(len(spots)) if spots.misfit is None else spots.misfit
-    variance = 0.5 * np.trace(spots.cov_px2, axis1=1, axis2=2)
+    variance = spots.variance_px2
     return replace(
         spots, uv_px=mean, cov_px2=spots.cov_px2 + place[:, None, None] * np.eye(2),
         misfit=(before * variance + place) / (variance + place), chi2=np.where(whole, misfits, np.inf).min(axis=0),

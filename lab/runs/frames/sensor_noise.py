@@ -118,8 +118,9 @@ class CameraNoise:
     def saturation_dn(self, picture: Picture, parameters: DetectParameters) -> float:
         """The grey value at which the sensor clips: stated, seen in the pictures, or the largest of their type."""
         seen = None if self.estimate is None else self.estimate.saturation_dn
-        known = seen if parameters.saturation_dn is None else parameters.saturation_dn
-        return saturation_of(replace(parameters, saturation_dn=known), picture)
+        if parameters.saturation_dn is not None or seen is None:
+            return saturation_of(parameters, picture)
+        return float(seen)
 
     @property
     def _black_dn(self) -> float | None:
