@@ -120,10 +120,12 @@ class RestingLights:
         chi2 = np.add.reduceat(residual * weighted, self.starts) - gain
         more = np.einsum("ni,ni->n", self.flux_of, step)
         misfit = chi2 > self._largest_chi2
-        less = (residual < 0) & (self.weight > 0)
-        darker = np.maximum(np.add.reduceat(less, self.starts, dtype=float), 1.0)
-        allowed = _MISFIT * (1.0 + _MISFIT_SIGMAS * np.sqrt(2.0 / darker))
-        passed = misfit & (np.add.reduceat(residual * weighted * less, self.starts) < allowed * darker)
+        passed = misfit.copy()
+        if passed.any():
+            less = (residual < 0) & (self.weight > 0)
+            darker = np.maximum(np.add.reduceat(less, self.starts, dtype=float), 1.0)
+            allowed = _MISFIT * (1.0 + _MISFIT_SIGMAS * np.sqrt(2.0 / darker))
+            passed &= np.add.reduceat(residual * weighted * less, self.starts) < allowed * darker
         far = np.linalg.norm(step[:, :2], axis=1) > _LARGEST_STEP * self.found.minor_px
         far |= np.abs(more) > _LARGEST_CHANGE
         changed = misfit | (far & (gain > _BY_CHANCE))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -75,11 +75,14 @@ class CameraNoise:
         """Whether the pictures show texture or objects that hide spots, from which a background may free them."""
         return self.model is not None and is_limited_by_texture(self.model)
 
-    def make_background(self, pictures: Sequence[Picture], parameters: DetectParameters) -> None:
+    def make_background(
+        self, pictures: Sequence[Picture], parameters: DetectParameters,
+        make: Callable[..., StaticBackground | None] = static_background,
+    ) -> None:  # fmt: skip
         """Make the static background of pictures spread over the recording, if that shows more or spares fits."""
         if pictures and self.model is not None and self.estimate is not None:
             usual = self._with_saturation(parameters, pictures[0])
-            self.background = static_background(pictures, self.model, self.estimate.texture_shift, usual)
+            self.background = make(pictures, self.model, self.estimate.texture_shift, usual)
 
     def detect(self, picture: Picture, parameters: DetectParameters) -> Detections:
         """The points of one picture. After pictures without any point the noise is estimated again."""
