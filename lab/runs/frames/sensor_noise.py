@@ -199,6 +199,8 @@ def camera_noises(run: Run, reader: FrameReader) -> dict[str, CameraNoise]:
             shown |= pictures_of_frames(source, [k for k in wanted if k not in shown], size_px)
             spread = [shown[k] for k in wanted]
             out[name].make_background([p for p in spread if isinstance(p, np.ndarray)], run.tracker.detect)
+        if isinstance(source, PictureFiles):
+            source.keep(shown)
     share_texture(list(out.values()))
     return out
 
