@@ -64,6 +64,11 @@ class Detections:
     def __len__(self) -> int:
         return len(self.uv_px)
 
+    @property
+    def variance_px2(self) -> Array:
+        """(n,): variance of a coordinate, the mean of both."""
+        return np.asarray(0.5 * (self.cov_px2[:, 0, 0] + self.cov_px2[:, 1, 1]))
+
     def __getitem__(self, rows: Ints | Bools | slice) -> Detections:
         """The points of the given rows, in that order."""
         known: list[Array] = [getattr(self, name)[rows] for name in Detections.__slots__[:7]]

@@ -10,11 +10,11 @@ import glob
 import os
 import re
 from collections import deque
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
-from itertools import count
+from itertools import count, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     import cv2
 
 AHEAD = 8  # pictures of a camera read before they are requested: 10 MB of 1280x1024, whatever the recording's length
+KEPT_BYTES = 1 << 25  # of a camera's pictures that are read before the others
 THREADS = min(4, os.cpu_count() or 1)  # pictures decoded at once
 _LARGEST_COUNT = 2**40  # of pictures in a video's header; a larger one is wrong
 _RATE_RANGE_HZ = (0.01, 1e6)  # a rate outside it in a video's header is not one
@@ -59,6 +60,13 @@ class PictureFiles:
     files: dict[int, Path]  # by increasing frame number
     notes: tuple[str, ...] = ()
     ignored: tuple[str, ...] = ()  # names in the folder that are not pictures
+    # Grey pictures that have been read already; the next reader takes them out instead of decoding them again.
+    kept: dict[int, GreyPicture | MissingPicture] = field(default_factory=dict, compare=False, repr=False)
+
+    def keep(self, read: Mapping[int, GreyPicture | MissingPicture]) -> None:
+        """Keep pictures for the next reader, as many as may be in memory."""
+        size = max((p.nbytes for p in read.values() if isinstance(p, np.ndarray)), default=1)
+        self.kept.update(islice(read.items(), KEPT_BYTES // size))
 
     @property
     def numbers(self) -> Ints:
@@ -261,7 +269,7 @@ def pictures(
     frame. The pictures end where a video ends.
     """
     reader: _Reader = (
-        _FileReader(source.files, size_px, colour)
+        _FileReader(source, size_px, colour)
         if isinstance(source, PictureFiles)
         else _VideoReader(source.path, size_px, colour)
     )
@@ -308,15 +316,17 @@ class _Reader(Protocol):
 
 
 class _FileReader:
-    def __init__(self, files: dict[int, Path], size_px: tuple[int, int] | None, colour: bool) -> None:
-        self._files, self._size_px, self._colour = files, size_px, colour
+    def __init__(self, source: PictureFiles, size_px: tuple[int, int] | None, colour: bool) -> None:
+        self._source, self._size_px, self._colour = source, size_px, colour
         self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="decode")
 
     def request(self, frame: int) -> Future[Read]:
         return self._pool.submit(self._read, frame)
 
     def _read(self, frame: int) -> Read:
-        path = self._files.get(frame)
+        if not self._colour and (kept := self._source.kept.pop(frame, None)) is not None:
+            return kept
+        path = self._source.files.get(frame)
         return MissingPicture(DROPPED) if path is None else read_picture(path, self._size_px, self._colour)
 
     def close(self) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools
 from tracking.background.joint_fit import MODULATED, Modulation
-from tracking.background.mean_pictures import in_steps
+from tracking.background.mean_pictures import STRIP, in_steps
 from tracking.background.places import SAME_LIGHT, near_each
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
@@ -81,13 +81,19 @@ class _Search:
         """Those in front of a background (h, w). modulated: its brightness modulates them; boxes: of `find_spots`."""
         steps, share = self.steps, self.modulation.share
         once = replace(self.noise.in_steps(steps), texture=0.0, local_texture=None)
-        light = self.mean - behind
-        if modulated:
-            light /= np.maximum(1 - share + share * behind / np.float32(self.modulation.level_dn), _LEAST_FACTOR)
-        light += np.float32(self.level_dn)
-        light[self.clipped] = clips = np.iinfo(np.uint16).max // steps
+        clips = np.iinfo(np.uint16).max // steps
+        raised = np.empty(behind.shape, np.uint16)
+        for top in range(0, len(raised), STRIP):  # in the processor's cache
+            part = np.s_[top : top + STRIP]
+            light = self.mean[part] - behind[part]
+            if modulated:
+                of_surface = share * behind[part] / np.float32(self.modulation.level_dn)
+                light /= np.maximum(1 - share + of_surface, _LEAST_FACTOR)
+            light += np.float32(self.level_dn)
+            light[self.clipped[part]] = clips
+            raised[part] = in_steps(light, steps)
         usual = replace(self.parameters, saturation_dn=(clips - 0.5) * steps)
-        found = find_spots(in_steps(light, steps), usual, once, boxes)
+        found = find_spots(raised, usual, once, boxes)
         return replace(found, flux=found.flux / steps, peak=found.peak / steps)
 
 
@@ -122,7 +128,7 @@ def _along_edges(search: _Search, spots: Detections) -> Detections:
     mean = np.einsum("kn,kni->ni", weight, uv)
     place = 0.5 * np.einsum("kn,kni->n", weight, (uv - mean) ** 2)
     before = np.zeros(len(spots)) if spots.misfit is None else spots.misfit
-    variance = 0.5 * np.trace(spots.cov_px2, axis1=1, axis2=2)
+    variance = spots.variance_px2
     return replace(
         spots, uv_px=mean, cov_px2=spots.cov_px2 + place[:, None, None] * np.eye(2),
         misfit=(before * variance + place) / (variance + place), chi2=np.where(whole, misfits, np.inf).min(axis=0),

@@ -14,6 +14,7 @@ from geometry.compilation.jit import compiled_for_threads
 from tracking.noise import BLOCK, Picture
 
 MOST_BYTES = 150_000_000  # of these pictures
+STRIP = 4 * BLOCK  # rows that are computed at once: several arrays of them are in the processor's cache
 _CUT = 0.25  # share of the lowest and of the highest grey values of a pixel that is left out
 GAIN_BITS = 8  # binary places of a factor on the difference
 _SMOOTH_BLOCKS = 6.0  # blocks: sigma of the smooth part of the background, which is no structure
@@ -35,11 +36,12 @@ def means_of(pictures: Sequence[NDArray[Any]]) -> tuple[NDArray[np.float32], NDA
     """
     lower, middle = np.empty((2, *pictures[0].shape), np.float32)
     count = len(pictures)
-    cut, strip = int(_CUT * count), 4 * BLOCK
-    for top in range(0, len(lower), strip):
-        values = _in_order([p[top : top + strip].copy() for p in pictures])
-        lower[top : top + strip] = _mean(values[1 : count // 2])
-        middle[top : top + strip] = _mean(values[cut : count - cut])
+    cut = int(_CUT * count)
+    for top in range(0, len(lower), STRIP):
+        part = np.s_[top : top + STRIP]
+        values = _in_order([p[part].copy() for p in pictures])
+        lower[part] = _mean(values[1 : count // 2])
+        middle[part] = _mean(values[cut : count - cut])
     return lower, middle
 
 

@@ -24,6 +24,7 @@ _LARGEST_STEP = 0.25  # widths: a longer step of the centre is not linear
 _LARGEST_CHANGE = 0.3  # of the flux, as a share
 _MISFIT, _MISFIT_SIGMAS = 1.4, 5.0  # chi-square per degree of freedom of an unchanged light: factor, and its sigmas
 _PARAMETERS = 9
+_BY_CHANCE = _MISFIT * (_PARAMETERS + _MISFIT_SIGMAS * (2.0 * _PARAMETERS) ** 0.5)  # decrease of chi-square by a step
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +72,8 @@ class RestingLights:
         fixed (n,): lights that stay where they are; they are measured only in pictures that differ from the mean there.
         Those that have changed are not measured correctly. Where there is more light than in the mean and nowhere less,
         something else passes over an unchanged light: that is in the difference from the mean, and the light stays
-        where the mean shows it.
+        where the mean shows it. So does a faint light of which a single picture shows no more than that it has not
+        changed.
         """
         found, (changed, passed) = self.found, np.zeros((2, len(self.found)), dtype=bool)
         if not len(found):
@@ -114,16 +116,21 @@ class RestingLights:
         weighted = residual * self.weight
         right = np.array([self.slopes[:, a:b] @ weighted[a:b] for a, b in zip(self.starts, self._ends, strict=True)])
         step = np.einsum("nij,nj->ni", self.inverse, right)
-        chi2 = np.add.reduceat(residual * weighted, self.starts) - np.einsum("ni,ni->n", step, right)
+        gain = np.einsum("ni,ni->n", step, right)
+        chi2 = np.add.reduceat(residual * weighted, self.starts) - gain
         more = np.einsum("ni,ni->n", self.flux_of, step)
         misfit = chi2 > self._largest_chi2
-        less = (residual < 0) & (self.weight > 0)
-        darker = np.maximum(np.add.reduceat(less, self.starts, dtype=float), 1.0)
-        allowed = _MISFIT * (1.0 + _MISFIT_SIGMAS * np.sqrt(2.0 / darker))
-        passed = misfit & (np.add.reduceat(residual * weighted * less, self.starts) < allowed * darker)
-        changed = misfit | (np.abs(more) > _LARGEST_CHANGE)
-        changed |= np.linalg.norm(step[:, :2], axis=1) > _LARGEST_STEP * self.found.minor_px
-        step, more = np.where(passed[:, None], 0.0, step), np.where(passed, 0.0, more)
+        passed = misfit.copy()
+        if passed.any():
+            less = (residual < 0) & (self.weight > 0)
+            darker = np.maximum(np.add.reduceat(less, self.starts, dtype=float), 1.0)
+            allowed = _MISFIT * (1.0 + _MISFIT_SIGMAS * np.sqrt(2.0 / darker))
+            passed &= np.add.reduceat(residual * weighted * less, self.starts) < allowed * darker
+        far = np.linalg.norm(step[:, :2], axis=1) > _LARGEST_STEP * self.found.minor_px
+        far |= np.abs(more) > _LARGEST_CHANGE
+        changed = misfit | (far & (gain > _BY_CHANCE))
+        stays = passed | (far & ~changed)
+        step, more = np.where(stays[:, None], 0.0, step), np.where(stays, 0.0, more)
         found = replace(self.found, uv_px=self.found.uv_px + step[:, :2], flux=self.found.flux * (1.0 + more))
         return found, np.asarray(changed & ~passed), np.asarray(passed)
 

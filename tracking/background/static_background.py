@@ -81,7 +81,10 @@ class StaticBackground:
     misfit_share: float = float("nan")  # of the lights that move, as in TextureShift
     # (h, w), in 2^-GAIN_BITS: undoes what the brightness of the surface does to a light; None: nothing
     gain: NDArray[np.uint16] | None = None
-    known: dict[TextureShift, Detections] = field(init=False, repr=False, compare=False, default_factory=dict)
+    # Of each texture: the lights at rest with their errors, and the errors by the texture in the light that moves.
+    known: dict[TextureShift, tuple[Detections, TextureShift]] = field(
+        init=False, repr=False, compare=False, default_factory=dict
+    )
 
     def with_light(self, pictures: Sequence[Picture]) -> StaticBackground:
         """The background whose light is 1 in a typical one of the pictures that it is made from."""
@@ -199,7 +202,7 @@ class StaticBackground:
         as_wide = spots.major_px[:, None] > _AS_WIDE * lights.major_px
         same = near_each(spots, lights, SAME_LIGHT) & as_wide & ~changed & ~passed
         apart = np.asarray(~same.any(axis=1))
-        known = self._known(shift)
+        known, _ = self._known(shift)
         rest = replace(lights, cov_px2=known.cov_px2, place_px2=known.place_px2, at_rest=known.at_rest)
         boxes = np.concatenate([self.unknown, np.column_stack([self.lights.found.uv_px, self.lights.half_px])[changed]])
         if not len(boxes):
@@ -209,17 +212,21 @@ class StaticBackground:
         found = spots[apart & ~inside(boxes, spots)].joined(again, parameters.max_detections)
         return found, rest[~changed & ~inside(boxes, rest)]
 
-    def _known(self, shift: TextureShift) -> Detections:
-        """The lights at rest in the mean picture, with the errors that they have in each picture."""
+    def _known(self, shift: TextureShift) -> tuple[Detections, TextureShift]:
+        """The lights at rest in the mean picture, with the errors that they have in each picture; errors of others."""
         if shift not in self.known:
             lights = self.lights.found
             # The error of the mean picture's fit is the same in all pictures.
-            common = 0.5 * self._noise_share * np.trace(lights.cov_px2, axis1=1, axis2=2)
+            common = self._noise_share * lights.variance_px2
             lights = shift.added_to(lights, self.noise, self._shifts_at(lights))
             place = np.zeros(len(lights)) if lights.place_px2 is None else lights.place_px2
             at_rest = self.fixed.astype(float) if len(self.fixed) else None
             covariance = (1 + self._noise_share) * lights.cov_px2
-            self.known[shift] = replace(lights, cov_px2=covariance, place_px2=place + common, at_rest=at_rest)
+            lights = replace(lights, cov_px2=covariance, place_px2=place + common, at_rest=at_rest)
+            moving = replace(shift, background_px=(0.0,) * len(shift.background_px))
+            if self.shifts_px is not None:
+                moving = replace(moving, misfit_share=self.misfit_share)
+            self.known[shift] = lights, moving
         return self.known[shift]
 
     def _shifts_at(self, points: Detections) -> Array | None:
@@ -274,21 +281,19 @@ class StaticBackground:
         if not len(spots):
             return spots
         gain = 1.0 if self.gain is None else self.gain[row, column] / 2.0**GAIN_BITS
-        spots = replace(spots, flux=spots.flux / (self.steps * gain), peak=spots.peak / (self.steps * gain))
+        peak = spots.peak / (self.steps * gain)
         bright = self.smooth[sampled] + self.structure[row, column]
-        light_of_spot = 0.5 * self.noise.slope_dn * spots.peak
+        light_of_spot = 0.5 * self.noise.slope_dn * peak
         here, used = (self.noise.variance(at) + light_of_spot for at in (bright, np.full(len(spots), self.low_dn)))
         own = self.shares[row, column]
         here *= gain**2 * (1 + own) / (1 + self._noise_share)
-        spots = replace(spots, cov_px2=spots.cov_px2 * (here / used)[:, None, None])
+        covariance = spots.cov_px2 * (here / used)[:, None, None]
+        spots = replace(spots, flux=spots.flux / (self.steps * gain), peak=peak, cov_px2=covariance)
         # The background's own noise is the same in all pictures.
-        fixed = own / (1 + own) * 0.5 * np.trace(spots.cov_px2, axis1=1, axis2=2)
-        of_light = replace(shift, background_px=(0.0,) * len(shift.background_px))
-        if self.shifts_px is not None:
-            of_light = replace(of_light, misfit_share=self.misfit_share)
+        fixed = own / (1 + own) * spots.variance_px2
         shifts = self._shifts_at(spots)
         if shifts is not None and self.gain is not None:
             shifts *= _NOT_UNDONE
-        spots = of_light.added_to(spots, self.noise, shifts)
+        spots = self._known(shift)[1].added_to(spots, self.noise, shifts)
         place = np.zeros(len(spots)) if spots.place_px2 is None else spots.place_px2
         return replace(spots, place_px2=place + fixed)

@@ -30,7 +30,10 @@ class MeanPicture(NamedTuple):
     def of(pictures: Sequence[Picture]) -> MeanPicture:
         """The mean of pictures of one size."""
         height, width = (n // BLOCK * BLOCK for n in pictures[0].shape)
-        mean = np.asarray(np.mean([p[:height, :width] for p in pictures], axis=0), dtype=np.float32)
+        mean = pictures[0][:height, :width].astype(np.float32)
+        for more in pictures[1:]:
+            mean += more[:height, :width]
+        mean /= np.float32(len(pictures))
         coarse = cv2.resize(mean, (width // BLOCK, height // BLOCK), interpolation=cv2.INTER_AREA)
         background = cv2.resize(cv2.medianBlur(coarse, 5), (width, height), interpolation=cv2.INTER_LINEAR)
         return MeanPicture(mean, background, len(pictures))

@@ -46,6 +46,7 @@ _FEWEST_PLACES = 500  # samples of the filters' outputs without lights and lines
 _WEIGHTED = 0.145
 _UNSURE = 0.02  # of the noise of the mean picture, which is subtracted: usual error of its estimate
 _SAMPLED = 3  # px: step of the sample of the filters' outputs
+_ROUND = np.eye(2)  # shape of a round spot, relative
 LARGEST_SHARE = 0.25  # of the spot's width: a larger error is not assumed; faint spots on texture have half of it
 
 
@@ -88,7 +89,7 @@ class TextureShift:
         by_peak = np.cumsum(peaks[order])
         usual_px = every[order][np.searchsorted(by_peak, 0.5 * by_peak[-1])]  # median, weighted with the peaks
         for points, width in zip(found, widths, strict=True):
-            variance = 0.5 * np.trace(points.cov_px2, axis1=1, axis2=2)
+            variance = points.variance_px2
             misfit = np.zeros(len(points)) if points.misfit is None else points.misfit
             clear = (
                 (width > _RESOLVED_PX) & (width < _WIDER * usual_px) & (variance * (1 - misfit) < (_CLEAR * width) ** 2)
@@ -141,17 +142,22 @@ class TextureShift:
         along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         outer = along[:, :, None] * along[:, None, :]
         ratio = (major / minor)[:, None, None]
-        shape = np.where(np.isnan(ratio * outer), np.eye(2), ratio * outer + (np.eye(2) - outer) / ratio)
+        shape = np.where(np.isnan(ratio * outer), _ROUND, ratio * outer + (_ROUND - outer) / ratio)
         expected = expected_px2[:, None, None] * shape
-        other = np.trace(seen, axis1=1, axis2=2) > _CLEARLY_MORE * np.trace(expected, axis1=1, axis2=2)
+        other = _trace(seen) > _CLEARLY_MORE * _trace(expected)
         place = np.where(other[:, None, None], seen, expected)
         # The grain of the light is the same for all spots of a camera, but does not show in each: then it is at least
         # usual.
-        usual = np.nan_to_num(self.misfit_share) ** 2 * major * minor
-        below = 0.5 * np.trace(place, axis1=1, axis2=2) < usual
-        place = np.where(below[:, None, None], usual[:, None, None] * shape, place)
-        place_px2 = 0.5 * np.trace(place, axis1=1, axis2=2)
-        return replace(found, cov_px2=found.cov_px2 - seen + place, place_px2=place_px2)
+        if self.misfit_share > 0:
+            usual = self.misfit_share**2 * major * minor
+            below = 0.5 * _trace(place) < usual
+            place = np.where(below[:, None, None], usual[:, None, None] * shape, place)
+        return replace(found, cov_px2=found.cov_px2 - seen + place, place_px2=0.5 * _trace(place))
+
+
+def _trace(matrices: Array) -> Array:
+    """(n,): of matrices (n, 2, 2)."""
+    return np.asarray(matrices[:, 0, 0] + matrices[:, 1, 1])
 
 
 def texture_shift(

@@ -63,7 +63,7 @@ def _of_folder(path: Path, full: bool) -> dict[str, Any]:
         size = file.stat().st_size
         total += size
         digest.update(file.name.encode("utf-8", "surrogateescape") + f"\0{size}\n".encode())
-        with file.open("rb", buffering=0) as content:
+        with file.open("rb") as content:
             any_sampled |= _read_into(digest, content, size, size if full else MAX_PICTURE_BYTES)
     covers = "names, sizes and samples of the contents" if any_sampled else "names, sizes and contents"
     return {"path": str(path), "sha256": digest.hexdigest(), "bytes": total, "covers": covers}
@@ -78,8 +78,5 @@ def _read_into(digest: Any, file: BinaryIO | Any, size: int, most: int) -> bool:
     length = max(most // _SAMPLES, 1)
     for i in range(_SAMPLES):
         file.seek((size - length) * i // (_SAMPLES - 1))
-        left = length
-        while left > 0 and (block := file.read(min(_BLOCK, left))):
-            digest.update(block)
-            left -= len(block)
+        digest.update(file.read(length))
     return True

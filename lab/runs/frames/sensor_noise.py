@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -75,11 +75,14 @@ class CameraNoise:
         """Whether the pictures show texture or objects that hide spots, from which a background may free them."""
         return self.model is not None and is_limited_by_texture(self.model)
 
-    def make_background(self, pictures: Sequence[Picture], parameters: DetectParameters) -> None:
+    def make_background(
+        self, pictures: Sequence[Picture], parameters: DetectParameters,
+        make: Callable[..., StaticBackground | None] = static_background,
+    ) -> None:  # fmt: skip
         """Make the static background of pictures spread over the recording, if that shows more or spares fits."""
         if pictures and self.model is not None and self.estimate is not None:
             usual = self._with_saturation(parameters, pictures[0])
-            self.background = static_background(pictures, self.model, self.estimate.texture_shift, usual)
+            self.background = make(pictures, self.model, self.estimate.texture_shift, usual)
 
     def detect(self, picture: Picture, parameters: DetectParameters) -> Detections:
         """The points of one picture. After pictures without any point the noise is estimated again."""
@@ -118,8 +121,9 @@ class CameraNoise:
     def saturation_dn(self, picture: Picture, parameters: DetectParameters) -> float:
         """The grey value at which the sensor clips: stated, seen in the pictures, or the largest of their type."""
         seen = None if self.estimate is None else self.estimate.saturation_dn
-        known = seen if parameters.saturation_dn is None else parameters.saturation_dn
-        return saturation_of(replace(parameters, saturation_dn=known), picture)
+        if parameters.saturation_dn is not None or seen is None:
+            return saturation_of(parameters, picture)
+        return float(seen)
 
     @property
     def _black_dn(self) -> float | None:
@@ -195,6 +199,8 @@ def camera_noises(run: Run, reader: FrameReader) -> dict[str, CameraNoise]:
             shown |= pictures_of_frames(source, [k for k in wanted if k not in shown], size_px)
             spread = [shown[k] for k in wanted]
             out[name].make_background([p for p in spread if isinstance(p, np.ndarray)], run.tracker.detect)
+        if isinstance(source, PictureFiles):
+            source.keep(shown)
     share_texture(list(out.values()))
     return out
 

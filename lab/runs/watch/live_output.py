@@ -22,6 +22,7 @@ from lab.runs.verdict.frame_checks import FrameChecks
 from lab.runs.watch.live_frames import LiveFrames
 
 LIVE_TABLE = "attitude_live.csv"
+_LATE_MS = 1000.0  # latency of the last pose above which the watch has not kept up
 
 
 @dataclass(slots=True)
@@ -74,17 +75,25 @@ class Latency:
             out["largest"] = float(values.max())
         if self.start:
             out["largest_at_start"] = max(self.start)
+        if self.steady or self.start:
+            out["last"] = (self.steady or self.start)[-1]
         return out
 
     def lines(self) -> tuple[str, ...]:
         """For the terminal; empty without a frame."""
-        if not self.steady:
-            return ()
-        known = self.as_mapping()
-        return (
-            f"latency: median {known['median']:.1f} ms, 95 % within {known['p95']:.1f} ms, 99 % within"
-            f" {known['p99']:.1f} ms, largest {known['largest']:.1f} ms ({known['frames']} frames)",
-        )
+        known, out = self.as_mapping(), []
+        if self.steady:
+            out.append(
+                f"latency: median {known['median']:.1f} ms, 95 % within {known['p95']:.1f} ms, 99 % within"
+                f" {known['p99']:.1f} ms, largest {known['largest']:.1f} ms ({known['frames']} frames)"
+            )
+        if known.get("last", 0.0) > _LATE_MS:
+            out.append(
+                "the pictures came faster than they were processed: the last pose was written"
+                f" {known['last'] / 1e3:.1f} s after its pictures. Pictures in folders wait and are all used, so the"
+                " poses come ever later; record at a lower rate, or use `beampose run` on the finished folder"
+            )
+        return tuple(out)
 
 
 @dataclass(slots=True)

@@ -1,7 +1,4 @@
-"""Processes a run while it is recorded: poses as frames arrive, and the usual results when the recording ends.
-
-The static background of a camera that is recording: made of the pictures so far, again and again.
-"""
+"""Processes a run while it is recorded: poses as frames arrive, and the usual results when the recording ends."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,61 +26,16 @@ from lab.findings.outcome import Outcome
 from lab.pictures.picture_file import GreyPicture
 from lab.progress import Progress
 from lab.runs.frames.pipeline import Pipeline, tracker_of
-from lab.runs.frames.sensor_noise import VIDEO_FRAMES, CameraNoise
+from lab.runs.frames.sensor_noise import CameraNoise
 from lab.runs.process import are_results, ready_run, write_results
 from lab.runs.smoothing_pass import TRACKING
 from lab.runs.verdict.frame_checks import FrameChecks
 from lab.runs.verdict.run_statistics import RunStatistics
+from lab.runs.watch.background import BackgroundProcess, LiveBackground
 from lab.runs.watch.live_frames import LiveFrames, WatchOptions
 from lab.runs.watch.live_output import LiveOutput, UdpLines, is_live_table
 from tracking.background.estimation import PICTURES
 from tracking.detections import Detections
-from tracking.parameters import DetectParameters
-
-_SPACING = VIDEO_FRAMES // PICTURES  # pictures from one that is kept to the next, at first
-_UNFIT = 20  # consecutive pictures that do not fit the background after which the camera or the light has changed
-
-
-@dataclass(slots=True)
-class LiveBackground:
-    """Keeps some of a camera's pictures and makes the background of them in a thread of its own.
-
-    The kept pictures are spread over the time since the start, twice as far apart after each background: so it contains
-    ever less of a light that moves slowly, and the cost per picture falls. After a change of the scene it starts again.
-    """
-
-    noise: CameraNoise
-    parameters: DetectParameters
-    _kept: list[GreyPicture] = field(default_factory=list)
-    _spacing: int = _SPACING
-    _since: int = 0  # pictures since the last one that was kept
-    _thread: threading.Thread | None = None
-
-    def add(self, picture: GreyPicture) -> None:
-        """Count a picture after its points have been detected, in the camera's thread."""
-        if not self.noise.shows_structure:
-            return
-        busy = self._thread is not None and self._thread.is_alive()
-        if self.noise.unfit >= _UNFIT and not busy:
-            self._kept, self._spacing, self._since = [], _SPACING, 0
-            self.noise.background, self.noise.unfit = None, 0
-        if self._since % self._spacing == 0 and len(self._kept) < PICTURES:
-            self._kept.append(picture)
-            self._since = 0
-        self._since += 1
-        if len(self._kept) == PICTURES and not busy:
-            given = (list(self._kept), self.parameters)
-            self._thread = threading.Thread(
-                target=self.noise.make_background, args=given, name=f"background-{self.noise.camera}", daemon=True
-            )
-            self._thread.start()
-            self._kept, self._spacing = self._kept[::2], 2 * self._spacing
-
-    def finish(self) -> None:
-        """Wait until the background that is being made is complete."""
-        if self._thread is not None:
-            self._thread.join()
-
 
 _log = logging.getLogger("beampose")
 _SWITCH_INTERVAL_S = 0.0005
@@ -127,7 +79,7 @@ def watch_run(
         output = LiveOutput(Path(out), frames, FrameChecks(run.rig, run.covariance), sender)
         stack.callback(output.close)
         with frames, _low_latency():
-            pipeline, finders = _started(run, frames, output)
+            pipeline, finders = _started(run, frames, output, stack.enter_context(BackgroundProcess()))
             if reprocess:
                 for done, _ in enumerate(pipeline.records(), start=1):
                     if progress is not None:
@@ -145,7 +97,9 @@ def watch_run(
     return replace(outcome, more=output.latency.lines())
 
 
-def _started(run: Run, frames: LiveFrames, output: LiveOutput) -> tuple[Pipeline, dict[str, _Finder]]:
+def _started(
+    run: Run, frames: LiveFrames, output: LiveOutput, process: BackgroundProcess
+) -> tuple[Pipeline, dict[str, _Finder]]:
     """The pipeline, after the noise is estimated from the first pictures. Raises RunError if none come."""
     _load_compiled_code(run)
     _log.info("ready: waiting for the first picture")
@@ -156,7 +110,8 @@ def _started(run: Run, frames: LiveFrames, output: LiveOutput) -> tuple[Pipeline
     with ThreadPoolExecutor(max(len(first), 1)) as pool:  # in parallel, since pictures queue up meanwhile
         list(pool.map(lambda name: noise[name].estimate_from(first[name]), first))
     pipeline = Pipeline(run, frames, tracker_of(run), noise, output.write)
-    finders = {name: _Finder(pipeline, name, LiveBackground(noise[name], run.tracker.detect)) for name in noise}
+    detect, make = run.tracker.detect, process.background
+    finders = {name: _Finder(pipeline, name, LiveBackground(own, detect, make)) for name, own in noise.items()}
     frames.inbox.set_finders(finders)
     return pipeline, finders
 

@@ -23,6 +23,7 @@ from lab.pictures.source import AHEAD, list_folder, pictures, video_at
 from lab.runs.frames import frames
 from lab.runs.frames.frames import FrameSet, pictures_at
 from lab.runs.frames.open_frames import open_frames
+from lab.runs.frames.pipeline import Pipeline
 from tests.lab.run_folders import edit, picture_of, write_run
 
 SIZE = (64, 48)
@@ -278,6 +279,22 @@ def test_a_limited_number_of_frames_is_read_ahead(tmp_path, monkeypatch):
             time.sleep(0.1)
             assert state["read"] == 2 * (taken + AHEAD - 1)
     assert state["read"] == 120
+
+
+def test_pictures_that_the_noise_is_estimated_from_are_not_decoded_again(tmp_path, monkeypatch):
+    decoded = []
+
+    def noted(path, size_px, colour):
+        decoded.append(path)
+        return read_picture(path, size_px)
+
+    monkeypatch.setattr("lab.pictures.source.read_picture", noted)
+    pipeline = Pipeline.of(load_run(write_run(tmp_path / "a", frames=20)))
+    assert decoded
+    for frame_set in pipeline.reader:
+        for picture in frame_set.images.values():
+            np.testing.assert_array_equal(picture, picture_of(frame_set.frame))
+    assert len(decoded) == len(set(decoded)) == 40
 
 
 def test_an_exception_in_a_thread_reaches_the_reader(tmp_path, monkeypatch):

@@ -70,6 +70,21 @@ def test_a_step_measures_a_light_as_precisely_as_a_fit(shift_px):
     assert 0.8 < np.sqrt(np.mean(np.square(errors))) < 1.25
 
 
+def test_a_faint_light_has_not_changed_while_a_picture_shows_no_more_than_noise():
+    """Its place has an error of a quarter of its width in a single picture; the light that goes out has changed."""
+    rng = np.random.default_rng(11)
+    faint = 20.0 + light(150.2, 120.6, 5.0, 1.3)
+    seen = [
+        np.rint(shown + rng.standard_normal(SIZE)).astype(np.uint8) for shown in [faint] * 80 + [0 * faint + 20] * 9
+    ]
+    mean = np.mean(seen[:20], axis=0).astype(np.float32)
+    found = find_spots(np.rint(16 * mean).astype(np.uint16), DetectParameters(), NoiseModel(16.0, 0.0, 320.0))
+    found = replace(found, flux=found.flux / 16, peak=found.peak / 16)[:1]
+    lamp = RestingLights.of(mean, found, NOISE, 255.0)
+    assert not any(lamp.in_picture(picture)[1][0] for picture in seen[20:80])
+    assert all(lamp.in_picture(picture)[1][0] for picture in seen[80:])
+
+
 def test_a_light_that_moves_far_or_dims_or_is_covered_has_changed():
     lamps = lamps_of(pictures(along(40), 3))
     for picture in (

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from lab.runs.frames.sensor_noise import VIDEO_FRAMES, CameraNoise
-from lab.runs.watch.watch import LiveBackground
+from lab.runs.watch.background import BackgroundProcess, LiveBackground
 from tests.tracking.background.test_static_background import USUAL, Recording, path
+from tracking.background.estimation import static_background
 from tracking.noise import Picture
 
 
-def live(recording: Recording) -> tuple[CameraNoise, LiveBackground]:
+def live(recording: Recording, make: Callable = static_background) -> tuple[CameraNoise, LiveBackground]:
     noise = CameraNoise("left")
     noise.estimate_from(recording.pictures[:6])
-    return noise, LiveBackground(noise, USUAL)
+    return noise, LiveBackground(noise, USUAL, make)
 
 
 def recall(noise: CameraNoise, picture: Picture, centres: np.ndarray) -> float:
@@ -34,6 +37,28 @@ def test_spots_that_the_texture_hides_are_found_once_the_background_has_been_see
     assert VIDEO_FRAMES - 5 < len(before) <= VIDEO_FRAMES + 1
     assert np.mean(before) < 0.7
     assert np.mean(after) > 0.97
+
+
+def test_a_process_makes_the_same_background_until_it_is_ended():
+    recording = Recording.of(path(90, 6, 2.0, 1), 4.5)
+    own, background = live(recording)
+    with BackgroundProcess() as process:
+        others, made_elsewhere = live(recording, process.background)
+        for picture in recording.pictures[: VIDEO_FRAMES + 1]:
+            background.add(picture)
+            made_elsewhere.add(picture)
+        background.finish()
+        made_elsewhere.finish()
+    for name in ("uv_px", "cov_px2", "flux"):
+        one, other = (getattr(noise.detect(recording.pictures[70], USUAL), name) for noise in (own, others))
+        np.testing.assert_array_equal(one, other)
+    assert own.background is not None
+    kept = others.background
+    assert kept is not None
+    for picture in recording.pictures:
+        made_elsewhere.add(picture)
+    made_elsewhere.finish()
+    assert others.background is kept
 
 
 def test_a_knocked_camera_gets_another_background():

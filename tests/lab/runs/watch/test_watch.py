@@ -28,7 +28,7 @@ from lab.runs.watch.cameras import DeviceCamera, FolderCamera
 from lab.runs.watch.frame_clock import FolderPoll, FrameClock
 from lab.runs.watch.inbox import MOST_WAITING, Inbox, is_complete
 from lab.runs.watch.live_frames import FIRST, WatchOptions
-from lab.runs.watch.live_output import LIVE_TABLE
+from lab.runs.watch.live_output import LIVE_TABLE, Latency
 from lab.runs.watch.watch import watch_run
 from lab.simulate.write import simulate
 from tracking.detections import Detections
@@ -151,6 +151,21 @@ def test_the_summary_contains_the_latency_of_the_poses_and_the_command(followed)
     latency = live["latency_ms"]
     assert latency["frames"] + latency["start_frames"] == FRAMES
     assert live["udp"]["not_sent"] == 0
+
+
+@pytest.mark.parametrize(
+    ("latency", "late"),
+    [
+        (Latency(steady=[6.0, 1500.0, 6.0]), False),
+        (Latency(start=[2500.0, 900.0]), False),
+        (Latency(steady=[6.0, 400.0, 1400.0]), True),
+        (Latency(start=[900.0, 2500.0]), True),  # the backlog of the start has grown
+    ],
+)
+def test_a_watch_that_has_not_kept_up_says_what_became_of_the_pictures(latency, late):
+    said = [line for line in latency.lines() if "faster than they were processed" in line]
+    assert bool(said) == late
+    assert all(f"{latency.as_mapping()['last'] / 1e3:.1f} s after" in line and "are all used" in line for line in said)
 
 
 def test_a_camera_that_stops_does_not_stop_the_other(recorded, tmp_path):

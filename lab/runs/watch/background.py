@@ -1,0 +1,132 @@
+"""The static background of a camera that is recording: made of the pictures so far, again and again.
+
+It is made in a process of its own, of low priority. In a thread of the watching process it would compete with detection
+and tracking for the interpreter, which each of their hundred calls of compiled code per frame releases and needs again.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+from lab.cycle_search import search_rarely
+from lab.pictures.picture_file import GreyPicture
+from lab.runs.frames.sensor_noise import VIDEO_FRAMES, CameraNoise
+from tracking.background.estimation import PICTURES, static_background
+from tracking.background.static_background import StaticBackground
+from tracking.parameters import DetectParameters
+
+_SPACING = VIDEO_FRAMES // PICTURES  # pictures from one that is kept to the next, at first
+_UNFIT = 20  # consecutive pictures that do not fit the background after which the camera or the light has changed
+_NICE = 10  # priority of the process: a background may come later, a pose may not
+ENDED = (OSError, EOFError, pickle.UnpicklingError)
+_PROTOCOL = 5  # of pickle: arrays are written and read in place, and the interpreter is free meanwhile
+
+
+@dataclass(slots=True)
+class BackgroundProcess:
+    """Computes `static_background` in another process, one call at a time. Used as a context manager."""
+
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _process: subprocess.Popen[bytes] | None = None
+    _ended: bool = False
+
+    def __enter__(self) -> BackgroundProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the process, also in the middle of a background."""
+        self._ended = True
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+
+    def background(self, *given: Any) -> StaticBackground | None:
+        """`static_background`, from its arguments. Raises one of ENDED where the process has been ended, or killed."""
+        with self._lock:
+            to, of = self._started()
+            pickle.dump(given, to, _PROTOCOL)
+            to.flush()
+            made: StaticBackground | None = pickle.load(of)
+            return made
+
+    def _started(self) -> tuple[Any, Any]:
+        """The pipes to the process and from it; it is started where it does not run. Raises OSError after the end."""
+        if self._ended:
+            raise OSError("the watch has ended")
+        if self._process is None or self._process.poll() is not None:
+            # Not multiprocessing, which would run the program's main module again.
+            program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve()"
+            piped = subprocess.PIPE
+            self._process = subprocess.Popen([sys.executable, "-c", program], stdin=piped, stdout=piped)
+        return self._process.stdin, self._process.stdout
+
+
+def serve() -> None:
+    """Make backgrounds of what comes from standard input until it ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches this process, too; the watch decides
+    if hasattr(os, "nice"):
+        os.nice(_NICE)
+    search_rarely()
+    out = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # for whatever prints
+    while True:
+        try:
+            given = pickle.load(sys.stdin.buffer)
+            pickle.dump(static_background(*given), out, _PROTOCOL)
+            out.flush()
+        except (EOFError, BrokenPipeError):  # the watch has ended
+            os._exit(0)
+
+
+@dataclass(slots=True)
+class LiveBackground:
+    """Keeps some of a camera's pictures and makes the background of them while others are processed.
+
+    The kept pictures are spread over the time since the start, twice as far apart after each background: so it contains
+    ever less of a light that moves slowly, and the cost per picture falls. After a change of the scene it starts again.
+    """
+
+    noise: CameraNoise
+    parameters: DetectParameters
+    make: Callable[..., StaticBackground | None]  # from the arguments of `static_background`
+    _kept: list[GreyPicture] = field(default_factory=list)
+    _spacing: int = _SPACING
+    _since: int = 0  # pictures since the last one that was kept
+    _thread: threading.Thread | None = None  # waits for the background that is being made
+
+    def add(self, picture: GreyPicture) -> None:
+        """Count a picture after its points have been detected, in the camera's thread."""
+        if not self.noise.shows_structure:
+            return
+        busy = self._thread is not None and self._thread.is_alive()
+        if self.noise.unfit >= _UNFIT and not busy:
+            self._kept, self._spacing, self._since = [], _SPACING, 0
+            self.noise.background, self.noise.unfit = None, 0
+        if self._since % self._spacing == 0 and len(self._kept) < PICTURES:
+            self._kept.append(picture)
+            self._since = 0
+        self._since += 1
+        if len(self._kept) == PICTURES and not busy:
+            self._thread = threading.Thread(
+                target=self._make, args=(list(self._kept),), name=f"background-{self.noise.camera}", daemon=True
+            )
+            self._thread.start()
+            self._kept, self._spacing = self._kept[::2], 2 * self._spacing
+
+    def _make(self, pictures: list[GreyPicture]) -> None:
+        with suppress(*ENDED):  # the earlier background stays
+            self.noise.make_background(pictures, self.parameters, self.make)
+
+    def finish(self) -> None:
+        """Wait until the background that is being made is complete."""
+        if self._thread is not None:
+            self._thread.join()
