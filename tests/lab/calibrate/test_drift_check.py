@@ -32,6 +32,11 @@ TRUE = scenes.true_rig(RIG, COVARIANCE, np.random.default_rng(1))
 AT_REST = Pose(exp(np.array([0.02, -0.03, 0.05])), np.array([0.05, 0.02, -0.03]))
 
 
+def changed(**values) -> CalibrationState:
+    """The state of the calibration with other values."""
+    return scenes.STATE.model_copy(update=values)
+
+
 def check(folder: Path, today, seed: int = 0, *, state=scenes.STATE, day=scenes.DAY, history=None, **points):
     """Result of a check with control points. today: the true rig."""
     rig = scenes.write_rig(folder, RIG, COVARIANCE, state)
@@ -159,14 +164,14 @@ def test_a_camera_without_points_is_reported_as_not_checked(tmp_path):
     ("state", "level", "words"),
     [
         (
-            replace(scenes.STATE, valid_until=scenes.DAY - datetime.timedelta(1)),
+            changed(valid_until=scenes.DAY - datetime.timedelta(1)),
             Level.FAIL,
             "expired on 2026-04-30, 1 day",
         ),
-        (replace(scenes.STATE, valid_until=scenes.DAY), Level.WARN, "expires on 2026-05-01, in 0 days"),
-        (replace(scenes.STATE, valid_until=None), Level.PASS, "without an expiry date"),
-        (replace(scenes.STATE, verdict="FAIL", reasons=("lens loose",)), Level.FAIL, "failed: lens loose"),
-        (replace(scenes.STATE, date=datetime.date(2027, 1, 1)), Level.WARN, "after today"),
+        (changed(valid_until=scenes.DAY), Level.WARN, "expires on 2026-05-01, in 0 days"),
+        (changed(valid_until=None), Level.PASS, "without an expiry date"),
+        (changed(verdict="FAIL", reasons=("lens loose",)), Level.FAIL, "failed: lens loose"),
+        (changed(date=datetime.date(2027, 1, 1)), Level.WARN, "after today"),
         (None, Level.WARN, "does not state when"),
     ],
     ids=["expired", "last day", "no expiry", "failed", "from the future", "unknown"],
@@ -384,7 +389,7 @@ def test_the_wrong_point_among_five_is_identified(tmp_path):
 
 def test_a_run_folder_is_processed_first(tmp_path):
     """The detections of a vehicle at rest are labelled and tracked before the check."""
-    rig = scenes.write_rig(tmp_path, RIG, COVARIANCE, replace(scenes.STATE, valid_until=None))
+    rig = scenes.write_rig(tmp_path, RIG, COVARIANCE, changed(valid_until=None))
     rng = np.random.default_rng(8)
     run = tmp_path / "run"
     run.mkdir()
