@@ -20,6 +20,7 @@ from geometry.arrays import Array, Bools
 
 _REACH = 0.4  # half of the window, in distances of the nearest parallel edge, which would be included from 0.5 on
 _MOST_PX = 12  # half of the window: a larger one includes more curved edges, and takes longer
+_PASSES = 2  # the curvature is first that of less accurate corners
 _SPARE = 2  # known corners around a corner beyond the coefficients of its curvature
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
 _STEPS, _SMALL_PX = 8, 1e-3  # of the fit of saddles: most need two to four
@@ -54,14 +55,15 @@ def refined(image: GreyImage, grid: Array, known: Bools | None = None, reach: fl
         which = within & (half == size)
         start = np.ascontiguousarray(grid[which], dtype=np.float32).reshape(-1, 1, 2)
         out[which] = cv2.cornerSubPix(image, start, (size, size), (-1, -1), _STOP).reshape(-1, 2)
-    shape = _local_shape(out, within)
-    for size in sizes:
-        chosen = np.argwhere(within & (half == size))
-        for first in range(0, len(chosen), _AT_ONCE):
-            i, j = chosen[first : first + _AT_ONCE].T
-            found, seen = _saddles(image, out[i, j], shape[i, j], size)
-            good = np.linalg.norm(found - out[i, j], axis=1) <= max(1.0, 0.25 * size)
-            out[i, j], look[i, j] = np.where(good[:, None], found, out[i, j]), seen
+    for _ in range(_PASSES):
+        shape = _local_shape(out, within)
+        for size in sizes:
+            chosen = np.argwhere(within & (half == size))
+            for first in range(0, len(chosen), _AT_ONCE):
+                i, j = chosen[first : first + _AT_ONCE].T
+                found, seen = _saddles(image, out[i, j], shape[i, j], size)
+                good = np.linalg.norm(found - out[i, j], axis=1) <= max(1.0, 0.25 * size)
+                out[i, j], look[i, j] = np.where(good[:, None], found, out[i, j]), seen
     out[np.linalg.norm(out - grid, axis=-1) > np.maximum(1.5, 0.75 * half)] = np.nan
     look = look[np.isfinite(out).all(axis=-1)]
     if not len(look):
@@ -126,9 +128,9 @@ def _quadratic(C: Array, t: Array) -> Array:
 def _local_shape(grid: Array, known: Bools) -> Array:
     """(rows, columns, 5, 2): the steps along rows and columns, px, and the curvature of the grid at each corner.
 
-    Of the cubic through the corners of five rows and columns around, or of the quadratic of three where too few are
-    known. The curvature, 1/px, is the coefficients of x², xy, y² of the displacement from the linear part, along which
-    edges are straight; it is 0 where still too few are known. The steps are then those of all corners.
+    Of a quartic of the homography of the corners of five rows and columns around, or of a quadratic of that of three
+    where too few are known. The curvature, 1/px, is the coefficients of x², xy, y² of the displacement from the linear
+    part, along which edges are straight; it is 0 where still too few are known. The steps are then those of all corners.
     """
     out = np.zeros((*known.shape, 5, 2))
     row, column = np.nonzero(known)
@@ -136,19 +138,27 @@ def _local_shape(grid: Array, known: Bools) -> Array:
         flat = np.stack([np.ones(len(row)), column, row], axis=1)
         out[..., :2, :] = np.linalg.lstsq(flat, grid[known], rcond=None)[0][1:]
     for i, j in zip(row, column, strict=True):
-        for order, across in ((3, 5), (2, 3)):
+        for order, across in ((4, 5), (2, 3)):
             near = _block(i, known.shape[0], across), _block(j, known.shape[1], across)
             b, a = np.nonzero(known[near])
             a, b = a + near[1].start - j, b + near[0].start - i
             powers = [(n - k, k) for n in range(order + 1) for k in range(n + 1)]
             if min(len(np.unique(a)), len(np.unique(b))) <= order or len(a) < len(powers) + _SPARE:
                 continue
-            M = np.stack([a**m * b**n for m, n in powers], axis=1).astype(float)
-            X = np.linalg.lstsq(M, grid[near][known[near]], rcond=None)[0]
-            L = np.linalg.inv(X[1:3])  # offset in px times L: offset in squares
+            to = grid[near][known[near]]
+            H, _ = cv2.findHomography(np.stack([a, b], axis=1).astype(float), to, 0)
+            if H is None:
+                continue
+            at = np.array([[0, -1, 1, 0, 0], [0, 0, 0, -1, 1], [1, 1, 1, 1, 1]], dtype=float)
+            at = np.concatenate([at, np.stack([a, b, np.ones(len(a))])], axis=1)
+            w = (H[:2] @ at / (H[2] @ at)).T
+            w = (w - w[0]) / np.linalg.norm(w[2] - w[1])
+            M = np.stack([w[5:, 0] ** m * w[5:, 1] ** n for m, n in powers], axis=1)
+            X = np.linalg.lstsq(M, to, rcond=None)[0]
+            L = np.linalg.inv(X[1:3])  # offset in px times L: that of w
             (p, q), (r, s) = L
             squares = np.array([[p * p, p * q, q * q], [2 * p * r, p * s + q * r, 2 * q * s], [r * r, r * s, s * s]])
-            out[i, j] = np.concatenate([X[1:3], squares @ X[3:6]])
+            out[i, j] = np.concatenate([np.stack([w[2] - w[1], w[4] - w[3]]) @ X[1:3], squares @ X[3:6]])
             break
     return out
 
