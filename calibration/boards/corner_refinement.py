@@ -1,4 +1,4 @@
-"""Measurement of chessboard corners to some thousandths of a pixel, with the blur and contrast of the edges between them.
+"""Measurement of chessboard corners to some thousandths of a pixel, and of the blur and contrast of their edges.
 
 A corner is where two edges cross. In a window around it, the product of two blurred steps is fitted to the pixels as
 they are, without interpolation; the fit is symmetric, so that contrast, blur and its shape do not move the corner.
@@ -75,8 +75,8 @@ def _saddles(image: GreyImage, start: Array, shape: Array, half: int) -> tuple[A
     """Corners (n, 2), px, and sigmas of the two edges, px, with the contrast, DN (n, 3), by least squares.
 
     start (n, 2), px; shape (n, 5, 2): the local derivatives of the grid, see `_local_shape`. Grey values are
-    (b + b' d) + (c + c' d) S1 S2 at the offset d from the corner, S the error function of the distance from an edge over
-    its sigma. The six linear parameters are eliminated. With t + Q(t) = d, Q of `shape`, edges are straight in t: in a
+    (b + b' d) + (c + c' d) S1 S2 at the offset d from the corner, with S the error function of the distance from an edge
+    over its sigma. The six linear parameters are eliminated. With t + Q(t) = d, Q of `shape`, edges are straight in t: in a
     window of 20 px the curved edges of a fisheye lens would displace corners by .04 px.
     """
     v, u = (w.ravel().astype(float) for w in np.mgrid[-half : half + 1, -half : half + 1])
@@ -130,14 +130,15 @@ def _local_shape(grid: Array, known: Bools) -> Array:
 
     Of a quartic of the homography of the corners of five rows and columns around, or of a quadratic of that of three
     where too few are known. The curvature, 1/px, is the coefficients of x², xy, y² of the displacement from the linear
-    part, along which edges are straight; it is 0 where still too few are known. The steps are then those of all corners.
+    part, along which edges are straight. Where still too few are known it is 0, and the steps are those of all corners.
+    With a cubic in place of the quartic, outer corners of a fisheye's picture are displaced by .003 px.
     """
     out = np.zeros((*known.shape, 5, 2))
     row, column = np.nonzero(known)
     if len(row):
         flat = np.stack([np.ones(len(row)), column, row], axis=1)
         out[..., :2, :] = np.linalg.lstsq(flat, grid[known], rcond=None)[0][1:]
-    for i, j in zip(row, column, strict=True):
+    for i, j in np.argwhere(known).tolist():
         for order, across in ((4, 5), (2, 3)):
             near = _block(i, known.shape[0], across), _block(j, known.shape[1], across)
             b, a = np.nonzero(known[near])
