@@ -75,9 +75,9 @@ def _saddles(image: GreyImage, start: Array, shape: Array, half: int) -> tuple[A
     """Corners (n, 2), px, and sigmas of the two edges, px, with the contrast, DN (n, 3), by least squares.
 
     start (n, 2), px; shape (n, 5, 2): the local derivatives of the grid, see `_local_shape`. Grey values are
-    (b + b' d) + (c + c' d) S1 S2 at the offset d from the corner, with S the error function of the distance from an edge
-    over its sigma. The six linear parameters are eliminated. With t + Q(t) = d, Q of `shape`, edges are straight in t: in a
-    window of 20 px the curved edges of a fisheye lens would displace corners by .04 px.
+    (b + b' d) + (c + c' d) S1 S2 at the offset d from the corner, with S the error function of the distance from an
+    edge over its sigma. The six linear parameters are eliminated. With t + Q(t) = d, Q of `shape`, edges are straight
+    in t: in a window of 20 px the curved edges of a fisheye lens would displace corners by .04 px.
     """
     v, u = (w.ravel().astype(float) for w in np.mgrid[-half : half + 1, -half : half + 1])
     whole = np.round(start).astype(int)
