@@ -248,34 +248,39 @@ def undistort(target: Array, coefficients: Array, fold_r2: float, fisheye: bool 
     x = target * np.minimum(1.0, 0.7 * r_limit / np.maximum(radius, 1e-300))
     out, J = distort(x, coefficients)
     residual = target - out
+    left = np.arange(len(x))  # points that still move
     for _ in range(60):
-        det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-        det = np.where(np.abs(det) < 1e-12, 1e-12, det)
-        step = np.stack(
-            [
-                (J[..., 1, 1] * residual[..., 0] - J[..., 0, 1] * residual[..., 1]) / det,
-                (J[..., 0, 0] * residual[..., 1] - J[..., 1, 0] * residual[..., 0]) / det,
-            ],
-            -1,
-        )
-        size = np.sum(residual * residual, axis=-1)
-        share = np.ones(len(x))
+        step = _newton_step(J[left], residual[left])
+        size = np.sum(residual[left] ** 2, axis=-1)
+        moved = np.zeros(len(left), dtype=bool)
+        trying = np.arange(len(left))
         for _ in range(12):
-            trial = x + share[:, None] * step
+            which = left[trying]
+            trial = x[which] + step[trying]
             t_out, t_J = distort(trial, coefficients)
-            t_residual = target - t_out
-            worse = (np.sum(t_residual * t_residual, -1) > size) | ~(np.linalg.norm(trial, axis=-1) < r_limit)
-            if not worse.any():
+            t_residual = target[which] - t_out
+            worse = (np.sum(t_residual * t_residual, -1) > size[trying]) | ~(np.linalg.norm(trial, axis=-1) < r_limit)
+            better = ~worse
+            x[which[better]], residual[which[better]], J[which[better]] = trial[better], t_residual[better], t_J[better]
+            moved[trying[better]] = (np.abs(step[trying[better]]) > 1e-15).any(-1)
+            trying = trying[worse]
+            if not len(trying):
                 break
-            share = np.where(worse, share / 2, share)
-        keep = ~worse
-        x = np.where(keep[:, None], trial, x)
-        residual = np.where(keep[:, None], t_residual, residual)
-        J = np.where(keep[:, None, None], t_J, J)
-        if not np.any(keep & (np.abs(share[:, None] * step) > 1e-15).any(-1)):
+            step[trying] /= 2
+        left = left[moved]
+        if not len(left):
             break
     good = (np.linalg.norm(residual, axis=-1) < 1e-9) & is_one_to_one(x, J, np.asarray(fold_r2))
     return np.where(good[:, None], x, np.nan)
+
+
+def _newton_step(J: Array, residual: Array) -> Array:
+    """Solutions (n, 2) of J (n, 2, 2) step = residual (n, 2)."""
+    det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+    det = np.where(np.abs(det) < 1e-12, 1e-12, det)
+    u = J[..., 1, 1] * residual[..., 0] - J[..., 0, 1] * residual[..., 1]
+    v = J[..., 0, 0] * residual[..., 1] - J[..., 1, 0] * residual[..., 0]
+    return np.stack([u / det, v / det], axis=-1)
 
 
 def _undistort_fisheye(target: Array, coefficients: Array, fold_r2: float) -> Array:

@@ -37,7 +37,8 @@ BOARDS = {
     "acircles": "acircles:4x11:24mm",
     "charuco": "charuco:9x7:30mm:22mm:DICT_4X4_50",
 }
-LOOK = PhotoSettings(blur_px=0.7, noise_dn=2.0, samples=16)
+LOOK = PhotoSettings(blur_px=0.7, noise_dn=2.0, samples=64)
+MOST_TILT_DEG = 65.0  # of a board against the line of sight: nobody photographs boards almost from the side
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +97,9 @@ def rendered_set(kind: str, text: str, seed: int, views: int | None = None) -> R
         inside = np.all((p := camera.project(pose.apply(board.points))) > 12, axis=1) & np.all(
             p < np.array(SIZE) - 13, 1
         )
-        if inside.mean() < (0.5 if partial else 1.0):
+        sight = pose.apply(board.middle)
+        facing = float(pose.rotation[:, 2] @ sight / np.linalg.norm(sight))
+        if inside.mean() < (0.5 if partial else 1.0) or facing < np.cos(np.deg2rad(MOST_TILT_DEG)):
             continue
         picture = photograph(board, camera, pose, look=LOOK, seed=int(rng.integers(1 << 30)))
         start = time.process_time()

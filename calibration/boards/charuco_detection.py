@@ -197,18 +197,17 @@ def _corners(image: GreyImage, board: Charuco, markers: Markers, notes: tuple[st
     # markers of 0.5, 0.7 and 0.8 squares: 1.3 times that distance gives 2 to 20 times the error, 0.8 times up to 1.3.
     reach = min(0.4, (1 - board.marker_m / board.square_m) / 2)
     fine = corner_refinement.refined(image, grid, np.isfinite(grid).all(axis=-1), reach)
-    seen = np.isfinite(fine).all(axis=-1).ravel()
+    seen = np.isfinite(fine.pixels).all(axis=-1).ravel()
     places = board.points[seen, :2] / board.square_m
     if seen.sum() < _FEWEST or np.linalg.matrix_rank(places - places.mean(axis=0), tol=0.1) < 2:
         return NotFound(
             f"only {seen.sum()} of {columns * rows} corners found, {_FEWEST} that span an area are needed: the board is"
             " mostly hidden or outside the picture, too far away, blurred, or absent"
         )
-    apart = corner_refinement.spacing(fine)
-    blur, contrast = corner_refinement.edge_blur(image, fine, reach=0.7 * reach)
-    if blur > BLUR_LIMIT * apart:
-        return too_blurred(blur, apart)
-    return BoardView(board.ids[seen], fine.reshape(-1, 2)[seen], apart, blur, contrast, notes)
+    apart = corner_refinement.spacing(fine.pixels)
+    if fine.blur_px > BLUR_LIMIT * apart:
+        return too_blurred(fine.blur_px, apart)
+    return BoardView(board.ids[seen], fine.pixels.reshape(-1, 2)[seen], apart, fine.blur_px, fine.contrast_dn, notes)
 
 
 def _mirrored(image: GreyImage, board: Charuco, seen: int) -> NotFound | None:

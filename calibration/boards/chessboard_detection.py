@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -19,6 +20,7 @@ from calibration.boards.board_view import (
     low_contrast,
     too_blurred,
 )
+from calibration.boards.corner_refinement import Corners
 from calibration.boards.pyramid import at_full_size, scaled, scales
 from geometry.arrays import Array
 
@@ -58,10 +60,10 @@ def find_chessboard(image: GreyImage, board: Chessboard, thorough: bool = True) 
 def _measured(image: GreyImage, grid: Array, board: Chessboard) -> BoardView | NotFound | None:
     """The view from approximate corners (rows, columns, 2); None if they are not of a chessboard."""
     fine = corner_refinement.refined(image, grid)
-    if not np.isfinite(fine).all() or not _is_sheet(fine):
+    if not np.isfinite(fine.pixels).all() or not _is_sheet(fine.pixels):
         return None
-    ordered = oriented(image, fine)
-    return None if ordered is None else _checked(image, ordered, board)
+    ordered = oriented(image, fine.pixels)
+    return None if ordered is None else _checked(image, replace(fine, pixels=ordered), board)
 
 
 def _grids(image: GreyImage, columns: int, rows: int) -> Iterator[Array]:
@@ -165,18 +167,17 @@ def alternation(image: GreyImage, grid: Array) -> float:
     return float(np.mean(steps > 0.3 * typical) - np.mean(steps < -0.3 * typical))
 
 
-def _checked(image: GreyImage, grid: Array, board: Chessboard) -> BoardView | NotFound:
-    larger = _goes_on(image, grid)
+def _checked(image: GreyImage, fine: Corners, board: Chessboard) -> BoardView | NotFound:
+    larger = _goes_on(image, fine.pixels)
     if larger:
         return NotFound(
             f"the chessboard continues {larger} beyond {board.columns}x{board.rows} inner corners; count the inner"
             " corners along both sides again"
         )
-    blur, contrast = corner_refinement.edge_blur(image, grid)
-    apart = corner_refinement.spacing(grid)
-    if blur > BLUR_LIMIT * apart:
-        return too_blurred(blur, apart)
-    return BoardView(board.ids, grid.reshape(-1, 2), apart, blur, contrast)
+    apart = corner_refinement.spacing(fine.pixels)
+    if fine.blur_px > BLUR_LIMIT * apart:
+        return too_blurred(fine.blur_px, apart)
+    return BoardView(board.ids, fine.pixels.reshape(-1, 2), apart, fine.blur_px, fine.contrast_dn)
 
 
 def _goes_on(image: GreyImage, grid: Array) -> str:
