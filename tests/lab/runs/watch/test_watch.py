@@ -108,7 +108,7 @@ def followed(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[
     load_compiled_code = watch._load_compiled_code
 
     def feeder() -> None:
-        assert ready.wait(600)  # compiling for a new machine takes minutes; without pictures the watch would wait for ever
+        assert ready.wait(600)  # compiling takes minutes; without pictures the watch waits for ever
         feed(recorded, run)
 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener, pytest.MonkeyPatch.context() as patch:
