@@ -32,7 +32,7 @@ _LEAST_TEXTURE, _FIRST_TEXTURE = 2.0, 20.0  # DN
 _ALIKE = 2.0  # texture is alike over some pixels: fewer of them are independent
 _LARGEST_CHI2 = 2.0  # per degree of freedom
 _LARGEST_SIGMA = 0.1  # of the mean place, in widths of the light
-_LEAST_SIGMA = 0.01
+_LEAST_SIGMA = 0.005  # widths: error of the mean place that the model leaves; 0.004 in front of photographs
 _LARGEST_CHANGE = 3.0  # of the width, as a factor, from the start
 
 

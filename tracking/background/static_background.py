@@ -290,7 +290,8 @@ class StaticBackground:
         covariance = spots.cov_px2 * (here / used)[:, None, None]
         spots = replace(spots, flux=spots.flux / (self.steps * gain), peak=peak, cov_px2=covariance)
         # The background's own noise is the same in all pictures.
-        fixed = own / (1 + own) * spots.variance_px2
+        noise_share = 1.0 if spots.misfit is None else 1 - spots.misfit
+        fixed = own / (1 + own) * noise_share * spots.variance_px2
         shifts = self._shifts_at(spots)
         if shifts is not None and self.gain is not None:
             shifts *= _NOT_UNDONE

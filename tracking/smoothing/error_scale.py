@@ -14,7 +14,7 @@ from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.rigid_body.models.information import single_frame_pose
 from tracking.rigid_body.online_estimates import DEADBAND
 from tracking.smoothing.motion.run_detections import Reference, RunDetections, labelled_points
-from tracking.smoothing.single_frame_poses import VarianceFactors, residual_bounds
+from tracking.smoothing.variance_factors import VarianceFactors, variance_factors
 
 # Largest shift of a spot's centre by texture, speckle and its shape, as a share of its width (1 sigma): 4 % texture
 # makes 0.04, speckle of contrast 0.3 up to 0.16.
@@ -34,7 +34,7 @@ class ErrorScale:
     misfit_share: Array  # (cameras,) least error by misfits of the fits (speckle, texture), as a share of the widths
     width_share: Array  # (cameras,) errors beyond the stated ones, as a share of the spots' widths (1 sigma)
     noise_scale: float  # ratio of the errors to the stated sigmas beyond these
-    bounds: VarianceFactors  # what the residuals allow of the stated variances
+    factors: VarianceFactors  # of both parts of the stated variances
 
     @staticmethod
     def of(
@@ -51,20 +51,22 @@ class ErrorScale:
         place = _place_variance(place_px2, run.size_px, misfit[own])
         even = run._replace(cov=_with_more(run.cov, place - place_px2))
 
-        def bounds_of(some: RunDetections) -> VarianceFactors:
-            return residual_bounds(views, some, assigned, camera, place, ref, measured)
+        def factors_of(some: RunDetections) -> VarianceFactors:
+            return variance_factors(views, some, assigned, camera, place, calibration_cov, ref, measured)
 
         seen = scattered_width_share(even, assigned, camera)
         wider = widened(even, seen)
-        bounds = bounds_of(wider)
+        factors = factors_of(wider)
         if seen.any():
-            seen = _less(seen, bounds.noise, wider, even)
-            bounds = bounds_of(widened(even, seen))
-        even = even._replace(cov=_within(bounds, even.cov, place, own))
+            seen = _less(seen, factors.noise, wider, even)
+            factors = factors_of(widened(even, seen))
+        even = even._replace(cov=_within(factors, even.cov, place, own))
         wider = widened(even, seen)
-        more = width_share(views, wider, assigned, calibration_cov, ref, measured)
-        scale = noise_scale(views, widened(wider, more), assigned, calibration_cov, ref, measured)
-        return ErrorScale(misfit, np.hypot(seen, more), scale, bounds)
+        # A vehicle at rest has few residuals that are independent of each other.
+        usual = max(DEADBAND, 1 + 3 * np.sqrt(2 / max(factors.freedom, 1e-9)))
+        more = width_share(views, wider, assigned, calibration_cov, ref, measured, usual)
+        scale = noise_scale(views, widened(wider, more), assigned, calibration_cov, ref, measured, usual)
+        return ErrorScale(misfit, np.hypot(seen, more), scale, factors)
 
     def covariance(self, stated: Array, width_px: Array, place_px2: Array, camera: Ints | int) -> Array:
         """Covariances (m, 2, 2), px^2, of spots with these widths (m,), px, and stated covariances (m, 2, 2).
@@ -72,14 +74,14 @@ class ErrorScale:
         place_px2 (m,): part of the stated variances that belongs to the place. Unknown widths (nan) add nothing.
         """
         place = _place_variance(place_px2, width_px, self.misfit_share[camera])
-        within = _within(self.bounds, _with_more(stated, place - place_px2), place, camera)
+        within = _within(self.factors, _with_more(stated, place - place_px2), place, camera)
         return (within + width_covariance(width_px, self.width_share[camera])) * self.noise_scale**2
 
     def place_px2(self, run: RunDetections, stated_px2: Array) -> Array:
         """(m,): variances of a run's detections that belong to their places."""
         camera = _cameras_of(run)
         place = _place_variance(stated_px2, run.size_px, self.misfit_share[camera])
-        return place * self.bounds.place[camera] * self.noise_scale**2
+        return place * self.factors.place[camera] * self.noise_scale**2
 
     def of_run(self, run: RunDetections, place_px2: Array) -> Array:
         """Covariances (m, 2, 2) of all detections of a run."""
@@ -107,13 +109,13 @@ def _with_more(cov: Array, variance_px2: Array) -> Array:
     return np.asarray(cov + variance_px2[:, None, None] * np.eye(2))
 
 
-def _within(bounds: VarianceFactors, cov: Array, place_px2: Array, camera: Ints | int) -> Array:
+def _within(factors: VarianceFactors, cov: Array, place_px2: Array, camera: Ints | int) -> Array:
     """Covariances (m, 2, 2) with both parts multiplied by their factors; their shape is kept.
 
     place_px2 (m,): the part that belongs to places.
     """
     share = np.minimum(place_px2 / np.maximum(0.5 * np.trace(cov, axis1=1, axis2=2), 1e-300), 1.0)
-    factor = (1 - share) * bounds.noise[camera] + share * bounds.place[camera]
+    factor = (1 - share) * factors.noise[camera] + share * factors.place[camera]
     return np.asarray(cov * factor[:, None, None])
 
 
@@ -163,12 +165,14 @@ def widened(detections: RunDetections, share: Array | float) -> RunDetections:
 
 
 def width_share(
-    views: Views, detections: RunDetections, assigned: Ints, calibration_cov: Array, ref: Reference, measured: Bools
-) -> float:
+    views: Views, detections: RunDetections, assigned: Ints, calibration_cov: Array, ref: Reference, measured: Bools,
+    usual: float = DEADBAND,
+) -> float:  # fmt: skip
     """Errors beyond the stated ones as a share of the spots' widths (1 sigma); 0 if the stated sigmas are correct.
 
-    Also 0 if no width is known. Texture and speckle shift a spot in proportion to its width, whatever its noise is: if
-    the residuals are larger than stated, such errors are added before all sigmas are scaled (`noise_scale`).
+    Also 0 up to a `usual` variance factor, and if no width is known. Texture and speckle shift a spot in proportion to
+    its width, whatever its noise is: if the residuals are larger than stated, such errors are added before all sigmas
+    are scaled (`noise_scale`).
     """
     if not np.isfinite(detections.size_px).any():
         return 0.0
@@ -177,7 +181,7 @@ def width_share(
     def variance_factor(share: float) -> float:
         return _mean_variance_factor(views, widened(detections, share), assigned, calibration_cov, ref, frames)
 
-    if variance_factor(0.0) <= DEADBAND:
+    if variance_factor(0.0) <= usual:
         return 0.0
     return _share_with(variance_factor)
 
@@ -234,11 +238,12 @@ def _share_with(variance_factor: Callable[[float], float]) -> float:
 
 
 def noise_scale(
-    views: Views, detections: RunDetections, assigned: Ints, calibration_cov: Array, ref: Reference, measured: Bools
-) -> float:
-    """Ratio of the spots' errors to their stated sigmas; 1 within the deadband."""
+    views: Views, detections: RunDetections, assigned: Ints, calibration_cov: Array, ref: Reference, measured: Bools,
+    usual: float = DEADBAND,
+) -> float:  # fmt: skip
+    """Ratio of the spots' errors to their stated sigmas; 1 up to a `usual` variance factor."""
     mean = _mean_variance_factor(views, detections, assigned, calibration_cov, ref, np.flatnonzero(measured))
-    return float(np.sqrt(mean)) if mean > DEADBAND else 1.0
+    return float(np.sqrt(mean)) if mean > usual else 1.0
 
 
 def _mean_variance_factor(

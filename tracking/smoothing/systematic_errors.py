@@ -13,9 +13,11 @@ from geometry.compiled_projection import Views, project_all
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import coordinates_of, covariance_of
 from geometry.uncertainty.rig_uncertainty import share_without_calibration
-from tracking.smoothing.motion.process_noise import SHORT_EXPOSURE, corner_offsets
+from tracking.smoothing.motion.process_noise import corner_offsets
 from tracking.smoothing.motion.run_detections import Reference, RunDetections, labelled_points
 from tracking.smoothing.recording import TrackedRecording
+
+_SHORT = 0.1  # of the step between two frames: within a shorter exposure accelerations move nothing
 
 
 def exposure_offsets(views: Views, motion: Reference, exposure_s: float, steady: Bools) -> Array:
@@ -52,7 +54,7 @@ def exposure_sigmas(motion: Reference, jumped: Bools, exposure_s: float, dt: Arr
     """
     corners = corner_offsets(motion, jumped, exposure_s, dt)
     other = np.zeros_like(corners)
-    if len(dt) > 2 and exposure_s > SHORT_EXPOSURE * float(np.median(dt[1:])):
+    if len(dt) > 2 and exposure_s > _SHORT * float(np.median(dt[1:])):
         pose = Pose(motion.R, motion.t)
         velocity = pose[1:].minus(pose[:-1]) / dt[1:, None]
         acceleration = (velocity[1:] - velocity[:-1]) / (0.5 * (dt[2:] + dt[1:-1]))[:, None]

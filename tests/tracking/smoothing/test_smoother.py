@@ -126,7 +126,10 @@ def test_the_covariances_of_velocity_and_rate_are_right():
 
 
 def test_with_the_jerk_set_by_hand_the_last_frame_agrees_with_the_tracker():
-    """With the same motion model, the same spots and no later frame, filter and smoother agree."""
+    """With the same motion model, the same spots and no later frame, filter and smoother agree.
+
+    The smoother's noise is what the residuals show: that of 150 frames is known to 5 %.
+    """
     by_hand = TrackerParameters(learn_jerk=False, jerk_m_s3=3.0, jerk_rad_s3=8.0, p_manoeuvre=1e-9)
     run = simulate_points("smooth", 7003, frames=150, clutter=0.0)
     causal = tracked(run, by_hand)
@@ -138,12 +141,12 @@ def test_with_the_jerk_set_by_hand_the_last_frame_agrees_with_the_tracker():
     assert a.motion is not None
     assert b.motion is not None
     sigma = np.sqrt(np.diagonal(a.pose_covariance))
-    assert np.abs(b.pose.minus(a.pose) / sigma).max() < 5e-3
-    np.testing.assert_allclose((b.pose_covariance - a.pose_covariance) / np.outer(sigma, sigma), 0, atol=5e-3)
+    assert np.abs(b.pose.minus(a.pose) / sigma).max() < 0.05
+    np.testing.assert_allclose((b.pose_covariance - a.pose_covariance) / np.outer(sigma, sigma), 0, atol=0.15)
     np.testing.assert_array_equal(a.point, b.point)
     v = np.sqrt(np.diagonal(a.motion.covariance))
-    assert np.abs((b.motion.velocity - a.motion.velocity) / v[:3]).max() < 5e-3
-    assert np.abs((b.motion.rate - a.motion.rate) / v[3:]).max() < 5e-3
+    assert np.abs((b.motion.velocity - a.motion.velocity) / v[:3]).max() < 0.05
+    assert np.abs((b.motion.rate - a.motion.rate) / v[3:]).max() < 0.05
 
 
 def test_smoothing_does_not_depend_on_the_direction_of_time():
@@ -280,7 +283,8 @@ def test_sigmas_three_times_too_small_are_corrected():
     run = simulate_points("smooth", 7008, frames=150)
     small = replace(run, detections=tuple(tuple(replace(d, cov_px2=d.cov_px2 / 9) for d in f) for f in run.detections))
     again, smoothed = smoothed_frames(small, tracked(small))
-    assert smoothed.errors.noise_scale == pytest.approx(3.0, rel=0.1)
+    assert np.sqrt(smoothed.errors.factors.noise) == pytest.approx(3.0, rel=0.1)
+    assert smoothed.errors.noise_scale == 1.0
     j = assess(run, again)
     assert np.mean(j.nees) / 6 < 1.7
     assert j.missed() <= 3

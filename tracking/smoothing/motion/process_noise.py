@@ -7,6 +7,7 @@ from typing import TypeVar
 import numpy as np
 
 from geometry.arrays import Array, Bools
+from geometry.pose import Pose
 from tracking.rigid_body.models.motion import process_noise
 from tracking.rigid_body.online_estimates import jump_variance
 from tracking.smoothing.motion.fixed_interval import Interval
@@ -141,7 +142,6 @@ P_JUMP_OCCLUDED = 0.05  # probability of a jump in each step at a frame that doe
 P_JUMP_SHARED = 0.3  # least probability of a known jump in each of several steps between which little is observed
 # Log determinant of a frame's information below the run's usual one: sigmas of the pose half as large again.
 WEAK_LOG_DET = 2 * 6 * np.log(1.5)
-SHORT_EXPOSURE = 0.1  # of the step between two frames: with a shorter exposure a corner is hardly ever within one
 SPEED_WINDOW_S = 0.5  # s: the size of a jump follows from the fastest motion within this time of it
 
 
@@ -185,15 +185,22 @@ def corner_offsets(ref: Reference, jumped: Bools, exposure_s: float, dt: Array) 
     """Largest mean pose over the exposure less that at its middle, (T, 6), where the velocities jump; 0 elsewhere.
 
     Where they jump at the middle of the exposure, the mean is an eighth of the exposure times the jump beside the
-    corner: for all spots as if the vehicle were there. A jump before frame k (jumped[k]) is in the exposure of that
-    frame or of the one before it. Short exposures hardly ever contain one and get 0. Source: ours.
+    corner: for all spots as if the vehicle were there. A jump before frame k (jumped[k]) may be in the exposure of that
+    frame or of the one before it, or beside a step that is also taken for a jump because of that offset. Each component
+    turns where its straight lines before and after meet; if that is farther than an exposure from the middle of a
+    frame, it has no error there. What shifts the instant by half an exposure, an error of the poses of half the
+    exposure times the jump, exceeds the offset. Source: ours.
     """
     out = np.zeros((len(ref.t), 6))
-    for k in np.flatnonzero(jumped[1:] & (exposure_s > SHORT_EXPOSURE * dt[1:])) + 1:
-        b = (ref.m[k, :6] - ref.m[k - 1, :6]) * exposure_s / 8
-        for frame in (k - 1, k):
-            if np.linalg.norm(b) > np.linalg.norm(out[frame]):
-                out[frame] = b
+    pose, t_s, steps = Pose(ref.R, ref.t), np.cumsum(dt), np.r_[jumped, False]
+    for k in (np.flatnonzero(jumped[1:] & (exposure_s > 0)) + 1).tolist():
+        for first, last in {(k - 1, k), (k - 1 - int(steps[k - 1]), k + int(steps[k + 1]))}:
+            jump = ref.m[last, :6] - ref.m[first, :6]
+            # The jump times the interval from the first frame to the corner.
+            late = ref.m[last, :6] * (t_s[last] - t_s[first]) - pose[last].minus(pose[first])
+            for frame in range(first, last + 1):
+                inside = np.abs(late - jump * (t_s[frame] - t_s[first])) < np.abs(jump) * exposure_s
+                out[frame] = np.maximum(np.where(inside, np.abs(jump) * exposure_s / 8, 0.0), out[frame])
     return out
 
 

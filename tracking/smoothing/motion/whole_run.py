@@ -29,7 +29,6 @@ from tracking.smoothing.motion.process_noise import (
     new_jumps,
     next_log_density,
     weak_frames,
-    with_error_along,
     with_errors_along_axes,
 )
 from tracking.smoothing.motion.run_detections import (
@@ -256,15 +255,6 @@ class _Estimator:
         measured, jumped = self.measured, self.jumped
         self.beside = corner_offsets(ref, jumped, self.run.exposure_s, self.dt)
         L, g, chi2 = self._spot_information(ref)
-        if self.run.exposure_s > 0:
-            short = ~np.any(self.beside[:-1] != 0, axis=1)
-            corners = np.flatnonzero(jumped[1:] & measured[1:] & measured[:-1] & short)
-            if len(corners):
-                L, g = L.copy(), g.copy()
-            for k in corners:
-                # As `corner_offsets`, for a short exposure.
-                b = (ref.m[k + 1, :6] - ref.m[k, :6]) * self.run.exposure_s / 8
-                L[k], g[k], _ = with_error_along(_padded(b, g[k]), L[k], g[k])
         if jumped.any():
             # For all later passes: a frame near the limit would be weak in every second one, and they would never end.
             self.weak |= weak_frames(L if self.run.delays is None else self._undelayed(ref), measured)

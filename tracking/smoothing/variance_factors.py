@@ -1,0 +1,125 @@
+"""Factors of the spots' variances, from the residuals of single-frame poses.
+
+Noise is estimated, and the texture of the background and the misfit of the fits predict errors that belong to places,
+before any pose is known. All of them may be wrong: too much light taken for noise, clipped spots with rings, a
+background that modulates the light less than a screen would. The residuals of a run with redundant spots contain the
+true errors. Source: ours.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from geometry.arrays import Array, Bools, Ints, evenly_spread
+from geometry.compiled_projection import Views, project_all
+from tracking.rigid_body.association.frame_detections import BLENDED
+from tracking.smoothing.motion.run_detections import Reference, RunDetections, fit_frames
+from tracking.smoothing.place_errors import correlation, frames_with_same_error, usable_widths
+
+_REACH = 2.0  # widths of the spot: assumed correlation length of the errors, for their number ...
+_ALIKE = 0.9  # ... and least correlation, with a length of one width, of errors whose difference shows the noise
+_FRAMES = 2000  # at most so many, evenly spaced
+_FACTOR = 1.25  # 1 sigma of the ratio of the stated sigma of each part to the true one
+_STEPS = 12  # of Fisher scoring; it converges in about six
+_LARGEST_STEP = 1.0  # of the logarithm of a factor
+_LEAST_VARIANCE = 1e-3  # relative to the stated one
+_ROBUST = 9.0  # times its median: most that a square of a residual counts; normal ones are larger in 0.2 %
+
+
+class VarianceFactors(NamedTuple):
+    """Factors (cameras,) of the two parts of the spots' variances."""
+
+    noise: Array
+    place: Array  # of the part that belongs to places
+    freedom: float  # of the mean square of all residuals: twice its squared inverse scatter
+
+
+class Squares(NamedTuple):
+    """m mean squares of two coordinates each, and the parts of their expected values, all over the stated variances."""
+
+    ratio: Array
+    noise: Array
+    place: Array
+    known: Array  # errors of the calibration
+    weight: Array  # number of independent pairs of coordinates that each stands for
+
+
+def variance_factors(
+    views: Views, run: RunDetections, assigned: Ints, camera_of: Ints, place_px2: Array, calibration_cov: Array,
+    ref: Reference, measured: Bools,
+) -> VarianceFactors:  # fmt: skip
+    """The factors of both parts of the stated variances, as the residuals show them.
+
+    run: m detections of T frames; assigned (T, n): their labels; camera_of (n,): of the views; place_px2 (m,): part of
+    their variances that belongs to places; calibration_cov (n, 2, 2), px^2; ref (T,): motion near which the pose of
+    each frame is found.
+
+    Noise differs in every frame, errors of one place count once: a vehicle at rest has few residuals that are
+    independent of each other. There the change of a residual from frame to frame shows the noise alone.
+    """
+    noise, place = np.ones(run.has_image.shape[1]), np.ones(run.has_image.shape[1])
+    labelled = (assigned >= 0) & (assigned < BLENDED)
+    frames = evenly_spread(np.flatnonzero(measured & (labelled.sum(axis=1) > 3)), _FRAMES)
+    if not len(frames):
+        return VarianceFactors(noise, place, 0.0)
+    some, assigned, labelled = run._replace(begin=run.begin[frames]), assigned[frames], labelled[frames]
+    row = np.where(labelled, some.begin[:, None] + assigned, 0)
+    near = Reference(ref.R[frames], ref.t[frames], ref.m[frames])
+    fits = fit_frames(views, some, assigned, calibration_cov, near)
+    uv, J = project_all(views, fits.R, fits.t)
+    P = np.linalg.pinv(fits.information, hermitian=True)
+    cov = run.cov[row] + calibration_cov
+    free = 1 - 0.5 * np.einsum("knia,kab,knjb,knji->kn", J, P, J, np.linalg.inv(cov))  # share not taken by the pose
+    usable = labelled & np.isfinite(uv).all(axis=-1) & (free > 0)
+    size2, own = 0.5 * np.trace(cov, axis1=2, axis2=3), 0.5 * np.trace(run.cov[row], axis1=2, axis2=3)
+    residual = np.where(usable[..., None], run.uv[row] - uv, np.nan)
+    part = np.minimum(place_px2[row], own)
+    parts = np.stack([own - part, part], axis=-1) / size2[..., None]  # the rest is that of the calibration
+    same = np.full(assigned.shape, np.nan)  # frames with the same error of a place
+    rho = np.zeros((len(frames) - 1, assigned.shape[1]))  # correlation of such errors in successive frames
+    measured_px = np.where(labelled[..., None], run.uv[row], np.nan)
+    for i, width in enumerate(usable_widths(run.usual_size_px)):
+        same[:, i] = frames_with_same_error(measured_px[:, i], _REACH * width)
+        rho[:, i] = correlation(np.linalg.norm(np.diff(measured_px[:, i], axis=0), axis=-1), width)
+    square = 0.5 * np.sum(residual**2, axis=-1) / (size2 * free)
+    step = 0.5 * np.sum(np.diff(residual, axis=0) ** 2, axis=-1) / (size2 * free)[1:]
+    weight = np.where(usable, free, 0.0)
+    of_place = float(np.sum(weight * parts[..., 1])) / max(float(weight.sum()), 1e-9)
+    every, places = 2 * float(weight.sum()), 2 * float(np.sum(weight / np.where(usable, same, 1.0)))
+    freedom = 1 / ((1 - of_place) ** 2 / max(every, 1e-9) + of_place**2 / max(places, 1e-9))
+    for camera in range(len(noise)):
+        at = usable & (camera_of == camera)
+        pair = at[1:] & at[:-1] & (rho > _ALIKE)
+        both = [
+            Squares(square[at], parts[at][:, 0], parts[at][:, 1], 1 - parts[at].sum(axis=1), (free / same)[at]),
+            Squares(
+                0.5 * step[pair], parts[1:][pair][:, 0], ((1 - rho) * parts[1:, :, 1])[pair], np.zeros(pair.sum()),
+                (free - free / same)[1:][pair],
+            ),
+        ]  # fmt: skip
+        if np.count_nonzero(at):
+            squares = Squares._make(np.concatenate(a) for a in zip(*both, strict=True))
+            noise[camera], place[camera] = likely_factors(squares)
+    return VarianceFactors(noise, place, freedom)
+
+
+def likely_factors(squares: Squares) -> tuple[float, float]:
+    """Means of the factors of noise and of errors of places under their posterior distribution.
+
+    Where places differ, the even ones show the noise and the others the factor. Before the residuals are seen both
+    factors are log-normal with a mean of 1.
+    """
+    precision = 1 / (2 * np.log(_FACTOR)) ** 2
+    usual = x = np.full(2, -0.5 / precision)
+    for _ in range(_STEPS):
+        parts = np.stack([squares.noise, squares.place]) * np.exp(x)[:, None]
+        variance = np.maximum(parts.sum(axis=0) + squares.known, _LEAST_VARIANCE)
+        slope, ratio = parts / variance, squares.ratio / variance
+        ratio = np.minimum(ratio, _ROBUST * np.median(ratio))
+        gradient = slope @ (squares.weight * (ratio - 1)) - precision * (x - usual)
+        information = (squares.weight * slope) @ slope.T + precision * np.eye(2)
+        x = x + np.clip(np.linalg.solve(information, gradient), -_LARGEST_STEP, _LARGEST_STEP)
+    noise, place = np.exp(x + 0.5 * np.diag(np.linalg.inv(information)))
+    return float(noise), float(place)
