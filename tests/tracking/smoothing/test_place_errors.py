@@ -93,7 +93,8 @@ def test_stated_errors_of_places_are_reduced_to_what_the_residuals_allow():
             frames, smoothed = smoothed_frames(run, tracked(run))
             answers.append(np.nanmean(assess(run, frames).nees) / 6)
             assert np.all(smoothed.errors.factors.place >= (0.7 if stated == 1 else 0.005))
-            assert np.all(smoothed.errors.factors.place <= (1.4 if stated == 1 else 0.025))
+            # The prior, which does not expect a factor of 10 in sigma, keeps some of it.
+            assert np.all(smoothed.errors.factors.place <= (1.4 if stated == 1 else 0.06))
     assert 0.5 < np.mean(nees[1.0]) < 1.5
     assert 0.4 < np.mean(nees[10.0]) < 1.5
 
