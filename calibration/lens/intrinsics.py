@@ -166,7 +166,8 @@ def _final(table: CornerTable, chosen: ModelCandidate, board: BoardFreedom) -> t
     assert chosen.fit is not None
     try:
         found = robust_fit(table, chosen.model, chosen.fit.values, board)
-        if chosen.refused or not folds_in_picture(found.lens, found.model.fisheye, table.image_size_px):
+        folded, folds = (folds_in_picture(f.lens, f.model.fisheye, table.image_size_px) for f in (chosen.fit, found))
+        if folded or not folds:
             return found, ViewEquations.of(table, found)
     except AdjustmentError:
         pass

@@ -175,8 +175,8 @@ def choose(table: CornerTable, candidates: Sequence[ModelCandidate]) -> ModelSel
         why = f"its directions have the smallest expected error where corners were seen ({chosen.error_px:.2g} px)"
     else:
         folding = {j.candidate.model for j in solved if j.folds}
-        chosen = min(done.values(), key=lambda c: (c.model in folding or c.error_px > UNKNOWN_PX, c.error_px))
-        why = "every model leaves directions unknown; where corners were seen, this one has the smallest error"
+        chosen = min(done.values(), key=lambda c: (c.model in folding, c.error_px > UNKNOWN_PX, c.error_px))
+        why = "every model folds or leaves directions unknown; this one has the smallest error where corners were seen"
     return ModelSelection(out, chosen, "as requested" if len(candidates) == 1 else why)
 
 

@@ -30,6 +30,11 @@ class ProjectionMap:
     by_parameter: Array  # (rows, columns, 2, p), px per unit of the model's free parameters, best rotation removed
     mm_per_px: Array  # (rows, columns, 2, 2): on a screen that faces the camera at the distance
 
+    def usual_mm_per_px(self) -> float:
+        """Length on that screen, mm, of a pixel: geometric mean of both axes, median over the picture."""
+        known = np.isfinite(self.mm_per_px).all(axis=(-2, -1))
+        return float(np.median(np.abs(np.linalg.det(self.mm_per_px[known]))) ** 0.5) if known.any() else np.nan
+
     def covariance_px2(self, covariance: Array) -> Array:
         """(rows, columns, 2, 2) from a covariance (p, p) of the parameters."""
         return self.by_parameter @ covariance @ np.swapaxes(self.by_parameter, -1, -2)

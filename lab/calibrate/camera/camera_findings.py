@@ -109,8 +109,7 @@ def _two(value: float) -> str:
 
 def _mm(c: Intrinsics, px: float) -> str:
     """A length in px, and in mm on the screen."""
-    per_px = float(np.nanmedian(np.abs(np.linalg.det(c.map.mm_per_px))) ** 0.5)
-    return f"{px:.3g} px ({_two(px * per_px)} mm at {c.distance_m:.3g} m)"
+    return f"{px:.3g} px ({_two(px * c.map.usual_mm_per_px())} mm at {c.distance_m:.3g} m)"
 
 
 def _listed(words: tuple[str, ...]) -> str:

@@ -36,7 +36,7 @@ def page_of(r: Intrinsics, photos: PhotoSet, valid_until: str) -> tuple[list[Key
 def _key_figures(r: Intrinsics, valid_until: str) -> list[KeyFigure]:
     px, mm = r.map.sigma_px(r.covariance), r.map.sigma_mm(r.covariance)
     at = f"at {format_number(r.distance_m)} m"
-    held = r.held_out_rms_px * _mm_per_px(r)
+    held = r.held_out_rms_px * r.map.usual_mm_per_px()
     return [
         (
             "focal length fx",
@@ -62,10 +62,6 @@ def _key_figures(r: Intrinsics, valid_until: str) -> list[KeyFigure]:
         ),
         ("valid until", valid_until or "no expiry date", ""),
     ]
-
-
-def _mm_per_px(r: Intrinsics) -> float:
-    return float(np.nanmedian(np.abs(np.linalg.det(r.map.mm_per_px))) ** 0.5)
 
 
 def _numbers(r: Intrinsics) -> Section:
