@@ -169,6 +169,13 @@ def test_all_findings_are_shown_with_reason_and_remedy_the_worst_first():
     assert "<title>FAIL" in html
 
 
+def test_what_the_command_line_shows_between_backticks_is_code_in_all_texts_of_a_finding():
+    html = html_of(report([], [Finding(Level.FAIL, "the `what` <i>", "the `why`", "run `beampose doctor`")]))
+    assert all(f"<code>{words}</code>" in html for words in ("what", "why", "beampose doctor"))
+    assert "`" not in re.sub(r"<script.*?</script>|<style.*?</style>", "", html, flags=re.DOTALL)
+    assert "<i>" not in html
+
+
 def test_all_names_and_texts_are_escaped():
     evil = "<script>alert(1)</script>"
     finding = Finding(Level.WARN, evil, evil, evil)
