@@ -80,9 +80,9 @@ def centroids(board: Board, turn: tuple[float, float, float]) -> tuple[np.ndarra
 @pytest.mark.parametrize(
     ("text", "within"),
     [
-        (CHESS, 0.03),
-        (CHARUCO, 0.04),
-        ("charuco:5x8:40mm:20mm:DICT_4X4_50:inverted:legacy", 0.04),
+        (CHESS, 0.012),
+        (CHARUCO, 0.015),
+        ("charuco:5x8:40mm:20mm:DICT_4X4_50:inverted:legacy", 0.012),
     ],
 )
 def test_points_are_detected_at_their_true_positions(text, within):
