@@ -17,7 +17,6 @@ from lab.calibrate.step import made_of
 from lab.errors import InputError
 from lab.findings.finding import Finding, Level
 from lab.report.calibration import calibration_charts as charts
-from lab.report.calibration import calibration_charts as maps
 from lab.report.calibration import calibration_drawings as draw
 from lab.report.calibration import calibration_scene as scene
 from lab.report.page import LARGEST_BYTES, Page, PageDrawing, PageTable, Section, Verdict, cell, html_of, write_page
@@ -64,10 +63,10 @@ def all_drawings() -> dict[str, str]:
         "ladder": charts.lens_model_chart(
             ["4 <&>", "5", "fisheye"], np.array([0.3, 0.2, np.nan]), 1, noise_px=np.array([0.3, 0.1, np.nan])
         ),
-        "flatness": maps.flatness_map(
+        "flatness": charts.flatness_map(
             RNG.normal(size=(40, 2)), RNG.normal(0, 1e-3, 40), size_m=(4, 3), bow=(1e-3, 0, 0)
         ),
-        "correlations": maps.correlation_matrix(["fx", "<k1>", "fixed", "a", "b", "c"], covariance),
+        "correlations": charts.correlation_matrix(["fx", "<k1>", "fixed", "a", "b", "c"], covariance),
         "drift": charts.drift_chart(
             {"left": charts.DriftLine(days, np.array([0.1, np.nan, 0.2, 0.1, 0.3]), np.full(5, 0.1))},
             warn=0.2,
