@@ -20,9 +20,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from geometry import lens
 from geometry.arrays import Array, Bools, Ints, cross, skew
-from geometry.camera import FISHEYE, Camera, in_picture, pinhole_numbers, project_points, project_points_full
+from geometry.camera import FISHEYE, in_picture, pinhole_numbers, project_points_full
 from geometry.compiled_projection import VIEW, Views, lens_codes, project_all
 from geometry.lens import padded, tilt_matrix
 from geometry.pose import Pose
@@ -273,27 +272,3 @@ class SpotModel:
         """Whether pixels (..., n, 2) lie in their cameras' pictures, or at most the margin outside; False for nan."""
 
         return in_picture(pixels, self.image_size_px, margin_px)
-
-
-@dataclass(frozen=True, slots=True)
-class MarkerModel:
-    """n markers at known places of the body, and the camera that sees them."""
-
-    markers: Array  # (n, 3), m, in body
-    camera: Camera
-
-    def project(self, world_from_body: Pose) -> tuple[Array, Array]:
-        """Distorted pixels (n, 2) and their Jacobian (n, 2, 6) by [dt (m, world), dtheta (rad, body)].
-
-        nan behind the camera. A small turn moves a marker at q by -R [q]x dtheta. Source: ours.
-        """
-        camera_from_world, R = self.camera.camera_from_world, world_from_body.rotation
-        pixels, d_point = project_points(
-            camera_from_world.apply(world_from_body.apply(self.markers)),
-            pinhole_numbers(self.camera),
-            lens.padded(self.camera.distortion),
-            np.asarray(self.camera.fold_r2),
-            np.asarray(self.camera.lens == FISHEYE),
-        )
-        d_world = d_point @ camera_from_world.rotation
-        return pixels, np.concatenate([d_world, -d_world @ R @ skew(self.markers)], axis=-1)

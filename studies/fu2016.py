@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -12,15 +12,17 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools
 from geometry.camera import Camera
-from geometry.forward_model import MarkerModel
 from geometry.pose import Pose
 from geometry.rotations import ypr_jacobian
 from lab.number_format import format_number
 from lab.report.plot.series import Line, Shade, time_panel
 from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION, picture_uri, robust_range
+from lab.targets.lamps import spots
 from studies.comparison import Comparison, ComparisonRow, Figure
-from tracking.corner_markers import MarkerMatch, MatchParameters, harris_corners, match_markers
-from tracking.detections import UNMATCHED
+from tracking.binocular.marker_model import MarkerModel
+from tracking.lamp_corners import harris_corners
+from tracking.lamp_tracker import LampFrame, LampTracker
+from tracking.statuses import PoseStatus
 from tracking.unscented import (
     P0,
     SPREAD,
@@ -157,9 +159,25 @@ def camera() -> Camera:
     return Camera("receiver", "", SIZE_PX, K, (), Pose(turn, np.zeros(3)))
 
 
-def marker_model() -> MarkerModel:
-    """The five lamps seen by the camera."""
-    return MarkerModel(MARKERS, camera())
+def lamp_model() -> MarkerModel:
+    """The five lamps."""
+    n = len(MARKERS)
+    names = tuple(str(k + 1) for k in range(n))
+    return MarkerModel(names, MARKERS, np.zeros(n, dtype=np.int64), np.full(n, np.nan))
+
+
+def lamp_tracker() -> LampTracker:
+    """A tracker of the lamps in the pictures of the camera."""
+    return LampTracker(camera(), lamp_model(), spots, DT_S)
+
+
+def projected(points: Array, pose: Pose) -> Array:
+    """Pixels (n, 2) of points of the body (n, 3), m; nan behind the camera."""
+    seen = camera()
+    in_camera = seen.camera_from_world.apply(pose.apply(points))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        flat = in_camera[:, :2] / np.where(in_camera[:, 2:] > 0, in_camera[:, 2:], np.nan)
+    return FOCAL_PX * flat + seen.matrix[:2, 2]
 
 
 def pose_of(state: Array) -> Pose:
@@ -189,12 +207,12 @@ def render(state: Array, difficulty: Difficulty, rng: np.random.Generator) -> ND
         + np.linspace(18, 0, h, dtype=np.float32)[:, None]
         + 7 * cv2.resize(cloud, SIZE_PX, interpolation=cv2.INTER_CUBIC)
     )
-    model, pose = marker_model(), pose_of(state)
+    pose = pose_of(state)
     for outline, grey in ((_WING, 62.0), (_BELLY, 55.0), (_BODY, 50.0)):
-        places, _ = MarkerModel(outline, model.camera).project(pose)
+        places = projected(outline, pose)
         if np.isfinite(places).all():
             cv2.fillPoly(sky, [np.round(16 * places).astype(np.int32)], grey, cv2.LINE_AA, 4)
-    lamps, _ = model.project(pose)
+    lamps = projected(MARKERS, pose)
     lit = lamps[(rng.random(len(lamps)) >= difficulty.p_hidden) & np.isfinite(lamps).all(axis=1)]
     false = rng.uniform((0, 0), SIZE_PX, (difficulty.false_lights, 2))
     about = lamps[rng.integers(len(lamps), size=difficulty.false_lights // 2)]
@@ -231,13 +249,12 @@ def _line(length_px: float, angle: float) -> NDArray[np.float32]:
 
 # The experiment of Fu (2016) with pictures: Harris corners, RANSAC, the pose of five lamps, and the filter on it.
 #
-# From 6 to 8 s the pictures are blurred, with more false lights and more hidden lamps. The filter predicts where the
-# lamps are searched, so a wrong pose would also spoil the next search.
+# From 6 to 8 s the pictures are blurred, with more false lights and more hidden lamps. The last measured pose tells
+# where the lamps are searched, so a wrong pose would also spoil the next search.
 
 
 START_SIGMA = np.array([0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.1, 0.1])  # of X0, from GPS and INS: m, m/s, rad
 POSED = [0, 1, 2, 6, 7]  # the numbers of the state that a pose measures
-SEARCH_SIGMAS, SEARCH_PX, MOST_SEARCH_PX = 4.0, 3.0, 60.0  # radius of the search around a predicted lamp
 WRONG_PX = 3.0  # a matched corner farther from its lamp has the wrong label
 
 
@@ -256,8 +273,7 @@ class PictureRun:
 def run_pictures(seed: int, robust: bool, steps: int | None = None) -> PictureRun:
     """One recording of pictures; the same ones for both filters. steps: the first ones only."""
     recording = simulate(seed, 0, "none")
-    rng, search = np.random.default_rng([seed, 71]), np.random.default_rng([seed, 72])
-    model = marker_model()
+    rng, tracker = np.random.default_rng([seed, 71]), lamp_tracker()
     T = len(recording.t_s) if steps is None else steps
     x, P = X0, np.diag(START_SIGMA**2)
     error, single, sigma = np.full((T, 8), np.nan), np.full((T, 5), np.nan), np.full((T, 8), np.nan)
@@ -267,44 +283,40 @@ def run_pictures(seed: int, robust: bool, steps: int | None = None) -> PictureRu
         picture = render(state, GUST if recording.disturbed[k] else CLEAR, rng)
         if k:
             x, P = predict(x, P, process(DT_S), Q, SPREAD)
-        corners = harris_corners(picture)
-        expected = pose_of(x)
-        parameters = replace(MatchParameters(), gate_px=_search_radius(x, P))
-        match = match_markers(model, corners.uv_px, expected, search, parameters)
-        if match is not None:
-            z, R = _measured(match)
+        frame = tracker.step(picture)
+        if frame.status is PoseStatus.MEASURED:
+            z, R = _measured(frame)
             rule = student_t_update if robust else update
             step = rule(x, P, z, lambda states: states[:, POSED], R, SPREAD)
             x, P = step.x, step.P
             single[k] = z - state[POSED]
-            wrong[k] = _is_wrong(match, corners.uv_px, pose_of(state))
+            wrong[k] = _is_wrong(frame, pose_of(state))
         error[k], sigma[k] = x - state, np.sqrt(np.diagonal(P))
     return PictureRun(recording.t_s[:T], error, single, recording.disturbed[:T], wrong, sigma)
 
 
-def _search_radius(x: Array, P: Array) -> float:
-    """px: how far a lamp may be from its predicted place."""
-    _, J = marker_model().project(pose_of(x))
-    order = [0, 1, 2, 7, 6]  # a turn about body y is the pitch, one about z the yaw, for small angles
-    columns = J[..., [0, 1, 2, 4, 5]]
-    spread = columns @ P[np.ix_(order, order)] @ np.swapaxes(columns, -1, -2)
-    largest = float(np.sqrt(np.linalg.eigvalsh(spread)[:, 1].max()))
-    return min(SEARCH_SIGMAS * largest + SEARCH_PX, MOST_SEARCH_PX)
-
-
-def _measured(match: MarkerMatch) -> tuple[Array, Array]:
-    """x, y, z, yaw, pitch (5,) of a pose, and their covariance."""
-    pose = match.fit.world_from_body
+def _measured(frame: LampFrame) -> tuple[Array, Array]:
+    """x, y, z, yaw, pitch (5,) of a measured pose, and their covariance."""
+    pose, covariance = frame.tracked.pose, frame.tracked.covariance
+    assert pose is not None
+    assert covariance is not None
     T = np.zeros((5, 6))
     T[:3, :3] = np.eye(3)
     T[3:, 3:] = ypr_jacobian(pose.rotation)[:2]
-    return np.concatenate([pose.translation, pose.ypr[:2]]), T @ match.fit.covariance @ T.T
+    return np.concatenate([pose.translation, pose.ypr[:2]]), T @ covariance @ T.T
 
 
-def _is_wrong(match: MarkerMatch, corners_px: Array, truth: Pose) -> bool:
-    places, _ = marker_model().project(truth)
-    matched = match.rows != UNMATCHED
-    return bool(np.any(np.linalg.norm(corners_px[match.rows[matched]] - places[matched], axis=1) > WRONG_PX))
+def _is_wrong(frame: LampFrame, truth: Pose) -> bool:
+    apart = labelled_px(frame) - projected(MARKERS, truth)
+    return bool(np.any(np.linalg.norm(apart, axis=1) > WRONG_PX))
+
+
+def labelled_px(frame: LampFrame) -> Array:
+    """Where each lamp (n, 2) is seen; nan where it is not."""
+    out, index = np.full((len(MARKERS), 2), np.nan), frame.tracked.index[0]
+    if frame.lights is not None:
+        out[index >= 0] = frame.lights.uv_px[index[index >= 0]]
+    return out
 
 
 # Rows and figure of the part of the study of Fu (2016) that uses pictures.
@@ -360,7 +372,7 @@ def picture_figure(seed: int, run: PictureRun) -> Figure:
     return Figure(
         "Pose from pictures: Harris corners and RANSAC (Figs. 2 and 3)",
         "Rendered pictures of a tanker with two lamps on the wing and three on the fuselage, 640 x 512 pixels, f = 500"
-        " px. Circles: corners; squares: those that RANSAC assigns to lamps. Left: clear. Right: disturbed. Below:"
+        " px. Circles: corners; squares: those that are lamps. Left: clear. Right: disturbed. Below:"
         " orange: pose of each picture; red: Student-t filter. Pictures without a safe pose have no orange value.",
         "".join(panels),
     )
@@ -372,15 +384,15 @@ def _shown(seed: int, disturbed: bool) -> str:
     state = recording.states[int(np.argmin(np.abs(recording.t_s - (FROM_S if disturbed else 1.0))))]
     rng = np.random.default_rng([seed, 73])
     grey = render(state, GUST if disturbed else CLEAR, rng)
+    frame = lamp_tracker().step(grey)
     corners = harris_corners(grey).uv_px
-    match = match_markers(marker_model(), corners, pose_of(state), rng)
     picture: Any = cv2.cvtColor(cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), cv2.COLOR_GRAY2BGR)
     for u, v in (2 * corners + 0.5).round().astype(int).tolist():
         cv2.circle(picture, (u, v), 9, (80, 200, 255), 1, cv2.LINE_AA)
-    matched = [] if match is None else match.rows[match.rows != UNMATCHED].tolist()
-    for u, v in (2 * corners[matched] + 0.5).round().astype(int).tolist():
+    seen = labelled_px(frame)
+    for u, v in (2 * seen[np.isfinite(seen[:, 0])] + 0.5).round().astype(int).tolist():
         cv2.rectangle(picture, (u - 12, v - 12), (u + 12, v + 12), (80, 220, 80), 1, cv2.LINE_AA)
-    middle = marker_model().project(pose_of(state))[0].mean(axis=0)
+    middle = projected(MARKERS, pose_of(state)).mean(axis=0)
     left, top = (2 * middle - np.array(_SHOWN_PX)).round().astype(int).tolist()
     left, top = (int(np.clip(at, 0, n - 2 * size)) for at, n, size in zip(
         (left, top), (picture.shape[1], picture.shape[0]), _SHOWN_PX, strict=True))  # fmt: skip

@@ -234,6 +234,46 @@ def point(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> Non
     _track(ctx, PointTarget(PointOptions(**options)), source, out)
 
 
+# `beampose track lamps`: the pose of a target with lamps.
+
+
+@click.command()
+@click.argument("pictures", metavar="VIDEO_OR_FOLDER", type=ANY_PATH)
+@click.option(
+    "--target",
+    required=True,
+    type=ANY_PATH,
+    help="The lamps: markers: {NAME: {position_m: [X, Y, Z]}, ...}, five or more.",
+)
+@click.option("--camera", required=True, type=ANY_PATH, help="camera.yaml, or the file of another program.")
+@click.option("--camera-name", help="The camera, where that file has several.")
+@click.option("--out", required=True, type=FOLDER, help="Gets attitude.csv, covariance.csv, summary.json, report.html.")
+@click.option(
+    "--detector",
+    default="spots",
+    show_default=True,
+    type=click.Choice(["spots", "harris"]),
+    help="What finds lights: as for laser spots, or the corners of Fu (2016).",
+)
+@click.option("--rate", "rate_hz", type=NumberRange(0.01, 1e6), help="Frames per second; default: the video's, or 25.")
+@click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
+@click.option("--video", "overlay", is_flag=True, help="Also write overlay.mp4: the pictures with the target's centre.")
+@click.pass_context
+def lamps(ctx: click.Context, /, pictures: Path, out: Path, **options: Any) -> None:
+    """Pose of a target with lamps at known places, from the pictures of one calibrated camera.
+
+    The lamps look alike: which light is which follows from their places. Five must be visible at the start, and four in
+    each measured frame; other lights do not matter. The pose is in the camera's frame: x to the right, y down, z ahead.
+
+    \b
+    Example:
+        beampose track lamps tanker.avi --target lamps.yaml --camera camera.yaml --out results/tanker
+    """
+    from lab.targets.lamps import LampsOptions, LampsTarget
+
+    _track(ctx, LampsTarget(LampsOptions(**options)), pictures, out)
+
+
 # `beampose stereo`: the pose of a target with coloured markers from a pair of cameras.
 
 
@@ -289,3 +329,4 @@ def pair(left: Path, right: Path, board: str, out: Path, names: str, lens: str, 
 
 track.add_command(drogue)
 track.add_command(point)
+track.add_command(lamps)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
@@ -139,6 +139,10 @@ class Target(ABC, Generic[F]):
     @abstractmethod
     def row(self, track: Track[F], k: int) -> list[object]:
         """The row of frame k (from 0) in its table; fields without a value are empty."""
+
+    def more_tables(self, track: Track[F]) -> Mapping[str, tuple[Sequence[str], Iterable[list[object]]]]:
+        """Further tables: columns and rows by the name of the file."""
+        return {}
 
     def findings(self, track: Track[F]) -> list[Finding]:
         """The findings that only this kind of target has."""

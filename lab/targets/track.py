@@ -183,6 +183,8 @@ def _tracked(target: Target[F], given: Path, folder: Path, progress: Progress | 
     track = target.read(given, progress)
     recording, events, findings = track.recording, track.events(), findings_of(target, track)
     write_table(folder / target.table, target.columns, (target.row(track, k) for k in range(len(track.frames))))
+    for name, (columns, rows) in target.more_tables(track).items():
+        write_table(folder / name, columns, rows)
     if target.options.overlay:
         write_overlay(target, track, folder)
     blocks: dict[str, Any] = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, permutations
 
 import numpy as np
@@ -39,7 +39,7 @@ class LabelledPose:
     index: Ints  # (2, K): the candidate of each marker in each picture, -1: none
     fit: PoseFit
     score: float  # nats: log likelihood against "all candidates are false"
-    evidence: float  # nats: the score without what six free numbers explain by chance
+    evidence: float  # nats: the score without what six free numbers, and the best of many hypotheses, explain by chance
 
     @property
     def markers(self) -> int:
@@ -145,21 +145,37 @@ def _image_chi2(images: Images, index: Ints, fit: PoseFit) -> Array:
 
 
 def _score(pair: StereoPair, images: Images, index: Ints, fit: PoseFit, p: MatchParameters) -> tuple[float, float]:
-    """Score of a labelling, and the part of it that three images of a free pose reach by chance, nats."""
+    """Score of a labelling, and the part of it that false candidates explain by chance, nats.
+
+    Three images of a free pose always fit; further ones fit by chance where the candidates are dense.
+    """
     observed = observations(images, index)
     pixels = fit.projected_px.reshape(observed.uv_px.shape)
-    score, gains = -0.5 * fit.chi2, []
+    score, chance, gains = -0.5 * fit.chi2, 0.0, []
     for c, (camera, found) in enumerate(zip(pair.cameras, images, strict=True)):
         if not len(found):
             continue  # a blind camera says nothing about hidden markers
-        density = max(len(found), 1) / float(np.prod(camera.image_size_px))
+        density = len(found) / float(np.prod(camera.image_size_px))
         seen = index[c] >= 0
         volume = 2 * np.pi * np.sqrt(np.linalg.det(observed.cov_px2[c, seen]))
         gain = np.log(p.detection_probability / (density * volume))
         gains += gain.tolist()
+        crowded = np.log(max(_density(found.uv_px, pixels[c]) / density, 1.0))
+        chance += max(int(seen.sum()) - _PARAMETERS_IN_IMAGES, 0) * crowded
         inside = in_picture(pixels[c], np.array(camera.image_size_px))
         score += float(gain.sum()) + float(np.sum(inside & ~seen)) * np.log(1 - p.detection_probability)
-    return score, _PARAMETERS_IN_IMAGES * float(np.mean(gains)) if gains else 0.0
+    return score, chance + _PARAMETERS_IN_IMAGES * float(np.mean(gains)) if gains else 0.0
+
+
+def _density(uv_px: Array, projected_px: Array) -> float:
+    """Candidates (n, 2) per px^2: where the markers are projected (K, 2), as far as twice their extent around them.
+
+    Candidates come in groups: a small image of the target in the middle of one explains several by chance.
+    """
+    middle = np.nanmean(projected_px, axis=0)
+    radius = 2 * float(np.nanmax(np.linalg.norm(projected_px - middle, axis=1)))
+    inside = np.linalg.norm(uv_px - middle, axis=1) <= radius
+    return float(inside.sum()) / (np.pi * radius**2) if radius > 0 else np.inf
 
 
 # The pose without a prediction: poses of three markers (P3P), tested against all candidates of both pictures.
@@ -210,6 +226,7 @@ def acquire(pair: StereoPair, model: MarkerModel, images: Images, p: MatchParame
     right: Bools = np.asarray(partners.any(axis=0))
     ranked = [_ranked(images[0], left), _ranked(images[1], right)]
     found: list[LabelledPose] = []
+    tried = 0
     expected = sum(min(len(model), len(candidates)) for candidates in images)
     triples = marker_triples(model)
     # The first triples in both pictures, then the others: any four markers of eight contain four triples.
@@ -217,15 +234,16 @@ def acquire(pair: StereoPair, model: MarkerModel, images: Images, p: MatchParame
         if c == 0 and any(_explains_a_picture(f, model, images) for f in found):
             break  # a camera that contradicts is not reconciled by other triples
         poses = _hypotheses(pair, model, images[c], ranked[c], c, some)
-        found += [
-            fitted
-            for pose in _best(pair, model, images, poses)
-            if (fitted := labelled_pose(pair, model, images, pose, near_pose(pose), p)) is not None
+        tried += len(poses.translation)
+        fits = [
+            labelled_pose(pair, model, images, pose, near_pose(pose), p) for pose in _best(pair, model, images, poses)
         ]
+        found += [fit for fit in fits if fit is not None]
         found = distinct(found)
         if found and (found[0].index >= 0).sum() >= _ENOUGH * expected:
             break
-    return found
+    # The best of many hypotheses explains more by chance than a single one.
+    return [replace(f, evidence=f.evidence - np.log(max(tried, 1))) for f in found]
 
 
 def _explains_a_picture(found: LabelledPose, model: MarkerModel, images: Images) -> bool:

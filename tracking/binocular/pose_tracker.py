@@ -134,7 +134,7 @@ class BinocularTracker:
 
     def _convincing(self, found: LabelledPose, images: Images) -> bool:
         explained = int((found.index >= 0).sum())
-        expected = min(2 * len(self._model), len(images[0]) + len(images[1]))
+        expected = sum(min(len(self._model), len(own)) for own in images)
         return chi2_tail(found.fit.chi2, max(found.fit.dof, 1)) > _TRUSTED_P and explained >= _TRUSTED_SHARE * expected
 
     def _prior_nats(self, candidate: LabelledPose, ahead: RigidMotion | None) -> float:

@@ -98,14 +98,14 @@ class _ColourBlock(fields.Block):
 
 class _MarkerBlock(fields.Block):
     position_m: fields.Vector3
-    colour: fields.Word
+    colour: fields.Word = ""
     radius_m: fields.Positive | None = None
 
 
 class TargetBlock(fields.Block):
     """Colours and markers."""
 
-    colours: dict[fields.Name, _ColourBlock]
+    colours: dict[fields.Name, _ColourBlock] = {}  # noqa: RUF012 - frozen
     markers: dict[fields.Name, _MarkerBlock]
     sigma_m: fields.NonNegative = 0.0
 
@@ -125,8 +125,17 @@ def load_target(given: Any, folder: Path, path: Path) -> Target:
     )
 
 
-def _target_of(block: TargetBlock, where: str) -> Target:
-    names = list(block.colours)
+def load_lamps(path: Path) -> MarkerModel:
+    """The markers of a target's file, without their colours: lamps look alike. Raises InputError."""
+    block = fields.validated(TargetBlock, read_mapping(path), path)
+    alike = {name: marker.model_copy(update={"colour": ""}) for name, marker in block.markers.items()}
+    return _target_of(
+        TargetBlock.model_construct(colours={}, markers=alike, sigma_m=block.sigma_m), f"{path}: ", False
+    ).model
+
+
+def _target_of(block: TargetBlock, where: str, coloured: bool = True) -> Target:
+    names = list(block.colours) if coloured else [""]
     if not names:
         raise InputError(f"{where}colours: expected one or more, got none")
     for name, marker in block.markers.items():
@@ -135,8 +144,9 @@ def _target_of(block: TargetBlock, where: str) -> Target:
                 f"{where}markers.{name}.colour: expected one of {', '.join(names)}, got {marker.colour!r}"
                 f"{suggest_name(marker.colour, names)}"
             )
-    if len(block.markers) < 3:
-        raise InputError(f"{where}markers: expected three or more, got {len(block.markers)}; two do not fix a pose")
+    least, word = (3, "three") if coloured else (4, "four")
+    if len(block.markers) < least:
+        raise InputError(f"{where}markers: expected {word} or more, got {len(block.markers)}; fewer do not fix a pose")
     x = np.array([m.position_m for m in block.markers.values()])
     spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
     if spread[1] < 1e-3 * max(spread[0], 1e-12):
@@ -153,7 +163,7 @@ def _target_of(block: TargetBlock, where: str) -> Target:
             f"{where}markers: expected markers that look different after every turn, got a symmetric set: its attitude"
             " is ambiguous; give one marker another colour, or move it"
         )
-    return Target(model, tuple(block.colours[n].named(n) for n in names))
+    return Target(model, tuple(colour.named(name) for name, colour in block.colours.items()))
 
 
 def is_symmetric(model: MarkerModel) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from lab.runs.tables import pose_numbers
 from lab.targets.stereo.run import StereoRecord, StereoResults, StereoRun
 from tracking.binocular.joint_fit import triangulate
 from tracking.binocular.marker_model import project_markers
+from tracking.binocular.pose_tracker import BinocularFrame
 from tracking.statuses import view_statuses
 
 POINTS = (
@@ -25,17 +26,9 @@ _UPPER = np.triu_indices(6)
 def write_tables(results: StereoResults, folder: Path) -> None:
     """Write attitude.csv, covariance.csv, systematic.csv, spots.csv, points.csv and detections.csv into a folder."""
     run, records = results.run, results.records
-    write_table(folder / "attitude.csv", columns.ATTITUDE, map(_attitude_row, records))
-    known = [r for r in records if r.tracked.covariance is not None]
-    write_table(
-        folder / "covariance.csv",
-        columns.COVARIANCE,
-        (
-            [r.frame, *map(repr, r.tracked.covariance[_UPPER].tolist())]
-            for r in known
-            if r.tracked.covariance is not None
-        ),
-    )
+    frames = [(r.frame, r.t_s, r.tracked) for r in records]
+    write_table(folder / "attitude.csv", columns.ATTITUDE, (attitude_row(*frame) for frame in frames))
+    write_table(folder / "covariance.csv", columns.COVARIANCE, covariance_rows(frames))
     if run.pair.covariance is not None or run.target.model.sigma_m > 0:
         fitted = [(r.frame, r.tracked.fit.systematic) for r in records if r.measured and r.tracked.fit is not None]
         rows = ([frame, *map(repr, S[_UPPER].tolist())] for frame, S in fitted)
@@ -47,15 +40,23 @@ def write_tables(results: StereoResults, folder: Path) -> None:
     )
 
 
-def _attitude_row(record: StereoRecord) -> list[object]:
-    t = record.tracked
-    head: list[object] = [record.frame, *number_fields([record.t_s])]
+def attitude_row(number: int, t_s: float, tracked: BinocularFrame) -> list[object]:
+    """The row of attitude.csv of a frame."""
+    head: list[object] = [number, *number_fields([t_s])]
     motion = [""] * len(columns.MOTION)  # poses are of single frames: they have no velocity
-    if t.pose is None or t.covariance is None:
-        return [*head, *[""] * len(columns.POSE), 0, "", t.status.value, *motion]
-    used = int((t.index >= 0).sum())
-    rms = number_fields([t.fit.rms_px if t.fit is not None and used else float("nan")])
-    return [*head, *number_fields(pose_numbers(t.pose, t.covariance)), used, *rms, t.status.value, *motion]
+    if tracked.pose is None or tracked.covariance is None:
+        return [*head, *[""] * len(columns.POSE), 0, "", tracked.status.value, *motion]
+    used = int((tracked.index >= 0).sum())
+    rms = number_fields([tracked.fit.rms_px if tracked.fit is not None and used else float("nan")])
+    pose = number_fields(pose_numbers(tracked.pose, tracked.covariance))
+    return [*head, *pose, used, *rms, tracked.status.value, *motion]
+
+
+def covariance_rows(frames: Iterable[tuple[int, float, BinocularFrame]]) -> Iterator[list[object]]:
+    """The rows of covariance.csv: the frames, as for `attitude_row`, that have a pose."""
+    for number, _, tracked in frames:
+        if tracked.covariance is not None:
+            yield [number, *map(repr, tracked.covariance[_UPPER].tolist())]
 
 
 def _spot_rows(run: StereoRun, record: StereoRecord) -> Iterator[list[object]]:

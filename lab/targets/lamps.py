@@ -1,0 +1,192 @@
+"""`beampose track lamps`: the pose of a target with lamps, from the pictures of one calibrated camera (Fu 2016)."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geometry.uncertainty.rig_uncertainty import RigCovariance
+from lab.errors import CalibrationError, InputError
+from lab.files.project.project import load_lens
+from lab.files.rig.camera_file import CameraFile
+from lab.files.text import columns
+from lab.findings.finding import Finding, Level, finding, level_above
+from lab.number_format import format_length, format_number
+from lab.pictures.source import open_inputs
+from lab.progress import Progress
+from lab.report.page import Section
+from lab.report.plot.series import Band, Line
+from lab.report.plot.svg import BLUE, SKY
+from lab.runs.processed import quantiles
+from lab.runs.tables import pose_numbers
+from lab.targets.page import TimeAxis
+from lab.targets.recording import DEFAULT_RATE_HZ
+from lab.targets.stereo.run import load_lamps
+from lab.targets.stereo.tables import attitude_row, covariance_rows
+from lab.targets.target import Codes, Target, Track, TrackOptions, header_rate, track_pictures
+from tracking.binocular.marker_model import MarkerImages, MatchParameters
+from tracking.detection.detect import find_spots
+from tracking.lamp_corners import harris_corners
+from tracking.lamp_tracker import LampFrame, LampTracker
+from tracking.noise import Picture
+
+LARGEST_NOISE_SCALE, GOOD_NOISE_SCALE = 5.0, 1.5  # residuals over their sigmas, as of a stereo run
+_MOST_LIGHTS = 60  # of a picture; the strongest
+_POSE = (("x", "m"), ("y", "m"), ("z", "m"), ("yaw", "deg"), ("pitch", "deg"), ("roll", "deg"))
+
+
+def spots(picture: Picture) -> MarkerImages:
+    """The spots of light of a picture, those of the highest peak first."""
+    found = find_spots(picture)
+    rows = np.argsort(-found.peak, kind="stable")[:_MOST_LIGHTS]
+    n = len(rows)
+    return MarkerImages(found.uv_px[rows], found.cov_px2[rows], np.full(n, np.nan), np.zeros(n, dtype=np.int64))
+
+
+# Name for --detector: what finds lights in a picture.
+DETECTORS: Mapping[str, Callable[[Picture], MarkerImages]] = {"spots": spots, "harris": harris_corners}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LampsOptions(TrackOptions):
+    """Which lamps to track, seen by which camera, and how."""
+
+    target: Path  # a file with `markers:`
+    camera: Path  # a camera.yaml, or a file of another program
+    camera_name: str | None = None  # where that file has several
+    detector: str = "spots"
+
+    def lens(self) -> CameraFile:
+        """The camera.
+
+        Raises:
+            InputError: the file cannot be used, or there is no such detector.
+            CalibrationError: its calibration failed, or is out of date.
+        """
+        if self.detector not in DETECTORS:
+            raise InputError(f"--detector: expected one of {', '.join(DETECTORS)}, got {self.detector!r}")
+        lens = load_lens(self.camera, self.camera_name)
+        state = lens.calibration
+        if state is not None and state.verdict == "FAIL":
+            raise CalibrationError(f"{self.camera}: calibration.verdict: FAIL: this calibration must not be used")
+        if state is not None and state.last_day is not None and state.last_day < datetime.date.today():
+            raise CalibrationError(
+                f"{self.camera}: calibration.valid_until: {state.valid_until} is past: calibrate the camera again"
+            )
+        return lens
+
+
+class LampsTarget(Target[LampFrame]):
+    """Lamps at known places of a body."""
+
+    schema, table, columns = "beampose/lamps/1", "attitude.csv", columns.ATTITUDE
+    subject, several = "target", "several poses that explain the lights"
+    codes = Codes(none="BP-J01", few="BP-J02", missing="BP-J03", ambiguous="BP-J04", far="")
+    options: LampsOptions
+
+    def __init__(self, options: LampsOptions) -> None:
+        self.options, self._lens, self._model = options, options.lens(), load_lamps(options.target)
+        of_lens = self._lens.covariance
+        self._covariance = (
+            None
+            if of_lens is None
+            else RigCovariance(tuple(f"cameras.{self._lens.name}.{p}" for p in of_lens.parameters), of_lens.matrix)
+        )
+
+    def read(self, path: Path, progress: Progress | None) -> Track[LampFrame]:
+        rate = self.options.rate_hz or header_rate(open_inputs([path])) or DEFAULT_RATE_HZ
+        find = DETECTORS[self.options.detector]
+        tracker = LampTracker(self._lens.camera(), self._model, find, 1 / rate, self._covariance)
+        track = track_pictures(path, tracker.step, self.options, progress)
+        if track.recording.size_px != self._lens.image_size_px:
+            expected, got = (
+                "{} x {} px".format(*(size or ())) for size in (self._lens.image_size_px, track.recording.size_px)
+            )
+            raise InputError(f"{path}: expected pictures of {expected}, as of {self.options.camera.name}, got {got}")
+        return track
+
+    def row(self, track: Track[LampFrame], k: int) -> list[object]:
+        number, rate_hz = int(track.recording.numbers[k]), track.recording.rate_hz
+        assert rate_hz is not None  # assumed where it is not stated
+        return attitude_row(number, number / rate_hz, track.frames[k].tracked)
+
+    def more_tables(self, track: Track[LampFrame]) -> Mapping[str, tuple[Sequence[str], Iterable[list[object]]]]:
+        numbered = zip(track.recording.numbers.tolist(), track.frames, strict=True)
+        rows = covariance_rows((number, 0.0, frame.tracked) for number, frame in numbered)
+        return {"covariance.csv": (columns.COVARIANCE, rows)}
+
+    def findings(self, track: Track[LampFrame]) -> list[Finding]:
+        """Residuals that contradict their sigmas, and a camera that states no covariance."""
+        out, scale = [], _noise_scale(track)
+        if np.isfinite(scale):
+            what = f"residuals are {format_number(scale)} times as large as the stated sigmas of the lamps"
+            out.append(finding("BP-J05", level_above(scale, GOOD_NOISE_SCALE, LARGEST_NOISE_SCALE), what))
+        if self._covariance is None:
+            what = f"{self.options.camera.name} states no covariance of the lens"
+            out.append(finding("BP-J06", Level.WARN, what))
+        return out
+
+    def figures(self, track: Track[LampFrame]) -> dict[str, Any]:
+        sigma = _sigmas(track)[track.measured]
+        block = {
+            "lamps": list(self._model.names),
+            "sigma_position_m": quantiles(np.linalg.norm(sigma[:, :3], axis=1)),
+            "sigma_rotation_deg": quantiles(np.linalg.norm(sigma[:, 3:], axis=1)),
+            "noise_scale": _noise_scale(track),
+        }
+        return {"target": block}
+
+    def parameters(self) -> dict[str, Any]:
+        options = {name: str(v) if isinstance(v, Path) else v for name, v in asdict(self.options).items()}
+        return {"options": options, "match": asdict(MatchParameters())}
+
+    def method(self) -> str:
+        return f"Fu et al. (2016): lights by {self.options.detector}, poses of three lamps tested against all lights"
+
+    def key_figures(self, track: Track[LampFrame]) -> list[tuple[str, str, str]]:
+        sigma = np.nanmedian(_sigmas(track)[track.measured], axis=0)
+        turn = f"± {format_number(float(np.linalg.norm(sigma[3:])), 2)} deg"
+        return [
+            ("Position", f"± {format_length(float(np.linalg.norm(sigma[:3])))}", "median sigma, all axes together"),
+            ("Attitude", turn, "median sigma, all angles together"),
+        ]
+
+    def sections(self, track: Track[LampFrame]) -> list[Section]:
+        axis, sigmas = TimeAxis.of(track), _sigmas(track)
+        values = np.full((len(track.frames), 6), np.nan)
+        for k, frame in enumerate(track.frames):
+            if frame.tracked.pose is not None:
+                values[k] = *frame.tracked.pose.translation, *np.rad2deg(frame.tracked.pose.ypr)
+        panels = [
+            axis.panel(
+                name, unit, Line(values[:, i], BLUE, name),
+                bands=(Band.about(values[:, i], sigmas[:, i], 3.0, SKY, "3 sigma", 0.5),), wide=False,
+            )
+            for i, (name, unit) in enumerate(_POSE)
+        ]  # fmt: skip
+        words = (
+            "Pose of the target in the camera's frame: x to the right, y down, z ahead. Yaw, pitch and roll turn about"
+            " z, y and x, in this order."
+        )
+        return [Section("Pose", words, panels)]
+
+
+def _sigmas(track: Track[LampFrame]) -> np.ndarray:
+    """(n, 6): sigmas of x, y, z (m), yaw, pitch, roll (deg); nan without a pose."""
+    out = np.full((len(track.frames), 6), np.nan)
+    for k, frame in enumerate(track.frames):
+        if frame.tracked.pose is not None and frame.tracked.covariance is not None:
+            out[k] = pose_numbers(frame.tracked.pose, frame.tracked.covariance)[10:]
+    return out
+
+
+def _noise_scale(track: Track[LampFrame]) -> float:
+    """Root of chi-square over degrees of freedom of the measured frames; nan without any."""
+    fits = [f.tracked.fit for f in track.frames if f.tracked.fit is not None and f.status.value == "measured"]
+    dof = sum(fit.dof for fit in fits)
+    return float(np.sqrt(sum(fit.chi2 for fit in fits) / dof)) if dof else float("nan")

@@ -1,0 +1,110 @@
+"""`beampose track lamps`, as typed: right poses of a renderer that shares no code with it, an honest no, bad input."""
+
+import csv
+import json
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+
+from bench.related_measurements.lamps import judged, write_recording
+from bench.related_measurements.second_renderer import background
+from cli import main
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("lamps") / "approach"
+    position, attitude = write_recording(folder, 102, 24)
+    statuses, errors = judged(folder, position, attitude, "spots")
+    return folder, statuses, errors
+
+
+def typed(folder, *options, pictures="frames", target="lamps.yaml", camera="camera.yaml"):
+    given = [folder / pictures, "--target", folder / target, "--camera", folder / camera, "--out", folder / "other"]
+    return CliRunner().invoke(main, ["track", "lamps", *map(str, given), *options])
+
+
+def test_the_poses_are_within_the_papers_ten_centimetres_and_one_degree(recording):
+    _, statuses, errors = recording
+    assert statuses.count("measured") >= 22
+    assert np.nanmax(errors[:, 0]) < 0.1
+    assert np.nanmax(errors[:, 1]) < 1.0
+    assert 0.3 < np.nanmean(errors[:, 2]) < 2
+
+
+def test_the_summary_and_the_page_state_pose_and_verdict(recording):
+    folder, _, _ = recording
+    summary = json.loads((folder / "out" / "summary.json").read_text("utf-8"))
+    assert summary["verdict"]["status"] == "pass"
+    assert summary["target"]["lamps"] == ["L1", "L2", "L3", "L4", "L5"]
+    assert "Yaw, pitch and roll" in (folder / "out" / "report.html").read_text("utf-8")
+
+
+def test_harris_corners_give_the_same_motion(recording):
+    folder, _, _ = recording
+    assert typed(folder, "--detector", "harris", "--limit", "6").exit_code == 0
+    rows = [list(csv.DictReader((folder / out / "attitude.csv").open())) for out in ("out", "other")]
+    for one, other in zip(*rows, strict=False):
+        assert abs(float(one["z_m"]) - float(other["z_m"])) < 0.05
+
+
+@pytest.mark.parametrize("kind", ["cloud", "ground", "water"])
+def test_pictures_without_the_target_have_no_pose(recording, kind):
+    folder, _, _ = recording
+    (folder / kind).mkdir()
+    rng = np.random.default_rng(3)
+    for k in range(2):
+        scene = background(kind, rng, (640, 480)) + 2 * rng.normal(size=(480, 640))
+        cv2.imwrite(str(folder / kind / f"{k}.png"), np.clip(scene, 0, 255).astype(np.uint8))
+    done = typed(folder, pictures=kind)
+    assert done.exit_code == 4
+    assert "no target was found in 2 frames" in done.output
+
+
+def test_a_lens_without_covariance_is_at_best_a_check(recording):
+    folder, _, _ = recording
+    content = yaml.safe_load((folder / "camera.yaml").read_text())
+    (folder / "bare.yaml").write_text(yaml.safe_dump({k: v for k, v in content.items() if k != "covariance"}))
+    done = typed(folder, "--limit", "4", camera="bare.yaml")
+    assert done.exit_code == 0
+    assert "CHECK" in done.output
+    assert "BP-J06" in (folder / "other" / "report.html").read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"markers": {n: {"position_m": [0, 0, 1]} for n in "ab"}}, "markers: expected four or more, got 2"),
+        (
+            {"markers": {str(k): {"position_m": [k, 0, 0]} for k in range(5)}},
+            "expected markers that are not on one line",
+        ),
+        ({"markers": {str(k): {"place": [k, 0, 0]} for k in range(5)}}, "position_m"),
+    ],
+)
+def test_a_wrong_target_is_one_plain_line(recording, change, words):
+    folder, _, _ = recording
+    (folder / "wrong.yaml").write_text(yaml.safe_dump(change))
+    done = typed(folder, target="wrong.yaml")
+    assert done.exit_code == 2
+    assert words in done.output
+    assert "Traceback" not in done.output
+
+
+def test_pictures_of_another_size_than_the_cameras_are_refused(recording):
+    folder, _, _ = recording
+    (folder / "small").mkdir()
+    cv2.imwrite(str(folder / "small" / "0.png"), np.zeros((240, 320), np.uint8))
+    done = typed(folder, pictures="small")
+    assert done.exit_code == 2
+    assert "expected pictures of 640 x 480 px, as of camera.yaml, got 320 x 240 px" in done.output
+
+
+def test_a_failed_calibration_is_not_used(recording):
+    folder, _, _ = recording
+    content = yaml.safe_load((folder / "camera.yaml").read_text())
+    (folder / "failed.yaml").write_text(yaml.safe_dump({**content, "calibration": {"verdict": "FAIL"}}))
+    assert typed(folder, camera="failed.yaml").exit_code == 3

@@ -1,0 +1,136 @@
+"""Lamps of a rendered tanker: lights at their places, right labels, poses with correct covariances, no wrong pose."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from geometry.pose import Pose
+from lab.targets.lamps import spots
+from studies.fu2016 import (
+    CLEAR,
+    DT_S,
+    GUST,
+    MARKERS,
+    Difficulty,
+    camera,
+    labelled_px,
+    lamp_model,
+    pose_of,
+    projected,
+    render,
+)
+from tracking.binocular.marker_model import MarkerImages
+from tracking.lamp_corners import harris_corners, harris_response
+from tracking.lamp_tracker import LampTracker
+from tracking.statuses import Cause, PoseStatus
+
+STATE = np.array([21.0, 6.0, 0.5, 0, 0, 0, 0.1, 0.05])
+PLACES = projected(MARKERS, pose_of(STATE))
+CLEAN = Difficulty(false_lights=0, p_hidden=0.0)
+BLACK = np.zeros((512, 640), np.uint8)
+
+
+def tracker_of(places, sigma_px=0.05):
+    """A tracker that is shown these lights, one set per picture."""
+    sets = iter(places)
+
+    def find(_):
+        at = next(sets)
+        n = len(at)
+        return MarkerImages(at, np.tile(sigma_px**2 * np.eye(2), (n, 1, 1)), np.full(n, np.nan), np.zeros(n, int))
+
+    return LampTracker(camera(), lamp_model(), find, DT_S)
+
+
+def test_a_corner_has_a_large_response_and_an_edge_has_not():
+    picture = np.full((60, 60), 50, np.uint8)
+    picture[20:40, 20:40] = 200
+    response = harris_response(picture)
+    assert response[20, 20] > 20 * response[20, 30]
+    assert response[30, 30] == 0
+
+
+@pytest.mark.parametrize("find", [harris_corners, spots])
+def test_each_lamp_is_found_at_its_place(find):
+    lights = find(render(STATE, CLEAN, np.random.default_rng(1)))
+    distance = np.linalg.norm(lights.uv_px[None] - PLACES[:, None], axis=-1).min(axis=1)
+    assert distance.max() < 0.5  # the wing tips: half of the background is darker
+
+
+def test_an_even_picture_has_no_corner():
+    assert len(harris_corners(np.full((80, 90), 7, np.uint8))) == 0
+
+
+def test_exact_lights_give_the_exact_pose_whatever_their_order():
+    order = np.random.default_rng(2).permutation(len(MARKERS))
+    frame = tracker_of([PLACES[order]]).step(BLACK)
+    assert frame.event == "acquired"
+    np.testing.assert_array_equal(order[frame.tracked.index[0]], np.arange(len(MARKERS)))
+    np.testing.assert_allclose(frame.tracked.pose.minus(pose_of(STATE)), 0, atol=1e-5)
+
+
+def test_poses_agree_with_their_covariances_and_labels_are_right():
+    rng, nees, tracker = np.random.default_rng(3), [], LampTracker(camera(), lamp_model(), spots, DT_S)
+    for _ in range(25):
+        frame = tracker.step(render(STATE, CLEAR, rng))
+        if frame.status is PoseStatus.MEASURED:
+            assert np.nanmax(np.linalg.norm(labelled_px(frame) - PLACES, axis=1)) < 2
+            error = pose_of(STATE).minus(frame.tracked.pose)
+            nees.append(error @ np.linalg.solve(frame.tracked.covariance, error) / 6)
+    assert len(nees) >= 20
+    assert 0.2 < np.median(nees) < 2  # lamps in front of the edges of the wing
+
+
+def test_four_lamps_are_enough_after_the_start_and_three_are_not():
+    tracker = tracker_of([PLACES, PLACES[1:], PLACES[2:]])
+    frames = [tracker.step(BLACK) for _ in range(3)]
+    np.testing.assert_array_equal(frames[1].tracked.index[0], [-1, 0, 1, 2, 3])
+    assert [f.status for f in frames] == [PoseStatus.MEASURED, PoseStatus.MEASURED, PoseStatus.PREDICTED]
+    assert frames[2].cause is Cause.UNCERTAIN
+
+
+def test_false_lights_alone_give_no_pose():
+    rng = np.random.default_rng(5)
+    crowds = [PLACES.mean(axis=0) + rng.normal(0, 40, (15, 2)) for _ in range(10)]
+    tracker = tracker_of([*crowds, np.zeros((0, 2))])
+    assert {tracker.step(BLACK).status for _ in range(11)} == {PoseStatus.LOST}
+
+
+def test_at_the_start_four_lamps_among_many_lights_are_not_enough():
+    crowd = PLACES.mean(axis=0) + np.random.default_rng(7).uniform(-60, 60, (12, 2))
+    assert tracker_of([np.concatenate([PLACES[1:], crowd])]).step(BLACK).status is PoseStatus.LOST
+
+
+def test_a_missing_picture_is_predicted_and_after_many_the_target_is_lost():
+    tracker = tracker_of([PLACES])
+    frames = [tracker.step(BLACK), *(tracker.step(None) for _ in range(40))]
+    assert frames[1].status is PoseStatus.PREDICTED
+    assert frames[1].cause is Cause.NO_IMAGE
+    assert frames[-1].status is PoseStatus.LOST
+    assert [f.event for f in frames if f.event] == ["acquired", "lost"]
+
+
+def test_the_pose_does_not_depend_on_where_the_camera_is_in_the_world():
+    moved = Pose.from_ypr(np.array([0.3, -0.2, 0.1]), np.array([1.0, 2.0, 3.0]))
+    seen = camera()
+    other = type(seen)(
+        seen.name, seen.screen, seen.image_size_px, seen.matrix, (), seen.camera_from_world @ moved.inverse()
+    )
+    here = tracker_of([PLACES]).step(BLACK).tracked.pose
+    find = tracker_of([PLACES])._find
+    there = LampTracker(other, lamp_model(), find, DT_S).step(BLACK).tracked.pose
+    np.testing.assert_allclose(there.minus(moved @ here), 0, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_disturbed_pictures_give_no_wrong_labels():
+    rng, wrong, found = np.random.default_rng(8), 0, 0
+    tracker = LampTracker(camera(), lamp_model(), spots, DT_S)
+    for k in range(150):
+        frame = tracker.step(render(STATE, GUST if k else CLEAN, rng))
+        if frame.status is PoseStatus.MEASURED:
+            found += 1
+            wrong += np.nanmax(np.linalg.norm(labelled_px(frame) - PLACES, axis=1)) > 3
+    assert found > 40
+    assert wrong <= 2
