@@ -17,11 +17,11 @@ from geometry.rotations import ypr_jacobian
 from lab.number_format import format_number
 from lab.report.plot.series import Line, Shade, time_panel
 from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION, picture_uri, robust_range
-from lab.targets.lamps import spots
+from lab.targets.stereo.lamps import spots
 from studies.comparison import Comparison, ComparisonRow, Figure
+from tracking.binocular.lamp_corners import harris_corners
+from tracking.binocular.lamp_tracker import LampFrame, LampTracker
 from tracking.binocular.marker_model import MarkerModel
-from tracking.lamp_corners import harris_corners
-from tracking.lamp_tracker import LampFrame, LampTracker
 from tracking.statuses import PoseStatus
 from tracking.unscented import (
     P0,
@@ -249,8 +249,8 @@ def _line(length_px: float, angle: float) -> NDArray[np.float32]:
 
 # The experiment of Fu (2016) with pictures: Harris corners, RANSAC, the pose of five lamps, and the filter on it.
 #
-# From 6 to 8 s the pictures are blurred, with more false lights and more hidden lamps. The last measured pose tells
-# where the lamps are searched, so a wrong pose would also spoil the next search.
+# From 6 to 8 s the pictures are blurred, with more false lights and more hidden lamps. Lamps are searched where the
+# measured poses predict them, so a wrong pose would also spoil the next search.
 
 
 START_SIGMA = np.array([0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.1, 0.1])  # of X0, from GPS and INS: m, m/s, rad

@@ -3,7 +3,7 @@
     python -m bench.related_measurements.lamps --seeds 1:6 --frames 100
 
 Written from the question alone, without the code of studies/: lamps are discs of light that the lens blurs, with a
-size and a brightness of their own, on a dark body before clouds or ground; the camera has a lens with distortion, the
+size and a brightness of their own, on a black body before clouds or ground; the camera has a lens with distortion, the
 body six degrees of freedom. Each recording is a folder of pictures, a camera.yaml and a lamps.yaml, given to the
 command. Lamps are hidden one at a time, for 3 to 19 frames, and
 other lights shine.

@@ -269,7 +269,7 @@ def lamps(ctx: click.Context, /, pictures: Path, out: Path, **options: Any) -> N
     Example:
         beampose track lamps tanker.avi --target lamps.yaml --camera camera.yaml --out results/tanker
     """
-    from lab.targets.lamps import LampsOptions, LampsTarget
+    from lab.targets.stereo.lamps import LampsOptions, LampsTarget
 
     _track(ctx, LampsTarget(LampsOptions(**options)), pictures, out)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geometry.pose import Pose
-from lab.targets.lamps import spots
+from lab.targets.stereo.lamps import spots
 from studies.fu2016 import (
     CLEAR,
     DT_S,
@@ -20,9 +20,9 @@ from studies.fu2016 import (
     projected,
     render,
 )
+from tracking.binocular.lamp_corners import harris_corners, harris_response
+from tracking.binocular.lamp_tracker import LampTracker
 from tracking.binocular.marker_model import MarkerImages
-from tracking.lamp_corners import harris_corners, harris_response
-from tracking.lamp_tracker import LampTracker
 from tracking.statuses import Cause, PoseStatus
 
 STATE = np.array([21.0, 6.0, 0.5, 0, 0, 0, 0.1, 0.05])

@@ -29,10 +29,10 @@ from lab.targets.recording import DEFAULT_RATE_HZ
 from lab.targets.stereo.run import load_lamps
 from lab.targets.stereo.tables import attitude_row, covariance_rows
 from lab.targets.target import Codes, Target, Track, TrackOptions, header_rate, track_pictures
+from tracking.binocular.lamp_corners import harris_corners
+from tracking.binocular.lamp_tracker import LampFrame, LampTracker
 from tracking.binocular.marker_model import MarkerImages, MatchParameters
 from tracking.detection.detect import find_spots
-from tracking.lamp_corners import harris_corners
-from tracking.lamp_tracker import LampFrame, LampTracker
 from tracking.noise import Picture
 
 LARGEST_NOISE_SCALE, GOOD_NOISE_SCALE = 5.0, 1.5  # residuals over their sigmas, as of a stereo run
