@@ -46,7 +46,7 @@ def read_picture(path: Path, size_px: tuple[int, int] | None, colour: bool = Fal
         data = _content(path)
     except OSError as error:
         return MissingPicture(f"{UNREADABLE}: {error.strerror}")
-    found = _decoded(data, size_px, colour)  # its checks find damage that OpenCV passes over
+    found = decode(data, size_px, colour)  # its checks find damage that OpenCV passes over
     if not colour or isinstance(found, MissingPicture) or found.ndim == 3:
         return found
     cv2 = load_cv2()
@@ -62,11 +62,6 @@ def as_colour(picture: NDArray[Any]) -> ColourPicture:
     if picture.ndim == 2 or picture.shape[2] == 1:
         return cast(ColourPicture, cv2.cvtColor(picture.reshape(picture.shape[:2]), cv2.COLOR_GRAY2BGR))
     return cast(ColourPicture, picture[..., :3])
-
-
-def decode(data: bytes, size_px: tuple[int, int] | None) -> GreyPicture | MissingPicture:
-    """As `read_picture`, from the content of a file."""
-    return _decoded(np.frombuffer(bytearray(data), np.uint8), size_px)
 
 
 def require_format(picture: NDArray[np.generic], size_px: tuple[int, int] | None) -> GreyPicture | MissingPicture:
@@ -102,10 +97,10 @@ def _wrong_size(width: int, height: int, size_px: tuple[int, int]) -> str:
     return f"wrong size {width}x{height}, the rig says {size_px[0]}x{size_px[1]}"
 
 
-def _decoded(
+def decode(
     data: NDArray[np.uint8], size_px: tuple[int, int] | None, colour: bool = False
 ) -> GreyPicture | MissingPicture:
-    """Grey; with `colour`, those that are decoded here in one step are (h, w, 3), BGR."""
+    """As `read_picture`, from the bytes (n,) of a file; with `colour`, those decoded in one step are (h, w, 3), BGR."""
     if not data.size:
         return MissingPicture(f"{UNREADABLE}: the file is empty")
     try:

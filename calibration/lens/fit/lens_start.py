@@ -45,7 +45,7 @@ def start(table: CornerTable, fisheye: bool) -> tuple[LensModel, Values]:
     guesses = _guesses(trial, fisheye)
     for focal in guesses:
         lens = _first_lens(focal, table.image_size_px)
-        poses, back_to_front = _poses(trial, lens, fisheye)
+        poses, back_to_front = board_poses(trial, lens, fisheye)
         mirrored += back_to_front
         found = np.asarray(np.isfinite(poses.translation).all(axis=1))
         trusted = found[trial.view]
@@ -67,13 +67,8 @@ def start(table: CornerTable, fisheye: bool) -> tuple[LensModel, Values]:
         raise StartError("the picture of the board is mirrored: its points are in the opposite sense of rotation")
     if best is None:
         raise StartError("no focal length and no pose of the board explain the corners")
-    poses, _ = _poses(table, best[1], fisheye)
+    poses, _ = board_poses(table, best[1], fisheye)
     return model, values_of(best[1], poses, len(table.board_points))
-
-
-def board_poses(table: CornerTable, lens: Array, fisheye: bool) -> Pose:
-    """camera_from_board of every view (V) through a lens (18,); nan where none explains its corners."""
-    return _poses(table, lens, fisheye)[0]
 
 
 def _spread_out(table: CornerTable) -> Ints:
@@ -117,7 +112,7 @@ def _short_solve(table: CornerTable, used: Bools, model: LensModel, values: Valu
     return values
 
 
-def _poses(table: CornerTable, lens: Array, fisheye: bool) -> tuple[Pose, int]:
+def board_poses(table: CornerTable, lens: Array, fisheye: bool) -> tuple[Pose, int]:
     """camera_from_board of every view (V), nan where there is none; and the number of boards seen from behind."""
     rotation, translation = np.full((table.views, 3, 3), np.nan), np.full((table.views, 3), np.nan)
     flat, in_reach = _flattened(table, lens, fisheye)

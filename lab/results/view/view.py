@@ -23,10 +23,6 @@ from lab.results.view.page import write_page
 from lab.results.view.scene import Mesh, View, mesh_of, read_content, view_of, write_glb
 from lab.results.view.slider_window import Player, as_open3d, look_along, open_slider_window, render
 
-KEYS = (
-    "space: play or pause; right, left: next, previous frame; up, down: a twentieth of the run; home, end: first,"
-    " last; drag: turn; wheel: zoom; Q: close"
-)
 _SPACE, _LEFT, _RIGHT, _DOWN, _UP, _HOME, _END = 32, 263, 262, 264, 265, 268, 269  # GLFW's numbers
 
 

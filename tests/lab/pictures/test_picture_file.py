@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 import pytest
 
+from lab.pictures import picture_file
 from lab.pictures.inflate import decompress
-from lab.pictures.picture_file import MissingPicture, decode, read_picture
+from lab.pictures.picture_file import MissingPicture, read_picture
 from tests.lab.pictures.picture_files import chunk, png, tiff
 
 SIZE = (37, 29)
@@ -26,6 +27,10 @@ def noise(dtype: type = np.uint8, channels: int = 1, largest: int | None = None)
     shape = (29, 37) if channels == 1 else (29, 37, channels)
     top = np.iinfo(dtype).max if largest is None else largest
     return np.random.default_rng(5).integers(0, top, shape, endpoint=True).astype(dtype)
+
+
+def decode(data: bytes, size_px: tuple[int, int]) -> np.ndarray | MissingPicture:
+    return picture_file.decode(np.frombuffer(bytearray(data), np.uint8), size_px)
 
 
 def assert_same(data: bytes, picture: np.ndarray) -> None:
@@ -374,9 +379,10 @@ def test_other_threads_run_while_a_png_is_decoded():
 
 CHATTER = """
 import sys
+import numpy as np
 from lab.pictures.picture_file import decode
 for line in sys.stdin.buffer.read().split(b"=====")[:-1]:
-    print(type(decode(line, None)).__name__)
+    print(type(decode(np.frombuffer(line, np.uint8), None)).__name__)
 """
 
 
