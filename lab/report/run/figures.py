@@ -7,6 +7,7 @@ Figures of the spots: tracks over the picture (Huo 2015, Fig. 8), statuses over 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
@@ -182,21 +183,8 @@ def pose_figure(m: ReportData, zoom: ZoomData | None = None) -> str:
     angles = np.degrees(np.unwrap(np.radians(p.yaw_pitch_roll_deg), axis=0)) if p.known.all() else p.yaw_pitch_roll_deg
     values = np.concatenate([angles, p.world_from_body.translation], axis=1)
     sigmas = np.concatenate([p.sigma_ypr_deg, p.sigma_position_m], axis=1)
-    return _rows(
-        m,
-        zoom,
-        [
-            _Curve(
-                name,
-                *(("deg", "mdeg", 1.0) if i < 3 else ("m", "mm", 0.1)),
-                values[:, i],
-                sigmas[:, i],
-                None if errors is None else errors[:, i],
-                None if causal is None else causal[:, i],
-            )
-            for i, name in enumerate(("yaw", "pitch", "roll", "x", "y", "z"))
-        ],
-    )
+    names, units = ("yaw", "pitch", "roll", "x", "y", "z"), (("deg", "mdeg", 1.0), ("m", "mm", 0.1))
+    return _rows(m, zoom, names, units, values, sigmas, errors, causal)
 
 
 def motion_figure(m: ReportData, zoom: ZoomData | None = None) -> str:
@@ -211,21 +199,8 @@ def motion_figure(m: ReportData, zoom: ZoomData | None = None) -> str:
     if m.truth is not None and m.truth.world_from_body is not None:
         errors = values - differenced(m.truth.world_from_body, m.poses.t_s)[0]
     names = [f"{what} {axis}" for what in ("velocity", "rate") for axis in "xyz"]
-    return _rows(
-        m,
-        zoom,
-        [
-            _Curve(
-                name,
-                *(("m/s", "mm/s", 1.0) if i < 3 else ("rad/s", "mrad/s", 1.0)),
-                values[:, i],
-                sigmas[:, i],
-                None if errors is None else errors[:, i],
-                None,  # ten times as uncertain: it would cover the other curves
-            )
-            for i, name in enumerate(names)
-        ],
-    )
+    causal = None  # ten times as uncertain: it would cover the other curves
+    return _rows(m, zoom, names, (("m/s", "mm/s", 1.0), ("rad/s", "mrad/s", 1.0)), values, sigmas, errors, causal)
 
 
 def _motion(p: PoseTrack) -> tuple[Array, Array]:
@@ -249,9 +224,23 @@ def _minus(poses: PoseTrack, true: Pose | None) -> Array | None:
     return np.concatenate([np.where(np.isfinite(shift[:, :1]), ypr, np.nan), shift], axis=1)
 
 
-def _rows(m: ReportData, zoom: ZoomData | None, curves: list[_Curve]) -> str:
-    measured = m.poses.has(PoseStatus.MEASURED)
-    return "".join(_row(m, zoom, curve, measured, curve is curves[-1]) for curve in curves)
+def _rows(
+    m: ReportData,
+    zoom: ZoomData | None,
+    names: Sequence[str],
+    units: tuple[tuple[str, str, float], tuple[str, str, float]],
+    values: Array,
+    sigmas: Array,
+    errors: Array | None,
+    causal: Array | None,
+) -> str:
+    """A row of two panels for each of six components (F, 6); units: `_Curve`'s, of the first and the last three."""
+    measured, rows = m.poses.has(PoseStatus.MEASURED), []
+    for i, name in enumerate(names):
+        known = (None if found is None else found[:, i] for found in (errors, causal))
+        curve = _Curve(name, *units[i // 3], values[:, i], sigmas[:, i], *known)
+        rows.append(_row(m, zoom, curve, measured, i == len(names) - 1))
+    return "".join(rows)
 
 
 def _row(m: ReportData, zoom: ZoomData | None, c: _Curve, measured: Bools, last: bool) -> str:
