@@ -59,6 +59,13 @@ def light(spot: Spot, size: tuple[int, int]) -> tuple[NDArray, tuple[slice, slic
     v0, v1 = max(int(spot.v) - reach, 0), min(int(spot.v) + reach + 1, height)
     if u0 >= u1 or v0 >= v1:
         return np.zeros((0, 0)), (slice(0, 0), slice(0, 0))
+    w = _WEIGHTS / 2
+    if not spot.streak and (spot.major == spot.minor or spot.angle == 0.0):
+        along, across = (
+            np.exp(-0.5 * ((np.arange(first, last)[:, None] + _NODES / 2 - centre) / sigma) ** 2) @ w
+            for first, last, centre, sigma in ((u0, u1, spot.u, spot.major), (v0, v1, spot.v, spot.minor))
+        )
+        return spot.peak * np.outer(across, along), (slice(v0, v1), slice(u0, u1))
     a = np.radians(spot.angle)
     steps = [0.0] if not spot.streak else list((np.arange(40) + 0.5) / 40 * spot.streak - spot.streak / 2)
     uu = (np.arange(u0, u1)[:, None] + _NODES / 2).reshape(-1)
@@ -68,7 +75,6 @@ def light(spot: Spot, size: tuple[int, int]) -> tuple[NDArray, tuple[slice, slic
         du, dv = np.meshgrid(uu - spot.u - s * np.cos(a), vv - spot.v - s * np.sin(a))
         p, q = du * np.cos(a) + dv * np.sin(a), -du * np.sin(a) + dv * np.cos(a)
         total += np.exp(-0.5 * ((p / spot.major) ** 2 + (q / spot.minor) ** 2)) / len(steps)
-    w = _WEIGHTS / 2
     cells = total.reshape(v1 - v0, 4, u1 - u0, 4)
     return spot.peak * np.einsum("aibj,i,j->ab", cells, w, w), (slice(v0, v1), slice(u0, u1))
 

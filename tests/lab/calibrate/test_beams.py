@@ -352,7 +352,7 @@ def test_an_unlabelled_run_is_labelled_by_the_nominal_beams_and_its_frames_at_re
 def test_a_run_without_known_poses_is_labelled_by_the_tracker_and_gives_the_angles(tmp_path):
     rng = np.random.default_rng(8)
     rig = RIGS["unequal-fan"]()
-    t = np.arange(60) / 50.0
+    t = np.arange(30) / 50.0
     turns = np.deg2rad(np.stack([15 * np.sin(5 * t), 9 * np.sin(7 * t), 12 * np.sin(3 * t)], axis=1))
     shifts = 0.1 * np.stack([np.sin(4 * t), np.sin(2 * t), np.cos(5 * t)], axis=1)
     nominal = drawn(rig, rng, 2e-4, 2e-4)  # the tracker needs nominal beams that fit the spots
@@ -363,7 +363,7 @@ def test_a_run_without_known_poses_is_labelled_by_the_tracker_and_gives_the_angl
     project = write_project(tmp_path, rig, nominal, None, [{"run": "recorded"}])
     outcome = calibrate_beams(project, tmp_path / "out")
     c = outcome.result
-    assert len(c.world_from_body.translation) >= 59  # the tracker may be uncertain in one of its first frames
+    assert len(c.world_from_body.translation) >= 29  # the tracker may be uncertain in one of its first frames
     off = np.array([a.angle for a in c.angles]) - np.deg2rad([18.0, 41.0, 23.0])
     assert np.all(np.abs(off) < 5 * np.array([a.sigma for a in c.angles]))
 

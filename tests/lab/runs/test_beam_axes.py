@@ -22,20 +22,32 @@ SCREEN = Screen("s", Pose(cv2.Rodrigues(np.radians([12.0, 48.0, 0.0]))[0], np.ar
 NOISE = NoiseModel(1.0, 0.02, 10.0)
 
 
-@pytest.mark.parametrize("exposure", [0.6, 1.5, 5.0])
-@pytest.mark.parametrize("top", [255.0, 4095.0])
-def test_a_wide_oblique_spot_is_where_its_axis_meets_the_screen(exposure, top):
-    """exposure: height of the light over the range of the sensor. The centre of the light is 0.05 px away and more."""
-    place, spread_m = np.array([0.15, -0.1]), 0.03
-    axis = CAMERA.project(SCREEN.world_from_screen.apply(np.array([*place, 0.0])))
+PLACE, SPREAD_M = np.array([0.15, -0.1]), 0.03  # of the beam on its screen, m
+
+
+@pytest.fixture(scope="module")
+def light() -> np.ndarray:
+    """The mean light of the beam in each pixel, 1 at its axis, from sixteen rays per pixel."""
     fine = (np.arange(4 * SIZE[0]) - 1.5) / 4, (np.arange(4 * SIZE[1]) - 1.5) / 4
     origin, direction = CAMERA.rays(np.stack(np.meshgrid(*fine), axis=-1))
-    away2 = np.sum((intersect_plane(origin, direction, SCREEN.world_from_screen) - place) ** 2, axis=-1)
-    light = np.exp(-0.5 * away2 / spread_m**2).reshape(SIZE[1], 4, SIZE[0], 4).mean(axis=(1, 3))
+    away2 = np.sum((intersect_plane(origin, direction, SCREEN.world_from_screen) - PLACE) ** 2, axis=-1)
+    return np.exp(-0.5 * away2 / SPREAD_M**2).reshape(SIZE[1], 4, SIZE[0], 4).mean(axis=(1, 3))
+
+
+@pytest.fixture(scope="module")
+def offsets() -> CentroidOffsets:
+    return CentroidOffsets(CAMERA, SCREEN)
+
+
+@pytest.mark.parametrize("exposure", [0.6, 1.5, 5.0])
+@pytest.mark.parametrize("top", [255.0, 4095.0])
+def test_a_wide_oblique_spot_is_where_its_axis_meets_the_screen(light, offsets, exposure, top):
+    """exposure: height of the light over the range of the sensor. The centre of the light is 0.05 px away and more."""
+    axis = CAMERA.project(SCREEN.world_from_screen.apply(np.array([*PLACE, 0.0])))
     expected = 10.0 + exposure * (top - 10.0) * light
     dtype = np.uint8 if top == 255 else np.uint16
     rng = np.random.default_rng(2)
-    errors, offsets = [], CentroidOffsets(CAMERA, SCREEN)
+    errors = []
     for _ in range(6):
         noisy = expected + rng.standard_normal(expected.shape)
         found = find_spots(np.clip(np.rint(noisy), 0, top).astype(dtype), DetectParameters(saturation_dn=top), NOISE)

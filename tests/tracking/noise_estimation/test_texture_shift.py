@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from geometry.arrays import Array
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
-from tracking.noise_estimation.photon_transfer import estimate_noise
+from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
 from tracking.noise_estimation.texture_shift import LARGEST_SHARE, TextureShift
 
 SIZE = (400, 500)
@@ -31,14 +32,19 @@ def pictures(reflectance: Array, light: Array | float, count: int) -> list[Pictu
     return [np.rint(expected + NOISE * rng.standard_normal(SIZE)).astype(np.uint16) for _ in range(count)]
 
 
+@cache
+def estimated(contrast: float, grain_px: float, seed: int) -> NoiseEstimate:
+    """From four pictures of a screen without spots."""
+    return estimate_noise(pictures(screen(contrast, grain_px, seed), 0.0, 4))
+
+
 def spots(sigma_px: float, peak: float, seed: int) -> tuple[Array, Array]:
     """Centres (n, 2) of Gaussian spots far apart, and their light (h, w)."""
     rng = np.random.default_rng(seed)
     u, v = np.meshgrid(np.arange(50.0, 460, 80), np.arange(50.0, 360, 80))
     centres = np.stack([u.ravel(), v.ravel()], axis=-1) + rng.uniform(-0.5, 0.5, (u.size, 2))
-    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
-    light = sum(np.exp(-0.5 * ((x - a) ** 2 + (y - b) ** 2) / sigma_px**2) for a, b in centres)
-    return centres, peak * np.asarray(light)
+    across, along = (np.exp(-0.5 * (np.arange(SIZE[i]) - centres[:, [1 - i]]) ** 2 / sigma_px**2) for i in (0, 1))
+    return centres, peak * across.T @ along
 
 
 @pytest.mark.parametrize(("sigma_px", "grain_px"), [(1.5, 1.0), (3.0, 1.5), (6.0, 1.0), (9.0, 1.0)])
@@ -47,7 +53,7 @@ def test_the_background_predicts_the_errors_of_bright_and_of_faint_spots(sigma_p
     errors, expected = [], []
     for seed in range(4):
         reflectance = screen(0.04, grain_px, seed)
-        estimate = estimate_noise(pictures(reflectance, 0.0, 4))
+        estimate = estimated(0.04, grain_px, seed)
         centres, light = spots(sigma_px, peak, seed)
         found = find_spots(pictures(reflectance, light, 1)[0], noise=NoiseModel(NOISE**2, 0.0, BACKGROUND))
         for centre in centres:
@@ -66,7 +72,7 @@ def test_fits_that_give_bright_pixels_less_weight_have_smaller_errors_on_fine_te
     errors, expected, peak = np.zeros((2, 0)), [], 6000.0
     for seed in range(4):
         reflectance = screen(0.04, grain_px, seed)
-        shift = estimate_noise(pictures(reflectance, 0.0, 4)).texture_shift
+        shift = estimated(0.04, grain_px, seed).texture_shift
         centres, light = spots(sigma_px, peak, seed)
         picture = pictures(reflectance, light, 1)[0]
         of_both = []
@@ -91,7 +97,7 @@ def test_elongated_spots_have_larger_errors_along_their_major_axis(angle_deg):
     errors, claimed = [], []
     for seed in range(4):
         reflectance = screen(0.05, 1.0, seed)
-        estimate = estimate_noise(pictures(reflectance, 0.0, 4))
+        estimate = estimated(0.05, 1.0, seed)
         centres, _ = spots(1.0, 1.0, seed)
         light = sum(
             np.exp(
@@ -141,7 +147,7 @@ def test_seams_and_the_edge_of_a_screen_are_not_texture(contrast):
 
 def test_texture_beside_seams_counts_as_without_them():
     at = np.array([1.5, 3.0, 5.0]), np.full(3, 10.0)
-    alone = estimate_noise(pictures(screen(0.05, 1.0, 3), 0.0, 4)).texture_shift.sigma_px(*at)
+    alone = estimated(0.05, 1.0, 3).texture_shift.sigma_px(*at)
     both = estimate_noise(pictures(screen(0.05, 1.0, 3) * seams(0.3), 0.0, 4)).texture_shift.sigma_px(*at)
     np.testing.assert_allclose(both, alone, rtol=0.2)
 

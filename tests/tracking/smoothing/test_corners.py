@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from geometry.arrays import Array, Bools
 from geometry.pose import Pose
 from lab.simulate.points import PointRun
 from lab.simulate.rigs import RIGS
@@ -63,6 +64,11 @@ def test_covariances_near_corners_between_frames_are_right(rate):
     assert np.max(nees) < 60
 
 
+@cache
+def cached_zig_zag(seed: int, frames: int, rate_hz: float, every: int) -> tuple[Pose, Array, Bools]:
+    return zig_zag(seed, frames, rate_hz, every, HARD, START)
+
+
 @pytest.mark.parametrize("share", [0.05, 0.2, 0.5])
 def test_a_corner_within_an_exposure_does_not_shift_the_pose_beyond_its_sigma(share):
     """A spot's mean over the exposure lies beside the corner, by up to an eighth of the exposure times the jump."""
@@ -71,7 +77,7 @@ def test_a_corner_within_an_exposure_does_not_shift_the_pose_beyond_its_sigma(sh
     for seed in (1, 2, 3):
         # The corners are from 3 % of a frame before the middle of an exposure to 6 % after it.
         every = 11 * parts + 1
-        fine, fine_t, turned = zig_zag(seed, frames * parts, rate_hz * parts, every, HARD, START)
+        fine, fine_t, turned = cached_zig_zag(seed, frames * parts, rate_hz * parts, every)
         middle, half = np.arange(parts + 4, (frames - 2) * parts, parts), round(share * parts / 2)
         during = [fine[middle + i].minus(fine[middle]) for i in range(-half, half + 1)]
         mean = fine[middle].plus(np.mean(during, axis=0))

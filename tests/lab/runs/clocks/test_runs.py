@@ -14,7 +14,7 @@ from lab.files.run.results import read_poses
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
 
-FRAMES, SEED = 80, 3
+FRAMES, SEED = 40, 3
 
 
 @pytest.fixture(scope="module")

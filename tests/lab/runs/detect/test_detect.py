@@ -51,8 +51,8 @@ def summary(out: Path) -> dict:
 @pytest.mark.parametrize("sigma", [45.0, 90.0])
 def test_a_beam_wider_than_the_limit_is_named_with_the_value_that_reports_it(tmp_path, sigma):
     """A user who sees the beam and an empty table learns the reason, and the value in the note works."""
-    v, u = np.mgrid[:720, :960]
-    light = 150.0 * np.exp(-0.5 * ((u - 500.3) ** 2 + (v - 350.8) ** 2) / sigma**2)
+    v, u = np.mgrid[:600, :720]
+    light = 150.0 * np.exp(-0.5 * ((u - 350.3) ** 2 + (v - 300.8) ** 2) / sigma**2)
     noisy = light + 10.0 + np.random.default_rng(3).normal(0, 1.5, light.shape)
     cv2.imwrite(str(tmp_path / "beam_1.png"), np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
     detect_pictures([tmp_path / "beam_1.png"], tmp_path / "plain")
@@ -61,7 +61,7 @@ def test_a_beam_wider_than_the_limit_is_named_with_the_value_that_reports_it(tmp
     options = DetectOptions(overrides={"detect.max_sigma_px": float(named[1])})
     detect_pictures([tmp_path / "beam_1.png"], tmp_path / "wide", options)
     (beam,) = rows(tmp_path / "wide")
-    assert np.hypot(float(beam["u_px"]) - 500.3, float(beam["v_px"]) - 350.8) < 0.2
+    assert np.hypot(float(beam["u_px"]) - 350.3, float(beam["v_px"]) - 300.8) < 0.2
     assert 0.95 * sigma < float(beam["major_px"]) < 1.05 * sigma
     assert "max_sigma_px=" not in (tmp_path / "wide" / "report.html").read_text("utf-8")
 

@@ -16,6 +16,8 @@ from lab.files.text import columns
 from lab.targets.stereo.process import process_stereo_run
 from lab.targets.stereo.simulated_recording import write_stereo_recording
 
+FRAMES = 12  # of the recording of points
+
 
 def typed(*arguments):
     return CliRunner().invoke(main, [str(a) for a in arguments], prog_name="beampose")
@@ -24,7 +26,7 @@ def typed(*arguments):
 @pytest.fixture(scope="module")
 def drogue(tmp_path_factory):
     """A recording of points."""
-    return write_stereo_recording(tmp_path_factory.mktemp("points") / "run", seed=5, frames=24, points=True)
+    return write_stereo_recording(tmp_path_factory.mktemp("points") / "run", seed=5, frames=FRAMES, points=True)
 
 
 @pytest.fixture(scope="module")
@@ -53,15 +55,15 @@ def test_the_tables_have_the_columns_of_the_contract_and_a_row_per_frame(result)
     ):  # fmt: skip
         assert tuple(rows(result.out, name)[0]) == header
     attitude = rows(result.out, "attitude.csv")
-    assert [int(r["frame"]) for r in attitude] == list(range(24))
+    assert [int(r["frame"]) for r in attitude] == list(range(FRAMES))
     assert {r["status"] for r in attitude} == {"measured"}
-    assert len(rows(result.out, "spots.csv")) == 24 * 2 * 7
+    assert len(rows(result.out, "spots.csv")) == FRAMES * 2 * 7
 
 
 def test_the_pose_errors_agree_with_the_stated_covariance(result):
     assert result.exit_status == 0
     nees = result.result.errors.nees
-    assert 3.5 < nees.mean() < 9.5  # 6 expected; sigma of the mean: 0.7
+    assert 3.5 < nees.mean() < 9.5  # 6 expected; sigma of the mean: 1.0
     assert np.abs(result.result.errors.range_m).max() < 0.05
 
 
@@ -109,12 +111,12 @@ def test_unsynchronised_pictures_fail_the_run_and_say_by_how_much(tmp_path):
     assert any(f.code == "BP-W05" for f in outcome.findings)
 
 
-@pytest.mark.parametrize(("shift", "words"), [(4, "frames with markers in both pictures"), (200, "right: 200 to 223")])
+@pytest.mark.parametrize(("shift", "words"), [(4, "frames with markers in both pictures"), (200, "right: 200 to 206")])
 def test_frame_numbers_of_one_camera_that_are_shifted_fail_the_run(drogue, tmp_path, shift, words):
     """Frames that only one camera has are measured by it alone: without the others they would seem right."""
     run = changed(drogue, tmp_path / "run")
     shutil.rmtree(run / "truth")
-    table = rows(run, "detections.csv")
+    table = [r for r in rows(run, "detections.csv") if int(r["frame"]) < 7]
     with (run / "detections.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, table[0])
         writer.writeheader()
@@ -131,7 +133,7 @@ def test_markers_that_are_not_where_run_yaml_says_are_reported(drogue, tmp_path)
     assert [r for r in outcome.result.records if r.measured and (r.tracked.index[:, 2] >= 0).all()] == []
     stated = {**target, "sigma_m": 0.02}
     outcome = process_stereo_run(changed(drogue, tmp_path / "known", target=stated), tmp_path / "again")
-    assert len(outcome.result.measured) == 24
+    assert len(outcome.result.measured) == FRAMES
     assert outcome.result.errors.nees.mean() < 15  # the survey's error is part of the covariance
 
 
