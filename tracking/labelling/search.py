@@ -54,15 +54,17 @@ def covering(
     of the sets that still lack one; of equals the one with the best quality.
     """
     names = list(triples)
+    columns = np.array([[spots.index(s) for s in t] for t in names], dtype=np.int64).reshape(-1, 3)
     quality = np.array([triples[t] for t in names])
     rng = np.random.default_rng(0)
     chosen: list[int] = []
     stages: dict[int, int] = {}
     for size in range(len(spots), least - 1, -1):
-        sets = [frozenset(s) for s in combinations(spots, size)]
+        sets = np.array(list(combinations(spots, size)))
         if len(sets) > MOST_SETS:
-            sets = [sets[i] for i in rng.choice(len(sets), MOST_SETS, replace=False)]
-        covers: Array = np.array([[s.issuperset(t) for s in sets] for t in names], dtype=float).reshape(-1, len(sets))
+            sets = sets[rng.choice(len(sets), MOST_SETS, replace=False)]
+        members = (sets[:, :, None] == spots).any(axis=1)  # (sets, spots)
+        covers = members[:, columns].all(axis=-1).T.astype(float)
         lacking = np.minimum(covers.sum(axis=0), TIMES)
         lacking = np.maximum(lacking - covers[chosen].sum(axis=0), 0.0)
         while lacking.any():
