@@ -11,6 +11,10 @@ for _library in ("OPENBLAS", "OMP", "MKL"):
 
 from hypothesis import settings  # noqa: E402
 
+# Waiting for the disk shows only after a power cut, and takes longer than the writing: a run waits for ten files. Tests
+# of when it happens replace this function.
+os.fsync = lambda file: None
+
 # The same examples every time: a test that failed fails again, and a machine that is busy is no failure.
 # `pytest --hypothesis-profile=explore` goes looking for new ones.
 settings.register_profile("fixed", derandomize=True, deadline=None)
