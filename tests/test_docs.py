@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import click
@@ -34,18 +35,18 @@ def strings_of(code: str) -> Iterator[str]:
             yield "".join(str(v.value) if isinstance(v, ast.Constant) else "X" for v in node.values)
 
 
-def texts(root: Path) -> Iterator[tuple[str, str]]:
+@cache
+def texts(root: Path) -> list[tuple[str, str]]:
     """File name and text of all messages, docstrings, templates and documents of the project."""
+    found = []
     for path in [root / "cli.py", *(p for name in PACKAGES for p in sorted((root / name).rglob("*.py")))]:
-        for text in strings_of(path.read_text(encoding="utf-8")):
-            yield str(path.relative_to(root)), text
+        found += [(str(path.relative_to(root)), text) for text in strings_of(path.read_text(encoding="utf-8"))]
     documents = [
         *sorted(root.glob("*.md")),
         *sorted((root / "docs").rglob("*.md")),
         *sorted((root / "lab").rglob("*.j2")),
     ]
-    for path in documents:
-        yield str(path.relative_to(root)), path.read_text(encoding="utf-8")
+    return found + [(str(path.relative_to(root)), path.read_text(encoding="utf-8")) for path in documents]
 
 
 def mentions(text: str) -> Iterator[str]:

@@ -11,16 +11,15 @@ from bench.fuzz.inputs import write_inputs
 from bench.fuzz.judge import fault_of_lines, not_finite_in, run_case, run_command
 from lab.runs.batch.task import COLUMNS
 
-INPUTS = 40
-
 
 @pytest.fixture(scope="module")
 def base(tmp_path_factory):
     return write_inputs(tmp_path_factory.mktemp("fuzz") / "base")
 
 
-def test_damaged_inputs_end_in_a_result_or_in_a_line(base, tmp_path):
-    endings = [run_case(2, n, base, tmp_path / "work") for n in range(INPUTS)]
+@pytest.mark.parametrize("numbers", [range(20), pytest.param(range(20, 120), marks=pytest.mark.slow)], ids=len)
+def test_damaged_inputs_end_in_a_result_or_in_a_line(base, tmp_path, numbers):
+    endings = [run_case(2, n, base, tmp_path / "work") for n in numbers]
     assert [e for e in endings if e.fault] == []
     assert {e.status for e in endings} >= {0, 2}
 

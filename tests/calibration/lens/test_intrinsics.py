@@ -129,6 +129,7 @@ def test_errors_correlated_within_a_photograph_inflate_the_sigmas():
     assert np.all(c.sigmas > 1.2 * np.sqrt(np.diagonal(c.fit.covariance)))
 
 
+@pytest.mark.slow
 def test_few_photographs_with_errors_of_their_own_give_a_focal_length_within_its_sigmas():
     z = []
     for seed in range(30):

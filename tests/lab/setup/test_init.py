@@ -21,12 +21,15 @@ LAYOUTS = [
     Layout(cameras=4, screens=2, beams=5),
     Layout(cameras=5, screens=2, beams=2),
     Layout(cameras=4, screens=4, beams=4),
-    Layout(cameras=3, screens=3, beams=12),
+    Layout(cameras=3, screens=3, beams=8),
     Layout(distance_m=0.5, image_size_px=(640, 480)),
 ]
 
 
-@pytest.mark.parametrize("layout", LAYOUTS, ids=str)
+MANY_BEAMS = pytest.param(Layout(cameras=3, screens=3, beams=12), marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("layout", [*LAYOUTS, MANY_BEAMS], ids=str)
 def test_the_files_pass_the_check_without_a_remark(tmp_path, layout):
     started = start(tmp_path / "lab", layout, 50.0)
     for path in (started.result, started.result / "rig.yaml"):

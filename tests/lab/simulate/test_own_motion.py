@@ -50,8 +50,14 @@ def test_a_rig_sees_all_its_spots_at_the_middle_of_its_view_wherever_it_stands(n
     assert {model.spot_names[i] for i in model.spot_of[seen]} == set(rig.spots)
 
 
-@pytest.mark.parametrize("scenario", ["small-motion", "sharp-turns"])
-@pytest.mark.parametrize("name", RIGS_ELSEWHERE)
+@pytest.mark.parametrize(
+    ("name", "scenario"),
+    [
+        pytest.param(name, scenario, marks=pytest.mark.slow if (i + k) % 2 else ())  # every rig, both scenarios
+        for i, name in enumerate(RIGS_ELSEWHERE)
+        for k, scenario in enumerate(("small-motion", "sharp-turns"))
+    ],
+)
 def test_a_scenario_is_recorded_by_a_rig_that_stands_elsewhere(name, scenario, tmp_path):
     save_rig(elsewhere(name, seed=3), tmp_path / "own.yaml")
     folder = simulate(scenario, tmp_path / "run", frames=40, detections_only=True, rig=tmp_path / "own.yaml", clutter=0)
