@@ -230,6 +230,13 @@ def test_a_cell_shows_numbers_to_four_digits(value, shown):
     assert cell(value) == shown
 
 
+def test_correlations_of_many_parameters_are_those_of_the_first_sixty():
+    for count in (60, 61):
+        drawn = charts.correlation_matrix([f"p{i:02d}" for i in range(count)], np.eye(count))
+        assert [f">p{i:02d}<" in drawn for i in range(count)] == [True] * 60 + [False] * (count - 60)
+        assert ("(the first 60)" in drawn) == (count > 60)
+
+
 def test_contours_of_a_cone_lie_on_its_circles():
     x, y = np.linspace(-1, 1, 81), np.linspace(-1, 1, 61)
     X, Y = np.meshgrid(x, y)

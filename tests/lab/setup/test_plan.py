@@ -63,6 +63,7 @@ def test_a_plan_is_two_tables_and_a_page(rig_path, tmp_path):
     assert outcome.line().startswith("plan: PASS: 100 % of 162 poses can be measured, sigma ")
     assert (outcome.level, outcome.exit_status) == (Level.PASS, 0)
     page = (tmp_path / "plan" / "report.html").read_text()
+    assert "z 0.1 m; yaw -4 to 4 deg (3); pitch -6 to 6 deg (3); roll -5 to 5 deg (2)." in page
     for title in ("What to improve first", "Error budget", "Over yaw and pitch", "Over x and y", "Visibility",
                   "Worst poses", "Effects of the calibration errors", "Assumptions"):  # fmt: skip
         assert f"<h2>{title}</h2>" in page

@@ -10,11 +10,46 @@ from studies.zhou2020 import random_pose
 from tests.tracking.binocular.scenes import MODEL, PAIR, images, pose_at
 from tracking.binocular.acquisition import matching_pairs, mirrored
 from tracking.binocular.calibration_check import FittedFrame, clock_offset
-from tracking.binocular.marker_model import MarkerImages, MarkerModel, MatchParameters, project_markers
+from tracking.binocular.marker_model import (
+    MarkerImages,
+    MarkerModel,
+    MatchParameters,
+    SegmentationParameters,
+    project_markers,
+)
 from tracking.binocular.pose_tracker import AMBIGUOUS, NO_PICTURES, TOO_FEW, BinocularTracker
 from tracking.statuses import PoseStatus
 
 P = MatchParameters()
+
+
+# The least and the largest value of each parameter, and numbers just beyond them.
+ENDS = [
+    (SegmentationParameters, "gamma", (1e-9, 5), (0, 5.01)),
+    *((SegmentationParameters, n, (0, 51), (-1, 52)) for n in ("opening_px", "closing_px")),
+    (SegmentationParameters, "median_px", (0, 1, 51), (-1, 2, 50, 53)),
+    (SegmentationParameters, "min_area_px2", (0, 39_999), (-1e-9, 40_000)),
+    (SegmentationParameters, "sigma_floor_px", (1e-9, 10), (0, 10.01)),
+    (SegmentationParameters, "max_markers", (3, 200), (2, 201)),
+    *((MatchParameters, n, (1e-9, 999_999), (0, 1e6)) for n in ("epipolar_sigmas", "gate_sigmas", "outlier_chi2")),
+    *((MatchParameters, n, (1e-9, 999_999), (0, 1e6)) for n in ("acceleration_m_s2", "turn_rad_s2")),
+    (MatchParameters, "epipolar_floor_px", (0, 100), (-1e-9, 100.1)),
+    (MatchParameters, "area_factor", (1.01, 100), (1, 100.1)),
+    (MatchParameters, "detection_probability", (0.5, 0.99), (0.49, 1)),
+    (MatchParameters, "min_markers", (3, 100), (2, 101)),
+    (MatchParameters, "lead_nats", (0, 100), (-1e-9, 100.1)),
+    (MatchParameters, "max_pose_chi2_p", (0, 0.99), (-1e-9, 1)),
+    (MatchParameters, "max_predicted_frames", (0, 100_000), (-1, 100_001)),
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "good", "bad"), ENDS)
+def test_a_parameter_may_have_the_ends_of_its_range_and_nothing_beyond(kind, name, good, bad):
+    for value in good:
+        assert getattr(kind(**{name: value}), name) == value
+    for value in bad:
+        with pytest.raises(ValueError, match=f"{name}: expected"):
+            kind(**{name: value})
 
 
 def consistent(pose, frame):

@@ -13,6 +13,7 @@ from geometry.arrays import Array
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
+from tracking.noise_estimation.objects import lights_and_lines
 from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
 from tracking.noise_estimation.texture_shift import LARGEST_SHARE, TextureShift
 
@@ -160,6 +161,15 @@ def test_a_brushed_screen_has_texture_though_it_consists_of_lines():
     )
     errors = estimate_noise(pictures(turned, 0.0, 4)).texture_shift.sigma_px(np.array([3.0]), np.array([10.0]))
     assert errors[0] > 0.02
+
+
+def test_a_light_covers_its_square_also_in_the_corners_of_the_picture():
+    at = np.array([[3.0, 2.0], [60.0, 40.0], [76.0, 60.0], [40.0, -9.0], [-9.0, 30.0]])  # two are beside it
+    shape = np.ones(5)
+    points = replace(Detections.at(at, np.tile(np.eye(2), (5, 1, 1))), major_px=shape, minor_px=shape)
+    expected = np.zeros((64, 80), np.uint8)
+    expected[0:9, 0:10] = expected[35:47, 55:67] = expected[55:, 71:] = 1
+    np.testing.assert_array_equal(lights_and_lines(np.zeros((64, 80), np.float32), [points]), expected)
 
 
 def test_lights_that_move_over_the_screen_are_not_texture():
