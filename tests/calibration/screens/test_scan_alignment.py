@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calibration.screens import clouds
 from calibration.screens.clouds import align, on_surfaces
 from geometry.pose import Pose
 from geometry.rotations import exp
@@ -65,3 +66,16 @@ def test_points_off_all_surfaces_are_removed_and_those_on_them_stay():
     kept = on_surfaces(np.concatenate([points, dust]))
     assert kept[: len(points)].mean() > 0.98
     assert kept[len(points) :].mean() < 0.1
+
+
+def test_errors_of_the_registration_move_the_screens_plane_as_the_covariance_says():
+    """Along its normal and about its own x and y; within the plane the frame is defined by the extent of the scan."""
+    rng = np.random.default_rng(4)
+    to_world, cloud_from_screen = (Pose.from_ypr(rng.normal(0, 1, 3), rng.normal(0, 3, 3)) for _ in range(2))
+    frame, step = to_world @ cloud_from_screen, 1e-6
+    J = np.stack([(to_world.plus(step * e) @ cloud_from_screen).minus(frame) / step for e in np.eye(6)], axis=-1)
+    J[:3] = np.outer(frame.rotation[:, 2], frame.rotation[:, 2] @ J[:3])
+    J[5] = 0.0
+    A = 1e-3 * rng.normal(size=(6, 6))
+    found = clouds._registration_covariance(to_world, frame, A @ A.T)
+    np.testing.assert_allclose(found, J @ A @ A.T @ J.T, rtol=0, atol=1e-4 * np.max(found))
