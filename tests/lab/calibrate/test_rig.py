@@ -11,8 +11,10 @@ import shutil
 import numpy as np
 import pytest
 
+from calibration.rig.rig_figures import ExpectedPose
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from lab.calibrate.rig import rig_findings
 from lab.calibrate.rig.rig import COLUMNS, calibrate_rig
 from lab.calibrate.step import calibration_date, expiry_date, expiry_findings
 from lab.errors import CalibrationError, InputError
@@ -26,6 +28,7 @@ from lab.simulate.write import simulate
 
 DAY = datetime.date(2026, 3, 14)
 SMALL = CampaignQuality(dots=(5, 4))
+LIMITS = rig_findings.RigLimits()
 
 
 @pytest.fixture(scope="module")
@@ -307,3 +310,23 @@ def test_a_recording_that_is_listed_twice_is_refused(project, tmp_path):
     copy = changed(project, tmp_path, r"(- \{spots: spots.csv, poses: poses.csv\})", r"\1\n\1")
     with pytest.raises(InputError, match=r"recordings.1: spots.csv is already listed as recordings.0"):
         calibrate_rig(copy, tmp_path / "out", today=DAY)
+
+
+@pytest.mark.parametrize(
+    ("turned", "moved", "level"),
+    [(0.9, 0.9, Level.PASS), (1.1, 0.5, Level.WARN), (0.5, 1.1, Level.WARN), (24.0, 0.5, Level.WARN),
+     (26.0, 0.5, Level.FAIL), (0.5, 19.0, Level.WARN), (0.5, 21.0, Level.FAIL)],
+)  # fmt: skip
+def test_the_expected_accuracy_is_judged_by_the_worse_of_attitude_and_position(turned, moved, level):
+    """Relative to the limits of a warning, 0.02 deg and 1 mm; the limits of use are 25 and 20 times as large."""
+    total = np.diag(np.repeat([(moved * 1e-3) ** 2, np.deg2rad(turned * 0.02) ** 2], 3))
+    shares = {"cameras": 0.2 * total, "beams": 0.6 * total}
+    poses = [ExpectedPose(Pose.identity(), 6, total, part * total, (1 - part) * total, shares) for part in (0.2, 0.8)]
+    found = [rig_findings._expected(pose, LIMITS) for pose in poses]
+    assert [f.level for f in found] == [level, level]
+    if level > Level.PASS:
+        assert [f.why.rsplit("from ", 1)[1] for f in found] == ["beams", "the spots' noise"]
+
+
+def test_a_centre_without_a_pose_fails():
+    assert rig_findings._expected(None, LIMITS).level == Level.FAIL

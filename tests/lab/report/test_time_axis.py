@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import datetime
 import json
 import re
 import zlib
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from lab.report.plot.series import Band, Line, ZoomData, time_panel
-from lab.report.plot.svg import BLUE, area_path, line_path
+from lab.report.plot.svg import BLUE, area_path, date_ticks, line_path
 from lab.report.run.page import write_report
 from lab.report.run.report_data import read_report_data
 from lab.report.run.trust import evidence, time_link
@@ -248,3 +249,19 @@ def test_a_band_about_a_centre_names_its_parts():
     )
     assert 'data-b="0 =0.1 3.0"' in panel
     assert 'data-s="0"' in panel
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "labels"),
+    [
+        ((2024, 2, 27), (2024, 3, 2), ["2024-02-27", "2024-02-28", "2024-02-29", "2024-03-01", "2024-03-02"]),
+        ((2024, 1, 20), (2025, 6, 10), ["2024-04", "2024-07", "2024-10", "2025-01", "2025-04"]),
+        ((2023, 12, 31), (2024, 5, 1), ["2024-01", "2024-02", "2024-03", "2024-04", "2024-05"]),
+        ((1990, 5, 5), (2026, 1, 1), ["2000", "2010", "2020"]),
+    ],
+)
+def test_ticks_of_dates_are_days_or_first_days_of_months_and_years(first, last, labels):
+    places, found = date_ticks(*(datetime.date(*day).toordinal() for day in (first, last)))
+    assert found == labels
+    days = [datetime.date.fromordinal(int(p)).isoformat() for p in places]
+    assert days == [label + "-01-01"[len(label) - 4 :] if len(label) < 10 else label for label in labels]
