@@ -108,6 +108,13 @@ def project_points(
     are broadcast against the points, so that one call serves points of several cameras. nan behind the camera (z <= 0)
     or beyond the fold.
     """
+    return _projected(points_camera, pinhole, distortion, fold_r2, fisheye)[:2]
+
+
+def _projected(
+    points_camera: Array, pinhole: Array, distortion: Array, fold_r2: Array, fisheye: Bools | None
+) -> tuple[Array, Array, Array, Array]:
+    """As `project_points`, then the normalised points (..., 2) and the distorted ones (..., 2)."""
     xy, z, in_front = _on_image_plane(points_camera)
     focal, centre = pinhole[..., :2], pinhole[..., 2:]
     if distortion.any() or (fisheye is not None and np.any(fisheye)):
@@ -121,7 +128,7 @@ def project_points(
     J = np.empty((*xy.shape, 3))
     J[..., :2] = J_xy / z[..., None, None]
     J[..., 2] = -np.einsum("...ij,...j->...i", J[..., :2], xy)
-    return pixels, J
+    return pixels, J, xy, distorted
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,13 +145,14 @@ def project_points_full(
     points_camera: Array, pinhole: Array, distortion: Array, fold_r2: Array, fisheye: Bools | None = None
 ) -> Projected:
     """As `project_points`, with the derivatives with respect to the camera's numbers too: for calibrations."""
-    pixels, d_point = project_points(points_camera, pinhole, distortion, fold_r2, fisheye)
-    xy, _, _ = _on_image_plane(points_camera)
-    distorted, _ = _distorted(xy, distortion, fisheye)
-    d_coefficients = lens.coefficient_jacobian(xy, distortion)
-    if fisheye is not None and np.any(fisheye):
-        wide = lens.fisheye_coefficient_jacobian(xy, distortion)
-        d_coefficients = np.where(np.asarray(fisheye)[..., None, None], wide, d_coefficients)
+    pixels, d_point, xy, distorted = _projected(points_camera, pinhole, distortion, fold_r2, fisheye)
+    if fisheye is None or not np.any(fisheye):
+        d_coefficients = lens.coefficient_jacobian(xy, distortion, distorted)
+    else:
+        d_coefficients = lens.fisheye_coefficient_jacobian(xy, distortion)
+        if not np.all(fisheye):
+            wide = np.asarray(fisheye)[..., None, None]
+            d_coefficients = np.where(wide, d_coefficients, lens.coefficient_jacobian(xy, distortion))
     d_pinhole = np.zeros((*pixels.shape, 4))
     d_pinhole[..., 0, 0], d_pinhole[..., 1, 1] = distorted[..., 0], distorted[..., 1]
     d_pinhole[..., 0, 2] = d_pinhole[..., 1, 3] = 1.0

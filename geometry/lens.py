@@ -58,15 +58,17 @@ def distort(xy: Array, coefficients: Array) -> tuple[Array, Array]:
 def _tilt(xy: Array, J: Array, tau_x: Array, tau_y: Array) -> tuple[Array, Array]:
     """Distorted points (..., 2) and Jacobians (..., 2, 2) after the Scheimpflug tilt of the sensor, applied last."""
     T = tilt_matrix(np.asarray(tau_x), np.asarray(tau_y))
-    h = T[..., :2] @ xy[..., None]
-    h = h[..., 0] + T[..., 2]
+    h = _turned(T, xy)
     out = h[..., :2] / h[..., 2:]
     D = (T[..., :2, :2] - out[..., :, None] * T[..., 2:, :2]) / h[..., 2:, None]
     return out, D @ J
 
 
-def coefficient_jacobian(xy: Array, coefficients: Array) -> Array:
-    """d(distorted)/d(coefficients) (..., 2, 14) of `distort`; xy (..., 2) and coefficients (..., 14) as there."""
+def coefficient_jacobian(xy: Array, coefficients: Array, distorted: Array | None = None) -> Array:
+    """d(distorted)/d(coefficients) (..., 2, 14) of `distort`; xy (..., 2) and coefficients (..., 14) as there.
+
+    distorted (..., 2): the result of `distort`, if it is known.
+    """
     k1, k2, _, _, k3, k4, k5, k6, *_, tau_x, tau_y = np.moveaxis(coefficients, -1, 0)
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
@@ -84,18 +86,27 @@ def coefficient_jacobian(xy: Array, coefficients: Array) -> Array:
     J[..., 0, 8], J[..., 0, 9] = r2, r4
     J[..., 1, 10], J[..., 1, 11] = r2, r4
     T, dT = tilt_matrix(np.asarray(tau_x), np.asarray(tau_y)), _tilt_derivatives(np.asarray(tau_x), np.asarray(tau_y))
-    untilted = np.array(coefficients, dtype=float)
-    untilted[..., 12:] = 0
-    bent, _ = distort(xy, untilted)
-    h = (T[..., :2] @ bent[..., None])[..., 0] + T[..., 2]
+    tilted = bool(np.any(tau_x) or np.any(tau_y))
+    if distorted is None or tilted:
+        untilted = np.array(coefficients, dtype=float)
+        untilted[..., 12:] = 0
+        bent, _ = distort(xy, untilted)
+    else:
+        bent = distorted
+    h = _turned(T, bent)
     out = h[..., :2] / h[..., 2:]
-    if np.any(tau_x) or np.any(tau_y):
+    if tilted:
         D = (T[..., :2, :2] - out[..., :, None] * T[..., 2:, :2]) / h[..., 2:, None]
         J[..., :12] = D @ J[..., :12]
     for column in (0, 1):
-        dh = (dT[column][..., :2] @ bent[..., None])[..., 0] + dT[column][..., 2]
+        dh = _turned(dT[column], bent)
         J[..., 12 + column] = (dh[..., :2] - out * dh[..., 2:]) / h[..., 2:]
     return J
+
+
+def _turned(T: Array, xy: Array) -> Array:
+    """T (..., 3, 3) applied to points (..., 2), as (..., 3)."""
+    return np.asarray(T[..., 0] * xy[..., :1] + T[..., 1] * xy[..., 1:] + T[..., 2])
 
 
 def _tilt_derivatives(tau_x: Array, tau_y: Array) -> tuple[Array, Array]:

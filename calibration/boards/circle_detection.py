@@ -2,7 +2,7 @@
 
 A centre is the centroid of the blob, not the image of the circle's centre. The two differ by tenths of a pixel; the
 observation equation of the calibration contains this difference (calibration/terms/corners.py) and requires the
-areas.
+areas. Ellipses from tangents are the start of a fit of the blurred outline to the pixels as they are.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import erf
 
 from calibration.boards import corner_refinement
 from calibration.boards.board_types import CircleGrid
@@ -32,6 +33,8 @@ _BIG_DOT = 1.35  # relative area of a corner circle, above which it marks the or
 _STRAY = 100  # blobs allowed besides three times the board's: among thousands OpenCV searches for many minutes
 _LATTICE = 0.25  # share of blobs arranged as in a lattice: boards among twice as many other blobs have more
 _INK = 0.5  # diameter over distance of neighbours where no blob gives it
+_AT_ONCE, _STEPS, _SMALL_PX = 32, 8, 2e-3  # outlines fitted together, and their iteration
+_MOST_MOVED = 0.1  # by the fit of an outline, in radii; more means that something else is beside it
 _FIT_PX = 0.08  # of the spacing: residual of a grid against a homography (strong lenses cause less than that)
 
 
@@ -40,9 +43,14 @@ class Ellipses:
     """Fitted ellipses; nan where none fits."""
 
     centres: Array  # (n, 2), px
-    areas: Array  # (n,), px^2
-    slopes: Array  # (n,), DN/px: the steepest on the outline
+    shapes: Array  # (n, 2, 2), px^2: L L^T of the outline c + L (cos a, sin a)
+    blurs: Array  # (n,), px: sigma of the edge, including the width of a pixel
     contrasts: Array  # (n,), DN
+
+    @property
+    def areas(self) -> Array:
+        """(n,), px^2."""
+        return np.asarray(np.pi * np.sqrt(np.linalg.det(self.shapes)))
 
 
 def find_circles(image: GreyImage, board: CircleGrid, thorough: bool = True) -> BoardView | NotFound:
@@ -137,8 +145,7 @@ def _measured(image: GreyImage, grid: Array, blobs: Array, board: CircleGrid, li
         ellipses = fit_ellipses(image, ordered.reshape(-1, 2), _radii(ordered, board, blobs))
     centres = ellipses.centres
     contrast = float(np.median(ellipses.contrasts))
-    sigma = np.median(ellipses.contrasts / ellipses.slopes) / np.sqrt(2 * np.pi)
-    blur = float(sigma)
+    blur = float(np.median(ellipses.blurs))
     apart = corner_refinement.spacing(centres.reshape(ordered.shape))
     if blur > BLUR_LIMIT * apart:
         return too_blurred(blur, apart)
@@ -176,29 +183,25 @@ def fit_ellipses(image: GreyImage, centres: Array, radii: Array) -> Ellipses:
     blur does not move the centre. Source: Ouellet and Hebert (2009), "Precise ellipse estimation without contour point
     extraction", Machine Vision and Applications 21.
     """
-    out = np.full((len(centres), 5), np.nan)
+    out = np.full((len(centres), 7), np.nan)
     smooth = np.asarray(cv2.GaussianBlur(image.astype(np.float64), (0, 0), 0.7), dtype=float)
     gx, gy = (np.asarray(cv2.Scharr(smooth, cv2.CV_64F, *d) / 32, dtype=float) for d in ((1, 0), (0, 1)))
     height, width = image.shape
     for n, (centre, radius) in enumerate(zip(centres, radii, strict=True)):
-        for _ in range(2):  # the second pass is about the centre from the first
-            reach = 1.5 * radius + 1.5
-            first = np.maximum(np.floor(centre - reach), 0).astype(int)
-            last = np.minimum(np.ceil(centre + reach), [width - 1, height - 1]).astype(int)
-            if np.any(last - first < radius):
-                break
-            piece = np.s_[first[1] : last[1] + 1, first[0] : last[0] + 1]
-            fit = _ellipse(gx[piece], gy[piece], smooth[piece], centre - first, reach)
-            if fit is None or np.linalg.norm(fit[:2] + first - centre) > 0.7 * radius + 1:
-                out[n] = np.nan
-                break
+        reach = 1.5 * radius + 1.5
+        first = np.maximum(np.floor(centre - reach), 0).astype(int)
+        last = np.minimum(np.ceil(centre + reach), [width - 1, height - 1]).astype(int)
+        if np.any(last - first < radius):
+            continue
+        piece = np.s_[first[1] : last[1] + 1, first[0] : last[0] + 1]
+        fit = _ellipse(gx[piece], gy[piece], smooth[piece], centre - first, reach)
+        if fit is not None and np.linalg.norm(fit[:2] + first - centre) <= 0.7 * radius + 1:
             out[n] = [*(fit[:2] + first), *fit[2:]]
-            centre = out[n, :2]
-    return Ellipses(out[:, :2], out[:, 2], out[:, 3], out[:, 4])
+    return _outlines(image, Ellipses(out[:, :2], out[:, [2, 3, 3, 4]].reshape(-1, 2, 2), out[:, 5], out[:, 6]))
 
 
 def _ellipse(gx: Array, gy: Array, grey: Array, centre: Array, reach: float) -> Array | None:
-    """Centre x, y, area, steepest slope, contrast (5,) in a patch; None if it is not an ellipse."""
+    """Centre x, y, shape xx, xy, yy, sigma of the edge, contrast (7,) in a patch; None if it is not an ellipse."""
     v, u = np.indices(gx.shape)
     x, y = u - centre[0], v - centre[1]
     strength = np.hypot(gx, gy)
@@ -221,7 +224,99 @@ def _ellipse(gx: Array, gy: Array, grey: Array, centre: Array, reach: float) -> 
     inside = np.hypot(x - place[0], y - place[1]) < 1.2
     outside = np.hypot(x, y) > 0.85 * reach
     contrast = float(np.median(grey[outside]) - np.min(grey[inside])) if inside.any() and outside.any() else np.nan
-    return np.array([*(place + centre), np.pi * np.sqrt(det), float(np.percentile(strength[edge], 90)), contrast])
+    blur = contrast / float(np.percentile(strength[edge], 90)) / np.sqrt(2 * np.pi)
+    return np.array([*(place + centre), shape[0, 0], shape[0, 1], shape[1, 1], blur, contrast])
+
+
+def _outlines(image: GreyImage, start: Ellipses) -> Ellipses:
+    """Ellipses with centres and shapes from a least-squares fit of blurred discs to the pixels beside their outlines.
+
+    Grey values are (b + b' d) + (c + c' d) S at the offset d from the centre, with S the error function of the distance
+    from the outline over its sigma. The outline is c + L (z + g conj(z)^2), |z| = 1, in complex numbers: of the
+    second-order part of perspective and distortion, the rest moves a circle as a whole or changes it in second order,
+    and g leaves the centroid at c. An ellipse fitted to an oblique outline with g is not at its centroid. Ours.
+    """
+    centres, shapes = start.centres.copy(), start.shapes.copy()
+    good = np.flatnonzero(np.isfinite(shapes).all(axis=(1, 2)) & np.isfinite(start.blurs))
+    good = good[np.argsort(start.areas[good])]
+    for first in range(0, len(good), _AT_ONCE):
+        rows = good[first : first + _AT_ONCE]
+        found, L2 = _fitted_outlines(image, centres[rows], shapes[rows], start.blurs[rows])
+        size = np.sqrt(np.linalg.det(shapes[rows]))
+        with np.errstate(invalid="ignore"):
+            near = np.linalg.norm(found - centres[rows], axis=1) < _MOST_MOVED * np.sqrt(size)
+            near &= np.abs(np.sqrt(np.linalg.det(L2)) / size - 1) < _MOST_MOVED
+        centres[rows[near]], shapes[rows[near]] = found[near], L2[near]
+    return Ellipses(centres, shapes, start.blurs, start.contrasts)
+
+
+def _fitted_outlines(image: GreyImage, centres: Array, shapes: Array, blur: Array) -> tuple[Array, Array]:
+    """Centres (n, 2) and shapes (n, 2, 2) of `_outlines`, from start values and sigmas (n,) of the edges, px."""
+    values, vectors = np.linalg.eigh(shapes)
+    A = (vectors / np.sqrt(values)[:, None]) @ np.swapaxes(vectors, 1, 2)  # offset in px to the unit circle
+    whole = np.round(centres).astype(int)
+    band = np.minimum(3 * blur + 1, 0.5 * np.sqrt(values[:, 0]) + 1)
+    near = [_beside(a, c - w, b, np.sqrt(v[1])) for a, c, w, b, v in zip(A, centres, whole, band, values, strict=True)]
+    most = max(len(place) for place in near)
+    place = np.stack([np.pad(p, ((0, most - len(p)), (0, 0))) for p in near])  # (n, m, 2) about `whole`
+    at = whole[:, None] + place
+    height, width = image.shape
+    weight = (np.arange(most) < np.array([len(p) for p in near])[:, None]).astype(corner_refinement.SINGLE)
+    weight *= np.all((at >= 0) & (at < [width, height]), axis=-1)
+    grey = weight * image[np.clip(at[..., 1], 0, height - 1), np.clip(at[..., 0], 0, width - 1)]
+    size = np.sqrt(values.prod(axis=1) ** 0.5)  # px
+    scale = np.stack([np.ones_like(size)] * 2 + [1 / size] * 3 + [np.ones_like(size)] * 3, axis=1)
+    x = np.concatenate([centres - whole, A.reshape(-1, 4)[:, [0, 1, 3]], np.zeros((len(A), 2)), blur[:, None]], axis=1)
+    largest = np.array([0.5, 0.5, 0.05, 0.05, 0.05, 0.05, 0.05, 0.3]) * scale
+    J, B = (np.empty((*grey.shape, k), dtype=corner_refinement.SINGLE) for k in (8, 6))
+    B[..., 0] = weight
+    for _ in range(_STEPS):
+        y = x.astype(corner_refinement.SINGLE)
+        d = place.astype(corner_refinement.SINGLE) - y[:, None, :2]
+        to_circle = y[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+        w = d @ to_circle
+        length = np.maximum(np.linalg.norm(w, axis=-1), 1e-6)
+        w /= length[..., None]
+        normal = w @ to_circle
+        n = np.maximum(np.linalg.norm(normal, axis=-1), 1e-9)
+        cube = (w[..., 0] + 1j * w[..., 1]) ** 3
+        away = (length * (1 - y[:, None, 5] * cube.real - y[:, None, 6] * cube.imag) - 1) / n
+        curved = np.linalg.det(to_circle)[:, None] ** 2 / n**3  # 1/px
+        sigma = y[:, 7:]
+        e = away / sigma + sigma * curved / 2  # blur displaces a curved edge towards its centre of curvature
+        B[..., 1:3] = weight[..., None] * d / size[:, None, None]
+        B[..., 3:] = B[..., :3] * erf(e / 2**0.5)[..., None]
+        linear = corner_refinement.linear_part(B, grey)
+        g = (
+            (2 / np.pi) ** 0.5
+            * np.exp(-e * e / 2)
+            * (B[..., :3] @ linear[:, 3:].astype(corner_refinement.SINGLE))[..., 0]
+            / sigma
+        )
+        g = g[..., None] / n[..., None]
+        J[..., :2] = -g * normal
+        J[..., 2:5] = g * np.stack(
+            [w[..., 0] * d[..., 0], np.sum(w * d[..., ::-1], axis=-1), w[..., 1] * d[..., 1]], -1
+        )
+        J[..., 5:7] = -g * (length[..., None] * np.stack([cube.real, cube.imag], axis=-1))
+        J[..., 7] = g[..., 0] * n * (curved * sigma / 2 - away / sigma)
+        step = corner_refinement.step_of(J, B, grey, linear)
+        x = x + np.clip(step, -largest, largest)
+        x[:, 7] = np.maximum(x[:, 7], 0.25)
+        if np.max(np.abs(step[:, :2])) < _SMALL_PX:
+            break
+    inverse = np.linalg.inv(x[:, [2, 3, 3, 4]].reshape(-1, 2, 2))
+    return whole + x[:, :2], inverse @ np.swapaxes(inverse, 1, 2)
+
+
+def _beside(A: Array, centre: Array, band: float, reach: float) -> Array:
+    """Offsets (m, 2), px, of the pixels within `band` of an ellipse about `centre`; A (2, 2): to the unit circle."""
+    half = int(np.ceil(reach + band)) + 1
+    v, u = np.mgrid[-half : half + 1, -half : half + 1]
+    w = np.stack([u - centre[0], v - centre[1]], axis=-1) @ A
+    length = np.maximum(np.linalg.norm(w, axis=-1), 1e-6)
+    near = np.abs(length - 1) < band * np.linalg.norm(w @ A, axis=-1) / length
+    return np.stack([u[near], v[near]], axis=-1)
 
 
 def homography(from_xy: Array, to_xy: Array) -> Array:

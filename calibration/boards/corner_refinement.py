@@ -9,22 +9,27 @@ cv2.cornerSubPix 0.018, 0.016, 0.015 and 0.023, 0.018, 0.017 px, mostly by its b
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
-from scipy.special import erf
+from numpy.typing import NDArray
+from scipy.special import comb, erf
 
 from calibration.boards.board_view import GreyImage
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array, Bools, Ints
 
 _REACH = 0.4  # half of the window, in distances of the nearest parallel edge, which would be included from 0.5 on
 _MOST_PX = 12  # half of the window: a larger one includes more curved edges, and takes longer
-_PASSES = 2  # the curvature is first that of less accurate corners
 _SPARE = 2  # known corners around a corner beyond the coefficients of its curvature
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
-_STEPS, _SMALL_PX = 8, 1e-3  # of the fit of saddles: most need two to four
+_STEPS = 8  # of the fit of saddles: most need two to four
+_SMALL_PX = (0.01, 1e-3)  # last step in each of two passes: the curvature is first that of less accurate corners
 _BLUR_PX = 0.9  # start value of the edges' sigma
+SINGLE = np.float32  # of sums over pixels: their rounding moves a corner by less than 1e-5 px, in half of the time
+Pixelwise = NDArray[np.floating]
 _AT_ONCE = 64  # corners: their arrays stay in the processor's cache
 
 
@@ -48,78 +53,100 @@ def refined(image: GreyImage, grid: Array, known: Bools | None = None, reach: fl
     height = edge_distance(grid, known)
     half = np.clip(np.nan_to_num(reach * height, nan=2.0).astype(int), 2, _MOST_PX)
     out = np.full(grid.shape, np.nan)
-    look = np.full((rows, columns, 3), np.nan)
+    look = np.full((rows, columns, 5), np.nan)  # directions and sigmas of the edges, contrast
     within = known & np.all((grid >= 0) & (grid <= np.array(image.shape[::-1]) - 1), axis=-1)
     sizes = np.unique(half[within]).tolist()
     for size in sizes:
         which = within & (half == size)
         start = np.ascontiguousarray(grid[which], dtype=np.float32).reshape(-1, 1, 2)
         out[which] = cv2.cornerSubPix(image, start, (size, size), (-1, -1), _STOP).reshape(-1, 2)
-    for _ in range(_PASSES):
+    for small_px in _SMALL_PX:
         shape = _local_shape(out, within)
         for size in sizes:
             chosen = np.argwhere(within & (half == size))
             for first in range(0, len(chosen), _AT_ONCE):
                 i, j = chosen[first : first + _AT_ONCE].T
-                found, seen = _saddles(image, out[i, j], shape[i, j], size)
+                steps, new = shape[i, j, :2], np.isnan(look[i, j, :1])
+                edges = np.column_stack([np.arctan2(steps[..., 1], steps[..., 0]), np.full((len(i), 2), _BLUR_PX)])
+                edges = np.where(new, edges, look[i, j, :4])
+                found, seen = _saddles(image, out[i, j], edges, shape[i, j, 2:], size, small_px)
                 good = np.linalg.norm(found - out[i, j], axis=1) <= max(1.0, 0.25 * size)
                 out[i, j], look[i, j] = np.where(good[:, None], found, out[i, j]), seen
     out[np.linalg.norm(out - grid, axis=-1) > np.maximum(1.5, 0.75 * half)] = np.nan
     look = look[np.isfinite(out).all(axis=-1)]
     if not len(look):
         return Corners(out, np.nan, np.nan)
-    return Corners(out, float(np.median(look[:, :2])), float(np.median(look[:, 2])))
+    return Corners(out, float(np.median(look[:, 2:4])), float(np.median(look[:, 4])))
 
 
-def _saddles(image: GreyImage, start: Array, shape: Array, half: int) -> tuple[Array, Array]:
-    """Corners (n, 2), px, and sigmas of the two edges, px, with the contrast, DN (n, 3), by least squares.
+def _saddles(
+    image: GreyImage, start: Array, edges: Array, bend: Array, half: int, small_px: float
+) -> tuple[Array, Array]:
+    """Corners (n, 2), px, with directions and sigmas of the two edges and the contrast, DN (n, 5), by least squares.
 
-    start (n, 2), px; shape (n, 5, 2): the local derivatives of the grid, see `_local_shape`. Grey values are
-    (b + b' d) + (c + c' d) S1 S2 at the offset d from the corner, with S the error function of the distance from an
-    edge over its sigma. The six linear parameters are eliminated. With t + Q(t) = d, Q of `shape`, edges are straight
-    in t: in a window of 20 px the curved edges of a fisheye lens would displace corners by .04 px.
+    start (n, 2), px, and edges (n, 4), rad and px: start values; bend (n, 3, 2): the curvature of `_local_shape`. Grey
+    values are (b + b' d) + (c + c' d) S1 S2 at the offset d from the corner, with S the error function of the distance
+    from an edge over its sigma. The six linear parameters are eliminated. With t + Q(t) = d, Q of `bend`, edges are
+    straight in t: in a window of 20 px the curved edges of a fisheye lens would displace corners by .04 px.
     """
-    v, u = (w.ravel().astype(float) for w in np.mgrid[-half : half + 1, -half : half + 1])
+    v, u = (w.ravel().astype(SINGLE) for w in np.mgrid[-half : half + 1, -half : half + 1])
     whole = np.round(start).astype(int)
     columns, rows = whole[:, :1] + u.astype(int), whole[:, 1:] + v.astype(int)
     height, width = image.shape
-    weight = ((columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)).astype(float)
+    weight = ((columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)).astype(SINGLE)
     grey = weight * image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
-    C = shape[:, 2:]
-    along = np.arctan2(shape[:, :2, 1], shape[:, :2, 0])
-    x = np.concatenate([start - whole, along, np.full((len(start), 2), _BLUR_PX)], axis=1)
+    C = bend.astype(SINGLE)
+    x = np.concatenate([start - whole, edges], axis=1)
     largest = np.array([0.7, 0.7, 0.3, 0.3, 0.3, 0.3])
-    J, L = (np.empty((*grey.shape, 6)) for _ in range(2))
+    J, L = (np.empty((*grey.shape, 6), dtype=SINGLE) for _ in range(2))
     L[..., 0] = weight
     for _ in range(_STEPS):
-        d = np.stack([u - x[:, :1], v - x[:, 1:2]], axis=-1)
+        at = x.astype(SINGLE)
+        d = np.stack([u - at[:, :1], v - at[:, 1:2]], axis=-1)
         t = d - _quadratic(C, d - _quadratic(C, d))
-        cos, sin = np.cos(x[:, None, 2:4]), np.sin(x[:, None, 2:4])
+        cos, sin = np.cos(at[:, None, 2:4]), np.sin(at[:, None, 2:4])
         along = np.stack([cos[:, 0], sin[:, 0]], axis=-1)
-        bend = np.sum(_quadratic(C, along) * np.stack([-sin[:, 0], cos[:, 0]], axis=-1), axis=-1)
+        curved = np.sum(_quadratic(C, along) * np.stack([-sin[:, 0], cos[:, 0]], axis=-1), axis=-1)
         # (n, m, 2): distances from the edges in sigmas; blur displaces a curved edge towards its centre of curvature
-        e = (cos * t[..., 1:] - sin * t[..., :1]) / x[:, None, 4:] - (x[:, 4:] * bend)[:, None]
-        S, slope = erf(e / np.sqrt(2)), np.sqrt(2 / np.pi) * np.exp(-e * e / 2) / x[:, None, 4:]
+        e = (cos * t[..., 1:] - sin * t[..., :1]) / at[:, None, 4:] - (at[:, 4:] * curved)[:, None]
+        S, slope = erf(e / 2**0.5), (2 / math.pi) ** 0.5 * np.exp(-e * e / 2) / at[:, None, 4:]
         L[..., 1:3] = weight[..., None] * d / half
         L[..., 3:] = L[..., :3] * (S[..., :1] * S[..., 1:])
-        H = np.swapaxes(L, 1, 2) @ L + 1e-9 * np.eye(6)
-        linear = np.linalg.solve(H, np.swapaxes(L, 1, 2) @ grey[..., None])
-        g = (L[..., :3] @ linear[:, 3:]) * S[..., ::-1] * slope
+        linear = linear_part(L, grey)
+        g = (L[..., :3] @ linear[:, 3:].astype(SINGLE)) * S[..., ::-1] * slope
         J[..., 0], J[..., 1] = np.sum(g * sin, axis=-1), -np.sum(g * cos, axis=-1)
         J[..., 2:4] = -g * (cos * t[..., :1] + sin * t[..., 1:])
         J[..., 4:] = -g * e
-        mixed = np.swapaxes(L, 1, 2) @ J
-        N = np.swapaxes(J, 1, 2) @ J - np.swapaxes(mixed, 1, 2) @ np.linalg.solve(H, mixed)
-        N += (1e-3 * np.einsum("nii->ni", N)[:, None] + 1e-9) * np.eye(6)
-        step = np.linalg.solve(N, np.swapaxes(J, 1, 2) @ (grey[..., None] - L @ linear))[..., 0]
+        step = step_of(J, L, grey, linear)
         x = x + np.clip(step, -largest, largest)
         x[:, 4:] = np.clip(x[:, 4:], 0.25, half)
-        if np.max(np.abs(step[:, :2])) < _SMALL_PX:
+        if np.max(np.abs(step[:, :2])) < small_px:
             break
-    return whole + x[:, :2], np.column_stack([x[:, 4:], 2 * np.abs(linear[:, 3, 0])])
+    return whole + x[:, :2], np.column_stack([x[:, 2:], 2 * np.abs(linear[:, 3, 0])])
 
 
-def _quadratic(C: Array, t: Array) -> Array:
+def linear_part(L: Pixelwise, grey: Pixelwise) -> Array:
+    """The linear parameters (n, k, 1) of n least-squares fits of L (n, m, k) to grey values (n, m)."""
+    return np.linalg.solve(_square(L), (np.swapaxes(L, 1, 2) @ grey[..., None]).astype(float))
+
+
+def step_of(J: Pixelwise, L: Pixelwise, grey: Pixelwise, linear: Array) -> Array:
+    """The Gauss-Newton step (n, p) of the other parameters, with derivatives J (n, m, p); the linear ones eliminated.
+
+    Source: Kaufman (1975), "A variable projection method for solving separable nonlinear least squares problems", BIT.
+    """
+    mixed = (np.swapaxes(L, 1, 2) @ J).astype(float)
+    N = (np.swapaxes(J, 1, 2) @ J).astype(float) - np.swapaxes(mixed, 1, 2) @ np.linalg.solve(_square(L), mixed)
+    N += (1e-3 * np.einsum("nii->ni", N)[:, None] + 1e-9) * np.eye(J.shape[-1])
+    left = grey[..., None] - L @ linear.astype(L.dtype)
+    return np.asarray(np.linalg.solve(N, (np.swapaxes(J, 1, 2) @ left).astype(float))[..., 0])
+
+
+def _square(L: Pixelwise) -> Array:
+    return np.asarray((np.swapaxes(L, 1, 2) @ L).astype(float) + 1e-9 * np.eye(L.shape[-1]))
+
+
+def _quadratic(C: Pixelwise, t: Pixelwise) -> Pixelwise:
     """(n, m, 2): the second-order displacement at offsets t (n, m, 2), px, with coefficients C (n, 3, 2), 1/px."""
     x, y = t[..., 0], t[..., 1]
     return np.stack([x * x, x * y, y * y], axis=-1) @ C
@@ -138,36 +165,53 @@ def _local_shape(grid: Array, known: Bools) -> Array:
     if len(row):
         flat = np.stack([np.ones(len(row)), column, row], axis=1)
         out[..., :2, :] = np.linalg.lstsq(flat, grid[known], rcond=None)[0][1:]
-    for i, j in np.argwhere(known).tolist():
-        for order, across in ((4, 5), (2, 3)):
-            near = _block(i, known.shape[0], across), _block(j, known.shape[1], across)
-            b, a = np.nonzero(known[near])
-            a, b = a + near[1].start - j, b + near[0].start - i
-            powers = [(n - k, k) for n in range(order + 1) for k in range(n + 1)]
-            if min(len(np.unique(a)), len(np.unique(b))) <= order or len(a) < len(powers) + _SPARE:
-                continue
-            to = grid[near][known[near]]
-            H, _ = cv2.findHomography(np.stack([a, b], axis=1).astype(float), to, 0)
-            if H is None:
-                continue
-            at = np.array([[0, -1, 1, 0, 0], [0, 0, 0, -1, 1], [1, 1, 1, 1, 1]], dtype=float)
-            at = np.concatenate([at, np.stack([a, b, np.ones(len(a))])], axis=1)
-            w = (H[:2] @ at / (H[2] @ at)).T
-            w = (w - w[0]) / np.linalg.norm(w[2] - w[1])
-            M = np.stack([w[5:, 0] ** m * w[5:, 1] ** n for m, n in powers], axis=1)
-            X = np.linalg.lstsq(M, to, rcond=None)[0]
-            L = np.linalg.inv(X[1:3])  # offset in px times L: that of w
-            (p, q), (r, s) = L
-            squares = np.array([[p * p, p * q, q * q], [2 * p * r, p * s + q * r, 2 * q * s], [r * r, r * s, s * s]])
-            out[i, j] = np.concatenate([np.stack([w[2] - w[1], w[4] - w[3]]) @ X[1:3], squares @ X[3:6]])
-            break
+    done = ~known
+    for order, across in ((4, 5), (2, 3)):
+        left = np.argwhere(~done)
+        first = np.maximum(np.minimum(left - across // 2, np.array(known.shape) - across), 0)
+        for corner in np.unique(first, axis=0):
+            block = np.s_[corner[0] : corner[0] + across, corner[1] : corner[1] + across]
+            at = left[np.all(first == corner, axis=1)]
+            shape = _shape_of_block(grid[block], known[block], (at - corner)[:, ::-1], order)
+            if shape is not None:
+                out[*at.T], done[*at.T] = shape, True
     return out
 
 
-def _block(at: int, count: int, across: int) -> slice:
-    """Of `count` rows, the `across` about one of them."""
-    first = max(min(at - across // 2, count - across), 0)
-    return slice(first, first + across)
+@cache
+def _powers(order: int) -> tuple[Ints, Ints, Array]:
+    """Powers of x and y (k, 2) of a polynomial, those of its derivatives by 1, x, y, x^2, xy, y^2, and their factors.
+
+    Factors (6, k) over the factorials of the derivative's powers: those of Taylor's coefficients.
+    """
+    powers = np.array([(n - k, k) for n in range(order + 1) for k in range(n + 1)])
+    by = powers[:6, None]
+    return powers, np.maximum(powers - by, 0), np.prod(comb(powers, by), axis=-1)
+
+
+def _shape_of_block(grid: Array, known: Bools, at: Array, order: int) -> Array | None:
+    """`_local_shape` (m, 5, 2) at corners (m, 2), column and row, of a block by its known ones; None if too few."""
+    b, a = np.nonzero(known)
+    powers, lower, factor = _powers(order)
+    if min(len(np.unique(a)), len(np.unique(b))) <= order or len(a) < len(powers) + _SPARE:
+        return None
+    to = grid[known]
+    H, _ = cv2.findHomography(np.stack([a, b], axis=1).astype(float), to, 0)
+    if H is None:
+        return None
+    around = at[:, None] + np.array([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1]])  # (m, 5, 2)
+    w, seen = (p @ H[:, :2].T + H[:, 2] for p in (around, np.stack([a, b], axis=1)))
+    w, seen = w[..., :2] / w[..., 2:], seen[:, :2] / seen[:, 2:]
+    middle, size = seen.mean(axis=0), np.ptp(seen, axis=0).max() / 2
+    w, seen = (w - middle) / size, (seen - middle) / size
+    X = np.linalg.lstsq(np.prod(seen[:, None] ** powers, axis=-1), to, rcond=None)[0]
+    # (m, 6, 2): Taylor's coefficients of 1, x, y, x^2, xy, y^2 at each corner
+    taylor = (np.prod(w[:, None, None, 0] ** lower, axis=-1) * factor) @ X
+    L = np.linalg.inv(taylor[:, 1:3])  # offset in px times L: that of w
+    (p, q), (r, s) = np.moveaxis(L, 0, -1)
+    squares = np.array([[p * p, p * q, q * q], [2 * p * r, p * s + q * r, 2 * q * s], [r * r, r * s, s * s]])
+    steps = np.stack([w[:, 2] - w[:, 1], w[:, 4] - w[:, 3]], axis=1) @ taylor[:, 1:3]
+    return np.concatenate([steps, np.moveaxis(squares, -1, 0) @ taylor[:, 3:]], axis=1)
 
 
 def edge_distance(grid: Array, known: Bools) -> Array:

@@ -159,15 +159,15 @@ def factored(H: sparse.csc_array) -> SuperLU | None:
         return None
 
 
-def damped_step(H: sparse.csc_array, g: Array, damping: float) -> Array:
+def damped_step(H: sparse.csc_array | Array, g: Array, damping: float) -> Array:
     """Levenberg-Marquardt step (n,): (H + damping diag H)^-1 g, solved in units in which diag H is 1.
 
     A singular system is solved with more damping; the step is 0 if that does not help.
     """
     diagonal = H.diagonal()
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    if len(g) <= _SMALL:
-        full = H.toarray() * np.outer(scale, scale)
+    if isinstance(H, np.ndarray):
+        full = H * np.outer(scale, scale)
         full[np.diag_indices_from(full)] += damping
         try:
             return np.asarray(cho_solve(cho_factor(full, check_finite=False), g * scale, check_finite=False) * scale)
@@ -361,6 +361,7 @@ def solve(
     damping = 1e-4
     for _ in range(limits.steps):
         H, g = _normal_equations(terms, lines, columns)
+        first = damping
         while True:
             delta = damped_step(H, g, damping)
             moved = columns.moved(values, delta)
@@ -368,7 +369,7 @@ def solve(
             finite = all(np.isfinite(line.residuals).all() for line in new_lines)
             new_cost = _cost(terms, new_lines) if finite else np.inf
             # Near the minimum, rounding hides a decrease of the cost, so a step this short is accepted in any case.
-            size = float(np.sqrt(max(delta @ (H @ delta), 0.0)))
+            size = float(np.sqrt(max(float(delta @ (H @ delta)), 0.0)))
             if new_cost <= cost or size < limits.small_step_sigmas:
                 break
             damping *= 10
@@ -376,7 +377,8 @@ def solve(
                 raise AdjustmentError("no step reduces the residuals")
         if new_cost <= cost:
             values, lines, cost = moved, new_lines, new_cost
-        damping = max(damping * 0.1, 1e-12)
+        if damping == first:  # else a tenth of it has just failed
+            damping = max(damping * 0.1, 1e-12)
         if size < limits.small_step_sigmas:
             break
     else:
@@ -386,7 +388,7 @@ def solve(
     chi2 = sum(float(np.sum(w[:, None] * line.residuals**2)) for w, line in zip(weights, lines, strict=True))
     count = sum(line.residuals.size for line in lines)
     residuals = tuple(line.residuals for line in lines)
-    return Adjusted(values, residuals, weights, chi2, count - columns.count, columns, H)
+    return Adjusted(values, residuals, weights, chi2, count - columns.count, columns, sparse.csc_array(H))
 
 
 @dataclass(frozen=True, slots=True)
@@ -453,8 +455,8 @@ def _cost(terms: Sequence[Term], lines: Sequence[Linearised]) -> float:
 
 def _normal_equations(
     terms: Sequence[Term], lines: Sequence[Linearised], columns: _Columns
-) -> tuple[sparse.csc_array, Array]:
-    """The normal matrix H = J^T W J (n, n) and the right-hand side -J^T W r (n,).
+) -> tuple[sparse.csc_array | Array, Array]:
+    """The normal matrix H = J^T W J (n, n), full if it is small, and the right-hand side -J^T W r (n,).
 
     Residuals that depend on the same unknowns form one dense block. The board corners of a picture, for instance, are
     dozens of residuals in a block of some 27 columns; summing blocks takes a hundredth of the entries of summing
@@ -496,6 +498,8 @@ def _normal_equations(
         return sparse.csc_array((n, n)), g
     i, j, h = np.concatenate(rows), np.concatenate(cols), np.concatenate(entries)
     used = (i >= 0) & (j >= 0)
+    if n <= _SMALL:
+        return np.asarray(np.bincount(i[used] * n + j[used], h[used], n * n), dtype=float).reshape(n, n), g
     return sparse.coo_array((h[used], (i[used], j[used])), shape=(n, n)).tocsc(), g
 
 

@@ -111,7 +111,9 @@ def fit(
     return LensFit(model, adjusted.values, adjusted, used, residuals, relative * scale, relative, board, dict(dropped))
 
 
-def robust_fit(table: CornerTable, model: LensModel, values: Values, board: BoardFreedom) -> LensFit:
+def robust_fit(
+    table: CornerTable, model: LensModel, values: Values, board: BoardFreedom, limits: Limits = CONVERGED
+) -> LensFit:
     """The fit without outliers: these are detected under a Cauchy loss and then excluded.
 
     values must hold a pose for each view; a view whose pose is nan is excluded.
@@ -135,7 +137,7 @@ def robust_fit(table: CornerTable, model: LensModel, values: Values, board: Boar
     dropped |= _bad_views(table, residuals, candidates, sigma, dropped)
     used = _used(table, residuals, sigma, dropped)
     for _ in range(_ROUNDS):
-        found = fit(table, used, model, values, board, dropped)
+        found = fit(table, used, model, values, board, dropped, limits)
         values = found.values
         again = _used(table, found.residuals, found.sigma_px, dropped)
         if np.array_equal(again, used):

@@ -316,7 +316,7 @@ def _rich_fit(table: CornerTable, model: LensModel, values: Values, reasons: lis
     """The robust fit with the bend of the board free if it can be solved for; empty if not even the lens can."""
     for board in (BoardFreedom(warp=True), AS_STATED):
         try:
-            return [robust_fit(table, model, values, board)]
+            return [robust_fit(table, model, values, board, BRIEF)]
         except AdjustmentError as error:
             reasons.append(str(error))
     return []

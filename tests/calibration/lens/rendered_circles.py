@@ -65,7 +65,7 @@ def shots(scene: CircleScene, seed: int) -> list[Shot]:
         t = at - R @ scene.board.middle
         if np.any(points @ R[2] + t[2] <= 0.05):
             continue
-        around = projected(scene, R, t, _outlines(scene).reshape(-1, 3)).reshape(len(points), -1, 2)
+        around = projected(scene, R, t, outlines(scene, 24).reshape(-1, 3)).reshape(len(points), -1, 2)
         if np.all((around > 12) & (around < size - 13)):
             out.append(_shot(scene, R, t, around, rng))
     return out
@@ -89,8 +89,9 @@ def _radius(scene: CircleScene) -> float:
     return (scene.diameter_m or scene.board.diameter_m) / 2
 
 
-def _outlines(scene: CircleScene) -> Array:
-    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+def outlines(scene: CircleScene, count: int) -> Array:
+    """Points (P, count, 3), m, on the circles of the board."""
+    turn = np.linspace(0, 2 * np.pi, count, endpoint=False)
     ring = _radius(scene) * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
     return scene.board.points[:, None] + ring
 

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from calibration.boards.board_types import parse
+from calibration.boards.circle_detection import fit_ellipses
 from calibration.lens.fit.corner_table import CircleAreas, CornerTable
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
 from calibration.lens.intrinsics_result import Intrinsics
 from lab.calibrate.camera.camera_findings import findings_of
 from lab.findings.finding import Level
-from tests.calibration.lens.rendered_circles import LENS, CircleScene, table_of
+from tests.calibration.lens.rendered_circles import LENS, CircleScene, outlines, projected, shots, table_of
 
 QUICK = IntrinsicsOptions(lens=LensModel(5), warp=False, stretch=False)
 SCENE = CircleScene(parse("acircles:4x9:20mm"), views=8)
@@ -31,6 +32,19 @@ def nees(c: Intrinsics) -> float:
     truth[: len(LENS)] = LENS
     off = (c.fit.lens - truth)[c.model.free]
     return float(off @ np.linalg.solve(c.covariance, off)) / len(off)
+
+
+def test_centres_are_the_centroids_of_blobs_that_distortion_makes_unlike_ellipses():
+    lens = (430.0, 431.0, 630.0, 520.0, 0.02, 0.003, -0.001, 0.0)
+    scene = CircleScene(parse("circles:4x3:30mm"), lens, fisheye=True, views=1, noise_dn=0.0, fill=(0.5, 0.7))
+    (shot,) = shots(scene, 1)
+    ring = projected(scene, shot.rotation, shot.translation, outlines(scene, 500).reshape(-1, 3)).reshape(-1, 500, 2)
+    following = np.roll(ring, -1, axis=1)
+    parts = ring[..., 0] * following[..., 1] - ring[..., 1] * following[..., 0]
+    centroids = np.sum((ring + following) * parts[..., None], axis=1) / (3 * np.sum(parts, axis=1)[:, None])
+    found = fit_ellipses(shot.image, shot.centres, shot.radii_px)
+    assert np.sqrt(np.mean((found.centres - centroids) ** 2)) < 0.003  # px; of ellipses from tangents .024
+    np.testing.assert_allclose(found.areas, np.abs(np.sum(parts, axis=1)) / 2, rtol=1e-3)
 
 
 def test_lens_and_circle_size_are_estimated_within_their_sigmas():
