@@ -79,7 +79,6 @@ def fit_clocks(
     J = _derivatives(model, recording, lin, numbers)
     if parameters is not None:
         J = np.concatenate([J, parameters.jacobian(recording, lin)[..., known]], axis=-1)
-    # In units of the prior and of the calibration's sigmas all columns have similar lengths.
     free, left = lin.residual_part(J), lin.residual_part(lin.residual)
     precision = np.zeros((J.shape[-1],) * 2)
     precision[: len(mean), : len(mean)] = np.diag(1 / sigma**2)
@@ -89,12 +88,15 @@ def fit_clocks(
     start = np.concatenate([mean, np.zeros(len(known))])
     dof = np.maximum(2.0 * lin.used.sum(axis=1) - lin.rank, 0.0)
     keep = dof > 0
-    theta, covariance = start, np.linalg.inv(precision)
+    if not keep.any():
+        return nothing
+    theta: Array = start
+    covariance: Array = np.asarray(np.linalg.inv(precision), dtype=float)
     for _ in range(_ROUNDS):
         variance = 1.0
         for _ in range(2):  # the second time with the noise that the first one shows
             X, r = free[keep].reshape(-1, J.shape[-1]), left[keep].ravel()
-            covariance = np.linalg.inv(X.T @ X / variance + precision)
+            covariance = np.asarray(np.linalg.inv(X.T @ X / variance + precision), dtype=float)
             theta = covariance @ (X.T @ r / variance + precision @ start)
             rest = left - free @ theta
             chi2 = np.sum(rest**2, axis=(1, 2))

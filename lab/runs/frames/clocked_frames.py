@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 import tempfile
 from collections.abc import Generator, Iterable, Iterator
@@ -34,19 +33,19 @@ class FoundPoints:
         self._files: dict[str, IO[bytes]] = {}
         for name in cameras:
             self._files[name] = tempfile.TemporaryFile(dir=folder, prefix=".points-")  # noqa: SIM115, until it is closed
+        self._counts = dict.fromkeys(self._files, 0)
 
     def add(self, camera: str, number: int, points: Any) -> None:
         """Add the points of the camera's next picture, or that it is missing."""
         if camera in self._files:
             pickle.dump((number, points), self._files[camera], 4)
+            self._counts[camera] += 1
 
     def of(self, camera: str) -> Generator[tuple[int, Any], None, None]:
         """The pictures of a camera, in their order."""
-        file = self._files[camera]
-        end = file.seek(0, os.SEEK_END)
-        file.seek(0)
-        while file.tell() < end:
-            yield pickle.load(file)  # written above, in a file that no other process can open
+        self._files[camera].seek(0)
+        for _ in range(self._counts[camera]):
+            yield pickle.load(self._files[camera])  # written above, in a file that no other process can open
 
     def close(self) -> None:
         """Delete the files."""
