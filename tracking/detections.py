@@ -16,6 +16,8 @@ class PictureClock:
     delay_s: float
     row_time_s: float  # by which each row is exposed later than the one above; 0: a global shutter
     middle_row: float  # (height - 1) / 2
+    sigma_s: float = 0.0  # of the delay, where it is being estimated
+    row_sigma_s: float = 0.0  # of the row time, likewise
 
     def after_s(self, v_px: Array) -> Array:
         """(...): when points in these rows (...) were exposed, s after the frame's instant."""
@@ -23,7 +25,11 @@ class PictureClock:
 
     def reversed(self) -> PictureClock:
         """The same for a time that runs backward."""
-        return PictureClock(-self.delay_s, -self.row_time_s, self.middle_row)
+        return PictureClock(-self.delay_s, -self.row_time_s, self.middle_row, self.sigma_s, self.row_sigma_s)
+
+    def variance_s2(self, v_px: Array) -> Array:
+        """(...): variances of these times, s^2."""
+        return np.asarray(self.sigma_s**2 + ((v_px - self.middle_row) * self.row_sigma_s) ** 2)
 
     @property
     def numbers(self) -> tuple[float, float, float]:

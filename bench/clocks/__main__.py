@@ -1,11 +1,14 @@
 """`python -m bench.clocks --seeds 1:201`: attitude errors with clocks of the cameras' own over those with one clock.
 
+With --estimate: errors with clocks that are estimated over those with the same clocks known.
+
 Each row: kind of clocks, ratio of the RMS attitude errors, NEES/6, wrong labels and found spots of both recordings.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +19,7 @@ from bench.clocks.recording import KINDS, Recording, random_recording, write_rec
 from bench.random_scenes.scene import view_indices
 from geometry.arrays import Array
 from lab.files.run.results import SpotGrid, read_poses, read_spots
+from lab.runs.clock_estimate import DETERMINED
 from lab.runs.process import process_run
 from tracking.statuses import PoseStatus
 
@@ -34,11 +38,13 @@ class Figures:
     found: float  # share of the visible spots that have their label
     wrong_poses: int
     status: str
+    # By number of a clock that was estimated: error and sigma, s, and the sigma of its prior.
+    clocks: tuple[tuple[float, float, float], ...] = ()
 
 
-def figures(r: Recording, folder: Path) -> Figures:
-    """Write, process and compare one recording."""
-    truth = write_recording(r, folder / "run")
+def figures(r: Recording, folder: Path, estimate: bool = False) -> Figures:
+    """Write, process and compare one recording. estimate: its clocks are not given."""
+    truth = write_recording(r, folder / "run", estimate)
     outcome = process_run(folder / "run", folder / "out")
     poses, spots = read_poses(folder / "out"), read_spots(folder / "out")
     true = r.pose_at(r.rows_s)[poses.frames]
@@ -51,8 +57,22 @@ def figures(r: Recording, folder: Path) -> Figures:
     nees[poses.frames[known]] = np.sum(delta[known] * whole, axis=1) / 6
     wrong, right, visible = _labels(r, truth, spots)
     return Figures(
-        attitude, nees, wrong, right / max(visible, 1), int(np.sum(nees > WRONG_POSE / 6)), outcome.verdict.status
-    )
+        attitude, nees, wrong, right / max(visible, 1), int(np.sum(nees > WRONG_POSE / 6)), outcome.verdict.status,
+        _estimated(r, folder / "out"),
+    )  # fmt: skip
+
+
+def _estimated(r: Recording, out: Path) -> tuple[tuple[float, float, float], ...]:
+    """Errors, sigmas and priors' sigmas of the clocks that a run has estimated."""
+    stated = json.loads((out / "summary.json").read_text())["parameters"].get("clocks", {})
+    found = []
+    for name, clock in zip(r.rig.cameras, r.clocks, strict=True):
+        for key, true in (("time_offset", clock.late_s), ("row_time", clock.row_time_s)):
+            one = stated.get(name, {})
+            if f"{key}_sigma_s" in one:
+                sigma, prior = one[f"{key}_sigma_s"], one[f"{key}_prior_sigma_s"]
+                found.append((one[f"{key}_s"] - true, sigma, prior))
+    return tuple(found)
 
 
 def _labels(r: Recording, truth: dict[tuple[int, int], tuple[Array, Array]], spots: SpotGrid) -> tuple[int, int, int]:
@@ -87,15 +107,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="bench.clocks", description=__doc__)
     parser.add_argument("--seeds", default="1:201", metavar="A:B")
     parser.add_argument("--frames", type=int, default=200)
+    parser.add_argument("--estimate", action="store_true", help="clocks to be estimated, against the known ones")
     a = parser.parse_args()
     first, _, last = a.seeds.partition(":")
     seeds = range(int(first), int(last) if last else int(first) + 1)
     table: dict[str, list[tuple[float, float, float]]] = {}
+    clocks: list[tuple[float, float, float]] = []
     for seed in seeds:
         r = random_recording(seed, a.frames)
         with tempfile.TemporaryDirectory() as name:
-            with_clocks = figures(r, Path(name) / "clocks")
-            one = figures(r.with_one_clock(), Path(name) / "one")
+            with_clocks = figures(r, Path(name) / "clocks", a.estimate)
+            one = figures(r if a.estimate else r.with_one_clock(), Path(name) / "one")
+        clocks += with_clocks.clocks
         both = np.isfinite(with_clocks.attitude_deg) & np.isfinite(one.attitude_deg)
         both[:EDGE] = both[-EDGE:] = False
         rms = [np.sqrt(np.mean(f.attitude_deg[both] ** 2)) if both.any() else np.nan for f in (with_clocks, one)]
@@ -106,7 +129,7 @@ def main() -> None:
             f"{seed}: ratio {ratio:.3f} ({rms[0]:.3g} / {rms[1]:.3g} deg, {both.sum()} of"
             f" {np.isfinite(one.attitude_deg).sum()}), NEES/6 {nees[0]:.2f} ({nees[1]:.2f}), wrong {with_clocks.wrong}"
             f" ({one.wrong}), found {with_clocks.found:.4f} ({one.found:.4f}), wrong poses {with_clocks.wrong_poses}"
-            f" ({one.wrong_poses}), {with_clocks.status} ({one.status}): {r.text}",
+            f" ({one.wrong_poses}), {with_clocks.status} ({one.status}){_in_words(with_clocks)}: {r.text}",
             flush=True,
         )
     for kind, rows in [*table.items(), ("all", [row for of_kind in table.values() for row in of_kind])]:
@@ -114,8 +137,21 @@ def main() -> None:
         print(
             f"{kind}: {len(rows)} recordings, ratio median {np.nanmedian(ratio):.3f},"
             f" 95 % {np.nanquantile(ratio, 0.95):.3f}; NEES/6 mean {np.nanmean(nees):.2f}, median"
-            f" {np.nanmedian(nees):.2f} (one clock {np.nanmean(nees_one):.2f}, {np.nanmedian(nees_one):.2f})"
+            f" {np.nanmedian(nees):.2f} (compared {np.nanmean(nees_one):.2f}, {np.nanmedian(nees_one):.2f})"
         )
+    if clocks:
+        error, sigma, prior = np.array(clocks).T
+        away, known = np.abs(error / sigma), sigma < DETERMINED * prior
+        print(
+            f"clocks: {len(clocks)} numbers, {known.sum()} determined; error over sigma of these within 1:"
+            f" {100 * np.mean(away[known] < 1):.0f} %, beyond 3: {100 * np.mean(away[known] > 3):.1f} %, of all:"
+            f" {100 * np.mean(away < 1):.0f} %, {100 * np.mean(away > 3):.1f} %"
+        )
+
+
+def _in_words(f: Figures) -> str:
+    """The errors of estimated clocks over their sigmas, and these as shares of the priors'."""
+    return "".join(f", {e / s:+.2f} ({s / p:.2g} of prior)" for e, s, p in f.clocks)
 
 
 if __name__ == "__main__":

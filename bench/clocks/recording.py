@@ -54,6 +54,7 @@ class Clock:
     offset_s: float
     row_time_s: float
     own: bool  # its times are in a table of its own
+    late_s: float = 0.0  # what `estimate` has to find: the offset, or what all times of the table have in common
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,11 +159,11 @@ def _draw_clocks(
             row_time = min(float(rng.uniform(*ROW_TIME_S)), longest)
         if kind == "offsets":
             numbers = np.arange(frames)
-            clocks.append(Clock(numbers, numbers / rate + offset, offset, row_time, False))
+            clocks.append(Clock(numbers, numbers / rate + offset, offset, row_time, False, offset))
         else:
             speed = 1 + (rng.uniform(-DRIFT, DRIFT) if kind == "drift" else 0.0)
             numbers = np.arange(int(np.ceil(frames * own_rate / rate)) + 2)
-            clocks.append(Clock(numbers, numbers / own_rate * speed + offset, 0.0, row_time, True))
+            clocks.append(Clock(numbers, numbers / own_rate * speed + offset, 0.0, row_time, True, offset))
         words.append(f"{offset * rate:+.2f} fr" + (f" {row_time * 1e6:.0f} us" if row_time else ""))
     return tuple(clocks), f" ({', '.join(words)})"
 
@@ -182,8 +183,11 @@ def pictured(r: Recording, c: int) -> tuple[Array, Ints]:
     return uv, nearest
 
 
-def write_recording(r: Recording, folder: Path) -> dict[tuple[int, int], tuple[Array, Array]]:
-    """Write a run folder; returns the true pixels (n, 2) and the visibility (n,) by camera and picture number."""
+def write_recording(r: Recording, folder: Path, estimate: bool = False) -> dict[tuple[int, int], tuple[Array, Array]]:
+    """Write a run folder; returns the true pixels (n, 2) and the visibility (n,) by camera and picture number.
+
+    estimate: run.yaml leaves the offsets of all cameras but the first, and all row times, to be estimated.
+    """
     folder.mkdir(parents=True)
     save_rig(RigFile(r.rig, {}), folder / "rig.yaml")
     camera_of, _ = view_indices(r.rig)
@@ -205,13 +209,18 @@ def write_recording(r: Recording, folder: Path) -> dict[tuple[int, int], tuple[A
             rows += [(n, name, *[""] * 10) for n in np.setdiff1d(np.arange(len(r.hidden)), clock.numbers).tolist()]
         block: dict[str, object] = {"detections": "detections.csv"}
         if clock.own:
-            times = zip(clock.numbers.tolist(), (f"{t:.12g}" for t in clock.instants_s), strict=True)
+            unknown_s = clock.late_s if estimate and c else 0.0
+            times = zip(clock.numbers.tolist(), (f"{t:.12g}" for t in clock.instants_s - unknown_s), strict=True)
             write_table(folder / f"times-{c}.csv", columns.TIMES, times)
             block["timestamps"] = f"times-{c}.csv"
         if clock.offset_s:
             block["time_offset_s"] = clock.offset_s
         if clock.row_time_s:
             block["row_time_s"] = clock.row_time_s
+        if estimate and c:
+            block["time_offset_s"] = "estimate"
+        if estimate and clock.row_time_s:
+            block["row_time_s"] = "estimate"
         blocks[name] = block
     write_table(folder / "detections.csv", columns.DETECTIONS, rows)
     p = r.prior

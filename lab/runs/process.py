@@ -16,10 +16,11 @@ from lab.files.run.parameter_overrides import with_overrides
 from lab.files.run.run_file import Run, load_run
 from lab.files.run.truth import load_run_truth
 from lab.files.text.atomic_write import atomic_folder, earlier_results
-from lab.findings.finding import Level
+from lab.findings.finding import Level, worst_first
 from lab.findings.finding import verdict as verdict_of
 from lab.findings.outcome import Outcome, Verdict
 from lab.progress import Progress
+from lab.runs.clock_estimate import clock_findings, with_estimated_clocks
 from lab.runs.frames.clocked_frames import ClockedFrames
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.frames.row_records import row_records
@@ -114,7 +115,8 @@ def _write_results(
 ) -> Outcome[RunStatistics]:
     run = pipeline.run
     log.start(run, versions())
-    passes = TrackingAndSmoothing(pipeline, work, log.progress(progress))
+    pipeline, clocks = with_estimated_clocks(pipeline, work, log.progress(progress))
+    passes = TrackingAndSmoothing(pipeline, work, log.progress(progress), clocks)
     statistics, model_check, verdict = write_tables(pipeline, passes, work, causal=causal)
     from lab.runs.verdict.score import against_truth, read_tables
 
@@ -181,6 +183,9 @@ def write_tables(
     from lab.runs.model_check.check import check_sampled_frames  # deferred: only needed at the end of a run
 
     model_check = check_sampled_frames(run.rig, sampler, run.covariance)
+    if passes.clocks is not None:
+        findings = (*clock_findings(passes.clocks), *model_check.findings)
+        model_check = dataclasses.replace(model_check, findings=worst_first(findings))
     # Where the model check has tested the residuals, it has separated noise from faults.
     noise_scale = None if model_check.result.diagnosis is not None else pipeline.tracker.noise_scale
     mosaics = {name: noise.mosaic for name, noise in pipeline.noise.items() if noise.mosaic}

@@ -9,11 +9,13 @@ from __future__ import annotations
 import pickle
 import tempfile
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from lab.progress import Progress
+from lab.runs.clock_estimate import ClockEstimate
+from lab.runs.frames.moments import Moment
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from tracking.smoothing.recording import TrackedRecording
 from tracking.smoothing.smoother import Smoothed, smooth
@@ -45,7 +47,9 @@ class TrackingAndSmoothing:
     pipeline: Pipeline
     folder: Path
     progress: Progress | None = None
+    clocks: ClockEstimate | None = None  # of a run whose clocks are estimated: by the passes before, then by this one
     smoothing: SmoothingSummary | None = field(default=None, init=False)  # None: not smoothed
+    _planned: Mapping[str, tuple[float, float]] = field(default_factory=dict, init=False)  # clocks of the moments
 
     def causal_only(self) -> Generator[tuple[FrameRecord, None], None, None]:
         """The causal pass alone: each frame estimated from the frames up to it."""
@@ -58,6 +62,9 @@ class TrackingAndSmoothing:
         """Both passes: each frame as smoothed over the whole run, and as in the causal pass."""
         run, total = self.pipeline.run, self.pipeline.reader.expected_frames
         recording = TrackedRecording(run.rig, run.tracker, run.covariance, run.exposure_s or 0.0)
+        if self.clocks is not None and self.clocks.numbers:
+            recording.clocks = self.clocks.of_recording(run)
+            self._planned = self.clocks.by_camera(self.clocks.value_s)
         first: list[FrameRecord] = []
         with tempfile.TemporaryFile(dir=self.folder, prefix=".frames-") as waiting:
             for done, record in enumerate(self.pipeline.records(), start=1):
@@ -68,6 +75,9 @@ class TrackingAndSmoothing:
                 recording.append(record.dt_s, record.detections, record.tracked)
                 self._report(done, total, TRACKING)
             smoothed = self._smooth(recording)
+            if self.clocks is not None and smoothed.clocks is not None:
+                self.clocks = self.clocks.corrected(smoothed.clocks)
+                self.pipeline.run = self.clocks.of_run(run)
             waiting.seek(0)
             for k in range(smoothed.frames):
                 # Written above, in a file that no other process can open.
@@ -75,8 +85,19 @@ class TrackingAndSmoothing:
                 clock = time.perf_counter()
                 tracked = smoothed.frame(k, causal.tracked, causal.detections)
                 self.pipeline.timings.smoothing += time.perf_counter() - clock
-                yield replace(causal, tracked=tracked), causal
+                yield replace(causal, tracked=tracked, moment=self._at_instants(causal.moment)), causal
                 self._report(k + 1, smoothed.frames, WRITING)
+
+    def _at_instants(self, moment: Moment | None) -> Moment | None:
+        """A moment whose pictures have their estimated instants."""
+        if self.clocks is None or moment is None:
+            return moment
+        planned, now = self._planned, self.clocks.by_camera(self.clocks.value_s)
+        pictures = {
+            name: replace(p, t_s=p.t_s + now[name][0] - planned[name][0]) if name in now else p
+            for name, p in moment.pictures.items()
+        }
+        return replace(moment, pictures=pictures)
 
     def _smooth(self, recording: TrackedRecording) -> Smoothed:
         self._report(0, None, SMOOTHING)

@@ -132,12 +132,19 @@ def _prior_numbers(run: Run) -> dict[str, Any] | None:
 
 
 def _clock_numbers(run: Run) -> dict[str, Any]:
-    """By camera: the clocks that run.yaml states."""
-    return {
-        name: {
+    """By camera: the clocks that run.yaml states, and those that were estimated, with their sigmas."""
+    out: dict[str, Any] = {}
+    for name, clock in run.clocks.items():
+        out[name] = {
             "time_offset_s": clock.offset_s,
             "row_time_s": clock.row_time_s,
             "timestamps": None if clock.times_path is None else str(clock.times_path),
         }
-        for name, clock in run.clocks.items()
-    }
+        if clock.offset_prior_s:
+            out[name] |= {
+                "time_offset_sigma_s": clock.offset_sigma_s,
+                "time_offset_prior_sigma_s": clock.offset_prior_s,
+            }
+        if clock.row_time_prior_s:
+            out[name] |= {"row_time_sigma_s": clock.row_time_sigma_s, "row_time_prior_sigma_s": clock.row_time_prior_s}
+    return out

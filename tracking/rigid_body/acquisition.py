@@ -53,6 +53,8 @@ FIRST_SPEED, FIRST_RATE = 4.0, 6.0  # m/s, rad/s
 FIRST_ACCELERATION, FIRST_ANGULAR_ACCELERATION = 30.0, 100.0  # m/s^2, rad/s^2
 # Sigmas of the motion between the pictures of one frame in a search by geometry alone: usual motions, since with the
 # fastest ones no pose could be distinguished from another. px/s where the prior's centre shows no spot.
+# Largest motion of a spot in the error of a clock that is not known yet: a vehicle that moves faster is found later.
+SEARCH_CLOCK_PX = 8.0
 SEARCH_SPEED, SEARCH_RATE, SEARCH_PX_S = 1.0, 1.0, 1500.0  # m/s, rad/s
 # Limits of the search around the last pose; beyond the second one a fan of beams looks like itself, turned.
 MAX_DISTANCE_M, MAX_TURN_RAD = 1.5, np.deg2rad(60.0)
@@ -183,7 +185,9 @@ class Acquisition:
         sigmas = np.repeat([SEARCH_SPEED, SEARCH_RATE], 3)
         speed2 = 0.5 * np.sum((J * sigmas) ** 2, axis=(1, 2))
         px_s2 = float(np.median(speed2[speed2 > 0])) if np.any(speed2 > 0) else SEARCH_PX_S**2
-        variance = points.clock.after_s(points.uv_px[:, 1]) ** 2 * px_s2
+        v = points.uv_px[:, 1]
+        unknown = np.minimum(points.clock.variance_s2(v) * px_s2, SEARCH_CLOCK_PX**2)
+        variance = points.clock.after_s(v) ** 2 * px_s2 + unknown
         return replace(points, cov_px2=points.cov_px2 + variance[:, None, None] * np.eye(2))
 
 

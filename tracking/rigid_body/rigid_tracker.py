@@ -23,13 +23,14 @@ from dataclasses import replace
 import numpy as np
 
 from geometry.arrays import Array, Ints
+from geometry.compiled_projection import Views, project_all
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import SolveLimits, fit_pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty
-from tracking.detections import Detections
+from tracking.detections import Detections, PictureClock
 from tracking.input_validation import UsablePoints, check_step
 from tracking.labelling.first_labels import MIN_EVIDENCE_NATS, NO_POINT, Labelling
 from tracking.parameters import TrackerParameters
@@ -38,6 +39,7 @@ from tracking.rigid_body.acquisition import (
     FIRST_SPEED,
     MISSING_TO_DOUBT,
     P_VISIBLE_AT_START,
+    SEARCH_CLOCK_PX,
     Acquisition,
     SearchSchedule,
     add_mirror_solutions,
@@ -123,6 +125,8 @@ class RigidTracker:
         self._saw_any = False  # the frame before had labelled spots
         self._evidence = 0.0  # nats, of the best hypothesis against "all points are false", until a pose is measured
         self._begun = False
+        self._stated_cov = np.zeros((0, 2, 2))  # of the present frame's detections
+        self._clocks: list[PictureClock | None] = []  # by camera, of its pictures
 
     def begin_at(self, pose: Pose, m: Array, P: Array) -> None:
         """Start from a known state instead of the prior: m (12,) and P (18, 18) as in models/motion.py."""
@@ -196,6 +200,7 @@ class RigidTracker:
         predicted velocities.
         """
         frame = self._points.frame(found, self.noise_scale, self._last_pose is None)
+        self._stated_cov, self._clocks = frame.cov, [None if f is None else f.clock for f in found]
         no_shift = np.zeros_like(self._calibration_cov)
         obs = Observation(
             self.model.numbers, self._view_table, self._detection_model, self._calibration_cov, frame, no_shift,
@@ -218,7 +223,33 @@ class RigidTracker:
         shift, cov = picture_shifts(self.model.numbers, camera, obs.clocks, state.R, state.t, state.m, velocity_P)
         views = self.model.numbers.copy()
         views["shift"] = shift
-        return obs._replace(views=views, calibration_cov=self._calibration_cov + cov, shift_cov=cov)
+        frame = obs.frame
+        if any(clock is not None and (clock.sigma_s or clock.row_sigma_s) for clock in self._clocks):
+            frame = frame._replace(cov=self._with_clock_errors(frame, views, state, velocity_P))
+        return obs._replace(views=views, calibration_cov=self._calibration_cov + cov, shift_cov=cov, frame=frame)
+
+    def _with_clock_errors(self, frame: FrameDetections, views: Views, state: State, velocity_P: Array) -> Array:
+        """Covariances (m, 2, 2) of the detections with the motion of their spots in the error of their clocks.
+
+        Each moves as the spot nearest to it. As noise of its own in each picture this error hardly biases the pose:
+        along the motion the other cameras decide.
+        """
+        uv, J = project_all(views, state.R[None], state.t[None])
+        speed = J[0] @ state.m[:6]
+        unknown2 = J[0] @ velocity_P @ np.swapaxes(J[0], -1, -2)
+        cov = self._stated_cov.copy()
+        for c, clock in enumerate(self._clocks):
+            rows = slice(int(frame.first[c]), int(frame.first[c + 1]))
+            mine = np.flatnonzero((self._view_table.camera == c) & np.isfinite(uv[0]).all(axis=1))
+            if clock is None or rows.start == rows.stop or not len(mine):
+                continue
+            gap = np.linalg.norm(frame.uv[rows, None] - uv[0, mine], axis=-1)
+            nearest, variance = mine[gap.argmin(axis=1)], clock.variance_s2(frame.uv[rows, 1])
+            less = SEARCH_CLOCK_PX**2 / (0.5 * np.trace(unknown2[nearest], axis1=1, axis2=2) + 1e-12)
+            moved = speed[nearest][:, :, None] * speed[nearest][:, None, :]
+            cov[rows] += variance[:, None, None] * moved
+            cov[rows] += np.minimum(variance, less)[:, None, None] * unknown2[nearest]
+        return cov
 
     def _at_candidate(self, obs: Observation, pose: Pose) -> Observation:
         """The observation for a vehicle at a pose of whose motion nothing is known."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -67,6 +67,15 @@ class _Column:
         return self._storage[: self._count]
 
 
+@dataclass(frozen=True, slots=True)
+class EstimatedClocks:
+    """p numbers of the cameras' clocks that are estimated with the motion, as corrections of those used so far."""
+
+    numbers: tuple[tuple[int, bool], ...]  # camera, and whether it is its row time, else its offset
+    mean_s: Array  # (p,) of the prior
+    sigma_s: Array  # (p,)
+
+
 class TrackedRecording:
     """Collects each frame and the causal tracker's answer; keeps about 1 kB per frame. T frames, n views."""
 
@@ -83,6 +92,7 @@ class TrackedRecording:
         self.parameters = parameters
         self.calibration = None if covariance is None else RigUncertainty(rig, self.model, covariance)
         self.exposure_s = exposure_s
+        self.clocks: EstimatedClocks | None = None  # None: all are known
         cameras = len(self.model.camera_names)
         self._dt, self._jumped, self._measured = _Column(), _Column(dtype=bool), _Column(dtype=bool)
         self._pose, self._assigned = _Column((4, 3)), _Column((len(self.model),), np.int64)
@@ -167,11 +177,20 @@ class TrackedRecording:
         """(m,): of the variance of a coordinate of each detection of the run, the part that belongs to its place."""
         return self._place.values
 
-    def delays(self) -> Delays | None:
-        """When the detections of the run were exposed; None: all at the instants of their frames."""
+    def delays(self, corrections_s: Array | None = None) -> Delays | None:
+        """When the detections of the run were exposed; None: all at the instants of their frames.
+
+        corrections_s (p,): of the estimated clocks.
+        """
         clocks = self._clock.values
-        if not clocks[..., :2].any():
+        if self.clocks is None and not clocks[..., :2].any():
             return None
+        if self.clocks is not None and corrections_s is not None:
+            more = np.zeros((clocks.shape[1], 2))
+            for (camera, is_row_time), correction in zip(self.clocks.numbers, corrections_s, strict=True):
+                more[camera, int(is_row_time)] = correction
+            clocks = clocks.copy()
+            clocks[..., :2] += np.where(self._has_image.values[..., None], more, 0.0)
         per_picture = np.diff(self._first.values, axis=1)  # (T, cameras) detections
         delay, row_time, middle = (np.repeat(clocks[..., i].ravel(), per_picture.ravel()) for i in range(3))
         return Delays(delay + (self._uv.values[:, 1] - middle) * row_time, row_time, np.ascontiguousarray(clocks))

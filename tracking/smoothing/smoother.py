@@ -41,6 +41,7 @@ from tracking.smoothing.motion.run_detections import (
     RunDetections,
     SmoothedMotion,
     Steps,
+    UnknownClocks,
     WholeRun,
     controlled_labels,
     moved_detections,
@@ -106,6 +107,14 @@ class ReportedSpots:
 
 
 @dataclass(frozen=True, slots=True)
+class FoundClocks:
+    """Corrections of p numbers of the cameras' clocks."""
+
+    correction_s: Array  # (p,)
+    covariance: Array  # (p, p)
+
+
+@dataclass(frozen=True, slots=True)
 class Smoothed:
     """A run's motion and labels given all of its frames: T frames, n views."""
 
@@ -129,6 +138,7 @@ class Smoothed:
     relabelled: int  # labels that differ from the causal ones
     errors: ErrorScale  # corrections of the spots' stated covariances
     shift_px: Array | None = None  # (T, n, 2) as TrackedFrame.shift_px
+    clocks: FoundClocks | None = None  # None: all clocks were known
 
     @property
     def frames(self) -> int:
@@ -206,6 +216,9 @@ class Smoothed:
 
 
 MAX_ROUNDS = 4  # of motion and labels
+MAX_CLOCK_STEPS = 4  # of the clocks after each estimate of the motion
+MAX_CLOCK_STEP = 0.5  # of a prior's sigma: a longer step is not linear
+NEGLIGIBLE_STEP = 0.05  # of its sigma: a shorter step of a clock is not taken
 BRIEF_PROBABILITY = 0.9999  # least one of a label of a spot that is occluded before and after
 VAGUE_SIGMA_PX = 1.0  # a spot predicted worse than this may be labelled by its path although the pose is measured
 MAX_REPAIRS = 3  # times that velocity jumps are added where poses contradict their spots
@@ -262,6 +275,7 @@ class _Smoother:
         self.probability = np.where(self.causal >= 0, 1.0, np.nan)
         ref = straight_between(rec.poses, self.measured, np.cumsum(rec.dt_s))
         self.delays = rec.delays()
+        self.correction_s = np.zeros(0 if rec.clocks is None else len(rec.clocks.numbers))
         # (T,) frames with pictures of other instants: beside a velocity jump they have no pose of their own.
         self.timed = np.zeros(len(rec), dtype=bool)
         if self.delays is not None:
@@ -325,13 +339,39 @@ class _Smoother:
         self.motion, self.own = self.motion.without_covariances(), SingleFramePoses.unknown(0)
         run = WholeRun(
             self.views, self.seen, self.calibration_cov, rec.dt_s, rec.exposure_s, self.parameters.learn_jerk,
-            self.delays,
+            self.delays, self._unknown_clocks(),
         )  # fmt: skip
         self.motion = estimate(run, self.assigned, self.measured, self.motion, max_distance, self.trusted)
+        for _ in range(MAX_CLOCK_STEPS):
+            found = self.motion.clocks
+            if found is None or self.rec.clocks is None:
+                break
+            sigma = np.sqrt(np.diagonal(found.noise))
+            if np.all(np.abs(found.correction_s) < NEGLIGIBLE_STEP * sigma):
+                break
+            most = MAX_CLOCK_STEP * self.rec.clocks.sigma_s
+            self.correction_s = self.correction_s + np.clip(found.correction_s, -most, most)
+            self.delays = self.rec.delays(self.correction_s)
+            run = replace(run, delays=self.delays, clocks=self._unknown_clocks())
+            self.motion = estimate(
+                run, self.assigned, self.measured, self.motion.without_covariances(), max_distance, self.trusted
+            )
         self.detections = self._at_frames(self.seen, self.motion)
         own = self._single_frame_poses(self.assigned)
         self.measured = own.measured & ~self.conflicting
         self.own = replace(own, measured=self.measured)
+
+    def _unknown_clocks(self) -> UnknownClocks | None:
+        """The clocks that are estimated with the motion."""
+        clocks, model = self.rec.clocks, self.model
+        if clocks is None:
+            return None
+        return UnknownClocks(
+            np.array([camera for camera, _ in clocks.numbers], dtype=np.int64),
+            np.array([is_row_time for _, is_row_time in clocks.numbers], dtype=bool),
+            clocks.mean_s - self.correction_s, clocks.sigma_s, self.view_table.camera,
+            (model.image_size_px[:, 1] - 1) / 2, self.rec.calibration,
+        )  # fmt: skip
 
     def _single_frame_poses(self, assigned: Ints) -> SingleFramePoses:
         motion, rec = self.motion, self.rec
@@ -468,12 +508,20 @@ class _Smoother:
         self.own = replace(self.own, measured=self.own.measured & self.trusted)
         final, pose_P, motion_P = self._with_own_poses()
         differ = (assigned % BLENDED != causal % BLENDED) & ~((assigned < 0) & (causal < 0))
-        place_share, covariance = self._place_errors(final, pose_P)
+        place_share, place_factor, covariance = self._place_errors(final, pose_P)
         # Measured is the mean over the exposure; reported is the pose at its middle.
         jumps = motion.jumped | np.append(motion.jumped[1:], False)
         offsets = exposure_offsets(self.views, final, self.rec.exposure_s, motion.known & ~jumps)
         of_spots, of_poses = exposure_sigmas(final, motion.jumped, self.rec.exposure_s, self.rec.dt_s)
         covariance = covariance + of_poses[:, :, None] ** 2 * np.eye(6)
+        clocks: FoundClocks | None = None
+        if motion.clocks is not None:
+            # Errors of places do not average out for the clocks either.
+            excess = float(np.median(place_factor[motion.known])) if motion.known.any() else 1.0
+            clock_cov = motion.clocks.noise * max(excess, 1.0) + motion.clocks.systematic
+            clocks = FoundClocks(self.correction_s, clock_cov)
+            spread = motion.clocks.motion @ clock_cov @ np.swapaxes(motion.clocks.motion, 1, 2)
+            covariance, motion_P = covariance + spread[:, :6, :6], motion_P + spread[:, 6:, 6:]
         jerk = np.full(2, np.nan)
         if motion.log_density is not None:
             half = 0.5 * np.median(motion.log_density, axis=0)
@@ -492,6 +540,7 @@ class _Smoother:
             poses=poses,
             spots=spots,
             shift_px=shifts,
+            clocks=clocks,
             velocities=final.m[:, :6],
             covariance=covariance,
             place_share=place_share,
@@ -525,8 +574,10 @@ class _Smoother:
             motion_P[k] = motion_P[k] + spread
         return Reference(R, t, ref.m), pose_P, motion_P
 
-    def _place_errors(self, ref: Reference, pose_P: Array) -> tuple[float, Array]:
-        """Share of the errors that belong to places, and the covariances (T, 6, 6) of the poses with it."""
+    def _place_errors(self, ref: Reference, pose_P: Array) -> tuple[float, Array, Array]:
+        """Share of the errors that belong to places, by how much they enlarge the covariances (T,) of the poses, and
+        these covariances (T, 6, 6).
+        """
         frames, detections = np.flatnonzero(self.own.measured), self.detections
         averaged, (residual, uv_px) = np.full(len(self.rec), np.nan), np.full((2, *self.assigned.shape, 2), np.nan)
         ratio = np.trace(np.linalg.solve(self.own.covariance[frames], pose_P[frames]), axis1=1, axis2=2)
@@ -544,4 +595,4 @@ class _Smoother:
         shares = self.errors.place_px2(detections, self.rec.place_px2())[rows] / size**2
         width_px, share = self.detections.usual_size_px, float(np.mean(shares)) if len(shares) else 0.0
         found = place_errors(residual, uv_px, width_px, averaged, explained, share)
-        return found.share, pose_P * (found.factor * self.noise_share)[:, None, None]
+        return found.share, found.factor, pose_P * (found.factor * self.noise_share)[:, None, None]

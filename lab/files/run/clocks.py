@@ -14,6 +14,12 @@ from lab.files.run.times import Times, load_times
 LONGEST_READOUT = 1.05  # of the time between two pictures; above 1 for a rounded row time
 
 
+ESTIMATE = "estimate"  # the word in run.yaml for a number that the run estimates
+# Sigmas of the priors of such numbers, both around 0: of an offset in steps between two frames, of a row time as a
+# share of the longest one, with which the rows fill the time between two pictures.
+OFFSET_SIGMA_FRAMES, ROW_TIME_SIGMA = 1.0, 1.0
+
+
 @dataclass(frozen=True, slots=True)
 class CameraClock:
     """When a camera takes its pictures. Without times of its own, picture n belongs to frame n of the run."""
@@ -22,6 +28,12 @@ class CameraClock:
     row_time_s: float = 0.0  # by which each row is exposed later than the one above
     times: Times | None = None  # of its own pictures
     times_path: Path | None = None
+    # Sigmas of the priors of what is estimated, s; 0: the number is known.
+    offset_prior_s: float = 0.0
+    row_time_prior_s: float = 0.0
+    # Sigmas of the two numbers as far as they are known, s.
+    offset_sigma_s: float = 0.0
+    row_time_sigma_s: float = 0.0
 
     def instants_s(self, run_times: Times, numbers: Ints) -> Array:
         """Times (m,), s, of pictures (m,) at mid-exposure of their middle rows, on the run's clock."""
@@ -48,15 +60,22 @@ def picture_numbers(clock: CameraClock | None, run_times: Times, rows: Ints) -> 
 
 
 def load_clock(
-    offset_s: float, row_time_s: float, timestamps: str | None, folder: Path, where: str, rate_hz: float, height: int
+    offset_s: float | str,
+    row_time_s: float | str,
+    timestamps: str | None,
+    folder: Path,
+    where: str,
+    rate_hz: float,
+    height: int,
 ) -> CameraClock | None:
-    """The clock of a camera as run.yaml states it; None: that of the run.
+    """The clock of a camera as run.yaml states it, ESTIMATE or seconds; None: that of the run.
 
     timestamps: the file's name, from the run folder. where: of the camera in run.yaml, for messages. rate_hz: of the
     run; height: of the pictures, px. Raises InputError.
     """
     times: Times | None = None
     path: Path | None = None
+    offset_prior_s = OFFSET_SIGMA_FRAMES / rate_hz if isinstance(offset_s, str) else 0.0
     if timestamps is not None:
         path = folder / timestamps
         if not path.is_file():
@@ -64,12 +83,16 @@ def load_clock(
         times = load_times(path, rate_hz)
         if times.times_s is not None and times.frames is not None and len(times.frames) > 1:
             rate_hz = 1 / float(np.median(np.diff(times.times_s) / np.diff(times.frames)))
+    row_time_prior_s = ROW_TIME_SIGMA / rate_hz / height if isinstance(row_time_s, str) else 0.0
+    offset_s = 0.0 if isinstance(offset_s, str) else offset_s
+    row_time_s = 0.0 if isinstance(row_time_s, str) else row_time_s
     readout_s = abs(row_time_s) * height
     if readout_s * rate_hz > LONGEST_READOUT:
         raise InputError(
             f"{where}.row_time_s: expected {height} rows within the {1 / rate_hz:.6g} s between two pictures, got"
             f" {readout_s:.6g} s; give seconds for one row, not microseconds and not for the whole picture"
         )
-    if offset_s == 0.0 and row_time_s == 0.0 and times is None:
+    priors = offset_prior_s, row_time_prior_s
+    if offset_s == 0.0 and row_time_s == 0.0 and times is None and not any(priors):
         return None
-    return CameraClock(offset_s, row_time_s, times, path)
+    return CameraClock(offset_s, row_time_s, times, path, *priors, *priors)

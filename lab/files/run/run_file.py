@@ -19,7 +19,7 @@ from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState, OptionalDay
 from lab.files.rig.rig_file import joint_covariance, load_rig_file
-from lab.files.run.clocks import CameraClock, load_clock
+from lab.files.run.clocks import ESTIMATE, CameraClock, load_clock
 from lab.files.run.not_a_run import no_run_error
 from lab.files.run.times import Times, load_times
 from lab.files.text import fields
@@ -237,20 +237,15 @@ class SourceBlock(fields.Block):
         return self
 
 
-def _seconds(value: Any) -> float:
-    if value == "estimate":
-        raise fields.field_error(
-            "expected a number of seconds, got 'estimate', which this version does not do; the model check of a run"
-            " states how late a camera is"
-        )
-    return fields.finite_number(value)
+def _seconds_or_estimate(value: Any) -> float | str:
+    return ESTIMATE if value == ESTIMATE else fields.finite_number(value)
 
 
 class _CameraBlock(SourceBlock):
     """The pictures of one camera in run.yaml, and its clock."""
 
-    time_offset_s: Annotated[float, pydantic.PlainValidator(_seconds)] = 0.0
-    row_time_s: Annotated[float, pydantic.PlainValidator(_seconds)] = 0.0
+    time_offset_s: Annotated[float | str, pydantic.PlainValidator(_seconds_or_estimate)] = 0.0
+    row_time_s: Annotated[float | str, pydantic.PlainValidator(_seconds_or_estimate)] = 0.0
     timestamps: fields.Word | None = None
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+import pickle
+import tempfile
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import ExitStack, closing
-from typing import Any
+from copy import copy
+from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 
@@ -21,12 +25,53 @@ SAME_RATE = 1.2  # ratio of the rate by a camera's times to that of a video's he
 WRITTEN_BY_DEFAULT = (25.0, 30.0)  # Hz: rates that programs write where nobody states one
 
 
+class FoundPoints:
+    """The points found in the pictures of a recording, in unnamed temporary files, one for each camera."""
+
+    def __init__(self, folder: Path, cameras: Iterable[str]) -> None:
+        """folder: of the files."""
+        self._files: dict[str, IO[bytes]] = {}
+        for name in cameras:
+            self._files[name] = tempfile.TemporaryFile(dir=folder, prefix=".points-")  # noqa: SIM115, until it is closed
+        self._counts = dict.fromkeys(self._files, 0)
+
+    def add(self, camera: str, number: int, points: Any) -> None:
+        """Add the points of the camera's next picture, or that it is missing."""
+        if camera in self._files:
+            pickle.dump((number, points), self._files[camera], 4)
+            self._counts[camera] += 1
+
+    def of(self, camera: str) -> Generator[tuple[int, Any], None, None]:
+        """The pictures of a camera, in their order."""
+        self._files[camera].seek(0)
+        for _ in range(self._counts[camera]):
+            yield pickle.load(self._files[camera])  # written above, in a file that no other process can open
+
+    def close(self) -> None:
+        """Delete the files."""
+        for file in self._files.values():
+            file.close()
+
+
 class ClockedFrames(FrameReader):
     """As FrameReader; each FrameSet is that of one of `moments`."""
 
     def __init__(self, run: Run) -> None:
         super().__init__(run)
+        self._found: FoundPoints | None = None
         self._numbers = {name: self._numbers_of(name) for name in run.cameras}
+        self._plan()
+
+    def again(self, run: Run, found: FoundPoints) -> ClockedFrames:
+        """The same recording with other clocks, and with the points that were found in its pictures before."""
+        out = copy(self)
+        out._run, out._found = run, found
+        out._plan()
+        return out
+
+    def _plan(self) -> None:
+        """Plan the moments for the clocks of the run."""
+        run = self._run
         own = {name: (n, self._clock(name).instants_s(run.times, n)) for name, n in self._numbers.items()}
         rows = self._rows({name: t_s for name, (_, t_s) in own.items()})
         rows_s = run.times.t_s(rows)
@@ -63,6 +108,8 @@ class ClockedFrames(FrameReader):
 
     def _stream(self, name: str) -> Generator[tuple[int, Any], None, None]:
         numbers = self._numbers[name].tolist()
+        if name in self._sources and self._found is not None:
+            return self._found.of(name)
         if name in self._sources:
             return pictures(self._sources[name], self._run.rig.cameras[name].image_size_px, wanted=numbers)
         table = self._tables[name]

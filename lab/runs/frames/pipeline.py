@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from geometry.forward_model import SpotModel
 from geometry.light_centroid import CentroidOffsets
 from geometry.pose_prior import PosePrior
 from lab.files.run.run_file import DetectionsTable, Run
 from lab.pictures.picture_file import GreyPicture, MissingPicture
+from lab.runs.frames.clocked_frames import FoundPoints
 from lab.runs.frames.frames import FrameSet
 from lab.runs.frames.moments import Moment
 from lab.runs.frames.open_frames import open_frames
@@ -111,6 +113,7 @@ class Pipeline:
     noise: dict[str, CameraNoise]  # of cameras with pictures
     on_record: Callable[[FrameRecord], None] | None = None  # called with each record at once
     timings: Timings = field(default_factory=Timings)
+    found: FoundPoints | None = None  # where the points of pictures are kept for a further pass
     _offsets: dict[str, CentroidOffsets] = field(default_factory=dict)
 
     @staticmethod
@@ -127,6 +130,15 @@ class Pipeline:
 
             noise = camera_noises(run, reader)
         return Pipeline(run, reader, tracker_of(run), noise)
+
+    @property
+    def model(self) -> SpotModel:
+        """The views of the run."""
+        return SpotModel.of(self.run.rig)
+
+    def again(self, run: Run, reader: Frames, keep: FoundPoints | None = None) -> Pipeline:
+        """A further pass over the same recording, with a new tracker and the clocks of `run`."""
+        return replace(self, run=run, reader=reader, tracker=tracker_of(run), found=keep)
 
     @property
     def notes(self) -> list[str]:
@@ -180,12 +192,14 @@ class Pipeline:
         missing: list[str] = []
         for name in self.run.rig.cameras:
             picture = frames.images[name]
+            if isinstance(picture, np.ndarray):
+                picture = self.spots_in(name, picture)
+            if self.found is not None and frames.moment is not None and name in frames.moment.pictures:
+                self.found.add(name, frames.moment.pictures[name].number, picture)
             if isinstance(picture, MissingPicture):
                 found.append(None)
                 missing.append(picture.reason)
                 continue
-            if isinstance(picture, np.ndarray):
-                picture = self.spots_in(name, picture)
             found.append(picture if frames.moment is None else self._timed(name, picture, frames.moment))
             missing.append("")
         return tuple(found), tuple(missing)
@@ -194,11 +208,13 @@ class Pipeline:
         """The points of a camera's picture with the time between the moment and their exposure."""
         delay_s = moment.pictures[camera].t_s - moment.t_s
         clock = self.run.clocks.get(camera)
-        row_time_s = 0.0 if clock is None else clock.row_time_s
-        if abs(delay_s) < NEGLIGIBLE_S and row_time_s == 0.0:
+        row_time_s, sigmas = 0.0, (0.0, 0.0)
+        if clock is not None:
+            row_time_s, sigmas = clock.row_time_s, (clock.offset_sigma_s, clock.row_time_sigma_s)
+        if abs(delay_s) < NEGLIGIBLE_S and row_time_s == 0.0 and not any(sigmas):
             return points
         middle = (self.run.rig.cameras[camera].image_size_px[1] - 1) / 2
-        return replace(points, clock=PictureClock(delay_s, row_time_s, middle))
+        return replace(points, clock=PictureClock(delay_s, row_time_s, middle, *sigmas))
 
 
 def on_beam_axes(

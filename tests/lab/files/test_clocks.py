@@ -53,10 +53,17 @@ def test_offset_row_time_and_times_are_read(tmp_path):
     assert tmp_path / "times.csv" in run.times_paths
 
 
+def test_what_is_to_be_estimated_starts_at_zero_with_the_sigma_of_its_prior(tmp_path):
+    clock = load_run(run_with(tmp_path, "time_offset_s: estimate, row_time_s: estimate")).clocks["right"]
+    assert (clock.offset_s, clock.row_time_s) == (0.0, 0.0)
+    assert clock.offset_prior_s == clock.offset_sigma_s == pytest.approx(0.01)
+    assert clock.row_time_prior_s == pytest.approx(0.01 / 48)
+
+
 @pytest.mark.parametrize(
     ("right", "says"),
     [
-        ("time_offset_s: estimate", "expected a number of seconds, got 'estimate'"),
+        ("time_offset_s: estimated", "expected a finite number"),
         ("row_time_s: 15", "give seconds for one row, not microseconds"),
         ("timestamps: none.csv", "expected a table frame,t_s, found none"),
         ("time_offset_s: 2.1", "expected pictures within the run"),

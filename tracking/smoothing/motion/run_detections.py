@@ -15,6 +15,7 @@ from geometry.compilation.jit import compiled
 from geometry.compiled_linalg import copy_into, copy_matrix_into, pose_plus
 from geometry.compiled_projection import Views, project_view
 from geometry.pose import Pose
+from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking.rigid_body.association.frame_detections import BLENDED, chosen_points
 from tracking.rigid_body.models.information import (
     add_spot,
@@ -286,6 +287,49 @@ def delayed_information(
 
 
 @compiled
+def timed_rows(
+    views: Views,
+    detections: RunDetections,
+    delays: Delays,
+    assigned: Ints,
+    calibration_cov: Array,
+    ref: Reference,
+    steps: Steps,
+    start: int,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """What `delayed_information` sums up, spot by spot; 0 for views without a label.
+
+    Returns residuals (F, n, 2), px; their weights (F, n, 2, 2); Jacobians (F, n, 2, 18) by the states; the speeds
+    (F, n, 2), px/s, of the spots; and their rows (F, n), px.
+    """
+    frames, n = ref.t.shape[0], assigned.shape[1]
+    e, W, H = np.zeros((frames, n, 2)), np.zeros((frames, n, 2, 2)), np.zeros((frames, n, 2, STATE))
+    speed, row = np.zeros((frames, n, 2)), np.zeros((frames, n))
+    at, J, one, no_cov = np.empty(2), np.empty((2, 6)), np.empty((2, STATE)), np.zeros((n, 2, 2))
+    for k in range(frames):
+        use, uv, noise = labelled_points(detections, start + k, assigned[start + k], no_cov)
+        for i in range(n):
+            if not use[i]:
+                continue
+            d = detections.begin[start + k] + assigned[start + k, i]
+            after = delays.after_s[d]
+            projected, m = timed_spot(views, i, ref.R[k], ref.t[k], ref.m[k], after, at, J, one)
+            if not projected:
+                continue
+            uu, both, vv = _covariance(noise[i], J, m, delays.row_time_s[d], steps, k, after)
+            uu, both, vv = uu + calibration_cov[i, 0, 0], both + calibration_cov[i, 0, 1], vv + calibration_cov[i, 1, 1]
+            w0, w1, w2, _ = inverse_2x2(uu, both, vv)
+            W[k, i, 0, 0], W[k, i, 0, 1], W[k, i, 1, 0], W[k, i, 1, 1] = w0, w1, w1, w2
+            moving = _speed(J, m)
+            row[k, i] = uv[i, 1]
+            for a in range(2):
+                e[k, i, a], speed[k, i, a] = uv[i, a] - at[a], moving[a]
+                for j in range(STATE):
+                    H[k, i, a, j] = one[a, j]
+    return e, W, H, speed, row
+
+
+@compiled
 def moved_detections(
     views: Views,
     camera: Ints,
@@ -345,6 +389,37 @@ class WholeRun:
     exposure_s: float
     adapt_jerk: bool  # estimate the strength of the jerk; else it is kept
     delays: Delays | None = None  # of the detections; None: all are of the instants of their frames
+    clocks: UnknownClocks | None = None  # numbers of the cameras' clocks that are estimated with the motion
+
+
+@dataclass(frozen=True, slots=True)
+class UnknownClocks:
+    """p numbers of the cameras' clocks, and what is known of their corrections before."""
+
+    camera: Ints  # (p,)
+    is_row_time: Bools  # (p,) else the offset
+    mean_s: Array  # (p,)
+    sigma_s: Array  # (p,)
+    camera_of: Ints  # (n,) of the views
+    middle_row: Array  # (n,) of the pictures
+    calibration: RigUncertainty | None = None
+
+    def columns(self, speed: Array, row: Array) -> Array:
+        """Derivatives (F, n, 2, p) of the expected pixels by the numbers, from `timed_rows`."""
+        later = row - self.middle_row
+        own = self.camera_of[:, None] == self.camera
+        factor = np.where(own, np.where(self.is_row_time, later[..., None], 1.0), 0.0)
+        return np.asarray(speed[..., None] * factor[:, :, None, :])
+
+
+@dataclass(frozen=True, slots=True)
+class ClockSolution:
+    """Corrections of p numbers of the clocks, jointly with the motion of T frames."""
+
+    correction_s: Array  # (p,)
+    noise: Array  # (p, p) covariance by the spots' noise and the prior ...
+    systematic: Array  # (p, p) ... and by the calibration's errors
+    motion: Array  # (T, 12, p) change of pose and velocities by the numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -359,6 +434,7 @@ class SmoothedMotion:
     motion_P: Array  # (T, 6, 6) of the velocities
     known: Bools  # (T,) the pose is not lost
     weight: Array  # (T,) of the information of each frame's spots in the motion; 0: not used
+    clocks: ClockSolution | None = None
 
     @staticmethod
     def begin(ref: Reference, jumped: Bools, log_density: Array | None) -> SmoothedMotion:

@@ -14,6 +14,7 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from tracking.rigid_body.models.motion import STATE, predicted
 from tracking.rigid_body.online_estimates import MANOEUVRE_S, jump_variance
+from tracking.smoothing.motion.clocks import solve_clocks
 from tracking.smoothing.motion.fixed_interval import (
     Interval,
     RunInformation,
@@ -32,6 +33,7 @@ from tracking.smoothing.motion.process_noise import (
     with_errors_along_axes,
 )
 from tracking.smoothing.motion.run_detections import (
+    ClockSolution,
     Reference,
     SmoothedMotion,
     Steps,
@@ -100,6 +102,7 @@ class _Estimator:
         self.fresh = motion.log_density is None
         self.log_density = self._first_density() if motion.log_density is None else motion.log_density[core].copy()
         self.interpolation_offset = motion.interpolation_offset
+        self.clocks: ClockSolution | None = None
         self.interior = np.ones(len(self.dt), dtype=bool)  # (T,) frames that all passes so far found to be interior
 
     def run_passes(self) -> SmoothedMotion:
@@ -128,6 +131,10 @@ class _Estimator:
             elif converged and not new.any():
                 break
         assert out is not None
+        if self.run.clocks is not None and self.steps is not None:
+            info, _ = self._information(self.ref)
+            at = self.ref, self.steps, self.core.start
+            self.clocks = solve_clocks(self.run, self.assigned, self.weight[self.core], at, info, density)
         return self._extrapolated(out)
 
     def _adapt(self, out: Interval, number: int, passes: int, new_jump: bool) -> bool:
@@ -350,9 +357,14 @@ class _Estimator:
         known = (sd[:, :3].max(axis=1) < LOST_SIGMA_M) & (sd[:, 3:].max(axis=1) < LOST_SIGMA_RAD)
         jumped = self.motion.jumped.copy()
         jumped[core] = self.jumped
+        clocks = self.clocks
+        if clocks is not None:
+            nearest = np.clip(np.arange(frames) - core.start, 0, core.stop - core.start - 1)
+            clocks = replace(clocks, motion=clocks.motion[nearest])
         return SmoothedMotion(
-            Reference(R, t, m), log_density, self.interpolation_offset, jumped, pose_P, motion_P, known, self.weight
-        )
+            Reference(R, t, m), log_density, self.interpolation_offset, jumped, pose_P, motion_P, known, self.weight,
+            clocks,
+        )  # fmt: skip
 
 
 def _damped(info: RunInformation, damping: float) -> RunInformation:

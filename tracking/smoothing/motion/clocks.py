@@ -1,0 +1,68 @@
+"""Numbers of the cameras' clocks, estimated jointly with the motion of a run.
+
+The Gauss-Newton step of the whole run (whole_run.py) is solved once more for each number: how the most probable motion
+changes with it. With the motion eliminated (Schur complement) a small system for the numbers is left. Source: ours.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geometry.arrays import Array, Ints
+from geometry.pose import Pose
+from tracking.smoothing.motion.fixed_interval import RunInformation, smoothed
+from tracking.smoothing.motion.run_detections import ClockSolution, Reference, Steps, WholeRun, timed_rows
+
+_CHUNK = 512  # frames whose rows are in memory at once
+
+
+def solve_clocks(
+    run: WholeRun, assigned: Ints, weight: Array, at: tuple[Reference, Steps, int], info: RunInformation, density: Array
+) -> ClockSolution:
+    """Corrections of the unknown numbers of a run's clocks.
+
+    at: F frames of a converged motion, their steps, and the first of them; info, density (F, 6): of the last step;
+    weight (F,): of the frames' spots. assigned (T, n).
+    """
+    ref, steps, start = at
+    clocks, delays = run.clocks, run.delays
+    assert clocks is not None
+    assert delays is not None
+    p, frames = len(clocks.camera), len(ref.t)
+    B, C, b = np.zeros((frames, info.vector.shape[1], p)), np.zeros((p, p)), np.zeros(p)
+    parts = [slice(first, min(first + _CHUNK, frames)) for first in range(0, frames, _CHUNK)]
+
+    def rows(part: slice) -> tuple[Array, Array, Array, Array]:
+        some = Reference(*(np.ascontiguousarray(a[part]) for a in ref))
+        of_part = Steps(*(np.ascontiguousarray(a[part]) for a in steps))
+        e, W, H, speed, row = timed_rows(
+            run.views, run.detections, delays, assigned, run.calibration_cov, some, of_part, start + part.start
+        )
+        return e, W * weight[part, None, None, None], H, clocks.columns(speed, row)
+
+    for part in parts:
+        e, W, H, d = rows(part)
+        Wd = W @ d
+        B[part] = np.einsum("knai,knaj->kij", H, Wd)
+        C += np.einsum("knai,knaj->ij", d, Wd)
+        b += np.einsum("knai,kna->i", Wd, e)
+    x = smoothed(ref, info, density).x
+    G = np.empty((frames, info.vector.shape[1], p))  # change of the states by the numbers, with the sign of B
+    for i, size in enumerate(clocks.sigma_s):
+        moved = info._replace(vector=np.ascontiguousarray(info.vector + B[..., i] * size))
+        G[..., i] = (smoothed(ref, moved, density).x - x) / size
+    precision = np.diag(1 / clocks.sigma_s**2)
+    noise = np.linalg.inv(C - np.einsum("kis,kit->st", B, G) + precision)
+    noise = 0.5 * (noise + noise.T)
+    correction = noise @ (b - np.einsum("kis,ki->s", B, x) + precision @ clocks.mean_s)
+    systematic = np.zeros((p, p))
+    if clocks.calibration is not None:
+        total = np.zeros((p, 0))
+        for part in parts:
+            _, W, H, d = rows(part)
+            Q = W @ (d - np.einsum("knai,kij->knaj", H, G[part]))
+            root = clocks.calibration.root_at(Pose(ref.R[part], ref.t[part])).reshape(*Q.shape[:3], -1)
+            one = np.einsum("knas,knar->sr", Q, root)
+            total = one if not total.size else total + one
+        systematic = noise @ total @ total.T @ noise
+    return ClockSolution(correction, noise, systematic, -G[:, :12])
