@@ -201,7 +201,7 @@ def _start_again(peaks: Array, chosen: Ints, table: Array, limits: DetectionLimi
 
 @compiled
 def _drop_background(table: Array, restarted: Bools) -> None:
-    """Reject fits that have started again (n,) and follow the background: wider than the peak, or no maximum on the slope.
+    """Reject restarted fits (n,) that follow the background: wider than the peak, or no maximum on the slope.
 
     The curvature of a wide reflection fits a faint wide spot. A spot is brighter than its surroundings on all sides.
     """
