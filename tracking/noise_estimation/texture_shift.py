@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array
+from geometry.compilation.jit import compiled
 from tracking.detections import Detections
 from tracking.noise import BLOCK, NORMAL_68, NoiseModel, Picture, quantile_variance
 from tracking.noise_estimation.black_level import level_over_light
@@ -46,7 +47,6 @@ _FEWEST_PLACES = 500  # samples of the filters' outputs without lights and lines
 _WEIGHTED = 0.145
 _UNSURE = 0.02  # of the noise of the mean picture, which is subtracted: usual error of its estimate
 _SAMPLED = 3  # px: step of the sample of the filters' outputs
-_ROUND = np.eye(2)  # shape of a round spot, relative
 LARGEST_SHARE = 0.25  # of the spot's width: a larger error is not assumed; faint spots on texture have half of it
 
 
@@ -133,31 +133,45 @@ class TextureShift:
         contain other errors, such as speckle. Both belong to the place.
         """
         misfit = np.zeros(len(found)) if found.misfit is None else found.misfit
-        seen = misfit[:, None, None] * found.cov_px2
-        major, minor = np.maximum(found.major_px, _NARROWEST_PX), np.maximum(found.minor_px, _NARROWEST_PX)
         width_px, brightness = np.sqrt(found.major_px * found.minor_px), noise.slope_dn * found.peak / noise.floor_dn2
-        sigma = self.sigma_px(width_px, found.peak / max(noise.black_dn, 1.0), brightness, light_px)
-        expected_px2 = np.where(np.isnan(sigma), 0.0, sigma) ** 2
-        angle = np.radians(found.angle_deg)
-        along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        outer = along[:, :, None] * along[:, None, :]
-        ratio = (major / minor)[:, None, None]
-        shape = np.where(np.isnan(ratio * outer), _ROUND, ratio * outer + (_ROUND - outer) / ratio)
-        expected = expected_px2[:, None, None] * shape
-        other = _trace(seen) > _CLEARLY_MORE * _trace(expected)
-        place = np.where(other[:, None, None], seen, expected)
+        sigma_px = self.sigma_px(width_px, found.peak / max(noise.black_dn, 1.0), brightness, light_px)
+        axes = np.stack([found.major_px, found.minor_px, np.radians(found.angle_deg)])
+        cov_px2, place_px2 = _with_errors(np.asarray(found.cov_px2), misfit, axes, sigma_px, self.misfit_share)
+        return replace(found, cov_px2=cov_px2, place_px2=place_px2)
+
+
+@compiled
+def _with_errors(
+    cov_px2: Array, misfit: Array, axes: Array, sigma_px: Array, usual_share: float
+) -> tuple[Array, Array]:
+    """The covariances (n, 2, 2) with these errors, and the part (n,) of a coordinate's variance that is theirs.
+
+    misfit (n,): share of the covariance; axes (3, n): half axes, px, and angle, rad; sigma_px (n,), nan: not known;
+    usual_share: misfit_share of TextureShift.
+    """
+    out, place_px2 = cov_px2.copy(), np.zeros(len(cov_px2))
+    for k in range(len(out)):
+        major, minor, known = max(axes[0, k], _NARROWEST_PX), max(axes[1, k], _NARROWEST_PX), axes[:, k].sum() < np.inf
+        along, across, ratio = np.cos(axes[2, k]), np.sin(axes[2, k]), major / minor
+        if not known:  # round
+            along, across, ratio = 1.0, 0.0, 1.0
+        uu, vv = ratio * along**2 + across**2 / ratio, ratio * across**2 + along**2 / ratio
+        uv = (ratio - 1 / ratio) * along * across
+        trace, seen = 0.5 * (uu + vv), 0.5 * misfit[k] * (cov_px2[k, 0, 0] + cov_px2[k, 1, 1])
+        variance = 0.0 if np.isnan(sigma_px[k]) else sigma_px[k] ** 2
+        other = seen > _CLEARLY_MORE * variance * trace
+        place_px2[k] = seen if other else variance * trace
         # The grain of the light is the same for all spots of a camera, but does not show in each: then it is at least
         # usual.
-        if self.misfit_share > 0:
-            usual = self.misfit_share**2 * major * minor
-            below = 0.5 * _trace(place) < usual
-            place = np.where(below[:, None, None], usual[:, None, None] * shape, place)
-        return replace(found, cov_px2=found.cov_px2 - seen + place, place_px2=0.5 * _trace(place))
-
-
-def _trace(matrices: Array) -> Array:
-    """(n,): of matrices (n, 2, 2)."""
-    return np.asarray(matrices[:, 0, 0] + matrices[:, 1, 1])
+        usual = usual_share**2 * major * minor
+        if usual_share > 0 and known and place_px2[k] < usual:
+            variance, other, place_px2[k] = usual, False, usual * trace
+        if not other:
+            for i in range(2):
+                for j in range(2):
+                    part = uu if i + j == 0 else (vv if i + j == 2 else uv)
+                    out[k, i, j] = (1 - misfit[k]) * cov_px2[k, i, j] + variance * part
+    return out, place_px2
 
 
 def texture_shift(

@@ -109,6 +109,8 @@ def _started(
     noise = {name: CameraNoise(name, camera.noise) for name, camera in run.rig.cameras.items()}
     with ThreadPoolExecutor(max(len(first), 1)) as pool:  # in parallel, since pictures queue up meanwhile
         list(pool.map(lambda name: noise[name].estimate_from(first[name]), first))
+    if any(own.shows_structure for own in noise.values()):
+        process.start()
     pipeline = Pipeline(run, frames, tracker_of(run), noise, output.write)
     detect, make = run.tracker.detect, process.background
     finders = {name: _Finder(pipeline, name, LiveBackground(own, detect, make)) for name, own in noise.items()}
