@@ -77,6 +77,8 @@ class StaticBackground:
     shown: ShownLight
     spot_px: float = 0.0  # usual width of the lights that move; 0: not known
     shifts_px: NDArray[np.float32] | None = None  # (h, w): `local_shifts` of such a light
+    # (n,): `local_shifts` of each light at rest, as wide as it is
+    rest_shifts_px: Array | None = None
     fixed: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))  # lights at rest while others move
     misfit_share: float = float("nan")  # of the lights that move, as in TextureShift
     # (h, w), in 2^-GAIN_BITS: undoes what the brightness of the surface does to a light; None: nothing
@@ -218,7 +220,9 @@ class StaticBackground:
             lights = self.lights.found
             # The error of the mean picture's fit is the same in all pictures.
             common = self._noise_share * lights.variance_px2
-            lights = shift.added_to(lights, self.noise, self._shifts_at(lights))
+            # Most of them are objects, whose misfits are no grain of the light.
+            own = replace(shift, misfit_share=self.misfit_share)
+            lights = own.added_to(lights, self.noise, self.rest_shifts_px, at_rest=True)
             place = np.zeros(len(lights)) if lights.place_px2 is None else lights.place_px2
             at_rest = self.fixed.astype(float) if len(self.fixed) else None
             covariance = (1 + self._noise_share) * lights.cov_px2
