@@ -48,7 +48,7 @@ from tracking.smoothing.motion.run_detections import (
     straight_between,
 )
 from tracking.smoothing.motion.whole_run import MAX_DISTANCE, estimate
-from tracking.smoothing.place_errors import place_errors
+from tracking.smoothing.place_errors import place_errors, scaled_shares
 from tracking.smoothing.recording import TrackedRecording, merged, track_backward
 from tracking.smoothing.single_frame_poses import SingleFramePoses, rms_residuals, single_frame_poses
 from tracking.smoothing.systematic_errors import calibration_errors, exposure_offsets, exposure_sigmas, pose_shift
@@ -583,11 +583,12 @@ class _Smoother:
         ratio = np.trace(np.linalg.solve(self.own.covariance[frames], pose_P[frames]), axis1=1, axis2=2)
         averaged[frames] = 6 / np.maximum(ratio, 1e-9)
         averaged = np.where(np.isfinite(averaged), averaged, np.nanmedian(averaged) if len(frames) else 1.0)
-        expected, assigned = project_all(self.views, ref.R[frames], ref.t[frames])[0], self.assigned[frames]
+        (expected, J), assigned = project_all(self.views, ref.R[frames], ref.t[frames]), self.assigned[frames]
         use = (assigned >= 0) & (assigned < BLENDED) & np.isfinite(expected).all(axis=-1)
         k, view = np.nonzero(use)
         rows = detections.begin[frames[k]] + assigned[use]
-        size = np.sqrt(0.5 * np.trace(detections.cov[rows] + self.calibration_cov[view], axis1=1, axis2=2))
+        cov = detections.cov[rows] + self.calibration_cov[view]
+        size = np.sqrt(0.5 * np.trace(cov, axis1=1, axis2=2))
         residual[frames[k], view] = (detections.uv[rows] - expected[use]) / size[:, None]
         uv_px[frames[k], view] = detections.uv[rows]
         explained = np.zeros(len(self.model))
@@ -595,4 +596,14 @@ class _Smoother:
         shares = self.errors.place_px2(detections, self.rec.place_px2())[rows] / size**2
         width_px, share = self.detections.usual_size_px, float(np.mean(shares)) if len(shares) else 0.0
         found = place_errors(residual, uv_px, width_px, averaged, explained, share)
-        return found.share, found.factor, pose_P * (found.factor * self.noise_share)[:, None, None]
+        # Spots on edges have larger shares: the errors of places lie in the directions that these determine.
+        own = scaled_shares(shares, share, found.share) * found.more[frames[k], view] * averaged[frames[k]]
+        more = np.zeros_like(pose_P)
+        for i in range(len(self.model)):
+            of_view = view == i
+            J_i = J[k[of_view], i]
+            information = np.swapaxes(J_i, 1, 2) @ np.linalg.solve(cov[of_view], J_i)
+            more[frames[k[of_view]]] += own[of_view, None, None] * information
+        covariance = pose_P * found.factor[:, None, None]
+        covariance[frames] = pose_P[frames] + pose_P[frames] @ more[frames] @ pose_P[frames]
+        return found.share, found.factor, covariance * self.noise_share[:, None, None]
