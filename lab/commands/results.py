@@ -123,6 +123,33 @@ def compare(result: Path, other: Path | None, reference: Path | None, out: Path 
     conclude(compare_and_write(result, other, reference, out, **options))
 
 
+# `beampose export`: the motion in the files of other programs.
+
+
+_FORMATS = ("tum", "mcap", "rosbag2", "c3d", "hdf5", "parquet")  # as in lab.results.export, which imports more
+
+
+@click.command()
+@click.argument("results", type=_RESULTS)
+@click.option("--to", required=True, type=click.Choice(_FORMATS), help="The format.")
+@click.option("--out", type=ANY_PATH, help="The file, or the folder of a rosbag2; default: the name of the results.")
+@click.option("--causal", is_flag=True, help="The poses as known at each instant, in place of the smoothed ones.")
+def export(results: Path, to: str, out: Path | None, causal: bool) -> None:
+    """Write the motion of a result in a format of other programs.
+
+    Times, poses as world_from_body and, as far as the format has places for them, statuses, sigmas and covariances.
+    Units and conventions are written into the file. Formats other than tum need a package of their own: pip install
+    'beampose[FORMAT]'.
+
+    \b
+    Example:
+        beampose export results/huo2015 --to tum --out results/huo2015.tum
+    """
+    from lab.results.export import export as export_motion
+
+    conclude(export_motion(results, to, out, causal=causal))
+
+
 # `beampose view`: a rig, a run or results in three dimensions.
 
 

@@ -94,7 +94,14 @@ def detect(pictures: tuple[Path, ...], out: Path, **options: Any) -> None:
 @click.option(
     "--out", required=True, type=FOLDER, help="Gets attitude_live.csv during the recording, and the results at the end."
 )
-@click.option("--udp", metavar="HOST:PORT", help="Also send each frame there, as a line of JSON.")
+@click.option("--udp", metavar="HOST:PORT", help="As --stream udp:HOST:PORT.")
+@click.option(
+    "--stream",
+    "streams",
+    multiple=True,
+    metavar="KIND:ADDRESS",
+    help="Also send each frame: udp:HOST:PORT or zmq:HOST:PORT (published there), as JSON; lsl:NAME. Repeatable.",
+)
 @click.option(
     "--idle",
     default=10.0,
@@ -133,7 +140,7 @@ def watch(
 
     \b
     Example:
-        beampose watch runs/today --out results/today --udp 127.0.0.1:5005
+        beampose watch runs/today --out results/today --stream udp:127.0.0.1:5005
     """
     from lab.runs.watch.live_frames import WatchOptions
     from lab.runs.watch.watch import stopped_by_ctrl_c, watch_run
