@@ -37,14 +37,28 @@ def check(path: Path) -> None:
 @click.option("--to", "last", type=int, help="With --video: last frame number.")
 @click.option("--every", type=click.IntRange(min=1), help="With --video: only each so many frames.")
 @click.option("--fps", type=NumberRange(1, 240), help="With --video: its frames per second; default: 25.")
-def report(results: Path, run_folder: Path | None, video: bool, **shown: Any) -> None:
+@click.option(
+    "--certificate", is_flag=True, help="Also write certificate.html: the uncertainty in the form of the GUM."
+)
+@click.option(
+    "--at", type=int, multiple=True, help="With --certificate: a frame number; repeatable. Default: a usual one."
+)
+def report(
+    results: Path, run_folder: Path | None, video: bool, certificate: bool, at: tuple[int, ...], **shown: Any
+) -> None:
     """Write report.html of a result folder again, with --video also a video of its pictures.
+
+    With --certificate also the uncertainty budget of attitude and position at chosen frames and over the recording:
+    sources, sensitivities, degrees of freedom, expanded uncertainty, traceability, and a Monte Carlo that checks it.
 
     \b
     Example:
         beampose report results/huo2015
         beampose report results/huo2015 --video --from 0 --to 30
+        beampose report results/huo2015 --certificate --at 100
     """
+    if at and not certificate:
+        raise click.UsageError("--at is of the certificate; add --certificate")
     given = {name: value for name, value in shown.items() if value is not None}
     if not video and given:
         raise click.UsageError("--from, --to, --every and --fps are of the video; add --video")
@@ -54,6 +68,11 @@ def report(results: Path, run_folder: Path | None, video: bool, **shown: Any) ->
     if not are_results(results):
         raise InputError(f"{results}: expected a folder that `beampose run` wrote, found no summary.json of one")
     show_line(f"report: {write_report(results, run_folder)}")
+    if certificate:
+        from lab.results.certificate import write_certificate
+
+        for line in write_certificate(results, run_folder, at).lines:
+            show_line(line)
     if video:
         from lab.results.show import write_video
 

@@ -218,7 +218,7 @@ def _row_text(number: int, header: list[str], old: bytes | None, new: bytes | No
 
 
 # Tables that a run writes under some conditions only: in the results but not computed, they are a difference.
-_OPTIONAL = ("systematic.csv", "attitude_causal.csv", "covariance_causal.csv")
+_OPTIONAL = ("systematic.csv", "budget.csv", "attitude_causal.csv", "covariance_causal.csv")
 
 
 @dataclass(frozen=True, slots=True)

@@ -125,6 +125,7 @@ class Smoothed:
     velocities: Array  # (T, 6): m/s in world, rad/s in body
     covariance: Array  # (T, 6, 6) of the poses, from noise and from errors that belong to places
     place_share: float  # share of the spots' error variance that belongs to places (place_errors.py)
+    rest_parts: Array  # (T, 7) as TrackedFrame.rest_parts
     systematic: Array  # (T or 1, 6, 6) the calibration's share, to be added
     motion_covariance: Array  # (T, 6, 6) of the velocities
     known: Bools  # (T,): the pose is not lost
@@ -188,6 +189,7 @@ class Smoothed:
             if known
             else None,
             pose_systematic=systematic if known else None,
+            rest_parts=self.rest_parts[k] if known else None,
             shift_px=None if self.shift_px is None else self.shift_px[k],
         )
 
@@ -544,6 +546,7 @@ class _Smoother:
             velocities=final.m[:, :6],
             covariance=covariance,
             place_share=place_share,
+            rest_parts=np.column_stack([1 - (1 - place_share) / place_factor, of_poses]),
             systematic=self.systematic,
             motion_covariance=motion_P,
             known=motion.known,
