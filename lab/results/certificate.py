@@ -271,7 +271,10 @@ def _frame_sections(f: FrameCertificate) -> list[Section]:
         row: list[object] = [value, u, f"{r.degrees_of_freedom[i]:.0f}", f"{r.factor[i]:.3f}", U]
         if f.simulated is not None:
             of_draws = f.simulated[1][i]
-            row += [_rounded(scale * of_draws, scale * r.expanded[i]), f"{100 * (of_draws / r.expanded[i] - 1):+.1f}"]
+            row += [
+                _rounded(scale * of_draws, scale * r.expanded[i]),
+                f"{100 * (of_draws / r.expanded[i] - 1):+.1f}".replace("-", "\u2212"),
+            ]
         of_result.append([f"{name} ({unit})", *row])
     probability = f"{100 * COVERAGE:g} %"
     heads = ["", "value", "u", "dof", "k", "U"]
@@ -291,8 +294,18 @@ def _frame_sections(f: FrameCertificate) -> list[Section]:
     budget: list[list[object]] = []
     for line, v, dof in zip(f.lines, f.variances, f.degrees_of_freedom.tolist(), strict=True):
         kind, shape, _ = EVALUATED[line]
-        budget.append([line, kind, shape, dof, *(scale * np.sqrt(max(float(v[i]), 0.0)) for _, i, *_, scale in _SHOWN)])
-    budget.append(["combined (u)", "", "", "", *(scale * float(r.combined[i]) for _, i, *_, scale in _SHOWN)])
+        budget.append(
+            [
+                line,
+                kind,
+                shape,
+                dof,
+                *(format_number(scale * np.sqrt(max(float(v[i]), 0.0))) for _, i, *_, scale in _SHOWN),
+            ]
+        )
+    budget.append(
+        ["combined (u)", "", "", "", *(format_number(scale * float(r.combined[i])) for _, i, *_, scale in _SHOWN)]
+    )
     sections = [
         Section(f"Result of {at}", words, (), PageTable(heads, of_result)),
         Section(
@@ -364,7 +377,11 @@ def _range(c: Certificate) -> Section:
         PageTable(
             ["", "least", "median", "95 % of frames within", "largest", "in frame"],
             [
-                [f"{name} ({unit})", *(scale * v[i] for v in figures), int(c.measured[np.argmax(U[:, i])])]
+                [
+                    f"{name} ({unit})",
+                    *(format_number(scale * float(v[i])) for v in figures),
+                    int(c.measured[np.argmax(U[:, i])]),
+                ]
                 for name, i, _, _, unit, scale in _SHOWN
             ],
         ),
