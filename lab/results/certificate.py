@@ -404,7 +404,7 @@ def _traceability(c: Certificate, results: Path, summary: Mapping[str, Any]) -> 
             rig,
             "Scale and axes are those of the survey, the boards and the stand that the rig was calibrated with; the"
             " laboratory adds their certificates.",
-            "Not contained: errors of these references that the calibration was not told, time offsets and row times of"
+            "Not contained: errors of these references beyond their stated sigmas, time offsets and row times of"
             " run.yaml (taken as exact), changes of the rig since its calibration (see the model check in report.html),"
             " and wrong labels of spots.",
         ],
