@@ -121,6 +121,7 @@ def _alignment_row(comparison: Comparison) -> dict[str, Any] | None:
 # The report of a comparison.
 
 
+_SENTENCES = ("The two motions agree.", "The two motions differ, or too little was compared.")  # by level
 _COLOURS = (svg.BLUE, svg.ORANGE, svg.GREEN)
 
 
@@ -137,7 +138,7 @@ def write_page(comparison: Comparison, folder: Path) -> Path:
         _key_figures(comparison),
         [*undetermined_lines(comparison.estimate), *comparison.notes],
         [("result", str(comparison.result)), (of_two, str(comparison.other)), made_with("numpy", "scipy")],
-        PageVerdict(verdict.level, verdict.what, (verdict,)),
+        PageVerdict(verdict.level, _SENTENCES[verdict.level], (verdict,)),
     )
     return write_report(page, folder)
 

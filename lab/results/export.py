@@ -22,7 +22,7 @@ from lab.errors import InputError
 from lab.extras import needed
 from lab.files.run.results import POSE_STATUSES, PoseTrack, read_poses, read_result_table, read_summary
 from lab.files.text import columns
-from lab.files.text.atomic_write import atomic_folder, atomic_write_bytes, earlier_results
+from lab.files.text.atomic_write import atomic_folder, atomic_write_bytes
 from lab.files.text.json_text import plain_value
 from lab.findings.outcome import Done
 from lab.runs.process import are_results
@@ -210,7 +210,7 @@ def _write_rosbag2(motion: Exported, path: Path) -> None:
     store = types.get_typestore(types.Stores.ROS2_HUMBLE)
     motion.kept(with_predicted=True)
     motion.notes.append("velocities and rates are not in the file")
-    with atomic_folder(path, earlier_results("metadata.yaml")) as work:
+    with atomic_folder(path, _is_ours) as work:
         inner = work / path.name  # the writer makes it, and names its database after it
         with bags.Writer(inner, version=9) as bag:
             for name, text in motion.about.items():
@@ -228,6 +228,12 @@ def _write_rosbag2(motion: Exported, path: Path) -> None:
         for file in inner.iterdir():
             shutil.move(file, work / file.name)
         inner.rmdir()
+
+
+def _is_ours(folder: Path) -> bool:
+    """Whether a folder is a bag of this program: other bags are not replaced."""
+    path = folder / "metadata.yaml"
+    return path.is_file() and "beampose_conventions" in path.read_text("utf-8", "replace")
 
 
 def _ros_messages(motion: Exported, types: Mapping[str, Any]) -> Iterator[tuple[int, str, Any]]:

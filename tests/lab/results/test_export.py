@@ -234,6 +234,9 @@ def test_an_earlier_file_is_replaced_and_a_foreign_folder_is_not(results, tmp_pa
     (tmp_path / "thesis/chapter.tex").write_text("years")
     with pytest.raises(lab.InputError):
         lab.export(results, to, tmp_path / "thesis")
+    (tmp_path / "thesis/metadata.yaml").write_text("rosbag2_bagfile_information: {}")  # a bag of another program
+    with pytest.raises(lab.InputError):
+        lab.export(results, to, tmp_path / "thesis")
     assert (tmp_path / "thesis/chapter.tex").read_text() == "years"
 
 
