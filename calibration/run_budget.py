@@ -93,11 +93,11 @@ def calibration_share(
     S = Sensitivity(rig, model, covariance.names).of(derivatives)[rows].reshape(2 * len(rows), -1)
     flat = J.reshape(-1, 6)
     common = S @ covariance.matrix @ S.T
-    weights = np.linalg.inv(spots_px2)
+    weights: Array = np.linalg.inv(spots_px2)
     for _ in range(2):  # with the noise alone, then with what the calibration leaves in the residuals
         JW = np.swapaxes(J, 1, 2) @ weights
         gain = np.linalg.solve(np.sum(JW @ J, axis=0), np.concatenate(list(JW), axis=1))
-        used = weights
+        used = np.asarray(weights, dtype=np.float64)
         left = np.eye(len(flat)) - flat @ gain
         residual = (left @ common @ left.T).reshape(len(rows), 2, len(rows), 2)
         weights = np.linalg.inv(spots_px2 + residual[np.arange(len(rows)), :, np.arange(len(rows))])
@@ -140,7 +140,7 @@ def expanded(variances: Array, degrees_of_freedom: Array) -> Expanded:
     with np.errstate(divide="ignore", invalid="ignore"):
         effective = total**2 / np.sum(variances**2 / dof, axis=0)
     effective = np.where(np.isfinite(effective), effective, np.inf)
-    factor = stats.t.ppf(0.5 + 0.5 * COVERAGE, effective)
+    factor = np.asarray(stats.t.ppf(0.5 + 0.5 * COVERAGE, effective), dtype=np.float64)
     combined = np.sqrt(np.maximum(total, 0.0))
     return Expanded(combined, effective, factor, factor * combined)
 
