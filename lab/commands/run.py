@@ -25,6 +25,9 @@ causal_option = click.option(
 )
 
 
+_ADDED = {"overlay.*": "--video", "certificate.html": "--certificate"}  # by `report`, to results
+
+
 @click.command()
 @click.argument("run_folder", metavar="RUN", type=ANY_PATH)
 @click.option("--out", required=True, type=FOLDER, help="Where the results go; earlier results there are replaced.")
@@ -59,11 +62,12 @@ def run(
     def more(of: Run) -> dict[str, Any]:
         return provenance(ctx) | ({"inputs": fingerprints(of, full=True)} if full_hash else {})
 
-    videos = sorted(out.glob("overlay.*"))  # of the earlier results in this folder
+    # Of the earlier results in this folder, with the option that makes it again.
+    added = [(p, option) for name, option in _ADDED.items() for p in sorted(out.glob(name))]
     with shown(run_folder.name, verbose=verbose, quiet=quiet) as progress:
         outcome = process_run(run_folder, out, progress=progress, more=more, **options)
     gone = "removed with the earlier results; make it again with `beampose report"
-    conclude(outcome, quiet=quiet, notes=[f"{video}: {gone} {out} --video`" for video in videos])
+    conclude(outcome, quiet=quiet, notes=[f"{path}: {gone} {out} {option}`" for path, option in added])
 
 
 @click.command()
