@@ -147,7 +147,7 @@ def clause(sentence: str) -> str:
 
 def first_sentence(text: str) -> str:
     """The first sentence of a text, without its full stop; the report has the whole text."""
-    return re.split(r"(?<=[\w)%`'\"])\.\s+(?=[A-Z`])", text, maxsplit=1)[0].rstrip(".")
+    return re.split(r"(?<=[\w)%`'\"])\.\s+(?=[A-Z`])|(?<=\?)\s+", text, maxsplit=1)[0].rstrip(".")
 
 
 def verdict(findings: Iterable[Finding]) -> Level:

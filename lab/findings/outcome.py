@@ -60,13 +60,19 @@ class Verdict:
         }
 
     def of_frames(self, measured: int, frames: int, errors: Sequence[str] = ()) -> str:
-        """The verdict on frames in one line: the first reason in one sentence; errors: against truth, in words."""
-        more = len(self.texts) - 1
-        first = [first_sentence(text) for text in self.texts[:1]]
+        """The verdict on frames in one line: the first reason in one sentence; errors: against truth, in words.
+
+        With the next reason where the first refers to the others.
+        """
+        codes = [f.code for f in self.findings if f.level > Level.PASS]
+        shown = 2 if codes[:1] == [_REFERS_TO_OTHERS] else 1
+        more = len(self.texts) - shown
+        first = [first_sentence(text) for text in self.texts[:shown]]
         others = [f"{more} more in the report"] if more > 0 else []
         texts = "; ".join([*first, *others, *errors])
         said = f" ({texts})" if texts else ""
         remedy = f" {first_sentence(self.remedy)}." if self.remedy else ""
+        remedy = remedy.replace("?.", "?")
         return f"{self.status.upper()}: {measured} of {frames} frames measured{said}{remedy}"
 
 
