@@ -42,5 +42,6 @@ def test_a_reason_that_refers_to_the_others_is_shown_with_the_next_one():
         Level.FAIL, "camera left: nothing was detected", remedy="Are the lasers on? If so, look.", code="BP-V08"
     )
     assert Verdict((lost, dark)).of_frames(0, 10) == (
-        "FAIL: 0 of 10 frames measured (the vehicle was never found; camera left: nothing was detected) Are the lasers on?"
+        "FAIL: 0 of 10 frames measured (the vehicle was never found; camera left: nothing was detected)"
+        " Are the lasers on?"
     )
