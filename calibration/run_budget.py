@@ -93,14 +93,15 @@ def calibration_share(
     S = Sensitivity(rig, model, covariance.names).of(derivatives)[rows].reshape(2 * len(rows), -1)
     flat = J.reshape(-1, 6)
     common = S @ covariance.matrix @ S.T
-    weights: Array = np.linalg.inv(spots_px2)
+    weights: Array = np.asarray(np.linalg.inv(spots_px2), dtype=np.float64)
     for _ in range(2):  # with the noise alone, then with what the calibration leaves in the residuals
         JW = np.swapaxes(J, 1, 2) @ weights
         gain = np.linalg.solve(np.sum(JW @ J, axis=0), np.concatenate(list(JW), axis=1))
-        used = np.asarray(weights, dtype=np.float64)
+        used = weights
         left = np.eye(len(flat)) - flat @ gain
         residual = (left @ common @ left.T).reshape(len(rows), 2, len(rows), 2)
-        weights = np.linalg.inv(spots_px2 + residual[np.arange(len(rows)), :, np.arange(len(rows))])
+        left_over = residual[np.arange(len(rows)), :, np.arange(len(rows))]
+        weights = np.asarray(np.linalg.inv(spots_px2 + left_over), dtype=np.float64)
     K = gain @ S
     adjusted = _transport(K @ covariance.matrix @ K.T, stated)
     return CalibrationShare(covariance, gain, adjusted @ K, rows, used, adjusted)
