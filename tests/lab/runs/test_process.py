@@ -44,7 +44,8 @@ CAUSAL_FILES = (
 FILES = (*CAUSAL_FILES, "attitude_causal.csv", "covariance_causal.csv", "budget.csv")
 HEADERS = {"attitude.csv": columns.ATTITUDE, "beams.csv": columns.BEAMS, "covariance.csv": columns.COVARIANCE,
            "detections.csv": columns.DETECTIONS, "spots.csv": columns.SPOTS,
-           "attitude_causal.csv": columns.ATTITUDE, "covariance_causal.csv": columns.COVARIANCE}  # fmt: skip
+           "attitude_causal.csv": columns.ATTITUDE, "covariance_causal.csv": columns.COVARIANCE,
+           "budget.csv": columns.BUDGET}  # fmt: skip
 FRAMES = 14
 # Frame 4 in no camera; 6 and 7 only in the right one; 9 damaged in the right one.
 DAMAGED = replace(
