@@ -42,12 +42,13 @@ from tracking.statuses import PoseStatus
 
 FILE_NAME = "certificate.html"
 DRAWS = 10_000  # of the Monte Carlo: its expanded uncertainty is known to 1 %
-NOISE, PLACES, TURNS = "centroid noise", "errors of a place", "turns within the exposure (clock)"
+NOISE, PLACES, TURNS, CLOCKS = "centroid noise", "errors of a place", "turns within the exposure", "cameras' clocks"
 # Type of evaluation, distribution, and where the figure comes from.
 EVALUATED = {
     NOISE: ("A", "normal", "residuals of the recording"),
     PLACES: ("A", "normal", "products of residuals at the same place; mean of the posterior distribution"),
     TURNS: ("B", "uniform", "instant of a velocity jump within the step, which is not known"),
+    CLOCKS: ("A", "normal", "the recording, where run.yaml lets the clocks be estimated; stated clocks are exact"),
     **dict.fromkeys(LINES, ("B", "normal", "covariance in rig.yaml, from the calibration")),
 }
 # Name, place in `AXES`, unit and scale of a value, unit and scale of its uncertainty.
@@ -98,17 +99,17 @@ def certificate(
     """
     run = load_run(_run_folder(results, run_folder))
     poses, spots = read_poses(results), read_spots(results)
-    place_share, turns = _rest_parts(results, poses)
+    stated = _rest_parts(results, poses)
     measured = np.flatnonzero(poses.has(PoseStatus.MEASURED) & np.isfinite(poses.covariance).all(axis=(1, 2)))
     if not len(measured):
         raise InputError(f"{results}: expected a frame with a measured pose, found none")
     if set(spots.views) != set(run.rig.views()):
         raise InputError(f"{run.path}: expected the cameras and spots of {results}, found another rig")
     dof = _degrees_of_freedom(spots, measured, poses)
-    rest = _rest_variances(poses, measured, place_share, turns)
+    rest = _rest_variances(poses, measured, *stated)
     systematic = np.nan_to_num(poses.systematic[measured])
     calibration = along_axes(systematic, poses.world_from_body[measured])
-    whole = expanded(np.concatenate([rest, calibration[None]]), np.array([dof, np.inf, np.inf, np.inf]))
+    whole = expanded(np.concatenate([rest, calibration[None]]), np.array([dof, *[np.inf] * len(rest)]))
     chosen = [int(poses.frames[measured[k]]) for k in _median(whole)] if not at else list(at)
     made = []
     for number in chosen:
@@ -129,26 +130,28 @@ def _run_folder(results: Path, given: Path | None) -> Path:
     return folder
 
 
-def _rest_parts(results: Path, poses: PoseTrack) -> tuple[Array, Array]:
-    """By frame: the share (T,) of errors of places, and the sigmas (T, 6) of turns; 0 where the run states neither."""
-    share, turns = np.zeros(len(poses.frames)), np.zeros((len(poses.frames), 6))
+def _rest_parts(results: Path, poses: PoseTrack) -> tuple[Array, Array, Array]:
+    """By frame: share (T,) of errors of places; covariances (T, 6, 6) of turns and of clocks; 0 where not stated."""
+    share, turns, clocks = np.zeros(len(poses.frames)), *np.zeros((2, len(poses.frames), 6, 6))
     path = results / "budget.csv"
     if path.is_file():
         table = read_result_table(path, columns.BUDGET)
         at = np.searchsorted(poses.frames, table.numbers["frame"])
         share[at] = table.numbers["place_share"]
-        turns[at] = table.stack(*columns.BUDGET[2:])
-    return share, turns
+        turns[at] = table.stack(*columns.BUDGET[2:8])[..., None] ** 2 * np.eye(6)
+        for name, i, j in zip(columns.BUDGET[8:], *np.triu_indices(6), strict=True):
+            clocks[at, i, j] = clocks[at, j, i] = table.numbers[name]
+    return share, turns, clocks
 
 
-def _rest_variances(poses: PoseTrack, rows: Ints, place_share: Array, turns: Array) -> Array:
-    """Variances (3, k, 6) along `AXES` of noise, errors of places and turns in some frames."""
+def _rest_variances(poses: PoseTrack, rows: Ints, place_share: Array, turns: Array, clocks: Array) -> Array:
+    """Variances (4, k, 6) along `AXES` of noise, errors of places, turns and clocks in some frames."""
     pose = poses.world_from_body[rows]
     rest = poses.covariance[rows] - np.nan_to_num(poses.systematic[rows])
-    of_turns = turns[rows][..., None] ** 2 * np.eye(6)
-    both = along_axes(rest - of_turns, pose)
+    both = along_axes(rest - turns[rows] - clocks[rows], pose)
     share = place_share[rows, None]
-    return np.stack([(1 - share) * both, share * both, along_axes(of_turns, pose)])
+    each = [along_axes(part[rows], pose) for part in (turns, clocks)]
+    return np.stack([(1 - share) * both, share * both, *each])
 
 
 def _degrees_of_freedom(spots: SpotGrid, measured: Ints, poses: PoseTrack) -> float:
@@ -176,7 +179,7 @@ def _of_frame(
     if spots.cov_uv_px2 is not None:
         cov[:, 0, 1] = cov[:, 1, 0] = np.nan_to_num(spots.cov_uv_px2[row][place][rows])
     systematic = poses.systematic[k]
-    names, variances = [NOISE, PLACES, TURNS], [*rest]
+    names, variances = [NOISE, PLACES, TURNS, CLOCKS], [*rest]
     share = None
     if run.covariance is not None and np.isfinite(systematic).all() and np.any(systematic):
         share = calibration_share(run.rig, run.covariance, pose, rows, cov, systematic)
@@ -404,9 +407,9 @@ def _traceability(c: Certificate, results: Path, summary: Mapping[str, Any]) -> 
             rig,
             "Scale and axes are those of the survey, the boards and the stand that the rig was calibrated with; the"
             " laboratory adds their certificates.",
-            "Not contained: errors of these references beyond their stated sigmas, time offsets and row times of"
-            " run.yaml (taken as exact), changes of the rig since its calibration (see the model check in report.html),"
-            " and wrong labels of spots.",
+            "Not contained: errors of these references beyond their stated sigmas, time offsets and row times that"
+            " run.yaml states (taken as exact), changes of the rig since its calibration (see the model check in"
+            " report.html), and wrong labels of spots.",
         ],
         (),
         PageTable(["file", "SHA-256", "covers"], rows),

@@ -16,7 +16,7 @@ from lab.files.rig.camera_block import Covariance
 from lab.files.rig.rig_file import load_rig_file, save_rig
 from lab.files.run.results import read_poses, read_result_table
 from lab.files.text import columns
-from lab.results.certificate import NOISE, PLACES, TURNS, certificate, write_certificate
+from lab.results.certificate import CLOCKS, NOISE, PLACES, TURNS, certificate, write_certificate
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
 
@@ -74,7 +74,7 @@ def test_the_range_has_the_uncertainty_of_each_measured_frame(results):
 def test_turns_within_the_exposure_and_errors_of_places_have_lines_of_their_own(results):
     table = read_result_table(results / "budget.csv", columns.BUDGET)
     poses = read_poses(results)
-    turns = table.stack(*columns.BUDGET[2:])
+    turns = table.stack(*columns.BUDGET[2:8])
     assert (turns > 0).any()
     rest = poses.covariance - poses.systematic
     assert np.linalg.eigvalsh(rest - turns[..., None] ** 2 * np.eye(6)).min() > 0
@@ -120,7 +120,7 @@ def test_a_rig_without_covariance_makes_an_incomplete_budget_that_says_so(tmp_pa
     process_run(run, tmp_path / "out")
     (tmp_path / "out/budget.csv").unlink()  # as results of earlier versions
     (frame,) = certificate(tmp_path / "out", draws=0).frames
-    assert frame.lines == (NOISE, PLACES, TURNS)
+    assert frame.lines == (NOISE, PLACES, TURNS, CLOCKS)
     assert frame.variances[1:].max() == 0
     write_certificate(tmp_path / "out", None, (), 50)
     assert (
