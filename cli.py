@@ -31,6 +31,7 @@ for command in (
     track.track,
     track.stereo,
     results.compare,
+    results.export,
     results.view,
     results.show,
     calibrate.calibrate,

@@ -129,6 +129,7 @@ def test_the_commands_are_those_of_the_contract():
         "track",
         "stereo",
         "compare",
+        "export",
         "view",
         "show",
         "calibrate",

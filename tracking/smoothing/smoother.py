@@ -125,6 +125,7 @@ class Smoothed:
     velocities: Array  # (T, 6): m/s in world, rad/s in body
     covariance: Array  # (T, 6, 6) of the poses, from noise and from errors that belong to places
     place_share: float  # share of the spots' error variance that belongs to places (place_errors.py)
+    rest_parts: Array  # (T, 28) as TrackedFrame.rest_parts
     systematic: Array  # (T or 1, 6, 6) the calibration's share, to be added
     motion_covariance: Array  # (T, 6, 6) of the velocities
     known: Bools  # (T,): the pose is not lost
@@ -188,6 +189,7 @@ class Smoothed:
             if known
             else None,
             pose_systematic=systematic if known else None,
+            rest_parts=self.rest_parts[k] if known else None,
             shift_px=None if self.shift_px is None else self.shift_px[k],
         )
 
@@ -514,6 +516,7 @@ class _Smoother:
         offsets = exposure_offsets(self.views, final, self.rec.exposure_s, motion.known & ~jumps)
         of_spots, of_poses = exposure_sigmas(final, motion.jumped, self.rec.exposure_s, self.rec.dt_s)
         covariance = covariance + of_poses[:, :, None] ** 2 * np.eye(6)
+        rest = [1 - (1 - place_share) / place_factor, of_poses, np.zeros((len(covariance), 21))]
         clocks: FoundClocks | None = None
         if motion.clocks is not None:
             # Errors of places do not average out for the clocks either.
@@ -522,6 +525,7 @@ class _Smoother:
             clocks = FoundClocks(self.correction_s, clock_cov)
             spread = motion.clocks.motion @ clock_cov @ np.swapaxes(motion.clocks.motion, 1, 2)
             covariance, motion_P = covariance + spread[:, :6, :6], motion_P + spread[:, 6:, 6:]
+            rest[2] = spread[:, *np.triu_indices(6)]
         jerk = np.full(2, np.nan)
         if motion.log_density is not None:
             half = 0.5 * np.median(motion.log_density, axis=0)
@@ -544,6 +548,7 @@ class _Smoother:
             velocities=final.m[:, :6],
             covariance=covariance,
             place_share=place_share,
+            rest_parts=np.column_stack(rest),
             systematic=self.systematic,
             motion_covariance=motion_P,
             known=motion.known,

@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +33,8 @@ from lab.runs.verdict.frame_checks import FrameChecks
 from lab.runs.verdict.run_statistics import RunStatistics
 from lab.runs.watch.background import BackgroundProcess, LiveBackground
 from lab.runs.watch.live_frames import LiveFrames, WatchOptions
-from lab.runs.watch.live_output import LiveOutput, UdpLines, is_live_table
+from lab.runs.watch.live_output import LiveOutput, is_live_table
+from lab.runs.watch.streams import opened
 from tracking.background.estimation import PICTURES
 from tracking.detections import Detections
 
@@ -46,6 +47,7 @@ def watch_run(
     out: Path,
     *,
     udp: str | None = None,
+    streams: Sequence[str] = (),
     reprocess: bool = False,
     options: WatchOptions = WatchOptions(),  # noqa: B008  (frozen)
     overrides: Mapping[str, Any] | None = None,
@@ -56,12 +58,13 @@ def watch_run(
     """Process a run folder whose cameras are folders that are being filled, or devices.
 
     During the recording `out` contains attitude_live.csv: a row per frame by the causal tracker, flushed at once. udp:
-    HOST:PORT that receives the same as a line of JSON. The recording ends when nothing has come for `options.idle_s`,
-    when all devices have ended, or when `stop` is set; then `out` receives the results of `beampose run`, computed from
-    the received detections. These differ from those of a run by the pictures that the noise and the static background
-    are estimated from (here each camera's first ones; of the background, those before each picture) and by pictures
-    that came too late. reprocess: computes the results from the finished
-    folders instead, as `beampose run` does, which takes longer. provenance: added to summary.json, such as the command.
+    HOST:PORT that receives the same as a line of JSON. streams: further receivers, `KIND:ADDRESS`. The recording ends
+    when nothing has come for `options.idle_s`, when all devices have ended, or when `stop` is set; then `out` receives
+    the results of `beampose run`, computed from the received detections. These differ from those of a run by the
+    pictures that the noise and the static background are estimated from (here each camera's first ones; of the
+    background, those before each picture) and by pictures that came too late. reprocess: computes the results from the
+    finished folders instead, as `beampose run` does, which takes longer. provenance: added to summary.json, such as the
+    command.
 
     Raises:
         BeamposeError: the run cannot be watched, or no picture came.
@@ -74,9 +77,9 @@ def watch_run(
         )
     with contextlib.ExitStack() as stack:
         work = stack.enter_context(atomic_folder(out, may_replace=lambda p: are_results(p) or is_live_table(p)))
-        sender = None if udp is None else UdpLines(udp)
+        sending = stack.enter_context(opened(udp, streams, run.frame_rate_hz))
         frames = LiveFrames(run, options, stop or threading.Event())
-        output = LiveOutput(Path(out), frames, FrameChecks(run.rig, run.covariance), sender)
+        output = LiveOutput(Path(out), frames, FrameChecks(run.rig, run.covariance), sending)
         stack.callback(output.close)
         with frames, _low_latency():
             pipeline, finders = _started(run, frames, output, stack.enter_context(BackgroundProcess()))
