@@ -167,7 +167,7 @@ class RigUncertainty:
         """
         self._model = model
         self._sensitivity = Sensitivity(rig, model, covariance.names)
-        self._root = _root(covariance.matrix)
+        self._root = covariance_root(covariance.matrix)
 
     def at(self, world_from_body: Pose) -> Array:
         """Covariance (..., 2n, 2n), px^2, of the pixels of the n views, ordered u, v; 0 for views without projection.
@@ -186,7 +186,7 @@ class RigUncertainty:
         return np.asarray(moves.reshape(*stack, n * two, p) @ self._root)  # the stack may be empty
 
 
-def _root(covariance: Array) -> Array:
+def covariance_root(covariance: Array) -> Array:
     """A (p, r) with A A^T the covariance (p, p), which may be singular and of numbers of very different units."""
     unit = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     safe = np.where(unit > 0, unit, 1.0)
