@@ -8,22 +8,22 @@ Source: ours; bundle adjustment with prior knowledge as in Triggs et al. (2000),
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calibration.changes import USUAL_SIZES, ExcessResidual
 from calibration.least_squares.adjustment import AdjustmentError, At, Prior, Values, solve
-from calibration.model_check.fault_identification import SuspectedFault, search_faults
+from calibration.model_check.fault_identification import SuspectedFault, compressed, search_faults
 from calibration.model_check.faults import BEAM, CAMERA, LASER_MOVED, MOVED, SCREEN, TILTED, PossibleFault
 from calibration.model_check.linearised_frames import (
     ModelCheckRecording,
     correlation_time,
     linearise,
 )
-from calibration.terms.recordings import RecordingTerm, Reduced
-from calibration.terms.rig_blocks import BEAMS, CAMERAS, SCREENS, named_errors, prior_of, rig_of, stacks_of
+from calibration.terms.recordings import STACKS, RecordingTerm, Reduced
+from calibration.terms.rig_blocks import BEAMS, CAMERAS, SCREENS, named_errors, names_at, prior_of, rig_of, stacks_of
 from geometry.arrays import Array, Bools, Ints, skew
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
@@ -51,12 +51,23 @@ class Knowledge:
         """(p, p)"""
         return np.asarray(self.root @ self.root.T)
 
-    def with_data(self, data: Sequence[Reduced]) -> Knowledge:
-        """After some recordings."""
+    def with_data(self, data: Sequence[Reduced], changed: Bools | None = None) -> Knowledge:
+        """After some recordings.
+
+        changed (p,): the numbers that are changed; the others keep their mean and stay uncertain (Schmidt 1966,
+        "Application of state-space methods to navigation problems"). None: all.
+        """
         S, g = normal_equations(data)
         values, vectors = np.linalg.eigh(np.eye(self.root.shape[1]) + self.root.T @ S @ self.root)
         root = self.root @ (vectors / np.sqrt(values))
-        return Knowledge(self.mean + root @ (root.T @ (g - S @ self.mean)), root)
+        step = root @ (root.T @ (g - S @ self.mean))
+        if changed is None or changed.all():
+            return Knowledge(self.mean + step, root)
+        gain = np.where(changed[:, None], root @ root.T, 0.0)
+        own = self.root - gain @ S @ self.root
+        return Knowledge(
+            self.mean + np.where(changed, step, 0.0), np.concatenate([own, gain @ compressed(S)[0].T], axis=1)
+        )
 
     def excess(self, data: Sequence[Reduced]) -> tuple[ExcessResidual, Array, float]:
         """What this does not explain of some recordings, the whitened X (q, p) that belongs to it, and ln p(data)."""
@@ -101,6 +112,7 @@ class Refinement:
     after: Knowledge
     recordings: tuple[ModelCheckRecording, ...]  # with the stated covariances, without outliers
     data: tuple[Reduced, ...]  # of each recording, or block of time, with increased covariances
+    given_data: tuple[Reduced, ...]  # the same with the given rig
     excluded: int  # spots
     noise: Mapping[str, float]  # ratio of errors to stated sigmas, by camera; at least 1
     correlation_frames: float  # number of frames that count as one
@@ -110,14 +122,52 @@ class Refinement:
     moved: tuple[SuspectedFault, ...]  # parts that have changed by more than that
     held_out: tuple[HeldOut, ...]
 
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """(p,): the part to which each unknown belongs, such as `cameras.left`."""
+        return tuple(
+            names_at(self.given, a)[0].rsplit(".", 1)[0] for a in self.at for _ in range(self.values[a[0]].dof)
+        )
+
+    @property
+    def shares(self) -> Array:
+        """(p, r): the share of each unknown in the squared length of each direction, in prior sigmas."""
+        sigma = np.sqrt(np.maximum(np.diagonal(self.before.covariance), 1e-300))
+        squares = (self.directions / sigma[:, None]) ** 2
+        return np.asarray(squares / squares.sum(axis=0))
+
+    @property
+    def conventions(self) -> int:
+        """Directions that no recording determines: the frames of world and body, where all their parts are free."""
+        free = [a for a in self.at]
+        world = all((s, i) in free for s in (CAMERAS, SCREENS) for i in range(len(self.values[s])))
+        body = all((BEAMS, i) in free for i in range(len(self.values[BEAMS])))
+        return 6 * world + 6 * body
+
+    def named_changes(self) -> dict[str, float]:
+        """The change of each number of the rig, by its name."""
+        old, new = stacks_of(self.given), stacks_of(self.rig)
+        steps = [new[s].pick(np.array([i])).minus(old[s].pick(np.array([i])))[0] for s, i in self.at]
+        names, T = named_errors(self.given, old, self.at)
+        return dict(zip(names, (T @ np.concatenate(steps)).tolist(), strict=True))
+
+    def of_data(self, i: int) -> ModelCheckRecording:
+        """The spots of `data[i]`."""
+        return self.recordings[i] if len(self.recordings) > 1 else _blocks(self.recordings[0])[i]
+
 
 def refine(
-    rig: Rig, covariance: RigCovariance, recordings: Sequence[ModelCheckRecording], start: Refinement | None = None
+    rig: Rig,
+    covariance: RigCovariance,
+    recordings: Sequence[ModelCheckRecording],
+    start: Refinement | None = None,
+    stacks: Collection[str] = STACKS,
 ) -> Refinement:
     """Refine a rig.
 
     covariance: of the rig's parameters; all others are held. recordings: with the views of this rig. start: an earlier
-    result, of other labels of the same recordings.
+    result, of other labels of the same recordings. stacks: those that are changed; the others keep their values and
+    their uncertainty.
 
     Raises:
         AdjustmentError: the recordings have too few frames, or the adjustment does not converge.
@@ -152,7 +202,9 @@ def refine(
     values = solve(values, [prior, *terms], free).values
     data = [t.reduced(values) for t in terms]
     known = Knowledge(_difference(prior, values), covariance_root(prior.covariance))
-    after = known.with_data(data)
+    changed = np.concatenate([np.full(values[s].dof, s in stacks) for s, _ in prior.at])
+    after = known.with_data(data, changed)
+    given_data = [t.reduced(stacks_of(rig)) for t in terms]
     S, _ = normal_equations(data)
     gain, vectors = np.linalg.eigh(known.root.T @ S @ known.root)
     excess, X, _ = known.excess(data)
@@ -161,7 +213,7 @@ def refine(
     named = np.diagonal(matrix) > 0
     return Refinement(
         given=rig,
-        rig=rig_of(rig, values),
+        rig=rig_of(rig, {s: v for s, v in values.items() if s in stacks}),
         covariance=RigCovariance(tuple(np.array(names)[named].tolist()), matrix[np.ix_(named, named)]),
         at=prior.at,
         values=values,
@@ -169,6 +221,7 @@ def refine(
         after=after,
         recordings=tuple(stated),
         data=tuple(data),
+        given_data=tuple(given_data),
         excluded=excluded,
         noise=dict(zip(rig.cameras, noise.tolist(), strict=True)),
         correlation_frames=frames,
@@ -176,7 +229,7 @@ def refine(
         directions=known.root @ vectors,
         p_change=excess.p_value,
         moved=search_faults(excess, X, _parts(rig, values, prior, known))[0],
-        held_out=_held_out(known, data, [t.reduced(stacks_of(rig)) for t in terms]),
+        held_out=_held_out(known, data, given_data, changed),
     )
 
 
@@ -226,14 +279,16 @@ def _difference(prior: Prior, values: Values) -> Array:
     )
 
 
-def _held_out(known: Knowledge, data: Sequence[Reduced], given: Sequence[Reduced]) -> tuple[HeldOut, ...]:
-    """Each recording predicted from the others. given: the same at the rig as given."""
+def _held_out(
+    known: Knowledge, data: Sequence[Reduced], given: Sequence[Reduced], changed: Bools
+) -> tuple[HeldOut, ...]:
+    """Each recording predicted from the others. given: the same at the rig as given. changed (p,)."""
     out = []
     for i, d in enumerate(data):
         others = [o for k, o in enumerate(data) if k != i]
         if not others:
             continue
-        fold = known.with_data(others)
+        fold = known.with_data(others, changed)
         excess, _, log_density = fold.excess([d])
         refined = d.rest + float(np.sum((d.y - d.X @ fold.mean) ** 2))
         before = given[i].rest + float(given[i].y @ given[i].y)

@@ -16,11 +16,12 @@ from calibration.least_squares.adjustment import At, Linearised, Loss, Part, Val
 from calibration.model_check.fault_identification import compressed
 from calibration.model_check.linearised_frames import LinearisedFrames, ModelCheckRecording, linearised_at, whitening
 from calibration.terms.rig_blocks import BEAMS, BOWS, CAMERAS, INTRINSICS, SCREENS, lines_in, rig_of
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Ints
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import unlimited
 
+STACKS = (INTRINSICS, CAMERAS, SCREENS, BOWS, BEAMS)
 _POSE_STEPS = 3  # Gauss-Newton steps of the poses: from 5 mrad and 10 mm the second one is shorter than 1e-6
 _LARGEST_STEP = np.array([0.3] * 3 + [0.2] * 3)  # m, rad: a pose that would move farther is not determined
 
@@ -46,12 +47,12 @@ class RecordingTerm:
 
     rig: Rig  # for what the stacks do not contain
     recording: ModelCheckRecording  # K frames, of which each determines its pose
-    free: Mapping[str, Bools]  # per stack (k, dof): the numbers that are unknown
+    free: Mapping[str, Array]  # per stack (k, dof): the numbers that are unknown
     at: tuple[At, ...] = field(init=False)  # the unknowns of which some number is free: p numbers in total
     loss: Loss | None = None
 
     def __post_init__(self) -> None:
-        at = [(s, int(i)) for s in _STACKS if s in self.free for i in np.flatnonzero(self.free[s].any(axis=1))]
+        at = [(s, int(i)) for s in STACKS if s in self.free for i in np.flatnonzero(self.free[s].any(axis=1))]
         object.__setattr__(self, "at", tuple(at))
 
     def linearise(self, values: Values) -> Linearised:
@@ -103,9 +104,6 @@ class RecordingTerm:
             out[:, views, :, start:stop] = np.where(used[:, views], block[:, views], 0.0) * self.free[stack][i]
             start = stop
         return out
-
-
-_STACKS = (INTRINSICS, CAMERAS, SCREENS, BOWS, BEAMS)
 
 
 def with_own_poses(model: SpotModel, recording: ModelCheckRecording) -> LinearisedFrames:

@@ -11,6 +11,7 @@ from calibration.model_check.linearised_frames import ModelCheckRecording
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from lab.runs.frames.even_sampler import EvenSampler
+from lab.runs.frames.pipeline import FrameRecord
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.statuses import PoseStatus, TrackedFrame
@@ -110,6 +111,13 @@ class FrameSampler:
                 tracked.pose_covariance, width_px,
             )
         )  # fmt: skip
+
+    def add_record(self, record: FrameRecord, camera_of: Ints, parameters: TrackerParameters) -> None:
+        """Add the next frame of a run, with the covariances that its detections state; arguments as there."""
+        tracked, found = record.tracked, record.detections
+        stated = stated_covariances(tracked, found, camera_of, parameters)
+        width = widths(tracked, found, camera_of)
+        self.add_tracked(record.t_s, tracked, tracked.predicted_cov_px2, stated, width)
 
     def recording(self) -> ModelCheckRecording | None:
         """The sampled frames; None where no frame was added."""
