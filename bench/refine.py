@@ -9,7 +9,6 @@ The projection and the errors of the rig (about each camera's own centre) share 
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 import time
 from dataclasses import dataclass, replace
@@ -21,14 +20,22 @@ from scipy.linalg import block_diag
 from bench.random_scenes.draw.motions import sines
 from bench.random_scenes.draw.nuisances import draw_false_points, draw_hidden, draw_missing
 from bench.random_scenes.draw.rigs import Lab, draw_lab
-from bench.random_scenes.projection import in_picture, spot_pixels
+from bench.random_scenes.projection import spot_pixels
 from bench.random_scenes.scene import Scene, composed, draw_prior, fitted_motion, view_indices
 from bench.random_scenes.write_folder import write_run_folder
+from calibration.terms.rig_blocks import stacks_of
 from geometry import rotations
 from geometry.arrays import Array, skew
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
+from lab.calibrate.refine.refine import refine_rig
+from lab.errors import BeamposeError
+from lab.files.rig.rig_file import load_rig
+from lab.files.run.results import read_poses
+from lab.runs.process import process_run
+from tracking.detections import Detections
+from tracking.statuses import PoseStatus
 
 POSE_NAMES = ("x_m", "y_m", "z_m", "rot_x_rad", "rot_y_rad", "rot_z_rad")
 LINE_NAMES = tuple(f"{kind}_{axis}{unit}" for kind, unit in (("direction", ""), ("point", "_m")) for axis in "xyz")
@@ -127,3 +134,169 @@ def _scene(key: list[int], seed: int, lab: Lab, frames: int) -> Scene | None:
         key, seed, lab.rig, poses, rate, np.full(len(camera_of), noise), false, hidden, has_image, motion.corners_s,
         text, draw_prior(np.random.default_rng([*key, PRIOR]), poses[0]),
     )  # fmt: skip
+
+
+REST, LATE, SLIPPED, EXCHANGED, MIRRORED, WRONG_LENS, MOVED = (
+    "rest", "late", "slipped", "exchanged", "mirrored", "wrong-lens", "moved",
+)  # fmt: skip
+CASES = ("all", MOVED, REST, LATE, SLIPPED, EXCHANGED, MIRRORED, WRONG_LENS)
+MOVED_SIGMAS = 10.0  # by which one part has moved, in the stated sigmas per axis
+WRONG_FOCUS = 0.03  # of the focal length, relative, with the lens of another camera
+
+
+def changed(case: str, known: Rig, scenes: list[Scene], rng: np.random.Generator) -> tuple[Rig, list[Scene]]:
+    """The rig and the recordings that are given, in a case that cannot be refined."""
+    cameras = dict(known.cameras)
+    first = list(cameras)[0]
+    c = cameras[first]
+    if case == REST:
+        scenes = [_at(s, np.zeros(len(s), dtype=int), rng) for s in scenes]
+    elif case in (LATE, SLIPPED):
+        by = 1 if case == LATE else 7
+        scenes = [_late(s, by) for s in scenes]
+    elif case == EXCHANGED:
+        a, b = list(cameras)[:2]
+        cameras[a], cameras[b] = (
+            replace(cameras[x], camera_from_world=cameras[y].camera_from_world, screen=cameras[y].screen)
+            for x, y in ((a, b), (b, a))
+        )
+    elif case == MIRRORED:
+        scenes = [_mirrored(s, c.image_size_px[0]) for s in scenes]
+    elif case == WRONG_LENS:
+        matrix = c.matrix.copy()
+        matrix[[0, 1], [0, 1]] *= 1 + WRONG_FOCUS
+        cameras[first] = replace(c, matrix=matrix)
+    return replace(known, cameras=cameras), scenes
+
+
+def _at(s: Scene, rows: Array, rng: np.random.Generator) -> Scene:
+    """The recording with the vehicle at rest at its first pose."""
+    uv = s.uv_px[rows]
+    new = []
+    for k in range(len(s)):
+        points = []
+        for c, (found, origin) in enumerate(zip(s.detections[k], s.origin[k], strict=True)):
+            there = origin >= 0
+            moved = found.uv_px.copy()
+            moved[there] += uv[k, origin[there]] - s.uv_px[k, origin[there]]
+            kept = np.isfinite(moved).all(axis=1) if c >= 0 else there
+            points.append(replace(found, uv_px=moved)[kept])
+        new.append(tuple(points))
+    return replace(s, detections=tuple(new), poses=s.poses[rows], uv_px=uv)
+
+
+def _late(s: Scene, by: int) -> Scene:
+    """The pictures of the first camera numbered as later frames."""
+    rows = [max(k - by, 0) for k in range(len(s))]
+    return replace(s, detections=tuple((s.detections[rows[k]][0], *s.detections[k][1:]) for k in range(len(s))))
+
+
+def _mirrored(s: Scene, width: int) -> Scene:
+    """The pictures of the first camera mirrored."""
+
+    def flipped(found: Detections) -> Detections:
+        uv = found.uv_px.copy()
+        uv[:, 0] = width - 1 - uv[:, 0]
+        return replace(found, uv_px=uv)
+
+    return replace(s, detections=tuple((flipped(d[0]), *d[1:]) for d in s.detections))
+
+
+def pose_errors(folder: Path, scene: Scene) -> tuple[Array, Array, Array]:
+    """Frames (k,) measured, errors (k, 6) of their poses, and their NEES/6 (k,)."""
+    track = read_poses(folder)
+    rows = np.flatnonzero(track.has(PoseStatus.MEASURED))
+    true = scene.poses[track.frames[rows]]
+    e = true.minus(track.world_from_body[rows])
+    nees = np.sum(e * np.linalg.solve(track.covariance[rows], e[..., None])[..., 0], axis=1) / 6
+    return track.frames[rows], e, nees
+
+
+def without_frames(e: Array, poses: Pose) -> Array:
+    """Errors (k, 6) without those that one motion of world and one of body explain: conventions of a refined rig."""
+    R, t = poses.rotation, poses.translation
+    k = len(t)
+    eye, zero = np.broadcast_to(np.eye(3), (k, 3, 3)), np.zeros((k, 3, 3))
+    world = np.concatenate(
+        [np.concatenate([eye, -skew(t)], axis=2), np.concatenate([zero, np.swapaxes(R, 1, 2)], axis=2)], axis=1
+    )
+    body = np.concatenate([np.concatenate([R, zero], axis=2), np.concatenate([zero, eye], axis=2)], axis=1)
+    J = np.concatenate([world, body], axis=2)
+    scale = 1 / np.sqrt(np.array([np.mean(e[:, :3] ** 2)] * 3 + [np.mean(e[:, 3:] ** 2)] * 3))
+    fit = np.linalg.lstsq((J * scale[:, None]).reshape(-1, 12), (e * scale).ravel(), rcond=1e-10)[0]
+    return np.asarray(e - J @ fit)
+
+
+def rms(values: Array) -> float:
+    """Root mean square length."""
+    return float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
+
+
+def one(seed: int, case: str, frames: int) -> str:
+    """A rig refined and used; a line of figures."""
+    lab, scenes, _ = campaign(seed, frames)
+    rng, s = np.random.default_rng([seed, RIG]), Sigmas()
+    true, only = lab.rig, None
+    if case == MOVED:
+        parts = [(kind, n) for kind in ("cameras", "screens", "beams") for n in getattr(true, kind)]
+        only = parts[rng.integers(len(parts))]
+    by = MOVED_SIGMAS if case == MOVED else 1.0
+    off = Sigmas(*(tuple(by * x for x in getattr(s, kind)) for kind in ("cameras", "screens", "beams")))
+    known = drawn_rig(rng, true, off, only)
+    known, scenes = changed(case, known, scenes, rng)
+    covariance = rig_covariance(known, s)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for i, scene in enumerate(scenes[:3]):
+            write_run_folder(replace(scene, known_rig=known, covariance=covariance), folder / f"run{i}")
+        started = time.process_time()
+        try:
+            outcome = refine_rig([folder / f"run{i}" for i in range(3)], folder / "run0" / "rig.yaml", folder / "new")
+        except BeamposeError as error:
+            return f"refused in {time.process_time() - started:.1f} s: {str(error)[:160]}".replace(name, "")
+        seconds = time.process_time() - started
+        refined = outcome.result.refined
+        told = "; ".join(f"{f.code} {f.what}" for f in outcome.findings if f.level > 0)[:300]
+        out = f"{outcome.level.name} in {seconds:.1f} s" + (f", moved {only[0]} {only[1]}" if only else "")
+        e = np.concatenate(
+            [
+                stack.pick(np.array([i])).minus(refined.values[n].pick(np.array([i])))[0]
+                for n, i in refined.at
+                for stack in [stacks_of(true)[n]]
+            ]
+        )
+        white = np.linalg.lstsq(refined.after.root, e, rcond=1e-12)[0]
+        out += f", rig NEES {np.mean(white**2):.3f} of {len(white)}, determined {int(np.sum(refined.gain > 1))}"
+        out += f" and {refined.conventions} conventions"
+        if (folder / "new" / "rig.yaml").is_file():
+            last = scenes[3]
+            write_run_folder(replace(last, known_rig=true, covariance=None), folder / "true")
+            process_run(folder / "true", folder / "true-out")
+            write_run_folder(replace(last, known_rig=true, covariance=None), folder / "refined")
+            (folder / "refined" / "rig.yaml").write_bytes((folder / "new" / "rig.yaml").read_bytes())
+            load_rig(folder / "refined" / "rig.yaml")
+            process_run(folder / "refined", folder / "refined-out")
+            (at, best, _), (with_it, ours, nees) = (pose_errors(folder / f"{n}-out", last) for n in ("true", "refined"))
+            both, i, k = np.intersect1d(at, with_it, return_indices=True)
+            poses = last.poses[both]
+            raw = rms(ours[k][:, 3:]) / rms(best[i][:, 3:])
+            a, b = without_frames(ours[k], poses), without_frames(best[i], poses)
+            out += f", attitude ratio {rms(a[:, 3:]) / rms(b[:, 3:]):.3f} position {rms(a[:, :3]) / rms(b[:, :3]):.3f}"
+            out += f" (with conventions {raw:.1f}), NEES/6 {np.mean(nees):.3f}, frames {len(with_it)} of {len(at)}"
+    return f"{out} {told}"
+
+
+def main() -> None:
+    """Run the seeds and print a line for each."""
+    parser = argparse.ArgumentParser(prog="bench.refine", description=__doc__)
+    parser.add_argument("--seeds", default="1:41", metavar="A:B")
+    parser.add_argument("--frames", type=int, default=600)
+    parser.add_argument("--case", default="all", choices=CASES)
+    a = parser.parse_args()
+    first, _, last = a.seeds.partition(":")
+    for seed in range(int(first), int(last) if last else int(first) + 1):
+        print(f"{seed} {a.case}: {one(seed, a.case, a.frames)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -31,6 +31,7 @@ from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import RigCovariance, covariance_root, unlimited
 
 FEWEST_FRAMES = 30  # of a recording: a shorter one is not used
+_FEWEST_AT_FIRST = 10  # of a first solution, which is for labels
 FEWEST_SPOTS = 4  # of a frame: three spots leave nothing that the pose does not absorb
 FOLDS = 5  # blocks of time of a single recording
 _P_OUTLIER = 1e-5  # probability that a correct spot is excluded
@@ -177,10 +178,11 @@ def refine(
         raise AdjustmentError("no parameter of the rig has a covariance")
     values: Values = stacks_of(rig) if start is None else start.values
     model = unlimited(SpotModel.of(rig_of(rig, values)))
-    stated = [r for r in (_usable(model, r) for r in recordings) if len(r.seen) >= FEWEST_FRAMES]
+    fewest = FEWEST_FRAMES if start is not None else _FEWEST_AT_FIRST
+    stated = [r for r in (_usable(model, r) for r in recordings) if len(r.seen) >= fewest]
     if not stated:
         raise AdjustmentError(
-            f"no recording has {FEWEST_FRAMES} frames with {FEWEST_SPOTS} and more spots that determine a pose"
+            f"no recording has {fewest} frames with {FEWEST_SPOTS} and more spots that determine a pose"
         )
     noise, excluded = np.ones(len(rig.cameras)), 0
     for _ in range(_ROUNDS):

@@ -14,9 +14,15 @@ import numpy as np
 
 from calibration.least_squares.adjustment import At, Linearised, Loss, Part, Values
 from calibration.model_check.fault_identification import compressed
-from calibration.model_check.linearised_frames import LinearisedFrames, ModelCheckRecording, linearised_at, whitening
+from calibration.model_check.linearised_frames import (
+    LinearisedFrames,
+    ModelCheckRecording,
+    finite,
+    linearised_at,
+    whitening,
+)
 from calibration.terms.rig_blocks import BEAMS, BOWS, CAMERAS, INTRINSICS, SCREENS, lines_in, rig_of
-from geometry.arrays import Array, Ints
+from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import unlimited
@@ -47,7 +53,7 @@ class RecordingTerm:
 
     rig: Rig  # for what the stacks do not contain
     recording: ModelCheckRecording  # K frames, of which each determines its pose
-    free: Mapping[str, Array]  # per stack (k, dof): the numbers that are unknown
+    free: Mapping[str, Bools]  # per stack (k, dof): the numbers that are unknown
     at: tuple[At, ...] = field(init=False)  # the unknowns of which some number is free: p numbers in total
     loss: Loss | None = None
 
@@ -86,7 +92,6 @@ class RecordingTerm:
         d = model.derivatives(lin.poses)
         screens = list(self.rig.screens)
         screen_of = np.array([screens.index(self.rig.spots[s].screen) for _, s in model.views], dtype=np.int64)
-        used = lin.used[..., None, None]
         B = lines_in(values).basis[model.beam_of]
         of: dict[str, tuple[Array, Ints]] = {
             INTRINSICS: (np.concatenate([d.pinhole, d.distortion], axis=-1), model.camera_of),
@@ -95,6 +100,7 @@ class RecordingTerm:
             BOWS: (d.bow, screen_of),
             BEAMS: (np.concatenate([d.direction @ B, d.point @ B], axis=-1), model.beam_of),
         }
+        used: Bools = np.asarray(lin.used[..., None, None])
         out = np.zeros((*lin.used.shape, 2, sum(values[s].dof for s, _ in self.at)))
         start = 0
         for stack, i in self.at:
@@ -110,7 +116,7 @@ def with_own_poses(model: SpotModel, recording: ModelCheckRecording) -> Linearis
     """All frames of a recording, linearised at the poses that fit this model best."""
     used = recording.usable
     none, frames = np.zeros_like(used), np.arange(len(used))
-    known = np.isfinite(recording.poses.translation).all(axis=-1)
+    known = finite(recording.poses.translation, -1)
     poses = replace(
         recording.poses,
         rotation=np.where(known[:, None, None], recording.poses.rotation, np.eye(3)),

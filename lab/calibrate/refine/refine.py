@@ -21,7 +21,7 @@ from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.calibrate.refine import prior_sigmas
 from lab.calibrate.refine.prior_sigmas import GROUPS, group_of, stated_covariance
-from lab.calibrate.refine.recordings import LabelledRun, labelled, with_rig
+from lab.calibrate.refine.recordings import LabelledRun, labelled, tolerant, with_rig
 from lab.calibrate.refine.refine_findings import RefineResult, refine_findings
 from lab.calibrate.refine.refine_page import page_of, pixel_residuals
 from lab.calibrate.step import Solved, Step, run_step
@@ -43,6 +43,8 @@ COLUMNS = (
     "sigma_u_px", "sigma_v_px",
 )  # fmt: skip
 _STEP = Step("refinement by recordings", (RESIDUALS,), RIG)
+# Frames of all runs, and at least of each, for the first solution: it only has to be good enough to label all frames.
+_FIRST, _FEWEST_OF_RUN = 600, 100
 _STACKS_OF = {
     prior_sigmas.CAMERAS: (CAMERAS,), prior_sigmas.SCREENS: (SCREENS, BOWS), prior_sigmas.BEAMS: (BEAMS,),
     prior_sigmas.LENS: (INTRINSICS,),
@@ -136,11 +138,11 @@ def _refined(
         for i, run in enumerate(runs):
             if progress is not None:
                 progress(half * len(runs) + i, 2 * len(runs), run.name)
-            out.append(labelled(run))
+            out.append(labelled(run, None if half else max(_FIRST // len(runs), _FEWEST_OF_RUN)))
         return out
 
     try:
-        first = all_labelled(runs, 0)
+        first = all_labelled([tolerant(run) for run in runs], 0)
         start = refine(rig, prior, [r.in_views_of(rig) for r in first], stacks=stacks)
         again = [with_rig(run, start.rig, start.covariance) for run in runs]
         second = all_labelled(again, 1)

@@ -6,7 +6,6 @@ import numpy as np
 
 from calibration.rig.refinement import Refinement
 from calibration.terms.recordings import Reduced
-from calibration.terms.rig_blocks import names_at
 from geometry.arrays import Array
 from geometry.uncertainty.rig_uncertainty import POSE, split_name
 from lab.calibrate.refine.refine_findings import RefineResult

@@ -74,6 +74,7 @@ class FrameSampler:
     """Keeps evenly spaced blocks of consecutive frames."""
 
     most: int = MOST_KEPT
+    with_predicted: bool = False  # whether poses are kept that are not measured
     _sampler: EvenSampler[SampledFrame] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -102,7 +103,8 @@ class FrameSampler:
             predicted_cov_px2 = predicted_cov_px2 + tracked.cov_px2 - stated_cov_px2
         cov_px2 = tracked.cov_px2 if stated_cov_px2 is None else stated_cov_px2
         # A predicted pose may be far from the frame's spots without any fault of the rig.
-        pose = tracked.pose if tracked.pose_status is PoseStatus.MEASURED else None
+        usable = self.with_predicted or tracked.pose_status is PoseStatus.MEASURED
+        pose = tracked.pose if usable else None
         shift = tracked.shift_px
         predicted_px = tracked.predicted_px if shift is None else tracked.predicted_px - shift
         self.add(
