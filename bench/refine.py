@@ -147,7 +147,7 @@ WRONG_FOCUS = 0.03  # of the focal length, relative, with the lens of another ca
 def changed(case: str, known: Rig, scenes: list[Scene], rng: np.random.Generator) -> tuple[Rig, list[Scene]]:
     """The rig and the recordings that are given, in a case that cannot be refined."""
     cameras = dict(known.cameras)
-    first = list(cameras)[0]
+    first = next(iter(cameras))
     c = cameras[first]
     if case == REST:
         scenes = [_at(s, np.zeros(len(s), dtype=int), rng) for s in scenes]

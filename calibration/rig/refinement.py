@@ -3,7 +3,7 @@
 The recordings determine some directions of the rig's parameters well and others not at all: a motion of the whole rig,
 or of all beams in the body, leaves no residual. What the rig file states decides those. All tests use the recordings
 without their poses (calibration/terms/recordings.py): y = X delta + noise of sigma 1, with the prior delta ~ N(m, C).
-Source: ours; bundle adjustment with prior knowledge as in Triggs et al. (2000), "Bundle adjustment: a modern synthesis".
+Source: ours; priors in a bundle adjustment: Triggs et al. (2000), "Bundle adjustment: a modern synthesis", section 6.
 """
 
 from __future__ import annotations
@@ -140,9 +140,8 @@ class Refinement:
     @property
     def conventions(self) -> int:
         """Directions that no recording determines: the frames of world and body, where all their parts are free."""
-        free = [a for a in self.at]
-        world = all((s, i) in free for s in (CAMERAS, SCREENS) for i in range(len(self.values[s])))
-        body = all((BEAMS, i) in free for i in range(len(self.values[BEAMS])))
+        world = all((s, i) in self.at for s in (CAMERAS, SCREENS) for i in range(len(self.values[s])))
+        body = all((BEAMS, i) in self.at for i in range(len(self.values[BEAMS])))
         return 6 * world + 6 * body
 
     def named_changes(self) -> dict[str, float]:

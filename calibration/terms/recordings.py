@@ -1,7 +1,7 @@
 """A recording as a term of an adjustment of the rig: the poses of all frames are free, and eliminated.
 
-For given values of the rig, the pose of each frame is the least-squares one, and residuals and derivatives are projected
-onto what the poses cannot absorb: the Schur complement, frame by frame (variable projection: Golub and Pereyra 1973,
+For given values of the rig, each frame has its least-squares pose, and residuals and derivatives are projected onto
+what the poses cannot absorb: the Schur complement, frame by frame (variable projection: Golub and Pereyra 1973,
 SIAM J. Numer. Anal. 10). What is left of a whole recording are as many numbers as it determines directions of the rig.
 """
 

@@ -101,7 +101,7 @@ def _solve(
 
     def write(folder: Path) -> None:
         if not failed:
-            save_rig(_rig_file(refined, findings, file, rig_path, runs, day), folder / RIG)
+            save_rig(_rig_file(refined, findings, file, runs, day), folder / RIG)
         _write_residuals(result, folder / RESIDUALS)
 
     return Solved(
@@ -165,7 +165,7 @@ def _figures(r: Refinement) -> str:
 
 
 def _rig_file(
-    r: Refinement, findings: Sequence[Finding], given: RigFile, rig_path: Path, runs: Sequence[Run], day: datetime.date
+    r: Refinement, findings: Sequence[Finding], given: RigFile, runs: Sequence[Run], day: datetime.date
 ) -> RigFile:
     """The refined rig with its covariance, and what it was made from."""
     prints = [p for run in runs for p in fingerprints(run)]
@@ -173,9 +173,7 @@ def _rig_file(
     old = given.calibration
     state = CalibrationState(
         date=day, verdict=verdict(findings).name, valid_until=None if old is None else old.valid_until,
-        reasons=reasons(worst_first(findings)), notes=f"{rig_path.name} refined by recordings"
-        + (f" of {len(runs)} runs" if len(runs) > 1 else "") + (f"; {old.notes}" if old is not None and old.notes else ""),
-        made_from=tuple(lines),
+        reasons=reasons(worst_first(findings)), notes="" if old is None else old.notes, made_from=tuple(lines),
     )  # fmt: skip
     return replace(given, rig=r.rig, covariances=covariance_blocks(r.covariance), calibration=state, measured_as={})
 

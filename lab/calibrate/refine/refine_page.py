@@ -104,8 +104,8 @@ def _held_out(result: RefineResult) -> Section:
     ]  # fmt: skip
     heads = ("held out", "residuals, given (sigmas)", "residuals, refined (sigmas)", "p", "gain of ln p")
     words = (
-        f"Each {'recording' if several else 'block of time of the recording'} against the rig refined by the others: its"
-        " residuals in sigmas, 1 if all sigmas are right; the p-value of its data with the refined rig and its"
+        f"Each {'recording' if several else 'block of time of the recording'} against the rig refined by the others:"
+        " its residuals in sigmas, 1 if all sigmas are right; the p-value of its data with the refined rig and its"
         " covariance; and by how much the logarithm of their probability density grows."
     )
     return Section("Held-out recordings", words, (), PageTable(heads, rows))

@@ -1,4 +1,4 @@
-"""`beampose refine`: a rig that is off by its stated sigmas is corrected by recordings; what is no small error is not."""
+"""`beampose refine`: recordings correct a rig that is off by its stated sigmas, and nothing else."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ def test_a_vehicle_at_rest_gives_no_confident_rig(lab, tmp_path):
 
 
 def test_exchanged_cameras_are_refused_and_nothing_is_written(lab, tmp_path):
-    folder, runs, true, _ = lab
+    _, runs, true, _ = lab
     left, right = true.cameras["left"], true.cameras["right"]
     swapped = {
         "left": replace(left, camera_from_world=right.camera_from_world, screen=right.screen),
