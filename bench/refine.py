@@ -13,6 +13,8 @@ import tempfile
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -23,16 +25,23 @@ from bench.random_scenes.draw.rigs import Lab, draw_lab
 from bench.random_scenes.projection import spot_pixels
 from bench.random_scenes.scene import Scene, composed, draw_prior, fitted_motion, view_indices
 from bench.random_scenes.write_folder import write_run_folder
+from calibration.least_squares.adjustment import AdjustmentError
+from calibration.model_check.linearised_frames import ModelCheckRecording
+from calibration.rig.refinement import Refinement, refine
 from calibration.terms.rig_blocks import stacks_of
 from geometry import rotations
 from geometry.arrays import Array, skew
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig
+from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.calibrate.refine.refine import refine_rig
+from lab.calibrate.refine.refine_findings import RefineResult, refine_findings
 from lab.errors import BeamposeError
 from lab.files.rig.rig_file import load_rig
 from lab.files.run.results import read_poses
+from lab.findings.finding import Level, verdict
+from lab.runs.model_check.check import check_model
 from lab.runs.process import process_run
 from tracking.detections import Detections
 from tracking.statuses import PoseStatus
@@ -175,12 +184,11 @@ def _at(s: Scene, rows: Array, rng: np.random.Generator) -> Scene:
     new = []
     for k in range(len(s)):
         points = []
-        for c, (found, origin) in enumerate(zip(s.detections[k], s.origin[k], strict=True)):
+        for found, origin in zip(s.detections[k], s.origin[k], strict=True):
             there = origin >= 0
             moved = found.uv_px.copy()
             moved[there] += uv[k, origin[there]] - s.uv_px[k, origin[there]]
-            kept = np.isfinite(moved).all(axis=1) if c >= 0 else there
-            points.append(replace(found, uv_px=moved)[kept])
+            points.append(replace(found, uv_px=moved)[np.isfinite(moved).all(axis=1)])
         new.append(tuple(points))
     return replace(s, detections=tuple(new), poses=s.poses[rows], uv_px=uv)
 
@@ -200,6 +208,35 @@ def _mirrored(s: Scene, width: int) -> Scene:
         return replace(found, uv_px=uv)
 
     return replace(s, detections=tuple((flipped(d[0]), *d[1:]) for d in s.detections))
+
+
+def with_true_labels(s: Scene) -> ModelCheckRecording:
+    """The points of a recording with their true labels, as a perfect tracker would give them."""
+    uv = np.full((*s.in_view.shape, 2), np.nan)
+    for k in range(len(s)):
+        for found, origin in zip(s.detections[k], s.origin[k], strict=True):
+            uv[k, origin[origin >= 0]] = found.uv_px[origin >= 0]
+    cov = np.broadcast_to(s.sigma_px[:, None, None] ** 2 * np.eye(2), (*s.in_view.shape, 2, 2)).copy()
+    return ModelCheckRecording(s.t_s, np.isfinite(uv[..., 0]), uv, cov, s.poses)
+
+
+def refined_with_true_labels(known: Rig, covariance: RigCovariance, scenes: list[Scene]) -> RefineResult:
+    """What the command computes behind the tracker."""
+    recordings = [with_true_labels(s) for s in scenes]
+    found = refine(known, covariance, recordings, refine(known, covariance, recordings))
+    checks = tuple(check_model(found.rig, r, found.covariance) for r in recordings)
+    runs: Any = tuple(
+        SimpleNamespace(run=SimpleNamespace(name=f"run{i}"), recording=r) for i, r in enumerate(recordings)
+    )
+    return RefineResult(found, covariance, runs, checks)
+
+
+def rig_nees(refined: Refinement, true: Rig) -> tuple[float, int]:
+    """Mean squared error of the rig per number in sigmas of the result, and the count of numbers."""
+    stacks = stacks_of(true)
+    one = [stacks[n].pick(np.array([i])).minus(refined.values[n].pick(np.array([i])))[0] for n, i in refined.at]
+    white = np.linalg.lstsq(refined.after.root, np.concatenate(one), rcond=1e-12)[0]
+    return float(np.mean(white**2)), len(white)
 
 
 def pose_errors(folder: Path, scene: Scene) -> tuple[Array, Array, Array]:
@@ -232,7 +269,16 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
 
 
-def one(seed: int, case: str, frames: int) -> str:
+def described(refined: Refinement, true: Rig) -> str:
+    """The rig's figures."""
+    nees, count = rig_nees(refined, true)
+    return (
+        f", rig NEES {nees:.3f} of {count}, determined {int(np.sum(refined.gain > 1))} and {refined.conventions}"
+        " conventions"
+    )
+
+
+def one(seed: int, case: str, frames: int, true_labels: bool) -> str:
     """A rig refined and used; a line of figures."""
     lab, scenes, _ = campaign(seed, frames)
     rng, s = np.random.default_rng([seed, RIG]), Sigmas()
@@ -245,6 +291,27 @@ def one(seed: int, case: str, frames: int) -> str:
     known = drawn_rig(rng, true, off, only)
     known, scenes = changed(case, known, scenes, rng)
     covariance = rig_covariance(known, s)
+    if true_labels:
+        started = time.process_time()
+        try:
+            result = refined_with_true_labels(known, covariance, scenes[:3])
+        except AdjustmentError as error:
+            return f"refused in {time.process_time() - started:.1f} s: {error}"
+        findings = refine_findings(result)
+        nees, count = rig_nees(result.refined, true)
+        level = verdict(findings)
+        wrong = level < Level.FAIL and nees * count > chi2_limit(1e-4, count)
+        moved = (
+            ""
+            if only is None
+            else f" true {only[0]} {only[1]}, named "
+            + ", ".join(
+                "/".join(f"{e.fault.component}s {e.fault.name}" for e in m.explanations) for m in result.refined.moved
+            )
+        )
+        told = "; ".join(f"{f.code} {f.what}" for f in findings if f.level > 0)[:160]
+        text = f"{level.name}{' CONFIDENT AND WRONG' * wrong} in {time.process_time() - started:.1f} s{moved}"
+        return f"{text}{described(result.refined, true)} {told}"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for i, scene in enumerate(scenes[:3]):
@@ -258,16 +325,7 @@ def one(seed: int, case: str, frames: int) -> str:
         refined = outcome.result.refined
         told = "; ".join(f"{f.code} {f.what}" for f in outcome.findings if f.level > 0)[:300]
         out = f"{outcome.level.name} in {seconds:.1f} s" + (f", moved {only[0]} {only[1]}" if only else "")
-        e = np.concatenate(
-            [
-                stack.pick(np.array([i])).minus(refined.values[n].pick(np.array([i])))[0]
-                for n, i in refined.at
-                for stack in [stacks_of(true)[n]]
-            ]
-        )
-        white = np.linalg.lstsq(refined.after.root, e, rcond=1e-12)[0]
-        out += f", rig NEES {np.mean(white**2):.3f} of {len(white)}, determined {int(np.sum(refined.gain > 1))}"
-        out += f" and {refined.conventions} conventions"
+        out += described(refined, true)
         if (folder / "new" / "rig.yaml").is_file():
             last = scenes[3]
             write_run_folder(replace(last, known_rig=true, covariance=None), folder / "true")
@@ -292,10 +350,11 @@ def main() -> None:
     parser.add_argument("--seeds", default="1:41", metavar="A:B")
     parser.add_argument("--frames", type=int, default=600)
     parser.add_argument("--case", default="all", choices=CASES)
+    parser.add_argument("--true-labels", action="store_true", help="without the tracker")
     a = parser.parse_args()
     first, _, last = a.seeds.partition(":")
     for seed in range(int(first), int(last) if last else int(first) + 1):
-        print(f"{seed} {a.case}: {one(seed, a.case, a.frames)}", flush=True)
+        print(f"{seed} {a.case}: {one(seed, a.case, a.frames, a.true_labels)}", flush=True)
 
 
 if __name__ == "__main__":

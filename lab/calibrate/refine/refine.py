@@ -44,7 +44,7 @@ COLUMNS = (
 )  # fmt: skip
 _STEP = Step("refinement by recordings", (RESIDUALS,), RIG)
 # Frames of all runs, and at least of each, for the first solution: it only has to be good enough to label all frames.
-_FIRST, _FEWEST_OF_RUN = 600, 100
+_FIRST, _FEWEST_OF_RUN = 300, 100
 _STACKS_OF = {
     prior_sigmas.CAMERAS: (CAMERAS,), prior_sigmas.SCREENS: (SCREENS, BOWS), prior_sigmas.BEAMS: (BEAMS,),
     prior_sigmas.LENS: (INTRINSICS,),
