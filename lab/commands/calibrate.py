@@ -200,7 +200,7 @@ def refine(runs: tuple[Path, ...], rig_path: Path, out: Path, **options: Any) ->
 
     \b
     Example:
-        beampose refine sample_runs/huo2015 --rig sample_runs/huo2015/rig.yaml --out results/refined
+        beampose refine runs/a runs/b --rig results/rig/rig.yaml --out results/refined
     """
     from lab.calibrate.refine.refine import refine_rig
 
