@@ -18,7 +18,8 @@ import pytest
 
 from lab.errors import InputError
 from lab.files.run.run_file import load_run
-from lab.pictures.picture_file import MissingPicture, decode, read_picture
+from lab.pictures import picture_file
+from lab.pictures.picture_file import MissingPicture, read_picture
 from lab.pictures.source import AHEAD, list_folder, pictures, video_at
 from lab.runs.frames import frames
 from lab.runs.frames.frames import FrameSet, pictures_at
@@ -27,6 +28,11 @@ from lab.runs.frames.pipeline import Pipeline
 from tests.lab.run_folders import edit, picture_of, write_run
 
 SIZE = (64, 48)
+
+
+def decode(data, size_px):
+    """The picture in the bytes of a file."""
+    return picture_file.decode(np.frombuffer(data, np.uint8), size_px)
 
 
 def textured(dtype: type = np.uint8, channels: int = 1) -> np.ndarray:
