@@ -196,7 +196,11 @@ def _at(s: Scene, rows: Array, rng: np.random.Generator) -> Scene:
 def _late(s: Scene, by: int) -> Scene:
     """The pictures of the first camera numbered as later frames."""
     rows = [max(k - by, 0) for k in range(len(s))]
-    return replace(s, detections=tuple((s.detections[rows[k]][0], *s.detections[k][1:]) for k in range(len(s))))
+    return replace(
+        s,
+        detections=tuple((s.detections[rows[k]][0], *s.detections[k][1:]) for k in range(len(s))),
+        origin=tuple((s.origin[rows[k]][0], *s.origin[k][1:]) for k in range(len(s))),
+    )
 
 
 def _mirrored(s: Scene, width: int) -> Scene:
