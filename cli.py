@@ -35,6 +35,7 @@ for command in (
     results.view,
     results.show,
     calibrate.calibrate,
+    calibrate.refine,
     plan_and_simulate.plan,
     maintenance.init,
     maintenance.schema,
