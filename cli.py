@@ -23,6 +23,7 @@ for command in (
     run.run,
     batch.batch,
     run.detect,
+    run.pick,
     run.watch,
     plan_and_simulate.simulate,
     results.check,

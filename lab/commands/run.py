@@ -90,6 +90,37 @@ def detect(pictures: tuple[Path, ...], out: Path, **options: Any) -> None:
 
 
 @click.command()
+@click.argument("photos", metavar="PHOTO...", nargs=-1, required=True)
+@click.option(
+    "--out",
+    default=Path("pick.html"),
+    show_default=True,
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="The page to write; open it in a browser.",
+)
+@click.option("--names", type=ANY_PATH, help="Names to choose from: a survey.csv with a column point, or a rig.yaml.")
+@click.option("--table", type=ANY_PATH, help="A points.csv or spots.csv to continue with.")
+@click.option("--darker", is_flag=True, help="Detect marks that are darker than what is around them.")
+@set_option
+def pick(photos: tuple[str, ...], out: Path, **options: Any) -> None:
+    """Write a page on which points in photos get their names: points.csv and spots.csv by clicks.
+
+    PHOTO is a picture or a folder of pictures, with the name of its camera before it: left=photos/l0.png. Without one
+    the camera is called as the folder, or as a single file. The page shows all detected points with their sub-pixel positions; click one, type or choose its
+    name, and download the table. It is one file that works without a network; nothing leaves the computer.
+
+    \b
+    Example:
+        beampose pick left=sample_runs/huo2015/frames/left/000000.png --names sample_runs/huo2015/rig.yaml
+    """
+    from lab.runs.detect.pick import PickOptions, write_pick_page
+
+    with progress_bar("pictures") as progress:
+        done = write_pick_page(photos, out, PickOptions(**options), progress)
+    conclude(done)
+
+
+@click.command()
 @click.argument("run_folder", metavar="RUN", type=ANY_PATH)
 @click.option(
     "--out", required=True, type=FOLDER, help="Gets attitude_live.csv during the recording, and the results at the end."

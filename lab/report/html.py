@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import hashlib
+import json
 import re
 from functools import cache
 from importlib import metadata
@@ -108,3 +109,8 @@ def environment() -> jinja2.Environment:
 def words(text: str) -> Markup:
     """A message as HTML: what the command line shows between backticks is code here."""
     return Markup(re.sub(r"`([^`\n]+)`", r"<code>\1</code>", str(escape(text))))
+
+
+def as_script(data: object) -> Markup:
+    """Data for a script element of type application/json."""
+    return Markup(json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from geometry.arrays import Array, Ints
 from geometry.forward_model import SpotModel
 from lab.files.text.atomic_write import atomic_write_text
 from lab.report.calibration.calibration_scene import Rectangle, scene_views
-from lab.report.html import environment
+from lab.report.html import as_script, environment
 from lab.report.plot.svg import ORANGE, PURPLE
 from lab.results.view.scene import Content, View, edges, thinned
 
@@ -40,11 +39,6 @@ def write_page(view: View, index: int | None, path: Path) -> None:
         )
     )
     atomic_write_text(html, path)
-
-
-def as_script(data: dict[str, Any]) -> Markup:
-    """Data for a script element of type application/json."""
-    return Markup(json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"))
 
 
 def scene_data(
