@@ -282,7 +282,7 @@ def test_simulate_lists_every_scenario(works):
         ("detect sample_runs/huo2015/frames/left --out r --every 0", "0 is not in the range"),
         ("detect sample_runs/huo2015/frames/left --out r --set r1_px=3", "expected a parameter of detection"),
         ("pick nowhere --out r", "nowhere: expected a picture"),
-        ("pick sample_runs/huo2015/frames/left --out r", "expected at most 40 pictures"),
+        ("pick sample_runs/damaged/frames/left --out r", "expected at most 40 pictures"),
         (
             "pick sample_runs/huo2015/frames/left/000000.png --out r --names nowhere.csv",
             "nowhere.csv: expected a table",

@@ -106,8 +106,9 @@ def pick(photos: tuple[str, ...], out: Path, **options: Any) -> None:
     """Write a page on which points in photos get their names: points.csv and spots.csv by clicks.
 
     PHOTO is a picture or a folder of pictures, with the name of its camera before it: left=photos/l0.png. Without one
-    the camera is called as the folder, or as a single file. The page shows all detected points with their sub-pixel positions; click one, type or choose its
-    name, and download the table. It is one file that works without a network; nothing leaves the computer.
+    the camera is called as the folder, or as a single file. The page shows all detected points with their sub-pixel
+    positions; click one, type or choose its name, and download the table. It is one file that works without a
+    network; nothing leaves the computer.
 
     \b
     Example:
