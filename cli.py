@@ -25,6 +25,7 @@ for command in (
     run.detect,
     run.pick,
     run.watch,
+    run.record,
     plan_and_simulate.simulate,
     results.check,
     results.report,

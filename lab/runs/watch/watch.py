@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import logging
-import signal
 import sys
 import threading
 import time
@@ -131,23 +130,6 @@ class _Finder:
         self.seconds += time.perf_counter() - clock
         self.background.add(picture)
         return found
-
-
-@contextlib.contextmanager
-def stopped_by_ctrl_c() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; a second Ctrl-C stops the program as usual."""
-    stop = threading.Event()
-
-    def end(*_: object) -> None:
-        stop.set()
-        signal.signal(signal.SIGINT, before)
-        _log.info("the recording ends; computing the results (press Ctrl-C again to stop without results)")
-
-    before = signal.signal(signal.SIGINT, end)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _load_compiled_code(run: Run) -> None:
