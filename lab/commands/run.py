@@ -132,6 +132,11 @@ def pick(photos: tuple[str, ...], out: Path, **options: Any) -> None:
 )
 @click.option("--udp", metavar="HOST:PORT", help="Also send each frame there, as a line of JSON.")
 @click.option(
+    "--page",
+    metavar="[HOST:]PORT",
+    help="Show pictures, spots, exposure and poses on a page: at this port, for this computer only without a HOST.",
+)
+@click.option(
     "--idle",
     default=10.0,
     show_default=True,
@@ -175,8 +180,10 @@ def watch(
     from lab.runs.watch.watch import watch_run
 
     with shown(run_folder.name, verbose=verbose, quiet=quiet) as progress, stopped_by_ctrl_c() as stop:
-        waiting, typed = WatchOptions(idle, timeout), provenance(ctx)
-        outcome = watch_run(run_folder, out, options=waiting, progress=progress, stop=stop, provenance=typed, **options)
+        waiting, typed, line = WatchOptions(idle, timeout), provenance(ctx), None if quiet else show_line
+        outcome = watch_run(
+            run_folder, out, options=waiting, progress=progress, stop=stop, provenance=typed, line=line, **options
+        )
     conclude(outcome, quiet=quiet)
 
 

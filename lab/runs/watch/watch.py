@@ -8,11 +8,12 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -33,8 +34,11 @@ from lab.runs.verdict.run_statistics import RunStatistics
 from lab.runs.watch.background import BackgroundProcess, LiveBackground
 from lab.runs.watch.live_frames import LiveFrames, WatchOptions
 from lab.runs.watch.live_output import LiveOutput, UdpLines, is_live_table
-from tracking.background.estimation import PICTURES
+from tracking.background.estimation import PICTURES, static_background
 from tracking.detections import Detections
+
+if TYPE_CHECKING:
+    from lab.runs.watch.board import Board
 
 _log = logging.getLogger("beampose")
 _SWITCH_INTERVAL_S = 0.0005
@@ -45,7 +49,9 @@ def watch_run(
     out: Path,
     *,
     udp: str | None = None,
+    page: str | None = None,
     reprocess: bool = False,
+    line: Callable[[str], None] | None = None,
     options: WatchOptions = WatchOptions(),  # noqa: B008  (frozen)
     overrides: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
@@ -55,7 +61,8 @@ def watch_run(
     """Process a run folder whose cameras are folders that are being filled, or devices.
 
     During the recording `out` contains attitude_live.csv: a row per frame by the causal tracker, flushed at once. udp:
-    HOST:PORT that receives the same as a line of JSON. The recording ends when nothing has come for `options.idle_s`,
+    HOST:PORT that receives the same as a line of JSON. page: PORT or HOST:PORT of the page that shows it meanwhile.
+    line: called with a line of status every second. The recording ends when nothing has come for `options.idle_s`,
     when all devices have ended, or when `stop` is set; then `out` receives the results of `beampose run`, computed from
     the received detections. These differ from those of a run by the pictures that the noise and the static background
     are estimated from (here each camera's first ones; of the background, those before each picture) and by pictures
@@ -75,7 +82,8 @@ def watch_run(
         work = stack.enter_context(atomic_folder(out, may_replace=lambda p: are_results(p) or is_live_table(p)))
         sender = None if udp is None else UdpLines(udp)
         frames = LiveFrames(run, options, stop or threading.Event())
-        output = LiveOutput(Path(out), frames, FrameChecks(run.rig, run.covariance), sender)
+        board = None if page is None else _served(run, frames, page, stack, line)
+        output = LiveOutput(Path(out), frames, FrameChecks(run.rig, run.covariance), sender, board, line)
         stack.callback(output.close)
         with frames, _low_latency():
             pipeline, finders = _started(run, frames, output, stack.enter_context(BackgroundProcess()))
@@ -96,6 +104,21 @@ def watch_run(
     return replace(outcome, more=output.latency.lines())
 
 
+def _served(
+    run: Run, frames: LiveFrames, page: str, stack: contextlib.ExitStack, line: Callable[[str], None] | None
+) -> Board:
+    """The content of the live page, and its server. Raises InputError: the address cannot be used."""
+    from lab.runs.watch.board import Board, page_html
+    from lab.runs.watch.page_server import PageServer
+
+    # A process of its own: that of the backgrounds may be busy for seconds.
+    board = Board(run, frames, stack.enter_context(BackgroundProcess()).call)
+    server = stack.enter_context(PageServer(page, page_html(run), board.state, board.picture))
+    if line is not None:
+        line(f"page: {server.url}")
+    return board
+
+
 def _started(
     run: Run, frames: LiveFrames, output: LiveOutput, process: BackgroundProcess
 ) -> tuple[Pipeline, dict[str, _Finder]]:
@@ -109,8 +132,11 @@ def _started(
     with ThreadPoolExecutor(max(len(first), 1)) as pool:  # in parallel, since pictures queue up meanwhile
         list(pool.map(lambda name: noise[name].estimate_from(first[name]), first))
     pipeline = Pipeline(run, frames, tracker_of(run), noise, output.write)
-    detect, make = run.tracker.detect, process.background
-    finders = {name: _Finder(pipeline, name, LiveBackground(own, detect, make)) for name, own in noise.items()}
+    detect, make = run.tracker.detect, partial(process.call, static_background)
+    board = output.board
+    if board is not None:
+        board.pipeline = pipeline
+    finders = {name: _Finder(pipeline, name, LiveBackground(own, detect, make), board) for name, own in noise.items()}
     frames.inbox.set_finders(finders)
     return pipeline, finders
 
@@ -122,6 +148,7 @@ class _Finder:
     pipeline: Pipeline
     camera: str
     background: LiveBackground
+    board: Board | None = None
     seconds: float = 0.0
 
     def __call__(self, picture: GreyPicture) -> Detections:
@@ -129,6 +156,8 @@ class _Finder:
         found = self.pipeline.spots_in(self.camera, picture)
         self.seconds += time.perf_counter() - clock
         self.background.add(picture)
+        if self.board is not None:
+            self.board.show(self.camera, picture, found)
         return found
 
 
