@@ -16,7 +16,7 @@
     camera.busy = true;
     try {
       const answer = await fetch(`picture${query}${query ? "&" : "?"}camera=${encodeURIComponent(name)}`);
-      if (!answer.ok) return;
+      if (answer.status !== 200) return; // 204: none yet
       const marks = JSON.parse(answer.headers.get("X-Marks"));
       const image = await createImageBitmap(await answer.blob());
       draw(camera.box.querySelector("canvas"), image, marks);

@@ -98,7 +98,7 @@ class Board:
                 for v in np.flatnonzero(self._model.camera_of == c)
                 if tracked.status[v].measured
             }
-            for picture, own in reversed(self._pictures[name]):
+            for picture, own in reversed(list(self._pictures[name])):
                 if own is found:
                     self._latest[name] = picture, own, labels
                     break

@@ -114,8 +114,8 @@ def _handler_of(page: PageServer) -> type[BaseHTTPRequestHandler]:
                     self._answer(200, "text/html; charset=utf-8", page.page.encode())
                 elif where.path == "/state":
                     self._states()
-                elif where.path == "/picture" and (found := page.picture(given.get("camera", [""])[0])) is not None:
-                    self._answer(200, "image/jpeg", found[0], (("X-Marks", json.dumps(found[1])),))
+                elif where.path == "/picture":
+                    self._picture(given.get("camera", [""])[0])
                 else:
                     self._answer(404, "text/plain", b"not here\n")
 
@@ -128,6 +128,13 @@ def _handler_of(page: PageServer) -> type[BaseHTTPRequestHandler]:
             for name, value in (("Content-Type", kind), *_PROTECTED, *more):
                 self.send_header(name, value)
             self.end_headers()
+
+        def _picture(self, camera: str) -> None:
+            found = page.picture(camera)
+            if found is None:
+                self._answer(204, "text/plain", b"")
+            else:
+                self._answer(200, "image/jpeg", found[0], (("X-Marks", json.dumps(found[1])),))
 
         def _states(self) -> None:
             if not page._readers.acquire(blocking=False):
