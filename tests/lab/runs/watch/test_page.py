@@ -87,9 +87,9 @@ def test_the_page_shows_pictures_labels_exposure_and_poses_until_the_recording_e
         for width in (420, 1200):
             browser.size(width, 800, "dark")
             assert browser.get("document.documentElement.scrollWidth <= innerWidth")
+        assert [line for line in browser.console if "readback" not in line] == []
         outcome = watched.end()
         browser.until("document.getElementById('state').textContent.startsWith('The recording has ended')")
-        assert [line for line in browser.console if "readback" not in line] == []
     finally:
         watched.stop.set()
         browser.close()
