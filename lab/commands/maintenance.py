@@ -154,8 +154,8 @@ def init(
     if own_screens or own_cameras or own_beams:
         from lab.setup.own_rig import parts_of, rig_of_parts
 
-        parts = ((own_screens, "--screen"), (own_cameras, "--camera"), (own_beams, "--beam"))
-        rig = rig_of_parts(*(parts_of(texts, option) for texts, option in parts), picture)
+        screens, cameras = parts_of(own_screens, "--screen"), parts_of(own_cameras, "--camera")
+        rig = rig_of_parts(screens, cameras, parts_of(own_beams, "--beam"), picture)
         conclude(start(folder, rig, given["rate"] or _DEFAULTS["rate"]))
     if own and not _on_a_terminal():
         raise click.UsageError("--own asks questions, which need a terminal; state --screen, --camera and --beam")

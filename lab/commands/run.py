@@ -168,9 +168,10 @@ def watch(
 ) -> None:
     """Process a run while it is recorded: the pose of every frame as it arrives.
 
-    RUN is a run folder whose frame folders receive pictures, or whose run.yaml names a `device` for a camera (a number
-    or name that OpenCV opens). Each pose is appended to attitude_live.csv in the folder --out. When the recording
-    ends (--idle, Ctrl-C, end of the device), the results of `run` are written from the received pictures.
+    RUN is a run folder whose frame folders receive pictures, or whose run.yaml names a `device` for a camera (a source
+    as of `record`). Each pose is appended to attitude_live.csv in the folder --out; a line per second has frames,
+    measured poses and latency, and --page shows pictures and poses in a browser. When the recording ends (--idle,
+    Ctrl-C, end of the device), the results of `run` are written from the received pictures.
 
     \b
     Example:
@@ -223,7 +224,7 @@ def record(cameras: dict[str, str], out: Path, quiet: bool, **options: Any) -> N
 
     \b
     Example:
-        beampose record --camera left=replay:sample_runs/huo2015/frames/left --rate 50 --seconds 2 --out runs/today
+        beampose record --camera left=replay:sample_runs/huo2015/frames/left --seconds 1 --out recorded
     """
     from lab.runs.watch.record import RecordOptions
     from lab.runs.watch.record import record as record_cameras

@@ -189,7 +189,7 @@ def start(folder: Path, layout: Layout | RigFile, frame_rate_hz: float) -> Done[
     if folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"{folder}: expected a new or empty folder, found files in it; name another one")
     own = layout if isinstance(layout, RigFile) else None
-    rig = own.rig if isinstance(layout, RigFile) else rig_of(layout)
+    rig = layout.rig if isinstance(layout, RigFile) else rig_of(layout)
     centre = assumed_range(rig).centre
     with atomic_folder(folder, may_replace=lambda _: False) as work:
         rig_path = work / "rig.yaml"

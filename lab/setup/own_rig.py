@@ -179,9 +179,9 @@ def understood(rig: Rig) -> list[str]:
         out.append(f"screen {name}: {size}, middle at {_words(at)} m, normal {_words(normal)}")
     for name, camera in rig.cameras.items():
         world_from_camera = camera.camera_from_world.inverse()
-        screen = rig.screens[camera.screen].world_from_screen
+        middle = rig.screens[camera.screen].world_from_screen.translation
         width = np.degrees(2 * np.arctan(camera.image_size_px[0] / 2 / camera.matrix[0, 0]))
-        away = float(np.linalg.norm(screen.translation - world_from_camera.translation))
+        away = float(np.linalg.norm(middle - world_from_camera.translation))
         out.append(f"camera {name}: at {_words(world_from_camera.translation)} m, looks along"
                    f" {_words(world_from_camera.rotation[:, 2])}, {width:.3g} deg wide, {away:.3g} m from the middle of"
                    f" screen {camera.screen}")  # fmt: skip

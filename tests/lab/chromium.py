@@ -81,16 +81,17 @@ class Browser:
             self.console.append(known["entry"]["text"])
         return message
 
-    def open(self, address: str, width: int = 1200, height: int = 800, scheme: str = "light") -> None:
-        """Open a page in a window of this size and colour scheme."""
-        self.size(width, height, scheme)
+    def open(self, address: str, width: int = 1200, height: int = 800, night: bool = False) -> None:
+        """Open a page in a window of this size, with the colours of the day or of the night."""
+        self.size(width, height, night)
         self.console.clear()
         self.send("Page.navigate", url=address)
         self.until("document.readyState === 'complete'")
 
-    def size(self, width: int, height: int, scheme: str = "light") -> None:
+    def size(self, width: int, height: int, night: bool = False) -> None:
         self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
-        self.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        name, value = ("prefers-color-scheme: dark" if night else "prefers-color-scheme: light").split(": ")
+        self.send("Emulation.setEmulatedMedia", features=[{"name": name, "value": value}])
 
     def get(self, expression: str) -> Any:
         """The value of a JavaScript expression."""

@@ -135,8 +135,12 @@ class Board:
             return None
         picture, found, labels = self._latest[camera]
         height, width = picture.shape
+        if picture.dtype != np.uint8:
+            picture = np.asarray(load_cv2().convertScaleAbs(picture, alpha=255.0 / max(int(picture.max()), 1)))
         scale = min(_SHOWN_PX / width, 1.0)
-        small = np.ascontiguousarray(ground(picture, (round(width * scale), round(height * scale)), scale)[..., 0])
+        small = np.ascontiguousarray(
+            ground(picture.astype(np.uint8, copy=False), (round(width * scale), round(height * scale)), scale)[..., 0]
+        )
         marks = [[round(float(u), 1), round(float(v), 1), labels.get(i, "")] for i, (u, v) in enumerate(found.uv_px)]
         marks.sort(key=lambda mark: not mark[2])
         shades = stretched(small, *grey_limits(small))

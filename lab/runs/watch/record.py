@@ -224,7 +224,7 @@ class CameraRecorder:
     def _append(self, line: str) -> None:
         """Append a line to the table of times, whole or not at all. Raises OSError."""
         assert self._times is not None
-        end = self._times.tell()
+        end = os.fstat(self._times.fileno()).st_size
         try:
             self._times.write(f"{line}\n")
             self._times.flush()
@@ -365,7 +365,8 @@ class _Recording:
                 notes.append(f"{one.name}: the camera states no times; those of arrival are used")
             if abs(one.clock.drift) > 1e-4:
                 notes.append(f"{one.name}: its clock differs by {1e6 * one.clock.drift:.0f} ppm from the computer's")
-        if self.options.rig is None:
-            notes.append(f"copy the rig.yaml of these cameras into {self.out} before `beampose run`")
         failed = any(one.failure for one in self.recorders)
-        return Done(self.out, (f"{self._counts()} -> {self.out}",), tuple(notes), exit_status=int(failed))
+        lines = [f"{self._counts()} -> {self.out}"]
+        if self.options.rig is None:
+            lines.append(f"Next: copy the rig.yaml of these cameras into {self.out}; beampose check {self.out}")
+        return Done(self.out, tuple(lines), tuple(notes), exit_status=int(failed))

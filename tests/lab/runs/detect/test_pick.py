@@ -126,7 +126,7 @@ def test_the_picture_is_moved_zoomed_and_stretched_and_points_still_lie_where_th
 def test_keys_alone_name_all_points_and_a_place_without_a_point_can_be_named(tmp_path, browser):
     page = tmp_path / "pick.html"
     write_pick_page([f"left={photo(tmp_path / 'l.png', darker=True)}"], page, PickOptions(darker=True))
-    opened(browser, page, 420, 900, "dark")
+    opened(browser, page, 420, 900, True)
     assert browser.get("document.documentElement.scrollWidth <= innerWidth")
     browser.get("document.getElementById('photo').focus()")
     for name in ("first", "second", "third"):

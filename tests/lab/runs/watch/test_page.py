@@ -85,7 +85,7 @@ def test_the_page_shows_pictures_labels_exposure_and_poses_until_the_recording_e
         assert " ± " in browser.get("document.querySelector('#curves figcaption').textContent")
         browser.until("document.getElementById('words').textContent.includes('last seconds')")
         for width in (420, 1200):
-            browser.size(width, 800, "dark")
+            browser.size(width, 800, night=True)
             assert browser.get("document.documentElement.scrollWidth <= innerWidth")
         assert [line for line in browser.console if "readback" not in line] == []
         outcome = watched.end()
