@@ -120,7 +120,7 @@ def test_pictures_are_written_without_loss(kind):
     grey = np.random.default_rng(1).integers(0, np.iinfo(kind).max, (37, 53), endpoint=True).astype(kind)
     data = encoded(grey)
     np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED), grey)
-    np.testing.assert_array_equal(decode(data, (53, 37)), grey)
+    np.testing.assert_array_equal(decode(np.frombuffer(bytearray(data), np.uint8), (53, 37)), grey)
 
 
 def test_two_cameras_are_recorded_and_every_picture_is_written_or_counted(shown, tmp_path, rig):
