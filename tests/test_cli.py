@@ -121,7 +121,9 @@ def test_the_commands_are_those_of_the_contract():
         "run",
         "batch",
         "detect",
+        "pick",
         "watch",
+        "record",
         "simulate",
         "check",
         "report",
@@ -204,7 +206,8 @@ def test_the_example_of_run_leaves_the_files_of_the_contract(desk):
 
 
 @pytest.mark.parametrize(
-    "name", ["check", "report", "detect", "track point", "doctor", "explain", "verify", "compare", "view", "show"]
+    "name",
+    ["check", "report", "detect", "track point", "doctor", "explain", "verify", "compare", "view", "show", "pick"],
 )
 def test_the_example_works(works, name):
     assert works(*example(name)).strip()
@@ -239,7 +242,7 @@ def test_the_examples_of_calibrate_lead_from_a_campaign_to_a_rig_that_is_checked
     works("check", "results/rig/rig.yaml")
 
 
-@pytest.mark.parametrize("name", ["calibrate board", "calibrate convert", "plan", "init", "schema"])
+@pytest.mark.parametrize("name", ["calibrate board", "calibrate convert", "plan", "init", "schema", "record"])
 def test_the_example_works_without_preparation(works, name):
     arguments = example(name)
     if name == "plan":
@@ -281,6 +284,16 @@ def test_simulate_lists_every_scenario(works):
         ("detect sample_runs/huo2015/frames --out r", "its folders left, right do: name one of them"),
         ("detect sample_runs/huo2015/frames/left --out r --every 0", "0 is not in the range"),
         ("detect sample_runs/huo2015/frames/left --out r --set r1_px=3", "expected a parameter of detection"),
+        ("pick nowhere --out r", "nowhere: expected a picture"),
+        ("pick sample_runs/damaged/frames/left --out r", "expected at most 40 pictures"),
+        (
+            "pick sample_runs/huo2015/frames/left/000000.png --out r --names nowhere.csv",
+            "nowhere.csv: expected a table",
+        ),
+        ("record --camera left --out r", "expected NAME=SOURCE such as left=0, got 'left'"),
+        ("record --camera left=nothing --out r", "expected a camera that OpenCV can open, got 'nothing'"),
+        ("watch sample_runs/huo2015 --out r --page here", "--page: expected PORT or HOST:PORT"),
+        ("init r --own", "--own asks questions, which need a terminal"),
         ("watch nowhere --out r", "nowhere: expected a run folder, found nothing"),
         ("watch sample_runs/four-skew-beams --out r", "expected a folder of pictures or a device to watch"),
         ("watch sample_runs/huo2015 --out r --udp here", "--udp: expected HOST:PORT"),

@@ -100,6 +100,25 @@ def _last(number: int, _frame: FrameType | None) -> None:
     os._exit(128 + number)
 
 
+@contextmanager
+def stopped_by_ctrl_c(
+    then: str = "computing the results (press Ctrl-C again to stop without results)",
+) -> Iterator[threading.Event]:
+    """An event that the first Ctrl-C sets; a second Ctrl-C stops the program as usual. then: what follows, in words."""
+    stop = threading.Event()
+
+    def end(*_: object) -> None:
+        stop.set()
+        signal.signal(signal.SIGINT, before)
+        logging.getLogger("beampose").info(f"the recording ends; {then}")
+
+    before = signal.signal(signal.SIGINT, end)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 if TYPE_CHECKING:
     from lab.findings.outcome import Done, Outcome
 

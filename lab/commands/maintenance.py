@@ -107,16 +107,43 @@ def _asked(given: dict[str, float | None]) -> dict[str, float]:
     metavar="WxH",
     help="Picture size, width and height in pixels.",
 )
+@click.option(
+    "--screen",
+    "own_screens",
+    multiple=True,
+    metavar="NAME={...}",
+    help="A screen as it was measured, once for each: 'wall={corner_m: [[0,0,0], [4,0,0], [0,0,3]]}'.",
+)
+@click.option(
+    "--camera",
+    "own_cameras",
+    multiple=True,
+    metavar="NAME={...}",
+    help="A camera: 'left={screen: wall, look_at: {eye_m: [2,3,1], target_m: [2,0,1.5]}, field_of_view_deg: 60}'.",
+)
+@click.option(
+    "--beam",
+    "own_beams",
+    multiple=True,
+    metavar="NAME={...}",
+    help="A beam: 'A={points_m: [[0,0,0], [1,0.1,0]], plus: wall}'; plus, minus: the screens that its ends meet.",
+)
+@click.option("--own", is_flag=True, help="Ask where the parts of your rig are, instead of a typical arrangement.")
 def init(
     folder: Path,
     distance: float,
     picture: tuple[int, int],
+    own: bool,
+    own_screens: tuple[str, ...],
+    own_cameras: tuple[str, ...],
+    own_beams: tuple[str, ...],
     **given: float | None,
 ) -> None:
-    """Write a commented rig.yaml and run.yaml to start from, with simulated points to try them.
+    """Write a commented rig.yaml and run.yaml to start from, with a drawing and simulated points to try them.
 
-    On a terminal it asks for what is not given as an option. The files pass `beampose check`; replace the numbers
-    by those of your lab.
+    On a terminal it asks for what is not given as an option. Without --screen, --camera, --beam and --own the rig is a
+    typical one; replace the numbers by those of your lab. A part of your own rig is stated in any form of rig.yaml, and
+    what was understood is printed and drawn (rig.html). The files pass `beampose check`.
 
     \b
     Example:
@@ -124,7 +151,23 @@ def init(
     """
     from lab.setup.init import Layout, start
 
+    if own_screens or own_cameras or own_beams:
+        from lab.setup.own_rig import parts_of, rig_of_parts
+
+        screens, cameras = parts_of(own_screens, "--screen"), parts_of(own_cameras, "--camera")
+        rig = rig_of_parts(screens, cameras, parts_of(own_beams, "--beam"), picture)
+        conclude(start(folder, rig, given["rate"] or _DEFAULTS["rate"]))
+    if own and not _on_a_terminal():
+        raise click.UsageError("--own asks questions, which need a terminal; state --screen, --camera and --beam")
     values = _asked(given)
+    if own:
+        from lab.setup.own_rig import ask_parts, rig_of_parts
+
+        def ask(question: str, default: str) -> str:
+            return str(click.prompt(question, default=default or None, show_default=bool(default)))
+
+        counts = (int(values[name]) for name in ("screens", "cameras", "beams"))
+        conclude(start(folder, rig_of_parts(*ask_parts(ask, *counts), picture), values["rate"]))
     layout = Layout(int(values["cameras"]), int(values["screens"]), int(values["beams"]), distance, picture)
     conclude(start(folder, layout, values["rate"]))
 

@@ -1,7 +1,8 @@
-"""`beampose run`, `watch` and `detect`: from pictures to results."""
+"""`beampose run`, `watch`, `record`, `detect` and `pick`: from pictures to results."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,16 @@ import click
 from lab.commands.common import (
     ANY_PATH,
     FOLDER,
+    ImageSize,
     NumberRange,
     conclude,
     progress_bar,
     provenance,
     quiet_option,
     set_option,
+    show_line,
     shown,
+    stopped_by_ctrl_c,
     verbose_option,
 )
 
@@ -94,6 +98,38 @@ def detect(pictures: tuple[Path, ...], out: Path, **options: Any) -> None:
 
 
 @click.command()
+@click.argument("photos", metavar="PHOTO...", nargs=-1, required=True)
+@click.option(
+    "--out",
+    default=Path("pick.html"),
+    show_default=True,
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="The page to write; open it in a browser.",
+)
+@click.option("--names", type=ANY_PATH, help="Names to choose from: a survey.csv with a column point, or a rig.yaml.")
+@click.option("--table", type=ANY_PATH, help="A points.csv or spots.csv to continue with.")
+@click.option("--darker", is_flag=True, help="Detect marks that are darker than what is around them.")
+@set_option
+def pick(photos: tuple[str, ...], out: Path, **options: Any) -> None:
+    """Write a page on which points in photos get their names: points.csv and spots.csv by clicks.
+
+    PHOTO is a picture or a folder of pictures, with the name of its camera before it: left=photos/l0.png. Without one
+    the camera is called as the folder, or as a single file. The page shows all detected points with their sub-pixel
+    positions; click one, type or choose its name, and download the table. It is one file that works without a
+    network; nothing leaves the computer.
+
+    \b
+    Example:
+        beampose pick left=sample_runs/huo2015/frames/left/000000.png --names sample_runs/huo2015/rig.yaml
+    """
+    from lab.runs.detect.pick import PickOptions, write_pick_page
+
+    with progress_bar("pictures") as progress:
+        done = write_pick_page(photos, out, PickOptions(**options), progress)
+    conclude(done)
+
+
+@click.command()
 @click.argument("run_folder", metavar="RUN", type=ANY_PATH)
 @click.option(
     "--out", required=True, type=FOLDER, help="Gets attitude_live.csv during the recording, and the results at the end."
@@ -105,6 +141,11 @@ def detect(pictures: tuple[Path, ...], out: Path, **options: Any) -> None:
     multiple=True,
     metavar="KIND:ADDRESS",
     help="Also send each frame: udp:HOST:PORT or zmq:HOST:PORT (published there), as JSON; lsl:NAME. Repeatable.",
+)
+@click.option(
+    "--page",
+    metavar="[HOST:]PORT",
+    help="Show pictures, spots, exposure and poses on a page: at this port, for this computer only without a HOST.",
 )
 @click.option(
     "--idle",
@@ -138,18 +179,67 @@ def watch(
 ) -> None:
     """Process a run while it is recorded: the pose of every frame as it arrives.
 
-    RUN is a run folder whose frame folders receive pictures, or whose run.yaml names a `device` for a camera (a number
-    or name that OpenCV opens). Each pose is appended to attitude_live.csv in the folder --out. When the recording
-    ends (--idle, Ctrl-C, end of the device), the results of `run` are written from the received pictures.
+    RUN is a run folder whose frame folders receive pictures, or whose run.yaml names a `device` for a camera (a source
+    as of `record`). Each pose is appended to attitude_live.csv in the folder --out; a line per second has frames,
+    measured poses and latency, and --page shows pictures and poses in a browser. When the recording ends (--idle,
+    Ctrl-C, end of the device), the results of `run` are written from the received pictures.
 
     \b
     Example:
         beampose watch runs/today --out results/today --stream udp:127.0.0.1:5005
     """
     from lab.runs.watch.live_frames import WatchOptions
-    from lab.runs.watch.watch import stopped_by_ctrl_c, watch_run
+    from lab.runs.watch.watch import watch_run
 
     with shown(run_folder.name, verbose=verbose, quiet=quiet) as progress, stopped_by_ctrl_c() as stop:
-        waiting, typed = WatchOptions(idle, timeout), provenance(ctx)
-        outcome = watch_run(run_folder, out, options=waiting, progress=progress, stop=stop, provenance=typed, **options)
+        waiting, typed, line = WatchOptions(idle, timeout), provenance(ctx), None if quiet else show_line
+        outcome = watch_run(
+            run_folder, out, options=waiting, progress=progress, stop=stop, provenance=typed, line=line, **options
+        )
     conclude(outcome, quiet=quiet)
+
+
+def _sources(ctx: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
+    """NAME=SOURCE pairs; a name becomes a folder and a file."""
+    out: dict[str, str] = {}
+    for text in values:
+        name, equals, source = text.partition("=")
+        if not equals or not source or not re.fullmatch(r"\w[\w.-]*", name):
+            raise click.BadParameter(f"expected NAME=SOURCE such as left=0, got {text!r}", ctx, parameter)
+        if name in out:
+            raise click.BadParameter(f"expected each camera once, got {name!r} twice", ctx, parameter)
+        out[name] = source
+    return out
+
+
+@click.command()
+@click.option("--camera", "cameras", required=True, multiple=True, metavar="NAME=SOURCE", callback=_sources,
+              help="A camera and its source; once for each.")  # fmt: skip
+@click.option("--out", required=True, type=FOLDER, help="The run folder to write; new or empty.")
+@click.option("--rig", type=ANY_PATH, help="The rig.yaml of the run: it is copied, and names and sizes are compared.")
+@click.option("--rate", "rate_hz", type=NumberRange(0.01, 1e5), help="Pictures per second, requested from cameras.")
+@click.option("--seconds", type=NumberRange(0, 1e7, min_open=True), help="End after this time; default: by Ctrl-C.")
+@click.option("--triggered", is_flag=True, help="One signal triggers all cameras: equal numbers are one instant.")
+@click.option(
+    "--exposure", "exposure_s", type=NumberRange(0, 10, min_open=True), help="Exposure time, s, for run.yaml."
+)
+@click.option("--size", "image_size_px", type=ImageSize(), metavar="WxH", help="Requested from devices, without --rig.")
+@quiet_option
+def record(cameras: dict[str, str], out: Path, quiet: bool, **options: Any) -> None:
+    """Record cameras into a run folder: lossless pictures with the times of the camera's own clock.
+
+    SOURCE is what OpenCV opens (a device's number or name, an address such as rtsp://..., a video file),
+    `genicam:SERIAL` for cameras of the GenICam standard (needs harvesters), or `replay:PATH`: a folder of pictures
+    shown as a camera would. A line per second counts pictures that were lost by the camera or not written. The folder
+    is a valid run whenever the recording ends: by --seconds, Ctrl-C, an unplugged camera, a full disk.
+
+    \b
+    Example:
+        beampose record --camera left=replay:sample_runs/huo2015/frames/left --seconds 1 --out recorded
+    """
+    from lab.runs.watch.record import RecordOptions
+    from lab.runs.watch.record import record as record_cameras
+
+    with stopped_by_ctrl_c("writing what is left") as stop:
+        done = record_cameras(cameras, out, RecordOptions(**options), stop=stop, line=None if quiet else show_line)
+    conclude(done, quiet=quiet)

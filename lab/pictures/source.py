@@ -1,7 +1,7 @@
 """One camera's recorded pictures: numbered files, or a video; grey or in colour. All commands read series here.
 
 Orientation flags are not applied: pixels stay in the sensor's order. A video's grey is that of the decoder: the luma of
-YUV videos, all channels of RGB videos. Files are regular files. Live cameras: lab/runs/watch/cameras.py.
+YUV videos, all channels of RGB videos. Files are regular files. Live cameras: live_source.py beside it.
 """
 
 from __future__ import annotations
@@ -373,6 +373,11 @@ def retrieved(capture: Grabbed, size_px: tuple[int, int] | None, colour: bool = 
     good, picture = capture.retrieve()
     if not good or picture is None:
         return MissingPicture(f"{UNREADABLE}: damaged")
+    return formatted(picture, size_px, colour)
+
+
+def formatted(picture: Any, size_px: tuple[int, int] | None, colour: bool = False) -> Any:
+    """A picture, grey or BGR, of this (width, height): grey values, or BGR with `colour`; else Missing."""
     checked = require_format(picture, size_px)
     if colour:
         return checked if isinstance(checked, MissingPicture) else as_colour(checked)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import hashlib
+import json
 import re
 from functools import cache
 from importlib import metadata
@@ -23,8 +24,10 @@ _END = "//end"  # Jinja drops a line break at the end of a template, which is no
 _SCRIPT = re.compile(r"<script>(.*?)</script>", re.DOTALL | re.IGNORECASE)
 
 
-def content_policy(environment: jinja2.Environment, template: str) -> str:
+def content_policy(environment: jinja2.Environment, template: str, served: bool = False) -> str:
     """The policy of one template, for its `<meta http-equiv="Content-Security-Policy">`.
+
+    served: the page may load from the server that it comes from.
 
     The inline scripts are allowed by their hashes, computed from the template and not from the page: a script that
     gets into the page by its data does not run. Scripts of templates therefore have no Jinja expressions: data is
@@ -40,6 +43,7 @@ def content_policy(environment: jinja2.Environment, template: str) -> str:
             "style-src 'unsafe-inline'",
             "img-src data:",
             f"script-src {' '.join(hashes) or chr(39) + 'none' + chr(39)}",
+            *(("connect-src 'self'",) if served else ()),
             "base-uri 'none'",
             "form-action 'none'",
         )
@@ -101,10 +105,15 @@ def environment() -> jinja2.Environment:
         lstrip_blocks=True,
     )
     made.filters["words"] = words
-    made.globals["content_policy"] = lambda template: content_policy(made, template)
+    made.globals["content_policy"] = lambda template, served=False: content_policy(made, template, served)
     return made
 
 
 def words(text: str) -> Markup:
     """A message as HTML: what the command line shows between backticks is code here."""
     return Markup(re.sub(r"`([^`\n]+)`", r"<code>\1</code>", str(escape(text))))
+
+
+def as_script(data: object) -> Markup:
+    """Data for a script element of type application/json."""
+    return Markup(json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"))

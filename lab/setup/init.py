@@ -14,13 +14,17 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.pose import Pose, look_at
+from geometry.pose_solver.visibility import assumed_range
 from geometry.rig import Beam, Rig, Screen, Spot
 from lab.errors import InputError
-from lab.files.rig.rig_file import load_rig, save_rig
+from lab.files.rig.rig_file import RigFile, load_rig, save_rig
 from lab.files.run.run_file import load_run, save_run
 from lab.files.text.atomic_write import atomic_folder, atomic_write_text
 from lab.files.text.yaml_text import with_comments
 from lab.findings.outcome import Done
+from lab.results.view.page import write_page
+from lab.results.view.scene import read_content, view_of
+from lab.setup.own_rig import understood
 from lab.simulate.scenarios import SCENARIOS
 from lab.simulate.write import simulate
 
@@ -161,6 +165,7 @@ _RUN_COMMENTS = {
     "prior": "Where the vehicle is in the first frame, and how far it may be from there. Leave it out if unknown.",
     "notes": "Optional, shown in the report.",
 }
+_OWN = "As it was stated; the comments have the numbers that were measured."
 _START = "A start, not a measurement: replace the numbers by those of your lab."
 _OPTIONAL_RIG = (
     "# Optional, in each camera: noise: {gain_e_per_dn: 38.0, read_noise_e: 6.0, black_dn: 4.0}; estimated if absent.\n"
@@ -172,20 +177,27 @@ _OPTIONAL_RUN = (
 )
 
 
-def start(folder: Path, layout: Layout, frame_rate_hz: float) -> Done[Path]:
-    """Write rig.yaml, run.yaml and simulated points into a new or empty folder.
+def start(folder: Path, layout: Layout | RigFile, frame_rate_hz: float) -> Done[Path]:
+    """Write rig.yaml, rig.html with its drawing, run.yaml and simulated points into a new or empty folder.
+
+    layout: of a typical rig, or a rig of one's own.
 
     Raises:
-        InputError: the folder holds files, or the layout cannot measure a pose.
+        InputError: the folder holds files, or the rig cannot measure a pose.
     """
     folder = Path(folder)
     if folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"{folder}: expected a new or empty folder, found files in it; name another one")
-    rig = rig_of(layout)
+    own = layout if isinstance(layout, RigFile) else None
+    rig = layout.rig if isinstance(layout, RigFile) else rig_of(layout)
+    centre = assumed_range(rig).centre
     with atomic_folder(folder, may_replace=lambda _: False) as work:
         rig_path = work / "rig.yaml"
-        save_rig(rig, rig_path)
-        _comment(rig_path, _RIG_COMMENTS, f"{_START}\n# Check it with `beampose check rig.yaml`.", _OPTIONAL_RIG)
+        save_rig(own or rig, rig_path)
+        head = _OWN if own is not None else _START
+        _comment(rig_path, _RIG_COMMENTS, f"{head}\n# Check it with `beampose check rig.yaml`.", _OPTIONAL_RIG)
+        content = read_content(rig_path, None)
+        write_page(view_of(content, content.at_frame(None)), content.at_frame(None), work / "rig.html")
         _points(work, frame_rate_hz)
         run = {
             "name": "first-run",
@@ -193,9 +205,9 @@ def start(folder: Path, layout: Layout, frame_rate_hz: float) -> Done[Path]:
             "frame_rate_hz": float(frame_rate_hz),
             "cameras": {name: {"detections": EXAMPLE} for name in rig.cameras},
             "prior": {
-                "position_m": [0.0, 0.0, 0.0],
-                "yaw_pitch_roll_deg": [0.0, 0.0, 0.0],
-                "within_m": min(0.5, 0.2 * layout.distance_m),
+                "position_m": centre.translation.round(4).tolist(),
+                "yaw_pitch_roll_deg": np.rad2deg(centre.ypr).round(3).tolist(),
+                "within_m": 0.5 if isinstance(layout, RigFile) else min(0.5, 0.2 * layout.distance_m),
                 "within_deg": 25.0,
             },
             "notes": "Simulated points of an example rig.",
@@ -203,8 +215,10 @@ def start(folder: Path, layout: Layout, frame_rate_hz: float) -> Done[Path]:
         _comment(save_run(run, work), _RUN_COMMENTS, "One recording.", _OPTIONAL_RUN)
         load_rig(rig_path)
         load_run(work)
+    shown = [] if own is None else understood(rig)
     following = f"Next: beampose check {folder}; beampose run {folder} --out {folder / 'results'}"
-    return Done(folder, (f"rig: {folder / 'rig.yaml'}", f"run: {folder / 'run.yaml'}", following))
+    files = (f"rig: {folder / 'rig.yaml'}", f"drawing: {folder / 'rig.html'}", f"run: {folder / 'run.yaml'}")
+    return Done(folder, (*shown, *files, following))
 
 
 def _points(work: Path, frame_rate_hz: float) -> None:

@@ -20,7 +20,7 @@ from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_text
 from lab.report.calibration.calibration_scene import LAB_VIEWS, scene_views
 from lab.report.failure import Failure, files_beside, write_failure_report
-from lab.report.html import environment
+from lab.report.html import as_script, environment
 from lab.report.plot.svg import POSE_COLOURS, SPOT_COLOURS
 from lab.report.run import figures, tables, trust
 from lab.report.run.events import ShownEvent, events, pictures, selected
@@ -29,7 +29,7 @@ from lab.report.run.methods import methods
 from lab.report.run.model_fit import HEADS as MODEL_FIT_HEADS
 from lab.report.run.model_fit import model_fit
 from lab.report.run.report_data import ReportData, read_report_data
-from lab.results.view.page import as_script, scene_data
+from lab.results.view.page import scene_data
 from lab.results.view.scene import content_of_poses, view_of
 from lab.runs.verdict.score import ResultTables
 from tracking.statuses import PoseStatus, SpotStatus

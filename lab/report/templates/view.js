@@ -86,7 +86,7 @@
       pen.fill();
       label(name, p);
     }
-    shown.textContent = `frame ${now.k} · ${now.t.toFixed(2)} s${now.m ? "" : " · not measured"}`;
+    shown.textContent = moments.length < 2 ? "" : `frame ${now.k} · ${now.t.toFixed(2)} s${now.m ? "" : " · not measured"}`;
   }
 
   function stop() { playing = null; play.textContent = "Play"; }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,8 @@ from markupsafe import Markup
 from geometry.arrays import Array, Ints
 from geometry.forward_model import SpotModel
 from lab.files.text.atomic_write import atomic_write_text
-from lab.report.calibration.calibration_scene import Rectangle, scene_views
-from lab.report.html import environment
+from lab.report.calibration.calibration_scene import Rectangle, outline, scene_views
+from lab.report.html import as_script, environment
 from lab.report.plot.svg import ORANGE, PURPLE
 from lab.results.view.scene import Content, View, edges, thinned
 
@@ -30,7 +29,8 @@ def write_page(view: View, index: int | None, path: Path) -> None:
         .render(
             name=content.name,
             poses=content.poses_from,
-            frame=None if index is None else int(content.frames[index]),
+            space=_space(view),
+            frame=None if index is None or not content.poses_from else int(content.frames[index]),
             moments=int(content.known.sum()),
             ellipsoids=len(view.ellipsoids),
             too_large=view.too_large,
@@ -42,9 +42,13 @@ def write_page(view: View, index: int | None, path: Path) -> None:
     atomic_write_text(html, path)
 
 
-def as_script(data: dict[str, Any]) -> Markup:
-    """Data for a script element of type application/json."""
-    return Markup(json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"))
+def _space(view: View) -> str:
+    """The size of a rig's workspace, in words; empty where there is none."""
+    box = next((t for t in view.fixed if t.name == "workspace"), None)
+    if box is None:
+        return ""
+    x, y, z = np.ptp(outline(box, 0.0)[np.isfinite(outline(box, 0.0)).all(axis=1)], axis=0)
+    return f", in a grey box of {x:.2g} x {y:.2g} x {z:.2g} m in which at least half of them stay in view"
 
 
 def scene_data(
@@ -57,7 +61,9 @@ def scene_data(
     lines = []
     for thing in view.fixed:
         for number, line in enumerate(edges(thing, view.reach_m)):
-            label = thing.name if labels and number == 0 and not thing.name.startswith("trajectory") else ""
+            label = (
+                thing.name if labels and number == 0 and not thing.name.startswith(("trajectory", "workspace")) else ""
+            )
             lines.append(
                 {"c": thing.colour, "n": label, "f": isinstance(thing, Rectangle), "p": _rounded(line, digits)}
             )

@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from geometry.pose_solver.visibility import assumed_range
 from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig
@@ -38,7 +40,7 @@ from tracking.statuses import PoseStatus
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """A rig and F poses of the vehicle; F is 0 for a rig alone."""
+    """A rig and F poses of the vehicle; for a rig alone, one in the middle of what it sees."""
 
     name: str
     poses_from: str  # what the poses are, in words; empty without poses
@@ -63,7 +65,7 @@ class Content:
         known = np.flatnonzero(self.known)
         if frame is None:
             return int(known[len(known) // 2]) if len(known) else None
-        if not len(known):
+        if not (len(known) and self.poses_from):
             raise InputError(f"--frame {frame}: {self.name} has no poses; leave --frame out")
         numbers = self.frames[known]
         if frame not in numbers:
@@ -139,9 +141,44 @@ def _of_run(path: Path, rig_path: Path | None) -> Content:
 
 
 def _without_poses(name: str, rig: Rig) -> Content:
-    none = Pose(np.zeros((0, 3, 3)), np.zeros((0, 3)))
-    empty = np.zeros(0)
-    return Content(name, "", rig, empty.astype(np.int64), empty, none, np.zeros((0, 3, 3)), empty.astype(bool))
+    """A rig with the vehicle in the middle of what it sees."""
+    centre = assumed_range(rig).centre
+    poses, unknown = Pose(centre.rotation[None], centre.translation[None]), np.full((1, 3, 3), np.nan)
+    one = np.zeros(1, dtype=np.int64)
+    return Content(name, "", rig, one, np.zeros(1), poses, unknown, np.zeros(1, dtype=bool))
+
+
+def workspace(rig: Rig, middle: Pose) -> Trail | None:
+    """The box along the world's axes in which half of the spots stay in view, with the attitude of the middle; ours.
+
+    Each side ends where, on the line through the middle, fewer spots are in view. None: too few in the middle.
+    """
+    model = SpotModel.of(rig)
+
+    def seen(places: Array) -> Ints:
+        """Spots (n,) in view at positions (n, 3)."""
+        poses = Pose(np.broadcast_to(middle.rotation, (len(places), 3, 3)), places)
+        inside = model.in_picture(model.project(poses)[0])
+        return np.sum([inside[:, model.spot_of == k].any(axis=1) for k in range(len(model.spot_names))], axis=0)
+
+    enough = max(3, -(-int(seen(middle.translation[None])[0]) // 2))
+    if seen(middle.translation[None])[0] < enough:
+        return None
+    steps = np.linspace(0.0, _FAR_M, _STEPS)[1:]
+    ends = np.zeros((2, 3))
+    for side, sign in enumerate((-1.0, 1.0)):
+        for axis in range(3):
+            few = seen(middle.translation + sign * steps[:, None] * np.eye(3)[axis]) < enough
+            first = int(np.argmax(few)) if few.any() else len(few)
+            ends[side, axis] = sign * (steps[first - 1] if first else 0.0)
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    edges_of = [(a, b) for a in range(8) for b in range(a) if np.sum(corners[a] != corners[b]) == 1]
+    gap = np.full((1, 3), np.nan)
+    lines = [
+        np.concatenate([np.where(corners[[a, b]] == 0, ends[0], ends[1]) + middle.translation, gap])
+        for a, b in edges_of
+    ]
+    return Trail("workspace", np.concatenate(lines)[:-1], GREY)
 
 
 def _times(frames: Ints, t_s: Array) -> Array:
@@ -259,6 +296,7 @@ MOST_ELLIPSOIDS = 60
 MOST_POINTS = 1500  # of the trajectory
 _LARGEST = 0.2  # largest semi-axis that is drawn, in shares of the scene's extent: larger ones would cover it
 _SHARE = 0.02  # of the scene's extent: the size at which a typical ellipsoid is drawn
+_FAR_M, _STEPS = 10.0, 401  # how far from the middle the workspace is looked for, and at how many places
 _SIZING = 200  # poses whose spots decide the size of a screen that states none
 _TURN = np.linspace(0, 2 * np.pi, 33)
 
@@ -313,10 +351,12 @@ def view_of(
     """
     pose = None if index is None else content.world_from_body[index]
     known = np.flatnonzero(content.known)
+    space = None if content.poses_from or pose is None else workspace(content.rig, pose)
     others = content.world_from_body[thinned(known, _SIZING)] if len(known) > 1 else None
     fixed: list[SceneObject] = [t for t in rig_things(content.rig, pose, others) if not isinstance(t, Ray | Marker)]
     if len(known) > 1:
         fixed.append(Trail("trajectory", _trajectory(content, most_points), PURPLE))
+    fixed += [] if space is None else [space]
     reach = frustum_length(fixed)
     points = np.concatenate([outline(t, reach) for t in fixed])
     extent = float(np.ptp(points[np.isfinite(points).all(axis=1)], axis=0).max())

@@ -19,7 +19,7 @@ from typing import Any
 from lab.cycle_search import search_rarely
 from lab.pictures.picture_file import GreyPicture
 from lab.runs.frames.sensor_noise import VIDEO_FRAMES, CameraNoise
-from tracking.background.estimation import PICTURES, static_background
+from tracking.background.estimation import PICTURES
 from tracking.background.static_background import StaticBackground
 from tracking.parameters import DetectParameters
 
@@ -32,7 +32,7 @@ _PROTOCOL = 5  # of pickle: arrays are written and read in place, and the interp
 
 @dataclass(slots=True)
 class BackgroundProcess:
-    """Computes `static_background` in another process, one call at a time. Used as a context manager."""
+    """Calls functions in another process, one at a time. Used as a context manager."""
 
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _process: subprocess.Popen[bytes] | None = None
@@ -42,7 +42,7 @@ class BackgroundProcess:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the process, also in the middle of a background."""
+        """End the process, also in the middle of a call."""
         self._ended = True
         if self._process is not None:
             self._process.kill()
@@ -53,14 +53,13 @@ class BackgroundProcess:
         with self._lock, suppress(OSError):
             self._started()
 
-    def background(self, *given: Any) -> StaticBackground | None:
-        """`static_background`, from its arguments. Raises one of ENDED where the process has been ended, or killed."""
+    def call(self, function: Callable[..., Any], *given: Any) -> Any:
+        """The function's result. Raises one of ENDED where the process has been ended, or killed."""
         with self._lock:
             to, of = self._started()
-            pickle.dump(given, to, _PROTOCOL)
+            pickle.dump((function, *given), to, _PROTOCOL)
             to.flush()
-            made: StaticBackground | None = pickle.load(of)
-            return made
+            return pickle.load(of)
 
     def _started(self) -> tuple[Any, Any]:
         """The pipes to the process and from it; it is started where it does not run. Raises OSError after the end."""
@@ -79,14 +78,14 @@ class BackgroundProcess:
 
 
 def serve() -> None:
-    """Make backgrounds of what comes from standard input until it ends."""
+    """Call what comes from standard input until it ends."""
     search_rarely()
     out = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # for whatever prints
     while True:
         try:
-            given = pickle.load(sys.stdin.buffer)
-            pickle.dump(static_background(*given), out, _PROTOCOL)
+            function, *given = pickle.load(sys.stdin.buffer)
+            pickle.dump(function(*given), out, _PROTOCOL)
             out.flush()
         except (EOFError, BrokenPipeError):  # the watch has ended
             os._exit(0)

@@ -10,13 +10,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
 from numpy.typing import NDArray
 
 from lab.errors import InputError
-from lab.pictures.opencv import load_cv2, opened
+from lab.pictures.live_source import LiveSource, open_live
 from lab.pictures.picture_file import UNREADABLE, MissingPicture, read_picture
-from lab.pictures.source import retrieved
 from lab.runs.watch.frame_clock import FolderPoll, FrameClock
 from lab.runs.watch.inbox import Inbox
 
@@ -138,32 +136,15 @@ class FolderCamera:
         self.inbox.put(self.name, number, content, arrived_s)
 
 
-class Capture(Protocol):
-    """The part of cv2.VideoCapture that is used."""
-
-    def grab(self) -> bool:
-        """Wait for the next picture; False without one."""
-
-    def retrieve(self) -> tuple[bool, NDArray | None]:
-        """Decode the picture that was grabbed."""
-
-    def release(self) -> None:
-        """Close the device."""
-
-
 @dataclass(slots=True)
 class DeviceCamera:
-    """A camera that OpenCV reads. Its pictures are numbered from 0, with gaps where the clock shows a loss.
-
-    endless: a device, which cannot wait; False: a file or a stream with an end, which is read completely.
-    """
+    """A camera that is read directly. Its pictures count from 0, with gaps where its count or a clock shows a loss."""
 
     name: str
-    capture: Capture
+    source: LiveSource
     size_px: tuple[int, int]
     inbox: Inbox
     clock: FrameClock
-    endless: bool = True
 
     def run(self) -> None:
         """Put pictures into the inbox until the device ends or the inbox stops."""
@@ -173,35 +154,34 @@ class DeviceCamera:
                 pass
             while not self.inbox.stopping.is_set():
                 self.inbox.catch_up(self.name)
-                if not self.endless and not self.inbox.has_room(self.name):
+                if not self.source.endless and not self.inbox.has_room(self.name):
                     self.inbox.stopping.wait(POLL_S)
                     continue
-                if not self.capture.grab():
+                if not self.source.grab():
                     failures += 1
-                    if not self.endless or failures >= _FAILURES:
+                    if not self.source.endless or failures >= _FAILURES:
                         return
                     self.inbox.stopping.wait(0.02)
                     continue
                 failures = 0
                 arrived_s = time.time()
-                number = self.clock.number(time.perf_counter()) if self.endless else self.clock.count()
+                number = (
+                    self.clock.number(time.perf_counter(), self.source.number())
+                    if self.source.endless
+                    else self.clock.count()
+                )
                 if not self.inbox.has_room(self.name):
                     self.inbox.count_refused(self.name)
                     continue
-                self.inbox.put(self.name, number, self._decoded(), arrived_s)
+                self.inbox.put(self.name, number, self.source.picture(self.size_px), arrived_s)
         finally:
-            self.capture.release()
+            self.source.release()
 
     @property
     def notes(self) -> list[str]:
         """A note on lost pictures."""
         lost = self.clock.lost
         return [f"{self.name}: {lost} pictures lost by the device, according to the clock"] if lost else []
-
-    def _decoded(self) -> NDArray | MissingPicture:
-        picture = retrieved(self.capture, self.size_px)
-        # Copied, since the device may overwrite its buffer.
-        return picture if isinstance(picture, MissingPicture) else np.array(picture)
 
 
 def open_device(name: str, device: int | str, size_px: tuple[int, int], inbox: Inbox, rate_hz: float) -> DeviceCamera:
@@ -210,20 +190,11 @@ def open_device(name: str, device: int | str, size_px: tuple[int, int], inbox: I
     Raises:
         InputError: the device cannot be opened.
     """
-    cv2 = load_cv2()
-    capture = opened(device)
-    if not capture.isOpened():
-        raise InputError(
-            f"cameras.{name}.device: expected a camera that OpenCV can open, got {device!r}, which it cannot"
-            " open (missing, in use, or without read permission?)"
-        )
-    endless = not capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0
-    if endless:
-        capture.set(cv2.CAP_PROP_FRAME_WIDTH, size_px[0])
-        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size_px[1])
-        capture.set(cv2.CAP_PROP_FPS, rate_hz)
-    capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
-    return DeviceCamera(name, capture, size_px, inbox, FrameClock(rate_hz), endless)
+    try:
+        source = open_live(device, size_px, rate_hz)
+    except InputError as error:
+        raise InputError(f"cameras.{name}.device: {error}") from None
+    return DeviceCamera(name, source, size_px, inbox, FrameClock(rate_hz))
 
 
 def in_thread(camera: LiveCamera, failed: Callable[[BaseException], None]) -> threading.Thread:

@@ -13,6 +13,7 @@ from lab.pictures.source import number_of
 
 # Frame numbers for the pictures of a device without any: counted, and checked against the clock.
 
+_RESTART = 30_000  # missing pictures by a camera's own count from which the count has started again (16 bits overflow)
 _CONFIRMING = 12  # consecutive late pictures that confirm a loss: a burst after a pause is late only at its start
 
 
@@ -29,14 +30,19 @@ class FrameClock:
     _next: int = 0
     _start_s: float = 0.0
     _late: deque[float] = field(default_factory=lambda: deque(maxlen=_CONFIRMING))
+    _counted: int | None = None  # the camera's own count of the last picture
 
     def count(self) -> int:
         """The number of the next picture of a source that loses none."""
         self._next += 1
         return self._next - 1
 
-    def number(self, now_s: float) -> int:
-        """The number of a picture that arrived at this time, s, of any steady clock."""
+    def number(self, now_s: float, counted: int | None = None) -> int:
+        """The number of a picture that arrived at this time, s, of any steady clock. counted: by the camera itself."""
+        if counted is not None:
+            missing = 0 if self._counted is None else counted - self._counted - 1
+            self._counted = counted
+            return self.skipping(missing if 0 < missing < _RESTART else 0)
         if self._next == 0:
             self._start_s = now_s
         self._late.append((now_s - self._start_s) * self.rate_hz - self._next)
@@ -45,9 +51,14 @@ class FrameClock:
             self._late.clear()
         elif len(self._late) == _CONFIRMING and min(self._late) >= 1:
             lost = int(min(self._late))
-            self.lost += lost
-            self._next += lost
             self._late.clear()
+            return self.skipping(lost)
+        return self.count()
+
+    def skipping(self, missing: int) -> int:
+        """The number of a picture before which so many were lost."""
+        self.lost += missing
+        self._next += missing
         return self.count()
 
 

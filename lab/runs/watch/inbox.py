@@ -161,24 +161,24 @@ class Inbox:
         with self.changed:
             self.queues[camera].refused += 1
 
-    def take(self, frame: int) -> tuple[dict[str, Content], float | None]:
+    def take(self, frame: int) -> tuple[dict[str, Content], dict[str, float]]:
         """Take a frame's pictures by camera, and close the frame.
 
-        Also returns when (time.time()) the last of them arrived; None if all are older than the watch.
+        Also returns when (time.time()) they arrived; without those that are older than the watch.
         """
         out: dict[str, Content] = {}
-        arrived: list[float] = []
+        arrived: dict[str, float] = {}
         for name, queue in self.queues.items():
             waiting = queue.pictures.pop(frame, None)
             since_and_why = queue.incomplete.pop(frame, None)
             if waiting is not None:
                 out[name] = waiting.content
                 if waiting.arrived_s is not None:
-                    arrived.append(waiting.arrived_s)
+                    arrived[name] = waiting.arrived_s
             else:
                 out[name] = MissingPicture(DROPPED if since_and_why is None else since_and_why[1])
         self.next_frame = frame + 1
-        return out, max(arrived, default=None)
+        return out, arrived
 
     def has_later(self, frame: int) -> bool:
         """Whether any camera has a picture of a later frame."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -21,6 +21,7 @@ from lab.runs.watch.frame_clock import FolderPoll
 from lab.runs.watch.inbox import CameraQueue, Inbox, is_complete
 
 FIRST = 6  # pictures of each camera for the estimate of the noise
+_ARRIVALS = 200  # frames whose arrivals are compared between cameras
 _START_S = 0.5  # longest wait for them, or the time of eight frames if that is more
 
 
@@ -44,6 +45,8 @@ class LiveFrames:
     stop: threading.Event = field(default_factory=threading.Event)
     inbox: Inbox = field(init=False)
     arrived_s: dict[int, float | None] = field(default_factory=dict)  # time.time(), by frame; removed by the output
+    # time.time() by camera, of the last frames
+    arrivals: deque[dict[str, float]] = field(default_factory=lambda: deque(maxlen=_ARRIVALS))
     caught_up: bool = False  # whether the backlog of the start has been processed
     _cameras: dict[str, LiveCamera] = field(init=False)
     _stack: ExitStack = field(default_factory=ExitStack)
@@ -78,6 +81,15 @@ class LiveFrames:
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
+
+    def missing(self, camera: str) -> Counter[str]:
+        """Reasons why frames had no picture of a camera, each with its count."""
+        return self._reasons[camera]
+
+    def lost(self, camera: str) -> int:
+        """Pictures of a camera that were lost, came too late, or were left out since they came too fast."""
+        queue, source = self.inbox.queues[camera], self._cameras[camera]
+        return queue.refused + queue.late + (source.clock.lost if isinstance(source, DeviceCamera) else 0)
 
     @property
     def expected_frames(self) -> int | None:
@@ -131,7 +143,9 @@ class LiveFrames:
         try:
             while self._wait_for(frame, since):
                 with self.inbox.changed:
-                    images, self.arrived_s[frame] = self.inbox.take(frame)
+                    images, arrived = self.inbox.take(frame)
+                    self.arrived_s[frame] = max(arrived.values(), default=None)
+                    self.arrivals.append(arrived)
                     self.caught_up |= not self.inbox.has_later(frame)
                 for name, content in images.items():
                     if isinstance(content, MissingPicture):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 
@@ -18,8 +18,13 @@ from lab.runs.tables import attitude_rows, pose_numbers
 from lab.runs.verdict.frame_checks import FrameChecks
 from lab.runs.watch.live_frames import LiveFrames
 from lab.runs.watch.streams import Stream
+from tracking.statuses import PoseStatus
+
+if TYPE_CHECKING:
+    from lab.runs.watch.board import Board
 
 LIVE_TABLE = "attitude_live.csv"
+_LINE_S = 1.0  # between two lines of status
 _LATE_MS = 1000.0  # latency of the last pose above which the watch has not kept up
 
 
@@ -72,8 +77,14 @@ class LiveOutput:
     frames: LiveFrames
     checks: FrameChecks
     streams: Sequence[Stream] = ()
+    board: Board | None = None
+    line: Callable[[str], None] | None = None  # called with a line of status every second
     latency: Latency = field(default_factory=Latency)
     _file: TextIO | None = None
+    _counts: tuple[int, int] = (0, 0)  # frames, and measured ones
+    _recent_ms: list[float] = field(default_factory=list)  # latencies since the last line
+    _begun_s: float | None = None
+    _said_s: float = 0.0  # when the last line was shown
 
     def write(self, record: FrameRecord) -> None:
         """Write and send one frame."""
@@ -90,6 +101,26 @@ class LiveOutput:
             content = frame_content(checked, latency_ms)
             for stream in self.streams:
                 stream.send(content)
+        if self.board is not None:
+            self.board.add(checked, latency_ms)
+        if self.line is not None:
+            self._say(checked, latency_ms, self.line)
+
+    def _say(self, record: FrameRecord, latency_ms: float | None, line: Callable[[str], None]) -> None:
+        now_s = time.perf_counter()
+        if self._begun_s is None:
+            self._begun_s = self._said_s = now_s
+        frames, measured = self._counts
+        self._counts = frames + 1, measured + (record.tracked.pose_status is PoseStatus.MEASURED)
+        if latency_ms is not None:
+            self._recent_ms.append(latency_ms)
+        if now_s - self._said_s < _LINE_S:
+            return
+        self._said_s = now_s
+        late = np.percentile(self._recent_ms, [50, 100]) if self._recent_ms else (np.nan, np.nan)
+        self._recent_ms.clear()
+        shown = "" if np.isnan(late[0]) else f", latency {late[0]:.1f} ms (largest {late[1]:.1f} ms)"
+        line(f"{now_s - self._begun_s:.0f} s: {self._counts[0]} frames, {self._counts[1]} measured{shown}")
 
     def finish(self, work: Path) -> dict[str, Any]:
         """Copy the live table into the results in `work`. Returns the watch's part of summary.json."""

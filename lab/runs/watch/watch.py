@@ -5,15 +5,15 @@ from __future__ import annotations
 import contextlib
 import gc
 import logging
-import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -35,8 +35,11 @@ from lab.runs.watch.background import BackgroundProcess, LiveBackground
 from lab.runs.watch.live_frames import LiveFrames, WatchOptions
 from lab.runs.watch.live_output import LiveOutput, is_live_table
 from lab.runs.watch.streams import opened
-from tracking.background.estimation import PICTURES
+from tracking.background.estimation import PICTURES, static_background
 from tracking.detections import Detections
+
+if TYPE_CHECKING:
+    from lab.runs.watch.board import Board
 
 _log = logging.getLogger("beampose")
 _SWITCH_INTERVAL_S = 0.0005
@@ -48,7 +51,9 @@ def watch_run(
     *,
     udp: str | None = None,
     streams: Sequence[str] = (),
+    page: str | None = None,
     reprocess: bool = False,
+    line: Callable[[str], None] | None = None,
     options: WatchOptions = WatchOptions(),  # noqa: B008  (frozen)
     overrides: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
@@ -58,7 +63,8 @@ def watch_run(
     """Process a run folder whose cameras are folders that are being filled, or devices.
 
     During the recording `out` contains attitude_live.csv: a row per frame by the causal tracker, flushed at once. udp:
-    HOST:PORT that receives the same as a line of JSON. streams: further receivers, `KIND:ADDRESS`. The recording ends
+    HOST:PORT that receives the same as a line of JSON. streams: further receivers, `KIND:ADDRESS`. page: PORT or
+    HOST:PORT of the page that shows it meanwhile. line: called with a line of status every second. The recording ends
     when nothing has come for `options.idle_s`, when all devices have ended, or when `stop` is set; then `out` receives
     the results of `beampose run`, computed from the received detections. These differ from those of a run by the
     pictures that the noise and the static background are estimated from (here each camera's first ones; of the
@@ -79,7 +85,8 @@ def watch_run(
         work = stack.enter_context(atomic_folder(out, may_replace=lambda p: are_results(p) or is_live_table(p)))
         sending = stack.enter_context(opened(udp, streams, run.frame_rate_hz))
         frames = LiveFrames(run, options, stop or threading.Event())
-        output = LiveOutput(Path(out), frames, FrameChecks(run.rig, run.covariance), sending)
+        board = None if page is None else _served(run, frames, page, stack, line)
+        output = LiveOutput(Path(out), frames, FrameChecks(run.rig, run.covariance), sending, board, line)
         stack.callback(output.close)
         with frames, _low_latency():
             pipeline, finders = _started(run, frames, output, stack.enter_context(BackgroundProcess()))
@@ -100,6 +107,21 @@ def watch_run(
     return replace(outcome, more=output.latency.lines())
 
 
+def _served(
+    run: Run, frames: LiveFrames, page: str, stack: contextlib.ExitStack, line: Callable[[str], None] | None
+) -> Board:
+    """The content of the live page, and its server. Raises InputError: the address cannot be used."""
+    from lab.runs.watch.board import Board, page_html
+    from lab.runs.watch.page_server import PageServer
+
+    # A process of its own: that of the backgrounds may be busy for seconds.
+    board = Board(run, frames, stack.enter_context(BackgroundProcess()).call)
+    server = stack.enter_context(PageServer(page, page_html(run), board.state, board.picture))
+    if line is not None:
+        line(f"page: {server.url}")
+    return board
+
+
 def _started(
     run: Run, frames: LiveFrames, output: LiveOutput, process: BackgroundProcess
 ) -> tuple[Pipeline, dict[str, _Finder]]:
@@ -115,8 +137,11 @@ def _started(
     if any(own.shows_structure for own in noise.values()):
         process.start()
     pipeline = Pipeline(run, frames, tracker_of(run), noise, output.write)
-    detect, make = run.tracker.detect, process.background
-    finders = {name: _Finder(pipeline, name, LiveBackground(own, detect, make)) for name, own in noise.items()}
+    detect, make = run.tracker.detect, partial(process.call, static_background)
+    board = output.board
+    if board is not None:
+        board.pipeline = pipeline
+    finders = {name: _Finder(pipeline, name, LiveBackground(own, detect, make), board) for name, own in noise.items()}
     frames.inbox.set_finders(finders)
     return pipeline, finders
 
@@ -128,6 +153,7 @@ class _Finder:
     pipeline: Pipeline
     camera: str
     background: LiveBackground
+    board: Board | None = None
     seconds: float = 0.0
 
     def __call__(self, picture: GreyPicture) -> Detections:
@@ -135,24 +161,9 @@ class _Finder:
         found = self.pipeline.spots_in(self.camera, picture)
         self.seconds += time.perf_counter() - clock
         self.background.add(picture)
+        if self.board is not None:
+            self.board.show(self.camera, picture, found)
         return found
-
-
-@contextlib.contextmanager
-def stopped_by_ctrl_c() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; a second Ctrl-C stops the program as usual."""
-    stop = threading.Event()
-
-    def end(*_: object) -> None:
-        stop.set()
-        signal.signal(signal.SIGINT, before)
-        _log.info("the recording ends; computing the results (press Ctrl-C again to stop without results)")
-
-    before = signal.signal(signal.SIGINT, end)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _load_compiled_code(run: Run) -> None:

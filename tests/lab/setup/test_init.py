@@ -7,7 +7,9 @@ import re
 import click
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from cli import main
 from lab.commands import maintenance
 from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig
@@ -105,3 +107,108 @@ def test_on_a_terminal_only_what_is_not_given_is_asked(monkeypatch):
         "screens": 2, "cameras": 7, "beams": 7, "rate": 25.0,
     }  # fmt: skip
     assert len(asked) == 2
+
+
+WALL = "wall={corner_m: [[-2,2.5,0],[2,2.5,0],[-2,2.5,3]]}"
+CEILING = "ceiling={yaw_pitch_roll_deg: [0,0,0], translation_m: [0,0.5,3], size_m: [4,3]}"
+FRONT = "front={screen: wall, look_at: {eye_m: [0.5,-1.5,1.2], target_m: [0,2.5,1.5]}, field_of_view_deg: 55}"
+UP = "up={screen: ceiling, look_at: {eye_m: [0.5,0.5,0.2], target_m: [0,0.5,3], up: [0,1,0]}, focal_px: 914}"
+BEAMS = [
+    "A={points_m: [[0,0,0],[0.1,1,0.05]], plus: wall}",
+    "B={points_m: [[0,0,0],[-0.2,1,0.1]], plus: wall}",
+    "C={points_m: [[0,0,0],[0.25,0.1,1]], plus: ceiling}",
+    "D={direction: [-0.2,-0.05,1], point_m: [0,0,0], plus: ceiling}",
+    "E={azimuth_elevation_deg: [70,5], point_m: [0,0,0], plus: wall}",
+]
+
+
+def own_arguments(folder, screens=(WALL, CEILING), cameras=(FRONT, UP), beams=BEAMS):
+    out = ["init", str(folder)]
+    for option, parts in (("--screen", screens), ("--camera", cameras), ("--beam", beams)):
+        out += [word for part in parts for word in (option, part)]
+    return out
+
+
+def test_a_rig_of_ones_own_is_what_was_measured_and_says_and_draws_it(tmp_path):
+    done = CliRunner().invoke(main, own_arguments(tmp_path / "lab"), prog_name="beampose")
+    assert done.exit_code == 0, done.output
+    assert "screen wall: 4 x 3 m, middle at (0, 2.5, 1.5) m, normal (0, -1, 0)" in done.output
+    assert (
+        "camera front: at (0.5, -1.5, 1.2) m, looks along (-0.124, 0.99, 0.0742), 55 deg wide, 4.04 m from"
+        in done.output
+    )
+    assert "beam D: along (-0.196, -0.049, 0.979) of the vehicle, to ceiling (spot 4)" in done.output
+    rig = load_rig(tmp_path / "lab" / "rig.yaml")
+    np.testing.assert_allclose(
+        rig.screens["wall"].world_from_screen.apply(np.array([-2, -1.5, 0])), [-2, 2.5, 0], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        rig.cameras["front"].camera_from_world.inverse().translation, [0.5, -1.5, 1.2], atol=1e-12
+    )
+    middle = rig.cameras["front"].project(np.array([[0.0, 2.5, 1.5]]))
+    np.testing.assert_allclose(np.ravel(middle)[:2], [639.5, 511.5], atol=1e-9)
+    width = 2 * np.degrees(np.arctan(640 / rig.cameras["front"].matrix[0, 0]))
+    assert width == pytest.approx(55, abs=0.01)
+    assert (rig.spots["4"].beam, rig.spots["4"].sign, rig.spots["4"].screen) == ("D", 1, "ceiling")
+    page = (tmp_path / "lab" / "rig.html").read_text()
+    assert "grey box of" in page
+    assert '<div class="controls" hidden>' in page
+    assert "# measured as {corner_m" in (tmp_path / "lab" / "rig.yaml").read_text()
+    assert check(tmp_path / "lab").exit_status == 0
+
+
+def test_questions_in_plain_words_give_the_same_rig_as_options(monkeypatch, tmp_path):
+    monkeypatch.setattr(maintenance, "_on_a_terminal", lambda: True)
+    answers = [
+        "2", "2", "2", "100",
+        "wall", "-2 2.5 0", "2, 2.5, 0", "-2 2.5 x", "-2 2.5 3",  # one is no number: asked again
+        "ceiling", "-2 -1 3", "2 -1 3", "-2 2 3",
+        "front", "wal", "wall", "0.5 -1.5 1.2", "0 2.5 1.5", "55",  # no such screen: asked again
+        "up", "ceiling", "0.5 0.5 0.2", "0.5 0.5 3", "70", "0 1 0",
+        "A", "0 0 0", "0.1 1 0.05", "wall", "",
+        "C", "0 0 0", "0.25 0.1 1", "ceiling", "wall",
+    ]  # fmt: skip
+    arguments = ["init", str(tmp_path / "asked"), "--own"]
+    done = CliRunner().invoke(main, arguments, input="\n".join(answers) + "\n", prog_name="beampose")
+    assert done.exit_code == 0, done.output
+    assert "expected 3 numbers, got '-2 2.5 x'; wall: the next corner along its height, x y z in m" in done.output
+    assert "'wal' is none of wall, ceiling; front: the screen that it films" in done.output
+    assert "it looks up or down: the direction that is up in its picture" in done.output
+    asked = load_rig(tmp_path / "asked" / "rig.yaml")
+    ceiling = "ceiling={corner_m: [[-2,-1,3],[2,-1,3],[-2,2,3]]}"
+    look_at = "{eye_m: [0.5,0.5,0.2], target_m: [0.5,0.5,3], up: [0,1,0]}"
+    up = f"up={{screen: ceiling, look_at: {look_at}, field_of_view_deg: 70}}"
+    beams = [BEAMS[0], "C={points_m: [[0,0,0],[0.25,0.1,1]], plus: ceiling, minus: wall}"]
+    done = CliRunner().invoke(main, own_arguments(tmp_path / "given", (WALL, ceiling), (FRONT, up), beams))
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "asked/rig.yaml").read_text() == (tmp_path / "given/rig.yaml").read_text()
+    ends = [(spot.beam, spot.sign, spot.screen) for spot in asked.spots.values()]
+    assert ends == [("A", 1, "wall"), ("C", -1, "wall"), ("C", 1, "ceiling")]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"screens": ("wall",)}, "--screen: expected NAME={...}"),
+        ({"screens": ("wall={corners: 3}",)}, "screens.wall: unknown field 'corners'; did you mean 'corner_m'?"),
+        (
+            {"screens": ("wall={corner_m: [[0,0,0],[1,0,0]]}",)},
+            "rig: screens.wall.world_from_screen.corner_m:",
+        ),
+        ({"cameras": ()}, "expected at least one --screen, --camera and --beam each"),
+        (
+            {"cameras": ("a={screen: wall, look_at: {eye_m: [0,0,0], target_m: [0,1,0]}}",)},
+            "expected field_of_view_deg or",
+        ),
+        (
+            {"cameras": (FRONT.replace("wall", "wal"), UP)},
+            "rig: cameras.front.screen: expected a screen of this file, got 'wal'",
+        ),
+        ({"beams": [*BEAMS[1:], "A={points_m: [[0,0,0],[0,1,0]], plus: floor}"]}, "screen of this file, got 'floor'"),
+    ],
+)
+def test_a_mistake_in_a_part_names_its_place(tmp_path, change, words):
+    done = CliRunner().invoke(main, own_arguments(tmp_path / "lab", **change), prog_name="beampose")
+    assert done.exit_code == 2
+    assert words in done.output
+    assert not (tmp_path / "lab").exists()

@@ -14,16 +14,18 @@ import pytest
 
 from calibration.open3d_loader import open3d
 from geometry.forward_model import SpotModel
+from geometry.pose import Pose
 from lab.errors import InputError
 from lab.files.rig.rig_file import save_rig
 from lab.results.view import scene as solids
 from lab.results.view import slider_window, view
 from lab.results.view import view as view_module
-from lab.results.view.page import scene_data
+from lab.results.view.page import scene_data, write_page
 from lab.results.view.scene import read_content, view_of, write_glb
 from lab.results.view.slider_window import Controls, Player
 from lab.results.view.view import fill, show
 from tests.lab.fake_results import make
+from tests.lab.simulate.test_own_motion import elsewhere
 from tests.open3d_marker import needs_open3d
 
 
@@ -37,11 +39,43 @@ def content(fake):
     return read_content(fake.results, None)
 
 
-def test_the_poses_of_results_and_of_a_runs_truth_are_shown_and_a_rig_has_none(fake, content, tmp_path):
+def test_the_poses_of_results_and_of_a_runs_truth_are_shown(fake, content):
     assert content.known.sum() > 10
     assert read_content(fake.run_folder, None).known.sum() > 10
-    save_rig(content.rig, tmp_path / "rig.yaml")
-    assert len(read_content(tmp_path / "rig.yaml", None).frames) == 0
+
+
+@pytest.mark.parametrize(
+    "rig_of", [lambda content: content.rig, lambda _: elsewhere("2 cameras, 2 screens, 5 beams", 2)]
+)
+def test_a_rig_alone_is_shown_with_beams_and_its_workspace_wherever_it_stands(content, tmp_path, rig_of):
+    rig = rig_of(content)
+    save_rig(rig, tmp_path / "rig.yaml")
+    alone = read_content(tmp_path / "rig.yaml", None)
+    index = alone.at_frame(None)
+    view = view_of(alone, index)
+    assert len(view.moving(index)) > len(rig.beams)
+    at = alone.world_from_body[0]
+    box = next(t for t in view.fixed if t.name == "workspace").places
+    low, high = np.nanmin(box, axis=0), np.nanmax(box, axis=0)
+    model = SpotModel.of(rig)
+    enough = max(3, -(-int(np.sum(model.in_picture(model.project(at)[0]))) // 2))
+
+    def seen(place):
+        return int(np.sum(model.in_picture(model.project(Pose(at.rotation, place))[0])))
+
+    for axis in range(3):
+        for end, beyond in ((low[axis], -0.05), (high[axis], 0.05)):
+            place = at.translation.copy()
+            place[axis] = end
+            assert seen(place) >= enough
+            place[axis] += beyond
+            assert seen(place) < enough
+    write_page(view, index, tmp_path / "view.html")
+    text = (tmp_path / "view.html").read_text()
+    assert '<div class="controls" hidden>' in text
+    assert "a rig, with the vehicle where its cameras see it, in a grey box of" in text
+    with pytest.raises(InputError, match="has no poses"):
+        alone.at_frame(3)
 
 
 def test_the_beams_end_where_the_forward_model_says(content):
@@ -182,11 +216,11 @@ def test_the_player_runs_at_the_speed_of_the_recording_and_stops_at_the_end(cont
 @needs_open3d
 def test_a_rig_without_poses_has_nothing_to_play(content, tmp_path):
     save_rig(content.rig, tmp_path / "rig.yaml")
-    view = view_of(read_content(tmp_path / "rig.yaml", None), None)
-    player = Player(view, None)
+    view = view_of(read_content(tmp_path / "rig.yaml", None), 0)
+    player = Player(view, 0)
     player.toggle(0.0)
     player.step(5)
-    assert (player.index, player.playing, player.advance(9.0)) == (None, False, False)
+    assert (player.index, player.playing, player.advance(9.0)) == (0, False, False)
 
 
 def _ends(view, index, opened):

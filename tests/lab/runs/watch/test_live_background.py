@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,7 @@ def test_a_process_makes_the_same_background_until_it_is_ended():
     recording = Recording.of(path(90, 6, 2.0, 1), 4.5)
     own, background = live(recording)
     with BackgroundProcess() as process:
-        others, made_elsewhere = live(recording, process.background)
+        others, made_elsewhere = live(recording, partial(process.call, static_background))
         for picture in recording.pictures[: VIDEO_FRAMES + 1]:
             background.add(picture)
             made_elsewhere.add(picture)

@@ -19,6 +19,7 @@ from lab.errors import InputError, RunError
 from lab.files.run.run_file import LiveDevice, load_run
 from lab.files.text import columns
 from lab.findings.outcome import Outcome
+from lab.pictures.live_source import OpenCvSource
 from lab.pictures.picture_file import MissingPicture, read_picture
 from lab.runs.frames import sensor_noise
 from lab.runs.process import process_run
@@ -481,7 +482,7 @@ class FakeCapture:
 @pytest.mark.parametrize("shape", [(4, 6), (4, 6, 1), (4, 6, 3)])
 def test_a_device_that_is_faster_than_the_processing_loses_pictures(shape):
     inbox, capture = Inbox(("left",), 0.01, 0.1), FakeCapture(MOST_WAITING + 5, shape)
-    camera = DeviceCamera("left", capture, (6, 4), inbox, FrameClock(100.0))
+    camera = DeviceCamera("left", OpenCvSource(capture), (6, 4), inbox, FrameClock(100.0))
     inbox.wanted.set()
     camera.run()
     queue = inbox.queues["left"]
