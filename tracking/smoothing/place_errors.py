@@ -115,6 +115,23 @@ def scaled_shares(shares: Array, predicted: float, found: float) -> Array:
     return np.asarray(scaled / (1 + scaled))
 
 
+def with_places(pose_P: Array, J: Array, cov: Array, at: tuple[Ints, Ints], more: Array) -> Array:
+    """Covariances (F, 6, 6) of means of poses, given those for independent errors, with the errors of places.
+
+    Spots on edges have larger ones than others; they lie in the directions of the pose that these spots determine.
+    J (F, n, 2, 6): Jacobians; at: frame and view of m points; cov (m, 2, 2), px^2; more (m,): variance that errors of
+    places add to a mean, times the number of frames in it, over the variance of one.
+    """
+    out = np.zeros_like(pose_P)
+    frame, view = at
+    for i in range(J.shape[1]):
+        of_view = view == i
+        J_i = J[frame[of_view], i]
+        information = np.swapaxes(J_i, 1, 2) @ np.linalg.solve(cov[of_view], J_i)
+        out[frame[of_view]] += more[of_view, None, None] * information
+    return np.asarray(pose_P + pose_P @ out @ pose_P)
+
+
 def usable_widths(width_px: Array) -> Array:
     """(n,): the widths of the spots, px; a usual one where not known."""
     return np.where(np.isfinite(width_px), np.maximum(width_px, 0.5), USUAL_WIDTH_PX)

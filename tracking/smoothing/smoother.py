@@ -48,7 +48,7 @@ from tracking.smoothing.motion.run_detections import (
     straight_between,
 )
 from tracking.smoothing.motion.whole_run import MAX_DISTANCE, estimate
-from tracking.smoothing.place_errors import place_errors, scaled_shares
+from tracking.smoothing.place_errors import place_errors, scaled_shares, with_places
 from tracking.smoothing.recording import TrackedRecording, merged, track_backward
 from tracking.smoothing.single_frame_poses import SingleFramePoses, rms_residuals, single_frame_poses
 from tracking.smoothing.systematic_errors import calibration_errors, exposure_offsets, exposure_sigmas, pose_shift
@@ -580,9 +580,7 @@ class _Smoother:
         return Reference(R, t, ref.m), pose_P, motion_P
 
     def _place_errors(self, ref: Reference, pose_P: Array) -> tuple[float, Array, Array]:
-        """Share of the errors that belong to places, by how much they enlarge the covariances (T,) of the poses, and
-        these covariances (T, 6, 6).
-        """
+        """Share of the errors that belong to places, their factor (T,) on the covariances, and these (T, 6, 6)."""
         frames, detections = np.flatnonzero(self.own.measured), self.detections
         averaged, (residual, uv_px) = np.full(len(self.rec), np.nan), np.full((2, *self.assigned.shape, 2), np.nan)
         ratio = np.trace(np.linalg.solve(self.own.covariance[frames], pose_P[frames]), axis1=1, axis2=2)
@@ -601,14 +599,7 @@ class _Smoother:
         shares = self.errors.place_px2(detections, self.rec.place_px2())[rows] / size**2
         width_px, share = self.detections.usual_size_px, float(np.mean(shares)) if len(shares) else 0.0
         found = place_errors(residual, uv_px, width_px, averaged, explained, share)
-        # Spots on edges have larger shares: the errors of places lie in the directions that these determine.
         own = scaled_shares(shares, share, found.share) * found.more[frames[k], view] * averaged[frames[k]]
-        more = np.zeros_like(pose_P)
-        for i in range(len(self.model)):
-            of_view = view == i
-            J_i = J[k[of_view], i]
-            information = np.swapaxes(J_i, 1, 2) @ np.linalg.solve(cov[of_view], J_i)
-            more[frames[k[of_view]]] += own[of_view, None, None] * information
         covariance = pose_P * found.factor[:, None, None]
-        covariance[frames] = pose_P[frames] + pose_P[frames] @ more[frames] @ pose_P[frames]
+        covariance[frames] = with_places(pose_P[frames], J, cov, (k, view), own)
         return found.share, found.factor, covariance * self.noise_share[:, None, None]
