@@ -19,8 +19,8 @@ from bench.clocks.recording import KINDS, Recording, random_recording, write_rec
 from bench.random_scenes.scene import view_indices
 from geometry.arrays import Array
 from lab.files.run.results import SpotGrid, read_poses, read_spots
-from lab.runs.clock_estimate import DETERMINED
 from lab.runs.process import process_run
+from tracking.smoothing.motion.clocks import DETERMINED
 from tracking.statuses import PoseStatus
 
 SAME_SPOT_PX, SAME_SPOT_SIGMAS = 3.0, 5.0

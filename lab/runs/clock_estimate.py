@@ -33,7 +33,6 @@ MOST_PASSES = 4  # causal ones
 SETTLED = 0.1  # of the prior's sigma: a smaller correction does not need another causal pass
 NONLINEAR = 0.1  # share of a correction that counts as its error in the next pass
 CODE = "BP-M09"
-DETERMINED = 0.3  # of the prior's sigma: a number whose sigma is larger is hardly determined by the recording
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,11 +122,12 @@ def clock_findings(estimate: ClockEstimate) -> tuple[Finding, ...]:
     values = zip(estimate.numbers, estimate.value_s, estimate.sigma_s, estimate.prior_sigma_s, strict=True)
     for number, value, sigma, prior in values:
         factor, unit = (1e6, "us") if number.is_row_time else (1e3, "ms")
-        text = f"{number.name}: estimated as {format_with_sigma(factor * value, factor * sigma)} {unit}"
-        if sigma < DETERMINED * prior:
-            out.append(finding(CODE, Level.PASS, text))
+        figure = f"{format_with_sigma(factor * value, factor * sigma)} {unit}"
+        if sigma < prior:
+            out.append(finding(CODE, Level.PASS, f"{number.name}: estimated as {figure}"))
             continue
-        text += f", which this recording hardly determines (prior: 0 ± {format_number(factor * prior, 2)} {unit})"
+        text = f"{number.name}: this recording hardly determines it, and"
+        text += f" the prior stays (prior: 0 ± {format_number(factor * prior, 2)} {unit})"
         out.append(finding(CODE, Level.WARN, text))
     if estimate.reference:
         text = f"the offset of camera `{estimate.reference}` is held at 0 as the reference of the others"

@@ -8,12 +8,39 @@ from __future__ import annotations
 
 import numpy as np
 
-from geometry.arrays import Array, Ints
+from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from tracking.smoothing.motion.fixed_interval import RunInformation, smoothed
-from tracking.smoothing.motion.run_detections import ClockSolution, Reference, Steps, WholeRun, timed_rows
+from tracking.smoothing.motion.run_detections import (
+    ClockSolution,
+    Reference,
+    Steps,
+    UnknownClocks,
+    WholeRun,
+    timed_rows,
+)
 
+DETERMINED = 0.3  # of the prior's sigma: a number whose sigma is larger keeps its prior
 _CHUNK = 512  # frames whose rows are in memory at once
+
+
+def _with_priors(S: Array, right: Array, kept: Bools, clocks: UnknownClocks) -> tuple[Array, Array]:
+    """Solution (p,) and covariance (p, p) of normal equations (p, p), (p,) where some numbers keep their priors.
+
+    kept (p,): those that the run hardly determines; noise of the spots' speeds would pass for motion. The others are
+    solved for with these at their means, and have the error that they cause in their covariance (Schmidt 1966).
+    """
+    found = ~kept
+    correction, covariance = clocks.mean_s.copy(), np.diag(clocks.sigma_s**2)
+    own = np.linalg.inv(S[np.ix_(found, found)])
+    across = S[np.ix_(found, kept)]
+    correction[found] = own @ (right[found] - across @ correction[kept])
+    gain = own @ across
+    prior = covariance[np.ix_(kept, kept)]
+    covariance[np.ix_(found, found)] = own + gain @ prior @ gain.T
+    covariance[np.ix_(found, kept)] = -gain @ prior
+    covariance[np.ix_(kept, found)] = -prior @ gain.T
+    return correction, 0.5 * (covariance + covariance.T)
 
 
 def solve_clocks(
@@ -52,9 +79,11 @@ def solve_clocks(
         moved = info._replace(vector=np.ascontiguousarray(info.vector + B[..., i] * size))
         G[..., i] = (smoothed(ref, moved, density).x - x) / size
     precision = np.diag(1 / clocks.sigma_s**2)
-    noise = np.linalg.inv(C - np.einsum("kis,kit->st", B, G) + precision)
-    noise = 0.5 * (noise + noise.T)
-    correction = noise @ (b - np.einsum("kis,ki->s", B, x) + precision @ clocks.mean_s)
+    S = C - np.einsum("kis,kit->st", B, G) + precision
+    right = b - np.einsum("kis,ki->s", B, x) + precision @ clocks.mean_s
+    noise = np.linalg.inv(0.5 * (S + S.T))
+    kept = np.sqrt(np.diagonal(noise)) >= DETERMINED * clocks.sigma_s
+    correction, noise = _with_priors(S, right, kept, clocks)
     systematic = np.zeros((p, p))
     if clocks.calibration is not None:
         total = np.zeros((p, 0))
@@ -65,4 +94,5 @@ def solve_clocks(
             one = np.einsum("knas,knar->sr", Q, root)
             total = one if not total.size else total + one
         systematic = noise @ total @ total.T @ noise
+        systematic[kept], systematic[:, kept] = 0.0, 0.0
     return ClockSolution(correction, noise, systematic, -G[:, :12])

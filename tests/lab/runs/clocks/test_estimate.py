@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from click.testing import CliRunner, Result
 
 from cli import main
@@ -45,17 +46,13 @@ def estimated(recording, tmp_path_factory) -> Path:
 def with_cameras(recording: Path, folder: Path, late: str, rows: str = "", left: str = "", only: str = "") -> Path:
     """A copy of a recording with these fields of its cameras: late of the right one, left of the left one."""
     shutil.copytree(recording, folder)
-    table = "detections: detections.csv"
-    row = f", row_time_s: {rows}" if rows else ""
-    cameras = [
-        f"  left: {{{table}{row}{f', time_offset_s: {left}' if left else ''}}}\n",
-        f"  right: {{{table}, time_offset_s: {late}{row}}}\n",
-    ]
-    text = (recording / "run.yaml").read_text()
-    before, after = text.split("cameras:\n")
-    rest_of = "".join(line for line in after.splitlines(keepends=True) if not line.startswith(("  left", "  right")))
-    kept = "".join(c for c in cameras if not only or c.strip().startswith(only))
-    (folder / "run.yaml").write_text(f"{before}cameras:\n{kept}{rest_of}")
+    content = yaml.safe_load((recording / "run.yaml").read_text())
+    cameras = {name: {"detections": block["detections"]} for name, block in content["cameras"].items()}
+    for name, offset in (("left", left), ("right", late)):
+        cameras[name] |= {"time_offset_s": offset} if offset else {}
+        cameras[name] |= {"row_time_s": rows} if rows else {}
+    content["cameras"] = {name: block for name, block in cameras.items() if only in ("", name)}
+    (folder / "run.yaml").write_text(yaml.safe_dump(content))
     return folder
 
 
@@ -93,7 +90,7 @@ def test_labels_and_attitude_are_those_of_known_clocks(recording, estimated, tmp
 
 
 def test_the_report_states_the_numbers_and_the_tables_have_the_estimated_instants(estimated):
-    assert [f["level"] for f in clock_findings(estimated)] == ["pass"] * 3
+    assert [f["level"] for f in clock_findings(estimated)] == ["PASS"] * 3
     assert "time_offset_s of camera" in (estimated / "report.html").read_text()
     offset = summary(estimated)["parameters"]["clocks"]["right"]["time_offset_s"]
     with (estimated / "detections.csv").open(newline="") as file:
@@ -120,7 +117,7 @@ def test_at_rest_the_prior_stays_and_a_finding_says_so(rest, tmp_path):
     assert right["time_offset_sigma_s"] > 0.5 * prior
     assert abs(right["time_offset_s"]) < 0.5 * prior
     (found,) = clock_findings(tmp_path / "out")
-    assert found["level"] == "check"
+    assert found["level"] == "WARN"
     assert "hardly determines" in found["what"]
     assert "prior: 0 ± 10 ms" in found["what"]
 
@@ -128,7 +125,7 @@ def test_at_rest_the_prior_stays_and_a_finding_says_so(rest, tmp_path):
 def test_one_camera_has_nothing_to_be_compared_with(recording, tmp_path):
     run(with_cameras(recording, tmp_path / "run", late="estimate", only="right"), tmp_path / "out")
     (found,) = clock_findings(tmp_path / "out")
-    assert found["level"] == "check"
+    assert found["level"] == "WARN"
     assert "no other camera" in found["what"]
 
 
