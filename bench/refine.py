@@ -313,9 +313,9 @@ def one(seed: int, case: str, frames: int, true_labels: bool) -> str:
                 "/".join(f"{e.fault.component}s {e.fault.name}" for e in m.explanations) for m in result.refined.moved
             )
         )
-        told = "; ".join(f"{f.code} {f.what}" for f in findings if f.level > 0)[:160]
+        reported = "; ".join(f"{f.code} {f.what}" for f in findings if f.level > 0)[:160]
         text = f"{level.name}{' CONFIDENT AND WRONG' * wrong} in {time.process_time() - started:.1f} s{moved}"
-        return f"{text}{described(result.refined, true)} {told}"
+        return f"{text}{described(result.refined, true)} {reported}"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for i, scene in enumerate(scenes[:3]):
@@ -327,7 +327,7 @@ def one(seed: int, case: str, frames: int, true_labels: bool) -> str:
             return f"refused in {time.process_time() - started:.1f} s: {str(error)[:160]}".replace(name, "")
         seconds = time.process_time() - started
         refined = outcome.result.refined
-        told = "; ".join(f"{f.code} {f.what}" for f in outcome.findings if f.level > 0)[:300]
+        reported = "; ".join(f"{f.code} {f.what}" for f in outcome.findings if f.level > 0)[:300]
         out = f"{outcome.level.name} in {seconds:.1f} s" + (f", moved {only[0]} {only[1]}" if only else "")
         out += described(refined, true)
         if (folder / "new" / "rig.yaml").is_file():
@@ -345,7 +345,7 @@ def one(seed: int, case: str, frames: int, true_labels: bool) -> str:
             a, b = without_frames(ours[k], poses), without_frames(best[i], poses)
             out += f", attitude ratio {rms(a[:, 3:]) / rms(b[:, 3:]):.3f} position {rms(a[:, :3]) / rms(b[:, :3]):.3f}"
             out += f" (with conventions {raw:.1f}), NEES/6 {np.mean(nees):.3f}, frames {len(with_it)} of {len(at)}"
-    return f"{out} {told}"
+    return f"{out} {reported}"
 
 
 def main() -> None:

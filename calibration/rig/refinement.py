@@ -2,7 +2,7 @@
 
 The recordings determine some directions of the rig's parameters well and others not at all: a motion of the whole rig,
 or of all beams in the body, leaves no residual. What the rig file states decides those. All tests use the recordings
-without their poses (calibration/terms/recordings.py): y = X delta + noise of sigma 1, with the prior delta ~ N(m, C).
+without their poses (calibration/rig/recordings.py): y = X delta + noise of sigma 1, with the prior delta ~ N(m, C).
 Source: ours; priors in a bundle adjustment: Triggs et al. (2000), "Bundle adjustment: a modern synthesis", section 6.
 """
 
@@ -22,7 +22,7 @@ from calibration.model_check.linearised_frames import (
     correlation_time,
     linearise,
 )
-from calibration.terms.recordings import STACKS, RecordingTerm, Reduced
+from calibration.rig.recordings import STACKS, RecordingTerm, Reduced
 from calibration.terms.rig_blocks import BEAMS, CAMERAS, SCREENS, named_errors, names_at, prior_of, rig_of, stacks_of
 from geometry.arrays import Array, Bools, Ints, skew
 from geometry.forward_model import SpotModel

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from calibration.rig.recordings import Reduced
 from calibration.rig.refinement import Refinement
-from calibration.terms.recordings import Reduced
 from geometry.arrays import Array
 from geometry.uncertainty.rig_uncertainty import POSE, split_name
 from lab.calibrate.refine.refine_findings import RefineResult
@@ -20,7 +20,7 @@ def page_of(result: RefineResult) -> tuple[list[KeyFigure], list[Section]]:
     """Key figures and sections of the report."""
     r = result.refined
     return _key_figures(r), [
-        _learnt(result),
+        _changes_of_numbers(result),
         _directions(r),
         _held_out(result),
         _residuals(r),
@@ -45,7 +45,7 @@ def _key_figures(r: Refinement) -> list[KeyFigure]:
     return out
 
 
-def _learnt(result: RefineResult) -> Section:
+def _changes_of_numbers(result: RefineResult) -> Section:
     r = result.refined
     prior, after = result.prior, r.covariance
     before = dict(zip(prior.names, np.sqrt(np.diagonal(prior.matrix)), strict=True))
@@ -54,8 +54,8 @@ def _learnt(result: RefineResult) -> Section:
     for name, change in r.named_changes().items():
         if name in before and name in sigma:
             unit, factor = ("mm", 1e3) if name.endswith("_m") else ("mrad", 1e3) if _is_angle(name) else ("", 1.0)
-            learnt = np.sqrt(max(before[name] ** 2 - sigma[name] ** 2, 0.0))
-            in_sigmas = change / learnt if learnt > 1e-3 * before[name] else float("nan")
+            removed = np.sqrt(max(before[name] ** 2 - sigma[name] ** 2, 0.0))
+            in_sigmas = change / removed if removed > 1e-3 * before[name] else float("nan")
             rows.append((name, unit, factor * before[name], factor * sigma[name], factor * change, float(in_sigmas)))
     heads = ("parameter", "unit", "sigma before", "sigma after", "change", "change / its sigma")
     words = [
@@ -63,7 +63,7 @@ def _learnt(result: RefineResult) -> Section:
         " unusual. The sigmas after contain the errors that all parts share, which the recordings do not determine (see"
         " the next section); differences between parts are known better: rig.yaml holds the joint covariance.",
     ]
-    return Section("What was learnt", words, (), PageTable(heads, rows))
+    return Section("Change of each number", words, (), PageTable(heads, rows))
 
 
 def _is_angle(name: str) -> bool:

@@ -105,9 +105,9 @@ def test_the_table_of_residuals_shows_the_noise_that_is_left(lab):
     assert np.std(refined) < 0.1 < np.std(given) / 2  # of 0.1 px, less what the poses absorb
 
 
-def test_the_report_has_what_was_learnt_and_held_out(lab):
+def test_the_report_has_the_change_of_each_number_and_held_out(lab):
     text = (lab[0] / "new" / "report.html").read_text()
-    for words in ("What was learnt", "What the recordings determine", "Held-out recordings", "Correlations"):
+    for words in ("Change of each number", "What the recordings determine", "Held-out recordings", "Correlations"):
         assert f"{words}</h2>" in text
     assert "cameras.left-a.x_m" in text
 

@@ -7,7 +7,7 @@ import pytest
 
 from calibration.least_squares.adjustment import Poses, solve
 from calibration.model_check.linearised_frames import ModelCheckRecording
-from calibration.terms.recordings import RecordingTerm
+from calibration.rig.recordings import RecordingTerm
 from calibration.terms.rig_blocks import BEAMS, CAMERAS, POSES, SCREENS, STAND, SpotPixels, SpotTerm, stacks_of
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
