@@ -266,6 +266,14 @@ def poses_of(coordinates: Array) -> Pose:
     return Pose.from_ypr(np.deg2rad(coordinates[:, 3:]), coordinates[:, :3])
 
 
+def axes_jacobian(rotation: Array) -> Array:
+    """d(`AXES`)/d[dt, dtheta] (..., 6, 6), m and deg, at rotations (..., 3, 3) world from body."""
+    out = np.zeros((*rotation.shape[:-2], 6, 6))
+    out[..., :3, :3] = np.eye(3)
+    out[..., 3:, 3:] = np.rad2deg(ypr_jacobian(rotation))
+    return out
+
+
 def _chunks(coordinates: Array) -> Iterator[Array]:
     for start in range(0, len(coordinates), _POSES_AT_ONCE):
         yield coordinates[start : start + _POSES_AT_ONCE]
@@ -273,11 +281,7 @@ def _chunks(coordinates: Array) -> Iterator[Array]:
 
 def _of_chunk(model: SpotModel, b: Budget, coordinates: Array) -> dict[str, Array]:
     """The columns of a plan for some of its poses, with effects (k, 6, q) and things (k, t, 6) in single precision."""
-    # From [dt, dtheta] to x, y, z (m), yaw, pitch, roll (deg), and for directions to m and deg.
-    turn = np.rad2deg(ypr_jacobian(poses_of(coordinates).rotation))
-    to_axes = np.zeros((len(coordinates), 6, 6))
-    to_axes[:, :3, :3] = np.eye(3)
-    to_axes[:, 3:, 3:] = turn
+    to_axes = axes_jacobian(poses_of(coordinates).rotation)
     parts = np.concatenate([b.noise[:, None], b.groups], axis=1)
     axes_of_parts = to_axes[:, None] @ parts @ np.swapaxes(to_axes, -1, -2)[:, None]
     axes_of_total = to_axes @ b.total @ np.swapaxes(to_axes, -1, -2)

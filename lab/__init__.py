@@ -13,6 +13,7 @@ _PLACES = {
     "load": "lab.api.results",
     "Results": "lab.api.results",
     "AnnotatedPicture": "lab.api.results",
+    "export": "lab.results.export",
     "process": "lab.api.processing",
     "simulate_run": "lab.api.processing",
     "scenarios": "lab.api.processing",

@@ -11,3 +11,4 @@ from lab.errors import BeamposeError as BeamposeError
 from lab.errors import CalibrationError as CalibrationError
 from lab.errors import InputError as InputError
 from lab.errors import RunError as RunError
+from lab.results.export import export as export

@@ -20,6 +20,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from lab.extras import PACKAGES
 from tests.paths import ROOT
 
 FLOORS = ("geometry", "tracking", "calibration", "lab", "studies", "cli")
@@ -214,15 +215,13 @@ def test_formulas_use_only_numerical_packages(floor):
 def test_what_the_program_imports_is_declared_in_pyproject():
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = declared["optional-dependencies"]
-    required = [*declared["dependencies"], *extras["parquet"], *extras["cluster"], *extras["training"]]
-    required += extras["genicam"]
+    required = [*declared["dependencies"], *(r for extra in PACKAGES for r in extras[extra]), *extras["training"]]
     names = {canonicalize_name(Requirement(requirement).name) for requirement in required}
     not_everywhere = {
         "open3d": ["open3d"],
         "libusb_package": ["libusb-package"],
         "pyarrow": ["pyarrow"],
         "torch": ["torch"],
-        "harvesters": ["harvesters"],
     }
     distributions = not_everywhere | packages_distributions()
     used = set().union(*(foreign_packages(ROOT, floor) for floor in FLOORS))

@@ -1,5 +1,6 @@
 """The sample runs are reproduced by their script and agree with their README."""
 
+import importlib
 import importlib.util
 import re
 
@@ -9,15 +10,19 @@ import pytest
 
 from lab.calibrate.rig.rig import calibrate_rig
 from lab.files.rig.rig_file import joint_covariance, load_rig_file
+from lab.report.run.page import write_report
 from lab.runs.input_check import check
 from lab.runs.process import process_run
 from lab.simulate.scene import compose
+from tests.lab.fake_results import make as make_results
 from tests.paths import ROOT
 
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 FOLDER = ROOT / "sample_runs"
+PICTURE = ROOT / "docs" / "report.txt"
 if not FOLDER.is_dir():
     pytest.skip("a source distribution has no sample runs", allow_module_level=True)
+shown = importlib.import_module("docs.website.figures").shown
 _SPEC = importlib.util.spec_from_file_location("sample_runs_make", FOLDER / "make.py")
 make = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(make)
@@ -105,8 +110,25 @@ def test_the_papers_run_passes_with_sigmas_that_agree_with_the_truth(tmp_path):
     """Its light has speckle that no fit shows, and texture that its unlit background does not show."""
     outcome = process_run(FOLDER / "huo2015", tmp_path / "run")
     assert outcome.verdict.status == "pass"
+    now, then = (
+        [re.match(r"([^:]*):? ?(\S*)", line).groups() for line in lines]
+        for lines in (shown((tmp_path / "run/report.html").read_text("utf-8")), PICTURE.read_text("utf-8").splitlines())
+    )
+    assert [name for name, _ in now] == [name for name, _ in then]
+    for (name, new), (_, old) in zip(now[1:], then[1:], strict=True):
+        assert float(new) == pytest.approx(float(old), rel=0.05), f"{name}: `python -m docs.website.figures report`"
     for name in ("pose", "pose_causal"):
         assert 0.7 < outcome.summary["errors"][name]["measured"]["nees_mean"] / 6 < 1.35
+
+
+def test_the_picture_of_the_report_has_the_key_figures_of_todays_reports(tmp_path):
+    """The values are compared by the slow test above, which processes the recording of the picture."""
+    fake = make_results(tmp_path, 120)
+    write_report(fake.results, fake.run_folder)
+    page = shown((fake.results / "report.html").read_text("utf-8"))
+    lines = PICTURE.read_text("utf-8").splitlines()
+    assert lines[0] == "PASS"
+    assert [line.split(":")[0] for line in lines[1:]] == [line.split(":")[0] for line in page[1:]]
 
 
 def test_the_papers_run_agrees_with_its_readme_line():

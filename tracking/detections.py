@@ -87,11 +87,12 @@ class Detections:
         """These and more points of the same picture, brightest first, at most so many; what is unknown becomes 0."""
         if not len(more):
             return self
+        order = np.argsort(-np.concatenate([self.flux, more.flux]), kind="stable")[:most]
         values: dict[str, Array] = {}
         for name in Detections.__slots__[:-1]:
-            parts = [(getattr(points, name), len(points)) for points in (self, more)]
-            values[name] = np.concatenate([np.zeros(n) if known is None else known for known, n in parts])
-        return Detections(**values, clock=self.clock)[np.argsort(-values["flux"], kind="stable")[:most]]
+            parts = [np.zeros(len(d)) if (x := getattr(d, name)) is None else x for d in (self, more)]
+            values[name] = np.concatenate(parts)[order]
+        return Detections(**values, clock=self.clock)
 
     @staticmethod
     def none() -> Detections:

@@ -159,6 +159,10 @@ class TrackedFrame:
     predicted_cov_px2: Array | None = None  # (n, 2, 2) of predicted_px, without the detection's own; None: not computed
     motion: MotionEstimate | None = None  # velocity and rate; None: unknown, or the tracker does not estimate them
     pose_systematic: Array | None = None  # (6, 6) the calibration's share of the covariance, the same in every frame
+    # (28,) of the rest: the part of errors of places in noise and errors of places; sigmas of [dt, dtheta] (m, rad), to
+    # be squared and added, of turns within the exposure; upper triangle of the part (6, 6) of estimated clocks. None:
+    # not known apart
+    rest_parts: Array | None = None
     # (n, 2) px: by how much uv_px and predicted_px, which are at the instants of the pictures, differ from those at the
     # instant of the pose. None: the instants are the same
     shift_px: Array | None = None

@@ -30,8 +30,7 @@ from bench.random_scenes.draw.nuisances import CLEAN_FRAMES
 from bench.random_scenes.projection import spot_pixels
 from bench.random_scenes.scene import Scene, draw_amplitudes, fitted_motion, view_indices
 from geometry.rig import Rig
-from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names, split_name
-from tests.geometry.perturbed_rig import perturbed
+from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed_rig, rig_names, split_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,7 +300,7 @@ def _drawn_rig(draw: Draw) -> Scene | None:
     covariance = rig_covariance(known.rig)
     rng = draw.rng(scene.LAB)
     delta = np.linalg.cholesky(covariance.matrix) @ rng.normal(size=len(covariance.names))
-    lab = replace(known, rig=perturbed(known.rig, covariance.names, delta))
+    lab = replace(known, rig=perturbed_rig(known.rig, covariance.names, delta))
     rng = draw.rng(scene.MOTION)
     motion = motions.sines(rng, np.arange(draw.frames) / 100.0)
     q = fitted_motion(lab, motion, 2 * draw_amplitudes(rng, lab), 20.0, 0.8)

@@ -474,14 +474,15 @@ def _normal_equations(
         root = np.sqrt(_weights(term, line))[:, None]
         r = line.residuals * root
         J = np.concatenate([columns.jacobian(p) for p in parts], axis=2) * root[..., None]
-        shape = [len(columns.column[p.stack]) for p in parts]
-        keys = np.ravel_multi_index([p.index for p in parts], shape)  # single numbers sort three times as fast
-
-        groups, group_of, sizes = np.unique(keys, return_inverse=True, return_counts=True)
-        indices = np.unravel_index(groups, shape)
-        where = np.concatenate([columns.column[p.stack][i] for p, i in zip(parts, indices, strict=True)], axis=1)
+        keys = np.zeros(len(r), dtype=np.int64)
+        if len(r) > 1:  # a single residual may depend on more unknowns than fit into one number
+            shape = [len(columns.column[p.stack]) for p in parts]
+            keys = np.ravel_multi_index([p.index for p in parts], shape)  # single numbers sort three times as fast
+        _, group_of, sizes = np.unique(keys, return_inverse=True, return_counts=True)
         order = np.argsort(group_of.ravel(), kind="stable")
         starts = np.cumsum(sizes) - sizes
+        first = order[starts]
+        where = np.concatenate([columns.column[p.stack][p.index[first]] for p in parts], axis=1)
         width = J.shape[2]
         for size in np.unique(sizes):
             same = np.flatnonzero(sizes == size)

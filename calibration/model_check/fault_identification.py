@@ -88,7 +88,7 @@ def diagnose(
     flat = free.reshape(-1, free.shape[-1])
     left = lin.residual_part(lin.residual)
     r = left.ravel()
-    X, V = _compressed(flat.T @ flat)
+    X, V = compressed(flat.T @ flat)
     y = V @ (flat.T @ r)
     fitted = (flat @ (V.T @ y)).reshape(left.shape)
     dof = lin.dof
@@ -107,7 +107,7 @@ def diagnose(
     root = np.linalg.cholesky(variance * np.eye(len(y)) + X @ covariance @ X.T)
     # Whitened once for all faults: the many small solves dominate the run time where BLAS runs in threads.
     start = ExcessResidual.of_white(np.linalg.solve(root, y))
-    suspected, after = _search(start, np.linalg.solve(root, X), faults)
+    suspected, after = search_faults(start, np.linalg.solve(root, X), faults)
     return FaultDiagnosis(
         suspected_faults=suspected,
         p_before=start.p_value,
@@ -121,7 +121,7 @@ def diagnose(
     )
 
 
-def _compressed(N: Array) -> tuple[Array, Array]:
+def compressed(N: Array) -> tuple[Array, Array]:
     """X (q, p) with X^T X = N (p, p), and V (q, p) with V N = X, where q is the number of observable directions."""
     scale = np.sqrt(np.maximum(np.diagonal(N), 0.0))
     safe = np.where(scale > 0, scale, 1.0)
@@ -131,7 +131,7 @@ def _compressed(N: Array) -> tuple[Array, Array]:
     return root * vectors[:, seen].T * scale, vectors[:, seen].T / root / safe
 
 
-def _search(
+def search_faults(
     start: ExcessResidual, X: Array, faults: Sequence[PossibleFault]
 ) -> tuple[tuple[SuspectedFault, ...], ExcessResidual]:
     """Adds suspected faults one by one. Returns them and the residual that they leave."""

@@ -9,7 +9,7 @@ with the whitened Jacobian A, H = A (A^T A)^-1 A^T and the fit's residual e = (I
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import prod
 
 import numpy as np
@@ -51,6 +51,15 @@ class ModelCheckRecording:
                 raise ValueError(f"{name}: expected shape {shape} as `seen` has {(T, n)}, got {value.shape}")
         if self.poses.translation.shape != (T, 3):
             raise ValueError(f"poses: expected {T} poses, got shape {self.poses.translation.shape}")
+
+    def at(self, rows: Ints) -> ModelCheckRecording:
+        """Some of the frames."""
+        of_frames = {
+            name: getattr(self, name)[rows]
+            for name in ModelCheckRecording.__slots__
+            if name != "width_px" and getattr(self, name) is not None
+        }
+        return replace(self, **of_frames)
 
     @property
     def usable(self) -> Bools:
@@ -177,24 +186,25 @@ def linearise(model: SpotModel, recording: ModelCheckRecording, frames: Ints) ->
         np.where(known[:, None], recording.poses.translation[frames], 0.0),
     )
     W = whitening(cov, used)
-    first = _about(model, frames, poses, used, np.zeros_like(used), uv, W)
+    first = linearised_at(model, frames, poses, used, np.zeros_like(used), uv, W)
     step = first.pose_shift(first.residual)
     small = np.all(np.abs(step) < _LARGEST_STEP, axis=-1)
     poses = poses.plus(np.where(small[:, None], step, 0.0))
     outlier = np.zeros_like(used)
-    at_pose = _about(model, frames, poses, used, outlier, uv, W)
+    at_pose = linearised_at(model, frames, poses, used, outlier, uv, W)
     for _ in range(_OUTLIER_ROUNDS):
         worst = _worst_of_frame(at_pose)
         if not worst.any():
             break
         outlier = outlier | worst
-        at_pose = _about(model, frames, poses, used, outlier, uv, W)
+        at_pose = linearised_at(model, frames, poses, used, outlier, uv, W)
     return at_pose
 
 
-def _about(
+def linearised_at(
     model: SpotModel, frames: Ints, poses: Pose, seen: Bools, outlier: Bools, uv: Array, W: Array
 ) -> LinearisedFrames:
+    """Frames (K,) linearised at given poses (K,); seen, outlier (K, n), uv (K, n, 2), and W (K, n, 2, 2) whitens."""
     projected, J = model.project(poses)
     used = seen & ~outlier & finite(projected, -1)
     W = np.where(used[..., None, None], W, 0.0)

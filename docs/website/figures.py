@@ -113,8 +113,18 @@ def beampose(command: str, folder: Path) -> None:
     subprocess.run([sys.executable, "-P", "-c", start, *command.split()], cwd=folder, check=True)
 
 
+def shown(html: str) -> list[str]:
+    """What the picture of a report shows, as text: the verdict, and name and value of each key figure.
+
+    docs/report.txt has these lines of docs/report.png; tests compare them with today's reports.
+    """
+    verdict = re.search(r'<strong class="word">(\w+)</strong>', html)
+    figures = re.findall(r'<span class="name">(.*?)</span><span class="value">(.*?)</span>', html)
+    return [verdict[1] if verdict else "", *(f"{name}: {value}" for name, value in figures)]
+
+
 def make_report_picture(work: Path, picture: Path) -> None:
-    """The beginning of the report of sample_runs/huo2015, as headless Chromium shows it.
+    """The beginning of the report of sample_runs/huo2015, as headless Chromium shows it, and what it shows as text.
 
     Raises:
         CalledProcessError: a command failed.
@@ -132,7 +142,9 @@ def make_report_picture(work: Path, picture: Path) -> None:
         f"--user-data-dir={work / 'browser'}",
     ]
     shot = [f"--window-size={REPORT_SIZE[0]},{REPORT_SIZE[1]}", f"--screenshot={picture}"]
-    subprocess.run([browser, *options, *shot, (work / "huo2015" / "report.html").as_uri()], check=True)
+    report = work / "huo2015" / "report.html"
+    subprocess.run([browser, *options, *shot, report.as_uri()], check=True)
+    picture.with_suffix(".txt").write_text("\n".join(shown(report.read_text("utf-8"))) + "\n", encoding="utf-8")
 
 
 def make(work: Path, images: Path) -> None:

@@ -28,6 +28,7 @@ _FROM = re.compile(rf"^[ \t]*from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|{_NA
 _IMPORT = re.compile(r"^[ \t]*import[ \t]+(.+)$", re.M)
 
 
+@cache
 def cache_folder(folder: Path) -> Path | None:
     """Cache folder for the functions of a source folder as they are now; None if no folder can be written safely."""
     return private_folder(_sources(folder))

@@ -17,7 +17,7 @@ from geometry.arrays import Array, symmetric
 from geometry.camera import FISHEYE, Camera
 from geometry.forward_model import SpotDerivatives, SpotModel
 from geometry.pose import Pose
-from geometry.rig import Rig
+from geometry.rig import Beam, Rig, Screen
 
 PINHOLE = ("fx", "fy", "cx", "cy")
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
@@ -87,6 +87,48 @@ def perturbed_camera(camera: Camera, change: Mapping[str, float]) -> Camera:
     pose = camera.camera_from_world
     place = pose.plus(moved) if moved.any() else pose
     return replace(camera, matrix=matrix, distortion=distortion, camera_from_world=place)
+
+
+def perturbed_rig(rig: Rig, names: Sequence[str], delta: Array) -> Rig:
+    """The rig with each named parameter changed by delta (p,), in the parameters' units.
+
+    Raises:
+        KeyError: the rig has no parameter of this name.
+    """
+    changes: dict[tuple[str, str], dict[str, float]] = {}
+    for name, value in zip(names, delta, strict=True):
+        if not is_known(rig, name):
+            raise KeyError(name)
+        kind, item, parameter = split_name(name)
+        changes.setdefault((kind, item), {})[parameter] = float(value)
+    cameras, screens, beams = dict(rig.cameras), dict(rig.screens), dict(rig.beams)
+    for (kind, item), change in changes.items():
+        if kind == "cameras":
+            cameras[item] = perturbed_camera(cameras[item], change)
+        elif kind == "screens":
+            screens[item] = _perturbed_screen(screens[item], change)
+        else:
+            beams[item] = _perturbed_beam(beams[item], change)
+    return Rig(screens, cameras, beams, rig.spots)
+
+
+def _changes_of(change: Mapping[str, float], names: Sequence[str]) -> Array:
+    """The changes of the named parameters (k,), 0 for those that do not change."""
+    return np.array([change.get(n, 0.0) for n in names])
+
+
+def _perturbed_pose(pose: Pose, change: Mapping[str, float]) -> Pose:
+    delta = _changes_of(change, POSE)
+    return pose.plus(delta) if delta.any() else pose
+
+
+def _perturbed_screen(screen: Screen, change: Mapping[str, float]) -> Screen:
+    a, b, c = (np.array(screen.bow) + _changes_of(change, BOW)).tolist()
+    return replace(screen, world_from_screen=_perturbed_pose(screen.world_from_screen, change), bow=(a, b, c))
+
+
+def _perturbed_beam(beam: Beam, change: Mapping[str, float]) -> Beam:
+    return Beam(beam.name, beam.direction + _changes_of(change, DIRECTION), beam.point + _changes_of(change, POINT))
 
 
 class Sensitivity:
@@ -167,7 +209,7 @@ class RigUncertainty:
         """
         self._model = model
         self._sensitivity = Sensitivity(rig, model, covariance.names)
-        self._root = _root(covariance.matrix)
+        self._root = covariance_root(covariance.matrix)
 
     def at(self, world_from_body: Pose) -> Array:
         """Covariance (..., 2n, 2n), px^2, of the pixels of the n views, ordered u, v; 0 for views without projection.
@@ -186,7 +228,7 @@ class RigUncertainty:
         return np.asarray(moves.reshape(*stack, n * two, p) @ self._root)  # the stack may be empty
 
 
-def _root(covariance: Array) -> Array:
+def covariance_root(covariance: Array) -> Array:
     """A (p, r) with A A^T the covariance (p, p), which may be singular and of numbers of very different units."""
     unit = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     safe = np.where(unit > 0, unit, 1.0)

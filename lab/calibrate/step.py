@@ -16,7 +16,7 @@ from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project
 from lab.files.text.atomic_write import atomic_folder, check_output_folder, earlier_results, keep_good_results
 from lab.files.text.json_text import bytes_of_file
-from lab.findings.finding import Finding, Level, finding, verdict
+from lab.findings.finding import Finding, Level, finding, first_sentence, verdict
 from lab.findings.outcome import Outcome, Verdict
 from lab.report.page import KeyFigure, Page, Section, made_with, write_page
 from lab.report.page import Verdict as PageVerdict
@@ -59,9 +59,9 @@ class Solved(Generic[R]):
 def _said(solved: Solved[R], level: Level) -> str:
     """Verdict and key figures; the worst finding, and after a FAIL what to do."""
     worst = max(solved.findings, key=lambda f: f.level)
-    reason = "" if level is Level.PASS else f": {worst.what.rstrip('.')}"
+    reason = "" if level is Level.PASS else f": {first_sentence(worst.what)}"
     if level is Level.FAIL:
-        reason += f". {(solved.advice or worst.remedy).rstrip('.')}"
+        reason += f". {first_sentence(solved.advice or worst.remedy)}"
     return f"{level.name}: {solved.figures}{reason}"
 
 

@@ -16,6 +16,7 @@ from lab.commands.common import (
     complete_rigs,
     conclude,
     progress_bar,
+    read_settings,
     seed_option,
     show_line,
     valid_days_option,
@@ -166,6 +167,46 @@ def check(rig: Path, out: Path, history: Path | None, **inputs: Path | None) -> 
     from lab.calibrate.drift_check.drift_inputs import DriftInputs
 
     conclude(check_drift(rig, out, DriftInputs(**inputs), history=history))
+
+
+def _groups(ctx: click.Context, parameter: click.Parameter, text: str | None) -> tuple[str, ...]:
+    """Names separated by commas."""
+    return tuple(part.strip() for part in text.split(",")) if text else ()
+
+
+@click.command()
+@click.argument("runs", nargs=-1, required=True, type=ANY_PATH, metavar="RUN...")
+@click.option("--rig", "rig_path", required=True, type=ANY_PATH, help="The rig.yaml to refine, in place of the runs'.")
+@click.option("--out", required=True, type=FOLDER, help="Gets rig.yaml, residuals.csv and report.html.")
+@click.option(
+    "--free",
+    callback=_groups,
+    metavar="GROUP,...",
+    help="Of cameras, screens, beams, lens: what is changed; default: all of which a sigma is known.",
+)
+@click.option(
+    "--sigma",
+    "sigmas",
+    multiple=True,
+    metavar="NAME=VALUE",
+    callback=read_settings,
+    help="What is known of a part instead of the file's covariance; e.g. --sigma cameras.left.position_m=0.02.",
+)
+def refine(runs: tuple[Path, ...], rig_path: Path, out: Path, **options: Any) -> None:
+    """Refine a rig by recordings, within what is known of it; exit status 3: there is no better rig.
+
+    Poses of all frames and the rig are solved together. The new rig.yaml is written only if it predicts recordings (or
+    blocks of time) better that were not used.
+
+    \b
+    Example:
+        beampose refine runs/a runs/b --rig results/rig/rig.yaml --out results/refined
+    """
+    from lab.calibrate.refine.refine import refine_rig
+
+    with progress_bar("recordings") as progress:
+        outcome = refine_rig(runs, rig_path, out, progress=progress, **options)
+    conclude(outcome)
 
 
 @calibrate.command()

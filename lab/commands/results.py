@@ -37,14 +37,28 @@ def check(path: Path) -> None:
 @click.option("--to", "last", type=int, help="With --video: last frame number.")
 @click.option("--every", type=click.IntRange(min=1), help="With --video: only each so many frames.")
 @click.option("--fps", type=NumberRange(1, 240), help="With --video: its frames per second; default: 25.")
-def report(results: Path, run_folder: Path | None, video: bool, **shown: Any) -> None:
+@click.option(
+    "--certificate", is_flag=True, help="Also write certificate.html: the uncertainty in the form of the GUM."
+)
+@click.option(
+    "--at", type=int, multiple=True, help="With --certificate: a frame number; repeatable. Default: a usual one."
+)
+def report(
+    results: Path, run_folder: Path | None, video: bool, certificate: bool, at: tuple[int, ...], **shown: Any
+) -> None:
     """Write report.html of a result folder again, with --video also a video of its pictures.
+
+    With --certificate also the uncertainty budget of attitude and position at chosen frames and over the recording:
+    sources, sensitivities, degrees of freedom, expanded uncertainty, traceability, and a Monte Carlo that checks it.
 
     \b
     Example:
         beampose report results/huo2015
         beampose report results/huo2015 --video --from 0 --to 30
+        beampose report results/huo2015 --certificate --at 100
     """
+    if at and not certificate:
+        raise click.UsageError("--at is of the certificate; add --certificate")
     given = {name: value for name, value in shown.items() if value is not None}
     if not video and given:
         raise click.UsageError("--from, --to, --every and --fps are of the video; add --video")
@@ -54,6 +68,11 @@ def report(results: Path, run_folder: Path | None, video: bool, **shown: Any) ->
     if not are_results(results):
         raise InputError(f"{results}: expected a folder that `beampose run` wrote, found no summary.json of one")
     show_line(f"report: {write_report(results, run_folder)}")
+    if certificate:
+        from lab.results.certificate import write_certificate
+
+        for line in write_certificate(results, run_folder, at).lines:
+            show_line(line)
     if video:
         from lab.results.show import write_video
 
@@ -121,6 +140,33 @@ def compare(result: Path, other: Path | None, reference: Path | None, out: Path 
     from lab.results.compare_page import compare_and_write
 
     conclude(compare_and_write(result, other, reference, out, **options))
+
+
+# `beampose export`: the motion in the files of other programs.
+
+
+_FORMATS = ("tum", "mcap", "rosbag2", "c3d", "hdf5", "parquet")  # as in lab.results.export, which imports more
+
+
+@click.command()
+@click.argument("results", type=_RESULTS)
+@click.option("--to", required=True, type=click.Choice(_FORMATS), help="The format.")
+@click.option("--out", type=ANY_PATH, help="The file, or the folder of a rosbag2; default: the name of the results.")
+@click.option("--causal", is_flag=True, help="The poses as known at each instant, in place of the smoothed ones.")
+def export(results: Path, to: str, out: Path | None, causal: bool) -> None:
+    """Write the motion of a result in a format of other programs.
+
+    Times, poses as world_from_body and, as far as the format has places for them, statuses, sigmas and covariances.
+    Units and conventions are written into the file. Formats other than tum need a package of their own: pip install
+    'beampose[FORMAT]'.
+
+    \b
+    Example:
+        beampose export results/huo2015 --to tum --out results/huo2015.tum
+    """
+    from lab.results.export import export as export_motion
+
+    conclude(export_motion(results, to, out, causal=causal))
 
 
 # `beampose view`: a rig, a run or results in three dimensions.

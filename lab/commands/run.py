@@ -29,6 +29,9 @@ causal_option = click.option(
 )
 
 
+_ADDED = {"overlay.*": "--video", "certificate.html": "--certificate"}  # by `report`, to results
+
+
 @click.command()
 @click.argument("run_folder", metavar="RUN", type=ANY_PATH)
 @click.option("--out", required=True, type=FOLDER, help="Where the results go; earlier results there are replaced.")
@@ -63,11 +66,12 @@ def run(
     def more(of: Run) -> dict[str, Any]:
         return provenance(ctx) | ({"inputs": fingerprints(of, full=True)} if full_hash else {})
 
-    videos = sorted(out.glob("overlay.*"))  # of the earlier results in this folder
+    # Of the earlier results in this folder, with the option that makes it again.
+    added = [(p, option) for name, option in _ADDED.items() for p in sorted(out.glob(name))]
     with shown(run_folder.name, verbose=verbose, quiet=quiet) as progress:
         outcome = process_run(run_folder, out, progress=progress, more=more, **options)
     gone = "removed with the earlier results; make it again with `beampose report"
-    conclude(outcome, quiet=quiet, notes=[f"{video}: {gone} {out} --video`" for video in videos])
+    conclude(outcome, quiet=quiet, notes=[f"{path}: {gone} {out} {option}`" for path, option in added])
 
 
 @click.command()
@@ -130,7 +134,14 @@ def pick(photos: tuple[str, ...], out: Path, **options: Any) -> None:
 @click.option(
     "--out", required=True, type=FOLDER, help="Gets attitude_live.csv during the recording, and the results at the end."
 )
-@click.option("--udp", metavar="HOST:PORT", help="Also send each frame there, as a line of JSON.")
+@click.option("--udp", metavar="HOST:PORT", help="As --stream udp:HOST:PORT.")
+@click.option(
+    "--stream",
+    "streams",
+    multiple=True,
+    metavar="KIND:ADDRESS",
+    help="Also send each frame: udp:HOST:PORT or zmq:HOST:PORT (published there), as JSON; lsl:NAME. Repeatable.",
+)
 @click.option(
     "--page",
     metavar="[HOST:]PORT",
@@ -175,7 +186,7 @@ def watch(
 
     \b
     Example:
-        beampose watch runs/today --out results/today --udp 127.0.0.1:5005
+        beampose watch runs/today --out results/today --stream udp:127.0.0.1:5005
     """
     from lab.runs.watch.live_frames import WatchOptions
     from lab.runs.watch.watch import watch_run

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from lab.errors import QUALITY_GATE_FAILED
-from lab.findings.finding import Finding, Level, reasons, verdict
+from lab.findings.finding import Finding, Level, first_sentence, reasons, verdict
 
 R_co = TypeVar("R_co", covariant=True)
 _REFERS_TO_OTHERS = "BP-V02"  # the remedy of this code names the other reasons
@@ -60,10 +60,19 @@ class Verdict:
         }
 
     def of_frames(self, measured: int, frames: int, errors: Sequence[str] = ()) -> str:
-        """The verdict on frames in one line; errors: against truth, in words."""
-        texts = "; ".join([*self.texts, *errors])
+        """The verdict on frames in one line: the first reason in one sentence; errors: against truth, in words.
+
+        With the next reason where the first refers to the others.
+        """
+        codes = [f.code for f in self.findings if f.level > Level.PASS]
+        shown = 2 if codes[:1] == [_REFERS_TO_OTHERS] else 1
+        more = len(self.texts) - shown
+        first = [first_sentence(text) for text in self.texts[:shown]]
+        others = [f"{more} more in the report"] if more > 0 else []
+        texts = "; ".join([*first, *others, *errors])
         said = f" ({texts})" if texts else ""
-        remedy = f" {self.remedy}" if self.remedy else ""
+        remedy = f" {first_sentence(self.remedy)}." if self.remedy else ""
+        remedy = remedy.replace("?.", "?")
         return f"{self.status.upper()}: {measured} of {frames} frames measured{said}{remedy}"
 
 

@@ -17,6 +17,7 @@ from lab.files.run.results import PoseTrack, read_poses, read_summary
 from lab.files.text.csv_table import Table
 from lab.files.text.csv_text import read_table
 from lab.files.text.error_text import name_of_path
+from lab.findings.finding import Finding, Level, clause, finding, passed
 from lab.number_format import format_number, format_percent, format_with_sigma
 from lab.runs.process import are_results
 from tracking.comparison.differences import (
@@ -299,12 +300,33 @@ def _named(axes: Array) -> str:
     return "the axis " + words[0] if len(words) == 1 else "the axes " + " and ".join(words)
 
 
+_MOST_CHI2 = 1.5  # per degree of freedom, less three of its sigmas, that stated uncertainties may be exceeded by
+_MOST_EXCLUDED = 0.05  # share of the compared frames
+
+
+def judged(comparison: Comparison) -> Finding:
+    """Whether the differences agree with the stated uncertainties, of the noise or of that and the calibration."""
+    found = comparison.differences
+    excluded = float((found.known & ~comparison.used).sum()) / max(int(found.known.sum()), 1)
+    tests = [c for c in (comparison.noise, comparison.total) if c is not None and np.isfinite(c.factor)]
+    if not tests or excluded > _MOST_EXCLUDED:
+        many = f"{format_percent(excluded)} of them were excluded as outliers"
+        return finding("BP-X02", Level.WARN, f"{int(found.known.sum())} frames were compared; {many}.")
+    good = [c for c in tests if c.factor - 3 * np.nan_to_num(c.sigma) <= _MOST_CHI2]
+    test = (good or tests)[0]
+    figure = f"chi-square per degree of freedom {format_with_sigma(test.factor, test.sigma)}"
+    if not good:
+        return finding("BP-X01", Level.WARN, f"The differences are larger than the stated uncertainties: {figure}.")
+    return passed(f"The differences agree with the stated uncertainties: {figure}.")
+
+
 def lines_of(comparison: Comparison) -> list[str]:
     """What the command prints."""
-    found = comparison.differences
+    found, verdict = comparison.differences, judged(comparison)
     lines = [
+        f"{verdict.level.word.upper()}: {clause(verdict.what)}{f'. {verdict.remedy}' if verdict.remedy else ''}",
         f"{int(found.known.sum())} of {len(comparison.frames)} measured frames compared,"
-        f" {int((found.known & ~comparison.used).sum())} of them excluded as outliers"
+        f" {int((found.known & ~comparison.used).sum())} of them excluded as outliers",
     ]
     lines += [
         f"{name}: {value}{'' if value == UNDETERMINED else ' ' + unit}"

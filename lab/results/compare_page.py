@@ -10,9 +10,10 @@ import numpy as np
 from lab.files.text.atomic_write import atomic_folder, check_output_folder, earlier_results
 from lab.files.text.csv_text import write_table
 from lab.files.text.json_text import write_json
-from lab.findings.outcome import Done
+from lab.findings.outcome import Done, Verdict
 from lab.number_format import format_number, format_percent, format_with_sigma
 from lab.report.page import Page, PageDrawing, PageTable, Section, made_with
+from lab.report.page import Verdict as PageVerdict
 from lab.report.page import write_page as write_report
 from lab.report.plot import svg
 from lab.report.plot.series import Band, Line, Shade, time_panel
@@ -22,6 +23,7 @@ from lab.results.compare import (
     StillStand,
     alignment_rows,
     compare,
+    judged,
     lines_of,
     undetermined_lines,
 )
@@ -68,6 +70,7 @@ def _summary(comparison: Comparison) -> dict[str, Any]:
         "result": str(comparison.result),
         "other": str(comparison.other),
         "versions": versions(),
+        "verdict": Verdict((judged(comparison),)).as_mapping(),
         "frames": {
             "result": len(comparison.frames),
             "in_common": int(comparison.differences.known.sum()),
@@ -118,12 +121,14 @@ def _alignment_row(comparison: Comparison) -> dict[str, Any] | None:
 # The report of a comparison.
 
 
+_SENTENCES = ("The two motions agree.", "The two motions differ, or too little was compared.")  # by level
 _COLOURS = (svg.BLUE, svg.ORANGE, svg.GREEN)
 
 
 def write_page(comparison: Comparison, folder: Path) -> Path:
     """Write report.html into a folder. Returns its path."""
     sections = [_alignment(comparison), _curves(comparison), _table(comparison), _allan(comparison.still)]
+    verdict = judged(comparison)
     of_two = "reference" if comparison.is_reference else "other result"
     page = Page(
         "comparison",
@@ -133,6 +138,7 @@ def write_page(comparison: Comparison, folder: Path) -> Path:
         _key_figures(comparison),
         [*undetermined_lines(comparison.estimate), *comparison.notes],
         [("result", str(comparison.result)), (of_two, str(comparison.other)), made_with("numpy", "scipy")],
+        PageVerdict(verdict.level, _SENTENCES[verdict.level], (verdict,)),
     )
     return write_report(page, folder)
 

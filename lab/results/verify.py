@@ -218,7 +218,8 @@ def _row_text(number: int, header: list[str], old: bytes | None, new: bytes | No
 
 
 # Tables that a run writes under some conditions only: in the results but not computed, they are a difference.
-_OPTIONAL = ("systematic.csv", "attitude_causal.csv", "covariance_causal.csv")
+_OPTIONAL = ("systematic.csv", "budget.csv", "attitude_causal.csv", "covariance_causal.csv")
+_NEW = ("budget.csv",)  # that earlier versions did not write
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,7 +275,9 @@ def verify(results: Path, run_folder: Path | None = None, progress: Progress | N
         pipeline = Pipeline.of(run)
         passes = TrackingAndSmoothing(pipeline, work, progress)
         write_tables(pipeline, passes, work, causal=recorded.causal)
-        tables = sorted({p.name for p in work.glob("*.csv")} | {n for n in _OPTIONAL if (results / n).is_file()})
+        missing = {name for name in _NEW if not (results / name).is_file()}
+        computed = {p.name for p in work.glob("*.csv")} - missing
+        tables = sorted(computed | {n for n in _OPTIONAL if (results / n).is_file()})
         found = [difference_of(results / table, work / table) for table in tables]
     differences = tuple(d for d in found if d is not None)
     same = Verification(results, inputs, tuple(other_versions(recorded)), tuple(tables), differences)

@@ -24,7 +24,7 @@ from lab.runs.clock_estimate import clock_findings, with_estimated_clocks
 from lab.runs.frames.clocked_frames import ClockedFrames
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.frames.row_records import row_records
-from lab.runs.model_check.frame_sampler import FrameSampler, stated_covariances, widths
+from lab.runs.model_check.frame_sampler import FrameSampler
 from lab.runs.run_log import RunLog, listening
 from lab.runs.setup_check import mistakes_of_run, pictures_sampler
 from lab.runs.smoothing_pass import TrackingAndSmoothing
@@ -168,9 +168,7 @@ def write_tables(
 
         def sampled(pairs: Iterable[Pair]) -> Iterator[Pair]:
             for record, before in pairs:
-                stated = stated_covariances(record.tracked, record.detections, model.camera_of, run.tracker)
-                width = widths(record.tracked, record.detections, model.camera_of)
-                sampler.add_tracked(record.t_s, record.tracked, record.tracked.predicted_cov_px2, stated, width)
+                sampler.add_record(record, model.camera_of, run.tracker)
                 yield record, before
 
         for record, in_causal_pass in rows_of(pipeline, sampled(checks.passed(records))):

@@ -38,7 +38,7 @@ class TableWriter:
     """Context manager that writes all tables of one run into an existing folder.
 
     with_systematic: also systematic.csv, the part of covariance.csv that is due to the calibration's errors.
-    with_causal: also attitude_causal.csv and covariance_causal.csv, the poses of the causal pass.
+    with_causal: also attitude_causal.csv and covariance_causal.csv, the poses of the causal pass, and budget.csv.
     with_picture_times: detections.csv has the instant of each picture, t_s.
     """
 
@@ -63,6 +63,7 @@ class TableWriter:
             self._files["systematic.csv"] = columns.COVARIANCE
         if with_causal:
             self._files |= {f"{name}{CAUSAL}.csv": _FILES[f"{name}.csv"] for name in ("attitude", "covariance")}
+            self._files["budget.csv"] = columns.BUDGET
         if with_picture_times:
             self._files["detections.csv"] = (*columns.DETECTIONS, columns.PICTURE_TIME)
         self._open: dict[str, TextIO] = {}
@@ -164,6 +165,9 @@ class TableWriter:
         self._open[f"covariance{which}.csv"].writelines(covariances)
         if systematic is not None:
             systematic.writelines(of_calibration)
+        if not which and (budget := self._open.get("budget.csv")) is not None:
+            parts = [(r.frame, r.tracked.rest_parts) for r in records if r.tracked.pose is not None]
+            budget.writelines(f"{frame},{_exact(of)}\n" for frame, of in parts if of is not None)
 
     def _beam_rows(self, records: Sequence[FrameRecord]) -> None:
         rows = []

@@ -50,8 +50,8 @@ def _solve(rig_path: Path, options: PlanOptions) -> Solved[Plan]:
         name="plan",
         result=plan,
         findings=tuple(findings(plan)),
-        figures=f"{format_percent(float(plan.measured.mean()))} of {len(plan.status)} poses can be measured, sigma"
-        f" {format_angle(sigma_deg)} and {format_length(sigma_m)} (worst direction, median of the poses)",
+        figures=f"{format_percent(float(plan.measured.mean()))} of {len(plan.status)} poses can be measured, sigma of"
+        f" the attitude {format_angle(sigma_deg)}, of the position {format_length(sigma_m)} (worst direction, median)",
         write=write,
         page=lambda: page_of(plan),
         day=datetime.date.today(),

@@ -58,7 +58,7 @@ _OF_NAMES: dict[str, Schema] = {
     "_an_angle_range": {"type": "number", "exclusiveMinimum": 0, "maximum": 180},
     "iso_date": {"type": "string", "description": "a date such as 2026-03-14"},
     "_day_or_none": {"type": ["string", "null"], "description": "a date such as 2026-03-14"},
-    "_seconds_or_estimate": {"anyOf": [{"type": "number"}, {"const": "estimate"}]},
+    "_seconds_or_estimate": {"anyOf": [{"type": "number"}, {"enum": ["estimate"]}]},
     "_number_tuple": {"type": "array", "items": {"type": "number"}},
 }
 _OF_TYPES: dict[Any, Schema] = {

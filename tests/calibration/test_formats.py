@@ -5,7 +5,9 @@ The texts follow the layouts that each program's documentation shows; their numb
 
 from __future__ import annotations
 
+from functools import partial
 from types import ModuleType
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +16,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.formats import colmap, kalibr, mrcal, opencv_yaml, ros
+from calibration.formats import colmap, kalibr, model, mrcal, opencv_yaml, ros
 from calibration.formats.model import ROOM, CameraModel, FormatError, Read, significant
 from geometry.camera import FISHEYE, PERSPECTIVE
 from geometry.pose import Pose
@@ -330,3 +332,53 @@ def test_a_chain_requires_poses():
     cameras = [CameraModel(n, (640, 480), (500, 500, 320, 240)) for n in ("left", "right")]
     with pytest.raises(FormatError, match="left, right has none: write each camera to a file of its own"):
         kalibr.write(cameras)
+
+
+LENS: dict[str, Any] = {"name": "left", "image_size_px": (1, 1), "pinhole": (1e-9, 1e-9, -5.0, 0.0)}
+
+
+@pytest.mark.parametrize("fields", [{}, *({"distortion": (0.1,) * n} for n in (0, 4, 5, 8, 12)), {"lens": FISHEYE}])
+def test_a_lens_at_the_limits_of_its_fields_is_accepted(fields):
+    assert CameraModel(**LENS | fields).name == "left"
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"image_size_px": (0, 1)}, "a picture of at least 1 pixel"),
+        ({"image_size_px": (1, 0)}, "a picture of at least 1 pixel"),
+        ({"pinhole": (1.0, 1.0, np.inf, 0.0)}, "finite numbers"),
+        ({"distortion": (0.1, 0.0, np.nan, 0.0)}, "finite numbers"),
+        ({"pinhole": (0.0, 1.0, 0.0, 0.0)}, "focal lengths above 0"),
+        ({"pinhole": (1.0, -1.0, 0.0, 0.0)}, "focal lengths above 0"),
+        ({"lens": "mirror"}, "a lens of perspective, fisheye, got 'mirror'"),
+        ({"distortion": (0.1,) * 3}, "coefficients .perspective., got 3"),
+        ({"distortion": (0.1,) * 5, "lens": FISHEYE}, "0 or 4 coefficients .fisheye., got 5"),
+    ],
+)
+def test_a_lens_that_no_camera_has_is_refused_with_its_name(fields, words):
+    with pytest.raises(FormatError, match=f"camera 'left': expected .*{words}"):
+        CameraModel(**LENS | fields)
+
+
+@pytest.mark.parametrize(
+    ("read", "value", "words"),
+    [
+        (model.number, True, "a finite number, got True"),
+        (model.number, np.inf, "a finite number, got inf"),
+        (model.number, None, "a finite number, got nothing"),
+        (model.numbers, "1, 2", "a list of numbers, got '1, 2'"),
+        (partial(model.numbers, count=3), [1, 2], "3 numbers, got 2"),
+        (partial(model.numbers, count=3), 7, "a list of 3 numbers, got 7"),
+        (model.mapping, [1], "a mapping, got"),
+        (model.matrix, {"rows": 2, "cols": 2, "data": [1, 2, 3]}, "2 x 2 numbers, got 3"),
+        (model.matrix, {"sizes": [4], "data": [1, 2, 3]}, "1 x 4 numbers, got 3"),
+        (lambda v, where: model.pinhole_of(np.ones(v), where), (2, 4), "a 3 x 3 matrix, got 2 x 4"),
+        (lambda v, where: model.pinhole_of(np.ones(v), where), (3, 3), "skew is not supported"),
+        (lambda v, where: model.picture_size(*v, where), (640, 480.5), "a width and a height in whole pixels"),
+        (lambda v, where: model.picture_size(*v, where), (0, 480), "a width and a height in whole pixels"),
+    ],
+)
+def test_a_value_of_another_form_is_refused_with_its_field(read, value, words):
+    with pytest.raises(FormatError, match=f"K: expected .*{words}"):
+        read(value, where="K")

@@ -29,8 +29,7 @@ from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import POSE as POSE_NAMES
-from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty, Sensitivity
-from tests.geometry.perturbed_rig import perturbed
+from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty, Sensitivity, perturbed_rig
 from tests.geometry.scenes import LENSES, paper_rig
 
 SIGMA_PX = 0.1
@@ -55,7 +54,7 @@ def root(C: np.ndarray) -> np.ndarray:
 def solved_error(rig: Rig, errors: RigErrors, delta: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """The pose error (6,) for rig errors delta (p,) and pixel errors noise (n, 2)."""
     model = SpotModel.of(rig)
-    true_pixels, _ = SpotModel.of(perturbed(rig, errors.names, delta)).project(POSE)
+    true_pixels, _ = SpotModel.of(perturbed_rig(rig, errors.names, delta)).project(POSE)
     spread = RigUncertainty(rig, model, RigCovariance(errors.names, errors.covariance))
     rows = np.arange(len(model))
     covariances = np.broadcast_to(SIGMA_PX**2 * np.eye(2), (len(model), 2, 2))
@@ -217,7 +216,7 @@ def test_the_pose_error_from_a_lens_error_agrees_with_opencvs_resection(rig):
     pixels = camera.project(dots)
     for lens in ("fx", "cy", "k1", "p2"):
         move = errors.moves[:, errors.names.index(f"cameras.left.{lens}")]
-        wrong = perturbed(
+        wrong = perturbed_rig(
             rig, errors.names, np.where([".left." in n and group_of(n) == INTRINSICS for n in errors.names], move, 0)
         )
         rvec = Rotation.from_matrix(camera.camera_from_world.rotation).as_rotvec()
@@ -247,7 +246,7 @@ def test_all_distortion_coefficients_together_displace_the_corner_by_the_stated_
     squares = 0.0
     for name in names:
         delta = np.where(np.array(errors.names) == name, errors.move_sigmas, 0.0)
-        there = perturbed(rig, errors.names, delta).cameras["left"].project(points)
+        there = perturbed_rig(rig, errors.names, delta).cameras["left"].project(points)
         squares += float(np.sum((there - camera.project(points)) ** 2))
     assert np.sqrt(squares) == pytest.approx(0.2, rel=0.1)  # each is scaled at its own worst corner
 

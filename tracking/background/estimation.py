@@ -21,7 +21,7 @@ from tracking.background.static_background import TRIED, StaticBackground
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
-from tracking.noise_estimation.texture_shift import TextureShift, local_shifts
+from tracking.noise_estimation.texture_shift import TextureShift, local_shifts, shifts_at_rest
 from tracking.parameters import DetectParameters
 
 PICTURES = 15  # from which a background is made, spread over the recording
@@ -33,7 +33,7 @@ _MOSTLY = 0.7  # share of the pictures with lights that move, above which those 
 # more, prints or objects, the spots show a part: 0.25 to 0.57 where photographs modulate their light by up to 60 %.
 _OF_SURFACE, _OF_OBJECTS = 0.1, 0.5
 _SETTLED = 0.01  # sigmas of a pixel: the background behind a light that changes by less is the last one
-_NO_GAUSSIAN = 0.04  # share of a light at rest that a Gaussian leaves in a pixel; it is no structure of the background
+_NO_GAUSSIAN = 0.02  # share of a light at rest that a Gaussian leaves in a pixel; it is no structure of the background
 
 
 def static_background(
@@ -141,7 +141,8 @@ def _with_shifts(
     share = replace(shift, misfit_share=float("nan")).with_lights(found).misfit_share
     part = 1.0 if background.noise.texture < _OF_SURFACE else _OF_OBJECTS
     shifts_px = np.float32(part) * local_shifts(mean, own, width)
-    return replace(better, spot_px=width, shifts_px=shifts_px, misfit_share=share)
+    rest_shifts_px = shifts_at_rest(mean, own, still)
+    return replace(better, spot_px=width, shifts_px=shifts_px, rest_shifts_px=rest_shifts_px, misfit_share=share)
 
 
 def _behind(

@@ -32,7 +32,7 @@ _LEAST_TEXTURE, _FIRST_TEXTURE = 2.0, 20.0  # DN
 _ALIKE = 2.0  # texture is alike over some pixels: fewer of them are independent
 _LARGEST_CHI2 = 2.0  # per degree of freedom
 _LARGEST_SIGMA = 0.1  # of the mean place, in widths of the light
-_LEAST_SIGMA = 0.005  # widths: error of the mean place that the model leaves; 0.004 in front of photographs
+LEAST_SIGMA = 0.005  # widths: error of the mean place that the model leaves; 0.004 in front of photographs
 _LARGEST_CHANGE = 3.0  # of the width, as a factor, from the start
 
 
@@ -263,6 +263,6 @@ def _checked(pixels: _Pixels, light: JointLight, width_px: float) -> JointFit | 
     bad |= float(np.sqrt(np.trace(common) / 2)) > _LARGEST_SIGMA * float(widths.max())
     if bad:
         return None
-    least = (_LEAST_SIGMA * float(widths.max())) ** 2
+    least = (LEAST_SIGMA * float(widths.max())) ** 2
     share = (0.5 * np.trace(common) + least) / max(0.5 * np.trace(single), 1e-9)
     return JointFit(light, float(share), covariance[:2, :2] * max(chi2, 1.0))

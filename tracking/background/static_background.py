@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools, Ints
-from tracking.background.joint_fit import Modulation
+from tracking.background.joint_fit import LEAST_SIGMA, Modulation
 from tracking.background.lights_on_edges import with_lights_on_edges
 from tracking.background.mean_pictures import (
     GAIN_BITS,
@@ -77,6 +77,8 @@ class StaticBackground:
     shown: ShownLight
     spot_px: float = 0.0  # usual width of the lights that move; 0: not known
     shifts_px: NDArray[np.float32] | None = None  # (h, w): `local_shifts` of such a light
+    # (n,): `local_shifts` of each light at rest, as wide as it is
+    rest_shifts_px: Array | None = None
     fixed: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))  # lights at rest while others move
     misfit_share: float = float("nan")  # of the lights that move, as in TextureShift
     # (h, w), in 2^-GAIN_BITS: undoes what the brightness of the surface does to a light; None: nothing
@@ -216,12 +218,15 @@ class StaticBackground:
         """The lights at rest in the mean picture, with the errors that they have in each picture; errors of others."""
         if shift not in self.known:
             lights = self.lights.found
-            # The error of the mean picture's fit is the same in all pictures.
-            common = self._noise_share * lights.variance_px2
-            lights = shift.added_to(lights, self.noise, self._shifts_at(lights))
+            # The error of the mean picture's fit is the same in all pictures, as is what a Gaussian leaves.
+            least = LEAST_SIGMA**2 * lights.major_px * lights.minor_px
+            common = self._noise_share * lights.variance_px2 + least
+            # Most of them are objects, whose misfits are no grain of the light.
+            own = replace(shift, misfit_share=self.misfit_share)
+            lights = own.added_to(lights, self.noise, self.rest_shifts_px, at_rest=True)
             place = np.zeros(len(lights)) if lights.place_px2 is None else lights.place_px2
             at_rest = self.fixed.astype(float) if len(self.fixed) else None
-            covariance = (1 + self._noise_share) * lights.cov_px2
+            covariance = (1 + self._noise_share) * lights.cov_px2 + least[:, None, None] * np.eye(2)
             lights = replace(lights, cov_px2=covariance, place_px2=place + common, at_rest=at_rest)
             moving = replace(shift, background_px=(0.0,) * len(shift.background_px))
             if self.shifts_px is not None:

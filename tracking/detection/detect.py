@@ -215,14 +215,9 @@ class SpotFinder:
     def _detections(self, regions: Array) -> Detections:
         """The spots, among the candidates measured last, that lie in one of the regions."""
         rows = self._out[: write_detections(self._table[: self._count], regions, self._out)]
+        columns = rows.T.copy()
         cov = rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
-        return Detections(
-            rows[:, :2].copy(),
-            cov,
-            *(rows[:, k].copy() for k in range(5, 10)),
-            misfit=rows[:, 10].copy(),
-            chi2=rows[:, 11].copy(),
-        )
+        return Detections(rows[:, :2].copy(), cov, *columns[5:10], misfit=columns[10], chi2=columns[11])
 
 
 def _insignificance(peaks: Array, model: NoiseModel) -> Array:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from geometry.arrays import Array, Ints
+from geometry.arrays import Array, Bools, Ints
 from geometry.compilation.jit import compiled, compiled_for_threads
 from tracking.detection import ellipse
 from tracking.detection.candidates import AT_U, AT_V, CONTRAST, HEIGHT, LEVEL, SCALE
@@ -119,9 +119,10 @@ def measure(
         if not _merge_parts(table):
             break
         fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, True, cells, algebra)
-    if _start_again(peaks, chosen, table, limits):
+    restarted = np.zeros(chosen.shape[0], np.bool_)
+    if _start_again(peaks, chosen, table, limits, restarted):
         fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, False, cells, algebra)
-        _drop_background(table)
+        _drop_background(table, restarted)
     if _hold_unresolved(peaks, chosen, table, limits):
         fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, False, cells, algebra)
         _judge_unresolved(image, table, noise, limits)
@@ -170,8 +171,10 @@ def _fit_wings(
 
 
 @compiled
-def _start_again(peaks: Array, chosen: Ints, table: Array, limits: DetectionLimits) -> bool:
+def _start_again(peaks: Array, chosen: Ints, table: Array, limits: DetectionLimits, restarted: Bools) -> bool:
     """Give candidates whose moments or fits left their light a start from the peak and its scale; whether there are.
+
+    Marks them in restarted (n,).
 
     On a sloping or textured background the window of the moments grows over the light beside a faint spot, or the fit
     over that beside a saturated one; then it explains little.
@@ -192,19 +195,19 @@ def _start_again(peaks: Array, chosen: Ints, table: Array, limits: DetectionLimi
         spot[MOMENT_U], spot[MOMENT_V] = peak[AT_U], peak[AT_V]
         spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV] = start, 0.0, start
         spot[FLUX], spot[ACTIVE] = 2 * pi * start * peak[HEIGHT], 1.0
-        found = True
+        restarted[k] = found = True
     return found
 
 
 @compiled
-def _drop_background(table: Array) -> None:
-    """Reject fits that have started again and follow the background: wider than the peak, or no maximum on the slope.
+def _drop_background(table: Array, restarted: Bools) -> None:
+    """Reject restarted fits (n,) that follow the background: wider than the peak, or no maximum on the slope.
 
     The curvature of a wide reflection fits a faint wide spot. A spot is brighter than its surroundings on all sides.
     """
     for k in range(table.shape[0]):
         spot = table[k]
-        if spot[FLUX] <= 0.0 or spot[MOMENT_UV] != 0.0 or spot[MOMENT_UU] != spot[MOMENT_VV]:
+        if spot[FLUX] <= 0.0 or not restarted[k]:
             continue
         det = spot[UU] * spot[VV] - spot[UV] ** 2
         height = spot[FLUX] / (2 * pi * sqrt(det))

@@ -273,8 +273,7 @@ def _median_of_border(window: Window, values: Array, state: Array, scratch: Arra
                 n += 1
     if n == 0:
         return background
-    insertion_sort(scratch, n)
-    return 0.5 * (scratch[(n - 1) // 2] + scratch[n // 2])
+    return 0.5 * (nth_smallest(scratch, n, (n - 1) // 2) + nth_smallest(scratch, n, n // 2))
 
 
 @compiled

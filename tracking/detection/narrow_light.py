@@ -41,7 +41,7 @@ EXACT_PX2 = 0.9**2  # px^2: narrower spots are integrated over the pixels numeri
 FAR_PX2 = 2.0**2  # px^2: what the far wing adds: its light reaches the border of the window
 _TOLERANT = 9.0  # squared sigmas from the usual shape at which that counts half: a spot may be a streak
 _FOUR_NODES_PX2 = 0.5**2  # px^2: narrower spots need eight instead of four nodes in each direction
-_NEGLIGIBLE = 8.5  # sigmas from the centre at which the light is 2e-16 of its peak
+_NEGLIGIBLE = 6.0  # sigmas from the centre at which the light is 2e-8 of its peak
 
 # Gauss-Legendre nodes and weights on [-1/2, 1/2] for 4 and 8 points: accurate to 1e-4 of the peak for sigmas of at
 # least 0.5 and 0.2 px.
@@ -120,7 +120,7 @@ def _moments_of_row(
     """Means over the pixels of a row (n,) of a Gaussian of covariance S, px^2, times 1, x, y, x^2, x y, y^2: (6, n).
 
     u0, dv: px, the first pixel relative to the centre; x and y are such distances over su and sv. scale: its value at
-    the centre. Beyond _NEGLIGIBLE sigmas the means are below the rounding of the sums, and 0. work: (4, 8 n) or larger.
+    the centre. Outside the ellipse of _NEGLIGIBLE sigmas they are 0. work: (4, 8 n) or larger.
     """
     wide = ellipse.eigenvalues(S[0], S[1], S[2])[0] > _FOUR_NODES_PX2
     nodes, weights = (_NODES4, _WEIGHTS4) if wide else (_NODES8, _WEIGHTS8)
@@ -129,10 +129,12 @@ def _moments_of_row(
     for p in range(6):
         for j in range(columns):
             out[p, j] = 0.0
-    if abs(dv) - 0.5 > _NEGLIGIBLE * sqrt(S[2]):
+    left2 = _NEGLIGIBLE**2 - max(abs(dv) - 0.5, 0.0) ** 2 / S[2]
+    if left2 <= 0.0:
         return
-    reach = _NEGLIGIBLE * sqrt(S[0]) + 0.5
-    first, last = max(int(-reach - u0), 0), min(int(reach - u0) + 1, columns)
+    slope = S[1] / S[2]  # of the line through the middles of the ellipse's rows
+    reach = sqrt(left2 / a[0]) + 0.5 * (1.0 + abs(slope))
+    first, last = max(int(slope * dv - reach - u0), 0), min(int(slope * dv + reach - u0) + 1, columns)
     n = max(last - first, 0)
     # First the sums over the nodes in v, of the light times 1, y and y^2, at all nodes in u of these pixels.
     u, light = work[0, : count * n], work[1, : count * n]

@@ -34,6 +34,7 @@ class PlaceErrors:
 
     share: float  # of the spots' error variance that belongs to places, in [0, 1]
     factor: Array  # (T,) of covariances that were computed as if the errors of all frames were independent
+    more: Array  # (T, n): the same less 1, of errors that all belong to places, for each view
     reach_px: Array  # (n,) correlation length: the sigma of a spot whose mean over white texture would make it
     elsewhere: float = 0.0  # share of the variance that is the same in all places: errors of the rig, not of a place
 
@@ -86,7 +87,7 @@ def place_errors(
         share = float(weight @ _SHARES / weight.sum())
     more = np.stack([more_of_means(uv_px[:, i], best.reach_px[i], averaged) for i in range(len(width))], axis=-1)
     total, views = np.where(labelled, more, 0.0).sum(axis=1), np.maximum(labelled.sum(axis=1), 1)
-    return PlaceErrors(share, 1 + share * total / views, best.reach_px, best.elsewhere)
+    return PlaceErrors(share, 1 + share * total / views, more, best.reach_px, best.elsewhere)
 
 
 def _prior(predicted: float) -> Array:
@@ -102,6 +103,16 @@ def _prior(predicted: float) -> Array:
     near = np.exp(-0.5 * away**2)
     out[1:] += (1 - _UNFORESEEN) * near / near.sum()
     return out
+
+
+def scaled_shares(shares: Array, predicted: float, found: float) -> Array:
+    """The shares (m,) of single errors, whose mean was predicted and found to be another: one factor on their odds."""
+    least = _SHARES[1]
+    if predicted < least or found < least:
+        return np.full(len(shares), found)
+    odds = [np.clip(x, 0.0, _SHARES[-1]) / (1 - np.clip(x, 0.0, _SHARES[-1])) for x in (shares, predicted, found)]
+    scaled = odds[0] * odds[2] / odds[1]
+    return np.asarray(scaled / (1 + scaled))
 
 
 def usable_widths(width_px: Array) -> Array:

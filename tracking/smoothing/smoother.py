@@ -48,7 +48,7 @@ from tracking.smoothing.motion.run_detections import (
     straight_between,
 )
 from tracking.smoothing.motion.whole_run import MAX_DISTANCE, estimate
-from tracking.smoothing.place_errors import place_errors
+from tracking.smoothing.place_errors import place_errors, scaled_shares
 from tracking.smoothing.recording import TrackedRecording, merged, track_backward
 from tracking.smoothing.single_frame_poses import SingleFramePoses, rms_residuals, single_frame_poses
 from tracking.smoothing.systematic_errors import calibration_errors, exposure_offsets, exposure_sigmas, pose_shift
@@ -125,6 +125,7 @@ class Smoothed:
     velocities: Array  # (T, 6): m/s in world, rad/s in body
     covariance: Array  # (T, 6, 6) of the poses, from noise and from errors that belong to places
     place_share: float  # share of the spots' error variance that belongs to places (place_errors.py)
+    rest_parts: Array  # (T, 28) as TrackedFrame.rest_parts
     systematic: Array  # (T or 1, 6, 6) the calibration's share, to be added
     motion_covariance: Array  # (T, 6, 6) of the velocities
     known: Bools  # (T,): the pose is not lost
@@ -188,6 +189,7 @@ class Smoothed:
             if known
             else None,
             pose_systematic=systematic if known else None,
+            rest_parts=self.rest_parts[k] if known else None,
             shift_px=None if self.shift_px is None else self.shift_px[k],
         )
 
@@ -514,6 +516,7 @@ class _Smoother:
         offsets = exposure_offsets(self.views, final, self.rec.exposure_s, motion.known & ~jumps)
         of_spots, of_poses = exposure_sigmas(final, motion.jumped, self.rec.exposure_s, self.rec.dt_s)
         covariance = covariance + of_poses[:, :, None] ** 2 * np.eye(6)
+        rest = [1 - (1 - place_share) / place_factor, of_poses, np.zeros((len(covariance), 21))]
         clocks: FoundClocks | None = None
         if motion.clocks is not None:
             # Errors of places do not average out for the clocks either.
@@ -522,6 +525,7 @@ class _Smoother:
             clocks = FoundClocks(self.correction_s, clock_cov)
             spread = motion.clocks.motion @ clock_cov @ np.swapaxes(motion.clocks.motion, 1, 2)
             covariance, motion_P = covariance + spread[:, :6, :6], motion_P + spread[:, 6:, 6:]
+            rest[2] = spread[:, *np.triu_indices(6)]
         jerk = np.full(2, np.nan)
         if motion.log_density is not None:
             half = 0.5 * np.median(motion.log_density, axis=0)
@@ -544,6 +548,7 @@ class _Smoother:
             velocities=final.m[:, :6],
             covariance=covariance,
             place_share=place_share,
+            rest_parts=np.column_stack(rest),
             systematic=self.systematic,
             motion_covariance=motion_P,
             known=motion.known,
@@ -583,11 +588,12 @@ class _Smoother:
         ratio = np.trace(np.linalg.solve(self.own.covariance[frames], pose_P[frames]), axis1=1, axis2=2)
         averaged[frames] = 6 / np.maximum(ratio, 1e-9)
         averaged = np.where(np.isfinite(averaged), averaged, np.nanmedian(averaged) if len(frames) else 1.0)
-        expected, assigned = project_all(self.views, ref.R[frames], ref.t[frames])[0], self.assigned[frames]
+        (expected, J), assigned = project_all(self.views, ref.R[frames], ref.t[frames]), self.assigned[frames]
         use = (assigned >= 0) & (assigned < BLENDED) & np.isfinite(expected).all(axis=-1)
         k, view = np.nonzero(use)
         rows = detections.begin[frames[k]] + assigned[use]
-        size = np.sqrt(0.5 * np.trace(detections.cov[rows] + self.calibration_cov[view], axis1=1, axis2=2))
+        cov = detections.cov[rows] + self.calibration_cov[view]
+        size = np.sqrt(0.5 * np.trace(cov, axis1=1, axis2=2))
         residual[frames[k], view] = (detections.uv[rows] - expected[use]) / size[:, None]
         uv_px[frames[k], view] = detections.uv[rows]
         explained = np.zeros(len(self.model))
@@ -595,4 +601,14 @@ class _Smoother:
         shares = self.errors.place_px2(detections, self.rec.place_px2())[rows] / size**2
         width_px, share = self.detections.usual_size_px, float(np.mean(shares)) if len(shares) else 0.0
         found = place_errors(residual, uv_px, width_px, averaged, explained, share)
-        return found.share, found.factor, pose_P * (found.factor * self.noise_share)[:, None, None]
+        # Spots on edges have larger shares: the errors of places lie in the directions that these determine.
+        own = scaled_shares(shares, share, found.share) * found.more[frames[k], view] * averaged[frames[k]]
+        more = np.zeros_like(pose_P)
+        for i in range(len(self.model)):
+            of_view = view == i
+            J_i = J[k[of_view], i]
+            information = np.swapaxes(J_i, 1, 2) @ np.linalg.solve(cov[of_view], J_i)
+            more[frames[k[of_view]]] += own[of_view, None, None] * information
+        covariance = pose_P * found.factor[:, None, None]
+        covariance[frames] = pose_P[frames] + pose_P[frames] @ more[frames] @ pose_P[frames]
+        return found.share, found.factor, covariance * self.noise_share[:, None, None]

@@ -47,6 +47,7 @@ class CalibrationState(Block):
     valid_until: OptionalDay = None  # the last valid day; without it, no limit
     reasons: Lines = ()  # a line for each finding that is not a PASS
     notes: Text = ""
+    made_from: Lines = ()  # a line for each file from which it was made, with its SHA-256
 
     def days_left(self, day: datetime.date) -> int | None:
         """Days of validity after `day`: negative after its end, None without one."""

@@ -124,8 +124,10 @@ def folder_of_run(given: Path) -> Path:
     return folder
 
 
-def load_run(run_folder: Path) -> Run:
+def load_run(run_folder: Path, rig_path: Path | None = None) -> Run:
     """Read and check run.yaml of a run folder, its rig and its timestamps; pictures are not opened.
+
+    rig_path: a rig.yaml in place of the one that run.yaml names.
 
     Raises:
         InputError: with file, field, what was expected and what was found; FileError for several mistakes.
@@ -135,7 +137,7 @@ def load_run(run_folder: Path) -> Run:
     content = fields.validated(_RunBlock, read_mapping(path), path)
     tracker = dataclass_from_yaml(TrackerParameters, content.tracker, path, "tracker")
 
-    rig_path = folder / content.rig
+    rig_path = folder / content.rig if rig_path is None else rig_path
     if not rig_path.is_file():
         raise InputError(
             f"{path}: rig: expected a rig file, found none at {rig_path}; paths start at run.yaml's folder"

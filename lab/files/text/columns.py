@@ -24,6 +24,10 @@ ATTITUDE = (
 POSE = ATTITUDE[2:18]  # the pose: position, quaternion, angles and their sigmas
 MOTION = ATTITUDE[21:]  # velocity of the body origin, in world; rate about the body's axes; their sigmas
 COVARIANCE = ("frame", *(f"c{i}{j}" for i in range(6) for j in range(i, 6)))
+BUDGET = (
+    "frame", "place_share", *(f"turn_{name}" for name in ("x_m", "y_m", "z_m", "rot_x_rad", "rot_y_rad", "rot_z_rad")),
+    *(f"clock_{name}" for name in COVARIANCE[1:]),
+)  # fmt: skip
 TRUTH_POSE = ("frame", "t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 TRUTH_SPOTS = ("frame", "camera", "spot", "u_px", "v_px", "in_view")
 TIMES = ("frame", "t_s")

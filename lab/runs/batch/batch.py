@@ -20,6 +20,7 @@ from typing import Any
 import filelock
 
 from lab.errors import QUALITY_GATE_FAILED, BeamposeError, CalibrationError, InputError, RunError
+from lab.extras import needed
 from lab.files.run.parameter_overrides import with_overrides
 from lab.files.text.atomic_write import atomic_write_bytes, made_folder
 from lab.files.text.csv_text import WORD_COLUMNS, text_of_field, write_table
@@ -153,16 +154,6 @@ FOLDER = "parquet"
 TABLES = ("attitude", "spots")
 
 
-def require_pyarrow() -> None:
-    """Raises InputError where pyarrow is not installed: to be called before long work."""
-    try:
-        import pyarrow  # noqa: F401
-    except ImportError:
-        raise InputError(
-            "--parquet: expected the package pyarrow (the extra `parquet`), which is not installed: pip install pyarrow"
-        ) from None
-
-
 def update_data_sets(rows: Iterable[Mapping[str, Any]], out: Path) -> Path:
     """Write out/parquet/attitude/ and out/parquet/spots/, a file per run; returns out/parquet.
 
@@ -172,7 +163,7 @@ def update_data_sets(rows: Iterable[Mapping[str, Any]], out: Path) -> Path:
     Raises:
         InputError: pyarrow is not installed, a table of the results is damaged, or a file cannot be written.
     """
-    require_pyarrow()
+    needed("parquet", "--parquet")
     root = Path(out) / FOLDER
     kept: dict[str, set[str]] = {name: set() for name in TABLES}
     try:
@@ -295,7 +286,7 @@ def process_batch(
     # A misspelt parameter is the command's mistake, not each run's.
     with_overrides(TrackerParameters(), options.overrides or {})
     if options.parquet:
-        require_pyarrow()
+        needed("parquet", "--parquet")
     folders = listed_runs(runs, lists)
     made_folder(out)
     tasks = _tasks(folders, out, options)

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lab.errors import InputError, RunError
+from lab.extras import needed
 from lab.files.output.part_folder import removed_at_the_end
 from lab.files.text.atomic_write import atomic_write_text
 from lab.runs.batch.task import Task, TaskOutcome, displayed, failed_row, perform, program_digest
@@ -67,17 +68,6 @@ class _Shared:
         return ""
 
 
-def require_distributed() -> None:
-    """Raises InputError where the package distributed is not installed: to be called before long work."""
-    try:
-        import distributed  # noqa: F401
-    except ImportError:
-        raise InputError(
-            "--dask: expected the package distributed (the extra `cluster`), which is not installed: pip install"
-            " distributed"
-        ) from None
-
-
 @contextlib.contextmanager
 def connected(address: str, out: Path) -> Iterator[Cluster]:
     """A connection to the cluster whose scheduler has this address, during the block.
@@ -88,7 +78,7 @@ def connected(address: str, out: Path) -> Iterator[Cluster]:
     Raises:
         InputError: distributed is not installed, or the scheduler does not answer.
     """
-    require_distributed()
+    needed("cluster", "--dask")
     from distributed import Client
 
     out = Path(os.path.realpath(out))

@@ -111,7 +111,7 @@ def _search_all(
                 found, likeness = series.search(frame, picture)
                 rows = detection_rows([(frame, camera, found)])
                 file.writelines(f"{row[:-1]},{like:.3f}\n" for row, like in zip(rows, likeness, strict=True))
-                sheet.offer(done - 1, frame, picture, found)
+                sheet.offer(done - 1, frame, picture, found, likeness)
             if progress is not None:
                 progress(done, total)
 

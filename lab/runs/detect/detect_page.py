@@ -40,6 +40,7 @@ class _Kept:
     frame: int
     picture: GreyPicture
     found: Detections
+    numbered: frozenset[int]  # rows of the spots that get their number
 
 
 @dataclass(slots=True)
@@ -53,10 +54,11 @@ class ContactSheet:
     _kept: dict[int, _Kept] = field(default_factory=dict)  # by index in the series
     _stride: int = 1
 
-    def offer(self, index: int, frame: int, picture: GreyPicture, found: Detections) -> None:
-        """Offer the picture at this index of the series, from 0, with its detections."""
+    def offer(self, index: int, frame: int, picture: GreyPicture, found: Detections, likeness: Array) -> None:
+        """Offer the picture at this index of the series, from 0, with its detections and their likeness (n,)."""
         if self._selects(index):
-            self._kept[index] = _Kept(frame, picture.copy(), found)
+            most_alike = np.argsort(-likeness, kind="stable")[:_NUMBERED]
+            self._kept[index] = _Kept(frame, picture.copy(), found, frozenset(most_alike.tolist()))
         if len(self._kept) > MOST:
             self._stride *= 2
             self._kept = {k: kept for k, kept in self._kept.items() if k % self._stride == 0}
@@ -90,7 +92,7 @@ class ContactSheet:
 
 
 def _tile(one: _Kept, width: int, height: int) -> Pixels:
-    """One picture with its caption above it, and rings around its spots; the brightest have a number."""
+    """One picture with its caption above it, and rings around its spots; those most like a laser's have a number."""
     out: Pixels = np.full((_STRIP + height, width, 3), PAPER, np.uint8)
     spots = f"{len(one.found)} spot{'' if len(one.found) == 1 else 's'}"
     write(out, (2, 15), f"frame {one.frame}", _TEXT)
@@ -106,7 +108,7 @@ def _tile(one: _Kept, width: int, height: int) -> Pixels:
         major = float(one.found.major_px[i]) if np.isfinite(one.found.major_px[i]) else 1.0
         radius = max(3.5 * major * scale, 5.0 if small else 8.0)
         canvas.ring(uv, radius, _RING)
-        if i < _NUMBERED:
+        if i in one.numbered:
             u, v = canvas.at(uv).tolist()
             canvas.label((u, v), radius + 2, str(i + 1), 10.0 if small else _TEXT, _RING, taken)
     left, top = (width - size[0]) // 2, _STRIP + (height - size[1]) // 2
@@ -282,8 +284,9 @@ def _sheet(sheet: ContactSheet) -> Section:
         f'<img src="{svg.image_uri(sheet.drawn(), "jpeg")}" alt="contact sheet: pictures with the spots found in them">'
     )
     caption = (
-        "Evenly spaced pictures with stretched grey values. Rings: detected spots, numbered by brightness, in the order"
-        " of the rows of a frame in detections.csv. Without compression loss: contact-sheet.png."
+        "Evenly spaced pictures with stretched grey values. Rings: detected spots. The number is that of the row of"
+        f" the frame in detections.csv, which are in the order of brightness; the {_NUMBERED} spots most like a laser's"
+        " have one. Without compression loss: contact-sheet.png."
     )
     return Section("Contact sheet", (), [PageDrawing(picture, caption, wide=True)])
 

@@ -71,6 +71,13 @@ class CameraNoise:
                 )
 
     @property
+    def grain(self) -> float:
+        """`misfit_share` of the lights; in front of a background that of those that move. nan: not known."""
+        if self.background is not None:
+            return self.background.misfit_share
+        return float("nan") if self.estimate is None else self.estimate.texture_shift.misfit_share
+
+    @property
     def shows_structure(self) -> bool:
         """Whether the pictures show texture or objects that hide spots, from which a background may free them."""
         return self.model is not None and is_limited_by_texture(self.model)
@@ -212,7 +219,7 @@ def share_texture(cameras: Sequence[CameraNoise]) -> None:
     this such errors would be taken for noise. Of several textures the finest is taken, of several grains the coarsest.
     """
     estimates = [c.estimate for c in cameras if c.estimate is not None]
-    grains = [e.texture_shift.misfit_share for e in estimates if np.isfinite(e.texture_shift.misfit_share)]
+    grains = [c.grain for c in cameras if np.isfinite(c.grain)]
     for camera in cameras:
         if camera.estimate is not None and grains and not np.isfinite(camera.estimate.texture_shift.misfit_share):
             shift = replace(camera.estimate.texture_shift, misfit_share=max(grains))

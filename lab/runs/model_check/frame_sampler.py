@@ -11,6 +11,7 @@ from calibration.model_check.linearised_frames import ModelCheckRecording
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from lab.runs.frames.even_sampler import EvenSampler
+from lab.runs.frames.pipeline import FrameRecord
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.statuses import PoseStatus, TrackedFrame
@@ -73,6 +74,7 @@ class FrameSampler:
     """Keeps evenly spaced blocks of consecutive frames."""
 
     most: int = MOST_KEPT
+    with_predicted: bool = False  # whether poses are kept that are not measured
     _sampler: EvenSampler[SampledFrame] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -101,7 +103,8 @@ class FrameSampler:
             predicted_cov_px2 = predicted_cov_px2 + tracked.cov_px2 - stated_cov_px2
         cov_px2 = tracked.cov_px2 if stated_cov_px2 is None else stated_cov_px2
         # A predicted pose may be far from the frame's spots without any fault of the rig.
-        pose = tracked.pose if tracked.pose_status is PoseStatus.MEASURED else None
+        usable = self.with_predicted or tracked.pose_status is PoseStatus.MEASURED
+        pose = tracked.pose if usable else None
         shift = tracked.shift_px
         predicted_px = tracked.predicted_px if shift is None else tracked.predicted_px - shift
         self.add(
@@ -110,6 +113,13 @@ class FrameSampler:
                 tracked.pose_covariance, width_px,
             )
         )  # fmt: skip
+
+    def add_record(self, record: FrameRecord, camera_of: Ints, parameters: TrackerParameters) -> None:
+        """Add the next frame of a run, with the covariances that its detections state; arguments as there."""
+        tracked, found = record.tracked, record.detections
+        stated = stated_covariances(tracked, found, camera_of, parameters)
+        width = widths(tracked, found, camera_of)
+        self.add_tracked(record.t_s, tracked, tracked.predicted_cov_px2, stated, width)
 
     def recording(self) -> ModelCheckRecording | None:
         """The sampled frames; None where no frame was added."""

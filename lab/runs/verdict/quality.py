@@ -36,6 +36,7 @@ LONG_EMPTY = (
 )
 MOST_WRONG = 0.005  # share of the measured poses beyond 10 sigmas from the truth, up to which the run does not fail
 LEAST_DISPLACED = 5  # frames in which none of a camera's spots fits the others' pose, from which on it is reported
+_SET_UP = "BP-M06"  # a mistake in the files that describe the set-up
 _FEW_FOUND = 0.2  # measured share of the expected spots, below which a mostly empty camera is reported
 
 
@@ -53,12 +54,15 @@ def judge(
     """
     if statistics.frames == 0:
         return _of([finding("BP-V01", Level.FAIL, "there is no frame at all")])
-    found = _measured(statistics)
+    given = [replace(f, what=f"{f.what}; {clause(f.why)}", why="") for f in findings if f.level > Level.PASS]
+    # A mistake of the set-up explains why nothing was found, or why the prior does not fit: it comes first.
+    found = [f for f in given if f.code == _SET_UP]
+    found += _measured(statistics)
     if statistics.measured:
         found += _cameras(statistics)
     if noise_scale is not None:
         found += _noise_scale(noise_scale)
-    found += [replace(f, what=f"{f.what}; {clause(f.why)}", why="") for f in findings if f.level > Level.PASS]
+    found += [f for f in given if f.code != _SET_UP]
     found += _mosaics(mosaics)
     found += _interruptions(statistics)
     if found:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import pickle
-import signal
 import subprocess
 import sys
 import threading
@@ -49,6 +48,11 @@ class BackgroundProcess:
             self._process.kill()
             self._process.wait()
 
+    def start(self) -> None:
+        """Start the process, so that it does not load the program while the first background is waited for."""
+        with self._lock, suppress(OSError):
+            self._started()
+
     def call(self, function: Callable[..., Any], *given: Any) -> Any:
         """The function's result. Raises one of ENDED where the process has been ended, or killed."""
         with self._lock:
@@ -62,8 +66,12 @@ class BackgroundProcess:
         if self._ended:
             raise OSError("the watch has ended")
         if self._process is None or self._process.poll() is not None:
-            # Not multiprocessing, which would run the program's main module again.
-            program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve()"
+            # Not multiprocessing, which would run the program's main module again. The imports take a second of a core.
+            program = (
+                "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN);"  # Ctrl-C: the watch decides
+                f" hasattr(os, 'nice') and os.nice({_NICE}); sys.path[:] = {sys.path!r};"
+                f" from {__name__} import serve; serve()"
+            )
             piped = subprocess.PIPE
             self._process = subprocess.Popen([sys.executable, "-c", program], stdin=piped, stdout=piped)
         return self._process.stdin, self._process.stdout
@@ -71,9 +79,6 @@ class BackgroundProcess:
 
 def serve() -> None:
     """Call what comes from standard input until it ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches this process, too; the watch decides
-    if hasattr(os, "nice"):
-        os.nice(_NICE)
     search_rarely()
     out = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # for whatever prints

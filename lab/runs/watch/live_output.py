@@ -1,26 +1,23 @@
-"""Live output of a watched run: a row of attitude_live.csv and a JSON line by UDP per frame, and their latency."""
+"""Live output of a watched run: a row of attitude_live.csv per frame, and what streams send of it; their latency."""
 
 from __future__ import annotations
 
-import json
 import shutil
-import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 
-from lab.errors import InputError
 from lab.files.text import columns
 from lab.files.text.atomic_write import replacement_within
-from lab.files.text.json_text import plain_value
 from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.tables import attitude_rows, pose_numbers
 from lab.runs.verdict.frame_checks import FrameChecks
 from lab.runs.watch.live_frames import LiveFrames
+from lab.runs.watch.streams import Stream
 from tracking.statuses import PoseStatus
 
 if TYPE_CHECKING:
@@ -29,40 +26,6 @@ if TYPE_CHECKING:
 LIVE_TABLE = "attitude_live.csv"
 _LINE_S = 1.0  # between two lines of status
 _LATE_MS = 1000.0  # latency of the last pose above which the watch has not kept up
-
-
-@dataclass(slots=True)
-class UdpLines:
-    """Sends text to one address, whether or not there is a listener."""
-
-    address: str  # HOST:PORT
-    failures: int = 0
-    _socket: socket.socket = field(init=False)
-    _to: Any = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Raises InputError if the address is invalid."""
-        host, colon, port = self.address.rpartition(":")
-        if not (colon and host and port.isascii() and port.isdigit() and 0 < int(port) < 65536):
-            raise InputError(f"--udp: expected HOST:PORT, such as 127.0.0.1:5005, got {self.address!r}")
-        try:
-            found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_DGRAM)
-        except OSError as error:
-            raise InputError(f"--udp: the host {host!r} is unknown: {error.strerror}") from None
-        family, kind, protocol, _, self._to = found[0]
-        self._socket = socket.socket(family, kind, protocol)
-        self._socket.setblocking(False)
-
-    def send(self, line: str) -> None:
-        """Send a line. A failure is counted and raises no error."""
-        try:
-            self._socket.sendto(line.encode("utf-8"), self._to)
-        except OSError:
-            self.failures += 1
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
 
 
 @dataclass(slots=True)
@@ -113,7 +76,7 @@ class LiveOutput:
     out: Path
     frames: LiveFrames
     checks: FrameChecks
-    udp: UdpLines | None = None
+    streams: Sequence[Stream] = ()
     board: Board | None = None
     line: Callable[[str], None] | None = None  # called with a line of status every second
     latency: Latency = field(default_factory=Latency)
@@ -134,8 +97,10 @@ class LiveOutput:
         latency_ms = None if arrived_s is None else max(1e3 * (time.time() - arrived_s), 0.0)
         if latency_ms is not None:
             (self.latency.steady if self.frames.caught_up else self.latency.start).append(latency_ms)
-        if self.udp is not None:
-            self.udp.send(json_line(checked, latency_ms))
+        if self.streams:
+            content = frame_content(checked, latency_ms)
+            for stream in self.streams:
+                stream.send(content)
         if self.board is not None:
             self.board.add(checked, latency_ms)
         if self.line is not None:
@@ -163,22 +128,22 @@ class LiveOutput:
             self._file.seek(0)
             with (work / LIVE_TABLE).open("w", encoding="utf-8", newline="") as copy:
                 shutil.copyfileobj(self._file, copy)
+        sent = [{"kind": s.kind, "to": s.address, "not_sent": s.failures} for s in self.streams]
         return {
             "live": {
                 "latency_ms": self.latency.as_mapping(),
                 "notes": self.frames.notes,
                 "idle_s": self.frames.options.idle_s,
                 "timeout_s": self.frames.options.timeout_s,
-                "udp": None if self.udp is None else {"to": self.udp.address, "not_sent": self.udp.failures},
+                "udp": next((s for s in sent if s["kind"] == "udp"), None),
+                "streams": sent,
             }
         }
 
     def close(self) -> None:
-        """Close the file and the socket."""
+        """Close the file. The streams belong to the caller."""
         if self._file is not None:
             self._file.close()
-        if self.udp is not None:
-            self.udp.close()
 
     def _opened(self) -> TextIO:
         """Open the live table in its own folder, which replaces earlier results."""
@@ -188,8 +153,8 @@ class LiveOutput:
         return file
 
 
-def json_line(record: FrameRecord, latency_ms: float | None) -> str:
-    """One frame as a line of JSON. Units are in the names; unknown values are null."""
+def frame_content(record: FrameRecord, latency_ms: float | None) -> dict[str, Any]:
+    """One frame for streams. Units are in the names; unknown values are None."""
     t = record.tracked
     content: dict[str, Any] = {"frame": record.frame, "t_s": record.t_s, "status": t.pose_status.value}
     names = ("position_m", "quaternion_wxyz", "yaw_pitch_roll_deg", "sigma_position_m", "sigma_yaw_pitch_roll_deg")
@@ -200,7 +165,7 @@ def json_line(record: FrameRecord, latency_ms: float | None) -> str:
         parts = (numbers[0:3], numbers[3:7], numbers[7:10], numbers[10:13], numbers[13:16])
         content |= dict(zip(names, parts, strict=True))
     content |= {"spots_used": t.spots_used, "latency_ms": latency_ms}
-    return json.dumps(plain_value(content), allow_nan=False) + "\n"
+    return content
 
 
 def is_live_table(folder: Path) -> bool:

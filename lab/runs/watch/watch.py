@@ -8,7 +8,7 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -33,7 +33,8 @@ from lab.runs.verdict.frame_checks import FrameChecks
 from lab.runs.verdict.run_statistics import RunStatistics
 from lab.runs.watch.background import BackgroundProcess, LiveBackground
 from lab.runs.watch.live_frames import LiveFrames, WatchOptions
-from lab.runs.watch.live_output import LiveOutput, UdpLines, is_live_table
+from lab.runs.watch.live_output import LiveOutput, is_live_table
+from lab.runs.watch.streams import opened
 from tracking.background.estimation import PICTURES, static_background
 from tracking.detections import Detections
 
@@ -49,6 +50,7 @@ def watch_run(
     out: Path,
     *,
     udp: str | None = None,
+    streams: Sequence[str] = (),
     page: str | None = None,
     reprocess: bool = False,
     line: Callable[[str], None] | None = None,
@@ -61,13 +63,14 @@ def watch_run(
     """Process a run folder whose cameras are folders that are being filled, or devices.
 
     During the recording `out` contains attitude_live.csv: a row per frame by the causal tracker, flushed at once. udp:
-    HOST:PORT that receives the same as a line of JSON. page: PORT or HOST:PORT of the page that shows it meanwhile.
-    line: called with a line of status every second. The recording ends when nothing has come for `options.idle_s`,
-    when all devices have ended, or when `stop` is set; then `out` receives the results of `beampose run`, computed from
-    the received detections. These differ from those of a run by the pictures that the noise and the static background
-    are estimated from (here each camera's first ones; of the background, those before each picture) and by pictures
-    that came too late. reprocess: computes the results from the finished
-    folders instead, as `beampose run` does, which takes longer. provenance: added to summary.json, such as the command.
+    HOST:PORT that receives the same as a line of JSON. streams: further receivers, `KIND:ADDRESS`. page: PORT or
+    HOST:PORT of the page that shows it meanwhile. line: called with a line of status every second. The recording ends
+    when nothing has come for `options.idle_s`, when all devices have ended, or when `stop` is set; then `out` receives
+    the results of `beampose run`, computed from the received detections. These differ from those of a run by the
+    pictures that the noise and the static background are estimated from (here each camera's first ones; of the
+    background, those before each picture) and by pictures that came too late. reprocess: computes the results from the
+    finished folders instead, as `beampose run` does, which takes longer. provenance: added to summary.json, such as the
+    command.
 
     Raises:
         BeamposeError: the run cannot be watched, or no picture came.
@@ -80,10 +83,10 @@ def watch_run(
         )
     with contextlib.ExitStack() as stack:
         work = stack.enter_context(atomic_folder(out, may_replace=lambda p: are_results(p) or is_live_table(p)))
-        sender = None if udp is None else UdpLines(udp)
+        sending = stack.enter_context(opened(udp, streams, run.frame_rate_hz))
         frames = LiveFrames(run, options, stop or threading.Event())
         board = None if page is None else _served(run, frames, page, stack, line)
-        output = LiveOutput(Path(out), frames, FrameChecks(run.rig, run.covariance), sender, board, line)
+        output = LiveOutput(Path(out), frames, FrameChecks(run.rig, run.covariance), sending, board, line)
         stack.callback(output.close)
         with frames, _low_latency():
             pipeline, finders = _started(run, frames, output, stack.enter_context(BackgroundProcess()))
@@ -131,6 +134,8 @@ def _started(
     noise = {name: CameraNoise(name, camera.noise) for name, camera in run.rig.cameras.items()}
     with ThreadPoolExecutor(max(len(first), 1)) as pool:  # in parallel, since pictures queue up meanwhile
         list(pool.map(lambda name: noise[name].estimate_from(first[name]), first))
+    if any(own.shows_structure for own in noise.values()):
+        process.start()
     pipeline = Pipeline(run, frames, tracker_of(run), noise, output.write)
     detect, make = run.tracker.detect, partial(process.call, static_background)
     board = output.board

@@ -14,7 +14,7 @@ from calibration.least_squares.adjustment import AdjustmentError
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_uncertainty import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed_rig
 from lab.calibrate.beams.beam_findings import beam_findings
 from lab.findings.finding import Level
 from lab.simulate.rigs import RIGS
@@ -30,7 +30,6 @@ from tests.calibration.beams.bench import (
     recorded,
     unknown_place,
 )
-from tests.geometry.perturbed_rig import perturbed
 
 
 @pytest.mark.parametrize("name", RIGS)
@@ -228,7 +227,7 @@ def simulated(seed: int, known: str):
     pose_sigmas = np.array([2e-4] * 3 + [20 * ARCSEC] * 3)
     read = poses.plus(rng.normal(size=(40, 6)) * pose_sigmas)
     knowledge = rig_errors(np.random.default_rng(0), mounted)
-    assumed = perturbed(
+    assumed = perturbed_rig(
         mounted, knowledge.names, -rng.multivariate_normal(np.zeros(len(knowledge.names)), knowledge.matrix)
     )
     stand_sigmas = np.array([3e-4] * 3 + [30 * ARCSEC] * 3)

@@ -13,8 +13,8 @@ from geometry import rotations
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
+from geometry.uncertainty.rig_uncertainty import perturbed_rig
 from lab.simulate.scene import Scene, compose
-from tests.geometry.perturbed_rig import perturbed
 
 SCENES = ("smooth", "sharp-turns", "huo2015", "two-cameras-per-screen", "four-skew-beams")
 NOISE_PX = 0.1
@@ -36,7 +36,7 @@ def turned(camera: str, angle_deg: float, axis: int) -> Change:
 
 def changed(name: str, by: float) -> Change:
     """One parameter of the rig changed, by its name in geometry.uncertainty.rig_uncertainty."""
-    return lambda rig: perturbed(rig, [name], np.array([by]))
+    return lambda rig: perturbed_rig(rig, [name], np.array([by]))
 
 
 @cache

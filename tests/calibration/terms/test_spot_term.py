@@ -11,8 +11,7 @@ from geometry.arrays import numeric_jacobian
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names
-from tests.geometry.perturbed_rig import perturbed
+from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed_rig, rig_names
 from tests.geometry.scenes import random_pose, random_rig
 
 POSITIONS = 4
@@ -24,7 +23,7 @@ def scene(seed: int, bent: bool = True) -> tuple[Rig, dict, SpotPixels]:
     rig = random_rig(rng)
     if bent:
         names = [f"screens.{s}.bow_{k}_per_m" for s in rig.screens for k in ("xx", "xy", "yy")]
-        rig = perturbed(rig, names, rng.normal(0, 0.01, len(names)))
+        rig = perturbed_rig(rig, names, rng.normal(0, 0.01, len(names)))
     world_from_stand = random_pose(rng, 0.1)
     world_from_body = [random_pose(rng, 0.1, 0.1) for _ in range(POSITIONS)]
     poses = Poses.of([world_from_stand.inverse() @ p for p in world_from_body])
@@ -101,7 +100,7 @@ def test_errors_of_stacks_equal_errors_of_the_named_numbers():
         step[i] = delta[start : start + values[s].dof]
         start += values[s].dof
         changed[s] = changed[s].plus(step)
-    one, other = rig_of(rig, changed), perturbed(rig, names, T @ delta)
+    one, other = rig_of(rig, changed), perturbed_rig(rig, names, T @ delta)
     poses = random_pose(rng, 0.1, 0.1)
     before = SpotModel.of(rig).project(poses)[0]
     moves = SpotModel.of(other).project(poses)[0] - before

@@ -7,8 +7,7 @@ import numpy as np
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import PoseFit, fit_pose
-from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty, rig_names
-from tests.geometry.perturbed_rig import perturbed
+from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty, perturbed_rig, rig_names
 from tests.geometry.scenes import LENSES, paper_rig
 
 RIG = paper_rig(LENSES[5])
@@ -26,7 +25,7 @@ NOISE_PX = 0.05
 
 def drawn_fit(rng: np.random.Generator, rows: np.ndarray) -> tuple[PoseFit, np.ndarray]:
     """A fit to noisy spots of a rig with randomly drawn errors, and the true pixels of all views."""
-    true = SpotModel.of(perturbed(RIG, NAMES, SIGMAS * rng.normal(size=len(SIGMAS)))).project(POSE)[0]
+    true = SpotModel.of(perturbed_rig(RIG, NAMES, SIGMAS * rng.normal(size=len(SIGMAS)))).project(POSE)[0]
     uv = true[rows] + NOISE_PX * rng.normal(size=(len(rows), 2))
     C = np.tile(NOISE_PX**2 * np.eye(2), (len(rows), 1, 1))
     fit = fit_pose(MODEL, rows, uv, C, POSE, calibration=SPREAD)
@@ -71,7 +70,7 @@ def test_poses_from_wrongly_calibrated_rigs_scatter_as_the_covariance_predicts()
 
 def test_frames_of_one_rig_scatter_as_the_noise_part_predicts():
     rng = np.random.default_rng(3)
-    off = SpotModel.of(perturbed(RIG, NAMES, SIGMAS * rng.normal(size=len(SIGMAS))))
+    off = SpotModel.of(perturbed_rig(RIG, NAMES, SIGMAS * rng.normal(size=len(SIGMAS))))
     C = np.tile(NOISE_PX**2 * np.eye(2), (6, 1, 1))
     poses = []
     for _ in range(400):

@@ -15,10 +15,10 @@ from geometry.uncertainty.rig_uncertainty import (
     RigUncertainty,
     Sensitivity,
     is_known,
+    perturbed_rig,
     rig_names,
     split_name,
 )
-from tests.geometry.perturbed_rig import perturbed
 from tests.geometry.scenes import LENSES, paper_rig, random_pose, uncommon_rig
 
 seeds = st.integers(0, 2**32 - 1)
@@ -32,7 +32,9 @@ def test_every_derivative_equals_the_finite_difference(seed):
     names = rig_names(rig, bow=True)
     model = SpotModel.of(rig)
     found = Sensitivity(rig, model, names).of(model.derivatives(pose))
-    expected = numeric_jacobian(lambda q: SpotModel.of(perturbed(rig, names, q)).project(pose)[0], np.zeros(len(names)))
+    expected = numeric_jacobian(
+        lambda q: SpotModel.of(perturbed_rig(rig, names, q)).project(pose)[0], np.zeros(len(names))
+    )
     # Spots far outside the picture, where the distortion is largest, have derivatives of thousands of px.
     good = np.isfinite(model.project(pose)[0][:, 0])
     np.testing.assert_allclose(found[good], expected[good], rtol=2e-5, atol=2e-3)
@@ -64,7 +66,7 @@ def test_a_name_that_the_rig_does_not_have_is_refused(name):
     rig = paper_rig(LENSES[5])
     assert not is_known(rig, name)
     with pytest.raises(KeyError):
-        perturbed(rig, [name], np.ones(1))
+        perturbed_rig(rig, [name], np.ones(1))
     with pytest.raises(KeyError):
         Sensitivity(rig, SpotModel.of(rig), [name])
 
@@ -72,7 +74,7 @@ def test_a_name_that_the_rig_does_not_have_is_refused(name):
 def test_a_perturbation_of_zero_changes_nothing():
     rig = uncommon_rig(np.random.default_rng(4))
     names = rig_names(rig, bow=True)
-    same = SpotModel.of(perturbed(rig, names, np.zeros(len(names))))
+    same = SpotModel.of(perturbed_rig(rig, names, np.zeros(len(names))))
     model = SpotModel.of(rig)
     np.testing.assert_allclose(same.pinhole, model.pinhole, rtol=0)
     np.testing.assert_allclose(same.screen_rotation, model.screen_rotation, rtol=0)
@@ -87,7 +89,7 @@ def test_the_covariance_of_the_pixels_equals_the_scatter_over_drawn_rigs():
     A[[i for i, n in enumerate(names) if n.endswith((".fx", ".cy"))]] *= 3000
     spread = RigUncertainty(rig, SpotModel.of(rig), RigCovariance(names, A @ A.T)).at(pose)
     draws = [
-        SpotModel.of(perturbed(rig, names, A @ rng.normal(size=len(names)))).project(pose)[0].ravel()
+        SpotModel.of(perturbed_rig(rig, names, A @ rng.normal(size=len(names)))).project(pose)[0].ravel()
         for _ in range(1500)
     ]
     claimed, seen = np.sqrt(np.diagonal(spread)), np.std(draws, axis=0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import doctest
 import importlib
+import json
 import subprocess
 import sys
 
@@ -75,6 +76,17 @@ def test_frames_have_the_columns_and_numbers_of_the_files(processed):
                 np.testing.assert_array_equal(frame[column], read[column])
             else:
                 assert frame[column].tolist() == read[column].tolist()
+
+
+def test_name_frames_and_events_are_those_of_the_summary(processed):
+    summary = json.loads((processed.folder / "summary.json").read_text("utf-8"))
+    assert processed.name == summary["name"]
+    assert repr(processed).startswith(f"<Results of {summary['name']}: {summary['verdict']['status']}, 40 frames, ")
+    assert processed.frames.tolist() == list(range(40))
+    listed = summary["events"]
+    assert listed
+    assert processed.events["frame"].tolist() == [e["frame"] for e in listed]
+    assert processed.events["text"].tolist() == [e["text"] for e in listed]
 
 
 def test_arrays_agree_with_the_frames(processed):

@@ -12,10 +12,9 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.rotations import exp
-from geometry.uncertainty.rig_uncertainty import camera_names
+from geometry.uncertainty.rig_uncertainty import camera_names, perturbed_rig
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import Covariance, RigFile, save_rig
-from tests.geometry.perturbed_rig import perturbed
 from tests.geometry.scenes import LENSES, paper_rig
 
 DAY = datetime.date(2026, 5, 1)
@@ -43,7 +42,7 @@ def rig_and_covariance() -> tuple[Rig, Covariance]:
         for k, parameter in enumerate(own):
             step = np.zeros(len(own))
             step[k] = 1e-3 if parameter.endswith((".fx", ".fy", ".cx", ".cy")) else 1e-6
-            ends = [perturbed(rig, own, s * step).cameras[name].project(xyz).ravel() for s in (1, -1)]
+            ends = [perturbed_rig(rig, own, s * step).cameras[name].project(xyz).ravel() for s in (1, -1)]
             J[:, k] = (ends[0] - ends[1]) / (2 * step[k])
         names += own
         blocks.append(np.linalg.inv(J.T @ J / 0.15**2))
@@ -59,7 +58,7 @@ def rig_and_covariance() -> tuple[Rig, Covariance]:
 def true_rig(rig: Rig, covariance: Covariance, rng: np.random.Generator) -> Rig:
     """The true rig: it differs from the stored one by a random error with the stated covariance."""
     values, vectors = np.linalg.eigh(covariance.matrix)
-    return perturbed(
+    return perturbed_rig(
         rig, covariance.parameters, vectors @ (np.sqrt(np.maximum(values, 0)) * rng.normal(size=len(values)))
     )
 

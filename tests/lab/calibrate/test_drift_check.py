@@ -16,7 +16,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.rotations import exp
-from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names
+from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed_rig, rig_names
 from lab.calibrate.drift_check.drift_check import COLUMNS, DriftLimits, check_drift
 from lab.calibrate.drift_check.drift_comparison import compare_points, read_history
 from lab.calibrate.drift_check.drift_inputs import DriftInputs, read_points
@@ -24,7 +24,6 @@ from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import joint_covariance
 from lab.findings.finding import Level
-from tests.geometry.perturbed_rig import perturbed
 from tests.lab.calibrate import drift_scenes as scenes
 
 RIG, COVARIANCE = scenes.rig_and_covariance()
@@ -74,14 +73,14 @@ def test_a_camera_turned_by_a_twentieth_of_a_degree_must_not_be_used(tmp_path, o
 
 
 def test_a_changed_focus_is_distinguished_from_a_rotation(tmp_path):
-    outcome = check(tmp_path, perturbed(TRUE, ["cameras.left.fx", "cameras.left.fy"], np.array([4.0, 4.0])))
+    outcome = check(tmp_path, perturbed_rig(TRUE, ["cameras.left.fx", "cameras.left.fy"], np.array([4.0, 4.0])))
     assert of(outcome, "left").change.kind == ZOOMED
     assert outcome.exit_status == 3
     assert any("focus or zoom changed" in f.what for f in outcome.findings)
 
 
 def test_a_camera_that_shifted_by_a_centimetre_must_not_be_used(tmp_path):
-    outcome = check(tmp_path, perturbed(TRUE, ["cameras.right.x_m"], np.array([0.01])))
+    outcome = check(tmp_path, perturbed_rig(TRUE, ["cameras.right.x_m"], np.array([0.01])))
     right = of(outcome, "right")
     assert outcome.exit_status == 3
     assert right.drift_mm == pytest.approx(10.0, abs=1.0)
@@ -205,7 +204,7 @@ def test_a_vehicle_at_a_known_pose_finds_a_turned_camera(tmp_path):
 def test_a_vehicle_at_rest_finds_a_laser_that_moved(tmp_path):
     names = ["beams.A.direction_y", "beams.A.direction_z"]
     for with_pose in (True, False):
-        outcome = still(tmp_path, perturbed(TRUE, names, np.array([1e-3, 1e-3])), with_pose)
+        outcome = still(tmp_path, perturbed_rig(TRUE, names, np.array([1e-3, 1e-3])), with_pose)
         assert any("laser A has moved" in f.what for f in outcome.findings)
         assert all(c.change is None for c in outcome.result.cameras)
 
@@ -427,7 +426,7 @@ def test_the_sigma_of_the_prediction_agrees_with_numeric_derivatives(tmp_path, o
     mine = [i for i, c in enumerate(known.camera) if c == "left"]
 
     def predicted(delta: np.ndarray) -> np.ndarray:
-        lab = perturbed(rig, names, delta)
+        lab = perturbed_rig(rig, names, delta)
         screen, out = lab.screens["left"], []
         for i in mine:
             x, y, z = known.xyz[i]

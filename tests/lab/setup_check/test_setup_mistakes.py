@@ -133,6 +133,8 @@ def test_a_mistake_fails_the_run_and_is_its_only_explanation(recording, tmp_path
     assert outcome.exit_status == 4
     codes = [r.as_mapping()["code"] for r in outcome.verdict.findings]
     assert codes.count("BP-M06") == 1
+    assert codes[0] == "BP-M06"  # before what follows from it, such as an ambiguous first frame
+    assert outcome.verdict.findings[0].remedy.split(". ")[0].rstrip(".") in outcome.line()
     assert "BP-M01" not in codes  # the deviations of a rig with a mistake are its consequences
 
 

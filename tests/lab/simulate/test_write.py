@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
+from geometry.uncertainty.rig_uncertainty import perturbed_rig
 from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig, save_rig
 from lab.files.run.detections_file import read_detections
@@ -18,7 +19,6 @@ from lab.simulate.points import simulate_points
 from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter, Light, Occlusion
 from lab.simulate.scene import compose
 from lab.simulate.write import simulate
-from tests.geometry.perturbed_rig import perturbed
 
 SMALL = {"picture_scale": 0.25}
 
@@ -234,7 +234,7 @@ def test_the_run_folder_of_a_given_rig_contains_its_calibration(tmp_path):
     """The spots are those of the true rig; the run folder contains its calibration."""
     true = simulate("clean", tmp_path / "first", seed=1, frames=2, detections_only=True) / "rig.yaml"
     rig = load_rig(true)
-    off = perturbed(rig, ["cameras.left.fx", "beams.A.direction_y"], np.array([3.0, 1e-3]))
+    off = perturbed_rig(rig, ["cameras.left.fx", "beams.A.direction_y"], np.array([3.0, 1e-3]))
     save_rig(off, tmp_path / "true.yaml")
     folder = simulate(
         "clean", tmp_path / "run", seed=1, frames=4, detections_only=True, noise_px=0.0, clutter=0.0,

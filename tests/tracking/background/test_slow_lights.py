@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -109,3 +110,26 @@ def test_a_spot_that_rests_beside_an_edge_is_found_although_nothing_moves(away_p
     gap, sigma = errors(found_in_all(board_pictures(paths, 2.0, 0.3, 5)), paths)
     assert gap.max() < 0.5
     assert (gap / sigma).max() < 4.0
+
+
+def test_lights_at_rest_state_errors_by_print_of_their_own_size_and_none_on_even_paper():
+    """The print, not the lights, has misfits: they are no grain of the light. A fit takes up print under a light."""
+    rng = np.random.default_rng(6)
+    paper = np.full(SIZE, 60, np.uint8)
+    for row in range(20, SIZE[0], 16):
+        cv2.putText(paper, "beams on a wall", (6, row), cv2.FONT_HERSHEY_SIMPLEX, 0.45, 15, 1, cv2.LINE_AA)
+    page = cv2.GaussianBlur(paper, (0, 0), 0.7).astype(float)
+    at = np.array([[x, y] for y in range(30, 300, 50) for x in (20, 60, 100, 180, 260, 340)])
+    at = at + rng.uniform(-5, 5, at.shape)
+    light = sum(60.0 * np.exp(-0.5 * ((X - u) ** 2 + (Y - v) ** 2) / 1.6**2) for u, v in at)
+    expected = page + (1 - 0.4 * (1 - page / 60)) * light
+    pictures = [np.rint(expected + NOISE * rng.standard_normal(SIZE)).astype(np.uint8) for _ in range(15)]
+    found = found_in_all(pictures)
+    gap, sigma = errors(found, np.broadcast_to(at, (15, *at.shape)))
+    even = at[:, 0] > 150
+    assert 0.5 < np.sqrt(np.mean((gap[:, even] / sigma[:, even]) ** 2) / 2) < 1.25
+    assert sigma[:, even].max() < 0.06
+    near = gap[:, ~even] < 3.2  # found
+    assert np.mean(near) > 0.7
+    assert np.sqrt(np.mean((gap[:, ~even][near] / sigma[:, ~even][near]) ** 2) / 2) < 1.5
+    assert (gap[:, ~even][near] / sigma[:, ~even][near]).max() < 5.0

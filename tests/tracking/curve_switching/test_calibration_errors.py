@@ -8,9 +8,8 @@ import pytest
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
-from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names, split_name
+from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed_rig, rig_names, split_name
 from lab.simulate.points import PointRun, simulate_points
-from tests.geometry.perturbed_rig import perturbed
 from tests.tracking.rigid_runs import Pooled, assess, smoothed_frames, tracked
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.parameters import TrackerParameters
@@ -41,7 +40,9 @@ def covariance_of(rig: Rig, scale: float = 1.0) -> RigCovariance:
 
 def drawn(rig: Rig, covariance: RigCovariance, rng: np.random.Generator) -> Rig:
     values, vectors = np.linalg.eigh(covariance.matrix)
-    return perturbed(rig, covariance.names, vectors @ (np.sqrt(np.maximum(values, 0)) * rng.normal(size=len(values))))
+    return perturbed_rig(
+        rig, covariance.names, vectors @ (np.sqrt(np.maximum(values, 0)) * rng.normal(size=len(values)))
+    )
 
 
 def track(run: PointRun, rig: Rig, covariance: RigCovariance | None) -> list[TrackedFrame]:

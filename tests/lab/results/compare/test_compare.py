@@ -89,6 +89,8 @@ def test_a_tum_file_gives_clocks_frames_tables_and_report(folder, result, motion
     rms = np.sqrt(np.mean([float(r["dx_m"]) ** 2 for r in rows if r["dx_m"]]))
     assert rms == pytest.approx(2.2e-4, rel=0.15)  # both sigmas together
     summary = json.loads((out / "comparison.json").read_text())
+    assert outcome.lines[0].startswith("PASS: the differences agree with the stated uncertainties: chi-square")
+    assert summary["verdict"]["status"] == "pass"
     assert summary["chi_square"]["per_degree_of_freedom"] == pytest.approx(0.97, abs=0.1)
     np.testing.assert_allclose(summary["alignment"]["lever_m"], SIMPLE.lever_m, atol=5e-4)
     page = (out / "report.html").read_text()
@@ -166,6 +168,20 @@ def test_a_reference_of_another_motion_is_reported_as_not_fitting(folder, result
     path = write_tum(folder / "wrong.tum", Motion(t, R, p, np.zeros((len(t), 6, 6))))
     outcome = compare_and_write(result, None, path, None)
     assert any("The recordings do not fit" in line for line in outcome.lines)
+    assert outcome.lines[0].startswith("CHECK: ")
+
+
+def test_a_reference_with_sigmas_that_are_too_small_is_a_check_with_a_remedy(folder, result, motions):
+    noise = 1e-3 * np.random.default_rng(4).normal(size=motions[1].position_m.shape)
+    path = write_tum(folder / "noisy.tum", replace(motions[1], position_m=motions[1].position_m + noise))
+    out = folder / "too-sure"
+    outcome = compare_and_write(result, None, path, out, sigma_m=1e-4, sigma_deg=np.rad2deg(5e-5))
+    assert outcome.lines[0].startswith("CHECK: the differences are larger than the stated uncertainties: chi-square")
+    assert "--sigma-m" in outcome.lines[0]
+    assert json.loads((out / "comparison.json").read_text())["verdict"]["evidence"][0]["code"] == "BP-X01"
+    page = (out / "report.html").read_text()
+    assert "Remedy:" in page
+    assert "BP-X01" in page
 
 
 def test_stated_sigmas_of_angles_become_the_covariance_of_the_body(folder):

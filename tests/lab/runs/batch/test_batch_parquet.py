@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import builtins
+import importlib
 
 import pandas as pd
 import pytest
@@ -43,14 +43,8 @@ def test_a_run_without_results_any_more_leaves_the_data_sets_and_the_others_are_
 
 
 def test_a_missing_package_is_reported_before_the_work(tmp_path, monkeypatch):
-    original = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name.split(".")[0] == "pyarrow":
-            raise ImportError(name)
-        return original(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(InputError, match="pip install pyarrow"):
+    real = importlib.import_module
+    monkeypatch.setattr(importlib, "import_module", lambda name, *a: real("no_such" if name == "pyarrow" else name, *a))
+    with pytest.raises(InputError, match=r"--parquet: .*pyarrow.*pip install 'beampose\[parquet\]'"):
         process_batch([tmp_path / "a"], tmp_path / "out", PARQUET)
     assert not (tmp_path / "out").exists()

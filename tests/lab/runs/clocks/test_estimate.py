@@ -12,7 +12,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from cli import main
+from lab.files.run.results import read_poses
 from lab.pictures.picture_file import DROPPED, MissingPicture
+from lab.results.certificate import CLOCKS, certificate
 from lab.runs.frames.clocked_frames import FoundPoints
 from lab.simulate.write import simulate
 from tracking.detections import Detections
@@ -97,6 +99,18 @@ def test_the_report_states_the_numbers_and_the_tables_have_the_estimated_instant
     with (estimated / "detections.csv").open(newline="") as file:
         late = {int(r["frame"]): float(r["t_s"]) for r in csv.DictReader(file) if r["camera"] == "right"}
     np.testing.assert_allclose([late[k] - k / 100 for k in late], offset, atol=1e-9)
+
+
+def test_the_certificate_has_a_line_for_the_clocks_and_adds_up_to_the_covariance(estimated):
+    poses = read_poses(estimated)
+    frames = certificate(estimated, at=poses.frames[poses.has("measured")].tolist(), draws=0).frames
+    rows = np.searchsorted(poses.frames, [frame.frame for frame in frames])
+    stated = np.sqrt(np.diagonal(poses.covariance, axis1=1, axis2=2)[rows, :3])
+    np.testing.assert_allclose([f.result.combined[:3] for f in frames], stated, rtol=1e-6)
+    np.testing.assert_allclose([f.result.combined[3:] for f in frames], poses.sigma_ypr_deg[rows], rtol=1e-6)
+    clocks = np.array([f.variances[f.lines.index(CLOCKS)] for f in frames])
+    assert np.all(clocks.max(axis=0) > 0)
+    assert min(f.variances.min() for f in frames) >= 0
 
 
 def test_at_rest_the_prior_stays_and_a_finding_says_so(rest, tmp_path):

@@ -238,7 +238,7 @@ def test_the_report_is_one_file_that_needs_no_network(tmp_path):
 def test_a_contact_sheet_shows_pictures_from_the_first_to_the_last(pictures, shown):
     sheet = ContactSheet(pictures)
     for k in range(pictures):
-        sheet.offer(k, k, np.zeros((3, 4), np.uint8), Detections.none())
+        sheet.offer(k, k, np.zeros((3, 4), np.uint8), Detections.none(), np.zeros(0))
     indices = sorted(sheet._kept)
     assert len(indices) == shown
     assert (indices[0], indices[-1]) == (0, pictures - 1)
@@ -248,7 +248,7 @@ def test_a_contact_sheet_shows_pictures_from_the_first_to_the_last(pictures, sho
 def test_a_contact_sheet_of_an_unknown_number_of_pictures_is_evenly_spaced():
     sheet = ContactSheet(None)
     for k in range(333):
-        sheet.offer(k, k, np.zeros((3, 4), np.uint8), Detections.none())
+        sheet.offer(k, k, np.zeros((3, 4), np.uint8), Detections.none(), np.zeros(0))
     indices = sorted(sheet._kept)
     assert MOST / 2 <= len(indices) <= MOST
     assert np.ptp(np.diff(indices)) == 0
@@ -257,7 +257,7 @@ def test_a_contact_sheet_of_an_unknown_number_of_pictures_is_evenly_spaced():
 def test_a_contact_sheet_has_rings_around_the_spots():
     sheet = ContactSheet(1)
     found = Detections(np.array([[100.0, 50.0]]), np.eye(2)[None], *(np.array([x]) for x in (1.0, 1.0, 2.0, 2.0, 0.0)))
-    sheet.offer(0, 5, np.full((120, 160), 10, np.uint8), found)
+    sheet.offer(0, 5, np.full((120, 160), 10, np.uint8), found, np.ones(1))
     drawn = sheet.drawn().astype(int)
     coloured = np.argwhere(drawn.max(axis=-1) - drawn.min(axis=-1) > 100)
     scale = 8  # 1280 / 160
@@ -265,6 +265,22 @@ def test_a_contact_sheet_has_rings_around_the_spots():
     ring = coloured[np.abs(coloured - centre).max(axis=1) < 70]  # its number stands above it, to the right
     radius = 3.5 * 2 * scale
     assert (ring[:, 0].max(), ring[:, 1].min()) == pytest.approx((centre[0] + radius, centre[1] - radius), abs=3)
+
+
+def test_the_spots_most_like_a_laser_have_a_number_however_faint_they_are():
+    count = 60
+    place = np.stack([20.0 + 60 * (np.arange(count) % 20), 20.0 + 60 * (np.arange(count) // 20)], axis=-1)
+    found = Detections(
+        place, np.tile(np.eye(2), (count, 1, 1)), *(np.full(count, x) for x in (1.0, 1.0, 2.0, 2.0, 0.0))
+    )
+    sheets = []
+    for alike in (count - 1, 0):
+        sheet = ContactSheet(1)
+        sheet.offer(0, 0, np.full((200, 1280), 10, np.uint8), found, np.where(np.arange(count) == alike, 0.9, 0.1))
+        sheets.append(sheet.drawn().astype(int))
+    changed = np.argwhere(np.abs(sheets[0] - sheets[1]).max(axis=-1) > 50) - [8 + 22, 8]
+    beside = np.abs(changed - place[count - 1][::-1]).max(axis=1) < 40
+    assert beside.any()  # the faintest spot has a number in the first sheet and none in the second
 
 
 def test_the_signal_to_noise_ratio_is_that_of_a_matched_filter():

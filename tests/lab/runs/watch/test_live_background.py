@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from lab.runs.frames.sensor_noise import VIDEO_FRAMES, CameraNoise
 from lab.runs.watch.background import BackgroundProcess, LiveBackground
@@ -60,6 +64,23 @@ def test_a_process_makes_the_same_background_until_it_is_ended():
         made_elsewhere.add(picture)
     made_elsewhere.finish()
     assert others.background is kept
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="reads the process time of another process")
+def test_the_process_gives_way_to_the_watch_before_it_loads_the_program():
+    """Its imports take a second of a core, in which poses would be late."""
+    with BackgroundProcess() as process:
+        process.start()
+        assert process._process is not None
+        number = process._process.pid
+        for _ in range(2000):
+            low = os.getpriority(os.PRIO_PROCESS, number) > os.getpriority(os.PRIO_PROCESS, 0)
+            used = Path(f"/proc/{number}/stat").read_text("utf-8").rpartition(")")[2].split()
+            if low:
+                break
+            time.sleep(0.01)
+        assert low
+        assert (int(used[11]) + int(used[12])) / os.sysconf("SC_CLK_TCK") < 0.3
 
 
 def test_a_knocked_camera_gets_another_background():

@@ -1,0 +1,343 @@
+"""Refinement of a rig by recordings: its prior covariance and the spots of all frames, whose poses are free.
+
+The recordings determine some directions of the rig's parameters well and others not at all: a motion of the whole rig,
+or of all beams in the body, leaves no residual. What the rig file states decides those. All tests use the recordings
+without their poses (calibration/terms/recordings.py): y = X delta + noise of sigma 1, with the prior delta ~ N(m, C).
+Source: ours; priors in a bundle adjustment: Triggs et al. (2000), "Bundle adjustment: a modern synthesis", section 6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibration.changes import USUAL_SIZES, ExcessResidual
+from calibration.least_squares.adjustment import AdjustmentError, At, Prior, Values, solve
+from calibration.model_check.fault_identification import SuspectedFault, compressed, search_faults
+from calibration.model_check.faults import BEAM, CAMERA, LASER_MOVED, MOVED, SCREEN, TILTED, PossibleFault
+from calibration.model_check.linearised_frames import (
+    ModelCheckRecording,
+    correlation_time,
+    linearise,
+)
+from calibration.terms.recordings import STACKS, RecordingTerm, Reduced
+from calibration.terms.rig_blocks import BEAMS, CAMERAS, SCREENS, named_errors, names_at, prior_of, rig_of, stacks_of
+from geometry.arrays import Array, Bools, Ints, skew
+from geometry.forward_model import SpotModel
+from geometry.rig import Rig
+from geometry.uncertainty.chi_square import chi2_limit
+from geometry.uncertainty.rig_uncertainty import RigCovariance, covariance_root, unlimited
+
+FEWEST_FRAMES = 30  # of a recording: a shorter one is not used
+_FEWEST_AT_FIRST = 10  # of a first solution, which is for labels
+FEWEST_SPOTS = 4  # of a frame: three spots leave nothing that the pose does not absorb
+FOLDS = 5  # blocks of time of a single recording
+_P_OUTLIER = 1e-5  # probability that a correct spot is excluded
+_ROUNDS = 5  # of outliers and noise scales
+_CONVERGED = 0.02  # relative change of a noise scale in one round below which it has converged
+_LARGER = 3.0  # prior size of a change that the stated sigmas do not explain, in those sigmas
+
+
+@dataclass(frozen=True, slots=True)
+class Knowledge:
+    """What is known of p errors delta: a mean and a covariance L L^T."""
+
+    mean: Array  # (p,)
+    root: Array  # (p, r)
+
+    @property
+    def covariance(self) -> Array:
+        """(p, p)"""
+        return np.asarray(self.root @ self.root.T)
+
+    def with_data(self, data: Sequence[Reduced], changed: Bools | None = None) -> Knowledge:
+        """After some recordings.
+
+        changed (p,): the numbers that are changed; the others keep their mean and stay uncertain (Schmidt 1966,
+        "Application of state-space methods to navigation problems"). None: all.
+        """
+        S, g = normal_equations(data)
+        values, vectors = np.linalg.eigh(np.eye(self.root.shape[1]) + self.root.T @ S @ self.root)
+        root = self.root @ (vectors / np.sqrt(values))
+        step = root @ (root.T @ (g - S @ self.mean))
+        if changed is None or changed.all():
+            return Knowledge(self.mean + step, root)
+        gain = np.where(changed[:, None], root @ root.T, 0.0)
+        own = self.root - gain @ S @ self.root
+        return Knowledge(
+            self.mean + np.where(changed, step, 0.0), np.concatenate([own, gain @ compressed(S)[0].T], axis=1)
+        )
+
+    def excess(self, data: Sequence[Reduced]) -> tuple[ExcessResidual, Array, float]:
+        """What this does not explain of some recordings, the whitened X (q, p) that belongs to it, and ln p(data)."""
+        X, y = np.concatenate([d.X for d in data]), np.concatenate([d.y for d in data])
+        spread = X @ self.root
+        factor = np.linalg.cholesky(np.eye(len(y)) + spread @ spread.T)
+        white = np.linalg.solve(factor, y - X @ self.mean)
+        log_density = -0.5 * float(white @ white) - float(np.sum(np.log(np.diagonal(factor))))
+        return ExcessResidual.of_white(white), np.linalg.solve(factor, X), log_density
+
+
+def normal_equations(data: Sequence[Reduced]) -> tuple[Array, Array]:
+    """X^T X (p, p) and X^T y (p,) of some recordings."""
+    return sum(d.X.T @ d.X for d in data), sum(d.X.T @ d.y for d in data)  # type: ignore[return-value]
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """One recording, or block of time, against the rig as given and as refined from the others."""
+
+    chi2: tuple[float, float]  # of the residuals
+    dof: int
+    p: float  # p-value of the data with the refined rig and its covariance
+    log_density: tuple[float, float]  # of the data, with both rigs and their covariances
+
+    @property
+    def better(self) -> bool:
+        """Whether the refined rig predicts these data better."""
+        return self.log_density[1] > self.log_density[0] and self.chi2[1] <= self.chi2[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Refinement:
+    """A refined rig. Errors of its parameters (p,) are in the order of the unknowns `at`."""
+
+    given: Rig
+    rig: Rig
+    covariance: RigCovariance
+    at: tuple[At, ...]
+    values: Values
+    before: Knowledge  # of the errors of this result
+    after: Knowledge
+    recordings: tuple[ModelCheckRecording, ...]  # with the stated covariances, without outliers
+    data: tuple[Reduced, ...]  # of each recording, or block of time, with increased covariances
+    given_data: tuple[Reduced, ...]  # the same with the given rig
+    excluded: int  # spots
+    noise: Mapping[str, float]  # ratio of errors to stated sigmas, by camera; at least 1
+    correlation_frames: float  # number of frames that count as one
+    gain: Array  # (r,) information of the data over that of the prior, in principal directions; ascending
+    directions: Array  # (p, r) these directions, as errors of one prior sigma
+    p_change: float  # of the changes if the stated sigmas are right
+    moved: tuple[SuspectedFault, ...]  # parts that have changed by more than that
+    held_out: tuple[HeldOut, ...]
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """(p,): the part to which each unknown belongs, such as `cameras.left`."""
+        return tuple(
+            names_at(self.given, a)[0].rsplit(".", 1)[0] for a in self.at for _ in range(self.values[a[0]].dof)
+        )
+
+    @property
+    def shares(self) -> Array:
+        """(p, r): the share of each unknown in the squared length of each direction, in prior sigmas."""
+        sigma = np.sqrt(np.maximum(np.diagonal(self.before.covariance), 1e-300))
+        squares = (self.directions / sigma[:, None]) ** 2
+        return np.asarray(squares / squares.sum(axis=0))
+
+    @property
+    def conventions(self) -> int:
+        """Directions that no recording determines: the frames of world and body, where all their parts are free."""
+        world = all((s, i) in self.at for s in (CAMERAS, SCREENS) for i in range(len(self.values[s])))
+        body = all((BEAMS, i) in self.at for i in range(len(self.values[BEAMS])))
+        return 6 * world + 6 * body
+
+    def named_changes(self) -> dict[str, float]:
+        """The change of each number of the rig, by its name."""
+        old, new = stacks_of(self.given), stacks_of(self.rig)
+        steps = [new[s].pick(np.array([i])).minus(old[s].pick(np.array([i])))[0] for s, i in self.at]
+        names, T = named_errors(self.given, old, self.at)
+        return dict(zip(names, (T @ np.concatenate(steps)).tolist(), strict=True))
+
+    def of_data(self, i: int) -> ModelCheckRecording:
+        """The spots of `data[i]`."""
+        return self.recordings[i] if len(self.recordings) > 1 else _blocks(self.recordings[0])[i]
+
+
+def refine(
+    rig: Rig,
+    covariance: RigCovariance,
+    recordings: Sequence[ModelCheckRecording],
+    start: Refinement | None = None,
+    stacks: Collection[str] = STACKS,
+) -> Refinement:
+    """Refine a rig.
+
+    covariance: of the rig's parameters; all others are held. recordings: with the views of this rig. start: an earlier
+    result, of other labels of the same recordings. stacks: those that are changed; the others keep their values and
+    their uncertainty.
+
+    Raises:
+        AdjustmentError: the recordings have too few frames, or the adjustment does not converge.
+    """
+    prior, free = prior_of(rig, covariance)
+    if prior is None:
+        raise AdjustmentError("no parameter of the rig has a covariance")
+    values: Values = stacks_of(rig) if start is None else start.values
+    model = unlimited(SpotModel.of(rig_of(rig, values)))
+    fewest = FEWEST_FRAMES if start is not None else _FEWEST_AT_FIRST
+    stated = [r for r in (_usable(model, r) for r in recordings) if len(r.seen) >= fewest]
+    if not stated:
+        raise AdjustmentError(
+            f"no recording has {fewest} frames with {FEWEST_SPOTS} and more spots that determine a pose"
+        )
+    noise, excluded = np.ones(len(rig.cameras)), 0
+    for _ in range(_ROUNDS):
+        wider = noise[model.camera_of][:, None, None] ** 2
+        terms = [RecordingTerm(rig, replace(r, cov_px2=r.cov_px2 * wider), free) for r in stated]
+        values = solve(values, [prior, *terms], free).values
+        reduced = [t.reduced(values) for t in terms]
+        wrong = [_outliers(d) for d in reduced]
+        count = sum(int(w.sum()) for w in wrong)
+        excluded += count
+        stated = [replace(r, seen=r.seen & ~w) for r, w in zip(stated, wrong, strict=True)]
+        before, noise = noise, np.maximum(noise * _noise_of_cameras(model, reduced), 1.0)
+        if not count and np.all(np.abs(noise / before - 1) < _CONVERGED):
+            break
+    frames = _correlation(reduced)
+    blocks = stated if len(stated) > 1 else _blocks(stated[0])
+    wider = frames * noise[model.camera_of][:, None, None] ** 2
+    terms = [RecordingTerm(rig, replace(r, cov_px2=r.cov_px2 * wider), free) for r in blocks]
+    values = solve(values, [prior, *terms], free).values
+    data = [t.reduced(values) for t in terms]
+    known = Knowledge(_difference(prior, values), covariance_root(prior.covariance))
+    changed = np.concatenate([np.full(values[s].dof, s in stacks) for s, _ in prior.at])
+    after = known.with_data(data, changed)
+    given_data = [t.reduced(stacks_of(rig)) for t in terms]
+    S, _ = normal_equations(data)
+    gain, vectors = np.linalg.eigh(known.root.T @ S @ known.root)
+    excess, X, _ = known.excess(data)
+    names, T = named_errors(rig, values, prior.at)
+    matrix = T @ after.covariance @ T.T
+    named = np.diagonal(matrix) > 0
+    return Refinement(
+        given=rig,
+        rig=rig_of(rig, {s: v for s, v in values.items() if s in stacks}),
+        covariance=RigCovariance(tuple(np.array(names)[named].tolist()), matrix[np.ix_(named, named)]),
+        at=prior.at,
+        values=values,
+        before=known,
+        after=after,
+        recordings=tuple(stated),
+        data=tuple(data),
+        given_data=tuple(given_data),
+        excluded=excluded,
+        noise=dict(zip(rig.cameras, noise.tolist(), strict=True)),
+        correlation_frames=frames,
+        gain=np.maximum(gain, 0.0),
+        directions=known.root @ vectors,
+        p_change=excess.p_value,
+        moved=search_faults(excess, X, _parts(rig, values, prior, known))[0],
+        held_out=_held_out(known, data, given_data, changed),
+    )
+
+
+def _usable(model: SpotModel, recording: ModelCheckRecording) -> ModelCheckRecording:
+    """The frames of a recording that determine their poses and check their spots, without gross outliers."""
+    lin = linearise(model, recording, np.arange(len(recording.seen)))
+    rows = np.flatnonzero((lin.used.sum(axis=1) >= FEWEST_SPOTS) & (lin.rank == 6))
+    return replace(recording, seen=lin.used, poses=lin.poses).at(rows)
+
+
+def _blocks(recording: ModelCheckRecording) -> list[ModelCheckRecording]:
+    """A recording as blocks of time, each with the views of all."""
+    rows = np.arange(len(recording.seen))
+    return [recording.at(some) for some in np.array_split(rows, min(FOLDS, len(rows) // FEWEST_FRAMES) or 1)]
+
+
+def _outliers(d: Reduced) -> Bools:
+    """(K, n): the worst spot of each frame, if it is an outlier against the frame's other spots."""
+    weights = d.lin.inverse_redundancy()
+    z2 = np.nan_to_num(np.sum(d.left * (weights @ d.left[..., None])[..., 0], axis=-1))
+    worst = np.zeros_like(d.lin.used)
+    worst[np.arange(len(worst)), z2.argmax(axis=1)] = True
+    return np.asarray(worst & (z2 > chi2_limit(_P_OUTLIER, 2)))
+
+
+def _noise_of_cameras(model: SpotModel, data: Sequence[Reduced]) -> Array:
+    """Errors over sigmas (cameras,); 1 where nothing checks a camera's spots."""
+    squares = sum(np.sum(d.left**2, axis=(0, 2)) for d in data)
+    redundancy = sum(np.einsum("knii->n", d.lin.redundancy()) for d in data)
+    out = np.ones(len(model.camera_names))
+    for c in range(len(out)):
+        total = float(np.sum(redundancy[model.camera_of == c]))
+        if total > FEWEST_FRAMES:
+            out[c] = np.sqrt(np.sum(squares[model.camera_of == c]) / total)
+    return out
+
+
+def _correlation(data: Sequence[Reduced]) -> float:
+    """Largest number of frames, of any recording, that count as one."""
+    return max(correlation_time(np.where(d.lin.used[..., None], d.left, np.nan).reshape(len(d.left), -1)) for d in data)
+
+
+def _difference(prior: Prior, values: Values) -> Array:
+    """The prior values minus the given ones (p,)."""
+    return np.concatenate(
+        [known.minus(values[s].pick(np.array([i])))[0] for (s, i), known in zip(prior.at, prior.values, strict=True)]
+    )
+
+
+def _held_out(
+    known: Knowledge, data: Sequence[Reduced], given: Sequence[Reduced], changed: Bools
+) -> tuple[HeldOut, ...]:
+    """Each recording predicted from the others. given: the same at the rig as given. changed (p,)."""
+    out = []
+    for i, d in enumerate(data):
+        others = [o for k, o in enumerate(data) if k != i]
+        if not others:
+            continue
+        fold = known.with_data(others, changed)
+        excess, _, log_density = fold.excess([d])
+        refined = d.rest + float(np.sum((d.y - d.X @ fold.mean) ** 2))
+        before = given[i].rest + float(given[i].y @ given[i].y)
+        out.append(HeldOut((before, refined), d.dof, excess.p_value, (known.excess([d])[2], log_density)))
+    return tuple(out)
+
+
+def _parts(rig: Rig, values: Values, prior: Prior, known: Knowledge) -> list[PossibleFault]:
+    """Every camera, screen and beam as the one that has changed by more than its stated sigma."""
+    model, place = SpotModel.of(rig), _places(prior.at, values)
+    sigmas = np.sqrt(np.diagonal(known.covariance))
+    screen_of = [rig.spots[s].screen for _, s in model.views]
+    out = []
+    for (stack, i), rows in place.items():
+        turn, move = _LARGER * np.median(sigmas[rows[3:]]), _LARGER * np.median(sigmas[rows[:3]])
+        of = np.zeros((len(sigmas), 6 if stack == CAMERAS else 3 if stack == SCREENS else 4))
+        if stack == CAMERAS:
+            pose = list(rig.cameras.values())[i].camera_from_world
+            # A turn about the camera's centre, as in model_check/faults.py; the shift is that of the centre.
+            of[rows, :3] = np.concatenate([-skew(pose.translation), pose.rotation.T])
+            of[rows[:3], 3:] = np.eye(3)
+            centre = np.linalg.lstsq(of[rows], np.eye(6), rcond=None)[0]
+            own = centre @ known.covariance[np.ix_(rows, rows)] @ centre.T
+            turn, move = (_LARGER * np.sqrt(np.trace(own[k, k]) / 3) for k in (np.s_[:3], np.s_[3:]))
+            sizes = np.repeat([max(turn, USUAL_SIZES.turn_rad), max(move, USUAL_SIZES.move_m)], 3)
+            component, kind, name, views = CAMERA, MOVED, list(rig.cameras)[i], model.camera_of == i
+        elif stack == SCREENS:
+            of[rows[:3], 0] = list(rig.screens.values())[i].world_from_screen.rotation[:, 2]
+            of[rows[3:5], 1:] = np.eye(2)
+            sizes = np.repeat([max(move, USUAL_SIZES.move_m), max(turn, USUAL_SIZES.turn_rad)], (1, 2))
+            component, kind, name = SCREEN, TILTED, list(rig.screens)[i]
+            views = np.array([s == name for s in screen_of])
+        elif stack == BEAMS:
+            of[rows] = np.eye(4)
+            turn, move = (_LARGER * np.max(sigmas[rows[k]]) for k in (np.s_[:2], np.s_[2:]))
+            sizes = np.repeat([max(turn, USUAL_SIZES.laser_rad), max(move, USUAL_SIZES.laser_m)], 2)
+            component, kind, name, views = BEAM, LASER_MOVED, list(rig.beams)[i], model.beam_of == i
+        else:
+            continue
+        if views.any():
+            out.append(PossibleFault(component, name, kind, of, sizes, views))
+    return out
+
+
+def _places(at: Sequence[At], values: Values) -> dict[At, Ints]:
+    """The positions of the numbers of each unknown in the vector of all."""
+    out, start = {}, 0
+    for a in at:
+        out[a] = start + np.arange(values[a[0]].dof)
+        start += values[a[0]].dof
+    return out

@@ -1,0 +1,131 @@
+"""A recording as a term of an adjustment of the rig: the poses of all frames are free, and eliminated.
+
+For given values of the rig, each frame has its least-squares pose, and residuals and derivatives are projected onto
+what the poses cannot absorb: the Schur complement, frame by frame (variable projection: Golub and Pereyra 1973,
+SIAM J. Numer. Anal. 10). What is left of a whole recording are as many numbers as it determines directions of the rig.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from calibration.least_squares.adjustment import At, Linearised, Loss, Part, Values
+from calibration.model_check.fault_identification import compressed
+from calibration.model_check.linearised_frames import (
+    LinearisedFrames,
+    ModelCheckRecording,
+    finite,
+    linearised_at,
+    whitening,
+)
+from calibration.terms.rig_blocks import BEAMS, BOWS, CAMERAS, INTRINSICS, SCREENS, lines_in, rig_of
+from geometry.arrays import Array, Bools, Ints
+from geometry.forward_model import SpotModel
+from geometry.rig import Rig
+from geometry.uncertainty.rig_uncertainty import unlimited
+
+STACKS = (INTRINSICS, CAMERAS, SCREENS, BOWS, BEAMS)
+_POSE_STEPS = 3  # Gauss-Newton steps of the poses: from 5 mrad and 10 mm the second one is shorter than 1e-6
+_LARGEST_STEP = np.array([0.3] * 3 + [0.2] * 3)  # m, rad: a pose that would move farther is not determined
+
+
+@dataclass(frozen=True, slots=True)
+class Reduced:
+    """A recording without its poses: y = X delta + noise of sigma 1, where delta are the errors of the unknowns."""
+
+    X: Array  # (q, p)
+    y: Array  # (q,) measured minus predicted
+    rest: float  # chi-square of the residuals that no change of the unknowns explains
+    dof: int  # number of residuals minus that of the poses' parameters
+    lin: LinearisedFrames  # at the poses that fit the rig best
+    left: Array  # (K, n, 2) whitened residuals, measured minus predicted
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingTerm:
+    """The spots of a recording, in sigmas, with free poses.
+
+    The stacks are those of rig_blocks.py in the rig's order. Screens are unlimited: a measured spot did hit its screen.
+    """
+
+    rig: Rig  # for what the stacks do not contain
+    recording: ModelCheckRecording  # K frames, of which each determines its pose
+    free: Mapping[str, Bools]  # per stack (k, dof): the numbers that are unknown
+    at: tuple[At, ...] = field(init=False)  # the unknowns of which some number is free: p numbers in total
+    loss: Loss | None = None
+
+    def __post_init__(self) -> None:
+        at = [(s, int(i)) for s in STACKS if s in self.free for i in np.flatnonzero(self.free[s].any(axis=1))]
+        object.__setattr__(self, "at", tuple(at))
+
+    def linearise(self, values: Values) -> Linearised:
+        """One residual of q + 1 numbers; nan where a measured spot cannot be predicted."""
+        reduced = self.reduced(values)
+        lost = reduced.lin.used.sum() < self.recording.usable.sum()
+        residual = np.append(-reduced.y, np.sqrt(reduced.rest))
+        parts, start = [], 0
+        for stack, i in self.at:
+            dof = values[stack].dof
+            J = np.zeros((len(residual), dof))
+            J[:-1] = reduced.X[:, start : start + dof]
+            parts.append(Part(stack, np.array([i]), J[None]))
+            start += dof
+        return Linearised(np.full_like(residual, np.nan)[None] if lost else residual[None], parts)
+
+    def reduced(self, values: Values) -> Reduced:
+        """The recording at these values of the rig, without its poses."""
+        model = unlimited(SpotModel.of(rig_of(self.rig, values)))
+        lin = with_own_poses(model, self.recording)
+        left = lin.residual_part(lin.residual)
+        free = lin.residual_part(lin.W @ self._derivatives(model, lin, values))
+        flat = free.reshape(-1, free.shape[-1])
+        X, V = compressed(flat.T @ flat)
+        y = V @ (flat.T @ left.ravel())
+        rest = max(float(left.ravel() @ left.ravel() - y @ y), 0.0)
+        return Reduced(X, y, rest, lin.dof, lin, left)
+
+    def _derivatives(self, model: SpotModel, lin: LinearisedFrames, values: Values) -> Array:
+        """d(pixels)/d(unknowns) (K, n, 2, p); 0 for spots that are not used, and for numbers that are not free."""
+        d = model.derivatives(lin.poses)
+        screens = list(self.rig.screens)
+        screen_of = np.array([screens.index(self.rig.spots[s].screen) for _, s in model.views], dtype=np.int64)
+        B = lines_in(values).basis[model.beam_of]
+        of: dict[str, tuple[Array, Ints]] = {
+            INTRINSICS: (np.concatenate([d.pinhole, d.distortion], axis=-1), model.camera_of),
+            CAMERAS: (d.camera, model.camera_of),
+            SCREENS: (d.screen, screen_of),
+            BOWS: (d.bow, screen_of),
+            BEAMS: (np.concatenate([d.direction @ B, d.point @ B], axis=-1), model.beam_of),
+        }
+        used: Bools = np.asarray(lin.used[..., None, None])
+        out = np.zeros((*lin.used.shape, 2, sum(values[s].dof for s, _ in self.at)))
+        start = 0
+        for stack, i in self.at:
+            block, element_of = of[stack]
+            views = np.flatnonzero(element_of == i)
+            stop = start + values[stack].dof
+            out[:, views, :, start:stop] = np.where(used[:, views], block[:, views], 0.0) * self.free[stack][i]
+            start = stop
+        return out
+
+
+def with_own_poses(model: SpotModel, recording: ModelCheckRecording) -> LinearisedFrames:
+    """All frames of a recording, linearised at the poses that fit this model best."""
+    used = recording.usable
+    none, frames = np.zeros_like(used), np.arange(len(used))
+    known = finite(recording.poses.translation, -1)
+    poses = replace(
+        recording.poses,
+        rotation=np.where(known[:, None, None], recording.poses.rotation, np.eye(3)),
+        translation=np.where(known[:, None], recording.poses.translation, 0.0),
+    )
+    W = whitening(recording.cov_px2, used)
+    for _ in range(_POSE_STEPS):
+        lin = linearised_at(model, frames, poses, used, none, recording.uv_px, W)
+        step = lin.pose_shift(lin.residual)
+        small = np.all(np.abs(step) < _LARGEST_STEP, axis=-1)
+        poses = poses.plus(np.where(small[:, None], step, 0.0))
+    return linearised_at(model, frames, poses, used, none, recording.uv_px, W)

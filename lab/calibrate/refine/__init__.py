@@ -1,0 +1,1 @@
+"""Refinement of a rig by recordings: `beampose refine`."""

@@ -1,0 +1,146 @@
+"""Recordings for a refinement: runs are tracked and smoothed with a rig, and their labelled spots kept."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.model_check.linearised_frames import ModelCheckRecording, finite
+from geometry.forward_model import SpotModel
+from geometry.pose_solver.visibility import assumed_range
+from geometry.rig import Rig
+from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty, is_known, unlimited
+from lab.errors import CalibrationError
+from lab.files.run.run_file import Run
+from lab.findings.finding import Level, worst_first
+from lab.runs.frames.frames import FrameSet
+from lab.runs.frames.pipeline import Frames, Pipeline
+from lab.runs.model_check.check import ModelCheck, check_model
+from lab.runs.model_check.frame_sampler import FrameSampler
+from lab.runs.setup_check import mistakes_by_themselves, pictures_sampler, recorded_mistakes
+from lab.runs.smoothing_pass import TrackingAndSmoothing
+from lab.runs.verdict.frame_checks import FrameChecks
+from tracking.statuses import PoseStatus
+
+LEAST_MEASURED = 0.9  # share of frames with a measured pose, below which usual mistakes of the set-up are tested
+# Share of the residuals that the errors of the rig cause, as sigma of the tracker's model: with all of it, or none,
+# rigs that are off by 10 px keep fewer labels (measured: 0.1 to 0.3 of the whole error, half of what no pose absorbs).
+_EXPECTED = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class LabelledRun:
+    """A run whose spots have labels."""
+
+    run: Run
+    recording: ModelCheckRecording  # of the run's own cameras; long recordings are thinned
+    frames: int  # of the run
+
+    def in_views_of(self, rig: Rig) -> ModelCheckRecording:
+        """The recording with the views of a rig that has further cameras."""
+        views, own = rig.views(), self.run.rig.views()
+        if views == own:
+            return self.recording
+        place, old = [views.index(v) for v in own], self.recording
+
+        def wider(values: Any, fill: float | bool) -> Any:
+            if values is None:
+                return None
+            out = np.full((len(values), len(views), *values.shape[2:]), fill, dtype=values.dtype)
+            out[:, place] = values
+            return out
+
+        return replace(
+            old, seen=wider(old.seen, False), uv_px=wider(old.uv_px, np.nan), cov_px2=wider(old.cov_px2, np.nan),
+            predicted_px=wider(old.predicted_px, np.nan), predicted_cov_px2=wider(old.predicted_cov_px2, np.nan),
+            width_px=None if old.width_px is None else wider(old.width_px[None], np.nan)[0],
+        )  # fmt: skip
+
+    def check(self, rig: Rig, covariance: RigCovariance) -> ModelCheck:
+        """The model check of this recording with another rig."""
+        run = with_rig(self.run, rig, covariance)
+        return check_model(run.rig, self.recording, run.covariance)
+
+
+def with_rig(run: Run, rig: Rig, covariance: RigCovariance) -> Run:
+    """The run with another rig, of which it has some cameras."""
+    own = replace(rig, cameras={n: rig.cameras[n] for n in run.rig.cameras})
+    rows = [i for i, name in enumerate(covariance.names) if is_known(own, name)]
+    names = tuple(covariance.names[i] for i in rows)
+    return replace(run, rig=own, covariance=RigCovariance(names, covariance.matrix[np.ix_(rows, rows)]))
+
+
+def tolerant(run: Run) -> Run:
+    """The run with a tracker that expects the residuals that the errors of its rig cause."""
+    model = SpotModel.of(run.rig)
+    if run.covariance is None:
+        return run
+    pose = (assumed_range(run.rig) if run.prior is None else run.prior).centre
+    C = RigUncertainty(run.rig, model, run.covariance).at(pose)
+    J = unlimited(model).project(pose)[1].reshape(-1, 6)
+    seen = (np.diagonal(C) > 0) & finite(J, -1)
+    J, C = J[seen], C[np.ix_(seen, seen)]
+    left = np.eye(len(J)) - J @ np.linalg.pinv(J)
+    px = float(np.sqrt(np.trace(left @ C @ left) / max(np.trace(left), 1.0)))
+    px *= _EXPECTED
+    return replace(run, tracker=replace(run.tracker, sigma_model_px=max(px, run.tracker.sigma_model_px)))
+
+
+@dataclass(frozen=True, slots=True)
+class _FirstFrames:
+    """The first frames of a recording."""
+
+    reader: Frames
+    most: int
+
+    @property
+    def notes(self) -> list[str]:
+        return self.reader.notes
+
+    @property
+    def expected_frames(self) -> int | None:
+        return self.reader.expected_frames
+
+    def __iter__(self) -> Iterator[FrameSet]:
+        return islice(self.reader, self.most)
+
+
+def labelled(run: Run, most: int | None = None) -> LabelledRun:
+    """Track and smooth a run with its rig. most: number of frames after which it ends.
+
+    Raises:
+        CalibrationError: the recording shows a mistake in the set-up, such as exchanged cameras, which no refinement
+            may absorb, or no pose at all.
+    """
+    camera_of = SpotModel.of(run.rig).camera_of
+    sampler, pictures = FrameSampler(with_predicted=most is not None), pictures_sampler()
+    frames = measured = 0
+    with tempfile.TemporaryDirectory(prefix="beampose-refine-") as work:
+        pipeline = Pipeline.of(run)
+        if most is not None:
+            pipeline.reader = _FirstFrames(pipeline.reader, most)
+        passes = TrackingAndSmoothing(pipeline, Path(work))
+        with contextlib.closing(passes.records()) as records:
+            for record, _ in FrameChecks(run.rig, run.covariance).passed(records):
+                sampler.add_record(record, camera_of, run.tracker)
+                found = zip(run.rig.cameras, record.detections, strict=True)
+                pictures.add({name: points for name, points in found if points is not None})
+                frames += 1
+                measured += record.tracked.pose_status is PoseStatus.MEASURED
+    recording = sampler.recording()
+    mistakes = mistakes_by_themselves(run.rig, run.prior)
+    if measured <= LEAST_MEASURED * frames:
+        mistakes = (*mistakes, *recorded_mistakes(run, pictures.blocks))
+    worst = next(iter(worst_first(mistakes)), None)
+    if worst is not None and worst.level is Level.FAIL:
+        raise CalibrationError(f"{run.folder}: {worst.what}. {worst.remedy}")
+    if recording is None:
+        raise CalibrationError(f"{run.folder}: there is no frame at all")
+    return LabelledRun(run, recording, frames)

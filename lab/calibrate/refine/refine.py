@@ -1,0 +1,192 @@
+"""`beampose refine`: a rig refined by recordings, written only if it predicts held-out recordings better.
+
+residuals.csv: the residual of every spot that was used, with the rig as given and as refined.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.least_squares.adjustment import AdjustmentError
+from calibration.rig.refinement import Refinement, refine
+from calibration.terms.rig_blocks import BEAMS, BOWS, CAMERAS, INTRINSICS, SCREENS
+from geometry.forward_model import SpotModel
+from geometry.rig import Rig
+from geometry.uncertainty.rig_uncertainty import RigCovariance
+from lab.calibrate.refine import prior_sigmas
+from lab.calibrate.refine.prior_sigmas import GROUPS, group_of, stated_covariance
+from lab.calibrate.refine.recordings import LabelledRun, labelled, tolerant, with_rig
+from lab.calibrate.refine.refine_findings import RefineResult, refine_findings
+from lab.calibrate.refine.refine_page import page_of, pixel_residuals
+from lab.calibrate.step import Solved, Step, run_step
+from lab.errors import CalibrationError, InputError
+from lab.files.rig.calibration_state import CalibrationState, require_valid_calibration
+from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance, load_rig_file, save_rig
+from lab.files.run.fingerprints import fingerprints
+from lab.files.run.run_file import Run, load_run
+from lab.files.text.csv_text import csv_word, write_table
+from lab.files.text.error_text import suggest_name
+from lab.findings.finding import Finding, Level, reasons, verdict, worst_first
+from lab.findings.outcome import Outcome
+from lab.progress import Progress
+from lab.runs.model_check.check import with_place_errors
+
+RIG, RESIDUALS = "rig.yaml", "residuals.csv"
+COLUMNS = (
+    "run", "t_s", "camera", "spot", "u_px", "v_px", "du_given_px", "dv_given_px", "du_refined_px", "dv_refined_px",
+    "sigma_u_px", "sigma_v_px",
+)  # fmt: skip
+_STEP = Step("refinement by recordings", (RESIDUALS,), RIG)
+# Frames of all runs, and at least of each, for the first solution: it only has to be good enough to label all frames.
+_FIRST, _FEWEST_OF_RUN = 300, 100
+_STACKS_OF = {
+    prior_sigmas.CAMERAS: (CAMERAS,), prior_sigmas.SCREENS: (SCREENS, BOWS), prior_sigmas.BEAMS: (BEAMS,),
+    prior_sigmas.LENS: (INTRINSICS,),
+}  # fmt: skip
+
+
+def refine_rig(
+    runs: Sequence[Path],
+    rig_path: Path,
+    out: Path,
+    *,
+    free: Sequence[str] = (),
+    sigmas: Mapping[str, Any] | None = None,
+    today: datetime.date | None = None,
+    progress: Progress | None = None,
+) -> Outcome[RefineResult]:
+    """Refine a rig by recordings; write rig.yaml, residuals.csv and report.html into the folder `out`.
+
+    The runs are tracked and smoothed with the given rig, and a second time with the first solution, which corrects
+    labels. If the verdict is FAIL, there is no rig.yaml. free: groups of parameters that are changed (GROUPS); empty:
+    all of which a covariance is known. sigmas: see `stated_covariance`.
+
+    Raises:
+        InputError: for errors in the files or options.
+        CalibrationError: the given rig must not be used, a recording shows a mistake in the set-up, or the recordings
+            determine no result.
+    """
+    day = today or datetime.date.today()
+    return run_step(_STEP, out, lambda: _solve(list(runs), Path(rig_path), list(free), sigmas or {}, day, progress))
+
+
+def _solve(
+    folders: Sequence[Path],
+    rig_path: Path,
+    free: Sequence[str],
+    sigmas: Mapping[str, Any],
+    day: datetime.date,
+    progress: Progress | None,
+) -> Solved[RefineResult]:
+    file = load_rig_file(rig_path)
+    if file.calibration is not None:  # one that has expired may be refined
+        require_valid_calibration(file.calibration, rig_path, file.calibration.date)
+    prior = stated_covariance(file.rig, joint_covariance(file.rig, file.covariances, rig_path), sigmas, rig_path)
+    stacks = _stacks(free, prior, rig_path)
+    runs = [with_rig(load_run(folder, rig_path), file.rig, prior) for folder in folders]
+    names = [str(r.folder.resolve()) for r in runs]
+    twice = next((n for n in names if names.count(n) > 1), None)
+    if twice is not None:
+        raise InputError(f"{twice}: expected each run once, got it {names.count(twice)} times")
+    result = _refined(runs, file.rig, prior, stacks, progress)
+    refined, findings = result.refined, refine_findings(result)
+    failed = verdict(findings) is Level.FAIL
+    inputs = [rig_path, *(r.path for r in runs)]
+
+    def write(folder: Path) -> None:
+        if not failed:
+            save_rig(_rig_file(refined, findings, file, runs, day), folder / RIG)
+        _write_residuals(result, folder / RESIDUALS)
+
+    return Solved(
+        name=rig_path.stem if rig_path.stem != "rig" else rig_path.resolve().parent.name,
+        result=result,
+        findings=findings,
+        figures=_figures(refined),
+        write=write,
+        page=lambda: page_of(result),
+        day=day,
+        inputs=inputs,
+    )
+
+
+def _stacks(free: Sequence[str], prior: RigCovariance, rig_path: Path) -> set[str]:
+    """The stacks of unknowns that the groups name; all without groups."""
+    stated = {group_of(n) for n in prior.names}
+    for group in free:
+        if group not in GROUPS:
+            raise InputError(f"--free: expected some of {','.join(GROUPS)}, got {group!r}{suggest_name(group, GROUPS)}")
+        if group not in stated:
+            raise InputError(
+                f"--free {group}: expected its covariance in {rig_path}, or its sigmas, got none; nothing is refined of"
+                " which nothing is stated"
+            )
+    return {stack for group in free or GROUPS for stack in _STACKS_OF[group]}
+
+
+def _refined(
+    runs: Sequence[Run], rig: Rig, prior: RigCovariance, stacks: set[str], progress: Progress | None
+) -> RefineResult:
+    def all_labelled(runs: Sequence[Run], half: int) -> list[LabelledRun]:
+        out = []
+        for i, run in enumerate(runs):
+            if progress is not None:
+                progress(half * len(runs) + i, 2 * len(runs), run.name)
+            out.append(labelled(run, None if half else max(_FIRST // len(runs), _FEWEST_OF_RUN)))
+        return out
+
+    try:
+        first = all_labelled([tolerant(run) for run in runs], 0)
+        start = refine(rig, prior, [r.in_views_of(rig) for r in first], stacks=stacks)
+        again = [with_rig(run, start.rig, start.covariance) for run in runs]
+        second = all_labelled(again, 1)
+        model = SpotModel.of(start.rig)
+        recordings = [with_place_errors(r.in_views_of(rig), model) for r in second]
+        refined = refine(rig, prior, recordings, start, stacks)
+    except AdjustmentError as error:
+        raise CalibrationError(f"the rig cannot be refined by these recordings: {error}") from None
+    checks = tuple(r.check(refined.rig, refined.covariance) for r in second)
+    return RefineResult(refined, prior, tuple(second), checks)
+
+
+def _figures(r: Refinement) -> str:
+    frames = sum(len(x.seen) for x in r.recordings)
+    determined = int(np.sum(r.gain > 1))
+    return (
+        f"{frames} frames of {len(r.recordings)} recording{'s' if len(r.recordings) > 1 else ''} determine {determined}"
+        f" of {len(r.gain)} directions"
+    )
+
+
+def _rig_file(
+    r: Refinement, findings: Sequence[Finding], given: RigFile, runs: Sequence[Run], day: datetime.date
+) -> RigFile:
+    """The refined rig with its covariance, and what it was made from."""
+    prints = [p for run in runs for p in fingerprints(run)]
+    lines = dict.fromkeys(f"{p['path']} sha256 {p['sha256']}" for p in prints)
+    old = given.calibration
+    state = CalibrationState(
+        date=day, verdict=verdict(findings).name, valid_until=None if old is None else old.valid_until,
+        reasons=reasons(worst_first(findings)), notes="" if old is None else old.notes, made_from=tuple(lines),
+    )  # fmt: skip
+    return replace(given, rig=r.rig, covariances=covariance_blocks(r.covariance), calibration=state, measured_as={})
+
+
+def _write_residuals(result: RefineResult, path: Path) -> None:
+    r = result.refined
+    views = r.rig.views()
+    rows: list[list[object]] = []
+    for i, d in enumerate(r.data):
+        run = result.runs[i if len(r.recordings) > 1 else 0].run.name
+        recording, before, after = r.of_data(i), pixel_residuals(r.given_data[i]), pixel_residuals(d)
+        sigma = np.sqrt(np.diagonal(recording.cov_px2, axis1=-2, axis2=-1))
+        for k, v in np.argwhere(d.lin.used):
+            numbers = [*recording.uv_px[k, v], *before[k, v], *after[k, v], *sigma[k, v]]
+            rows.append([csv_word(run), f"{recording.t_s[k]:.9g}", *views[v], *(f"{x:.6g}" for x in numbers)])
+    write_table(path, COLUMNS, rows)

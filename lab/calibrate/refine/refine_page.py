@@ -1,0 +1,146 @@
+"""Report of a refinement."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibration.rig.refinement import Refinement
+from calibration.terms.recordings import Reduced
+from geometry.arrays import Array
+from geometry.uncertainty.rig_uncertainty import POSE, split_name
+from lab.calibrate.refine.refine_findings import RefineResult
+from lab.number_format import format_number
+from lab.report.calibration.calibration_charts import correlation_matrix
+from lab.report.calibration.calibration_drawings import residual_field
+from lab.report.calibration.calibration_scene import rig_things, scene_views
+from lab.report.page import KeyFigure, PageDrawing, PageTable, Section
+
+
+def page_of(result: RefineResult) -> tuple[list[KeyFigure], list[Section]]:
+    """Key figures and sections of the report."""
+    r = result.refined
+    return _key_figures(r), [
+        _learnt(result),
+        _directions(r),
+        _held_out(result),
+        _residuals(r),
+        _correlations(r),
+        _scene(r),
+    ]
+
+
+def pixel_residuals(d: Reduced) -> Array:
+    """(K, n, 2), px, measured minus predicted; 0 for spots that are not used."""
+    back = np.linalg.inv(np.where(d.lin.used[..., None, None], d.lin.W, np.eye(2)))
+    return np.asarray((back @ d.left[..., None])[..., 0])
+
+
+def _key_figures(r: Refinement) -> list[KeyFigure]:
+    out = []
+    for name, data in (("residuals, given", r.given_data), ("residuals, refined", r.data)):
+        rms = np.sqrt(sum(np.sum(pixel_residuals(d) ** 2) for d in data) / sum(2 * d.lin.used.sum() for d in data))
+        out.append((name, f"{format_number(float(rms))} px", "RMS per axis, poses fitted"))
+    out.append(("frames", str(sum(len(x.seen) for x in r.recordings)), f"{r.excluded} spots excluded"))
+    out.append(("determined", f"{int(np.sum(r.gain > 1))} of {len(r.gain)}", "directions of the rig's parameters"))
+    return out
+
+
+def _learnt(result: RefineResult) -> Section:
+    r = result.refined
+    prior, after = result.prior, r.covariance
+    before = dict(zip(prior.names, np.sqrt(np.diagonal(prior.matrix)), strict=True))
+    sigma = dict(zip(after.names, np.sqrt(np.diagonal(after.matrix)), strict=True))
+    rows = []
+    for name, change in r.named_changes().items():
+        if name in before and name in sigma:
+            unit, factor = ("mm", 1e3) if name.endswith("_m") else ("mrad", 1e3) if _is_angle(name) else ("", 1.0)
+            learnt = np.sqrt(max(before[name] ** 2 - sigma[name] ** 2, 0.0))
+            in_sigmas = change / learnt if learnt > 1e-3 * before[name] else float("nan")
+            rows.append((name, unit, factor * before[name], factor * sigma[name], factor * change, float(in_sigmas)))
+    heads = ("parameter", "unit", "sigma before", "sigma after", "change", "change / its sigma")
+    words = [
+        "Sigmas of each number before and after, and its change, also in sigmas of a correct prior: values beyond 3 are"
+        " unusual. The sigmas after contain the errors that all parts share, which the recordings do not determine (see"
+        " the next section); differences between parts are known better: rig.yaml holds the joint covariance.",
+    ]
+    return Section("What was learnt", words, (), PageTable(heads, rows))
+
+
+def _is_angle(name: str) -> bool:
+    return name.endswith("_rad") or split_name(name)[2].startswith("direction")
+
+
+def _directions(r: Refinement) -> Section:
+    conventions = r.conventions
+    free = len(r.gain) - int(np.sum(r.gain > 1))
+    words = [
+        f"The recordings determine {int(np.sum(r.gain > 1))} of {len(r.gain)} directions of the unknown numbers better"
+        f" than what was stated. {conventions} directions are conventions: motions of all cameras and screens together,"
+        " and of all beams in the body, change no residual. What is stated of all parts together decides them, and no"
+        f" recording can. The other {max(free - conventions, 0)} stay near what was stated.",
+    ]
+    rows: list[tuple[object, ...]] = []
+    for i in np.argsort(r.gain):
+        parts: dict[str, float] = {}
+        for share, part in zip(r.shares[:, i], r.parts, strict=True):
+            parts[part] = parts.get(part, 0.0) + share
+        largest = sorted(parts.items(), key=lambda p: -p[1])[:3]
+        ratio = 1 / np.sqrt(1 + r.gain[i])
+        rows.append((len(rows) + 1, float(ratio), ", ".join(f"{n} {100 * s:.0f} %" for n, s in largest)))
+    heads = ("direction", "sigma after / before", "largest shares")
+    return Section("What the recordings determine", words, (), PageTable(heads, rows))
+
+
+def _held_out(result: RefineResult) -> Section:
+    r = result.refined
+    several = len(r.recordings) > 1
+    rows = [
+        (
+            result.runs[i].run.name if several else f"block {i + 1}",
+            float(np.sqrt(h.chi2[0] / h.dof)), float(np.sqrt(h.chi2[1] / h.dof)), h.p,
+            h.log_density[1] - h.log_density[0],
+        )
+        for i, h in enumerate(r.held_out)
+    ]  # fmt: skip
+    heads = ("held out", "residuals, given (sigmas)", "residuals, refined (sigmas)", "p", "gain of ln p")
+    words = (
+        f"Each {'recording' if several else 'block of time of the recording'} against the rig refined by the others:"
+        " its residuals in sigmas, 1 if all sigmas are right; the p-value of its data with the refined rig and its"
+        " covariance; and by how much the logarithm of their probability density grows."
+    )
+    return Section("Held-out recordings", words, (), PageTable(heads, rows))
+
+
+def _residuals(r: Refinement) -> Section:
+    drawings = []
+    model_views = r.rig.views()
+    for camera, c in r.rig.cameras.items():
+        views = np.array([name == camera for name, _ in model_views])
+        for words, data in (("given", r.given_data), ("refined", r.data)):
+            places, residuals = [], []
+            for i, d in enumerate(data):
+                used = d.lin.used & views
+                places.append(r.of_data(i).uv_px[used])
+                residuals.append(pixel_residuals(d)[used])
+            at = np.concatenate(places)
+            if len(at):
+                title = f"Camera {camera}, {words} rig"
+                drawings.append(
+                    PageDrawing(residual_field(c.image_size_px, at, np.concatenate(residuals), title, things="spots"))
+                )
+    words_ = "Mean residuals over each picture, after the pose of each frame was fitted; the scales differ."
+    return Section("Residuals", words_, drawings)
+
+
+def _correlations(r: Refinement) -> Section:
+    keep = [i for i, n in enumerate(r.covariance.names) if split_name(n)[2] in POSE][:60]
+    names = [r.covariance.names[i] for i in keep]
+    picture = correlation_matrix(names, r.covariance.matrix[np.ix_(keep, keep)], "Correlations of cameras and screens")
+    words = "Common motions of all parts are strongly correlated; the covariance in rig.yaml contains this."
+    return Section("Correlations", words, [PageDrawing(picture, wide=True)])
+
+
+def _scene(r: Refinement) -> Section:
+    poses = r.data[0].lin.poses
+    things = rig_things(r.rig, poses[len(poses.translation) // 2])
+    return Section("The refined rig", "", [PageDrawing(picture) for picture in scene_views(things)])

@@ -1,0 +1,233 @@
+"""`beampose refine`: recordings correct a rig that is off by its stated sigmas, and nothing else."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from calibration.terms.rig_blocks import stacks_of
+from cli import main
+from geometry.rig import Rig
+from geometry.uncertainty.chi_square import chi2_limit
+from geometry.uncertainty.rig_uncertainty import covariance_root
+from lab.calibrate.refine.prior_sigmas import stated_covariance
+from lab.calibrate.refine.refine import refine_rig
+from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance, load_rig_file, save_rig
+from lab.findings.finding import Level
+from lab.simulate.write import simulate
+from tests.geometry.perturbed_rig import perturbed
+
+SIGMAS = {
+    "cameras.position_m": 0.003, "cameras.rotation_deg": 0.1, "screens.position_m": 0.002, "screens.rotation_deg": 0.05,
+    "beams.point_m": 0.001, "beams.direction_deg": 0.05,
+}  # fmt: skip
+FRAMES = 60
+
+
+def typed(*arguments: object):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+def recordings(
+    folder: Path, scenario: str = "two-cameras-per-screen", count: int = 2, frames: int = FRAMES
+) -> list[Path]:
+    return [
+        simulate(scenario, folder / f"run{i}", seed=i, frames=frames, detections_only=True, clutter=0.0)
+        for i in range(count)
+    ]
+
+
+def write_known(true: Rig, path: Path, seed: int = 0) -> None:
+    """A rig.yaml that is off by a draw of its covariance."""
+    covariance = stated_covariance(true, None, SIGMAS, path)
+    root = covariance_root(covariance.matrix)
+    off = root @ np.random.default_rng(seed).normal(size=root.shape[1])
+    known = perturbed(true, list(covariance.names), off)
+    covariance = stated_covariance(known, None, SIGMAS, path)
+    save_rig(RigFile(known, covariance_blocks(covariance)), path)
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    """Two runs, the true rig, a rig.yaml that is off, and the folder and outcome of its refinement."""
+    folder = tmp_path_factory.mktemp("refine")
+    runs = recordings(folder)
+    true = load_rig_file(runs[0] / "rig.yaml").rig
+    write_known(true, folder / "rig.yaml")
+    return folder, runs, true, refine_rig(runs, folder / "rig.yaml", folder / "new")
+
+
+def test_a_rig_that_is_off_by_its_sigmas_is_corrected_as_its_covariance_says(lab):
+    folder, _, true, outcome = lab
+    assert outcome.level is Level.PASS, outcome.line()
+    given, new = load_rig_file(folder / "rig.yaml"), load_rig_file(folder / "new" / "rig.yaml")
+    covariance = joint_covariance(new.rig, new.covariances, "new")
+    spread = np.trace(covariance.matrix) / np.trace(joint_covariance(given.rig, given.covariances, "old").matrix)
+    assert spread < 0.9
+    error = error_of(new.rig, true)
+    named = [list(covariance.names).index(n) for n in error]
+    root = covariance_root(covariance.matrix[np.ix_(named, named)])
+    white = np.linalg.lstsq(root, np.array(list(error.values())), rcond=1e-9)[0]
+    assert chi2_limit(0.999, len(white)) < np.sum(white**2) < chi2_limit(0.001, len(white))
+
+
+def error_of(rig: Rig, true: Rig) -> dict[str, float]:
+    """The errors of the poses of cameras and screens, by the names of rig.yaml."""
+    out = {}
+    for kind in ("cameras", "screens"):
+        e = stacks_of(true)[kind].minus(stacks_of(rig)[kind])
+        for i, name in enumerate(getattr(rig, kind)):
+            axes = ("x_m", "y_m", "z_m", "rot_x_rad", "rot_y_rad", "rot_z_rad")
+            out |= {f"{kind}.{name}.{axis}": float(v) for axis, v in zip(axes, e[i], strict=True)}
+    return out
+
+
+def test_the_new_rig_names_its_parent_and_recordings_with_their_checksums(lab):
+    folder, runs, _, _ = lab
+    made_from = load_rig_file(folder / "new" / "rig.yaml").calibration.made_from
+    for path in (folder / "rig.yaml", runs[0] / "run.yaml", runs[1] / "detections.csv"):
+        assert [line for line in made_from if line.startswith(f"{path} sha256 ")] != []
+
+
+def test_the_table_of_residuals_shows_the_noise_that_is_left(lab):
+    folder, _, _, _ = lab
+    with (folder / "new" / "residuals.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    given, refined = (
+        np.array([[float(r[f"d{axis}_{name}_px"]) for axis in "uv"] for r in rows]) for name in ("given", "refined")
+    )
+    assert len(rows) > 8 * FRAMES
+    assert np.std(refined) < 0.1 < np.std(given) / 2  # of 0.1 px, less what the poses absorb
+
+
+def test_the_report_has_what_was_learnt_and_held_out(lab):
+    text = (lab[0] / "new" / "report.html").read_text()
+    for words in ("What was learnt", "What the recordings determine", "Held-out recordings", "Correlations"):
+        assert f"{words}</h2>" in text
+    assert "cameras.left-a.x_m" in text
+
+
+def test_one_recording_is_held_out_by_blocks_of_time(lab, tmp_path):
+    folder, runs, _, _ = lab
+    outcome = refine_rig(runs[:1], folder / "rig.yaml", tmp_path / "new")
+    assert len(outcome.result.refined.held_out) == 2  # of at least 30 frames each
+    assert (tmp_path / "new" / "rig.yaml").exists() == (outcome.level < 2)
+
+
+def test_only_the_named_groups_change_and_the_others_stay_uncertain(lab, tmp_path):
+    folder, runs, _, _ = lab
+    outcome = refine_rig(runs, folder / "rig.yaml", tmp_path / "new", free=["cameras"])
+    r, given = outcome.result.refined, load_rig_file(folder / "rig.yaml")
+    assert stacks_of(r.rig)["screens"].minus(stacks_of(given.rig)["screens"]).any().item() is False
+    assert stacks_of(r.rig)["cameras"].minus(stacks_of(given.rig)["cameras"]).all()
+    old = joint_covariance(given.rig, given.covariances, "old")
+    for name in ("screens.left.x_m", "screens.right.rot_z_rad"):
+        sigmas = [np.sqrt(c.matrix[c.names.index(name), c.names.index(name)]) for c in (old, r.covariance)]
+        assert sigmas[1] == pytest.approx(sigmas[0], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("part", "change"),
+    [("cameras.left-b", {"rot_x_rad": 0.01, "rot_y_rad": -0.01}), ("screens.right", {"z_m": 0.03, "rot_x_rad": 0.01})],
+)
+def test_a_part_that_moved_by_more_than_stated_is_named_and_an_earlier_rig_stays(lab, tmp_path, part, change):
+    folder, runs, true, _ = lab
+    out = tmp_path / "new"
+    out.mkdir()
+    for name in ("rig.yaml", "residuals.csv"):
+        (out / name).write_bytes((folder / "new" / name).read_bytes())
+    moved = perturbed(true, [f"{part}.{name}" for name in change], np.array(list(change.values())))
+    save_rig(RigFile(moved, covariance_blocks(stated_covariance(moved, None, SIGMAS, out))), tmp_path / "rig.yaml")
+    done = typed("refine", *runs, "--rig", tmp_path / "rig.yaml", "--out", out)
+    kind, name = part.split(".")
+    assert (done.exit_code, f"{kind.removesuffix('s')} `{name}` has moved by" in done.output) == (3, True), done.output
+    assert (out / "rig.yaml").read_bytes() == (folder / "new" / "rig.yaml").read_bytes()
+    assert (tmp_path / "new-failed" / "report.html").exists()
+    assert not (tmp_path / "new-failed" / "rig.yaml").exists()
+
+
+def test_a_vehicle_at_rest_gives_no_confident_rig(lab, tmp_path):
+    true = lab[2]
+    runs = recordings(tmp_path, "static")
+    write_known(true, tmp_path / "rig.yaml")
+    outcome = refine_rig(runs, tmp_path / "rig.yaml", tmp_path / "new")
+    r = outcome.result.refined
+    error = np.concatenate(
+        [stacks_of(true)[s].pick(np.array([i])).minus(r.values[s].pick(np.array([i])))[0] for s, i in r.at]
+    )
+    white = np.linalg.lstsq(r.after.root, error, rcond=1e-9)[0]
+    assert outcome.level == 2 or np.sum(white**2) < chi2_limit(0.001, len(white))
+    assert np.sum(r.gain > 1) < np.sum(lab[3].result.refined.gain > 1)
+
+
+def test_exchanged_cameras_are_refused_and_nothing_is_written(lab, tmp_path):
+    _, runs, true, _ = lab
+    a, b = "left-a", "right-a"  # with the others in place, no pose of the symmetric rig explains them
+    swapped = {
+        x: replace(true.cameras[x], camera_from_world=true.cameras[y].camera_from_world, screen=true.cameras[y].screen)
+        for x, y in ((a, b), (b, a))
+    }
+    write_known(replace(true, cameras={**true.cameras, **swapped}), tmp_path / "rig.yaml")
+    done = typed("refine", *runs, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "new")
+    assert done.exit_code == 3, done.output
+    assert not (tmp_path / "new" / "rig.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--free", "camera"], "expected some of cameras,screens,beams,lens, got 'camera'"),
+        (["--free", "lens"], "nothing is refined of which nothing is stated"),
+        (["--sigma", "cameras.left.position=1"], "expected one of cameras.position_m"),
+        (["--sigma", "cameras.middle.position_m=0.1"], "expected one of the rig's cameras, got 'middle'"),
+        (["--sigma", "cameras.left.position_m=0.1"], "expected cameras.rotation_deg beside cameras.position_m"),
+        (["--sigma", "beams.point_m=-1"], "expected a number above 0"),
+    ],
+)
+def test_an_option_that_cannot_be_meant_is_refused_with_what_was_expected(lab, tmp_path, options, words):
+    folder, runs, _, _ = lab
+    done = typed("refine", *runs, "--rig", folder / "rig.yaml", "--out", tmp_path / "new", *options)
+    assert (done.exit_code, words in done.output) == (2, True), done.output
+
+
+def test_a_rig_of_which_nothing_is_stated_is_refused_and_the_option_is_named(lab, tmp_path):
+    _, runs, true, _ = lab
+    save_rig(true, tmp_path / "rig.yaml")
+    done = typed("refine", runs[0], "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "new")
+    assert done.exit_code == 2
+    assert "--sigma cameras.position_m=0.005" in done.output
+
+
+def test_a_run_that_is_named_twice_is_refused(lab, tmp_path):
+    folder, runs, _, _ = lab
+    done = typed("refine", runs[0], runs[0], "--rig", folder / "rig.yaml", "--out", tmp_path / "new")
+    assert (done.exit_code, "expected each run once" in done.output) == (2, True)
+
+
+def test_a_sigma_replaces_what_the_file_states_of_that_part_alone():
+    from tests.geometry.scenes import random_rig
+
+    rig = random_rig(np.random.default_rng(0))
+    stated = stated_covariance(rig, None, SIGMAS, Path("rig.yaml"))
+    camera = next(iter(rig.cameras))
+    wider = {f"cameras.{camera}.position_m": 0.5, f"cameras.{camera}.rotation_deg": 1.0}
+    new = stated_covariance(rig, stated, wider, Path("rig.yaml"))
+    assert set(new.names) == set(stated.names)
+    for name in stated.names:
+        before, after = (c.matrix[c.names.index(name), c.names.index(name)] for c in (stated, new))
+        assert (after > before) if name.startswith(f"cameras.{camera}.") else (after == before)
+
+
+def test_parts_of_which_nothing_is_stated_are_held_and_named(lab, tmp_path):
+    _, runs, true, _ = lab
+    save_rig(true, tmp_path / "rig.yaml")
+    options = ["--sigma", "cameras.position_m=0.003", "--sigma", "cameras.rotation_deg=0.1"]
+    done = typed("refine", *runs, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "new", *options)
+    text = (tmp_path / "new" / "report.html").read_text()
+    assert done.exit_code in (0, 3)
+    assert "nothing is stated of screens.left, screens.right, beams.A" in text
