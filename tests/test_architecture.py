@@ -216,14 +216,12 @@ def test_what_the_program_imports_is_declared_in_pyproject():
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = declared["optional-dependencies"]
     required = [*declared["dependencies"], *(r for extra in PACKAGES for r in extras[extra]), *extras["training"]]
-    required += extras["genicam"]
     names = {canonicalize_name(Requirement(requirement).name) for requirement in required}
     not_everywhere = {
         "open3d": ["open3d"],
         "libusb_package": ["libusb-package"],
         "pyarrow": ["pyarrow"],
         "torch": ["torch"],
-        "harvesters": ["harvesters"],
     }
     distributions = not_everywhere | packages_distributions()
     used = set().union(*(foreign_packages(ROOT, floor) for floor in FLOORS))

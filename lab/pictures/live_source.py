@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from lab.errors import InputError
+from lab.extras import needed
 from lab.pictures.opencv import load_cv2, opened
 from lab.pictures.picture_file import GreyPicture, MissingPicture, require_format
 from lab.pictures.source import Grabbed, formatted, open_inputs, pictures, retrieved
@@ -133,17 +134,11 @@ class GenicamSource:
     @staticmethod
     def opened(which: str, rate_hz: float | None) -> GenicamSource:
         """which: a serial number, or a place in the list of cameras from 0. Raises InputError."""
-        try:
-            from harvesters.core import Harvester
-        except ImportError:
-            raise InputError(
-                "expected the package harvesters for a GenICam camera, found none; install beampose[genicam]"
-            ) from None
         folders = [Path(f) for f in os.environ.get(_PRODUCERS, "").split(os.pathsep) if f]
         producers = [p for folder in folders for p in ([folder] if folder.suffix == ".cti" else folder.glob("*.cti"))]
         if not producers:
             raise InputError(f"expected the camera maker's *.cti file in a folder of {_PRODUCERS}, found none")
-        harvester = Harvester()
+        harvester = needed("genicam", f"{GENICAM}{which}", "core").Harvester()
         try:
             for producer in producers:
                 harvester.add_file(str(producer))
