@@ -1,4 +1,4 @@
-"""Cost of servers for the live page: `python -m bench.throughput.page_servers [--seconds 10]`; of aiohttp where installed.
+"""Cost of servers for the live page: `python -m bench.throughput.page_servers`; of aiohttp where it is installed.
 
 Each server runs in a process of its own and sends, four times a second, a state of 40 kB as an event and two pictures
 of 120 kB to one reader, as the live page asks for them. Printed: process time per second, and that of the import.
