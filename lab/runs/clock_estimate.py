@@ -25,8 +25,7 @@ from lab.progress import Progress
 from lab.runs.frames.clocked_frames import ClockedFrames, FoundPoints
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.model_check.frame_sampler import FrameSampler, stated_covariances, widths
-from tracking.smoothing.recording import EstimatedClocks
-from tracking.smoothing.smoother import FoundClocks
+from tracking.smoothing.recording import EstimatedClocks, FoundClocks
 from tracking.statuses import TrackedFrame
 
 MOST_PASSES = 4  # causal ones

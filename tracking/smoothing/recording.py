@@ -20,7 +20,7 @@ from tracking.rigid_body.association.frame_detections import BLENDED, distinct_s
 from tracking.rigid_body.hypotheses.hypothesis_set import MIN_REDUNDANT_SPOTS
 from tracking.rigid_body.models.motion import STATE
 from tracking.rigid_body.rigid_tracker import RigidTracker
-from tracking.smoothing.motion.run_detections import Delays, RunDetections, SmoothedMotion
+from tracking.smoothing.motion.run_detections import Delays, RunDetections, SmoothedMotion, UnknownClocks
 from tracking.statuses import PoseStatus, SpotStatus, TrackedFrame
 
 _FIRST_VALUES = 1024  # that a column has room for at the start
@@ -74,6 +74,14 @@ class EstimatedClocks:
     numbers: tuple[tuple[int, bool], ...]  # camera, and whether it is its row time, else its offset
     mean_s: Array  # (p,) of the prior
     sigma_s: Array  # (p,)
+
+
+@dataclass(frozen=True, slots=True)
+class FoundClocks:
+    """Corrections of p numbers of the cameras' clocks."""
+
+    correction_s: Array  # (p,)
+    covariance: Array  # (p, p)
 
 
 class TrackedRecording:
@@ -176,6 +184,17 @@ class TrackedRecording:
     def place_px2(self) -> Array:
         """(m,): of the variance of a coordinate of each detection of the run, the part that belongs to its place."""
         return self._place.values
+
+    def unknown_clocks(self, corrections_s: Array) -> UnknownClocks | None:
+        """The clocks that are estimated with the motion, after these corrections (p,)."""
+        clocks, model = self.clocks, self.model
+        if clocks is None:
+            return None
+        camera, is_row_time = zip(*clocks.numbers, strict=True)
+        return UnknownClocks(
+            np.array(camera, dtype=np.int64), np.array(is_row_time, dtype=bool), clocks.mean_s - corrections_s,
+            clocks.sigma_s, model.camera_of, (model.image_size_px[:, 1] - 1) / 2, self.calibration,
+        )  # fmt: skip
 
     def delays(self, corrections_s: Array | None = None) -> Delays | None:
         """When the detections of the run were exposed; None: all at the instants of their frames.

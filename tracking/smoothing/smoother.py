@@ -41,7 +41,6 @@ from tracking.smoothing.motion.run_detections import (
     RunDetections,
     SmoothedMotion,
     Steps,
-    UnknownClocks,
     WholeRun,
     controlled_labels,
     moved_detections,
@@ -49,7 +48,7 @@ from tracking.smoothing.motion.run_detections import (
 )
 from tracking.smoothing.motion.whole_run import MAX_DISTANCE, estimate
 from tracking.smoothing.place_errors import place_errors, scaled_shares, with_places
-from tracking.smoothing.recording import TrackedRecording, merged, track_backward
+from tracking.smoothing.recording import FoundClocks, TrackedRecording, merged, track_backward
 from tracking.smoothing.single_frame_poses import SingleFramePoses, rms_residuals, single_frame_poses
 from tracking.smoothing.systematic_errors import calibration_errors, exposure_offsets, exposure_sigmas, pose_shift
 from tracking.statuses import Event, MotionEstimate, PoseStatus, SpotStatus, TrackedFrame, view_statuses
@@ -104,14 +103,6 @@ class ReportedSpots:
             if len(of_exposure):
                 cov_px2[k, view] += of_exposure[k, view]
         return ReportedSpots(uv_px, cov_px2, exists, model.in_picture(uv_px))
-
-
-@dataclass(frozen=True, slots=True)
-class FoundClocks:
-    """Corrections of p numbers of the cameras' clocks."""
-
-    correction_s: Array  # (p,)
-    covariance: Array  # (p, p)
 
 
 @dataclass(frozen=True, slots=True)
@@ -341,7 +332,7 @@ class _Smoother:
         self.motion, self.own = self.motion.without_covariances(), SingleFramePoses.unknown(0)
         run = WholeRun(
             self.views, self.seen, self.calibration_cov, rec.dt_s, rec.exposure_s, self.parameters.learn_jerk,
-            self.delays, self._unknown_clocks(),
+            self.delays, rec.unknown_clocks(self.correction_s),
         )  # fmt: skip
         self.motion = estimate(run, self.assigned, self.measured, self.motion, max_distance, self.trusted)
         for _ in range(MAX_CLOCK_STEPS):
@@ -354,7 +345,7 @@ class _Smoother:
             most = MAX_CLOCK_STEP * self.rec.clocks.sigma_s
             self.correction_s = self.correction_s + np.clip(found.correction_s, -most, most)
             self.delays = self.rec.delays(self.correction_s)
-            run = replace(run, delays=self.delays, clocks=self._unknown_clocks())
+            run = replace(run, delays=self.delays, clocks=rec.unknown_clocks(self.correction_s))
             self.motion = estimate(
                 run, self.assigned, self.measured, self.motion.without_covariances(), max_distance, self.trusted
             )
@@ -362,18 +353,6 @@ class _Smoother:
         own = self._single_frame_poses(self.assigned)
         self.measured = own.measured & ~self.conflicting
         self.own = replace(own, measured=self.measured)
-
-    def _unknown_clocks(self) -> UnknownClocks | None:
-        """The clocks that are estimated with the motion."""
-        clocks, model = self.rec.clocks, self.model
-        if clocks is None:
-            return None
-        return UnknownClocks(
-            np.array([camera for camera, _ in clocks.numbers], dtype=np.int64),
-            np.array([is_row_time for _, is_row_time in clocks.numbers], dtype=bool),
-            clocks.mean_s - self.correction_s, clocks.sigma_s, self.view_table.camera,
-            (model.image_size_px[:, 1] - 1) / 2, self.rec.calibration,
-        )  # fmt: skip
 
     def _single_frame_poses(self, assigned: Ints) -> SingleFramePoses:
         motion, rec = self.motion, self.rec
