@@ -24,7 +24,7 @@ SAMPLE_RUNS_LIMIT = 25_000_000  # bytes: what a clone may be asked to carry
 # Written so that this file does not match itself.
 MACHINE_PATH = re.compile(r"(?<![\w./])/(?:wor[k]|hom[e]|roo[t]|Users|opt|tm[p])/\w")
 PRIVATE_HOST = re.compile(
-    r"https?://(?:\d+\.\d+\.\d+\.\d+|localhos[t]|[\w-]+[:/]|[\w.-]+\.(?:internal|local|lan|corp|intra)\b)"
+    r"https?://(?!127\.0\.0\.1\b)(?:\d+\.\d+\.\d+\.\d+|localhos[t]|[\w-]+[:/]|[\w.-]+\.(?:internal|local|lan|corp|intra)\b)"
 )
 UNFINISHED = re.compile(r"\b(?:TOD[O]|FIXM[E]|XX[X])\b")
 PACKAGE_INDEX = re.compile(r"--(?:extra-)?index-url|--find-links|--trusted-host|@ (?:file|https?):|https?://")

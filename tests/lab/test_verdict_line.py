@@ -38,10 +38,10 @@ def test_the_line_has_one_sentence_of_the_first_reason_and_counts_the_others():
 
 def test_a_reason_that_refers_to_the_others_is_shown_with_the_next_one():
     lost = Finding(Level.FAIL, "the vehicle was never found", remedy="Act on the other reasons.", code="BP-V02")
-    dark = Finding(
+    unlit = Finding(
         Level.FAIL, "camera left: nothing was detected", remedy="Are the lasers on? If so, look.", code="BP-V08"
     )
-    assert Verdict((lost, dark)).of_frames(0, 10) == (
+    assert Verdict((lost, unlit)).of_frames(0, 10) == (
         "FAIL: 0 of 10 frames measured (the vehicle was never found; camera left: nothing was detected)"
         " Are the lasers on?"
     )

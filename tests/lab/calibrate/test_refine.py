@@ -14,13 +14,12 @@ from calibration.terms.rig_blocks import stacks_of
 from cli import main
 from geometry.rig import Rig
 from geometry.uncertainty.chi_square import chi2_limit
-from geometry.uncertainty.rig_uncertainty import covariance_root
+from geometry.uncertainty.rig_uncertainty import covariance_root, perturbed_rig
 from lab.calibrate.refine.prior_sigmas import stated_covariance
 from lab.calibrate.refine.refine import refine_rig
 from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance, load_rig_file, save_rig
 from lab.findings.finding import Level
 from lab.simulate.write import simulate
-from tests.geometry.perturbed_rig import perturbed
 
 SIGMAS = {
     "cameras.position_m": 0.003, "cameras.rotation_deg": 0.1, "screens.position_m": 0.002, "screens.rotation_deg": 0.05,
@@ -47,7 +46,7 @@ def write_known(true: Rig, path: Path, seed: int = 0) -> None:
     covariance = stated_covariance(true, None, SIGMAS, path)
     root = covariance_root(covariance.matrix)
     off = root @ np.random.default_rng(seed).normal(size=root.shape[1])
-    known = perturbed(true, list(covariance.names), off)
+    known = perturbed_rig(true, list(covariance.names), off)
     covariance = stated_covariance(known, None, SIGMAS, path)
     save_rig(RigFile(known, covariance_blocks(covariance)), path)
 
@@ -141,7 +140,7 @@ def test_a_part_that_moved_by_more_than_stated_is_named_and_an_earlier_rig_stays
     out.mkdir()
     for name in ("rig.yaml", "residuals.csv"):
         (out / name).write_bytes((folder / "new" / name).read_bytes())
-    moved = perturbed(true, [f"{part}.{name}" for name in change], np.array(list(change.values())))
+    moved = perturbed_rig(true, [f"{part}.{name}" for name in change], np.array(list(change.values())))
     save_rig(RigFile(moved, covariance_blocks(stated_covariance(moved, None, SIGMAS, out))), tmp_path / "rig.yaml")
     done = typed("refine", *runs, "--rig", tmp_path / "rig.yaml", "--out", out)
     kind, name = part.split(".")

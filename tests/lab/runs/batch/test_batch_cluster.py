@@ -105,7 +105,7 @@ def test_a_file_of_a_scheduler_stands_for_its_address(address, tmp_path):
 
 def test_without_the_package_a_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(InputError, match="pip install distributed"):
+    with pytest.raises(InputError, match=r"distributed, .* pip install 'beampose\[cluster\]'"):
         process_batch([points_run(tmp_path / "a")], tmp_path / "out", BatchOptions(dask="tcp://127.0.0.1:8786"))
 
 
