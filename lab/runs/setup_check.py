@@ -19,6 +19,7 @@ from tracking.detections import Detections
 from tracking.setup_mistakes.evidence import LEAST_FITTING, LEAST_POINTS, Comparison, Frames, compare
 from tracking.setup_mistakes.possible import HERE, Block, possible_mistakes
 
+UNUSED = "BP-M07"  # code of the finding on a camera of which no point is labelled
 FRAMES = 6  # of a recording, with which mistakes are tested
 MOST_KEPT = 90  # frames from which they are chosen
 FEWEST, PART = 10, 0.6  # points, and the share of width and height that they do not exceed in part of a picture
@@ -93,7 +94,7 @@ def mistakes_of_run(run: Run, statistics: RunStatistics, pictures: Pictures, *, 
         return of_files
     found = recorded_mistakes(run, pictures.blocks)
     # Of a run, all pictures show whether a camera is used, not only the sampled ones; without any pose none is.
-    others = [f for f in found if f.code != "BP-M07"]
+    others = [f for f in found if f.code != UNUSED]
     if verdict(found) is Level.FAIL or not statistics.measured:
         return (*others, *of_files)
     unlabelled = [unused_finding(n, statistics.cameras[n].points, statistics.cameras[n].pictures) for n in unused]
@@ -179,7 +180,7 @@ def _findings(compared: Comparison, rig: Rig) -> tuple[Finding, ...]:
 def unused_finding(camera: str, points: int, pictures: int) -> Finding:
     """The finding on a camera of which no point is ever labelled."""
     what = f"camera `{camera}`: none of its {points} points in {pictures} pictures is the spot of a pose"
-    return finding("BP-M07", Level.WARN, what)
+    return finding(UNUSED, Level.WARN, what)
 
 
 def _sentence(text: str) -> str:

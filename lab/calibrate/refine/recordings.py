@@ -24,10 +24,10 @@ from lab.runs.frames.frames import FrameSet
 from lab.runs.frames.pipeline import Frames, Pipeline
 from lab.runs.model_check.check import ModelCheck, check_model
 from lab.runs.model_check.frame_sampler import FrameSampler
-from lab.runs.setup_check import mistakes_by_themselves, pictures_sampler, recorded_mistakes
+from lab.runs.setup_check import UNUSED, mistakes_of_run, pictures_sampler
 from lab.runs.smoothing_pass import TrackingAndSmoothing
 from lab.runs.verdict.frame_checks import FrameChecks
-from tracking.statuses import PoseStatus
+from lab.runs.verdict.run_statistics import CameraStatistics, RunStatistics
 
 LEAST_MEASURED = 0.9  # share of frames with a measured pose, below which usual mistakes of the set-up are tested
 # Share of the residuals that the errors of the rig cause, as sigma of the tracker's model: with all of it, or none,
@@ -121,7 +121,8 @@ def labelled(run: Run, most: int | None = None) -> LabelledRun:
     """
     camera_of = SpotModel.of(run.rig).camera_of
     sampler, pictures = FrameSampler(with_predicted=most is not None), pictures_sampler()
-    frames = measured = 0
+    cameras = {name: CameraStatistics() for name in run.rig.cameras}
+    statistics = RunStatistics(cameras, SpotModel.of(run.rig).views, run.tracker.labels.min_spots)
     with tempfile.TemporaryDirectory(prefix="beampose-refine-") as work:
         pipeline = Pipeline.of(run)
         if most is not None:
@@ -132,15 +133,13 @@ def labelled(run: Run, most: int | None = None) -> LabelledRun:
                 sampler.add_record(record, camera_of, run.tracker)
                 found = zip(run.rig.cameras, record.detections, strict=True)
                 pictures.add({name: points for name, points in found if points is not None})
-                frames += 1
-                measured += record.tracked.pose_status is PoseStatus.MEASURED
+                statistics.add(record)
     recording = sampler.recording()
-    mistakes = mistakes_by_themselves(run.rig, run.prior)
-    if measured <= LEAST_MEASURED * frames:
-        mistakes = (*mistakes, *recorded_mistakes(run, pictures.blocks))
+    passes_well = statistics.measured > LEAST_MEASURED * statistics.frames
+    mistakes = mistakes_of_run(run, statistics, pictures, passes=passes_well)
     worst = next(iter(worst_first(mistakes)), None)
-    if worst is not None and worst.level is Level.FAIL:
+    if worst is not None and (worst.level is Level.FAIL or worst.code == UNUSED):
         raise CalibrationError(f"{run.folder}: {worst.what}. {worst.remedy}")
     if recording is None:
         raise CalibrationError(f"{run.folder}: there is no frame at all")
-    return LabelledRun(run, recording, frames)
+    return LabelledRun(run, recording, statistics.frames)

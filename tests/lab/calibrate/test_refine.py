@@ -151,8 +151,8 @@ def test_a_part_that_moved_by_more_than_stated_is_named_and_an_earlier_rig_stays
 
 
 def test_a_vehicle_at_rest_gives_no_confident_rig(lab, tmp_path):
-    true = lab[2]
     runs = recordings(tmp_path, "static")
+    true = load_rig_file(runs[0] / "rig.yaml").rig
     write_known(true, tmp_path / "rig.yaml")
     outcome = refine_rig(runs, tmp_path / "rig.yaml", tmp_path / "new")
     r = outcome.result.refined
@@ -182,9 +182,9 @@ def test_exchanged_cameras_are_refused_and_nothing_is_written(lab, tmp_path):
     [
         (["--free", "camera"], "expected some of cameras,screens,beams,lens, got 'camera'"),
         (["--free", "lens"], "nothing is refined of which nothing is stated"),
-        (["--sigma", "cameras.left.position=1"], "expected one of cameras.position_m"),
+        (["--sigma", "cameras.left-a.position=1"], "expected one of cameras.position_m"),
         (["--sigma", "cameras.middle.position_m=0.1"], "expected one of the rig's cameras, got 'middle'"),
-        (["--sigma", "cameras.left.position_m=0.1"], "expected cameras.rotation_deg beside cameras.position_m"),
+        (["--sigma", "cameras.left-a.position_m=0.1"], "expected cameras.rotation_deg beside cameras.position_m"),
         (["--sigma", "beams.point_m=-1"], "expected a number above 0"),
     ],
 )
