@@ -333,8 +333,8 @@ def _delay(name: str, late_s: float, sigma_s: float, model: SpotModel, frame_int
 
 
 def p_text(p: float) -> str:
-    """`= 3e-09`, `below 1e-12`."""
-    return "below 1e-12" if p < 1e-12 else f"= {p:.0e}"
+    """`= 0.2`, `= 3e-09`, `below 1e-12`."""
+    return "below 1e-12" if p < 1e-12 else f"= {p:.1g}"
 
 
 @dataclass(frozen=True, slots=True)
