@@ -20,7 +20,7 @@ from lab.findings.finding import Level, worst_first
 from lab.findings.finding import verdict as verdict_of
 from lab.findings.outcome import Outcome, Verdict
 from lab.progress import Progress
-from lab.runs.clock_estimate import clock_findings, with_estimated_clocks
+from lab.runs.clock_estimate import clock_findings
 from lab.runs.frames.clocked_frames import ClockedFrames
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.frames.row_records import row_records
@@ -115,8 +115,8 @@ def _write_results(
 ) -> Outcome[RunStatistics]:
     run = pipeline.run
     log.start(run, versions())
-    pipeline, clocks = with_estimated_clocks(pipeline, work, log.progress(progress))
-    passes = TrackingAndSmoothing(pipeline, work, log.progress(progress), clocks)
+    passes = TrackingAndSmoothing.of(pipeline, work, log.progress(progress))
+    pipeline = passes.pipeline
     statistics, model_check, verdict = write_tables(pipeline, passes, work, causal=causal)
     from lab.runs.verdict.score import against_truth, read_tables
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from lab.progress import Progress
-from lab.runs.clock_estimate import ClockEstimate
+from lab.runs.clock_estimate import ClockEstimate, with_estimated_clocks
 from lab.runs.frames.moments import Moment
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from tracking.smoothing.recording import TrackedRecording
@@ -50,6 +50,12 @@ class TrackingAndSmoothing:
     clocks: ClockEstimate | None = None  # of a run whose clocks are estimated: by the passes before, then by this one
     smoothing: SmoothingSummary | None = field(default=None, init=False)  # None: not smoothed
     _planned: Mapping[str, tuple[float, float]] = field(default_factory=dict, init=False)  # clocks of the moments
+
+    @classmethod
+    def of(cls, pipeline: Pipeline, folder: Path, progress: Progress | None = None) -> TrackingAndSmoothing:
+        """The passes of a run, after those that estimate its clocks, where it leaves that to them."""
+        with_clocks, clocks = with_estimated_clocks(pipeline, folder, progress)
+        return cls(with_clocks, folder, progress, clocks)
 
     def causal_only(self) -> Generator[tuple[FrameRecord, None], None, None]:
         """The causal pass alone: each frame estimated from the frames up to it."""

@@ -124,10 +124,9 @@ def labelled(run: Run, most: int | None = None) -> LabelledRun:
     cameras = {name: CameraStatistics() for name in run.rig.cameras}
     statistics = RunStatistics(cameras, SpotModel.of(run.rig).views, run.tracker.labels.min_spots)
     with tempfile.TemporaryDirectory(prefix="beampose-refine-") as work:
-        pipeline = Pipeline.of(run)
+        passes = TrackingAndSmoothing.of(Pipeline.of(run), Path(work))
         if most is not None:
-            pipeline.reader = _FirstFrames(pipeline.reader, most)
-        passes = TrackingAndSmoothing(pipeline, Path(work))
+            passes.pipeline.reader = _FirstFrames(passes.pipeline.reader, most)
         with contextlib.closing(passes.records()) as records:
             for record, _ in FrameChecks(run.rig, run.covariance).passed(records):
                 sampler.add_record(record, camera_of, run.tracker)

@@ -146,3 +146,9 @@ def test_points_of_pictures_are_read_again_in_their_order(tmp_path):
         np.testing.assert_array_equal(again[0][1].uv_px, np.ones((2, 2)))
         assert again[1][1] == MissingPicture(DROPPED)
     found.close()
+
+
+def test_verify_estimates_the_clocks_again_and_finds_the_same_tables(estimated):
+    done = CliRunner().invoke(main, ["verify", str(estimated)])
+    assert done.exit_code == 0, done.output
+    assert "SAME: " in done.output
