@@ -234,8 +234,8 @@ def test_recordings_can_be_run_folders_with_unlabelled_spots(tmp_path):
     path.write_text(text)
     ended = calibrate_rig(project, tmp_path / "out", today=DAY)
     assert len(ended.result.steps.beams.world_from_body.translation) == 60
-    assert np.rad2deg(ended.held_out.attitude_rms) < 0.01
-    assert ended.held_out.ratio < 1.1
+    assert np.rad2deg(ended.result.held_out.attitude_rms) < 0.01
+    assert ended.result.held_out.ratio < 1.1
 
 
 @pytest.mark.slow
@@ -244,8 +244,8 @@ def test_other_rigs_are_calibrated_to_a_hundredth_of_a_degree(tmp_path, rig):
     project = simulate_calibration(tmp_path / "lab", seed=2, rig=rig, wrong=0.02)
     ended = calibrate_rig(project, tmp_path / "out", today=DAY)
     assert ended.level <= Level.WARN
-    assert np.rad2deg(ended.held_out.attitude_rms) < 0.01
-    assert ended.held_out.position_rms < 0.5e-3
+    assert np.rad2deg(ended.result.held_out.attitude_rms) < 0.01
+    assert ended.result.held_out.position_rms < 0.5e-3
 
 
 def with_survey_columns(project, tmp_path, order):
