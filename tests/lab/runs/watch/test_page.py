@@ -51,13 +51,17 @@ class Watched:
         options = WatchOptions(idle_s=5.0, timeout_s=0.5)
         self.outcome = watch_run(run, out, page=page, options=options, stop=self.stop, line=self.lines.append)
 
-    @property
-    def url(self) -> str:
+    def line(self, number: int) -> str:
+        """A line on the terminal, waited for."""
         end = time.monotonic() + 60
-        while not self.lines:
+        while len(self.lines) <= number:
             assert time.monotonic() < end
             time.sleep(0.02)
-        return self.lines[0].removeprefix("page: ")
+        return self.lines[number]
+
+    @property
+    def url(self) -> str:
+        return self.line(0).removeprefix("page: ")
 
     def end(self):
         self.stop.set()
@@ -89,6 +93,7 @@ def test_the_page_shows_pictures_labels_exposure_and_poses_until_the_recording_e
             browser.size(width, 800, night=True)
             assert browser.get("document.documentElement.scrollWidth <= innerWidth")
         assert [line for line in browser.console if "readback" not in line] == []
+        watched.line(1)  # the first of status comes a second after the first frame
         outcome = watched.end()
         browser.until("document.getElementById('state').textContent.startsWith('The recording has ended')")
     finally:
