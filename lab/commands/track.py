@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 # `beampose track`: one target through a video or a folder of pictures.
 
 _PIXEL = NumberRange(-1e6, 1e6)
+_rate_option = click.option(
+    "--rate", "rate_hz", type=NumberRange(0.01, 1e6), help="Frames per second; default: the video's, or 25."
+)
+_limit_option = click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
 
 
 @click.group(cls=Commands)
@@ -70,7 +74,7 @@ def _track(ctx: click.Context, target: Target[Any], given: Path, out: Path) -> N
     type=click.Choice(["supported", "outer", "inner", "opening"]),
     help="Which edge, where a target has several: of the rim, of a thin rim's inner side, of the opening inside it.",
 )
-@click.option("--rate", "rate_hz", type=NumberRange(0.01, 1e6), help="Frames per second; default: the video's, or 25.")
+@_rate_option
 @click.option(
     "--form",
     default="sound",
@@ -85,7 +89,7 @@ def _track(ctx: click.Context, target: Target[Any], given: Path, out: Path) -> N
     type=click.Choice(["classical", "learned"]),
     help="What proposes circles: votes of gradients, or a network that was trained on rendered drogues.",
 )
-@click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
+@_limit_option
 @click.option(
     "--video", "overlay", is_flag=True, help="Also write overlay.mp4: the pictures with the circle drawn into them."
 )
@@ -136,8 +140,8 @@ def circle(ctx: click.Context, /, pictures: Path, out: Path, **options: Any) -> 
     type=NumberRange(8, 10_000),
     help="Largest one; default: the picture's smaller side.",
 )
-@click.option("--rate", "rate_hz", type=NumberRange(0.01, 1e6), help="Frames per second; default: the video's, or 25.")
-@click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
+@_rate_option
+@_limit_option
 @click.option(
     "--video", "overlay", is_flag=True, help="Also write overlay.mp4: the pictures with the drogue drawn into them."
 )
@@ -201,7 +205,7 @@ def _place(ctx: click.Context, parameter: click.Parameter, value: str | None) ->
     help="Pictures per second; default: that of the video or t_s.",
 )
 @click.option("--camera", help="The camera, for a table with several.")
-@click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
+@_limit_option
 @click.option(
     "--min-measured",
     default=0.5,
@@ -255,8 +259,8 @@ def point(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> Non
     type=click.Choice(["spots", "harris"]),
     help="What finds lights: as for laser spots, or the corners of Fu (2016).",
 )
-@click.option("--rate", "rate_hz", type=NumberRange(0.01, 1e6), help="Frames per second; default: the video's, or 25.")
-@click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
+@_rate_option
+@_limit_option
 @click.option("--video", "overlay", is_flag=True, help="Also write overlay.mp4: the pictures with the target's centre.")
 @click.pass_context
 def lamps(ctx: click.Context, /, pictures: Path, out: Path, **options: Any) -> None:

@@ -23,10 +23,9 @@ from lab.findings.finding import Finding, Level, finding
 from lab.number_format import format_number, format_with_sigma
 from lab.progress import Progress
 from lab.runs.frames.clocked_frames import ClockedFrames, FoundPoints
-from lab.runs.frames.pipeline import FrameRecord, Pipeline
-from lab.runs.model_check.frame_sampler import FrameSampler, stated_covariances, widths
+from lab.runs.frames.pipeline import Pipeline
+from lab.runs.model_check.frame_sampler import FrameSampler
 from tracking.smoothing.recording import EstimatedClocks, FoundClocks
-from tracking.statuses import TrackedFrame
 
 MOST_PASSES = 4  # causal ones
 SETTLED = 0.1  # of the prior's sigma: a smaller correction does not need another causal pass
@@ -138,14 +137,6 @@ def clock_findings(estimate: ClockEstimate) -> tuple[Finding, ...]:
     return tuple(out)
 
 
-def add_to(sampler: FrameSampler, pipeline: Pipeline, record: FrameRecord, tracked: TrackedFrame) -> None:
-    """Add a frame as tracked or smoothed to those of which the residuals are used."""
-    model, run = pipeline.model, pipeline.run
-    stated = stated_covariances(tracked, record.detections, model.camera_of, run.tracker)
-    width = widths(tracked, record.detections, model.camera_of)
-    sampler.add_tracked(record.t_s, tracked, tracked.predicted_cov_px2, stated, width)
-
-
 def with_estimated_clocks(
     pipeline: Pipeline, folder: Path, progress: Progress | None = None
 ) -> tuple[Pipeline, ClockEstimate | None]:
@@ -164,7 +155,7 @@ def with_estimated_clocks(
     for number in range(MOST_PASSES if estimate.numbers else 0):
         sampler, total = FrameSampler(), here.reader.expected_frames
         for done, record in enumerate(here.records(), start=1):
-            add_to(sampler, here, record, record.tracked)
+            sampler.add_record(record, here.model.camera_of, run.tracker)
             if progress is not None:
                 progress(done, total, f"clocks, pass {number + 1}")
         estimate, correction_s = estimate.fitted(run, sampler.recording())

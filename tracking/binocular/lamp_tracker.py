@@ -77,6 +77,10 @@ class LampTracker:
         blind = replace(camera, name=f"{camera.name} (none)", camera_from_world=aside)
         self.pair, self.model = StereoPair((camera, blind), covariance), model
         self._find, self._interval_s = find, interval_s
+        self._mean = replace(  # of the lamps, as a marker
+            model, names=("",), positions=model.positions.mean(axis=0, keepdims=True), colour=model.colour[:1],
+            radius_m=np.full(1, np.nan),
+        )  # fmt: skip
         self._tracker = BinocularTracker(self.pair, model, parameters or MatchParameters())
         self._count, self._was, self._seen = -1, PoseStatus.LOST, False
 
@@ -99,11 +103,7 @@ class LampTracker:
         """The image (3,) of the lamps' mean, and its sigmas."""
         place, sigmas = np.full(3, np.nan), np.full(3, np.nan)
         if tracked.pose is not None and tracked.covariance is not None:
-            middle = replace(
-                self.model, names=("",), positions=self.model.positions.mean(axis=0, keepdims=True),
-                colour=self.model.colour[:1], radius_m=np.full(1, np.nan),
-            )  # fmt: skip
-            pixels, J = project_markers(self.pair, middle, tracked.pose)
+            pixels, J = project_markers(self.pair, self._mean, tracked.pose)
             place[:2] = pixels[0, 0]
             sigmas[:2] = np.sqrt(np.diagonal(J[0, 0] @ tracked.covariance @ J[0, 0].T))
         return place, sigmas

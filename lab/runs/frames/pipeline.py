@@ -100,7 +100,7 @@ class Timings:
 
 
 NEGLIGIBLE_S = 1e-9  # between a picture and its moment: rounding of times
-_CLIPPED = 0.85  # of the range above the background: a spot whose peak is higher is taken to be clipped
+CLIPPED = 0.85  # of the range above the background: a spot whose peak is higher is taken to be clipped
 
 
 @dataclass(slots=True)
@@ -229,7 +229,7 @@ def on_beam_axes(
     c, s = np.cos(np.radians(found.angle_deg)), np.sin(np.radians(found.angle_deg))
     major2, minor2 = found.major_px**2, found.minor_px**2
     shape = np.stack([major2 * c**2 + minor2 * s**2, (major2 - minor2) * c * s, major2 * s**2 + minor2 * c**2], axis=-1)
-    clipped = found.peak > _CLIPPED * (saturation_dn - noise.black_dn)
+    clipped = found.peak > CLIPPED * (saturation_dn - noise.black_dn)
     height = np.where(clipped, found.flux / (2 * np.pi * found.major_px * found.minor_px), found.peak)
     brightness = noise.slope_dn * height / noise.floor_dn2
     clip = np.where(clipped, found.peak / np.maximum(height, 1e-9), 1.0)

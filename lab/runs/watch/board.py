@@ -22,9 +22,9 @@ from lab.pictures.picture_file import GreyPicture
 from lab.report.frames.canvas import ground
 from lab.report.html import environment
 from lab.report.plot.svg import grey_limits, stretched
-from lab.runs.frames.pipeline import FrameRecord
+from lab.runs.frames.pipeline import CLIPPED, FrameRecord
 from lab.runs.model_check.check import check_sampled_frames
-from lab.runs.model_check.frame_sampler import FrameSampler, stated_covariances, widths
+from lab.runs.model_check.frame_sampler import FrameSampler
 from lab.runs.tables import pose_numbers
 from lab.runs.watch.background import ENDED
 from tracking.detections import Detections
@@ -41,8 +41,7 @@ _CHECKED = 200  # ... of so many frames, those of the curves' last ten seconds
 _SHOWN_PX = 960  # largest width of a picture on the page
 _KEPT = 8  # pictures of a camera from which that of the latest frame is taken
 _MOST_MARKS = 60  # points of a picture that are drawn
-_CLIPPED = 0.85  # of the range above black: a peak above it is taken to be clipped, as in lab/runs/frames/pipeline.py
-_DIM, _GOOD = 0.3, 0.65  # of that range: peaks below the first are dim; the second is where they should be
+_DIM, _GOOD = 0.3, 0.65  # of the range above black: peaks below the first are dim; the second is where they should be
 _BRIGHT = 0.25  # of the sensor's range: a background above it costs precision
 
 
@@ -61,7 +60,7 @@ class Board:
     _latest: dict[str, tuple[GreyPicture, Detections, dict[int, str]]] = field(default_factory=dict)
     _curves: deque[str] = field(default_factory=lambda: deque(maxlen=round(_WINDOW_S / _EVERY_S)))
     _latency_ms: deque[float] = field(default_factory=lambda: deque(maxlen=500))
-    _sampled: deque[tuple[Any, ...]] = field(default_factory=lambda: deque(maxlen=_CHECKED))
+    _sampled: deque[FrameRecord] = field(default_factory=lambda: deque(maxlen=_CHECKED))
     _word: dict[str, Any] = field(default_factory=dict)
     _model: SpotModel = field(init=False)
     _next_s: float = 0.0
@@ -110,9 +109,7 @@ class Board:
         # As text at once: that of all rows, four times a second, would keep the tracker waiting.
         shown = ",".join("null" if v != v else f"{v:.7g}" for v in (*numbers[:3].tolist(), *numbers[7:].tolist()))
         self._curves.append(f'[{record.t_s:.4f},"{tracked.pose_status.value}",{shown}]')
-        stated = stated_covariances(tracked, record.detections, self._model.camera_of, self.run.tracker)
-        width = widths(tracked, record.detections, self._model.camera_of)
-        self._sampled.append((record.t_s, tracked, tracked.predicted_cov_px2, stated, width))
+        self._sampled.append(record)
 
     # When a browser asks
 
@@ -175,7 +172,7 @@ class Board:
         peaks = found.peak[rows] / max(top - black, 1.0)
         out["spots"] = [
             [labels.get(i, ""), *(round(float(x), 2) for x in found.uv_px[i]), round(float(found.peak[i]), 1),
-             round(float(found.major_px[i]), 2), bool(p > _CLIPPED)]
+             round(float(found.major_px[i]), 2), bool(p > CLIPPED)]
             for i, p in zip(rows, peaks, strict=True)
         ]  # fmt: skip
         out["advice"], out["level"] = exposure_advice(peaks, float(np.median(picture[::8, ::8])) / top, expected)
@@ -198,10 +195,10 @@ class Board:
         self._checking = threading.Thread(target=self._checked, args=(list(self._sampled),), daemon=True)
         self._checking.start()
 
-    def _checked(self, frames: Sequence[tuple[Any, ...]]) -> None:
+    def _checked(self, frames: Sequence[FrameRecord]) -> None:
         sampler = FrameSampler(_CHECKED)
         for frame in frames:
-            sampler.add_tracked(*frame)
+            sampler.add_record(frame, self._model.camera_of, self.run.tracker)
         with suppress(*ENDED):
             found = self.check(check_sampled_frames, self.run.rig, sampler, self.run.covariance)
             worst = max(found.findings, key=lambda f: f.level, default=None)
@@ -215,7 +212,7 @@ def exposure_advice(peaks: Array, background: float, expected: int) -> tuple[str
 
     peaks (n,): of the spots, share of the sensor's range above black. background: share of the range. expected: spots.
     """
-    clipped = int(np.count_nonzero(peaks > _CLIPPED))
+    clipped = int(np.count_nonzero(peaks > CLIPPED))
     if not len(peaks):
         return ("no point found: are the lasers on, and is the lens open?", "fail") if expected else ("", "pass")
     if clipped:

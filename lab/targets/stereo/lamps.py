@@ -26,7 +26,7 @@ from lab.runs.processed import quantiles
 from lab.runs.tables import pose_numbers
 from lab.targets.page import TimeAxis
 from lab.targets.recording import DEFAULT_RATE_HZ
-from lab.targets.stereo.run import load_lamps
+from lab.targets.stereo.run import GOOD_NOISE_SCALE, LARGEST_NOISE_SCALE, load_lamps, noise_scale
 from lab.targets.stereo.tables import attitude_row, covariance_rows
 from lab.targets.target import Codes, Target, Track, TrackOptions, header_rate, track_pictures
 from tracking.binocular.lamp_corners import harris_corners
@@ -34,8 +34,8 @@ from tracking.binocular.lamp_tracker import LampFrame, LampTracker
 from tracking.binocular.marker_model import MarkerImages, MatchParameters
 from tracking.detection.detect import find_spots
 from tracking.noise import Picture
+from tracking.statuses import PoseStatus
 
-LARGEST_NOISE_SCALE, GOOD_NOISE_SCALE = 5.0, 1.5  # residuals over their sigmas, as of a stereo run
 _MOST_LIGHTS = 60  # of a picture; the strongest
 _POSE = (("x", "m"), ("y", "m"), ("z", "m"), ("yaw", "deg"), ("pitch", "deg"), ("roll", "deg"))
 
@@ -186,7 +186,5 @@ def _sigmas(track: Track[LampFrame]) -> np.ndarray:
 
 
 def _noise_scale(track: Track[LampFrame]) -> float:
-    """Root of chi-square over degrees of freedom of the measured frames; nan without any."""
-    fits = [f.tracked.fit for f in track.frames if f.tracked.fit is not None and f.status.value == "measured"]
-    dof = sum(fit.dof for fit in fits)
-    return float(np.sqrt(sum(fit.chi2 for fit in fits) / dof)) if dof else float("nan")
+    measured = (f.tracked.fit for f in track.frames if f.status is PoseStatus.MEASURED)
+    return noise_scale([fit for fit in measured if fit is not None])

@@ -27,7 +27,15 @@ from lab.progress import Progress
 from lab.runs.processed import Processed, write_processed
 from lab.targets.stereo.frames import StereoFrame, stereo_frames
 from lab.targets.stereo.page import write_stereo_page
-from lab.targets.stereo.run import StereoRecord, StereoResults, StereoRun, load_stereo_run, truth_errors
+from lab.targets.stereo.run import (
+    GOOD_NOISE_SCALE,
+    LARGEST_NOISE_SCALE,
+    StereoRecord,
+    StereoResults,
+    StereoRun,
+    load_stereo_run,
+    truth_errors,
+)
 from lab.targets.stereo.tables import write_tables
 from tracking.binocular.calibration_check import (
     MOST_FRAMES,
@@ -43,7 +51,6 @@ from tracking.binocular.segmentation import is_grey, marker_candidates, prepared
 
 LEAST_MEASURED, GOOD_MEASURED = 0.1, 0.95  # shares of the frames, as for runs of laser spots
 GOOD_PICTURES = 0.95  # share of frames with a usable picture, per camera
-LARGEST_NOISE_SCALE, GOOD_NOISE_SCALE = 5.0, 1.5  # residuals over their sigmas
 _ENOUGH, _FEWEST_SEEN = 4, 3  # markers of a picture that determine a pose, and frames with as many in both
 LARGEST_NEES = 20.0  # per number, of poses with an error of the calibration: above, the sigmas are of no use
 _MOST_NAMED = 4  # errors of the calibration in a message

@@ -66,6 +66,7 @@ from tracking.binocular.pose_tracker import BinocularFrame
 from tracking.binocular.segmentation import ColourRange
 from tracking.statuses import PoseStatus
 
+LARGEST_NOISE_SCALE, GOOD_NOISE_SCALE = 5.0, 1.5  # residuals over their sigmas
 _SYMMETRIC = 0.03  # share of the target's size within which turned markers count as the same
 
 
@@ -369,9 +370,13 @@ class StereoResults:
     @property
     def noise_scale(self) -> float:
         """Root of chi-square over degrees of freedom of all measured frames: 1 if the stated sigmas are right."""
-        fits = [fit for fit in self.fits if fit is not None]
-        dof = sum(f.dof for f in fits)
-        return float(np.sqrt(sum(f.chi2 for f in fits) / dof)) if dof else float("nan")
+        return noise_scale([fit for fit in self.fits if fit is not None])
+
+
+def noise_scale(fits: Sequence[PoseFit]) -> float:
+    """Root of chi-square over degrees of freedom of measured poses: 1 if the stated sigmas are right; nan: no pose."""
+    dof = sum(f.dof for f in fits)
+    return float(np.sqrt(sum(f.chi2 for f in fits) / dof)) if dof else float("nan")
 
 
 def _rms(values: Array) -> float:

@@ -252,6 +252,36 @@ def _speed(J: Array, m: Array) -> Array:
 
 
 @compiled
+def _weighted_spot(
+    views: Views,
+    i: int,
+    noise: Array,
+    calibration_cov: Array,
+    delays: Delays,
+    d: int,
+    ref: Reference,
+    steps: Steps,
+    k: int,
+    at: Array,
+    J: Array,
+    H: Array,
+) -> tuple[bool, Array, float, float, float]:
+    """Whether view i is projected at the instant of point d, its motion as of `timed_spot`, and its weight.
+
+    noise, calibration_cov (2, 2), px^2: of the point, and of the view. k: frame of ref and steps. at, J, H receive what
+    `timed_spot` writes. The weight is the upper triangle of the inverse of the covariance, 1/px^2.
+    """
+    after = delays.after_s[d]
+    projected, m = timed_spot(views, i, ref.R[k], ref.t[k], ref.m[k], after, at, J, H)
+    if not projected:
+        return False, m, 0.0, 0.0, 0.0
+    uu, both, vv = _covariance(noise, J, m, delays.row_time_s[d], steps, k, after)
+    uu, both, vv = uu + calibration_cov[0, 0], both + calibration_cov[0, 1], vv + calibration_cov[1, 1]
+    w0, w1, w2, _ = inverse_2x2(uu, both, vv)
+    return True, m, w0, w1, w2
+
+
+@compiled
 def delayed_information(
     views: Views,
     detections: RunDetections,
@@ -275,13 +305,11 @@ def delayed_information(
             if not use[i]:
                 continue
             d = detections.begin[start + k] + assigned[start + k, i]
-            after = delays.after_s[d]
-            projected, m = timed_spot(views, i, ref.R[k], ref.t[k], ref.m[k], after, at, J, H)
+            projected, _, w0, w1, w2 = _weighted_spot(
+                views, i, noise[i], calibration_cov[i], delays, d, ref, steps, k, at, J, H
+            )
             if not projected:
                 continue
-            uu, both, vv = _covariance(noise[i], J, m, delays.row_time_s[d], steps, k, after)
-            uu, both, vv = uu + calibration_cov[i, 0, 0], both + calibration_cov[i, 0, 1], vv + calibration_cov[i, 1, 1]
-            w0, w1, w2, _ = inverse_2x2(uu, both, vv)
             chi2[k] += add_spot(L[k], g[k], H, w0, w1, w2, uv[i, 0] - at[0], uv[i, 1] - at[1])
     return L, g, chi2
 
@@ -312,13 +340,11 @@ def timed_rows(
             if not use[i]:
                 continue
             d = detections.begin[start + k] + assigned[start + k, i]
-            after = delays.after_s[d]
-            projected, m = timed_spot(views, i, ref.R[k], ref.t[k], ref.m[k], after, at, J, one)
+            projected, m, w0, w1, w2 = _weighted_spot(
+                views, i, noise[i], calibration_cov[i], delays, d, ref, steps, k, at, J, one
+            )
             if not projected:
                 continue
-            uu, both, vv = _covariance(noise[i], J, m, delays.row_time_s[d], steps, k, after)
-            uu, both, vv = uu + calibration_cov[i, 0, 0], both + calibration_cov[i, 0, 1], vv + calibration_cov[i, 1, 1]
-            w0, w1, w2, _ = inverse_2x2(uu, both, vv)
             W[k, i, 0, 0], W[k, i, 0, 1], W[k, i, 1, 0], W[k, i, 1, 1] = w0, w1, w1, w2
             moving = _speed(J, m)
             row[k, i] = uv[i, 1]
