@@ -192,6 +192,7 @@ _REFINED, _REFINED_SHARE = 24, 0.6  # best hypotheses that are fitted: at most s
 _CHUNK = 4000  # hypotheses scored at once: 15 MB
 _COARSE_PX, _COARSE_SHARE = 2.0, 0.04  # gate of the scoring: px, and share of the target's size in the picture
 _SAME_RAD, _SAME_SHARE = np.deg2rad(6.0), 0.02  # poses that differ by less, the position relative to the distance
+_BY_CHANCE = 4  # candidates of a picture that a wrong pose explains
 _ENOUGH = 0.95  # share of the images explained at which the second camera's triples are not needed
 
 
@@ -247,9 +248,15 @@ def acquire(pair: StereoPair, model: MarkerModel, images: Images, p: MatchParame
 
 
 def _explains_a_picture(found: LabelledPose, model: MarkerModel, images: Images) -> bool:
-    """Whether a pose explains nearly all candidates of one picture, or all its markers."""
+    """Whether a pose explains nearly all candidates of one picture, or all its markers, and that not by chance.
+
+    Three candidates give a pose, and among hundreds of hypotheses one explains a fourth one by chance.
+    """
     explained = (found.index >= 0).sum(axis=1)
-    return any(n >= _ENOUGH * min(len(model), len(own)) > 0 for n, own in zip(explained, images, strict=True))
+    return any(
+        n >= max(_ENOUGH * min(len(model), len(own)), _BY_CHANCE + 1)
+        for n, own in zip(explained, images, strict=True)
+    )
 
 
 def distinct(found: list[LabelledPose]) -> list[LabelledPose]:
