@@ -254,8 +254,7 @@ def _explains_a_picture(found: LabelledPose, model: MarkerModel, images: Images)
     """
     explained = (found.index >= 0).sum(axis=1)
     return any(
-        n >= max(_ENOUGH * min(len(model), len(own)), _BY_CHANCE + 1)
-        for n, own in zip(explained, images, strict=True)
+        n >= max(_ENOUGH * min(len(model), len(own)), _BY_CHANCE + 1) for n, own in zip(explained, images, strict=True)
     )
 
 
