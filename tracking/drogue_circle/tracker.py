@@ -33,10 +33,11 @@ _RIM_SHARE = 0.92  # score of the outermost circle of a target, as a share of th
 _LEAST_POINTS = 12  # independent edge points: texture often gives a short arc of a small circle
 _CORRELATED_PX = 3.5  # length of rim that counts as one point, see `rim_fit`
 # Residuals of the rim points, RMS: share of the radius, and px. Of plain and ribbed discs they are .10 to .16 px, of
-# textured ones of 27 px .3 px, of the round outlines of clouds, fields and waves .5 to .8 px at 9 to 19 px. Crowns of trees
-# and shreds of cloud of 8 to 10 px have .03 to .037 of the radius times the coverage, targets of 8 to 22 px .01 to .023.
+# textured ones of 27 px .3 px, of the round outlines of clouds, fields and waves .5 to .8 px at 9 to 19 px. Crowns of
+# trees and shreds of cloud of 8 to 10 px have .03 to .037 of the seen radius (times the coverage), targets of 8 to
+# 22 px .01 to .023.
 _LARGEST_RMS = 0.012, 0.15
-_LARGEST_SHARE = 0.026
+_LARGEST_SHARE = 0.026  # of the seen radius
 _START_RMS = 0.05, 0.35  # as _LARGEST_RMS before `_best_near`: a mixture of rims has larger ones
 _EDGE_SHARE = 0.6  # score of another edge of a target, as a share of the best one's
 _THIN, _OPENING = 0.85, 0.9  # radii of the inner edge of a thin rim and of an opening, as shares of the outer edge's
