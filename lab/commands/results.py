@@ -174,7 +174,7 @@ def export(results: Path, to: str, out: Path | None, causal: bool) -> None:
 
 @click.command()
 @click.argument("path", type=ANY_PATH)
-@click.option("--out", type=FOLDER, help="Write files here and open no window. Without a display: results/view.")
+@click.option("--out", type=FOLDER, help="Write the files here and open no browser; default: results/view.")
 @click.option("--frame", type=int, help="Frame number of the beams and spots; default: the middle one.")
 @click.option("--rig", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Instead of the run's rig.")
 @click.option(
@@ -185,9 +185,8 @@ def export(results: Path, to: str, out: Path | None, causal: bool) -> None:
 def view(path: Path, out: Path | None, frame: int | None, rig: Path | None, sigma_scale: float | None) -> None:
     """Show a rig.yaml, a run folder or results in three dimensions.
 
-    Screens, cameras with their fields of view, beams, spots and the trajectory with sigma ellipsoids. Opens a window
-    where there is a display: space plays, arrow keys step, and with a driver of Vulkan it has a slider. Otherwise, or
-    with --out, it writes view.html to turn and play in a browser, scene.glb, scene.ply and pictures.
+    Screens, cameras with their fields of view, beams, spots and the trajectory with sigma ellipsoids. Writes view.html
+    to turn and play in a browser, which opens where there is a display, scene.glb, scene.ply and pictures.
 
     \b
     Example:

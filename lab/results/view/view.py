@@ -1,112 +1,29 @@
-"""`beampose view`: a window where a display exists, else files.
-
-A window of Open3D with keys alone, for systems on which the one with a slider cannot open.
-
-It shows the scene, with the vehicle, its beams and spots at a moment that keys change.
-"""
+"""`beampose view`: files of a scene, and its page in the web browser where there is a display."""
 
 from __future__ import annotations
 
-import ctypes
+import multiprocessing
 import os
 import sys
-import time
+import webbrowser
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from calibration.open3d_loader import MissingOpen3DError, open3d
+from geometry.arrays import Array
 from lab.errors import InputError
 from lab.files.text.atomic_write import made_folder
 from lab.findings.outcome import Done
 from lab.report.calibration.calibration_scene import LAB_VIEWS, VIEWS
 from lab.results.view.page import write_page
 from lab.results.view.scene import Mesh, View, mesh_of, read_content, view_of, write_glb
-from lab.results.view.slider_window import Player, as_open3d, look_along, open_slider_window, render
-
-_SPACE, _LEFT, _RIGHT, _DOWN, _UP, _HOME, _END = 32, 263, 262, 264, 265, 268, 269  # GLFW's numbers
-
-
-def open_window(view: View, index: int | None) -> bool:
-    """Show the view until the window is closed, with a slider if possible. False: no window could be opened."""
-    if open_slider_window(view, index):
-        return True
-    o3d = open3d()
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        window = o3d.visualization.VisualizerWithKeyCallback()
-        if not window.create_window(f"beampose: {view.content.name}", 1280, 900):
-            return False
-        fill(window, view, Player(view, index))
-        window.run()
-        window.destroy_window()
-    return True
-
-
-def fill(window: Any, view: View, player: Player) -> None:
-    """Add the scene to a window, and what keys and time do."""
-    window.add_geometry(as_open3d(mesh_of(view.fixed, view.ellipsoids, view.reach_m, view.extent_m)))
-    shown: list[Any] = []
-
-    def show(first: bool = False) -> bool:
-        for old in shown:
-            window.remove_geometry(old, reset_bounding_box=False)
-        shown.clear()
-        things = view.moving(player.index)
-        if things:
-            shown.append(as_open3d(mesh_of(things, [], view.reach_m, view.extent_m)))
-            window.add_geometry(shown[0], reset_bounding_box=first)
-        return True
-
-    def key(action: Any) -> Any:
-        def pressed(_: Any) -> bool:
-            action()
-            return show()
-
-        return pressed
-
-    def tick(_: Any) -> bool:
-        return show() if player.advance(time.monotonic()) else False
-
-    show(first=True)
-    window.get_render_option().mesh_show_back_face = True
-    look_along(window.get_view_control(), *next(iter(VIEWS.values())))
-    last = len(player.known)
-    for number, action in (
-        (_SPACE, lambda: player.toggle(time.monotonic())),
-        (_RIGHT, lambda: player.step(1)),
-        (_LEFT, lambda: player.step(-1)),
-        (_UP, lambda: player.leap(0.05)),
-        (_DOWN, lambda: player.leap(-0.05)),
-        (_HOME, lambda: player.step(-last)),
-        (_END, lambda: player.step(last)),
-    ):
-        window.register_key_callback(number, key(action))
-    window.register_animation_callback(tick)
-
 
 DEFAULT_OUT = Path("results", "view")
 _PICTURES = dict(zip(LAB_VIEWS, ("view-oblique.png", "view-above.png", "view-front.png"), strict=True))
-
-
-def has_display() -> bool:
-    """Whether a window can open.
-
-    On Linux: whether the X server that DISPLAY names answers. Without one Open3D opens a window that nobody sees, and
-    that nobody can close.
-    """
-    if not sys.platform.startswith("linux"):
-        return True
-    if not os.environ.get("DISPLAY"):
-        return False
-    try:
-        x11 = ctypes.CDLL("libX11.so.6")
-    except OSError:
-        return False
-    x11.XOpenDisplay.restype = ctypes.c_void_p
-    display = x11.XOpenDisplay(None)
-    if not display:
-        return False
-    x11.XCloseDisplay(ctypes.c_void_p(display))
-    return True
+_SIZE_PX = (1280, 900)
+_SECONDS = 120.0  # for all pictures; software drawing takes a few
 
 
 def show(
@@ -117,7 +34,7 @@ def show(
     rig: Path | None = None,
     sigma_scale: float | None = None,
 ) -> Done[tuple[Path, ...]]:
-    """Show a rig.yaml, a run folder or results in a window; without a display, or with `out`, write files.
+    """Write the scene of a rig.yaml, a run folder or results; without `out`, also open its page in the browser.
 
     frame: of the beams and spots; None: the middle one. sigma_scale: of the ellipsoids; None: a round number that makes
     them visible. rig: a rig.yaml in place of the run's.
@@ -127,33 +44,33 @@ def show(
     """
     content = read_content(path, rig)
     index = content.at_frame(frame)
-    view = view_of(content, index, sigma_scale)
-    notes: tuple[str, ...] = ()
-    if out is None and has_display():
-        try:
-            if open_window(view, index):
-                return Done((), ())
-            notes = ("no window could be opened; files are written instead",)
-        except MissingOpen3DError as error:
-            notes = (f"no window: {error}",)
-    return write_files(view, index, out or DEFAULT_OUT, notes)
+    return write_files(view_of(content, index, sigma_scale), index, out or DEFAULT_OUT, out is None and has_display())
 
 
-def write_files(view: View, index: int | None, out: Path, notes: tuple[str, ...] = ()) -> Done[tuple[Path, ...]]:
-    """view.html and scene.glb, and where Open3D can be loaded scene.ply and pictures.
+def has_display() -> bool:
+    """Whether a browser can show a page here, and not in the terminal."""
+    names = ("DISPLAY", "WAYLAND_DISPLAY")
+    return not sys.platform.startswith("linux") or any(os.environ.get(name) for name in names)
+
+
+def write_files(view: View, index: int | None, out: Path, opened: bool = False) -> Done[tuple[Path, ...]]:
+    """view.html and scene.glb, and where Open3D can be loaded scene.ply and pictures. opened: in the browser.
 
     Raises:
         InputError: a file cannot be written.
     """
     made_folder(out)
     write_page(view, index, out / "view.html")
+    if opened:
+        webbrowser.open((out / "view.html").resolve().as_uri())
     mesh = mesh_of([*view.fixed, *view.moving(index)], view.ellipsoids, view.reach_m, view.extent_m)
     write_glb(mesh, out / "scene.glb")
     files = [out / "view.html", out / "scene.glb"]
+    notes: tuple[str, ...] = ()
     try:
         files += _by_open3d(mesh, out)
     except MissingOpen3DError as error:
-        notes = (*notes, f"no scene.ply and no rendered pictures: {error}")
+        notes = (f"no scene.ply and no rendered pictures: {error}",)
     return Done(tuple(files), tuple(map(str, files)), notes)
 
 
@@ -164,3 +81,59 @@ def _by_open3d(mesh: Mesh, out: Path) -> list[Path]:
         raise InputError(f"{ply}: cannot be written; choose another --out")
     part.replace(ply)
     return [ply, *render(mesh, {view: out / name for view, name in _PICTURES.items()})]
+
+
+def render(mesh: Mesh, views: dict[str, Path]) -> list[Path]:
+    """Write PNG pictures of a mesh; views: file by name of a view, of VIEWS. Returns those that could be drawn.
+
+    In a process of its own, since a graphics driver may write to standard output and may end the process. Without a
+    display Open3D draws through EGL, where the system has it.
+    """
+    for path in views.values():
+        path.unlink(missing_ok=True)
+    context = multiprocessing.get_context("spawn")
+    jobs = [(VIEWS[name], str(path)) for name, path in views.items()]
+    worker = context.Process(target=_draw, args=(mesh, jobs), daemon=True)
+    worker.start()
+    worker.join(_SECONDS)
+    if worker.is_alive():
+        worker.kill()
+        worker.join()
+    return [path for path in views.values() if path.is_file()]
+
+
+def as_open3d(mesh: Mesh) -> Any:
+    """Open3D's triangle mesh, with normals."""
+    o3d = open3d()
+    out = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.triangles.astype(np.int32))
+    )
+    out.vertex_colors = o3d.utility.Vector3dVector(mesh.colours)
+    out.compute_vertex_normals()
+    return out
+
+
+def _draw(mesh: Mesh, jobs: list[tuple[tuple[Array, Array], str]]) -> None:
+    """The work of the process. What libraries print goes nowhere."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 1)
+    os.dup2(null, 2)
+    o3d = open3d()
+    drawn = as_open3d(mesh)
+    window = o3d.visualization.Visualizer()
+    if not window.create_window("beampose", *_SIZE_PX, visible=False):
+        return
+    window.add_geometry(drawn)
+    window.get_render_option().mesh_show_back_face = True
+    for (right, up), path in jobs:
+        control = window.get_view_control()
+        control.set_front(np.cross(right, up))
+        control.set_up(up)
+        control.set_zoom(0.75)
+        window.poll_events()
+        window.update_renderer()
+        part = f"{path}.part.png"
+        window.capture_screen_image(part, do_render=True)
+        if os.path.isfile(part):
+            os.replace(part, path)
+    window.destroy_window()

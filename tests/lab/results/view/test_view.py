@@ -1,12 +1,10 @@
-"""A view shows what the rig and the results say, as a page, a mesh, pictures, and a window that keys play."""
+"""A view shows what the rig and the results say, as a page, a mesh and pictures."""
 
 from __future__ import annotations
 
 import json
-import os
 import re
 import sys
-import time
 
 import cv2
 import numpy as np
@@ -18,12 +16,10 @@ from geometry.pose import Pose
 from lab.errors import InputError
 from lab.files.rig.rig_file import save_rig
 from lab.results.view import scene as solids
-from lab.results.view import slider_window, view
 from lab.results.view import view as view_module
 from lab.results.view.page import scene_data, write_page
 from lab.results.view.scene import read_content, view_of, write_glb
-from lab.results.view.slider_window import Controls, Player
-from lab.results.view.view import fill, show
+from lab.results.view.view import show
 from tests.lab.fake_results import make
 from tests.lab.simulate.test_own_motion import elsewhere
 from tests.open3d_marker import needs_open3d
@@ -181,12 +177,20 @@ def test_files_are_written_without_a_display(fake, tmp_path, monkeypatch):
         assert (picture.max(axis=2) - picture.min(axis=2) > 60).mean() > 1e-3  # coloured lines on white
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems always have a display")
-def test_a_display_that_does_not_answer_is_none(monkeypatch):
-    monkeypatch.setenv("DISPLAY", ":9876")
-    assert not view_module.has_display()
-    monkeypatch.delenv("DISPLAY")
-    assert not view_module.has_display()
+@pytest.mark.parametrize("display", [True, False])
+@pytest.mark.parametrize("out", [None, "out"])
+def test_the_page_opens_in_the_browser_where_there_is_a_display_and_no_out(fake, tmp_path, monkeypatch, display, out):
+    opened = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setenv("DISPLAY", ":0" if display else "")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(view_module.webbrowser, "open", opened.append)
+    monkeypatch.setattr(view_module, "_by_open3d", lambda mesh, out: [])
+    show(fake.results, out and tmp_path / out)
+    page = tmp_path / (out or "results/view") / "view.html"
+    assert page.is_file()
+    assert opened == ([page.resolve().as_uri()] if display and out is None else [])
 
 
 def test_without_open3d_the_page_and_the_glb_are_written_and_the_reason_is_said(fake, tmp_path, monkeypatch):
@@ -196,131 +200,9 @@ def test_without_open3d_the_page_and_the_glb_are_written_and_the_reason_is_said(
     assert "no scene.ply and no rendered pictures: this needs Open3D" in done.notes[0]
 
 
-def test_the_player_runs_at_the_speed_of_the_recording_and_stops_at_the_end(content):
-    player = Player(view_of(content, None), None)
-    times = content.t_s[content.known]
-    player.toggle(50.0)
-    assert player.playing
-    player.advance(50.0 + times[3] - times[0] + 1e-6)
-    assert player.at == 3
-    player.advance(1e6)
-    assert (player.at, player.playing) == (len(times) - 1, False)
-    player.step(-1)
-    assert player.at == len(times) - 2
-    player.step(-(10**6))
-    assert player.at == 0
-    player.leap(0.5)
-    assert player.at == round(0.5 * len(times))
-
-
-@needs_open3d
-def test_a_rig_without_poses_has_nothing_to_play(content, tmp_path):
-    save_rig(content.rig, tmp_path / "rig.yaml")
-    view = view_of(read_content(tmp_path / "rig.yaml", None), 0)
-    player = Player(view, 0)
-    player.toggle(0.0)
-    player.step(5)
-    assert (player.index, player.playing, player.advance(9.0)) == (0, False, False)
-
-
-def _ends(view, index, opened):
-    os._exit(139)
-
-
-def _opens_and_ends(view, index, opened):
-    opened.send(True)
-    os._exit(139)
-
-
-class Window:
-    """Notes what is added to a window, and its keys."""
-
-    def __init__(self):
-        self.shown, self.keys, self.tick = [], {}, None
-        self.remove_geometry = lambda thing, **_: self.shown.remove(thing)
-
-    def add_geometry(self, thing, **_):
-        self.shown.append(thing)
-
-    def register_key_callback(self, key, action):
-        self.keys[key] = action
-
-    def register_animation_callback(self, tick):
-        self.tick = tick
-
-    def get_render_option(self):
-        return self
-
-    def get_view_control(self):
-        return self
-
-    def set_front(self, _):
-        pass
-
-    set_up = set_zoom = set_front
-
-
-@needs_open3d
-def test_a_key_moves_the_beams_of_the_window(content):
-    scene = view_of(content, None)
-    window, player = Window(), Player(scene, None)
-    fill(window, scene, player)
-    assert len(window.shown) == 2
-    before = np.asarray(window.shown[1].vertices).copy()
-    assert window.keys[269](window)  # end
-    assert len(window.shown) == 2
-    assert np.abs(np.asarray(window.shown[1].vertices) - before).max() > 1e-3
-    assert not window.tick(window)  # nothing plays
-
-
-@needs_open3d
-def test_the_slider_the_button_the_keys_and_the_clock_move_one_and_the_same_player(content):
-    """With Open3D's own widgets, which work without a window."""
-    gui, drawn = open3d().visualization.gui, []
-    player = Player(view_of(content, None), None)
-    controls = Controls(gui, player, lambda: drawn.append(player.at))
-    last = len(player.known) - 1
-    assert (controls.slider.get_minimum_value, controls.slider.get_maximum_value) == (0, last)
-    controls.slid(3.0)
-    assert (player.at, drawn, controls.slider.int_value) == (3, [3], 3)
-    frame, t_s = content.frames[player.known[3]], content.t_s[player.known[3]]
-    assert controls.caption.text == f"frame {frame}, {t_s:.3f} s"
-    assert controls.press(gui.KeyName.END)
-    assert (controls.slider.int_value, drawn[-1]) == (last, last)
-    assert not controls.press(gui.KeyName.Q)
-    assert controls.press(gui.KeyName.SPACE)  # plays from the start again
-    assert (controls.button.text, player.at) == ("Pause", 0)
-    assert controls.tick(time.monotonic() + 1e6)
-    assert (controls.slider.int_value, controls.button.text, drawn[-1]) == (last, "Play", last)
-    assert not controls.tick(time.monotonic() + 2e6)
-    controls.slid(float(last + 10))  # beyond the end
-    assert player.at == last
-
-
-@needs_open3d
-def test_where_the_window_with_a_slider_cannot_open_the_other_one_is_tried(content, monkeypatch):
-    """Its process ends without a window, whatever the reason: no Vulkan, or a driver that ends the process."""
-    monkeypatch.setattr(slider_window, "_show", _ends)
-    assert not slider_window.open_slider_window(view_of(content, None), None)
-
-
-@needs_open3d
-def test_a_window_that_was_open_is_not_followed_by_another(content, monkeypatch):
-    monkeypatch.setattr(slider_window, "_show", _opens_and_ends)
-    assert slider_window.open_slider_window(view_of(content, None), None)
-
-
-def test_where_the_window_with_a_slider_opens_no_other_one_is_tried(content, monkeypatch):
-    tried = []
-    monkeypatch.setattr(view, "open3d", lambda: tried.append(True))
-    monkeypatch.setattr(view, "open_slider_window", lambda view, index: True)
-    assert view.open_window(view_of(content, None), None)
-    assert tried == []
-
-
 @needs_open3d
 def test_a_renderer_that_hangs_or_fails_gives_no_pictures(content, tmp_path, monkeypatch):
-    monkeypatch.setattr(slider_window, "_SECONDS", 0.05)
+    monkeypatch.setattr(view_module, "_SECONDS", 0.05)
     view = view_of(content, None)
     mesh = solids.mesh_of(view.fixed, [], view.reach_m, view.extent_m)
-    assert slider_window.render(mesh, {"from above (along −z)": tmp_path / "a.png"}) == []
+    assert view_module.render(mesh, {"from above (along −z)": tmp_path / "a.png"}) == []
