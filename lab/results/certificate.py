@@ -83,6 +83,7 @@ class Certificate:
     """The budgets of a result: of chosen frames, and the expanded uncertainty of all measured frames."""
 
     name: str
+    summary: Mapping[str, Any]  # summary.json
     run: Run
     frames: tuple[FrameCertificate, ...]
     measured: Ints  # (k,) frame numbers
@@ -97,7 +98,8 @@ def certificate(
     Raises:
         InputError: a table or the run folder cannot be read, or a frame is not measured.
     """
-    run = load_run(_run_folder(results, run_folder))
+    summary = read_summary(results)
+    run = load_run(_run_folder(results, run_folder, str(summary.get("run_folder") or "")))
     poses, spots = read_poses(results), read_spots(results)
     stated = _rest_parts(results, poses)
     measured = np.flatnonzero(poses.has(PoseStatus.MEASURED) & np.isfinite(poses.covariance).all(axis=(1, 2)))
@@ -119,11 +121,10 @@ def certificate(
                 f"--at {number}: expected a frame with a measured pose, found another or none of this number"
             )
         made.append(_of_frame(run, poses, spots, int(measured[here[0]]), rest[:, here[0]], dof, (draws, seed)))
-    return Certificate(results.resolve().name, run, tuple(made), poses.frames[measured], whole)
+    return Certificate(results.resolve().name, summary, run, tuple(made), poses.frames[measured], whole)
 
 
-def _run_folder(results: Path, given: Path | None) -> Path:
-    named = str(read_summary(results).get("run_folder") or "")
+def _run_folder(results: Path, given: Path | None, named: str) -> Path:
     folder = given or run_folder_named(results, named)
     if folder is None:
         raise InputError(f"{results}: its run folder {named} is not there; name it with --run")
@@ -222,9 +223,8 @@ def write_certificate(
 
 
 def _page(c: Certificate, results: Path) -> Page:
-    summary = read_summary(results)
     of_frames = [section for f in c.frames for section in _frame_sections(f)]
-    sections = [_measurand(c), *of_frames, _range(c), _traceability(c, results, summary)]
+    sections = [_measurand(c), *of_frames, _range(c), _traceability(c, results)]
     first = c.frames[0].result
     low, high = f"{first.factor.min():.2f}", f"{first.factor.max():.2f}"
     note = f"frame {c.frames[0].frame}, k = {low if low == high else f'{low} to {high}'}"
@@ -238,13 +238,13 @@ def _page(c: Certificate, results: Path) -> Page:
             "rig.yaml states no covariance: the uncertainty of the calibration is not part of this budget, which is"
             " then incomplete. Calibrate with beampose, which writes the covariance."
         )
-    if summary.get("verdict", {}).get("status") == "fail":
+    if c.summary.get("verdict", {}).get("status") == "fail":
         notes.append("The verdict of this run is FAIL: its results must not be used; see report.html.")
     recorded = "date of the recording not stated" if c.run.recorded is None else f"recorded {c.run.recorded}"
     made = [
         made_with("numpy", "scipy"),
         ("form", "JCGM 100:2008 (GUM), JCGM 101:2008 (Monte Carlo)"),
-        ("command of the run", str(summary.get("command", ""))),
+        ("command of the run", str(c.summary.get("command", ""))),
     ]
     return Page("uncertainty of a measurement", c.name, f"{c.run.name}, {recorded}", sections, keys, notes, made)
 
@@ -391,12 +391,12 @@ def _range(c: Certificate) -> Section:
     )
 
 
-def _traceability(c: Certificate, results: Path, summary: Mapping[str, Any]) -> Section:
+def _traceability(c: Certificate, results: Path) -> Section:
     state = c.run.calibration
     rig = "rig.yaml states no date and verdict of its calibration."
     if state is not None:
         rig = f"Calibration of the rig: {state.date}, verdict {state.verdict}, {state.validity}. {state.notes}".strip()
-    rows = [[Path(str(i["path"])).name, i["sha256"], i.get("covers", "")] for i in summary.get("inputs") or ()]
+    rows = [[Path(str(i["path"])).name, i["sha256"], i.get("covers", "")] for i in c.summary.get("inputs") or ()]
     made = [results / name for name in ("attitude.csv", "covariance.csv", "systematic.csv", "budget.csv")]
     rows += [
         [p.name, hashlib.sha256(p.read_bytes()).hexdigest(), "contents (this result)"] for p in made if p.is_file()

@@ -31,14 +31,14 @@ _PROTOCOL = 5  # of pickle: arrays are written and read in place, and the interp
 
 
 @dataclass(slots=True)
-class BackgroundProcess:
+class FunctionProcess:
     """Calls functions in another process, one at a time. Used as a context manager."""
 
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _process: subprocess.Popen[bytes] | None = None
     _ended: bool = False
 
-    def __enter__(self) -> BackgroundProcess:
+    def __enter__(self) -> FunctionProcess:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -31,7 +31,7 @@ from lab.runs.process import are_results, ready_run, write_results
 from lab.runs.smoothing_pass import TRACKING
 from lab.runs.verdict.frame_checks import FrameChecks
 from lab.runs.verdict.run_statistics import RunStatistics
-from lab.runs.watch.background import BackgroundProcess, LiveBackground
+from lab.runs.watch.background import FunctionProcess, LiveBackground
 from lab.runs.watch.live_frames import LiveFrames, WatchOptions
 from lab.runs.watch.live_output import LiveOutput, is_live_table
 from lab.runs.watch.streams import opened
@@ -89,7 +89,7 @@ def watch_run(
         output = LiveOutput(Path(out), frames, FrameChecks(run.rig, run.covariance), sending, board, line)
         stack.callback(output.close)
         with frames, _low_latency():
-            pipeline, finders = _started(run, frames, output, stack.enter_context(BackgroundProcess()))
+            pipeline, finders = _started(run, frames, output, stack.enter_context(FunctionProcess()))
             if reprocess:
                 for done, _ in enumerate(pipeline.records(), start=1):
                     if progress is not None:
@@ -115,7 +115,7 @@ def _served(
     from lab.runs.watch.page_server import PageServer
 
     # A process of its own: that of the backgrounds may be busy for seconds.
-    board = Board(run, frames, stack.enter_context(BackgroundProcess()).call)
+    board = Board(run, frames, stack.enter_context(FunctionProcess()).call)
     server = stack.enter_context(PageServer(page, page_html(run), board.state, board.picture))
     if line is not None:
         line(f"page: {server.url}")
@@ -123,7 +123,7 @@ def _served(
 
 
 def _started(
-    run: Run, frames: LiveFrames, output: LiveOutput, process: BackgroundProcess
+    run: Run, frames: LiveFrames, output: LiveOutput, process: FunctionProcess
 ) -> tuple[Pipeline, dict[str, _Finder]]:
     """The pipeline, after the noise is estimated from the first pictures. Raises RunError if none come."""
     _load_compiled_code(run)

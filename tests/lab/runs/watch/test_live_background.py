@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from lab.runs.frames.sensor_noise import VIDEO_FRAMES, CameraNoise
-from lab.runs.watch.background import BackgroundProcess, LiveBackground
+from lab.runs.watch.background import FunctionProcess, LiveBackground
 from tests.tracking.background.test_static_background import USUAL, Recording, path
 from tracking.background.estimation import static_background
 from tracking.noise import Picture
@@ -47,7 +47,7 @@ def test_spots_that_the_texture_hides_are_found_once_the_background_has_been_see
 def test_a_process_makes_the_same_background_until_it_is_ended():
     recording = Recording.of(path(90, 6, 2.0, 1), 4.5)
     own, background = live(recording)
-    with BackgroundProcess() as process:
+    with FunctionProcess() as process:
         others, made_elsewhere = live(recording, partial(process.call, static_background))
         for picture in recording.pictures[: VIDEO_FRAMES + 1]:
             background.add(picture)
@@ -69,7 +69,7 @@ def test_a_process_makes_the_same_background_until_it_is_ended():
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="reads the process time of another process")
 def test_the_process_gives_way_to_the_watch_before_it_loads_the_program():
     """Its imports take a second of a core, in which poses would be late."""
-    with BackgroundProcess() as process:
+    with FunctionProcess() as process:
         process.start()
         assert process._process is not None
         number = process._process.pid
