@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -10,90 +12,108 @@ from geometry.arrays import Array
 from geometry.rotations import ypr_jacobian
 from lab.number_format import format_angle, format_length, format_number, format_percent
 from lab.report.plot.svg import true_ranges
-from lab.report.run.report_data import MotionErrors, PoseSpread, ReportData, SpotErrors, TruthErrors, ViewErrors
+from lab.report.run.report_data import ReportData
 from tracking.statuses import PoseStatus, SpotStatus
 
-# The report's tables of errors against truth.
+# The report's tables of errors against truth, as lab.runs.verdict.score gives them; a missing number is a dash.
+
+Errors: TypeAlias = Mapping[str, Any]
 
 
-def truth_figures(e: TruthErrors | None) -> list[KeyFigure]:
+def part(errors: object, *names: str) -> Errors:
+    """A block within blocks, without texts, which no table shows; empty where it is not there."""
+    for name in names:
+        errors = errors.get(name) if isinstance(errors, Mapping) else None
+    return {k: v for k, v in errors.items() if not isinstance(v, str)} if isinstance(errors, Mapping) else {}
+
+
+def truth_figures(e: Errors | None) -> list[KeyFigure]:
     """The key figures of the errors against truth."""
     keys = []
-    if e is not None and e.spots is not None:
-        s, smooth = e.spots, e.spots.prediction_px.get("smooth")
-        outside = s.out_of_view_px
+    if s := part(e, "spots"):
+        outside = part(s, "out_of_view_px")
         keys += [
-            KeyFigure("right in view", format_percent(s.in_view_identity), "of visible spots"),
-            KeyFigure("wrong labels", counted(s.wrong_labels), "measured rows"),
-            KeyFigure("prediction error", pixels(None if smooth is None else smooth.rms), "RMS without true bends"),
+            KeyFigure("right in view", format_percent(s.get("in_view_identity")), "of visible spots"),
+            KeyFigure("wrong labels", counted(s.get("wrong_labels")), "measured rows"),
+            KeyFigure(
+                "prediction error", pixels(part(s, "prediction_px", "smooth").get("rms")), "RMS without true bends"
+            ),
             KeyFigure(
                 "out-of-view error",
-                pixels(None if outside is None else outside.rms),
-                f"RMS; largest {pixels(outside.max)}" if outside else "no spot was out of view",
+                pixels(outside.get("rms")),
+                f"RMS; largest {pixels(outside.get('max'))}" if outside else "no spot was out of view",
             ),
         ]
-    if e is not None and e.pose is not None and (measured := e.pose.measured) is not None:
-        causal = None if e.pose_causal is None else e.pose_causal.measured
+    if measured := part(e, "pose", "measured"):
+        rotation, position = (part(measured, name).get("rms") for name in ("rotation_deg", "position_m"))
         notes = ["RMS, measured poses"] * 2
-        if causal is not None:
-            shown = format_angle(causal.rotation_deg.rms), format_length(causal.position_m.rms)
+        if causal := part(e, "pose_causal", "measured"):
+            shown = (
+                format_angle(part(causal, "rotation_deg").get("rms")),
+                format_length(part(causal, "position_m").get("rms")),
+            )
             notes = [f"RMS, smoothed; causal {value}" for value in shown]
         keys += [
-            KeyFigure("rotation error", format_angle(measured.rotation_deg.rms), notes[0]),
-            KeyFigure("position error", format_length(measured.position_m.rms), notes[1]),
-            KeyFigure("NEES", format_number(measured.nees_mean), "mean; 6 if σ is correct"),
+            KeyFigure("rotation error", format_angle(rotation), notes[0]),
+            KeyFigure("position error", format_length(position), notes[1]),
+            KeyFigure("NEES", format_number(measured.get("nees_mean")), "mean; 6 if σ is correct"),
         ]
     return keys
 
 
-def pixel_rows(e: TruthErrors | None) -> list[tuple[str, ...]]:
+def pixel_rows(e: Errors | None) -> list[tuple[str, ...]]:
     """Errors in the picture: name, rows, RMS u, RMS v, 99th percentile and largest distance (px), meaning."""
-    if e is None or e.spots is None:
-        return []
-    s, prediction = e.spots, e.spots.prediction_px.get
     kinds = (
-        ("prediction", prediction("smooth"), "one frame ahead, without starts of tracks and true bends"),
-        ("prediction, matched", prediction("straight"), "rows with status matched, without starts of tracks"),
-        ("prediction at turns", prediction("turned"), "rows with status turned"),
-        ("prediction at true bends", prediction("bends"), "where the true path bends by more than 2 px"),
-        ("prediction at the start", prediction("start"), "the first two frames of a track: the speed is not yet known"),
-        ("measured place", s.measured_px, "of correctly labelled spots"),
-        ("out of view", s.out_of_view_px, "computed from the other spots"),
-        ("occluded", s.occluded_px, "the estimate while no detection was accepted"),
+        ("prediction", ("prediction_px", "smooth"), "one frame ahead, without starts of tracks and true bends"),
+        ("prediction, matched", ("prediction_px", "straight"), "rows with status matched, without starts of tracks"),
+        ("prediction at turns", ("prediction_px", "turned"), "rows with status turned"),
+        ("prediction at true bends", ("prediction_px", "bends"), "where the true path bends by more than 2 px"),
+        (
+            "prediction at the start",
+            ("prediction_px", "start"),
+            "the first two frames of a track: the speed is not yet known",
+        ),
+        ("measured place", ("measured_px",), "of correctly labelled spots"),
+        ("out of view", ("out_of_view_px",), "computed from the other spots"),
+        ("occluded", ("occluded_px",), "the estimate while no detection was accepted"),
     )
     return [
-        (name, counted(x.rows), *(format_number(v) for v in (x.rms_u, x.rms_v, x.p99, x.max)), meaning)
-        for name, x, meaning in kinds
-        if x is not None
+        (name, counted(x.get("rows")), *(format_number(x.get(k)) for k in ("rms_u", "rms_v", "p99", "max")), meaning)
+        for name, place, meaning in kinds
+        if (x := part(e, "spots", *place))
     ]
 
 
-def error_rows(e: TruthErrors | None) -> list[tuple[str, str, str]]:
+def error_rows(e: Errors | None) -> list[tuple[str, str, str]]:
     """Name, value and meaning of the other errors against truth."""
-    if e is None:
-        return []
-    out = [] if e.spots is None else _label_rows(e.spots)
-    for block, name, causal in (
-        (e.pose, "measured", ""),
-        (e.pose, "predicted", ""),
-        (e.pose_causal, "measured", ", causal"),
+    out = _label_rows(part(e, "spots"))
+    for block, kind, name in (
+        ("pose", "measured", "measured"),
+        ("pose", "predicted", "predicted"),
+        ("pose_causal", "measured", "measured, causal"),
     ):
-        spread = None if block is None else block.measured if name == "measured" else block.predicted
-        if spread is not None:
-            out += _pose_rows(spread, name + causal)
-    return out + _motion_rows(e.motion_vs_differences, "") + _motion_rows(e.motion_causal_vs_differences, ", causal")
+        out += _pose_rows(part(e, block, kind), name)
+    out += _motion_rows(part(e, "motion_vs_differences"), "")
+    return out + _motion_rows(part(e, "motion_causal_vs_differences"), ", causal")
 
 
-def _label_rows(s: SpotErrors) -> list[tuple[str, str, str]]:
+def _label_rows(s: Errors) -> list[tuple[str, str, str]]:
+    if not s:
+        return []
+    share, wrong = format_percent(s.get("wrong_label_share")), counted(s.get("wrong_labels"))
     out = [
-        ("right identity in view", format_percent(s.in_view_identity), "of visible spots, found under their own name"),
-        ("wrong labels", f"{counted(s.wrong_labels)} ({format_percent(s.wrong_label_share)})", "of all measured rows"),
+        (
+            "right identity in view",
+            format_percent(s.get("in_view_identity")),
+            "of visible spots, found under their own name",
+        ),
+        ("wrong labels", f"{wrong} ({share})", "of all measured rows"),
     ]
-    for block, name in ((s.re_entries, "re-entries kept"), (s.after_hiding, "kept after occlusion")):
-        if block.total:
-            late = f", at most {block.max_delay_frames} frames late" if block.max_delay_frames else ""
-            out.append((name, f"{block.kept} of {block.total}{late}", "found again under the same name"))
-    rate = s.recognition_rate_eq15.get
+    for block, name in ((part(s, "re_entries"), "re-entries kept"), (part(s, "after_hiding"), "kept after occlusion")):
+        if block.get("total"):
+            late = f", at most {block['max_delay_frames']} frames late" if block.get("max_delay_frames") else ""
+            out.append((name, f"{block.get('kept')} of {block['total']}{late}", "found again under the same name"))
+    rate = part(s, "recognition_rate_eq15").get
     return [
         *out,
         ("recognition rate, eq. (15)", format_percent(rate("paper")), "all rows; spots out of view count as wrong"),
@@ -102,30 +122,33 @@ def _label_rows(s: SpotErrors) -> list[tuple[str, str, str]]:
     ]
 
 
-def _pose_rows(x: PoseSpread, name: str) -> list[tuple[str, str, str]]:
-    turns = ", ".join(f"{k} {format_angle(v)}" for k, v in x.rotation_rms_deg.items())
-    shifts = ", ".join(f"{k} {format_length(v)}" for k, v in x.position_rms_m.items())
-    largest = format_angle(x.rotation_deg.max), format_length(x.position_m.max)
-    out = [
-        (f"rotation, {name} poses", f"RMS {turns}; largest {largest[0]}", f"about the body's axes, {x.rows} frames"),
-        (f"position, {name} poses", f"RMS {shifts}; largest {largest[1]}", f"along the world's axes, {x.rows} frames"),
-    ]
-    if x.nees_mean is not None and x.nees_mean_95 is not None:
-        low, high = (format_number(v) for v in x.nees_mean_95)
+def _pose_rows(x: Errors, name: str) -> list[tuple[str, str, str]]:
+    out = []
+    for what, of, unit, axes, shown in (
+        ("rotation", "rotation", "deg", "about the body's axes", format_angle),
+        ("position", "position", "m", "along the world's axes", format_length),
+    ):
+        if x:
+            each = ", ".join(f"{k} {shown(v)}" for k, v in part(x, f"{of}_rms_{unit}").items())
+            largest = shown(part(x, f"{of}_{unit}").get("max"))
+            value = f"RMS {each}; largest {largest}"
+            out.append((f"{what}, {name} poses", value, f"{axes}, {counted(x.get('rows'))} frames"))
+    if x.get("nees_mean") is not None and x.get("nees_mean_95") is not None:
+        low, high = (format_number(v) for v in x["nees_mean_95"])
         meaning = f"6 expected; {low} to {high} in 95 % of runs of independent frames"
-        out.append((f"NEES, {name} poses", format_number(x.nees_mean), meaning))
+        out.append((f"NEES, {name} poses", format_number(x["nees_mean"]), meaning))
     return out
 
 
-def _motion_rows(x: MotionErrors | None, causal: str) -> list[tuple[str, str, str]]:
+def _motion_rows(x: Errors, causal: str) -> list[tuple[str, str, str]]:
     out = []
-    if x is not None:
-        bends = f", without {x.rows_at_bends_left_out} frames at bends" if x.rows_at_bends_left_out else ""
-        for block, what, unit in ((x.velocity_m_s, "velocity", "mm/s"), (x.rate_rad_s, "angular rate", "mrad/s")):
-            if block is not None:
-                axes = ", ".join(f"{k} {format_number(1000 * v)} {unit}" for k, v in block.rms_axes.items())
-                value = f"RMS {axes}; largest {format_number(1000 * block.max)} {unit}"
-                out.append((f"{what}{causal}", value, f"against differences of the true poses{bends}"))
+    left_out = x.get("rows_at_bends_left_out")
+    bends = f", without {left_out} frames at bends" if left_out else ""
+    for name, what, unit in (("velocity_m_s", "velocity", "mm/s"), ("rate_rad_s", "angular rate", "mrad/s")):
+        if block := part(x, name):
+            axes = ", ".join(f"{k} {format_number(1000 * v)} {unit}" for k, v in part(block, "rms_axes").items())
+            value = f"RMS {axes}; largest {format_number(1000 * block.get('max', np.nan))} {unit}"
+            out.append((f"{what}{causal}", value, f"against differences of the true poses{bends}"))
     return out
 
 
@@ -196,8 +219,8 @@ def spot_rows(m: ReportData) -> tuple[list[str], list[list[str]]]:
     doubtful = np.isfinite(m.spots.label_probability)
     if doubtful.any():
         heads.append("label left open")
-    spots = None if m.errors is None else m.errors.spots
-    scored = {} if spots is None else {(v.camera, v.spot): v for v in spots.per_spot}
+    listed = part(m.errors, "spots").get("per_spot")
+    scored = {(v.get("camera"), v.get("spot")): v for v in listed or () if isinstance(v, Mapping)}
     if scored:
         heads += ["right in view", "wrong labels", "out-of-view RMS (px)"]
     rows = []
@@ -215,12 +238,11 @@ def spot_rows(m: ReportData) -> tuple[list[str], list[list[str]]]:
         if doubtful.any():
             row.append(str(int((doubtful & ~m.spots.measured)[:, j].sum()) or "·"))
         if scored:
-            own = scored.get((camera, spot), ViewErrors(camera, spot))
-            outside = own.out_of_view_error_px
+            own = scored.get((camera, spot))
             row += [
-                format_percent(own.identity),
-                counted(own.wrong_labels),
-                format_number(None if outside is None else outside.rms),
+                format_percent(part(own).get("identity")),
+                counted(part(own).get("wrong_labels")),
+                format_number(part(own, "out_of_view_error_px").get("rms")),
             ]
         rows.append(row)
     return heads, rows

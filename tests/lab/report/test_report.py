@@ -23,6 +23,7 @@ from lab.report.index import write_index
 from lab.report.plot import svg
 from lab.report.plot.series import Line, Shade, time_panel
 from lab.report.plot.svg import BLUE, SPOT_COLOURS, grey_limits, line_path, stretched, tick_texts, ticks
+from lab.report.run import tables
 from lab.report.run.events import MOST_PICTURES, events, selected
 from lab.report.run.page import write_report
 from lab.report.run.report_data import read_report_data
@@ -242,6 +243,19 @@ def test_damaged_parts_of_a_summary_are_left_out():
     assert [(e.frame, e.kind) for e in summary.events] == [(4, "noted")]
     assert [i.path for i in summary.inputs] == ["b"]
     assert summary.notes == ("one",)
+
+
+def test_damaged_errors_against_truth_are_dashes(tmp_path):
+    fake = make(tmp_path, 3)
+    shutil.rmtree(fake.run_folder)
+    path = fake.results / "summary.json"
+    odd = {"spots": {"wrong_labels": "many", "in_view_identity": 0.5, "prediction_px": 3, "per_spot": ["odd"]},
+           "pose": {"measured": {"rotation_deg": "large", "nees_mean": 6.2}}, "motion_vs_differences": []}  # fmt: skip
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"errors": odd}))
+    html = write_report(fake.results).read_text(encoding="utf-8")
+    assert "50.0 %" in html
+    assert "6.20" in html
+    assert tables.truth_figures(odd)[4].value == "\u2013"
 
 
 @pytest.mark.parametrize(("status", "word"), [("pass", "PASS"), ("check", "CHECK"), ("fail", "FAIL")])
