@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import os
+import sys
+
+# Tests start the program hundreds of times: where the caller forbids byte code, each start compiles the sources again.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # Before numpy is loaded: on small matrices, the threads of the linear algebra library mostly wait for each other, and
 # every test process has its own. One thread instead of two halves the processor time of the calibration's tests.
 for _library in ("OPENBLAS", "OMP", "MKL"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
+import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
+
+from calibration.open3d_loader import MissingOpen3DError, open3d  # noqa: E402
 
 # Waiting for the disk shows only after a power cut, and takes longer than the writing: a run waits for ten files. Tests
 # of when it happens replace this function.
@@ -20,3 +28,12 @@ os.fsync = lambda file: None
 settings.register_profile("fixed", derandomize=True, deadline=None)
 settings.register_profile("explore", deadline=None, max_examples=1000)
 settings.load_profile("fixed")
+
+
+@pytest.fixture(scope="session")
+def loaded_open3d() -> None:
+    """Skips a test where Open3D cannot be loaded."""
+    try:
+        open3d()
+    except MissingOpen3DError as error:
+        pytest.skip(str(error))

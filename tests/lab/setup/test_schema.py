@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,12 @@ from tests.lab.run_folders import RIG, RUN
 from tests.paths import ROOT
 
 SAMPLES = sorted((ROOT / "sample_runs").rglob("*.yaml"))
-VALIDATORS = {name: Draft202012Validator(schema(name)) for name in BLOCKS}
 MAX_LEAVES = 150  # of one file that are made wrong, one after the other
+
+
+@cache
+def validator_of(name: str) -> Draft202012Validator:
+    return Draft202012Validator(schema(name))
 
 
 def kind_of(content: dict[str, Any]) -> str:
@@ -54,7 +59,7 @@ CONTENTS = contents()
 @pytest.mark.parametrize("name", CONTENTS)
 def test_every_file_that_is_read_here_is_valid(name):
     content = CONTENTS[name]
-    errors = [e.message for e in VALIDATORS[kind_of(content)].iter_errors(content)]
+    errors = [e.message for e in validator_of(kind_of(content)).iter_errors(content)]
     assert errors == []
 
 
@@ -62,7 +67,7 @@ def test_there_is_a_file_of_every_kind(tmp_path):
     rig = load_rig_file(next(p for p in SAMPLES if p.name == "rig.yaml")).rig
     save_screens(ScreensFile("lab", rig, None, None), tmp_path / "screens.yaml")
     content = read_mapping(tmp_path / "screens.yaml")
-    assert [e.message for e in VALIDATORS["screens"].iter_errors(content)] == []
+    assert [e.message for e in validator_of("screens").iter_errors(content)] == []
     assert {kind_of(c) for c in CONTENTS.values()} | {"screens"} == set(BLOCKS)
 
 
@@ -86,7 +91,7 @@ def changed(content: dict[str, Any], path: tuple[Any, ...], value: Any) -> dict[
 @pytest.mark.parametrize("name", CONTENTS)
 def test_a_value_of_a_wrong_type_is_rejected_wherever_it_is(name):
     content = CONTENTS[name]
-    validator = VALIDATORS[kind_of(content)]
+    validator = validator_of(kind_of(content))
     paths = list(leaves(content))[:MAX_LEAVES]
     assert [p for p in paths if validator.is_valid(changed(content, p, {"nonsense": [1]}))] == []
 
@@ -94,7 +99,7 @@ def test_a_value_of_a_wrong_type_is_rejected_wherever_it_is(name):
 @pytest.mark.parametrize("name", CONTENTS)
 def test_an_unknown_key_and_a_missing_schema_are_rejected(name):
     content = CONTENTS[name]
-    validator = VALIDATORS[kind_of(content)]
+    validator = validator_of(kind_of(content))
     assert not validator.is_valid({**content, "colour": "red"})
     assert not validator.is_valid({k: v for k, v in content.items() if k != "schema"})
 
@@ -111,7 +116,7 @@ def test_an_unknown_key_and_a_missing_schema_are_rejected(name):
     ],
 )
 def test_mistakes_in_a_run_are_rejected(path, value):
-    assert not VALIDATORS["run"].is_valid(changed(CONTENTS["run"], path, value))
+    assert not validator_of("run").is_valid(changed(CONTENTS["run"], path, value))
 
 
 def empty(tree: Any, where: str = "") -> Iterator[str]:
