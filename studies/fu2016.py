@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,14 +32,15 @@ from tracking.unscented import (
     PrintedFilter,
     Q,
     R,
-    Updated,
+    Rule,
     bearings,
-    gated_update,
+    full_weight,
+    gate,
     observability,
     predict,
     process,
     selection,
-    student_t_update,
+    student_t,
     update,
 )
 
@@ -104,21 +104,17 @@ def estimate(recording: Recording, name: str) -> Array:
     if name == "as printed":
         printed = PrintedFilter()
         return np.array([printed.step(z, DT_S).x for z in recording.measured])
-    rule = _UPDATES[name]
+    rule = _RULES[name]
     x, P, out = X0, P0, []
     for z in recording.measured:
         x, P = predict(x, P, process(DT_S), Q, SPREAD)
-        step = rule(x, P, z, selection, R, SPREAD)
+        step = update(x, P, z, selection, R, SPREAD, rule)
         x, P = step.x, step.P
         out.append(x)
     return np.array(out)
 
 
-_UPDATES: dict[str, Callable[..., Updated]] = {
-    "standard": update,
-    "gate": gated_update,
-    "Student-t": student_t_update,
-}
+_RULES: dict[str, Rule] = {"standard": full_weight, "gate": gate, "Student-t": student_t}
 
 
 def peaks(recording: Recording, states: Array) -> tuple[float, float, float]:
@@ -286,8 +282,8 @@ def run_pictures(seed: int, robust: bool, steps: int | None = None) -> PictureRu
         frame = tracker.step(picture)
         if frame.status is PoseStatus.MEASURED:
             z, R = _measured(frame)
-            rule = student_t_update if robust else update
-            step = rule(x, P, z, lambda states: states[:, POSED], R, SPREAD)
+            rule = student_t if robust else full_weight
+            step = update(x, P, z, lambda states: states[:, POSED], R, SPREAD, rule)
             x, P = step.x, step.P
             single[k] = z - state[POSED]
             wrong[k] = _is_wrong(frame, pose_of(state))
