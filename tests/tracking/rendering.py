@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import erf
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
@@ -51,6 +52,16 @@ class Scene:
     speckle: float = 0.0  # contrast of a multiplicative texture with grains of 1 px sigma, on the spots
 
 
+def round_lights(shape: tuple[int, int], centres: ArrayLike, peak: float, sigma_px: float) -> NDArray:
+    """The sum (h, w) of equal round Gaussians at centres (n, 2), by the values at the centres of the pixels."""
+    u, v = np.asarray(centres, dtype=float).reshape(-1, 2).T
+    columns, rows = (
+        np.exp(-0.5 * ((np.arange(count) - at[:, None]) / sigma_px) ** 2)
+        for count, at in ((shape[1], u), (shape[0], v))
+    )
+    return peak * (rows.T @ columns)
+
+
 def light(spot: Spot, size: tuple[int, int]) -> tuple[NDArray, tuple[slice, slice]]:
     """Mean values of the pixels of a spot, and their place in the picture (rows, columns)."""
     width, height = size
@@ -67,14 +78,16 @@ def light(spot: Spot, size: tuple[int, int]) -> tuple[NDArray, tuple[slice, slic
         )
         return spot.peak * np.outer(across, along), (slice(v0, v1), slice(u0, u1))
     a = np.radians(spot.angle)
-    steps = [0.0] if not spot.streak else list((np.arange(40) + 0.5) / 40 * spot.streak - spot.streak / 2)
     uu = (np.arange(u0, u1)[:, None] + _NODES / 2).reshape(-1)
     vv = (np.arange(v0, v1)[:, None] + _NODES / 2).reshape(-1)
-    total = np.zeros((len(vv), len(uu)))
-    for s in steps:
-        du, dv = np.meshgrid(uu - spot.u - s * np.cos(a), vv - spot.v - s * np.sin(a))
-        p, q = du * np.cos(a) + dv * np.sin(a), -du * np.sin(a) + dv * np.cos(a)
-        total += np.exp(-0.5 * ((p / spot.major) ** 2 + (q / spot.minor) ** 2)) / len(steps)
+    du, dv = np.meshgrid(uu - spot.u, vv - spot.v)
+    p, q = du * np.cos(a) + dv * np.sin(a), -du * np.sin(a) + dv * np.cos(a)
+    if spot.streak:  # the mean over the motion in closed form
+        ends = [erf((p + s * spot.streak / 2) / (np.sqrt(2) * spot.major)) for s in (1, -1)]
+        total = np.sqrt(np.pi / 2) * spot.major / spot.streak * (ends[0] - ends[1])
+        total *= np.exp(-0.5 * (q / spot.minor) ** 2)
+    else:
+        total = np.exp(-0.5 * ((p / spot.major) ** 2 + (q / spot.minor) ** 2))
     cells = total.reshape(v1 - v0, 4, u1 - u0, 4)
     return spot.peak * np.einsum("aibj,i,j->ab", cells, w, w), (slice(v0, v1), slice(u0, u1))
 

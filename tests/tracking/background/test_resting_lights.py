@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.tracking.rendering import round_lights
 from tracking.background.estimation import static_background
 from tracking.background.resting_lights import RestingLights
 from tracking.detection.detect import find_spots
@@ -24,8 +25,7 @@ USUAL = DetectParameters(saturation_dn=255.0)
 
 
 def light(u: float, v: float, peak: float, sigma: float) -> np.ndarray:
-    row, column = np.mgrid[: SIZE[0], : SIZE[1]]
-    return peak * np.exp(-0.5 * ((column - u) ** 2 + (row - v) ** 2) / sigma**2)
+    return round_lights(SIZE, (u, v), peak, sigma)
 
 
 def pictures(spots: np.ndarray, seed: int, shift_px: float = 0.0) -> list[np.ndarray]:

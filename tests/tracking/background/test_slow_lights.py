@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from geometry.arrays import Array
+from tests.tracking.rendering import round_lights
 from tracking.background.estimation import PICTURES, static_background
 from tracking.detections import Detections
 from tracking.noise import Picture
@@ -26,7 +27,7 @@ def board_pictures(paths: Array, sigma_px: float, modulated: float, seed: int) -
     response = 1 - modulated * (1 - BOARD / WHITE)
     pictures = []
     for at in paths:
-        light = sum(90.0 * np.exp(-0.5 * ((X - u) ** 2 + (Y - v) ** 2) / sigma_px**2) for u, v in at)
+        light = round_lights(SIZE, at, 90.0, sigma_px)
         pictures.append(np.clip(np.rint(BOARD + response * light + NOISE * rng.standard_normal(SIZE)), 0, 255))
     return [p.astype(np.uint8) for p in pictures]
 
@@ -121,7 +122,7 @@ def test_lights_at_rest_state_errors_by_print_of_their_own_size_and_none_on_even
     page = cv2.GaussianBlur(paper, (0, 0), 0.7).astype(float)
     at = np.array([[x, y] for y in range(30, 300, 50) for x in (20, 60, 100, 180, 260, 340)])
     at = at + rng.uniform(-5, 5, at.shape)
-    light = sum(60.0 * np.exp(-0.5 * ((X - u) ** 2 + (Y - v) ** 2) / 1.6**2) for u, v in at)
+    light = round_lights(SIZE, at, 60.0, 1.6)
     expected = page + (1 - 0.4 * (1 - page / 60)) * light
     pictures = [np.rint(expected + NOISE * rng.standard_normal(SIZE)).astype(np.uint8) for _ in range(15)]
     found = found_in_all(pictures)

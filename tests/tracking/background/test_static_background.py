@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from geometry.arrays import Array
+from tests.tracking.rendering import round_lights
 from tracking.background import mean_pictures
 from tracking.background.estimation import PICTURES, static_background
 from tracking.background.static_background import StaticBackground
@@ -31,11 +32,7 @@ def reflectance(seed: int, texture: float) -> Array:
 
 
 def light_of(centres: Array, peak: float, sigma_px: float = 1.2) -> Array:
-    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
-    out = np.zeros(SIZE)
-    for a, b in centres:
-        out += peak * np.exp(-0.5 * ((x - a) ** 2 + (y - b) ** 2) / sigma_px**2)
-    return out
+    return round_lights(SIZE, centres, peak, sigma_px)
 
 
 def path(pictures: int, spots: int, speed_px: float, seed: int) -> Array:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from geometry.arrays import Array
+from tests.tracking.rendering import round_lights
 from tracking.detection.detect import find_spots
 from tracking.noise import Picture
 from tracking.noise_estimation.photon_transfer import estimate_noise
@@ -26,9 +27,7 @@ def places(seed: int) -> Array:
 
 def pictures(background: Array, spots: Array, sigma_px: float, count: int, seed: int) -> list[Picture]:
     rng = np.random.default_rng(seed)
-    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
-    light = sum((np.exp(-0.5 * ((x - a) ** 2 + (y - b) ** 2) / sigma_px**2) for a, b in spots), np.zeros(SIZE))
-    expected = background + FAINT * NOISE * light
+    expected = background + round_lights(SIZE, spots, FAINT * NOISE, sigma_px)
     return [np.rint(expected + NOISE * rng.standard_normal(SIZE)).astype(np.uint8) for _ in range(count)]
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from geometry.camera import SensorNoise
-from tests.tracking.rendering import Scene, Spot, photograph
+from tests.tracking.rendering import Scene, Spot, photograph, round_lights
 from tracking.detection.detect import find_spots
 from tracking.noise import ROUNDING_DN2, NoiseModel, guess_noise
 from tracking.noise_estimation.block_steps import block_step
@@ -54,8 +54,7 @@ class Lab:
         out = []
         for k in range(count):
             lit = light.copy()
-            for x, y in start + k * step:
-                lit += self.spot_peak * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * 2.2**2)) * albedo
+            lit += round_lights((h, w), start + k * step, self.spot_peak, 2.2) * albedo
             lit *= 1 + self.flicker * rng.standard_normal()
             noise = np.sqrt(np.maximum(lit, 0) * self.gain + self.read_e**2) / self.gain * rng.standard_normal((h, w))
             grey = np.clip(np.rint(lit + self.black + noise), 0, 2**self.bits - 1)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from geometry.arrays import Array
+from tests.tracking.rendering import round_lights
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
@@ -21,6 +22,7 @@ SIZE = (400, 500)
 BACKGROUND, NOISE = 600.0, 3.0  # DN
 
 
+@cache
 def screen(contrast: float, grain_px: float, seed: int) -> Array:
     """The reflectance (h, w) of a textured screen."""
     smooth = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal(SIZE), (0, 0), grain_px)
@@ -44,8 +46,7 @@ def spots(sigma_px: float, peak: float, seed: int) -> tuple[Array, Array]:
     rng = np.random.default_rng(seed)
     u, v = np.meshgrid(np.arange(50.0, 460, 80), np.arange(50.0, 360, 80))
     centres = np.stack([u.ravel(), v.ravel()], axis=-1) + rng.uniform(-0.5, 0.5, (u.size, 2))
-    across, along = (np.exp(-0.5 * (np.arange(SIZE[i]) - centres[:, [1 - i]]) ** 2 / sigma_px**2) for i in (0, 1))
-    return centres, peak * across.T @ along
+    return centres, round_lights(SIZE, centres, peak, sigma_px)
 
 
 @pytest.mark.parametrize(("sigma_px", "grain_px"), [(1.5, 1.0), (3.0, 1.5), (6.0, 1.0), (9.0, 1.0)])
