@@ -1,8 +1,8 @@
 """Reads and writes CSV files: every table that the program reads passes through this module.
 
 `read_table` reads the named columns of any CSV file into a `Table`. A regular file (each line as many commas as the
-header, no quotes, no blank line) is split at its commas, or read by pandas if it is large; the csv module reads all
-others. All errors name the line of the file (`Table.error`). See docs/decisions/csv-layer.md.
+header, no quotes, no blank line) is split at its commas; the csv module reads all others. All errors name the line of
+the file (`Table.error`). See docs/decisions/csv-layer.md.
 
 Range checks of table columns: a digit too many, a wrong unit, a placeholder.
 """
@@ -15,7 +15,6 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -84,7 +83,6 @@ def check_sigmas(table: Table, name: str, allowed: tuple[float, float], unit: st
 
 # The columns that hold words; every other column holds numbers.
 WORD_COLUMNS = ("camera", "spot", "beam", "status", "point", "screen", "date", "verdict", "view")
-LARGE_BYTES = 4_000_000  # pandas reads regular files of this size and larger
 _ROWS_AT_ONCE, _BYTES_AT_ONCE = 1_500, 200_000  # bound the memory of the text (1 MB): a table is read in pieces
 _MAX_TEXTS = 1000  # kept per column, of fields that are not numbers
 
@@ -106,10 +104,7 @@ def read_table(path: Path, required: Iterable[str], optional: Iterable[str] = ()
     data = _content(path, required, damaged)
     header = _checked_header(path, data, required)
     wanted = tuple(dict.fromkeys((*required, *optional)))
-    regular = _is_regular(data, header)
-    table = _read_large(path, data, header, wanted) if regular and len(data) >= LARGE_BYTES else None
-    if table is None:
-        table = (_read_regular if regular else _read_any)(path, data, header, wanted)
+    table = (_read_regular if _is_regular(data, header) else _read_any)(path, data, header, wanted)
     for name in wanted:
         if name not in header and name not in WORD_COLUMNS:
             table.numbers[name] = np.full(len(table), np.nan)
@@ -173,37 +168,6 @@ def _is_regular(data: bytes, header: tuple[str, ...]) -> bool:
     """Whether row i of a table stands in line i + 2, with each field between two commas."""
     first = data[: data.find(b"\n") + 1].decode("utf-8", errors="replace")
     return tuple(first.strip().split(",")) == header and _all_lines_are_equal(data, len(header))
-
-
-def _read_large(path: Path, data: bytes, header: tuple[str, ...], wanted: Sequence[str]) -> Table | None:
-    """A regular file by pandas; None where a field is not a number."""
-    import pandas as pd
-
-    # Exact to the last bit; pandas does so by default since 3.1, where the option is deprecated.
-    exactly: Any = {} if tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1) else {"float_precision": "round_trip"}
-    there = [name for name in wanted if name in header]
-    words = [name for name in there if name in WORD_COLUMNS]
-    try:
-        table = pd.read_csv(
-            io.BytesIO(data),
-            usecols=there,
-            dtype={name: "category" if name in words else float for name in there},
-            keep_default_na=False,
-            na_values={name: [""] for name in there if name not in words},
-            skipinitialspace=True,
-            encoding_errors="replace",
-            **exactly,
-        )
-    except ValueError:
-        return None
-    coded = {}
-    for name in words:
-        codes, found = pd.factorize(table[name])  # in the order of first appearance, as the other reader has them
-        stripped = tuple(str(word).strip() for word in found)
-        unique = tuple(dict.fromkeys(stripped))
-        coded[name] = Categorical(np.array([unique.index(w) for w in stripped] or [-1], dtype=np.int64)[codes], unique)
-    numbers = {name: table[name].to_numpy(dtype=float) for name in there if name not in words}
-    return Table(path, header, numbers, coded, np.arange(2, len(table) + 2), {}, (), ())
 
 
 def _all_lines_are_equal(data: bytes, columns: int) -> bool:
