@@ -259,3 +259,31 @@ def test_a_contour_line_ends_at_cells_without_a_value():
 def test_levels_of_a_steep_map_crowd_where_it_is_low():
     assert contour_levels(0.02, 1.0).tolist() == pytest.approx([0.05, 0.1, 0.2, 0.5])
     assert value_range(np.array([1.0] * 99 + [1e6]), False)[1] < 10  # one runaway value does not drown the map
+
+
+def test_a_field_of_view_begins_at_the_camera_and_its_corners_are_those_of_the_picture():
+    camera = next(iter(paper_rig().cameras.values()))
+    (width, height), K = camera.image_size_px, camera.matrix
+    apex, *corners = scene.outline(scene.frustum_of(camera), 2.0)
+    np.testing.assert_allclose(apex, camera.camera_from_world.inverse().translation, atol=1e-12)
+    x, y, z = camera.camera_from_world.apply(np.array(corners)).T
+    np.testing.assert_allclose(z, 2.0)
+    np.testing.assert_allclose(K[0, 0] * x / z, width / 2 * np.array([-1, 1, 1, -1]))
+    np.testing.assert_allclose(K[1, 1] * y / z, height / 2 * np.array([-1, -1, 1, 1]))
+    wide = scene.Frustum("wide", Pose.identity(), (9.0, 0.5))
+    assert np.ptp(scene.outline(wide, 1.0), axis=0).tolist() == [3.4, 1.0, 1.0]  # drawn with 120 degrees at most
+
+
+@pytest.mark.parametrize(("centred", "first"), [(True, [-1.5, -1.0, 0.0]), (False, [0.0, 0.0, 0.0])])
+def test_a_rectangle_has_its_size_about_its_centre_or_from_its_corner(centred, first):
+    world_from_rectangle = Pose.from_ypr(np.array([0.3, 0.2, 0.1]), np.array([1.0, 2.0, 3.0]))
+    rectangle = scene.Rectangle("r", world_from_rectangle, (3.0, 2.0), centred)
+    corners = world_from_rectangle.inverse().apply(scene.outline(rectangle, 1.0))
+    np.testing.assert_allclose(corners - first, [[0, 0, 0], [3, 0, 0], [3, 2, 0], [0, 2, 0]], atol=1e-12)
+
+
+def test_the_outlines_of_rays_trails_and_markers_are_their_own_places():
+    a, b = np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0])
+    np.testing.assert_array_equal(scene.outline(scene.Ray("r", a, b), 1.0), [a, b])
+    np.testing.assert_array_equal(scene.outline(scene.Trail("t", np.array([a, b, a])), 1.0), [a, b, a])
+    np.testing.assert_array_equal(scene.outline(scene.Marker("m", b), 1.0), [b])
