@@ -71,3 +71,28 @@ def test_scatter_is_one_for_noise_and_larger_for_errors_common_to_a_photograph()
         factors.append(float(np.sqrt(np.mean(np.square(squares)))))
     assert factors[0] == pytest.approx(1, abs=0.15)
     assert factors[1] > 1.2
+
+
+def drawn_apart(views: int, rng: np.random.Generator) -> tuple[np.ndarray, ViewEquations]:
+    """The error (3,) of three unknowns by photographs that see unknowns of their own, and the equations there."""
+    rows = rng.normal(0, 1, (views, 6, 3))
+    S = np.swapaxes(rows, 1, 2) @ rows
+    values, vectors = np.linalg.eigh(S.sum(axis=0))
+    basis = vectors / np.sqrt(values)
+    own = rng.normal(0, [3.0, 1.0, 1.0], (views, 3))  # the first scatters most
+    gradient = -(S @ own[..., None])[..., 0] @ basis
+    zeros = np.zeros(views)
+    at_truth = ViewEquations(basis.T @ S @ basis, gradient, zeros, zeros.astype(int), np.arange(views), basis, 3)
+    error, _ = at_truth.solution()
+    return error, at_truth.moved(error)
+
+
+@pytest.mark.parametrize("views", [5, 8, 13, 30])
+def test_photographs_that_scatter_have_errors_of_the_stated_size_however_few_they_are(views):
+    rng = np.random.default_rng(views)
+    squares = []
+    for _ in range(400):
+        error, equations = drawn_apart(views, rng)
+        squares.append(error**2 / np.diagonal(equations.scattered_covariance(equations.scatter().factor)))
+    spread = np.sqrt(np.mean(squares, axis=0))
+    assert np.all((spread > 0.7) & (spread < 1.2)), spread  # without degrees of freedom 1.2 to 1.6
