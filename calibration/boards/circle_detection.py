@@ -27,7 +27,7 @@ from calibration.boards.board_view import (
 )
 from calibration.boards.chessboard_detection import upright
 from calibration.boards.pyramid import at_full_size, scaled, scales
-from geometry.arrays import Array
+from geometry.arrays import Array, Ints
 
 _BIG_DOT = 1.35  # relative area of a corner circle, above which it marks the origin
 _STRAY = 100  # blobs allowed besides three times the board's: among thousands OpenCV searches for many minutes
@@ -139,18 +139,15 @@ def _measured(image: GreyImage, grid: Array, blobs: Array, board: CircleGrid, li
     lost = np.isnan(ellipses.areas)
     if lost.any():
         return NotFound(f"{lost.sum()} of {len(lost)} circles have no clean outline: hidden, in glare or blurred")
-    turned = _by_big_dot(ordered, ellipses.areas, board)
-    if turned is not None:
-        ordered = turned
-        ellipses = fit_ellipses(image, ordered.reshape(-1, 2), _radii(ordered, board, blobs))
-    centres = ellipses.centres
+    order = _by_big_dot(ordered, ellipses.areas, board)
+    centres = ellipses.centres[order]
     contrast = float(np.median(ellipses.contrasts))
     blur = float(np.median(ellipses.blurs))
     apart = corner_refinement.spacing(centres.reshape(ordered.shape))
     if blur > BLUR_LIMIT * apart:
         return too_blurred(blur, apart)
     notes = ("white circles on a black ground",) if light else ()
-    return BoardView(board.ids, centres, apart, blur, contrast, notes, ellipses.areas)
+    return BoardView(board.ids, centres, apart, blur, contrast, notes, ellipses.areas[order])
 
 
 def _radii(grid: Array, board: CircleGrid, blobs: Array) -> Array:
@@ -393,27 +390,27 @@ def _goes_on(grid: Array, board: CircleGrid, blobs: Array) -> str:
     return " and ".join(names)
 
 
-def _by_big_dot(grid: Array, areas: Array, board: CircleGrid) -> Array | None:
-    """The grid turned so that a markedly larger corner circle comes first; None if there is no such circle.
+def _by_big_dot(grid: Array, areas: Array, board: CircleGrid) -> Ints:
+    """The order (n,) of the circles in which a markedly larger corner circle comes first; as they are without one.
 
     On boards with unequal sides, a large dot that could come first only by mirroring becomes the last one of the first
     row.
     """
+    number = np.arange(len(areas)).reshape(grid.shape[:2])
     if board.asymmetric:
-        return None
+        return number.ravel()
     H = homography(board.points[:, :2], grid.reshape(-1, 2))
     size = (areas / _jacobian_determinants(H, board.points[:, :2])).reshape(grid.shape[:2])
     size = size / np.median(size)
     corners = {(0, 0): size[0, 0], (0, -1): size[0, -1], (-1, 0): size[-1, 0], (-1, -1): size[-1, -1]}
     big = [where for where, share in corners.items() if share > _BIG_DOT]
     if len(big) != 1:
-        return None
-    dot = grid[big[0]]
-    ways = [grid, grid[::-1, ::-1]]
+        return number.ravel()
+    ways = [number, number[::-1, ::-1]]
     if board.columns == board.rows:
-        ways += [np.swapaxes(grid[::-1], 0, 1), np.swapaxes(grid[:, ::-1], 0, 1)]
-    first = [way for way in ways if np.array_equal(way[0, 0], dot)]
-    return first[0] if first else next(way for way in ways if np.array_equal(way[0, -1], dot))
+        ways += [number[::-1].T, number[:, ::-1].T]
+    first = [way for way in ways if way[0, 0] == number[big[0]]]
+    return (first[0] if first else next(way for way in ways if way[0, -1] == number[big[0]])).ravel()
 
 
 def _why_not(image: GreyImage, board: CircleGrid, blobs: Array) -> NotFound:

@@ -97,7 +97,7 @@ def select_model(
         starts = [f for f in rich if f.model.fisheye == model.fisheye and f.model.coefficients <= model.coefficients]
         starts = starts or [f for f in rich if f.model.fisheye == model.fisheye]
         if below is not None and not model.fisheye and model.coefficients >= RATIONAL.coefficients:
-            starts = [*(f for f in starts if f.model == RATIONAL), below]
+            starts = [*(f for f in starts if f.model == model), below]
         elif len(starts) > 1:
             starts = starts[:1]  # the best of them
         candidate = _best_start(table, used, model, [{**f.values, **shape} for f in starts] or [None], board)
