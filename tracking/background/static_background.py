@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools, Ints
-from tracking.background.joint_fit import LEAST_SIGMA, Modulation
+from tracking.background.joint_fit import Modulation
 from tracking.background.lights_on_edges import with_lights_on_edges
 from tracking.background.mean_pictures import (
     GAIN_BITS,
@@ -50,6 +50,7 @@ _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
 _AS_WIDE = 0.7  # of a light at rest: what is in its middle and as wide is that light, brighter than in the mean
 _LEAST_MODULATION = 0.1  # of the light by the surface: less is not undone
 _MODULATION = (0.25, 4.0)  # of the light, at most
+_LEAST_SIGMA = 0.005  # widths: least error of a light at rest, which is no Gaussian
 _NOT_UNDONE = 0.2  # share of the modulation's errors
 TRIED = 3  # every such picture shows whether there are further spots
 _WIDE_PX = 4.0  # a narrower light is in few of the sampled pixels
@@ -219,7 +220,7 @@ class StaticBackground:
         if shift not in self.known:
             lights = self.lights.found
             # The error of the mean picture's fit is the same in all pictures, as is what a Gaussian leaves.
-            least = LEAST_SIGMA**2 * lights.major_px * lights.minor_px
+            least = _LEAST_SIGMA**2 * lights.major_px * lights.minor_px
             common = self._noise_share * lights.variance_px2 + least
             # Most of them are objects, whose misfits are no grain of the light.
             own = replace(shift, misfit_share=self.misfit_share)

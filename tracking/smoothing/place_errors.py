@@ -21,7 +21,7 @@ _CHUNK = 256  # consecutive frames that are compared with each other
 _MIN_CORRELATION = 0.05  # below it two places count as different
 _REACHES = (1.0, 2.0, 4.0, 8.0)  # tried correlation lengths, in widths of the spot
 _SHARES = np.concatenate([[0.0], 1 / (1 + np.geomspace(1e3, 1e-3, 61))])  # of the variance: hypotheses
-_FACTOR = 1.5  # 1 sigma of the ratio of a predicted standard deviation of the errors of places to the true one
+PLACE_FACTOR = 1.5  # 1 sigma of the ratio of a predicted standard deviation of the errors of places to the true one
 _UNFORESEEN = 0.1  # probability that the errors of places are not those predicted: none, or any
 _LEAST_SQUARE = 0.1  # of its expectation by noise: the statistic scatters below zero
 _SIGNIFICANT = 3.0  # sigmas of the statistic under noise alone, above which it decides about the correlation length
@@ -99,7 +99,7 @@ def _prior(predicted: float) -> Array:
         return out
     # The variance of the noise is known: uncertain is its ratio to that of the errors of places.
     noise = np.log(1 / min(predicted, _SHARES[-1]) - 1)
-    away = (np.log(1 / _SHARES[1:] - 1) - noise) / (2 * np.log(_FACTOR))
+    away = (np.log(1 / _SHARES[1:] - 1) - noise) / (2 * np.log(PLACE_FACTOR))
     near = np.exp(-0.5 * away**2)
     out[1:] += (1 - _UNFORESEEN) * near / near.sum()
     return out

@@ -16,12 +16,12 @@ from geometry.arrays import Array, Bools, Ints, evenly_spread
 from geometry.compiled_projection import Views, project_all
 from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.smoothing.motion.run_detections import Reference, RunDetections, fit_frames
-from tracking.smoothing.place_errors import correlation, frames_with_same_error, usable_widths
+from tracking.smoothing.place_errors import PLACE_FACTOR, correlation, frames_with_same_error, usable_widths
 
 _REACH = 2.0  # widths of the spot: assumed correlation length of the errors, for their number ...
 _ALIKE = 0.9  # ... and least correlation, with a length of one width, of errors whose difference shows the noise
 _FRAMES = 2000  # at most so many, evenly spaced
-_FACTOR = 1.25  # 1 sigma of the ratio of the stated sigma of each part to the true one
+_NOISE_FACTOR = 1.25  # 1 sigma of the ratio of the stated sigma of the noise to the true one; of places PLACE_FACTOR
 _STEPS = 12  # of Fisher scoring; it converges in about six
 _LARGEST_STEP = 1.0  # of the logarithm of a factor
 _LEAST_VARIANCE = 1e-3  # relative to the stated one
@@ -111,15 +111,15 @@ def likely_factors(squares: Squares) -> tuple[float, float]:
     Where places differ, the even ones show the noise and the others the factor. Before the residuals are seen both
     factors are log-normal with a mean of 1.
     """
-    precision = 1 / (2 * np.log(_FACTOR)) ** 2
-    usual = x = np.full(2, -0.5 / precision)
+    precision = 1 / (2 * np.log([_NOISE_FACTOR, PLACE_FACTOR])) ** 2
+    usual = x = -0.5 / precision
     for _ in range(_STEPS):
         parts = np.stack([squares.noise, squares.place]) * np.exp(x)[:, None]
         variance = np.maximum(parts.sum(axis=0) + squares.known, _LEAST_VARIANCE)
         slope, ratio = parts / variance, squares.ratio / variance
         ratio = np.minimum(ratio, _ROBUST * np.median(ratio))
         gradient = slope @ (squares.weight * (ratio - 1)) - precision * (x - usual)
-        information = (squares.weight * slope) @ slope.T + precision * np.eye(2)
+        information = (squares.weight * slope) @ slope.T + np.diag(precision)
         x = x + np.clip(np.linalg.solve(information, gradient), -_LARGEST_STEP, _LARGEST_STEP)
     noise, place = np.exp(x + 0.5 * np.diag(np.linalg.inv(information)))
     return float(noise), float(place)

@@ -65,6 +65,21 @@ def test_a_light_at_rest_on_an_edge_is_not_separated_unless_some_pictures_show_t
     assert abs(fit.modulated_share(60.0)[0] - 0.6) < 0.1
 
 
+def test_the_error_that_all_places_share_is_stated_and_not_much_larger_than_it_is():
+    """In addition to their own noise, which the mean of n places has to 1 / n: it would count twice."""
+    noise, at, mean2, stated = 4 * NOISE, places(12.0), [], []
+    for seed in range(10):
+        more = np.random.default_rng(100 + seed).standard_normal((len(at), SIDE, SIDE))
+        seen = pictures(at, EDGE, 0.6, seed) + np.sqrt(noise**2 - NOISE**2) * more
+        values = seen.reshape(len(seen), -1)
+        fit = fitted(UV, values, np.full(values.shape, noise**2), at + OFF, 3.0, 0.7 * HEIGHT)
+        assert fit is not None
+        error = fit.light.places - at
+        mean2.append(np.mean(error.mean(axis=0) ** 2))
+        stated.append((fit.share + 1 / len(at)) * np.mean(error.var(axis=0, ddof=1)))
+    assert 0.75 < np.mean(mean2) / np.mean(stated) < 1.4
+
+
 def test_pictures_without_a_light_give_no_fit():
     seen = EDGE + NOISE * np.random.default_rng(3).standard_normal((15, SIDE, SIDE))
     assert fit_of(seen, places(3.0)) is None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tracking.smoothing.place_errors import PLACE_FACTOR
 from tracking.smoothing.variance_factors import Squares, likely_factors
 
 
@@ -35,11 +36,10 @@ def test_few_independent_places_leave_the_stated_errors():
 
 def test_factors_drawn_from_their_prior_are_found_without_bias_from_few_residuals():
     """The mean ratio of true to found variances is 1, so that NEES stays right; a bound of 95 % makes it 0.6."""
-    rng = np.random.default_rng(2)
-    ratios = []
+    rng, spread, ratios = np.random.default_rng(2), 2 * np.log(PLACE_FACTOR), []
     for _ in range(400):
         place = np.full(10, 0.9)
-        true = np.exp(rng.normal(-0.5 * (2 * np.log(1.25)) ** 2, 2 * np.log(1.25)))
+        true = np.exp(rng.normal(-0.5 * spread**2, spread))
         variance = 0.1 + 0.9 * true
         noise, of_place = likely_factors(squares(0.5 * rng.chisquare(2, 10) * variance, place))
         ratios.append(variance / (0.1 * noise + 0.9 * of_place))
