@@ -31,7 +31,7 @@ _LEAST_FOUND = 0.2  # further or better spots per picture from which the subtrac
 _MOSTLY = 0.7  # share of the pictures with lights that move, above which those at rest in all of them are no spots
 # Contrast up to which the structure is that of the screen's surface, and modulates the spots' light in full. Of what is
 # more, prints or objects, the spots show a part: 0.25 to 0.57 where photographs modulate their light by up to 60 %.
-_OF_SURFACE, _OF_OBJECTS = 0.1, 0.5
+_OF_SURFACE, _OF_OBJECTS = 0.1, 0.4
 _SETTLED = 0.01  # sigmas of a pixel: the background behind a light that changes by less is the last one
 _NO_GAUSSIAN = 0.02  # share of a light at rest that a Gaussian leaves in a pixel; it is no structure of the background
 

@@ -32,9 +32,9 @@ _LEAST_TEXTURE, _FIRST_TEXTURE = 2.0, 20.0  # DN
 _ALIKE = 2.0  # texture is alike over some pixels: fewer of them are independent
 _LARGEST_CHI2 = 2.0  # per degree of freedom
 _LARGEST_SIGMA = 0.1  # of the mean place, in widths of the light
-# Widths: error of the mean place that the model leaves, beyond that by noise: of 63 lights in front of photographs the
-# mean squares of both errors and of their stated sigmas agree.
-_LEAST_SIGMA = 0.0017
+# Widths: error of the places that the model leaves. With it the products of the errors in successive pictures agree with
+# the stated shared variance (63 lights in front of photographs).
+_LEAST_SIGMA = 0.002
 _LARGEST_CHANGE = 3.0  # of the width, as a factor, from the start
 
 
@@ -163,13 +163,21 @@ class _Seen:
     def cost(self) -> float:
         return float(np.sum(self.residual**2) + np.sum(self.usual**2))
 
+    def own_variance(self, light: JointLight) -> float:
+        """Variance, px^2, of a coordinate of the light's place in one picture by its noise: the background is known."""
+        l11, l21, l22 = light.shape
+        weighted = (light.plain + light.modulated * self.behind) * self.light_of * self.root
+        slopes = np.stack([weighted * self.along * l11, weighted * (self.along * l21 + self.across * l22)])
+        information = np.einsum("ikm,jkm->kij", slopes, slopes)
+        return float(np.mean(np.trace(np.linalg.pinv(information, hermitian=True), axis1=1, axis2=2))) / 2
+
 
 @dataclass(frozen=True, slots=True)
 class JointFit:
     """A light of which the fit explains the pictures."""
 
     light: JointLight
-    share: float  # variance of the error that its places share, over that of one of them about their mean
+    share: float  # variance of the errors that its places share, over that of one of them by the noise of its picture
     strength_cov: Array  # (2, 2): of p and q
 
     def modulated_share(self, level_dn: float) -> tuple[float, float]:
@@ -255,18 +263,17 @@ def _checked(pixels: _Pixels, light: JointLight, width_px: float) -> JointFit | 
     normal, _ = pixels.normal(light, seen)
     covariance = np.linalg.pinv(normal, hermitian=True)
     places = covariance[5 : 5 + 2 * n, 5 : 5 + 2 * n].reshape(n, 2, n, 2)
-    common = places.mean(axis=(0, 2)) * max(chi2, 1.0)
-    single = np.einsum("kikj->ij", places) / n - places.mean(axis=(0, 2))
+    every, own = float(np.einsum("kiki->", places)) / (2 * n), seen.own_variance(light)
+    mean = float(np.trace(places.mean(axis=(0, 2)))) / 2 * max(chi2, 1.0)
     lit = seen.light_of.max(axis=0) > 0.1
     height = (light.plain + light.modulated * seen.behind)[lit]
     bad = chi2 > _LARGEST_CHI2 or not height.size or float(np.median(height)) <= 0
     bad |= light.modulated * pixels.usual < -MODULATED[0] * pixels.height
     bad |= bool((widths > _LARGEST_CHANGE * width_px).any() or (widths < width_px / _LARGEST_CHANGE).any())
-    bad |= float(np.sqrt(np.trace(common) / 2)) > _LARGEST_SIGMA * float(widths.max())
+    bad |= np.sqrt(mean) > _LARGEST_SIGMA * float(widths.max())
     if bad:
         return None
-    least = (_LEAST_SIGMA * float(widths.max())) ** 2
-    # A part of the mean's error is that of n independent ones, which each picture has in addition to what they share.
-    own = max(0.5 * float(np.trace(single)), 1e-9)
-    share = max(0.5 * np.trace(common) / own - 1 / n, 0.0) + least / own
+    # The noise of the background, 1 / n, is in its information as well.
+    shared = max(every - (1 + 1 / n) * own, 0.0) * max(chi2, 1.0) + (_LEAST_SIGMA * float(widths.max())) ** 2
+    share = shared / max(own, 1e-9)
     return JointFit(light, float(share), covariance[:2, :2] * max(chi2, 1.0))
