@@ -32,8 +32,8 @@ _LEAST_TEXTURE, _FIRST_TEXTURE = 2.0, 20.0  # DN
 _ALIKE = 2.0  # texture is alike over some pixels: fewer of them are independent
 _LARGEST_CHI2 = 2.0  # per degree of freedom
 _LARGEST_SIGMA = 0.1  # of the mean place, in widths of the light
-# Widths: error of the places that the model leaves. With it the products of the errors in successive pictures agree with
-# the stated shared variance (63 lights in front of photographs).
+# Widths: error of the places that the model leaves. With it the products of the errors in successive pictures agree
+# with the stated shared variance (63 lights in front of photographs).
 _LEAST_SIGMA = 0.002
 _LARGEST_CHANGE = 3.0  # of the width, as a factor, from the start
 
