@@ -44,6 +44,7 @@ from tracking.rigid_body.hypotheses.hypothesis_set import (
     add_child,
     iterated_update,
 )
+from tracking.rigid_body.models.information import has_clocks
 from tracking.rigid_body.models.motion import predicted
 from tracking.rigid_body.models.occlusion import MISSED, joint_log_likelihood, marginal, predict, update
 from tracking.statuses import Event
@@ -51,11 +52,13 @@ from tracking.statuses import Event
 # Sigmas of the motion of a vehicle that has just been found.
 FIRST_SPEED, FIRST_RATE = 4.0, 6.0  # m/s, rad/s
 FIRST_ACCELERATION, FIRST_ANGULAR_ACCELERATION = 30.0, 100.0  # m/s^2, rad/s^2
-# Sigmas of the motion between the pictures of one frame in a search by geometry alone: usual motions, since with the
-# fastest ones no pose could be distinguished from another. px/s where the prior's centre shows no spot.
+# Sigmas of the motion between the pictures of one frame in a search by geometry alone: each search tries some shares of
+# them, since with the fastest motion no pose of few spots can be distinguished from another. px/s where the prior's
+# centre shows no spot.
+SEARCH_SPEED, SEARCH_RATE, SEARCH_PX_S = 1.0, 1.0, 1500.0  # m/s, rad/s
+SEARCH_SHARES = (1.0, 0.2, 0.04)
 # Largest motion of a spot in the error of a clock that is not known yet: a vehicle that moves faster is found later.
 SEARCH_CLOCK_PX = 8.0
-SEARCH_SPEED, SEARCH_RATE, SEARCH_PX_S = 1.0, 1.0, 1500.0  # m/s, rad/s
 # Limits of the search around the last pose; beyond the second one a fan of beams looks like itself, turned.
 MAX_DISTANCE_M, MAX_TURN_RAD = 1.5, np.deg2rad(60.0)
 # Spots of two poses nearer than this are the same. A vehicle that is symmetric up to more than this can be measured.
@@ -147,28 +150,34 @@ class Acquisition:
 
         first: the vehicle has not been measured before. static_too: use static points as well.
         """
-        p, by_camera, rows = self._parameters, {}, []
+        p, usable, rows = self._parameters, {}, []
         for c, (name, points) in enumerate(zip(self._model.camera_names, found, strict=True)):
             rows.append(np.zeros(0, dtype=np.int64))
             if points is None:
                 continue
             static = frame.log_static[frame.first[c] : frame.first[c + 1]] > STATIC_LOG_DENSITY
             rows[c] = np.arange(len(points)) if static_too else np.flatnonzero(~static)
-            some_points = points if len(rows[c]) == len(points) else points[rows[c]]
-            by_camera[name] = self._widened(some_points, prior, c)
-        if sum(len(points) for points in by_camera.values()) < p.labels.min_spots:
+            usable[name] = points if len(rows[c]) == len(points) else points[rows[c]]
+        if sum(len(points) for points in usable.values()) < p.labels.min_spots:
             return []
+        tries = [
+            {name: self._widened(points, prior, name, share) for name, points in usable.items()}
+            for share in (SEARCH_SHARES if has_clocks(found) else SEARCH_SHARES[:1])
+        ]
         some: list[Labelling] = []
         if first and not self._tie_reported:
-            result = find_labels(self._rig, self._model, by_camera, prior, p.labels, self._calibration)
+            results = [find_labels(self._rig, self._model, t, prior, p.labels, self._calibration) for t in tries]
+            result = max(results, key=lambda r: max((one.score for one in r.candidates), default=-np.inf))
             if result.tie:
                 events.append(Event("tie", result.in_words(self._model)))
                 self._tie_reported = True
             some = [result.chosen] if result.chosen is not None else list(result.candidates)
         if not some:
-            some = candidate_labellings(
-                self._rig, self._model, by_camera, prior, p.labels, self._calibration, most=MAX_CANDIDATES
-            )
+            for t in tries:
+                some += candidate_labellings(
+                    self._rig, self._model, t, prior, p.labels, self._calibration, most=MAX_CANDIDATES
+                )
+            some = sorted(some, key=lambda one: -one.score)[:MAX_CANDIDATES]
         out: list[Labelling] = []
         for one in some:
             point = one.point_of.copy()
@@ -177,14 +186,18 @@ class Acquisition:
             out.append(replace(one, point_of=point))
         return out
 
-    def _widened(self, points: Detections, prior: PosePrior, camera: int) -> Detections:
-        """The points of a picture with covariances for the unknown motion of the vehicle until it was taken."""
+    def _widened(self, points: Detections, prior: PosePrior, camera: str, share: float) -> Detections:
+        """The points of a picture with covariances for the unknown motion of the vehicle until it was taken.
+
+        share: of the usual motion.
+        """
         if points.clock is None or not len(points):
             return points
-        J = self._model.project(prior.centre)[1][self._model.camera_of == camera]  # 0 without a projection
-        sigmas = np.repeat([SEARCH_SPEED, SEARCH_RATE], 3)
+        mine = self._model.camera_of == self._model.camera_names.index(camera)
+        J = self._model.project(prior.centre)[1][mine]  # 0 without a projection
+        sigmas = share * np.repeat([SEARCH_SPEED, SEARCH_RATE], 3)
         speed2 = 0.5 * np.sum((J * sigmas) ** 2, axis=(1, 2))
-        px_s2 = float(np.median(speed2[speed2 > 0])) if np.any(speed2 > 0) else SEARCH_PX_S**2
+        px_s2 = float(np.median(speed2[speed2 > 0])) if np.any(speed2 > 0) else (share * SEARCH_PX_S) ** 2
         v = points.uv_px[:, 1]
         unknown = np.minimum(points.clock.variance_s2(v) * px_s2, SEARCH_CLOCK_PX**2)
         variance = points.clock.after_s(v) ** 2 * px_s2 + unknown
@@ -207,10 +220,14 @@ class Start(NamedTuple):
     manoeuvre: bool  # the state may have jumped, or is unknown
 
 
-def unknown_vehicle(prior: PosePrior, log_weight: float, visibilities: int) -> Start:
-    """A vehicle that is somewhere in the search region and of whose motion nothing is known."""
+def unknown_vehicle(prior: PosePrior, log_weight: float, visibilities: int, share: float = 1.0) -> Start:
+    """A vehicle that is somewhere in the search region and of whose motion nothing is known.
+
+    share: of the usual speeds, as in SEARCH_SHARES.
+    """
     where = (min(prior.within_m, 10.0) / np.sqrt(3), prior.within_rad / np.sqrt(3))
-    sigmas = [*where, FIRST_SPEED, FIRST_RATE, FIRST_ACCELERATION, FIRST_ANGULAR_ACCELERATION]
+    speeds = (share * FIRST_SPEED, share * FIRST_RATE)
+    sigmas = [*where, *speeds, FIRST_ACCELERATION, FIRST_ANGULAR_ACCELERATION]
     R, t = np.ascontiguousarray(prior.centre.rotation), np.array(prior.centre.translation)
     state = State(R, t, np.zeros(12), np.diag(np.repeat(sigmas, 3) ** 2))
     return Start(state, np.full(visibilities, P_VISIBLE_AT_START), log_weight, -1, True)

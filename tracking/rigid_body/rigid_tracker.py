@@ -35,13 +35,13 @@ from tracking.input_validation import UsablePoints, check_step
 from tracking.labelling.first_labels import MIN_EVIDENCE_NATS, NO_POINT, Labelling
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.acquisition import (
-    FIRST_RATE,
-    FIRST_SPEED,
     MISSING_TO_DOUBT,
     P_VISIBLE_AT_START,
     SEARCH_CLOCK_PX,
+    SEARCH_SHARES,
     Acquisition,
     SearchSchedule,
+    Start,
     add_mirror_solutions,
     add_pose,
     continued_hypotheses,
@@ -251,12 +251,12 @@ class RigidTracker:
             cov[rows] += np.minimum(variance, less)[:, None, None] * unknown2[nearest]
         return cov
 
-    def _at_candidate(self, obs: Observation, pose: Pose) -> Observation:
-        """The observation for a vehicle at a pose of whose motion nothing is known."""
+    def _at_candidate(self, obs: Observation, pose: Pose, unknown: Start) -> Observation:
+        """The observation for an unknown vehicle that is at a pose."""
         if not obs.timed:
             return obs
-        state = State(np.array(pose.rotation, order="C"), np.array(pose.translation), np.zeros(12), np.zeros((18, 18)))
-        return self._moved(obs, state, np.diag(np.repeat([FIRST_SPEED, FIRST_RATE], 3) ** 2))
+        state = unknown.state._replace(R=np.array(pose.rotation, order="C"), t=np.array(pose.translation))
+        return self._moved(obs, state, np.ascontiguousarray(state.P[6:12, 6:12]))
 
     # -- search for the whole vehicle ---------------------------------------------------------------------------------
 
@@ -282,14 +282,16 @@ class RigidTracker:
         )  # fmt: skip
         static_too = self._schedule.searches % STATIC_SEARCH_INTERVAL == 0
         candidates = self._acquisition.labellings(obs.frame, found, prior, first, static_too, events)
-        if first and len(candidates) == 1 and candidates[0].fit.dof > 0 and candidates[0].score >= MIN_EVIDENCE_NATS:
-            # Later the scale is known, and a misfit shows a wrong answer (a scale of 3 after a screen was occluded).
-            unmoved = self._at_candidate(obs, candidates[0].fit.world_from_body)
-            self._raise_variance_factor(unmoved, candidates[0])
-            obs, _ = self._observations(found, dt_s)
         # A vehicle that was never measured may as well appear now; else it is rarely off all predictions.
         log_weight = 0.0 if self._hypotheses is None else -self._evidence if first else float(np.log(P_NEW))
-        starts = [unknown_vehicle(prior, log_weight, len(self.model) + self._groups)]
+        visibilities = len(self.model) + self._groups
+        shares = SEARCH_SHARES if obs.timed else SEARCH_SHARES[:1]
+        starts = [unknown_vehicle(prior, log_weight, visibilities, share) for share in shares]
+        if first and len(candidates) == 1 and candidates[0].fit.dof > 0 and candidates[0].score >= MIN_EVIDENCE_NATS:
+            # Later the scale is known, and a misfit shows a wrong answer (a scale of 3 after a screen was occluded).
+            unmoved = self._at_candidate(obs, candidates[0].fit.world_from_body, starts[0])
+            self._raise_variance_factor(unmoved, candidates[0])
+            obs, _ = self._observations(found, dt_s)
         if self._hypotheses is not None and dt_s > 0:
             dynamics = self.process_noise.dynamics
             starts += continued_hypotheses(self._hypotheses, dt_s, dynamics, len(self.model), manoeuvre=True)
@@ -304,15 +306,16 @@ class RigidTracker:
             least = distinct_spots(best >= 0, self.model.spot_of) + MISSING_TO_DOUBT
             candidates = [c for c in candidates if distinct_spots(c.point_of != NO_POINT, self.model.spot_of) >= least]
             if candidates:
-                count, starts[0] = without_history(children, count, obs, self.model, starts[0])
+                count, best_start = without_history(children, count, obs, self.model, starts[0])
+                of_unknown = [s._replace(log_weight=best_start.log_weight) for s in starts if s.parent < 0]
+                starts[: len(of_unknown)] = of_unknown
         for one in candidates:
             pose = one.fit.world_from_body
             assigned = self._assigned(obs.frame, one)
-            unmoved = self._at_candidate(obs, pose)
             for start in starts:
                 if not start.manoeuvre and continues(children, branched, start.parent, assigned):
                     continue
-                here = unmoved if start.parent < 0 else obs
+                here = self._at_candidate(obs, pose, start) if start.parent < 0 else obs
                 count, place = add_pose(children, count, here, self.model, start, assigned, pose)
                 if place >= 0:
                     searched.pop(place, None)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.clocks.recording import random_recording, write_recording
 from lab.files.run.results import read_poses
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
@@ -85,3 +86,10 @@ def test_a_camera_of_another_rate_needs_only_its_times(recording, tmp_path):
     poses = read_poses(tmp_path / "out")
     assert len(poses.frames) == FRAMES
     assert attitude_rms_deg(tmp_path / "out") < 0.1
+
+
+def test_four_spots_seen_by_free_running_cameras_are_found(tmp_path):
+    """If the first search allowed for the fastest motion alone, no pose could be distinguished from false points."""
+    write_recording(random_recording(1006, frames=12), tmp_path / "run")
+    process_run(tmp_path / "run", tmp_path / "out")
+    assert read_poses(tmp_path / "out").has("measured").sum() >= 8
