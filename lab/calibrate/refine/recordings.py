@@ -6,7 +6,7 @@ import contextlib
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +21,14 @@ from lab.errors import CalibrationError
 from lab.files.run.run_file import Run
 from lab.findings.finding import Level, worst_first
 from lab.runs.frames.frames import FrameSet
-from lab.runs.frames.pipeline import Frames, Pipeline
+from lab.runs.frames.pipeline import FrameRecord, Frames, Pipeline
 from lab.runs.model_check.check import ModelCheck, check_model
 from lab.runs.model_check.frame_sampler import FrameSampler
 from lab.runs.setup_check import UNUSED, mistakes_of_run, pictures_sampler
 from lab.runs.smoothing_pass import TrackingAndSmoothing
 from lab.runs.verdict.frame_checks import FrameChecks
 from lab.runs.verdict.run_statistics import CameraStatistics, RunStatistics
+from tracking.statuses import PoseStatus
 
 LEAST_MEASURED = 0.9  # share of frames with a measured pose, below which usual mistakes of the set-up are tested
 # Share of the residuals that the errors of the rig cause, as sigma of the tracker's model: with all of it, or none,
@@ -93,12 +94,14 @@ def tolerant(run: Run) -> Run:
     return replace(run, tracker=replace(run.tracker, sigma_model_px=max(px, run.tracker.sigma_model_px)))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _FirstFrames:
-    """The first frames of a recording."""
+    """The first frames of a recording, until so many of them have a measured pose."""
 
     reader: Frames
     most: int
+    enough: int
+    measured: int = 0
 
     @property
     def notes(self) -> list[str]:
@@ -109,11 +112,17 @@ class _FirstFrames:
         return self.reader.expected_frames
 
     def __iter__(self) -> Iterator[FrameSet]:
-        return islice(self.reader, self.most)
+        return takewhile(lambda _: self.measured < self.enough, islice(self.reader, self.most))
+
+    def count(self, record: FrameRecord) -> None:
+        """Count a tracked frame."""
+        self.measured += record.tracked.pose_status is PoseStatus.MEASURED
 
 
-def labelled(run: Run, most: int | None = None) -> LabelledRun:
-    """Track and smooth a run with its rig. most: number of frames after which it ends.
+def labelled(run: Run, most: int | None = None, enough: int = 0, *, judged: bool = True) -> LabelledRun:
+    """Track and smooth a run with its rig. most: number of frames after which it ends, or after `enough` with poses.
+
+    judged: usual mistakes of the set-up are tested where few frames have a pose.
 
     Raises:
         CalibrationError: the recording shows a mistake in the set-up, such as exchanged cameras, which no refinement
@@ -126,7 +135,8 @@ def labelled(run: Run, most: int | None = None) -> LabelledRun:
     with tempfile.TemporaryDirectory(prefix="beampose-refine-") as work:
         passes = TrackingAndSmoothing.of(Pipeline.of(run), Path(work))
         if most is not None:
-            passes.pipeline.reader = _FirstFrames(passes.pipeline.reader, most)
+            first = _FirstFrames(passes.pipeline.reader, most, enough)
+            passes.pipeline.reader, passes.pipeline.on_record = first, first.count
         with contextlib.closing(passes.records()) as records:
             for record, _ in FrameChecks(run.rig, run.covariance).passed(records):
                 sampler.add_record(record, camera_of, run.tracker)
@@ -135,9 +145,10 @@ def labelled(run: Run, most: int | None = None) -> LabelledRun:
                 statistics.add(record)
     recording = sampler.recording()
     passes_well = statistics.measured > LEAST_MEASURED * statistics.frames
-    mistakes = mistakes_of_run(run, statistics, pictures, passes=passes_well)
+    mistakes = mistakes_of_run(run, statistics, pictures, passes=passes_well or not judged)
     worst = next(iter(worst_first(mistakes)), None)
-    if worst is not None and (worst.level is Level.FAIL or worst.code == UNUSED):
+    # A camera without labels in the first frames may have them later, with a better rig.
+    if worst is not None and (worst.level is Level.FAIL or (most is None and worst.code == UNUSED)):
         raise CalibrationError(f"{run.folder}: {worst.what}. {worst.remedy}")
     if recording is None:
         raise CalibrationError(f"{run.folder}: there is no frame at all")

@@ -43,8 +43,9 @@ COLUMNS = (
     "sigma_u_px", "sigma_v_px",
 )  # fmt: skip
 _STEP = Step("refinement by recordings", (RESIDUALS,), RIG)
-# Frames of all runs, and at least of each, for the first solution: it only has to be good enough to label all frames.
-_FIRST, _FEWEST_OF_RUN = 300, 100
+# Frames of each run for the first solutions, at most and with a pose: each solution only has to be good enough to label
+# the frames of the next. While the rig is off by 10 px, half of the spots get no label and a frame takes 0.1 s.
+_FIRST_FRAMES = ((40, 20), (100, 100))
 _STACKS_OF = {
     prior_sigmas.CAMERAS: (CAMERAS,), prior_sigmas.SCREENS: (SCREENS, BOWS), prior_sigmas.BEAMS: (BEAMS,),
     prior_sigmas.LENS: (INTRINSICS,),
@@ -133,19 +134,28 @@ def _stacks(free: Sequence[str], prior: RigCovariance, rig_path: Path) -> set[st
 def _refined(
     runs: Sequence[Run], rig: Rig, prior: RigCovariance, stacks: set[str], progress: Progress | None
 ) -> RefineResult:
-    def all_labelled(runs: Sequence[Run], half: int) -> list[LabelledRun]:
+    stages: tuple[tuple[int, ...], ...] = (*_FIRST_FRAMES, ())
+
+    def all_labelled(runs: Sequence[Run], stage: int) -> list[LabelledRun]:
         out = []
         for i, run in enumerate(runs):
             if progress is not None:
-                progress(half * len(runs) + i, 2 * len(runs), run.name)
-            out.append(labelled(run, None if half else max(_FIRST // len(runs), _FEWEST_OF_RUN)))
+                progress(stage * len(runs) + i, len(stages) * len(runs), run.name)
+            out.append(labelled(run, *stages[stage], judged=stage > 0))
         return out
 
     try:
-        first = all_labelled([tolerant(run) for run in runs], 0)
-        start = refine(rig, prior, [r.in_views_of(rig) for r in first], stacks=stacks)
-        again = [with_rig(run, start.rig, start.covariance) for run in runs]
-        second = all_labelled(again, 1)
+        now = list(runs)
+        for stage in range(len(_FIRST_FRAMES)):
+            some = all_labelled([tolerant(run) for run in now], stage)
+            try:
+                start = refine(rig, prior, [r.in_views_of(rig) for r in some], stacks=stacks)
+            except AdjustmentError:
+                if stage > 0:
+                    raise
+                continue  # the first few frames have too few labels
+            now = [with_rig(run, start.rig, start.covariance) for run in runs]
+        second = all_labelled(now, len(_FIRST_FRAMES))
         model = SpotModel.of(start.rig)
         recordings = [with_place_errors(r.in_views_of(rig), model) for r in second]
         refined = refine(rig, prior, recordings, start, stacks)
