@@ -15,6 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 if str(ROOT) not in sys.path:  # MkDocs loads this file by its path
     sys.path.insert(0, str(ROOT))
 
+from docs.website import gallery  # noqa: E402
 from docs.website.formulas import FormulaError, with_mathml  # noqa: E402
 from docs.website.navigation import expanded  # noqa: E402
 from docs.website.network import network_addresses  # noqa: E402
@@ -27,14 +28,17 @@ _LOG = logging.getLogger("mkdocs.hooks.beampose")
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Replace patterns such as `papers/*.md` in the navigation by the files that match them."""
     if config.nav is not None:
-        config.nav = expanded(config.nav, Path(config.docs_dir))
+        config.nav = expanded(config.nav, Path(config.docs_dir), [f"gallery/{name}.md" for name in gallery.names()])
     return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that are generated from the code."""
+    """Add the pages that are generated from the code, and the gallery, made again if the program has changed."""
     for path, page in GENERATED.items():
         files.append(File.generated(config, path, content=page()))
+    for made in sorted(gallery.build().iterdir()):
+        if made.suffix != "":
+            files.append(File.generated(config, f"gallery/{made.name}", abs_src_path=str(made)))
     return files
 
 
