@@ -31,7 +31,7 @@ import numpy as np
 
 from docs.website.recordings import MISTAKES, photograph_board, record
 from docs.website.text import cell, table
-from lab.findings.finding import ENTRIES
+from lab.findings.finding import ENTRIES, sentence
 from lab.runs.verdict.score import normalised_squares, pose_errors, read_tables, read_truth
 from tracking.statuses import PoseStatus
 
@@ -204,12 +204,12 @@ def page(
     for p in printed:
         status = f"  # exit status {p.status}" if p.status else ""
         lines += ["```console", f"$ {p.command}{status}", *_shown(p.output), "```", ""]
-    for e in evidence:
+    for e in (e for e in evidence if e["code"] in sight.named):
         code = str(e["code"])
         lines += [
             f"The report, {e['level'].upper()}, [{code}](../reference/codes.md#{code.lower()}) "
             f"{cell(ENTRIES[code].title.lower())}:", "",
-            *(f"> {cell(e[part].rstrip('.'))}.\n>" for part in ("what", "why") if e[part]), "",
+            *(f"> {cell(sentence(e[part]))}\n>" for part in ("what", "why") if e[part]), "",
         ]  # fmt: skip
     if cost:
         lines += ["What it costs, per axis; the errors are those against the truth of the simulation:", "", *cost]
@@ -222,10 +222,10 @@ def page(
     return "\n".join(lines)
 
 
-def _shown(output: str, most: int = 14) -> list[str]:
-    """The lines of an output; of a long one the beginning."""
-    lines = [html.unescape(line) for line in output.splitlines()]
-    return lines if len(lines) <= most else [*lines[:most], "..."]
+def _shown(output: str) -> list[str]:
+    """The lines of an output; that of `check` without the description of the recording below its remarks."""
+    lines = output.splitlines()
+    return [*lines[: lines.index("Rig")], "..."] if "Rig" in lines else lines
 
 
 def _story(sight: Sight) -> str:
@@ -323,7 +323,7 @@ def build(out: Path = BUILD, only: Sequence[str] = ()) -> Path:
     with ProcessPoolExecutor(min(WORKERS, os.cpu_count() or 1)) as pool:
         for sight, text in zip(chosen, pool.map(_made, chosen, [out] * len(chosen)), strict=True):
             (out / f"{sight.name}.md").write_text(text, encoding="utf-8")
-    (out / "index.md").write_text(overview(chosen), encoding="utf-8")
+    (out / "index.md").write_text(overview([s for s in sights() if (out / f"{s.name}.md").is_file()]), encoding="utf-8")
     if not only:
         stamp.write_text(version)
     return out

@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import yaml
 
 from calibration.boards.board_types import parse
 from geometry.pose import Pose
@@ -24,7 +25,7 @@ from lab.simulate.scenarios import SCENARIOS, PictureTiming
 from lab.simulate.write import simulate
 
 BOARD = "chessboard:12x8:30mm"
-PHOTOS = 10
+PHOTOS = 16
 
 
 def record(folder: Path, stated: Mapping[str, Any], frames: int | None = None) -> Path:
@@ -40,9 +41,11 @@ def record(folder: Path, stated: Mapping[str, Any], frames: int | None = None) -
         save_rig(with_lenses(scaled(RIGS[scenario.rig](), 0.5)), Path(other) / "rig.yaml")
         rig = Path(other) / "rig.yaml"
         simulate(scenario, folder, seed=stated.get("seed", 1), frames=frames or stated["frames"], rig=rig)
-    run = folder / "run.yaml"
-    lines = run.read_text(encoding="utf-8").splitlines(keepends=True)
-    run.write_text("".join(line for line in lines if "time_offset_s" not in line), encoding="utf-8")
+    path = folder / "run.yaml"
+    run = yaml.safe_load(path.read_text(encoding="utf-8"))
+    for camera in run["cameras"].values():
+        camera.pop("time_offset_s", None)
+    path.write_text(yaml.safe_dump(run, sort_keys=False), encoding="utf-8")
     return folder
 
 

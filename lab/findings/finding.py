@@ -145,6 +145,11 @@ def clause(sentence: str) -> str:
     return f"{sentence[:1].lower()}{sentence[1:]}".rstrip(".")
 
 
+def sentence(text: str) -> str:
+    """A text with a capital and one full stop."""
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
+
+
 def first_sentence(text: str) -> str:
     """The first sentence of a text, without its full stop; the report has the whole text."""
     return re.split(r"(?<=[\w)%`'\"])\.\s+(?=[A-Z`])|(?<=\?)\s+", text, maxsplit=1)[0].rstrip(".")

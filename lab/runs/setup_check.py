@@ -11,7 +11,7 @@ from geometry.camera import Camera
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.files.run.run_file import Run, VideoFile
-from lab.findings.finding import Finding, Level, finding, verdict
+from lab.findings.finding import Finding, Level, finding, sentence, verdict
 from lab.pictures.source import video_at
 from lab.runs.frames.even_sampler import EvenSampler
 from lab.runs.verdict.run_statistics import RunStatistics
@@ -150,7 +150,7 @@ def _lens(camera: Camera) -> tuple[object, ...]:
 def mistakes_by_themselves(rig: Rig, prior: PosePrior | None) -> tuple[Finding, ...]:
     """Findings on numbers of the files that cannot be those of a lab."""
     return tuple(
-        finding("BP-M06", Level.FAIL, m.what, why="no lab has such numbers", remedy=_sentence(m.remedy))
+        finding("BP-M06", Level.FAIL, m.what, why="no lab has such numbers", remedy=sentence(m.remedy))
         for m in possible_mistakes(rig, prior)
         if m.by_itself
     )
@@ -168,7 +168,7 @@ def _findings(compared: Comparison, rig: Rig) -> tuple[Finding, ...]:
         )
         what = ", or ".join(m.what for m, _ in compared.found)
         remedies = dict.fromkeys(m.remedy for m, _ in compared.found)
-        return (finding("BP-M06", Level.FAIL, what, why=why, remedy=_sentence("; or ".join(remedies))),)
+        return (finding("BP-M06", Level.FAIL, what, why=why, remedy=sentence("; or ".join(remedies))),)
     if given.good:
         return ()
     names, points = list(rig.cameras), given.points.sum(axis=0)
@@ -181,7 +181,3 @@ def unused_finding(camera: str, points: int, pictures: int) -> Finding:
     """The finding on a camera of which no point is ever labelled."""
     what = f"camera `{camera}`: none of its {points} points in {pictures} pictures is the spot of a pose"
     return finding(UNUSED, Level.WARN, what)
-
-
-def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}."

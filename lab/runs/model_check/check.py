@@ -181,20 +181,20 @@ def fault_finding(
     """The finding for one suspected fault. effects: of its explanations, in order."""
     level, effect = level_of(diagnosis, effects), effects[0]
     descriptions = [_description(e, model, frame_interval_s) for e in suspected.explanations]
-    text = descriptions[0]
+    what = descriptions[0]
     if len(descriptions) > 1:
         count = suspected.more_alternatives
         more = f"; or one of {count} more" if count > 1 else "; or one more" if count else ""
-        text = f"{'; or '.join(descriptions)}{more}: this recording does not distinguish them"
-    where = ""
+        what += f". Or {'; or '.join(descriptions[1:])}{more}: this recording does not distinguish them"
+    p_value = p_text(suspected.best.change.p_value)
     if effect.axis >= 0:
         camera, spot = model.views[effect.view]
-        where = (
-            f"spot {spot} in camera `{camera}` lies {format_number(effect.off_sigmas, 2)} sigma"
-            f" ({format_number(effect.off_px, 2)} px)"
-            f" off in {'uv'[effect.axis]} against the other spots: "
+        what += (
+            f". Spot {spot} in camera `{camera}` lies {format_number(effect.off_sigmas, 2)} sigma"
+            f" ({format_number(effect.off_px, 2)} px) off in {'uv'[effect.axis]} against the other spots, p {p_value}"
         )
-    what = f"{where}{text}, p {p_text(suspected.best.change.p_value)}"
+    else:
+        what += f", p {p_value}"
     components = list(dict.fromkeys(e.fault.component for e in suspected.explanations))
     remedy = " ".join(ENTRIES["BP-M01"].variant(c).remedy for c in components)
     if suspected.alternatives:

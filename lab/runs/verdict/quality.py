@@ -12,7 +12,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
-from lab.findings.finding import Finding, Level, clause, finding, level_above, worst_first
+from lab.findings.finding import Finding, Level, finding, level_above, sentence, verdict, worst_first
 from lab.findings.outcome import Verdict
 from lab.runs.verdict.frame_checks import FrameRanges
 from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, Cause, RunStatistics
@@ -54,16 +54,19 @@ def judge(
     """
     if statistics.frames == 0:
         return _of([finding("BP-V01", Level.FAIL, "there is no frame at all")])
-    given = [replace(f, what=f"{f.what}; {clause(f.why)}", why="") for f in findings if f.level > Level.PASS]
-    # A mistake of the set-up explains why nothing was found, or why the prior does not fit: it comes first.
+    given = [
+        replace(f, what=f"{f.what}. {sentence(f.why).rstrip('.')}", why="") for f in findings if f.level > Level.PASS
+    ]
+    # A mistake of the set-up explains why nothing was found, or why the prior does not fit, and a colour mosaic why the
+    # residuals do not fit the rig: they come first.
     found = [f for f in given if f.code == _SET_UP]
+    found += _mosaics(mosaics, verdict(given))
     found += _measured(statistics)
     if statistics.measured:
         found += _cameras(statistics)
     if noise_scale is not None:
         found += _noise_scale(noise_scale)
     found += [f for f in given if f.code != _SET_UP]
-    found += _mosaics(mosaics)
     found += _interruptions(statistics)
     if found:
         return _of(found)
@@ -92,8 +95,8 @@ def against_truth(verdict: Verdict, errors: Mapping[str, Any] | None) -> Verdict
     return _of((finding("BP-V20", level, what, numbers=numbers), *verdict.findings))
 
 
-def _mosaics(mosaics: Mapping[str, float]) -> list[Finding]:
-    """Cameras with raw pictures of a colour sensor. No residual shows their errors, since all spots have them."""
+def _mosaics(mosaics: Mapping[str, float], fit: Level) -> list[Finding]:
+    """Cameras with raw pictures of a colour sensor; fit: the level of the model check, whose residuals they explain."""
     if not mosaics:
         return []
     names = " and ".join(mosaics)
@@ -102,7 +105,7 @@ def _mosaics(mosaics: Mapping[str, float]) -> list[Finding]:
         f"{shown} a colour mosaic (neighbouring pixels differ by {max(mosaics.values()):.0%}): raw pictures of a colour"
         " camera move a spot's centroid by up to some tenths of a pixel"
     )
-    return [finding("BP-V18", Level.WARN, what, numbers=mosaics)]
+    return [finding("BP-V18", max(Level.WARN, fit), what, numbers=mosaics)]
 
 
 def _measured(statistics: RunStatistics) -> list[Finding]:
@@ -150,7 +153,7 @@ def _why_never(statistics: RunStatistics) -> list[Finding]:
         )
         return [finding("BP-V11", Level.FAIL, what, numbers={"causal_measured": statistics.causal_measured})]
     if statistics.tie_text:
-        what = f"the spots fit more than one pose: {statistics.tie_text}"
+        what = f"the spots fit more than one pose. {sentence(statistics.tie_text).rstrip('.')}"
         return [finding("BP-V12", Level.FAIL, what, numbers=_frame_numbers(statistics.ties))]
     causes = statistics.causes
     unexplained, few = causes.get(Cause.UNEXPLAINED, 0), causes.get(Cause.FEW_POINTS, 0)
@@ -252,7 +255,8 @@ def _interruptions(statistics: RunStatistics) -> list[Finding]:
     out = []
     if statistics.measured and statistics.ties:
         which = "frame" if len(statistics.ties) == 1 else "frames"
-        what = f"{which} {statistics.ties.as_text()} could be explained in more than one way: {statistics.tie_text}"
+        candidates = sentence(statistics.tie_text).rstrip(".")
+        what = f"{which} {statistics.ties.as_text()} could be explained in more than one way. {candidates}"
         out.append(finding("BP-V12", Level.WARN, what, numbers=_frame_numbers(statistics.ties)))
     if statistics.measured and len(statistics.lost):
         never = statistics.lost.ranges[-1][1] == statistics.last_frame

@@ -11,7 +11,7 @@ import pytest
 
 from calibration.model_check.fault_identification import NOISY, Effect, FaultDiagnosis
 from geometry.pose_prior import PosePrior
-from lab.findings.finding import Level
+from lab.findings.finding import Level, first_sentence
 from lab.number_format import format_number, format_with_sigma
 from lab.runs.model_check import check
 from lab.runs.model_check.check import check_model, check_sampled_frames
@@ -58,9 +58,11 @@ def test_of_three_or_more_cameras_the_one_out_of_step_is_reported_early_or_late(
 def test_a_finding_states_spot_size_effect_and_remedy():
     run, recording = recorded("two-cameras-per-screen", 5, frames=300, really=turned("right-a", 0.05, 1))
     (finding,) = check_model(run.rig, recording).findings
-    assert finding.what.startswith("spot ")
+    assert first_sentence(finding.what).startswith("camera `right-a` may have turned, by 0.87")
+    assert len(first_sentence(finding.what)) < 80
+    assert ". Spot " in finding.what
     assert "in camera `right-a` lies " in finding.what
-    assert " px) off in u against the other spots: camera `right-a` may have turned, by 0.87" in finding.what
+    assert " px) off in u against the other spots, p below 1e-12" in finding.what
     assert "deg and " in finding.why
     assert "of its stated sigmas; averaging over frames does not reduce it" in finding.why
     assert "mount" in finding.remedy

@@ -159,7 +159,8 @@ def test_too_few_points_are_distinguished_from_points_that_do_not_fit():
 def test_a_tie_is_reported_with_its_candidates():
     verdict = never(ties=ranges((3, 3)), tie_text="spots 1, 2 or spots 2, 3")
     assert kinds(verdict) == ["never_found", "ambiguous"]
-    assert verdict.texts[1] == "the spots fit more than one pose: spots 1, 2 or spots 2, 3"
+    assert verdict.texts[1] == "the spots fit more than one pose. Spots 1, 2 or spots 2, 3"
+    assert "spots 1, 2" not in verdict.of_frames(0, FRAMES).lower()
     assert "narrower" in verdict.remedy
 
 
@@ -249,7 +250,7 @@ def test_findings_of_the_model_check_count_by_their_level_and_keep_their_remedy(
         ("BP-M01", Level.WARN, remedy),
     ]
     assert kinds(verdict) == ["model", "model"]
-    assert verdict.texts[0] == "camera `right` may have moved; it turns the pose"
+    assert verdict.texts[0] == "camera `right` may have moved. It turns the pose"
 
 
 def test_failures_come_before_points_to_check():
@@ -295,3 +296,11 @@ def test_a_camera_that_moved_during_the_recording_is_a_point_to_check(frames, st
     if status == "check":
         assert kinds(verdict) == ["camera_moved"]
         assert "camera left: in 5 frames (500 to 504)" in verdict.texts[0]
+
+
+def test_a_colour_mosaic_comes_before_the_misfit_that_it_explains():
+    moved = Finding(Level.FAIL, "camera `left` may have moved", why="averaging does not help", code="BP-M01")
+    verdict = judge(statistics_of(), [moved], mosaics={"left": 0.5})
+    assert kinds(verdict) == ["colour_mosaic", "model"]
+    assert "demosaicing" in verdict.of_frames(FRAMES, FRAMES)
+    assert verdict.texts[1] == "camera `left` may have moved. Averaging does not help"
