@@ -195,10 +195,12 @@ def page(
     sight: Sight, printed: Sequence[Printed], evidence: Sequence[Mapping[str, Any]], cost: Sequence[str] = ()
 ) -> str:
     """The page as Markdown. cost: lines of a table, of a sight that is a PASS."""
-    usual = "" if sight.board is not None else " Left: as it should be. Right: with the mistake."
+    usual = "" if sight.board is not None else "Left: as it should be. Right: this recording."
+    if usual and "spot" not in sight.picture:
+        usual += " Spots are drawn larger than they are."
     lines = [
         f"# {sight.title}", "", "## What you see", "", sight.see.strip(), "",
-        f"![{sight.title}]({sight.name}.webp)", "", f'<p class="caption">{usual.strip()}</p>' if usual else "", "",
+        f"![{sight.title}]({sight.name}.webp)", "", f'<p class="caption">{usual}</p>' if usual else "", "",
         "## What beampose reports", "",
     ]  # fmt: skip
     for p in printed:
@@ -241,20 +243,18 @@ def _story(sight: Sight) -> str:
 
 
 def draw(sight: Sight, folder: Path, work: Path) -> np.ndarray:
-    """The usual picture and that of the sight side by side, both with the same grey levels."""
+    """The usual picture and that of the sight side by side, with the same grey levels."""
     frame, camera = sight.picture.get("frame", 10), sight.picture.get("camera", "left")
     if sight.board is not None:
         shots = [cv2.imread(str(p), cv2.IMREAD_GRAYSCALE) for p in sorted((folder / "photos").iterdir())[1:3]]
         return _beside([_fit(shot) for shot in shots])
     healthy = record(work / "usual", _usual(sight), frame + 1)
     pictures = [_picture(at, camera, frame) for at in (healthy, folder)]
-    low, high = sight.picture.get("levels") or (np.percentile(pictures[0], 5), np.percentile(pictures[0], 99.9))
-    panels = []
-    for picture in pictures:
-        shown = _cut(picture, healthy, sight.picture, camera, frame)
-        grey = np.clip((shown.astype(float) - low) / max(high - low, 1.0), 0, 1)
-        panels.append(_fit(np.round(255 * grey).astype(np.uint8), enlarged="spot" in sight.picture))
-    return _beside(panels)
+    cuts = [_cut(picture, healthy, sight.picture, camera, frame) for picture in pictures]
+    highest = np.max(cuts) if "spot" in sight.picture else np.percentile(pictures[0], 99.9)
+    low, high = sight.picture.get("levels") or (np.percentile(pictures[0], 5), highest)
+    greys = [np.clip((cut.astype(float) - low) / max(high - low, 1.0), 0, 1) for cut in cuts]
+    return _beside([_fit(np.round(255 * grey).astype(np.uint8), "spot" in sight.picture) for grey in greys])
 
 
 def _usual(sight: Sight) -> dict[str, Any]:
@@ -270,9 +270,9 @@ def _picture(run: Path, camera: str, frame: int) -> np.ndarray:
 
 
 def _cut(picture: np.ndarray, healthy: Path, chosen: Mapping[str, Any], camera: str, frame: int) -> np.ndarray:
-    """The surroundings of a spot, by the truth of the usual recording; the whole picture where no spot is chosen."""
+    """The surroundings of a spot, by the truth of the usual recording; without one the whole picture, spots widened."""
     if "spot" not in chosen:
-        return picture
+        return np.asarray(cv2.dilate(picture, np.ones((7, 7), np.uint8)))  # so that spots can be seen
     half = chosen.get("half_px", 20)
     rows = (line.split(",") for line in (healthy / "truth" / "spots.csv").read_text("utf-8").splitlines()[1:])
     u, v = next((float(r[3]), float(r[4])) for r in rows if r[:3] == [str(frame), camera, chosen["spot"]])

@@ -21,7 +21,7 @@ from lab.files.rig.rig_file import load_rig, save_rig
 from lab.simulate.board_photo import PhotoSettings, photograph
 from lab.simulate.campaign import board_poses
 from lab.simulate.rigs import RIGS, scaled, unequal_fan
-from lab.simulate.scenarios import SCENARIOS, PictureTiming
+from lab.simulate.scenarios import SCENARIOS, Clutter, PictureTiming
 from lab.simulate.write import simulate
 
 BOARD = "chessboard:12x8:30mm"
@@ -34,7 +34,9 @@ def record(folder: Path, stated: Mapping[str, Any], frames: int | None = None) -
     stated: scenario, frames, seed; `change` has other values for fields of the scenario and of its parts, such as
     {light: {peak_dn: 900}}; `late` the delays (frames) of cameras, which run.yaml does not state.
     """
-    scenario = _changed(SCENARIOS[stated["scenario"]], stated.get("change", {}))
+    scenario = SCENARIOS[stated["scenario"]]
+    light = replace(scenario.light, reflections=0, hot_pixels=0)  # one sight at a time
+    scenario = _changed(replace(scenario, clutter=Clutter(per_spot=0), light=light), stated.get("change", {}))
     late = (PictureTiming(name, delay) for name, delay in stated.get("late", {}).items())
     scenario = replace(scenario, clocks=(*scenario.clocks, *late))
     with tempfile.TemporaryDirectory() as other:
