@@ -18,6 +18,7 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
 IMAGES = ROOT / "docs" / "images"
+TOUR = ROOT / "docs" / "tour"
 COMMANDS = (
     "calibrate simulate --photos --seed 3 --out campaign",
     "calibrate board charuco:5x7:36mm:18mm:DICT_4X4_50 --out board",
@@ -32,7 +33,12 @@ COMMANDS = (
     "simulate small-motion --rig my-campaign/truth/rig.yaml --known-rig my-rig/rig.yaml --frames 200 --light quiet"
     " --seed 1 --out my-run",
     "run my-run --out day-1",
+    # the tour
+    f"calibrate camera {TOUR}/left --board chessboard:9x6:25mm --out tour-left",
+    f"calibrate camera {TOUR}/webcam --board chessboard:9x7:24.4mm --out tour-webcam",
+    f"detect {TOUR}/room.jpg --out tour-room",
 )
+FAILING = {"tour-webcam": 3}  # exit statuses that the pages show
 # Name of the picture: the folder of the report, the beginning of the label of its figure there, which of several.
 FIGURES = {
     "plan-attitude": ("plan", "Attitude sigma (mdeg), maximum", 0),
@@ -47,6 +53,10 @@ FIGURES = {
     "run-yaw": ("day-1", "yaw", 0),
     "run-yaw-error": ("day-1", "yaw: ", 0),
     "run-status": ("day-1", "Status of the pose", 0),
+    "tour-coverage": ("tour-left", "Where the sensor had corners", 0),
+    "tour-uncertainty": ("tour-left", "Uncertainty of a pixel", 0),
+    "tour-webcam-coverage": ("tour-webcam", "Where the sensor had corners", 0),
+    "tour-webcam-uncertainty": ("tour-webcam", "Uncertainty of a pixel", 0),
     "huo2015/prediction-conventional": ("study", "conventional, stiff", 0),
     "huo2015/prediction-switching": ("study", "curve switching, stiff", 0),
     "huo2015/out-of-view-3": ("study", "spot 3: distance from truth", 0),
@@ -106,11 +116,23 @@ def mosaic(photos: list[Path], columns: int = 3, width: int = 360) -> np.ndarray
     return np.vstack([np.hstack(small[i : i + columns]) for i in range(0, len(small), columns)])
 
 
+def reduced(path: Path, to: Path, width: int) -> None:
+    """Write a picture again, so many pixels wide. Raises FileNotFoundError."""
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if picture is None:
+        raise FileNotFoundError(path)
+    size = (width, round(picture.shape[0] * width / picture.shape[1]))
+    options = [cv2.IMWRITE_JPEG_QUALITY, 80] if to.suffix == ".jpg" else []
+    cv2.imwrite(str(to), cv2.resize(picture, size, interpolation=cv2.INTER_AREA), options)
+
+
 def beampose(command: str, folder: Path) -> None:
     """Run a command of this checkout in a folder. Raises CalledProcessError."""
     print(f"beampose {command}", flush=True)
     start = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from cli import main; main(prog_name='beampose')"
-    subprocess.run([sys.executable, "-P", "-c", start, *command.split()], cwd=folder, check=True)
+    done = subprocess.run([sys.executable, "-P", "-c", start, *command.split()], cwd=folder, check=False)
+    if done.returncode != FAILING.get(command.split()[-1], 0):
+        raise subprocess.CalledProcessError(done.returncode, command)
 
 
 def shown(html: str) -> list[str]:
@@ -170,11 +192,8 @@ def make(work: Path, images: Path) -> None:
     shutil.copyfile(work / "study" / "figures.csv", images / "huo2015" / "figures.csv")
     photos = [work / "campaign" / "photos" / "left" / f"{k:02d}.png" for k in PHOTOS]
     cv2.imwrite(str(images / "photos.jpg"), mosaic(photos), [cv2.IMWRITE_JPEG_QUALITY, 80])
-    board = cv2.imread(str(work / "board" / "board.png"), cv2.IMREAD_GRAYSCALE)
-    if board is None:
-        raise FileNotFoundError("board.png")
-    size = (420, round(board.shape[0] * 420 / board.shape[1]))
-    cv2.imwrite(str(images / "board.png"), cv2.resize(board, size, interpolation=cv2.INTER_AREA))
+    reduced(work / "board" / "board.png", images / "board.png", 420)
+    reduced(work / "tour-room" / "contact-sheet.png", images / "tour-room.jpg", 900)
 
 
 if __name__ == "__main__":
