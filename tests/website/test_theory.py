@@ -1,4 +1,7 @@
-"""Every formula of the theory pages names the function that computes it; tests/test_docs.py checks that it exists."""
+"""Every formula of the theory pages names its function, and every page ends in a check that can be run.
+
+tests/test_docs.py checks that the functions exist.
+"""
 
 from __future__ import annotations
 
@@ -34,3 +37,14 @@ def test_every_formula_can_be_rendered(page):
     for latex in re.findall(r"\$\$(.+?)\$\$|(?<!\$)\$([^$\n]+)\$(?!\$)", PAGES[page]):
         shown = "".join(latex).replace("&", "&amp;").replace("<", "&lt;")
         assert "<math" in formulas.with_mathml(rf'<span class="arithmatex">\({shown}\)</span>')
+
+
+CHECK = re.compile(r"\n## Check it\n.*?```python\n(.*?)```\n.*?```text\n(.*?)```\n\Z", re.DOTALL)
+
+
+@pytest.mark.parametrize("page", sorted(set(PAGES) - {"index.md"}))
+def test_a_page_ends_in_a_check_that_prints_what_is_shown(page, tmp_path, monkeypatch, capsys):
+    code, shown = CHECK.search(PAGES[page]).groups()
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, page, "exec"), {})
+    assert capsys.readouterr().out == shown
