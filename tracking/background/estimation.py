@@ -14,7 +14,7 @@ from geometry.arrays import Array
 from tracking.background.behind_lights import LARGEST_PATH_PX, BehindLights
 from tracking.background.joint_fit import Modulation
 from tracking.background.mean_pictures import MOST_BYTES, means_of, smooth_part, usable
-from tracking.background.places import AROUND_LIGHT, ON_LIGHT, SAME_LIGHT, near_each, number_of_better, places_of
+from tracking.background.places import AROUND_LIGHT, AROUND_SPOT, ON_LIGHT, SAME_LIGHT, near_each, places_of
 from tracking.background.shown_light import Shown
 from tracking.background.slow_lights import ROUNDS, SlowLights, as_pictures_show, light_at
 from tracking.background.static_background import TRIED, StaticBackground
@@ -32,6 +32,7 @@ _MOSTLY = 0.7  # share of the pictures with lights that move, above which those 
 # Contrast up to which the structure is that of the screen's surface, and modulates the spots' light in full. Of what is
 # more, prints or objects, the spots show a part: 0.25 to 0.57 where photographs modulate their light by up to 60 %.
 _OF_SURFACE, _OF_OBJECTS = 0.1, 0.4
+_CLEARLY_BETTER = 0.5  # ratio of the variances of two measurements of a spot
 _SETTLED = 0.01  # sigmas of a pixel: the background behind a light that changes by less is the last one
 _NO_GAUSSIAN = 0.02  # share of a light at rest that a Gaussian leaves in a pixel; it is no structure of the background
 
@@ -189,8 +190,11 @@ def _spots_at(
 
 def _better_in(background: StaticBackground, picture: Picture, shift: TextureShift) -> int:
     """How many spots the difference of a picture shows that the picture does not, or clearly more precisely."""
-    in_picture = shift.added_to(find_spots(picture, background.parameters, background.noise), background.noise)
-    return number_of_better(background.spots_in(picture, background.parameters, shift), in_picture)
+    found = shift.added_to(find_spots(picture, background.parameters, background.noise), background.noise)
+    spots = background.spots_in(picture, background.parameters, shift)
+    same = near_each(spots, found, AROUND_SPOT)
+    better = spots.variance_px2[:, None] < _CLEARLY_BETTER * found.variance_px2
+    return int(np.count_nonzero(~np.any(same & ~better, axis=1)))
 
 
 def _searched(background: StaticBackground, picture: Picture, shift: TextureShift, fit: Shown | None) -> Detections:

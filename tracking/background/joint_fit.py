@@ -119,7 +119,7 @@ class _Pixels:
 
     def normal(self, light: JointLight, seen: _Seen) -> tuple[Array, Array]:
         """Normal matrix and right side of the step, with the background eliminated."""
-        (n, m), (l11, l21, l22) = self.values.shape, light.shape
+        n, m = self.values.shape
         size = 5 + 2 * n + 3
         weighted = (light.plain + light.modulated * seen.behind) * seen.light_of * seen.root
         slopes = np.zeros((size, n + 2, m))
@@ -128,8 +128,7 @@ class _Pixels:
         slopes[3, :n] = -weighted * seen.along * seen.dv
         slopes[4, :n] = -weighted * seen.across * seen.dv
         each = np.arange(n)
-        slopes[5 + 2 * each, each] = weighted * seen.along * l11
-        slopes[6 + 2 * each, each] = weighted * (seen.along * l21 + seen.across * l22)
+        slopes[5 + 2 * each, each], slopes[6 + 2 * each, each] = seen.place_slopes(light)
         about = self.uv - light.origin
         slopes[5 + 2 * n :, n] = -np.stack([np.ones(m), *about.T]) / light.texture_dn
         by_background = np.concatenate([
@@ -163,13 +162,11 @@ class _Seen:
     def cost(self) -> float:
         return float(np.sum(self.residual**2) + np.sum(self.usual**2))
 
-    def own_variance(self, light: JointLight) -> float:
-        """Variance, px^2, of a coordinate of the light's place in one picture by its noise: the background is known."""
+    def place_slopes(self, light: JointLight) -> Array:
+        """(2, n, m): derivatives of the values, in sigmas, by the light's place, px, with the background as it is."""
         l11, l21, l22 = light.shape
         weighted = (light.plain + light.modulated * self.behind) * self.light_of * self.root
-        slopes = np.stack([weighted * self.along * l11, weighted * (self.along * l21 + self.across * l22)])
-        information = np.einsum("ikm,jkm->kij", slopes, slopes)
-        return float(np.mean(np.trace(np.linalg.pinv(information, hermitian=True), axis1=1, axis2=2))) / 2
+        return np.stack([weighted * self.along * l11, weighted * (self.along * l21 + self.across * l22)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,7 +260,9 @@ def _checked(pixels: _Pixels, light: JointLight, width_px: float) -> JointFit | 
     normal, _ = pixels.normal(light, seen)
     covariance = np.linalg.pinv(normal, hermitian=True)
     places = covariance[5 : 5 + 2 * n, 5 : 5 + 2 * n].reshape(n, 2, n, 2)
-    every, own = float(np.einsum("kiki->", places)) / (2 * n), seen.own_variance(light)
+    slopes = seen.place_slopes(light)
+    alone = np.linalg.pinv(np.einsum("ikm,jkm->kij", slopes, slopes), hermitian=True)  # if the background were known
+    every, own = (float(np.trace(P, axis1=1, axis2=2).mean()) / 2 for P in (np.einsum("kikj->kij", places), alone))
     mean = float(np.trace(places.mean(axis=(0, 2)))) / 2 * max(chi2, 1.0)
     lit = seen.light_of.max(axis=0) > 0.1
     height = (light.plain + light.modulated * seen.behind)[lit]

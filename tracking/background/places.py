@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from geometry.arrays import Bools
 from tracking.detections import Detections
 
-_CLEARLY_BETTER = 0.5  # ratio of the variances of two measurements of a spot
 # Widths, and px: kept clear of lights at rest; of other spots; a light itself; its middle.
 AROUND_LIGHT, AROUND_SPOT, ON_LIGHT, SAME_LIGHT = (3.0, 3.0), (3.0, 2.0), (2.5, 1.5), (1.0, 0.0)
 
@@ -28,14 +27,6 @@ def near_each(spots: Detections, found: Detections, size: tuple[float, float]) -
     widths, more = size
     gap = np.linalg.norm(spots.uv_px[:, None] - found.uv_px, axis=-1)
     return np.asarray(gap < widths * found.major_px + more)
-
-
-def number_of_better(spots: Detections, found: Detections) -> int:
-    """How many spots of a difference (n,) are not among those found in the picture (m,), or clearly more precise."""
-    part = near_each(spots, found, AROUND_SPOT)
-    size2, usual2 = (np.trace(d.cov_px2, axis1=1, axis2=2) for d in (spots, found))
-    replaces = part & (size2[:, None] < _CLEARLY_BETTER * usual2)
-    return int(np.count_nonzero(~np.any(part & ~replaces, axis=1)))
 
 
 def inside(boxes: NDArray[np.float64], found: Detections) -> Bools:

@@ -229,7 +229,7 @@ class StaticBackground:
             at_rest = self.fixed.astype(float) if len(self.fixed) else None
             covariance = (1 + self._noise_share) * lights.cov_px2 + least[:, None, None] * np.eye(2)
             lights = replace(lights, cov_px2=covariance, place_px2=place + common, at_rest=at_rest)
-            moving = replace(shift, background_px=(0.0,) * len(shift.background_px))
+            moving = shift.of_light
             if self.shifts_px is not None:
                 moving = replace(moving, misfit_share=self.misfit_share)
             self.known[shift] = lights, moving

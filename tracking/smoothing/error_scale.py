@@ -75,7 +75,7 @@ class ErrorScale:
         """
         place = _place_variance(place_px2, width_px, self.misfit_share[camera])
         within = _within(self.factors, _with_more(stated, place - place_px2), place, camera)
-        return (within + width_covariance(width_px, self.width_share[camera])) * self.noise_scale**2
+        return _with_more(within, _variance_of_share(width_px, self.width_share[camera])) * self.noise_scale**2
 
     def place_px2(self, run: RunDetections, stated_px2: Array) -> Array:
         """(m,): variances of a run's detections that belong to their places."""
@@ -153,15 +153,10 @@ def usual_misfit(run: RunDetections, place_px2: Array, assigned: Ints, camera_of
     return np.where(np.isnan(out), usual, out)
 
 
-def width_covariance(width_px: Array, share: Array | float) -> Array:
-    """Covariances (m, 2, 2), px^2, of errors that are shares of the spots' widths (m,), px; 0 where not known."""
-    return _variance_of_share(width_px, share)[:, None, None] * np.eye(2)
-
-
 def widened(detections: RunDetections, share: Array | float) -> RunDetections:
     """The detections with covariances that include errors of these shares (cameras,) of the spots' widths."""
     own = np.broadcast_to(share, (detections.has_image.shape[1],))[_cameras_of(detections)]
-    return detections._replace(cov=detections.cov + width_covariance(detections.size_px, own))
+    return detections._replace(cov=_with_more(detections.cov, _variance_of_share(detections.size_px, own)))
 
 
 def width_share(
