@@ -10,10 +10,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from sys import modules
 from typing import Any
 
 import numba
-from numba.core import codegen
+from numba.core import codegen, environment
 from numba.core.caching import FunctionCache
 from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]  # written in C, without types
 from numba.core.types import unliteral
@@ -32,6 +33,7 @@ _NEEDED = {
         ("_guard_against_spurious_io_errors", "_load_overload", "flush", "load_overload", "save_overload"),
     ),
     "_nrt_python": (_nrt_python, ("c_helpers",)),
+    "environment": (environment, ("Environment", "_rebuild_env", "lookup_environment")),
     "dispatcher": (type(numba.njit(lambda: None)), ("get_call_template",)),
 }  # fmt: skip
 _missing = [
@@ -122,6 +124,25 @@ def _name_functions_of_numba() -> None:
     """
     for name, address in _nrt_python.c_helpers.items():
         _llvm.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
+
+
+def _environment(module: str, constants: list[Any], name: str) -> Any:
+    """The namespace that machine code from disk has of a function, without an import of the function's module.
+
+    Compiled code reads only the constants. numba imports the module, and with that of a mean or a sort scipy.linalg.
+    """
+    known: Any = environment.lookup_environment(name)  # type: ignore[no-untyped-call]  # numba has no types
+    if known is not None:
+        return known
+    made: Any = environment.Environment(modules[module].__dict__ if module in modules else {"__name__": module})
+    made.consts[:], made.env_name = constants, name
+    environment.Environment._memo[name] = made
+    return made
+
+
+# Files of machine code contain the name of numba's own function.
+_environment.__module__, _environment.__qualname__ = environment.__name__, "_rebuild_env"
+environment._rebuild_env = _environment
 
 
 def keep_on_disk(dispatcher: Any, function: Callable, folder: Path) -> None:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from geometry.compilation.jit import compiled
+from geometry.compilation.jit import compiled, compiled_in_caller
 from geometry.compiled_projection import inside, project_view
 from geometry.pose_solver.three_spots import pose_of_lengths, spot_lengths
 from tracking.labelling.points import (
@@ -128,7 +128,7 @@ def generate(
     return tried
 
 
-@compiled
+@compiled_in_caller
 def _add_poses(
     problem: LabelProblem,
     triple: Ints,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.arrays import Array, Ints
-from geometry.compilation.jit import compiled
+from geometry.compilation.jit import compiled, compiled_in_caller
 from geometry.compiled_linalg import best_first, pose_plus
 from geometry.compiled_projection import inside, project_view
 from tracking.labelling.candidates import BestCandidates, best_point_of
@@ -91,7 +91,7 @@ def fit_labelled(
     return R, t, True
 
 
-@compiled
+@compiled_in_caller
 def evidence(
     problem: LabelProblem, labels: Ints, R: Array, t: Array, work: PoseWorkspace
 ) -> tuple[Array, Array, float, int, int]:
@@ -117,7 +117,7 @@ def evidence(
     return best_R, best_t, logs[best] + np.log(total), best, views
 
 
-@compiled
+@compiled_in_caller
 def _fixed_terms(problem: LabelProblem, labels: Ints, work: PoseWorkspace) -> tuple[float, int]:
     """The terms of the evidence that do not depend on the residuals, nats, and the number of expected views."""
     points, spots = problem.points, problem.spots
@@ -140,7 +140,7 @@ def _fixed_terms(problem: LabelProblem, labels: Ints, work: PoseWorkspace) -> tu
     return fixed, views
 
 
-@compiled
+@compiled_in_caller
 def _rear_screens(problem: LabelProblem, labels: Ints, R: Array, t: Array) -> int:
     """The number of screens that the beams of labelled views hit from the side without a camera."""
     front, views = problem.front, problem.views
@@ -165,7 +165,7 @@ def _rear_screens(problem: LabelProblem, labels: Ints, R: Array, t: Array) -> in
     return count
 
 
-@compiled
+@compiled_in_caller
 def _add_likelihood(value: float, problem: LabelProblem, labels: Ints, share: float, work: PoseWorkspace) -> float:
     """`value` plus the log-likelihood of the residuals and the log of the poses' volume, at one model error."""
     points, spots, uv = problem.points, problem.spots, work.uv
@@ -188,7 +188,7 @@ def _add_likelihood(value: float, problem: LabelProblem, labels: Ints, share: fl
     return value
 
 
-@compiled
+@compiled_in_caller
 def _second_view_term(
     problem: LabelProblem, first_view: int, first_point: int, point: int, trace: float, allowance: float
 ) -> float:
@@ -285,7 +285,7 @@ def complete(
     return evidence(problem, labels, R, t, work)
 
 
-@compiled
+@compiled_in_caller
 def _add_points(
     problem: LabelProblem, labels: Ints, R: Array, t: Array, work: PoseWorkspace
 ) -> tuple[Array, Array, bool]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from geometry.compilation.jit import compiled
+from geometry.compilation.jit import compiled, compiled_in_caller
 from geometry.compiled_projection import Views
 from geometry.forward_model import SpotModel
 from geometry.planes import intersect_surface
@@ -262,7 +262,7 @@ def cholesky(H: Array) -> float:
     return log_det
 
 
-@compiled
+@compiled_in_caller
 def solve_cholesky(L: Array, x: Array) -> None:
     """x = (L L^T)^-1 x, in place."""
     for i in range(6):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from geometry.compilation.jit import compiled
+from geometry.compilation.jit import compiled, compiled_in_caller
 from geometry.compiled_linalg import block, cholesky, hstack, multiply, pose_plus, solve
 from geometry.compiled_projection import Views, project_view
 from geometry.forward_model import SpotModel
@@ -100,7 +100,7 @@ def summarise(
     return FrameSummary(labelled, use, uv, cov, chi2, rms, single_frame_cov, expected, J, inside, false_points, discs)
 
 
-@compiled
+@compiled_in_caller
 def _false_points_near(obs: Observation, camera: int, u: float, v: float, assigned: Ints) -> int:
     """Number of a camera's unlabelled detections within CLUTTER_RADIUS_PX of a pixel (u, v)."""
     frame = obs.frame

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from geometry.compilation.jit import compiled
+from geometry.compilation.jit import compiled, compiled_in_caller
 from geometry.compiled_linalg import best_first, copy_into, copy_matrix_into, pose_plus
 from tracking.rigid_body.association.frame_detections import (
     BLENDED,
@@ -107,7 +107,7 @@ def associate(
     return beam.assigned[:count], beam.score[:count], beam.counted[:count], beam.R[:count], beam.t[:count], count
 
 
-@compiled
+@compiled_in_caller
 def _beam_width(obs: Observation, R: Array, t: Array, P: Array) -> int:
     """Number of partial assignments to keep: the less certain the prediction, the more."""
     uv, J = np.empty(2), np.empty((2, 6))
@@ -140,7 +140,7 @@ def _copy_pose(beam: _Beam, k: int, R: Array, t: Array, P: Array) -> None:
     copy_matrix_into(beam.P[k], P)
 
 
-@compiled
+@compiled_in_caller
 def _next_view(obs: Observation, beam: _Beam, count: int, undecided: Bools) -> int:
     """The undecided view (n,) that the best partial assignment predicts best; -1: none that one of them projects.
 
@@ -172,7 +172,7 @@ def _next_view(obs: Observation, beam: _Beam, count: int, undecided: Bools) -> i
     return view
 
 
-@compiled
+@compiled_in_caller
 def _extend(
     obs: Observation,
     beam: _Beam,
@@ -271,7 +271,7 @@ def _insert(
     return count, worst
 
 
-@compiled
+@compiled_in_caller
 def _select(
     obs: Observation,
     beam: _Beam,
@@ -300,7 +300,7 @@ def _select(
     return kept
 
 
-@compiled
+@compiled_in_caller
 def _update_pose(
     obs: Observation, view: int, d: int, predictions: _Predictions, node: int, R: Array, t: Array, P: Array
 ) -> None:
@@ -372,7 +372,7 @@ def complete(obs: Observation, assigned: Ints, R: Array, t: Array, P: Array, p_u
     return found
 
 
-@compiled
+@compiled_in_caller
 def explainable(obs: Observation, assigned: Ints) -> float:
     """Upper bound, nats, of what `complete` can add to the log-likelihood of an assignment (n,)."""
     frame, total = obs.frame, 0.0

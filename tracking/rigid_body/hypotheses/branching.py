@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array, Ints
-from geometry.compilation.jit import compiled
+from geometry.compilation.jit import compiled, compiled_in_caller
 from geometry.compiled_linalg import block, copy_into, copy_matrix_into
 from tracking.rigid_body.association.frame_detections import (
     BLENDED,
@@ -88,9 +88,11 @@ def branch(
         if old.log_weight[h] < -PRUNE_NATS:
             continue
         p_visible = predict(old.p_visible[h], n) if dt > 0.0 else old.p_visible[h]
-        count, best, suspected = _branch_steady(obs, step, h, p_visible, children, count, best)
-        if suspected:
-            count, best = _branch_manoeuvre(after_jump, step, h, p_visible, children, count, best)
+        suspected = False
+        for manoeuvre in (False, True):
+            if suspected or not manoeuvre:
+                seen = after_jump if manoeuvre else obs
+                count, best, suspected = _branch_motion(seen, step, h, manoeuvre, p_visible, children, count, best)
     return children, count
 
 
@@ -117,20 +119,26 @@ def _max_clutter_ratio(obs: Observation) -> float:
     return out
 
 
-@compiled
-def _branch_steady(
-    obs: Observation, step: _Step, h: int, p_visible: Array, children: Children, count: int, best: float
-) -> tuple[int, float, bool]:
-    """Add the children of hypothesis h that moves steadily.
+@compiled_in_caller
+def _branch_motion(
+    obs: Observation, step: _Step, h: int, manoeuvre: bool, p_visible: Array, children: Children, count: int,
+    best: float,
+) -> tuple[int, float, bool]:  # fmt: skip
+    """Add the children of hypothesis h that moves steadily, or with a manoeuvre.
 
     p_visible (n + groups,): predicted. best: largest log-weight so far. Returns the number of children, the largest
-    log-weight, and whether the likeliest assignment suggests a manoeuvre.
+    log-weight, and whether the likeliest assignment to a steady motion suggests a manoeuvre.
+
+    Assignments with fewer than MIN_CONFIRMING_SPOTS are left out with a manoeuvre: they would fit it wherever the spots
+    lie, and the mixture of both motions covers them, which belongs to the steady one.
     """
-    old, dynamics, dt, group = step.old, step.dynamics, step.dt, obs.view_table.group
-    steady = _predicted_state(step, h, False)
+    old, group = step.old, obs.view_table.group
+    expected = _predicted_state(step, h, manoeuvre)
     p_unoccluded = marginal(p_visible, group)
-    log_prior = old.log_weight[h] + np.log(1 - dynamics.p_manoeuvre)
-    found, b = _assignments(obs, steady, p_unoccluded)
+    p_motion = step.dynamics.p_manoeuvre if manoeuvre else 1 - step.dynamics.p_manoeuvre
+    log_prior = old.log_weight[h] + np.log(p_motion)
+    mixes = step.dt > 0.0 and not manoeuvre
+    found, b = _assignments(obs, expected, p_unoccluded)
     assigned, score = found.assigned, found.score
     bound = _max_clutter_ratio(obs)
     suspected, likeliest, highest, k = False, -np.inf, score[0], -1
@@ -140,77 +148,42 @@ def _branch_steady(
         if most < best - PRUNE_NATS or score[k] < highest - PRUNE_NATS:
             continue
         labelled = _labelled(assigned[k])
+        if manoeuvre and labelled < MIN_CONFIRMING_SPOTS:
+            continue
         # Visible spots that are not found have become occluded, or the vehicle has turned.
         sudden = _misses_expected_spot(assigned[k], p_unoccluded)
-        prior = steady
-        if dt > 0.0 and labelled < MIN_CONFIRMING_SPOTS:
-            prior = _with_either_motion(step, h, steady, sudden)
+        prior = expected
+        if mixes and labelled < MIN_CONFIRMING_SPOTS:
+            prior = _with_either_motion(step, h, expected, sudden)
         result = iterated_update(obs, prior, assigned[k], found.R[k], found.t[k])
         b = _add_completed(obs, found, k, b, result.state, p_unoccluded)
         log_likelihood, chi2 = result.log_likelihood, result.chi2
-        if 0 < labelled < MIN_CONFIRMING_SPOTS and dt > 0.0:
+        if mixes and 0 < labelled < MIN_CONFIRMING_SPOTS:
             # The mixture is at least as likely as its steady part; otherwise a false third spot would seem likelier.
-            narrow = iterated_update(obs, steady, assigned[k], found.R[k], found.t[k])
+            narrow = iterated_update(obs, expected, assigned[k], found.R[k], found.t[k])
             chi2 = narrow.chi2
             p_steady = 1.0 - (P_MANOEUVRE_SUDDEN if sudden else P_MANOEUVRE_OCCLUDED)
             log_likelihood = max(log_likelihood, narrow.log_likelihood + np.log(p_steady))
-        if dt > 0.0 and MIN_CONFIRMING_SPOTS <= labelled < MIN_REDUNDANT_SPOTS:
-            prior = _with_either_motion(step, h, steady, sudden)
+        if mixes and MIN_CONFIRMING_SPOTS <= labelled < MIN_REDUNDANT_SPOTS:
+            prior = _with_either_motion(step, h, expected, sudden)
         state = _state_if_determined(obs, prior, result, assigned[k], labelled)
         log_weight = _log_weight(obs, log_prior + found.counted[k] + log_likelihood, p_visible, assigned[k], state)
-        if log_weight >= likeliest and dt > 0.0 and old.log_weight[h] > -MANOEUVRE_PRUNE_NATS:
+        if mixes and log_weight >= likeliest and old.log_weight[h] > -MANOEUVRE_PRUNE_NATS:
             likeliest, dof = log_weight, 2 * result.spots
             suspected = (
                 chi2 > dof + UNEXPECTED_SIGMAS * np.sqrt(2.0 * max(dof, 1))
                 or (labelled < MIN_CONFIRMING_SPOTS and sudden)
                 or _misses_whole_screen(assigned[k], p_unoccluded, group)
-                or _leaves_points(obs, steady, assigned[k], p_unoccluded)
+                or _leaves_points(obs, expected, assigned[k], p_unoccluded)
             )
         if np.isfinite(log_weight):
             best = max(best, log_weight)
             after = update(p_visible, group, assigned[k], obs.detection_model.p_detect)
-            count, _ = add_child(children, count, state, log_weight, after, assigned[k], False, h)
+            count, _ = add_child(children, count, state, log_weight, after, assigned[k], manoeuvre, h)
     return count, best, suspected
 
 
-@compiled
-def _branch_manoeuvre(
-    obs: Observation, step: _Step, h: int, p_visible: Array, children: Children, count: int, best: float
-) -> tuple[int, float]:
-    """Add the children of hypothesis h with a manoeuvre; arguments and results as in `_branch_steady`.
-
-    Assignments with fewer than MIN_CONFIRMING_SPOTS are left out: they would fit a manoeuvre wherever the spots lie,
-    and the mixture of both motions in `_branch_steady` covers them.
-    """
-    old, dynamics, group = step.old, step.dynamics, obs.view_table.group
-    prior = _predicted_state(step, h, True)
-    p_unoccluded = marginal(p_visible, group)
-    log_prior = old.log_weight[h] + np.log(dynamics.p_manoeuvre)
-    found, b = _assignments(obs, prior, p_unoccluded)
-    assigned, score = found.assigned, found.score
-    bound, highest, k = _max_clutter_ratio(obs), score[0], -1
-    while k < b - 1:
-        k += 1
-        most = log_prior + score[k] + bound + explainable(obs, assigned[k])
-        if most < best - PRUNE_NATS or score[k] < highest - PRUNE_NATS:
-            continue
-        labelled = _labelled(assigned[k])
-        if labelled < MIN_CONFIRMING_SPOTS:
-            continue
-        result = iterated_update(obs, prior, assigned[k], found.R[k], found.t[k])
-        b = _add_completed(obs, found, k, b, result.state, p_unoccluded)
-        state = _state_if_determined(obs, prior, result, assigned[k], labelled)
-        log_weight = _log_weight(
-            obs, log_prior + found.counted[k] + result.log_likelihood, p_visible, assigned[k], state
-        )
-        if np.isfinite(log_weight):
-            best = max(best, log_weight)
-            after = update(p_visible, group, assigned[k], obs.detection_model.p_detect)
-            count, _ = add_child(children, count, state, log_weight, after, assigned[k], True, h)
-    return count, best
-
-
-@compiled
+@compiled_in_caller
 def _assignments(obs: Observation, predicted: State, p_unoccluded: Array) -> tuple[_Assignments, int]:
     """The assignments of a joint search from a predicted state, with room for completed ones, and their number."""
     assigned, score, counted, R, t, b = associate(obs, predicted.R, predicted.t, block(predicted.P, 6), p_unoccluded)
@@ -226,7 +199,7 @@ def _assignments(obs: Observation, predicted: State, p_unoccluded: Array) -> tup
     return out, b
 
 
-@compiled
+@compiled_in_caller
 def _add_completed(obs: Observation, of: _Assignments, k: int, b: int, state: State, p_unoccluded: Array) -> int:
     """Add assignment k with the further spots that its updated state explains to b assignments; returns their number.
 
@@ -263,7 +236,7 @@ def _labelled(assigned: Ints) -> int:
     return out
 
 
-@compiled
+@compiled_in_caller
 def _state_if_determined(obs: Observation, prior: State, result: Update, assigned: Ints, labelled: int) -> State:
     """The updated state; the predicted one where so few labelled spots are predicted so badly that false points fit."""
     limit = MAX_TRACKING_SIGMA_PX if labelled < MIN_CONFIRMING_SPOTS else MAX_THREE_SPOT_SIGMA_PX
@@ -294,7 +267,7 @@ def _with_either_motion(step: _Step, h: int, steady: State, sudden: bool) -> Sta
     return State(steady.R, steady.t, steady.m, _mixture(steady.P, manoeuvre.P, p))
 
 
-@compiled
+@compiled_in_caller
 def _mixture(P: Array, other: Array, p: float) -> Array:
     """(1 - p) P + p other, of matrices."""
     out = np.empty_like(P)
@@ -313,7 +286,7 @@ def _misses_expected_spot(assigned: Ints, p_unoccluded: Array) -> bool:
     return misses
 
 
-@compiled
+@compiled_in_caller
 def _misses_whole_screen(assigned: Ints, p_unoccluded: Array, group: Ints) -> bool:
     """Whether none of the spots of a screen was found although one of them is probably not occluded.
 
@@ -331,7 +304,7 @@ def _misses_whole_screen(assigned: Ints, p_unoccluded: Array, group: Ints) -> bo
     return False
 
 
-@compiled
+@compiled_in_caller
 def _leaves_points(obs: Observation, predicted: State, assigned: Ints, p_unoccluded: Array) -> bool:
     """Whether a spot that is probably not occluded has no label although its camera shows a point of no spot.
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from geometry.compilation.jit import compiled
+from geometry.compilation.jit import compiled, compiled_in_caller
 from geometry.compiled_linalg import (
     apply,
     best_first,
@@ -250,7 +250,7 @@ def unweighted_spread(children: Children, kept: Ints) -> Array:
     return out
 
 
-@compiled
+@compiled_in_caller
 def _equivalent(children: Children, k: int, o: int) -> bool:
     """Whether two children have the same assignment and nearly the same state."""
     for i in range(children.assigned.shape[1]):
@@ -404,7 +404,7 @@ def _difference(state: tuple[Array, Array, Array], prior: State, size: int) -> A
     return out
 
 
-@compiled
+@compiled_in_caller
 def _plus(prior: State, delta: Array) -> tuple[Array, Array, Array]:
     """The prior plus the first numbers (s,) of a state: R, t, m."""
     R, t = pose_plus(prior.R, prior.t, delta)
@@ -414,7 +414,7 @@ def _plus(prior: State, delta: Array) -> tuple[Array, Array, Array]:
     return R, t, m
 
 
-@compiled
+@compiled_in_caller
 def _in_tangent_of_prior(L: Array, g: Array, delta: Array) -> tuple[Array, Array]:
     """Normal matrix (s, s) and vector (s,) by delta (s,), the state minus the prior, from those by the state."""
     size = delta.shape[0]

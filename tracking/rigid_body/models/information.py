@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from geometry.compilation.jit import compiled
+from geometry.compilation.jit import compiled, compiled_in_caller
 from geometry.compiled_linalg import apply, column, dot, pose_plus, posterior, solve
 from geometry.compiled_projection import Views, project_view
 from tracking.detections import AT_THE_FRAME, Detections
@@ -127,7 +127,7 @@ def well_controlled(views: Views, R: Array, t: Array, use: Bools, cov: Array) ->
     return out
 
 
-@compiled
+@compiled_in_caller
 def add_curvature_covariance(views: Views, use: Bools, cov: Array, R: Array, t: Array, P: Array) -> float:
     """Add the linearisation error along the widest direction of P to the used spots' covariances, in place.
 
@@ -181,7 +181,7 @@ def add_curvature_covariance(views: Views, use: Bools, cov: Array, R: Array, t: 
     return sigma
 
 
-@compiled
+@compiled_in_caller
 def quadratic_form(P: Array, e: Array) -> float:
     """e^T P e of a matrix P (n, n) and a vector e (n,)."""
     out = 0.0
@@ -286,7 +286,7 @@ def timed_spot(
     return True, m_then
 
 
-@compiled
+@compiled_in_caller
 def timed_information(
     views: Views, camera: Ints, clocks: Array, state: tuple[Array, Array, Array], use: Bools, uv: Array, cov: Array
 ) -> tuple[Array, Array, float, int, float]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.arrays import Array
-from geometry.compilation.jit import compiled
+from geometry.compilation.jit import compiled, compiled_in_caller
 from geometry.compiled_linalg import exp, multiply, pose_plus, posterior, right_jacobian, symmetrise
 
 STATE = 18  # numbers of the error state
@@ -119,7 +119,7 @@ def predicted(
     return R_new, t_new, m_new, out, F
 
 
-@compiled
+@compiled_in_caller
 def _transformed(F: Array, P: Array) -> Array:
     """F P F^T; zeros of F, which are most of its entries, are skipped."""
     half = multiply(F, P)
@@ -134,7 +134,7 @@ def _transformed(F: Array, P: Array) -> Array:
     return out
 
 
-@compiled
+@compiled_in_caller
 def updated(
     R: Array, t: Array, m: Array, P: Array, information: Array, r: Array
 ) -> tuple[Array, Array, Array, Array, float, Array]:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from geometry.compilation.jit import compiled
+from geometry.compilation.jit import compiled, compiled_in_caller
 from geometry.compiled_linalg import apply, block, column, hstack, multiply, pose_plus, solve, symmetrise
 from geometry.compiled_projection import Views, inside, project_all, project_view
 from geometry.forward_model import SpotModel
@@ -197,7 +197,7 @@ def reassociated(
     return out, probability, sigma_px
 
 
-@compiled
+@compiled_in_caller
 def _choose(tried: _Tried, out: Ints, probability: Array) -> None:
     """Write the likeliest assignment into out (n,) and the probability of each of its choices into probability (n,)."""
     n = out.shape[0]
@@ -225,7 +225,7 @@ def _same_point(a: int, b: int) -> bool:
     return (a < 0 and b < 0) or (a >= 0 and b >= 0 and a % BLENDED == b % BLENDED)
 
 
-@compiled
+@compiled_in_caller
 def _prediction_without(
     run: RunObservation, assigned: Ints, ref: Reference, pose_P: Array, weight: float, k: int
 ) -> tuple[Array, Array, Array, float]:
@@ -262,7 +262,7 @@ def _prediction_without(
     return P_without, R, t, np.sqrt(largest)
 
 
-@compiled
+@compiled_in_caller
 def _explanations(case: _Case, P: Array, jump_sigma: Array) -> _Tried:
     """Assignments of one frame with their log-likelihoods, under up to three explanations.
 
@@ -270,25 +270,25 @@ def _explanations(case: _Case, P: Array, jump_sigma: Array) -> _Tried:
     adds jump_sigma (6,); and a wrong motion. The current labels compete under each, even if they lie outside the gates.
     """
     n = case.current.shape[0]
-    tried = _Tried(np.empty((MAX_TRIED, n), np.int64), np.empty(MAX_TRIED))
-    prior = _widened(case, P, np.zeros(6))
-    count, expected = _try_assignments(case, prior, np.log(1.0 - P_JUMP), tried, 0)
-    if not expected:
-        if case.labels > 0:
-            count = _try_current(case, prior, np.log(1.0 - P_JUMP), case.R, case.t, tried, count)
-        prior = _widened(case, P, jump_sigma)
-        count, _ = _try_assignments(case, prior, np.log(P_JUMP), tried, count)
-        if case.labels > 0:
-            count = _try_current(case, prior, np.log(P_JUMP), case.R, case.t, tried, count)
-        if case.labels >= MIN_SPOTS_AGAINST_MOTION:
-            sigma = np.empty(6)
+    tried, frame = _Tried(np.empty((MAX_TRIED, n), np.int64), np.empty(MAX_TRIED)), case.obs.frame
+    count, expected = 0, False
+    for explanation in range(2 if case.labels < MIN_SPOTS_AGAINST_MOTION else 3):
+        R, t, sigma, log_prior = case.R, case.t, np.zeros(6), np.log(1.0 - P_JUMP)
+        if explanation == 1:
+            sigma, log_prior = jump_sigma, np.log(P_JUMP)
+        elif explanation == 2:
             for i in range(6):
                 sigma[i] = WRONG_MOTION_M if i < 3 else WRONG_MOTION_RAD
-            prior = _widened(case, P, sigma)
-            frame = case.obs.frame
+            log_prior = np.log(P_WRONG_MOTION)
             use, uv, cov = chosen_points(frame.uv, frame.cov, 0, case.current, case.obs.calibration_cov)
             R, t, _, _, _ = single_frame_pose(case.obs.views, case.R, case.t, use, uv, cov)
-            count = _try_current(case, prior, np.log(P_WRONG_MOTION), R, t, tried, count)
+        prior = _widened(case, P, sigma)
+        if explanation < 2:
+            count, expected = _try_assignments(case, prior, log_prior, tried, count)
+        if explanation == 0 and expected:
+            break
+        if case.labels > 0:
+            count = _try_current(case, prior, log_prior, R, t, tried, count)
     return _Tried(tried.assigned[:count], tried.score[:count])
 
 
@@ -321,7 +321,7 @@ def _bonus(case: _Case) -> float:
     return KEEP_NATS if case.labels < MIN_SPOTS_AGAINST_MOTION else 0.0
 
 
-@compiled
+@compiled_in_caller
 def _try_assignments(case: _Case, prior: State, log_prior: float, tried: _Tried, count: int) -> tuple[int, bool]:
     """Add the assignments of a joint search from a prediction.
 
@@ -347,7 +347,7 @@ def _try_assignments(case: _Case, prior: State, log_prior: float, tried: _Tried,
     return count, expected
 
 
-@compiled
+@compiled_in_caller
 def _try_current(case: _Case, prior: State, log_prior: float, R: Array, t: Array, tried: _Tried, count: int) -> int:
     """Add the current labels, with an update that starts at the pose (R, t); returns the number of assignments."""
     result = iterated_update(case.obs, prior, case.current, R, t)
@@ -358,7 +358,7 @@ def _try_current(case: _Case, prior: State, log_prior: float, R: Array, t: Array
     return count + 1
 
 
-@compiled
+@compiled_in_caller
 def _visibility_from_neighbours(assigned: Ints, group: Ints, groups: int, k: int) -> Array:
     """Probabilities (n + groups,), as in occlusion.py, of frame k from the labels (T, n) of the frames next to it."""
     frames, n = assigned.shape

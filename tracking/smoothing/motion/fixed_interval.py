@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array
-from geometry.compilation.jit import compiled
+from geometry.compilation.jit import compiled, compiled_in_caller
 from geometry.compiled_linalg import (
     apply,
     block,
@@ -45,7 +45,7 @@ def noise_root(dt: float, jerk: float, velocity_jump: float, acceleration_jump: 
     return cholesky(Q)
 
 
-@compiled
+@compiled_in_caller
 def subtract_noise(Y: Array, y: Array, axis: int, root: Array) -> None:
     """Information about x - w from that about x, in place: (Y^-1 + Q)^-1, Q = root root^T of one axis of noise w."""
     n = Y.shape[0]
@@ -187,7 +187,7 @@ def log_likelihood(ref: Reference, info: RunInformation, jerk: Array) -> float:
     return total
 
 
-@compiled
+@compiled_in_caller
 def _predict_backward(
     ref: Reference, info: RunInformation, jerk: Array, k: int, Y: Array, y: Array
 ) -> tuple[Array, Array]:
@@ -248,7 +248,7 @@ def smoothed(ref: Reference, info: RunInformation, jerk: Array) -> Interval:
     return out
 
 
-@compiled
+@compiled_in_caller
 def _empty_interval(frames: int) -> Interval:
     return Interval(
         np.empty((frames, STATE)),
@@ -278,7 +278,7 @@ def _filter_chunk(
     return x, P
 
 
-@compiled
+@compiled_in_caller
 def _filter_checkpoints(
     ref: Reference, info: RunInformation, jerk: Array, chunk: int, xs: Array, Ps: Array
 ) -> tuple[Array, Array]:
@@ -300,7 +300,7 @@ def _filter_checkpoints(
     return start_x, start_P
 
 
-@compiled
+@compiled_in_caller
 def _combine(out: Interval, k: int, x: Array, filtered_P: Array, Y: Array, y: Array) -> Array:
     """Write frame k's result: its filtered state x, P combined with the information of the later frames Y, y.
 
@@ -324,7 +324,7 @@ def _combine(out: Interval, k: int, x: Array, filtered_P: Array, Y: Array, y: Ar
     return P
 
 
-@compiled
+@compiled_in_caller
 def _test_process_noise(info: RunInformation, jerk: Array, k: int, Y: Array, y: Array, P: Array, out: Interval) -> None:
     """Write row k of `out.shock`, `out.energy` and `out.gamma`: tests of the process noise of the step before frame k.
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from geometry.compilation.jit import compiled
+from geometry.compilation.jit import compiled, compiled_in_caller
 from geometry.compiled_linalg import copy_into, copy_matrix_into, pose_plus
 from geometry.compiled_projection import Views, project_view
 from geometry.pose import Pose
@@ -211,7 +211,7 @@ class Steps(NamedTuple):
     velocity_jump: Array  # (F, 2) variances of the velocities' jump
 
 
-@compiled
+@compiled_in_caller
 def _open_variance(steps: Steps, k: int, axis: int, after: float) -> float:
     """Variance of an axis of the pose `after` seconds from frame k beyond the extrapolated state; m^2 or rad^2."""
     s = abs(after)
