@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from geometry.camera import Camera
 from geometry.pose_prior import PosePrior
@@ -34,16 +35,26 @@ def pictures_sampler() -> Pictures:
 
 
 def frames_of(blocks: Sequence[Block], prior: PosePrior | None, min_spots: int) -> Frames | None:
-    """The frames to be tested: the first, and others with many points; None where none has enough points."""
+    """The frames to be tested: the first, those in which points move most, and others; None without enough points.
+
+    Where a vehicle rests between steps, only the few frames of the steps show that pictures are numbered wrongly.
+    """
     counts = np.array([sum(map(len, block[HERE].values())) for block in blocks])
     rows = np.flatnonzero(counts >= min_spots)
     if not len(rows):
         return None
     full = rows[counts[rows] >= np.median(counts[rows])]
-    chosen = full[np.unique(np.linspace(0, len(full) - 1, FRAMES).round().astype(int))]
-    if rows[0] == 0:
-        chosen = np.unique([0, *chosen])[:FRAMES]
+    moved = full[np.argsort([-_moved_px(blocks[i]) for i in full], kind="stable")][: FRAMES // 2]
+    even = full[np.unique(np.linspace(0, len(full) - 1, FRAMES).round().astype(int))]
+    chosen = list(dict.fromkeys([*rows[rows == 0], *moved, *even]))[:FRAMES]
     return Frames([blocks[i] for i in chosen], prior, at_start=bool(chosen[0] == 0))
+
+
+def _moved_px(block: Block) -> float:
+    """How far a quarter of the points of a camera move at most, px, to a frame beside it; other points may be false."""
+    pairs = ((found, other[n]) for n, found in block[HERE].items() for other in block if n in other)
+    away = (cdist(a.uv_px, b.uv_px).min(axis=1) for a, b in pairs if len(a) and len(b))
+    return max((float(np.quantile(one, 0.25)) for one in away), default=0.0)
 
 
 def recorded_mistakes(run: Run, blocks: Sequence[Block]) -> tuple[Finding, ...]:

@@ -34,8 +34,7 @@ class EvenSampler(Generic[T]):
 
     @property
     def blocks(self) -> list[list[T]]:
-        """The complete blocks."""
-        out: dict[int, list[T]] = {}
-        for frame, number in zip(self.kept, self._numbers, strict=True):
-            out.setdefault(number // BLOCK, []).append(frame)
-        return [block for block in out.values() if len(block) == BLOCK]
+        """All runs of BLOCK consecutive frames that are kept."""
+        rows = range(len(self.kept) - BLOCK + 1)
+        whole = (i for i in rows if self._numbers[i + BLOCK - 1] - self._numbers[i] == BLOCK - 1)
+        return [self.kept[i : i + BLOCK] for i in whole]

@@ -127,6 +127,18 @@ def test_a_mistake_that_the_recording_shows_is_a_problem_at_check(recording, tmp
     assert "(BP-M06)" in text
 
 
+@pytest.mark.parametrize("name", [None, "numbered from 1, another camera"])
+def test_wrong_numbers_show_although_a_turntable_moves_in_few_frames_only(recording, tmp_path, name):
+    files = read(recording)
+    pose_of = [0] * 12 + [3, 6, 9] + [12] * 12 + [15, 18, 21] + [24] * 12  # frame of the recording
+    at = {n: [row for row in files.rows if row["frame"] == str(n)] for n in set(pose_of)}
+    files.rows = [{**row, "frame": str(k)} for k, n in enumerate(pose_of) for row in at[n]]
+    if name is not None:
+        CASE[name].make(files)
+    text, status = checked(write(files, tmp_path / "run"))
+    assert (status, "numbers one too" in text) == ((0, False) if name is None else (2, True))
+
+
 @pytest.mark.parametrize("name", ["turned by 180 deg", "numbered from 1, one camera"])
 def test_a_mistake_fails_the_run_and_is_its_only_explanation(recording, tmp_path, name):
     outcome = process_run(with_mistake(name, recording, tmp_path / "run"), tmp_path / "out")
