@@ -30,9 +30,9 @@ POINT = ("point_x_m", "point_y_m", "point_z_m")
 
 @dataclass(frozen=True, slots=True)
 class RigCovariance:
-    """The joint covariance of the errors of a rig's parameters."""
+    """The joint covariance of the errors of a rig's parameters, or of those of one camera or screen."""
 
-    names: tuple[str, ...]  # p names, as in the module's docstring
+    names: tuple[str, ...]  # p names, as in the module's docstring; of one part without its place: fx, k1, x_m ...
     matrix: Array  # (p, p), in the parameters' units; may be singular
 
 

@@ -65,6 +65,6 @@ def plan_of(rig_path: Path, options: PlanOptions) -> Plan:
     file = load_rig_file(Path(rig_path))
     stated = joint_covariance(file.rig, file.covariances, rig_path)
     target = file.covariances.get(TARGET)
-    is_joint = target is not None and any(n.startswith(("cameras.", "screens.")) for n in target.parameters)
+    is_joint = target is not None and any(n.startswith(("cameras.", "screens.")) for n in target.names)
     errors, sources = expected_errors(file.rig, options.expected, stated, is_joint)
     return plan_grid(file.rig, errors, sources, options.about(assumed_range(file.rig).centre))

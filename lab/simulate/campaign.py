@@ -22,12 +22,11 @@ from geometry.forward_model import SpotModel
 from geometry.lens import padded
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen
-from geometry.uncertainty.rig_uncertainty import PINHOLE, distortion_names
+from geometry.uncertainty.rig_uncertainty import PINHOLE, RigCovariance, distortion_names
 from lab.errors import InputError
 from lab.files.project.point_files import POINTS, POSE_SIGMAS, SURVEY, SURVEY_SIGMAS
 from lab.files.project.project import SCHEMA
 from lab.files.rig.board_file import save_board
-from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
 from lab.files.rig.pose_block import pose_mapping
 from lab.files.rig.rig_file import RigFile, as_mapping, load_rig, save_rig
@@ -421,7 +420,7 @@ def _project(c: Campaign) -> dict[str, Any]:
 
 def _camera_file(name: str, lens: LensDraw) -> CameraFile:
     c = lens.camera
-    covariance = Covariance(lens.names, lens.covariance)
+    covariance = RigCovariance(lens.names, lens.covariance)
     state = CameraCalibration(date=_DATE, verdict="PASS", notes="simulated")
     return CameraFile(name, c.image_size_px, c.matrix, c.distortion, c.lens, covariance, state)
 

@@ -21,13 +21,13 @@ from calibration.lens.intrinsics import (
 )
 from calibration.lens.intrinsics_result import Intrinsics
 from geometry.camera import FISHEYE, PERSPECTIVE
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.calibrate.camera.camera_findings import findings_of, next_photographs
 from lab.calibrate.camera.camera_page import page_of
 from lab.calibrate.camera.photos import TABLE_SUFFIXES, PhotoSet, find_in_photos, origins_of, read_corner_table
 from lab.calibrate.step import Solved, Step, run_step
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.board_file import load_board_or_text
-from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
 from lab.files.text.csv_text import write_table
 from lab.files.text.error_text import suggest_name
@@ -187,7 +187,7 @@ def camera_file(
         camera_matrix=r.matrix,
         distortion=r.distortion,
         lens=FISHEYE if r.model.fisheye else PERSPECTIVE,
-        covariance=Covariance(r.parameters, r.covariance),
+        covariance=RigCovariance(r.parameters, r.covariance),
         calibration=calibration,
     )
 

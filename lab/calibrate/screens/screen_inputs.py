@@ -333,7 +333,7 @@ def _lens_prior(project: Project, rig: Rig) -> tuple[Prior | None, Bools | None]
     for name, entry in project.cameras.items():
         c = entry.lens.covariance
         if c is not None:
-            names += [f"cameras.{name}.{p}" for p in c.parameters]
+            names += [f"cameras.{name}.{p}" for p in c.names]
             blocks.append(c.matrix)
     if not names:
         return None, None

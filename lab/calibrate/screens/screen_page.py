@@ -229,7 +229,7 @@ def _correlations(result: ScreensResult) -> Section:
     labels = [names[i].split(".", 1)[1] for i in rows]
     drawing = correlation_matrix(labels, result.fit.covariance.matrix[np.ix_(rows, rows)])
     words = (
-        f"Parameters of camera {first} ({len(block.parameters)}) and its screen. Use the joint covariance in"
+        f"Parameters of camera {first} ({len(block.names)}) and its screen. Use the joint covariance in"
         " screens.yaml, which has these correlations for the whole lab."
     )
     return Section("Correlations", words, [PageDrawing(drawing)])

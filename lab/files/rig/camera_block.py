@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
@@ -11,18 +10,11 @@ import pydantic
 from geometry import lens
 from geometry.arrays import Array, symmetric
 from geometry.camera import FISHEYE, LENSES, PERSPECTIVE
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.files.text import fields
 
 # Tolerance of symmetry and of eigenvalues, relative to the diagonal: rounding of sums in double precision.
 COVARIANCE_TOLERANCE = 1e-6
-
-
-@dataclass(frozen=True, slots=True)
-class Covariance:
-    """Covariance of the parameters of one camera, one screen or the target."""
-
-    parameters: tuple[str, ...]  # n names
-    matrix: Array  # (n, n), symmetric, in the parameters' units
 
 
 def _image_size(value: Any) -> list[int]:
@@ -68,14 +60,14 @@ class CovarianceBlock(fields.Block):
             )
         return self
 
-    def value(self) -> Covariance:
+    def value(self) -> RigCovariance:
         """The block as a value."""
-        return Covariance(tuple(self.parameters), np.array(self.matrix, dtype=float).reshape(len(self.matrix), -1))
+        return RigCovariance(tuple(self.parameters), np.array(self.matrix, dtype=float).reshape(len(self.matrix), -1))
 
 
-def covariance_error(covariance: Covariance) -> str:
+def covariance_error(covariance: RigCovariance) -> str:
     """The mistake of a matrix that is not a covariance, as text of a message; empty for a covariance."""
-    C, names = covariance.matrix, covariance.parameters
+    C, names = covariance.matrix, covariance.names
     variances = np.diagonal(C)
     if not len(C):
         return ""
@@ -148,10 +140,10 @@ def lens_mapping(
     return out
 
 
-def covariance_mapping(covariance: Covariance) -> dict[str, Any]:
+def covariance_mapping(covariance: RigCovariance) -> dict[str, Any]:
     """The plain mapping from which a `CovarianceBlock` reads the same numbers."""
     return {
-        "parameters": list(covariance.parameters),
+        "parameters": list(covariance.names),
         "matrix": [plain_floats(row) for row in covariance.matrix],
     }
 

@@ -12,16 +12,9 @@ import pydantic
 from geometry.arrays import Array
 from geometry.camera import PERSPECTIVE, Camera
 from geometry.pose import Pose
-from geometry.uncertainty.rig_uncertainty import PINHOLE, distortion_names
+from geometry.uncertainty.rig_uncertainty import PINHOLE, RigCovariance, distortion_names
 from lab.files.rig.calibration_state import VERDICTS, DayText, iso_date
-from lab.files.rig.camera_block import (
-    Covariance,
-    CovarianceBlock,
-    LensBlock,
-    covariance_error,
-    covariance_mapping,
-    lens_mapping,
-)
+from lab.files.rig.camera_block import CovarianceBlock, LensBlock, covariance_error, covariance_mapping, lens_mapping
 from lab.files.text import fields
 from lab.files.text.error_text import suggest_name
 from lab.files.text.yaml_text import read_mapping, write_mapping
@@ -62,7 +55,7 @@ class CameraFile:
     camera_matrix: Array  # (3, 3), px: fx, fy, cx, cy; no skew
     distortion: tuple[float, ...]  # OpenCV order; 0, 4, 5, 8, 12 or 14 numbers
     lens: str = PERSPECTIVE  # or "fisheye": OpenCV's k1 ... k4
-    covariance: Covariance | None = None  # of fx, fy, cx, cy, k1 ... or some of them
+    covariance: RigCovariance | None = None  # of fx, fy, cx, cy, k1 ... or some of them
     calibration: CameraCalibration | None = None
 
     @property

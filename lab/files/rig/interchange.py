@@ -12,8 +12,8 @@ import numpy as np
 from calibration.formats import colmap, kalibr, mrcal, opencv_yaml, ros
 from calibration.formats.model import CameraModel, FormatError, Read, Written, significant
 from geometry.camera import Camera, pinhole_numbers
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
-from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraFile, load_camera, save_camera
 from lab.files.rig.rig_file import SCHEMA as RIG_SCHEMA
 from lab.files.rig.rig_file import RigFile, load_rig_file
@@ -134,7 +134,7 @@ def _format_of_name(path: Path) -> str:
 # Reading -------------------------------------------------------------------------------------------------------------
 
 
-def _read(text: str, path: Path, origin: str) -> tuple[Read, dict[str, Covariance]]:
+def _read(text: str, path: Path, origin: str) -> tuple[Read, dict[str, RigCovariance]]:
     """The cameras of a file, and the covariances of their parameters."""
     if origin == RIG:
         return _from_rig(load_rig_file(path))
@@ -157,7 +157,7 @@ def _model_of(camera: Camera, placed: bool) -> CameraModel:
     return CameraModel(camera.name, camera.image_size_px, (fx, fy, cx, cy), camera.distortion, camera.lens, pose)
 
 
-def _from_rig(file: RigFile) -> tuple[Read, dict[str, Covariance]]:
+def _from_rig(file: RigFile) -> tuple[Read, dict[str, RigCovariance]]:
     """The cameras of a rig, each with its block of the joint covariance."""
     covariances = {}
     for name in file.rig.cameras:
@@ -171,17 +171,17 @@ def _from_rig(file: RigFile) -> tuple[Read, dict[str, Covariance]]:
     return Read(tuple(_model_of(c, placed=True) for c in file.rig.cameras.values())), covariances
 
 
-def _share(covariance: Covariance, prefix: str) -> Covariance | None:
+def _share(covariance: RigCovariance, prefix: str) -> RigCovariance | None:
     """The covariance of the lens parameters: with the prefix, not the pose's; None where there are none."""
     own = [
         i
-        for i, name in enumerate(covariance.parameters)
+        for i, name in enumerate(covariance.names)
         if name.startswith(prefix) and "." not in name[len(prefix) :] and not re.search(r"_(m|rad)$", name)
     ]
     if not own:
         return None
-    names = tuple(covariance.parameters[i].removeprefix(prefix) for i in own)
-    return Covariance(names, covariance.matrix[np.ix_(own, own)])
+    names = tuple(covariance.names[i].removeprefix(prefix) for i in own)
+    return RigCovariance(names, covariance.matrix[np.ix_(own, own)])
 
 
 def _chosen(models: Sequence[CameraModel], camera: str | None, path: Path, target: str) -> tuple[CameraModel, ...]:
@@ -228,7 +228,7 @@ def _check_destination(source: Path, destination: Path, target: str) -> None:
 
 
 def _write(
-    models: tuple[CameraModel, ...], covariances: Mapping[str, Covariance], path: Path, target: str
+    models: tuple[CameraModel, ...], covariances: Mapping[str, RigCovariance], path: Path, target: str
 ) -> tuple[str, ...]:
     """Write, and return notes of what the file does not contain."""
     if target == BEAMPOSE:
@@ -242,7 +242,7 @@ def _write(
     return (*written.notes, f"{target} cannot hold a covariance: that of {', '.join(lost)} is not written")
 
 
-def _write_ours(model: CameraModel, covariance: Covariance | None, path: Path) -> tuple[str, ...]:
+def _write_ours(model: CameraModel, covariance: RigCovariance | None, path: Path) -> tuple[str, ...]:
     fx, fy, cx, cy = model.pinhole
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
     save_camera(CameraFile(model.name, model.image_size_px, K, model.distortion, model.lens, covariance), path)

@@ -16,14 +16,7 @@ from geometry.pose import Pose
 from geometry.uncertainty.rig_uncertainty import RigCovariance, camera_names
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState
-from lab.files.rig.camera_block import (
-    Covariance,
-    CovarianceBlock,
-    LensBlock,
-    covariance_error,
-    covariance_mapping,
-    lens_mapping,
-)
+from lab.files.rig.camera_block import CovarianceBlock, LensBlock, covariance_error, covariance_mapping, lens_mapping
 from lab.files.rig.interchange import BEAMPOSE, RIG, read_cameras, recognised_format
 from lab.files.rig.pose_block import CameraPoseBlock, pose_mapping
 from lab.files.rig.rig_file import joint_covariance, load_rig_file
@@ -103,7 +96,7 @@ def _own(content: _PairBlock, path: Path) -> PairFile:
     if content.covariance is not None:
         block = content.covariance.value()
         known = [f"cameras.{name}.{p}" for name, camera in cameras.items() for p in camera_names(camera)]
-        for name in block.parameters:
+        for name in block.names:
             if name not in known:
                 raise InputError(
                     f"{path}: covariance.parameters: unknown parameter {name!r}{suggest_name(name, known)}"
@@ -111,7 +104,7 @@ def _own(content: _PairBlock, path: Path) -> PairFile:
         mistake = covariance_error(block)
         if mistake:
             raise InputError(f"{path}: covariance.matrix: {mistake}")
-        covariance = RigCovariance(block.parameters, symmetric(block.matrix))
+        covariance = RigCovariance(block.names, symmetric(block.matrix))
     return PairFile(cameras, covariance, content.calibration)
 
 
@@ -128,7 +121,7 @@ def save_pair_file(file: PairFile, path: Path) -> None:
         },
     }
     if file.covariance is not None:
-        content["covariance"] = covariance_mapping(Covariance(file.covariance.names, file.covariance.matrix))
+        content["covariance"] = covariance_mapping(file.covariance)
     if file.calibration is not None:
         content["calibration"] = file.calibration.as_mapping()
     validated(_PairBlock, content, path)

@@ -17,7 +17,6 @@ from geometry.uncertainty.rig_uncertainty import RigCovariance, is_known, split_
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.camera_block import (
-    Covariance,
     CovarianceBlock,
     LensBlock,
     covariance_error,
@@ -35,7 +34,7 @@ from lab.files.text.yaml_text import read_mapping, write_mapping
 TARGET = "target"
 
 
-def joint_covariance(rig: Rig, blocks: Mapping[str, Covariance], path: Path | str) -> RigCovariance | None:
+def joint_covariance(rig: Rig, blocks: Mapping[str, RigCovariance], path: Path | str) -> RigCovariance | None:
     """The joint covariance of the parameters of this rig in the blocks; None where there are none.
 
     blocks: by `cameras.NAME`, `screens.NAME`, `target`. The target's block may also name parameters of cameras and
@@ -46,19 +45,19 @@ def joint_covariance(rig: Rig, blocks: Mapping[str, Covariance], path: Path | st
         InputError: a matrix is not a covariance.
     """
     target = blocks.get(TARGET)
-    if target is not None and any(n.startswith(("cameras.", "screens.")) for n in target.parameters):
+    if target is not None and any(n.startswith(("cameras.", "screens.")) for n in target.names):
         used = {TARGET: target}
     else:
         used = dict(blocks)
     names: list[str] = []
     pieces: list[Array] = []
     for where, block in used.items():
-        full = [n if where == TARGET else f"{where}.{n}" for n in block.parameters]
+        full = [n if where == TARGET else f"{where}.{n}" for n in block.names]
         known = [i for i, n in enumerate(full) if is_known(rig, n)]
         if not known:
             continue
         matrix = block.matrix[np.ix_(known, known)]
-        mistake = covariance_error(Covariance(tuple(block.parameters[i] for i in known), matrix))
+        mistake = covariance_error(RigCovariance(tuple(block.names[i] for i in known), matrix))
         if mistake:
             raise InputError(f"{path}: {where}.covariance.matrix: {mistake}")
         names += [full[i] for i in known]
@@ -73,9 +72,9 @@ def joint_covariance(rig: Rig, blocks: Mapping[str, Covariance], path: Path | st
     return RigCovariance(tuple(names), joint)
 
 
-def covariance_blocks(covariance: RigCovariance) -> dict[str, Covariance]:
+def covariance_blocks(covariance: RigCovariance) -> dict[str, RigCovariance]:
     """A joint covariance as blocks of a rig.yaml: complete for the target, an excerpt for each camera and screen."""
-    out: dict[str, Covariance] = {}
+    out: dict[str, RigCovariance] = {}
     of: dict[str, list[int]] = {}
     for i, name in enumerate(covariance.names):
         kind, thing, _ = split_name(name)
@@ -83,8 +82,8 @@ def covariance_blocks(covariance: RigCovariance) -> dict[str, Covariance]:
             of.setdefault(f"{kind}.{thing}", []).append(i)
     for where, rows in of.items():
         names = tuple(split_name(covariance.names[i])[2] for i in rows)
-        out[where] = Covariance(names, symmetric(covariance.matrix[np.ix_(rows, rows)]))
-    out[TARGET] = Covariance(covariance.names, symmetric(covariance.matrix))
+        out[where] = RigCovariance(names, symmetric(covariance.matrix[np.ix_(rows, rows)]))
+    out[TARGET] = RigCovariance(covariance.names, symmetric(covariance.matrix))
     return out
 
 
@@ -102,7 +101,7 @@ class RigFile:
     """
 
     rig: Rig
-    covariances: Mapping[str, Covariance] = field(default_factory=dict)
+    covariances: Mapping[str, RigCovariance] = field(default_factory=dict)
     calibration: CalibrationState | None = None  # None: not stated
     # How a transform or a beam was stated where not in the form of a written file; by its place, such as
     # screens.left.world_from_screen. A written file has it as a comment.

@@ -11,7 +11,7 @@ import pydantic
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.files.rig.calibration_state import CalibrationState
-from lab.files.rig.camera_block import Covariance, CovarianceBlock, covariance_mapping
+from lab.files.rig.camera_block import CovarianceBlock, covariance_mapping
 from lab.files.rig.rig_file import (
     TARGET,
     CameraBlock,
@@ -78,7 +78,7 @@ def save_screens(file: ScreensFile, path: Path) -> None:
         "cameras": {n: camera_mapping(c) for n, c in file.rig.cameras.items()},
     }
     if file.covariance is not None:
-        content["covariance"] = covariance_mapping(Covariance(file.covariance.names, file.covariance.matrix))
+        content["covariance"] = covariance_mapping(file.covariance)
     if file.calibration is not None:
         content["calibration"] = file.calibration.as_mapping()
     validated(_ScreensBlock, content, path)

@@ -95,7 +95,7 @@ class LampsTarget(Target[LampFrame]):
         self._covariance = (
             None
             if of_lens is None
-            else RigCovariance(tuple(f"cameras.{self._lens.name}.{p}" for p in of_lens.parameters), of_lens.matrix)
+            else RigCovariance(tuple(f"cameras.{self._lens.name}.{p}" for p in of_lens.names), of_lens.matrix)
         )
 
     def read(self, path: Path, progress: Progress | None) -> Track[LampFrame]:

@@ -12,9 +12,9 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.rotations import exp
-from geometry.uncertainty.rig_uncertainty import camera_names, perturbed_rig
+from geometry.uncertainty.rig_uncertainty import RigCovariance, camera_names, perturbed_rig
 from lab.files.rig.calibration_state import CalibrationState
-from lab.files.rig.rig_file import Covariance, RigFile, save_rig
+from lab.files.rig.rig_file import RigFile, save_rig
 from tests.geometry.scenes import LENSES, paper_rig
 
 DAY = datetime.date(2026, 5, 1)
@@ -23,7 +23,7 @@ POINT_SIGMA_M = 1e-4
 _WRITTEN: dict[tuple[int, int, int], tuple[bytes, object]] = {}  # rig.yaml of what is kept alive beside it
 
 
-def rig_and_covariance() -> tuple[Rig, Covariance]:
+def rig_and_covariance() -> tuple[Rig, RigCovariance]:
     """The stored rig, and the covariance of a calibration from 60 control points per camera measured to 0.15 px.
 
     Computed by numeric derivatives of the projection, independently of the code of the check.
@@ -52,14 +52,14 @@ def rig_and_covariance() -> tuple[Rig, Covariance]:
     for block in blocks:
         matrix[at : at + len(block), at : at + len(block)] = block
         at += len(block)
-    return rig, Covariance(tuple(names), matrix)
+    return rig, RigCovariance(tuple(names), matrix)
 
 
-def true_rig(rig: Rig, covariance: Covariance, rng: np.random.Generator) -> Rig:
+def true_rig(rig: Rig, covariance: RigCovariance, rng: np.random.Generator) -> Rig:
     """The true rig: it differs from the stored one by a random error with the stated covariance."""
     values, vectors = np.linalg.eigh(covariance.matrix)
     return perturbed_rig(
-        rig, covariance.parameters, vectors @ (np.sqrt(np.maximum(values, 0)) * rng.normal(size=len(values)))
+        rig, covariance.names, vectors @ (np.sqrt(np.maximum(values, 0)) * rng.normal(size=len(values)))
     )
 
 
@@ -78,7 +78,7 @@ def control_points(rig: Rig) -> dict[str, tuple[str, np.ndarray]]:
     return {f"{s[0].upper()}{i}": (s, np.array(p)) for s in rig.screens for i, p in enumerate(places, 1)}
 
 
-def write_rig(folder: Path, rig: Rig, covariance: Covariance | None, state: CalibrationState | None = STATE) -> Path:
+def write_rig(folder: Path, rig: Rig, covariance: RigCovariance | None, state: CalibrationState | None = STATE) -> Path:
     """Write rig.yaml of a calibrated lab; return its path."""
     path = folder / "rig.yaml"
     known = id(rig), id(covariance), id(state)

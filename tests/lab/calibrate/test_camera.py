@@ -59,7 +59,7 @@ def test_camera_yaml_reads_back_and_states_its_uncertainty(left):
     assert len(file.distortion) == 4
     np.testing.assert_array_equal(file.camera_matrix, left.result.matrix)
     assert file.covariance is not None
-    assert file.covariance.parameters == file.parameter_names
+    assert file.covariance.names == file.parameter_names
     np.testing.assert_allclose(file.covariance.matrix, left.result.covariance, rtol=1e-12)
     assert file.calibration is not None
     assert file.calibration.verdict == left.level.name == "WARN"

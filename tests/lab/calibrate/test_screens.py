@@ -15,10 +15,10 @@ import pytest
 from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Charuco, parse
 from geometry.pose import Pose
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.calibrate.screens.screen import DOT_COLUMNS, RESIDUAL_COLUMNS, calibrate_screen
 from lab.errors import CalibrationError, InputError
 from lab.files.project.point_files import read_point_cloud
-from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraFile, load_camera, save_camera
 from lab.files.rig.rig_file import load_rig_file
 from lab.files.rig.screens_file import load_screens, save_screens
@@ -92,7 +92,7 @@ def test_rig_yaml_holds_the_nominal_beams_and_states_that_they_are_not_calibrate
     assert list(file.rig.beams) == ["A", "B"]
     assert file.calibration.verdict == "WARN"
     assert "not calibrated" in file.calibration.reasons[0]
-    assert "cameras.left.x_m" in file.covariances["target"].parameters
+    assert "cameras.left.x_m" in file.covariances["target"].names
 
 
 def test_the_tables_have_a_row_per_observation_and_per_control_point(good):
@@ -146,7 +146,7 @@ def test_a_lens_covariance_is_propagated_to_the_result(tmp_path):
     path = write_project(tmp_path / "p", points_each=10)
     lens = tmp_path / "p" / "left-camera.yaml"
     file = load_camera(lens)
-    save_camera(replace(file, covariance=Covariance(("fx", "fy"), np.diag([0.25, 0.25]))), lens)
+    save_camera(replace(file, covariance=RigCovariance(("fx", "fy"), np.diag([0.25, 0.25]))), lens)
     fit = calibrate_screen(path, tmp_path / "out").result.fit
     names = fit.covariance.names
     sigma = np.sqrt(fit.covariance.matrix[names.index("cameras.left.fx"), names.index("cameras.left.fx")])

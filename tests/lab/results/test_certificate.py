@@ -10,9 +10,8 @@ import pytest
 from click.testing import CliRunner
 
 from cli import main
-from geometry.uncertainty.rig_uncertainty import rig_names
+from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names
 from lab.errors import InputError
-from lab.files.rig.camera_block import Covariance
 from lab.files.rig.rig_file import load_rig_file, save_rig
 from lab.files.run.results import read_poses, read_result_table
 from lab.files.text import columns
@@ -39,7 +38,7 @@ def run_folder(tmp_path_factory):
     C = A @ A.T
     scale = sigma / np.sqrt(np.diagonal(C))
     save_rig(
-        dataclasses.replace(rig_file, covariances={"target": Covariance(names, C * np.outer(scale, scale))}),
+        dataclasses.replace(rig_file, covariances={"target": RigCovariance(names, C * np.outer(scale, scale))}),
         folder / "rig.yaml",
     )
     return folder

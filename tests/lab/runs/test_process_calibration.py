@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 import yaml
 
-from geometry.uncertainty.rig_uncertainty import rig_names
+from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names
 from lab.errors import CalibrationError
 from lab.files.rig.calibration_state import CalibrationState
-from lab.files.rig.camera_block import Covariance
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from lab.files.run.results import read_poses
 from lab.runs.batch.batch import process_batch
@@ -36,7 +35,9 @@ def change_rig(run_folder, **changes):
 
 def covariance(rig, sigma=2e-4):
     names = rig_names(rig)
-    return {"target": Covariance(names, np.diag([(1.0 if n.endswith((".cx", ".cy")) else sigma) ** 2 for n in names]))}
+    return {
+        "target": RigCovariance(names, np.diag([(1.0 if n.endswith((".cx", ".cy")) else sigma) ** 2 for n in names]))
+    }
 
 
 def test_the_calibrations_covariance_is_in_its_own_table_and_in_the_total(run_folder, tmp_path):

@@ -12,8 +12,8 @@ import pytest
 from calibration.budget import AXES, NOISE, STATUS, ExpectedErrors, plan_grid, poses_of
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose, ypr_sigmas
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
-from lab.files.rig.camera_block import Covariance
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from lab.findings.finding import Level
 from lab.setup.plan import plan_of, plan_rig
@@ -139,13 +139,13 @@ def test_the_covariance_of_the_rig_file_is_used(rig_path):
     joint = (*names, "cameras.left.cx", "cameras.left.rot_y_rad")
     C = np.diag([1e-8] * 9 + [0.09, 6.25e-8])
     C[9, 10] = C[10, 9] = -0.1 * 0.3 * 2.5e-4
-    save_rig(RigFile(file.rig, {"target": Covariance(joint, C)}), rig_path)
+    save_rig(RigFile(file.rig, {"target": RigCovariance(joint, C)}), rig_path)
     plan = plan_of(rig_path, SMALL)
     assert set(plan.sources.values()) == {"rig file"}
     lines = {line.name: line for line in budget_lines(plan)}
     assert set(lines) == {NOISE, "beam directions", "camera intrinsics", "camera poses", CORRELATION}
     assert sum(line.share_m for line in lines.values()) == pytest.approx(1)
-    save_rig(RigFile(file.rig, {"target": Covariance(names, C[:9, :9])}), rig_path)
+    save_rig(RigFile(file.rig, {"target": RigCovariance(names, C[:9, :9])}), rig_path)
     assert plan_of(rig_path, SMALL).sources["beam directions"] == "rig file"
     assert plan_of(rig_path, SMALL).sources["camera poses"] == "assumed"
 
@@ -154,7 +154,7 @@ def test_strongly_correlated_groups_are_combined_into_one_line(rig_path):
     file = load_rig_file(rig_path)
     joint = tuple(f"cameras.{c}.{p}" for c in ("left", "right") for p in ("cx", "rot_y_rad"))
     one = np.array([[9.0, 0.999 * 3.0 * 2.5e-3], [0.999 * 3.0 * 2.5e-3, 6.25e-6]])  # px and rad that cancel
-    save_rig(RigFile(file.rig, {"target": Covariance(joint, np.kron(np.eye(2), one))}), rig_path)
+    save_rig(RigFile(file.rig, {"target": RigCovariance(joint, np.kron(np.eye(2), one))}), rig_path)
     lines = {line.name: line for line in budget_lines(plan_of(rig_path, SMALL))}
     assert set(lines) == {NOISE, TOTAL_CALIBRATION}
     assert sum(line.share_deg for line in lines.values()) == pytest.approx(1)

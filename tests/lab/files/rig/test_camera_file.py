@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
-from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraCalibration, CameraFile, load_camera, save_camera
 from lab.files.rig.rig_file import load_rig, save_rig
 from tests.lab.run_folders import RIG
@@ -37,7 +37,7 @@ def test_a_camera_has_the_values_of_its_file(tmp_path):
     assert camera.distortion == (-0.1, 0.02, 0.001, -0.0005, 0.0)
     assert camera.parameter_names == ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
     assert camera.covariance is not None
-    assert camera.covariance.parameters == ("fx", "fy", "k1")
+    assert camera.covariance.names == ("fx", "fy", "k1")
     assert camera.covariance.matrix[2, 2] == 1e-8
     assert camera.calibration == CameraCalibration(
         date="2026-03-14", verdict="PASS", rms_px=0.15, views=24, corners=1800, board="chessboard 9x6"
@@ -51,7 +51,7 @@ def same(a: CameraFile, b: CameraFile) -> None:
     np.testing.assert_array_equal(a.camera_matrix, b.camera_matrix)
     assert (a.covariance is None) == (b.covariance is None)
     if a.covariance is not None and b.covariance is not None:
-        assert a.covariance.parameters == b.covariance.parameters
+        assert a.covariance.names == b.covariance.names
         np.testing.assert_array_equal(a.covariance.matrix, b.covariance.matrix)
 
 
@@ -76,7 +76,7 @@ def test_saving_and_loading_changes_no_bit(seed, count, judged, tmp_path_factory
         camera.camera_matrix,
         camera.distortion,
         camera.lens,
-        Covariance(names, (covariance + covariance.T) / 2),
+        RigCovariance(names, (covariance + covariance.T) / 2),
         CameraCalibration(
             date="2026-01-02T03:04:05", verdict="WARN", rms_px=rng.uniform(), sigma_px=rng.uniform(), views=7,
             corners=99, board="on: 1e3", distance_m=2.5, reasons=("too few: 3", "- tilt"),

@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 import pytest
 
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
-from lab.files.rig.camera_block import Covariance
 from lab.files.rig.camera_file import CameraFile, load_camera, save_camera
 from lab.files.rig.interchange import FORMATS, convert, read_cameras, recognised_format, same_lens
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
@@ -49,7 +49,7 @@ def test_a_lens_survives_any_two_conversions(first, second, source, tmp_path):
 
 def test_the_line_names_both_formats_and_what_was_left_out(source, tmp_path):
     save_camera(
-        CameraFile("left", (1280, 1024), K, (), covariance=Covariance(("fx", "fy"), np.eye(2))), tmp_path / "c.yaml"
+        CameraFile("left", (1280, 1024), K, (), covariance=RigCovariance(("fx", "fy"), np.eye(2))), tmp_path / "c.yaml"
     )
     outcome = convert(tmp_path / "c.yaml", tmp_path / "left.yml")
     lines = outcome.line().splitlines()
@@ -96,12 +96,12 @@ def test_a_camera_of_a_rig_keeps_the_covariance_of_its_lens(joint, rig, tmp_path
     prefix = "cameras.right." if joint else ""
     names = tuple(prefix + n for n in ("fx", "x_m", "k1", "rot_x_rad"))
     C = np.diag([4.0, 9.0, 16.0, 25.0]) + 0.5
-    block = Covariance(("beams.A.point_x_m", *names), np.pad(C, (1, 0))) if joint else Covariance(names, C)
+    block = RigCovariance(("beams.A.point_x_m", *names), np.pad(C, (1, 0))) if joint else RigCovariance(names, C)
     file = load_rig_file(rig)
     save_rig(RigFile(file.rig, {"target" if joint else "cameras.right": block}), rig)
     convert(rig, tmp_path / "camera.yaml", camera="right")
     covariance = load_camera(tmp_path / "camera.yaml").covariance
-    assert covariance.parameters == ("fx", "k1")
+    assert covariance.names == ("fx", "k1")
     np.testing.assert_array_equal(covariance.matrix, [[4.5, 0.5], [0.5, 16.5]])
 
 

@@ -7,10 +7,9 @@ import datetime
 import numpy as np
 import pytest
 
-from geometry.uncertainty.rig_uncertainty import rig_names
+from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.calibration_state import CalibrationState, require_valid_calibration
-from lab.files.rig.camera_block import Covariance
 from lab.files.rig.rig_file import RigFile, joint_covariance, load_rig_file, save_rig
 from lab.simulate.rigs import RIGS
 
@@ -19,9 +18,9 @@ RIG = RIGS["fan"]()
 
 def test_separate_blocks_are_uncorrelated():
     blocks = {
-        "cameras.left": Covariance(("fx", "cx"), np.array([[4.0, 1.0], [1.0, 9.0]])),
-        "screens.right": Covariance(("x_m",), np.array([[1e-6]])),
-        "target": Covariance(("beams.A.direction_x",), np.array([[1e-8]])),
+        "cameras.left": RigCovariance(("fx", "cx"), np.array([[4.0, 1.0], [1.0, 9.0]])),
+        "screens.right": RigCovariance(("x_m",), np.array([[1e-6]])),
+        "target": RigCovariance(("beams.A.direction_x",), np.array([[1e-8]])),
     }
     joint = joint_covariance(RIG, blocks, "rig.yaml")
     assert joint.names == ("cameras.left.fx", "cameras.left.cx", "screens.right.x_m", "beams.A.direction_x")
@@ -32,8 +31,8 @@ def test_separate_blocks_are_uncorrelated():
 
 def test_a_joint_block_of_the_target_is_complete():
     blocks = {
-        "cameras.left": Covariance(("fx",), np.array([[4.0]])),
-        "target": Covariance(("cameras.left.fx", "beams.A.direction_x"), np.array([[4.0, 1e-5], [1e-5, 1e-8]])),
+        "cameras.left": RigCovariance(("fx",), np.array([[4.0]])),
+        "target": RigCovariance(("cameras.left.fx", "beams.A.direction_x"), np.array([[4.0, 1e-5], [1e-5, 1e-8]])),
     }
     joint = joint_covariance(RIG, blocks, "rig.yaml")
     assert joint.names == ("cameras.left.fx", "beams.A.direction_x")
@@ -41,10 +40,10 @@ def test_a_joint_block_of_the_target_is_complete():
 
 
 def test_unknown_names_are_ignored():
-    blocks = {"target": Covariance(("A.x", "beams.A.point_x_m", "B.y"), np.diag([-1.0, 4e-8, np.pi]))}
+    blocks = {"target": RigCovariance(("A.x", "beams.A.point_x_m", "B.y"), np.diag([-1.0, 4e-8, np.pi]))}
     joint = joint_covariance(RIG, blocks, "rig.yaml")
     assert joint.names == ("beams.A.point_x_m",)
-    assert joint_covariance(RIG, {"target": Covariance(("A.x",), np.eye(1))}, "rig.yaml") is None
+    assert joint_covariance(RIG, {"target": RigCovariance(("A.x",), np.eye(1))}, "rig.yaml") is None
     assert joint_covariance(RIG, {}, "rig.yaml") is None
 
 
@@ -57,7 +56,7 @@ def test_unknown_names_are_ignored():
     ],
 )
 def test_a_matrix_that_is_not_a_covariance_is_refused_with_its_field(matrix, words):
-    blocks = {"cameras.left": Covariance(("fx", "fy"), np.array(matrix))}
+    blocks = {"cameras.left": RigCovariance(("fx", "fy"), np.array(matrix))}
     with pytest.raises(InputError, match=f"rig.yaml: cameras.left.covariance.matrix: .*{words}"):
         joint_covariance(RIG, blocks, "rig.yaml")
 
@@ -77,7 +76,7 @@ def test_state_bow_and_joint_covariance_are_saved_and_loaded(tmp_path):
         reasons=("the left screen is bent",),
         notes="by night",
     )
-    save_rig(RigFile(rig, {"target": Covariance(names, A @ A.T)}, state), tmp_path / "rig.yaml")
+    save_rig(RigFile(rig, {"target": RigCovariance(names, A @ A.T)}, state), tmp_path / "rig.yaml")
     again = load_rig_file(tmp_path / "rig.yaml")
     assert again.calibration == state
     assert again.rig.screens["left"].bow == bent.bow

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from geometry.camera import Camera, SensorNoise
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen, Spot
+from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
-from lab.files.rig.rig_file import Covariance, RigFile, load_rig, load_rig_file, save_rig
+from lab.files.rig.rig_file import RigFile, load_rig, load_rig_file, save_rig
 from lab.files.text import atomic_write
 from lab.files.text.error_text import FileError
 from tests.lab.run_folders import RIG
@@ -117,7 +118,7 @@ def test_covariance_blocks_are_loaded_and_saved(tmp_path):
     assert set(file.covariances) == {"cameras.left", "target"}
     save_rig(file, tmp_path / "again.yaml")
     again = load_rig_file(tmp_path / "again.yaml")
-    assert again.covariances["cameras.left"].parameters == ("fx", "fy")
+    assert again.covariances["cameras.left"].names == ("fx", "fy")
     np.testing.assert_array_equal(again.covariances["cameras.left"].matrix, [[1.0, 0.1], [0.1, 2.0]])
     np.testing.assert_array_equal(again.covariances["target"].matrix, [[1e-8]])
     same(load_rig(tmp_path / "again.yaml"), load_rig(written(tmp_path, RIG)))
@@ -132,7 +133,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
 
     monkeypatch.setattr(atomic_write.os, "fsync", full_disk)
     with pytest.raises(InputError, match="cannot be written: No space left"):
-        save_rig(RigFile(rig, {"target": Covariance(("a",), np.eye(1))}), path)
+        save_rig(RigFile(rig, {"target": RigCovariance(("a",), np.eye(1))}), path)
     assert path.read_text() == RIG
     assert [p.name for p in tmp_path.iterdir()] == ["rig.yaml"]
 
