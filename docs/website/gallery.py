@@ -251,7 +251,7 @@ def draw(sight: Sight, folder: Path, work: Path) -> np.ndarray:
     healthy = record(work / "usual", _usual(sight), frame + 1)
     pictures = [_picture(at, camera, frame) for at in (healthy, folder)]
     cuts = [_cut(picture, healthy, sight.picture, camera, frame) for picture in pictures]
-    highest = np.max(cuts) if "spot" in sight.picture else np.percentile(pictures[0], 99.9)
+    highest = np.max(cuts) / (1 if "spot" in sight.picture else 2)
     low, high = sight.picture.get("levels") or (np.percentile(pictures[0], 5), highest)
     greys = [np.clip((cut.astype(float) - low) / max(high - low, 1.0), 0, 1) for cut in cuts]
     return _beside([_fit(np.round(255 * grey).astype(np.uint8), "spot" in sight.picture) for grey in greys])

@@ -21,6 +21,7 @@ from docs.website.navigation import expanded  # noqa: E402
 from docs.website.network import network_addresses  # noqa: E402
 from docs.website.pages import GENERATED  # noqa: E402
 from docs.website.study_tables import with_tables  # noqa: E402
+from docs.website.validation import with_comparisons  # noqa: E402
 
 _LOG = logging.getLogger("mkdocs.hooks.beampose")
 
@@ -43,8 +44,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: MkDocsConfig, files: Files) -> str:
-    """Put the tables of studies into their pages."""
-    return with_tables(markdown)
+    """Put tables and figures that are kept as CSV into their pages."""
+    return with_comparisons(with_tables(markdown))
 
 
 def on_page_content(html: str, page: Any, config: MkDocsConfig, files: Files) -> str:

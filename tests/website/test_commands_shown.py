@@ -76,6 +76,12 @@ def test_the_pages_of_the_user_show_commands():
     assert len(PAGES["docs/tutorial.md"]) >= 10
 
 
+def test_the_first_part_of_the_tutorial_has_six_commands_and_is_read_in_eight_minutes():
+    text = (ROOT / "docs/tutorial.md").read_text(encoding="utf-8").split("## Part 2")[0]
+    assert 5 <= len(commands_in(text)) <= 6
+    assert len(text.split()) <= 8 * 150  # words in a minute, of a technical text
+
+
 @pytest.mark.parametrize(
     "line",
     [

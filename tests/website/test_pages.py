@@ -12,7 +12,7 @@ import sys
 import pytest
 
 from calibration.budget import ExpectedErrors
-from docs.website import codes, commands, parameters, study_tables, yaml_files
+from docs.website import codes, commands, parameters, study_tables, validation, yaml_files
 from docs.website.navigation import expanded
 from docs.website.network import network_addresses
 from docs.website.pages import GENERATED
@@ -86,6 +86,19 @@ def test_the_table_of_the_study_is_put_into_its_page():
     page = study_tables.with_tables((ROOT / "docs" / "huo2015.md").read_text(encoding="utf-8"))
     assert not study_tables.MARKER.search(page)
     assert "| 65.97 |" in page
+
+
+def test_every_figure_of_the_validation_page_is_in_the_page_of_accuracy():
+    accuracy = " ".join((ROOT / "docs" / "accuracy.md").read_text(encoding="utf-8").split())
+    page = validation.with_comparisons((ROOT / "docs" / "validation.md").read_text(encoding="utf-8"))
+    shown = validation.rows()
+    assert [row.what for row in shown if row.quote not in accuracy] == []
+    assert {row.data for row in shown} == {"simulated", "simulated light in real photographs", "real"}
+    for row in shown:
+        quoted = {float(n) for n in re.findall(r"\d*\.\d+", row.quote)}
+        found = {round(r, 2) for r in (row.lowest, row.highest, row.lowest**2, row.highest**2)}
+        assert len(found & quoted) >= 1, row.what
+        assert validation.cell(row.what) in page
 
 
 def test_a_cell_keeps_its_text_whatever_characters_it_has():
