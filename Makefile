@@ -72,7 +72,7 @@ format: setup  ## Format the code and apply the linter's automatic fixes
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-docs: $(READY_DOCS)  ## Build the documentation site (build/docs/index.html); it needs no network when it is read
+docs: $(READY_DOCS)  ## Build the documentation site (build/docs/index.html); its gallery is executed, which takes some minutes
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "Open build/docs/index.html"
 
