@@ -287,7 +287,7 @@ def _fit(picture: np.ndarray, enlarged: bool = False) -> np.ndarray:
 
 
 def _beside(panels: Sequence[np.ndarray]) -> np.ndarray:
-    gap = np.full((_PANEL_PX[1], _GAP_PX), 255, np.uint8)
+    gap = np.full((_PANEL_PX[1], _GAP_PX), 128, np.uint8)
     return np.hstack([panels[0], gap, panels[1]])
 
 
