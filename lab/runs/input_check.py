@@ -35,7 +35,7 @@ from lab.files.rig.rig_file import joint_covariance, load_rig_file
 from lab.files.run.run_file import DetectionsTable, Run, load_run
 from lab.files.run.truth import largest_disagreement_px, load_run_truth
 from lab.files.text.error_text import FileError
-from lab.findings.finding import Level
+from lab.findings.finding import Level, sentence
 from lab.findings.outcome import Done
 from lab.number_format import format_number
 from lab.pictures.picture_file import DROPPED, UNREADABLE, MissingPicture
@@ -175,7 +175,7 @@ def check_rig(
 ) -> None:
     """Numbers that no lab has, and mistakes that the symmetry of the rig hides unless there are true poses."""
     impossible = mistakes_by_themselves(rig, prior)
-    findings.problems += [f"{f.what}; {f.why}. {f.remedy} ({f.code})" for f in impossible]
+    findings.problems += [f"{f.what}. {sentence(f.why)} {f.remedy} ({f.code})" for f in impossible]
     if impossible:
         return
     kinds: dict[str, list[Invisible]] = {}
@@ -206,7 +206,7 @@ def check_rig(
 def check_recording(findings: Findings, run: Run, sampler: EvenSampler[FrameSet]) -> None:
     """Mistakes that a sample of the recording shows."""
     for f in (*recorded_mistakes(run, _blocks(run, sampler)), *rates_of_videos(run)):
-        text = f"{f.what}; {f.why}. {f.remedy} ({f.code})"
+        text = f"{f.what}. {sentence(f.why)} {f.remedy} ({f.code})"
         (findings.problems if f.level is Level.FAIL else findings.remarks).append(text)
 
 

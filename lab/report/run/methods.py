@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.arrays import Array
+from lab.findings.finding import first_sentence
 from lab.number_format import format_angle, format_length, format_number, format_percent
 from lab.report.run.model_fit import ModelFit
 from lab.report.run.report_data import ReportData
@@ -110,7 +111,7 @@ def _results(m: ReportData, fit: ModelFit | None) -> str:
     if len(rms):
         out += f" The median residual of a pose is {format_number(float(np.median(rms)))} px (RMS over its spots)."
     if fit is not None and fit.tested:
-        found = "; ".join(f.what for f in fit.findings)
+        found = "; ".join(first_sentence(f.what) for f in fit.findings)
         out += (
             f" Deviations from the calibrated rig found in the residuals: {found}."
             if found

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.arrays import Array, Bools
-from lab.findings.finding import Level, verdict
+from lab.findings.finding import Level, first_sentence, verdict
 from lab.number_format import format_number, format_percent
 from lab.report.plot.svg import true_ranges
 from lab.report.run.model_fit import ModelFit
@@ -104,7 +104,9 @@ def _model(fit: ModelFit | None) -> Evidence:
             "deviations within the stated uncertainty" if worst is Level.PASS else "the residuals do not fit the rig"
         )
     words += f" ({_count(fit.frames)} tested)" if fit.frames is not None else ""
-    found = "; ".join(f.what for f in fit.findings[:2]) + ("; and more" if len(fit.findings) > 2 else "")
+    found = "; ".join(first_sentence(f.what) for f in fit.findings[:2]) + (
+        "; and more" if len(fit.findings) > 2 else ""
+    )
     return Evidence(worst, _MODEL, f"{words}: {found}" if found else words)
 
 

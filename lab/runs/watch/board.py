@@ -17,6 +17,7 @@ from geometry.arrays import Array
 from geometry.forward_model import SpotModel
 from lab.files.run.run_file import Run
 from lab.files.text.json_text import plain_value
+from lab.findings.finding import first_sentence
 from lab.pictures.opencv import load_cv2
 from lab.pictures.picture_file import GreyPicture
 from lab.report.frames.canvas import ground
@@ -202,7 +203,7 @@ class Board:
         with suppress(*ENDED):
             found = self.check(check_sampled_frames, self.run.rig, sampler, self.run.covariance)
             worst = max(found.findings, key=lambda f: f.level, default=None)
-            words = found.why_not or "the last seconds fit the rig" if worst is None else worst.what
+            words = found.why_not or "the last seconds fit the rig" if worst is None else first_sentence(worst.what)
             level = "" if found.why_not else "pass" if worst is None else worst.level.word
             self._word = {"words": words, "level": level, "remedy": "" if worst is None else worst.remedy}
 

@@ -42,7 +42,9 @@ def test_findings_come_first_and_every_spot_camera_and_beam_has_a_row(moved_scre
     assert all(len(row) == len(HEADS) for row in fit.rows)
     line = trust._model(fit)
     assert (line.level, line.name) == (Level.FAIL, "Fit of rig and recording")
-    assert line.text.startswith("the residuals do not fit the rig (300 frames tested): spot 6 in camera `right`")
+    assert line.text.startswith("the residuals do not fit the rig (300 frames tested): screen `right` may have moved")
+    assert "Spot 6" not in line.text  # a line; the finding has the rest
+    assert ". Spot 6 in camera `right` lies" in fit.findings[0].what
 
 
 def test_each_camera_has_a_drawing_with_arrows_along_the_mean_residuals(moved_screen):
