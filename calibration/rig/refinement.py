@@ -20,6 +20,7 @@ from calibration.model_check.faults import BEAM, CAMERA, LASER_MOVED, MOVED, SCR
 from calibration.model_check.linearised_frames import (
     ModelCheckRecording,
     correlation_time,
+    finite,
     linearise,
 )
 from calibration.rig.recordings import STACKS, RecordingTerm, Reduced
@@ -235,6 +236,41 @@ def refine(
         moved=search_faults(excess, X, _parts(rig, values, prior, known))[0],
         held_out=_held_out(known, data, given_data, changed),
     )
+
+
+# Motions about the middle of a recording that would show more: along the axes of world, and about those of the body.
+MOTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
+_SHIFT_M, _TURN_RAD = 0.2, float(np.deg2rad(10.0))  # to both sides, or half, a quarter ... of it while spots are lost
+_MOTION_FRAMES, _HALVINGS = 41, 4
+
+
+def further_motions(r: Refinement, free: Mapping[str, Bools]) -> dict[str, tuple[float, Array]]:
+    """What as many frames again would determine, by one of MOTIONS: its size, m or rad, and the sigmas (r,) afterwards.
+
+    The sigmas are those of the directions, in prior sigmas. free: as of `prior_of`. Empty where no spots would be left.
+    """
+    model, poses, used = SpotModel.of(r.rig), r.data[0].lin.poses, r.data[0].lin.used
+    middle, coefficients = poses[len(poses.translation) // 2], np.linalg.pinv(r.directions)
+    usual = np.median(r.of_data(0).cov_px2[used], axis=0)
+    noise = np.array([r.noise[name] for name in model.camera_names])[model.camera_of]
+    count = sum(len(recording.seen) for recording in r.recordings) / r.correlation_frames
+    cov = usual * noise[:, None, None] ** 2 * (_MOTION_FRAMES / count)
+    out = {}
+    for axis, name in enumerate(MOTIONS):
+        for halved in range(_HALVINGS + 1):
+            step = np.zeros((_MOTION_FRAMES, 6))
+            size = (_SHIFT_M if axis < 3 else _TURN_RAD) / 2**halved
+            step[:, axis] = np.linspace(-size, size, _MOTION_FRAMES)
+            moved = middle.plus(step)
+            uv = model.project(moved)[0]
+            seen = model.in_picture(uv) & finite(uv, -1)
+            if np.all(seen.sum(axis=1) >= FEWEST_SPOTS):
+                every = np.broadcast_to(cov, (*seen.shape, 2, 2))
+                recording = ModelCheckRecording(np.arange(_MOTION_FRAMES, dtype=float), seen, uv, every, moved)
+                known = r.after.with_data([RecordingTerm(r.given, recording, free).reduced(r.values)])
+                out[name] = size, np.sqrt(np.diagonal(coefficients @ known.covariance @ coefficients.T))
+                break
+    return out
 
 
 def _usable(model: SpotModel, recording: ModelCheckRecording) -> ModelCheckRecording:

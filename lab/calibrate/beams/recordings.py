@@ -20,6 +20,7 @@ from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.project.point_files import StandPoses, read_poses
 from lab.files.project.project import Project, RecordingEntry
+from lab.files.run.clocks import ESTIMATE
 from lab.files.run.run_file import Run, load_run
 from lab.files.text.csv_table import Table
 from lab.files.text.csv_text import SIGMA_RANGE_PX, check_pixels, check_sigmas, read_table
@@ -121,6 +122,11 @@ def spots_of_run(folder: Path, rig: Rig, known: StandPoses | None, world_from_st
         raise InputError(
             f"{run.path}: cameras.{missing[0]}: expected a camera of the calibration, got {missing[0]!r}; it has"
             f" {', '.join(rig.cameras)}"
+        )
+    if any(clock.offset_prior_s or clock.row_time_prior_s for clock in run.clocks.values()):
+        raise InputError(
+            f"{run.path}: cameras: expected clocks that are known, got `{ESTIMATE}`; a stand at rest shows no clock:"
+            f" remove `{ESTIMATE}`, and record while the stand is at rest"
         )
     rig_of_run = dataclasses.replace(rig, cameras={n: c for n, c in rig.cameras.items() if n in run.cameras})
     run = dataclasses.replace(run, rig=rig_of_run, covariance=None)

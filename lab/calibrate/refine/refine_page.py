@@ -5,15 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from calibration.rig.recordings import Reduced
-from calibration.rig.refinement import Refinement
+from calibration.rig.refinement import MOTIONS, Refinement, further_motions
+from calibration.terms.rig_blocks import prior_of
 from geometry.arrays import Array
+from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import POSE, split_name
 from lab.calibrate.refine.refine_findings import RefineResult
 from lab.number_format import format_number
 from lab.report.calibration.calibration_charts import correlation_matrix
 from lab.report.calibration.calibration_drawings import residual_field
-from lab.report.calibration.calibration_scene import rig_things, scene_views
+from lab.report.calibration.calibration_scene import SceneObject, Trail, frustum_length, rig_things, scene_views
 from lab.report.page import KeyFigure, PageDrawing, PageTable, Section
+
+_MUCH_BETTER = 0.7  # of its sigma: what a further motion must at least leave to be named
 
 
 def page_of(result: RefineResult) -> tuple[list[KeyFigure], list[Section]]:
@@ -21,7 +25,7 @@ def page_of(result: RefineResult) -> tuple[list[KeyFigure], list[Section]]:
     r = result.refined
     return _key_figures(r), [
         _changes_of_numbers(result),
-        _directions(r),
+        _directions(result),
         _held_out(result),
         _residuals(r),
         _correlations(r),
@@ -70,7 +74,8 @@ def _is_angle(name: str) -> bool:
     return name.endswith("_rad") or split_name(name)[2].startswith("direction")
 
 
-def _directions(r: Refinement) -> Section:
+def _directions(result: RefineResult) -> Section:
+    r = result.refined
     conventions = r.conventions
     free = len(r.gain) - int(np.sum(r.gain > 1))
     words = [
@@ -78,7 +83,10 @@ def _directions(r: Refinement) -> Section:
         f" than what was stated. {conventions} directions are conventions: motions of all cameras and screens together,"
         " and of all beams in the body, change no residual. What is stated of all parts together decides them, and no"
         f" recording can. The other {max(free - conventions, 0)} stay near what was stated.",
+        "The last column is the motion, along an axis of world or about one of the body, that would determine a"
+        " direction best in as many frames again, and the sigma that it would leave over that before.",
     ]
+    motions = further_motions(r, prior_of(r.given, result.prior)[1])
     rows: list[tuple[object, ...]] = []
     for i in np.argsort(r.gain):
         parts: dict[str, float] = {}
@@ -86,8 +94,14 @@ def _directions(r: Refinement) -> Section:
             parts[part] = parts.get(part, 0.0) + share
         largest = sorted(parts.items(), key=lambda p: -p[1])[:3]
         ratio = 1 / np.sqrt(1 + r.gain[i])
-        rows.append((len(rows) + 1, float(ratio), ", ".join(f"{n} {100 * s:.0f} %" for n, s in largest)))
-    heads = ("direction", "sigma after / before", "largest shares")
+        name = min(motions, key=lambda m: motions[m][1][i], default="")
+        would = ""
+        if name and motions[name][1][i] < _MUCH_BETTER * ratio:
+            size, sigmas = motions[name]
+            words_of = f"{format_number(1e3 * size, 2)} mm" if name in MOTIONS[:3] else f"{np.rad2deg(size):.2g} deg"
+            would = f"{name} ± {words_of}: {format_number(float(sigmas[i]), 2)}"
+        rows.append((len(rows) + 1, float(ratio), ", ".join(f"{n} {100 * s:.0f} %" for n, s in largest), would))
+    heads = ("direction", "sigma after / before", "largest shares", "motion that would help")
     return Section("What the recordings determine", words, (), PageTable(heads, rows))
 
 
@@ -143,4 +157,28 @@ def _correlations(r: Refinement) -> Section:
 def _scene(r: Refinement) -> Section:
     poses = r.data[0].lin.poses
     things = rig_things(r.rig, poses[len(poses.translation) // 2])
-    return Section("The refined rig", "", [PageDrawing(picture) for picture in scene_views(things)])
+    arrows, times = _arrows(r, 1.5 * frustum_length(things))
+    words = f"Arrows are the changes of cameras and screens, {format_number(times, 2)} times as long." if arrows else ""
+    return Section("The refined rig", words, [PageDrawing(picture) for picture in scene_views([*things, *arrows])])
+
+
+def _arrows(r: Refinement, longest_m: float) -> tuple[list[SceneObject], float]:
+    """The changes of the places of cameras and screens, the largest of this length, and how much they are stretched."""
+
+    def places(rig: Rig) -> dict[str, Array]:
+        out = {f"camera {n}": c.camera_from_world.inverse().translation for n, c in rig.cameras.items()}
+        return out | {f"screen {n}": s.world_from_screen.translation for n, s in rig.screens.items()}
+
+    before, after = places(r.given), places(r.rig)
+    moved = {name: after[name] - place for name, place in before.items()}
+    largest = max(float(np.linalg.norm(m)) for m in moved.values())
+    if not largest > 0:
+        return [], 1.0
+    out: list[SceneObject] = []
+    for name, shift in moved.items():
+        end = before[name] + shift * (longest_m / largest)
+        back, across = -0.2 * (end - before[name]), 0.1 * np.cross(end - before[name], [0.3, 0.5, 0.8])
+        head = [end, end + back + across, end, end + back - across]
+        text = f"{name}: {format_number(1e3 * float(np.linalg.norm(shift)), 2)} mm"
+        out.append(Trail(text, np.array([before[name], *head])))
+    return out, longest_m / largest

@@ -349,6 +349,18 @@ def test_an_unlabelled_run_is_labelled_by_the_nominal_beams_and_its_frames_at_re
     assert np.abs(errors(rig, c.rig)[:, :2]).max() < 60 * ARCSEC
 
 
+def test_a_run_whose_clocks_are_to_be_estimated_is_refused_in_a_line(tmp_path):
+    rng, rig = np.random.default_rng(5), RIGS["unequal-fan"]()
+    detections_run(tmp_path / "recorded", rig, rig, positions(rng, 3), rng, 1)
+    run = tmp_path / "recorded" / "run.yaml"
+    content = yaml.safe_load(run.read_text())
+    content["cameras"]["right"]["time_offset_s"] = "estimate"
+    run.write_text(yaml.safe_dump(content))
+    project = write_project(tmp_path, rig, rig, STAND, [{"run": "recorded", "poses": "recorded/poses.csv"}])
+    with pytest.raises(InputError, match="remove `estimate`, and record while the stand is at rest"):
+        calibrate_beams(project, tmp_path / "out")
+
+
 def test_a_run_without_known_poses_is_labelled_by_the_tracker_and_gives_the_angles(tmp_path):
     rng = np.random.default_rng(8)
     rig = RIGS["unequal-fan"]()

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from calibration.terms.rig_blocks import stacks_of
+from calibration.rig.refinement import MOTIONS, further_motions
+from calibration.terms.rig_blocks import prior_of, stacks_of
 from cli import main
 from geometry.rig import Rig
 from geometry.uncertainty.chi_square import chi2_limit
@@ -109,6 +110,22 @@ def test_the_report_has_the_change_of_each_number_and_held_out(lab):
     for words in ("Change of each number", "What the recordings determine", "Held-out recordings", "Correlations"):
         assert f"{words}</h2>" in text
     assert "cameras.left-a.x_m" in text
+    assert "motion that would help" in text
+    assert "Arrows are the changes" in text
+
+
+def test_a_further_motion_determines_more_but_no_convention(lab):
+    result = lab[3].result
+    r = result.refined
+    motions = further_motions(r, prior_of(r.given, result.prior)[1])
+    assert set(motions) == set(MOTIONS)
+    inverse = np.linalg.pinv(r.directions)
+    before = np.sqrt(np.diagonal(inverse @ r.after.covariance @ inverse.T))
+    conventions = np.argsort(r.gain)[: r.conventions]
+    for _, after in motions.values():
+        assert np.all(after < before + 1e-6)
+        assert np.all(after[conventions] > 0.99)
+        assert np.min(after / before) < 0.75  # as many frames again
 
 
 def test_one_recording_is_held_out_by_blocks_of_time(lab, tmp_path):
