@@ -35,7 +35,7 @@ from tracking.smoothing.labels.continuity import continued, transfers_between_ca
 from tracking.smoothing.labels.neighbouring_frames import brief, connected, displaced, isolated, next_to
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated, run_log_clutter, run_log_static
 from tracking.smoothing.labels.view_path import PathContext
-from tracking.smoothing.motion.process_noise import corner_offsets, jump_sigmas, jump_variances
+from tracking.smoothing.motion.process_noise import corner_offsets, corner_times, jump_sigmas, jump_variances
 from tracking.smoothing.motion.run_detections import (
     Reference,
     RunDetections,
@@ -319,7 +319,8 @@ class _Smoother:
             return seen
         nowhere = np.zeros(len(self.rec), dtype=bool)
         jump = jump_variances(motion.ref, nowhere, self.measured, motion.jumped, self.rec.dt_s)
-        steps = Steps(self.rec.dt_s, np.exp(motion.log_density), np.ascontiguousarray(jump))
+        corners = corner_times(motion.ref, motion.jumped, self.rec.dt_s)
+        steps = Steps(self.rec.dt_s, np.exp(motion.log_density), np.ascontiguousarray(jump), corners)
         uv, cov = moved_detections(
             self.views, self.view_table.camera, seen, self.delays, self.assigned, motion.ref, motion.motion_P, steps
         )

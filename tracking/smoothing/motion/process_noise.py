@@ -181,6 +181,22 @@ def new_jumps(shock: Array, jumped: Bools) -> Bools:
     return np.asarray(peak & (shock > SHOCK_CHI2) & ~jumped)
 
 
+def corner_times(ref: Reference, jumped: Bools, dt: Array) -> Array:
+    """When the velocities jump within a step, (T, 2), s after its begin, of translation and rotation; nan: not known.
+
+    Where the straight lines before and after meet, along the jump; jumped (T,): steps with a known jump. Lines that
+    meet outside of the step, and those between two jumps, say that the jump may be in another one.
+    """
+    out, pose = np.full((len(ref.t), 2), np.nan), Pose(ref.R, ref.t)
+    alone = jumped & ~np.r_[False, jumped[:-1]] & ~np.r_[jumped[1:], False]
+    for k in (np.flatnonzero(alone[1:]) + 1).tolist():
+        jump = (ref.m[k, :6] - ref.m[k - 1, :6]).reshape(2, 3)
+        late = (ref.m[k, :6] * dt[k] - pose[k].minus(pose[k - 1])).reshape(2, 3)
+        at = np.sum(late * jump, axis=1) / np.maximum(np.sum(jump**2, axis=1), 1e-300)
+        out[k] = np.where((at > 0) & (at < dt[k]), at, np.nan)
+    return out
+
+
 def corner_offsets(ref: Reference, jumped: Bools, exposure_s: float, dt: Array) -> Array:
     """Largest mean pose over the exposure less that at its middle, (T, 6), where the velocities jump; 0 elsewhere.
 

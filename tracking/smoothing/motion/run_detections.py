@@ -209,6 +209,10 @@ class Steps(NamedTuple):
     dt: Array  # (F,) s
     jerk: Array  # (F, 6) spectral densities of the white jerk
     velocity_jump: Array  # (F, 2) variances of the velocities' jump
+    corner_s: Array  # (F, 2) when they jump, s after the step's begin; nan: not known
+
+
+CORNER_SHARE = 0.05  # of a step: how much nearer to a frame than the corner a spot must be to belong to the same line
 
 
 @compiled_in_caller
@@ -218,7 +222,10 @@ def _open_variance(steps: Steps, k: int, axis: int, after: float) -> float:
     out = steps.jerk[k, axis] * s**5 / 20
     step = k + 1 if after > 0.0 else k
     if 0 < step < steps.dt.shape[0] and steps.dt[step] > 0.0:
-        out += steps.velocity_jump[step, axis // 3] / steps.dt[step] * s**3 / 3
+        corner, dt = steps.corner_s[step, axis // 3], steps.dt[step]
+        beyond = s - (corner if after > 0.0 else dt - corner)
+        if not beyond < -CORNER_SHARE * dt:
+            out += steps.velocity_jump[step, axis // 3] / dt * s**3 / 3
     return out
 
 

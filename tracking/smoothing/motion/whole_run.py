@@ -25,6 +25,7 @@ from tracking.smoothing.motion.fixed_interval import (
 )
 from tracking.smoothing.motion.process_noise import (
     corner_offsets,
+    corner_times,
     jump_variances,
     largest_near,
     new_jumps,
@@ -317,12 +318,13 @@ class _Estimator:
     def _steps(self) -> Steps:
         """What the motion leaves open within each step; nothing before the first pass."""
         none = np.zeros((len(self.dt), 6))
-        return Steps(self.dt, none, none[:, :2].copy()) if self.steps is None else self.steps
+        return Steps(self.dt, none, none[:, :2].copy(), none[:, :2].copy()) if self.steps is None else self.steps
 
     def _open_steps(self, density: Array) -> None:
         """Update the steps to jerk densities (T, 6) and to the jumps known so far."""
         jump = jump_variances(self.ref, self.weak, self.measured, self.jumped, self.dt)
-        self.steps, self.kept = Steps(self.dt, np.ascontiguousarray(density), np.ascontiguousarray(jump)), None
+        corners = corner_times(self.ref, self.jumped, self.dt)
+        self.steps, self.kept = Steps(self.dt, np.ascontiguousarray(density), np.ascontiguousarray(jump), corners), None
 
     # -- result -------------------------------------------------------------------------------------------------------
 
