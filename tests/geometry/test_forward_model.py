@@ -289,3 +289,18 @@ def test_rays_hit_a_bent_screen_on_its_surface(seed):
     good = np.isfinite(hits[:, 0])
     expected = numeric_jacobian(lambda d: model.hits(pose.plus(d))[0], np.zeros(6))
     np.testing.assert_allclose(J[good], expected[good], rtol=1e-4, atol=1e-5)
+
+
+@settings(max_examples=15)
+@given(seed=seeds)
+def test_the_pixels_of_a_strongly_bent_screen_are_those_of_its_surface(seed):
+    """The compiled projection against the intersection in numpy and the camera: a wrong slope converges too slowly."""
+    rng = np.random.default_rng(seed)
+    flat = random_rig(rng)
+    screens = {n: dataclasses.replace(s, bow=tuple(rng.normal(0, 0.03, 3))) for n, s in flat.screens.items()}
+    rig, pose = dataclasses.replace(flat, screens=screens), random_pose(rng, 0.3, 0.3)
+    model = SpotModel.of(rig)
+    (hits, _), (pixels, _) = model.hits(pose), model.project(pose)
+    for i, (camera, _) in enumerate(model.views):
+        if np.isfinite(pixels[i]).all():
+            np.testing.assert_allclose(pixels[i], rig.cameras[camera].project(hits[i]), atol=1e-9)
