@@ -264,8 +264,7 @@ def _checked(pixels: _Pixels, light: JointLight, width_px: float) -> JointFit | 
     alone = np.linalg.pinv(np.einsum("ikm,jkm->kij", slopes, slopes), hermitian=True)  # if the background were known
     every, own = (float(np.trace(P, axis1=1, axis2=2).mean()) / 2 for P in (np.einsum("kikj->kij", places), alone))
     mean = float(np.trace(places.mean(axis=(0, 2)))) / 2 * max(chi2, 1.0)
-    lit = seen.light_of.max(axis=0) > 0.1
-    height = (light.plain + light.modulated * seen.behind)[lit]
+    height = (light.plain + light.modulated * seen.behind)[seen.light_of.max(axis=0) > 0.1]
     bad = chi2 > _LARGEST_CHI2 or not height.size or float(np.median(height)) <= 0
     bad |= light.modulated * pixels.usual < -MODULATED[0] * pixels.height
     bad |= bool((widths > _LARGEST_CHANGE * width_px).any() or (widths < width_px / _LARGEST_CHANGE).any())
@@ -274,5 +273,4 @@ def _checked(pixels: _Pixels, light: JointLight, width_px: float) -> JointFit | 
         return None
     # The noise of the background, 1 / n, is in its information as well.
     shared = max(every - (1 + 1 / n) * own, 0.0) * max(chi2, 1.0) + (_LEAST_SIGMA * float(widths.max())) ** 2
-    share = shared / max(own, 1e-9)
-    return JointFit(light, float(share), covariance[:2, :2] * max(chi2, 1.0))
+    return JointFit(light, float(shared / max(own, 1e-9)), covariance[:2, :2] * max(chi2, 1.0))
