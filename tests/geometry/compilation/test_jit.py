@@ -165,6 +165,41 @@ def test_code_from_disk_is_inlined_into_a_caller_that_is_compiled_again(program,
     assert (again["value"], again["compiled"]) == (40.0, ["twice_grown"])
 
 
+MEAN = """
+from geometry.compilation.jit import compiled
+
+@compiled
+def mean(x):
+    if x.size == 0:
+        raise ValueError("no values")
+    return x.mean()
+"""
+USE_MEAN = """
+import sys
+import numpy as np
+from floor.mean import mean
+try:
+    mean(np.zeros(0))
+except ValueError as error:
+    print(error, mean(np.array([1.0, 3.0])), "numba.np.arraymath" in sys.modules, "scipy.linalg" in sys.modules)
+"""
+
+
+def test_code_from_disk_imports_nothing_that_only_a_compilation_needs(program, tmp_path):
+    """numba imports the module of each of its own functions that machine code contains: scipy.linalg for a mean."""
+    copy = tmp_path / "program"
+    shutil.copytree(program, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    (copy / "floor" / "mean.py").write_text(MEAN)
+    environment = {**os.environ, "PYTHONPATH": str(copy)}
+    printed = [
+        subprocess.run([sys.executable, "-c", USE_MEAN], env=environment, capture_output=True, text=True, timeout=60)
+        for _ in range(2)
+    ]
+    assert [(p.stdout.strip(), p.stderr) for p in printed] == [
+        ("no values 2.0 True True", ""), ("no values 2.0 False False", ""),
+    ]  # fmt: skip
+
+
 def test_with_a_numba_that_has_other_internals_code_is_kept_and_never_that_of_an_edited_source(program, tmp_path):
     copy = tmp_path / "program"
     shutil.copytree(program, copy, ignore=shutil.ignore_patterns("__pycache__"))
