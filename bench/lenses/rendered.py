@@ -165,6 +165,7 @@ class Row:
     z: Array  # errors of fx, fy, cx, cy in sigmas
     ratio: float  # error of directions where corners were seen, over the claim
     error_px: float
+    chance: float  # of such a ratio or a larger one, if the stated covariance is right
     seconds_20: float  # process time per 20 photographs
 
 
@@ -178,11 +179,19 @@ def judged(kind: str, s: RenderedSet) -> Row:
         others = [_calibrated(s.table, m) for m in (LensModel(4), LensModel(5), LensModel(4, FISHEYE))]
         lost = any(o is not None and verdict(findings_of(o)) < Level.FAIL for o in others)
     if c is None:
-        return Row(kind, "none", "ERROR", lost, np.full(4, np.nan), np.nan, np.nan, seconds)
+        return Row(kind, "none", "ERROR", lost, np.full(4, np.nan), np.nan, np.nan, np.nan, seconds)
     e = lens_error(projection(s), c)
     z = (c.fit.lens - s.lens)[:4] / c.sigmas[:4]
     return Row(
-        kind, c.model.title, verdict(findings_of(c)).name, lost, z, e.error_px / e.stated_px, e.error_px, seconds
+        kind,
+        c.model.title,
+        verdict(findings_of(c)).name,
+        lost,
+        z,
+        e.error_px / e.stated_px,
+        e.error_px,
+        e.chance,
+        seconds,
     )
 
 
@@ -209,8 +218,9 @@ def summary(rows: Sequence[Row]) -> str:
     failed = sum(r.level in ("FAIL", "ERROR") for r in rows)
     return (
         f"FAIL {failed}, of these lost {sum(r.lost for r in rows)}, of {len(rows)}; within 1 sigma"
-        f" {100 * np.nanmean(np.abs(z) < 1):.0f} %; map error over claim: median {np.nanmedian(ratio):.2f}, at"
-        f" most 1.3 in {100 * np.mean(ratio <= 1.3):.0f} %; fx {np.nanmean(z[:, 0]):+.2f} sigmas in the mean;"
+        f" {100 * np.nanmean(np.abs(z) < 1):.0f} %; map error over claim: median {np.nanmedian(ratio):.2f}, RMS"
+        f" {np.sqrt(np.nanmean(ratio**2)):.2f}, at most 1.3 in {100 * np.mean(ratio <= 1.3):.0f} %, chance below .05 in"
+        f" {100 * np.mean([r.chance < 0.05 for r in rows]):.0f} %; fx {np.nanmean(z[:, 0]):+.2f} sigmas in the mean;"
         f" {np.max([r.seconds_20 for r in rows]):.1f} s per 20 photographs at most"
     )
 
@@ -230,7 +240,8 @@ def main(arguments: list[str]) -> None:
             rms, inward, error = corner_error(s)
             print(
                 f"{kind:17s} {seed:4d} {s.table.views:3d} photographs: {row.level:5s} {row.model:7s}"
-                f" z {np.round(row.z, 1).tolist()} map {row.error_px:.3f} px, {row.ratio:.2f} of the claim;"
+                f" z {np.round(row.z, 1).tolist()} map {row.error_px:.3f} px, {row.ratio:.2f} of the claim (chance"
+                f" {row.chance:.2f});"
                 f" points {rms:.3f} px, inward {inward:+.4f} ± {error:.4f} px; {row.seconds_20:.1f} s"
                 f"{' LOST' if row.lost else ''}",
                 flush=True,

@@ -34,7 +34,7 @@ def coverage_of(table: CornerTable, used: Bools, camera_from_board: Pose) -> Cov
     tilt = np.degrees(np.arccos(np.clip(normals[:, 2], -1, 1)))
     azimuth = np.degrees(np.arctan2(normals[:, 1], normals[:, 0]))
     return Coverage(
-        filled=_filled(table, used),
+        filled=float(_mask(table, used).mean()),
         gaps=_gaps(table.pixels[used], table.image_size_px),
         tilt_deg=np.where(in_use, tilt, np.nan),
         azimuth_deg=np.where(in_use, azimuth, np.nan),
@@ -47,10 +47,6 @@ def spread_deg(normals: Array) -> float:
     if len(normals) < 2:
         return 0.0
     return float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1).min())))
-
-
-def _filled(table: CornerTable, used: Bools) -> float:
-    return float(_mask(table, used).mean())
 
 
 def seen_at(table: CornerTable, used: Bools, pixels: Array) -> Bools:

@@ -91,18 +91,17 @@ def fit(
     board: BoardFreedom,
     dropped: Mapping[int, str] = {},
     limits: Limits = CONVERGED,
-    sigma_px: float | None = None,
 ) -> LensFit:
     """Plain least squares over the used corners (N,).
 
-    sigma_px: expected sigma of a corner; None: estimated from the start values. It only sets the size of the last step:
-    a model that misses by pixels need not converge to a thousandth of a pixel.
+    The sigma of a corner is estimated from the start values. It only sets the size of the last step: a model that
+    misses by pixels need not converge to a thousandth of a pixel.
 
     Raises:
         AdjustmentError: the adjustment is singular or does not converge.
     """
     values, _ = with_circle_radius(table, used, model, values)
-    scale = sigma_px or _spread(_residuals(table, used, model, values)[used])
+    scale = _spread(_residuals(table, used, model, values)[used])
     adjusted = adjust(table, used, model, values, board, FitSettings(scale, limits=limits))
     everything = term_of(table, np.ones(len(table), dtype=bool), model.fisheye)
     residuals = everything.project(adjusted.values) - table.pixels

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.stats import chi2
 
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import undistorted
@@ -144,6 +145,7 @@ class LensError:
 
     error_px: float
     stated_px: float
+    chance: float  # of a ratio at least as large, if the stated covariance is right
 
 
 def lens_error(true: TrueLens, c: Intrinsics) -> LensError:
@@ -160,5 +162,10 @@ def lens_error(true: TrueLens, c: Intrinsics) -> LensError:
         return (true.project(rays @ exp(turn).T) - grid[near]).ravel()
 
     left = least_squares(off, np.zeros(3), x_scale=1e-3).fun
-    stated = np.trace(c.map.covariance_px2(c.covariance), axis1=-2, axis2=-1).reshape(-1)[near]
-    return LensError(float(np.sqrt(np.sum(left**2) / near.sum())), float(np.sqrt(np.nanmean(stated))))
+    error = np.sqrt(np.sum(left**2) / near.sum())
+    by_parameter = c.map.by_parameter.reshape(len(grid), 2, -1)[near].reshape(2 * near.sum(), -1)
+    M = by_parameter.T @ by_parameter / near.sum() @ c.covariance
+    stated = np.sqrt(np.trace(M))
+    # A weighted sum of chi-squares; Satterthwaite's chi-square has the same two moments.
+    dof = np.trace(M) ** 2 / np.trace(M @ M)
+    return LensError(float(error), float(stated), float(chi2.sf((error / stated) ** 2 * dof, dof)))
