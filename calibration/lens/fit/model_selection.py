@@ -94,21 +94,15 @@ def select_model(
         if model.coefficients >= RATIONAL.coefficients and any(_is_enough(table, c) for c in fitted):
             fitted.append(ModelCandidate(model, None, refused="a smaller model leaves no correlated residuals"))
             continue
-        starts = [f for f in rich if f.model.fisheye == model.fisheye and f.model.coefficients <= model.coefficients]
-        starts = starts or [f for f in rich if f.model.fisheye == model.fisheye]
-        if below is not None and not model.fisheye and model.coefficients >= RATIONAL.coefficients:
-            starts = [*(f for f in starts if f.model == model), below]
-        elif len(starts) > 1:
-            starts = starts[:1]  # the best of them
+        same = [f for f in rich if f.model.fisheye == model.fisheye]
+        starts = [f for f in same if f.model.coefficients <= model.coefficients] or same
+        smaller = None if model.fisheye else below
+        is_rich = model.coefficients >= RATIONAL.coefficients
+        starts = [*(f for f in starts if f.model == model), smaller] if smaller and is_rich else starts[:1]
         candidate = _best_start(table, used, model, [{**f.values, **shape} for f in starts] or [None], board)
-        if (
-            candidate.fit is None
-            and below is not None
-            and not model.fisheye
-            and model.coefficients < RATIONAL.coefficients
-        ):
+        if candidate.fit is None and smaller and not is_rich:
             # A rich lens that folds beyond the corners may fold before them without its last coefficients.
-            candidate = _best_start(table, used, model, [{**below.values, **shape}], board)
+            candidate = _best_start(table, used, model, [{**smaller.values, **shape}], board)
         if candidate.fit is not None and not model.fisheye:
             below = candidate.fit
         fitted.append(candidate)
