@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from geometry.camera import Camera
 from geometry.pose_prior import PosePrior
@@ -53,7 +52,7 @@ def frames_of(blocks: Sequence[Block], prior: PosePrior | None, min_spots: int) 
 def _moved_px(block: Block) -> float:
     """How far a quarter of the points of a camera move at most, px, to a frame beside it; other points may be false."""
     pairs = ((found, other[n]) for n, found in block[HERE].items() for other in block if n in other)
-    away = (cdist(a.uv_px, b.uv_px).min(axis=1) for a, b in pairs if len(a) and len(b))
+    away = (np.linalg.norm(a.uv_px[:, None] - b.uv_px, axis=-1).min(axis=1) for a, b in pairs if len(a) and len(b))
     return max((float(np.quantile(one, 0.25)) for one in away), default=0.0)
 
 
