@@ -32,8 +32,7 @@ from lab.findings.outcome import Outcome
 from lab.runs.input_check import check
 from lab.runs.process import process_run
 from lab.runs.verdict.run_statistics import RunStatistics
-from lab.runs.verdict.score import normalised_squares, pose_errors, read_tables, read_truth
-from tracking.statuses import PoseStatus
+from lab.runs.verdict.score import measured_errors, normalised_squares
 
 CODES = ("BP-M06", "BP-M07", "BP-M08", "BP-V20")  # of findings on mistakes
 FLOOR = 1e-5  # m and rad: poses that agree with the truth to this are right
@@ -70,13 +69,8 @@ def answer(folder: Path, out: Path, truth: Path | None) -> Answer:
         return Answer("\n".join(lines), "refused", refusal, 0, 0, seconds)
     wrong = 0
     if truth is not None:
-        tables = read_tables(out)
-        true = read_truth(truth, tables.spots, tables.poses)
-        assert true is not None
-        assert true.world_from_body is not None
-        delta = pose_errors(tables.poses, true.world_from_body)
-        use = np.isfinite(delta).all(axis=1) & tables.poses.has(PoseStatus.MEASURED)
-        nees = normalised_squares(delta[use], tables.poses.covariance[use] + FLOOR**2 * np.eye(6))
+        delta, covariance = measured_errors(out, truth)
+        nees = normalised_squares(delta, covariance + FLOOR**2 * np.eye(6))
         wrong = int(np.sum(nees > 100))
     verdict = outcome.verdict
     codes = tuple(str(r.as_mapping()["code"]) for r in verdict.findings)

@@ -72,22 +72,22 @@ def pictures(seeds: range) -> None:
     )
 
 
-def disturbed(recording: Recording, shape: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Measurements (T, 4) with a disturbance of one of SHAPES, and the steps (T,) that it covers."""
-    t, z, on = recording.t_s[:, None], recording.measured.copy(), recording.disturbed
+def disturbed(seed: int, shape: str) -> tuple[Recording, np.ndarray]:
+    """A recording with a disturbance of one of SHAPES, and the steps (T,) that it covers."""
+    if shape in DISTURBANCES:
+        recording = simulate(seed, 0, shape)
+        return recording, recording.disturbed
+    recording = simulate(seed, 0, "none")
+    t, on = recording.t_s[:, None], recording.disturbed
     if shape == "outage":
         on = (recording.t_s > FROM_S - 0.5 * DT_S) & (recording.t_s < FROM_S + OUTAGE_S)
-    share = np.clip((t - FROM_S) / (TO_S - FROM_S), 0, 1)
-    noise = rng.standard_normal(z.shape)
     added = {
-        "burst": 0.5 + noise,
-        "ramp": share,
-        "smooth bias": np.sin(np.pi * share) ** 2,
+        "ramp": (t - FROM_S) / (TO_S - FROM_S),
         "oscillation": np.sin(2 * np.pi * 1.5 * (t - FROM_S)),
-        "outage": 3 * noise,
+        "outage": 3 * np.random.default_rng(seed).standard_normal(recording.measured.shape),
     }[shape]
-    z[on] += (SIZE * added)[on]
-    return z, on
+    recording.measured[on] += (SIZE * added)[on]
+    return recording, on
 
 
 def rivals(seeds: range) -> None:
@@ -96,12 +96,11 @@ def rivals(seeds: range) -> None:
     for shape in SHAPES:
         peak, nees = {n: np.zeros(len(seeds)) for n in rules}, {n: np.zeros(len(seeds)) for n in rules}
         for i, seed in enumerate(seeds):
-            recording = simulate(seed, 0, "none")
-            z, on = disturbed(recording, shape, np.random.default_rng(seed))
+            recording, on = disturbed(seed, shape)
             steps = np.flatnonzero(on)
             for name, rule in rules.items():
                 x, P = X0, P0
-                for k, measured in enumerate(z[: steps[-1] + AFTER]):
+                for k, measured in enumerate(recording.measured[: steps[-1] + AFTER]):
                     x, P = predict(x, P, process(DT_S), Q, SPREAD)
                     if not (name == "ignoring" and on[k]):
                         step = update(x, P, measured, selection, R, SPREAD, rule)

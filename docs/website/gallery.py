@@ -32,8 +32,7 @@ import numpy as np
 from docs.website.recordings import MISTAKES, photograph_board, record
 from docs.website.text import cell, table
 from lab.findings.finding import ENTRIES, sentence
-from lab.runs.verdict.score import normalised_squares, pose_errors, read_tables, read_truth
-from tracking.statuses import PoseStatus
+from lab.runs.verdict.score import measured_errors, normalised_squares
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = Path(__file__).with_name("sights.toml")
@@ -115,8 +114,12 @@ def make(sight: Sight, work: Path, out: Path) -> str:
     missing = [code for code in sight.named if code not in found and f"({code})" not in said]
     if missing or (not sight.named and found - {""}):
         raise SightError(f"{sight.name}: expected {list(sight.named)}, found {sorted(found)}; printed:\n{said}")
-    cost = () if sight.named else _cost(sight, work)
-    picture = draw(sight, folder, work)
+    usual = work / "beside" / "usual"
+    if sight.board is None:
+        record(usual, _usual(sight))
+        (usual / "truth").rename(usual.with_name("truth"))
+    cost = () if sight.named else _cost(work, usual)
+    picture = draw(sight, folder, usual)
     out.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(out / f"{sight.name}.webp"), picture, [cv2.IMWRITE_WEBP_QUALITY, 85])
     return page(sight, printed, evidence, cost)
@@ -159,12 +162,10 @@ def _evidence(results: Path) -> list[dict[str, Any]]:
     return [e for e in found if e["code"]]
 
 
-def _cost(sight: Sight, work: Path) -> list[str]:
+def _cost(work: Path, usual: Path) -> list[str]:
     """A table of sigmas and errors of this recording and of the usual one."""
-    usual = record(work / "beside" / "usual", _usual(sight))
-    (usual / "truth").rename(work / "beside" / "truth")
-    execute("run RUN --out results", "usual", work / "beside")
-    columns = [_figures(folder / "results", folder) for folder in (work / "beside", work)]
+    execute("run RUN --out results", usual.name, usual.parent)
+    columns = [_figures(folder / "results", folder) for folder in (usual.parent, work)]
     rows = (
         "frames measured", "sigma of the attitude, median", "sigma of the position, median",
         "error of the attitude, RMS", "error of the position, RMS", "errors over sigmas, RMS",
@@ -174,13 +175,8 @@ def _cost(sight: Sight, work: Path) -> list[str]:
 
 def _figures(results: Path, true: Path) -> list[str]:
     """What the results claim, and what is true: per axis, of measured frames."""
-    tables = read_tables(results)
-    truth = read_truth(true, tables.spots, tables.poses)
-    assert truth is not None
-    assert truth.world_from_body is not None
-    delta = pose_errors(tables.poses, truth.world_from_body)
-    use = np.isfinite(delta).all(axis=1) & tables.poses.has(PoseStatus.MEASURED)
-    delta, covariance = delta[use], tables.poses.covariance[use]
+    delta, covariance = measured_errors(results, true)
+    counts = json.loads((results / "summary.json").read_text(encoding="utf-8"))["counts"]
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     ratio = np.sqrt(np.mean(normalised_squares(delta, covariance)) / 6)
     numbers = (
@@ -188,7 +184,7 @@ def _figures(results: Path, true: Path) -> list[str]:
         f"{1000 * np.rad2deg(np.sqrt(np.mean(delta[:, 3:] ** 2))):.1f} mdeg",
         f"{1000 * np.sqrt(np.mean(delta[:, :3] ** 2)):.3f} mm", f"{ratio:.2f}",
     )  # fmt: skip
-    return [f"{np.sum(use)} of {len(use)}", *numbers]
+    return [f"{counts['pose_status']['measured']} of {counts['frames']}", *numbers]
 
 
 def page(
@@ -242,15 +238,15 @@ def _story(sight: Sight) -> str:
 # Pictures ------------------------------------------------------------------------------------------------------------
 
 
-def draw(sight: Sight, folder: Path, work: Path) -> np.ndarray:
-    """The usual picture and that of the sight side by side, with the same grey levels."""
+def draw(sight: Sight, folder: Path, usual: Path) -> np.ndarray:
+    """The picture of the usual recording and that of the sight side by side, with the same grey levels."""
     frame, camera = sight.picture.get("frame", 10), sight.picture.get("camera", "left")
     if sight.board is not None:
         shots = [cv2.imread(str(p), cv2.IMREAD_GRAYSCALE) for p in sorted((folder / "photos").iterdir())[1:3]]
         return _beside([_fit(shot) for shot in shots])
-    healthy = record(work / "usual", _usual(sight), frame + 1)
-    pictures = [_picture(at, camera, frame) for at in (healthy, folder)]
-    cuts = [_cut(picture, healthy, sight.picture, camera, frame) for picture in pictures]
+    pictures = [_picture(at, camera, frame) for at in (usual, folder)]
+    true = usual.with_name("truth")
+    cuts = [_cut(picture, true, sight.picture, camera, frame) for picture in pictures]
     highest = np.max(cuts) / (1 if "spot" in sight.picture else 2)
     low, high = sight.picture.get("levels") or (np.percentile(pictures[0], 5), highest)
     greys = [np.clip((cut.astype(float) - low) / max(high - low, 1.0), 0, 1) for cut in cuts]
@@ -269,12 +265,12 @@ def _picture(run: Path, camera: str, frame: int) -> np.ndarray:
     return picture
 
 
-def _cut(picture: np.ndarray, healthy: Path, chosen: Mapping[str, Any], camera: str, frame: int) -> np.ndarray:
+def _cut(picture: np.ndarray, true: Path, chosen: Mapping[str, Any], camera: str, frame: int) -> np.ndarray:
     """The surroundings of a spot, by the truth of the usual recording; without one the whole picture, spots widened."""
     if "spot" not in chosen:
         return np.asarray(cv2.dilate(picture, np.ones((7, 7), np.uint8)))  # so that spots can be seen
     half = chosen.get("half_px", 20)
-    rows = (line.split(",") for line in (healthy / "truth" / "spots.csv").read_text("utf-8").splitlines()[1:])
+    rows = (line.split(",") for line in (true / "spots.csv").read_text("utf-8").splitlines()[1:])
     u, v = next((float(r[3]), float(r[4])) for r in rows if r[:3] == [str(frame), camera, chosen["spot"]])
     tall = half * _PANEL_PX[1] // _PANEL_PX[0]
     left, top = max(round(u) - half, 0), max(round(v) - tall, 0)

@@ -15,6 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 if str(ROOT) not in sys.path:  # MkDocs loads this file by its path
     sys.path.insert(0, str(ROOT))
 
+# After the path is set.
 from docs.website import gallery  # noqa: E402
 from docs.website.formulas import FormulaError, with_mathml  # noqa: E402
 from docs.website.navigation import expanded  # noqa: E402

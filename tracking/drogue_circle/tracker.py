@@ -36,9 +36,8 @@ _CORRELATED_PX = 3.5  # length of rim that counts as one point, see `rim_fit`
 # textured ones of 27 px .3 px, of the round outlines of clouds, fields and waves .5 to .8 px at 9 to 19 px. Crowns of
 # trees and shreds of cloud of 8 to 10 px have .03 to .037 of the seen radius (times the coverage), targets of 8 to
 # 22 px .01 to .023.
-_LARGEST_RMS = 0.012, 0.15
-_LARGEST_SHARE = 0.026  # of the seen radius
-_START_RMS = 0.05, 0.35  # as _LARGEST_RMS before `_best_near`: a mixture of rims has larger ones
+_LARGEST_RMS = 0.012, 0.15, 0.026  # the last one a share of the seen radius
+_START_RMS = 0.05, 0.35, np.inf  # the same before `_best_near`: a mixture of rims has larger ones
 _EDGE_SHARE = 0.6  # score of another edge of a target, as a share of the best one's
 _THIN, _OPENING = 0.85, 0.9  # radii of the inner edge of a thin rim and of an opening, as shares of the outer edge's
 _REACH, _MOST_EDGES = 3.2, 10  # of the search for other edges: radii, and number
@@ -161,7 +160,7 @@ def _fitted(
         window = Window(c.u_px, c.v_px, half, p.gate_px, p.min_radius_px, 2 * c.radius_px)
         crop = smooth_crop(picture, window, p.blur_px)
         fit = fit_rim(crop, c, p.acquire_coverage)
-        if fit is not None and is_certain(fit, at_start=True):
+        if fit is not None and is_certain(fit, _START_RMS):
             fit = _best_near(crop, fit, p)
         largest = p.max_radius_px or 0.5 * max(picture.shape[:2])
         if (
@@ -200,15 +199,12 @@ def _clean_share(fit: RimFit) -> float:
     return fit.coverage * erf(near / (np.sqrt(2) * max(fit.rms_px, 1e-3)))
 
 
-def is_certain(fit: RimFit, at_start: bool = False) -> bool:
+def is_certain(fit: RimFit, largest_rms: tuple[float, float, float] = _LARGEST_RMS) -> bool:
     """Whether a rim has enough precise edge points that texture does not imitate it."""
-    radius = fit.rim.radius_px
-    share, px = _START_RMS if at_start else _LARGEST_RMS
+    (share, px, seen_share), radius = largest_rms, fit.rim.radius_px
     seen_px = fit.coverage * radius
-    is_round = at_start or fit.rms_px <= _LARGEST_SHARE * seen_px
-    return bool(
-        is_round and 2 * np.pi * seen_px / _CORRELATED_PX >= _LEAST_POINTS and fit.rms_px <= share * radius + px
-    )
+    largest = min(share * radius + px, seen_share * seen_px)
+    return bool(2 * np.pi * seen_px / _CORRELATED_PX >= _LEAST_POINTS and fit.rms_px <= largest)
 
 
 def _may_be(c: CircleCandidate, wanted: Wanted) -> bool:

@@ -21,6 +21,7 @@ from lab.runs.verdict.score import (
     _returns,
     against_truth,
     differenced,
+    measured_errors,
     normalised_squares,
     read_tables,
     read_truth,
@@ -78,6 +79,13 @@ def test_poses_with_correct_covariances_have_a_mean_nees_of_six(quiet):
     low, high = block["nees_mean_95"]
     assert low < block["nees_mean"] < high
     assert low < 6 < high
+
+
+def test_the_errors_of_measured_poses_are_those_that_the_score_counts(eventful):
+    delta, covariance = measured_errors(eventful.results, eventful.run_folder)
+    measured = score(eventful.results, eventful.run_folder)["pose"]["measured"]
+    assert len(delta) == len(covariance) == measured["rows"]
+    assert np.mean(normalised_squares(delta, covariance)) == pytest.approx(measured["nees_mean"])
 
 
 def test_half_the_stated_covariance_doubles_the_nees(quiet):

@@ -88,11 +88,11 @@ def branch(
         if old.log_weight[h] < -PRUNE_NATS:
             continue
         p_visible = predict(old.p_visible[h], n) if dt > 0.0 else old.p_visible[h]
-        suspected = False
-        for manoeuvre in (False, True):
-            if suspected or not manoeuvre:
-                seen = after_jump if manoeuvre else obs
-                count, best, suspected = _branch_motion(seen, step, h, manoeuvre, p_visible, children, count, best)
+        for manoeuvre in (False, True):  # one call, since the function is compiled into this place
+            seen = after_jump if manoeuvre else obs
+            count, best, suspected = _branch_motion(seen, step, h, manoeuvre, p_visible, children, count, best)
+            if not suspected:
+                break
     return children, count
 
 
