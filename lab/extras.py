@@ -9,7 +9,6 @@ from lab.errors import InputError
 
 PACKAGES = {
     "c3d": ("ezc3d", "ezc3d"),
-    "cluster": ("distributed", "distributed"),
     "genicam": ("harvesters", "harvesters"),
     "hdf5": ("h5py", "h5py"),
     "lsl": ("pylsl", "pylsl"),

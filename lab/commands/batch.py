@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-from click.core import ParameterSource
 
 from lab.commands.common import (
     ANY_PATH,
@@ -46,11 +45,6 @@ def _shard(ctx: click.Context, parameter: click.Parameter, value: str | None) ->
 @click.option("--list", "lists", multiple=True, type=ANY_PATH, help="A text file with a run per line; - is stdin.")
 @click.option("--out", required=True, type=FOLDER, help="Gets one folder per run, batch.csv and index.html.")
 @click.option("--jobs", default=1, show_default=True, type=click.IntRange(1, 1024), help="Processes at the same time.")
-@click.option(
-    "--dask",
-    metavar="ADDRESS",
-    help="Process the runs on this Dask cluster: its scheduler's address, or the scheduler's file (needs distributed).",
-)
 @click.option("--force", is_flag=True, help="Process all runs again, also those that are done.")
 @click.option("--shard", metavar="I/N", callback=_shard, help="Only the I-th of N parts of the runs, for array jobs.")
 @click.option("--full-hash", is_flag=True, help="Compare all bytes of pictures and videos with --out, not samples.")
@@ -77,8 +71,8 @@ def batch(
 
     RUN is a run folder, a pattern such as 'data/*/run-*', or @FILE, a text file with a run per line. A run whose
     results in --out have the same inputs, settings, calibration and version is skipped: after an interruption, the
-    same command continues. Several batches may use one --out. The workers of a Dask cluster must see the folders under
-    the same paths as this computer, and have the same versions installed.
+    same command continues. Several batches may use one --out: on a cluster, start one with --shard I/N on each
+    computer.
 
     \b
     Example:
@@ -86,8 +80,6 @@ def batch(
     """
     if not runs and not lists:
         raise click.UsageError("Missing argument 'RUN...'.", ctx)
-    if chosen["dask"] is not None and ctx.get_parameter_source("jobs") is ParameterSource.COMMANDLINE:
-        raise click.UsageError("expected --jobs or --dask, got both", ctx)
     check_verbosity(verbose=verbose, quiet=quiet)
     from lab.runs.batch.batch import BatchOptions, process_batch
     from lab.runs.batch.task import shard_of

@@ -12,7 +12,7 @@ from tests.test_architecture import FLOORS, foreign_packages
 
 # Libraries without influence on numbers: the command line, reports, and reading of settings.
 WITHOUT_NUMBERS = {
-    *("click", "contourpy", "distributed", "filelock", "fpdf", "jinja2", "libusb_package", "markupsafe"),
+    *("click", "contourpy", "filelock", "fpdf", "jinja2", "libusb_package", "markupsafe"),
     *("ezc3d", "h5py", "harvesters", "mcap", "pyarrow", "pylsl", "rosbags", "zmq"),
     *("pydantic", "pydantic_core", "rich", "torch", "yaml"),
 }

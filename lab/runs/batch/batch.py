@@ -238,7 +238,6 @@ class BatchOptions:
     shard: tuple[int, int] = (1, 1)  # (i, n): the i-th of n parts of the runs
     full_hash: bool = False  # large files are read completely for the fingerprint
     parquet: bool = False  # also write Parquet data sets of attitudes and spots
-    dask: str | None = None  # address of a Dask cluster that processes the runs, in place of processes
     provenance: Mapping[str, Any] | None = None  # added to every summary.json, such as the command line
 
 
@@ -296,7 +295,7 @@ def process_batch(
     rows: dict[str, Mapping[str, Any]] = {}
     skipped = 0
     progress(0, 0, len(mine))
-    with _outcomes(mine, out, options, report) as outcomes, _written(table) as add:
+    with contextlib.closing(_outcomes(mine, options.jobs)) as outcomes, _written(table) as add:
         for task, ended in outcomes:
             outcome = concluded(task, ended)
             rows[task.place] = outcome.row
@@ -354,28 +353,13 @@ def _tasks(folders: Sequence[Path], out: Path, options: BatchOptions) -> list[Ta
     ]
 
 
-@contextlib.contextmanager
-def _outcomes(
-    tasks: Sequence[Task], out: Path, options: BatchOptions, report: Callable[[str], None]
-) -> Iterator[Iterator[tuple[Task, TaskOutcome]]]:
-    """The tasks with their outcomes, as they end: in this process, in others, or on a cluster."""
-    with contextlib.ExitStack() as stack:
-        if options.dask is not None:
-            from lab.runs.batch.cluster import connected
-
-            cluster = stack.enter_context(connected(options.dask, out))
-            if note := cluster.check(tasks):
-                report(f"note: {note}")
-            outcomes = cluster.performed(tasks)
-        elif options.jobs is None or len(tasks) <= 1:
-            outcomes = ((task, perform(task)) for task in tasks)
-        else:
-            outcomes = _by_processes(tasks, min(options.jobs, len(tasks)))
-        yield stack.enter_context(contextlib.closing(outcomes))
-
-
-def _by_processes(tasks: Sequence[Task], jobs: int) -> Generator[tuple[Task, TaskOutcome], None, None]:
-    with contextlib.closing(performed(tasks, perform, jobs)) as results:
+def _outcomes(tasks: Sequence[Task], jobs: int | None) -> Generator[tuple[Task, TaskOutcome], None, None]:
+    """The tasks with their outcomes, as they end: in this process, or in `jobs` others."""
+    if jobs is None or len(tasks) <= 1:
+        for task in tasks:
+            yield task, perform(task)
+        return
+    with contextlib.closing(performed(tasks, perform, min(jobs, len(tasks)))) as results:
         for task, outcome in results:
             died = "the process ended without a result: it was killed, or ran out of memory, or a library crashed"
             yield task, outcome or TaskOutcome(failed_row(task, died))

@@ -25,7 +25,6 @@ from typing import Any
 from urllib.parse import quote
 
 from lab.errors import BeamposeError, InputError, RunError
-from lab.files.output.part_folder import FolderInUseError
 from lab.files.run.fingerprints import fingerprints
 from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_text
@@ -233,7 +232,6 @@ COLUMNS = (
     "results", "message", "report",
 )  # fmt: skip
 REPORT = "report.html"  # in a result folder
-_WAITING_S = 1.0  # between two attempts
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,7 +246,6 @@ class Task:
     force: bool = False  # process although results exist
     full_hash: bool = False
     provenance: Mapping[str, Any] = field(default_factory=dict)  # added to summary.json
-    patience_s: float = 0.0  # for the end of another process that writes to the result folder
 
     @property
     def place(self) -> str:
@@ -310,20 +307,10 @@ def perform(task: Task) -> TaskOutcome:
 
 
 def _processed(task: Task, more: Callable[[Run], Mapping[str, Any]]) -> dict[str, Any]:
-    """The row of a processed run; waits while another process writes to its result folder. Raises as `process_run`."""
-    waited = 0.0
-    while True:
-        try:
-            started = time.perf_counter()
-            outcome = process_run(
-                task.folder, task.out / task.results, overrides=task.overrides, causal=task.causal, more=more
-            )
-            return {**_row(task, outcome.summary), "seconds": round(time.perf_counter() - started, 3)}
-        except FolderInUseError:
-            if waited >= task.patience_s:
-                raise
-            time.sleep(_WAITING_S)
-            waited += _WAITING_S
+    """The row of a processed run. Raises as `process_run`."""
+    started = time.perf_counter()
+    outcome = process_run(task.folder, task.out / task.results, overrides=task.overrides, causal=task.causal, more=more)
+    return {**_row(task, outcome.summary), "seconds": round(time.perf_counter() - started, 3)}
 
 
 def failed_row(task: Task, message: str, exit_status: int = RunError.exit_status) -> dict[str, Any]:

@@ -103,7 +103,6 @@ def test_files_of_users_are_read_through_the_helpers_that_refuse_pipes():
         "setup/doctor.py",
         "files/project/point_files.py",
         "setup/init.py",
-        "runs/batch/cluster.py",
         "runs/batch/task.py",
     }
     found = {
