@@ -14,7 +14,7 @@ import numpy as np
 import geometry
 from geometry.compilation.compile_cache import cache_folder, is_empty
 from lab.errors import InputError
-from lab.files.rig.calibration_state import CalibrationState, iso_date
+from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.camera_file import load_camera
 from lab.files.rig.rig_file import load_rig_file
 from lab.files.rig.screens_file import load_screens
@@ -204,25 +204,16 @@ def _state_of(path: Path) -> CalibrationState | None:
         return load_run(path).calibration
     schema = str(read_mapping(path).get("schema", ""))
     if schema.startswith("beampose/camera/"):
-        return _state_of_camera(path)
+        return load_camera(path).calibration
     return load_screens(path).calibration if schema.startswith("beampose/screens/") else load_rig_file(path).calibration
-
-
-def _state_of_camera(path: Path) -> CalibrationState | None:
-    known = load_camera(path).calibration
-    if known is None or not known.date:
-        return None
-    return CalibrationState(
-        date=iso_date(known.date), verdict=known.verdict or "PASS", valid_until=known.last_day, reasons=known.reasons
-    )
 
 
 def _judged(state: CalibrationState | None, today: datetime.date) -> tuple[Level, str, str]:
     """Level, words and remedy of a calibration."""
-    if state is None:
+    if state is None or state.date is None:
         return Level.WARN, " states no date of calibration", _AGAIN
     days, left = (today - state.date).days, state.days_left(today)
-    text = f": {state.verdict}, {days} days old"
+    text = f": {state.verdict or Level.PASS.name}, {days} days old"
     if state.failed:
         return Level.FAIL, text + state.reason, "Correct the cause and calibrate again"
     if days < 0:
@@ -235,7 +226,7 @@ def _judged(state: CalibrationState | None, today: datetime.date) -> tuple[Level
         return Level.WARN, text, _AGAIN
     if left is not None and left <= EXPIRES_SOON:
         return Level.WARN, f"{text}, in {left} days", _AGAIN
-    if state.verdict != "PASS":
+    if state.verdict == Level.WARN.name:
         return Level.WARN, text + state.reason, "Read the report beside the file before using it"
     return Level.PASS, text, ""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import inspect
 import json
@@ -87,12 +88,12 @@ def schema_of_block(block: type[Block], commented: type | None = None) -> Schema
 
 
 def comments_of(cls: type) -> dict[str, str]:
-    """The comments behind the fields of a class, by field; empty without its source."""
-    try:
-        source = textwrap.dedent(inspect.getsource(cls))
-    except (OSError, TypeError):
-        return {}
-    return dict(_COMMENT.findall(source))
+    """The comments behind the fields of a class and of those that it extends, by field; empty without their source."""
+    found: dict[str, str] = {}
+    for one in reversed(cls.__mro__):
+        with contextlib.suppress(OSError, TypeError):
+            found.update(_COMMENT.findall(textwrap.dedent(inspect.getsource(one))))
+    return found
 
 
 def _of_field(field: pydantic.fields.FieldInfo) -> Schema:

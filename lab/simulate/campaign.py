@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -27,7 +28,8 @@ from lab.errors import InputError
 from lab.files.project.point_files import POINTS, POSE_SIGMAS, SURVEY, SURVEY_SIGMAS
 from lab.files.project.project import SCHEMA
 from lab.files.rig.board_file import save_board
-from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
+from lab.files.rig.calibration_state import CameraCalibration
+from lab.files.rig.camera_file import CameraFile, save_camera
 from lab.files.rig.pose_block import pose_mapping
 from lab.files.rig.rig_file import RigFile, as_mapping, load_rig, save_rig
 from lab.files.text import columns
@@ -421,7 +423,7 @@ def _project(c: Campaign) -> dict[str, Any]:
 def _camera_file(name: str, lens: LensDraw) -> CameraFile:
     c = lens.camera
     covariance = RigCovariance(lens.names, lens.covariance)
-    state = CameraCalibration(date=_DATE, verdict="PASS", notes="simulated")
+    state = CameraCalibration(date=datetime.date.fromisoformat(_DATE), verdict="PASS", notes="simulated")
     return CameraFile(name, c.image_size_px, c.matrix, c.distortion, c.lens, covariance, state)
 
 

@@ -28,7 +28,8 @@ from lab.calibrate.camera.photos import TABLE_SUFFIXES, PhotoSet, find_in_photos
 from lab.calibrate.step import Solved, Step, run_step
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.board_file import load_board_or_text
-from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
+from lab.files.rig.calibration_state import CameraCalibration
+from lab.files.rig.camera_file import CameraFile, save_camera
 from lab.files.text.csv_text import write_table
 from lab.files.text.error_text import suggest_name
 from lab.findings.finding import Finding, Level, verdict
@@ -115,7 +116,7 @@ def _solve(
         raise CalibrationError(f"{options.name} ({found.line()}): {error}") from None
     findings = findings_of(r)
     failed = verdict(findings) is Level.FAIL
-    until = "" if options.valid_days is None or failed else (day + datetime.timedelta(options.valid_days)).isoformat()
+    until = None if options.valid_days is None or failed else day + datetime.timedelta(options.valid_days)
     file = camera_file(r, found.board.describe(), findings, options.name, day, until)
 
     def write(folder: Path) -> None:
@@ -130,7 +131,7 @@ def _solve(
         figures=f"fx {r.fit.lens[0]:.2f} ± {format_number(r.sigmas[0], 2)} px, {r.model.words}, RMS {r.rms_px:.3f} px,"
         f" directions to {format_number(px, 2)} px / {format_number(mm, 2)} mm at {r.distance_m:.3g} m",
         write=write,
-        page=lambda: page_of(r, found, "must not be used" if failed else until),
+        page=lambda: page_of(r, found, "must not be used" if failed else str(until or "")),
         day=day,
         inputs=list(dict.fromkeys(found.paths[name] for name, _ in found.views)),
         title=f"{options.name}, {r.table.image_size_px[0]} x {r.table.image_size_px[1]} px",
@@ -164,11 +165,16 @@ def corner_table(photos: PhotoSet) -> CornerTable:
 
 
 def camera_file(
-    r: Intrinsics, board: str, findings: Sequence[Finding], name: str, day: datetime.date, valid_until: str
+    r: Intrinsics,
+    board: str,
+    findings: Sequence[Finding],
+    name: str,
+    day: datetime.date,
+    valid_until: datetime.date | None,
 ) -> CameraFile:
-    """The content of camera.yaml. board: in words; valid_until: ISO date, or empty."""
+    """The content of camera.yaml. board: in words."""
     calibration = CameraCalibration(
-        date=day.isoformat(),
+        date=day,
         verdict=verdict(findings).name,
         rms_px=r.rms_px,
         sigma_px=r.fit.sigma_px,

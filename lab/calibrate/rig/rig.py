@@ -247,11 +247,10 @@ def _lens_findings(project: Project, day: datetime.date) -> list[Finding]:
     out = []
     for name, camera in project.cameras.items():
         state, file = camera.lens.calibration, camera.lens_path.name
-        if state is not None and state.verdict == "FAIL":
-            why = f": {state.reasons[0]}" if state.reasons else ""
-            what = f"camera {name!r}: the lens calibration {file} has the verdict FAIL{why}"
+        if state is not None and state.failed:
+            what = f"camera {name!r}: the lens calibration {file} has the verdict FAIL{state.reason}"
             out.append(finding("BP-K04", Level.FAIL, what))
-        if state is not None and state.last_day is not None and state.last_day < day:
+        if state is not None and (state.days_left(day) or 0) < 0:
             what = f"camera {name!r}: the lens calibration {file} expired on {state.valid_until}"
             out.append(finding("BP-K05", Level.WARN, what))
         if camera.lens.covariance is None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import pydantic
 
 from lab.errors import CalibrationError
-from lab.files.text.fields import Block, Lines, Text, one_of, unexpected_value
+from lab.files.text.fields import Block, Integer, Lines, NonNegative, Number, Positive, Text, one_of, unexpected_value
 
 VERDICTS = ("PASS", "WARN", "FAIL")
 
@@ -30,17 +30,12 @@ def _day_or_none(value: Any) -> datetime.date | None:
     return None if value in (None, "") else iso_date(value)
 
 
-def _text_of_day(value: Any) -> str:
-    return "" if value in (None, "") or not iso_date(value) else str(value)
-
-
-DayText = Annotated[str, pydantic.PlainValidator(_text_of_day)]  # kept as written, with a time if it has one
 Day = Annotated[datetime.date, pydantic.PlainValidator(iso_date)]
 OptionalDay = Annotated[datetime.date | None, pydantic.PlainValidator(_day_or_none)]
 
 
 class CalibrationState(Block):
-    """Date, verdict and validity of a calibration: the block `calibration:` of a rig.yaml."""
+    """Date, verdict and validity of a calibration: the block `calibration:` of a file."""
 
     date: Day
     verdict: Annotated[str, pydantic.PlainValidator(one_of(VERDICTS))]
@@ -67,6 +62,21 @@ class CalibrationState(Block):
     def reason(self) -> str:
         """The first reason of the verdict, such as ` (RMS 3 px)`; empty without one."""
         return f" ({self.reasons[0]})" if self.reasons else ""
+
+
+class CameraCalibration(CalibrationState):
+    """The state of a lens calibration with its quality: the block of a camera.yaml. All of it may be unknown."""
+
+    date: OptionalDay = None  # type: ignore[assignment]
+    verdict: Annotated[str, pydantic.PlainValidator(one_of((*VERDICTS, "")))] = ""
+    rms_px: NonNegative | None = None  # of the corners' residuals, per axis
+    sigma_px: NonNegative | None = None  # of one corner's coordinate, estimated by the solve
+    hold_out_rms_px: NonNegative | None = None  # of corners not used by the solve
+    views: Integer | None = None  # photographs used
+    corners: Integer | None = None  # corners used
+    board: Text = ""  # description of the board, or its file
+    distance_m: Positive | None = None  # distance for figures in millimetres
+    figures: dict[str, Number] = {}  # noqa: RUF012 - frozen  # further figures, with their unit in the name
 
 
 def require_valid_calibration(

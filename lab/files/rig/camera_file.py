@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,37 +12,13 @@ from geometry.arrays import Array
 from geometry.camera import PERSPECTIVE, Camera
 from geometry.pose import Pose
 from geometry.uncertainty.rig_uncertainty import PINHOLE, RigCovariance, distortion_names
-from lab.files.rig.calibration_state import VERDICTS, DayText, iso_date
+from lab.files.rig.calibration_state import CameraCalibration
 from lab.files.rig.camera_block import CovarianceBlock, LensBlock, covariance_error, covariance_mapping, lens_mapping
 from lab.files.text import fields
 from lab.files.text.error_text import suggest_name
 from lab.files.text.yaml_text import read_mapping, write_mapping
 
 SCHEMA = "beampose/camera/1"
-
-
-class CameraCalibration(fields.Block):
-    """Origin and quality of a camera's calibration. Unknown values are None or empty."""
-
-    date: DayText = ""  # ISO 8601: 2026-03-14, with a time if wanted
-    # PASS, WARN or FAIL; empty without a verdict, such as for converted cameras
-    verdict: Annotated[str, pydantic.PlainValidator(fields.one_of((*VERDICTS, "")))] = ""
-    rms_px: fields.NonNegative | None = None  # of the corners' residuals, per axis
-    sigma_px: fields.NonNegative | None = None  # of one corner's coordinate, estimated by the solve
-    hold_out_rms_px: fields.NonNegative | None = None  # of corners not used by the solve
-    views: fields.Integer | None = None  # photographs used
-    corners: fields.Integer | None = None  # corners used
-    board: fields.Text = ""  # description of the board, or its file
-    distance_m: fields.Positive | None = None  # distance for figures in millimetres
-    valid_until: DayText = ""  # ISO 8601; empty: no limit
-    reasons: fields.Lines = ()  # a line for each finding that is not a PASS
-    figures: dict[str, fields.Number] = {}  # noqa: RUF012 - frozen  # further figures, with their unit in the name
-    notes: fields.Text = ""
-
-    @property
-    def last_day(self) -> datetime.date | None:
-        """The last valid day; None: no limit."""
-        return iso_date(self.valid_until) if self.valid_until else None
 
 
 @dataclass(frozen=True, slots=True)

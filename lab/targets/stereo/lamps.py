@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from geometry.uncertainty.rig_uncertainty import RigCovariance
-from lab.errors import CalibrationError, InputError
+from lab.errors import InputError
 from lab.files.project.project import load_lens
+from lab.files.rig.calibration_state import require_valid_calibration
 from lab.files.rig.camera_file import CameraFile
 from lab.files.text import columns
 from lab.findings.finding import Finding, Level, finding, level_above
@@ -71,13 +72,7 @@ class LampsOptions(TrackOptions):
         if self.detector not in DETECTORS:
             raise InputError(f"--detector: expected one of {', '.join(DETECTORS)}, got {self.detector!r}")
         lens = load_lens(self.camera, self.camera_name)
-        state = lens.calibration
-        if state is not None and state.verdict == "FAIL":
-            raise CalibrationError(f"{self.camera}: calibration.verdict: FAIL: this calibration must not be used")
-        if state is not None and state.last_day is not None and state.last_day < datetime.date.today():
-            raise CalibrationError(
-                f"{self.camera}: calibration.valid_until: {state.valid_until} is past: calibrate the camera again"
-            )
+        require_valid_calibration(lens.calibration, self.camera, datetime.date.today())
         return lens
 
 

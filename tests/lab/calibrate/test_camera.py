@@ -63,8 +63,8 @@ def test_camera_yaml_reads_back_and_states_its_uncertainty(left):
     np.testing.assert_allclose(file.covariance.matrix, left.result.covariance, rtol=1e-12)
     assert file.calibration is not None
     assert file.calibration.verdict == left.level.name == "WARN"
-    assert file.calibration.date == "2026-03-14"
-    assert file.calibration.valid_until == "2026-04-13"
+    assert str(file.calibration.date) == "2026-03-14"
+    assert str(file.calibration.valid_until) == "2026-04-13"
     assert file.calibration.views == 7
     assert file.calibration.distance_m == 2.0
     assert any("7 photographs" in reason for reason in file.calibration.reasons)

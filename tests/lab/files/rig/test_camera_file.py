@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import datetime
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +11,8 @@ from hypothesis import strategies as st
 
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
-from lab.files.rig.camera_file import CameraCalibration, CameraFile, load_camera, save_camera
+from lab.files.rig.calibration_state import CameraCalibration
+from lab.files.rig.camera_file import CameraFile, load_camera, save_camera
 from lab.files.rig.rig_file import load_rig, save_rig
 from tests.lab.run_folders import RIG
 
@@ -40,7 +43,7 @@ def test_a_camera_has_the_values_of_its_file(tmp_path):
     assert camera.covariance.names == ("fx", "fy", "k1")
     assert camera.covariance.matrix[2, 2] == 1e-8
     assert camera.calibration == CameraCalibration(
-        date="2026-03-14", verdict="PASS", rms_px=0.15, views=24, corners=1800, board="chessboard 9x6"
+        date=datetime.date(2026, 3, 14), verdict="PASS", rms_px=0.15, views=24, corners=1800, board="chessboard 9x6"
     )
 
 
@@ -78,7 +81,7 @@ def test_saving_and_loading_changes_no_bit(seed, count, judged, tmp_path_factory
         camera.lens,
         RigCovariance(names, (covariance + covariance.T) / 2),
         CameraCalibration(
-            date="2026-01-02T03:04:05", verdict="WARN", rms_px=rng.uniform(), sigma_px=rng.uniform(), views=7,
+            date=datetime.date(2026, 1, 2), verdict="WARN", rms_px=rng.uniform(), sigma_px=rng.uniform(), views=7,
             corners=99, board="on: 1e3", distance_m=2.5, reasons=("too few: 3", "- tilt"),
             figures={"focal_sigma_px": rng.uniform()}, notes="#1",
         ) if judged else None,
