@@ -11,10 +11,8 @@ writes the recording of a sight, to try the commands on.
 from __future__ import annotations
 
 import hashlib
-import html
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -39,10 +37,6 @@ TABLE = Path(__file__).with_name("sights.toml")
 BUILD = ROOT / "build" / "gallery"
 SOURCES = ("geometry", "tracking", "calibration", "lab", "docs/website")
 WORKERS = 2
-_FINDING = re.compile(  # of a calibration's report, where a finding that is not a PASS has its code
-    r'<li><span class="badge (?P<level>\w+)">[^<]*</span><div><p>(?P<what>.*?)'
-    r'(?: <span class="soft">(?P<code>BP-\w+)</span>)?</p>\s*(?:<p class="soft">Why it matters: (?P<why>.*?)</p>)?'
-)
 _PANEL_PX = (400, 320)  # width and height of one of the two pictures
 _GAP_PX = 8
 
@@ -148,18 +142,10 @@ def execute(command: str, run: str, folder: Path) -> Printed:
 
 def _evidence(results: Path) -> list[dict[str, Any]]:
     """The findings of the results that are not a PASS: level, code, what, why."""
-    summary = results / "summary.json"
     if not results.is_dir():
         return []
-    if summary.is_file():
-        evidence: list[dict[str, Any]] = json.loads(summary.read_text(encoding="utf-8"))["verdict"]["evidence"]
-        return [e for e in evidence if e["level"] != "pass"]
-    report = (results / "report.html").read_text(encoding="utf-8")  # calibrations state their findings only there
-    found = [
-        {k: html.unescape(re.sub("<[^>]*>", "", v or "")) for k, v in m.groupdict().items()}
-        for m in _FINDING.finditer(report)
-    ]
-    return [e for e in found if e["code"]]
+    summary = json.loads((results / "summary.json").read_text(encoding="utf-8"))
+    return [e for e in summary["verdict"]["evidence"] if e["level"] != "pass"]
 
 
 def _cost(work: Path, usual: Path) -> list[str]:
@@ -203,9 +189,9 @@ def page(
         status = f"  # exit status {p.status}" if p.status else ""
         lines += ["```console", f"$ {p.command}{status}", *_shown(p.output), "```", ""]
     for e in (e for e in evidence if e["code"] in sight.named):
-        code = str(e["code"])
+        code, word = str(e["code"]), e["level"].upper()
         lines += [
-            f"The report, {e['level'].upper()}, [{code}](../reference/codes.md#{code.lower()}) "
+            f"The report, {word if sight.board is None else word.replace('CHECK', 'WARN')}, [{code}](../reference/codes.md#{code.lower()}) "
             f"{cell(ENTRIES[code].title.lower())}:", "",
             *(f"> {cell(sentence(e[part]))}\n>" for part in ("what", "why") if e[part]), "",
         ]  # fmt: skip

@@ -1,27 +1,30 @@
 """The steps of `beampose calibrate`: each solves and says what it writes; one runner does what all have in common.
 
-The runner checks the folder, solves, judges by the findings, keeps earlier good results, and writes files and page.
+The runner checks the folder, solves, judges by the findings, keeps earlier good results, and writes files, summary.json
+and page.
 """
 
 from __future__ import annotations
 
 import datetime
-import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project
+from lab.files.run.fingerprints import fingerprints_of
 from lab.files.text.atomic_write import atomic_folder, check_output_folder, earlier_results, keep_good_results
-from lab.files.text.json_text import bytes_of_file
-from lab.findings.finding import Finding, Level, finding, first_sentence, verdict
+from lab.files.text.json_text import write_json
+from lab.findings.finding import Finding, Level, finding, first_sentence, verdict, worst_first
 from lab.findings.outcome import Outcome, Verdict
 from lab.report.page import KeyFigure, Page, Section, made_with, write_page
 from lab.report.page import Verdict as PageVerdict
+from lab.versions import versions
 
 R = TypeVar("R")
+SCHEMA = "beampose/calibration-summary/1"  # of summary.json
 _SENTENCES = (
     "The result may be used.",
     "The result may be used; note the warnings below.",
@@ -66,7 +69,7 @@ def _said(solved: Solved[R], level: Level) -> str:
 
 
 def run_step(step: Step, out: Path, solve: Callable[[], Solved[R]]) -> Outcome[R]:
-    """Solve a step and write its files and report.html into the folder `out`, all or none.
+    """Solve a step and write its files, summary.json and report.html into the folder `out`, all or none.
 
     A FAIL never replaces an earlier usable result: it goes to `OUT-failed`.
 
@@ -79,32 +82,44 @@ def run_step(step: Step, out: Path, solve: Callable[[], Solved[R]]) -> Outcome[R
     level = verdict(solved.findings)
     folder = keep_good_results(out, level is Level.FAIL, step.good) if step.good else Path(out)
     key_figures, sections = solved.page()
+    inputs = fingerprints_of_inputs(solved.inputs)
     judgement = PageVerdict(level, step.sentences[level], solved.findings, ("PASS", "WARN", "FAIL"))
     page = Page(
         f"calibration · {step.kind}", solved.title or solved.name, f"{solved.day.isoformat()} · {judgement.counted}",
-        sections, key_figures, made=made_of(solved.inputs, solved.day), verdict=judgement,
+        sections, key_figures, made=made_of(solved.day, inputs), verdict=judgement,
     )  # fmt: skip
+    judged = Verdict(worst_first(solved.findings))
+    said = _said(solved, level)
+    outcome = Outcome(solved.name, folder, judged, solved.result, said, failed_status=step.failed_status)
+    summary = {
+        "schema": SCHEMA,
+        "kind": step.kind,
+        "name": solved.name,
+        "date": solved.day.isoformat(),
+        "verdict": {**judged.as_mapping(), "exit_status": outcome.exit_status},
+        "versions": versions(),
+        "inputs": inputs,
+    }
     with atomic_folder(folder, own) as work:
         solved.write(work)
+        write_json(summary, work / "summary.json")
         write_page(page, work)
-    judged = Verdict(solved.findings)
-    return Outcome(solved.name, folder, judged, solved.result, _said(solved, level), failed_status=step.failed_status)
+    return outcome
 
 
-def made_of(inputs: Sequence[Path], day: datetime.date) -> list[tuple[str, str]]:
-    """The date, the version of the program and the SHA-256 of the input files.
+def fingerprints_of_inputs(inputs: Sequence[Path]) -> list[dict[str, Any]]:
+    """Path, SHA-256 and size of the input files. Raises InputError for one that cannot be read."""
+    try:
+        return fingerprints_of(inputs, ())
+    except OSError as error:
+        raise InputError(f"{error.filename}: cannot be read: {error.strerror}") from None
 
-    Raises:
-        InputError: for an input that cannot be read.
-    """
-    lines = [("date", day.isoformat()), made_with()]
-    for path in inputs:
-        try:
-            digest = hashlib.sha256(bytes_of_file(Path(path))).hexdigest()
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-        lines.append(("" if len(lines) > 2 else "inputs", f"{Path(path).name}  sha256 {digest[:16]}"))
-    return lines
+
+def made_of(day: datetime.date, inputs: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """The date, the version of the program and the SHA-256 of the input files, for the report."""
+    lines = [f"{Path(i['path']).name}  sha256 {i['sha256'][:16]}" for i in inputs]
+    named = zip(("inputs", *[""] * len(lines)), lines, strict=False)
+    return [("date", day.isoformat()), made_with(), *named]
 
 
 # Date of a calibration and end of its validity.

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from lab.files.run.run_file import FramesFolder, LiveDevice, Run
+from lab.files.run.run_file import LiveDevice, Run
 
 MAX_HASHED_BYTES = 64 * 2**20  # bytes: larger files (videos) are sampled: this many bytes and the size
 MAX_PICTURE_BYTES = 64 * 2**10  # bytes: larger pictures of a folder are sampled in the same way
@@ -27,14 +27,8 @@ def fingerprints(run: Run, full: bool = False) -> list[dict[str, Any]]:
     """
     files = [run.path, run.rig_path, *run.times_paths]
     files += [p for p in (run.folder / "truth" / name for name in ("pose.csv", "spots.csv")) if p.is_file()]
-    out = [_of_file(f, full) for f in files]
-    done: set[Path] = set()
-    for source in run.cameras.values():
-        if isinstance(source, LiveDevice) or source.path in done:
-            continue
-        done.add(source.path)
-        out.append(_of_folder(source.path, full) if isinstance(source, FramesFolder) else _of_file(source.path, full))
-    return out
+    sources = [s.path for s in run.cameras.values() if not isinstance(s, LiveDevice)]
+    return fingerprints_of(files, sources, full)
 
 
 def fingerprints_of(files: Iterable[Path], sources: Iterable[Path], full: bool = False) -> list[dict[str, Any]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import datetime
+import json
 
 import cv2
 import numpy as np
@@ -51,8 +52,20 @@ def test_real_photographs_give_the_published_focal_length_within_two_sigmas(left
     assert left.result.rms_2d_px < 0.22
 
 
+def test_summary_json_states_the_findings_of_the_report_and_the_inputs(left):
+    summary = json.loads((left.out / "summary.json").read_text(encoding="utf-8"))
+    assert (summary["kind"], summary["verdict"]["status"], summary["verdict"]["exit_status"]) == ("camera", "check", 0)
+    levels = [e["level"] for e in summary["verdict"]["evidence"]]
+    assert levels == sorted(levels, key=["fail", "check", "pass"].index)
+    warned = [e for e in summary["verdict"]["evidence"] if e["level"] == "check"]
+    assert [e["what"] for e in warned] == [f.what for f in left.findings if f.level is Level.WARN] != []
+    report = (left.out / "report.html").read_text(encoding="utf-8")
+    assert all(e["code"] in report and e["remedy"] for e in warned)
+    assert len(summary["inputs"]) == 13
+
+
 def test_camera_yaml_reads_back_and_states_its_uncertainty(left):
-    assert sorted(p.name for p in left.out.iterdir()) == [CAMERA, CORNERS, "report.html"]
+    assert sorted(p.name for p in left.out.iterdir()) == [CAMERA, CORNERS, "report.html", "summary.json"]
     file = load_camera(left.out / CAMERA)
     assert file.name == "left"
     assert file.image_size_px == (640, 480)

@@ -60,7 +60,7 @@ def test_good_measurements_pass_and_the_line_states_the_uncertainty(outcome):
         r" -> .*/out$",
         outcome.line(),
     )
-    assert sorted(p.name for p in outcome.out.iterdir()) == ["report.html", "residuals.csv", "rig.yaml"]
+    assert sorted(p.name for p in outcome.out.iterdir()) == ["report.html", "residuals.csv", "rig.yaml", "summary.json"]
 
 
 def test_the_rig_file_states_date_expiry_and_verdict(outcome, project, tmp_path):

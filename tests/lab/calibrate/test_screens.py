@@ -66,7 +66,7 @@ def test_a_good_survey_passes_and_the_line_states_the_uncertainty(good):
     assert all("control points cover" in w for w in warnings), warnings
     assert outcome.exit_status == 0
     assert outcome.line().startswith(f"bay 3: {outcome.level.name}: 2 cameras, 2 screens, surfaces to 0.")
-    assert files_below(out) == ["dots.csv", "report.html", "residuals.csv", "rig.yaml", "screens.yaml"]
+    assert files_below(out) == ["dots.csv", "report.html", "residuals.csv", "rig.yaml", "screens.yaml", "summary.json"]
 
 
 def test_the_written_poses_are_near_the_truth_and_read_back_unchanged(good):
@@ -138,7 +138,7 @@ def test_a_rough_screen_fails_with_exit_status_3_and_no_yaml_is_written(tmp_path
     outcome = calibrate_screen(path, tmp_path / "out")
     assert outcome.level == Level.FAIL
     assert outcome.exit_status == 3
-    assert files_below(tmp_path / "out") == ["dots.csv", "report.html", "residuals.csv"]
+    assert files_below(tmp_path / "out") == ["dots.csv", "report.html", "residuals.csv", "summary.json"]
     assert "FAIL" in (tmp_path / "out" / "report.html").read_text()
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from geometry.pose import Pose
 from lab.calibrate.camera.camera_page import representative_views
-from lab.calibrate.step import made_of
+from lab.calibrate.step import fingerprints_of_inputs, made_of
 from lab.errors import InputError
 from lab.findings.finding import Finding, Level
 from lab.report.calibration import calibration_charts as charts
@@ -206,7 +206,7 @@ def test_the_representative_views_are_the_worst_the_median_and_the_best():
 def test_the_file_is_written_atomically_and_lists_its_inputs(tmp_path: Path):
     data = tmp_path / "photo.png"
     data.write_bytes(b"123")
-    made = made_of([data], datetime.date(2026, 5, 1))
+    made = made_of(datetime.date(2026, 5, 1), fingerprints_of_inputs([data]))
     path = write_page(Page("beams", "x", "", [], made=made), tmp_path)
     assert path == tmp_path / "report.html"
     text = path.read_text(encoding="utf-8")
@@ -215,7 +215,7 @@ def test_the_file_is_written_atomically_and_lists_its_inputs(tmp_path: Path):
     assert "2026-05-01" in text
     assert [p.name for p in tmp_path.iterdir() if p.name.endswith(".part")] == []
     with pytest.raises(InputError, match="cannot be read"):
-        made_of([tmp_path / "missing.png"], datetime.date(2026, 5, 1))
+        fingerprints_of_inputs([tmp_path / "missing.png"])
 
 
 def test_an_uneven_table_is_refused():
