@@ -1,4 +1,4 @@
-"""Loads Open3D, which reads and processes point clouds and draws scenes.
+"""Loads Open3D, which reads and processes point clouds.
 
 Only the commands that use it load it, because the import takes most of a second. On Linux its library needs libusb-1.0,
 which comes with the PyPI package libusb-package, and libraries of the graphics system, which a desktop has.

@@ -189,9 +189,10 @@ def page(
         status = f"  # exit status {p.status}" if p.status else ""
         lines += ["```console", f"$ {p.command}{status}", *_shown(p.output), "```", ""]
     for e in (e for e in evidence if e["code"] in sight.named):
-        code, word = str(e["code"]), e["level"].upper()
+        code = str(e["code"])
+        word = {"check": "CHECK" if sight.board is None else "WARN"}.get(e["level"], "FAIL")
         lines += [
-            f"The report, {word if sight.board is None else word.replace('CHECK', 'WARN')}, [{code}](../reference/codes.md#{code.lower()}) "
+            f"The report, {word}, [{code}](../reference/codes.md#{code.lower()}) "
             f"{cell(ENTRIES[code].title.lower())}:", "",
             *(f"> {cell(sentence(e[part]))}\n>" for part in ("what", "why") if e[part]), "",
         ]  # fmt: skip

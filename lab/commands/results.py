@@ -186,13 +186,13 @@ def view(path: Path, out: Path | None, frame: int | None, rig: Path | None, sigm
     """Show a rig.yaml, a run folder or results in three dimensions.
 
     Screens, cameras with their fields of view, beams, spots and the trajectory with sigma ellipsoids. Writes view.html
-    to turn and play in a browser, which opens where there is a display, scene.glb, scene.ply and pictures.
+    to turn and play in a browser, which opens where there is a display, and scene.glb for other programs.
 
     \b
     Example:
         beampose view sample_runs/huo2015 --out results/view
     """
-    from lab.results.view.view import show
+    from lab.results.view.page import show
 
     conclude(show(path, out, frame=frame, rig=rig, sigma_scale=sigma_scale))
 

@@ -158,9 +158,9 @@ def check_encoding(encoding: str) -> Finding:
 
 
 def check_point_clouds() -> Finding:
-    """open3d, which only clouds of points and 3-D views need."""
+    """open3d, which only clouds of points need."""
     if find_spec("open3d") is None:
-        return finding("BP-D12", Level.PASS, "open3d: not installed; only point clouds and 3-D views need it")
+        return finding("BP-D12", Level.PASS, "open3d: not installed; only point clouds need it")
     return finding("BP-D12", Level.PASS, f"open3d: {metadata.version(_open3d_package())}")
 
 

@@ -1,7 +1,13 @@
-"""view.html: the scene to turn and to play in a browser, and still drawings of it, in one file that works offline."""
+"""`beampose view`: view.html, the scene to turn and to play in a browser with still drawings, and scene.glb.
+
+view.html is one file that works offline; it opens in the browser where there is a display.
+"""
 
 from __future__ import annotations
 
+import os
+import sys
+import webbrowser
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +16,49 @@ from markupsafe import Markup
 
 from geometry.arrays import Array, Ints
 from geometry.forward_model import SpotModel
-from lab.files.text.atomic_write import atomic_write_text
+from lab.files.text.atomic_write import atomic_write_text, made_folder
+from lab.findings.outcome import Done
 from lab.report.calibration.calibration_scene import Rectangle, outline, scene_views
 from lab.report.html import as_script, environment
 from lab.report.plot.svg import ORANGE, PURPLE
-from lab.results.view.scene import Content, View, edges, thinned
+from lab.results.view.scene import Content, View, edges, mesh_of, read_content, thinned, view_of, write_glb
 
+DEFAULT_OUT = Path("results", "view")
 MOST_MOMENTS = 800  # of the playback
+
+
+def show(
+    path: Path,
+    out: Path | None,
+    *,
+    frame: int | None = None,
+    rig: Path | None = None,
+    sigma_scale: float | None = None,
+) -> Done[tuple[Path, ...]]:
+    """Write the scene of a rig.yaml, a run folder or results; without `out`, also open its page in the browser.
+
+    frame: of the beams and spots; None: the middle one. sigma_scale: of the ellipsoids; None: a round number that makes
+    them visible. rig: a rig.yaml in place of the run's.
+
+    Raises:
+        InputError: an input is not as it should be, or a file cannot be written.
+    """
+    content = read_content(path, rig)
+    index = content.at_frame(frame)
+    view = view_of(content, index, sigma_scale)
+    folder = made_folder(out or DEFAULT_OUT)
+    files = folder / "view.html", folder / "scene.glb"
+    write_page(view, index, files[0])
+    if out is None and has_display():
+        webbrowser.open(files[0].resolve().as_uri())
+    write_glb(mesh_of([*view.fixed, *view.moving(index)], view.ellipsoids, view.reach_m, view.extent_m), files[1])
+    return Done(files, tuple(map(str, files)))
+
+
+def has_display() -> bool:
+    """Whether a browser can show a page here, and not in the terminal."""
+    names = ("DISPLAY", "WAYLAND_DISPLAY")
+    return not sys.platform.startswith("linux") or any(os.environ.get(name) for name in names)
 
 
 def write_page(view: View, index: int | None, path: Path) -> None:

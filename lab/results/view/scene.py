@@ -396,8 +396,6 @@ def _scale(content: Content, indices: Ints, extent_m: float) -> float:
 
 
 # Scenes as binary glTF 2.0 (.glb), which browsers, Blender and presentation programs open.
-#
-# Open3D 0.20 writes .glb with base64 text instead of a binary part, which its own reader refuses.
 
 
 _FLOAT, _UINT32, _VERTICES, _INDICES = 5126, 5125, 34962, 34963

@@ -12,8 +12,8 @@ import pytest
 
 from lab.report.index import write_index
 from lab.report.run.page import write_report
+from lab.results.view.page import write_page
 from lab.results.view.scene import View, read_content, view_of
-from lab.results.view.view import write_files
 from tests.lab.report.test_report import make
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -120,8 +120,8 @@ document.title = JSON.stringify({ rows, edge });
 
 @pytest.mark.parametrize("width", [500, 1300])
 def test_the_scene_is_seen_whole_at_first(tmp_path, width):
-    write_files(*_scene(make(tmp_path).results), tmp_path / "view")
-    page = tmp_path / "view" / "view.html"
+    write_page(*_scene(make(tmp_path).results), tmp_path / "view.html")
+    page = tmp_path / "view.html"
     text = re.sub(r"<meta http-equiv.*?>", "", page.read_text("utf-8"), count=1)
     page.write_text(text.replace("</body>", INK + "</body>"), "utf-8")
     ink = json.loads(browse(page, width)[0])
