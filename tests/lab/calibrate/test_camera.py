@@ -61,7 +61,7 @@ def test_summary_json_states_the_findings_of_the_report_and_the_inputs(left):
     assert [e["what"] for e in warned] == [f.what for f in left.findings if f.level is Level.WARN] != []
     report = (left.out / "report.html").read_text(encoding="utf-8")
     assert all(e["code"] in report and e["remedy"] for e in warned)
-    assert len(summary["inputs"]) == 13
+    assert len(summary["inputs"]) == 7
 
 
 def test_camera_yaml_reads_back_and_states_its_uncertainty(left):
