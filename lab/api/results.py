@@ -16,22 +16,13 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.errors import InputError
-from lab.files.run.results import (
-    PoseTrack,
-    has_causal,
-    read_poses,
-    read_result_table,
-    read_spots,
-    read_summary,
-    run_folder_named,
-)
-from lab.files.run.run_file import Run, load_run
+from lab.files.run.results import ResultFolder, read_result_table
+from lab.files.run.run_file import Run
 from lab.files.text import columns
 from lab.files.text.csv_table import Categorical, Table
 from lab.report.frames.canvas import Pixels, png
 from lab.report.run.report_data import pose_residuals
 from lab.results.show import show_frame, write_picture
-from lab.runs.process import are_results
 from tracking.statuses import PoseStatus
 
 _EVENT_COLUMNS = ("frame", "last_frame", "kind", "camera", "spot", "text")
@@ -73,43 +64,43 @@ class Results:
         """keep: a temporary folder that lasts as long as this object."""
         self.folder = folder
         self._given = run_folder
+        self._read = ResultFolder(folder, run_folder)
         self._keep = keep
 
     def __repr__(self) -> str:
         status = self.summary.get("verdict", {}).get("status", "no verdict")
         return f"<Results of {self.name}: {status}, {len(self.frames)} frames, {self.folder}>"
 
-    @cached_property
+    @property
     def summary(self) -> dict[str, Any]:
         """summary.json: verdict, counts, parameters, versions, fingerprints."""
-        return read_summary(self.folder)
+        return self._read.summary
 
     @property
     def name(self) -> str:
         """The name of the run."""
-        return str(self.summary.get("name", self.folder.name))
+        return self._read.name
 
     @cached_property
     def attitude(self) -> pd.DataFrame:
         """attitude.csv: a row per frame with position, quaternion, angles, their sigmas, velocities and status."""
-        return read_frame(self.folder / "attitude.csv", columns.ATTITUDE, columns.MOTION)
+        return read_frame(self.folder / "attitude.csv", columns.ATTITUDE)
 
     @cached_property
     def attitude_causal(self) -> pd.DataFrame | None:
         """attitude_causal.csv, the poses as known at each instant; None where the results are not smoothed."""
-        if not has_causal(self.folder):
-            return None
-        return read_frame(self.folder / f"attitude{columns.CAUSAL}.csv", columns.ATTITUDE, columns.MOTION)
+        path = self.folder / f"attitude{columns.CAUSAL}.csv"
+        return read_frame(path, columns.ATTITUDE) if path.is_file() else None
 
     @cached_property
     def spots(self) -> pd.DataFrame:
         """spots.csv: a row per frame, camera and spot with place (px), sigma, status and prediction."""
-        return read_frame(self.folder / "spots.csv", columns.SPOTS, ("cov_uv_px2", "label_probability"))
+        return read_frame(self.folder / "spots.csv", columns.SPOTS)
 
     @cached_property
     def detections(self) -> pd.DataFrame:
         """detections.csv: a row per detected point of light."""
-        return read_frame(self.folder / "detections.csv", columns.DETECTIONS, ("cov_uv_px2",))
+        return read_frame(self.folder / "detections.csv", columns.DETECTIONS)
 
     @cached_property
     def beams(self) -> pd.DataFrame:
@@ -123,53 +114,49 @@ class Results:
         rows = [{name: e.get(name) for name in _EVENT_COLUMNS} for e in listed if isinstance(e, dict)]
         return pd.DataFrame(rows, columns=list(_EVENT_COLUMNS))
 
-    @cached_property
-    def _poses(self) -> PoseTrack:
-        return read_poses(self.folder)
-
     @property
     def frames(self) -> Ints:
         """Frame numbers (n,); all arrays below have a row for each."""
-        return self._poses.frames
+        return self._read.poses.frames
 
     @property
     def time_s(self) -> Array:
         """(n,), s since frame 0, at mid-exposure."""
-        return self._poses.t_s
+        return self._read.poses.t_s
 
     @property
     def known(self) -> Bools:
         """(n,): whether there is a pose."""
-        return self._poses.known
+        return self._read.poses.known
 
     @property
     def measured(self) -> Bools:
         """(n,): whether the pose is measured from the spots of the frame."""
-        return self._poses.has(PoseStatus.MEASURED)
+        return self._read.poses.has(PoseStatus.MEASURED)
 
     @property
     def positions(self) -> Array:
         """(n, 3), m: the body's origin in world; nan where unknown."""
-        return self._poses.world_from_body.translation
+        return self._read.poses.world_from_body.translation
 
     @property
     def rotations(self) -> Array:
         """(n, 3, 3), world from body; nan where unknown."""
-        return np.where(self.known[:, None, None], self._poses.world_from_body.rotation, np.nan)
+        return np.where(self.known[:, None, None], self._read.poses.world_from_body.rotation, np.nan)
 
     @property
     def covariance(self) -> Array:
         """(n, 6, 6) of the pose error [dt (m, in world), dtheta (rad, in body)]; nan where unknown."""
-        return self._poses.covariance
+        return self._read.poses.covariance
 
     @property
     def systematic(self) -> Array:
         """(n, 6, 6), the calibration's share of the covariance, equal in all frames; nan where it is unknown."""
-        return self._poses.systematic
+        return self._read.poses.systematic
 
     @cached_property
     def _run(self) -> Run:
-        return load_run(self.run_folder)
+        return self._read.run("name it: lab.load(folder, run=...)")
 
     @property
     def rig(self) -> Rig:
@@ -184,13 +171,7 @@ class Results:
     @property
     def run_folder(self) -> Path:
         """The run folder that was processed. Raises InputError where it is not there."""
-        named = str(self.summary.get("run_folder") or "")
-        folder = self._given or run_folder_named(self.folder, named)
-        if folder is not None and folder.is_dir():
-            return folder
-        raise InputError(
-            f"{self.folder}: its run folder {self._given or named} is not there; name it: lab.load(folder, run=...)"
-        )
+        return self._run.folder
 
     @cached_property
     def residuals(self) -> pd.DataFrame:
@@ -199,11 +180,11 @@ class Results:
         Projected from the pose of the frame, where that is measured. Raises InputError where the run folder is not
         there.
         """
-        spots = read_spots(self.folder)
-        residual = pose_residuals(spots, self._poses, self._run)[0]
+        spots = self._read.spots
+        residual = pose_residuals(spots, self._read.poses, self._run)[0]
         if residual is None:
             raise InputError(f"{self.run_folder}: expected the cameras and spots of {self.folder}, found another rig")
-        frame, view = np.nonzero(spots.measured & self._poses.has(PoseStatus.MEASURED)[:, None])
+        frame, view = np.nonzero(spots.measured & self._read.poses.has(PoseStatus.MEASURED)[:, None])
         names = {"camera": [camera for camera, _ in spots.views], "spot": [spot for _, spot in spots.views]}
         return pd.DataFrame(
             {
@@ -237,10 +218,7 @@ def load(folder: Path | str, *, run: Path | str | None = None) -> Results:
     Raises:
         InputError: the folder holds no results. (A damaged table raises it when it is first used.)
     """
-    folder = Path(folder)
-    if not are_results(folder):
-        raise InputError(f"{folder}: expected a folder that `beampose run` wrote, found no summary.json of one")
-    return Results(folder, None if run is None else Path(run))
+    return Results(ResultFolder.of_run(folder).folder, None if run is None else Path(run))
 
 
 # Tables of results as pandas frames, with the names of the CSV files, which contain the units.
@@ -249,14 +227,12 @@ def load(folder: Path | str, *, run: Path | str | None = None) -> Results:
 WHOLE = ("frame", "spots_used")  # columns of whole numbers
 
 
-def read_frame(path: Path, names: Iterable[str], optional: Iterable[str] = ()) -> pd.DataFrame:
+def read_frame(path: Path, names: Iterable[str]) -> pd.DataFrame:
     """A CSV file of results: numbers are float64, frame numbers int64, names and statuses categories.
 
-    Columns that an older file does not have are nan. Raises InputError.
+    Raises InputError.
     """
-    names, optional = list(names), list(optional)
-    table = read_result_table(path, [n for n in names if n not in optional], optional)
-    return frame_of(table, names)
+    return frame_of(read_result_table(path, names), names)
 
 
 def frame_of(table: Table, names: Iterable[str]) -> pd.DataFrame:

@@ -8,7 +8,6 @@ from typing import Any
 import click
 
 from lab.commands.common import ANY_PATH, FOLDER, NumberRange, complain, conclude, progress_bar, show_line
-from lab.errors import InputError
 
 # `beampose check` and `report`: inputs checked, results shown.
 
@@ -62,11 +61,10 @@ def report(
     given = {name: value for name, value in shown.items() if value is not None}
     if not video and given:
         raise click.UsageError("--from, --to, --every and --fps are of the video; add --video")
+    from lab.files.run.results import ResultFolder
     from lab.report.run.page import write_report
-    from lab.runs.process import are_results
 
-    if not are_results(results):
-        raise InputError(f"{results}: expected a folder that `beampose run` wrote, found no summary.json of one")
+    ResultFolder.of_run(results)
     show_line(f"report: {write_report(results, run_folder)}")
     if certificate:
         from lab.results.certificate import write_certificate

@@ -23,16 +23,8 @@ from calibration.run_budget import (
 )
 from geometry.arrays import Array, Ints
 from lab.errors import InputError
-from lab.files.run.results import (
-    PoseTrack,
-    SpotGrid,
-    read_poses,
-    read_result_table,
-    read_spots,
-    read_summary,
-    run_folder_named,
-)
-from lab.files.run.run_file import Run, load_run
+from lab.files.run.results import PoseTrack, ResultFolder, SpotGrid, read_result_table
+from lab.files.run.run_file import Run
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_write_text
 from lab.findings.outcome import Done
@@ -98,9 +90,8 @@ def certificate(
     Raises:
         InputError: a table or the run folder cannot be read, or a frame is not measured.
     """
-    summary = read_summary(results)
-    run = load_run(_run_folder(results, run_folder, str(summary.get("run_folder") or "")))
-    poses, spots = read_poses(results), read_spots(results)
+    folder = ResultFolder(results, run_folder)
+    run, poses, spots = folder.run(), folder.poses, folder.spots
     stated = _rest_parts(results, poses)
     measured = np.flatnonzero(poses.has(PoseStatus.MEASURED) & np.isfinite(poses.covariance).all(axis=(1, 2)))
     if not len(measured):
@@ -121,14 +112,7 @@ def certificate(
                 f"--at {number}: expected a frame with a measured pose, found another or none of this number"
             )
         made.append(_of_frame(run, poses, spots, int(measured[here[0]]), rest[:, here[0]], dof, (draws, seed)))
-    return Certificate(results.resolve().name, summary, run, tuple(made), poses.frames[measured], whole)
-
-
-def _run_folder(results: Path, given: Path | None, named: str) -> Path:
-    folder = given or run_folder_named(results, named)
-    if folder is None:
-        raise InputError(f"{results}: its run folder {named} is not there; name it with --run")
-    return folder
+    return Certificate(results.resolve().name, folder.summary, run, tuple(made), poses.frames[measured], whole)
 
 
 def _rest_parts(results: Path, poses: PoseTrack) -> tuple[Array, Array, Array]:
@@ -177,8 +161,7 @@ def _of_frame(
     rows = np.flatnonzero(seen)
     sigma = spots.sigma_px[row][place][rows]
     cov = np.einsum("mi,ij->mij", sigma**2, np.eye(2))
-    if spots.cov_uv_px2 is not None:
-        cov[:, 0, 1] = cov[:, 1, 0] = np.nan_to_num(spots.cov_uv_px2[row][place][rows])
+    cov[:, 0, 1] = cov[:, 1, 0] = np.nan_to_num(spots.cov_uv_px2[row][place][rows])
     systematic = poses.systematic[k]
     names, variances = [NOISE, PLACES, TURNS, CLOCKS], [*rest]
     share = None

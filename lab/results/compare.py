@@ -13,13 +13,12 @@ import numpy as np
 from geometry import rotations
 from geometry.arrays import Array, Bools, Ints
 from lab.errors import InputError
-from lab.files.run.results import PoseTrack, read_poses, read_summary
+from lab.files.run.results import ResultFolder
 from lab.files.text.csv_table import Table
 from lab.files.text.csv_text import read_table
 from lab.files.text.error_text import name_of_path
 from lab.findings.finding import Finding, Level, clause, finding, passed
 from lab.number_format import format_number, format_percent, format_with_sigma
-from lab.runs.process import are_results
 from tracking.comparison.differences import (
     LEAST_READINGS,
     AllanDeviation,
@@ -482,9 +481,7 @@ def compare(
 
 def _motion_of(folder: Path) -> tuple[Ints, Motion, Motion]:
     """Frames (n,), motion with the noise part of the covariances, and with all of them, of the measured frames."""
-    if not are_results(folder):
-        raise InputError(f"{folder}: expected a folder that `beampose run` wrote, found no summary.json of one")
-    track: PoseTrack = read_poses(folder)
+    track = ResultFolder.of_run(folder).poses
     good = track.known & track.has(PoseStatus.MEASURED) & np.isfinite(track.covariance).all(axis=(1, 2))
     rows = np.flatnonzero(good)
     if len(rows) < 4:
@@ -543,7 +540,7 @@ def _still(motion: Motion) -> StillStand | None:
 
 def _of_the_same_run(first: Path, second: Path) -> str:
     """A note on the recordings of two results. Raises InputError where a summary.json is damaged."""
-    summaries = [read_summary(folder) for folder in (first, second)]
+    summaries = [ResultFolder(folder).summary for folder in (first, second)]
     recorded = [_recorded(summary) for summary in summaries]
     if not all(recorded):
         return "Both results may rest on the same pictures: their errors are then not independent."

@@ -20,12 +20,11 @@ import numpy as np
 from geometry.arrays import Array, Bools
 from lab.errors import InputError
 from lab.extras import needed
-from lab.files.run.results import POSE_STATUSES, PoseTrack, read_poses, read_result_table, read_summary
+from lab.files.run.results import POSE_STATUSES, PoseTrack, ResultFolder, read_result_table
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder, atomic_write_bytes
 from lab.files.text.json_text import plain_value
 from lab.findings.outcome import Done
-from lab.runs.process import are_results
 from lab.versions import versions
 from tracking.statuses import PoseStatus
 
@@ -88,26 +87,26 @@ def export(results: Path | str, to: str, out: Path | str | None = None, *, causa
     results = Path(results)
     if to not in FORMATS:
         raise InputError(f"--to: expected one of {', '.join(FORMATS)}, got {to!r}")
-    if not are_results(results):
-        raise InputError(f"{results}: expected a folder that `beampose run` wrote, found no summary.json of one")
+    folder = ResultFolder.of_run(results)
     wanted = FORMATS[to]
     path = Path(out) if out is not None else Path(f"{results.resolve().name}{wanted.suffix}")
-    motion = _read(results, causal, wanted.covariance)
+    motion = _read(folder, causal, wanted.covariance)
     wanted.write(motion, path)
     return Done(path, (f"{to}: {path} ({int(motion.poses.known.sum())} poses)",), tuple(motion.notes))
 
 
-def _read(results: Path, causal: bool, covariance: str) -> Exported:
+def _read(results: ResultFolder, causal: bool, covariance: str) -> Exported:
     which = columns.CAUSAL if causal else ""
-    path = results / f"attitude{which}.csv"
-    if causal and not path.is_file():
-        raise InputError(f"{results}: expected attitude_causal.csv, which `beampose run` writes with a smoothing pass")
-    poses = read_poses(results, causal)
-    table = read_result_table(path, [c for c in columns.ATTITUDE if c not in columns.ADDED], columns.MOTION)
+    path = results.folder / f"attitude{which}.csv"
+    poses = results.causal if causal else results.poses
+    if poses is None:
+        what = "expected attitude_causal.csv, which `beampose run` writes with a smoothing pass"
+        raise InputError(f"{results.folder}: {what}")
+    table = read_result_table(path, columns.ATTITUDE)
     words = np.array([*POSE_STATUSES, ""], dtype=object)
     values = {c: words[poses.status] if c in table.words else table.numbers[c] for c in columns.ATTITUDE}
     values |= {c: values[c].astype(np.int64) for c in _WHOLE}
-    summary = read_summary(results)
+    summary = results.summary
     inputs, rig = summary.get("inputs") or (), Path(str(summary.get("rig", ""))).name
     about = {
         "source": f"beampose {versions()['beampose']}, {path.name} of {summary.get('name', '')}",
@@ -115,7 +114,7 @@ def _read(results: Path, causal: bool, covariance: str) -> Exported:
         "rig": next((f"sha256 {i['sha256']}" for i in inputs if Path(str(i.get("path"))).name == rig), ""),
         "conventions": " ".join([*CONVENTIONS, *([covariance] if covariance else [])]),
     }
-    return Exported(results.resolve().name, about, causal, poses, values, [])
+    return Exported(results.folder.resolve().name, about, causal, poses, values, [])
 
 
 # TUM: a line of t x y z qx qy qz qw for each pose.

@@ -15,15 +15,14 @@ import pydantic
 
 from lab.errors import QUALITY_GATE_FAILED, InputError
 from lab.files.run.fingerprints import fingerprints
-from lab.files.run.run_file import LiveDevice, Run, load_run
+from lab.files.run.results import ResultFolder
+from lab.files.run.run_file import LiveDevice, Run
 from lab.files.text.dataclass_fields import dataclass_from_yaml
-from lab.files.text.json_text import read_json
 from lab.findings.outcome import Done
 from lab.progress import Progress
 from lab.runs.frames.pipeline import Pipeline
 from lab.runs.process import write_tables
 from lab.runs.smoothing_pass import TrackingAndSmoothing
-from lab.runs.summary import SUMMARY_SCHEMA
 from lab.versions import versions
 from tracking.parameters import TrackerParameters
 
@@ -53,7 +52,6 @@ class _Summary(pydantic.BaseModel):
 class Recorded:
     """How a result was made."""
 
-    run_folder: Path
     causal: bool
     tracker: TrackerParameters
     versions: Mapping[str, str]
@@ -75,17 +73,7 @@ def read_recorded(results: Path) -> Recorded:
     Raises:
         InputError: the folder holds no results of a run, or summary.json lacks what is needed.
     """
-    path = Path(results) / "summary.json"
-    try:
-        content = read_json(path)
-    except FileNotFoundError:
-        raise InputError(
-            f"{results}: expected a folder that `beampose run` wrote, found no summary.json in it"
-        ) from None
-    except (ValueError, OSError) as error:
-        raise InputError(f"{path}: expected the summary of a run, found {error}; process the run again") from None
-    if not isinstance(content, dict) or content.get("schema") != SUMMARY_SCHEMA:
-        raise InputError(f"{path}: schema: expected {SUMMARY_SCHEMA!r}; process the run again")
+    content, path = ResultFolder.of_run(results).summary, Path(results) / "summary.json"
     try:
         summary = _Summary.model_validate(content)
     except pydantic.ValidationError as error:
@@ -93,7 +81,7 @@ def read_recorded(results: Path) -> Recorded:
         raise InputError(f"{path}: {field}: expected what a run records there; process the run again") from None
     tracker = dataclass_from_yaml(TrackerParameters, summary.parameters.tracker, path, "parameters.tracker")
     causal = summary.attitude == "causal"
-    return Recorded(Path(summary.run_folder), causal, tracker, summary.versions, tuple(summary.inputs))
+    return Recorded(causal, tracker, summary.versions, tuple(summary.inputs))
 
 
 def other_versions(recorded: Recorded) -> list[str]:
@@ -263,10 +251,7 @@ def verify(results: Path, run_folder: Path | None = None, progress: Progress | N
     """
     results = Path(results)
     recorded = read_recorded(results)
-    folder = recorded.run_folder if run_folder is None else Path(run_folder)
-    if run_folder is None and not folder.is_dir():
-        raise InputError(f"{results}: its run folder {folder} does not exist; name its new place with --run")
-    run = dataclasses.replace(load_run(folder), tracker=recorded.tracker)
+    run = dataclasses.replace(ResultFolder(results, run_folder).run(), tracker=recorded.tracker)
     if any(isinstance(source, LiveDevice) for source in run.cameras.values()):
         raise InputError(f"{run.path}: expected recorded pictures or points, found a live camera: nothing to verify")
     inputs = compare_inputs(recorded, run)

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 from geometry.forward_model import SpotModel
 from lab.files.rig.calibration_state import require_valid_calibration
 from lab.files.run.parameter_overrides import with_overrides
+from lab.files.run.results import ResultFolder, are_results
 from lab.files.run.run_file import Run, load_run
 from lab.files.run.truth import load_run_truth
-from lab.files.text.atomic_write import atomic_folder, earlier_results
+from lab.files.text.atomic_write import atomic_folder
 from lab.findings.finding import Level, worst_first
 from lab.findings.finding import verdict as verdict_of
 from lab.findings.outcome import Outcome, Verdict
@@ -28,7 +29,7 @@ from lab.runs.model_check.frame_sampler import FrameSampler
 from lab.runs.run_log import RunLog, listening
 from lab.runs.setup_check import mistakes_of_run, pictures_sampler
 from lab.runs.smoothing_pass import TrackingAndSmoothing
-from lab.runs.summary import SUMMARY_SCHEMA, processed_run
+from lab.runs.summary import processed_run
 from lab.runs.tables import TableWriter
 from lab.runs.verdict import quality
 from lab.runs.verdict.frame_checks import FrameChecks, Pair
@@ -120,7 +121,7 @@ def _write_results(
     statistics, model_check, verdict = write_tables(pipeline, passes, work, causal=causal)
     from lab.runs.verdict.score import against_truth, read_tables
 
-    tables, added = against_truth(read_tables(work), run.folder), more()
+    tables, added = against_truth(read_tables(ResultFolder(work)), run.folder), more()
     verdict = quality.against_truth(verdict, tables.errors)
 
     def page(folder: Path, content: Mapping[str, Any]) -> None:
@@ -203,6 +204,3 @@ def rows_of(pipeline: Pipeline, processed: Iterable[Pair]) -> Iterable[Pair]:
         return processed
     own = [name in run.clocks and run.clocks[name].times is not None for name in run.cameras]
     return row_records(processed, reader.moments, tuple(run.cameras), own, SpotModel.of(run.rig).camera_of)
-
-
-are_results = earlier_results(SUMMARY_SCHEMA)  # of a run, which a new run may replace

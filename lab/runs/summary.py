@@ -12,6 +12,7 @@ import numpy as np
 from geometry.pose import Pose
 from geometry.rotations import log
 from lab.files.run.fingerprints import fingerprints
+from lab.files.run.results import SUMMARY_SCHEMA
 from lab.files.run.run_file import Run
 from lab.findings.outcome import Verdict
 from lab.runs.frames.pipeline import Pipeline
@@ -21,8 +22,6 @@ from lab.runs.verdict.run_statistics import MOST_EVENTS, RunStatistics
 
 if TYPE_CHECKING:
     from lab.runs.model_check.check import ModelCheck
-
-SUMMARY_SCHEMA = "beampose/summary/1"
 
 
 def processed_run(

@@ -6,7 +6,6 @@ correct.
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -274,21 +273,6 @@ def _write_truth(r: _Recording, model: SpotModel, folder: Path) -> None:
         for j, view in enumerate(model.views)
     ]
     write_table(folder / "spots.csv", columns.TRUTH_SPOTS, spots)
-
-
-def without_added_columns(results: Path, folder: Path) -> Path:
-    """A copy of a results folder as it was written before tables had the columns of columns.ADDED."""
-    folder.mkdir()
-    for path in results.iterdir():
-        if path.suffix != ".csv":
-            (folder / path.name).write_bytes(path.read_bytes())
-            continue
-        with path.open(newline="") as file:
-            rows = list(csv.reader(file))
-        kept = [i for i, name in enumerate(rows[0]) if name not in columns.ADDED]
-        with (folder / path.name).open("w", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows([row[i] for i in kept] for row in rows)
-    return folder
 
 
 def _path(t: Array) -> tuple[Array, Pose]:

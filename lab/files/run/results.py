@@ -1,27 +1,31 @@
-"""Reads a results folder: its tables as arrays by frame and view. The run folder is not needed."""
+"""Reads a results folder: summary.json, its tables as arrays by frame and view, and the run that it is of."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from lab.errors import InputError
+from lab.files.run.run_file import Run, load_run
 from lab.files.text import columns
 from lab.files.text.columns import CAUSAL
 from lab.files.text.csv_table import Categorical, Table
 from lab.files.text.csv_text import MAX_TIME_S, read_table
-from lab.files.text.json_text import read_json
+from lab.files.text.error_text import name_of_path
+from lab.files.text.json_text import has_schema, read_json
 from tracking.statuses import PoseStatus, SpotStatus
 
 SPOT_STATUSES = tuple(SpotStatus)
 POSE_STATUSES = tuple(PoseStatus)
 ABSENT = -1  # the status code where the file has no row
+SUMMARY_SCHEMA = "beampose/summary/1"  # of a run's summary.json
 
 
 def read_result_table(path: Path, required: Iterable[str], optional: Iterable[str] = ()) -> Table:
@@ -61,11 +65,6 @@ def _check_frames(table: Table) -> None:
             raise table.error(i, f"t_s: expected seconds, got {table.found('t_s', i)}; process the run again")
 
 
-def run_folder_named(results: Path, named: str) -> Path | None:
-    """The run folder that summary.json names, from here or from the results; None where it is not there."""
-    return next((p for p in (Path(named), results / named) if named and p.is_dir()), None)
-
-
 @dataclass(frozen=True, slots=True)
 class SpotGrid:
     """spots.csv by frame and view: F frame numbers, V views."""
@@ -77,9 +76,9 @@ class SpotGrid:
     sigma_px: Array  # (F, V, 2)
     predicted_px: Array  # (F, V, 2), predicted before the detection
     gain: Array  # (F, V)
-    label_probability: Array  # (F, V) probability that the label is right; nan without a label, and in older results
+    label_probability: Array  # (F, V) probability that the label is right; nan without a label
     status: Ints  # (F, V) index into SPOT_STATUSES, or ABSENT
-    cov_uv_px2: Array | None = None  # (F, V), nan in older results; None: not read
+    cov_uv_px2: Array  # (F, V)
 
     @property
     def measured(self) -> Bools:
@@ -148,8 +147,7 @@ def on_grid(
 
 def read_spots(results: Path) -> SpotGrid:
     """spots.csv of a results folder. Raises InputError."""
-    required = [c for c in columns.SPOTS if c != "cov_uv_px2" and c not in columns.ADDED]
-    table = read_result_table(results / "spots.csv", required, ("label_probability", "cov_uv_px2"))
+    table = read_result_table(results / "spots.csv", columns.SPOTS)
     frame, camera, spot = table.numbers["frame"], table.words["camera"], table.words["spot"]
     frames = np.unique(frame).astype(np.int64)
     pairs = np.unique(np.stack([camera.codes, spot.codes], -1), axis=0) if len(table) else np.zeros((0, 2), np.int64)
@@ -192,8 +190,7 @@ def read_poses(results: Path, causal: bool = False) -> PoseTrack:
     causal: attitude_causal.csv and covariance_causal.csv (the filter's poses, not smoothed) instead.
     """
     which = CAUSAL if causal else ""
-    required = [c for c in columns.ATTITUDE if c not in columns.ADDED]
-    table = read_result_table(results / f"attitude{which}.csv", required, columns.MOTION)
+    table = read_result_table(results / f"attitude{which}.csv", columns.ATTITUDE)
     frames = table.numbers["frame"].astype(np.int64)
     return PoseTrack(
         frames=frames,
@@ -212,11 +209,6 @@ def read_poses(results: Path, causal: bool = False) -> PoseTrack:
         sigma_velocity_m_s=table.stack(*columns.MOTION[6:9]),
         sigma_rate_rad_s=table.stack(*columns.MOTION[9:12]),
     )
-
-
-def has_causal(results: Path) -> bool:
-    """Whether a results folder has the causal filter's poses in addition to the smoothed ones."""
-    return (results / f"attitude{CAUSAL}.csv").is_file()
 
 
 def _read_covariance(path: Path, frames: Ints) -> Array:
@@ -244,3 +236,69 @@ def read_summary(results: Path) -> dict[str, Any]:
     if not isinstance(summary, dict):
         raise InputError(f"{path}: expected a JSON object, found {type(summary).__name__}")
     return summary
+
+
+def are_results(folder: Path) -> bool:
+    """Whether `beampose run` wrote this folder; a new run may then replace it."""
+    return has_schema(folder, SUMMARY_SCHEMA)
+
+
+class ResultFolder:
+    """A folder of results, and the run that it is of.
+
+    Files are read when they are first used; a missing or damaged one raises InputError.
+    """
+
+    def __init__(self, folder: Path | str, run_folder: Path | str | None = None) -> None:
+        """run_folder: where the run is now; None: where summary.json names it."""
+        self.folder = Path(folder)
+        self._given = None if run_folder is None else Path(run_folder)
+
+    @classmethod
+    def of_run(cls, folder: Path | str, run_folder: Path | str | None = None) -> Self:
+        """A folder that `beampose run` wrote."""
+        if not are_results(Path(folder)):
+            raise InputError(f"{folder}: expected a folder that `beampose run` wrote, found no summary.json of one")
+        return cls(folder, run_folder)
+
+    @cached_property
+    def summary(self) -> dict[str, Any]:
+        """summary.json: verdict, counts, parameters, versions, fingerprints; empty where there is none."""
+        return read_summary(self.folder)
+
+    @property
+    def name(self) -> str:
+        """The name of the run."""
+        return str(self.summary.get("name") or name_of_path(self.folder))
+
+    @cached_property
+    def spots(self) -> SpotGrid:
+        """spots.csv."""
+        return read_spots(self.folder)
+
+    @cached_property
+    def poses(self) -> PoseTrack:
+        """attitude.csv with its covariances."""
+        return read_poses(self.folder)
+
+    @cached_property
+    def causal(self) -> PoseTrack | None:
+        """attitude_causal.csv, the poses as known at each instant; None where the results are not smoothed."""
+        return read_poses(self.folder, causal=True) if (self.folder / f"attitude{CAUSAL}.csv").is_file() else None
+
+    @property
+    def run_folder(self) -> Path | None:
+        """The run folder, given or named by summary.json (from here or the results); None where it is not there."""
+        named = self._named
+        places = [Path(named), self.folder / named] if self._given is None else [self._given]
+        return next((place for place in places if named and place.is_dir()), None)
+
+    @property
+    def _named(self) -> str:
+        return str(self._given or self.summary.get("run_folder") or "")
+
+    def run(self, remedy: str = "name it with --run") -> Run:
+        """The run. remedy: where its folder is not there."""
+        if self.run_folder is None:
+            raise InputError(f"{self.folder}: its run folder {self._named} is not there; {remedy}")
+        return load_run(self.run_folder)

@@ -32,4 +32,3 @@ TRUTH_POSE = ("frame", "t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 TRUTH_SPOTS = ("frame", "camera", "spot", "u_px", "v_px", "in_view")
 TIMES = ("frame", "t_s")
 CAUSAL = "_causal"  # suffix of the tables of the causal filter; the tables without it are smoothed
-ADDED = ("label_probability", *MOTION)  # columns that results of versions before the rigid tracker do not have

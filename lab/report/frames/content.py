@@ -20,15 +20,11 @@ from lab.files.run.results import (
     POSE_STATUSES,
     SPOT_STATUSES,
     PoseTrack,
+    ResultFolder,
     SpotGrid,
-    read_poses,
     read_result_table,
-    read_spots,
-    read_summary,
-    run_folder_named,
 )
-from lab.files.run.run_file import FramesFolder, Run, VideoFile, load_run
-from lab.files.text.error_text import name_of_path
+from lab.files.run.run_file import FramesFolder, Run, VideoFile
 from lab.pictures.picture_file import GreyPicture, MissingPicture
 from lab.runs.frames.frames import Picture, pictures_of_rows
 from tracking.detections import Detections
@@ -84,15 +80,15 @@ def read_result_data(results: Path, run_folder: Path | None = None) -> ResultDat
     Raises:
         InputError: the results cannot be read, or the given run folder is not theirs.
     """
-    spots, poses = read_spots(results), read_poses(results)
+    folder = ResultFolder(results, run_folder)
+    spots, poses = folder.spots, folder.poses
     if not len(spots.frames) or not spots.views:
         raise InputError(
             f"{results / 'spots.csv'}: expected rows of at least one frame, got none; process the run again"
         )
     if not np.array_equal(spots.frames, poses.frames):
         raise InputError(f"{results}: spots.csv and attitude.csv have different frames; process the run again")
-    summary = read_summary(results)
-    run, notes = _run_of(results, run_folder, str(summary.get("run_folder") or ""))
+    run, notes = _run_of(folder, run_folder is not None)
     if run is not None:
         known = SpotModel.of(run.rig).views
         unknown = [view for view in spots.views if view not in known]
@@ -104,7 +100,7 @@ def read_result_data(results: Path, run_folder: Path | None = None) -> ResultDat
         if unknown:
             notes = (f"the rig of {run.folder} has other spots than the results: no pictures and no beam tracks",)
             run = None
-    return result_data(str(summary.get("name") or name_of_path(results)), spots, poses, run, results, notes)
+    return result_data(folder.name, spots, poses, run, results, notes)
 
 
 def result_data(
@@ -120,16 +116,13 @@ def result_data(
     return ResultData(name, spots, poses, run, model, _sizes(spots, run), detections, notes)
 
 
-def _run_of(results: Path, given: Path | None, named: str) -> tuple[Run | None, tuple[str, ...]]:
-    """The run of results and, where it cannot be read, why. Raises InputError for a given folder that is no run."""
-    if given is not None:
-        return load_run(given), ()
-    folder = run_folder_named(results, named)
-    if folder is None:
-        return None, ("the run folder is not there: no pictures and no beam tracks; name it with --run",)
+def _run_of(results: ResultFolder, given: bool) -> tuple[Run | None, tuple[str, ...]]:
+    """The run of results and, where it cannot be read, why. Raises InputError where its folder is given."""
     try:
-        return load_run(folder), ()
+        return results.run(), ()
     except BeamposeError as error:
+        if given:
+            raise
         return None, (f"no pictures and no beam tracks: {error}",)
 
 
@@ -327,7 +320,7 @@ def _stated(data: ResultData, index: int, j: int) -> Array:
     """The covariance of a spot's place as spots.csv states it."""
     s = data.spots
     cov = np.diag(s.sigma_px[index, j] ** 2)
-    mixed = np.nan if s.cov_uv_px2 is None else float(s.cov_uv_px2[index, j])
+    mixed = float(s.cov_uv_px2[index, j])
     cov[0, 1] = cov[1, 0] = mixed if np.isfinite(mixed) else 0.0
     return cov if np.isfinite(cov).all() else _UNKNOWN
 

@@ -13,9 +13,8 @@ import numpy as np
 from geometry.arrays import Array, Bools
 from geometry.forward_model import SpotModel
 from lab.errors import BeamposeError
-from lab.files.run.results import PoseTrack, SpotGrid, read_summary, run_folder_named
-from lab.files.run.run_file import Run, load_run
-from lab.files.text.error_text import name_of_path
+from lab.files.run.results import PoseTrack, ResultFolder, SpotGrid
+from lab.files.run.run_file import Run
 from lab.report.summary import RunSummary, summary_of
 from lab.runs.verdict.score import ResultTables, TruthArrays, against_truth, pose_errors, read_tables
 from tracking.statuses import PoseStatus
@@ -75,21 +74,21 @@ def read_report_data(
     Raises:
         InputError: the results cannot be read.
     """
-    summary = summary_of(read_summary(results))
-    folder = _reachable(results, run_folder, summary)
+    of = ResultFolder(results, run_folder)
+    summary, folder = summary_of(of.summary), of.run_folder
     if tables is None:
-        tables = read_tables(results)
+        tables = read_tables(of)
         if folder is not None:
             with suppress(BeamposeError):
                 tables = against_truth(tables, folder)
     if run is None and folder is not None:
         with suppress(BeamposeError):
-            run = load_run(folder)
+            run = of.run()
     spots, poses = tables.spots, tables.poses
     times_known = bool(len(spots.t_s)) and bool(np.isfinite([*spots.t_s, *poses.t_s]).all())
     residual_px, residual_share = (None, None) if run is None else pose_residuals(spots, poses, run)
     return ReportData(
-        name=summary.name or name_of_path(results),
+        name=of.name,
         summary=summary,
         spots=spots,
         poses=poses,
@@ -103,13 +102,6 @@ def read_report_data(
         residual_px=residual_px,
         residual_share=residual_share,
     )
-
-
-def _reachable(results: Path, run_folder: Path | None, summary: RunSummary) -> Path | None:
-    """The run folder given or named by summary.json, where it exists."""
-    if run_folder is not None:
-        return run_folder if run_folder.is_dir() else None
-    return run_folder_named(results, summary.run_folder)
 
 
 def pose_residuals(spots: SpotGrid, poses: PoseTrack, run: Run) -> tuple[Array | None, float | None]:

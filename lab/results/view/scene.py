@@ -17,7 +17,7 @@ from geometry.pose_solver.visibility import assumed_range
 from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig
-from lab.files.run.results import PoseTrack, read_poses, read_summary
+from lab.files.run.results import PoseTrack, ResultFolder
 from lab.files.run.run_file import load_run
 from lab.files.run.truth import load_run_truth
 from lab.files.text.atomic_write import atomic_write_bytes
@@ -95,10 +95,9 @@ def read_content(path: Path, rig_path: Path | None) -> Content:
 
 
 def _of_results(results: Path, rig_path: Path | None) -> Content:
-    summary = read_summary(results)
-    rig = load_rig(rig_path) if rig_path is not None else _rig_of_results(results, str(summary.get("run_folder") or ""))
-    track = read_poses(results)
-    return content_of_poses(str(summary.get("name") or results.resolve().name), rig, track)
+    folder = ResultFolder(results)
+    rig = load_rig(rig_path) if rig_path is not None else folder.run("name its rig: --rig rig.yaml").rig
+    return content_of_poses(folder.name, rig, folder.poses)
 
 
 def content_of_poses(name: str, rig: Rig, track: PoseTrack) -> Content:
@@ -109,15 +108,6 @@ def content_of_poses(name: str, rig: Rig, track: PoseTrack) -> Content:
     measured = track.has(PoseStatus.MEASURED)
     t_s = _times(track.frames, track.t_s)
     return Content(name, "attitude.csv", rig, track.frames, t_s, track.world_from_body, covariance, measured)
-
-
-def _rig_of_results(results: Path, run_folder: str) -> Rig:
-    """The rig of the run that results are of."""
-    for folder in (Path(run_folder), results / run_folder) if run_folder else ():
-        if folder.is_dir():
-            return load_run(folder).rig
-    was = f"its run folder {run_folder} is not there" if run_folder else "summary.json names no run folder"
-    raise InputError(f"{results}: the rig is unknown, because {was}; name it: --rig rig.yaml")
 
 
 def _of_run(path: Path, rig_path: Path | None) -> Content:

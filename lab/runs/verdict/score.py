@@ -23,12 +23,10 @@ from lab.files.run.results import (
     POSE_STATUSES,
     SPOT_STATUSES,
     PoseTrack,
+    ResultFolder,
     SpotGrid,
-    has_causal,
     on_grid,
     pose_stack,
-    read_poses,
-    read_spots,
 )
 from lab.files.run.truth import load_truth
 from tracking.statuses import PoseStatus, SpotStatus
@@ -163,13 +161,11 @@ class ResultTables:
     errors: dict[str, Any] | None = None  # against the truth, as `score_against` gives them
 
 
-def read_tables(results: Path) -> ResultTables:
+def read_tables(results: ResultFolder) -> ResultTables:
     """The tables of a results folder, without truth. Raises InputError."""
-    spots, poses = read_spots(results), read_poses(results)
-    causal = read_poses(results, causal=True) if has_causal(results) else None
-    if causal is not None and not np.array_equal(causal.frames, poses.frames):
-        causal = None
-    return ResultTables(spots, poses, causal)
+    spots, poses, causal = results.spots, results.poses, results.causal
+    same = causal is not None and np.array_equal(causal.frames, poses.frames)
+    return ResultTables(spots, poses, causal if same else None)
 
 
 def against_truth(tables: ResultTables, run_folder: Path) -> ResultTables:
@@ -362,7 +358,7 @@ def measured_errors(results: Path, folder: Path) -> tuple[Array, Array]:
 
     folder: a run folder with the true poses.
     """
-    tables = read_tables(results)
+    tables = read_tables(ResultFolder(results))
     truth = read_truth(folder, tables.spots, tables.poses)
     if truth is None or truth.world_from_body is None:
         raise ValueError(f"{folder}: expected true poses, found none")

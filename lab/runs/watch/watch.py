@@ -20,6 +20,7 @@ import numpy as np
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from lab.errors import InputError, RunError
+from lab.files.run.results import are_results
 from lab.files.run.run_file import LiveDevice, Run
 from lab.files.text.atomic_write import atomic_folder
 from lab.findings.outcome import Outcome
@@ -27,7 +28,7 @@ from lab.pictures.picture_file import GreyPicture
 from lab.progress import Progress
 from lab.runs.frames.pipeline import Pipeline, tracker_of
 from lab.runs.frames.sensor_noise import CameraNoise
-from lab.runs.process import are_results, ready_run, write_results
+from lab.runs.process import ready_run, write_results
 from lab.runs.smoothing_pass import TRACKING
 from lab.runs.verdict.frame_checks import FrameChecks
 from lab.runs.verdict.run_statistics import RunStatistics

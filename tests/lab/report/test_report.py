@@ -28,7 +28,7 @@ from lab.report.run.events import MOST_PICTURES, events, selected
 from lab.report.run.page import write_report
 from lab.report.run.report_data import read_report_data
 from lab.report.summary import summary_of, verdict_of
-from tests.lab.fake_results import Fake, make, without_added_columns
+from tests.lab.fake_results import Fake, make
 from tracking.statuses import PoseStatus, SpotStatus
 
 
@@ -170,14 +170,6 @@ def test_velocity_and_rate_have_a_panel_and_a_band_each(fake, page):
         assert f"<title>{name}</title>" in page
         assert f"<title>{name}: \u00b1\u03c3, \u00b13\u03c3 and error</title>" in page
     assert "against differences of the true poses" in page
-
-
-def test_a_report_is_written_for_older_results_without_velocities(fake, tmp_path):
-    html = write_report(without_added_columns(fake.results, tmp_path / "older")).read_text(encoding="utf-8")
-    assert "Velocity and angular rate" not in html
-    assert "label left open" not in html.split("<h2>Residuals")[0].split("Status over time")[1]
-    assert "Attitude and position" in html
-    assert_well_formed(html)
 
 
 def test_the_report_counts_doubtful_and_changed_labels(fake, tmp_path):

@@ -16,14 +16,14 @@ import yaml
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from lab.errors import InputError, RunError
-from lab.files.run.results import POSE_STATUSES, read_poses, read_spots
+from lab.files.run.results import POSE_STATUSES, are_results, read_poses, read_spots
 from lab.files.run.run_file import load_run
 from lab.files.text import columns
 from lab.files.text.json_text import plain_value
 from lab.runs import process, processed, smoothing_pass
 from lab.runs.batch.batch import process_batch
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
-from lab.runs.process import are_results, process_run
+from lab.runs.process import process_run
 from lab.runs.smoothing_pass import SMOOTHING, TRACKING, WRITING, TrackingAndSmoothing
 from lab.runs.verdict.quality import LEAST_MEASURED
 from lab.runs.verdict.run_statistics import CameraStatistics, RunStatistics

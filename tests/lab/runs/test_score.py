@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from geometry.pose import Pose
 from lab.errors import InputError
-from lab.files.run.results import ABSENT, SPOT_STATUSES, SpotGrid, read_poses, read_spots
+from lab.files.run.results import ABSENT, SPOT_STATUSES, ResultFolder, SpotGrid, read_poses, read_spots
 from lab.runs.verdict.score import (
     TruthArrays,
     _returns,
@@ -28,7 +28,7 @@ from lab.runs.verdict.score import (
     right_spot,
     score_against,
 )
-from tests.lab.fake_results import MOTION_SIGMA, NOISE_PX, Fake, make, without_added_columns
+from tests.lab.fake_results import MOTION_SIGMA, NOISE_PX, Fake, make
 from tracking.statuses import PoseStatus, SpotStatus
 
 
@@ -44,7 +44,7 @@ def eventful(tmp_path_factory: pytest.TempPathFactory) -> Fake:
 
 
 def score(results: Path, run_folder: Path) -> dict[str, Any] | None:
-    return against_truth(read_tables(results), run_folder).errors
+    return against_truth(read_tables(ResultFolder(results)), run_folder).errors
 
 
 def rewritten(source: Fake, folder: Path, change: Callable[[dict[str, str]], dict[str, str] | None]) -> Path:
@@ -376,19 +376,7 @@ def test_causal_poses_are_scored_separately_from_smoothed_ones(tmp_path):
     assert s["motion_causal_vs_differences"]["rows"] == s["motion_vs_differences"]["rows"]
 
 
-def test_results_of_an_older_version_have_no_velocities(quiet, tmp_path):
-    older = without_added_columns(quiet.results, tmp_path / "older")
-    poses, spots = read_poses(older), read_spots(older)
-    assert np.isnan(poses.velocity_m_s).all()
-    assert np.isnan(poses.sigma_rate_rad_s).all()
-    assert np.isnan(spots.label_probability).all()
-    now, before = score(quiet.results, quiet.run_folder), score(older, quiet.run_folder)
-    assert (before["spots"], before["pose"]) == (now["spots"], now["pose"])
-    assert before["motion_vs_differences"] is None
-    assert before["pose_causal"] is None
-
-
-def test_a_column_of_the_oldest_version_is_required(quiet, tmp_path):
+def test_every_column_is_required(quiet, tmp_path):
     results = tmp_path / "results"
     results.mkdir()
     text = (quiet.results / "attitude.csv").read_text()

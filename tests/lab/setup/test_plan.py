@@ -54,7 +54,7 @@ def rows_of(path):
 
 def test_a_plan_is_two_tables_and_a_page(rig_path, tmp_path):
     outcome = plan_rig(rig_path, tmp_path / "plan", SMALL)
-    assert {p.name for p in (tmp_path / "plan").iterdir()} == {"plan.csv", "effects.csv", "report.html"}
+    assert {p.name for p in (tmp_path / "plan").iterdir()} == {"plan.csv", "effects.csv", "report.html", "summary.json"}
     plan = plan_of(rig_path, SMALL)
     rows = rows_of(tmp_path / "plan" / "plan.csv")
     assert tuple(rows[0]) == plan_columns(plan)

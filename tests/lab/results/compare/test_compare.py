@@ -14,10 +14,10 @@ import pytest
 from geometry import rotations
 from geometry.arrays import Array
 from lab.errors import InputError
+from lab.files.run.results import SUMMARY_SCHEMA
 from lab.files.text import columns
 from lab.results.compare import UNDETERMINED, alignment_rows, compare, read_reference
 from lab.results.compare_page import DIFFERENCES, compare_and_write
-from lab.runs.summary import SUMMARY_SCHEMA
 from tests.tracking.comparison.motions import TRUTH, recordings, smooth
 from tracking.comparison.frame_alignment import Motion
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import replace
 
@@ -121,7 +122,7 @@ def test_prediction_ellipses_have_the_scatter_of_the_predictions(data):
 def test_results_without_their_run_folder_are_drawn_on_empty_pictures(fake, tmp_path):
     shutil.copytree(fake.results, tmp_path / "results", ignore=shutil.ignore_patterns("summary.json"))
     shown = show_frame(tmp_path / "results", 10)
-    assert "run folder is not there" in shown.notes[0]
+    assert re.search(r"its run folder .* is not there; name it with --run", shown.notes[0])
     assert all(c.picture is None for c in shown.content.cameras)
     assert any(np.isfinite(m.uv_px).all() for c in shown.content.cameras for m in c.marks)
 

@@ -113,7 +113,7 @@ def test_an_unknown_frame_and_a_missing_run_folder_are_named(fake, content, tmp_
     summary = json.loads((moved / "summary.json").read_text())
     text = json.dumps(summary).replace(json.dumps(str(fake.run_folder))[1:-1], "gone")
     (moved / "summary.json").write_text(text)
-    with pytest.raises(InputError, match=r"the rig is unknown, because .*; name it: --rig rig.yaml"):
+    with pytest.raises(InputError, match=r"its run folder .* is not there; name its rig: --rig rig.yaml"):
         read_content(moved, None)
     save_rig(content.rig, tmp_path / "rig.yaml")
     assert read_content(moved, tmp_path / "rig.yaml").known.any()
