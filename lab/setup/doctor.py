@@ -16,8 +16,7 @@ from geometry.compilation.compile_cache import cache_folder, is_empty
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.camera_file import load_camera
-from lab.files.rig.rig_file import load_rig_file
-from lab.files.rig.screens_file import load_screens
+from lab.files.rig.rig_file import load_lab_file
 from lab.files.run.run_file import load_run
 from lab.files.text.yaml_text import read_mapping
 from lab.findings.finding import Finding, Level, finding
@@ -205,7 +204,7 @@ def _state_of(path: Path) -> CalibrationState | None:
     schema = str(read_mapping(path).get("schema", ""))
     if schema.startswith("beampose/camera/"):
         return load_camera(path).calibration
-    return load_screens(path).calibration if schema.startswith("beampose/screens/") else load_rig_file(path).calibration
+    return load_lab_file(path).calibration
 
 
 def _judged(state: CalibrationState | None, today: datetime.date) -> tuple[Level, str, str]:

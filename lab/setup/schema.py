@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import pydantic
 
 from lab.files.project.project import Project
-from lab.files.rig import board_file, camera_file, rig_file, screens_file
+from lab.files.rig import board_file, camera_file, rig_file
 from lab.files.run import run_file
 from lab.files.text import fields
 from lab.files.text.atomic_write import atomic_write_text, made_folder
@@ -150,7 +150,7 @@ BLOCKS: dict[str, tuple[type[Block], str]] = {
     "camera": (camera_file._CameraFileBlock, "camera.yaml: the lens of a camera"),
     "board": (board_file._BoardBlock, "board.yaml: a calibration board"),
     "calibration": (Project, "calibration.yaml: the measurements of a calibration"),
-    "screens": (screens_file._ScreensBlock, "screens.yaml: cameras and screens in one frame"),
+    "screens": (rig_file.ScreensFileBlock, "screens.yaml: cameras and screens in one frame"),
 }
 
 

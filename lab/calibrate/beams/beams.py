@@ -27,10 +27,8 @@ from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expi
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project, load_project
 from lab.files.rig.calibration_state import CalibrationState
-from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance, load_rig_file, save_rig
-from lab.files.rig.screens_file import load_screens
+from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance, load_lab_file, save_rig
 from lab.files.text.error_text import suggest_name
-from lab.files.text.yaml_text import read_mapping
 from lab.findings.finding import Finding, Level, finding, passed, reasons, verdict
 from lab.findings.outcome import Outcome
 
@@ -116,7 +114,8 @@ def _calibrated_lab(project: Project, rig_path: Path) -> tuple[RigFile, RigCovar
             f"{rig_path}: expected a rig.yaml with calibrated cameras and screens, found no file; run"
             f" `beampose calibrate screen {project.path}` first and give its rig.yaml with --rig"
         )
-    file, lab_covariance = _lab_file(rig_path)
+    file = load_lab_file(rig_path)
+    lab_covariance = joint_covariance(file.rig, file.covariances, rig_path)
     for kind, wanted, calibrated in (
         ("camera", project.cameras, file.rig.cameras),
         ("screen", project.screens, file.rig.screens),
@@ -140,15 +139,6 @@ def _calibrated_lab(project: Project, rig_path: Path) -> tuple[RigFile, RigCovar
                 f"{project.path}: target.spots.{name}.screen: expected a screen of {rig_path}, got {spot.screen!r}"
             )
     return replace(file, rig=replace(file.rig, beams=project.beams, spots=project.spots)), lab_covariance
-
-
-def _lab_file(path: Path) -> tuple[RigFile, RigCovariance | None]:
-    """Cameras and screens of a rig.yaml or a screens.yaml, and their covariance where the file states it."""
-    if str(read_mapping(path).get("schema", "")).startswith("beampose/screens/"):
-        screens = load_screens(path)
-        return RigFile(screens.rig, {}, screens.calibration), screens.covariance
-    file = load_rig_file(path)
-    return file, joint_covariance(file.rig, file.covariances, path)
 
 
 def _lab_findings(with_covariance: bool, state: CalibrationState | None, rig_path: Path) -> list[Finding]:

@@ -20,8 +20,7 @@ from lab.calibrate.screens.screen_page import page_of
 from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expiry_findings, run_step
 from lab.files.project.project import Project, load_project
 from lab.files.rig.calibration_state import CalibrationState
-from lab.files.rig.rig_file import RigFile, covariance_blocks, save_rig
-from lab.files.rig.screens_file import ScreensFile, save_screens
+from lab.files.rig.rig_file import TARGET, RigFile, covariance_blocks, save_rig, save_screens
 from lab.files.text.csv_text import write_table
 from lab.findings.finding import Finding, Level, finding, reasons, verdict
 from lab.findings.outcome import Outcome
@@ -150,7 +149,7 @@ def _save(
         if screen.size_m is None and scan is not None:
             width, height = (2 * np.abs(scan.xyz[:, :2]).max(axis=0)).tolist()
             rig = replace(rig, screens={**rig.screens, name: replace(screen, size_m=(width, height))})
-    save_screens(ScreensFile(project.name, rig, fit.covariance, state), folder / SCREENS)
+    save_screens(project.name, RigFile(rig, {TARGET: fit.covariance}, state), folder / SCREENS)
     if project.beams:
         note = "the beams are nominal, not calibrated: run `beampose calibrate beams`"
         state = state.model_copy(update={"verdict": max(level, Level.WARN).name, "reasons": (note, *why)})

@@ -1,4 +1,4 @@
-"""rig.yaml: the rig, and the joint covariance of its parameters."""
+"""rig.yaml: the rig, and the joint covariance of its parameters; screens.yaml: a rig without beams."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def covariance_blocks(covariance: RigCovariance) -> dict[str, RigCovariance]:
 # rig.yaml: screens, cameras, and the beams and spots of the vehicle; read, checked and written.
 
 
-SCHEMA = "beampose/rig/1"
+SCHEMA, SCREENS_SCHEMA = "beampose/rig/1", "beampose/screens/1"
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +122,31 @@ def load_rig_file(path: Path) -> RigFile:
         raise FileError(f"{path}: {m}" for m in mistakes)
     covariances = {where: block.value() for where, block in _covariance_blocks(content)}
     return RigFile(_rig_of(content), covariances, content.calibration, dict(measured_forms(content)))
+
+
+def load_lab_file(path: Path) -> RigFile:
+    """The cameras and screens of a rig.yaml, or of a screens.yaml: a rig without beams. Raises InputError."""
+    mapping = read_mapping(path)
+    if mapping.get("schema") != SCREENS_SCHEMA:
+        return load_rig_file(path)
+    content = fields.validated(ScreensFileBlock, mapping, path)
+    mistakes = _unknown_screens(content)
+    if mistakes:
+        raise FileError(f"{path}: {m}" for m in mistakes)
+    covariances = {} if content.covariance is None else {TARGET: content.covariance.value()}
+    return RigFile(_rig_of(content), covariances, content.calibration)
+
+
+def save_screens(name: str, file: RigFile, path: Path) -> None:
+    """Write the cameras and screens of a rig as a screens.yaml, as `save_rig` does. name: of the project."""
+    own = as_mapping(file)
+    content = {"schema": SCREENS_SCHEMA, "name": name, "screens": own["screens"], "cameras": own["cameras"]}
+    if TARGET in file.covariances:
+        content["covariance"] = covariance_mapping(file.covariances[TARGET])
+    if "calibration" in own:
+        content["calibration"] = own["calibration"]
+    fields.validated(ScreensFileBlock, content, path)
+    write_mapping(content, Path(path))
 
 
 def save_rig(rig: Rig | RigFile, path: Path) -> None:
@@ -238,16 +263,32 @@ class _RigBlock(fields.Block):
     calibration: CalibrationState | None = None
 
 
+class ScreensFileBlock(fields.Block):
+    """screens.yaml: cameras and screens in one world frame, with their joint covariance."""
+
+    schema_: Annotated[str, pydantic.PlainValidator(fields.one_of((SCREENS_SCHEMA,)))] = pydantic.Field(alias="schema")
+    name: fields.Word
+    screens: dict[str, ScreenBlock]
+    cameras: dict[str, CameraBlock]
+    covariance: CovarianceBlock | None = None
+    calibration: CalibrationState | None = None
+
+
 def _broken_references(content: _RigBlock) -> list[str]:
     """Mistakes across fields: too few entries, and names that do not exist."""
     out = []
     for name, block in (("screens", content.screens), ("cameras", content.cameras)):
         if not block:
             out.append(f"{name}: expected one or more, got none")
-    for name, camera in content.cameras.items():
-        if camera.screen not in content.screens:
-            out.append(unknown_name("screen", camera.screen, f"cameras.{name}.screen", content.screens))
-    return out + content.target.mistakes(content.screens)
+    return out + _unknown_screens(content) + content.target.mistakes(content.screens)
+
+
+def _unknown_screens(content: _RigBlock | ScreensFileBlock) -> list[str]:
+    return [
+        unknown_name("screen", camera.screen, f"cameras.{name}.screen", content.screens)
+        for name, camera in content.cameras.items()
+        if camera.screen not in content.screens
+    ]
 
 
 def unknown_name(kind: str, name: str, where: str, known: Collection[str]) -> str:
@@ -262,12 +303,13 @@ def _covariance_blocks(content: _RigBlock) -> list[tuple[str, CovarianceBlock]]:
     return [(where, block) for where, block in blocks if block is not None]
 
 
-def _rig_of(content: _RigBlock) -> Rig:
+def _rig_of(content: _RigBlock | ScreensFileBlock) -> Rig:
+    target = content.target if isinstance(content, _RigBlock) else None
     return Rig(
         screens={name: s.value(name) for name, s in content.screens.items()},
         cameras={name: c.value(name) for name, c in content.cameras.items()},
-        beams=content.target.beam_values(),
-        spots=content.target.spot_values(),
+        beams={} if target is None else target.beam_values(),
+        spots={} if target is None else target.spot_values(),
     )
 
 

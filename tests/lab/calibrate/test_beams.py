@@ -31,8 +31,15 @@ from lab.errors import CalibrationError, InputError
 from lab.files.project.project import load_project
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.camera_file import CameraFile, save_camera
-from lab.files.rig.rig_file import RigFile, as_mapping, covariance_blocks, joint_covariance, load_rig_file, save_rig
-from lab.files.rig.screens_file import ScreensFile, save_screens
+from lab.files.rig.rig_file import (
+    RigFile,
+    as_mapping,
+    covariance_blocks,
+    joint_covariance,
+    load_rig_file,
+    save_rig,
+    save_screens,
+)
 from lab.files.run.run_file import save_run
 from lab.files.text.yaml_text import write_mapping
 from lab.findings.finding import Level
@@ -435,7 +442,7 @@ def test_warnings_and_expiry_of_screens_yaml_go_into_the_rig(campaign, tmp_path)
         valid_until=date(2026, 4, 1),
         reasons=("the left screen is bent by 2 mm",),
     )
-    save_screens(ScreensFile("the lab", lab, lab_covariance(rig), state), tmp_path / "screens.yaml")
+    save_screens("the lab", RigFile(lab, {"target": lab_covariance(rig)}, state), tmp_path / "screens.yaml")
     outcome = calibrate_beams(project, tmp_path / "out", tmp_path / "screens.yaml", date(2026, 3, 14))
     assert outcome.level == Level.WARN
     written = load_rig_file(tmp_path / "out" / "rig.yaml").calibration
@@ -445,7 +452,7 @@ def test_warnings_and_expiry_of_screens_yaml_go_into_the_rig(campaign, tmp_path)
 
 def test_a_lab_and_a_project_without_beams_are_refused(campaign, tmp_path):
     rig, project = campaign
-    save_screens(ScreensFile("the lab", replace(rig, beams={}, spots={}), None, None), tmp_path / "screens.yaml")
+    save_screens("the lab", RigFile(replace(rig, beams={}, spots={})), tmp_path / "screens.yaml")
     text = project.read_text()
     project.write_text(text[: text.index("target:")] + text[text.index("recordings:") :])
     with pytest.raises(InputError, match="target: expected the nominal beams and spots, got none; add them"):

@@ -20,8 +20,7 @@ from lab.calibrate.screens.screen import DOT_COLUMNS, RESIDUAL_COLUMNS, calibrat
 from lab.errors import CalibrationError, InputError
 from lab.files.project.point_files import read_point_cloud
 from lab.files.rig.camera_file import CameraFile, load_camera, save_camera
-from lab.files.rig.rig_file import load_rig_file
-from lab.files.rig.screens_file import load_screens, save_screens
+from lab.files.rig.rig_file import load_lab_file, load_rig_file, save_screens
 from lab.files.text.yaml_text import write_mapping
 from lab.findings.finding import Level
 from lab.simulate.board_photo import PhotoSettings, photograph
@@ -71,19 +70,21 @@ def test_a_good_survey_passes_and_the_line_states_the_uncertainty(good):
 
 def test_the_written_poses_are_near_the_truth_and_read_back_unchanged(good):
     out, outcome = good
-    file = load_screens(out / "screens.yaml")
+    file = load_lab_file(out / "screens.yaml")
     for name, camera in truth().cameras.items():
         found = file.rig.cameras[name].camera_from_world.inverse().translation
         assert np.linalg.norm(found - camera.camera_from_world.inverse().translation) < 0.015
     assert str(file.calibration.date) == "2026-03-14"
     assert str(file.calibration.valid_until) == "2026-04-13"
-    np.testing.assert_array_equal(file.covariance.matrix, outcome.result.fit.covariance.matrix)
-    assert file.covariance.names == outcome.result.fit.covariance.names
-    save_screens(file, out.parent / "again.yaml")
-    again = load_screens(out.parent / "again.yaml")
+    (covariance,) = file.covariances.values()
+    np.testing.assert_array_equal(covariance.matrix, outcome.result.fit.covariance.matrix)
+    assert covariance.names == outcome.result.fit.covariance.names
+    save_screens("bay 3", file, out.parent / "again.yaml")
+    again = load_lab_file(out.parent / "again.yaml")
     for name, screen in file.rig.screens.items():
         assert np.max(np.abs(again.rig.screens[name].world_from_screen.minus(screen.world_from_screen))) < 1e-15
-    assert (again.calibration, again.name) == (file.calibration, file.name)
+    assert again.calibration == file.calibration
+    assert (out.parent / "again.yaml").read_text() == (out / "screens.yaml").read_text()
 
 
 def test_rig_yaml_holds_the_nominal_beams_and_states_that_they_are_not_calibrated(good):
@@ -126,7 +127,7 @@ def test_an_earlier_result_is_replaced_but_no_other_folder(good, tmp_path):
 def test_a_bent_screen_is_a_warning_and_its_bow_is_written(tmp_path):
     outcome = calibrate_screen(write_project(tmp_path / "p", bow=4e-3), tmp_path / "out")
     assert outcome.level == Level.WARN
-    screen = load_screens(tmp_path / "out" / "screens.yaml").rig.screens["left"]
+    screen = load_lab_file(tmp_path / "out" / "screens.yaml").rig.screens["left"]
     assert abs(screen.bow[0]) == pytest.approx(4e-3, abs=8e-4)
     assert "screens.left.bow_xx_per_m" in outcome.result.fit.covariance.names
 
@@ -271,7 +272,7 @@ def test_a_scan_replaces_the_control_points_of_a_screen(tmp_path, kind):
         np.savetxt(tmp_path / "p" / "scan.xyz", points, fmt="%.3f")
     changed(path, screens__right__cloud={"file": f"scan.{kind}", "unit": "mm"})
     outcome = calibrate_screen(path, tmp_path / "out")
-    found = load_screens(tmp_path / "out" / "screens.yaml").rig.screens["right"].world_from_screen
+    found = load_lab_file(tmp_path / "out" / "screens.yaml").rig.screens["right"].world_from_screen
     normal = screen.world_from_screen.rotation[:, 2]
     assert abs(found.rotation[:, 2] @ normal) == pytest.approx(1, abs=1e-6)
     assert abs((found.translation - screen.world_from_screen.translation) @ normal) < 1e-3
@@ -298,7 +299,7 @@ def test_two_scans_of_a_screen_are_aligned_and_points_off_it_left_out(tmp_path):
         np.savetxt(tmp_path / "p" / name, pose.apply(screen.apply(np.concatenate(parts))), fmt="%.5f")
     changed(path, screens__right__cloud={"file": "a.xyz", "also": ["b.xyz"]})
     outcome = calibrate_screen(path, tmp_path / "out")
-    found = load_screens(tmp_path / "out" / "screens.yaml").rig.screens["right"].world_from_screen
+    found = load_lab_file(tmp_path / "out" / "screens.yaml").rig.screens["right"].world_from_screen
     normal = screen.rotation[:, 2]
     assert abs(found.rotation[:, 2] @ normal) == pytest.approx(1, abs=1e-6)
     assert abs((found.translation - screen.translation) @ normal) < 1e-3  # the shift of b is 15 mm along it

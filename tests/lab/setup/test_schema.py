@@ -15,8 +15,7 @@ from jsonschema import Draft202012Validator
 from calibration.boards import board_types
 from lab.errors import InputError
 from lab.files.rig import board_file
-from lab.files.rig.rig_file import load_rig_file
-from lab.files.rig.screens_file import ScreensFile, save_screens
+from lab.files.rig.rig_file import RigFile, load_rig_file, save_screens
 from lab.files.text.yaml_text import parse_mapping, read_mapping
 from lab.setup import schema as files
 from lab.setup.schema import BLOCKS, as_text, schema
@@ -65,7 +64,7 @@ def test_every_file_that_is_read_here_is_valid(name):
 
 def test_there_is_a_file_of_every_kind(tmp_path):
     rig = load_rig_file(next(p for p in SAMPLES if p.name == "rig.yaml")).rig
-    save_screens(ScreensFile("lab", rig, None, None), tmp_path / "screens.yaml")
+    save_screens("lab", RigFile(rig), tmp_path / "screens.yaml")
     content = read_mapping(tmp_path / "screens.yaml")
     assert [e.message for e in validator_of("screens").iter_errors(content)] == []
     assert {kind_of(c) for c in CONTENTS.values()} | {"screens"} == set(BLOCKS)

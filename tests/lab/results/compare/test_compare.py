@@ -32,10 +32,10 @@ def write_results(folder: Path, motion: Motion) -> Path:
     ypr = np.rad2deg(rotations.ypr_from_matrix(motion.rotation))
     q = rotations.quaternion_from_matrix(motion.rotation)
     with (folder / "attitude.csv").open("w") as file:
-        file.write(",".join(columns.ATTITUDE[:21]) + "\n")
+        file.write(",".join(columns.ATTITUDE) + "\n")
         for i, t in enumerate(motion.t_s.tolist()):
             numbers = [*motion.position_m[i], *q[i], *ypr[i], *np.sqrt(np.diag(motion.covariance[i]))]
-            file.write(f"{i},{t!r},{','.join(repr(float(v)) for v in numbers)},6,0.1,measured\n")
+            file.write(f"{i},{t!r},{','.join(repr(float(v)) for v in numbers)},6,0.1,measured{12 * ','}\n")
     upper = np.triu_indices(6)
     with (folder / "covariance.csv").open("w") as file:
         file.write(",".join(columns.COVARIANCE) + "\n")
