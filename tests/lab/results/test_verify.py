@@ -137,7 +137,7 @@ def test_a_run_folder_that_has_gone_is_an_input_error(copy):
     path = copy / "out" / "summary.json"
     content = json.loads(path.read_text())
     path.write_text(json.dumps({**content, "run_folder": str(copy / "gone")}))
-    with pytest.raises(InputError, match="its run folder .* is not there; name it with --run"):
+    with pytest.raises(InputError, match=r"its run folder .* is not there; name it with --run"):
         verify(copy / "out")
 
 
