@@ -35,9 +35,7 @@ def truth_figures(e: Errors | None) -> list[KeyFigure]:
         keys += [
             KeyFigure("right in view", format_percent(s.get("in_view_identity")), "of visible spots"),
             KeyFigure("wrong labels", counted(s.get("wrong_labels")), "measured rows"),
-            KeyFigure(
-                "prediction error", pixels(part(s, "prediction_px", "smooth").get("rms")), "RMS, straight parts"
-            ),
+            KeyFigure("prediction error", pixels(part(s, "prediction_px", "smooth").get("rms")), "RMS, straight parts"),
             KeyFigure(
                 "out-of-view error",
                 pixels(outside.get("rms")),
@@ -64,7 +62,7 @@ def truth_figures(e: Errors | None) -> list[KeyFigure]:
 def pixel_rows(e: Errors | None) -> list[tuple[str, ...]]:
     """Errors in the picture: name, rows, RMS u, RMS v, 99th percentile and largest distance (px), meaning."""
     kinds = (
-        ("prediction", ("prediction_px", "smooth"), "one frame ahead, without starts of tracks and bends of the true path"),
+        ("prediction", ("prediction_px", "smooth"), "one frame ahead, without starts of tracks and bends"),
         ("prediction, matched", ("prediction_px", "straight"), "rows with status matched, without starts of tracks"),
         ("prediction at turns", ("prediction_px", "turned"), "rows with status turned"),
         ("prediction at bends", ("prediction_px", "bends"), "where the true path bends by more than 2 px"),
@@ -213,7 +211,8 @@ def key_figures(m: ReportData) -> list[KeyFigure]:
 
 def spot_rows(m: ReportData) -> tuple[list[str], list[list[str]]]:
     """Heads and rows of the table of views: counts of each status, and errors."""
-    heads = ["camera", "spot", *(str(s).replace("_", " ") for s in SpotStatus), "median σ (px)", "measured \u2212 predicted, RMS (px)"]
+    heads = ["camera", "spot", *(str(s).replace("_", " ") for s in SpotStatus)]
+    heads += ["median σ (px)", "measured \u2212 predicted, RMS (px)"]
     if m.residual_px is not None:
         heads += ["residual RMS (px)", "mean residual u, v (px)"]
     doubtful = np.isfinite(m.spots.label_probability)
