@@ -15,9 +15,9 @@ import numpy as np
 from bench.random_scenes.scene import Scene
 from geometry.arrays import Array, Bools
 from geometry.pose import Pose
+from lab.files.run.clocks import Times
 from lab.files.run.results import read_poses, read_spots
 from lab.files.run.run_file import Run
-from lab.files.run.times import Times
 from lab.pictures.picture_file import DROPPED, MissingPicture
 from lab.runs import process
 from lab.runs.frames.frames import FrameSet

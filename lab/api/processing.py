@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from lab.api.results import Results
-from lab.files.run.parameter_overrides import with_overrides
+from lab.files.text.dataclass_fields import with_overrides
 from lab.progress import Progress
 from lab.runs.process import process_run
 from lab.simulate.scenarios import SCENARIOS

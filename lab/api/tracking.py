@@ -17,10 +17,10 @@ from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.rig.rig_file import RigFile, joint_covariance, load_rig_file
-from lab.files.run.parameter_overrides import with_overrides
 from lab.files.run.run_file import prior_from
 from lab.files.text import columns
 from lab.files.text.csv_table import is_whole
+from lab.files.text.dataclass_fields import with_overrides
 from lab.files.text.error_text import suggest_name
 from lab.runs.tables import pose_numbers
 from tracking.curve_switching.spot_tracker import SpotTracker

@@ -14,10 +14,11 @@ from typing import Any, Generic, TypeVar
 
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project
+from lab.files.rig.calibration_state import CalibrationState
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.text.atomic_write import atomic_folder, check_output_folder, earlier_results, keep_good_results
 from lab.files.text.json_text import write_json
-from lab.findings.finding import Finding, Level, finding, first_sentence, verdict, worst_first
+from lab.findings.finding import Finding, Level, finding, first_sentence, reasons, verdict, worst_first
 from lab.findings.outcome import Outcome, Verdict
 from lab.report.page import KeyFigure, Page, Section, made_with, write_page
 from lab.report.page import Verdict as PageVerdict
@@ -122,7 +123,25 @@ def made_of(day: datetime.date, inputs: Sequence[Mapping[str, Any]]) -> list[tup
     return [("date", day.isoformat()), made_with(), *named]
 
 
-# Date of a calibration and end of its validity.
+# State of a calibration: its verdict, its date and the end of its validity.
+
+
+def state_of(
+    findings: Sequence[Finding],
+    day: datetime.date,
+    valid_until: datetime.date | None,
+    notes: str = "",
+    made_from: tuple[str, ...] = (),
+) -> CalibrationState:
+    """What the file of a calibration states: verdict and reasons, the most severe first; date and validity."""
+    return CalibrationState(
+        date=day,
+        verdict=verdict(findings).name,
+        valid_until=valid_until,
+        reasons=reasons(worst_first(findings)),
+        notes=notes,
+        made_from=made_from,
+    )
 
 
 def calibration_date(project: Project, today: datetime.date | None) -> datetime.date:

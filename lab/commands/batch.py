@@ -17,6 +17,7 @@ from lab.commands.common import (
     FOLDER,
     check_verbosity,
     complain,
+    progress_bar,
     provenance,
     quiet_option,
     set_option,
@@ -134,26 +135,13 @@ def _printer() -> Callable[[str], None]:
 
 @contextlib.contextmanager
 def _progress() -> Iterator[Shown]:
-    """A line with the number of runs, the rate and the remaining time, on a terminal only."""
-    if not sys.stderr.isatty():
-        yield lambda done, processed, total: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    parts = (
-        TextColumn("runs"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[pace]}"),
-    )
-    with Progress(*parts, console=Console(stderr=True), transient=True) as bar:
-        task, begun = bar.add_task("runs", total=None, pace=""), time.monotonic()
+    """A bar with the number of runs, the rate and the remaining time, on a terminal only."""
+    begun = time.monotonic()
+    with progress_bar("runs") as bar:
 
         def show(done: int, processed: int, total: int) -> None:
-            text = pace(processed, total - done, time.monotonic() - begun)
-            bar.update(task, completed=done, total=total, pace=text)
+            if bar is not None:
+                bar(done, total, pace(processed, total - done, time.monotonic() - begun))
 
         yield show
 

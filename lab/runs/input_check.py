@@ -41,9 +41,9 @@ from lab.number_format import format_number
 from lab.pictures.picture_file import DROPPED, UNREADABLE, MissingPicture
 from lab.pictures.source import PictureFiles
 from lab.progress import Progress
+from lab.runs.frames.clocked_frames import open_frames
 from lab.runs.frames.even_sampler import EvenSampler
 from lab.runs.frames.frames import FrameReader, FrameSet, pictures_at
-from lab.runs.frames.open_frames import open_frames
 from lab.runs.setup_check import FRAMES, MOST_KEPT, mistakes_by_themselves, rates_of_videos, recorded_mistakes
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters

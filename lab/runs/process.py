@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 from geometry.forward_model import SpotModel
 from lab.files.rig.calibration_state import require_valid_calibration
-from lab.files.run.parameter_overrides import with_overrides
 from lab.files.run.results import ResultFolder, are_results
 from lab.files.run.run_file import Run, load_run
 from lab.files.run.truth import load_run_truth
 from lab.files.text.atomic_write import atomic_folder
+from lab.files.text.dataclass_fields import with_overrides
 from lab.findings.finding import Level, worst_first
 from lab.findings.finding import verdict as verdict_of
 from lab.findings.outcome import Outcome, Verdict

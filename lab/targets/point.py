@@ -14,8 +14,8 @@ import numpy as np
 
 from geometry.arrays import Array
 from lab.errors import InputError
-from lab.files.run.parameter_overrides import with_overrides
 from lab.files.text.csv_text import number_fields
+from lab.files.text.dataclass_fields import with_overrides
 from lab.findings.finding import Finding, Level, finding
 from lab.number_format import format_number, format_percent
 from lab.pictures.picture_file import MissingPicture

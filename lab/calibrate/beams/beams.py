@@ -23,13 +23,13 @@ from lab.calibrate.beams.beam_findings import (
 )
 from lab.calibrate.beams.beams_page import BEAMS, page_of, write_tables
 from lab.calibrate.beams.recordings import read_recordings, stand_of
-from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expiry_findings, run_step
+from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expiry_findings, run_step, state_of
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project, load_project
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance, load_lab_file, save_rig
 from lab.files.text.error_text import suggest_name
-from lab.findings.finding import Finding, Level, finding, passed, reasons, verdict
+from lab.findings.finding import Finding, Level, finding, passed, verdict
 from lab.findings.outcome import Outcome
 
 RIG = "rig.yaml"
@@ -159,11 +159,5 @@ def _rig_file(
 ) -> RigFile:
     lab = file.calibration  # of cameras and screens: the new rig.yaml expires no later than they do
     expiry = [d for d in (lab.valid_until if lab is not None else None, expiry_date(project, day)) if d is not None]
-    state = CalibrationState(
-        date=day,
-        verdict=verdict(findings).name,
-        valid_until=min(expiry, default=None),
-        reasons=reasons(findings),
-        notes=project.notes,
-    )
+    state = state_of(findings, day, min(expiry, default=None), project.notes)
     return RigFile(c.rig, covariance_blocks(c.covariance), state)

@@ -24,7 +24,7 @@ _WHAT = {
 }
 
 
-def group_of(name: str) -> str:
+def free_group(name: str) -> str:
     """The group of `--free` to which a parameter belongs."""
     kind, _, parameter = split_name(name)
     return LENS if kind == CAMERAS and parameter not in POSE else kind
@@ -44,7 +44,7 @@ def stated_covariance(rig: Rig, stated: RigCovariance | None, sigmas: Mapping[st
     names: list[str] = []
     blocks: list[Array] = []
     if stated is not None:
-        kept = [i for i, n in enumerate(stated.names) if group_of(n) == LENS or split_name(n)[:2] not in chosen]
+        kept = [i for i, n in enumerate(stated.names) if free_group(n) == LENS or split_name(n)[:2] not in chosen]
         kept = [i for i in kept if stated.matrix[i, i] > 0]
         names += [stated.names[i] for i in kept]
         blocks.append(stated.matrix[np.ix_(kept, kept)])

@@ -20,19 +20,19 @@ from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.calibrate.refine import prior_sigmas
-from lab.calibrate.refine.prior_sigmas import GROUPS, group_of, stated_covariance
+from lab.calibrate.refine.prior_sigmas import GROUPS, free_group, stated_covariance
 from lab.calibrate.refine.recordings import LabelledRun, labelled, tolerant, with_rig
 from lab.calibrate.refine.refine_findings import RefineResult, refine_findings
 from lab.calibrate.refine.refine_page import page_of, pixel_residuals
-from lab.calibrate.step import Solved, Step, run_step
+from lab.calibrate.step import Solved, Step, run_step, state_of
 from lab.errors import CalibrationError, InputError
-from lab.files.rig.calibration_state import CalibrationState, require_valid_calibration
+from lab.files.rig.calibration_state import require_valid_calibration
 from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance, load_rig_file, save_rig
 from lab.files.run.fingerprints import fingerprints
 from lab.files.run.run_file import Run, load_run
 from lab.files.text.csv_text import csv_word, write_table
 from lab.files.text.error_text import suggest_name
-from lab.findings.finding import Finding, Level, reasons, verdict, worst_first
+from lab.findings.finding import Finding, Level, verdict
 from lab.findings.outcome import Outcome
 from lab.progress import Progress
 from lab.runs.model_check.check import with_place_errors
@@ -119,7 +119,7 @@ def _solve(
 
 def _stacks(free: Sequence[str], prior: RigCovariance, rig_path: Path) -> set[str]:
     """The stacks of unknowns that the groups name; all without groups."""
-    stated = {group_of(n) for n in prior.names}
+    stated = {free_group(n) for n in prior.names}
     for group in free:
         if group not in GROUPS:
             raise InputError(f"--free: expected some of {','.join(GROUPS)}, got {group!r}{suggest_name(group, GROUPS)}")
@@ -181,10 +181,8 @@ def _rig_file(
     prints = [p for run in runs for p in fingerprints(run)]
     lines = dict.fromkeys(f"{p['path']} sha256 {p['sha256']}" for p in prints)
     old = given.calibration
-    state = CalibrationState(
-        date=day, verdict=verdict(findings).name, valid_until=None if old is None else old.valid_until,
-        reasons=reasons(worst_first(findings)), notes="" if old is None else old.notes, made_from=tuple(lines),
-    )  # fmt: skip
+    until, notes = (None, "") if old is None else (old.valid_until, old.notes)
+    state = state_of(findings, day, until, notes, tuple(lines))
     return replace(given, rig=r.rig, covariances=covariance_blocks(r.covariance), calibration=state, measured_as={})
 
 

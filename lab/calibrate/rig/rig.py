@@ -41,14 +41,13 @@ from lab.calibrate.rig.rig_findings import RigLimits, RigResult, joint_findings
 from lab.calibrate.rig.rig_page import page_of
 from lab.calibrate.screens.screen_findings import ScreenLimits, near_findings, network_findings, survey_findings
 from lab.calibrate.screens.screen_inputs import adjusted_screens, screen_inputs
-from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expiry_findings, run_step
+from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expiry_findings, run_step, state_of
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project, load_project
-from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import RigFile, covariance_blocks, save_rig
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.csv_text import csv_word
-from lab.findings.finding import Finding, Level, finding, passed, reasons, verdict, worst_first
+from lab.findings.finding import Finding, Level, finding, passed, verdict
 from lab.findings.outcome import Outcome
 from lab.progress import Progress
 
@@ -260,8 +259,5 @@ def _lens_findings(project: Project, day: datetime.date) -> list[Finding]:
 
 
 def _rig_file(joint: Joint, findings: Sequence[Finding], project: Project, day: datetime.date) -> RigFile:
-    until, why = expiry_date(project, day), reasons(worst_first(findings))
-    state = CalibrationState(
-        date=day, verdict=verdict(findings).name, valid_until=until, reasons=why, notes=project.notes
-    )
+    state = state_of(findings, day, expiry_date(project, day), project.notes)
     return RigFile(joint.rig, covariance_blocks(joint.covariance), state)

@@ -17,12 +17,11 @@ from geometry.rig import Rig
 from lab.calibrate.screens.screen_findings import near_findings, network_findings, survey_findings
 from lab.calibrate.screens.screen_inputs import adjusted_screens, screen_inputs
 from lab.calibrate.screens.screen_page import page_of
-from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expiry_findings, run_step
+from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expiry_findings, run_step, state_of
 from lab.files.project.project import Project, load_project
-from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import TARGET, RigFile, covariance_blocks, save_rig, save_screens
 from lab.files.text.csv_text import write_table
-from lab.findings.finding import Finding, Level, finding, reasons, verdict
+from lab.findings.finding import Finding, Level, finding, verdict
 from lab.findings.outcome import Outcome
 from lab.progress import Progress
 
@@ -139,10 +138,8 @@ def _figures(result: ScreensResult) -> str:
 def _save(
     project: Project, result: ScreensResult, findings: Sequence[Finding], day: datetime.date, folder: Path
 ) -> None:
-    level, why, fit = verdict(findings), reasons(findings), result.fit
-    state = CalibrationState(
-        date=day, verdict=level.name, valid_until=expiry_date(project, day), reasons=why, notes=project.notes
-    )
+    fit = result.fit
+    state = state_of(findings, day, expiry_date(project, day), project.notes)
     rig = fit.rig
     for k, (name, screen) in enumerate(rig.screens.items()):
         scan = None if project.screens[name].cloud is None else result.screens[k]
@@ -152,6 +149,7 @@ def _save(
     save_screens(project.name, RigFile(rig, {TARGET: fit.covariance}, state), folder / SCREENS)
     if project.beams:
         note = "the beams are nominal, not calibrated: run `beampose calibrate beams`"
-        state = state.model_copy(update={"verdict": max(level, Level.WARN).name, "reasons": (note, *why)})
+        level = max(verdict(findings), Level.WARN)
+        state = state.model_copy(update={"verdict": level.name, "reasons": (note, *state.reasons)})
         whole = Rig(rig.screens, rig.cameras, project.beams, project.spots)
         save_rig(RigFile(whole, covariance_blocks(fit.covariance), state), folder / RIG)

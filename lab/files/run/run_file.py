@@ -19,12 +19,11 @@ from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState, OptionalDay
 from lab.files.rig.rig_file import joint_covariance, load_rig_file
-from lab.files.run.clocks import ESTIMATE, CameraClock, load_clock
-from lab.files.run.not_a_run import no_run_error
-from lab.files.run.times import Times, load_times
+from lab.files.run.clocks import ESTIMATE, CameraClock, Times, load_clock, load_times
 from lab.files.text import fields
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.error_text import FileError, name_of_path, suggest_name
+from lab.files.text.json_text import read_json
 from lab.files.text.yaml_text import read_mapping, write_mapping
 from lab.pictures.picture_file import PICTURE_SUFFIXES
 from tracking.parameters import TrackerParameters
@@ -205,6 +204,46 @@ def save_run(content: Mapping[str, Any], run_folder: Path) -> Path:
     dataclass_from_yaml(TrackerParameters, block.tracker, path, "tracker")
     write_mapping(full, path)
     return path
+
+
+_MOST_NAMES = 3
+
+
+def no_run_error(folder: Path) -> InputError:
+    """The error for a folder without a run.yaml: what was found in it, and what to name instead.
+
+    Raises:
+        InputError: a summary.json in it is a named pipe, a socket or a device.
+    """
+    start = f"{folder}: expected a run folder, with a run.yaml,"
+    if (folder / "summary.json").is_file() and (run := _run_of_results(folder)):
+        return InputError(f"{start} found results; they are of the run {run}")
+    try:
+        entries = sorted(folder.iterdir())
+    except OSError as error:
+        return InputError(f"{folder}: cannot be read: {error.strerror}")
+    runs = [path for path in entries if (path / "run.yaml").is_file()]
+    if runs:
+        names = ", ".join(name_of_path(path) for path in runs[:_MOST_NAMES])
+        more = f" and {len(runs) - _MOST_NAMES} more" if len(runs) > _MOST_NAMES else ""
+        return InputError(f"{start} found run folders in it: {names}{more}; name one, or give all to `beampose batch`")
+    above = next((path for path in list(folder.resolve().parents)[:2] if (path / "run.yaml").is_file()), None)
+    if above is not None:
+        return InputError(f"{start} found a part of one; name the run folder {name_of_path(above)}")
+    if any(path.suffix.lower() in PICTURE_SUFFIXES for path in entries):
+        return InputError(
+            f"{start} found pictures; `beampose detect` needs no run.yaml, and `beampose init` writes one to start from"
+        )
+    return InputError(f"{start} found none; check the path, or write one with `beampose init`")
+
+
+def _run_of_results(folder: Path) -> str:
+    """The run folder that a summary.json names; empty where it names none."""
+    try:
+        summary = read_json(folder / "summary.json")
+        return str(summary.get("run_folder") or "")
+    except (OSError, ValueError, AttributeError):
+        return ""
 
 
 # The schema of the file ----------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import typing
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, cast
 
 import pydantic
 
@@ -117,3 +117,26 @@ def _value_of(cls: type[T], block: fields.Block) -> T:
             value = _value_of(typing.cast(type, inner[0]), value)
         values[name] = value
     return cls(**values)
+
+
+MAX_DOTS = 5  # of a name; the parameters have one level of blocks
+
+
+def with_overrides(parameters: T, overrides: Mapping[str, Any], place: str = "--set") -> T:
+    """Parameters with overrides, checked as in a file. Dotted names address inner blocks.
+
+    place: where the overrides are from, in messages. Raises InputError.
+    """
+    content: dict[str, Any] = dataclasses.asdict(cast(Any, parameters))
+    for name, value in overrides.items():
+        *blocks, last = name.split(".") if name.count(".") <= MAX_DOTS else [name]
+        inner: Any = content
+        for block in blocks:
+            inner = inner.setdefault(block, {})
+            if not isinstance(inner, dict):
+                break
+        else:
+            inner[last] = value
+            continue
+        content[name] = value  # there is no such block, which the check reports
+    return dataclass_from_yaml(type(parameters), content, place)

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from lab.errors import InputError
-from lab.files.run.parameter_overrides import with_overrides
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder, earlier_results
 from lab.files.text.csv_text import csv_word
+from lab.files.text.dataclass_fields import with_overrides
 from lab.files.text.json_text import write_json
 from lab.findings.outcome import Done
 from lab.pictures.picture_file import MissingPicture

@@ -204,3 +204,13 @@ def _count_pictures(video: Video) -> int:
     if video.count is not None:
         return video.count
     return sum(1 for _ in pictures(video))
+
+
+def open_frames(run: Run) -> FrameReader:
+    """The reader of a run's pictures. Single damaged pictures are no error: they are Missing.
+
+    Raises:
+        InputError: a folder is empty or has two pictures of one number, a video or table cannot be read, or a frame has
+            no timestamp.
+    """
+    return ClockedFrames(run) if run.clocks else FrameReader(run)

@@ -14,10 +14,9 @@ from geometry.light_centroid import CentroidOffsets
 from geometry.pose_prior import PosePrior
 from lab.files.run.run_file import DetectionsTable, Run
 from lab.pictures.picture_file import GreyPicture, MissingPicture
-from lab.runs.frames.clocked_frames import FoundPoints
+from lab.runs.frames.clocked_frames import FoundPoints, open_frames
 from lab.runs.frames.frames import FrameSet
 from lab.runs.frames.moments import Moment
-from lab.runs.frames.open_frames import open_frames
 from tracking.detections import Detections, PictureClock
 from tracking.noise import NoiseModel
 from tracking.rigid_body.rigid_tracker import RigidTracker

@@ -37,6 +37,7 @@ from geometry.pose_solver.gauss_newton import PoseFit
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState, OptionalDay
 from lab.files.rig.pair_file import REMEDY, load_pair_file, of_two_cameras
+from lab.files.run.clocks import Times, load_times
 from lab.files.run.run_file import (
     RATE_RANGE_HZ,
     DetectionsTable,
@@ -47,7 +48,6 @@ from lab.files.run.run_file import (
     folder_of_run,
     source_of,
 )
-from lab.files.run.times import Times, load_times
 from lab.files.text import fields
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.error_text import name_of_path, suggest_name

@@ -11,9 +11,9 @@ from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.project.point_files import read_observations, read_poses, read_survey
 from lab.files.rig.rig_file import load_rig
+from lab.files.run.clocks import load_times
 from lab.files.run.detections_file import read_detections
 from lab.files.run.results import read_result_table
-from lab.files.run.times import load_times
 from lab.files.run.truth import load_truth
 from lab.files.text import csv_text
 from lab.files.text.csv_text import read_table

@@ -15,8 +15,8 @@ import pytest
 
 from geometry import rotations
 from lab.errors import InputError
+from lab.files.run.clocks import Times, load_times
 from lab.files.run.run_file import DetectionsTable, FramesFolder, VideoFile, load_run, save_run
-from lab.files.run.times import Times, load_times
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from tests.lab.run_folders import RUN, edit, write_run
 from tracking.parameters import DetectParameters, TrackerParameters
