@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from itertools import product
 from types import MappingProxyType
@@ -405,12 +405,12 @@ def worst_first(plan: Plan, count: int) -> list[int]:
     return [*fewest.tolist(), *rest.tolist()]
 
 
-def axis_words(direction: Array, names: Sequence[str] = ("x", "y", "z")) -> str:
+def axis_words(direction: Array) -> str:
     """A direction (3,) in words: `y`, or `0.8 x − 0.6 z`; a dash for none."""
     if not np.isfinite(direction).all():
         return "–"
     if np.max(np.abs(direction)) > 0.95:
-        return names[int(np.argmax(np.abs(direction)))]
-    terms = [(f"{abs(v):.1f} {n}", v < 0) for v, n in zip(direction.tolist(), names, strict=True) if abs(v) >= 0.25]
+        return "xyz"[int(np.argmax(np.abs(direction)))]
+    terms = [(f"{abs(v):.1f} {n}", v < 0) for v, n in zip(direction.tolist(), "xyz", strict=True) if abs(v) >= 0.25]
     text = ("−" if terms[0][1] else "") + terms[0][0]
     return text + "".join(f" {'−' if negative else '+'} {term}" for term, negative in terms[1:])

@@ -38,7 +38,7 @@ def require_regular_file(path: Path) -> None:
             raise InputError(f"{path}: expected a file, found {words}; write its content to a file")
 
 
-def text_of_file(path: Path, encoding: str = "utf-8", errors: str = "strict") -> str:
+def text_of_file(path: Path) -> str:
     """The text of a file.
 
     Raises:
@@ -47,7 +47,7 @@ def text_of_file(path: Path, encoding: str = "utf-8", errors: str = "strict") ->
         ValueError: it has another encoding.
     """
     require_regular_file(path)
-    return path.read_text(encoding, errors)
+    return path.read_text("utf-8")
 
 
 def bytes_of_file(path: Path) -> bytes:

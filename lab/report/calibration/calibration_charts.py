@@ -150,7 +150,6 @@ def lens_model_chart(
     names: Sequence[str],
     error_px: Array,
     chosen: int,
-    title: str = "Lens models: expected error of directions",
     *,
     noise_px: Array | None = None,
 ) -> str:
@@ -160,6 +159,7 @@ def lens_model_chart(
     """
     rms = np.asarray(error_px, dtype=float)
     finite = rms[np.isfinite(rms)]
+    title = "Lens models: expected error of directions"
     # The bar of a model with a much larger error is cut and its number marked, so that the others stay readable.
     top = max(min(float(finite.max()), 4 * float(finite.min())) * 1.15 if finite.size else 1.0, 1e-9)
     row, left = 26.0, min(20 + 6.4 * max((len(n) for n in names), default=0), 200.0)

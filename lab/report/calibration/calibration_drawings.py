@@ -65,14 +65,13 @@ def residual_field(
     residual_px: Array,
     title: str = "Residuals over the sensor, all views",
     *,
-    cells: int = 16,
     things: str = "corners",
 ) -> str:
     """The residuals of all views over the sensor: single residuals faint, the mean of each cell bold.
 
     found_px, residual_px (n, 2), px. With a suitable lens model the means are about zero; means that vary
-    systematically over the sensor show distortion that the model cannot describe. A mean is drawn where its cell has 5
-    or more points. cells: over the width. things: the name of the points in the text.
+    systematically over the sensor show distortion that the model cannot describe. A mean is drawn where its cell, a
+    sixteenth of the width, has 5 or more points. things: the name of the points in the text.
     """
     found, residual = np.asarray(found_px, dtype=float), np.asarray(residual_px, dtype=float)
     good = np.isfinite(found).all(axis=1) & np.isfinite(residual).all(axis=1)
@@ -90,7 +89,7 @@ def residual_field(
     starts = p.at(found)
     d = svg.segments(starts[kept], starts[kept] + _capped(residual[kept] * stretch))
     out.append(f'<path d="{d}" stroke="{svg.BLUE}" stroke-width="0.7" stroke-opacity="0.55" fill="none"/>')
-    middle, mean, _ = cell_means(size_px, found, residual, cells)
+    middle, mean, _ = cell_means(size_px, found, residual, 16)
     tips = p.at(middle) + mean * stretch * 2
     d = svg.segments(p.at(middle), tips)
     out.append(f'<path d="{d}" stroke="var(--paper)" stroke-width="4" fill="none"/>')
@@ -163,18 +162,20 @@ def coverage_map(
     return svg.svg_of(p, title, [*out, svg.frame(p)])
 
 
-def tilt_polar(
-    tilts_deg: Array, azimuths_deg: Array, title: str = "How the boards were tilted", *, wanted_deg: float = 20.0
-) -> str:
+_WANTED_DEG = 20.0  # views of boards that are tilted less contribute little to the focal length
+
+
+def tilt_polar(tilts_deg: Array, azimuths_deg: Array) -> str:
     """The tilt of the board in each view as a polar plot: radius the angle, direction the azimuth.
 
     tilts_deg (n,): angle between the normal of the board and the optical axis; azimuths_deg (n,): direction of the tilt
-    from +u towards +v. Views tilted by less than `wanted_deg` contribute little to the focal length.
+    from +u towards +v.
     """
     tilts, azimuths = np.asarray(tilts_deg, dtype=float), np.radians(np.asarray(azimuths_deg, dtype=float))
     finite = tilts[np.isfinite(tilts)]
     outer = max(60.0, float(finite.max()) * 1.05 if finite.size else 0.0)
     p = svg.PlotArea(svg.Scale(-outer, outer, 95, 445), svg.Scale(-outer, outer, 30, 380), 540, 412)
+    title = "How the boards were tilted"
     out = [svg.text(58, 15, title, "title")]
     at = p.at(np.zeros(2))
     per_degree = 175 / outer
@@ -184,16 +185,15 @@ def tilt_polar(
             f' stroke="var(--line)" stroke-width="0.8"/>'
         )
         out.append(svg.text(float(at[0]) + 3, float(at[1]) - ring * per_degree - 2, f"{ring}°"))
-    out.append(
-        f'<circle cx="{at[0]}" cy="{at[1]}" r="{wanted_deg * per_degree:.1f}" fill="{svg.ORANGE}" fill-opacity="0.16"/>'
-    )
+    few = f'r="{_WANTED_DEG * per_degree:.1f}" fill="{svg.ORANGE}" fill-opacity="0.16"'
+    out.append(f'<circle cx="{at[0]}" cy="{at[1]}" {few}/>')
     out.append('<path class="grid" d="M95 205H445M270 30V380"/>')
     out += [svg.text(449, 209, "+u"), svg.text(270, 394, "+v", "mid")]
     places = p.at(np.stack([tilts * np.cos(azimuths), tilts * np.sin(azimuths)], axis=-1))
     style = f'fill="{svg.BLUE}" fill-opacity="0.75" stroke="var(--paper)" stroke-width="0.7"'
     out.append(f'<path d="{svg.dots(places, 3.6)}" {style}/>')
-    few = int((finite > wanted_deg).sum())
-    out.append(svg.text(58, 408, f"{few} of {finite.size} views are tilted by more than {wanted_deg:g}°"))
+    tilted = int((finite > _WANTED_DEG).sum())
+    out.append(svg.text(58, 408, f"{tilted} of {finite.size} views are tilted by more than {_WANTED_DEG:g}°"))
     return svg.svg_of(p, title, out)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import cv2
 import numpy as np
 from contourpy import contour_generator
@@ -96,26 +94,23 @@ def heat_map(
     x_name: str = "u (px)",
     y_name: str = "v (px)",
     y_down: bool = True,
-    diverging: bool = False,
-    levels: Sequence[float] | None = None,
     limits: tuple[float, float] | None = None,
     equal: bool = True,
 ) -> str:
     """A quantity over a plane, with contour lines and a colour bar.
 
     values (rows, columns): at evenly spaced places from the first to the last of extent = (x_first, x_last, y_first,
-    y_last), row 0 at y_first; nan where there is none (hatched). levels: of the contours; None: round ones. limits:
-    of the colours; None: of the values. equal: one unit has the same length in x and y.
+    y_last), row 0 at y_first; nan where there is none (hatched). limits: of the colours; None: of the values.
+    equal: one unit has the same length in x and y.
     """
     values = np.asarray(values, dtype=float)
-    lo, hi = limits or value_range(values, diverging)
+    lo, hi = limits or value_range(values, False)
     x0, x1, y0, y1 = extent
     p = svg.plot_area((x0, x1), (y0, y1), equal=equal, y_down=y_down, right=BAR_WIDTH)
     out = [*svg.axes(p, title, x_name, y_name, grid=False), _hatched(*p.box)]
-    out.append(_image(p, _enlarged(values if y_down else values[::-1]), lo, hi, diverging))
-    marks = np.asarray(levels, dtype=float) if levels is not None else contour_levels(lo, hi)
+    out.append(_image(p, _enlarged(values if y_down else values[::-1]), lo, hi))
     grid_x, grid_y = np.linspace(x0, x1, values.shape[1]), np.linspace(y0, y1, values.shape[0])
-    for level in marks.tolist():
+    for level in contour_levels(lo, hi).tolist():
         lines = [p.at(line) for line in contour_lines(values, grid_x, grid_y, level)]
         if not lines:
             continue
@@ -126,7 +121,7 @@ def heat_map(
             style = "fill:#fff;font-weight:600;paint-order:stroke;stroke:#000a;stroke-width:2.6px"
             out.append(svg.text(place[0], place[1] + 3.5, svg.number(level), "mid", style))
     finite = values[np.isfinite(values)]
-    out.append(colour_bar(p, lo, hi, unit, diverging))
+    out.append(colour_bar(p, lo, hi, unit, False))
     if finite.size:
         spread = f"{svg.number(float(finite.min()))} to {svg.number(float(finite.max()))} {unit}"
         out.append(svg.note(p, f"{spread}, median {svg.number(float(np.median(finite)))}"))
@@ -173,9 +168,9 @@ def label_place(p: svg.PlotArea, lines: list[Array]) -> tuple[float, float] | No
     return x, y
 
 
-def _image(p: svg.PlotArea, values: Array, lo: float, hi: float, diverging: bool) -> str:
+def _image(p: svg.PlotArea, values: Array, lo: float, hi: float) -> str:
     """The colours of values (rows, columns) over the plot area as an embedded PNG, transparent at nan."""
-    rgb = colours((values - lo) / (hi - lo), diverging)
+    rgb = colours((values - lo) / (hi - lo))
     alpha = np.where(np.isfinite(values), 255, 0).astype(np.uint8)
     return svg.filled(p, svg.image_uri(np.dstack([rgb[..., ::-1], alpha]), "png"))
 

@@ -93,19 +93,12 @@ def _space(view: View) -> str:
     return f", in a grey box of {x:.2g} x {y:.2g} x {z:.2g} m in which at least half of them stay in view"
 
 
-def scene_data(
-    view: View, index: int | None, most_moments: int = MOST_MOMENTS, digits: int = 4, labels: bool = True
-) -> dict[str, Any]:
-    """The scene for the page's program: lines, labels and moments; coordinates in m, rounded to so many digits.
-
-    labels: with the names of screens and cameras.
-    """
+def scene_data(view: View, index: int | None, most_moments: int = MOST_MOMENTS, digits: int = 4) -> dict[str, Any]:
+    """The scene for the page's program: lines, labels and moments; coordinates in m, rounded to so many digits."""
     lines = []
     for thing in view.fixed:
         for number, line in enumerate(edges(thing, view.reach_m)):
-            label = (
-                thing.name if labels and number == 0 and not thing.name.startswith(("trajectory", "workspace")) else ""
-            )
+            label = thing.name if number == 0 and not thing.name.startswith(("trajectory", "workspace")) else ""
             lines.append(
                 {"c": thing.colour, "n": label, "f": isinstance(thing, Rectangle), "p": _rounded(line, digits)}
             )

@@ -139,9 +139,9 @@ def _measured(statistics: RunStatistics) -> list[Finding]:
     return [finding("BP-V03", level, what, variant="" if cause is None else cause.value, numbers=numbers)]
 
 
-def _causes_text(causes: Mapping[Cause, int], most: int = 3) -> str:
+def _causes_text(causes: Mapping[Cause, int]) -> str:
     """`30 with hidden spots, 4 without a picture of some camera`."""
-    return ", ".join(f"{count} {cause.meaning}" for cause, count in list(causes.items())[:most])
+    return ", ".join(f"{count} {cause.meaning}" for cause, count in list(causes.items())[:3])
 
 
 def _why_never(statistics: RunStatistics) -> list[Finding]:
