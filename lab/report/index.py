@@ -2,7 +2,7 @@
 
 One run of a batch as the index shows it: its row of batch.csv, and what its result folder adds.
 
-A result folder may be missing, damaged or of an older version: what cannot be read is left empty.
+A result folder may be missing or damaged: what cannot be read is left empty.
 """
 
 from __future__ import annotations
@@ -33,10 +33,6 @@ from lab.report.plot import svg
 from lab.report.summary import VERDICTS, day_of, valid
 from tracking.statuses import PoseStatus
 
-NAME = ("name", "run", "run_folder")  # keys of a row, in order of preference
-FOLDER = NAME[1:]
-VERDICT = ("verdict", "status")
-LINK = ("report", "results")
 _RANKS = {"error": 0, "fail": 1, "check": 2, "pass": 3}
 _ANGLES = ("yaw_deg", "pitch_deg", "roll_deg")
 _POSITION = ("x_m", "y_m", "z_m")
@@ -88,23 +84,19 @@ class IndexedRun:
 
 def indexed_run(row: Mapping[str, Any], out: Path) -> IndexedRun:
     """A row of batch.csv, with what its result folder below `out` adds."""
-    status = first_of(row, VERDICT).lower() or "error"
-    report = _report(row, out)
-    folder = None if report is None else (out / report).parent
+    results = str(row.get("results") or "")
+    report = str(row.get("report") or (f"{results}/report.html" if results else ""))
+    folder = out / results if results else None
     summary = {} if folder is None else _summary(folder)
-    if status == "error" and str(_at(summary, "verdict", "status")).lower() in VERDICTS:
-        report, folder, summary = None, None, {}  # the folder has the results of an earlier, successful processing
     angles, position, medians = _poses(folder)
-    frames = valid(int, row.get("frames"))
-    share = _number(row.get("measured_share"))
     return IndexedRun(
         row=row,
-        name=first_of(row, NAME) or "unnamed",
-        folder=first_of(row, FOLDER),
-        href="" if report is None or not (out / report).is_file() else _address(report),
-        status=status,
-        frames=frames if frames is not None else valid(int, _at(summary, "counts", "frames")),
-        measured_share=share if share is not None else _number(_at(summary, "rates", "measured_share")),
+        name=str(row["name"]),
+        folder=str(row["run"]),
+        href=f"./{quote(os.fsencode(report))}" if report and (out / report).is_file() else "",
+        status=str(row["status"]),
+        frames=valid(int, row.get("frames")),
+        measured_share=_number(row.get("measured_share")),
         rms_px=medians[0],
         sigma_attitude_deg=medians[1],
         sigma_position_m=medians[2],
@@ -114,28 +106,6 @@ def indexed_run(row: Mapping[str, Any], out: Path) -> IndexedRun:
         angles_deg=angles,
         position_m=position,
     )
-
-
-def first_of(row: Mapping[str, Any], keys: tuple[str, ...]) -> str:
-    """The first value that is not empty, as text."""
-    return next((str(row[k]) for k in keys if row.get(k) not in (None, "")), "")
-
-
-def _report(row: Mapping[str, Any], out: Path) -> Path | None:
-    """The report that a row names, relative to `out` if it is in it. An error's row has one only if it names it."""
-    named = first_of(row, LINK)
-    if not named and (first_of(row, VERDICT).lower() or "error") != "error":
-        named = first_of(row, NAME)
-    if not named:
-        return None
-    path = Path(named) if named.endswith(".html") else Path(named) / "report.html"
-    if path.is_absolute() and path.is_relative_to(out.resolve()):
-        path = path.relative_to(out.resolve())
-    return path
-
-
-def _address(report: Path) -> str:
-    return report.as_uri() if report.is_absolute() else "./" + quote(os.fsencode(report.as_posix()))
 
 
 def _summary(folder: Path) -> Mapping[str, Any]:
@@ -161,7 +131,7 @@ def _recorded(row: Mapping[str, Any], summary: Mapping[str, Any]) -> datetime.da
     """The day of the recording, from summary.json or else from the run.yaml that can be reached."""
     if stated := day_of(summary.get("recorded")):
         return stated
-    for folder in (first_of(row, FOLDER), valid(str, summary.get("run_folder"))):
+    for folder in (str(row["run"]), valid(str, summary.get("run_folder"))):
         path = Path(folder or "") / "run.yaml"
         try:
             if folder and path.is_file() and (stated := day_of(read_mapping(path).get("recorded"))):
@@ -367,8 +337,8 @@ _POINTS = (64, 20)  # per curve of a thumbnail: of few runs, of many
 _LEAST_DEG, _LEAST_M = 0.1, 0.001  # ranges that fill a thumbnail's height
 # Keys of a row that have a column of their own, or that its other columns imply.
 _SHOWN = {
-    *NAME, *VERDICT, *LINK, "folder", "frames", "measured_share", "measured_frames", "exit_status", "seconds",
-    "message",
+    "run", "name", "folder", "status", "exit_status", "frames", "measured_frames", "measured_share", "seconds",
+    "results", "message", "report",
 }  # fmt: skip
 
 
@@ -393,11 +363,8 @@ class Column:
 def write_index(rows: Sequence[Mapping[str, Any]], out: Path) -> Path:
     """Write index.html into the batch's folder `out`; returns its path.
 
-    rows: those of batch.csv, a mapping per run. Known keys: `name`, `run` (its folder), `status` (or `verdict`): pass,
-    check, fail or error, `report` or `results` (a path relative to `out`; default: the folder of the run's name, but
-    none for an error), `frames`, `measured_share`, `seconds`, `message`. Every other key becomes a column. The rest is
-    read from the result folders as far as it is there. The row of an error links a report only if the row names it and
-    its summary.json has no verdict of an earlier processing.
+    rows: those of batch.csv, a mapping per run; a column that a batch does not have is shown as it is. The rest is read
+    from the result folders as far as it is there.
     """
     runs = sorted((indexed_run(row, Path(out)) for row in rows), key=lambda run: run.badness)
     above = _common_folder([run.folder for run in runs])

@@ -453,10 +453,24 @@ class TestNumbers:
 
 class TestIndex:
     ROWS = (
-        {"name": "a-pass", "status": "pass", "results": "a-pass", "frames": 600, "message": ""},
-        {"name": "b-error", "status": "error", "results": "", "frames": "", "message": "no <rig> & no run"},
-        {"name": "c-fail", "status": "fail", "results": "c-fail", "frames": 20, "message": "lost"},
-        {"name": "d-check", "status": "check", "results": "d-check", "frames": 20, "message": "few spots"},
+        {"name": "a-pass", "run": "/d/a-pass", "status": "pass", "results": "a-pass", "frames": 600, "message": ""},
+        {
+            "name": "b-error",
+            "run": "/d/b-error",
+            "status": "error",
+            "results": "",
+            "frames": "",
+            "message": "no <rig> & no run",
+        },
+        {"name": "c-fail", "run": "/d/c-fail", "status": "fail", "results": "c-fail", "frames": 20, "message": "lost"},
+        {
+            "name": "d-check",
+            "run": "/d/d-check",
+            "status": "check",
+            "results": "d-check",
+            "frames": 20,
+            "message": "few spots",
+        },
     )
 
     def write(self, out: Path) -> str:
