@@ -161,10 +161,6 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 
-class FolderInUseError(InputError):
-    """Another process writes to the output folder. Its end may be waited for."""
-
-
 class LockedError(Exception):
     """Another process holds the lock. The message names it."""
 
@@ -177,14 +173,14 @@ def folder_lock(target: Path, name: str) -> Iterator[bool]:
     system has no locks.
 
     Raises:
-        FolderInUseError: another process writes to this folder.
+        InputError: another process writes to this folder.
         OSError: the file of the lock cannot be made.
     """
     path = target.parent / f".{target.name}.beampose-lock"
     try:
         file, held = _locked_file(path)
     except LockedError as error:
-        raise FolderInUseError(
+        raise InputError(
             f"{name}: expected a folder that nothing else writes to, found one in use{error}; wait for its end, or"
             " choose another --out"
         ) from None

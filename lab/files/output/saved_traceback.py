@@ -14,19 +14,21 @@ from pathlib import Path
 _LONGEST = 300  # characters of an exception's text in a line
 
 
-def unexpected_error(error: BaseException) -> str:
+def unexpected_error(error: BaseException, file: Path | None = None) -> str:
     """Save the traceback of an unforeseen exception. Returns one line about it, with the place of the file.
 
-    Where no file can be written, the traceback itself follows the line.
+    file: where it is saved, if it can be. Where no file can be written, the traceback itself follows the line. Of an
+    error of the system its reason is enough: it needs no report.
     """
     report = _report(error)
+    of_system = isinstance(error, OSError) and bool(error.strerror)
     words = "".join(c if c.isprintable() else " " for c in f"{type(error).__name__}: {_text(error)}")
     words = " ".join(words.split()).rstrip(": ")
     words = words if len(words) <= _LONGEST else f"{words[: _LONGEST - 4]} ..."
-    place = _save(report)
+    place, please = _save(report, file), "" if of_system else "; please report it"
     if place is None:
-        return f"unexpected error: {words}; please report it with this traceback:\n{report}"
-    return f"unexpected error: {words}; the traceback is in {place}; please report it"
+        return f"unexpected error: {words}{please} with this traceback:\n{report}"
+    return f"unexpected error: {words}; the traceback is in {place}{please}"
 
 
 def _text(error: BaseException) -> str:
@@ -58,8 +60,15 @@ def _report(error: BaseException) -> str:
     return "\n".join((*lines, "", trace))
 
 
-def _save(report: str) -> Path | None:
-    """Write a report to a new file: in the user's cache folder, else the one for temporary files, else here."""
+def _save(report: str, file: Path | None) -> Path | None:
+    """Write a report to a file: the given one, else a new one in the user's cache folder, in that of temporary files,
+    or here.
+    """
+    if file is not None:
+        with contextlib.suppress(OSError):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(report, "utf-8", "backslashreplace")
+            return file
     places = []
     with contextlib.suppress(RuntimeError):  # no home folder
         places.append(Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "beampose" / "errors")
@@ -71,8 +80,8 @@ def _save(report: str) -> Path | None:
             number, name = tempfile.mkstemp(
                 prefix=f"beampose-error-{datetime.date.today().isoformat()}-", suffix=".txt", dir=place
             )
-            with open(number, "w", encoding="utf-8", errors="backslashreplace") as file:
-                file.write(report)
+            with open(number, "w", encoding="utf-8", errors="backslashreplace") as new:
+                new.write(report)
         except OSError:
             continue
         return Path(name)

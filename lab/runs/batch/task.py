@@ -14,9 +14,7 @@ import hashlib
 import json
 import os
 import sys
-import tempfile
 import time
-import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -25,6 +23,7 @@ from typing import Any
 from urllib.parse import quote
 
 from lab.errors import BeamposeError, InputError, RunError
+from lab.files.output.saved_traceback import unexpected_error
 from lab.files.run.fingerprints import fingerprints
 from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_text
@@ -302,7 +301,8 @@ def perform(task: Task) -> TaskOutcome:
         except BeamposeError as error:
             row, skipped, code = failed_row(task, str(error), error.exit_status), False, error.code
         except Exception as error:  # unforeseen: it must not stop the other runs
-            row, skipped, code = failed_row(task, _unforeseen(task, error)), False, RunError.code
+            words, _, _ = unexpected_error(error, task.error_file).partition("\n")
+            row, skipped, code = failed_row(task, words), False, RunError.code
     return TaskOutcome(row, skipped, code, tuple(log))
 
 
@@ -349,26 +349,6 @@ def _row(task: Task, summary: Mapping[str, Any]) -> dict[str, Any]:
 def _as_text(text: str) -> str:
     """Text that UTF-8 can hold."""
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
-
-
-def _unforeseen(task: Task, error: Exception) -> str:
-    """Save the traceback; returns the message with its place."""
-    first = (str(error).splitlines() or [""])[0]
-    kind = type(error).__name__
-    if isinstance(error, OSError) and error.strerror:
-        named = isinstance(error.filename, str | bytes | os.PathLike)
-        first = f"{displayed(error.filename)}: {error.strerror}" if named else error.strerror
-        kind = ""  # the system's reason is enough
-    message = f"unforeseen error: {kind}: {first}" if kind else first
-    text = _as_text("".join(traceback.format_exception(error)))
-    for path in (task.error_file, Path(tempfile.gettempdir()) / f"beampose-{task.results}-{os.getpid()}.txt"):
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            atomic_write_text(text, path)
-        except (OSError, BeamposeError):
-            continue
-        return f"{message}; the traceback is in {displayed(path)}{'; please report it' if kind else ''}"
-    return f"{message}; its traceback could not be saved"
 
 
 def concluded(task: Task, outcome: TaskOutcome) -> TaskOutcome:
