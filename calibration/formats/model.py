@@ -60,6 +60,12 @@ class CameraModel:
             words = ", ".join(map(str, allowed[:-1])) + f" or {allowed[-1]}"
             raise FormatError(f"{where}: expected {words} coefficients ({self.lens}), got {len(self.distortion)}")
 
+    @property
+    def matrix(self) -> Array:
+        """The camera matrix (3, 3), px."""
+        fx, fy, cx, cy = self.pinhole
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
 
 @dataclass(frozen=True, slots=True)
 class Read:

@@ -224,9 +224,6 @@ def load(folder: Path | str, *, run: Path | str | None = None) -> Results:
 # Tables of results as pandas frames, with the names of the CSV files, which contain the units.
 
 
-WHOLE = ("frame", "spots_used")  # columns of whole numbers
-
-
 def read_frame(path: Path, names: Iterable[str]) -> pd.DataFrame:
     """A CSV file of results: numbers are float64, frame numbers int64, names and statuses categories.
 
@@ -244,7 +241,7 @@ def _column(table: Table, name: str) -> object:
     if name in table.words:
         return category(table.words[name])
     values = table.numbers[name]
-    return values.astype(np.int64) if name in WHOLE and np.isfinite(values).all() else values
+    return values.astype(np.int64) if name in columns.WHOLE and np.isfinite(values).all() else values
 
 
 def category(column: Categorical) -> pd.Categorical[str]:

@@ -38,7 +38,6 @@ _COVARIANCE = "Covariance: of [dt in world (m), dtheta in body (rad)]: t_true = 
 _ROS_COVARIANCE = "Covariance: of x, y, z (m) and rotations about the axes of world (rad), as ROS states it."
 _UNITS = ("rad_s", "m_s", "deg", "rad", "px", "m", "s")  # endings of columns
 _MOST_C3D_FRAMES = 65_535
-_WHOLE = ("frame", "spots_used")  # columns of whole numbers
 _ARM_M = 1.0  # from the body's origin to each virtual point of a C3D file
 
 
@@ -105,7 +104,7 @@ def _read(results: ResultFolder, causal: bool, covariance: str) -> Exported:
     table = read_result_table(path, columns.ATTITUDE)
     words = np.array([*POSE_STATUSES, ""], dtype=object)
     values = {c: words[poses.status] if c in table.words else table.numbers[c] for c in columns.ATTITUDE}
-    values |= {c: values[c].astype(np.int64) for c in _WHOLE}
+    values |= {c: values[c].astype(np.int64) for c in columns.WHOLE}
     summary = results.summary
     inputs, rig = summary.get("inputs") or (), Path(str(summary.get("rig", ""))).name
     about = {
@@ -342,7 +341,7 @@ def _write_parquet(motion: Exported, path: Path) -> None:
     arrays, fields = [], []
     upper = {c: motion.poses.covariance[:, int(c[1]), int(c[2])] for c in columns.COVARIANCE[1:]}
     for name, values in {**motion.columns, **upper}.items():
-        kind = pa.string() if name == "status" else pa.int64() if name in _WHOLE else pa.float64()
+        kind = pa.string() if name == "status" else pa.int64() if name in columns.WHOLE else pa.float64()
         arrays.append(pa.array(values, kind, from_pandas=True))
         fields.append(pa.field(name, kind, metadata={"unit": _unit(name)}))
     content = pa.BufferOutputStream()

@@ -156,10 +156,6 @@ _Photos = Annotated[tuple[Path, ...], pydantic.PlainValidator(_patterns)]
 _BoardText = Annotated[Board, pydantic.PlainValidator(_board)]
 
 
-_Pair = Annotated[tuple[float, float], pydantic.PlainValidator(fields.numbers(2)), pydantic.AfterValidator(tuple)]
-
-
-_Metres = fields.Number
 _Sigma = fields.Positive | None
 _Two = Annotated[tuple[float, float], pydantic.PlainValidator(fields.numbers(2)), pydantic.AfterValidator(tuple)]
 _Bow = Annotated[str, pydantic.PlainValidator(fields.one_of(BOW))]
@@ -195,7 +191,9 @@ class FixedBoard(fields.Block):
 
     board: _BoardText
     photos: dict[str, _File]  # photograph of the fixed board by camera
-    offset_m: _Metres = 0.0  # from the printed side into the board to the receiving surface; negative: it is in front
+    offset_m: fields.Number = (
+        0.0  # from the printed side into the board to the receiving surface; negative: it is in front
+    )
     sigma_m: fields.Positive = 0.0002  # of offset_m
     tilt_sigma_deg: fields.Positive = 0.05  # of the angle between board and surface
 
@@ -446,9 +444,7 @@ def load_lens(path: Path, name: str | None = None) -> CameraFile:
     model = cameras[0] if name is None else known[name]
     if len(cameras) == 1 and _is_camera_yaml(path):
         return load_camera(path)
-    fx, fy, cx, cy = model.pinhole
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return CameraFile(model.name, model.image_size_px, matrix, model.distortion, model.lens)
+    return CameraFile(model.name, model.image_size_px, model.matrix, model.distortion, model.lens)
 
 
 def _is_camera_yaml(path: Path) -> bool:

@@ -243,9 +243,9 @@ def _write(
 
 
 def _write_ours(model: CameraModel, covariance: RigCovariance | None, path: Path) -> tuple[str, ...]:
-    fx, fy, cx, cy = model.pinhole
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    save_camera(CameraFile(model.name, model.image_size_px, K, model.distortion, model.lens, covariance), path)
+    save_camera(
+        CameraFile(model.name, model.image_size_px, model.matrix, model.distortion, model.lens, covariance), path
+    )
     if model.camera_from_reference is None:
         return ()
     return (f"camera.yaml cannot hold a pose: that of {model.name} is not written",)

@@ -78,10 +78,8 @@ def load_pair_file(path: Path) -> PairFile:
         )
     cameras = {}
     for m in models:
-        fx, fy, cx, cy = m.pinhole
-        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
         pose = m.camera_from_reference or Pose.identity()
-        cameras[m.name] = Camera(m.name, "", m.image_size_px, K, m.distortion, pose, lens=m.lens)
+        cameras[m.name] = Camera(m.name, "", m.image_size_px, m.matrix, m.distortion, pose, lens=m.lens)
     return PairFile(cameras)
 
 

@@ -21,6 +21,7 @@ ATTITUDE = (
     "sigma_velocity_x_m_s", "sigma_velocity_y_m_s", "sigma_velocity_z_m_s",
     "sigma_rate_x_rad_s", "sigma_rate_y_rad_s", "sigma_rate_z_rad_s",
 )  # fmt: skip
+WHOLE = ("frame", "spots_used")  # columns of whole numbers
 POSE = ATTITUDE[2:18]  # the pose: position, quaternion, angles and their sigmas
 MOTION = ATTITUDE[21:]  # velocity of the body origin, in world; rate about the body's axes; their sigmas
 COVARIANCE = ("frame", *(f"c{i}{j}" for i in range(6) for j in range(i, 6)))
