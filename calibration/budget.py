@@ -9,9 +9,8 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints, skew, symmetric
-from geometry.camera import FISHEYE, Camera, Projected, in_picture, pinhole_numbers, project_points_full
+from geometry.camera import Camera, in_picture, pinhole_numbers, project_points_full
 from geometry.forward_model import SpotModel
-from geometry.lens import padded
 from geometry.planes import intersect_plane
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import RANK_TOLERANCE, SolveLimits
@@ -478,7 +477,7 @@ def _distortion_sigmas(camera: Camera, at_corner_px: float) -> Array:
     # If the lens model is not valid at the corners, its effect is evaluated half-way to them.
     half_way = np.append(0.25 * np.array(camera.image_size_px) / pinhole_numbers(camera)[:2], 1.0)[None]
     points = rays[good] @ camera.camera_from_world.rotation.T if good.any() else half_way
-    projected = _projected(camera, points)
+    projected = project_points_full(points, *camera.lens_numbers)
     moves = np.linalg.norm(projected.d_distortion[..., :count], axis=-2).max(axis=0)  # px per unit
     return at_corner_px / np.sqrt(count) / np.maximum(moves, 1e-12)
 
@@ -492,7 +491,7 @@ def _resection(camera: Camera, screen: Screen, expected: ExpectedErrors) -> tupl
     if len(points) < _FEWEST_DOTS:
         return None
     in_camera = camera.camera_from_world.apply(points)
-    projected = _projected(camera, in_camera)
+    projected = project_points_full(in_camera, *camera.lens_numbers)
     d_pose = np.concatenate(
         [np.broadcast_to(np.eye(3), (len(points), 3, 3)), -(camera.camera_from_world.rotation @ skew(points))], axis=-1
     )
@@ -528,13 +527,3 @@ def _picture_grid(camera: Camera, columns: int, rows: int, inset: float) -> Arra
     u = np.linspace(inset * width, (1 - inset) * width, columns) - 0.5
     v = np.linspace(inset * height, (1 - inset) * height, rows) - 0.5
     return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-
-
-def _projected(camera: Camera, points_camera: Array) -> Projected:
-    return project_points_full(
-        points_camera,
-        pinhole_numbers(camera),
-        padded(camera.distortion),
-        np.asarray(camera.fold_r2),
-        np.asarray(camera.lens == FISHEYE),
-    )

@@ -24,6 +24,11 @@ def evenly_spread(rows: Ints, most: int) -> Ints:
     return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(np.int64)]
 
 
+def finite(values: Array, axes: int | tuple[int, ...]) -> Bools:
+    """Whether all numbers along these axes are finite."""
+    return np.asarray(np.isfinite(values).all(axis=axes), dtype=np.bool_)
+
+
 def skew(v: Array) -> Array:
     """The matrices (..., 3, 3) with skew(v) @ w = v x w, of vectors (..., 3)."""
     out = np.zeros((*v.shape[:-1], 3, 3))

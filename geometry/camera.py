@@ -58,13 +58,14 @@ class Camera:
 
     def project(self, points_world: Array) -> Array:
         """Distorted pixels (..., 2) of world points (..., 3), m; nan behind the camera or beyond the fold."""
-        return project_points(
-            self.camera_from_world.apply(np.asarray(points_world, dtype=float)),
-            pinhole_numbers(self),
-            lens.padded(self.distortion),
-            np.asarray(self.fold_r2),
-            np.asarray(self.lens == FISHEYE),
-        )[0]
+        in_camera = self.camera_from_world.apply(np.asarray(points_world, dtype=float))
+        return project_points(in_camera, *self.lens_numbers)[0]
+
+    @property
+    def lens_numbers(self) -> tuple[Array, Array, Array, Bools]:
+        """Pinhole numbers, distortion, fold and kind of lens, as arguments of `project_points`."""
+        fold_r2, fisheye = np.asarray(self.fold_r2), np.asarray(self.lens == FISHEYE)
+        return pinhole_numbers(self), lens.padded(self.distortion), fold_r2, fisheye
 
     def rays(self, pixels: Array) -> tuple[Array, Array]:
         """Origins (3,), m, and unit directions (..., 3), both in world, of distorted pixels (..., 2)."""

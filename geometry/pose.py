@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +25,12 @@ class Pose:
     def identity() -> Pose:
         """The identity."""
         return Pose(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def stack(poses: Iterable[Pose]) -> Pose:
+        """A stack (k,) of single transforms, possibly none."""
+        rows = [(p.rotation, p.translation) for p in poses]
+        return Pose(np.array([R for R, _ in rows]).reshape(-1, 3, 3), np.array([t for _, t in rows]).reshape(-1, 3))
 
     @staticmethod
     def from_quaternion(quaternion_wxyz: Array, translation_m: Array) -> Pose:

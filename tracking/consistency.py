@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, finite
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.uncertainty.chi_square import chi2_limit
@@ -137,11 +137,6 @@ def is_covariance(matrices: Array) -> Bools:
     scaled = np.where(good[..., None, None], scaled, np.eye(matrices.shape[-1]))
     symmetric = np.abs(scaled - np.swapaxes(scaled, -1, -2)).max(axis=(-2, -1)) < 1e-6
     return np.asarray(good & symmetric & (np.linalg.eigvalsh(scaled)[..., 0] > _LEAST_EIGENVALUE))
-
-
-def finite(values: Array, axes: int | tuple[int, ...]) -> Bools:
-    """Whether all numbers along these axes are finite."""
-    return np.asarray(np.isfinite(values).all(axis=axes), dtype=np.bool_)
 
 
 def limits(dof: Ints, p: float) -> Array:

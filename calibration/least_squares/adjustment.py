@@ -93,8 +93,7 @@ class Poses:
     @staticmethod
     def of(poses: list[Pose]) -> Poses:
         """A stack of single transforms."""
-        rotation = np.array([p.rotation for p in poses], dtype=float).reshape(-1, 3, 3)
-        return Poses(Pose(rotation, np.array([p.translation for p in poses], dtype=float).reshape(-1, 3)))
+        return Poses(Pose.stack(poses))
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,12 +37,11 @@ from calibration.model_check.linearised_frames import (
     UnseenView,
     correlation_time,
     evenly_spaced,
-    finite,
     linearise,
     unseen_views,
     whitening,
 )
-from geometry.arrays import Array, Ints
+from geometry.arrays import Array, Ints, finite
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.chi_square import gamma_quantile

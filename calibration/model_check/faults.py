@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.changes import USUAL_SIZES
-from calibration.model_check.linearised_frames import LinearisedFrames, ModelCheckRecording, finite
-from geometry.arrays import Array, Bools, Ints, normalised, skew
+from calibration.model_check.linearised_frames import LinearisedFrames, ModelCheckRecording
+from geometry.arrays import Array, Bools, Ints, finite, normalised, skew
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import DIRECTION, POINT, POSE, RigCovariance, Sensitivity, is_known

@@ -14,7 +14,7 @@ from math import prod
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, finite
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import whiten
@@ -69,11 +69,6 @@ class ModelCheckRecording:
         with np.errstate(invalid="ignore"):
             positive = (a > 0) & (a * c - b * b > 0) & np.isfinite(a + b + c)
         return np.asarray(self.seen & finite(self.uv_px, -1) & positive & known[:, None])
-
-
-def finite(values: Array, axes: int | tuple[int, ...]) -> Bools:
-    """Whether all values along these axes are finite."""
-    return np.asarray(np.isfinite(values).all(axis=axes), dtype=np.bool_)
 
 
 def evenly_spaced(candidates: Ints, most: int) -> Ints:

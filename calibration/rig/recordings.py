@@ -17,12 +17,11 @@ from calibration.model_check.fault_identification import compressed
 from calibration.model_check.linearised_frames import (
     LinearisedFrames,
     ModelCheckRecording,
-    finite,
     linearised_at,
     whitening,
 )
 from calibration.terms.rig_blocks import BEAMS, BOWS, CAMERAS, INTRINSICS, SCREENS, lines_in, rig_of
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, finite
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import unlimited

@@ -17,15 +17,10 @@ from calibration.changes import USUAL_SIZES, ExcessResidual
 from calibration.least_squares.adjustment import AdjustmentError, At, Prior, Values, solve
 from calibration.model_check.fault_identification import SuspectedFault, compressed, search_faults
 from calibration.model_check.faults import BEAM, CAMERA, LASER_MOVED, MOVED, SCREEN, TILTED, PossibleFault
-from calibration.model_check.linearised_frames import (
-    ModelCheckRecording,
-    correlation_time,
-    finite,
-    linearise,
-)
+from calibration.model_check.linearised_frames import ModelCheckRecording, correlation_time, linearise
 from calibration.rig.recordings import STACKS, RecordingTerm, Reduced
 from calibration.terms.rig_blocks import BEAMS, CAMERAS, SCREENS, named_errors, names_at, prior_of, rig_of, stacks_of
-from geometry.arrays import Array, Bools, Ints, skew
+from geometry.arrays import Array, Bools, Ints, finite, skew
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.chi_square import chi2_limit

@@ -11,8 +11,7 @@ import numpy as np
 
 from calibration.screens.network import Network, Start
 from geometry.arrays import Array, Bools, Ints, normalised
-from geometry.camera import FISHEYE, Camera, pinhole_numbers, project_points
-from geometry.lens import padded
+from geometry.camera import Camera, project_points
 from geometry.pose import Pose
 
 # Robust resection: the pose of a camera from points with outliers, as start value of an adjustment.
@@ -135,13 +134,7 @@ def _solutions(points: Array, xy: Array) -> list[Pose]:
 
 def _evaluated(camera: Camera, pose: Pose, points: Array, pixels: Array, within_px: float) -> ResectedPose:
     # As camera.project, without creating a camera for each of hundreds of poses.
-    seen, _ = project_points(
-        pose.apply(points),
-        pinhole_numbers(camera),
-        padded(camera.distortion),
-        np.asarray(camera.fold_r2),
-        np.asarray(camera.lens == FISHEYE),
-    )
+    seen, _ = project_points(pose.apply(points), *camera.lens_numbers)
     distances = np.linalg.norm(seen - pixels, axis=1)
     errors = np.where(np.isfinite(distances), distances, np.inf)
     inliers = errors < within_px
@@ -316,9 +309,9 @@ def start_of(
         lost = [p for i, p in enumerate(network.placements) if i not in chained.world_from_board]
         raise NotConnectedError(f"board at {lost[0]!r}: it is not seen by any camera of the network")
     return Start(
-        camera_from_world=_stack([chained.camera_from_world[i] for i in range(len(network.rig.cameras))]),
-        world_from_screen=_stack([screens[i] for i in range(len(names))]),
-        world_from_board=_stack([chained.world_from_board[i] for i in order]),
+        camera_from_world=Pose.stack(chained.camera_from_world[i] for i in range(len(network.rig.cameras))),
+        world_from_screen=Pose.stack(screens[i] for i in range(len(names))),
+        world_from_board=Pose.stack(chained.world_from_board[i] for i in order),
         bow=bow,
         held_camera=held_camera,
         held_board=held_board,
@@ -351,13 +344,6 @@ def _screen_from_board(middle: Array, offset_m: float) -> Pose:
 def _is_observed(boards: Mapping[tuple[int, int], Pose], placement: int, cameras: Mapping[int, Pose]) -> bool:
     """Whether a camera with a known pose sees the board, from which the board's pose is more accurate."""
     return any(p == placement and c in cameras for c, p in boards)
-
-
-def _stack(poses: list[Pose]) -> Pose:
-    return Pose(
-        np.array([p.rotation for p in poses], dtype=float).reshape(-1, 3, 3),
-        np.array([p.translation for p in poses], dtype=float).reshape(-1, 3),
-    )
 
 
 def _unconnected(lost: list[str], reached: list[str], boards: Mapping[tuple[int, int], Pose], names: list[str]) -> str:

@@ -64,9 +64,7 @@ def alternative_poses(
             pose = fit.world_from_body
         if all(np.abs(pose.minus(other)).max() > SAME for other in (world_from_body, *found)):
             found.append(pose)
-    if not found:
-        return none
-    return Pose(np.stack([p.rotation for p in found]), np.stack([p.translation for p in found]))
+    return Pose.stack(found)
 
 
 def _best_triple(model: SpotModel, J: Array, rows: Ints) -> Ints | None:

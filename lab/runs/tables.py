@@ -227,8 +227,7 @@ def _numbers_of_poses(records: Sequence[FrameRecord]) -> list[list[float]]:
     frames, poses, covariances = zip(*known, strict=True)
     covariance = np.stack(covariances)
     _sigmas(np.diagonal(covariance, axis1=-2, axis2=-1), frames)
-    together = Pose(np.stack([p.rotation for p in poses]), np.stack([p.translation for p in poses]))
-    out: list[list[float]] = pose_numbers(together, covariance).tolist()
+    out: list[list[float]] = pose_numbers(Pose.stack(poses), covariance).tolist()
     return out
 
 

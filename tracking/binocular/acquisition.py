@@ -454,7 +454,6 @@ def _three_marker_poses(pair: StereoPair, model: MarkerModel, observed: MarkerOb
             poses += [solved[int(i)].inverse() for i in np.flatnonzero(good)]
     if not poses:
         return []
-    stack = Pose(np.stack([p.rotation for p in poses]), np.stack([p.translation for p in poses]))
-    apart = np.nan_to_num(project_markers(pair, model, stack)[0] - observed.uv_px, nan=0.0)
+    apart = np.nan_to_num(project_markers(pair, model, Pose.stack(poses))[0] - observed.uv_px, nan=0.0)
     order = np.argsort((apart**2).sum(axis=(1, 2, 3)))
     return [poses[int(i)] for i in order[:_STARTS]]

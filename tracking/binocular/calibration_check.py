@@ -184,7 +184,7 @@ class _Adjustment:
 
     def __init__(self, pair: StereoPair, model: MarkerModel, frames: Sequence[LabelledFrame]) -> None:
         self._pair, self._model, self._names = pair, model, _names(pair)
-        self._start = Pose(np.stack([f.pose.rotation for f in frames]), np.stack([f.pose.translation for f in frames]))
+        self._start = Pose.stack(f.pose for f in frames)
         uv = np.stack([f.observed.uv_px for f in frames])
         seen = np.isfinite(uv[..., 0])
         self._uv_px = np.nan_to_num(uv)

@@ -249,13 +249,7 @@ def calibration_jacobian(pair: StereoPair, points_world: Array, names: Sequence[
     out = np.zeros((2, len(points_world), 2, len(names)))
     for c, camera in enumerate(pair.cameras):
         to_camera = camera.camera_from_world
-        seen = project_points_full(
-            to_camera.apply(points_world),
-            pinhole_numbers(camera),
-            padded(camera.distortion),
-            np.asarray(camera.fold_r2),
-            np.asarray(camera.lens == FISHEYE),
-        )
+        seen = project_points_full(to_camera.apply(points_world), *camera.lens_numbers)
         by_turn = cross(points_world[:, None, :], seen.d_point @ to_camera.rotation)
         by = dict(
             zip(

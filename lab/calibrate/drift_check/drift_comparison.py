@@ -24,9 +24,8 @@ from calibration.changes import (
     camera_columns,
 )
 from geometry.arrays import Array, Ints, skew
-from geometry.camera import FISHEYE, Camera, Projected, pinhole_numbers, project_points_full
+from geometry.camera import Camera, Projected, pinhole_numbers, project_points_full
 from geometry.forward_model import SpotDerivatives, SpotModel
-from geometry.lens import padded
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
@@ -253,13 +252,7 @@ def _compare_camera(
 ) -> PixelComparison:
     """Compare the points of one camera. rows: (k,) indices into `known`; world: (k, 3), m."""
     in_camera = camera.camera_from_world.apply(world)
-    lens = project_points_full(
-        in_camera,
-        pinhole_numbers(camera),
-        padded(camera.distortion),
-        np.asarray(camera.fold_r2),
-        np.asarray(camera.lens == FISHEYE),
-    )
+    lens = project_points_full(in_camera, *camera.lens_numbers)
     n = len(rows)
     R_c = camera.camera_from_world.rotation
     noise = np.zeros((n, 2, n, 2))

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from calibration.model_check.linearised_frames import ModelCheckRecording, finite
+from calibration.model_check.linearised_frames import ModelCheckRecording
+from geometry.arrays import finite
 from geometry.forward_model import SpotModel
 from geometry.pose_solver.visibility import assumed_range
 from geometry.rig import Rig

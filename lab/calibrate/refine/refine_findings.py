@@ -8,8 +8,8 @@ import numpy as np
 
 from calibration.model_check.fault_identification import FittedFault, SuspectedFault
 from calibration.model_check.faults import BEAM, CAMERA
-from calibration.model_check.linearised_frames import finite
 from calibration.rig.refinement import FEWEST_FRAMES, Refinement
+from geometry.arrays import finite
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, split_name
 from lab.calibrate.refine.prior_sigmas import BEAMS, CAMERAS, SCREENS

@@ -135,7 +135,7 @@ class FrameSampler:
             seen=np.stack([k.seen for k in kept]),
             uv_px=np.stack([k.uv_px for k in kept]),
             cov_px2=np.stack([k.cov_px2 for k in kept]),
-            poses=Pose(np.stack([p.rotation for p in poses]), np.stack([p.translation for p in poses])),
+            poses=Pose.stack(poses),
             predicted_px=_stacked([k.predicted_px for k in kept], (n, 2)),
             predicted_cov_px2=_stacked([k.predicted_cov_px2 for k in kept], (n, 2, 2)),
             width_px=_median_widths(kept),

@@ -16,7 +16,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array, Bools, finite
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
@@ -28,7 +28,6 @@ from tracking.consistency import (
     against_causal,
     against_own_spots,
     contradictory,
-    finite,
     is_covariance,
 )
 from tracking.statuses import Event, PoseStatus, SpotStatus, TrackedFrame
@@ -214,7 +213,7 @@ def _poses(frames: list[TrackedFrame]) -> tuple[Pose, Array]:
     """The poses (T,) and their covariances (T, 6, 6); nan without a pose."""
     poses = [_NO_POSE if t.pose is None else t.pose for t in frames]
     covariances = [_UNKNOWN if t.pose_covariance is None else t.pose_covariance for t in frames]
-    return Pose(np.stack([p.rotation for p in poses]), np.stack([p.translation for p in poses])), np.stack(covariances)
+    return Pose.stack(poses), np.stack(covariances)
 
 
 def _used(tracked: TrackedFrame) -> Bools:
