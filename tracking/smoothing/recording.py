@@ -224,7 +224,6 @@ class TrackedRecording:
             begin=self._begin.values,
             first=self._first.values,
             has_image=self._has_image.values,
-            log_static=np.full(len(size), -np.inf),
             size_px=size,
             usual_size_px=np.full(len(self.model), np.nan),
         )

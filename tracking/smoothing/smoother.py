@@ -32,8 +32,8 @@ from tracking.rigid_body.hypotheses.hypothesis_set import MAX_CHECKING_SIGMA_PX,
 from tracking.rigid_body.models.information import run_shifts
 from tracking.smoothing.error_scale import ErrorScale, usual_sizes
 from tracking.smoothing.labels.continuity import continued, transfers_between_cameras
-from tracking.smoothing.labels.neighbouring_frames import brief, connected, displaced, isolated, next_to
-from tracking.smoothing.labels.reassociation import RunObservation, reassociated, run_log_clutter, run_log_static
+from tracking.smoothing.labels.neighbouring_frames import connected, displaced, isolated, next_to
+from tracking.smoothing.labels.reassociation import RunObservation, reassociated, run_log_clutter
 from tracking.smoothing.labels.view_path import PathContext
 from tracking.smoothing.motion.process_noise import corner_offsets, corner_times, jump_sigmas, jump_variances
 from tracking.smoothing.motion.run_detections import (
@@ -212,7 +212,6 @@ MAX_ROUNDS = 4  # of motion and labels
 MAX_CLOCK_STEPS = 4  # of the clocks after each estimate of the motion
 MAX_CLOCK_STEP = 0.5  # of a prior's sigma: a longer step is not linear
 NEGLIGIBLE_STEP = 0.05  # of its sigma: a shorter step of a clock is not taken
-BRIEF_PROBABILITY = 0.9999  # least one of a label of a spot that is occluded before and after
 VAGUE_SIGMA_PX = 1.0  # a spot predicted worse than this may be labelled by its path although the pose is measured
 MAX_REPAIRS = 3  # times that velocity jumps are added where poses contradict their spots
 # Excess chi-square (6 degrees of freedom) of a frame's spots at the smoothed pose over that at their own pose, above
@@ -376,9 +375,6 @@ class _Smoother:
     def reassociate(self) -> bool:
         """Label each frame from the motion that the other frames give; whether any label changed."""
         ref, known = self.motion.ref, self.motion.known
-        log_static = run_log_static(self.views, self.view_table, self.detections, self.assigned, ref, known)
-        self.detections = self.detections._replace(log_static=log_static)
-        self.seen = self.seen._replace(log_static=log_static)
         detection_model = DetectionModel(self.parameters.p_detect, self.parameters.p_blend)
         run = RunObservation(self.views, self.view_table, detection_model, self.calibration_cov, self.detections)
         found, probability, sigma_px = reassociated(
@@ -387,7 +383,6 @@ class _Smoother:
         )  # fmt: skip
         before, likely = self.assigned, probability >= self.parameters.min_label_probability
         self.assigned = new = np.where(likely & known[:, None], found, -1)
-        new[self._brief(new >= 0) & (probability < BRIEF_PROBABILITY)] = -1
         self.measured = self._single_frame_poses(new).measured
         # Where the other frames do not check a label, those of its frame must, or a tracker that was sure of it.
         vague = sigma_px > MAX_CHECKING_SIGMA_PX
@@ -407,12 +402,6 @@ class _Smoother:
         self.trusted = ~unchecked & ~self.conflicting
         self.measured = measured & ~dropped & ~self.conflicting
         return changed
-
-    def _brief(self, labelled: Bools) -> Bools:
-        """Labels (T, n) of spots that are occluded just before and after."""
-        expected, _ = project_all(self.views, self.motion.ref.R, self.motion.ref.t)
-        visible = self.model.in_picture(expected) & self.detections.has_image[:, self.view_table.camera]
-        return brief(labelled, visible & ~labelled)
 
     def label_backward(self) -> bool:
         """Label frames that the causal tracker did not measure with certainty from later ones; whether any changed."""
@@ -476,8 +465,6 @@ class _Smoother:
         context = PathContext(self.view_table.camera, uv, cov, log_clutter, ~known | ~sure | vague)
         transfers = transfers_between_cameras(self.rec.rig, self.model.views)
         self.assigned, probability = continued(self.detections, self.assigned, context, transfers)
-        unsure = self._brief(self.assigned >= 0) & (probability < BRIEF_PROBABILITY)
-        self.assigned[unsure], probability[unsure] = -1, np.nan
         visible = self.model.in_picture(uv) & sure & ~vague
         with_displaced = displaced(self.detections, self.assigned, self.view_table.camera, uv, visible)
         probability[with_displaced != self.assigned] = SURE_PROBABILITY

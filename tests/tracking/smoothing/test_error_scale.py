@@ -18,7 +18,7 @@ def detections(sizes: np.ndarray, sigma_px: float) -> RunDetections:
     return RunDetections(
         uv=np.zeros((count, 2)), cov=np.tile(sigma_px**2 * np.eye(2), (count, 1, 1)), blend_px=np.zeros(count),
         begin=np.arange(len(sizes) + 1) * sizes.shape[1], first=np.tile([0, sizes.shape[1]], (len(sizes), 1)),
-        has_image=np.ones((len(sizes), 1), dtype=bool), log_static=np.full(count, -np.inf), size_px=sizes.ravel(),
+        has_image=np.ones((len(sizes), 1), dtype=bool), size_px=sizes.ravel(),
         usual_size_px=np.full(sizes.shape[1], np.nan),
     )  # fmt: skip
 

@@ -134,11 +134,7 @@ class _Path(ViewPath):
             if self.open[k]:
                 predicted = predictions(uv, self.sigmas, k, direction)
                 if predicted:
-                    found = (
-                        (beyond[k], CORNER_PROBABILITY)
-                        if k in beyond
-                        else self._found(k, predicted, uv[known_before(uv, k, direction, REACH)[0]])
-                    )
+                    found = (beyond[k], CORNER_PROBABILITY) if k in beyond else self._found(k, predicted)
                     if found is None and (beyond := self._beyond_corner(k, uv, direction)):
                         found = beyond[k], CORNER_PROBABILITY
                     out[k] = found
@@ -153,17 +149,13 @@ class _Path(ViewPath):
             _drop_unsure(out, latest)
         return out
 
-    def _found(self, k: int, predicted: list[Prediction], before: Array) -> tuple[int, float] | None:
-        """Row of the point of frame k that continues a path, and its probability; None: there is none.
-
-        before: last place (2,) of the path.
-        """
+    def _found(self, k: int, predicted: list[Prediction]) -> tuple[int, float] | None:
+        """Row of the point of frame k that continues a path, and its probability; None: there is none."""
         rows, place = self.points(k)
         if not len(rows):
             return None
         likelihood = mean_density(predicted, place, self.covariances(k, rows))
-        false = self.false_density(k, rows, place, before)
-        odds = likelihood * (1 - P_GONE) / false
+        odds = likelihood * (1 - P_GONE) / np.exp(self.log_clutter(k))
         best = int(np.argmax(odds))
         p = float(odds[best] / (odds.sum() + P_GONE))
         if p < MIN_PROBABILITY or not self.allowed(k, int(rows[best])):
@@ -347,14 +339,10 @@ class _Pair:
         right = np.nan_to_num(mean_density(of_relative, apart, cov[:, None] + other_cov))
         if self.first.camera == self.second.camera:
             right[rows[:, None] == other_rows] = 0.0  # one point is not two spots
-        false = self.first.false_density(k, rows, place, uv[last])
-        other_false = self.second.false_density(k, other_rows, other, second_uv[last])
-        # A reflection explains one of the points. That a second one lies right relative to it is a coincidence.
-        alone, other_alone = np.exp(self.first.log_clutter(k)), np.exp(self.second.log_clutter(k))
-        both_false = np.maximum(false[:, None] * other_alone, alone * other_false)
+        false, other_false = np.exp(self.first.log_clutter(k)), np.exp(self.second.log_clutter(k))
         here = _anywhere(of_first, place, cov, uv[last], self.first.speed_px * abs(k - last))
         there = _anywhere(of_second, other, other_cov, second_uv[last], self.second.speed_px * abs(k - last))
-        both = here[:, None] * right / both_false * (1 - P_GONE) ** 2
+        both = here[:, None] * right / (false * other_false) * (1 - P_GONE) ** 2
         only_one = ((here / false).sum() + (there / other_false).sum()) * P_GONE * (1 - P_GONE)
         i, j = np.unravel_index(int(np.argmax(both)), both.shape)
         p = float(both[i, j] / (both.sum() + only_one + P_GONE))

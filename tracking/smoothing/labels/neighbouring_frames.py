@@ -1,4 +1,4 @@
-"""Labels judged by the frames next to them: isolated and brief ones, and those of a camera that was knocked."""
+"""Labels judged by the frames next to them: isolated ones, and those of a camera that was knocked."""
 
 from __future__ import annotations
 
@@ -11,9 +11,6 @@ from geometry.arrays import Array, Bools, Ints
 from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.rigid_body.hypotheses.hypothesis_set import MIN_CONFIRMING_SPOTS
 from tracking.smoothing.motion.run_detections import RunDetections
-
-# Of the frames at most AROUND away from a label: in so many at most the spot is seen, in so many at least missed.
-AROUND, BRIEF_FRAMES, ABSENT_FRAMES = 3, 2, 4
 
 
 def connected(measured: Bools, confirmed: Bools) -> Bools:
@@ -31,23 +28,6 @@ def next_to(mask: Bools) -> Bools:
     out[1:] |= mask[:-1]
     out[:-1] |= mask[1:]
     return out
-
-
-def brief(labelled: Bools, missed: Bools) -> Bools:
-    """(T, n): labels of a spot that is seen in at most BRIEF_FRAMES frames around, and missed in ABSENT_FRAMES or more.
-
-    labelled, missed (T, n): the spot has a label; it should be in the picture and has none. An occluded spot seldom
-    reappears for so short a time, and a false point at its place is not rare in a long occlusion.
-    """
-    seen, absent = (_count_around(mask) for mask in (labelled, missed))
-    return labelled & (seen <= BRIEF_FRAMES) & (absent >= ABSENT_FRAMES)
-
-
-def _count_around(mask: Bools) -> Ints:
-    """(T, n): frames of a mask (T, n) at most AROUND frames away, the frame itself included."""
-    total = np.concatenate([np.zeros((1, mask.shape[1]), dtype=np.int64), np.cumsum(mask, axis=0)])
-    k = np.arange(len(mask))
-    return total[np.minimum(k + AROUND + 1, len(mask))] - total[np.maximum(k - AROUND, 0)]
 
 
 def isolated(count: Ints) -> Bools:

@@ -14,7 +14,7 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.compilation.jit import compiled, compiled_in_caller
 from geometry.compiled_linalg import apply, block, column, hstack, multiply, pose_plus, solve, symmetrise
-from geometry.compiled_projection import Views, inside, project_all, project_view
+from geometry.compiled_projection import Views, inside, project_view
 from geometry.forward_model import SpotModel
 from tracking.rigid_body.association.frame_detections import (
     BLENDED,
@@ -32,7 +32,6 @@ from tracking.rigid_body.hypotheses.hypothesis_set import State, iterated_update
 from tracking.rigid_body.models.information import frame_information, single_frame_pose
 from tracking.rigid_body.models.motion import STATE
 from tracking.rigid_body.models.occlusion import joint_log_likelihood, marginal
-from tracking.rigid_body.online_estimates import PicturePoints, no_places, static_log_density, update_places
 from tracking.smoothing.motion.run_detections import Reference, RunDetections, labelled_points
 
 
@@ -80,25 +79,6 @@ def run_log_clutter(
     area = np.array([np.prod(model.image_size_px[model.camera_of == c][:1]) for c in range(len(near))])
     density = np.maximum(np.maximum(near, np.diff(detections.first, axis=1) / area), min_per_px2)
     return np.ascontiguousarray(np.log(density)[:, model.camera_of])
-
-
-def run_log_static(
-    views: Views, view_table: ViewTable, detections: RunDetections, assigned: Ints, ref: Reference, known: Bools
-) -> Array:
-    """Log density (m,) of static points, 1/px^2, at each detection, from the known (T,) frames of the whole run."""
-    places = no_places(detections.has_image.shape[1])
-    expected, _ = project_all(views, ref.R, ref.t)
-    rows = [slice(int(detections.begin[k]), int(detections.begin[k + 1])) for k in range(len(known))]
-    for k in np.flatnonzero(known):
-        labels = np.where(assigned[k] >= 0, assigned[k] % BLENDED, -1)
-        points = PicturePoints(
-            detections.uv[rows[k]], detections.cov[rows[k]], detections.first[k], detections.has_image[k]
-        )
-        update_places(places, points, labels, expected[k], view_table.camera, 1.0)
-    parts = [
-        static_log_density(places, detections.uv[r], detections.cov[r], detections.first[k]) for k, r in enumerate(rows)
-    ]
-    return np.concatenate([np.zeros(0), *parts])
 
 
 # Probability that a spot is not occluded if its screen is visible, by the neighbouring frames in which the screen was
@@ -179,7 +159,7 @@ def reassociated(
         a, b = detections.begin[k], detections.begin[k + 1]
         frame = FrameDetections(
             detections.uv[a:b], detections.cov[a:b], detections.blend_px[a:b], detections.first[k],
-            detections.has_image[k], log_clutter[k], detections.log_static[a:b], detections.size_px[a:b],
+            detections.has_image[k], log_clutter[k], np.full(b - a, -np.inf), detections.size_px[a:b],
             detections.usual_size_px, no_excess,
         )  # fmt: skip
         obs = Observation(

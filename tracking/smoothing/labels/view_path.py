@@ -221,7 +221,6 @@ def _disagree(one: _Row, other: _Row) -> bool:
     return any(frame in one and one[frame][0] != row for frame, (row, _) in other.items())
 
 
-REST_CHI2 = 9.0  # of the distance between two points of one spot at rest (2 degrees of freedom)
 POSE_GATE_CHI2 = 25.0  # squared Mahalanobis distance from the place that the pose predicts
 
 
@@ -268,19 +267,8 @@ class ViewPath:
         """Covariances (m, 2, 2), px^2, of points of a frame."""
         return np.asarray(self.detections.cov[self.detections.begin[k] + rows])
 
-    def false_density(self, k: int, rows: Ints, place: Array, before: Array) -> Array:
-        """Density (m,), 1/px^2, of false points at those of a frame; before (2,): last place of the path.
-
-        A spot at rest looks like a static reflection while it has no label. One just where the spot has been is none:
-        the two would have been one point.
-        """
-        away = place - before
-        rests = np.einsum("mi,mij,mj->m", away, np.linalg.inv(2 * self.covariances(k, rows)), away) < REST_CHI2
-        static = np.where(rests, -np.inf, self.detections.log_static[self.detections.begin[k] + rows])
-        return np.asarray(np.exp(np.maximum(self.log_clutter(k), static)))
-
     def log_clutter(self, k: int) -> float:
-        """Log density, 1/px^2, of false points in a frame without what is known of static ones."""
+        """Log density, 1/px^2, of false points in a frame."""
         return float(self.context.log_clutter[k, self.view])
 
     def allowed(self, k: int, row: int) -> bool:

@@ -93,7 +93,7 @@ def straight_between(poses: Array, measured: Bools, t_s: Array) -> Reference:
 class RunDetections(NamedTuple):
     """m detections of T frames and n views; those of frame k are the rows begin[k] to begin[k + 1], sorted by camera.
 
-    `blend_px`, `log_static`, `size_px` and `usual_size_px` are as in FrameDetections.
+    `blend_px`, `size_px` and `usual_size_px` are as in FrameDetections.
     """
 
     uv: Array  # (m, 2) px
@@ -102,7 +102,6 @@ class RunDetections(NamedTuple):
     begin: Ints  # (T + 1,)
     first: Ints  # (T, cameras + 1) where the rows of each camera begin within the frame
     has_image: Bools  # (T, cameras)
-    log_static: Array  # (m,)
     size_px: Array  # (m,)
     usual_size_px: Array  # (n,)
 

@@ -43,7 +43,7 @@ def filmed(
     every = RunDetections(
         np.concatenate(places), np.tile(SIGMA_PX**2 * np.eye(2), (m, 1, 1)), np.zeros(m),
         np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), np.array(first, dtype=np.int64),
-        np.ones((FRAMES, int(camera.max()) + 1), dtype=bool), np.full(m, -np.inf), np.full(m, np.nan),
+        np.ones((FRAMES, int(camera.max()) + 1), dtype=bool), np.full(m, np.nan),
         np.full(uv.shape[1], np.nan),
     )  # fmt: skip
     return every, rows

@@ -101,14 +101,12 @@ def test_a_straight_path_is_followed_across_two_corners_without_labels_between_t
         assert given.mean() > 0.95
 
 
-def test_a_spot_at_rest_is_no_static_reflection():
-    """Points without a label that stay at one place for long count as a reflection; not where the spot has been."""
+def test_a_spot_at_rest_keeps_its_labels():
     uv = np.tile(paths()[:1], (FRAMES, 1, 1))
     visible = np.ones((FRAMES, 2), dtype=bool)
     visible[[55, 60, 61], 0] = False
     every, rows = filmed(uv, visible, 0.0, 8)
-    static = every._replace(log_static=np.full(len(every.uv), 5.0))
-    out, _ = continued(static, without(rows, GAP), context(uv), {})
+    out, _ = continued(every, without(rows, GAP), context(uv), {})
     np.testing.assert_array_equal(out[GAP], rows[GAP])
 
 

