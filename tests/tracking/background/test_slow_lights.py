@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from geometry.arrays import Array
 from tests.tracking.rendering import round_lights
 from tracking.background.estimation import PICTURES, static_background
+from tracking.background.slow_lights import light_at
 from tracking.detections import Detections
 from tracking.noise import Picture
 from tracking.noise_estimation.photon_transfer import estimate_noise
@@ -134,3 +138,18 @@ def test_lights_at_rest_state_errors_by_print_of_their_own_size_and_none_on_even
     assert np.mean(near) > 0.7
     assert np.sqrt(np.mean((gap[:, ~even][near] / sigma[:, ~even][near]) ** 2) / 2) < 1.5
     assert (gap[:, ~even][near] / sigma[:, ~even][near]).max() < 5.0
+
+
+def test_the_light_of_a_spot_is_the_normal_density_of_its_ellipse_times_its_flux():
+    """The light falls on pixels with a side of 1 px, whose variance of 1/12 px^2 widens it."""
+    turn, major, minor, flux = np.radians(30.0), 4.0, 1.5, 7000.0
+    spot = replace(
+        Detections.at(np.array([[20.3, 31.8]]), np.eye(2)[None]), flux=np.array([flux]), major_px=np.array([major]),
+        minor_px=np.array([minor]), angle_deg=np.array([30.0]),
+    )  # fmt: skip
+    axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    covariance = axes @ np.diag([major**2 + 1 / 12, minor**2 + 1 / 12]) @ axes.T
+    u, v = (x.ravel() for x in np.meshgrid(np.arange(40), np.arange(60)))
+    expected = flux * multivariate_normal([20.3, 31.8], covariance).pdf(np.column_stack([u, v]))
+    np.testing.assert_allclose(light_at(spot, u, v), expected, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(light_at(spot.joined(spot, 2), u, v), 2 * expected, rtol=1e-4, atol=1e-6)

@@ -220,26 +220,18 @@ def corner_offsets(ref: Reference, jumped: Bools, exposure_s: float, dt: Array) 
     return out
 
 
-def with_error_along(b: Array, information: Array, vector: Array) -> tuple[Array, Array, float]:
-    """Information (s, s) and vector (s,) of spots with a further common error, of one sigma b (s,); and by how much
-    their chi-square falls. Source: the Sherman-Morrison formula.
-    """
-    Lb = information @ b
-    along, share = float(b @ vector), float(1 / (1 + b @ Lb))
-    return information - np.outer(Lb, Lb) * share, vector - Lb * along * share, along**2 * share
-
-
 def with_errors_along_axes(b: Array, information: Array, vector: Array) -> tuple[Array, Array, float]:
-    """As `with_error_along`, with an independent error of one sigma b_i of each pose component.
+    """Information (s, s) and vector (s,) of spots with a further common error of one sigma b_i in each pose component.
 
-    Two components that turn within one frame do so at different moments, and the error is not a multiple of b.
+    The errors are independent: two components that turn within one frame do so at different moments. Also by how much
+    chi-square falls. Source: the Sherman-Morrison formula.
     """
     total = 0.0
     for i in np.flatnonzero(b):
-        one = np.zeros(len(b))
-        one[i] = b[i]
-        information, vector, less = with_error_along(one, information, vector)
-        total += less
+        Lb = information[:, i] * b[i]
+        along, share = float(b[i] * vector[i]), float(1 / (1 + b[i] * Lb[i]))
+        information, vector = information - np.outer(Lb, Lb) * share, vector - Lb * along * share
+        total += along**2 * share
     return information, vector, total
 
 
