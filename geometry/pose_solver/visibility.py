@@ -44,10 +44,9 @@ def alternative_poses(
     target, J = model.project(world_from_body)
     places = model.hits(world_from_body)[0]
     views = views[np.isfinite(target[views, 0])]
-    none = Pose(np.zeros((0, 3, 3)), np.zeros((0, 3)))
     triple = _best_triple(model, J, views)
     if triple is None:
-        return none
+        return Pose.stack([])
     solutions = poses_from_three_spots(model.point[triple], model.ray[triple], places[triple])
     solutions = solutions[np.isfinite(solutions.translation[:, 0])]
     found: list[Pose] = []
