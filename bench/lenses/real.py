@@ -23,6 +23,7 @@ from geometry.arrays import Ints
 from lab.calibrate.camera.camera import corner_table
 from lab.calibrate.camera.camera_findings import findings_of
 from lab.calibrate.camera.pair import baseline_sigma
+from lab.calibrate.camera.pair import findings_of as pair_findings
 from lab.calibrate.camera.photos import find_in_photos
 from lab.findings.finding import Level, verdict
 
@@ -144,8 +145,9 @@ def bench_pair(name: str, count: int, seed: int) -> None:
     tables = [table_of(side)[0] for side in PAIRS[name]]
     views = tables[0].views
 
-    def solved(rows: Ints) -> tuple[float, float] | str:
-        single = [calibrated(t.only_views(rows)) for t in tables]
+    def solved(rows: Ints, lens: LensModel | None = None) -> tuple[float, float, bool] | str:
+        """Baseline and sigma, mm, and whether the pair is no FAIL; or why there is none."""
+        single = [calibrated(t.only_views(rows), lens) for t in tables]
         if isinstance(single[0], str) or isinstance(single[1], str):
             return f"{single[0]} {single[1]}"
         numbers = list(range(len(rows)))
@@ -153,7 +155,8 @@ def bench_pair(name: str, count: int, seed: int) -> None:
             pair = calibrate_pair(("left", "right"), (single[0], single[1]), (numbers, numbers))
         except PairError as error:
             return str(error)
-        return 1000 * pair.baseline_m, 1000 * baseline_sigma(pair)
+        usable = verdict(pair_findings(pair, ("left", "right"))) < Level.FAIL
+        return 1000 * pair.baseline_m, 1000 * baseline_sigma(pair), usable
 
     whole = solved(np.arange(views))
     print(f"pair {name}: baseline and sigma, mm: {whole}", flush=True)
@@ -161,19 +164,24 @@ def bench_pair(name: str, count: int, seed: int) -> None:
     values: list[float] = []
     sigmas: list[float] = []
     shares: list[float] = []
-    lost = 0
+    failed = lost = 0
     for _ in range(count):
         size = int(rng.integers(5, min(13, views - 1) + 1))
-        found = solved(np.sort(rng.choice(views, size, replace=False)))
+        rows = np.sort(rng.choice(views, size, replace=False))
+        found = solved(rows)
+        if isinstance(found, str) or not found[2]:
+            failed += 1
+            others = [solved(rows, LensModel(k)) for k in (4, 5)]
+            lost += any(not isinstance(one, str) and one[2] for one in others)
+            print(f"  {size} pairs: {found} | 4: {others[0]} | 5: {others[1]}", flush=True)
         if isinstance(found, str):
-            lost += 1
-            print(f"  {size} pairs: {found}")
             continue
         values.append(found[0])
         sigmas.append(found[1])
         shares.append(size / views)
     if count and not isinstance(whole, str):
-        print(f"  {count} subsets: not solved {lost}; baseline in sigmas {spread(values, sigmas, shares, whole[0])}")
+        around = spread(values, sigmas, shares, whole[0])
+        print(f"  {count} subsets: FAIL {failed}, of these where 4 or 5 do not {lost}; baseline in sigmas {around}")
 
 
 def main(arguments: list[str]) -> None:

@@ -42,9 +42,15 @@ from lab.pictures.picture_file import DROPPED, UNREADABLE, MissingPicture
 from lab.pictures.source import PictureFiles
 from lab.progress import Progress
 from lab.runs.frames.clocked_frames import open_frames
-from lab.runs.frames.even_sampler import EvenSampler
-from lab.runs.frames.frames import FrameReader, FrameSet, pictures_at
-from lab.runs.setup_check import FRAMES, MOST_KEPT, mistakes_by_themselves, rates_of_videos, recorded_mistakes
+from lab.runs.frames.frames import FrameReader, pictures_at
+from lab.runs.setup_check import (
+    FRAMES,
+    Pictures,
+    mistakes_by_themselves,
+    points_in,
+    rates_of_videos,
+    recorded_mistakes,
+)
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters
 from tracking.setup_mistakes.evidence import Invisible, invisible_mistakes
@@ -203,27 +209,23 @@ def check_rig(
         )
 
 
-def check_recording(findings: Findings, run: Run, sampler: EvenSampler[FrameSet]) -> None:
+def check_recording(findings: Findings, run: Run, sampler: Pictures) -> None:
     """Mistakes that a sample of the recording shows."""
     for f in (*recorded_mistakes(run, _blocks(run, sampler)), *rates_of_videos(run)):
         text = f"{f.what}. {sentence(f.why)} {f.remedy} ({f.code})"
         (findings.problems if f.level is Level.FAIL else findings.remarks).append(text)
 
 
-def _blocks(run: Run, sampler: EvenSampler[FrameSet]) -> list[Block]:
+def _blocks(run: Run, sampler: Pictures) -> list[Block]:
     """The points of sampled frames; those of pictures are detected."""
-    blocks = sampler.blocks
+    blocks = sampler.frames
     filmed = [name for name, source in run.cameras.items() if not isinstance(source, DetectionsTable)]
     if filmed and blocks:
         chosen = np.unique(np.linspace(0, len(blocks) - 1, FRAMES).round().astype(int))
         blocks = [blocks[i] for i in chosen]
     numbers = [frame.frame for block in blocks for frame in block]
     found = _detected(run, filmed, numbers) if filmed else {}
-    return [[_points(frame) | found.get(frame.frame, {}) for frame in block] for block in blocks]
-
-
-def _points(frame: FrameSet) -> dict[str, Detections]:
-    return {name: points for name, points in frame.images.items() if isinstance(points, Detections)}
+    return [[points_in(frame) | found.get(frame.frame, {}) for frame in block] for block in blocks]
 
 
 def _detected(run: Run, cameras: list[str], frames: list[int]) -> dict[int, dict[str, Detections]]:
@@ -257,16 +259,13 @@ class _Seen:
     size: str = ""  # why the last of them is wrong
 
 
-def check_pictures(
-    findings: Findings, run: Run, reader: FrameReader, progress: Progress | None
-) -> EvenSampler[FrameSet]:
+def check_pictures(findings: Findings, run: Run, reader: FrameReader, progress: Progress | None) -> Pictures:
     """Decode all pictures of a run, and check them with its times and its truth; returns a sample without pixels."""
     seen = {name: _Seen() for name in reader.cameras}
-    sampler: EvenSampler[FrameSet] = EvenSampler(MOST_KEPT)
+    sampler = Pictures()
     done = 0
     for frame_set in reader:
-        points = {name: found for name, found in frame_set.images.items() if isinstance(found, Detections)}
-        sampler.add(FrameSet(frame_set.frame, points))
+        sampler.add(frame_set.frame, frame_set.images)
         for name, picture in frame_set.images.items():
             _count(seen[name], frame_set.frame, picture)
         done += 1

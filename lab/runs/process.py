@@ -27,7 +27,7 @@ from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.frames.row_records import row_records
 from lab.runs.model_check.frame_sampler import FrameSampler
 from lab.runs.run_log import RunLog, listening
-from lab.runs.setup_check import mistakes_of_run, pictures_sampler
+from lab.runs.setup_check import Pictures, mistakes_of_run
 from lab.runs.smoothing_pass import TrackingAndSmoothing
 from lab.runs.summary import processed_run
 from lab.runs.tables import TableWriter
@@ -159,7 +159,7 @@ def write_tables(
         causal=checks.causal,
         invalid=checks.invalid,
     )
-    sampler, pictures = FrameSampler(), pictures_sampler()
+    sampler, pictures = FrameSampler(), Pictures()
     with (
         TableWriter(
             work, run.rig, run.covariance is not None, with_causal=not causal, with_picture_times=bool(run.clocks)
@@ -175,8 +175,7 @@ def write_tables(
         for record, in_causal_pass in rows_of(pipeline, sampled(checks.passed(records))):
             tables.write(record, in_causal_pass)
             statistics.add(record, in_causal_pass)
-            found = zip(run.rig.cameras, record.detections, strict=True)
-            pictures.add({name: points for name, points in found if points is not None})
+            pictures.add(record.frame, dict(zip(run.rig.cameras, record.detections, strict=True)))
             if on_frame is not None:
                 on_frame(record, in_causal_pass)
     from lab.runs.model_check.check import check_sampled_frames  # deferred: only needed at the end of a run

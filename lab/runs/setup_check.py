@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
@@ -12,12 +13,21 @@ from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.files.run.run_file import Run, VideoFile
 from lab.findings.finding import Finding, Level, finding, sentence, verdict
+from lab.number_format import format_number
 from lab.pictures.source import video_at
-from lab.runs.frames.even_sampler import EvenSampler
+from lab.runs.frames.even_sampler import BLOCK, EvenSampler
+from lab.runs.frames.frames import FrameSet
 from lab.runs.verdict.run_statistics import RunStatistics
 from tracking.detections import Detections
-from tracking.setup_mistakes.evidence import LEAST_FITTING, LEAST_POINTS, Comparison, Frames, compare
-from tracking.setup_mistakes.possible import HERE, Block, possible_mistakes
+from tracking.setup_mistakes.evidence import (
+    LEAST_FITTING,
+    LEAST_POINTS,
+    Comparison,
+    Frames,
+    compare,
+    invisible_mistakes,
+)
+from tracking.setup_mistakes.possible import HERE, SHOWN_BY, Block, possible_mistakes
 
 UNUSED = "BP-M07"  # code of the finding on a camera of which no point is labelled
 FRAMES = 6  # of a recording, with which mistakes are tested
@@ -25,12 +35,42 @@ MOST_KEPT = 90  # frames from which they are chosen
 FEWEST, PART = 10, 0.6  # points, and the share of width and height that they do not exceed in part of a picture
 SAME_RATE = 0.02  # relative difference of frame rates, above which they are not the same
 WRITTEN_BY_DEFAULT = (25.0, 30.0)  # Hz, in the header of a video
-Pictures = EvenSampler[Mapping[str, Detections]]  # the points of each frame, by camera
+DOUBTFUL = 2  # pictures of a camera without any of its spots, from which on a run that passes is tested, too
 
 
-def pictures_sampler() -> Pictures:
-    """An empty sampler of the points of a recording."""
-    return EvenSampler(MOST_KEPT)
+@dataclass(slots=True)
+class Pictures:
+    """Sampled frames: blocks at even distances, and those in which points move most."""
+
+    even: EvenSampler[FrameSet] = field(default_factory=lambda: EvenSampler(MOST_KEPT))
+    moving: list[tuple[float, int, list[FrameSet]]] = field(default_factory=list)
+    _last: list[tuple[float, FrameSet]] = field(default_factory=list)  # how far points have moved, and the frame
+
+    def add(self, number: int, points: Mapping[str, object]) -> None:
+        """Add the next frame; pictures that are not points have no motion."""
+        here = FrameSet(number, {name: found for name, found in points.items() if isinstance(found, Detections)})
+        px = _moved_px(points_in(here), points_in(self._last[-1][1])) if self._last else 0.0
+        self.even.add(here)
+        self._last = [*self._last[1 - BLOCK :], (px, here)]
+        if len(self._last) == BLOCK and (most := max(step for step, _ in self._last[1:])) > 0:
+            self.moving.append((most, number, [frame for _, frame in self._last]))
+            self.moving = sorted(self.moving, key=lambda one: -one[0])[:FRAMES]
+
+    @property
+    def frames(self) -> list[list[FrameSet]]:
+        """The blocks, in the order of the recording."""
+        blocks = {block[HERE].frame: block for block in [*self.even.blocks, *(one[2] for one in self.moving)]}
+        return [blocks[number] for number in sorted(blocks)]
+
+    @property
+    def blocks(self) -> list[Block]:
+        """The points of the frames."""
+        return [[points_in(frame) for frame in block] for block in self.frames]
+
+
+def points_in(frame: FrameSet) -> dict[str, Detections]:
+    """The points of a frame by camera."""
+    return {name: found for name, found in frame.images.items() if isinstance(found, Detections)}
 
 
 def frames_of(blocks: Sequence[Block], prior: PosePrior | None, min_spots: int) -> Frames | None:
@@ -43,15 +83,16 @@ def frames_of(blocks: Sequence[Block], prior: PosePrior | None, min_spots: int) 
     if not len(rows):
         return None
     full = rows[counts[rows] >= np.median(counts[rows])]
-    moved = full[np.argsort([-_moved_px(blocks[i]) for i in full], kind="stable")][: FRAMES // 2]
+    steps = [max(_moved_px(b[HERE], b[0]), _moved_px(b[-1], b[HERE])) for b in blocks]
+    moved = full[np.argsort([-steps[i] for i in full], kind="stable")][: FRAMES // 2]
     even = full[np.unique(np.linspace(0, len(full) - 1, FRAMES).round().astype(int))]
     chosen = list(dict.fromkeys([*rows[rows == 0], *moved, *even]))[:FRAMES]
     return Frames([blocks[i] for i in chosen], prior, at_start=bool(chosen[0] == 0))
 
 
-def _moved_px(block: Block) -> float:
-    """How far a quarter of the points of a camera move at most, px, to a frame beside it; other points may be false."""
-    pairs = ((found, other[n]) for n, found in block[HERE].items() for other in block if n in other)
+def _moved_px(here: Mapping[str, Detections], before: Mapping[str, Detections]) -> float:
+    """How far a quarter of the points of a camera have moved at most, px; other points may be false."""
+    pairs = ((found, before[name]) for name, found in here.items() if name in before)
     away = (np.linalg.norm(a.uv_px[:, None] - b.uv_px, axis=-1).min(axis=1) for a, b in pairs if len(a) and len(b))
     return max((float(np.quantile(one, 0.25)) for one in away), default=0.0)
 
@@ -95,20 +136,46 @@ def _parts_of_pictures(rig: Rig, blocks: Sequence[Block]) -> tuple[Finding, ...]
 def mistakes_of_run(run: Run, statistics: RunStatistics, pictures: Pictures, *, passes: bool) -> tuple[Finding, ...]:
     """Findings on mistakes in the set-up of a run that has been processed.
 
-    passes: whether nothing else is to be reported: the rig then explains the recording, and only cameras that the poses
-    do not use are tested.
+    passes: whether nothing else is to be reported: the rig then explains the recording. It is tested only where the
+    poses hardly use a camera, and for mistakes that its symmetry hides.
     """
     of_files = (*mistakes_by_themselves(run.rig, run.prior), *rates_of_videos(run))
-    unused = [n for n, c in statistics.cameras.items() if c.points >= LEAST_POINTS * max(c.pictures, 1) and not c.found]
-    if verdict(of_files) is Level.FAIL or (passes and not unused):
+    cameras = statistics.cameras
+    unused = [n for n, c in cameras.items() if c.points >= LEAST_POINTS * max(c.pictures, 1) and not c.found]
+    doubtful = any(c.unlabelled + len(c.displaced) >= DOUBTFUL for c in cameras.values())
+    if verdict(of_files) is Level.FAIL:
         return of_files
+    if passes and not unused and not doubtful:
+        return (*hidden_by_symmetry(run, statistics), *of_files)
     found = recorded_mistakes(run, pictures.blocks)
+    if passes and not unused and verdict(found) is not Level.FAIL:
+        return (*hidden_by_symmetry(run, statistics), *of_files)
     # Of a run, all pictures show whether a camera is used, not only the sampled ones; without any pose none is.
     others = [f for f in found if f.code != UNUSED]
     if verdict(found) is Level.FAIL or not statistics.measured:
         return (*others, *of_files)
-    unlabelled = [unused_finding(n, statistics.cameras[n].points, statistics.cameras[n].pictures) for n in unused]
+    unlabelled = [unused_finding(n, cameras[n].points, cameras[n].pictures) for n in unused]
     return (*unlabelled, *others, *of_files)
+
+
+def hidden_by_symmetry(run: Run, statistics: RunStatistics) -> tuple[Finding, ...]:
+    """Findings on mistakes with which another first pose within the prior explains a run without truth as well."""
+    if statistics.first_pose is None or (run.folder / "truth" / "pose.csv").exists():
+        return ()
+    prior = PosePrior.everywhere(run.rig) if run.prior is None else run.prior
+    hidden = invisible_mistakes(run.rig, prior, run.tracker.labels, statistics.first_pose)
+    return tuple(
+        finding(
+            "BP-M10",
+            Level.WARN,
+            f"the recording does not show whether {one.mistake.what}; the first poses would then be wrong by"
+            f" {format_number(one.off_m)} m, {format_number(one.off_deg)} deg",
+            remedy=f"To exclude it, {SHOWN_BY[one.mistake.kind]}; then make the prior in run.yaml so narrow that it"
+            " excludes the other first pose, or give one known pose in truth/pose.csv.",
+        )
+        for one in hidden
+        if not one.is_harmless
+    )
 
 
 def rates_of_videos(run: Run) -> tuple[Finding, ...]:

@@ -99,7 +99,8 @@ def _notes(pipeline: Pipeline, statistics: RunStatistics) -> list[str]:
         notes.append(f"cameras of the rig without data in this run: {', '.join(pipeline.run.left_out)}")
     if unlisted := statistics.events.unlisted:
         notes.append(f"events: the first {MOST_EVENTS} of {MOST_EVENTS + unlisted} are listed")
-    if away := _away_from_prior(pipeline.run, statistics.first_pose):
+    at_start = statistics.first_measured == statistics.first_frame
+    if away := _away_from_prior(pipeline.run, statistics.first_pose if at_start else None):
         notes.append(away)
     if outside := pipeline.run.paths_outside:
         notes.append(f"read from outside the run folder: {', '.join(map(str, outside))}")

@@ -97,6 +97,7 @@ def compare(
 
     covariance: of the rig's calibration, if known.
     """
+    unlimited = parameters
     parameters = replace(
         parameters,
         max_points=min(parameters.max_points, MOST_POINTS),
@@ -124,6 +125,10 @@ def compare(
         left = [*(whole[i] for i in order)]
     whole.sort(key=lambda one: -float(one[1].nats.sum()))
     found = [one for one in whole if _better(one[1], given)]
+    if found:
+        # In a crowd the limited search misses poses by chance, which is no evidence for a mistake.
+        given = explained(as_given, frames, unlimited, covariance)
+        found = [] if given.is_certain else [one for one in found if _better(one[1], given)]
     limit = float(found[0][1].nats.sum()) - SAME_NATS if found else 0.0
     return Comparison(given, tuple(one for one in found if one[1].nats.sum() >= limit))
 
@@ -204,6 +209,8 @@ def _fits(one: Labelling, model: SpotModel, points: dict[str, Detections]) -> bo
 NAMES = "target"  # the kind of mistakes that may exchange names only
 POSES = 200  # of which the TRIED with the most visible spots are tried
 TRIED = 2
+BESIDE = (0.05, 0.03, -0.04, 0.05, -0.03, 0.04)  # m and rad, from the first pose of a recording to one beside it ...
+NEAR_M, NEAR_RAD = 0.3, 0.3  # ... whose counterpart is searched for this near that of the first
 SIGMA_PX = 0.1  # of the simulated points; they are exact, and fit a symmetric rig ...
 LARGEST_RMS_PX = 0.02  # ... to less than this
 SAME_M, SAME_DEG = 1e-3, 0.01  # poses that differ by less are the same
@@ -223,11 +230,17 @@ class Invisible:
         return self.off_m < SAME_M and self.off_deg < SAME_DEG
 
 
-def invisible_mistakes(rig: Rig, prior: PosePrior | None, parameters: LabelParameters) -> Iterator[Invisible]:
-    """The mistakes that a rig hides, over the poses of a prior (without one: of a usual range)."""
+def invisible_mistakes(
+    rig: Rig, prior: PosePrior | None, parameters: LabelParameters, first: Pose | None = None
+) -> Iterator[Invisible]:
+    """The mistakes that a rig hides over the poses of a prior (without one: of a usual range).
+
+    first: of a recording, to which the prior refers; then only this pose and one beside it are tried.
+    """
     model = SpotModel.of(rig)
     prior = assumed_range(rig) if prior is None else prior
-    poses = poses_within(prior, POSES)
+    # A pose on the axis of symmetry is the same with the mistake; the one beside it shows whether others differ.
+    poses = poses_within(prior, POSES) if first is None else first.plus(np.array([np.zeros(6), BESIDE]))
     views = np.count_nonzero(model.in_picture(model.project(poses)[0]).any(axis=0))
     for mistake in possible_mistakes(rig):
         late = any(change.later for change in mistake.pictures.values())
@@ -240,14 +253,19 @@ def invisible_mistakes(rig: Rig, prior: PosePrior | None, parameters: LabelParam
             continue  # such a rig would have spots that it never sees
         recorded = _recorded(mistake, true, pixels)
         off: list[Array] = []
-        for k in np.argsort(-seen.sum(axis=1), kind="stable")[:TRIED]:
+        rows = np.argsort(-seen.sum(axis=1), kind="stable")[:TRIED] if first is None else (0, 1)
+        near = prior
+        for k in rows:
             points = _detections(mistake, true, recorded[k], seen[k])
             if sum(map(len, points.values())) < max(parameters.min_spots, 1):
                 break
-            found = candidate_labellings(rig, model, points, prior, parameters, most=1)
+            found = candidate_labellings(rig, model, points, near, parameters, most=1)
             if not found or not _explains_all(found[0], points):
                 break
-            off.append(_off(found[0].fit.world_from_body, poses[int(k)]))
+            other = found[0].fit.world_from_body
+            off.append(_off(other, poses[int(k)]))
+            if first is not None:
+                near = PosePrior(other, NEAR_M, NEAR_RAD)
         if len(off) == TRIED:
             worst = np.max(off, axis=0)
             yield Invisible(mistake, float(worst[0]), float(np.rad2deg(worst[1])))

@@ -25,7 +25,7 @@ from lab.runs.frames.frames import FrameSet
 from lab.runs.frames.pipeline import FrameRecord, Frames, Pipeline
 from lab.runs.model_check.check import ModelCheck, check_model
 from lab.runs.model_check.frame_sampler import FrameSampler
-from lab.runs.setup_check import UNUSED, mistakes_of_run, pictures_sampler
+from lab.runs.setup_check import UNUSED, Pictures, mistakes_of_run
 from lab.runs.smoothing_pass import TrackingAndSmoothing
 from lab.runs.verdict.frame_checks import FrameChecks
 from lab.runs.verdict.run_statistics import CameraStatistics, RunStatistics
@@ -130,7 +130,7 @@ def labelled(run: Run, most: int | None = None, enough: int = 0, *, judged: bool
             may absorb, or no pose at all.
     """
     camera_of = SpotModel.of(run.rig).camera_of
-    sampler, pictures = FrameSampler(with_predicted=most is not None), pictures_sampler()
+    sampler, pictures = FrameSampler(with_predicted=most is not None), Pictures()
     cameras = {name: CameraStatistics() for name in run.rig.cameras}
     statistics = RunStatistics(cameras, SpotModel.of(run.rig).views, run.tracker.labels.min_spots)
     with tempfile.TemporaryDirectory(prefix="beampose-refine-") as work:
@@ -141,8 +141,7 @@ def labelled(run: Run, most: int | None = None, enough: int = 0, *, judged: bool
         with contextlib.closing(passes.records()) as records:
             for record, _ in FrameChecks(run.rig, run.covariance).passed(records):
                 sampler.add_record(record, camera_of, run.tracker)
-                found = zip(run.rig.cameras, record.detections, strict=True)
-                pictures.add({name: points for name, points in found if points is not None})
+                pictures.add(record.frame, dict(zip(run.rig.cameras, record.detections, strict=True)))
                 statistics.add(record)
     recording = sampler.recording()
     passes_well = statistics.measured > LEAST_MEASURED * statistics.frames

@@ -49,6 +49,7 @@ class CameraStatistics:
     points: int = 0  # points of light in all pictures
     expected: int = 0  # spots that the pose puts inside the pictures
     found: int = 0  # expected spots that were measured
+    unlabelled: int = 0  # pictures with points enough for two or more expected spots, none of which was measured
     empty_at_end: int = 0  # pictures since the last one that has a point of light
     expected_at_end: int = 0  # spots that the pose puts inside those
     missing: FrameRanges = field(default_factory=FrameRanges)  # frames without a usable picture
@@ -127,7 +128,8 @@ class RunStatistics:
     spot_status: dict[tuple[str, str], Counter[str]] = field(default_factory=dict)  # by view: SpotStatus -> frames
     labels_left_open: int = 0  # rows of spots.csv with a detection whose label is too uncertain
     events: Events = field(default_factory=Events)
-    first_pose: Pose | None = None  # of the first frame, if it is measured
+    first_pose: Pose | None = None  # the first that is measured
+    first_measured: int = -1  # its frame
     _found: bool = False  # whether a pose has been found
     _causes: Counter[tuple[Cause, int]] = field(default_factory=Counter)  # with the number of unlabelled points
     _surplus: Counter[int] = field(default_factory=Counter)  # unlabelled points of measured frames
@@ -142,7 +144,8 @@ class RunStatistics:
         tracked = record.tracked
         if self.frames == 0:
             self.first_frame = record.frame
-            self.first_pose = tracked.pose if tracked.pose_status is PoseStatus.MEASURED else None
+        if self.first_pose is None and tracked.pose_status is PoseStatus.MEASURED:
+            self.first_pose, self.first_measured = tracked.pose, record.frame
         self.last_frame = record.frame
         self.frames += 1
         self.pose[tracked.pose_status.value] += 1
@@ -194,6 +197,7 @@ class RunStatistics:
                 camera.found += sum(s.measured for s in own)
                 expected = sum(s.measured or s is SpotStatus.OCCLUDED for s in own)
                 camera.expected += expected
+                camera.unlabelled += 2 <= expected <= len(found) and not any(s.measured for s in own)
                 camera.expected_at_end += expected if camera.empty_at_end else 0
                 labelled = [v for v in views if status[v].measured]
                 measured = record.tracked.pose_status is PoseStatus.MEASURED

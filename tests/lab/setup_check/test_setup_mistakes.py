@@ -14,6 +14,7 @@ import yaml
 from bench.mistakes.mistakes import CASES, read, turned_aside, write
 from bench.mistakes.recordings import calibrated
 from geometry.arrays import Array
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
@@ -127,10 +128,11 @@ def test_a_mistake_that_the_recording_shows_is_a_problem_at_check(recording, tmp
     assert "(BP-M06)" in text
 
 
+@pytest.mark.parametrize("rest", [12, 90])
 @pytest.mark.parametrize("name", [None, "numbered from 1, another camera"])
-def test_wrong_numbers_show_although_a_turntable_moves_in_few_frames_only(recording, tmp_path, name):
+def test_wrong_numbers_show_although_a_turntable_moves_in_few_frames_only(recording, tmp_path, name, rest):
     files = read(recording)
-    pose_of = [0] * 12 + [3, 6, 9] + [12] * 12 + [15, 18, 21] + [24] * 12  # frame of the recording
+    pose_of = [0] * rest + [3, 6, 9] + [12] * rest + [15, 18, 21] + [24] * rest  # frame of the recording
     at = {n: [row for row in files.rows if row["frame"] == str(n)] for n in set(pose_of)}
     files.rows = [{**row, "frame": str(k)} for k, n in enumerate(pose_of) for row in at[n]]
     if name is not None:
@@ -156,7 +158,38 @@ def test_a_mistake_that_symmetry_hides_is_a_remark_with_the_measurement_that_sho
     assert status == 0
     assert "no recording with this rig would show, because it is symmetric, that the pictures of cameras" in text
     assert "cover the lens of one camera for some frames" in text
-    assert process_run(run, tmp_path / "out").verdict.status == "pass"
+    verdict = process_run(run, tmp_path / "out").verdict
+    assert [f.code for f in verdict.findings] == ["BP-M10"]
+    assert (
+        "the recording does not show whether the pictures of cameras `left` and `right` are exchanged"
+        in (verdict.texts[0])
+    )
+
+
+@pytest.mark.parametrize(
+    ("first_m", "within_m", "codes"),
+    [
+        (0.3, 1.0, ["BP-M10"]),
+        (0.3, 0.2, []),  # the other first pose is outside
+        (0.0, 0.2, ["BP-M10"]),  # on the axis of symmetry: the first pose is the same, the others are not
+    ],
+)
+def test_only_a_prior_that_excludes_the_other_first_pose_shows_what_symmetry_hides(
+    symmetric, tmp_path, first_m, within_m, codes
+):
+    files, model, rng = read(symmetric), SpotModel.of(fan()), np.random.default_rng(0)
+    files.run["prior"] = {
+        "position_m": [first_m, 0, 0], "yaw_pitch_roll_deg": [0, 0, 0], "within_m": within_m, "within_deg": 20.0
+    }  # fmt: skip
+    usual, files.rows = files.rows[0], []
+    for k in range(30):
+        pose = Pose.from_ypr(np.deg2rad([0.5 * k, 0.2 * k, 0]), np.array([first_m + 0.004 * k, 0.003 * k, 0]))
+        pixels = model.project(pose)[0] + rng.normal(0, 0.1, (len(model), 2))
+        for c, (u, v) in zip(model.camera_of, pixels, strict=True):
+            camera = model.camera_names[c]
+            files.rows.append({**usual, "frame": str(k), "camera": camera, "u_px": str(u), "v_px": str(v)})
+    outcome = process_run(write(files, tmp_path / "run"), tmp_path / "out")
+    assert [f.code for f in outcome.verdict.findings] == codes
 
 
 def test_poses_that_contradict_the_truth_fail_the_run(symmetric, tmp_path):
