@@ -12,9 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.least_squares.adjustment import Adjusted, AdjustmentError, Limits, Poses, Vectors, solve
+from calibration.least_squares.adjustment import Adjusted, AdjustmentError, Limits, Poses, Term, Vectors, solve
+from calibration.lens.board_shape import HALF_SIGNIFICANT
 from calibration.lens.fit.lens_adjustment import coefficient_prior
 from calibration.lens.fit.lens_parameters import Values
+from calibration.lens.fit.view_equations import BEND_PROBABLE, SCATTER_SIGNIFICANT, ViewEquations
 from calibration.lens.intrinsics_result import Intrinsics
 from calibration.terms.corners import CornerTerm
 from geometry.arrays import Array, Bools, Ints
@@ -121,12 +123,11 @@ class _Problem:
                 view_place[view] = place[key]
             rows.append(view_place[one.table.view])
         left = single[0].fit
-        warp = left.warp if any(s.warp is not None and s.warp.corrected for s in single) else np.zeros(3)
         values: Values = {
             "intrinsics": Vectors(np.stack([s.fit.lens for s in single])),
             "cameras": Poses.of([Pose.identity(), right_from_left]),
             "boards": Poses.of(boards),
-            "warp": Vectors(warp[None]),
+            "warp": Vectors(left.warp[None]),
             "stretch": Vectors(left.stretch[None]),
             "print": Vectors(_printed(single)),
             "radius": Vectors(np.array([[np.mean([s.fit.radius_m for s in single])]])),
@@ -135,19 +136,59 @@ class _Problem:
 
     def solved(self) -> Adjusted:
         """Both lenses, the pose of the right camera, all boards, and the bend where it is significant."""
-        bent = any(s.warp is not None and s.warp.corrected for s in self.single)
         free: dict[str, bool | Bools] = {
             "intrinsics": np.stack([s.model.free for s in self.single]),
             "cameras": np.repeat([[False], [True]], 6, axis=1),
             "boards": True,
-            "warp": bent,
+            "warp": self.bent,
         }
-        priors = [
-            prior
-            for c, s in enumerate(self.single)
-            for prior in coefficient_prior(s.table, s.fit.used, s.model, s.fit.values, c)
-        ]
-        return solve(self.values, [self.term, *priors], free, _LIMITS)
+        return solve(self.values, [self.term, *self.priors()], free, _LIMITS)
+
+    def priors(self) -> list[Term]:
+        """The weak priors on the coefficients of both lenses."""
+        both = enumerate(self.single)
+        return [p for c, s in both for p in coefficient_prior(s.table, s.fit.used, s.model, s.fit.values, c)]
+
+    def equations(self, adjusted: Adjusted, misfit: float, bent: bool) -> ViewEquations:
+        """Of each instant, on both lenses, the right camera's pose and, if `bent`, the bend of the board.
+
+        misfit: factor on the sigmas of the corners.
+        """
+        lenses = [s.model.free for s in self.single]
+        starts = np.cumsum([0, *(int(free.sum()) for free in lenses)])
+
+        def rows(term: Term) -> Array:
+            """Derivatives (N, 2, q), or of a prior (n, 1, q)."""
+            parts = {p.stack: p for p in term.linearise(adjusted.values).parts}
+            by_lens = parts["intrinsics"]
+            out = np.zeros((*by_lens.jacobian.shape[:2], starts[2] + 6))
+            for c, free in enumerate(lenses):
+                mine = by_lens.index == c
+                out[mine, :, starts[c] : starts[c + 1]] = by_lens.jacobian[mine][..., free]
+            if "cameras" in parts:
+                out[..., starts[2] :] = np.where((by_lens.index == 1)[:, None, None], parts["cameras"].jacobian, 0.0)
+            bend = parts["warp"].jacobian if "warp" in parts else np.zeros((*out.shape[:2], 3))
+            return np.concatenate([out, bend], axis=2) if bent else out
+
+        boards = next(p for p in self.term.linearise(adjusted.values).parts if p.stack == "boards").jacobian
+        shared = rows(self.term)
+        known = [rows(prior).reshape(-1, shared.shape[-1]) for prior in self.priors()]
+        return ViewEquations.of_rows(
+            shared / misfit,
+            boards / misfit,
+            adjusted.residuals[0] / misfit,
+            self.term.placement,
+            np.unique(self.term.placement),
+            np.concatenate([*known, np.zeros((0, shared.shape[-1]))]),
+            int(starts[2]) + 6,
+        )
+
+    @property
+    def bent(self) -> bool:
+        """Whether the bend of the board is solved for: a camera by itself shows it, or each of them supports it."""
+        tests = [s.warp for s in self.single if s.warp is not None]
+        each = len(tests) == 2 and all(t.p_value < HALF_SIGNIFICANT for t in tests)
+        return any(t.corrected for t in tests) or each
 
     def pair_rms(self, adjusted: Adjusted, shared: Sequence[int]) -> Array:
         """RMS (pairs,), in px, of the residuals of each pair that shares a board; nan for separated ones."""
@@ -223,7 +264,7 @@ def _result(
     misfit = float(np.sqrt(adjusted.chi2 / max(adjusted.dof, 1)))
     return CalibratedPair(
         cameras=(cameras[0], cameras[1]),
-        covariance=_covariance(names, single, adjusted, misfit),
+        covariance=_covariance(names, single, problem, adjusted, misfit),
         single=single,
         rms_px=(rms[0], rms[1]),
         misfit=misfit,
@@ -234,18 +275,25 @@ def _result(
 
 
 def _covariance(
-    names: tuple[str, str], single: tuple[Intrinsics, Intrinsics], adjusted: Adjusted, misfit: float
+    names: tuple[str, str], single: tuple[Intrinsics, Intrinsics], problem: _Problem, adjusted: Adjusted, misfit: float
 ) -> RigCovariance:
     """Of both lenses and the right camera's pose, raised where the residuals are larger than those of single cameras.
 
     The scatter between photographs and the errors of the lens models raise it as they do for a single camera.
     """
-    whole = adjusted.covariance([("intrinsics", 0), ("intrinsics", 1), ("cameras", 1)])
-    lens = len(single[0].model.free)
-    chosen = np.concatenate(
-        [c * lens + np.flatnonzero(s.model.free) for c, s in enumerate(single)] + [2 * lens + np.arange(6)]
-    )
+    scale = max(misfit, 1.0)
+    equations = problem.equations(adjusted, scale, problem.bent)
+    factor = max(s.correlated_noise for s in single)
+    spread = equations.scatter()
+    if spread.p_value < SCATTER_SIGNIFICANT:
+        factor = max(factor, spread.factor)
+    whole = equations.scattered_covariance(factor) if factor > 1 else equations.basis @ equations.basis.T
+    whole = whole[: equations.lens, : equations.lens]
+    shapes = [s.board for s in single if s.board is not None]
+    if not problem.bent and any(b.warp.p_value < BEND_PROBABLE and not b.points.corrected for b in shapes):
+        change = problem.equations(adjusted, scale, True).solution()[0][: equations.lens]
+        whole = whole + np.outer(change, change)
     labels = [f"cameras.{n}.{p}" for n, s in zip(names, single, strict=True) for p in s.parameters]
     labels += [f"cameras.{names[1]}.{p}" for p in POSE]
-    raised = max(misfit, 1.0) * max(s.correlated_noise * s.model_uncertainty.factor for s in single)
-    return RigCovariance(tuple(labels), whole[np.ix_(chosen, chosen)] * raised**2)
+    raised = max(s.model_uncertainty.factor for s in single)
+    return RigCovariance(tuple(labels), whole * raised**2)

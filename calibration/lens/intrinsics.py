@@ -18,7 +18,7 @@ from calibration.lens.fit.lens_parameters import AS_STATED, BOARD_BLOCKS, BoardF
 from calibration.lens.fit.lens_start import StartError, start
 from calibration.lens.fit.model_selection import RATIONAL, ModelCandidate, inliers_of_rich_models, select_model
 from calibration.lens.fit.projection_map import Difference, ProjectionMap, difference, projection_map
-from calibration.lens.fit.view_equations import ViewEquations, scattered
+from calibration.lens.fit.view_equations import BEND_PROBABLE, SCATTER_SIGNIFICANT, ViewEquations, scattered
 from calibration.lens.intrinsics_result import Intrinsics, Origins
 from calibration.lens.model_uncertainty import estimate_model_uncertainty
 from geometry.arrays import Array, Bools
@@ -26,11 +26,6 @@ from geometry.arrays import Array, Bools
 FEWEST_VIEWS = 4
 # With a smaller angle between the boards' normals, focal length and distance cannot be separated.
 LEAST_TILT_DEG = 5.0
-# Scatter between photographs with a smaller p-value inflates the covariance; 5 % of correct models are affected, by a
-# factor of about 1.2. With 1 %, sets of five to seven real photographs often stated sigmas that were too small.
-SCATTER_SIGNIFICANT = 0.05
-# With a smaller p-value of a flat board, the effect of solving for its bend is part of the covariance.
-BEND_PROBABLE = 0.05
 
 
 class IntrinsicsError(ValueError):
