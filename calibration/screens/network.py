@@ -93,7 +93,6 @@ class Network:
     screen_priors: tuple[Prior, ...] = ()  # of screens from scans
     lens_priors: tuple[Prior, ...] = ()
     warp_sigma_m: float = WARP_SIGMA_M  # sigma of a board's bend at its edge; 0: flat
-    radii_m: Array | None = None  # (boards,): of their circles, 0 for boards of corners; None: no circles
     lens_free: Bools | None = None  # (cameras, 18): free lens parameters; None: none
 
 
@@ -163,8 +162,8 @@ def _unknowns(network: Network, start: Start) -> tuple[Values, dict[str, bool | 
     values["boards"] = Poses(start.world_from_board)
     count = 0 if network.corners is None else int(network.corners.board.max(initial=-1)) + 1
     values["warp"] = Vectors(np.zeros((count, 3)))
-    if network.radii_m is not None:
-        values["radius"] = Vectors(network.radii_m[:count, None])
+    if network.corners is not None and network.corners.areas_px2 is not None:
+        values["radius"] = Vectors(network.corners.radii_by_areas(values)[:, None])
     n_cameras, n_screens = len(rig.cameras), len(rig.screens)
     cameras = np.ones((n_cameras, 6), dtype=bool)
     bow = np.zeros((n_screens, 3), dtype=bool)

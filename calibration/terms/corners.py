@@ -19,12 +19,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.boards.circle_detection import homography, mapped
 from calibration.least_squares.adjustment import Linearised, Loss, Part, Values
 from calibration.terms.surveyed import array_of, pose_of
 from geometry.arrays import Array, Bools, Ints, cross
-from geometry.camera import Camera, Projected, project_points_full
-from geometry.pose import Pose
+from geometry.camera import Projected, project_points_full
 
 # The centroid of the image of a circle, from images of points on its outline.
 #
@@ -77,33 +75,6 @@ def centroid(outline: Array) -> tuple[Array, Array]:
     return middle + np.stack([cx, cy], axis=1), G
 
 
-def radius_by_areas(board_xy: Array, pixels: Array, areas_px2: Array, camera: Camera) -> float:
-    """The radius, m, of a board's circles from the areas (n,) of their blobs at pixels (n, 2).
-
-    board_xy (n, 2), m: centres of the circles on the board. Each area is divided by pi and by the local scale of the
-    image, in px^2 per m^2, which includes distortion; the result is the root of the median.
-
-    Raises:
-        ValueError: fewer than four pixels have a ray through the lens.
-    """
-    alone = replace(camera, camera_from_world=Pose.identity())
-    _, rays = alone.rays(pixels)
-    good = np.isfinite(rays).all(axis=1)
-    if good.sum() < 4:
-        raise ValueError(f"expected four or more pixels within the fold of the lens model, got {int(good.sum())}")
-    H = homography(board_xy[good], rays[good, :2] / rays[good, 2:])
-
-    def image_of(xy: Array) -> Array:
-        flat = mapped(H, xy)
-        return alone.project(np.concatenate([flat, np.ones((len(flat), 1))], axis=1))
-
-    step = 1e-3 * float(np.ptp(board_xy))
-    by_x, by_y = ((image_of(board_xy[good] + d) - image_of(board_xy[good] - d)) / (2 * step) for d in step * np.eye(2))
-
-    scale = np.abs(by_x[:, 0] * by_y[:, 1] - by_x[:, 1] * by_y[:, 0])
-    return float(np.sqrt(np.nanmedian(areas_px2[good] / (np.pi * scale))))
-
-
 INTRINSICS_COUNT = 18  # numbers of a camera: fx, fy, cx, cy and OpenCV's fourteen distortion coefficients
 _BY_BOARD = ("warp", "radius", "stretch")  # stacks with one unknown per board
 
@@ -122,6 +93,7 @@ class CornerTerm:
     fisheye: Bools  # (cameras,)
     loss: Loss | None = None
     point: Ints | None = None  # (N,) index of the board's point into "print"; None if that stack is not used
+    areas_px2: Array | None = None  # (N,), of the blobs of circles; nan for corners
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -129,7 +101,7 @@ class CornerTerm:
     def pick(self, rows: Bools, loss: Loss | None = None) -> CornerTerm:
         """Some of the corners, with this loss."""
         per_row = ["pixels", "points", "from_middle", "camera", "placement", "board", "sigma_px"]
-        per_row += [] if self.point is None else ["point"]
+        per_row += [name for name in ("point", "areas_px2") if getattr(self, name) is not None]
         return replace(self, **{name: getattr(self, name)[rows] for name in per_row}, loss=loss)
 
     def widened(self, scale: float) -> CornerTerm:
@@ -164,6 +136,28 @@ class CornerTerm:
                 whole[rows] = J / self.sigma_px[rows, None, None]
         return Linearised(residuals, [Part(name, self._index(name), J) for name, J in jacobians.items()])
 
+    def radii_by_areas(self, values: Values) -> Array:
+        """Radius (boards,), m, of each board's circles; 0 without areas.
+
+        The median of measured areas over those of circles of 1 m at the local scale of the image, with distortion.
+        """
+        assert self.areas_px2 is not None
+        centres = {name: stack for name, stack in values.items() if name not in ("radius", "print")}
+        placed = _Placed.of(self, centres, np.arange(len(self)), None)
+        by_place = self._by_board_point(centres, placed, self._projected(centres, placed))[..., :2]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            squared = self.areas_px2 / (np.pi * np.abs(np.linalg.det(by_place)))
+        out = np.zeros(len(values["warp"]))
+        for board in np.unique(self.board[np.isfinite(squared)]):
+            out[board] = np.sqrt(np.nanmedian(squared[self.board == board]))
+        return out
+
+    def _by_board_point(self, values: Values, placed: _Placed, projected: Projected) -> Array:
+        """Derivatives (n, 2, 3) of the pixels by the points in the board's frame."""
+        R = pose_of(values, "cameras").rotation[placed.camera]
+        boards = pose_of(values, "boards").rotation[self.placement[placed.row]]
+        return np.asarray(projected.d_point @ R @ boards)
+
     def _index(self, stack: str) -> Ints:
         """The unknown (N,) of a stack on which each corner depends."""
         if stack in _BY_BOARD:
@@ -183,9 +177,8 @@ class CornerTerm:
 
     def _derivatives(self, values: Values, placed: _Placed, projected: Projected) -> Mapping[str, Array]:
         """Derivatives (n, 2, dof) of the pixels by each stack."""
-        boards, R = pose_of(values, "boards"), pose_of(values, "cameras").rotation
-        by_world_point = projected.d_point @ R[placed.camera]
-        by_board_point = by_world_point @ boards.rotation[self.placement[placed.row]]
+        by_world_point = projected.d_point @ pose_of(values, "cameras").rotation[placed.camera]
+        by_board_point = self._by_board_point(values, placed, projected)
         # d(R Exp(theta) x)/dtheta = -R [x]_x; with a row w of the derivative by the point: -w [x]_x = x cross w.
         out = {
             "intrinsics": np.concatenate([projected.d_pinhole, projected.d_distortion], axis=2),
@@ -274,11 +267,12 @@ def single_camera(
     fisheye: bool,
     loss: Loss | None = None,
     point: Ints | None = None,
+    areas_px2: Array | None = None,
 ) -> CornerTerm:
     """The N corners that one camera sees of one board; points (N, 3), m, and middle (3,), m, in the board's frame.
 
     placement (N,): index of each corner's placement. point (N,): index of its point on the board, required if the
-    errors of the points are unknowns ("print").
+    errors of the points are unknowns ("print"). areas_px2 (N,): of the blobs of circles, where they were measured.
     """
     one = np.zeros(len(pixels), dtype=np.int64)
     return CornerTerm(
@@ -292,6 +286,7 @@ def single_camera(
         fisheye=np.array([fisheye]),
         loss=loss,
         point=point,
+        areas_px2=areas_px2,
     )
 
 

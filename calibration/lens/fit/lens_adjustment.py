@@ -58,6 +58,7 @@ def term_of(
         fisheye,
         loss,
         table.point[used],
+        None if table.circles is None or table.circles.areas_px2 is None else table.circles.areas_px2[used],
     )
 
 
@@ -98,10 +99,10 @@ def with_circle_radius(table: CornerTable, used: Bools, model: LensModel, values
     """
     if table.circles is None:
         return values, []
-    areas, stated = table.circles.areas_px2, table.circles.diameter_m
+    term, stated = term_of(table, used, model.fisheye), table.circles.diameter_m
     radius, sigma = table.spacing_m / 4, np.inf
-    if areas is not None and used.any():
-        radius, sigma = _radius_by_areas(table, used, model, values), _RADIUS_SIGMA
+    if term.areas_px2 is not None and used.any():
+        radius, sigma = float(term.radii_by_areas(values)[0]), _RADIUS_SIGMA
     elif stated is not None:
         radius, sigma = stated / 2, _STATED_RADIUS_SIGMA
     elif array_of(values, "radius")[0, 0] > 0:
@@ -109,19 +110,6 @@ def with_circle_radius(table: CornerTable, used: Bools, model: LensModel, values
     known = Vectors(np.array([[radius]]))
     prior: list[Term] = list(independent("radius", known, np.array([[radius * sigma]]))) if np.isfinite(sigma) else []
     return {**values, "radius": known}, prior
-
-
-def _radius_by_areas(table: CornerTable, used: Bools, model: LensModel, values: Values) -> float:
-    """Median over the circles, m: measured area over the area that a circle of 1 m would have at the local scale."""
-    assert table.circles is not None
-    assert table.circles.areas_px2 is not None
-    term = term_of(table, used, model.fisheye)
-    flat = {**values, "radius": Vectors(np.zeros((1, 1))), "print": Vectors(np.zeros((len(table.board_points), 3)))}
-    # d(pixel)/d(print) is the derivative by the position on the board; its first two columns are in the board's plane.
-    by_place = next(p for p in term.linearise(flat).parts if p.stack == "print").jacobian[..., :2]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        squared = table.circles.areas_px2[used] / (np.pi * np.abs(np.linalg.det(by_place)))
-    return float(np.sqrt(np.nanmedian(squared)))
 
 
 def prior_terms(table: CornerTable, used: Bools, model: LensModel, values: Values) -> list[Term]:

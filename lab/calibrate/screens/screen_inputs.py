@@ -30,7 +30,7 @@ from calibration.screens.screens import (
     misfit_of,
     wrong_unit,
 )
-from calibration.terms.corners import CornerTerm, radius_by_areas
+from calibration.terms.corners import CornerTerm
 from calibration.terms.rig_blocks import prior_of
 from calibration.terms.surveyed import BoardOnScreenTerm
 from geometry.arrays import Array, Bools, Ints
@@ -59,7 +59,6 @@ class BoardViews:
     fixed: BoardOnScreenTerm | None
     photo_of: Mapping[tuple[int, int], Path]  # (camera, placement) -> photograph
     notes: tuple[str, ...]  # excluded photographs, each with the reason
-    radii_m: Array | None = None  # (boards,) radius of each board's circles, 0 for other boards; None: no circles
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,14 +97,12 @@ def board_views(project: Project, rig: Rig) -> BoardViews:
         return BoardViews(None, (), None, {}, tuple(notes))
     cameras = list(rig.cameras)
     photo_of = {(cameras.index(c), i): p.photos[c] for i, (p, views) in enumerate(found) for c in views}
-    n_boards = len(project.boards) + sum(p.fixed is not None for p in placements)
     return BoardViews(
         _corners(found, rig),
         tuple(p.name for p, _ in found),
         _fixed_boards(found),
         photo_of,
         tuple(notes),
-        _radii(found, rig, n_boards),
     )
 
 
@@ -142,7 +139,7 @@ def _views(placement: _Placement, rig: Rig, notes: list[str]) -> dict[str, Board
 def _corners(found: _Found, rig: Rig) -> CornerTerm:
     """The corners of all views, in the order of the placements."""
     cameras = list(rig.cameras)
-    pixels, points, from_middle, camera_of, placement_of, board_of = [], [], [], [], [], []
+    pixels, points, from_middle, camera_of, placement_of, board_of, areas = [], [], [], [], [], [], []
     for i, (placement, views) in enumerate(found):
         board = placement.board
         for camera, view in views.items():
@@ -153,6 +150,8 @@ def _corners(found: _Found, rig: Rig) -> CornerTerm:
             camera_of.append(np.full(len(rows), cameras.index(camera)))
             placement_of.append(np.full(len(rows), i))
             board_of.append(np.full(len(rows), placement.board_index))
+            areas.append(np.full(len(rows), np.nan) if view.areas_px2 is None else view.areas_px2)
+    circles = any(view.areas_px2 is not None for _, views in found for view in views.values())
     return CornerTerm(
         pixels=np.concatenate(pixels),
         points=np.concatenate(points),
@@ -162,6 +161,7 @@ def _corners(found: _Found, rig: Rig) -> CornerTerm:
         board=np.concatenate(board_of),
         sigma_px=np.full(sum(map(len, pixels)), START_CORNER_SIGMA_PX),
         fisheye=_fisheye(rig),
+        areas_px2=np.concatenate(areas) if circles else None,
     )
 
 
@@ -178,18 +178,6 @@ def _fixed_boards(found: _Found) -> BoardOnScreenTerm | None:
         sigma_m=np.array([b.sigma_m for _, _, b in fixed]),
         tilt_sigma_rad=np.array([b.tilt_sigma_rad for _, _, b in fixed]),
     )
-
-
-def _radii(found: _Found, rig: Rig, n_boards: int) -> Array | None:
-    """Radius (n_boards,), m, of each board's circles, the median over its views; None if no board has circles."""
-    radii: dict[int, list[float]] = {}
-    for placement, views in found:
-        for camera, view in views.items():
-            if view.areas_px2 is not None:
-                xy = placement.board.points[np.searchsorted(placement.board.ids, view.ids)][:, :2]
-                radius = radius_by_areas(xy, view.pixels, view.areas_px2, rig.cameras[camera])
-                radii.setdefault(placement.board_index, []).append(radius)
-    return np.array([float(np.median(radii.get(b, [0.0]))) for b in range(n_boards)]) if radii else None
 
 
 def _fisheye(rig: Rig) -> Bools:
@@ -262,7 +250,6 @@ def screen_inputs(project: Project) -> ScreenInputs:
         corners=boards.corners,
         placements=boards.placements,
         fixed=boards.fixed,
-        radii_m=boards.radii_m,
         lens_priors=() if prior is None else (prior,),
         lens_free=lens_free,
     )

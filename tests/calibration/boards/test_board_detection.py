@@ -15,9 +15,11 @@ from calibration.boards import charuco_detection, chessboard_detection, corner_r
 from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Board, CircleGrid, parse
 from calibration.boards.board_view import QUICK_SEARCH_FAILED, BoardView, NotFound
-from calibration.terms.corners import radius_by_areas
+from calibration.least_squares.adjustment import Poses, Vectors
+from calibration.terms.corners import single_camera
 from geometry import rotations
-from geometry.camera import FISHEYE, PERSPECTIVE, Camera
+from geometry.camera import FISHEYE, PERSPECTIVE, Camera, pinhole_numbers
+from geometry.lens import padded
 from geometry.pose import Pose
 from lab.simulate.board_photo import BoardPhoto, PhotoSettings, photograph
 from tests.paths import DATA
@@ -129,8 +131,15 @@ def test_centroids_and_areas_of_circles_are_correct(text, turn):
     assert np.abs(np.mean(view.pixels - places, axis=0)).max() < 0.008 * px
     assert view.areas_px2 is not None
     np.testing.assert_allclose(np.sqrt(view.areas_px2 / areas), 1, atol=0.02)
-    radius = radius_by_areas(board.points[:, :2], view.pixels, view.areas_px2, camera())
-    assert 2 * radius == pytest.approx(board.diameter_m, rel=0.01)
+    one = np.zeros(len(view), dtype=int)
+    term = single_camera(view.pixels, board.points, board.middle, one, 1.0, False, areas_px2=view.areas_px2)
+    values = {
+        "intrinsics": Vectors(np.concatenate([pinhole_numbers(camera()), padded(camera().distortion)])[None]),
+        "cameras": Poses.of([Pose.identity()]),
+        "boards": Poses.of([board_pose(board, turn)]),
+        "warp": Vectors(np.zeros((1, 3))),
+    }
+    assert 2 * term.radii_by_areas(values) == pytest.approx([board.diameter_m], rel=0.01)
 
 
 @pytest.mark.parametrize("blur", [0.6, 1.0, 1.8])
