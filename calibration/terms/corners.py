@@ -14,7 +14,7 @@ Stacks on which it depends:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -94,6 +94,7 @@ class CornerTerm:
     loss: Loss | None = None
     point: Ints | None = None  # (N,) index of the board's point into "print"; None if that stack is not used
     areas_px2: Array | None = None  # (N,), of the blobs of circles; nan for corners
+    fixed: frozenset[str] = frozenset()  # stacks by which no derivatives are needed
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -180,21 +181,18 @@ class CornerTerm:
         by_world_point = projected.d_point @ pose_of(values, "cameras").rotation[placed.camera]
         by_board_point = self._by_board_point(values, placed, projected)
         # d(R Exp(theta) x)/dtheta = -R [x]_x; with a row w of the derivative by the point: -w [x]_x = x cross w.
-        out = {
-            "intrinsics": np.concatenate([projected.d_pinhole, projected.d_distortion], axis=2),
-            "boards": np.concatenate([by_world_point, cross(placed.on_board[:, None], by_board_point)], axis=2),
-            "cameras": np.concatenate([projected.d_point, cross(placed.in_world[:, None], by_world_point)], axis=2),
-            "warp": by_board_point[..., 2:] * _bend(placed.from_middle)[:, None],
+        out: dict[str, Callable[[], Array]] = {
+            "intrinsics": lambda: np.concatenate([projected.d_pinhole, projected.d_distortion], axis=2),
+            "boards": lambda: np.concatenate([by_world_point, cross(placed.on_board[:, None], by_board_point)], axis=2),
+            "cameras": lambda: np.concatenate(
+                [projected.d_point, cross(placed.in_world[:, None], by_world_point)], axis=2
+            ),
+            "warp": lambda: by_board_point[..., 2:] * _bend(placed.from_middle)[:, None],
+            "stretch": lambda: by_board_point[..., :1] * placed.from_middle[:, None],
+            "print": lambda: by_board_point,
+            "radius": lambda: (by_board_point @ placed.by_radius[..., None])[..., :1],
         }
-        if "stretch" in values:
-            out["stretch"] = by_board_point[..., :1] * placed.from_middle[:, None]
-        if "print" in values:
-            out["print"] = by_board_point
-        if "radius" in values and not np.any(placed.by_radius):
-            out["radius"] = np.zeros((*by_board_point.shape[:2], 1))
-        elif "radius" in values:
-            out["radius"] = (by_board_point @ placed.by_radius[..., None])[..., :1]
-        return out
+        return {name: by() for name, by in out.items() if name in values and name not in self.fixed}
 
     def _projected(self, values: Values, placed: _Placed) -> Projected:
         """Pixels with derivatives.

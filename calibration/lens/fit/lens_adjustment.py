@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -141,8 +141,9 @@ def adjust(
     whole_lens = lens_free is None
     known: list[Term] = []
     if whole_lens:
-        known = prior_terms(table, used, model, values)
-        values, _ = with_circle_radius(table, used, model, values)
+        prior = coefficient_prior(table, used, model, values)
+        values, known = with_circle_radius(table, used, model, values)
+        known = [*known, *prior]
     free: dict[str, bool | Bools] = {
         "intrinsics": (model.free if lens_free is None else lens_free)[None],
         "boards": np.repeat(in_use[:, None], 6, axis=1),
@@ -154,7 +155,8 @@ def adjust(
         seen = np.bincount(table.point[used], minlength=len(table.board_points)) > 0
         free["print"] = np.repeat(seen[:, None], 3, axis=1)
         known.append(Anchors("print", np.zeros((len(seen), 3)), _PRINT_SIGMA * table.spacing_m))
-    term = term_of(table, used, model.fisheye, settings.sigma_px, settings.loss)
+    fixed = frozenset(name for name in values if not np.any(free.get(name, False)))
+    term = replace(term_of(table, used, model.fisheye, settings.sigma_px, settings.loss), fixed=fixed)
     basis = {"intrinsics": _lens_basis([term, *known], model, values)} if whole_lens and model.coefficients > 5 else {}
     return solve(values, [term, *known], free, settings.limits, basis)
 
