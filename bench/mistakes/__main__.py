@@ -34,7 +34,7 @@ from lab.runs.process import process_run
 from lab.runs.verdict.run_statistics import RunStatistics
 from lab.runs.verdict.score import measured_errors, normalised_squares
 
-CODES = ("BP-M06", "BP-M07", "BP-M08", "BP-V20")  # of findings on mistakes
+CODES = ("BP-M06", "BP-M07", "BP-M08", "BP-M10", "BP-V20")  # of findings on mistakes
 FLOOR = 1e-5  # m and rad: poses that agree with the truth to this are right
 COLUMNS = ("check", "verdict", "harmless", "CHECK unnamed", "FAIL unnamed", "PASS wrong")
 

@@ -13,6 +13,7 @@ import yaml
 
 from bench.mistakes.mistakes import CASES, read, turned_aside, write
 from bench.mistakes.recordings import calibrated
+from bench.random_scenes.scene import random_scene
 from geometry.arrays import Array
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
@@ -24,11 +25,13 @@ from lab.files.rig.rig_file import save_rig
 from lab.pictures.source import pictures, video_at
 from lab.runs.input_check import check
 from lab.runs.process import process_run
+from lab.runs.setup_check import Pictures, frames_of
 from lab.simulate.rigs import fan, unequal_fan
 from lab.simulate.write import simulate
 from tests.lab.run_folders import edit, write_run
 from tracking.parameters import LabelParameters
-from tracking.setup_mistakes.evidence import invisible_mistakes
+from tracking.setup_mistakes import evidence
+from tracking.setup_mistakes.evidence import MOST_POINTS, MOST_TRIPLES, compare, invisible_mistakes
 from tracking.setup_mistakes.possible import possible_mistakes
 
 FRAMES = 45
@@ -206,6 +209,20 @@ def test_poses_that_agree_with_the_truth_pass(symmetric, tmp_path):
     assert (
         "no recording with this rig would show" not in checked(symmetric)[0]
     )  # the truth would show what symmetry hides
+
+
+def test_poses_that_the_limited_search_misses_in_a_crowd_are_no_evidence_for_a_mistake(monkeypatch):
+    scene = random_scene(50025)  # 13 points per picture, of which 6 are spots
+    pictures = Pictures()
+    for k in range(len(scene)):
+        pictures.add(k, dict(zip(scene.rig.cameras, scene.found(k), strict=True)))
+    frames = frames_of(pictures.blocks, scene.prior, LabelParameters().min_spots)
+    numbers = [m for m in possible_mistakes(scene.known_rig) if m.kind == "numbers"]
+    monkeypatch.setattr(evidence, "possible_mistakes", lambda *_: numbers)
+    limited = LabelParameters(max_points=MOST_POINTS, max_triples=MOST_TRIPLES)
+    assert not compare(scene.known_rig, frames, limited, scene.covariance).given.is_certain
+    found = compare(scene.known_rig, frames, LabelParameters(), scene.covariance)
+    assert not found.found
 
 
 def test_exchanged_beams_of_a_fan_change_names_only():
