@@ -18,6 +18,7 @@ from calibration.boards.board_view import (
     low_contrast,
     too_blurred,
 )
+from calibration.boards.circle_detection import mapped
 from calibration.boards.pyramid import scaled, scales
 from geometry.arrays import Array, Ints
 
@@ -148,12 +149,12 @@ def _fit(board: Charuco, markers: Markers) -> _Fit:
     if found is None:
         return _Fit(0.0, None)
     H = np.asarray(found, dtype=float)
-    centres = _mapped(H, seen.mean(axis=1))
+    centres = mapped(H, seen.mean(axis=1))
     good = np.linalg.norm(centres - on_board, axis=1) < 0.3
     share = float(good.sum() / max(len(markers.ids), 1))
     if good.sum() < 2:
         return _Fit(0.0, None)
-    shape = _mapped(H, seen[good].reshape(-1, 2)).reshape(-1, 4, 2)
+    shape = mapped(H, seen[good].reshape(-1, 2)).reshape(-1, 4, 2)
     # The corners must be in the board's sense of rotation; a mirrored numbering has another homography.
     way = shape - shape.mean(axis=1, keepdims=True)
     agree = np.sum(way * corners, axis=(1, 2)) / (np.linalg.norm(way, axis=(1, 2)) * np.linalg.norm(corners))
@@ -167,12 +168,6 @@ def _marker_places(board: Charuco) -> tuple[Array, Array]:
     places = np.array([np.asarray(p).reshape(4, 3)[:, :2] for p in known.getObjPoints()]) / board.square_m
     centres = places.mean(axis=1)
     return centres, places[0] - centres[0]
-
-
-def _mapped(H: Array, xy: Array) -> Array:
-    p = xy @ H[:, :2].T + H[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):  # a wrong board can have points at infinity
-        return np.asarray(p[..., :2] / p[..., 2:], dtype=float)
 
 
 def _cv_board(board: Charuco) -> cv2.aruco.CharucoBoard:

@@ -332,7 +332,8 @@ def homography(from_xy: Array, to_xy: Array) -> Array:
 def mapped(H: Array, xy: Array) -> Array:
     """H applied to points (..., 2)."""
     p = xy @ H[:, :2].T + H[:, 2]
-    return p[..., :2] / p[..., 2:]
+    with np.errstate(divide="ignore", invalid="ignore"):  # a wrong board can have points at infinity
+        return np.asarray(p[..., :2] / p[..., 2:], dtype=float)
 
 
 def _jacobian_determinants(H: Array, xy: Array) -> Array:
