@@ -34,6 +34,7 @@ _MOSTLY = 0.7  # share of the pictures with lights that move, above which those 
 _OF_SURFACE, _OF_OBJECTS = 0.1, 0.4
 _CLEARLY_BETTER = 0.5  # ratio of the variances of two measurements of a spot
 _SETTLED = 0.01  # sigmas of a pixel: the background behind a light that changes by less is the last one
+_LARGEST_MISFIT = 0.05  # error of a light by the misfit of its fit, in widths; of spots at most .01, of objects .1 to .5
 _NO_GAUSSIAN = 0.02  # share of a light at rest that a Gaussian leaves in a pixel; it is no structure of the background
 
 
@@ -133,17 +134,26 @@ def _with_shifts(
     if not len(widths):
         return better
     width = float(np.median(widths))
-    at = row, column = np.nonzero(places_of(still, background.structure.shape, AROUND_LIGHT))
     mean = background.plain()
-    light = light_at(still, column, row)
-    mean[at] -= light
     own = (background.shares * background.noise.variance(mean)).astype(np.float32)
-    own[at] += (_NO_GAUSSIAN * light) ** 2
     share = replace(shift, misfit_share=float("nan")).with_lights(found).misfit_share
     part = 1.0 if background.noise.texture < _OF_SURFACE else _OF_OBJECTS
+    # What no Gaussian explains, a board or a lamp, is a part of the surface for the lights that move over it.
+    off = np.zeros(len(still)) if still.misfit is None else np.sqrt(still.misfit * still.variance_px2)
+    lamps = off < _LARGEST_MISFIT * np.sqrt(still.major_px * still.minor_px)
+    _subtract(still[lamps], mean, own)
     shifts_px = np.float32(part) * local_shifts(mean, own, width)
+    _subtract(still[~lamps], mean, own)
     rest_shifts_px = shifts_at_rest(mean, own, still)
     return replace(better, spot_px=width, shifts_px=shifts_px, rest_shifts_px=rest_shifts_px, misfit_share=share)
+
+
+def _subtract(lights: Detections, mean: NDArray[np.float32], own: NDArray[np.float32]) -> None:
+    """Subtract lights from a mean (h, w) in place, DN, and add what no Gaussian explains to its variance, DN^2."""
+    at = row, column = np.nonzero(places_of(lights, mean.shape, AROUND_LIGHT))
+    light = light_at(lights, column, row)
+    mean[at] -= light
+    own[at] += (_NO_GAUSSIAN * light) ** 2
 
 
 def _behind(
