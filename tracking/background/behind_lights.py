@@ -37,16 +37,17 @@ class BehindLights:
 
     @staticmethod
     def of(
-        pictures: Sequence[NDArray[Any]], found: Sequence[Detections], boxes: Array, noise: NoiseModel, usual_dn: float
-    ) -> BehindLights:
-        """From the points found in each picture inside boxes (k, 3): u, v and half side, px.
+        pictures: Sequence[NDArray[Any]], strength: Array, found: Sequence[Detections], boxes: Array,
+        noise: NoiseModel, usual_dn: float,
+    ) -> BehindLights:  # fmt: skip
+        """From the points found in each of n pictures inside boxes (k, 3): u, v and half side, px.
 
-        usual_dn: brightness of the surface. The modulation that most lights of a camera show helps with the others.
+        strength (n,): of the lights; usual_dn: brightness of the surface. The modulation that most lights of a camera show helps with the others.
         """
-        parts = _behind_each(pictures, found, boxes, noise, None)
+        parts = _behind_each(pictures, strength, found, boxes, noise, None)
         modulation = _modulation([part.fit for part in parts], usual_dn)
         if modulation is not None:
-            parts = _behind_each(pictures, found, boxes, noise, modulation)
+            parts = _behind_each(pictures, strength, found, boxes, noise, modulation)
         if not parts:
             return BehindLights(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0), None)
         row, column = np.concatenate([p.row for p in parts]), np.concatenate([p.column for p in parts])
@@ -80,15 +81,15 @@ class _Part(NamedTuple):
 
 
 def _behind_each(
-    pictures: Sequence[NDArray[Any]], found: Sequence[Detections], boxes: Array, noise: NoiseModel,
+    pictures: Sequence[NDArray[Any]], strength: Array, found: Sequence[Detections], boxes: Array, noise: NoiseModel,
     modulation: Modulation | None,
 ) -> list[_Part]:  # fmt: skip
-    parts = [_behind_one(pictures, found, box, noise, modulation) for box in boxes]
+    parts = [_behind_one(pictures, strength, found, box, noise, modulation) for box in boxes]
     return [part for part in parts if part is not None]
 
 
 def _behind_one(
-    pictures: Sequence[NDArray[Any]], found: Sequence[Detections], box: Array, noise: NoiseModel,
+    pictures: Sequence[NDArray[Any]], strength: Array, found: Sequence[Detections], box: Array, noise: NoiseModel,
     modulation: Modulation | None,
 ) -> _Part | None:  # fmt: skip
     """The pixels behind the brightest light in a box; None: no fit."""
@@ -107,14 +108,15 @@ def _behind_one(
     lacks = _lacking(pictures, shown, middle, width) > _LACKS * height
     # What is found in the middle although the light has left is an edge.
     true = ~(lacks[shown] & (np.linalg.norm(places - middle, axis=1) < width))
-    some, places = [pictures[k] for k, there in zip(shown, true, strict=True) if there], places[true]
+    there, places = np.array(shown)[true], places[true]
+    some, strength = [pictures[k] for k in there], strength[there, None]
     empty = [p for k, p in enumerate(pictures) if lacks[k] and k not in shown]
     side = 2 * (box[2] + _AROUND * width)
     step = max(int(width / _SAMPLES), int(np.ceil(side / np.sqrt(_MOST_SAMPLES))), 1)
     values, uv = _around(some, box, _AROUND * width, step)
     without = _around(empty, box, _AROUND * width, step)[0] if empty else np.zeros((0, len(uv)))
-    fit = fitted(uv, values, noise.variance(values), places, width, height, without, modulation)
-    return None if fit is None else _whole(some, empty, box, width, fit, noise)
+    fit = fitted(uv, values, noise.variance(values), places, width, height, without, modulation, strength)
+    return None if fit is None else _whole(some, strength, empty, box, width, fit, noise)
 
 
 def _lacking(pictures: Sequence[NDArray[Any]], shown: Sequence[int], place: Array, width: float) -> Array:
@@ -128,13 +130,13 @@ def _lacking(pictures: Sequence[NDArray[Any]], shown: Sequence[int], place: Arra
 
 
 def _whole(
-    pictures: Sequence[NDArray[Any]], empty: Sequence[NDArray[Any]], box: Array, width: float, fit: JointFit,
-    noise: NoiseModel,
+    pictures: Sequence[NDArray[Any]], strength: Array, empty: Sequence[NDArray[Any]], box: Array, width: float,
+    fit: JointFit, noise: NoiseModel,
 ) -> _Part:  # fmt: skip
     """All pixels that the light of a fit reaches. empty: pictures without it."""
     values, uv = _around(pictures, box, 2 * _AROUND * width, 1)
     without = _around(empty, box, 2 * _AROUND * width, 1)[0] if empty else np.zeros((0, len(uv)))
-    level, information, light = fit.behind(uv, values, noise.variance(values), without)
+    level, information, light = fit.behind(uv, values, noise.variance(values), without, strength)
     lit = light > _LIT
     column, row = uv[lit].astype(np.int64).T
     return _Part(row, column, level[lit], fit.share + 1 / np.maximum(information[lit], 1e-3), fit)

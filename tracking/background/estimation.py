@@ -69,14 +69,16 @@ def static_background(
     moving = few and any(len(background.spots_in(p, parameters, shift)) for p in tried)
     if moving and sum(_better_in(background, p, shift) for p in tried) < max(_LEAST_FOUND * len(tried), 2):
         return None
-    return _without_slow_lights(background, mean, some, equal, shift)
+    return _without_slow_lights(background, mean, some, equal, 1 / np.array(lights), shift)
 
 
 def _without_slow_lights(
     background: StaticBackground, mean: NDArray[np.float32], pictures: Sequence[Picture],
-    equal: Sequence[NDArray[Any]], shift: TextureShift,
+    equal: Sequence[NDArray[Any]], strength: Array, shift: TextureShift,
 ) -> StaticBackground:  # fmt: skip
     """The background from the mean (h, w) of these pictures (in equal light), given the one from the lower half.
+
+    strength (n,): of the moving lights in the pictures in equal light.
 
     A light that moves slowly, or rests for a part of the recording, is in the mean of the pictures. Where it is in
     some of them the others count; where its absence leaves a hole, those with the hole.
@@ -94,7 +96,7 @@ def _without_slow_lights(
     paths = boxes[boxes[:, 2] < LARGEST_PATH_PX]
     here = [_spots_at(better, p, paths, shift, fit) for p, fit in zip(pictures, fits, strict=True)]
     known = slow[slow.known]
-    behind = BehindLights.of(equal, here, boxes, background.noise, better.usual_dn())
+    behind = BehindLights.of(equal, strength, here, boxes, background.noise, better.usual_dn())
     mean[behind.row, behind.column] = behind.level_dn
     slow = slow[~slow.known & ~behind.covers(mean.shape)[slow.row, slow.column]]
     if len(slow.row):

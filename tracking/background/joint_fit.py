@@ -3,9 +3,10 @@
 Where a light moves by less than its size it is in all pictures, and no picture shows the background behind it. But the
 background is the same in all of them: of the pictures k at a pixel x,
 
-    g_k(x) = B(x) + (p + q B(x)) G(x - c_k),
+    g_k(x) = B(x) + (p + q B(x)) s_k G(x - c_k),
 
-with a Gaussian G of peak 1 and one size for all pictures. The light falls on the surface whose own brightness is B, so
+with a Gaussian G of peak 1 and one size for all pictures, and known strengths s_k of the light (1, unless the pictures
+were scaled to equal light of the room). The light falls on the surface whose own brightness is B, so
 the surface modulates it: q > 0. B is linear in this equation and is eliminated at each pixel; p, q, the size and the
 places c_k are found by Gauss-Newton steps. A bright light is so determined to a few hundredths of a pixel by a motion
 of half its width, on any background. What the motion leaves open is decided by a plane: B differs from it by as much as
@@ -89,13 +90,14 @@ class _Pixels:
     modulated: tuple[float, float]  # expected share of the light, and its sigma
     empty: Array  # (m,) DN, of pictures without the light: their mean, and the information of that, 1/DN^2
     empty_information: Array  # (m,)
+    strength: Array | float = 1.0  # (n, 1)
 
     def seen(self, light: JointLight) -> _Seen:
         """A light in these pixels."""
         l11, l21, l22 = light.shape
         du, dv = (self.uv[:, i] - light.places[:, i : i + 1] for i in (0, 1))
         along, across = l11 * du + l21 * dv, l22 * dv
-        light_of = np.exp(-0.5 * (along**2 + across**2))
+        light_of = self.strength * np.exp(-0.5 * (along**2 + across**2))
         weight = 1 / (self.variance + (_NO_GAUSSIAN * self.height * light_of) ** 2)
         slope = 1 + light.modulated * light_of
         about = self.uv - light.origin
@@ -150,7 +152,7 @@ class _Seen:
     dv: Array
     along: Array  # (n, m), widths
     across: Array
-    light_of: Array  # (n, m): of a peak of 1
+    light_of: Array  # (n, m): of a peak of `strength`
     root: Array  # (n, m): of the weights, 1/DN
     slope: Array  # (n, m): by the background
     behind: Array  # (m,) DN: the background
@@ -184,14 +186,14 @@ class JointFit:
         return more / (p + more), float(slope @ self.strength_cov @ slope)
 
     def behind(
-        self, uv: Array, values: Array, variance: Array, empty: Array | None = None
+        self, uv: Array, values: Array, variance: Array, empty: Array | None = None, strength: Array | float = 1.0
     ) -> tuple[Array, Array, Array]:
         """The background (m,), DN, its information in pictures (m,), and the light, (m,), highest of all pictures.
 
         uv (m, 2): pixels; values, variance (n, m): of the pictures there, DN and DN^2; empty (k, m): of pictures
-        without the light.
+        without the light; strength (n, 1).
         """
-        pixels = _Pixels(uv, values, variance, 1.0, self.light.plain, MODULATED, *_mean_of(empty, variance))
+        pixels = _Pixels(uv, values, variance, 1.0, self.light.plain, MODULATED, *_mean_of(empty, variance), strength)
         seen = pixels.seen(self.light)
         return seen.behind, seen.information * variance.mean(axis=0), seen.light_of.max(axis=0)
 
@@ -205,17 +207,17 @@ def _mean_of(empty: Array | None, variance: Array) -> tuple[Array, Array]:
 
 def fitted(
     uv: Array, values: Array, variance: Array, places: Array, width_px: float, height_dn: float,
-    empty: Array | None = None, modulation: Modulation | None = None,
+    empty: Array | None = None, modulation: Modulation | None = None, strength: Array | float = 1.0,
 ) -> JointFit | None:  # fmt: skip
     """A light in n pictures that starts from these places (n, 2), width and height; None: it does not explain them.
 
     uv (m, 2): pixels around it; values, variance (n, m): of the pictures there, DN and DN^2; empty (k, m): of pictures
-    without the light. modulation: as other lights show it.
+    without the light. modulation: as other lights show it. strength (n, 1): of the light in each picture.
     """
     low = np.sort(values, axis=0)[: max(len(values) // 2, 1)].mean(axis=0)
     usual = float(np.median(low))
     expected = MODULATED if modulation is None else modulation.at(max(usual, 1.0))
-    pixels = _Pixels(uv, values, variance, max(usual, 1.0), height_dn, expected, *_mean_of(empty, variance))
+    pixels = _Pixels(uv, values, variance, max(usual, 1.0), height_dn, expected, *_mean_of(empty, variance), strength)
     origin, inverse = uv.mean(axis=0), 1 / width_px
     light = JointLight(
         places, np.array([inverse, 0.0, inverse]), (1 - expected[0]) * height_dn,
@@ -266,7 +268,7 @@ def _checked(pixels: _Pixels, light: JointLight, width_px: float) -> JointFit | 
     mean = float(np.trace(places.mean(axis=(0, 2)))) / 2 * max(chi2, 1.0)
     height = (light.plain + light.modulated * seen.behind)[seen.light_of.max(axis=0) > 0.1]
     bad = chi2 > _LARGEST_CHI2 or not height.size or float(np.median(height)) <= 0
-    bad |= light.modulated * pixels.usual < -MODULATED[0] * pixels.height
+    bad |= abs(light.modulated * pixels.usual - MODULATED[0] * pixels.height) > pixels.height
     bad |= bool((widths > _LARGEST_CHANGE * width_px).any() or (widths < width_px / _LARGEST_CHANGE).any())
     bad |= np.sqrt(mean) > _LARGEST_SIGMA * float(widths.max())
     if bad:

@@ -80,6 +80,23 @@ def test_the_error_that_all_places_share_is_stated_and_not_much_larger_than_it_i
     assert 0.75 < np.mean(mean2) / np.mean(stated) < 1.4
 
 
+def test_pictures_scaled_to_equal_light_of_the_room_show_lights_of_other_strengths():
+    """A drift of the room's light by 30 % while the spot moves over a gentle slope: that is no modulation."""
+    at, slope = places(8.0), 20.0 + 0.3 * (X - MIDDLE)
+    room = np.linspace(0.85, 1.15, len(at))
+    rng = np.random.default_rng(2)
+    light = pictures(at, slope, 0.4, 1) - slope
+    seen = slope + light / room[:, None, None] + 0.1 * NOISE * rng.standard_normal(light.shape)
+    values = seen.reshape(len(seen), -1)
+    fit = fitted(UV, values, np.full(values.shape, NOISE**2), at + OFF, 3.0, 0.7 * HEIGHT, strength=1 / room[:, None])
+    assert fit is not None
+    assert np.abs(fit.light.places - at).max() < 0.1
+    share, variance = fit.modulated_share(20.0)
+    assert abs(share - 0.4 * 20 / 60 / (0.6 + 0.4 * 20 / 60)) < max(3 * np.sqrt(variance), 0.1)
+    alike = fitted(UV, values, np.full(values.shape, NOISE**2), at + OFF, 3.0, 0.7 * HEIGHT)
+    assert alike is None or np.abs(alike.light.places - at).max() > 0.2
+
+
 def test_pictures_without_a_light_give_no_fit():
     seen = EDGE + NOISE * np.random.default_rng(3).standard_normal((15, SIDE, SIDE))
     assert fit_of(seen, places(3.0)) is None
@@ -94,11 +111,11 @@ def test_the_modulation_that_one_light_shows_helps_with_the_others():
     even = np.rint(pictures(at, np.full(X.shape, 20.0), 0.6)).astype(np.uint8)
     found = [find_spots(p, DetectParameters(), noise) for p in even]
     box = np.array([[MIDDLE, MIDDLE, 9.0]])
-    behind = BehindLights.of(list(seen), found, box, noise, 40.0)
+    behind = BehindLights.of(list(seen), np.ones(len(seen)), found, box, noise, 40.0)
     expected = 0.6 * 40 / 60 / (0.4 + 0.6 * 40 / 60)
     assert behind.modulation is not None
     assert behind.modulation.share == pytest.approx(expected, abs=0.1)
     assert np.abs(behind.level_dn - EDGE[behind.row, behind.column]).max() < 3.0
-    nowhere = BehindLights.of(list(seen), found, np.array([[3.0, 3.0, 2.0]]), noise, 40.0)
+    nowhere = BehindLights.of(list(seen), np.ones(len(seen)), found, np.array([[3.0, 3.0, 2.0]]), noise, 40.0)
     assert nowhere.modulation is None
     assert not nowhere.covers((SIDE, SIDE)).any()
