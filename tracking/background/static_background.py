@@ -227,7 +227,7 @@ class StaticBackground:
             lights = own.added_to(lights, self.noise, self.rest_shifts_px, at_rest=True)
             place = np.zeros(len(lights)) if lights.place_px2 is None else lights.place_px2
             at_rest = self.fixed.astype(float) if len(self.fixed) else None
-            covariance = (1 + self._noise_share) * lights.cov_px2 + least[:, None, None] * np.eye(2)
+            covariance = lights.cov_px2 + common[:, None, None] * np.eye(2)
             lights = replace(lights, cov_px2=covariance, place_px2=place + common, at_rest=at_rest)
             moving = shift.of_light
             if self.shifts_px is not None:

@@ -140,7 +140,7 @@ class PicturePoints(NamedTuple):
     """One frame's m detections, sorted by camera."""
 
     uv: Array  # (m, 2) px
-    cov: Array  # (m, 2, 2) px^2
+    noise_px2: Array  # (m,): variances of a coordinate, without errors of their places, which repeat
     first: Ints  # (c + 1,) where the rows of each camera begin
     has_image: Bools  # (c,)
 
@@ -151,23 +151,23 @@ def no_places(cameras: int) -> StaticPlaces:
 
 
 @compiled
-def radius2_px2(cov: Array) -> float:
-    """Squared radius of a place, px^2, for a point of covariance (2, 2)."""
-    return max(RADIUS_SIGMAS * RADIUS_SIGMAS * 0.5 * (cov[0, 0] + cov[1, 1]), MIN_RADIUS_PX * MIN_RADIUS_PX)
+def radius2_px2(noise_px2: float) -> float:
+    """Squared radius of a place, px^2, for a point with this variance of its noise."""
+    return max(RADIUS_SIGMAS * RADIUS_SIGMAS * noise_px2, MIN_RADIUS_PX * MIN_RADIUS_PX)
 
 
 @compiled
-def static_log_density(places: StaticPlaces, uv: Array, cov: Array, first: Ints) -> Array:
+def static_log_density(places: StaticPlaces, uv: Array, noise_px2: Array, first: Ints) -> Array:
     """Log density of static points, 1/px^2, at each of a frame's detections (m,); -inf where no place is known.
 
-    uv (m, 2), cov (m, 2, 2); first (c + 1,): where the rows of each camera begin.
+    uv (m, 2), noise_px2 (m,), first (c + 1,): as in PicturePoints.
     """
     out = np.full(uv.shape[0], -np.inf)
     for c in range(first.shape[0] - 1):
         if places.frames[c] <= 0.0:
             continue
         for d in range(first[c], first[c + 1]):
-            r2 = radius2_px2(cov[d])
+            r2 = radius2_px2(noise_px2[d])
             count = 0.0
             for k in range(MAX_PLACES):
                 a, b = places.uv[c, k, 0] - uv[d, 0], places.uv[c, k, 1] - uv[d, 1]
@@ -187,7 +187,7 @@ def update_places(
     Points that are labelled, or lie near an expected spot, are left out. assigned (n,): row of each view's detection,
     -1 without a label; expected (n, 2), px: pixels of the spots at the frame's pose; decay: 1 or DECAY.
     """
-    uv, cov, first = points.uv, points.cov, points.first
+    uv, first = points.uv, points.first
     for c in range(first.shape[0] - 1):
         if not points.has_image[c]:
             continue
@@ -202,7 +202,7 @@ def update_places(
                     is_spot |= assigned[i] == d or a * a + b * b < NEAR_PX * NEAR_PX
             if is_spot:
                 continue
-            r2 = radius2_px2(cov[d])
+            r2 = radius2_px2(points.noise_px2[d])
             best, nearest = -1, r2
             weakest = 0
             for k in range(MAX_PLACES):
@@ -267,6 +267,7 @@ class PointStatistics:
         self._clutter = ClutterNearSpots(model, parameters.labels.clutter_per_px2)
         self._static = no_places(len(model.camera_names))
         self._usual_size_px = np.full(len(model), np.nan)
+        self._noise_px2 = np.zeros(0)  # of the last frame's points
 
     def frame(self, found: Sequence[Detections | None], noise_scale: float, first: bool) -> FrameDetections:
         """All cameras' detections in one list, with the errors and densities that are known so far.
@@ -285,10 +286,12 @@ class PointStatistics:
             cov = np.ascontiguousarray(np.concatenate([f.cov_px2 for f in some]) * noise_scale**2)
             cov[:, [0, 1], [0, 1]] += self._parameters.sigma_model_px**2
             blend = np.where(np.isnan(major), 0.0, self._parameters.blend_px)
+            place = [np.zeros(len(f)) if f.place_px2 is None else f.place_px2 for f in some]
+            self._noise_px2 = 0.5 * np.trace(cov, axis1=1, axis2=2) - np.concatenate(place) * noise_scale**2
         else:
-            uv, cov, blend = np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0)
+            uv, cov, blend, self._noise_px2 = np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0)
         has_image = np.array([f is not None for f in found])
-        static = static_log_density(self._static, uv, cov, first_rows)
+        static = static_log_density(self._static, uv, self._noise_px2, first_rows)
         if any(f.at_rest is not None for f in some):
             at_rest = np.concatenate([np.zeros(len(f)) if f.at_rest is None else f.at_rest for f in some]) > 0
             static[at_rest] = np.maximum(static[at_rest], SURE_LOG_DENSITY)
@@ -305,7 +308,7 @@ class PointStatistics:
         self._clutter.update(summary.false_points, summary.discs)
         if measured:
             labels = np.where(assigned >= 0, assigned % BLENDED, -1)
-            points = PicturePoints(frame.uv, frame.cov, frame.first, frame.has_image)
+            points = PicturePoints(frame.uv, self._noise_px2, frame.first, frame.has_image)
             update_places(self._static, points, labels, summary.expected_px, self._camera, DECAY)
         for v in np.flatnonzero(summary.use):
             size = frame.size_px[assigned[v]]

@@ -24,8 +24,8 @@ HAS_IMAGE = np.ones(2, dtype=bool)
 NO_LABEL, LABELLED = np.array([-1]), np.array([0])
 
 
-def cov(points: Array) -> Array:
-    return np.tile(SIGMA_PX**2 * np.eye(2), (len(points), 1, 1))
+def noise(points: Array) -> Array:
+    return np.full(len(points), SIGMA_PX**2)
 
 
 def after(places: StaticPlaces, path: Array, assigned: Array, expected: Array, decay: float = DECAY) -> StaticPlaces:
@@ -33,13 +33,13 @@ def after(places: StaticPlaces, path: Array, assigned: Array, expected: Array, d
     rng = np.random.default_rng(1)
     for at, spot in zip(path, expected, strict=True):
         uv = (at + SIGMA_PX * rng.normal(size=2))[None]
-        points = PicturePoints(uv, cov(uv), FIRST, HAS_IMAGE)
+        points = PicturePoints(uv, noise(uv), FIRST, HAS_IMAGE)
         update_places(places, points, assigned, spot[None], CAMERA_OF, decay)
     return places
 
 
 def density_at(places: StaticPlaces, uv: Array) -> float:
-    return float(static_log_density(places, uv, cov(uv), FIRST)[0])
+    return float(static_log_density(places, uv, noise(uv), FIRST)[0])
 
 
 STILL = np.tile([[400.0, 300.0]], (30, 1))
@@ -56,7 +56,7 @@ def test_a_reflection_becomes_static_within_a_few_frames():
     # It is there in every frame: density 1 over the area of a disc of 0.4 px.
     assert density_at(places, STILL[:1]) == pytest.approx(-np.log(np.pi * 0.4**2), abs=0.05)
     assert density_at(places, STILL[:1] + 5.0) == -np.inf
-    camera_1 = static_log_density(places, STILL[:1], cov(STILL[:1]), np.array([0, 0, 1]))
+    camera_1 = static_log_density(places, STILL[:1], noise(STILL[:1]), np.array([0, 0, 1]))
     assert camera_1[0] == -np.inf
 
 
@@ -80,7 +80,7 @@ def test_a_reflection_that_is_gone_is_forgotten_unless_counts_do_not_decay():
         places = after(no_places(2), STILL, NO_LABEL, AWAY, decay)
         none = np.zeros((0, 2))
         for _ in range(300):
-            points = PicturePoints(none, cov(none), np.zeros(3, dtype=np.int64), HAS_IMAGE)
+            points = PicturePoints(none, noise(none), np.zeros(3, dtype=np.int64), HAS_IMAGE)
             update_places(places, points, NO_LABEL, FAR_PX, CAMERA_OF, decay)
         assert (density_at(places, STILL[:1]) == -np.inf) == forgotten
 
@@ -91,6 +91,6 @@ def test_the_places_of_a_camera_without_a_picture_do_not_decay():
     none = np.zeros((0, 2))
     for _ in range(500):
         no_picture = np.zeros(2, dtype=bool)
-        points = PicturePoints(none, cov(none), np.zeros(3, dtype=np.int64), no_picture)
+        points = PicturePoints(none, noise(none), np.zeros(3, dtype=np.int64), no_picture)
         update_places(places, points, NO_LABEL, FAR_PX, CAMERA_OF, DECAY)
     assert density_at(places, STILL[:1]) == before
