@@ -268,7 +268,8 @@ def _checked(pixels: _Pixels, light: JointLight, width_px: float) -> JointFit | 
     mean = float(np.trace(places.mean(axis=(0, 2)))) / 2 * max(chi2, 1.0)
     height = (light.plain + light.modulated * seen.behind)[seen.light_of.max(axis=0) > 0.1]
     bad = chi2 > _LARGEST_CHI2 or not height.size or float(np.median(height)) <= 0
-    bad |= abs(light.modulated * pixels.usual - MODULATED[0] * pixels.height) > pixels.height
+    modulated = light.modulated * pixels.usual
+    bad |= abs(modulated - MODULATED[0] * (light.plain + modulated)) > light.plain + modulated
     bad |= bool((widths > _LARGEST_CHANGE * width_px).any() or (widths < width_px / _LARGEST_CHANGE).any())
     bad |= np.sqrt(mean) > _LARGEST_SIGMA * float(widths.max())
     if bad:
