@@ -42,7 +42,8 @@ class BehindLights:
     ) -> BehindLights:  # fmt: skip
         """From the points found in each of n pictures inside boxes (k, 3): u, v and half side, px.
 
-        strength (n,): of the lights; usual_dn: brightness of the surface. The modulation that most lights of a camera show helps with the others.
+        strength (n,): of the lights; usual_dn: brightness of the surface. The modulation that most lights of a camera
+        show helps with the others.
         """
         parts = _behind_each(pictures, strength, found, boxes, noise, None)
         modulation = _modulation([part.fit for part in parts], usual_dn)

@@ -34,7 +34,9 @@ _MOSTLY = 0.7  # share of the pictures with lights that move, above which those 
 _OF_SURFACE, _OF_OBJECTS = 0.1, 0.4
 _CLEARLY_BETTER = 0.5  # ratio of the variances of two measurements of a spot
 _SETTLED = 0.01  # sigmas of a pixel: the background behind a light that changes by less is the last one
-_LARGEST_MISFIT = 0.05  # error of a light by the misfit of its fit, in widths; of spots at most .01, of objects .1 to .5
+_LARGEST_MISFIT = (
+    0.05  # error of a light by the misfit of its fit, in widths; of spots at most .01, of objects .1 to .5
+)
 _NO_GAUSSIAN = 0.02  # share of a light at rest that a Gaussian leaves in a pixel; it is no structure of the background
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -193,6 +193,24 @@ def test_lights_that_do_not_move_stay_as_the_picture_shows_them():
         rows = [d.uv_px[np.hypot(*(d.uv_px - at).T) < 2] for d in (usual, found)]
         assert len(rows[0]) == 1
         np.testing.assert_allclose(rows[0], rows[1], atol=0.02)
+
+
+def test_a_bright_board_that_the_search_takes_for_a_light_shifts_spots_at_its_edges_only():
+    recording = Recording.of(path(45, 6, 4.0, 1), 4.5)
+    u, v = 200, 150
+    board = np.zeros(SIZE)
+    board[v - 14 : v + 15, u - 20 : u + 21] = 1.5 * LEVEL
+    board[v - 14 : v - 4, u + 6 : u + 21] = 0.0
+    some = [np.rint(p + board).astype(np.uint8) for p in recording.pictures]
+    background = replace(recording, pictures=some).background()
+    assert background is not None
+    shifts = background.shifts_px
+    assert shifts is not None
+    assert np.any(np.linalg.norm(background.lights.found.uv_px - [u, v], axis=1) < 8)
+    rows = np.s_[v + 2 : v + 8]
+    inside, edge, screen = shifts[rows, u - 13 : u + 14], shifts[rows, u + 20], float(np.median(shifts))
+    assert np.quantile(inside, 0.9) < 2 * screen
+    assert edge.min() > 3 * screen
 
 
 def test_few_pictures_or_different_ones_make_no_background():

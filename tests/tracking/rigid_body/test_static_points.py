@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from geometry.arrays import Array
+from geometry.forward_model import SpotModel
+from lab.simulate.rigs import fan
+from tracking.detections import Detections
+from tracking.parameters import TrackerParameters
+from tracking.rigid_body.frame_summary import FrameSummary
 from tracking.rigid_body.online_estimates import (
     DECAY,
     MIN_SEEN,
     PicturePoints,
+    PointStatistics,
     StaticPlaces,
     no_places,
     static_log_density,
@@ -94,3 +102,23 @@ def test_the_places_of_a_camera_without_a_picture_do_not_decay():
         points = PicturePoints(none, noise(none), np.zeros(3, dtype=np.int64), no_picture)
         update_places(places, points, NO_LABEL, FAR_PX, CAMERA_OF, DECAY)
     assert density_at(places, STILL[:1]) == before
+
+
+def test_an_object_that_stands_still_is_static_however_uncertain_the_place_of_its_middle_is():
+    """A board of 25 px: its fit is 20 px off, by the same in all pictures."""
+    model = SpotModel.of(fan())
+    statistics = PointStatistics(model, TrackerParameters())
+    board = replace(
+        Detections.at(STILL[:1], 400.0 * np.eye(2)[None]), major_px=np.array([25.0]), place_px2=np.array([399.99])
+    )
+    found = [board if c == 0 else Detections.none() for c in range(len(model.camera_names))]
+    n = len(model)
+    away = np.full((n, 2), 900.0)
+    summary = FrameSummary(
+        np.zeros(n, bool), np.zeros(n, bool), away, np.zeros((n, 2, 2)), 0.0, 0.0, np.eye(6), away,
+        np.zeros((n, 2, 6)), np.zeros(n, bool), np.zeros(len(found)), np.zeros(len(found)),
+    )  # fmt: skip
+    for _ in range(2 * int(MIN_SEEN)):
+        statistics.update(statistics.frame(found, 1.0, False), np.full(n, -1), summary, measured=True)
+    # As a spot it would have a density of 1 / (2 pi 400 px^2).
+    assert statistics.frame(found, 1.0, False).log_static[0] > np.log(0.1)
