@@ -39,6 +39,10 @@ class Camera:
     camera_from_world: Pose
     noise: SensorNoise | None = None
     lens: str = PERSPECTIVE  # or FISHEYE: the model whose coefficients the distortion numbers are
+    # Of its clock in every recording, added to what the recording states: its mid-exposure minus the frame's instant,
+    # and by how much each row is exposed later than the one above.
+    time_offset_s: float = 0.0
+    row_time_s: float = 0.0
     fold_r2: float = field(init=False)  # squared normalised radius beyond which the lens model folds
 
     def __post_init__(self) -> None:

@@ -92,12 +92,12 @@ class FaultParameters:
 
 def clock_derivatives(model: SpotModel, recording: ModelCheckRecording, frames: Ints) -> Array:
     """Derivatives of the pixels by the delay of each camera: (K, n, 2, cameras), px/s; 0 where unknown."""
-    velocity = np.nan_to_num(_pixel_velocities(model, recording, frames))
+    velocity = np.nan_to_num(pixel_velocities(model, recording, frames))
     of_camera = model.camera_of[:, None] == np.arange(len(model.camera_names))
     return np.asarray(velocity[..., None] * of_camera[:, None, :])
 
 
-def _pixel_velocities(model: SpotModel, recording: ModelCheckRecording, frames: Ints) -> Array:
+def pixel_velocities(model: SpotModel, recording: ModelCheckRecording, frames: Ints) -> Array:
     """Velocities of the spots (K, n, 2), px/s, from the poses of the neighbouring frames; nan where unknown.
 
     A neighbour that is missing or far away in time is replaced by the frame itself.

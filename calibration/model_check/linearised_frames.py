@@ -33,6 +33,9 @@ class ModelCheckRecording:
     predicted_cov_px2: Array | None = None  # (T, n, 2, 2) stated covariance of the predicted spot position
     pose_covariance: Array | None = None  # (T, 6, 6) stated by the run, [m in world, rad in body]
     width_px: Array | None = None  # (n,) usual sigma of each view's intensity profile; nan or None: unknown
+    velocity_px_s: Array | None = None  # (T, n, 2) of the spots, where clocks are unknown; 0 where it is unknown
+    # (n, 2), s: offset and row time of the rig's cameras, by view, with which the spots were moved to their instants.
+    clock_s: Array | None = None
 
     def __post_init__(self) -> None:
         T, n = self.seen.shape
@@ -44,6 +47,8 @@ class ModelCheckRecording:
             "predicted_cov_px2": (T, n, 2, 2),
             "pose_covariance": (T, 6, 6),
             "width_px": (n,),
+            "velocity_px_s": (T, n, 2),
+            "clock_s": (n, 2),
         }
         for name, shape in expected.items():
             value = getattr(self, name)
@@ -57,7 +62,7 @@ class ModelCheckRecording:
         of_frames = {
             name: getattr(self, name)[rows]
             for name in ModelCheckRecording.__slots__
-            if name != "width_px" and getattr(self, name) is not None
+            if name not in ("width_px", "clock_s") and getattr(self, name) is not None
         }
         return replace(self, **of_frames)
 
@@ -69,6 +74,21 @@ class ModelCheckRecording:
         with np.errstate(invalid="ignore"):
             positive = (a > 0) & (a * c - b * b > 0) & np.isfinite(a + b + c)
         return np.asarray(self.seen & finite(self.uv_px, -1) & positive & known[:, None])
+
+
+def with_clocks(model: SpotModel, recording: ModelCheckRecording, clock_s: Array) -> ModelCheckRecording:
+    """The recording with its spots moved to the frames' instants by other clocks (n, 2), s."""
+    if recording.velocity_px_s is None or recording.clock_s is None:
+        return recording
+    by_clock = clock_derivatives(model, recording)
+    return replace(recording, uv_px=recording.uv_px - (by_clock * (clock_s - recording.clock_s)[:, None]).sum(axis=-1))
+
+
+def clock_derivatives(model: SpotModel, recording: ModelCheckRecording) -> Array:
+    """Derivatives (T, n, 2, 2) of the pixels by each view's offset and row time, px/s."""
+    assert recording.velocity_px_s is not None
+    later = np.nan_to_num(recording.uv_px[..., 1]) - (model.image_size_px[:, 1] - 1) / 2
+    return np.stack([recording.velocity_px_s, recording.velocity_px_s * later[..., None]], axis=-1)
 
 
 def evenly_spaced(candidates: Ints, most: int) -> Ints:

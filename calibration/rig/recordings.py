@@ -17,16 +17,29 @@ from calibration.model_check.fault_identification import compressed
 from calibration.model_check.linearised_frames import (
     LinearisedFrames,
     ModelCheckRecording,
+    clock_derivatives,
     linearised_at,
     whitening,
+    with_clocks,
 )
-from calibration.terms.rig_blocks import BEAMS, BOWS, CAMERAS, INTRINSICS, SCREENS, lines_in, rig_of
+from calibration.terms.rig_blocks import (
+    BEAMS,
+    BOWS,
+    CAMERAS,
+    INTRINSICS,
+    OFFSETS,
+    ROW_TIMES,
+    SCREENS,
+    lines_in,
+    rig_of,
+)
+from calibration.terms.surveyed import array_of
 from geometry.arrays import Array, Bools, Ints, finite
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import unlimited
 
-STACKS = (INTRINSICS, CAMERAS, SCREENS, BOWS, BEAMS)
+STACKS = (INTRINSICS, CAMERAS, SCREENS, BOWS, BEAMS, OFFSETS, ROW_TIMES)
 _POSE_STEPS = 3  # Gauss-Newton steps of the poses: from 5 mrad and 10 mm the second one is shorter than 1e-6
 _LARGEST_STEP = np.array([0.3] * 3 + [0.2] * 3)  # m, rad: a pose that would move farther is not determined
 
@@ -77,7 +90,8 @@ class RecordingTerm:
     def reduced(self, values: Values) -> Reduced:
         """The recording at these values of the rig, without its poses."""
         model = unlimited(SpotModel.of(rig_of(self.rig, values)))
-        lin = with_own_poses(model, self.recording)
+        clocks = np.concatenate([array_of(values, s) for s in (OFFSETS, ROW_TIMES)], axis=1)[model.camera_of]
+        lin = with_own_poses(model, with_clocks(model, self.recording, clocks))
         left = lin.residual_part(lin.residual)
         free = lin.residual_part(lin.W @ self._derivatives(model, lin, values))
         flat = free.reshape(-1, free.shape[-1])
@@ -99,10 +113,16 @@ class RecordingTerm:
             BOWS: (d.bow, screen_of),
             BEAMS: (np.concatenate([d.direction @ B, d.point @ B], axis=-1), model.beam_of),
         }
+        if self.recording.velocity_px_s is not None:
+            by_clock = clock_derivatives(model, self.recording)
+            of |= {s: (by_clock[..., i : i + 1], model.camera_of) for i, s in enumerate((OFFSETS, ROW_TIMES))}
         used: Bools = np.asarray(lin.used[..., None, None])
         out = np.zeros((*lin.used.shape, 2, sum(values[s].dof for s, _ in self.at)))
         start = 0
         for stack, i in self.at:
+            if stack not in of:  # a clock, and no motion that shows it
+                start += values[stack].dof
+                continue
             block, element_of = of[stack]
             views = np.flatnonzero(element_of == i)
             stop = start + values[stack].dof

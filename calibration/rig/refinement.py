@@ -16,8 +16,21 @@ import numpy as np
 from calibration.changes import USUAL_SIZES, ExcessResidual
 from calibration.least_squares.adjustment import AdjustmentError, At, Prior, Values, solve
 from calibration.model_check.fault_identification import SuspectedFault, compressed, search_faults
-from calibration.model_check.faults import BEAM, CAMERA, LASER_MOVED, MOVED, SCREEN, TILTED, PossibleFault
-from calibration.model_check.linearised_frames import ModelCheckRecording, correlation_time, linearise
+from calibration.model_check.faults import (
+    BEAM,
+    CAMERA,
+    LASER_MOVED,
+    MOVED,
+    SCREEN,
+    TILTED,
+    PossibleFault,
+    pixel_velocities,
+)
+from calibration.model_check.linearised_frames import (
+    ModelCheckRecording,
+    correlation_time,
+    linearise,
+)
 from calibration.rig.recordings import STACKS, RecordingTerm, Reduced
 from calibration.terms.rig_blocks import BEAMS, CAMERAS, SCREENS, named_errors, names_at, prior_of, rig_of, stacks_of
 from geometry.arrays import Array, Bools, Ints, finite, skew
@@ -250,18 +263,21 @@ def further_motions(r: Refinement, free: Mapping[str, Bools]) -> dict[str, tuple
     noise = np.array([r.noise[name] for name in model.camera_names])[model.camera_of]
     count = sum(len(recording.seen) for recording in r.recordings) / r.correlation_frames
     cov = usual * noise[:, None, None] ** 2 * (_MOTION_FRAMES / count)
+    t_s = np.linspace(0.0, 1.0, _MOTION_FRAMES)  # to one side, to the other and back: speeds that show clocks
     out = {}
     for axis, name in enumerate(MOTIONS):
         for halved in range(_HALVINGS + 1):
             step = np.zeros((_MOTION_FRAMES, 6))
             size = (_SHIFT_M if axis < 3 else _TURN_RAD) / 2**halved
-            step[:, axis] = np.linspace(-size, size, _MOTION_FRAMES)
+            step[:, axis] = size * np.sin(2 * np.pi * t_s)
             moved = middle.plus(step)
             uv = model.project(moved)[0]
             seen = model.in_picture(uv) & finite(uv, -1)
             if np.all(seen.sum(axis=1) >= FEWEST_SPOTS):
                 every = np.broadcast_to(cov, (*seen.shape, 2, 2))
-                recording = ModelCheckRecording(np.arange(_MOTION_FRAMES, dtype=float), seen, uv, every, moved)
+                recording = ModelCheckRecording(t_s, seen, uv, every, moved)
+                velocity = pixel_velocities(model, recording, np.arange(_MOTION_FRAMES))
+                recording = replace(recording, velocity_px_s=velocity, clock_s=np.zeros((len(model), 2)))
                 known = r.after.with_data([RecordingTerm(r.given, recording, free).reduced(r.values)])
                 out[name] = size, np.sqrt(np.diagonal(coefficients @ known.covariance @ coefficients.T))
                 break
@@ -357,6 +373,8 @@ def _parts(rig: Rig, values: Values, prior: Prior, known: Knowledge) -> list[Pos
     screen_of = [rig.spots[s].screen for _, s in model.views]
     out = []
     for (stack, i), rows in place.items():
+        if stack not in (CAMERAS, SCREENS, BEAMS):
+            continue
         turn, move = _LARGER * np.median(sigmas[rows[3:]]), _LARGER * np.median(sigmas[rows[:3]])
         of = np.zeros((len(sigmas), 6 if stack == CAMERAS else 3 if stack == SCREENS else 4))
         if stack == CAMERAS:
@@ -375,13 +393,11 @@ def _parts(rig: Rig, values: Values, prior: Prior, known: Knowledge) -> list[Pos
             sizes = np.repeat([max(move, USUAL_SIZES.move_m), max(turn, USUAL_SIZES.turn_rad)], (1, 2))
             component, kind, name = SCREEN, TILTED, list(rig.screens)[i]
             views = np.array([s == name for s in screen_of])
-        elif stack == BEAMS:
+        else:
             of[rows] = np.eye(4)
             turn, move = (_LARGER * np.max(sigmas[rows[k]]) for k in (np.s_[:2], np.s_[2:]))
             sizes = np.repeat([max(turn, USUAL_SIZES.laser_rad), max(move, USUAL_SIZES.laser_m)], 2)
             component, kind, name, views = BEAM, LASER_MOVED, list(rig.beams)[i], model.beam_of == i
-        else:
-            continue
         if views.any():
             out.append(PossibleFault(component, name, kind, of, sizes, views))
     return out

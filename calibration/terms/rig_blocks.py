@@ -1,7 +1,7 @@
 """A rig as stacks of unknowns (values, names and covariances), and the pixels of its spots as a term of an adjustment.
 
-The stacks "intrinsics", "cameras", "screens", "bow" and "beams" have the rig's order. The pixels measure beams,
-screens, cameras, the stand and its positions.
+The stacks "intrinsics", "cameras", "screens", "bow", "beams", "offsets" and "row times" are in the rig's order. Pixels
+of a vehicle at rest measure beams, screens, cameras, the stand and its positions; those of a recording also the clocks.
 """
 
 from __future__ import annotations
@@ -20,9 +20,21 @@ from geometry.lens import fisheye_fold_limit, fold_limit, padded
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import whiten
 from geometry.rig import Beam, Rig
-from geometry.uncertainty.rig_uncertainty import BOW, DIRECTION, PINHOLE, POINT, POSE, RigCovariance, distortion_names
+from geometry.uncertainty.rig_uncertainty import (
+    BOW,
+    DIRECTION,
+    PINHOLE,
+    POINT,
+    POSE,
+    ROW_TIME,
+    TIME_OFFSET,
+    RigCovariance,
+    distortion_names,
+)
 
 INTRINSICS, CAMERAS, SCREENS, BOWS, BEAMS = "intrinsics", "cameras", "screens", "bow", "beams"
+OFFSETS, ROW_TIMES = "offsets", "row times"  # of the cameras' clocks, s
+_CLOCKS = {OFFSETS: TIME_OFFSET, ROW_TIMES: ROW_TIME}
 STAND, POSES = "stand", "poses"  # world_from_stand (1), and stand_from_body, one per stand position
 _INTRINSICS_COUNT = 18  # fx, fy, cx, cy and 14 distortion coefficients
 # Share of its variance that is added to each number of a prior. A singular covariance then also constrains the
@@ -32,16 +44,19 @@ _RIDGE = 1e-8
 
 def stacks_of(rig: Rig) -> dict[str, Stack]:
     """The stacks of a rig. Lens numbers that a camera's model does not have are 0 and must not be free."""
-    lens = [np.concatenate([pinhole_numbers(c), padded(c.distortion)]) for c in rig.cameras.values()]
+    cameras = list(rig.cameras.values())
+    lens = [np.concatenate([pinhole_numbers(c), padded(c.distortion)]) for c in cameras]
     return {
         INTRINSICS: Vectors(np.array(lens, dtype=float).reshape(-1, _INTRINSICS_COUNT)),
-        CAMERAS: Poses.of([c.camera_from_world for c in rig.cameras.values()]),
+        CAMERAS: Poses.of([c.camera_from_world for c in cameras]),
         SCREENS: Poses.of([s.world_from_screen for s in rig.screens.values()]),
         BOWS: Vectors(np.array([s.bow for s in rig.screens.values()], dtype=float).reshape(-1, 3)),
         BEAMS: Lines(
             np.array([b.point for b in rig.beams.values()], dtype=float).reshape(-1, 3),
             np.array([b.direction for b in rig.beams.values()], dtype=float).reshape(-1, 3),
         ),
+        OFFSETS: Vectors(np.array([c.time_offset_s for c in cameras], dtype=float).reshape(-1, 1)),
+        ROW_TIMES: Vectors(np.array([c.row_time_s for c in cameras], dtype=float).reshape(-1, 1)),
     }
 
 
@@ -74,8 +89,10 @@ def names_at(rig: Rig, at: At) -> tuple[str, ...]:
         KeyError: the stack does not belong to the rig.
     """
     stack, i = at
-    if stack in (INTRINSICS, CAMERAS):
+    if stack in (INTRINSICS, CAMERAS, *_CLOCKS):
         name, camera = list(rig.cameras.items())[i]
+        if stack in _CLOCKS:
+            return (f"cameras.{name}.{_CLOCKS[stack]}",)
         return _full_names(f"cameras.{name}", (*PINHOLE, *distortion_names(camera)) if stack == INTRINSICS else POSE)
     if stack in (SCREENS, BOWS):
         return _full_names(f"screens.{list(rig.screens)[i]}", POSE if stack == SCREENS else BOW)
@@ -135,6 +152,10 @@ def prior_of(rig: Rig, covariance: RigCovariance) -> tuple[Prior | None, dict[st
 
 def _camera(c: Camera, i: int, values: Values) -> Camera:
     pose = pose_of(values, CAMERAS)[i] if CAMERAS in values else c.camera_from_world
+    if OFFSETS in values:
+        c = replace(c, time_offset_s=float(array_of(values, OFFSETS)[i, 0]))
+    if ROW_TIMES in values:
+        c = replace(c, row_time_s=float(array_of(values, ROW_TIMES)[i, 0]))
     if INTRINSICS not in values:
         return replace(c, camera_from_world=pose)
     fx, fy, cx, cy, *lens = array_of(values, INTRINSICS)[i].tolist()

@@ -1,7 +1,8 @@
 """The parameters of a rig that a calibration determines, their covariance, and where it and the pose put the spots.
 
 Names are those of rig.yaml's covariance blocks: `cameras.left.fx`, `screens.right.rot_x_rad`, `beams.A.direction_y`.
-Cameras have fx, fy, cx, cy (px), as many of k1 ... tau_y as their lens model uses, and the error of camera_from_world;
+Cameras have fx, fy, cx, cy (px), as many of k1 ... tau_y as their lens model uses, the error of camera_from_world, and
+the numbers of their clocks, whose effect on the pixels depends on the motion and is not part of `Sensitivity`;
 screens have the error of world_from_screen and the bow; beams have a direction and a point in body, whose components
 along the beam have no effect.
 """
@@ -23,6 +24,7 @@ PINHOLE = ("fx", "fy", "cx", "cy")
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 FISHEYE_DISTORTION = ("k1", "k2", "k3", "k4")
 POSE = ("x_m", "y_m", "z_m", "rot_x_rad", "rot_y_rad", "rot_z_rad")
+TIME_OFFSET, ROW_TIME = CLOCK = ("time_offset_s", "row_time_s")
 BOW = ("bow_xx_per_m", "bow_xy_per_m", "bow_yy_per_m")
 DIRECTION = ("direction_x", "direction_y", "direction_z")
 POINT = ("point_x_m", "point_y_m", "point_z_m")
@@ -43,7 +45,7 @@ def distortion_names(camera: Camera) -> tuple[str, ...]:
 
 
 def camera_names(camera: Camera) -> tuple[str, ...]:
-    """The names of all parameters of a camera, without its own name."""
+    """The names of the parameters of a camera that place its spots, without its own name."""
     return (*PINHOLE, *distortion_names(camera), *POSE)
 
 
@@ -68,7 +70,7 @@ def is_known(rig: Rig, name: str) -> bool:
         return False
     kind, item, parameter = split_name(name)
     if kind == "cameras" and item in rig.cameras:
-        return parameter in camera_names(rig.cameras[item])
+        return parameter in CLOCK or parameter in camera_names(rig.cameras[item])
     if kind == "screens" and item in rig.screens:
         return parameter in (*POSE, *BOW)
     return kind == "beams" and item in rig.beams and parameter in (*DIRECTION, *POINT)
@@ -86,7 +88,8 @@ def perturbed_camera(camera: Camera, change: Mapping[str, float]) -> Camera:
     moved = of(POSE)
     pose = camera.camera_from_world
     place = pose.plus(moved) if moved.any() else pose
-    return replace(camera, matrix=matrix, distortion=distortion, camera_from_world=place)
+    clock = {n: getattr(camera, n) + change.get(n, 0.0) for n in CLOCK}
+    return replace(camera, matrix=matrix, distortion=distortion, camera_from_world=place, **clock)
 
 
 def perturbed_rig(rig: Rig, names: Sequence[str], delta: Array) -> Rig:
@@ -154,6 +157,8 @@ class Sensitivity:
             if not is_known(rig, name):
                 raise KeyError(name)
             kind, item, parameter = split_name(name)
+            if parameter in CLOCK:
+                continue
             if kind == "cameras":
                 field, column = _camera_column(rig.cameras[item], parameter)
                 views = camera_of == cameras.index(item)

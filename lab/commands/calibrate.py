@@ -182,7 +182,7 @@ def _groups(ctx: click.Context, parameter: click.Parameter, text: str | None) ->
     "--free",
     callback=_groups,
     metavar="GROUP,...",
-    help="Of cameras, screens, beams, lens: what is changed; default: all of which a sigma is known.",
+    help="Of cameras, screens, beams, lens, clocks, shutter: what changes; default: all of which a sigma is known.",
 )
 @click.option(
     "--sigma",

@@ -16,7 +16,7 @@ import numpy as np
 
 from calibration.model_check.clocks import ClockFit, ClockNumber, fit_clocks
 from calibration.model_check.linearised_frames import ModelCheckRecording
-from geometry.arrays import Array
+from geometry.arrays import Array, Bools
 from lab.files.run.clocks import CameraClock
 from lab.files.run.run_file import DetectionsTable, Run
 from lab.findings.finding import Finding, Level, finding
@@ -40,9 +40,11 @@ class ClockEstimate:
     numbers: tuple[ClockNumber, ...]
     value_s: Array  # (p,)
     covariance: Array  # (p, p)
-    prior_sigma_s: Array  # (p,) about 0
+    prior_s: Array  # (p,)
+    prior_sigma_s: Array  # (p,)
+    wide: Bools  # (p,) whether the prior is
     reference: str = ""  # the camera that is held, where all offsets are to be estimated
-    reference_prior_s: float = 0.0
+    reference_prior: tuple[float, float] = (0.0, 0.0)  # s, and its sigma
 
     @staticmethod
     def of(run: Run) -> ClockEstimate | None:
@@ -54,15 +56,21 @@ class ClockEstimate:
         if not any(c.offset_prior_s or c.row_time_prior_s for c in clocks.values()):
             return None
         reference = next(iter(clocks)) if all(c.offset_prior_s for c in clocks.values()) else ""
-        numbers, sigmas = [], []
+        numbers, priors, wide = [], [], []
         for name, clock in clocks.items():
-            for prior, is_row_time in ((clock.offset_prior_s, False), (clock.row_time_prior_s, True)):
-                if prior and (is_row_time or name != reference):
+            here = clock.wide(run.frame_rate_hz, run.rig.cameras[name].image_size_px[1])
+            offset, row_time = (clock.offset_s, clock.offset_prior_s), (clock.row_time_s, clock.row_time_prior_s)
+            for prior, is_row_time in ((offset, False), (row_time, True)):
+                if prior[1] and (is_row_time or name != reference):
                     numbers.append(ClockNumber(name, is_row_time))
-                    sigmas.append(prior)
-        sigma = np.array(sigmas)
-        prior_s = clocks[reference].offset_prior_s if reference else 0.0
-        return ClockEstimate(tuple(numbers), np.zeros(len(sigma)), np.diag(sigma**2), sigma, reference, prior_s)
+                    priors.append(prior)
+                    wide.append(here)
+        mean, sigma = np.array(priors).reshape(-1, 2).T
+        held = clocks[reference] if reference else CameraClock()
+        return ClockEstimate(
+            tuple(numbers), mean, np.diag(sigma**2), mean, sigma, np.array(wide, dtype=bool),
+            reference, (held.offset_s, held.offset_prior_s),
+        )  # fmt: skip
 
     @property
     def sigma_s(self) -> Array:
@@ -71,7 +79,7 @@ class ClockEstimate:
 
     def fitted(self, run: Run, recording: ModelCheckRecording | None) -> tuple[ClockEstimate, Array]:
         """The estimate after a pass whose clocks were the present ones, and the corrections (p,), s, that it found."""
-        mean, sigma = -self.value_s, self.prior_sigma_s
+        mean, sigma = self.prior_s - self.value_s, self.prior_sigma_s
         if recording is None:
             fit = ClockFit(mean, np.diag(sigma**2), 0)
         else:
@@ -82,7 +90,7 @@ class ClockEstimate:
         """The numbers as the smoothing pass corrects them."""
         cameras = list(run.rig.cameras)
         numbers = tuple((cameras.index(n.camera), n.is_row_time) for n in self.numbers)
-        return EstimatedClocks(numbers, -self.value_s, self.prior_sigma_s)
+        return EstimatedClocks(numbers, self.prior_s - self.value_s, self.prior_sigma_s)
 
     def corrected(self, found: FoundClocks) -> ClockEstimate:
         """The estimate after the smoothing pass."""
@@ -117,22 +125,25 @@ class ClockEstimate:
 def clock_findings(estimate: ClockEstimate) -> tuple[Finding, ...]:
     """What a run has found of its clocks."""
     out = []
-    values = zip(estimate.numbers, estimate.value_s, estimate.sigma_s, estimate.prior_sigma_s, strict=True)
-    for number, value, sigma, prior in values:
+    e = estimate
+    values = zip(e.numbers, e.value_s, e.sigma_s, e.prior_s, e.prior_sigma_s, e.wide, strict=True)
+    for number, value, sigma, mean, prior, wide in values:
         factor, unit = (1e6, "us") if number.is_row_time else (1e3, "ms")
         figure = f"{format_with_sigma(factor * value, factor * sigma)} {unit}"
         if sigma < prior:
             out.append(finding(CODE, Level.PASS, f"{number.name}: estimated as {figure}"))
             continue
         text = f"{number.name}: this recording hardly determines it, and"
-        text += f" the prior stays (prior: 0 ± {format_number(factor * prior, 2)} {unit})"
-        out.append(finding(CODE, Level.WARN, text))
+        stays = format_with_sigma(factor * mean, factor * prior) if mean else f"0 ± {format_number(factor * prior, 2)}"
+        out.append(finding(CODE, Level.WARN if wide else Level.PASS, f"{text} the prior stays (prior: {stays} {unit})"))
     if estimate.reference:
-        text = f"the offset of camera `{estimate.reference}` is held at 0 as the reference of the others"
+        held, prior = (1e3 * value for value in e.reference_prior)
+        at = f"{format_number(held)} ms" if held else "0"
+        text = f"the offset of camera `{e.reference}` is held at {at} as the reference of the others"
         others = any(not number.is_row_time for number in estimate.numbers)
         if not others:
-            text = f"{ClockNumber(estimate.reference, False).name}: there is no other camera to compare with, 0 is kept"
-            text += f" (prior: 0 ± {format_number(1e3 * estimate.reference_prior_s, 2)} ms)"
+            text = f"{ClockNumber(e.reference, False).name}: there is no other camera to compare with, {at} is kept"
+            text += f" (prior: {at} ± {format_number(prior, 2)} ms)"
         out.append(finding(CODE, Level.PASS if others else Level.WARN, text))
     return tuple(out)
 
@@ -142,17 +153,21 @@ def with_estimated_clocks(
 ) -> tuple[Pipeline, ClockEstimate | None]:
     """The pipeline of a run with its clocks as far as causal passes show them, and these clocks.
 
-    None, and the pipeline itself, where all clocks are known. folder: of temporary files.
+    None, and the pipeline itself, where all clocks are known. folder: of temporary files. Priors that are not wide need
+    no causal pass.
     """
     estimate = ClockEstimate.of(pipeline.run)
     if estimate is None:
         return pipeline, None
+    if not estimate.wide.any():
+        pipeline.run = estimate.of_run(pipeline.run)
+        return pipeline, estimate
     run, reader = pipeline.run, pipeline.reader
     assert isinstance(reader, ClockedFrames)
     pictures = [name for name, source in run.cameras.items() if not isinstance(source, DetectionsTable)]
     found = FoundPoints(folder, pictures)
     here = pipeline.again(estimate.of_run(run), reader, keep=found)
-    for number in range(MOST_PASSES if estimate.numbers else 0):
+    for number in range(MOST_PASSES):
         sampler, total = FrameSampler(), here.reader.expected_frames
         for done, record in enumerate(here.records(), start=1):
             sampler.add_record(record, here.model.camera_of, run.tracker)

@@ -123,7 +123,7 @@ def spots_of_run(folder: Path, rig: Rig, known: StandPoses | None, world_from_st
             f"{run.path}: cameras.{missing[0]}: expected a camera of the calibration, got {missing[0]!r}; it has"
             f" {', '.join(rig.cameras)}"
         )
-    if any(clock.offset_prior_s or clock.row_time_prior_s for clock in run.clocks.values()):
+    if any(c.wide(run.frame_rate_hz, rig.cameras[n].image_size_px[1]) for n, c in run.clocks.items()):
         raise InputError(
             f"{run.path}: cameras: expected clocks that are known, got `{ESTIMATE}`; a stand at rest shows no clock:"
             f" remove `{ESTIMATE}`, and record while the stand is at rest"

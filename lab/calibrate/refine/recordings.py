@@ -12,13 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from calibration.model_check.linearised_frames import ModelCheckRecording
-from geometry.arrays import finite
+from calibration.model_check.faults import pixel_velocities
+from calibration.model_check.linearised_frames import ModelCheckRecording, with_clocks
+from geometry.arrays import Array, finite
 from geometry.forward_model import SpotModel
 from geometry.pose_solver.visibility import assumed_range
 from geometry.rig import Rig
-from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty, is_known, unlimited
+from geometry.uncertainty.rig_uncertainty import CLOCK, RigCovariance, RigUncertainty, is_known, unlimited
 from lab.errors import CalibrationError
+from lab.files.run.clocks import CameraClock, clocks_in
 from lab.files.run.run_file import Run
 from lab.findings.finding import Level, worst_first
 from lab.runs.frames.frames import FrameSet
@@ -63,12 +65,16 @@ class LabelledRun:
             old, seen=wider(old.seen, False), uv_px=wider(old.uv_px, np.nan), cov_px2=wider(old.cov_px2, np.nan),
             predicted_px=wider(old.predicted_px, np.nan), predicted_cov_px2=wider(old.predicted_cov_px2, np.nan),
             width_px=None if old.width_px is None else wider(old.width_px[None], np.nan)[0],
+            velocity_px_s=wider(old.velocity_px_s, 0.0),
+            clock_s=None if old.clock_s is None else wider(old.clock_s[None], 0.0)[0],
         )  # fmt: skip
 
     def check(self, rig: Rig, covariance: RigCovariance) -> ModelCheck:
         """The model check of this recording with another rig."""
         run = with_rig(self.run, rig, covariance)
-        return check_model(run.rig, self.recording, run.covariance)
+        model = SpotModel.of(run.rig)
+        recording = with_clocks(model, self.recording, _clocks_of(run.rig)[model.camera_of])
+        return check_model(run.rig, recording, run.covariance)
 
 
 def with_rig(run: Run, rig: Rig, covariance: RigCovariance) -> Run:
@@ -76,7 +82,13 @@ def with_rig(run: Run, rig: Rig, covariance: RigCovariance) -> Run:
     own = replace(rig, cameras={n: rig.cameras[n] for n in run.rig.cameras})
     rows = [i for i, name in enumerate(covariance.names) if is_known(own, name)]
     names = tuple(covariance.names[i] for i in rows)
-    return replace(run, rig=own, covariance=RigCovariance(names, covariance.matrix[np.ix_(rows, rows)]))
+    known = RigCovariance(names, covariance.matrix[np.ix_(rows, rows)])
+    return replace(run, rig=own, covariance=known, clocks=clocks_in(own, known, run.clocks, run.rig))
+
+
+def _clocks_of(rig: Rig) -> Array:
+    """Offset and row time (cameras, 2), s, that a rig states."""
+    return np.array([[getattr(c, number) for number in CLOCK] for c in rig.cameras.values()])
 
 
 def tolerant(run: Run) -> Run:
@@ -152,4 +164,12 @@ def labelled(run: Run, most: int | None = None, enough: int = 0, *, judged: bool
         raise CalibrationError(f"{run.folder}: {worst.what}. {worst.remedy}")
     if recording is None:
         raise CalibrationError(f"{run.folder}: there is no frame at all")
+    if passes.clocks is not None:
+        model, rig_s = SpotModel.of(run.rig), _clocks_of(run.rig)
+        own, now = (
+            [c.get(n, CameraClock()) for n in run.rig.cameras] for c in (run.clocks, passes.pipeline.run.clocks)
+        )
+        more = np.array([(b.offset_s - a.offset_s, b.row_time_s - a.row_time_s) for a, b in zip(own, now, strict=True)])
+        velocity = np.nan_to_num(pixel_velocities(model, recording, np.arange(len(recording.seen))))
+        recording = replace(recording, velocity_px_s=velocity, clock_s=(rig_s + more)[model.camera_of])
     return LabelledRun(run, recording, statistics.frames)

@@ -15,7 +15,7 @@ import numpy as np
 
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.refinement import Refinement, refine
-from calibration.terms.rig_blocks import BEAMS, BOWS, CAMERAS, INTRINSICS, SCREENS
+from calibration.terms.rig_blocks import BEAMS, BOWS, CAMERAS, INTRINSICS, OFFSETS, ROW_TIMES, SCREENS
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
@@ -48,7 +48,7 @@ _STEP = Step("refinement by recordings", (RESIDUALS,), RIG)
 _FIRST_FRAMES = ((40, 20), (100, 100))
 _STACKS_OF = {
     prior_sigmas.CAMERAS: (CAMERAS,), prior_sigmas.SCREENS: (SCREENS, BOWS), prior_sigmas.BEAMS: (BEAMS,),
-    prior_sigmas.LENS: (INTRINSICS,),
+    prior_sigmas.LENS: (INTRINSICS,), prior_sigmas.CLOCKS: (OFFSETS,), prior_sigmas.SHUTTER: (ROW_TIMES,),
 }  # fmt: skip
 
 

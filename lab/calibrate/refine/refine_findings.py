@@ -12,7 +12,7 @@ from calibration.rig.refinement import FEWEST_FRAMES, Refinement
 from geometry.arrays import finite
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, split_name
-from lab.calibrate.refine.prior_sigmas import BEAMS, CAMERAS, SCREENS
+from lab.calibrate.refine.prior_sigmas import BEAMS, CAMERAS, SCREENS, free_group
 from lab.calibrate.refine.recordings import LabelledRun
 from lab.findings.finding import Finding, Level, clause, finding, passed
 from lab.number_format import format_number, format_with_sigma
@@ -118,7 +118,7 @@ def _used(result: RefineResult) -> list[Finding]:
 
 def _held(rig: Rig, prior: RigCovariance) -> list[Finding]:
     """Cameras, screens and beams of which nothing is stated."""
-    known = {split_name(n)[:2] for n in prior.names if not n.endswith(("fx", "fy", "cx", "cy"))}
+    known = {split_name(n)[:2] for n in prior.names if free_group(n) == split_name(n)[0]}
     of = {CAMERAS: rig.cameras, SCREENS: rig.screens, BEAMS: rig.beams}
     held = [f"{kind}.{name}" for kind, parts in of.items() for name in parts if (kind, name) not in known]
     if not held:

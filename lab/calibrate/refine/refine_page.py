@@ -9,7 +9,7 @@ from calibration.rig.refinement import MOTIONS, Refinement, further_motions
 from calibration.terms.rig_blocks import prior_of
 from geometry.arrays import Array
 from geometry.rig import Rig
-from geometry.uncertainty.rig_uncertainty import POSE, split_name
+from geometry.uncertainty.rig_uncertainty import CLOCK, POSE, ROW_TIME, split_name
 from lab.calibrate.refine.refine_findings import RefineResult
 from lab.number_format import format_number
 from lab.report.calibration.calibration_charts import correlation_matrix
@@ -57,7 +57,7 @@ def _changes_of_numbers(result: RefineResult) -> Section:
     rows = []
     for name, change in r.named_changes().items():
         if name in before and name in sigma:
-            unit, factor = ("mm", 1e3) if name.endswith("_m") else ("mrad", 1e3) if _is_angle(name) else ("", 1.0)
+            unit, factor = _unit(name)
             removed = np.sqrt(max(before[name] ** 2 - sigma[name] ** 2, 0.0))
             in_sigmas = change / removed if removed > 1e-3 * before[name] else float("nan")
             rows.append((name, unit, factor * before[name], factor * sigma[name], factor * change, float(in_sigmas)))
@@ -70,8 +70,13 @@ def _changes_of_numbers(result: RefineResult) -> Section:
     return Section("Change of each number", words, (), PageTable(heads, rows))
 
 
-def _is_angle(name: str) -> bool:
-    return name.endswith("_rad") or split_name(name)[2].startswith("direction")
+def _unit(name: str) -> tuple[str, float]:
+    """The unit in which a number is shown, and its factor."""
+    parameter = split_name(name)[2]
+    if parameter in CLOCK:
+        return ("us", 1e6) if parameter == ROW_TIME else ("ms", 1e3)
+    is_angle = parameter.endswith("_rad") or parameter.startswith("direction")
+    return ("mm", 1e3) if parameter.endswith("_m") else ("mrad", 1e3) if is_angle else ("", 1.0)
 
 
 def _directions(result: RefineResult) -> Section:

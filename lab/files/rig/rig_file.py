@@ -13,7 +13,7 @@ import pydantic
 from geometry.arrays import Array, symmetric
 from geometry.camera import Camera, SensorNoise
 from geometry.rig import Beam, Rig, Screen, Spot
-from geometry.uncertainty.rig_uncertainty import RigCovariance, is_known, split_name
+from geometry.uncertainty.rig_uncertainty import CLOCK, RigCovariance, is_known, split_name
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.camera_block import (
@@ -193,6 +193,8 @@ class CameraBlock(LensBlock):
     screen: fields.Word
     camera_from_world: CameraPoseBlock
     noise: _NoiseBlock | None = None
+    time_offset_s: fields.Number = 0.0
+    row_time_s: fields.Number = 0.0
     covariance: CovarianceBlock | None = None
 
     def value(self, name: str) -> Camera:
@@ -207,6 +209,8 @@ class CameraBlock(LensBlock):
             camera_from_world=self.camera_from_world.pose(),
             noise=None if n is None else SensorNoise(n.gain_e_per_dn, n.read_noise_e, n.black_dn),
             lens=self.lens,
+            time_offset_s=self.time_offset_s,
+            row_time_s=self.row_time_s,
         )
 
 
@@ -366,4 +370,5 @@ def camera_mapping(camera: Camera) -> dict[str, Any]:
             "read_noise_e": float(n.read_noise_e),
             "black_dn": float(n.black_dn),
         }
+    out |= {n: getattr(camera, n) for n in CLOCK if getattr(camera, n)}
     return out

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from geometry.arrays import Array, Ints
+from geometry.rig import Rig
+from geometry.uncertainty.rig_uncertainty import ROW_TIME, TIME_OFFSET, RigCovariance
 from lab.errors import InputError
 from lab.files.text import columns
 from lab.files.text.csv_table import Table
@@ -36,6 +39,12 @@ class Times:
         inside = np.interp(numbers, self.frames, self.times_s)
         beyond = numbers - np.clip(numbers, self.frames[0], self.frames[-1])
         return inside + beyond / self.frame_rate_hz
+
+    def usual_step_s(self, rate_hz: float) -> float:
+        """The usual time from one frame to the next; 1 / rate_hz where no two frames have a timestamp."""
+        if self.frames is None or self.times_s is None or len(self.frames) < 2:
+            return 1 / rate_hz
+        return float(np.median(np.diff(self.times_s) / np.diff(self.frames)))
 
     def without_time(self, frames: Ints) -> Ints:
         """The frame numbers, of (n,) given, without a timestamp; none where the rate is constant."""
@@ -84,6 +93,7 @@ ESTIMATE = "estimate"  # the word in run.yaml for a number that the run estimate
 # Sigmas of the priors of such numbers, both around 0: of an offset in steps between two frames, of a row time as a
 # share of the longest one, with which the rows fill the time between two pictures.
 OFFSET_SIGMA_FRAMES, ROW_TIME_SIGMA = 1.0, 1.0
+WIDE = 0.25  # of these: a larger sigma needs causal passes before the smoothing pass estimates the number
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +115,31 @@ class CameraClock:
         """Times (m,), s, of pictures (m,) at mid-exposure of their middle rows, on the run's clock."""
         times = run_times if self.times is None else self.times
         return np.asarray(times.t_s(numbers) + self.offset_s)
+
+    def wide(self, rate_hz: float, height: int) -> bool:
+        """Whether the sigma of a prior is wide. rate_hz: of the run; height: of the pictures, px."""
+        step_s = 1 / rate_hz if self.times is None else self.times.usual_step_s(rate_hz)
+        priors = self.offset_prior_s / OFFSET_SIGMA_FRAMES, self.row_time_prior_s * height / ROW_TIME_SIGMA
+        return max(priors) > WIDE * step_s
+
+
+def clocks_in(
+    rig: Rig, covariance: RigCovariance | None, own: Mapping[str, CameraClock], before: Rig | None = None
+) -> dict[str, CameraClock]:
+    """The clocks of a rig's cameras: what the rig states, added to a run's own; its sigmas are those of the priors.
+
+    own: of the run, by camera, with what the rig `before` states.
+    """
+    known = {} if covariance is None else dict(zip(covariance.names, np.diagonal(covariance.matrix), strict=True))
+    out = {}
+    for name, camera in rig.cameras.items():
+        clock, old = own.get(name, CameraClock()), None if before is None else before.cameras[name]
+        sigmas = [float(np.sqrt(known.get(f"cameras.{name}.{number}", 0.0))) for number in (TIME_OFFSET, ROW_TIME)]
+        priors = sigmas[0] or clock.offset_prior_s, sigmas[1] or clock.row_time_prior_s
+        offset_s = clock.offset_s + camera.time_offset_s - (0.0 if old is None else old.time_offset_s)
+        row_time_s = clock.row_time_s + camera.row_time_s - (0.0 if old is None else old.row_time_s)
+        out[name] = CameraClock(offset_s, row_time_s, clock.times, clock.times_path, *priors, *priors)
+    return {name: clock for name, clock in out.items() if clock != CameraClock()}
 
 
 def picture_numbers(clock: CameraClock | None, run_times: Times, rows: Ints) -> Ints:
@@ -147,8 +182,7 @@ def load_clock(
         if not path.is_file():
             raise InputError(f"{where}.timestamps: expected a table frame,t_s, found none at {path}")
         times = load_times(path, rate_hz)
-        if times.times_s is not None and times.frames is not None and len(times.frames) > 1:
-            rate_hz = 1 / float(np.median(np.diff(times.times_s) / np.diff(times.frames)))
+        rate_hz = 1 / times.usual_step_s(rate_hz)
     row_time_prior_s = ROW_TIME_SIGMA / rate_hz / height if isinstance(row_time_s, str) else 0.0
     offset_s = 0.0 if isinstance(offset_s, str) else offset_s
     row_time_s = 0.0 if isinstance(row_time_s, str) else row_time_s

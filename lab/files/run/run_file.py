@@ -19,7 +19,7 @@ from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
 from lab.files.rig.calibration_state import CalibrationState, OptionalDay
 from lab.files.rig.rig_file import joint_covariance, load_rig_file
-from lab.files.run.clocks import ESTIMATE, CameraClock, Times, load_clock, load_times
+from lab.files.run.clocks import ESTIMATE, CameraClock, Times, clocks_in, load_clock, load_times
 from lab.files.text import fields
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.error_text import FileError, name_of_path, suggest_name
@@ -89,7 +89,8 @@ class Run:
     covariance: RigCovariance | None = None  # of the rig's calibration
     calibration: CalibrationState | None = None  # date and verdict
     recorded: datetime.date | None = None  # the day of the recording
-    clocks: Mapping[str, CameraClock] = dataclasses.field(default_factory=dict)  # of cameras that have one of their own
+    # Of cameras that have one of their own, with what the rig states of it.
+    clocks: Mapping[str, CameraClock] = dataclasses.field(default_factory=dict)
 
     @property
     def path(self) -> Path:
@@ -162,6 +163,9 @@ def load_run(run_folder: Path, rig_path: Path | None = None) -> Run:
                 clocks[name] = clock
         except InputError as error:
             mistakes.append(str(error))
+    in_use = dataclasses.replace(rig, cameras={n: c for n, c in rig.cameras.items() if n in sources})
+    covariance = joint_covariance(in_use, rig_file.covariances, rig_path)
+    clocks = clocks_in(in_use, covariance, clocks)
     if clocks and tracker.method != "rigid":
         mistakes.append(
             f"{path}: cameras.{next(iter(clocks))}: expected tracker.method rigid with a clock of its own, got"
@@ -171,7 +175,6 @@ def load_run(run_folder: Path, rig_path: Path | None = None) -> Run:
         raise FileError(mistakes)
 
     times_path = None if content.timestamps is None else folder / content.timestamps
-    in_use = dataclasses.replace(rig, cameras={n: c for n, c in rig.cameras.items() if n in sources})
     return Run(
         folder=folder,
         name=content.name or name_of_path(folder),
@@ -186,7 +189,7 @@ def load_run(run_folder: Path, rig_path: Path | None = None) -> Run:
         prior=None if content.prior is None else _prior_of(content.prior),
         tracker=tracker,
         notes=content.notes,
-        covariance=joint_covariance(in_use, rig_file.covariances, rig_path),
+        covariance=covariance,
         calibration=rig_file.calibration,
         recorded=content.recorded,
         clocks=clocks,

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from click.testing import CliRunner
 
 from calibration.rig.refinement import MOTIONS, further_motions
@@ -197,7 +199,9 @@ def test_exchanged_cameras_are_refused_and_nothing_is_written(lab, tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--free", "camera"], "expected some of cameras,screens,beams,lens, got 'camera'"),
+        (["--free", "camera"], "expected some of cameras,screens,beams,lens,clocks,shutter, got 'camera'"),
+        (["--free", "clocks"], "--free clocks: expected its covariance"),
+        (["--sigma", "cameras.time_offset=1"], "did you mean 'cameras.time_offset_s'?"),
         (["--free", "lens"], "nothing is refined of which nothing is stated"),
         (["--sigma", "cameras.left-a.position=1"], "expected one of cameras.position_m"),
         (["--sigma", "cameras.middle.position_m=0.1"], "expected one of the rig's cameras, got 'middle'"),
@@ -247,3 +251,61 @@ def test_parts_of_which_nothing_is_stated_are_held_and_named(lab, tmp_path):
     assert done.exit_code in (0, 3), done.output
     text = (tmp_path / "new" / "report.html").read_text()
     assert "nothing is stated of screens.left, screens.right, beams.A" in text
+
+
+LATER_S = 0.002  # by which the clock of camera right differs from what run.yaml states
+
+
+@pytest.fixture(scope="module")
+def late(tmp_path_factory):
+    """A run whose run.yaml states a wrong offset, its true rig, and the folder with the refined clocks."""
+    folder = tmp_path_factory.mktemp("late")
+    (run,) = recordings(folder, "clocks", count=1, frames=80)
+    path = run / "run.yaml"
+    content = yaml.safe_load(path.read_text())
+    content["cameras"]["right"]["time_offset_s"] -= LATER_S
+    path.write_text(yaml.safe_dump(content))
+    options = ["--sigma", "cameras.time_offset_s=0.003", "--sigma", "cameras.row_time_s=2e-6", "--free", "clocks"]
+    done = typed("refine", run, "--rig", run / "rig.yaml", "--out", folder / "new", *options)
+    assert done.exit_code == 0, done.output
+    return folder, run
+
+
+def test_a_wrong_clock_is_corrected_to_its_sigma_and_the_first_camera_is_the_reference(late):
+    folder, _ = late
+    new = load_rig_file(folder / "new" / "rig.yaml")
+    covariance = joint_covariance(new.rig, new.covariances, "new")
+    assert "cameras.left.time_offset_s" not in covariance.names
+    sigma = covariance.matrix[(covariance.names.index("cameras.right.time_offset_s"),) * 2] ** 0.5
+    assert sigma < 0.1 * LATER_S
+    assert abs(new.rig.cameras["right"].time_offset_s - LATER_S) < 4 * sigma
+    assert [c.row_time_s for c in new.rig.cameras.values()] == [0.0, 0.0]  # stated, and not to be changed
+    assert "cameras.right.row_time_s" in covariance.names
+    assert "cameras.right.time_offset_s" in (folder / "new" / "report.html").read_text()
+
+
+def test_a_run_with_the_refined_rig_has_its_clocks_and_states_their_sigmas(late, tmp_path):
+    folder, run = late
+    errors = {}
+    for name, rig in (("given", run / "rig.yaml"), ("refined", folder / "new" / "rig.yaml")):
+        content = yaml.safe_load((run / "run.yaml").read_text())
+        (run / "run.yaml").write_text(yaml.safe_dump({**content, "rig": str(rig)}))
+        typed("run", run, "--out", tmp_path / name, "--quiet")
+        summary = json.loads((tmp_path / name / "summary.json").read_text())
+        errors[name] = summary["errors"]["pose"]["measured"]["rotation_deg"]["rms"]
+    clock = summary["parameters"]["clocks"]["right"]
+    stated = yaml.safe_load((run / "run.yaml").read_text())["cameras"]["right"]["time_offset_s"]
+    assert clock["time_offset_s"] == pytest.approx(stated + LATER_S, abs=4 * clock["time_offset_sigma_s"])
+    assert 0 < clock["time_offset_sigma_s"] < 1.01 * clock["time_offset_prior_sigma_s"] < 0.1 * LATER_S
+    assert errors["refined"] < 0.5 * errors["given"]
+
+
+def test_a_rig_with_clocks_is_read_back_as_it_was_written(tmp_path):
+    from tests.geometry.scenes import random_rig
+
+    rig = random_rig(np.random.default_rng(0))
+    name, camera = next(iter(rig.cameras.items()))
+    rig = replace(rig, cameras={**rig.cameras, name: replace(camera, time_offset_s=-0.0013, row_time_s=8e-6)})
+    save_rig(rig, tmp_path / "rig.yaml")
+    back = load_rig_file(tmp_path / "rig.yaml").rig.cameras[name]
+    assert (back.time_offset_s, back.row_time_s) == (-0.0013, 8e-6)
