@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from lab.commands.common import (
     stopped_by_ctrl_c,
     verbose_option,
 )
+from lab.findings.outcome import Outcome
 
 causal_option = click.option(
     "--causal", is_flag=True, help="No smoothing pass: attitude.csv has the poses as known at each instant."
@@ -39,6 +41,11 @@ _ADDED = {"overlay.*": "--video", "certificate.html": "--certificate"}  # by `re
 @click.option(
     "--full-hash", is_flag=True, help="Fingerprint every byte of the inputs; otherwise large ones are sampled."
 )
+@click.option(
+    "--refined",
+    is_flag=True,
+    help="First refine the rig by this run, into OUT-refined, as `refine` does; exit status 3: there is no better rig.",
+)
 @verbose_option
 @quiet_option
 @set_option
@@ -49,6 +56,7 @@ def run(
     run_folder: Path,
     out: Path,
     full_hash: bool,
+    refined: bool,
     verbose: bool,
     quiet: bool,
     **options: Any,
@@ -63,13 +71,19 @@ def run(
     from lab.files.run.run_file import Run
     from lab.runs.process import process_run
 
+    process: Callable[..., Outcome[Any]] = process_run
+    if refined:
+        from lab.calibrate.refine.refine import run_with_refined_rig
+
+        process = run_with_refined_rig
+
     def more(of: Run) -> dict[str, Any]:
         return provenance(ctx) | ({"inputs": fingerprints(of, full=True)} if full_hash else {})
 
     # Of the earlier results in this folder, with the option that makes it again.
     added = [(p, option) for name, option in _ADDED.items() for p in sorted(out.glob(name))]
     with shown(run_folder.name, verbose=verbose, quiet=quiet) as progress:
-        outcome = process_run(run_folder, out, progress=progress, more=more, **options)
+        outcome = process(run_folder, out, progress=progress, more=more, **options)
     gone = "removed with the earlier results; make it again with `beampose report"
     conclude(outcome, quiet=quiet, notes=[f"{path}: {gone} {out} {option}`" for path, option in added])
 

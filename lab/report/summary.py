@@ -10,6 +10,8 @@ from typing import Any, TypeVar, cast
 
 from pydantic import TypeAdapter, ValidationError
 
+from lab.files.run.results import REFINED
+
 T = TypeVar("T")
 DETAILS = ("parameters", "smoother", "rates", "timings", "versions")  # blocks that the report shows as they are
 METHODS = ("rigid", "spots")
@@ -86,6 +88,7 @@ class RunSummary:
     details: dict[str, list[tuple[str, str]]]  # the blocks of DETAILS: dotted names and plain values
     errors: Mapping[str, Any] | None  # of the score against truth, as lab.runs.verdict.score writes it
     model_check: Mapping[str, Any] | None
+    refined: Mapping[str, Any]  # of `run --refined`: line, report, heads and rows of the changes; otherwise empty
     calibration: Mapping[str, Any] | None  # date, verdict, valid_until; None where the rig states none
 
 
@@ -110,6 +113,7 @@ def summary_of(tree: Mapping[str, Any]) -> RunSummary:
         details={name: flattened(tree.get(name) or {}) for name in DETAILS},
         errors=_mapping(tree.get("errors")) or None,
         model_check=valid(dict[str, Any], tree.get("model_check")),
+        refined=_mapping(tree.get(REFINED)),
         calibration=valid(dict[str, Any], tree.get("calibration")),
     )
 

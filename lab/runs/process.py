@@ -48,19 +48,21 @@ def process_run(
     causal: bool = False,
     progress: Progress | None = None,
     more: Callable[[Run], Mapping[str, Any]] | None = None,
+    rig_path: Path | None = None,
 ) -> Outcome[RunStatistics]:
     """Process one run folder into the folder `out`: the tables, summary.json and report.html.
 
     overrides: tracker parameters that replace those of run.yaml. causal: the tables hold the causal estimates and
     nothing is smoothed; otherwise they hold the smoothed estimates, and attitude_causal.csv the causal ones.
-    more: additional content of summary.json; called with the run before its processing.
+    more: additional content of summary.json; called with the run before its processing. rig_path: a rig.yaml in place
+    of the run's.
 
     Raises:
         BeamposeError: the run cannot be processed (CalibrationError: its rig's calibration must not be used); `out` is
             then unchanged.
     """
     started = time.perf_counter()
-    run = ready_run(run_folder, overrides)
+    run = ready_run(run_folder, overrides, rig_path)
     added = {} if more is None else more(run)
     with atomic_folder(out, may_replace=are_results) as work:
         return write_results(
@@ -68,14 +70,14 @@ def process_run(
         )
 
 
-def ready_run(run_folder: Path, overrides: Mapping[str, Any] | None = None) -> Run:
-    """A run that may be processed, with some tracker parameters replaced.
+def ready_run(run_folder: Path, overrides: Mapping[str, Any] | None = None, rig_path: Path | None = None) -> Run:
+    """A run that may be processed, with some tracker parameters replaced. rig_path: in place of the run's.
 
     Raises:
         InputError: the run folder or an override is invalid.
         CalibrationError: its rig's calibration must not be used.
     """
-    run = load_run(run_folder)
+    run = load_run(run_folder, rig_path)
     if overrides:
         run = dataclasses.replace(run, tracker=with_overrides(run.tracker, overrides))
     recorded = datetime.date.today() if run.recorded is None else run.recorded

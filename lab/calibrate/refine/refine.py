@@ -6,7 +6,7 @@ residuals.csv: the residual of every spot that was used, with the rig as given a
 from __future__ import annotations
 
 import datetime
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,19 +23,22 @@ from lab.calibrate.refine import prior_sigmas
 from lab.calibrate.refine.prior_sigmas import GROUPS, free_group, stated_covariance
 from lab.calibrate.refine.recordings import LabelledRun, labelled, tolerant, with_rig
 from lab.calibrate.refine.refine_findings import RefineResult, refine_findings
-from lab.calibrate.refine.refine_page import page_of, pixel_residuals
+from lab.calibrate.refine.refine_page import changes_of_numbers, page_of, pixel_residuals
 from lab.calibrate.step import Solved, Step, run_step, state_of
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.calibration_state import require_valid_calibration
 from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance, load_rig_file, save_rig
 from lab.files.run.fingerprints import fingerprints
+from lab.files.run.results import REFINED
 from lab.files.run.run_file import Run, load_run
 from lab.files.text.csv_text import csv_word, write_table
 from lab.files.text.error_text import suggest_name
 from lab.findings.finding import Finding, Level, verdict
 from lab.findings.outcome import Outcome
 from lab.progress import Progress
+from lab.report.page import cell
 from lab.runs.model_check.check import with_place_errors
+from lab.runs.process import process_run
 
 RIG, RESIDUALS = "rig.yaml", "residuals.csv"
 COLUMNS = (
@@ -75,6 +78,29 @@ def refine_rig(
     """
     day = today or datetime.date.today()
     return run_step(_STEP, out, lambda: _solve(list(runs), Path(rig_path), list(free), sigmas or {}, day, progress))
+
+
+def run_with_refined_rig(
+    run_folder: Path, out: Path, *, more: Callable[[Run], Mapping[str, Any]] | None = None, **options: Any
+) -> Outcome[Any]:
+    """Refine the rig of a run by this run, into `OUT-refined`, and process the run with the result, into `out`.
+
+    If the refinement is a FAIL, its outcome is returned, and `out` stays as it was. more, options: as of `process_run`;
+    the report and summary.json have the changes of the rig's numbers, too.
+    """
+    folder = Path(out).with_name(Path(out).name + "-refined")
+    found = refine_rig([run_folder], load_run(run_folder).rig_path, folder, progress=options.get("progress"))
+    if found.level is Level.FAIL:
+        return found
+    table = changes_of_numbers(found.result).table
+    assert table is not None
+    content = {"line": found.line(), "report": str(folder.resolve() / "report.html"), "heads": table.heads}
+
+    def with_changes(run: Run) -> dict[str, Any]:
+        rows = [[cell(value) for value in row] for row in table.rows]
+        return {**({} if more is None else more(run)), REFINED: {**content, "rows": rows}}
+
+    return process_run(run_folder, out, rig_path=folder / RIG, more=with_changes, **options)
 
 
 def _solve(

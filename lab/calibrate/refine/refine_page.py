@@ -24,7 +24,7 @@ def page_of(result: RefineResult) -> tuple[list[KeyFigure], list[Section]]:
     """Key figures and sections of the report."""
     r = result.refined
     return _key_figures(r), [
-        _changes_of_numbers(result),
+        changes_of_numbers(result),
         _directions(result),
         _held_out(result),
         _residuals(r),
@@ -49,7 +49,8 @@ def _key_figures(r: Refinement) -> list[KeyFigure]:
     return out
 
 
-def _changes_of_numbers(result: RefineResult) -> Section:
+def changes_of_numbers(result: RefineResult) -> Section:
+    """The section with the change of each number."""
     r = result.refined
     prior, after = result.prior, r.covariance
     before = dict(zip(prior.names, np.sqrt(np.diagonal(prior.matrix)), strict=True))

@@ -24,6 +24,7 @@ from tracking.statuses import PoseStatus, SpotStatus
 
 SPOT_STATUSES = tuple(SpotStatus)
 POSE_STATUSES = tuple(PoseStatus)
+REFINED = "refined"  # block of summary.json: the rig was refined by the run before it was processed
 ABSENT = -1  # the status code where the file has no row
 SUMMARY_SCHEMA = "beampose/summary/1"  # of a run's summary.json
 
@@ -301,4 +302,14 @@ class ResultFolder:
         """The run. remedy: where its folder is not there."""
         if self.run_folder is None:
             raise InputError(f"{self.folder}: its run folder {self._named} is not there; {remedy}")
-        return load_run(self.run_folder)
+        return load_run(self.run_folder, self._refined_rig)
+
+    @property
+    def _refined_rig(self) -> Path | None:
+        """The rig of the results of `run --refined`; None: that of the run. Raises InputError: it is not there."""
+        if not self.summary.get(REFINED):
+            return None
+        path = Path(str(self.summary.get("rig")))
+        if not path.is_file():
+            raise InputError(f"{path}: expected the refined rig of these results, found none; process the run again")
+        return path

@@ -181,6 +181,7 @@ def page(m: ReportData, results: Path) -> str:
         "rates": details["rates"],
         "versions": details["versions"],
         "inputs": m.summary.inputs,
+        "refined": m.summary.refined,
     }
     context["zoom_data"] = "" if zoom is None else Markup(zoom.encoded())
     return environment().get_template("report.html.j2").render(context)

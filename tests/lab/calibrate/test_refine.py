@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -298,6 +299,40 @@ def test_a_run_with_the_refined_rig_has_its_clocks_and_states_their_sigmas(late,
     assert clock["time_offset_s"] == pytest.approx(stated + LATER_S, abs=4 * clock["time_offset_sigma_s"])
     assert 0 < clock["time_offset_sigma_s"] < 1.01 * clock["time_offset_prior_sigma_s"] < 0.1 * LATER_S
     assert errors["refined"] < 0.5 * errors["given"]
+
+
+def with_clock_sigma(run: Path, folder: Path) -> Path:
+    """The run with the sigma of its right camera's offset in its rig.yaml."""
+    shutil.copytree(run, folder)
+    rig = load_rig_file(folder / "rig.yaml").rig
+    known = stated_covariance(rig, None, {"cameras.right.time_offset_s": 0.003}, folder)
+    save_rig(RigFile(rig, covariance_blocks(known)), folder / "rig.yaml")
+    content = yaml.safe_load((folder / "run.yaml").read_text())
+    (folder / "run.yaml").write_text(yaml.safe_dump({**content, "rig": "rig.yaml"}))
+    return folder
+
+
+def test_a_run_refines_its_rig_first_and_its_results_know_that_rig(late, tmp_path):
+    run = with_clock_sigma(late[1], tmp_path / "run")
+    done = typed("run", run, "--refined", "--out", tmp_path / "out", "--quiet")
+    assert done.exit_code in (0, 4), done.output
+    new = load_rig_file(tmp_path / "out-refined" / "rig.yaml").rig.cameras["right"]
+    assert new.time_offset_s == pytest.approx(LATER_S, abs=0.1 * LATER_S)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["rig"] == str(tmp_path / "out-refined" / "rig.yaml")
+    text = (tmp_path / "out" / "report.html").read_text()
+    assert "Refined rig" in text
+    assert "cameras.right.time_offset_s" in text
+    again = typed("verify", tmp_path / "out")
+    assert (again.exit_code, "SAME: " in again.output) == (0, True), again.output
+
+
+def test_a_run_whose_rig_cannot_be_refined_is_not_processed(late, tmp_path):
+    run = with_clock_sigma(recordings(tmp_path / "short", "clocks", count=1, frames=40)[0], tmp_path / "run")
+    done = typed("run", run, "--refined", "--out", tmp_path / "out", "--quiet")
+    assert done.exit_code == 3, done.output
+    assert not (tmp_path / "out").exists()
+    assert (tmp_path / "out-refined" / "report.html").exists()
 
 
 def test_a_rig_with_clocks_is_read_back_as_it_was_written(tmp_path):
