@@ -1,8 +1,9 @@
 """Rigs refined from recordings, against the true rig: `python -m bench.refine --seeds 1:41`.
 
 Each seed is a random lab (bench/random_scenes) and four recordings of points. The program is given a rig that is off by
-a draw of its stated sigmas, refines it from three recordings, and measures the fourth with the result. Printed per rig:
-RMS of the poses of the fourth recording over that with the true rig, NEES of the rig and of the poses, and the verdict.
+a draw of its stated sigmas, refines it from three recordings, and measures the fourth with the result. The offsets of
+all cameras but the first, whose instants are the recordings' own, are off as well. Printed per rig: RMS of the poses of
+the fourth recording over that with the true rig, NEES of the rig and of the poses, and the verdict.
 The projection and the errors of the rig (about each camera's own centre) share no code with the program.
 """
 
@@ -17,6 +18,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.linalg import block_diag
 
 from bench.random_scenes.draw.motions import sines
@@ -48,7 +50,7 @@ from tracking.statuses import PoseStatus
 
 POSE_NAMES = ("x_m", "y_m", "z_m", "rot_x_rad", "rot_y_rad", "rot_z_rad")
 LINE_NAMES = tuple(f"{kind}_{axis}{unit}" for kind, unit in (("direction", ""), ("point", "_m")) for axis in "xyz")
-LAB, RIG, MOTION, NUISANCE, PRIOR = range(5)
+LAB, RIG, MOTION, NUISANCE, PRIOR, CLOCKS = range(6)
 NOISE_PX = (0.03, 0.3)
 FASTEST_PX = 30.0
 
@@ -60,6 +62,7 @@ class Sigmas:
     cameras: tuple[float, float] = (5e-3, 3e-3)
     screens: tuple[float, float] = (2e-3, 1e-3)
     beams: tuple[float, float] = (1e-3, 1e-3)
+    clocks: float = 2e-3  # s
 
 
 def rig_covariance(rig: Rig, s: Sigmas) -> RigCovariance:
@@ -79,6 +82,9 @@ def rig_covariance(rig: Rig, s: Sigmas) -> RigCovariance:
         across = np.eye(3) - np.outer(b.direction, b.direction)
         names += [f"beams.{n}.{p}" for p in LINE_NAMES]
         blocks.append(block_diag(s.beams[1] ** 2 * across, s.beams[0] ** 2 * across))
+    if s.clocks:
+        names += [f"cameras.{n}.time_offset_s" for n in list(rig.cameras)[1:]]
+        blocks.append(s.clocks**2 * np.eye(len(rig.cameras) - 1))
     return RigCovariance(tuple(names), block_diag(*blocks))
 
 
@@ -93,7 +99,8 @@ def drawn_rig(rng: np.random.Generator, true: Rig, s: Sigmas, only: tuple[str, s
     for n, c in true.cameras.items():
         shift, turn = off("cameras", n, s.cameras)
         R = rotations.exp(turn) @ c.camera_from_world.rotation
-        cameras[n] = replace(c, camera_from_world=Pose(R, -R @ (_centre(c.camera_from_world) + shift)))
+        place = Pose(R, -R @ (_centre(c.camera_from_world) + shift))
+        cameras[n] = replace(c, camera_from_world=place, time_offset_s=0.0)
     for n, screen in true.screens.items():
         shift, turn = off("screens", n, s.screens)
         place = screen.world_from_screen
@@ -110,12 +117,20 @@ def _centre(camera_from_world: Pose) -> Array:
     return -camera_from_world.rotation.T @ camera_from_world.translation
 
 
-def campaign(seed: int, frames: int = 600, recordings: int = 4) -> tuple[Lab, list[Scene], str]:
-    """A lab with recordings in which all six coordinates move."""
+def with_clocks(lab: Lab, rng: np.random.Generator, sigma_s: float) -> Lab:
+    """The lab with an offset of every camera but the first."""
+    cameras = dict(lab.rig.cameras)
+    for name in list(cameras)[1:]:
+        cameras[name] = replace(cameras[name], time_offset_s=float(rng.normal() * sigma_s))
+    return replace(lab, rig=replace(lab.rig, cameras=cameras))
+
+
+def campaign(seed: int, frames: int = 600, recordings: int = 4, clocks_s: float = 0.0) -> tuple[Lab, list[Scene], str]:
+    """A lab with recordings in which all six coordinates move. clocks_s: sigma of the offsets of the clocks."""
     attempt = 0
     while True:
         key = [seed, attempt]
-        lab = draw_lab(np.random.default_rng([*key, LAB]))
+        lab = with_clocks(draw_lab(np.random.default_rng([*key, LAB])), np.random.default_rng([seed, CLOCKS]), clocks_s)
         scenes = [_scene([*key, r], seed, lab, frames) for r in range(recordings)]
         if len(lab.rig.cameras) > 1 and all(s is not None for s in scenes):
             return lab, [s for s in scenes if s is not None], lab.text
@@ -133,6 +148,11 @@ def _scene(key: list[int], seed: int, lab: Lab, frames: int) -> Scene | None:
     poses = lab.poses(q)
     uv = spot_pixels(lab.rig, poses)
     camera_of, spot_of = view_indices(lab.rig)
+    instants, curve = np.arange(frames) / rate, CubicSpline(np.arange(frames) / rate, q)
+    for c, camera in enumerate(lab.rig.cameras.values()):
+        if camera.time_offset_s:
+            late = spot_pixels(lab.rig, lab.poses(curve(instants + camera.time_offset_s)))
+            uv[:, camera_of == c] = late[:, camera_of == c]
     noise = float(np.exp(np.random.default_rng([seed, NUISANCE]).uniform(*np.log(NOISE_PX))))
     rng = np.random.default_rng([*key, NUISANCE])
     false = draw_false_points(rng, lab.rig, uv, camera_of)
@@ -141,7 +161,7 @@ def _scene(key: list[int], seed: int, lab: Lab, frames: int) -> Scene | None:
     text = f"{motion.text}; noise {noise:.2g} px; {false.text}; {hidden_text}"
     return composed(
         key, seed, lab.rig, poses, rate, np.full(len(camera_of), noise), false, hidden, has_image, motion.corners_s,
-        text, draw_prior(np.random.default_rng([*key, PRIOR]), poses[0]),
+        text, draw_prior(np.random.default_rng([*key, PRIOR]), poses[0]), uv,
     )  # fmt: skip
 
 
@@ -282,16 +302,18 @@ def described(refined: Refinement, true: Rig) -> str:
     )
 
 
-def one(seed: int, case: str, frames: int, true_labels: bool) -> str:
+def one(seed: int, case: str, frames: int, true_labels: bool, clocks_s: float) -> str:
     """A rig refined and used; a line of figures."""
-    lab, scenes, _ = campaign(seed, frames)
-    rng, s = np.random.default_rng([seed, RIG]), Sigmas()
+    s = Sigmas(clocks=clocks_s)
+    lab, scenes, _ = campaign(seed, frames, clocks_s=s.clocks)
+    rng = np.random.default_rng([seed, RIG])
     true, only = lab.rig, None
     if case == MOVED:
         parts = [(kind, n) for kind in ("cameras", "screens", "beams") for n in getattr(true, kind)]
         only = parts[rng.integers(len(parts))]
     by = MOVED_SIGMAS if case == MOVED else 1.0
-    off = Sigmas(*(tuple(by * x for x in getattr(s, kind)) for kind in ("cameras", "screens", "beams")))
+    cameras, screens, beams = ((by * length, by * angle) for length, angle in (s.cameras, s.screens, s.beams))
+    off = Sigmas(cameras, screens, beams)
     known = drawn_rig(rng, true, off, only)
     known, scenes = changed(case, known, scenes, rng)
     covariance = rig_covariance(known, s)
@@ -354,11 +376,13 @@ def main() -> None:
     parser.add_argument("--seeds", default="1:41", metavar="A:B")
     parser.add_argument("--frames", type=int, default=600)
     parser.add_argument("--case", default="all", choices=CASES)
-    parser.add_argument("--true-labels", action="store_true", help="without the tracker")
+    parser.add_argument("--true-labels", action="store_true", help="without the tracker, and without clocks")
+    parser.add_argument("--clocks", type=float, default=2e-3, metavar="SECONDS", help="sigma of the clocks' offsets")
     a = parser.parse_args()
     first, _, last = a.seeds.partition(":")
     for seed in range(int(first), int(last) if last else int(first) + 1):
-        print(f"{seed} {a.case}: {one(seed, a.case, a.frames, a.true_labels)}", flush=True)
+        clocks_s = 0.0 if a.true_labels or a.case != "all" else a.clocks
+        print(f"{seed} {a.case}: {one(seed, a.case, a.frames, a.true_labels, clocks_s)}", flush=True)
 
 
 if __name__ == "__main__":

@@ -145,9 +145,10 @@ def composed(
     corner_frames: Array,
     text: str,
     prior: PosePrior | None,
+    uv: Array | None = None,
 ) -> Scene:
-    """The points and the truth of a motion with a rig."""
-    uv = spot_pixels(rig, poses)
+    """The points and the truth of a motion with a rig. uv (T, n, 2): where pictures have instants of their own."""
+    uv = spot_pixels(rig, poses) if uv is None else uv
     camera_of, _ = view_indices(rig)
     sizes = np.array([c.image_size_px for c in rig.cameras.values()], dtype=float)
     inside = in_picture(uv, sizes[camera_of])

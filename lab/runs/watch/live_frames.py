@@ -67,8 +67,8 @@ class LiveFrames:
         if self.run.clocks:
             raise InputError(
                 f"{self.run.path}: cameras.{next(iter(self.run.clocks))}: expected no clocks of single cameras in a run"
-                " that is watched; take out time_offset_s, row_time_s and timestamps, and process the recording with"
-                " `beampose run` when it is complete"
+                " that is watched; take out time_offset_s, row_time_s (also of rig.yaml) and timestamps, or process the"
+                " recording with `beampose run` when it is complete"
             )
         self._cameras = {name: self._camera(name) for name in self.run.cameras}
 
