@@ -5,21 +5,29 @@ python -m bench.related_measurements.second_checks empty SEED COUNT         100 
 python -m bench.related_measurements.second_checks edges SEED COUNT         thin rims: which edge is tracked
 python -m bench.related_measurements.second_checks consistency SEED COUNT   errors of centres against their sigmas
 python -m bench.related_measurements.second_checks approaches SEED COUNT    approaching drogues, by the light tracker
+python -m bench.related_measurements.second_checks detector SEED COUNT      COUNT drogues and empty pictures per scene
 """
 
 from __future__ import annotations
 
+import os
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
+import cv2
 import numpy as np
 
 from bench.related_measurements import second_renderer as render
+from bench.related_measurements.learned_detector import is_right
 from geometry.arrays import Array
 from lab.targets.circle import CircleOptions
 from lab.targets.drogue import DrogueOptions
+from studies.learned_detector.samples import Sample
 from tracking.drogue_circle.detectors import Edge, Picture
+from tracking.learned_detector.detector import WEIGHTS, find_drogues
 from tracking.statuses import Cause, PoseStatus
 
 _CLEAR, _HELD = 30, 20  # frames before a probe comes, and after it has arrived
@@ -211,6 +219,38 @@ def approaches(seed: int, count: int) -> None:
         )
 
 
+def detector(seed: int, count: int) -> None:
+    """The learned detector at a confidence of .5; half of the drogues have 9 to 15 px, the others 15 to 200."""
+    cv2.setNumThreads(1)
+    weights, spent, n = Path(os.environ.get("WEIGHTS", WEIGHTS)), 0.0, 0
+    for kind in render.BACKGROUNDS:
+        hits: dict[bool, list[bool]] = {True: [], False: []}
+        false, ratios, away = [0, 0], [], []
+        for k in range(2 * count):
+            rng = np.random.default_rng([seed, k])
+            scene, look = render.background(kind, rng), render.face("drogue", rng, hose=True)
+            small, shown = k % 4 < 2, k % 2 == 0
+            diameter = float(np.exp(rng.uniform(*np.log((9, 15) if small else (15, 200)))))
+            u, v = (rng.uniform(0.6 * diameter, side - 0.6 * diameter) for side in render.SIZE)
+            picture = render.draw(scene, look if shown else None, u, v, diameter / 2, rng)
+            start = time.process_time()
+            found = find_drogues(picture, 9.0, 200.0, 0.5, weights)
+            spent, n = spent + time.process_time() - start, n + 1
+            right = [c for c in found if shown and is_right(Sample(picture, (u, v), diameter), c)]
+            false[shown] += len(found) - len(right[:1])
+            if shown:
+                hits[small].append(bool(right))
+            ratios += [c.diameter_px / diameter for c in right[:1]]
+            away += [np.hypot(c.u_px - u, c.v_px - v) / diameter for c in right[:1]]
+        print(
+            f"{kind}: recall {np.mean(hits[True] + hits[False]):.3f}, at 9 to 15 px {np.mean(hits[True]):.3f}; diameter"
+            f" {100 * (np.median(ratios) - 1):+.1f} % in the median; centre, RMS"
+            f" {100 * np.sqrt(np.mean(np.square(away))):.1f} % of the diameter; false per empty picture"
+            f" {false[0] / count:.3f}, per picture of a drogue {false[1] / count:.3f}"
+        )
+    print(f"{1e3 * spent / n:.0f} ms of process time per picture")
+
+
 if __name__ == "__main__":
     what, *rest = sys.argv[1:] or [""]
     checks = {
@@ -219,6 +259,7 @@ if __name__ == "__main__":
         "edges": edges,
         "approaches": approaches,
         "consistency": consistency,
+        "detector": detector,
     }
     if what in checks and len(rest) == 2:
         checks[what](int(rest[0]), int(rest[1]))

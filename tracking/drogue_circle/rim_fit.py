@@ -21,6 +21,10 @@ _OBLIQUE = 0.6  # largest tangential slope, as a share of the radial one: the ed
 _MOST_BLUR = 1.2  # of the half width of the rays: a wider edge has no known height
 _LEAST_SHARE = 0.25  # of the median slope of the rim: weaker maxima are not the rim
 _LEAST_SLOPE = 3.0  # standard deviations of the slope's noise
+# Where the grey values beside an edge are compared: distance from the rays' end, in radii and at most px; and half of
+# the length of rim over which their slopes are averaged, px.
+_BESIDE, _BESIDE_PX, _ALONG_PX = 0.3, 3.0, 2.0
+_LEAST_COMMON_PX = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +55,7 @@ class RimPoints:
     inside: Bools  # (n,) the ray lies inside the picture
     spacing_px: float  # between neighbouring rays at the rim
     shift_px: float = 0.0  # by which the radii are corrected for blur
+    common_px: float = 0.0  # shift of all edges by a slope inside the target, whose size is not known; 0: none
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,14 +130,38 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
     height_dn = polarity * (values[:, -1] - values[:, 0])[good]
     sigma = _edge_width(height_dn / strength[good], float(offset[-1]), crop.blur_px) if good.any() else crop.blur_px
     shift = sigma**2 / (2 * max(rim.radius_px, 1.0))
-    radius += shift
-    radius = np.where(good, radius, np.nan)
+    radius = np.where(good, radius + shift, np.nan)
     strength = np.where(good, strength, np.nan)
+    away, common = _beside(crop, rim, theta, values, half_px, polarity)
+    radius -= sigma / np.sqrt(2 * np.pi) * away / strength
+    common = abs(sigma / np.sqrt(2 * np.pi) * common / median(strength[good])) if good.any() else 0.0
+    common = common if common > _LEAST_COMMON_PX else 0.0
     if hidden is None:
-        return RimPoints(theta, radius, strength, radius, inside, spacing, shift)
+        return RimPoints(theta, radius, strength, radius, inside, spacing, shift, common)
     own = ~hidden[(rows * len(hidden)) // n]
     seen = np.where(own, radius, np.nan)
-    return RimPoints(theta, seen, np.where(own, strength, np.nan), radius, inside, spacing, shift)
+    return RimPoints(theta, seen, np.where(own, strength, np.nan), radius, inside, spacing, shift, common)
+
+
+def _beside(
+    crop: SmoothCrop, rim: Rim, theta: Array, values: NDArray[np.float32], half_px: float, polarity: int
+) -> tuple[Array, float]:
+    """Slope outside the rays' ends less that inside (n,), DN/px, of which the mean slope inside is left out and returned.
+
+    A step of height A between slopes a and b, blurred by sigma, is steepest at (b - a) sigma^2 / A from the step:
+    before clouds that moves a side of the rim. The mean slope inside may be that of another edge, which is nearer.
+    values: along the rays, up to half a step beyond half_px.
+    """
+    length = min(_BESIDE_PX, _BESIDE * rim.radius_px)
+    ends = rim.radius_at(theta)[:, None] + (half_px + _STEP_PX + length) * np.array([-1.0, 1.0])
+    x = (rim.u_px - crop.left + ends * np.cos(theta)[:, None]).astype(np.float32)
+    y = (rim.v_px - crop.top + ends * np.sin(theta)[:, None]).astype(np.float32)
+    far = cv2.remap(crop.values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    inner, outer = polarity / length * (values[:, 0] - far[:, 0]), polarity / length * (far[:, 1] - values[:, -1])
+    common = float(np.mean(inner))
+    wide = 2 * round(_ALONG_PX * len(theta) / (2 * np.pi * max(rim.radius_px, 1.0))) + 1
+    away = np.tile(outer - inner + common, 3).astype(np.float32)[None]
+    return cv2.blur(away, (wide, 1))[0, len(theta) : 2 * len(theta)].astype(float), common
 
 
 def _edge_width(ratios_px: Array, half_px: float, least_px: float) -> float:
@@ -237,10 +266,24 @@ def _is_near(rim: Rim, coarse: CircleCandidate) -> bool:
     return moved < max(6.0, 0.3 * coarse.radius_px) and abs(rim.radius_px / coarse.radius_px - 1) < 0.35
 
 
-def _design(theta: Array, oblique: bool) -> Array:
-    """Derivatives (n, 3 or 5) of the distance of a rim along the rays by u, v, radius, cos2 and sin2."""
+def _design(points: RimPoints, oblique: bool) -> Array:
+    """Derivatives (n, 3 to 6) of the edges along the rays by u, v, radius, cos2 and sin2, and by the common shift.
+
+    A common slope inside the target moves an edge by the inverse of its own height, more than the mean radius.
+    """
+    theta, slope = points.theta, points.slope
     columns = [np.cos(theta), np.sin(theta), np.ones_like(theta)]
-    return np.stack(columns + ([np.cos(2 * theta), np.sin(2 * theta)] if oblique else []), axis=-1)
+    columns += [np.cos(2 * theta), np.sin(2 * theta)] if oblique else []
+    columns += [np.nanmean(slope) / slope - 1] if points.common_px else []
+    return np.stack(columns, axis=-1)
+
+
+def _prior(points: RimPoints, sigma_px: float, count: int) -> Array:
+    """What is known before the fit (count, count), over points of sigma_px: the common shift is about as large as stated."""
+    out = np.zeros((count, count))
+    if points.common_px:
+        out[-1, -1] = (sigma_px / points.common_px) ** 2
+    return out
 
 
 def _solve(rim: Rim, points: RimPoints, least_scale_px: float, oblique: bool) -> tuple[Rim, Array] | None:
@@ -250,13 +293,14 @@ def _solve(rim: Rim, points: RimPoints, least_scale_px: float, oblique: bool) ->
     and the second-order term, the square of the tangential shift over twice the radius, is subtracted.
     """
     found = np.flatnonzero(np.isfinite(points.radius_px))
-    A = _design(points.theta[found], oblique)
+    A = _design(points, oblique)[found]
     count = A.shape[1]
     if len(found) < 3 * count:
         return None
     cosine, sine = A[:, 0], A[:, 1]
     observed = points.radius_px[found]
-    start = np.array([0.0, 0.0, rim.radius_px, rim.cos2_px, rim.sin2_px])[:count]
+    start = np.array([0.0, 0.0, rim.radius_px, rim.cos2_px, rim.sin2_px])[: 5 if oblique else 3]
+    start = np.append(start, np.zeros(count - len(start)))
     if not oblique:  # a robust start: median radius
         start[2] = rim.radius_px + float(np.clip(np.median(observed - rim.radius_px), -2.0, 2.0))
     x, weight = start, np.ones(len(found))
@@ -265,11 +309,12 @@ def _solve(rim: Rim, points: RimPoints, least_scale_px: float, oblique: bool) ->
         residual = observed - A @ x + bend
         scale = max(1.4826 * median(np.abs(residual)), least_scale_px / _TUKEY, _LEAST_SIGMA_PX)
         weight = np.maximum(1 - (residual / (_TUKEY * scale)) ** 2, 0.0) ** 2
-        normal = (A * weight[:, None]).T @ A
+        prior = _prior(points, scale, count)
+        normal = (A * weight[:, None]).T @ A + prior
         # The columns have entries of the size of 1: a small determinant means an arc too short for the parameters.
         if np.linalg.det(normal) < _LEAST_DETERMINANT * max(float(weight.sum()), 1e-9) ** count:
             return None
-        step = np.linalg.solve(normal, A.T @ (weight * residual))
+        step = np.linalg.solve(normal, A.T @ (weight * residual) - prior @ x)
         x = x + step
         if np.abs(step).max() < (1e-3 if least_scale_px == 0 else 0.03):
             break
@@ -277,7 +322,7 @@ def _solve(rim: Rim, points: RimPoints, least_scale_px: float, oblique: bool) ->
         return None
     full = np.zeros(len(points.theta))
     full[found] = weight
-    return Rim(rim.u_px + float(x[0]), rim.v_px + float(x[1]), *map(float, x[2:])), full
+    return Rim(rim.u_px + float(x[0]), rim.v_px + float(x[1]), *map(float, x[2 : 5 if oblique else 3])), full
 
 
 def _oblique_fit(
@@ -332,14 +377,16 @@ def _described(
     if coverage < min_coverage:
         return None
     oblique = bool(rim.cos2_px or rim.sin2_px)
-    A = _design(points.theta[good], oblique)
+    A = _design(points, oblique)[good]
     count = A.shape[1]
     away = _residuals(rim, points)
-    residual = away[good] - A @ np.linalg.lstsq(A, away[good], rcond=None)[0]
+    prior = _prior(points, float(np.std(away[good])), count)
+    away[good] -= A @ np.linalg.solve(A.T @ A + prior, A.T @ away[good])
+    residual = away[good]
     correlated = _correlation_length(away, good, points.spacing_px)
     independent = max(len(residual) / correlated, count + 3.0)
     variance = max(float(np.mean(residual**2)), _LEAST_SIGMA_PX**2) * independent / (independent - count)
-    covariance = variance * correlated * np.linalg.inv(A.T @ A)
+    covariance = variance * correlated * np.linalg.inv(A.T @ A + prior)
     covariance = symmetric(covariance[:3, :3]) + _MODEL_SIGMA_PX**2 * np.eye(3)
     covariance[2, 2] += (_BLUR_SIGMA * points.shift_px) ** 2
     rms = float(np.sqrt(np.mean(residual**2)))
