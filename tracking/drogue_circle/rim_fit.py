@@ -21,10 +21,12 @@ _OBLIQUE = 0.6  # largest tangential slope, as a share of the radial one: the ed
 _MOST_BLUR = 1.2  # of the half width of the rays: a wider edge has no known height
 _LEAST_SHARE = 0.25  # of the median slope of the rim: weaker maxima are not the rim
 _LEAST_SLOPE = 3.0  # standard deviations of the slope's noise
-# Where the grey values beside an edge are compared: distance from the rays' end, in radii and at most px; and half of
-# the length of rim over which their slopes are averaged, px.
-_BESIDE, _BESIDE_PX, _ALONG_PX = 0.3, 3.0, 2.0
-_LEAST_COMMON_PX = 0.03
+# Slopes beside the rim: over so many radii, at most so many px, from the rays' ends; averaged over so much of the rim.
+_BESIDE, _BESIDE_PX, _ALONG_PX = 0.3, 3.0, 5.0
+# Shares of the median slope of the rim: where a side is steeper in the mean, or a part of it, that is another edge.
+_ANOTHER, _ANOTHER_PART = 0.1, 0.3
+_LEAST_COMMON_PX = 0.03  # a smaller common shift of all edges is not fitted
+CORRELATED_PX = 3.5  # length of rim over which the filter's noise is correlated
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,10 +134,16 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
     shift = sigma**2 / (2 * max(rim.radius_px, 1.0))
     radius = np.where(good, radius + shift, np.nan)
     strength = np.where(good, strength, np.nan)
-    away, common = _beside(crop, rim, theta, values, half_px, polarity)
-    radius -= sigma / np.sqrt(2 * np.pi) * away / strength
-    common = abs(sigma / np.sqrt(2 * np.pi) * common / median(strength[good])) if good.any() else 0.0
-    common = common if common > _LEAST_COMMON_PX else 0.0
+    common = 0.0
+    if good.any() and half_px == _PASSES[-1][0]:  # the passes before need no such precision
+        height = np.sqrt(2 * np.pi) * sigma * strength
+        tail = 0.5 * median(height[good]) * (1 - erf(float(offset[-1]) / (np.sqrt(2) * sigma)))
+        away, inner = _beside(
+            crop, rim, theta, polarity, polarity * values[:, [0, -1]], tail, good, median(strength[good])
+        )
+        radius -= sigma**2 * away / height
+        common = abs(sigma**2 * inner / median(height[good]))
+        common = common if common > _LEAST_COMMON_PX else 0.0
     if hidden is None:
         return RimPoints(theta, radius, strength, radius, inside, spacing, shift, common)
     own = ~hidden[(rows * len(hidden)) // n]
@@ -144,24 +152,39 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
 
 
 def _beside(
-    crop: SmoothCrop, rim: Rim, theta: Array, values: NDArray[np.float32], half_px: float, polarity: int
+    crop: SmoothCrop,
+    rim: Rim,
+    theta: Array,
+    polarity: int,
+    ends_dn: Array,
+    tail_dn: float,
+    good: Bools,
+    slope_dn: float,
 ) -> tuple[Array, float]:
-    """Slope outside the rays' ends less that inside (n,), DN/px, of which the mean slope inside is left out and returned.
+    """Slope outside the rays less that inside (n,), DN/px, each as a difference to its mean; and the mean one inside.
 
     A step of height A between slopes a and b, blurred by sigma, is steepest at (b - a) sigma^2 / A from the step:
-    before clouds that moves a side of the rim. The mean slope inside may be that of another edge, which is nearer.
-    values: along the rays, up to half a step beyond half_px.
+    before clouds that moves a side of the rim. Source: ours; the derivative of the blurred profile is zero there.
+    ends_dn: (n, 2) grey values at the rays' inner and outer end, half a step beyond the last pass's half width;
+    tail_dn: what the blurred step still rises there; slope_dn: median slope of the rim.
     """
     length = min(_BESIDE_PX, _BESIDE * rim.radius_px)
-    ends = rim.radius_at(theta)[:, None] + (half_px + _STEP_PX + length) * np.array([-1.0, 1.0])
-    x = (rim.u_px - crop.left + ends * np.cos(theta)[:, None]).astype(np.float32)
-    y = (rim.v_px - crop.top + ends * np.sin(theta)[:, None]).astype(np.float32)
-    far = cv2.remap(crop.values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    inner, outer = polarity / length * (values[:, 0] - far[:, 0]), polarity / length * (far[:, 1] - values[:, -1])
-    common = float(np.mean(inner))
-    wide = 2 * round(_ALONG_PX * len(theta) / (2 * np.pi * max(rim.radius_px, 1.0))) + 1
-    away = np.tile(outer - inner + common, 3).astype(np.float32)[None]
-    return cv2.blur(away, (wide, 1))[0, len(theta) : 2 * len(theta)].astype(float), common
+    distance = rim.radius_at(theta)[:, None] + (_PASSES[-1][0] + _STEP_PX + length) * np.array([-1.0, 1.0])
+    x = (rim.u_px - crop.left + distance * np.cos(theta)[:, None]).astype(np.float32)
+    y = (rim.v_px - crop.top + distance * np.sin(theta)[:, None]).astype(np.float32)
+    far = polarity * cv2.remap(crop.values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    slopes = (np.stack([ends_dn[:, 0] - far[:, 0], far[:, 1] - ends_dn[:, 1]], axis=1) - tail_dn) / length
+    wide = 2 * round(_ALONG_PX * len(theta) / (4 * np.pi * max(rim.radius_px, 1.0))) + 1
+    means = np.mean(slopes[good], axis=0)
+    edge = np.abs(slopes - means) > _ANOTHER_PART * slope_dn
+    around = np.tile(np.concatenate([slopes - means, edge], axis=1), (3, 1)).astype(np.float32)
+    mean = cv2.blur(around, (1, wide))[len(theta) : 2 * len(theta)]
+    away = np.where((np.abs(means) > _ANOTHER * slope_dn) | (mean[:, 2:] > 0), 0.0, mean[:, :2])
+    noise = 2 * (crop.noise_dn / length) ** 2 * min(CORRELATED_PX / _ALONG_PX, 1.0)
+    away *= np.maximum(
+        1 - 0.455 * noise / np.maximum(np.median(away[good] ** 2, axis=0), 1e-12), 0.0
+    )  # a Wiener filter
+    return away[:, 1] - away[:, 0], float(means[0])
 
 
 def _edge_width(ratios_px: Array, half_px: float, least_px: float) -> float:
@@ -365,7 +388,7 @@ def _residuals(rim: Rim, points: RimPoints) -> Array:
 
 
 def _independent(points: RimPoints, weight: Array) -> float:
-    return float(np.count_nonzero(weight)) / max(3.5 / max(points.spacing_px, 0.3), 1.0)
+    return float(np.count_nonzero(weight)) / max(CORRELATED_PX / max(points.spacing_px, 0.3), 1.0)
 
 
 def _described(

@@ -13,6 +13,7 @@ from geometry.arrays import Array, Bools
 from tracking.drogue_circle.detectors import CircleCandidate, CircleDetector, CircleParameters, Edge, Picture, Window
 from tracking.drogue_circle.kalman import FilterBank, motion_models
 from tracking.drogue_circle.rim_fit import (
+    CORRELATED_PX,
     Appearance,
     CircleFrame,
     RimFit,
@@ -31,7 +32,6 @@ _MOST_FITTED = 24  # of the whole picture
 _SAME_CENTRE = 0.6  # distance of two centres, as a share of the larger radius, below which they are one target
 _RIM_SHARE = 0.92  # score of the outermost circle of a target, as a share of the best one's, that makes it the rim
 _LEAST_POINTS = 12  # independent edge points: texture often gives a short arc of a small circle
-_CORRELATED_PX = 3.5  # length of rim that counts as one point, see `rim_fit`
 # Residuals of the rim points, RMS: share of the radius, and px. Of plain and ribbed discs they are .10 to .16 px, of
 # textured ones of 27 px .3 px, of the round outlines of clouds, fields and waves .5 to .8 px at 9 to 19 px. Crowns of
 # trees and shreds of cloud of 8 to 10 px have .03 to .037 of the seen radius (times the coverage), targets of 8 to
@@ -204,7 +204,7 @@ def is_certain(fit: RimFit, largest_rms: tuple[float, float, float] = _LARGEST_R
     (share, px, seen_share), radius = largest_rms, fit.rim.radius_px
     seen_px = fit.coverage * radius
     largest = min(share * radius + px, seen_share * seen_px)
-    return bool(2 * np.pi * seen_px / _CORRELATED_PX >= _LEAST_POINTS and fit.rms_px <= largest)
+    return bool(2 * np.pi * seen_px / CORRELATED_PX >= _LEAST_POINTS and fit.rms_px <= largest)
 
 
 def _may_be(c: CircleCandidate, wanted: Wanted) -> bool:
