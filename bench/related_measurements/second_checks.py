@@ -5,12 +5,11 @@ python -m bench.related_measurements.second_checks empty SEED COUNT         100 
 python -m bench.related_measurements.second_checks edges SEED COUNT         thin rims: which edge is tracked
 python -m bench.related_measurements.second_checks consistency SEED COUNT   errors of centres against their sigmas
 python -m bench.related_measurements.second_checks approaches SEED COUNT    approaching drogues, by the light tracker
-python -m bench.related_measurements.second_checks detector SEED COUNT      COUNT drogues and empty pictures per scene
+python -m bench.related_measurements.second_checks detector SEED COUNT [WEIGHTS]  COUNT drogues of each scene
 """
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Iterator
@@ -219,10 +218,10 @@ def approaches(seed: int, count: int) -> None:
         )
 
 
-def detector(seed: int, count: int) -> None:
+def detector(seed: int, count: int, weights: Path = WEIGHTS) -> None:
     """The learned detector at a confidence of .5; half of the drogues have 9 to 15 px, the others 15 to 200."""
     cv2.setNumThreads(1)
-    weights, spent, n = Path(os.environ.get("WEIGHTS", WEIGHTS)), 0.0, 0
+    spent, n = 0.0, 0
     for kind in render.BACKGROUNDS:
         hits: dict[bool, list[bool]] = {True: [], False: []}
         false, ratios, away = [0, 0], [], []
@@ -263,5 +262,7 @@ if __name__ == "__main__":
     }
     if what in checks and len(rest) == 2:
         checks[what](int(rest[0]), int(rest[1]))
+    elif what == "detector" and len(rest) == 3:
+        detector(int(rest[0]), int(rest[1]), Path(rest[2]))
     else:
         sys.exit(__doc__)

@@ -16,26 +16,25 @@ from geometry.pose import Pose
 from studies.drogue.render import fractal_noise, render_drogue
 from studies.drogue.scene import PICTURE, DrogueBackground, DrogueLight, DrogueLook, DrogueScene, Floats32, Occluder
 
-# Structured backgrounds of training: roads, arcs, letters, ridges and land.
+# Structured backgrounds of training: roads, arcs, letters and ridges.
 #
-# They teach the network that sharp man-made patterns, houses and round trees are no drogue. None of them is of the kinds of the test (stripes,
+# They teach the network that sharp man-made patterns are no drogue. None of them is of the kinds of the test (stripes,
 # checks, blobs, walls of polygons; samples.py).
 
-ROADS, ARCS, LETTERS, RIDGES, LAND = "roads", "arcs", "letters", "ridges", "land"
-KINDS = (ROADS, ARCS, LETTERS, RIDGES, LAND)
-_SHARES = (0.15, 0.15, 0.15, 0.15, 0.4)
+ROADS, ARCS, LETTERS, RIDGES = "roads", "arcs", "letters", "ridges"
+KINDS = (ROADS, ARCS, LETTERS, RIDGES)
 _FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_TRIPLEX, cv2.FONT_HERSHEY_SCRIPT_SIMPLEX)
 _LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789&%#?"
 
 
 def structured_picture(rng: np.random.Generator, size_px: tuple[int, int]) -> NDArray[np.uint8]:
     """A random picture (h, w, 3) of one of KINDS under an uneven light; size_px: width, height."""
-    kind = str(rng.choice(KINDS, p=_SHARES))
-    draw = {ROADS: _roads, ARCS: _arcs, LETTERS: _letters, RIDGES: _ridges, LAND: _land}[kind]
+    kind = KINDS[int(rng.integers(len(KINDS)))]
+    draw = {ROADS: _roads, ARCS: _arcs, LETTERS: _letters, RIDGES: _ridges}[kind]
     field = cv2.GaussianBlur(draw(rng, size_px), (0, 0), float(rng.uniform(0.4, 2.0)))
     uneven = 12 * fractal_noise(rng, size_px, 3, 1.0)
     fine = rng.uniform(0, 12) * fractal_noise(rng, size_px, 12, float(rng.uniform(0.2, 0.8)))
-    level = rng.uniform(50, 190) + rng.uniform(5, 80 if kind == LAND else 55) * field + uneven + fine
+    level = rng.uniform(50, 190) + rng.uniform(5, 55) * field + uneven + fine
     grey = np.clip(level, 0, 255).astype(np.uint8)
     return np.asarray(cv2.merge([grey, grey, grey]), dtype=np.uint8)
 
@@ -90,66 +89,17 @@ def _ridges(rng: np.random.Generator, size_px: tuple[int, int]) -> Floats32:
     return np.asarray((sharp - sharp.mean()) * np.float32(rng.choice([-2.0, 2.0])), np.float32)
 
 
-def _land(rng: np.random.Generator, size_px: tuple[int, int]) -> Floats32:
-    """Land from above: fields with rows, roads between them, houses with two roofs, trees, and the shadows of both."""
-    size, unit = np.array(size_px), float(np.exp(rng.uniform(np.log(0.6), np.log(3.0))))  # px of a metre or so
-    v, u = np.mgrid[: size_px[1], : size_px[0]].astype(np.float32)
-    number = np.zeros(u.shape, np.int64)
-    turns, roads = rng.uniform(0, np.pi) + rng.normal(0, 0.4, 2), []
-    for k in range(int(rng.integers(2, 12))):  # every straight boundary divides the fields that it crosses
-        at, turn = rng.uniform(0, 1, 2) * size, turns[k % 2] + rng.normal(0, 0.15) + k % 2 * np.pi / 2
-        along = size.max() * np.array([-np.sin(turn), np.cos(turn)])
-        number = 2 * number + ((u - at[0]) * np.cos(turn) + (v - at[1]) * np.sin(turn) > 0)
-        roads.append((at - along, at + along))
-    fields, of = np.unique(number, return_inverse=True)
-    rows = np.sin((u * np.cos(turns[0]) + v * np.sin(turns[0])) * np.float32(rng.uniform(0.5, 2) / unit))
-    ploughed = rng.uniform(-1, 1, len(fields)).clip(0) * rng.uniform(0, 0.3)
-    levels = rng.uniform(-1, 1, len(fields))
-    of = of.reshape(u.shape)
-    field = np.asarray(levels[of] + ploughed[of] * rows, np.float32)
-    for a, b in roads:
-        if rng.random() < 0.5:
-            thick = max(round(unit * rng.uniform(1, 6)), 1)
-            cv2.line(field, a.astype(int).tolist(), b.astype(int).tolist(), _level(rng), thick, cv2.LINE_AA)
-    shadow = unit * rng.uniform(0.5, 3) * rng.normal(size=2)
-    for at in rng.uniform(0, 1, (int(rng.integers(0, 120)), 2)) * size:
-        if rng.random() < 0.5:
-            _tree(field, at, unit * float(rng.uniform(1.5, 9)), shadow, rng)
-        else:
-            _house(field, at, unit * rng.uniform(3, 20, 2), turns[0] + rng.normal(0, 0.3), shadow, rng)
-    return field
-
-
-def _house(field: Floats32, at: Array, sides: Array, turn: float, shadow: Array, rng: np.random.Generator) -> None:
-    """Draw a rectangle whose halves have different levels, and its shadow."""
-    x = sides[0] / 2 * np.array([np.cos(turn), np.sin(turn)])
-    y = sides[1] / 2 * np.array([-np.sin(turn), np.cos(turn)])
-    level = _level(rng)
-    halves = ((shadow, -1, 1, -1.2), (0, -1, 1, level), (0, 0, 1, level + rng.normal(0, 0.3)))
-    for move, low, high, grey in halves:
-        corners = at + move + np.array([low * x - y, high * x - y, high * x + y, low * x + y])
-        cv2.fillConvexPoly(field, corners.round().astype(np.int32), float(grey), cv2.LINE_AA)
-
-
-def _tree(field: Floats32, at: Array, radius: float, shadow: Array, rng: np.random.Generator) -> None:
-    """Draw a nearly round crown, brighter on the side of the light, and its shadow."""
-    level, axes = float(rng.uniform(-1, 0.5)), np.maximum((radius * rng.uniform(0.8, 1.1, 2)).round(), 1).astype(int)
-    light = 0.35 * radius * shadow / max(float(np.linalg.norm(shadow)), 1e-9)
-    for move, size, grey in ((shadow, axes, -1.2), (0, axes, level), (-light, (axes + 1) // 2, level + 0.3)):
-        centre = (at + move).round().astype(int).tolist()
-        cv2.ellipse(field, centre, np.asarray(size).tolist(), 0, 0, 360, float(grey), -1, cv2.LINE_AA)
-
-
 # Rendered pictures of drogues with everything drawn at random, for training, validation and test.
 #
-# Training and validation have the backgrounds sky, clouds and ground, and the structured ones above; the test has backgrounds of its own kind, made of stripes, checks, blobs and walls of random
+# Training and validation have the backgrounds sky, clouds and ground, and roads, arcs, letters and ridges
+# (structured.py); the test has backgrounds of its own kind, made of stripes, checks, blobs and walls of random
 # polygons, which no training picture shows.
 
 
 Grey = NDArray[np.uint8]
 
 EMPTY_SHARE = 0.3  # of the samples that show no drogue
-STRUCTURED_SHARE = 0.65  # of the backgrounds of training
+STRUCTURED_SHARE = 0.5  # of the backgrounds of training
 RADIUS_M = 0.3
 
 
@@ -210,20 +160,15 @@ def _scene(
     towards /= np.linalg.norm(towards)
     ambient = rng.uniform(0.25, 0.75)
     light = DrogueLight((float(towards[0]), float(towards[1]), float(towards[2])), ambient, float(1 - ambient))
-    canopy, ribs, lining, coupling = rng.uniform((79, 60, 10, 60), (228, 200, 80, 500)).tolist()
+    shade = rng.uniform(0.35, 1.0)
     look = DrogueLook(
-        canopy_bgr=(canopy,) * 3,
-        rib_bgr=(ribs,) * 3,
-        lining_bgr=(lining,) * 3,
-        coupling_bgr=(coupling,) * 3,
-        hose_length=float(rng.uniform(0, 40)),
-        hose_radius=float(rng.uniform(0.04, 0.14)),
-        canopy_inner=float(rng.uniform(0.62, 0.9)),
+        canopy_bgr=(225 * shade, 228 * shade, 230 * shade),
+        canopy_inner=float(rng.uniform(0.72, 0.88)),
         gore_contrast=float(rng.uniform(0.0, 0.3)),
         ribs=int(rng.integers(10, 25)),
         rib_share=float(rng.uniform(0.25, 0.55)),
         depth=float(rng.uniform(0.6, 1.2)),
-        rear=float(rng.uniform(0.2, 0.5)),
+        rear=float(rng.uniform(0.2, 0.45)),
     )
     blur = float(rng.uniform(0.4, 1.0) + (rng.random() < 0.3) * rng.uniform(0, 0.05) * diameter)
     motion = rng.normal(0, 0.04 * diameter, 2)

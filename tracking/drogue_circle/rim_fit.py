@@ -138,9 +138,8 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
     if good.any() and half_px == _PASSES[-1][0]:  # the passes before need no such precision
         height = np.sqrt(2 * np.pi) * sigma * strength
         tail = 0.5 * median(height[good]) * (1 - erf(float(offset[-1]) / (np.sqrt(2) * sigma)))
-        away, inner = _beside(
-            crop, rim, theta, polarity, polarity * values[:, [0, -1]], tail, good, median(strength[good])
-        )
+        ends = polarity * values[:, [0, -1]] + [-tail, tail]  # without what the blurred step still rises there
+        away, inner = _beside(crop, rim, theta, polarity, ends, np.where(good, strength, np.nan))
         radius -= sigma**2 * away / height
         common = abs(sigma**2 * inner / median(height[good]))
         common = common if common > _LEAST_COMMON_PX else 0.0
@@ -152,38 +151,32 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
 
 
 def _beside(
-    crop: SmoothCrop,
-    rim: Rim,
-    theta: Array,
-    polarity: int,
-    ends_dn: Array,
-    tail_dn: float,
-    good: Bools,
-    slope_dn: float,
+    crop: SmoothCrop, rim: Rim, theta: Array, polarity: int, ends_dn: Array, slope: Array
 ) -> tuple[Array, float]:
     """Slope outside the rays less that inside (n,), DN/px, each as a difference to its mean; and the mean one inside.
 
     A step of height A between slopes a and b, blurred by sigma, is steepest at (b - a) sigma^2 / A from the step:
     before clouds that moves a side of the rim. Source: ours; the derivative of the blurred profile is zero there.
-    ends_dn: (n, 2) grey values at the rays' inner and outer end, half a step beyond the last pass's half width;
-    tail_dn: what the blurred step still rises there; slope_dn: median slope of the rim.
+    ends_dn: (n, 2) grey values at the rays' inner and outer end, half a step beyond the last pass's half width.
+    slope: (n,) DN/px, of the edges; nan without one.
     """
+    good = np.isfinite(slope)
+    steep = median(slope[good])
     length = min(_BESIDE_PX, _BESIDE * rim.radius_px)
     distance = rim.radius_at(theta)[:, None] + (_PASSES[-1][0] + _STEP_PX + length) * np.array([-1.0, 1.0])
     x = (rim.u_px - crop.left + distance * np.cos(theta)[:, None]).astype(np.float32)
     y = (rim.v_px - crop.top + distance * np.sin(theta)[:, None]).astype(np.float32)
     far = polarity * cv2.remap(crop.values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    slopes = (np.stack([ends_dn[:, 0] - far[:, 0], far[:, 1] - ends_dn[:, 1]], axis=1) - tail_dn) / length
+    slopes = (ends_dn - far) * [1.0, -1.0] / length
     wide = 2 * round(_ALONG_PX * len(theta) / (4 * np.pi * max(rim.radius_px, 1.0))) + 1
     means = np.mean(slopes[good], axis=0)
-    edge = np.abs(slopes - means) > _ANOTHER_PART * slope_dn
+    edge = np.abs(slopes - means) > _ANOTHER_PART * steep
     around = np.tile(np.concatenate([slopes - means, edge], axis=1), (3, 1)).astype(np.float32)
     mean = cv2.blur(around, (1, wide))[len(theta) : 2 * len(theta)]
-    away = np.where((np.abs(means) > _ANOTHER * slope_dn) | (mean[:, 2:] > 0), 0.0, mean[:, :2])
-    noise = 2 * (crop.noise_dn / length) ** 2 * min(CORRELATED_PX / _ALONG_PX, 1.0)
-    away *= np.maximum(
-        1 - 0.455 * noise / np.maximum(np.median(away[good] ** 2, axis=0), 1e-12), 0.0
-    )  # a Wiener filter
+    away = np.where((np.abs(means) > _ANOTHER * steep) | (mean[:, 2:] > 0), 0.0, mean[:, :2])
+    # A Wiener filter: what is mostly noise is left out. The median of a squared normal error is .455 of its variance.
+    noise = 0.455 * 2 * (crop.noise_dn / length) ** 2 * min(CORRELATED_PX / _ALONG_PX, 1.0)
+    away *= np.maximum(1 - noise / np.maximum(np.median(away[good] ** 2, axis=0), 1e-12), 0.0)
     return away[:, 1] - away[:, 0], float(means[0])
 
 
@@ -302,7 +295,7 @@ def _design(points: RimPoints, oblique: bool) -> Array:
 
 
 def _prior(points: RimPoints, sigma_px: float, count: int) -> Array:
-    """What is known before the fit (count, count), over points of sigma_px: the common shift is about as large as stated."""
+    """Information (count, count) before the fit, over that of a point of sigma_px: the size of the common shift."""
     out = np.zeros((count, count))
     if points.common_px:
         out[-1, -1] = (sigma_px / points.common_px) ** 2

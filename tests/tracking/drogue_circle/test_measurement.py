@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.stats import norm
 
-from tests.tracking.drogue_circle.discs import covered, discs, rounded
+from tests.tracking.drogue_circle.discs import BLUR_PX, covered, discs, rounded
 from tracking.drogue_circle.detectors import (
     CircleCandidate,
     CircleParameters,
@@ -37,6 +38,21 @@ def test_the_centre_of_a_disc_is_found_to_a_few_hundredths_of_a_pixel(radius, to
     assert fit.polarity == -1  # brighter inside
     assert np.hypot(fit.rim.u_px - 80.3, fit.rim.v_px - 60.6) < tolerance
     assert fit.rim.radius_px == pytest.approx(radius, abs=0.1)
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_slope_of_the_grey_values_on_one_side_of_the_rim_does_not_move_the_centre(inside):
+    x = np.arange(160.0) - 80.3
+    light = discs([(80.3, 60.6, 30.0)], noise=0.0).astype(float)
+    across = np.hypot(x[None, :], np.arange(120.0)[:, None] - 60.6) - 30.0
+    mine = across < 0 if inside else across > 0
+    # 3 DN/px to the right of the disc, from the rim on: the blurred step is steepest .08 px from its place.
+    ramp = np.where(mine & (x > 0), np.clip(3.0 * across, -18.0, 18.0), 0.0)
+    light += cv2.GaussianBlur(ramp, (0, 0), BLUR_PX)
+    fit = fitted(rounded(light + np.random.default_rng(3).normal(0, 1.0, light.shape)), 80.3, 60.6, 30.0)
+    assert fit is not None
+    away = np.array([fit.rim.u_px - 80.3, fit.rim.v_px - 60.6])
+    assert np.hypot(*away) < 0.03
 
 
 def test_a_plate_over_one_side_does_not_pull_the_centre():
