@@ -22,8 +22,7 @@ from lab.targets.page import TimeAxis
 from lab.targets.target import Codes, Target, Track, TrackOptions, texts, track_pictures
 from tracking.drogue_circle.detectors import CircleDetector, CircleParameters, Edge, classical_detector
 from tracking.drogue_circle.printed import PrintedTracker
-from tracking.drogue_circle.rim_fit import CircleFrame
-from tracking.drogue_circle.tracker import CircleTracker
+from tracking.drogue_circle.tracker import CircleFrame, CircleTracker
 from tracking.learned_detector.detector import learned_detector
 
 Tracker: TypeAlias = CircleTracker | PrintedTracker

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools, symmetric
 from tracking.drogue_circle.detectors import CircleCandidate, Picture, Window, crop_bounds
-from tracking.statuses import Cause, PoseStatus
 
 # Edge points of a rim with sub-pixel precision: the maximum of the slope along the gradient of a circle, on rays.
 
@@ -429,41 +428,6 @@ def _correlation_length(away: Array, good: Bools, spacing_px: float) -> float:
     products = np.fft.irfft(np.abs(np.fft.rfft(values)) ** 2, len(values))[1 : lags + 1]
     total = 1 + 2 * float(np.sum((1 - np.arange(1, lags + 1) / (lags + 1)) * products)) / power
     return max(total, least)
-
-
-# The circle in one frame: status, cause, state, and the fit behind it.
-
-
-@dataclass(frozen=True, slots=True)
-class CircleFrame:
-    """The circle in one frame. Arrays are nan while nothing is known."""
-
-    status: PoseStatus
-    cause: Cause
-    state: Array  # (6,) u, v, r in px and their rates in px/frame
-    covariance: Array  # (6, 6)
-    predicted: Array  # (3,) u, v, r before the picture was used
-    measured: RimFit | None  # the fit that was used
-    occlusion: float  # gamma; nan where it is unknown
-    found: int = 0  # separate circles, where the whole picture was searched
-    event: str = ""  # acquired, reacquired, lost, ambiguous
-    edges_px: tuple[float, ...] = ()  # radii of the edges of the target that was acquired, the outermost first
-
-    @property
-    def place(self) -> Array:
-        """u, v, radius (3,), px."""
-        return self.state[:3]
-
-    @property
-    def sigmas(self) -> Array:
-        """Standard deviations (3,) of `place`."""
-        return np.sqrt(np.diag(self.covariance))[:3]
-
-
-def nothing_known(cause: Cause, event: str = "") -> CircleFrame:
-    """A lost frame."""
-    nan = np.full(6, np.nan)
-    return CircleFrame(PoseStatus.LOST, cause, nan, np.full((6, 6), np.nan), nan[:3], None, np.nan, event=event)
 
 
 # The occlusion coefficient: the area of the target that is seen, against the expected one.

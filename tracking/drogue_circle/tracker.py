@@ -15,7 +15,6 @@ from tracking.drogue_circle.kalman import FilterBank, motion_models
 from tracking.drogue_circle.rim_fit import (
     CORRELATED_PX,
     Appearance,
-    CircleFrame,
     RimFit,
     RimHabit,
     SmoothCrop,
@@ -23,7 +22,6 @@ from tracking.drogue_circle.rim_fit import (
     first_appearance,
     fit_rim,
     is_clear,
-    nothing_known,
     smooth_crop,
 )
 from tracking.statuses import Cause, PoseStatus
@@ -371,6 +369,41 @@ def _bank_at(fit: RimFit, p: CircleParameters) -> FilterBank:
     rate = _START_RATE_RADII * fit.rim.radius_px
     models = motion_models(p.accelerations_px, p.jerks_px, p.radius_share)
     return FilterBank.started(fit.centre_and_radius, fit.covariance_px2, rate, models)
+
+
+# The circle in one frame: status, cause, state, and the fit behind it.
+
+
+@dataclass(frozen=True, slots=True)
+class CircleFrame:
+    """The circle in one frame. Arrays are nan while nothing is known."""
+
+    status: PoseStatus
+    cause: Cause
+    state: Array  # (6,) u, v, r in px and their rates in px/frame
+    covariance: Array  # (6, 6)
+    predicted: Array  # (3,) u, v, r before the picture was used
+    measured: RimFit | None  # the fit that was used
+    occlusion: float  # gamma; nan where it is unknown
+    found: int = 0  # separate circles, where the whole picture was searched
+    event: str = ""  # acquired, reacquired, lost, ambiguous
+    edges_px: tuple[float, ...] = ()  # radii of the edges of the target that was acquired, the outermost first
+
+    @property
+    def place(self) -> Array:
+        """u, v, radius (3,), px."""
+        return self.state[:3]
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations (3,) of `place`."""
+        return np.sqrt(np.diag(self.covariance))[:3]
+
+
+def nothing_known(cause: Cause, event: str = "") -> CircleFrame:
+    """A lost frame."""
+    nan = np.full(6, np.nan)
+    return CircleFrame(PoseStatus.LOST, cause, nan, np.full((6, 6), np.nan), nan[:3], None, np.nan, event=event)
 
 
 # Tracks one circle through pictures: Zhou (2014), figure 2, with a rim fit, a sound noise model and acquisition.
