@@ -35,14 +35,7 @@ from tracking.smoothing.labels.continuity import continued, transfers_between_ca
 from tracking.smoothing.labels.neighbouring_frames import connected, displaced, isolated, next_to
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated, run_log_clutter
 from tracking.smoothing.labels.view_path import PathContext
-from tracking.smoothing.motion.process_noise import (
-    SHOCK_SEPARATION,
-    corner_offsets,
-    corner_times,
-    jump_sigmas,
-    jump_variances,
-    largest_near,
-)
+from tracking.smoothing.motion.process_noise import corner_offsets, corner_times, jump_sigmas, jump_variances
 from tracking.smoothing.motion.run_detections import (
     Reference,
     RunDetections,
@@ -251,7 +244,6 @@ def smooth(recording: TrackedRecording) -> Smoothed:
                 smoother.estimate(max_distance=MAX_DISTANCE)
         elif not gapless:
             smoother.estimate(max_distance=MAX_DISTANCE)
-        smoother.merge_jumps()
         smoother.add_jumps_at_contradictions()
         # Labels need a pose, except where the paths of spots continue.
         smoother.assigned = np.where(smoother.motion.known[:, None], smoother.assigned, -1)
@@ -437,19 +429,6 @@ class _Smoother:
             poses[k, :3], poses[k, 3] = back.R[k], back.t[k]
         self.motion = replace(motion, ref=straight_between(poses, found, np.cumsum(self.rec.dt_s)))
         return True
-
-    def merge_jumps(self) -> None:
-        """Of velocity jumps in steps beside each other keep the largest, where pictures have instants of their own.
-
-        A picture that was taken behind the corner, after the frame's instant, makes the step before look like a second
-        jump, and frames between two jumps have vague poses. A jump that is needed is found again.
-        """
-        jumped, m = self.motion.jumped, self.motion.ref.m[:, :6]
-        step = np.r_[0.0, np.linalg.norm(np.diff(m, axis=0) / np.std(m, axis=0).clip(1e-12), axis=1)] * jumped
-        kept = jumped & (step >= largest_near(step, SHOCK_SEPARATION))
-        if self.timed.any() and not np.array_equal(kept, jumped):
-            self.motion = replace(self.motion, jumped=kept)
-            self.estimate(max_distance=MAX_DISTANCE)
 
     def add_jumps_at_contradictions(self) -> None:
         """Assume velocity jumps where the pose contradicts the frame's own spots, and estimate the motion again."""
