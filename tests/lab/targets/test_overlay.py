@@ -12,7 +12,7 @@ from lab.targets.point import PointFrame, PointTarget
 from lab.targets.recording import Recording
 from lab.targets.target import Track
 from lab.targets.track import drawn
-from tracking.drogue_circle import rim_fit as circles
+from tracking.drogue_circle import tracker as circles
 from tracking.light_tracker import frames as drogues
 from tracking.single_target.point_tracker import NOTHING
 from tracking.statuses import Cause, PoseStatus
