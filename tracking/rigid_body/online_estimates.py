@@ -180,20 +180,20 @@ def static_log_density(places: StaticPlaces, uv: Array, noise_px2: Array, first:
 
 @compiled
 def update_places(
-    places: StaticPlaces, points: PicturePoints, assigned: Ints, expected: Array, camera_of: Ints, decay: float
+    places: StaticPlaces, points: PicturePoints, assigned: Ints, expected: Array, camera_of: Ints
 ) -> None:
     """Add one frame whose pose is known, in place.
 
     Points that are labelled, or lie near an expected spot, are left out. assigned (n,): row of each view's detection,
-    -1 without a label; expected (n, 2), px: pixels of the spots at the frame's pose; decay: 1 or DECAY.
+    -1 without a label; expected (n, 2), px: pixels of the spots at the frame's pose.
     """
     uv, first = points.uv, points.first
     for c in range(first.shape[0] - 1):
         if not points.has_image[c]:
             continue
-        places.frames[c] = decay * places.frames[c] + 1.0
+        places.frames[c] = DECAY * places.frames[c] + 1.0
         for k in range(MAX_PLACES):
-            places.seen[c, k] *= decay
+            places.seen[c, k] *= DECAY
         for d in range(first[c], first[c + 1]):
             is_spot = False
             for i in range(assigned.shape[0]):
@@ -309,7 +309,7 @@ class PointStatistics:
         if measured:
             labels = np.where(assigned >= 0, assigned % BLENDED, -1)
             points = PicturePoints(frame.uv, self._noise_px2, frame.first, frame.has_image)
-            update_places(self._static, points, labels, summary.expected_px, self._camera, DECAY)
+            update_places(self._static, points, labels, summary.expected_px, self._camera)
         for v in np.flatnonzero(summary.use):
             size = frame.size_px[assigned[v]]
             if np.isfinite(size):
