@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.model_check.faults import FaultParameters, clock_derivatives
+from calibration.model_check.faults import FaultParameters, pixel_velocities
 from calibration.model_check.linearised_frames import (
     LinearisedFrames,
     ModelCheckRecording,
+    clock_derivatives,
     correlation_time,
     evenly_spaced,
     linearise,
@@ -115,13 +116,12 @@ def _derivatives(
     model: SpotModel, recording: ModelCheckRecording, lin: LinearisedFrames, numbers: Sequence[ClockNumber]
 ) -> Array:
     """Derivatives (K, n, 2, p) of the whitened pixels by the numbers."""
-    by_delay = clock_derivatives(model, recording, lin.frames)
-    out = np.zeros((*by_delay.shape[:3], len(numbers)))
-    later = np.nan_to_num(recording.uv_px[lin.frames, :, 1]) - (model.image_size_px[:, 1] - 1) / 2
+    velocity = np.nan_to_num(pixel_velocities(model, recording, lin.frames))
+    by_clock = clock_derivatives(model, recording.uv_px[lin.frames], velocity)
+    out = np.zeros((*velocity.shape, len(numbers)))
     for i, number in enumerate(numbers):
-        out[..., i] = by_delay[..., model.camera_names.index(number.camera)]
-        if number.is_row_time:
-            out[..., i] *= later[..., None]
+        views = model.camera_of == model.camera_names.index(number.camera)
+        out[:, views, :, i] = by_clock[:, views, :, int(number.is_row_time)]
     return np.asarray(lin.W @ out)
 
 

@@ -83,18 +83,13 @@ class FaultParameters:
         first = len(self.sensitivity.names)
         out[..., :first] = np.where(lin.used[..., None, None], self.sensitivity.of(derivatives), 0.0)
         clocks = len(self.model.camera_names)
-        out[..., first : first + clocks] = clock_derivatives(self.model, recording, lin.frames)
+        velocity = np.nan_to_num(pixel_velocities(self.model, recording, lin.frames))
+        of_camera = self.model.camera_of[:, None] == np.arange(clocks)
+        out[..., first : first + clocks] = velocity[..., None] * of_camera[:, None, :]
         rows = np.arange(n)
         for axis in (0, 1):
             out[:, rows, axis, first + clocks + 2 * rows + axis] = 1.0
         return np.asarray(lin.W @ out)
-
-
-def clock_derivatives(model: SpotModel, recording: ModelCheckRecording, frames: Ints) -> Array:
-    """Derivatives of the pixels by the delay of each camera: (K, n, 2, cameras), px/s; 0 where unknown."""
-    velocity = np.nan_to_num(pixel_velocities(model, recording, frames))
-    of_camera = model.camera_of[:, None] == np.arange(len(model.camera_names))
-    return np.asarray(velocity[..., None] * of_camera[:, None, :])
 
 
 def pixel_velocities(model: SpotModel, recording: ModelCheckRecording, frames: Ints) -> Array:

@@ -80,15 +80,14 @@ def with_clocks(model: SpotModel, recording: ModelCheckRecording, clock_s: Array
     """The recording with its spots moved to the frames' instants by other clocks (n, 2), s."""
     if recording.velocity_px_s is None or recording.clock_s is None:
         return recording
-    by_clock = clock_derivatives(model, recording)
+    by_clock = clock_derivatives(model, recording.uv_px, recording.velocity_px_s)
     return replace(recording, uv_px=recording.uv_px - (by_clock * (clock_s - recording.clock_s)[:, None]).sum(axis=-1))
 
 
-def clock_derivatives(model: SpotModel, recording: ModelCheckRecording) -> Array:
-    """Derivatives (T, n, 2, 2) of the pixels by each view's offset and row time, px/s."""
-    assert recording.velocity_px_s is not None
-    later = np.nan_to_num(recording.uv_px[..., 1]) - (model.image_size_px[:, 1] - 1) / 2
-    return np.stack([recording.velocity_px_s, recording.velocity_px_s * later[..., None]], axis=-1)
+def clock_derivatives(model: SpotModel, uv_px: Array, velocity_px_s: Array) -> Array:
+    """Derivatives (T, n, 2, 2) of spots (T, n, 2) by their camera's offset, px/s, and row time, px rows/s."""
+    later = np.nan_to_num(uv_px[..., 1]) - (model.image_size_px[:, 1] - 1) / 2
+    return np.stack([velocity_px_s, velocity_px_s * later[..., None]], axis=-1)
 
 
 def evenly_spaced(candidates: Ints, most: int) -> Ints:

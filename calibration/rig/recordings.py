@@ -114,7 +114,7 @@ class RecordingTerm:
             BEAMS: (np.concatenate([d.direction @ B, d.point @ B], axis=-1), model.beam_of),
         }
         if self.recording.velocity_px_s is not None:
-            by_clock = clock_derivatives(model, self.recording)
+            by_clock = clock_derivatives(model, self.recording.uv_px, self.recording.velocity_px_s)
             of |= {s: (by_clock[..., i : i + 1], model.camera_of) for i, s in enumerate((OFFSETS, ROW_TIMES))}
         used: Bools = np.asarray(lin.used[..., None, None])
         out = np.zeros((*lin.used.shape, 2, sum(values[s].dof for s, _ in self.at)))

@@ -40,10 +40,11 @@ class Times:
         beyond = numbers - np.clip(numbers, self.frames[0], self.frames[-1])
         return inside + beyond / self.frame_rate_hz
 
-    def usual_step_s(self, rate_hz: float) -> float:
-        """The usual time from one frame to the next; 1 / rate_hz where no two frames have a timestamp."""
+    @property
+    def usual_step_s(self) -> float:
+        """The usual time from one frame to the next; that of the frame rate where no two frames have a timestamp."""
         if self.frames is None or self.times_s is None or len(self.frames) < 2:
-            return 1 / rate_hz
+            return 1 / self.frame_rate_hz
         return float(np.median(np.diff(self.times_s) / np.diff(self.frames)))
 
     def without_time(self, frames: Ints) -> Ints:
@@ -69,20 +70,19 @@ def load_times(path: Path, frame_rate_hz: float) -> Times:
             f"t_s: expected increasing times, got {times_s[i]:g} s of frame {frames[i]} after {times_s[i - 1]:g} s of"
             f" frame {frames[i - 1]}",
         )
-    _check_unit(table, frames, times_s, frame_rate_hz)
-    return Times(frame_rate_hz, frames, times_s)
+    times = Times(frame_rate_hz, frames, times_s)
+    _check_unit(table, times)
+    return times
 
 
-def _check_unit(table: Table, frames: Ints, times_s: Array, frame_rate_hz: float) -> None:
+def _check_unit(table: Table, times: Times) -> None:
     """Raises InputError where the usual step is far from that of the frame rate: milliseconds, or a wrong rate."""
-    if len(frames) < 2:
-        return
-    step_s = float(np.median(np.diff(times_s) / np.diff(frames)))
-    if not 1 / UNIT_FACTOR < step_s * frame_rate_hz < UNIT_FACTOR:
+    rate_hz, step_s = times.frame_rate_hz, times.usual_step_s
+    if not 1 / UNIT_FACTOR < step_s * rate_hz < UNIT_FACTOR:
         raise table.error(
             1,
-            f"t_s: expected steps of about {1 / frame_rate_hz:.3g} s (frame_rate_hz: {frame_rate_hz:g}), got"
-            f" {step_s:.3g} s for each frame; give seconds, not milliseconds, or correct frame_rate_hz in run.yaml",
+            f"t_s: expected steps of about {1 / rate_hz:.3g} s (frame_rate_hz: {rate_hz:g}), got {step_s:.3g} s for"
+            " each frame; give seconds, not milliseconds, or correct frame_rate_hz in run.yaml",
         )
 
 
@@ -118,7 +118,7 @@ class CameraClock:
 
     def wide(self, rate_hz: float, height: int) -> bool:
         """Whether the sigma of a prior is wide. rate_hz: of the run; height: of the pictures, px."""
-        step_s = 1 / rate_hz if self.times is None else self.times.usual_step_s(rate_hz)
+        step_s = 1 / rate_hz if self.times is None else self.times.usual_step_s
         priors = self.offset_prior_s / OFFSET_SIGMA_FRAMES, self.row_time_prior_s * height / ROW_TIME_SIGMA
         return max(priors) > WIDE * step_s
 
@@ -182,7 +182,7 @@ def load_clock(
         if not path.is_file():
             raise InputError(f"{where}.timestamps: expected a table frame,t_s, found none at {path}")
         times = load_times(path, rate_hz)
-        rate_hz = 1 / times.usual_step_s(rate_hz)
+        rate_hz = 1 / times.usual_step_s
     row_time_prior_s = ROW_TIME_SIGMA / rate_hz / height if isinstance(row_time_s, str) else 0.0
     offset_s = 0.0 if isinstance(offset_s, str) else offset_s
     row_time_s = 0.0 if isinstance(row_time_s, str) else row_time_s
