@@ -7,12 +7,12 @@ the frame of the left camera. Source: ours, on the terms of the rig calibration 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.least_squares.adjustment import Adjusted, AdjustmentError, Limits, Poses, Term, Vectors, solve
+from calibration.least_squares.adjustment import Adjusted, AdjustmentError, Limits, Part, Poses, Term, Vectors, solve
 from calibration.lens.board_shape import HALF_SIGNIFICANT
 from calibration.lens.fit.lens_adjustment import coefficient_prior
 from calibration.lens.fit.lens_parameters import Values
@@ -20,7 +20,7 @@ from calibration.lens.fit.view_equations import BEND_PROBABLE, SCATTER_SIGNIFICA
 from calibration.lens.intrinsics_result import Intrinsics
 from calibration.terms.corners import CornerTerm
 from geometry.arrays import Array, Bools, Ints
-from geometry.camera import FISHEYE, PERSPECTIVE, Camera
+from geometry.camera import FISHEYE, PERSPECTIVE, Camera, camera_matrix
 from geometry.pose import Pose
 from geometry.uncertainty.rig_uncertainty import POSE, RigCovariance
 
@@ -157,9 +157,11 @@ class _Problem:
         lenses = [s.model.free for s in self.single]
         starts = np.cumsum([0, *(int(free.sum()) for free in lenses)])
 
-        def rows(term: Term) -> Array:
+        def parts_of(term: Term) -> dict[str, Part]:
+            return {p.stack: p for p in term.linearise(adjusted.values).parts}
+
+        def rows(parts: Mapping[str, Part]) -> Array:
             """Derivatives (N, 2, q), or of a prior (n, 1, q)."""
-            parts = {p.stack: p for p in term.linearise(adjusted.values).parts}
             by_lens = parts["intrinsics"]
             out = np.zeros((*by_lens.jacobian.shape[:2], starts[2] + 6))
             for c, free in enumerate(lenses):
@@ -170,12 +172,12 @@ class _Problem:
             bend = parts["warp"].jacobian if "warp" in parts else np.zeros((*out.shape[:2], 3))
             return np.concatenate([out, bend], axis=2) if bent else out
 
-        boards = next(p for p in self.term.linearise(adjusted.values).parts if p.stack == "boards").jacobian
-        shared = rows(self.term)
-        known = [rows(prior).reshape(-1, shared.shape[-1]) for prior in self.priors()]
+        of_corners = parts_of(self.term)
+        shared = rows(of_corners)
+        known = [rows(parts_of(prior)).reshape(-1, shared.shape[-1]) for prior in self.priors()]
         return ViewEquations.of_rows(
             shared / misfit,
-            boards / misfit,
+            of_corners["boards"].jacobian / misfit,
             adjusted.residuals[0] / misfit,
             self.term.placement,
             np.unique(self.term.placement),
@@ -254,8 +256,7 @@ def _result(
     assert isinstance(poses, Poses)
     cameras = []
     for c, (name, s) in enumerate(zip(names, single, strict=True)):
-        fx, fy, cx, cy = intrinsics.array[c, :4]
-        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+        K = camera_matrix(intrinsics.array[c, :4])
         distortion = tuple(float(v) for v in intrinsics.array[c, 4 : 4 + s.model.coefficients])
         lens = FISHEYE if s.model.fisheye else PERSPECTIVE
         cameras.append(Camera(name, "", s.table.image_size_px, K, distortion, poses.pose[c], lens=lens))
@@ -264,7 +265,7 @@ def _result(
     misfit = float(np.sqrt(adjusted.chi2 / max(adjusted.dof, 1)))
     return CalibratedPair(
         cameras=(cameras[0], cameras[1]),
-        covariance=_covariance(names, single, problem, adjusted, misfit),
+        covariance=_covariance(names, problem, adjusted, misfit),
         single=single,
         rms_px=(rms[0], rms[1]),
         misfit=misfit,
@@ -274,14 +275,12 @@ def _result(
     )
 
 
-def _covariance(
-    names: tuple[str, str], single: tuple[Intrinsics, Intrinsics], problem: _Problem, adjusted: Adjusted, misfit: float
-) -> RigCovariance:
+def _covariance(names: tuple[str, str], problem: _Problem, adjusted: Adjusted, misfit: float) -> RigCovariance:
     """Of both lenses and the right camera's pose, raised where the residuals are larger than those of single cameras.
 
     The scatter between photographs and the errors of the lens models raise it as they do for a single camera.
     """
-    scale = max(misfit, 1.0)
+    single, scale = problem.single, max(misfit, 1.0)
     equations = problem.equations(adjusted, scale, problem.bent)
     factor = max(s.correlated_noise for s in single)
     spread = equations.scatter()

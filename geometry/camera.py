@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -102,6 +103,12 @@ def in_picture(pixels: Array, sizes_px: Array, margin_px: float | Array = 0.0) -
 def pinhole_numbers(camera: Camera) -> Array:
     """fx, fy, cx, cy (4,), px."""
     return np.array([camera.matrix[0, 0], camera.matrix[1, 1], camera.matrix[0, 2], camera.matrix[1, 2]])
+
+
+def camera_matrix(pinhole: Array | Sequence[float]) -> Array:
+    """The camera matrix (3, 3), px, of fx, fy, cx, cy, px."""
+    fx, fy, cx, cy = pinhole
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
 def project_points(

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from geometry.arrays import Array
-from geometry.camera import FISHEYE, LENSES, PERSPECTIVE
+from geometry.camera import FISHEYE, LENSES, PERSPECTIVE, camera_matrix
 from geometry.lens import ALLOWED_LENGTHS
 from geometry.pose import Pose
 
@@ -63,8 +63,7 @@ class CameraModel:
     @property
     def matrix(self) -> Array:
         """The camera matrix (3, 3), px."""
-        fx, fy, cx, cy = self.pinhole
-        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+        return camera_matrix(self.pinhole)
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ from calibration.lens.fit.projection_map import Difference, ProjectionMap
 from calibration.lens.fit.view_equations import Scatter
 from calibration.lens.model_uncertainty import ModelUncertainty
 from geometry.arrays import Array
+from geometry.camera import camera_matrix
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +56,7 @@ class Intrinsics:
     @property
     def matrix(self) -> Array:
         """(3, 3), px."""
-        fx, fy, cx, cy = self.fit.lens[:4]
-        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+        return camera_matrix(self.fit.lens[:4])
 
     @property
     def distortion(self) -> tuple[float, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 from calibration.least_squares.adjustment import At, Linearised, Lines, Loss, Part, Poses, Prior, Stack, Values, Vectors
 from calibration.terms.surveyed import array_of, pose_of
 from geometry.arrays import Array, Bools, Ints, skew
-from geometry.camera import FISHEYE, Camera, pinhole_numbers
+from geometry.camera import FISHEYE, Camera, camera_matrix, pinhole_numbers
 from geometry.forward_model import SpotModel
 from geometry.lens import fisheye_fold_limit, fold_limit, padded
 from geometry.pose import Pose
@@ -158,9 +158,9 @@ def _camera(c: Camera, i: int, values: Values) -> Camera:
         c = replace(c, row_time_s=float(array_of(values, ROW_TIMES)[i, 0]))
     if INTRINSICS not in values:
         return replace(c, camera_from_world=pose)
-    fx, fy, cx, cy, *lens = array_of(values, INTRINSICS)[i].tolist()
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return replace(c, matrix=matrix, distortion=tuple(lens[: len(c.distortion)]), camera_from_world=pose)
+    lens = array_of(values, INTRINSICS)[i].tolist()
+    distortion = tuple(lens[4 : 4 + len(c.distortion)])
+    return replace(c, matrix=camera_matrix(lens[:4]), distortion=distortion, camera_from_world=pose)
 
 
 def _full_names(item: str, parameters: Sequence[str]) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from calibration.least_squares.adjustment import Poses, Stack, Vectors, solve
 from calibration.terms.corners import single_camera
 from calibration.terms.rig_blocks import SpotPixels
 from geometry.arrays import Array, Bools, Ints
-from geometry.camera import FISHEYE, Camera, in_picture, pinhole_numbers
+from geometry.camera import FISHEYE, Camera, camera_matrix, in_picture, pinhole_numbers
 from geometry.forward_model import SpotModel
 from geometry.lens import padded
 from geometry.pose import Pose
@@ -242,11 +242,9 @@ def lens_covariance(camera: Camera, corner_px: float, views: int = 30) -> Array:
 
 def _lens(true: Camera, q: CampaignQuality, rng: np.random.Generator) -> LensDraw:
     C = lens_covariance(true, q.lens_corner_px)
-    fx, fy, cx, cy, *distortion = np.concatenate([pinhole_numbers(true), true.distortion]) + (
-        np.linalg.cholesky(C) @ rng.normal(size=len(C))
-    )
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    drawn = replace(true, matrix=matrix, distortion=tuple(float(d) for d in distortion))
+    off = np.linalg.cholesky(C) @ rng.normal(size=len(C))
+    lens = (np.concatenate([pinhole_numbers(true), true.distortion]) + off).tolist()
+    drawn = replace(true, matrix=camera_matrix(lens[:4]), distortion=tuple(lens[4:]))
     return LensDraw(drawn, (*PINHOLE, *distortion_names(true)), C)
 
 
