@@ -45,7 +45,7 @@ from lab.runs.frames.clocked_frames import open_frames
 from lab.runs.frames.frames import FrameReader, pictures_at
 from lab.runs.setup_check import (
     FRAMES,
-    Pictures,
+    SampledFrames,
     mistakes_by_themselves,
     points_in,
     rates_of_videos,
@@ -209,14 +209,14 @@ def check_rig(
         )
 
 
-def check_recording(findings: Findings, run: Run, sampler: Pictures) -> None:
+def check_recording(findings: Findings, run: Run, sampler: SampledFrames) -> None:
     """Mistakes that a sample of the recording shows."""
     for f in (*recorded_mistakes(run, _blocks(run, sampler)), *rates_of_videos(run)):
         text = f"{f.what}. {sentence(f.why)} {f.remedy} ({f.code})"
         (findings.problems if f.level is Level.FAIL else findings.remarks).append(text)
 
 
-def _blocks(run: Run, sampler: Pictures) -> list[Block]:
+def _blocks(run: Run, sampler: SampledFrames) -> list[Block]:
     """The points of sampled frames; those of pictures are detected."""
     blocks = sampler.frames
     filmed = [name for name, source in run.cameras.items() if not isinstance(source, DetectionsTable)]
@@ -259,10 +259,10 @@ class _Seen:
     size: str = ""  # why the last of them is wrong
 
 
-def check_pictures(findings: Findings, run: Run, reader: FrameReader, progress: Progress | None) -> Pictures:
+def check_pictures(findings: Findings, run: Run, reader: FrameReader, progress: Progress | None) -> SampledFrames:
     """Decode all pictures of a run, and check them with its times and its truth; returns a sample without pixels."""
     seen = {name: _Seen() for name in reader.cameras}
-    sampler = Pictures()
+    sampler = SampledFrames()
     done = 0
     for frame_set in reader:
         sampler.add(frame_set.frame, frame_set.images)

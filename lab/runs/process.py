@@ -27,7 +27,7 @@ from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.frames.row_records import row_records
 from lab.runs.model_check.frame_sampler import FrameSampler
 from lab.runs.run_log import RunLog, listening
-from lab.runs.setup_check import Pictures, mistakes_of_run
+from lab.runs.setup_check import SampledFrames, mistakes_of_run
 from lab.runs.smoothing_pass import TrackingAndSmoothing
 from lab.runs.summary import processed_run
 from lab.runs.tables import TableWriter
@@ -161,7 +161,7 @@ def write_tables(
         causal=checks.causal,
         invalid=checks.invalid,
     )
-    sampler, pictures = FrameSampler(), Pictures()
+    sampler, pictures = FrameSampler(), SampledFrames()
     with (
         TableWriter(
             work, run.rig, run.covariance is not None, with_causal=not causal, with_picture_times=bool(run.clocks)

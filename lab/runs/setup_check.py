@@ -39,7 +39,7 @@ DOUBTFUL = 2  # pictures of a camera without any of its spots, from which on a r
 
 
 @dataclass(slots=True)
-class Pictures:
+class SampledFrames:
     """Sampled frames: blocks at even distances, and those in which points move most."""
 
     even: EvenSampler[FrameSet] = field(default_factory=lambda: EvenSampler(MOST_KEPT))
@@ -133,7 +133,9 @@ def _parts_of_pictures(rig: Rig, blocks: Sequence[Block]) -> tuple[Finding, ...]
     return tuple(out)
 
 
-def mistakes_of_run(run: Run, statistics: RunStatistics, pictures: Pictures, *, passes: bool) -> tuple[Finding, ...]:
+def mistakes_of_run(
+    run: Run, statistics: RunStatistics, pictures: SampledFrames, *, passes: bool
+) -> tuple[Finding, ...]:
     """Findings on mistakes in the set-up of a run that has been processed.
 
     passes: whether nothing else is to be reported: the rig then explains the recording. It is tested only where the
@@ -145,9 +147,8 @@ def mistakes_of_run(run: Run, statistics: RunStatistics, pictures: Pictures, *, 
     doubtful = any(c.unlabelled + len(c.displaced) >= DOUBTFUL for c in cameras.values())
     if verdict(of_files) is Level.FAIL:
         return of_files
-    if passes and not unused and not doubtful:
-        return (*hidden_by_symmetry(run, statistics), *of_files)
-    found = recorded_mistakes(run, pictures.blocks)
+    tested = not passes or unused or doubtful
+    found = recorded_mistakes(run, pictures.blocks) if tested else ()
     if passes and not unused and verdict(found) is not Level.FAIL:
         return (*hidden_by_symmetry(run, statistics), *of_files)
     # Of a run, all pictures show whether a camera is used, not only the sampled ones; without any pose none is.

@@ -25,7 +25,7 @@ from lab.files.rig.rig_file import save_rig
 from lab.pictures.source import pictures, video_at
 from lab.runs.input_check import check
 from lab.runs.process import process_run
-from lab.runs.setup_check import Pictures, frames_of
+from lab.runs.setup_check import SampledFrames, frames_of
 from lab.simulate.rigs import fan, unequal_fan
 from lab.simulate.write import simulate
 from tests.lab.run_folders import edit, write_run
@@ -213,7 +213,7 @@ def test_poses_that_agree_with_the_truth_pass(symmetric, tmp_path):
 
 def test_poses_that_the_limited_search_misses_in_a_crowd_are_no_evidence_for_a_mistake(monkeypatch):
     scene = random_scene(50025)  # 13 points per picture, of which 6 are spots
-    pictures = Pictures()
+    pictures = SampledFrames()
     for k in range(len(scene)):
         pictures.add(k, dict(zip(scene.rig.cameras, scene.found(k), strict=True)))
     frames = frames_of(pictures.blocks, scene.prior, LabelParameters().min_spots)
