@@ -363,8 +363,8 @@ class Column:
 def write_index(rows: Sequence[Mapping[str, Any]], out: Path) -> Path:
     """Write index.html into the batch's folder `out`; returns its path.
 
-    rows: those of batch.csv, a mapping per run; a column that a batch does not have is shown as it is. The rest is read
-    from the result folders as far as it is there.
+    rows: those of batch.csv, a mapping per run; other keys become columns. The rest is read from the result folders as
+    far as it is there.
     """
     runs = sorted((indexed_run(row, Path(out)) for row in rows), key=lambda run: run.badness)
     above = _common_folder([run.folder for run in runs])

@@ -34,9 +34,8 @@ _MOSTLY = 0.7  # share of the pictures with lights that move, above which those 
 _OF_SURFACE, _OF_OBJECTS = 0.1, 0.4
 _CLEARLY_BETTER = 0.5  # ratio of the variances of two measurements of a spot
 _SETTLED = 0.01  # sigmas of a pixel: the background behind a light that changes by less is the last one
-_LARGEST_MISFIT = (
-    0.05  # error of a light by the misfit of its fit, in widths; of spots at most .01, of objects .1 to .5
-)
+# Error of a light by the misfit of its fit, in widths: of spots at most .01, of objects .1 to .5.
+_LARGEST_MISFIT = 0.05
 _NO_GAUSSIAN = 0.02  # share of a light at rest that a Gaussian leaves in a pixel; it is no structure of the background
 
 
@@ -144,10 +143,10 @@ def _with_shifts(
     part = 1.0 if background.noise.texture < _OF_SURFACE else _OF_OBJECTS
     # What no Gaussian explains, a board or a lamp, is a part of the surface for the lights that move over it.
     off = np.zeros(len(still)) if still.misfit is None else np.sqrt(still.misfit * still.variance_px2)
-    lamps = off < _LARGEST_MISFIT * np.sqrt(still.major_px * still.minor_px)
-    _subtract(still[lamps], mean, own)
+    gaussian = off < _LARGEST_MISFIT * np.sqrt(still.major_px * still.minor_px)
+    _subtract(still[gaussian], mean, own)
     shifts_px = np.float32(part) * local_shifts(mean, own, width)
-    _subtract(still[~lamps], mean, own)
+    _subtract(still[~gaussian], mean, own)
     rest_shifts_px = shifts_at_rest(mean, own, still)
     return replace(better, spot_px=width, shifts_px=shifts_px, rest_shifts_px=rest_shifts_px, misfit_share=share)
 

@@ -269,6 +269,7 @@ def _checked(pixels: _Pixels, light: JointLight, width_px: float) -> JointFit | 
     height = (light.plain + light.modulated * seen.behind)[seen.light_of.max(axis=0) > 0.1]
     bad = chi2 > _LARGEST_CHI2 or not height.size or float(np.median(height)) <= 0
     modulated = light.modulated * pixels.usual
+    # Its share of the light must lie within 1 of the usual one.
     bad |= abs(modulated - MODULATED[0] * (light.plain + modulated)) > light.plain + modulated
     bad |= bool((widths > _LARGEST_CHANGE * width_px).any() or (widths < width_px / _LARGEST_CHANGE).any())
     bad |= np.sqrt(mean) > _LARGEST_SIGMA * float(widths.max())

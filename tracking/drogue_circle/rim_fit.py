@@ -138,7 +138,7 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
         height = np.sqrt(2 * np.pi) * sigma * strength
         tail = 0.5 * median(height[good]) * (1 - erf(float(offset[-1]) / (np.sqrt(2) * sigma)))
         ends = polarity * values[:, [0, -1]] + [-tail, tail]  # without what the blurred step still rises there
-        away, inner = _beside(crop, rim, theta, polarity, ends, np.where(good, strength, np.nan))
+        away, inner = _beside(crop, rim, theta, polarity, ends, strength)
         radius -= sigma**2 * away / height
         common = abs(sigma**2 * inner / median(height[good]))
         common = common if common > _LEAST_COMMON_PX else 0.0

@@ -141,9 +141,8 @@ def adjust(
     whole_lens = lens_free is None
     known: list[Term] = []
     if whole_lens:
-        prior = coefficient_prior(table, used, model, values)
         values, known = with_circle_radius(table, used, model, values)
-        known = [*known, *prior]
+        known += coefficient_prior(table, used, model, values)
     free: dict[str, bool | Bools] = {
         "intrinsics": (model.free if lens_free is None else lens_free)[None],
         "boards": np.repeat(in_use[:, None], 6, axis=1),

@@ -27,7 +27,7 @@ from lab.runs.frames.frames import FrameSet
 from lab.runs.frames.pipeline import FrameRecord, Frames, Pipeline
 from lab.runs.model_check.check import ModelCheck, check_model
 from lab.runs.model_check.frame_sampler import FrameSampler
-from lab.runs.setup_check import UNUSED, Pictures, mistakes_of_run
+from lab.runs.setup_check import UNUSED, SampledFrames, mistakes_of_run
 from lab.runs.smoothing_pass import TrackingAndSmoothing
 from lab.runs.verdict.frame_checks import FrameChecks
 from lab.runs.verdict.run_statistics import CameraStatistics, RunStatistics
@@ -91,6 +91,12 @@ def _clocks_of(rig: Rig) -> Array:
     return np.array([[getattr(c, number) for number in CLOCK] for c in rig.cameras.values()])
 
 
+def _clocks_in_use(run: Run) -> Array:
+    """Offset and row time (cameras, 2), s, of the cameras of a run: of its rig and its own."""
+    clocks = [run.clocks.get(name, CameraClock()) for name in run.rig.cameras]
+    return np.array([(c.offset_s, c.row_time_s) for c in clocks])
+
+
 def tolerant(run: Run) -> Run:
     """The run with a tracker that expects the residuals that the errors of its rig cause."""
     model = SpotModel.of(run.rig)
@@ -142,7 +148,7 @@ def labelled(run: Run, most: int | None = None, enough: int = 0, *, judged: bool
             may absorb, or no pose at all.
     """
     camera_of = SpotModel.of(run.rig).camera_of
-    sampler, pictures = FrameSampler(with_predicted=most is not None), Pictures()
+    sampler, pictures = FrameSampler(with_predicted=most is not None), SampledFrames()
     cameras = {name: CameraStatistics() for name in run.rig.cameras}
     statistics = RunStatistics(cameras, SpotModel.of(run.rig).views, run.tracker.labels.min_spots)
     with tempfile.TemporaryDirectory(prefix="beampose-refine-") as work:
@@ -165,11 +171,8 @@ def labelled(run: Run, most: int | None = None, enough: int = 0, *, judged: bool
     if recording is None:
         raise CalibrationError(f"{run.folder}: there is no frame at all")
     if passes.clocks is not None:
-        model, rig_s = SpotModel.of(run.rig), _clocks_of(run.rig)
-        own, now = (
-            [c.get(n, CameraClock()) for n in run.rig.cameras] for c in (run.clocks, passes.pipeline.run.clocks)
-        )
-        more = np.array([(b.offset_s - a.offset_s, b.row_time_s - a.row_time_s) for a, b in zip(own, now, strict=True)])
+        model, estimated = SpotModel.of(run.rig), passes.pipeline.run
+        clock_s = _clocks_of(run.rig) + (_clocks_in_use(estimated) - _clocks_in_use(run))
         velocity = np.nan_to_num(pixel_velocities(model, recording, np.arange(len(recording.seen))))
-        recording = replace(recording, velocity_px_s=velocity, clock_s=(rig_s + more)[model.camera_of])
+        recording = replace(recording, velocity_px_s=velocity, clock_s=clock_s[model.camera_of])
     return LabelledRun(run, recording, statistics.frames)

@@ -17,8 +17,8 @@ _LONGEST = 300  # characters of an exception's text in a line
 def unexpected_error(error: BaseException, file: Path | None = None) -> str:
     """Save the traceback of an unforeseen exception. Returns one line about it, with the place of the file.
 
-    file: where it is saved, if it can be. Where no file can be written, the traceback itself follows the line. Of an
-    error of the system its reason is enough: it needs no report.
+    file: where it is saved, if it can be. Where no file can be written, the traceback itself follows the line. The user
+    is asked to report it, unless the system states its reason (a full disk).
     """
     report = _report(error)
     of_system = isinstance(error, OSError) and bool(error.strerror)
