@@ -191,9 +191,7 @@ class FixedBoard(fields.Block):
 
     board: _BoardText
     photos: dict[str, _File]  # photograph of the fixed board by camera
-    offset_m: fields.Number = (
-        0.0  # from the printed side into the board to the receiving surface; negative: it is in front
-    )
+    offset_m: fields.Number = 0.0  # from the printed side into the board to the receiving surface; negative: before it
     sigma_m: fields.Positive = 0.0002  # of offset_m
     tilt_sigma_deg: fields.Positive = 0.05  # of the angle between board and surface
 

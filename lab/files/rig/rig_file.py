@@ -193,8 +193,8 @@ class CameraBlock(LensBlock):
     screen: fields.Word
     camera_from_world: CameraPoseBlock
     noise: _NoiseBlock | None = None
-    time_offset_s: fields.Number = 0.0
-    row_time_s: fields.Number = 0.0
+    time_offset_s: fields.Number = 0.0  # of its clock in every run, added to that of run.yaml; later: positive
+    row_time_s: fields.Number = 0.0  # by which a row is exposed later than the one above; added to that of run.yaml
     covariance: CovarianceBlock | None = None
 
     def value(self, name: str) -> Camera:

@@ -288,8 +288,8 @@ def _seconds_or_estimate(value: Any) -> float | str:
 class _CameraBlock(SourceBlock):
     """The pictures of one camera in run.yaml, and its clock."""
 
-    time_offset_s: Annotated[float | str, pydantic.PlainValidator(_seconds_or_estimate)] = 0.0
-    row_time_s: Annotated[float | str, pydantic.PlainValidator(_seconds_or_estimate)] = 0.0
+    time_offset_s: Annotated[float | str, pydantic.PlainValidator(_seconds_or_estimate)] = 0.0  # added to rig.yaml's
+    row_time_s: Annotated[float | str, pydantic.PlainValidator(_seconds_or_estimate)] = 0.0  # added to rig.yaml's
     timestamps: fields.Word | None = None
 
 

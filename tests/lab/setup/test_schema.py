@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import re
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -151,6 +152,14 @@ def test_parameters_are_described_as_in_the_code():
     tracker = schema("run")["properties"]["tracker"]["anyOf"][0]["properties"]
     assert tracker["r1_px"]["description"].startswith("r1, px: radius of the first search")
     assert tracker["detect"]["properties"]["threshold_sigma"]["default"] == 6.0
+
+
+def test_the_comment_of_a_field_stands_in_its_line_where_the_schema_finds_it():
+    """The formatter moves the comment of a line that is too long into brackets."""
+    wrapped = re.compile(r"^    (\w+): [^\n]*= \(\n[^\n]*#", re.MULTILINE)
+    files_of_fields = [*(ROOT / "lab" / "files").rglob("*.py"), *(ROOT / "tracking").rglob("*.py")]
+    assert {p.name: names for p in files_of_fields if (names := wrapped.findall(p.read_text("utf-8")))} == {}
+    assert "receiving surface" in as_text("calibration")
 
 
 def test_the_schemas_are_written_into_a_folder(tmp_path: Path):
