@@ -110,6 +110,7 @@ def test_a_text_without_a_mistake_passes(text):
 
 PATH = re.compile(r"`([\w./-]+/(?:[\w.-]+\.(?:py|md|j2|txt|yaml|toml))?)`")
 FUNCTIONS_OF = re.compile(r"`([\w./]+\.py)`: ((?:`\w+`(?:, )?)+)")
+NAME_OF = re.compile(r"(`\w+`) of `([\w./]+\.py)`")
 
 
 def documents(root: Path) -> list[Path]:
@@ -121,7 +122,7 @@ def missing_paths(text: str, root: Path) -> list[str]:
     tops = ("geometry", "tracking", "calibration", "lab", "studies", "tests", "bench", "docs", "sample_runs")
     paths = [path for path in PATH.findall(text) if path.split("/")[0] in tops]
     wrong = [path for path in paths if not (root / path).exists()]
-    for path, names in FUNCTIONS_OF.findall(text):
+    for path, names in [*FUNCTIONS_OF.findall(text), *((path, name) for name, path in NAME_OF.findall(text))]:
         code = (root / path).read_text(encoding="utf-8") if (root / path).is_file() else ""
         wrong += [
             f"{path}: {n}" for n in re.findall(r"\w+", names) if not re.search(rf"^(def|class) {n}\b", code, re.M)
@@ -158,6 +159,22 @@ def test_the_map_answers_a_newcomers_questions_with_paths():
     assert [wrong for line in questions for wrong in unclear_answers(line, ROOT)] == []
 
 
-@pytest.mark.parametrize("text", ["`geometry/spots.py`", "`lab/none/`", "`geometry/lens.py`: `no_such_function`"])
+def test_every_name_in_the_text_of_the_design_is_one_of_the_program():
+    files = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    code = set(re.findall(r"\w+", " ".join(path.read_text(encoding="utf-8") for path in files)))
+    names = re.findall(r"`([a-zA-Z]+_\w+)`", (ROOT / "docs" / "design.md").read_text(encoding="utf-8"))
+    assert len(names) > 20
+    assert [name for name in names if name not in code] == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "`geometry/spots.py`",
+        "`lab/none/`",
+        "`geometry/lens.py`: `no_such_function`",
+        "`no_such_function` of `geometry/lens.py`",
+    ],
+)
 def test_a_path_or_function_that_does_not_exist_is_found(text):
     assert missing_paths(text, ROOT)
