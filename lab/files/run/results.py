@@ -29,9 +29,9 @@ ABSENT = -1  # the status code where the file has no row
 SUMMARY_SCHEMA = "beampose/summary/1"  # of a run's summary.json
 
 
-def read_result_table(path: Path, required: Iterable[str], optional: Iterable[str] = ()) -> Table:
+def read_result_table(path: Path, required: Iterable[str]) -> Table:
     """The named columns of a table of results. Raises InputError where it is not as a run writes it."""
-    table = read_table(path, required, optional)
+    table = read_table(path, required)
     damaged = [*table.long_lines, *table.short_lines, *(line for of in table.texts.values() for line in of)]
     if damaged:
         raise InputError(

@@ -217,11 +217,11 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:.{digits}g}".replace("-", "\u2212")
 
 
-def padded_range(values: Array, margin: float = 0.06) -> tuple[float, float]:
+def padded_range(values: Array) -> tuple[float, float]:
     """The range of the finite values with a small margin; never empty."""
     finite = values[np.isfinite(values)]
     lo, hi = (float(finite.min()), float(finite.max())) if finite.size else (-1.0, 1.0)
-    pad = max(margin * (hi - lo), 1e-9, 1e-6 * abs(hi))
+    pad = max(0.06 * (hi - lo), 1e-9, 1e-6 * abs(hi))
     return lo - pad, hi + pad
 
 
@@ -277,7 +277,6 @@ def plot_area(
     y_down: bool = False,
     width: float = 540,
     height: float = 300,
-    left: float = 58,
     right: float = 12,
     bottom: float = 52,
     tallest: float = 440,
@@ -286,7 +285,7 @@ def plot_area(
 
     y_down: y grows downwards, as in images. `bottom` leaves room for tick labels, the name of the axis and a `note`.
     """
-    top = 24.0
+    left, top = 58.0, 24.0
     wide = width - left - right
     if equal:
         high = wide * (y_range[1] - y_range[0]) / (x_range[1] - x_range[0])
@@ -297,16 +296,14 @@ def plot_area(
     return PlotArea(Scale(*x_range, left, left + wide), Scale(*y_range, low, up), width, height)
 
 
-def image_area(size_px: tuple[int, int], *, width: float = 540, right: float = 12) -> PlotArea:
+def image_area(size_px: tuple[int, int]) -> PlotArea:
     """A plot area for the pixels of an image, whose edges are at -0.5 and size - 0.5."""
-    return plot_area(
-        (-0.5, size_px[0] - 0.5), (-0.5, size_px[1] - 0.5), equal=True, y_down=True, width=width, right=right
-    )
+    return plot_area((-0.5, size_px[0] - 0.5), (-0.5, size_px[1] - 0.5), equal=True, y_down=True)
 
 
-def svg_of(p: PlotArea, title: str, parts: list[str], css: str = "plot") -> str:
+def svg_of(p: PlotArea, title: str, parts: list[str]) -> str:
     """The drawing as an svg element with a name for screen readers."""
-    return figure(p.width, p.height, title, parts, css=css)
+    return figure(p.width, p.height, title, parts, css="plot")
 
 
 def axes(

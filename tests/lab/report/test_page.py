@@ -56,7 +56,7 @@ def all_drawings() -> dict[str, str]:
         "coverage of none": draw.coverage_map(SIZE, CORNERS[:0]),
         "tilt": draw.tilt_polar(np.array([10.0, 40, np.nan]), np.array([0.0, 90, 10])),
         "map": heat_map(holed, (0, 640, 0, 480), "uncertainty <px>", "px"),
-        "signed map": heat_map(MAP - 1, (-1, 1, -1, 1), "t", "mm", y_down=False),
+        "map that rises upwards": heat_map(MAP - 1, (-1, 1, -1, 1), "t", "mm", y_down=False),
         "map of nothing": heat_map(np.full((3, 4), np.nan), (0, 1, 0, 1), "t", "px"),
         "histogram": charts.residual_histogram(RESIDUALS, sigma=0.2),
         "histogram of none": charts.residual_histogram(RESIDUALS[:0]),
