@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import gc
+import inspect
 import os
 import sys
 
@@ -23,11 +26,19 @@ from calibration.open3d_loader import MissingOpen3DError, open3d  # noqa: E402
 # of when it happens replace this function.
 os.fsync = lambda file: None
 
+# The schemas read the comments of some 40 classes 340 times: 4 s in every test process, all in Python's tokenizer.
+inspect.getsource = functools.cache(inspect.getsource)
+
 # The same examples every time: a test that failed fails again, and a machine that is busy is no failure.
 # `pytest --hypothesis-profile=explore` goes looking for new ones.
 settings.register_profile("fixed", derandomize=True, deadline=None)
 settings.register_profile("explore", deadline=None, max_examples=1000)
 settings.load_profile("fixed")
+
+
+def pytest_collection_finish() -> None:
+    """The search for cycles leaves out all modules and tests, which stay until the end."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
