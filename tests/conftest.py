@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import gc
 import inspect
 import os
 import sys
@@ -34,11 +33,6 @@ inspect.getsource = functools.cache(inspect.getsource)
 settings.register_profile("fixed", derandomize=True, deadline=None)
 settings.register_profile("explore", deadline=None, max_examples=1000)
 settings.load_profile("fixed")
-
-
-def pytest_collection_finish() -> None:
-    """The search for cycles leaves out all modules and tests, which stay until the end."""
-    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -35,7 +35,7 @@ from tests.lab.run_folders import write_run
 from tests.paths import ROOT
 
 SAMPLE = ROOT / "sample_runs" / "huo2015"
-PICTURES = 40  # of each camera of the sample run, enough for every file of a result; `-m slow` takes all 220
+PICTURES = 24  # of each camera of the sample run, enough for every file of a result; `-m slow` takes all 220
 PROGRAM = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from cli import main; main(prog_name='beampose')"
 EXAMPLE = re.compile(r"^\s*beampose (.+)$", flags=re.MULTILINE)
 
