@@ -138,7 +138,7 @@ def test_markers_that_are_not_where_run_yaml_says_are_reported(drogue, tmp_path)
 
 
 def test_two_cameras_exchanged_give_no_confident_pose(tmp_path):
-    drogue = write_stereo_recording(tmp_path / "drogue", seed=6, frames=2, points=True)
+    drogue = write_stereo_recording(tmp_path / "drogue", seed=6, frames=3, points=True)
     pair = yaml.safe_load((drogue / "pair.yaml").read_text(encoding="utf-8"))
     left, right = pair["cameras"]["left"], pair["cameras"]["right"]
     pair["cameras"] = {"left": right, "right": left}
