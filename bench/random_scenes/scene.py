@@ -226,7 +226,7 @@ def draw_amplitudes(rng: np.random.Generator, lab: Lab) -> Array:
 def fitted_motion(lab: Lab, motion: Motion, amplitudes: Array, fastest_px: float, least_in_view: float) -> Array | None:
     """x, y, z, yaw, pitch, roll (T, 6) with amplitudes reduced until enough spots are in view and not too fast.
 
-    None where even a small motion does not show LEAST_SPOTS spots in the first frames.
+    None where even a small motion does not show LEAST_SPOTS spots (or all) in the first frames.
     """
     camera_of, spot_of = view_indices(lab.rig)
     sizes = np.array([c.image_size_px for c in lab.rig.cameras.values()], dtype=float)[camera_of]
@@ -238,7 +238,7 @@ def fitted_motion(lab: Lab, motion: Motion, amplitudes: Array, fastest_px: float
         early = min(len(np.unique(spot_of[row])) for row in seen[:CLEAN_FRAMES])
         moved = np.linalg.norm(np.diff(uv, axis=0), axis=-1)
         quick = np.nanmax(np.where(seen[1:], moved, 0.0))
-        if early >= LEAST_SPOTS and seen.mean() >= least_in_view and quick <= fastest_px:
+        if early >= min(LEAST_SPOTS, len(lab.rig.spots)) and seen.mean() >= least_in_view and quick <= fastest_px:
             return q
         size *= 0.8
     return None
