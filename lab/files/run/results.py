@@ -29,9 +29,9 @@ ABSENT = -1  # the status code where the file has no row
 SUMMARY_SCHEMA = "beampose/summary/1"  # of a run's summary.json
 
 
-def read_result_table(path: Path, required: Iterable[str]) -> Table:
+def read_result_table(path: Path, required: Iterable[str], optional: Iterable[str] = ()) -> Table:
     """The named columns of a table of results. Raises InputError where it is not as a run writes it."""
-    table = read_table(path, required)
+    table = read_table(path, required, optional)
     damaged = [*table.long_lines, *table.short_lines, *(line for of in table.texts.values() for line in of)]
     if damaged:
         raise InputError(
@@ -77,7 +77,7 @@ class SpotGrid:
     sigma_px: Array  # (F, V, 2)
     predicted_px: Array  # (F, V, 2), predicted before the detection
     gain: Array  # (F, V)
-    label_probability: Array  # (F, V) probability that the label is right; nan without a label
+    label_probability: Array  # (F, V) probability that the label is right; nan without a label, or where not stated
     status: Ints  # (F, V) index into SPOT_STATUSES, or ABSENT
     cov_uv_px2: Array  # (F, V)
 
@@ -148,7 +148,7 @@ def on_grid(
 
 def read_spots(results: Path) -> SpotGrid:
     """spots.csv of a results folder. Raises InputError."""
-    table = read_result_table(results / "spots.csv", columns.SPOTS)
+    table = read_result_table(results / "spots.csv", columns.SPOTS[:-1], columns.SPOTS[-1:])
     frame, camera, spot = table.numbers["frame"], table.words["camera"], table.words["spot"]
     frames = np.unique(frame).astype(np.int64)
     pairs = np.unique(np.stack([camera.codes, spot.codes], -1), axis=0) if len(table) else np.zeros((0, 2), np.int64)
@@ -191,7 +191,8 @@ def read_poses(results: Path, causal: bool = False) -> PoseTrack:
     causal: attitude_causal.csv and covariance_causal.csv (the filter's poses, not smoothed) instead.
     """
     which = CAUSAL if causal else ""
-    table = read_result_table(results / f"attitude{which}.csv", columns.ATTITUDE)
+    required = [c for c in columns.ATTITUDE if c not in columns.MOTION]
+    table = read_result_table(results / f"attitude{which}.csv", required, columns.MOTION)
     frames = table.numbers["frame"].astype(np.int64)
     return PoseTrack(
         frames=frames,
