@@ -62,9 +62,7 @@ class TrackerParameters:
     p_norm: float = 2.0  # p: the norm of eqs. (7) and (9)
     # Denominator of g1; the paper's image diagonal makes g1 almost constant.
     g1_scale: Literal["search radius", "paper"] = "search radius"
-    min_vector_px: float = (
-        1.0  # px: floor of vector lengths in g2, g3; shorter ones have a noisy direction (0/0 at rest)
-    )
+    min_vector_px: float = 1.0  # px: floor of vector lengths in g2, g3; shorter ones have a noisy direction
     radius_sigmas: float = 5.0  # r1 grows to this many sigmas of the predicted position (0: constant r1) ...
     max_radius_px: float = 120.0  # px: ... up to this limit, which also bounds r2; r2 grows with the last displacement
 
