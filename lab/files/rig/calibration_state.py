@@ -67,7 +67,7 @@ class CalibrationState(Block):
 class CameraCalibration(CalibrationState):
     """The state of a lens calibration with its quality: the block of a camera.yaml. All of it may be unknown."""
 
-    date: OptionalDay = None  # type: ignore[assignment]
+    date: OptionalDay = None  # type: ignore[assignment]  # a lens may have none, a rig has one
     verdict: Annotated[str, pydantic.PlainValidator(one_of((*VERDICTS, "")))] = ""
     rms_px: NonNegative | None = None  # of the corners' residuals, per axis
     sigma_px: NonNegative | None = None  # of one corner's coordinate, estimated by the solve

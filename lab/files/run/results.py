@@ -29,9 +29,13 @@ ABSENT = -1  # the status code where the file has no row
 SUMMARY_SCHEMA = "beampose/summary/1"  # of a run's summary.json
 
 
-def read_result_table(path: Path, required: Iterable[str], optional: Iterable[str] = ()) -> Table:
-    """The named columns of a table of results. Raises InputError where it is not as a run writes it."""
-    table = read_table(path, required, optional)
+def read_result_table(path: Path, names: Iterable[str]) -> Table:
+    """The named columns of a table of results; those beyond the contract are nan where the file does not have them.
+
+    Raises InputError where it is not as a run writes it.
+    """
+    names = tuple(names)
+    table = read_table(path, [n for n in names if n not in columns.ADDED], [n for n in names if n in columns.ADDED])
     damaged = [*table.long_lines, *table.short_lines, *(line for of in table.texts.values() for line in of)]
     if damaged:
         raise InputError(
@@ -148,7 +152,7 @@ def on_grid(
 
 def read_spots(results: Path) -> SpotGrid:
     """spots.csv of a results folder. Raises InputError."""
-    table = read_result_table(results / "spots.csv", columns.SPOTS[:-1], columns.SPOTS[-1:])
+    table = read_result_table(results / "spots.csv", columns.SPOTS)
     frame, camera, spot = table.numbers["frame"], table.words["camera"], table.words["spot"]
     frames = np.unique(frame).astype(np.int64)
     pairs = np.unique(np.stack([camera.codes, spot.codes], -1), axis=0) if len(table) else np.zeros((0, 2), np.int64)
@@ -191,8 +195,7 @@ def read_poses(results: Path, causal: bool = False) -> PoseTrack:
     causal: attitude_causal.csv and covariance_causal.csv (the filter's poses, not smoothed) instead.
     """
     which = CAUSAL if causal else ""
-    required = [c for c in columns.ATTITUDE if c not in columns.MOTION]
-    table = read_result_table(results / f"attitude{which}.csv", required, columns.MOTION)
+    table = read_result_table(results / f"attitude{which}.csv", columns.ATTITUDE)
     frames = table.numbers["frame"].astype(np.int64)
     return PoseTrack(
         frames=frames,

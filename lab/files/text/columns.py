@@ -24,6 +24,7 @@ ATTITUDE = (
 WHOLE = ("frame", "spots_used")  # columns of whole numbers
 POSE = ATTITUDE[2:18]  # the pose: position, quaternion, angles and their sigmas
 MOTION = ATTITUDE[21:]  # velocity of the body origin, in world; rate about the body's axes; their sigmas
+ADDED = frozenset({"label_probability", *MOTION})  # to the contract's columns: nan in a table that does not have them
 COVARIANCE = ("frame", *(f"c{i}{j}" for i in range(6) for j in range(i, 6)))
 BUDGET = (
     "frame", "place_share", *(f"turn_{name}" for name in ("x_m", "y_m", "z_m", "rot_x_rad", "rot_y_rad", "rot_z_rad")),
