@@ -135,8 +135,9 @@ def expected_light(
         picture[piece] += (values * _speckle(rng, (h, w), light)).astype(np.float32)
         pieces.append(piece)
 
-    shape = np.nanmedian(spots.covariance_px2, axis=0)
-    typical_flux = float(np.nanmedian(powers.flux_dn_per_light[views] * spots.light))
+    met = np.isfinite(spots.light)  # beams that meet the screen; the picture of a camera may have none
+    shape = np.median(spots.covariance_px2[met], axis=0) if met.any() else np.eye(2)
+    typical_flux = float(np.median(powers.flux_dn_per_light[views][met] * spots.light[met])) if met.any() else np.nan
     for i, view in enumerate(views):
         occluded = scene.in_view[k, view] not in (VISIBLE, 0)
         if not occluded and np.isfinite(paths[:, i]).all():
@@ -165,7 +166,8 @@ def _paths(scene: Scene, views: NDArray[np.int64], k: int, covariance_px2: Array
 
     ends = at(half * np.array([-1.0, 1.0]))
     length = np.linalg.norm(ends[1] - ends[0], axis=-1)
-    narrow = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(covariance_px2, nan=1.0))[:, 0])
+    seen = np.isfinite(covariance_px2).all(axis=(1, 2), keepdims=True)
+    narrow = np.sqrt(np.linalg.eigvalsh(np.where(seen, covariance_px2, np.eye(2)))[:, 0])
     longest = int(np.nanargmax(np.nan_to_num(length / narrow)))
     instants, weights = exposure_instants(float(np.nan_to_num(length[longest])), float(narrow[longest]))
     return at(2 * half * instants), weights

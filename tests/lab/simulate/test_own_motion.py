@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -117,6 +118,17 @@ def test_a_trajectory_that_leaves_the_view_says_when_and_which_spot(tmp_path):
         of_spot = np.array([rig_spot == spot for rig_spot in np.array(list(rig.spots))[truth.spot.codes]])
         by_frame = np.array([truth.in_view[of_spot & (truth.frame == k)].any() for k in range(21)])
         assert f"out of view in frame {int(np.argmin(by_frame))} " in line
+
+
+def test_a_camera_whose_screen_no_beam_meets_shows_an_empty_picture(tmp_path):
+    turns = [0.0, 45.0, 90.0, 135.0]
+    table = poses(tmp_path / "away.csv", np.zeros((4, 3)), np.stack([turns, [0.0] * 4, [0.0] * 4], -1))
+    folder = simulate("clean", tmp_path / "run", picture_scale=0.25, trajectory=table)
+    lit = [
+        {int(cv2.imread(str(p), cv2.IMREAD_UNCHANGED).max()) > 60 for p in folder.rglob(f"*{k:04d}.png")}
+        for k in range(4)
+    ]
+    assert lit[0] == {True} and lit[2] == {False}
 
 
 @pytest.mark.parametrize(
