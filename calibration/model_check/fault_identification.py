@@ -79,6 +79,11 @@ class FaultDiagnosis:
         """Whether what no constant fault explains is correlated over several frames, unlike noise."""
         return self.correlation_frames > CORRELATED_FRAMES
 
+    @property
+    def is_random(self) -> bool:
+        """Whether the rig explains all but random errors, however large."""
+        return not (self.suspected_faults or self.unexplained or self.is_correlated)
+
 
 def diagnose(
     lin: LinearisedFrames, jacobian: Array, covariance: Array, faults: Sequence[PossibleFault]

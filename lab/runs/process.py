@@ -187,10 +187,12 @@ def write_tables(
         findings = (*clock_findings(passes.clocks), *model_check.findings)
         model_check = dataclasses.replace(model_check, findings=worst_first(findings))
     # Where the model check has tested the residuals, it has separated noise from faults.
-    noise_scale = None if model_check.result.diagnosis is not None else pipeline.tracker.noise_scale
+    diagnosis = model_check.result.diagnosis
+    noise_scale = None if diagnosis is not None else pipeline.tracker.noise_scale
     mosaics = {name: noise.mosaic for name, noise in pipeline.noise.items() if noise.mosaic}
     verdict = quality.judge(statistics, model_check.findings, noise_scale, mosaics)
-    mistakes = mistakes_of_run(run, statistics, pictures, passes=verdict.status == "pass")
+    explained = diagnosis is not None and diagnosis.is_random
+    mistakes = mistakes_of_run(run, statistics, pictures, passes=verdict.status == "pass", explained=explained)
     if mistakes:
         # The deviations of a rig with such a mistake are its consequences.
         others = () if verdict_of(mistakes) is Level.FAIL else model_check.findings

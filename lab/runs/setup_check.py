@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
 
 import numpy as np
 
@@ -97,14 +96,23 @@ def _moved_px(here: Mapping[str, Detections], before: Mapping[str, Detections]) 
     return max((float(np.quantile(one, 0.25)) for one in away), default=0.0)
 
 
-def recorded_mistakes(run: Run, blocks: Sequence[Block]) -> tuple[Finding, ...]:
-    """Findings on mistakes that sampled frames of a recording show."""
+def recorded_mistakes(run: Run, blocks: Sequence[Block], *, explained: bool = False) -> tuple[Finding, ...]:
+    """Findings on mistakes that sampled frames of a recording show.
+
+    explained: whether the rig leaves nothing but random errors of the recording: sigmas of points are then too small.
+    """
     frames = frames_of(blocks, run.prior, run.tracker.labels.min_spots)
     if frames is None:
         return ()
     compared = compare(run.rig, frames, run.tracker.labels, run.covariance)
-    found = _findings(compared, run.rig)
-    return found if compared.found or compared.given.good else (*found, *_parts_of_pictures(run.rig, blocks))
+    found, given = _findings(compared, run.rig), compared.given
+    if compared.found or given.good or explained:
+        return found
+    seen = [
+        n for n, c in zip(run.rig.cameras, given.points.sum(axis=0), strict=True) if c >= LEAST_POINTS * len(given.fits)
+    ]
+    lenses = same_lenses(run.rig, seen) if given.fits.mean() < LEAST_FITTING else ()
+    return (*found, *lenses, *_parts_of_pictures(run.rig, blocks))
 
 
 def _parts_of_pictures(rig: Rig, blocks: Sequence[Block]) -> tuple[Finding, ...]:
@@ -134,12 +142,12 @@ def _parts_of_pictures(rig: Rig, blocks: Sequence[Block]) -> tuple[Finding, ...]
 
 
 def mistakes_of_run(
-    run: Run, statistics: RunStatistics, pictures: SampledFrames, *, passes: bool
+    run: Run, statistics: RunStatistics, pictures: SampledFrames, *, passes: bool, explained: bool = False
 ) -> tuple[Finding, ...]:
     """Findings on mistakes in the set-up of a run that has been processed.
 
     passes: whether nothing else is to be reported: the rig then explains the recording. It is tested only where the
-    poses hardly use a camera, and for mistakes that its symmetry hides.
+    poses hardly use a camera, and for mistakes that its symmetry hides. explained: as in `recorded_mistakes`.
     """
     of_files = (*mistakes_by_themselves(run.rig, run.prior), *rates_of_videos(run))
     cameras = statistics.cameras
@@ -148,7 +156,7 @@ def mistakes_of_run(
     if verdict(of_files) is Level.FAIL:
         return of_files
     tested = not passes or unused or doubtful
-    found = recorded_mistakes(run, pictures.blocks) if tested else ()
+    found = recorded_mistakes(run, pictures.blocks, explained=explained) if tested else ()
     if passes and not unused and verdict(found) is not Level.FAIL:
         return (*hidden_by_symmetry(run, statistics), *of_files)
     # Of a run, all pictures show whether a camera is used, not only the sampled ones; without any pose none is.
@@ -207,22 +215,25 @@ def same_lenses(rig: Rig, names: Sequence[str]) -> tuple[Finding, ...]:
 
     names: of the cameras with points.
     """
+    groups: dict[tuple[object, ...], list[str]] = {}
+    for name in names:
+        groups.setdefault(_lens(rig.cameras[name]), []).append(f"`{name}`")
+    alike = (f"{', '.join(same[:-1])} and {same[-1]}" for same in groups.values() if len(same) > 1)
     return tuple(
         finding(
             "BP-M08",
             Level.WARN,
-            f"cameras `{a}` and `{b}` have the same lens to the last digit, and the recording does not fit: one of them"
-            " may have the wrong camera.yaml",
+            f"cameras {cameras} have the same lens to the last digit, and the recording does not fit: one of them may"
+            " have the wrong camera.yaml",
             why="two calibrations never agree to the last digit",
-            remedy=f"Compare camera_matrix and distortion of `{a}` and `{b}` with their camera.yaml.",
+            remedy=f"Compare camera_matrix and distortion of {cameras} with their camera.yaml.",
         )
-        for a, b in combinations(names, 2)
-        if _lens(rig.cameras[a]) == _lens(rig.cameras[b])
+        for cameras in alike
     )
 
 
 def _lens(camera: Camera) -> tuple[object, ...]:
-    return (camera.matrix.tolist(), camera.distortion, camera.lens)
+    return (camera.matrix.tobytes(), camera.distortion, camera.lens)
 
 
 def mistakes_by_themselves(rig: Rig, prior: PosePrior | None) -> tuple[Finding, ...]:
@@ -250,9 +261,7 @@ def _findings(compared: Comparison, rig: Rig) -> tuple[Finding, ...]:
     if given.good:
         return ()
     names, points = list(rig.cameras), given.points.sum(axis=0)
-    with_points = [n for n, count in zip(names, points, strict=True) if count >= LEAST_POINTS * len(given.fits)]
-    unused = [unused_finding(names[c], int(points[c]), len(given.fits)) for c in given.with_few_labels()]
-    return (*unused, *(same_lenses(rig, with_points) if given.fits.mean() < LEAST_FITTING else ()))
+    return tuple(unused_finding(names[c], int(points[c]), len(given.fits)) for c in given.with_few_labels())
 
 
 def unused_finding(camera: str, points: int, pictures: int) -> Finding:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
@@ -261,6 +263,20 @@ def video(path: Path, size: tuple[int, int] = (64, 48), rate: float = 25.0, four
         writer.write(ramp)
     writer.release()
     return path
+
+
+def test_errors_larger_than_the_sigmas_do_not_accuse_lenses_that_are_the_same_by_design(symmetric, tmp_path):
+    run = shutil.copytree(symmetric, tmp_path / "run")
+    points = pd.read_csv(run / "detections.csv")
+    points[["sigma_u_px", "sigma_v_px"]] /= 4
+    points["cov_uv_px2"] /= 16
+    points.to_csv(run / "detections.csv", index=False)
+    found = process_run(run, tmp_path / "out").verdict.findings
+    assert [f.code for f in found] == ["BP-M04"]
+    rig = (run / "rig.yaml").read_text()
+    (run / "rig.yaml").write_text(re.sub(r"fx: [\d.]+", "fx: 1100.0", rig))  # both cannot be right, nor explain it
+    found = process_run(run, tmp_path / "wrong").verdict.findings
+    assert [f.what.split(" have")[0] for f in found if f.code == "BP-M08"] == ["cameras `left` and `right`"]
 
 
 def test_a_frame_rate_that_the_header_of_a_video_contradicts_is_reported(tmp_path):
