@@ -486,7 +486,7 @@ def _motion_of(folder: Path) -> tuple[Ints, Motion, Motion]:
     rows = np.flatnonzero(good)
     if len(rows) < 4:
         raise InputError(
-            f"{folder}: expected measured frames with covariances, found {len(rows)}; process the run again"
+            f"{folder}: expected 4 measured frames with covariances or more, found {len(rows)} of {len(good)}"
         )
     pose, total = track.world_from_body[rows], track.covariance[rows]
     beyond = np.abs(pose.translation).max(axis=1) > FARTHEST

@@ -57,10 +57,11 @@ class Exported:
         shown = self.poses.known if with_predicted else self.poses.has(PoseStatus.MEASURED)
         missing = int(np.sum(~shown))
         if missing:
-            of = "without a pose" if with_predicted else "whose pose is not measured, which the format cannot mark,"
-            self.notes.append(f"{missing} of {len(shown)} frames {of} are not in the file")
+            why = "they have no pose" if with_predicted else "their poses are not measured, which the format cannot mark"
+            self.notes.append(f"{missing} of {len(shown)} frames not in the file: {why}")
         if not shown.any():
-            raise InputError(f"{self.name}: expected a frame with a pose to write, found none")
+            kind = "pose" if with_predicted else "measured pose"
+            raise InputError(f"{self.name}: expected a frame with a {kind} to write, found none")
         return shown
 
     def stamps_ns(self) -> list[int]:
@@ -91,7 +92,8 @@ def export(results: Path | str, to: str, out: Path | str | None = None, *, causa
     path = Path(out) if out is not None else Path(f"{results.resolve().name}{wanted.suffix}")
     motion = _read(folder, causal, wanted.covariance)
     wanted.write(motion, path)
-    return Done(path, (f"{to}: {path} ({int(motion.poses.known.sum())} poses)",), tuple(motion.notes))
+    written = motion.poses.has(PoseStatus.MEASURED) if wanted.measured_only else motion.poses.known
+    return Done(path, (f"{to}: {path} ({int(written.sum())} poses)",), tuple(motion.notes))
 
 
 def _read(results: ResultFolder, causal: bool, covariance: str) -> Exported:
@@ -351,15 +353,16 @@ def _write_parquet(motion: Exported, path: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """A format: how it is written, the end of a file's name, and what it says of covariances."""
+    """A format: how it is written, the end of a file's name, what it says of covariances, and which poses it holds."""
 
     write: Callable[[Exported, Path], None]
     suffix: str
     covariance: str = ""
+    measured_only: bool = False
 
 
 FORMATS: Mapping[str, Format] = {
-    "tum": Format(_write_tum, ".tum"),
+    "tum": Format(_write_tum, ".tum", measured_only=True),
     "mcap": Format(_write_mcap, ".mcap", _COVARIANCE),
     "rosbag2": Format(_write_rosbag2, "-rosbag2", _ROS_COVARIANCE),
     "c3d": Format(_write_c3d, ".c3d"),
