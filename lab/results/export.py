@@ -57,7 +57,7 @@ class Exported:
         shown = self.poses.known if with_predicted else self.poses.has(PoseStatus.MEASURED)
         missing = int(np.sum(~shown))
         if missing:
-            why = "they have no pose" if with_predicted else "their poses are not measured, which the format cannot mark"
+            why = "no pose" if with_predicted else "no measured pose, and the format marks none"
             self.notes.append(f"{missing} of {len(shown)} frames not in the file: {why}")
         if not shown.any():
             kind = "pose" if with_predicted else "measured pose"

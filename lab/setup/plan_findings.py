@@ -361,7 +361,8 @@ def _views(plan: Plan) -> Iterator[Finding]:
         yield passed(f"Every spot is in its picture in at least {format_percent(float(shares.min()))} of the poses.")
         return
     camera, spot = plan.views[poor[0]]
-    more = f", and {len(poor) - 1} more of the spots' views in fewer than {format_percent(MIN_IN_VIEW)}" if len(poor) > 1 else ""
+    others = f", and {len(poor) - 1} more of the spots' views in fewer than {format_percent(MIN_IN_VIEW)}"
+    more = others if len(poor) > 1 else ""
     where = _where(plan, ~plan.seen[:, poor[0]])
     what = (
         f"Spot {spot} is in the picture of {camera} in only {format_percent(float(shares[poor[0]]))} of the"

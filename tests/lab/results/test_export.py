@@ -269,7 +269,7 @@ def test_results_without_a_pose_or_without_causal_poses_are_an_error(results, tm
     lost = ["0", "0", *[""] * 16, "0", "", "lost", *[""] * 12]
     write_table(nothing / "attitude.csv", columns.ATTITUDE, [lost])
     for to in ("tum", "rosbag2", "c3d"):
-        with pytest.raises(lab.InputError, match="expected a frame with a (measured )?pose"):
+        with pytest.raises(lab.InputError, match=r"expected a frame with a (measured )?pose"):
             lab.export(nothing, to, tmp_path / "m")
     for to in ("mcap", "hdf5", "parquet"):  # which contain the statuses
         assert "(0 poses)" in lab.export(nothing, to, tmp_path / "m").line()

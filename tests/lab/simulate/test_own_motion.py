@@ -128,7 +128,7 @@ def test_a_camera_whose_screen_no_beam_meets_shows_an_empty_picture(tmp_path):
         {int(cv2.imread(str(p), cv2.IMREAD_UNCHANGED).max()) > 60 for p in folder.rglob(f"*{k:04d}.png")}
         for k in range(4)
     ]
-    assert lit[0] == {True} and lit[2] == {False}
+    assert (lit[0], lit[2]) == ({True}, {False})
 
 
 @pytest.mark.parametrize(
