@@ -24,7 +24,6 @@ class BoardView:
     pixels: Array  # (n, 2), distorted; of circles the centroids of their blobs, not the images of their centres
     spacing_px: float  # median distance of neighbouring points
     blur_px: float  # sigma of the edges, including the width of a pixel; nan where it could not be measured
-    contrast_dn: float  # white minus black
     notes: tuple[str, ...] = ()  # remarks for the user about this picture
     areas_px2: Array | None = None  # (n,), areas of the blobs of circles; None for other boards
 

@@ -177,7 +177,7 @@ def _checked(image: GreyImage, fine: Corners, board: Chessboard) -> BoardView | 
     apart = corner_refinement.spacing(fine.pixels)
     if fine.blur_px > BLUR_LIMIT * apart:
         return too_blurred(fine.blur_px, apart)
-    return BoardView(board.ids, fine.pixels.reshape(-1, 2), apart, fine.blur_px, fine.contrast_dn)
+    return BoardView(board.ids, fine.pixels.reshape(-1, 2), apart, fine.blur_px)
 
 
 def _goes_on(image: GreyImage, grid: Array) -> str:

@@ -45,7 +45,6 @@ class Ellipses:
     centres: Array  # (n, 2), px
     shapes: Array  # (n, 2, 2), px^2: L L^T of the outline c + L (cos a, sin a)
     blurs: Array  # (n,), px: sigma of the edge, including the width of a pixel
-    contrasts: Array  # (n,), DN
 
     @property
     def areas(self) -> Array:
@@ -141,13 +140,12 @@ def _measured(image: GreyImage, grid: Array, blobs: Array, board: CircleGrid, li
         return NotFound(f"{lost.sum()} of {len(lost)} circles have no clean outline: hidden, in glare or blurred")
     order = _by_big_dot(ordered, ellipses.areas, board)
     centres = ellipses.centres[order]
-    contrast = float(np.median(ellipses.contrasts))
     blur = float(np.median(ellipses.blurs))
     apart = corner_refinement.spacing(centres.reshape(ordered.shape))
     if blur > BLUR_LIMIT * apart:
         return too_blurred(blur, apart)
     notes = ("white circles on a black ground",) if light else ()
-    return BoardView(board.ids, centres, apart, blur, contrast, notes, ellipses.areas[order])
+    return BoardView(board.ids, centres, apart, blur, notes, ellipses.areas[order])
 
 
 def _radii(grid: Array, board: CircleGrid, blobs: Array) -> Array:
@@ -180,7 +178,7 @@ def fit_ellipses(image: GreyImage, centres: Array, radii: Array) -> Ellipses:
     blur does not move the centre. Source: Ouellet and Hebert (2009), "Precise ellipse estimation without contour point
     extraction", Machine Vision and Applications 21.
     """
-    out = np.full((len(centres), 7), np.nan)
+    out = np.full((len(centres), 6), np.nan)
     smooth = np.asarray(cv2.GaussianBlur(image.astype(np.float64), (0, 0), 0.7), dtype=float)
     gx, gy = (np.asarray(cv2.Scharr(smooth, cv2.CV_64F, *d) / 32, dtype=float) for d in ((1, 0), (0, 1)))
     height, width = image.shape
@@ -194,11 +192,11 @@ def fit_ellipses(image: GreyImage, centres: Array, radii: Array) -> Ellipses:
         fit = _ellipse(gx[piece], gy[piece], smooth[piece], centre - first, reach)
         if fit is not None and np.linalg.norm(fit[:2] + first - centre) <= 0.7 * radius + 1:
             out[n] = [*(fit[:2] + first), *fit[2:]]
-    return _outlines(image, Ellipses(out[:, :2], out[:, [2, 3, 3, 4]].reshape(-1, 2, 2), out[:, 5], out[:, 6]))
+    return _outlines(image, Ellipses(out[:, :2], out[:, [2, 3, 3, 4]].reshape(-1, 2, 2), out[:, 5]))
 
 
 def _ellipse(gx: Array, gy: Array, grey: Array, centre: Array, reach: float) -> Array | None:
-    """Centre x, y, shape xx, xy, yy, sigma of the edge, contrast (7,) in a patch; None if it is not an ellipse."""
+    """Centre x, y, shape xx, xy, yy, sigma of the edge (6,) in a patch; None if it is not an ellipse."""
     v, u = np.indices(gx.shape)
     x, y = u - centre[0], v - centre[1]
     strength = np.hypot(gx, gy)
@@ -222,7 +220,7 @@ def _ellipse(gx: Array, gy: Array, grey: Array, centre: Array, reach: float) -> 
     outside = np.hypot(x, y) > 0.85 * reach
     contrast = float(np.median(grey[outside]) - np.min(grey[inside])) if inside.any() and outside.any() else np.nan
     blur = contrast / float(np.percentile(strength[edge], 90)) / np.sqrt(2 * np.pi)
-    return np.array([*(place + centre), shape[0, 0], shape[0, 1], shape[1, 1], blur, contrast])
+    return np.array([*(place + centre), shape[0, 0], shape[0, 1], shape[1, 1], blur])
 
 
 def _outlines(image: GreyImage, start: Ellipses) -> Ellipses:
@@ -244,7 +242,7 @@ def _outlines(image: GreyImage, start: Ellipses) -> Ellipses:
             near = np.linalg.norm(found - centres[rows], axis=1) < _MOST_MOVED * np.sqrt(size)
             near &= np.abs(np.sqrt(np.linalg.det(L2)) / size - 1) < _MOST_MOVED
         centres[rows[near]], shapes[rows[near]] = found[near], L2[near]
-    return Ellipses(centres, shapes, start.blurs, start.contrasts)
+    return Ellipses(centres, shapes, start.blurs)
 
 
 def _fitted_outlines(image: GreyImage, centres: Array, shapes: Array, blur: Array) -> tuple[Array, Array]:

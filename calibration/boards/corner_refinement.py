@@ -1,4 +1,4 @@
-"""Measurement of chessboard corners to some thousandths of a pixel, and of the blur and contrast of their edges.
+"""Measurement of chessboard corners to some thousandths of a pixel, and of the blur of their edges.
 
 A corner is where two edges cross. In a window around it, the product of two blurred steps is fitted to the pixels as
 they are, without interpolation; the fit is symmetric, so that contrast, blur and its shape do not move the corner.
@@ -35,11 +35,10 @@ _AT_ONCE = 64  # corners: their arrays stay in the processor's cache
 
 @dataclass(frozen=True, slots=True)
 class Corners:
-    """Measured corners, with the appearance of the edges that meet there."""
+    """Measured corners, with the blur of the edges that meet there."""
 
     pixels: Array  # (rows, columns, 2); nan if not found
     blur_px: float  # median sigma of the edges, including the width of a pixel; nan if no corner was found
-    contrast_dn: float  # median difference of white and black
 
 
 def refined(image: GreyImage, grid: Array, known: Bools | None = None, reach: float = _REACH) -> Corners:
@@ -53,7 +52,7 @@ def refined(image: GreyImage, grid: Array, known: Bools | None = None, reach: fl
     height = edge_distance(grid, known)
     half = np.clip(np.nan_to_num(reach * height, nan=2.0).astype(int), 2, _MOST_PX)
     out = np.full(grid.shape, np.nan)
-    look = np.full((rows, columns, 5), np.nan)  # directions and sigmas of the edges, contrast
+    look = np.full((rows, columns, 4), np.nan)  # directions and sigmas of the edges
     within = known & np.all((grid >= 0) & (grid <= np.array(image.shape[::-1]) - 1), axis=-1)
     sizes = np.unique(half[within]).tolist()
     for size in sizes:
@@ -68,21 +67,21 @@ def refined(image: GreyImage, grid: Array, known: Bools | None = None, reach: fl
                 i, j = chosen[first : first + _AT_ONCE].T
                 steps, new = shape[i, j, :2], np.isnan(look[i, j, :1])
                 edges = np.column_stack([np.arctan2(steps[..., 1], steps[..., 0]), np.full((len(i), 2), _BLUR_PX)])
-                edges = np.where(new, edges, look[i, j, :4])
+                edges = np.where(new, edges, look[i, j])
                 found, seen = _saddles(image, out[i, j], edges, shape[i, j, 2:], size, small_px)
                 good = np.linalg.norm(found - out[i, j], axis=1) <= max(1.0, 0.25 * size)
                 out[i, j], look[i, j] = np.where(good[:, None], found, out[i, j]), seen
     out[np.linalg.norm(out - grid, axis=-1) > np.maximum(1.5, 0.75 * half)] = np.nan
     look = look[np.isfinite(out).all(axis=-1)]
     if not len(look):
-        return Corners(out, np.nan, np.nan)
-    return Corners(out, float(np.median(look[:, 2:4])), float(np.median(look[:, 4])))
+        return Corners(out, np.nan)
+    return Corners(out, float(np.median(look[:, 2:])))
 
 
 def _saddles(
     image: GreyImage, start: Array, edges: Array, bend: Array, half: int, small_px: float
 ) -> tuple[Array, Array]:
-    """Corners (n, 2), px, with directions and sigmas of the two edges and the contrast, DN (n, 5), by least squares.
+    """Corners (n, 2), px, with directions and sigmas of the two edges (n, 4), by least squares.
 
     start (n, 2), px, and edges (n, 4), rad and px: start values; bend (n, 3, 2): the curvature of `_local_shape`. Grey
     values are (b + b' d) + (c + c' d) S1 S2 at the offset d from the corner, with S the error function of the distance
@@ -122,7 +121,7 @@ def _saddles(
         x[:, 4:] = np.clip(x[:, 4:], 0.25, half)
         if np.max(np.abs(step[:, :2])) < small_px:
             break
-    return whole + x[:, :2], np.column_stack([x[:, 2:], 2 * np.abs(linear[:, 3, 0])])
+    return whole + x[:, :2], x[:, 2:]
 
 
 def linear_part(L: Pixelwise, grey: Pixelwise) -> Array:

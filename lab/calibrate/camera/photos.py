@@ -314,7 +314,7 @@ def read_corner_table(path: Path, board: Board, image_size_px: tuple[int, int]) 
             )
         order = np.argsort(ids)
         if len(ids):
-            found.append((name, BoardView(ids[order], pixels[order], np.nan, np.nan, np.nan)))
+            found.append((name, BoardView(ids[order], pixels[order], np.nan, np.nan)))
     if not found:
         raise InputError(f"{path}: expected corners of {board.describe()}, got none")
     return PhotoSet(board, image_size_px, tuple(found), (), {name: path for name, _ in found})
