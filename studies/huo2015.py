@@ -64,7 +64,7 @@ class Study:
     bends: Bools  # (T,)
 
 
-def repeat_huo2015(seed: int, frames: int) -> Study:
+def repeat_huo2015(seed: int, frames: int = 600) -> Study:
     """The experiment on points with 0.1 px noise and 20 % clutter; the seed determines the result."""
     run = simulate_points("huo2015", seed, frames=frames, noise_px=NOISE_PX)
     bends = _bends(run)
@@ -305,9 +305,9 @@ U_COLOUR, V_COLOUR = svg.BLUE, svg.VERMILLION
 _TRACK_COLOURS = (svg.BLUE, svg.VERMILLION, svg.GREEN, svg.PURPLE, svg.ORANGE, svg.SKY)
 
 
-def compare_huo2015(seed: int = 1, frames: int = 600) -> Comparison:
+def compare_huo2015(seed: int = 1) -> Comparison:
     """The table and the figures of section 5.1."""
-    return comparison_of(repeat_huo2015(seed, frames))
+    return comparison_of(repeat_huo2015(seed))
 
 
 def comparison_of(study: Study) -> Comparison:

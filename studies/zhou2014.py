@@ -290,13 +290,12 @@ def measured_once(picture: Picture, prior: Array, parameters: CircleParameters) 
     return max(good, key=lambda f: f.score - abs(f.rim.radius_px / radius - 1), default=None)
 
 
-def strongest(picture: Picture, radii_px: tuple[int, int] = (10, 60)) -> Array | None:
+def strongest(picture: Picture) -> Array | None:
     """The strongest circle (3,) of cv2.HoughCircles; its threshold is lowered until it finds one."""
     for threshold in (60, 40, 25, 15, 8):
         found = cv2.HoughCircles(
-            picture, cv2.HOUGH_GRADIENT, 1, 20, param1=100, param2=threshold, minRadius=radii_px[0],
-            maxRadius=radii_px[1],
-        )  # fmt: skip
+            picture, cv2.HOUGH_GRADIENT, 1, 20, param1=100, param2=threshold, minRadius=10, maxRadius=60
+        )
         if found is not None:
             return np.asarray(found, dtype=float).reshape(-1, 3)[0]
     return None
@@ -329,8 +328,9 @@ class HiddenRun:
         return float(np.where(np.isfinite(chosen), chosen, np.inf).max())
 
 
-def hidden_run(seed: int, frames: int = 60, first: int = 40, count: int = 8) -> HiddenRun:
-    """A ring on a smooth path, behind a plate for `count` frames."""
+def hidden_run(seed: int) -> HiddenRun:
+    """A ring on a smooth path of 60 frames, behind a plate for eight of them."""
+    frames, first, count = 60, 40, 8
     rng = np.random.default_rng([seed, 2])
     background = textured(rng, STILL_SIZE)
     phase, radius = rng.uniform(0, 2 * np.pi, 4), float(rng.uniform(16, 30))
@@ -358,7 +358,7 @@ def hidden_run(seed: int, frames: int = 60, first: int = 40, count: int = 8) -> 
     return HiddenRun(frame, hidden, errors[:, 0], errors[:, 1])
 
 
-def cost_ratio(seed: int, pictures: Sequence[Picture] | None = None, rounds: int = 5) -> tuple[float, float]:
+def cost_ratio(seed: int, pictures: Sequence[Picture] | None = None) -> tuple[float, float]:
     """Process time, ms per frame of 1280 x 1024 px, of the tracker and of HoughCircles on the whole picture.
 
     One thread for both, since idle threads of OpenCV count as process time. pictures: consecutive ones with a circle,
@@ -369,7 +369,7 @@ def cost_ratio(seed: int, pictures: Sequence[Picture] | None = None, rounds: int
     cv2.setNumThreads(1)
     times = []
     try:
-        for _ in range(rounds):
+        for _ in range(5):
             tracker = CircleOptions().tracker()
             for picture in given[:_WARM_UP]:
                 tracker.step(picture)
@@ -386,14 +386,14 @@ def cost_ratio(seed: int, pictures: Sequence[Picture] | None = None, rounds: int
     return float(ours), float(opencv)
 
 
-def _large_pictures(seed: int, count: int = 24) -> list[NDArray[np.uint8]]:
+def _large_pictures(seed: int) -> list[NDArray[np.uint8]]:
     rng = np.random.default_rng([seed, 3])
     below = textured(rng, _LARGE)
     look, radius = int(rng.integers(2**31)), float(rng.uniform(*RADII_PX))
     left, top = 500, 400
     patch = below[top : top + STILL_SIZE[1], left : left + STILL_SIZE[0]]
     out = []
-    for k in range(count):
+    for k in range(24):
         centre = (STILL_SIZE[0] / 2 + 0.5 * k, STILL_SIZE[1] / 2 + 0.3 * k)
         still = ring_still(np.random.default_rng(look), radius, 0.0, centre_px=centre, background=patch)
         picture = np.clip(np.rint(below + rng.normal(0, 2.0, below.shape)), 0, 255).astype(np.uint8)

@@ -112,16 +112,14 @@ class PoseErrors:
         return np.array([np.linalg.norm(error[s]) / np.linalg.norm(smallest[s]) for s in (slice(0, 3), slice(3, 6))])
 
 
-def pose_errors(
-    trials: int, noise_px: float, rng: np.random.Generator, distance_m: float = 10.0, focal_px: float = 1500.0
-) -> PoseErrors:
-    """Trials of seven markers (rim of 0.3 m) at a distance."""
-    pair, model = simulated_pair(focal_px, (1280, 1024), BASELINE_M), drogue_markers()
+def pose_errors(trials: int, noise_px: float, rng: np.random.Generator) -> PoseErrors:
+    """Trials of seven markers (rim of 0.3 m) at 10 m, with a focal length of 1500 px."""
+    pair, model = simulated_pair(1500.0, (1280, 1024), BASELINE_M), drogue_markers()
     cov = np.broadcast_to(noise_px**2 * np.eye(2), (2, len(model), 2, 2))
     seen = np.ones((2, len(model)), dtype=bool)
     rows: list[tuple[Array, Array, Array, float]] = []
     for _ in range(trials):
-        pose = random_pose(distance_m, rng)
+        pose = random_pose(10.0, rng)
         uv = project_markers(pair, model, pose)[0] + rng.normal(0, noise_px, (2, len(model), 2))
         flat = np.stack([undistorted_pixels(c, u) for c, u in zip(pair.cameras, uv, strict=True)])
         horn = pose_of_points(model.positions, linear_points(pair, flat))
@@ -237,13 +235,13 @@ def _centroid_rows(seed: int) -> list[ComparisonRow]:
     return [ComparisonRow("centroid of a marker, RMS", "px", None, (contour, None, coverage), note_)]
 
 
-def centroid_errors(seed: int, pictures: int = PICTURES) -> tuple[float, float]:
+def centroid_errors(seed: int) -> tuple[float, float]:
     """RMS per coordinate, px, of contour and coverage centroids of the markers in simulated pictures."""
     view = scene(seed, 60, (640, 480), 1100.0)
     rng = np.random.default_rng([seed, 3])
     true, hidden, red = true_pixels(view), occluded(view), ColourRange("red", (340.0, 20.0))
     errors: tuple[list[Array], list[Array]] = ([], [])
-    for i in np.linspace(0, len(view.t_s) - 1, pictures).astype(int).tolist():
+    for i in np.linspace(0, len(view.t_s) - 1, PICTURES).astype(int).tolist():
         pictures_ = [render(view, i, c, rng) for c in (0, 1)]
         seen = prepared(pictures_[0], pictures_[1], SegmentationParameters())
         for kind, out in zip(("contour", "coverage"), errors, strict=True):

@@ -241,12 +241,12 @@ def spacing(grid: Array) -> float:
     return float(np.nanmedian(both)) if np.isfinite(both).any() else np.nan
 
 
-def sampled(image: GreyImage, where: Array, method: int = cv2.INTER_LINEAR) -> Array:
-    """Grey values (...) at (..., 2), by default by bilinear interpolation; outside, those of the border."""
+def sampled(image: GreyImage, where: Array) -> Array:
+    """Grey values (...) at (..., 2) by bilinear interpolation; outside, those of the border."""
     flat = np.nan_to_num(where, nan=-1.0).reshape(-1, 2).astype(np.float32)
     out = np.empty(len(flat))
     for first in range(0, len(flat), 30_000):  # cv2.remap's maps have at most 32767 rows
         u, v = np.ascontiguousarray(flat[first : first + 30_000].T)[..., None]
-        read = cv2.remap(image, u, v, method, borderMode=cv2.BORDER_REPLICATE)
+        read = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         out[first : first + 30_000] = read.ravel()
     return out.reshape(where.shape[:-1])

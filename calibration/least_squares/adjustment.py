@@ -141,6 +141,7 @@ class Lines:
 
 # Symmetric linear systems: scaling, factors, damped steps; small ones are solved as full matrices.
 
+_UNDETERMINED = 1e-9  # ratio of the information along a direction to that on its numbers one by one
 _SMALL = 300  # unknowns up to which a full matrix takes less time: forty photographs of one camera (1 ms against 4 ms)
 
 
@@ -324,10 +325,10 @@ class Adjusted:
         out[np.ix_(free, free)] = (S + S.T) / 2
         return out
 
-    def undetermined(self, keep: Sequence[At], threshold: float = 1e-9) -> Array:
+    def undetermined(self, keep: Sequence[At]) -> Array:
         """The m directions (m, p) in the errors of the kept unknowns that the data do not determine.
 
-        threshold: largest ratio of the information along such a direction to that on its numbers one by one.
+        Their information is below _UNDETERMINED times that on their numbers one by one.
         """
         S = self.reduced_normal(keep)
         columns = np.concatenate([self._columns.of(*a) for a in keep])
@@ -335,8 +336,8 @@ class Adjusted:
         alone = np.sqrt(np.maximum(self._normal.diagonal()[columns[used]], 1e-300))
         scaled = S[np.ix_(used, used)] / np.outer(alone, alone)
         eigenvalues, vectors = np.linalg.eigh(scaled)
-        out = np.zeros((int(np.sum(eigenvalues < threshold)), len(columns)))
-        out[:, used] = (vectors[:, eigenvalues < threshold] / alone[:, None]).T
+        out = np.zeros((int(np.sum(eigenvalues < _UNDETERMINED)), len(columns)))
+        out[:, used] = (vectors[:, eigenvalues < _UNDETERMINED] / alone[:, None]).T
         return out
 
 

@@ -121,7 +121,7 @@ def spot_sigma(joint: Joint) -> float:
     return float(np.sqrt(np.median((spots.covariance[:, 0, 0] + spots.covariance[:, 1, 1]) / 2)))
 
 
-def hold_out(measured: Measured, joint: Joint, seed: int = 0) -> HoldOut | None:
+def hold_out(measured: Measured, joint: Joint) -> HoldOut | None:
     """Five-fold cross-validation of the positions: calibrate without a fifth of their spots and predict them.
 
     None if there are too few positions. The held-out spots are compared with their prediction from rig, stand and
@@ -133,7 +133,7 @@ def hold_out(measured: Measured, joint: Joint, seed: int = 0) -> HoldOut | None:
     count = len(measured.stand.stand_from_body.translation)
     if count < FEWEST_POSITIONS:
         return None
-    fold_of = np.random.default_rng(seed).permutation(count) % FOLDS
+    fold_of = np.random.default_rng(0).permutation(count) % FOLDS
     scale = joint.scales.get(SPOTS, 1.0)
     positions, errors, sigmas = [], [], []
     chi2, dof = 0.0, 0

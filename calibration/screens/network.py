@@ -104,9 +104,7 @@ class Start:
     world_from_screen: Pose  # batch, one per screen: the axes within the plane keep these directions
     world_from_board: Pose  # batch, one per placement
     bow: Array  # (screens, 3), 1/m
-    # If no survey defines the world: the camera, or the board fixed to a screen, whose pose is held.
-    held_camera: int | None = None
-    held_board: int | None = None
+    held_board: int | None = None  # fixed to a screen: its pose is held if no survey defines the world
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,17 +163,14 @@ def _unknowns(network: Network, start: Start) -> tuple[Values, dict[str, bool | 
     if network.corners is not None and network.corners.areas_px2 is not None:
         values["radius"] = Vectors(network.corners.radii_by_areas(values)[:, None])
     n_cameras, n_screens = len(rig.cameras), len(rig.screens)
-    cameras = np.ones((n_cameras, 6), dtype=bool)
     bow = np.zeros((n_screens, 3), dtype=bool)
     bow[sorted(network.bent)] = True
-    if start.held_camera is not None:
-        cameras[start.held_camera] = False
     boards = np.ones((len(start.world_from_board.translation), 6), dtype=bool)
     if start.held_board is not None:
         boards[start.held_board] = False
     lens = np.zeros((n_cameras, 18), dtype=bool) if network.lens_free is None else network.lens_free
     free: dict[str, bool | Bools] = {
-        "cameras": cameras,
+        "cameras": True,
         "screens": True,
         "bow": bow,
         "points": True,

@@ -232,20 +232,17 @@ def chain(
     poses_by_camera: Mapping[int, Pose],
     boards: Mapping[tuple[int, int], Pose],
     held_screen: int | None = None,
-    held_camera: int | None = None,
     problems: Mapping[int, str] | None = None,
 ) -> ChainedPoses:
     """Propagate poses from the world to every camera and board.
 
     on_dots: camera -> camera_from_world by surveyed dots; boards: (camera, placement) -> camera_from_board. Without a
-    survey the world is the frame of held_screen or else of held_camera. problems: camera -> why its dots give no pose.
+    survey the world is the frame of held_screen. problems: camera -> why its dots give no pose.
 
     Raises:
         NotConnectedError: some cameras are not connected with the others.
     """
     cameras: dict[int, Pose] = dict(poses_by_camera)
-    if not cameras and held_camera is not None:
-        cameras[held_camera] = Pose.identity()
     placed: dict[int, Pose] = {}
     screens: dict[int, Pose] = {}
     fixed = (
@@ -286,12 +283,11 @@ def start_of(
     chained: ChainedPoses,
     frames: Mapping[int, Pose],
     bow: Array,
-    held_camera: int | None = None,
     held_board: int | None = None,
 ) -> Start:
     """The start values of an adjustment. frames: screen -> world_from_screen from its dots or its scan.
 
-    held_camera, held_board: element whose pose is fixed if there is no survey.
+    held_board: board whose pose is fixed if there is no survey.
 
     Raises:
         NotConnectedError: a screen or a board has no pose.
@@ -313,7 +309,6 @@ def start_of(
         world_from_screen=Pose.stack(screens[i] for i in range(len(names))),
         world_from_board=Pose.stack(chained.world_from_board[i] for i in order),
         bow=bow,
-        held_camera=held_camera,
         held_board=held_board,
     )
 

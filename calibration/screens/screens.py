@@ -87,12 +87,11 @@ def calibrate(
     setups: Sequence[ScreenSetup],
     near: Mapping[int, ApproximatePosition] | None = None,
     held_screen: int | None = None,
-    held_camera: int | None = None,
 ) -> ScreensResult:
     """Poses of all cameras and screens, their bows where significant, and the joint covariance.
 
     setups: one per screen. near: camera -> approximate position, which decides between two poses. Without a survey, the
-    world is the frame that held_screen gets from the board fixed to it, or that of held_camera.
+    world is the frame that held_screen gets from the board fixed to it.
 
     Raises:
         NotConnectedError: some cameras or screens are not connected with the others.
@@ -106,16 +105,9 @@ def calibrate(
     surveyed = bool(chosen) or (bool(np.any(network.control_points.screen_of >= 0)) and not boards)
     problems = {c: found.problem for c, found in poses_by_camera.items()}
     placed = {c: p.camera_from_world for c, p in chosen.items()}
-    chained = chain(network, placed, boards, held_screen, held_camera, problems)
+    chained = chain(network, placed, boards, held_screen, problems)
     complete, frames, bows, results = _screen_starts(network, setups, chained)
-    start = start_of(
-        complete,
-        chained,
-        frames,
-        bows,
-        None if surveyed or held_screen is not None else held_camera,
-        None if surveyed else _board_on(network, held_screen),
-    )
+    start = start_of(complete, chained, frames, bows, None if surveyed else _board_on(network, held_screen))
     fit = adjust(complete, start)
     results = [_in_final_frame(r, complete, fit, k) for k, r in enumerate(results)]
     second_poses = {

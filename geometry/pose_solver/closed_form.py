@@ -71,11 +71,11 @@ def quadratic_coefficients(O: Array, A: Array, B: Array, beta: float) -> tuple[A
     return m1 - m * m, m2 - 2 * m * l, m3 - l * l
 
 
-def outer_spot(O: Array, A: Array, B: Array, alpha: float, beta: float, tolerance: float = ANGLE_TOLERANCE) -> Array:
+def outer_spot(O: Array, A: Array, B: Array, alpha: float, beta: float) -> Array:
     """C (..., 3), m, eq. (11): the spot beyond B, of a beam at the angle `beta` (rad) from B's; nan if it misses.
 
     O, A, B (..., 3), m, in world; alpha, the calibrated angle AOB, and beta are in (0, pi/2). Of the two roots of eq.
-    (14), the one with k > 0 and an angle AOC of alpha + beta, within the tolerance, is taken. The paper's rule, "the
+    (14), the one with k > 0 and an angle AOC of alpha + beta, within ANGLE_TOLERANCE, is taken. The paper's rule, "the
     root whose angle AOC is 2 alpha", is not fulfilled by any root if the beam points away from the plane (8 % of
     geometries for alpha of 10 to 30 deg, 90 % for 60 to 89 deg); the nearest root is then A itself.
     """
@@ -89,7 +89,7 @@ def outer_spot(O: Array, A: Array, B: Array, alpha: float, beta: float, toleranc
         C = B[..., None, :] + k[..., None] * (B - A)[..., None, :]
         OA, OC = normalised(A - O)[..., None, :], normalised(C - O[..., None, :])
         off = np.abs(_angle(OA, OC) - (alpha + beta))
-        fits = np.isfinite(k) & (k > 0) & (off < tolerance)
+        fits = np.isfinite(k) & (k > 0) & (off < ANGLE_TOLERANCE)
         best = np.argmin(np.where(fits, off, np.inf), axis=-1)
     chosen = np.take_along_axis(C, best[..., None, None], axis=-2)[..., 0, :]
     return np.where(np.any(fits, axis=-1, keepdims=True), chosen, np.nan)

@@ -25,6 +25,7 @@ RANK_TOLERANCE = 1e-7
 # If the start is farther from the solution than this, the effect of the calibration's errors is computed again: within
 # it, the sigmas of the pixels change by up to some per cent.
 NEAR_M, NEAR_RAD = 0.05, np.deg2rad(1.0)
+_MOST_ITERATIONS = 25
 
 
 class PoseModel(Protocol):
@@ -125,32 +126,29 @@ def fit_pose(
     pixels: Array,
     covariances: Array,
     start: Pose,
-    *,
-    prior: tuple[Pose, Array] | None = None,
     calibration: CommonErrors | None = None,
-    max_iterations: int = 25,
 ) -> PoseFit | None:
     """The least-squares pose of the spots of views `rows` (m,) at `pixels` (m, 2), with covariances (m, 2, 2), px^2.
 
-    start: the first pose; an error of some ten degrees is allowed. prior: a pose and its information matrix (6, 6),
-    used as six more measurements. calibration: the covariance of its errors is added to that of the spots, and its
-    effect on the pose is the systematic part. Levenberg's damping keeps steps from a poor start bounded. None if the
-    iteration does not converge (a spot loses its projection on the way, or the start is singular).
+    start: the first pose; an error of some ten degrees is allowed. calibration: the covariance of its errors is added
+    to that of the spots, and its effect on the pose is the systematic part. Levenberg's damping keeps steps from a poor
+    start bounded. None if the iteration does not converge (a spot loses its projection on the way, or the start is
+    singular).
     """
     if len(rows) == 0:
         return None
     rows = np.asarray(rows)
     if calibration is None:
-        return _fit(model, rows, pixels, covariances, start, prior, None, max_iterations)
+        return _fit(model, rows, pixels, covariances, start, None)
     common = calibration.at(start)
-    fit = _fit(model, rows, pixels, covariances, start, prior, common, max_iterations)
+    fit = _fit(model, rows, pixels, covariances, start, common)
     if fit is None:
         return None
     error_of_start = fit.world_from_body.minus(start)
     if np.linalg.norm(error_of_start[:3]) < NEAR_M and np.linalg.norm(error_of_start[3:]) < NEAR_RAD:
         return fit
     common = calibration.at(fit.world_from_body)
-    return _fit(model, rows, pixels, covariances, fit.world_from_body, prior, common, max_iterations)
+    return _fit(model, rows, pixels, covariances, fit.world_from_body, common)
 
 
 def _fit(
@@ -159,9 +157,7 @@ def _fit(
     pixels: Array,
     covariances: Array,
     start: Pose,
-    prior: tuple[Pose, Array] | None,
     common: Array | None,
-    max_iterations: int,
 ) -> PoseFit | None:
     """As `fit_pose`, with the covariance (2n, 2n), px^2, of all pixels due to the calibration's errors, or None."""
     if common is None:
@@ -172,11 +168,11 @@ def _fit(
         W = np.linalg.inv(root)
         log_det = 2 * float(np.sum(np.log(np.diagonal(root))))
     pose, damping = start, 0.0
-    terms = _terms(model, rows, pixels, W, pose, prior)
+    terms = _terms(model, rows, pixels, W, pose)
     if terms is None:
         return None
     H, g, cost, residuals, projected, J = terms
-    for _ in range(max_iterations):
+    for _ in range(_MOST_ITERATIONS):
         scale = np.maximum(np.diagonal(H), 1e-12 * np.trace(H))
         # The smallest damping affects only directions that no spot observes; elsewhere it is far below rounding.
         step = np.asarray(np.linalg.solve(H + np.diag((damping + 1e-14) * scale), g), dtype=np.float64)
@@ -184,7 +180,7 @@ def _fit(
         if not np.isfinite(gain):
             return None
         trial = pose.plus(step)
-        trial_terms = _terms(model, rows, pixels, W, trial, prior)
+        trial_terms = _terms(model, rows, pixels, W, trial)
         if trial_terms is None or trial_terms[2] > cost * (1 + 1e-9) + 1e-12:
             damping = max(10 * damping, 1e-3)
             if damping > 1e8:
@@ -197,7 +193,7 @@ def _fit(
     else:
         return None
     covariance, observable = covariance_of(H)
-    dof = 2 * len(rows) - 6 + (6 if prior is not None else 0)
+    dof = 2 * len(rows) - 6
     K, systematic, share = np.zeros((6, 2 * len(rows))), np.zeros((6, 6)), 0.0
     if common is not None and observable:
         S = common[np.ix_(coordinates_of(rows), coordinates_of(rows))]
@@ -238,7 +234,7 @@ def _blocks(covariances: Array) -> Array:
 
 
 def _terms(
-    model: PoseModel, rows: Ints, pixels: Array, W: Array, pose: Pose, prior: tuple[Pose, Array] | None
+    model: PoseModel, rows: Ints, pixels: Array, W: Array, pose: Pose
 ) -> tuple[Array, Array, float, Array, Array, Array] | None:
     """Normal matrix (6, 6), right-hand side (6,), cost, residuals (m, 2), px, pixels (n, 2) and Jacobians (n, 2, 6).
 
@@ -255,12 +251,7 @@ def _terms(
     else:
         r = W @ residuals.ravel()
         A = W @ J[rows].reshape(-1, 6)
-    H, g, cost = A.T @ A, A.T @ r, float(r @ r)
-    if prior is not None:
-        # d(minus)/d(step) is the identity to first order in the distance, accurate enough for a prior.
-        gap = prior[0].minus(pose)
-        H, g, cost = H + prior[1], g + prior[1] @ gap, cost + float(gap @ prior[1] @ gap)
-    return H, g, cost, residuals, projected, J
+    return A.T @ A, A.T @ r, float(r @ r), residuals, projected, J
 
 
 def covariance_of(H: Array) -> tuple[Array, bool]:

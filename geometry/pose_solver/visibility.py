@@ -28,15 +28,14 @@ from geometry.rig import Rig
 SAME = 1e-4  # m and rad
 # A fit to all spots reduces the misfit that a solution for three of them leaves in the others by less than this factor.
 MAX_FIT_GAIN = 50.0
+TOLERANCE_PX = 1.0  # of a fit to all spots: the other pose agrees with every view to within this
 
 
-def alternative_poses(
-    model: SpotModel, world_from_body: Pose, rows: Ints | Sequence[int], tolerance_px: float = 1.0
-) -> Pose:
+def alternative_poses(model: SpotModel, world_from_body: Pose, rows: Ints | Sequence[int]) -> Pose:
     """All other poses (k,) that put the spots of views `rows` (m,) where the given pose puts them.
 
-    With three spots the poses are exact; with more, they are fitted to all spots and agree in every view to within the
-    tolerance. Views of two cameras may show one spot. The stack is empty if there is no other pose. It is also empty
+    With three spots the poses are exact; with more, they are fitted to all spots and agree in every view to within
+    TOLERANCE_PX. Views of two cameras may show one spot. The stack is empty if there is no other pose. It is also empty
     for fewer than three spots, or three collinear ones, which allow a continuum of poses: the caller must check whether
     the spots determine the pose at all (`observable` of a fit).
     """
@@ -53,12 +52,12 @@ def alternative_poses(
     exact = len(np.unique(model.spot_of[views])) == 3
     for start in (solutions[i] for i in range(len(solutions.translation))):
         misfit = _misfit(model, start, views, target)
-        if not misfit <= MAX_FIT_GAIN * tolerance_px:
+        if not misfit <= MAX_FIT_GAIN * TOLERANCE_PX:
             continue
         pose = start
-        if not exact and misfit > 1e-3 * tolerance_px:
+        if not exact and misfit > 1e-3 * TOLERANCE_PX:
             fit = fit_pose(model, views, target[views], np.tile(np.eye(2), (len(views), 1, 1)), start)
-            if fit is None or not _misfit(model, fit.world_from_body, views, target) <= tolerance_px:
+            if fit is None or not _misfit(model, fit.world_from_body, views, target) <= TOLERANCE_PX:
                 continue
             pose = fit.world_from_body
         if all(np.abs(pose.minus(other)).max() > SAME for other in (world_from_body, *found)):
@@ -193,12 +192,12 @@ def _aimed(model: SpotModel, aims: Array, place: Array) -> Pose:
     return Pose(rotations.exp(rolls[:, None] * u[:, 0]) @ aimed, np.tile(place, (_ROLLS, 1)))
 
 
-def poses_within(prior: PosePrior, count: int, seed: int = SEED) -> Pose:
+def poses_within(prior: PosePrior, count: int) -> Pose:
     """Random poses (count,), uniform over a prior: over its cube, and over all rotations up to its angle.
 
     Uniform in the Haar measure of the rotations, whose density over the angle is proportional to 1 - cos(angle).
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(SEED)
     axis = normalised(rng.normal(size=(count, 3)))
     grid = np.linspace(0, prior.within_rad, 2001)
     below = grid - np.sin(grid)

@@ -83,7 +83,7 @@ class Certificate:
 
 
 def certificate(
-    results: Path, run_folder: Path | None = None, at: Sequence[int] = (), draws: int = DRAWS, seed: int = 0
+    results: Path, run_folder: Path | None = None, at: Sequence[int] = (), draws: int = DRAWS
 ) -> Certificate:
     """The budgets of the frames `at`; without any, of the measured frame with the median uncertainty of attitude.
 
@@ -111,7 +111,7 @@ def certificate(
             raise InputError(
                 f"--at {number}: expected a frame with a measured pose, found another or none of this number"
             )
-        made.append(_of_frame(run, poses, spots, int(measured[here[0]]), rest[:, here[0]], dof, (draws, seed)))
+        made.append(_of_frame(run, poses, spots, int(measured[here[0]]), rest[:, here[0]], dof, draws))
     return Certificate(results.resolve().name, folder.summary, run, tuple(made), poses.frames[measured], whole)
 
 
@@ -152,7 +152,7 @@ def _median(whole: Expanded) -> list[int]:
 
 
 def _of_frame(
-    run: Run, poses: PoseTrack, spots: SpotGrid, k: int, rest: Array, dof: float, simulation: tuple[int, int]
+    run: Run, poses: PoseTrack, spots: SpotGrid, k: int, rest: Array, dof: float, draws: int
 ) -> FrameCertificate:
     pose, row = poses.world_from_body[k], int(np.searchsorted(spots.frames, poses.frames[k]))
     order = {view: i for i, view in enumerate(spots.views)}
@@ -172,8 +172,7 @@ def _of_frame(
             variances.append(along_axes(part, pose))
     freedom = np.array([dof, *[np.inf] * (len(names) - 1)])
     random = poses.covariance[k] - np.nan_to_num(systematic)
-    draws, seed = simulation
-    simulated = monte_carlo(run.rig, share, pose, random, dof, draws, seed) if draws else None
+    simulated = monte_carlo(run.rig, share, pose, random, dof, draws, 0) if draws else None
     return FrameCertificate(
         frame=int(poses.frames[k]),
         t_s=float(poses.t_s[k]),

@@ -186,10 +186,10 @@ class DroguePicture:
 RIM_POINTS = 360
 
 
-def rim_points_px(scene: DrogueScene, points: int = RIM_POINTS) -> Array:
-    """Images (points, 2), px, of points at equal angles on the rim; nan where there is no projection."""
-    angle = np.arange(points) * (2 * np.pi / points)
-    rim = scene.radius_m * np.stack([np.cos(angle), np.sin(angle), np.zeros(points)], axis=1)
+def rim_points_px(scene: DrogueScene) -> Array:
+    """Images (RIM_POINTS, 2), px, of points at equal angles on the rim; nan where there is no projection."""
+    angle = np.arange(RIM_POINTS) * (2 * np.pi / RIM_POINTS)
+    rim = scene.radius_m * np.stack([np.cos(angle), np.sin(angle), np.zeros(RIM_POINTS)], axis=1)
     return scene.camera.project(scene.world_from_drogue.apply(rim))
 
 

@@ -44,12 +44,12 @@ def harris_response(picture: Picture, window_px: int = 5) -> Array:
     return np.asarray((uu * vv - uv * uv) / (uu + vv + 1e-6), dtype=float)
 
 
-def harris_corners(picture: Picture, parameters: HarrisParameters | None = None) -> MarkerImages:
+def harris_corners(picture: Picture) -> MarkerImages:
     """The lamps of a picture (h, w), strongest first: local maxima of the response above the threshold.
 
     Corners that are not brighter than their surroundings are none. Areas are nan, all have colour 0.
     """
-    p = HarrisParameters() if parameters is None else parameters
+    p = HarrisParameters()
     response = harris_response(picture, p.window_px)
     limit = max(p.threshold_sigma * float(np.median(response)), p.threshold_share * float(response.max()), 1e-9)
     peaks = (response >= cv2.dilate(response, np.ones((p.window_px, p.window_px)))) & (response > limit)

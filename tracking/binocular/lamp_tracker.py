@@ -71,7 +71,6 @@ class LampTracker:
         find: Callable[[Picture], MarkerImages],
         interval_s: float,
         covariance: RigCovariance | None = None,
-        parameters: MatchParameters | None = None,
     ) -> None:
         aside = Pose(camera.camera_from_world.rotation, camera.camera_from_world.translation + np.array([1.0, 0, 0]))
         blind = replace(camera, name=f"{camera.name} (none)", camera_from_world=aside)
@@ -81,7 +80,7 @@ class LampTracker:
             model, names=("",), positions=model.positions.mean(axis=0, keepdims=True), colour=model.colour[:1],
             radius_m=np.full(1, np.nan),
         )  # fmt: skip
-        self._tracker = BinocularTracker(self.pair, model, parameters or MatchParameters())
+        self._tracker = BinocularTracker(self.pair, model, MatchParameters())
         self._count, self._was, self._seen = -1, PoseStatus.LOST, False
 
     def step(self, picture: Picture | None) -> LampFrame:

@@ -187,7 +187,7 @@ class AllanDeviation:
     slope: Array  # (k,): d log deviation / d log tau; -1/2 white noise, 0 flicker noise, 1/2 random walk
 
 
-def allan_deviation(readings: Array, step_s: float, confidence: float = 0.95) -> AllanDeviation:
+def allan_deviation(readings: Array, step_s: float) -> AllanDeviation:
     """The overlapping Allan deviation of evenly spaced readings (n,), at averaging times in octaves.
 
     sigma^2(tau) = < (next average - average)^2 > / 2. Limits: chi-square with the degrees of freedom of the noise that
@@ -210,7 +210,7 @@ def allan_deviation(readings: Array, step_s: float, confidence: float = 0.95) ->
     deviation = np.sqrt(variance)
     slope = _slopes(deviation)
     freedom = np.array([_freedom(n + 1, m, s) for m, s in zip(averaged.tolist(), slope.tolist(), strict=True)])
-    tail = 0.5 * (1 - confidence)
+    tail = 0.025  # limits of 95 %
     low = deviation * np.sqrt(freedom / np.asarray(chi2.ppf(1 - tail, freedom), dtype=float))
     high = deviation * np.sqrt(freedom / np.asarray(chi2.ppf(tail, freedom), dtype=float))
     return AllanDeviation(np.asarray(averaged * step_s, dtype=float), averaged, deviation, low, high, freedom, slope)

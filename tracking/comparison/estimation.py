@@ -68,15 +68,15 @@ def speeds_correlation(result: Motion, reference: Motion) -> tuple[Array, Array]
     return offset[enough], r[enough]
 
 
-def offset_candidates(result: Motion, reference: Motion, most: int = 6) -> list[float]:
-    """Offsets at the largest local maxima of the correlation of the speeds, best first."""
+def offset_candidates(result: Motion, reference: Motion) -> list[float]:
+    """Offsets at the six largest local maxima of the correlation of the speeds, best first."""
     offset, r = speeds_correlation(result, reference)
     if not len(r):
         return []
     padded = np.concatenate([[-np.inf], r, [-np.inf]])
     peaks = np.flatnonzero((padded[1:-1] >= padded[:-2]) & (padded[1:-1] > padded[2:]))
     order = peaks[np.argsort(-r[peaks], kind="stable")]
-    return [float(offset[i]) for i in order[:most] if r[i] >= _LEAST_CORRELATION * r[order[0]]]
+    return [float(offset[i]) for i in order[:6] if r[i] >= _LEAST_CORRELATION * r[order[0]]]
 
 
 # What the motion determines: which parameters of an alignment the data distinguish from noise.

@@ -76,21 +76,21 @@ def board_and_model_texts(c: Intrinsics) -> list[str]:
     return [f.what for f in found if f is not None]
 
 
-def next_photographs(c: Intrinsics, limits: FindingLimits = LIMITS) -> str:
+def next_photographs(c: Intrinsics) -> str:
     """What to photograph next, in one sentence, from what the photographs lack."""
     count = int(np.sum(c.table.counts(c.fit.used) > 0))
     wanted = max(_ENOUGH_VIEWS - count, _FEWEST_MORE)
     places = _listed(c.coverage.gaps)
     where = f"near the {places} of the picture" if places else "in every part of the picture up to its corners"
     tilt = "tilted by 20 to 45 deg to all sides"
-    if c.coverage.spread_deg < limits.spread_deg[0]:
+    if c.coverage.spread_deg < LIMITS.spread_deg[0]:
         tilt += f" (so far {c.coverage.spread_deg:.0f} deg between any two)"
     turned = (
         ", half of them turned by 90 deg in its plane"
-        if level_above(abs(c.fit.lens[0] / c.fit.lens[1] - 1), *limits.aspect)
+        if level_above(abs(c.fit.lens[0] / c.fit.lens[1] - 1), *LIMITS.aspect)
         else ""
     )
-    sharp = ", sharp, on a stiff flat plate" if level_above(c.fit.sigma_px, *limits.noise_px) else ""
+    sharp = ", sharp, on a stiff flat plate" if level_above(c.fit.sigma_px, *LIMITS.noise_px) else ""
     return f"Photograph next: {wanted} more, the board {where}, {tilt}{turned}{sharp}."
 
 

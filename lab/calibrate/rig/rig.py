@@ -37,7 +37,7 @@ from lab.calibrate.beams.beam_findings import (
     stand_findings,
 )
 from lab.calibrate.beams.recordings import Recordings, read_recordings, stand_of
-from lab.calibrate.rig.rig_findings import RigLimits, RigResult, joint_findings
+from lab.calibrate.rig.rig_findings import RigResult, joint_findings
 from lab.calibrate.rig.rig_page import page_of
 from lab.calibrate.screens.screen_findings import ScreenLimits, near_findings, network_findings, survey_findings
 from lab.calibrate.screens.screen_inputs import adjusted_screens, screen_inputs
@@ -129,7 +129,6 @@ def calibrate_rig(
     project_path: Path,
     out: Path,
     today: datetime.date | None = None,
-    limits: RigLimits | None = None,
     *,
     progress: Progress | None = None,
 ) -> Outcome[RigResult]:
@@ -143,12 +142,10 @@ def calibrate_rig(
         InputError: for errors in the files.
         CalibrationError: if the measurements do not determine a calibration.
     """
-    return run_step(_STEP, out, lambda: _solve(Path(project_path), today, limits or RigLimits(), progress))
+    return run_step(_STEP, out, lambda: _solve(Path(project_path), today, progress))
 
 
-def _solve(
-    project_path: Path, today: datetime.date | None, limits: RigLimits, progress: Progress | None
-) -> Solved[RigResult]:
+def _solve(project_path: Path, today: datetime.date | None, progress: Progress | None) -> Solved[RigResult]:
     project = load_project(project_path)
     day = calibration_date(project, today)
     check_no_duplicates(project)
@@ -172,7 +169,7 @@ def _solve(
     result = RigResult(steps, expected, held_out)
     findings = (
         *near_findings(screens, inputs.near),
-        *joint_findings(steps, recordings.names, expected, held_out, limits),
+        *joint_findings(steps, recordings.names, expected, held_out),
         *survey_findings(project, screens),
         *_step_findings(steps, rig, recordings.names),
         *expiry_findings(project, day, today),

@@ -31,6 +31,9 @@ class RigLimits:
     hold_out_fail: float = 3.0
 
 
+LIMITS = RigLimits()
+
+
 @dataclass(frozen=True, slots=True)
 class RigResult:
     """A calibrated rig, and how accurate its poses are."""
@@ -45,23 +48,22 @@ def joint_findings(
     positions: Sequence[str],
     expected: ExpectedPose | None,
     held_out: HoldOut | None,
-    limits: RigLimits = RigLimits(),
 ) -> list[Finding]:
     """All findings of the joint adjustment. positions: names of the stand's positions."""
     joint = steps.joint
-    out = [_fit_of(joint, name, limits) for name in joint.groups if name in ENTRIES[_MISFIT].variants]
-    out += _contradiction(steps, limits)
-    out += _outliers(steps, positions, limits)
+    out = [_fit_of(joint, name) for name in joint.groups if name in ENTRIES[_MISFIT].variants]
+    out += _contradiction(steps)
+    out += _outliers(steps, positions)
     if held_out is not None:
-        out.append(_held_out(held_out, limits))
+        out.append(_held_out(held_out))
     else:
         what = f"none of {len(positions)} positions could be held out: the others do not determine the calibration"
         out.append(finding("BP-R01", Level.FAIL, what))
-    out.append(_expected(expected, limits))
+    out.append(_expected(expected))
     return out
 
 
-def _fit_of(joint: Joint, name: str, limits: RigLimits) -> Finding:
+def _fit_of(joint: Joint, name: str) -> Finding:
     """Consistency of one kind of measurement with all others."""
     fit = joint.groups[name]
     counted = f"{fit.numbers} numbers, redundancy {fit.redundancy:.0f}"
@@ -80,20 +82,20 @@ def _fit_of(joint: Joint, name: str, limits: RigLimits) -> Finding:
         scale = now.scale
     done = "all their sigmas were multiplied by it" if name in joint.scales else "their sigmas were not changed"
     what = f"{name}: residuals are {scale:.2g} times their sigmas ({counted}); {done}"
-    return finding("BP-R02", level_above(scale, limits.scale_warn, limits.scale_fail), what, variant=name)
+    return finding("BP-R02", level_above(scale, LIMITS.scale_warn, LIMITS.scale_fail), what, variant=name)
 
 
-def _contradiction(steps: RigCalibration, limits: RigLimits) -> list[Finding]:
+def _contradiction(steps: RigCalibration) -> list[Finding]:
     """Whether steps that are consistent separately contradict each other."""
     alone = steps.screens.fit.variance_factor == 1.0 and steps.beams.fit.scale == 1.0
     worst = max(steps.joint.scales.values(), default=1.0)
-    if not alone or worst <= limits.scale_warn:
+    if not alone or worst <= LIMITS.scale_warn:
         return []
     what = "cameras and screens are consistent separately, and so are beams, but not together"
     return [finding("BP-R03", Level.WARN, what)]
 
 
-def _outliers(steps: RigCalibration, positions: Sequence[str], limits: RigLimits) -> list[Finding]:
+def _outliers(steps: RigCalibration, positions: Sequence[str]) -> list[Finding]:
     joint, measured = steps.joint, steps.measured
     views = joint.rig.views()
     names, cameras = measured.network.control_points.names, list(joint.rig.cameras)
@@ -103,7 +105,7 @@ def _outliers(steps: RigCalibration, positions: Sequence[str], limits: RigLimits
         if not wrong:
             continue
         share = len(wrong) / len(kept)
-        level = level_above(share, limits.wrong_warn, limits.wrong_fail)
+        level = level_above(share, LIMITS.wrong_warn, LIMITS.wrong_fail)
         if name == RECORDS:
             where = first_names([positions[i] for i in wrong])
             what = f"{name}: the recorded pose does not fit the spots at {len(wrong)} of {len(kept)} ({where})"
@@ -115,7 +117,7 @@ def _outliers(steps: RigCalibration, positions: Sequence[str], limits: RigLimits
             which = [f"position {positions[at.position[i]]} camera {views[at.view[i]][0]} spot {views[at.view[i]][1]}"
                      for i in wrong]  # fmt: skip
         elif name == DOTS:
-            if share <= limits.wrong_warn and not steps.screens.fit.used[wrong].any():
+            if share <= LIMITS.wrong_warn and not steps.screens.fit.used[wrong].any():
                 continue  # listed with their causes by the previous step
             s = measured.network.point_observations
             seen = zip(s.point_of[wrong].tolist(), s.camera_of[wrong].tolist(), strict=True)
@@ -127,17 +129,17 @@ def _outliers(steps: RigCalibration, positions: Sequence[str], limits: RigLimits
     return out
 
 
-def _held_out(h: HoldOut, limits: RigLimits) -> Finding:
+def _held_out(h: HoldOut) -> Finding:
     deg, mm = np.rad2deg(h.attitude_rms), 1e3 * h.position_rms
     what = (
         f"hold-out of positions ({len(h.positions)}, each predicted by a calibration without its spots): attitude on"
         f" this stand {deg:.2g} deg, position {mm:.2g} mm RMS per axis; {h.ratio:.2f} times the expected error"
     )
-    level = Level.PASS if h.p >= P_MISFIT else level_above(h.ratio, limits.hold_out_warn, limits.hold_out_fail)
+    level = Level.PASS if h.p >= P_MISFIT else level_above(h.ratio, LIMITS.hold_out_warn, LIMITS.hold_out_fail)
     return finding("BP-R07", level, what)
 
 
-def _expected(e: ExpectedPose | None, limits: RigLimits) -> Finding:
+def _expected(e: ExpectedPose | None) -> Finding:
     if e is None:
         what = "at the centre of the stand's positions too few spots are in the pictures to measure a pose"
         return finding("BP-R08", Level.FAIL, what)
@@ -147,14 +149,14 @@ def _expected(e: ExpectedPose | None, limits: RigLimits) -> Finding:
         f" which {in_degrees(e.systematic):.2g} deg and {in_mm(e.systematic):.2g} mm from the calibration"
     )
     turn, shift = float(np.deg2rad(deg)), 1e-3 * mm
-    if turn <= limits.attitude_warn and shift <= limits.position_warn_m:
+    if turn <= LIMITS.attitude_warn and shift <= LIMITS.position_warn_m:
         return passed(what)
-    unusable = turn > limits.attitude_fail or shift > limits.position_fail_m
+    unusable = turn > LIMITS.attitude_fail or shift > LIMITS.position_fail_m
     most = "the spots' noise"
     if in_degrees(e.systematic) > in_degrees(e.noise):
         most = max(e.shares, key=lambda n: in_degrees(e.shares[n]))
     why = (
-        f"the goal is {np.rad2deg(limits.attitude_warn) / 2:.2g} deg and {1e3 * limits.position_warn_m / 2:.2g} mm;"
+        f"the goal is {np.rad2deg(LIMITS.attitude_warn) / 2:.2g} deg and {1e3 * LIMITS.position_warn_m / 2:.2g} mm;"
         f" the largest part is from {most}"
     )
     return finding("BP-R09", Level.FAIL if unusable else Level.WARN, what, why=why)

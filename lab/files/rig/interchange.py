@@ -70,12 +70,10 @@ def convert(
     return Done(tuple(models), (line, *(f"  note: {note}" for note in notes)))
 
 
-def read_cameras(path: Path, from_format: str | None = None) -> tuple[CameraModel, ...]:
+def read_cameras(path: Path) -> tuple[CameraModel, ...]:
     """The cameras of a file of any known format. Raises InputError."""
-    path = Path(path)
     text = read_text(path)
-    origin = _known(from_format, READABLE, "--from") if from_format else recognised_format(text, path)
-    return _read(text, path, origin)[0].cameras
+    return _read(text, path, recognised_format(text, path))[0].cameras
 
 
 # Formats -------------------------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from lab.report.plot import svg
 _MOST_VECTORS = 2000  # in a residual field: more cover each other
 _ARROW = 24.0  # drawing units: length of the 95th percentile of the residuals
 _LONGEST = 70.0  # drawing units: longer vectors are cut
+_CELLS = 12  # of the map of coverage, from left to right
 _PICTURE_WIDTH = 720  # px of an embedded photograph
 
 
@@ -122,7 +123,6 @@ def coverage_map(
     corners_px: Array,
     title: str = "Where the sensor had corners",
     *,
-    cells: int = 12,
     things: str = "corners",
     outlines_px: list[Array] | None = None,
 ) -> str:
@@ -135,8 +135,8 @@ def coverage_map(
     corners = corners[np.isfinite(corners).all(axis=1)]
     p = svg.image_area(size_px)
     out = svg.axes(p, title, "u (px)", "v (px)", grid=False)
-    middle, _, count = cell_means(size_px, corners, np.zeros((len(corners), 1)), cells, 0)
-    side = np.array([size_px[0] / cells, size_px[1] * cells / len(count)])
+    middle, _, count = cell_means(size_px, corners, np.zeros((len(corners), 1)), _CELLS, 0)
+    side = np.array([size_px[0] / _CELLS, size_px[1] * _CELLS / len(count)])
     most = max(float(count.max()), 1.0)
     for (x, y), n in zip(middle.tolist(), count.tolist(), strict=True):
         left, top = p.at(np.array([x - side[0] / 2, y - side[1] / 2])).tolist()

@@ -77,11 +77,11 @@ VIEWS: dict[str, tuple[Array, Array]] = {
 LAB_VIEWS = tuple(VIEWS)
 
 
-def frustum_of(camera: Camera, colour: str = svg.BLUE) -> Frustum:
+def frustum_of(camera: Camera) -> Frustum:
     """The field of view of a calibrated camera; its distortion is neglected."""
     fx, fy, _, _ = pinhole_numbers(camera)
     half = (0.5 * camera.image_size_px[0] / fx, 0.5 * camera.image_size_px[1] / fy)
-    return Frustum(camera.name, camera.camera_from_world, half, colour)
+    return Frustum(camera.name, camera.camera_from_world, half, svg.BLUE)
 
 
 def rig_things(rig: Rig, world_from_body: Pose | None = None, others: Pose | None = None) -> list[SceneObject]:

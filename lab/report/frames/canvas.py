@@ -73,11 +73,11 @@ class Canvas:
         """Places (..., 2) in the drawing of pixels of the camera; integers are centres in both."""
         return (np.asarray(uv_px, dtype=float) - self.corner) * self.scale - 0.5
 
-    def holds(self, uv_px: Array, margin: float = 0.0) -> bool:
+    def holds(self, uv_px: Array) -> bool:
         """Whether a pixel of the camera lies in the drawing; False for nan."""
         x, y = self.at(uv_px)
         h, w = self.image.shape[:2]
-        return bool(-margin <= x < w + margin and -margin <= y < h + margin)
+        return bool(0 <= x < w and 0 <= y < h)
 
     def line(self, uv_px: Array, colour: Colour, width: float = 1.0, dash: float = 0.0) -> None:
         """A line through pixels of the camera (n, 2), interrupted at nan. dash: length of its dashes; 0: none."""
@@ -98,10 +98,10 @@ class Canvas:
         reach = radius * self.unit / self.scale
         self.line(uv_px + reach * np.stack([np.cos(_TURN), np.sin(_TURN)], axis=1), colour, width, dash)
 
-    def box(self, uv_px: Array, radius: float, colour: Colour, width: float = 1.0) -> None:
+    def box(self, uv_px: Array, radius: float, colour: Colour) -> None:
         """A square about a pixel of the camera; radius: half its side, in units."""
         r = radius * self.unit / self.scale
-        self.line(uv_px + r * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]), colour, width)
+        self.line(uv_px + r * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]), colour)
 
     def cross(self, uv_px: Array, radius: float, colour: Colour, width: float = 1.0) -> None:
         """A diagonal cross on a pixel of the camera; radius in units."""

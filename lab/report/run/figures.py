@@ -71,13 +71,11 @@ def view_shades(m: ReportData, j: int) -> tuple[Shade, ...]:
     return (*shades, Shade(m.spots.has(SpotStatus.LOST)[:, j], "lost", "lost"))
 
 
-def error_grid(
-    m: ReportData, columns: tuple[tuple[str, Array], ...], at_least_px: float = 0.5, zoom: ZoomData | None = None
-) -> str:
+def error_grid(m: ReportData, columns: tuple[tuple[str, Array], ...], zoom: ZoomData | None = None) -> str:
     """A row of panels for each view: u and v of the named errors (F, V, 2), px, over time; one y scale per column."""
     out = []
     shown = [j for j in range(len(m.spots.views)) if any(np.isfinite(e[:, j]).any() for _, e in columns)]
-    ranges = [svg.robust_range(e[:, shown], at_least_px) if shown else (-1.0, 1.0) for _, e in columns]
+    ranges = [svg.robust_range(e[:, shown], 0.5) if shown else (-1.0, 1.0) for _, e in columns]
     for j in shown:
         camera, spot = m.spots.views[j]
         last = j == shown[-1]

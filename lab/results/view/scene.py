@@ -235,8 +235,9 @@ def tube(line: Array, radius_m: float, colour: str) -> Mesh:
     return Mesh(vertices, triangles, _coloured(colour, len(vertices)))
 
 
-def ball(centre: Array, axes: Array, colour: str, rows: int = 8, columns: int = 12) -> Mesh:
+def ball(centre: Array, axes: Array, colour: str) -> Mesh:
     """An ellipsoid: centre (3,) + axes (3, 3) @ u for u on the unit sphere."""
+    rows, columns = 8, 12
     latitude = np.pi * (np.arange(rows + 1) / rows - 0.5)
     longitude = 2 * np.pi * np.arange(columns) / columns
     up, round_ = np.meshgrid(latitude, longitude, indexing="ij")

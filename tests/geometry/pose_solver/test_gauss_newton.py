@@ -185,33 +185,6 @@ def test_a_vague_pose_is_not_a_measurement():
     assert not is_measurement(fit, SolveLimits(1.01 * sigma_m, 0.99 * sigma_rad))
 
 
-def test_a_prior_makes_a_pose_observable():
-    model, rng = MODELS["fan"], np.random.default_rng(7)
-    rows = row_of(model, "1", "2", "3")
-    pose = seen_pose(model, rng, turn_deg=10, shift_m=0.3)
-    information = np.diag([1e4] * 3 + [1e6] * 3)  # 10 mm, 1 mrad
-    fit = fit_pose(model, rows, model.project(pose)[0][rows], isotropic(3), pose.plus(rng.normal(0, 0.01, 6)),
-                   prior=(pose, information))  # fmt: skip
-    assert fit is not None
-    assert fit.observable
-    assert fit.dof == 6
-    assert np.abs(fit.world_from_body.minus(pose)).max() < 1e-8
-
-
-def test_a_prior_from_the_same_spots_halves_the_covariance():
-    """The fit of spots, used as prior for the same spots again: the same pose, half the covariance."""
-    model, rng = MODELS["skew"], np.random.default_rng(8)
-    rows = np.arange(6)
-    uv = model.project(Pose.identity())[0] + rng.normal(0, NOISE_PX, (6, 2))
-    once = fit_pose(model, rows, uv, isotropic(6), Pose.identity())
-    assert once is not None
-    prior = once.world_from_body, np.linalg.inv(once.covariance)
-    twice = fit_pose(model, rows, uv, isotropic(6), Pose.identity(), prior=prior)
-    assert twice is not None
-    assert np.abs(twice.world_from_body.minus(once.world_from_body)).max() < 1e-7
-    np.testing.assert_allclose(twice.covariance, once.covariance / 2, rtol=1e-3, atol=1e-4 * once.covariance.max())
-
-
 # -- covariance -------------------------------------------------------------------------------------------------------
 
 

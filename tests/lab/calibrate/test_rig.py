@@ -28,7 +28,6 @@ from lab.simulate.write import simulate
 
 DAY = datetime.date(2026, 3, 14)
 SMALL = CampaignQuality(dots=(5, 4))
-LIMITS = rig_findings.RigLimits()
 
 
 @pytest.fixture(scope="module")
@@ -322,11 +321,11 @@ def test_the_expected_accuracy_is_judged_by_the_worse_of_attitude_and_position(t
     total = np.diag(np.repeat([(moved * 1e-3) ** 2, np.deg2rad(turned * 0.02) ** 2], 3))
     shares = {"cameras": 0.2 * total, "beams": 0.6 * total}
     poses = [ExpectedPose(Pose.identity(), 6, total, part * total, (1 - part) * total, shares) for part in (0.2, 0.8)]
-    found = [rig_findings._expected(pose, LIMITS) for pose in poses]
+    found = [rig_findings._expected(pose) for pose in poses]
     assert [f.level for f in found] == [level, level]
     if level > Level.PASS:
         assert [f.why.rsplit("from ", 1)[1] for f in found] == ["beams", "the spots' noise"]
 
 
 def test_a_centre_without_a_pose_fails():
-    assert rig_findings._expected(None, LIMITS).level == Level.FAIL
+    assert rig_findings._expected(None).level == Level.FAIL
