@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import inspect
 import os
 import sys
 
@@ -24,9 +22,6 @@ from calibration.open3d_loader import MissingOpen3DError, open3d  # noqa: E402
 # Waiting for the disk shows only after a power cut, and takes longer than the writing: a run waits for ten files. Tests
 # of when it happens replace this function.
 os.fsync = lambda file: None
-
-# The schemas read the comments of some 40 classes 340 times: 4 s in every test process, all in Python's tokenizer.
-inspect.getsource = functools.cache(inspect.getsource)
 
 # The same examples every time: a test that failed fails again, and a machine that is busy is no failure.
 # `pytest --hypothesis-profile=explore` goes looking for new ones.

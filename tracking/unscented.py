@@ -219,7 +219,6 @@ class Observability:
     rank: int  # number of directions that the measurements determine better than the prior
     sigma_prior: Array  # (n,)
     sigma: Array  # (n,) with prior and measurements, without process noise
-    unobserved: Array  # (n, n - rank) directions that are not observed, columns, in units of the prior's sigmas
 
     def observed(self, largest_ratio: float = 0.5) -> tuple[bool, ...]:
         """For each state: whether the measurements reduce its sigma to this share of the prior's, or less."""
@@ -247,16 +246,9 @@ def observability(states: Array, process: Function, measurement: Function, R: Ar
         transition = numeric_jacobian(lambda a: process(a[None])[0], x) @ transition
     root = square_root(prior)
     values, vectors = np.linalg.eigh(symmetric(root.T @ information @ root))
-    low = values < DETERMINED
     left = root @ vectors / np.sqrt(1 + np.maximum(values, 0.0))
-    sigma_prior = np.sqrt(np.diagonal(prior))
-    return Observability(
-        information,
-        int(np.count_nonzero(~low)),
-        sigma_prior,
-        np.linalg.norm(left, axis=1),
-        root @ vectors[:, low] / sigma_prior[:, None],
-    )
+    rank = int(np.count_nonzero(values >= DETERMINED))
+    return Observability(information, rank, np.sqrt(np.diagonal(prior)), np.linalg.norm(left, axis=1))
 
 
 # The filter of Fu (2016): relative state of a tanker and a receiver, and the printed modification of the update.

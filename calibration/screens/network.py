@@ -338,7 +338,6 @@ _SAME_POSITION = 0.15  # tolerance of another dot's position, as a share of the 
 class Outlier:
     """An outlier among the observations, with its probable cause."""
 
-    observation: int
     camera: str
     dot: str
     error_px: float
@@ -371,7 +370,7 @@ def classify_outliers(network: Network, fit: NetworkFit) -> tuple[Outlier, ...]:
         if control_points.screen_of[dot] >= 0:
             error_m = _on_screen(camera, screens[control_points.screen_of[dot]], s.pixels[i], control_points.xyz[dot])
         error_px = float(np.linalg.norm(fit.observation_residuals_px[i]))
-        out.append(Outlier(int(i), camera.name, control_points.names[dot], error_px, error_m, at_place_of, swapped))
+        out.append(Outlier(camera.name, control_points.names[dot], error_px, error_m, at_place_of, swapped))
     return tuple(out)
 
 

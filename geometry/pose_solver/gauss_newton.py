@@ -67,7 +67,6 @@ class PoseFit:
     dof: int  # 2 m - 6
     projected_px: Array  # (n, 2) pixels of all views of the model at this pose, from SpotModel.project, and ...
     jacobian: Array  # (n, 2, 6) ... their Jacobians: kept so that the pose need not be projected again
-    log_det: float  # log determinant of the covariance (2m, 2m), px^2, by which the residuals were weighted
     _gain: Array  # (6, 2m) derivative of the pose by the measured pixels
     _common: Array | None  # (2n, 2n) covariance of the pixels, px^2, due to the calibration's errors
 
@@ -162,11 +161,9 @@ def _fit(
     """As `fit_pose`, with the covariance (2n, 2n), px^2, of all pixels due to the calibration's errors, or None."""
     if common is None:
         W = whiten(covariances)
-        log_det = -2 * float(np.sum(np.log(W[:, [0, 1], [0, 1]])))
     else:
         root = np.linalg.cholesky(_blocks(covariances) + common[np.ix_(coordinates_of(rows), coordinates_of(rows))])
         W = np.linalg.inv(root)
-        log_det = 2 * float(np.sum(np.log(np.diagonal(root))))
     pose, damping = start, 0.0
     terms = _terms(model, rows, pixels, W, pose)
     if terms is None:
@@ -214,7 +211,6 @@ def _fit(
         dof=dof,
         projected_px=projected,
         jacobian=J,
-        log_det=log_det,
         _gain=K,
         _common=common if observable else None,
     )

@@ -18,10 +18,9 @@ from lab.files.rig.calibration_state import CalibrationState
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.text.atomic_write import atomic_folder, check_output_folder, earlier_results, keep_good_results
 from lab.files.text.json_text import write_json
-from lab.findings.finding import Finding, Level, finding, first_sentence, reasons, verdict, worst_first
+from lab.findings.finding import Finding, Level, counted, finding, first_sentence, reasons, verdict, worst_first
 from lab.findings.outcome import Outcome, Verdict
 from lab.report.page import KeyFigure, Page, Section, made_with, write_page
-from lab.report.page import Verdict as PageVerdict
 from lab.versions import versions
 
 R = TypeVar("R")
@@ -84,10 +83,11 @@ def run_step(step: Step, out: Path, solve: Callable[[], Solved[R]]) -> Outcome[R
     folder = keep_good_results(out, level is Level.FAIL, step.good) if step.good else Path(out)
     key_figures, sections = solved.page()
     inputs = fingerprints_of_inputs(solved.inputs)
-    judgement = PageVerdict(level, step.sentences[level], solved.findings, ("PASS", "WARN", "FAIL"))
     page = Page(
-        f"calibration · {step.kind}", solved.title or solved.name, f"{solved.day.isoformat()} · {judgement.counted}",
-        sections, key_figures, made=made_of(solved.day, inputs), verdict=judgement,
+        f"calibration · {step.kind}", solved.title or solved.name,
+        f"{solved.day.isoformat()} · {counted(solved.findings)}",
+        sections, key_figures, made=made_of(solved.day, inputs), findings=solved.findings,
+        sentence=step.sentences[level], words=("PASS", "WARN", "FAIL"),
     )  # fmt: skip
     judged = Verdict(worst_first(solved.findings))
     said = _said(solved, level)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import textwrap
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
@@ -158,6 +158,13 @@ def first_sentence(text: str) -> str:
 def verdict(findings: Iterable[Finding]) -> Level:
     """The most severe level among the findings; PASS if there are none."""
     return max((f.level for f in findings), default=Level.PASS)
+
+
+def counted(findings: Sequence[Finding]) -> str:
+    """`2 failed, 1 warning, 5 passed`."""
+    count = {level: sum(f.level == level for f in findings) for level in Level}
+    warnings = f"{count[Level.WARN]} warning{'s' if count[Level.WARN] != 1 else ''}"
+    return f"{count[Level.FAIL]} failed, {warnings}, {count[Level.PASS]} passed"
 
 
 def level_above(value: float, warn: float, fail: float) -> Level:

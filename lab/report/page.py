@@ -16,7 +16,7 @@ import numpy as np
 from markupsafe import Markup
 
 from lab.files.text.atomic_write import atomic_write_text
-from lab.findings.finding import Finding, Level, worst_first
+from lab.findings.finding import Finding, verdict, worst_first
 from lab.number_format import format_number
 from lab.report.html import environment
 from lab.versions import versions
@@ -60,23 +60,6 @@ class Section:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
-    """What a page says at its top about the results as a whole."""
-
-    level: Level
-    sentence: str
-    findings: Sequence[Finding]
-    words: tuple[str, str, str] = ("PASS", "CHECK", "FAIL")  # by level
-
-    @property
-    def counted(self) -> str:
-        """`2 failed, 1 warning, 5 passed`."""
-        count = {level: sum(f.level == level for f in self.findings) for level in Level}
-        warnings = f"{count[Level.WARN]} warning{'s' if count[Level.WARN] != 1 else ''}"
-        return f"{count[Level.FAIL]} failed, {warnings}, {count[Level.PASS]} passed"
-
-
-@dataclass(frozen=True, slots=True)
 class Page:
     """Content of a report."""
 
@@ -87,7 +70,9 @@ class Page:
     key_figures: Sequence[KeyFigure] = ()
     notes: Sequence[str] = ()
     made: Sequence[tuple[str, str]] = ()  # with what the results were made: name and value
-    verdict: Verdict | None = None  # None: nothing is judged
+    findings: Sequence[Finding] = ()
+    sentence: str = ""  # what the page says at its top about the results as a whole; empty: nothing is judged
+    words: tuple[str, str, str] = ("PASS", "CHECK", "FAIL")  # of the verdict and of the findings, by level
 
 
 def made_with(*libraries: str) -> tuple[str, str]:
@@ -128,11 +113,10 @@ def html_of(page: Page) -> str:
 
 
 def _rendered(page: Page, drawn: list[list[PageDrawing]]) -> str:
-    verdict = page.verdict
-    findings = () if verdict is None else worst_first(verdict.findings)
+    level = verdict(page.findings) if page.sentence else None
     sections = [_section(s, d) for s, d in zip(page.sections, drawn, strict=True)]
     template = environment().get_template("page.html.j2")
-    return template.render(page=page, verdict=verdict, findings=findings, sections=sections)
+    return template.render(page=page, level=level, findings=worst_first(page.findings), sections=sections)
 
 
 def _section(section: Section, drawings: list[PageDrawing]) -> dict[str, Any]:

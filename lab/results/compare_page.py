@@ -13,7 +13,6 @@ from lab.files.text.json_text import write_json
 from lab.findings.outcome import Done, Verdict
 from lab.number_format import format_number, format_percent, format_with_sigma
 from lab.report.page import Page, PageDrawing, PageTable, Section, made_with
-from lab.report.page import Verdict as PageVerdict
 from lab.report.page import write_page as write_report
 from lab.report.plot import svg
 from lab.report.plot.series import Band, Line, Shade, time_panel
@@ -128,7 +127,7 @@ _COLOURS = (svg.BLUE, svg.ORANGE, svg.GREEN)
 def write_page(comparison: Comparison, folder: Path) -> Path:
     """Write report.html into a folder. Returns its path."""
     sections = [_alignment(comparison), _curves(comparison), _table(comparison), _allan(comparison.still)]
-    verdict = judged(comparison)
+    found = judged(comparison)
     of_two = "reference" if comparison.is_reference else "other result"
     page = Page(
         "comparison",
@@ -138,7 +137,8 @@ def write_page(comparison: Comparison, folder: Path) -> Path:
         _key_figures(comparison),
         [*undetermined_lines(comparison.estimate), *comparison.notes],
         [("result", str(comparison.result)), (of_two, str(comparison.other)), made_with("numpy", "scipy")],
-        PageVerdict(verdict.level, _SENTENCES[verdict.level], (verdict,)),
+        (found,),
+        _SENTENCES[found.level],
     )
     return write_report(page, folder)
 

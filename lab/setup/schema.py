@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import inspect
 import json
 import re
 import textwrap
 import types
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -87,12 +88,12 @@ def schema_of_block(block: type[Block], commented: type | None = None) -> Schema
     return {**out, "required": required} if required else out
 
 
-def comments_of(cls: type) -> dict[str, str]:
+@functools.cache  # a schema asks for those of one block up to ten times, and its source is searched anew each time
+def comments_of(cls: type) -> Mapping[str, str]:
     """The comments behind the fields of a class and of those that it extends, by field; empty without their source."""
-    found: dict[str, str] = {}
-    for one in reversed(cls.__mro__):
-        with contextlib.suppress(OSError, TypeError):
-            found.update(_COMMENT.findall(textwrap.dedent(inspect.getsource(one))))
+    found = {} if cls is object else {k: v for base in reversed(cls.__bases__) for k, v in comments_of(base).items()}
+    with contextlib.suppress(OSError, TypeError):
+        found.update(_COMMENT.findall(textwrap.dedent(inspect.getsource(cls))))
     return found
 
 

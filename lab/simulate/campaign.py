@@ -98,8 +98,7 @@ class Campaign:
     lenses: dict[str, LensDraw]
     dot_names: tuple[str, ...]  # n dots
     dot_screen: Ints  # (n,): index into the screens
-    dots_true: Array  # (n, 3), m, world
-    dots_surveyed: Array  # (n, 3)
+    dots_surveyed: Array  # (n, 3), m, world
     seen_camera: Ints  # (k,)
     seen_dot: Ints  # (k,)
     seen_pixels: Array  # (k, 2)
@@ -108,8 +107,7 @@ class Campaign:
     stand_from_body: Pose  # (p,) truth
     stand_recorded: Pose  # (p,) as reported by the stand
     spots: SpotPixels
-    wrong_dots: Bools  # (k,): pixels made outliers
-    wrong_spots: Bools  # (n spots,)
+    wrong_spots: Bools  # (n spots,): pixels made outliers
 
 
 def draw_campaign(seed: int, rig: str | Rig = "fan", quality: CampaignQuality | None = None) -> Campaign:
@@ -143,7 +141,7 @@ def draw_campaign(seed: int, rig: str | Rig = "fan", quality: CampaignQuality | 
     stand_surveyed = world_from_stand.plus(rng.normal(size=6) * place)
     spots = spots_at(truth, world_from_stand @ stand_from_body, q.spot_px, np.random.default_rng([seed, _SPOTS]))
     rng = np.random.default_rng([seed, _WRONG])
-    wrong_dots, pixels = _some_wrong(pixels, q.wrong, rng)
+    _, pixels = _some_wrong(pixels, q.wrong, rng)
     wrong_spots, spot_pixels = _some_wrong(spots.pixels, q.wrong, rng)
     return Campaign(
         name=rig if isinstance(rig, str) else "rig",
@@ -154,7 +152,6 @@ def draw_campaign(seed: int, rig: str | Rig = "fan", quality: CampaignQuality | 
         lenses=lenses,
         dot_names=names,
         dot_screen=of_screen,
-        dots_true=dots,
         dots_surveyed=surveyed,
         seen_camera=camera,
         seen_dot=dot,
@@ -164,7 +161,6 @@ def draw_campaign(seed: int, rig: str | Rig = "fan", quality: CampaignQuality | 
         stand_from_body=stand_from_body,
         stand_recorded=recorded,
         spots=replace(spots, pixels=spot_pixels),
-        wrong_dots=wrong_dots,
         wrong_spots=wrong_spots,
     )
 

@@ -11,7 +11,7 @@ import numpy as np
 from geometry.arrays import Array
 from lab.findings.finding import Finding, verdict
 from lab.number_format import format_number, format_percent
-from lab.report.page import Page, PageDrawing, PageTable, Section, Verdict, made_with, write_page
+from lab.report.page import Page, PageDrawing, PageTable, Section, made_with, write_page
 from lab.report.plot import svg
 from lab.report.plot.series import Band, Line, Shade, time_panel
 from lab.targets.target import F, Target, Track
@@ -28,19 +28,18 @@ _MOST_DOTS = 6000
 
 def write_target_page(target: Target[F], track: Track[F], findings: Sequence[Finding], folder: Path) -> Path:
     """Write the page of a target in one camera into a folder. Returns its path."""
-    level = verdict(findings)
     sentence = (
         f"The {target.subject} was followed.",
         f"The {target.subject} was followed; note the warnings below.",
         "The results must not be used as they are.",
-    )[level]
+    )[verdict(findings)]
     own = target.key_figures(track) if track.measured.any() else []
     sections = [_motion(target, track), *target.sections(track), *_path(track), *_events(target, track)]
     recording = track.recording
     made = ("method", target.method()), made_with("numpy", "opencv-python-headless")
     page = Page(
         f"tracked {target.subject}", recording.name, str(recording.path), sections,
-        [*_key_figures(target, track), *own], recording.notes, made, Verdict(level, sentence, findings),
+        [*_key_figures(target, track), *own], recording.notes, made, findings, sentence,
     )  # fmt: skip
     return write_page(page, folder)
 

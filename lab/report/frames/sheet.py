@@ -186,7 +186,6 @@ class Layout:
 
     columns: int
     widths: tuple[int, ...]  # of the cameras' pictures, px
-    heights: tuple[int, ...]
     unit: float  # width of a fine line, px
     line: float  # height of a line of text, px
 
@@ -203,9 +202,8 @@ class Layout:
             wide = float(np.clip(w, min(least, _LARGEST_ZOOM * w), most))
             wide = min(wide, 1.6 * most * w / h)  # tall pictures are limited by their height
             widths.append(max(round(wide), 16))
-        heights = [max(round(h * a / w), 1) for (w, h), a in zip(sizes_px, widths, strict=True)]
         unit = 1.5 if max(widths) > 1100 else 1.0
-        return Layout(min(n, 2 if n < 5 else 3), tuple(widths), tuple(heights), unit, _LINE * unit)
+        return Layout(min(n, 2 if n < 5 else 3), tuple(widths), unit, _LINE * unit)
 
 
 def sheet(

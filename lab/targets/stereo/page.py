@@ -9,7 +9,7 @@ import numpy as np
 from geometry.arrays import Array, Ints
 from lab.findings.finding import Finding, verdict
 from lab.number_format import format_angle, format_length, format_number
-from lab.report.page import Page, PageDrawing, PageTable, Section, Verdict, made_with, write_page
+from lab.report.page import Page, PageDrawing, PageTable, Section, made_with, write_page
 from lab.report.plot.series import Band, Line, time_panel
 from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION, padded_range
 from lab.runs.tables import pose_numbers
@@ -32,10 +32,17 @@ def write_stereo_page(results: StereoResults, findings: tuple[Finding, ...], fol
         sections.insert(1, _truth(results, results.errors))
     run = results.run
     notes = [*results.notes, *([run.notes] if run.notes else [])]
-    level, made = verdict(findings), [("method", _method(results)), made_with("numpy", "opencv-python-headless")]
-    judgement = Verdict(level, _SENTENCES[level], findings)
+    made = [("method", _method(results)), made_with("numpy", "opencv-python-headless")]
     page = Page(
-        "pose from two cameras", run.name, str(run.folder), sections, _key_figures(results), notes, made, judgement
+        "pose from two cameras",
+        run.name,
+        str(run.folder),
+        sections,
+        _key_figures(results),
+        notes,
+        made,
+        findings,
+        _SENTENCES[verdict(findings)],
     )
     return write_page(page, folder)
 

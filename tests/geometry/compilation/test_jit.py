@@ -223,13 +223,12 @@ def test_a_truncated_cache_file_is_discarded_and_compiled_again(program, first_t
     shutil.copytree(program, copy)
     folder = Path(found(started(copy))["folder"])
     for kind in ("*.nbi", "*.nbc"):
-        for kept_bytes in (0, 20):
-            files = sorted(folder.rglob(kind))
-            assert files
-            for file in files:
-                file.write_bytes(file.read_bytes()[:kept_bytes])
-            again = found(started(copy))
-            assert (again["value"], "twice_grown" in again["compiled"]) == (20.0, True)
+        files = sorted(folder.rglob(kind))
+        assert len(files) >= 2
+        for n, file in enumerate(files):
+            file.write_bytes(file.read_bytes()[: 20 * (n % 2)])
+        again = found(started(copy))
+        assert (again["value"], {"grown", "twice_grown"} <= set(again["compiled"])) == (20.0, True)
     assert found(started(copy))["compiled"] == []  # what was compiled again is kept
 
 

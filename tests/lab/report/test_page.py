@@ -15,11 +15,11 @@ from geometry.pose import Pose
 from lab.calibrate.camera.camera_page import representative_views
 from lab.calibrate.step import fingerprints_of_inputs, made_of
 from lab.errors import InputError
-from lab.findings.finding import Finding, Level
+from lab.findings.finding import Finding, Level, counted
 from lab.report.calibration import calibration_charts as charts
 from lab.report.calibration import calibration_drawings as draw
 from lab.report.calibration import calibration_scene as scene
-from lab.report.page import LARGEST_BYTES, Page, PageDrawing, PageTable, Section, Verdict, cell, html_of, write_page
+from lab.report.page import LARGEST_BYTES, Page, PageDrawing, PageTable, Section, cell, html_of, write_page
 from lab.report.plot.maps import contour_levels, contour_lines, heat_map, value_range
 from tests.geometry.scenes import paper_rig
 
@@ -91,10 +91,8 @@ DRAWINGS = all_drawings()
 
 def report(sections: list[Section], findings: list[Finding] | None = None) -> Page:
     findings = findings if findings is not None else [Finding(Level.PASS, "fine")]
-    level = max(f.level for f in findings)
     figures = [("RMS <&>", "0.2 px", "0.5 mm")]
-    verdict = Verdict(level, "as it is", findings)
-    return Page("camera", "left <b>", verdict.counted, sections, figures, verdict=verdict)
+    return Page("camera", "left <b>", counted(findings), sections, figures, findings=findings, sentence="as it is")
 
 
 @pytest.mark.parametrize("name", DRAWINGS)
@@ -179,8 +177,7 @@ def test_all_names_and_texts_are_escaped():
     evil = "<script>alert(1)</script>"
     finding = Finding(Level.WARN, evil, evil, evil)
     section = Section(evil, evil, [PageDrawing("<svg></svg>", evil)], PageTable((evil,), [(evil,)]))
-    verdict = Verdict(Level.WARN, evil, [finding])
-    whole = Page(evil, evil, evil, [section], [(evil, evil, evil)], [evil], [(evil, evil)], verdict)
+    whole = Page(evil, evil, evil, [section], [(evil, evil, evil)], [evil], [(evil, evil)], [finding], evil)
     assert "<script" not in html_of(whole)
 
 
