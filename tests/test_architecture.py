@@ -54,8 +54,11 @@ def modules(root: Path) -> dict[str, Path]:
 
 def statements(tree: ast.AST, into_functions: bool) -> Iterator[ast.AST]:
     """All nodes below, with or without those that run only when a function is called."""
+    if into_functions:
+        yield from ast.walk(tree)
+        return
     for node in ast.iter_child_nodes(tree):
-        if into_functions or not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
             yield node
             yield from statements(node, into_functions)
 

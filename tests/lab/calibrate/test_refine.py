@@ -131,17 +131,22 @@ def test_a_further_motion_determines_more_but_no_convention(lab):
         assert np.min(after / before) < 0.75  # as many frames again
 
 
-def test_one_recording_is_held_out_by_blocks_of_time(lab, tmp_path):
+@pytest.fixture(scope="module")
+def cameras_alone(lab, tmp_path_factory):
+    """The folder and outcome of one recording that refines the cameras' poses only."""
     folder, runs, _, _ = lab
-    outcome = refine_rig(runs[:1], folder / "rig.yaml", tmp_path / "new")
+    out = tmp_path_factory.mktemp("cameras") / "new"
+    return out, refine_rig(runs[:1], folder / "rig.yaml", out, free=["cameras"])
+
+
+def test_one_recording_is_held_out_by_blocks_of_time(cameras_alone):
+    out, outcome = cameras_alone
     assert len(outcome.result.refined.held_out) == 2  # of at least 30 frames each
-    assert (tmp_path / "new" / "rig.yaml").exists() == (outcome.level < 2)
+    assert (out / "rig.yaml").exists() == (outcome.level < 2)
 
 
-def test_only_the_named_groups_change_and_the_others_stay_uncertain(lab, tmp_path):
-    folder, runs, _, _ = lab
-    outcome = refine_rig(runs, folder / "rig.yaml", tmp_path / "new", free=["cameras"])
-    r, given = outcome.result.refined, load_rig_file(folder / "rig.yaml")
+def test_only_the_named_groups_change_and_the_others_stay_uncertain(lab, cameras_alone):
+    r, given = cameras_alone[1].result.refined, load_rig_file(lab[0] / "rig.yaml")
     assert stacks_of(r.rig)["screens"].minus(stacks_of(given.rig)["screens"]).any().item() is False
     assert stacks_of(r.rig)["cameras"].minus(stacks_of(given.rig)["cameras"]).all()
     old = joint_covariance(given.rig, given.covariances, "old")
@@ -162,7 +167,7 @@ def test_a_part_that_moved_by_more_than_stated_is_named_and_an_earlier_rig_stays
         (out / name).write_bytes((folder / "new" / name).read_bytes())
     moved = perturbed_rig(true, [f"{part}.{name}" for name in change], np.array(list(change.values())))
     save_rig(RigFile(moved, covariance_blocks(stated_covariance(moved, None, SIGMAS, out))), tmp_path / "rig.yaml")
-    done = typed("refine", *runs, "--rig", tmp_path / "rig.yaml", "--out", out)
+    done = typed("refine", runs[0], "--rig", tmp_path / "rig.yaml", "--out", out)
     kind, name = part.split(".")
     assert (done.exit_code, f"{kind.removesuffix('s')} `{name}` has moved by" in done.output) == (3, True), done.output
     assert (out / "rig.yaml").read_bytes() == (folder / "new" / "rig.yaml").read_bytes()
@@ -171,7 +176,7 @@ def test_a_part_that_moved_by_more_than_stated_is_named_and_an_earlier_rig_stays
 
 
 def test_a_vehicle_at_rest_gives_no_confident_rig(lab, tmp_path):
-    runs = recordings(tmp_path, "static")
+    runs = recordings(tmp_path, "static", count=1)
     true = load_rig_file(runs[0] / "rig.yaml").rig
     write_known(true, tmp_path / "rig.yaml")
     outcome = refine_rig(runs, tmp_path / "rig.yaml", tmp_path / "new")
@@ -192,7 +197,7 @@ def test_exchanged_cameras_are_refused_and_nothing_is_written(lab, tmp_path):
         for x, y in ((a, b), (b, a))
     }
     write_known(replace(true, cameras={**true.cameras, **swapped}), tmp_path / "rig.yaml")
-    done = typed("refine", *runs, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "new")
+    done = typed("refine", runs[0], "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "new")
     assert done.exit_code == 3, done.output
     assert not (tmp_path / "new" / "rig.yaml").exists()
 
@@ -248,7 +253,7 @@ def test_parts_of_which_nothing_is_stated_are_held_and_named(lab, tmp_path):
     _, runs, true, _ = lab
     save_rig(true, tmp_path / "rig.yaml")
     options = ["--sigma", "cameras.position_m=0.003", "--sigma", "cameras.rotation_deg=0.1"]
-    done = typed("refine", *runs, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "new", *options)
+    done = typed("refine", runs[0], "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "new", *options)
     assert done.exit_code in (0, 3), done.output
     text = (tmp_path / "new" / "report.html").read_text()
     assert "nothing is stated of screens.left, screens.right, beams.A" in text

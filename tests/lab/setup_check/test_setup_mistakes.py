@@ -133,10 +133,9 @@ def test_a_mistake_that_the_recording_shows_is_a_problem_at_check(recording, tmp
     assert "(BP-M06)" in text
 
 
-@pytest.mark.parametrize("rest", [12, 90])
 @pytest.mark.parametrize("name", [None, "numbered from 1, another camera"])
-def test_wrong_numbers_show_although_a_turntable_moves_in_few_frames_only(recording, tmp_path, name, rest):
-    files = read(recording)
+def test_wrong_numbers_show_although_a_turntable_moves_in_few_frames_only(recording, tmp_path, name):
+    files, rest = read(recording), 40
     pose_of = [0] * rest + [3, 6, 9] + [12] * rest + [15, 18, 21] + [24] * rest  # frame of the recording
     at = {n: [row for row in files.rows if row["frame"] == str(n)] for n in set(pose_of)}
     files.rows = [{**row, "frame": str(k)} for k, n in enumerate(pose_of) for row in at[n]]
@@ -250,6 +249,7 @@ def test_a_camera_whose_points_are_never_labelled_is_reported(tmp_path, recordin
     turned_aside(files.rig["cameras"]["third"]["camera_from_world"])
     files.rig["cameras"]["third"]["camera_matrix"]["fx"] *= 1.7
     files.run["cameras"]["third"] = {"detections": "detections.csv"}
+    files.rows = [row for row in files.rows if int(row["frame"]) < 24]
     files.rows += [{**row, "camera": "third"} for row in files.rows if row["camera"] == "left"]
     outcome = process_run(write(files, tmp_path / "run"), tmp_path / "out")
     assert outcome.verdict.status == "check"

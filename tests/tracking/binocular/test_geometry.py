@@ -114,10 +114,10 @@ def test_the_image_of_a_tilted_disc_is_predicted_at_its_centroid_not_at_its_cent
 
 
 def test_the_joint_fit_beats_horns_pose_and_states_its_errors():
-    e = pose_errors(40, NOISE_PX, np.random.default_rng(7))
+    e = pose_errors(16, NOISE_PX, np.random.default_rng(7))
     turn = [np.sqrt((d[:, 3:] ** 2).sum(axis=1).mean()) for d in (e.joint, e.horn)]
     assert turn[0] < 0.3 * turn[1]
-    assert 0.7 < e.nees.mean() / 6 < 1.35  # sigma of the mean: 0.09
+    assert 0.6 < e.nees.mean() / 6 < 1.5  # sigma of the mean: 0.14; the slow test has 1500 poses
 
 
 @pytest.mark.slow
@@ -131,7 +131,7 @@ def test_a_calibration_error_within_its_covariance_is_within_the_covariance_of_t
     names = tuple(f"cameras.right.{p}" for p in ("x_m", "y_m", "z_m", "rot_x_rad", "rot_y_rad", "rot_z_rad"))
     sigma = np.array([1e-4] * 3 + [2e-4] * 3)
     rng, nees = np.random.default_rng(9), []
-    for i in range(50):
+    for i in range(25):
         pose = pose_at(10, i)
         left, right = PAIR.cameras
         wrong = replace(right, camera_from_world=right.camera_from_world.plus(sigma * rng.normal(size=6)))
@@ -141,7 +141,7 @@ def test_a_calibration_error_within_its_covariance_is_within_the_covariance_of_t
         delta = pose.minus(fit.world_from_body)
         nees.append(delta @ np.linalg.solve(fit.covariance, delta))
         assert np.linalg.eigvalsh(fit.covariance - fit.systematic)[0] > 0
-    assert 0.75 < np.mean(nees) / 6 < 1.3  # without the calibration's part: 16
+    assert 0.65 < np.mean(nees) / 6 < 1.4  # sigma of the mean: 0.12; without the calibration's part: 16
 
 
 def test_the_first_fit_finds_the_pose_of_a_far_target_from_labels_alone():

@@ -42,9 +42,9 @@ def places_only(motion: Motion) -> Motion:
 
 
 def test_errors_of_all_fourteen_parameters_agree_with_their_covariance():
-    found = [estimate_alignment(*recordings(seed), offset_s=0.1) for seed in range(10)]
+    found = [estimate_alignment(*recordings(seed), offset_s=0.1) for seed in range(6)]
     assert all(e.free.all() and not e.determined.undetermined for e in found)
-    # 10 x 14 squared normal errors: a mean of 1 with a standard deviation of 0.12.
+    # 6 x 14 squared normal errors: a mean of 1 with a standard deviation of 0.15. The slow test has 60 recordings.
     assert 0.6 < nees(found) < 1.4
     assert 0.85 < np.mean([e.scale for e in found]) < 1.15
 

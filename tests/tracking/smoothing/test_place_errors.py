@@ -139,7 +139,7 @@ def test_spots_that_are_wider_in_other_places_have_no_larger_errors():
     assert 0.5 < np.nanmean(assess(run, frames).nees) / 6 < 1.5
 
 
-@pytest.mark.parametrize("count", [4, 5, 6])
+@pytest.mark.parametrize("count", [4, pytest.param(5, marks=pytest.mark.slow), 6])
 def test_a_vehicle_at_rest_does_not_show_that_its_errors_of_places_are_small(count):
     """Few residuals, which agree in all frames, are small by chance."""
     nees = []

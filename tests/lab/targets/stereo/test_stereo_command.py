@@ -16,7 +16,7 @@ from lab.files.text import columns
 from lab.targets.stereo.process import process_stereo_run
 from lab.targets.stereo.simulated_recording import write_stereo_recording
 
-FRAMES = 12  # of the recording of points
+FRAMES = 9  # of the recording of points
 
 
 def typed(*arguments):
@@ -63,7 +63,7 @@ def test_the_tables_have_the_columns_of_the_contract_and_a_row_per_frame(result)
 def test_the_pose_errors_agree_with_the_stated_covariance(result):
     assert result.exit_status == 0
     nees = result.result.errors.nees
-    assert 3.5 < nees.mean() < 9.5  # 6 expected; sigma of the mean: 1.0
+    assert 3.0 < nees.mean() < 10.0  # 6 expected; sigma of the mean: 1.2
     assert np.abs(result.result.errors.range_m).max() < 0.05
 
 
