@@ -12,6 +12,7 @@ from lab.simulate.rigs import RIGS
 from tracking.detections import PictureClock
 from tracking.rigid_body.models.information import exposed_after, picture_shifts, timed_spot
 from tracking.rigid_body.models.motion import state_after
+from tracking.smoothing.motion.run_detections import Delays, Reference, RunDetections, Steps, moved_detections
 
 MODEL = SpotModel.of(RIGS["four-skew-beams"]())
 R, T = np.eye(3), np.zeros(3)
@@ -48,6 +49,24 @@ def test_the_covariance_of_a_shift_is_that_of_the_way_in_that_time():
     _, cov = picture_shifts(MODEL.numbers, MODEL.camera_of, clocks, R, T, np.zeros(12), np.eye(6) * 0.1**2)
     J = MODEL.project(Pose(R, T))[1]
     np.testing.assert_allclose(cov, (0.1 * 0.004) ** 2 * J @ np.swapaxes(J, 1, 2), rtol=1e-9)
+
+
+def test_points_are_moved_to_their_frames_instant_as_their_spots_move():
+    """Their covariance grows by that of the way; points without a label move as the spots nearest to them."""
+    after, jerk, n = 0.004, 2e6, len(MODEL)
+    R_then, t_then, _ = state_after(R, T, M, after)
+    uv, J = MODEL.project(Pose(R_then, t_then))
+    cov = np.tile([[0.02, 0.005], [0.005, 0.03]], (n, 1, 1))
+    first = np.searchsorted(MODEL.camera_of, [[0, 1, 2]])
+    seen = RunDetections(uv, cov, np.zeros(n), np.array([0, n]), first, np.ones((1, 2), bool), np.ones(n), np.ones(n))
+    delays = Delays(np.full(n, after), np.zeros(n), np.array([[[after, 0.0, 511.5]] * 2]))
+    steps = Steps(np.array([0.01]), np.full((1, 6), jerk), np.zeros((1, 2)), np.full((1, 2), np.nan))
+    labels = np.where(np.arange(n) % 2, np.arange(n) - first[0, MODEL.camera_of], -1)[None]
+    motion, velocity_P = Reference(R[None], T[None], M[None]), np.eye(6)[None] * 0.1**2
+    moved = moved_detections(MODEL.numbers, MODEL.camera_of, seen, delays, labels, motion, velocity_P, steps)
+    np.testing.assert_allclose(moved[0], pixels_after(0.0), atol=1e-9)
+    variance = (0.1 * after) ** 2 + jerk * after**5 / 20  # of the way, in m and rad
+    np.testing.assert_allclose(moved[1], cov + variance * J @ np.swapaxes(J, 1, 2), rtol=1e-9)
 
 
 @pytest.mark.parametrize("after", [-0.006, 0.0, 0.004])
