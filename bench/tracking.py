@@ -170,7 +170,7 @@ def out_of_view_rows(poses: int) -> Iterator[Row]:
     rig = RIGS["fan"]()
     model = SpotModel.of(rig)
     rows = np.array([0, 1, 3, 4])
-    recipes = CoplanarViews.of(rig, model)
+    recipes = CoplanarViews.of(model)
     for noise in (0.0, 0.1):
         rng = np.random.default_rng(FIRST_SEED)
         quadratic, rigid, between = [], [], []

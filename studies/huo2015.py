@@ -168,7 +168,7 @@ def out_of_view_errors(run: PointRun, way: str, noise_px: float) -> Array:
     """
     rng = np.random.default_rng([run.seed, 52])
     T, n = run.in_view.shape
-    recipes = CoplanarViews.of(run.rig, run.model)
+    recipes = CoplanarViews.of(run.model)
     covariance = max(noise_px, 1e-3) ** 2 * np.eye(2)
     error = np.full((T, n), np.nan)
     for k in range(T):

@@ -12,7 +12,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from lab.simulate.scenarios import PriorRegion, Scenario
-from lab.simulate.scene import POINT_NOISE, VISIBLE, compose, with_overrides
+from lab.simulate.scene import POINT_NOISE, VISIBLE, compose, scenario_with
 from tracking.detections import Detections
 
 # Shape and brightness of a laser spot in a picture, and its light integrated over pixels and exposure.
@@ -180,22 +180,19 @@ def simulate_points(
     frames: int | None = None,
     noise_px: float = 0.1,
     clutter: float | None = None,
-    miss_probability: float | None = None,
     picture_scale: float = 1.0,
     rig: Rig | None = None,
 ) -> PointRun:
     """One recording of a scenario as points.
 
     noise_px: 1 sigma per axis, also of clutter. clutter: probability of a false point near each spot in the picture
-    (default: that of the scenario). miss_probability: of each spot in each frame. The motion depends on scenario and
-    seed only; the clutter of a lower probability is a subset of that of a higher one. picture_scale, rig: as in
-    `compose`.
+    (default: that of the scenario). The motion depends on scenario and seed only; the clutter of a lower probability is
+    a subset of that of a higher one. picture_scale, rig: as in `compose`.
 
     Raises:
         InputError: an unknown scenario, or an argument out of range.
     """
-    overridden = with_overrides(scenario, clutter=clutter, miss_probability=miss_probability)
-    scene = compose(overridden, seed, frames, picture_scale, rig)
+    scene = compose(scenario_with(scenario, clutter=clutter), seed, frames, picture_scale, rig)
     model, false = scene.model, scene.clutter_points
     n, cameras = len(model), range(len(model.camera_names))
     first_false = np.searchsorted(false.frame, np.arange(len(scene.frame) + 1))

@@ -253,15 +253,14 @@ def _usable_pictures(scenario: Scenario, model: SpotModel, count: int) -> Bools:
     return usable
 
 
-def with_overrides(
+def scenario_with(
     scenario: str | Scenario,
     *,
     clutter: float | None = None,
-    miss_probability: float | None = None,
     frame_rate_hz: float | None = None,
     exposure_s: float | None = None,
 ) -> Scenario:
-    """The scenario with another clutter probability per spot, probability of a missed spot, rate or exposure.
+    """The scenario with another clutter probability per spot, rate or exposure.
 
     Raises:
         InputError: an unknown scenario, a probability outside 0 to 1, or an exposure longer than a frame.
@@ -280,8 +279,4 @@ def with_overrides(
         if not 0.0 <= clutter <= 1.0:
             raise InputError(f"clutter: expected a probability per spot and frame, 0 to 1, got {clutter:g}")
         scenario = replace(scenario, clutter=replace(scenario.clutter, per_spot=clutter))
-    if miss_probability is not None:
-        if not 0.0 <= miss_probability <= 1.0:
-            raise InputError(f"miss_probability: expected 0 to 1, got {miss_probability:g}")
-        scenario = replace(scenario, occlusion=replace(scenario.occlusion, miss_probability=miss_probability))
     return scenario

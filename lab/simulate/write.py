@@ -26,7 +26,7 @@ from lab.simulate.picture import LaserPowers, Picture, Sensor, laser_powers, mak
 from lab.simulate.points import simulate_points
 from lab.simulate.rigs import RIGS
 from lab.simulate.scenarios import LIGHTS, Scenario
-from lab.simulate.scene import Scene, compose, with_overrides
+from lab.simulate.scene import Scene, compose, scenario_with
 
 # PNG filters do not help with noisy or nearly constant pictures. A 1280x1024 picture with 1 DN of noise: 414 kB in
 # 13 ms with these options, 385 kB in 19 ms with the default filters of OpenCV; one of light "quiet": 44 kB in 3 ms,
@@ -50,7 +50,6 @@ def simulate(
     detections_only: bool = False,
     light: str | None = None,
     clutter: float | None = None,
-    miss_probability: float | None = None,
     noise_px: float = 0.1,
     picture_scale: float = 1.0,
     noisy: bool = True,
@@ -71,7 +70,7 @@ def simulate(
 
     scenario: a name of SCENARIOS, or a value. frames: default: those of the scenario. video: one lossless video per
     camera instead of PNG files. detections_only: no pictures, but a detections.csv with `noise_px` (1 sigma per axis).
-    light: a name of LIGHTS instead of the light of the scenario. clutter, miss_probability: as in simulate_points.
+    light: a name of LIGHTS instead of the light of the scenario. clutter: as in simulate_points.
     picture_scale: 0.5 gives pictures of half the width and height. noisy: False: no shot and read noise, only rounding.
     threads: number of threads that render and write pictures. progress: called after each picture. rig: a rig.yaml
     instead of the rig of the scenario: the motion is moved to where that rig sees the vehicle, and as large as keeps
@@ -93,7 +92,7 @@ def simulate(
     known = None if known_rig is None else load_rig_file(known_rig)
     if start is not None and trajectory is not None:
         raise InputError("a trajectory states where the vehicle is; omit the start or the trajectory")
-    scenario = _with_light(with_overrides(scenario, clutter=clutter, miss_probability=miss_probability), light)
+    scenario = _with_light(scenario_with(scenario, clutter=clutter), light)
     seen_by = RIGS[scenario.rig]() if true_rig is None else true_rig
     if trajectory is not None:
         scenario, notes = along(scenario, Path(trajectory), seen_by, frame_rate_hz)
@@ -102,7 +101,7 @@ def simulate(
                 note(line)
     elif true_rig is not None or start is not None:
         scenario = placed(scenario, seen_by, start)
-    scenario = with_overrides(scenario, frame_rate_hz=frame_rate_hz, exposure_s=exposure_s)
+    scenario = scenario_with(scenario, frame_rate_hz=frame_rate_hz, exposure_s=exposure_s)
     if video:
         _check_video(scenario, detections_only)
     with atomic_folder(Path(out_folder), lambda _: False) as folder:

@@ -178,7 +178,7 @@ def _scene(
         RADIUS_M,
         look=look,
         light=light,
-        background=_background(rng, size_px, unseen, diameter),
+        background=_background(rng, size_px, unseen),
         blur_px=blur,
         motion_px=(float(motion[0]), float(motion[1])),
         noise_dn=float(rng.uniform(0.5, 8)),
@@ -206,7 +206,7 @@ def _occluders(rng: np.random.Generator, centre: tuple[float, float], diameter: 
     )
 
 
-def _background(rng: np.random.Generator, size_px: tuple[int, int], unseen: bool, diameter: float) -> DrogueBackground:
+def _background(rng: np.random.Generator, size_px: tuple[int, int], unseen: bool) -> DrogueBackground:
     seed = int(rng.integers(2**31))
     if unseen:
         return DrogueBackground(PICTURE, seed, picture=_unseen_picture(rng, size_px))

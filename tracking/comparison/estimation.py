@@ -386,7 +386,7 @@ def _fit(
             gain, _ = _gain(info, what.basis)
             delta = what.basis @ np.einsum("kni,ni->k", gain, w.r.values)
             alignment = alignment.plus(-delta)
-            if _is_small(delta, w, result):
+            if _is_small(delta, result):
                 break
     w = _weighted(result, reference, alignment, gap)
     if w is None or what is None:
@@ -396,7 +396,7 @@ def _fit(
     return Estimate(alignment, covariance, mask, what, w.scale, correlation, inliers & w.r.known, ())
 
 
-def _is_small(delta: Array, w: _Weighted, result: Motion) -> bool:
+def _is_small(delta: Array, result: Motion) -> bool:
     """Whether a step changes the alignment by less than the residuals can show."""
     limit = np.array([1e-6 * result.step_s, 1e-6 * result.step_s / max(float(np.ptp(result.t_s)), 1e-9)])
     return bool(np.all(np.abs(delta[TIME]) < limit) and np.all(np.abs(delta[2:]) < 1e-10))

@@ -41,7 +41,7 @@ class CoplanarViews:
     constructions: tuple[Construction, ...]
 
     @staticmethod
-    def of(rig: Rig, model: SpotModel) -> CoplanarViews:
+    def of(model: SpotModel) -> CoplanarViews:
         """Find every view that follows from two beams of which both ends are observed."""
         opposite = _opposites(model)
         constructions: list[Construction] = []

@@ -62,7 +62,7 @@ class SpotTracker:
         self.calibration = None if covariance is None else RigUncertainty(rig, self.model, covariance)
         self.parameters = parameters
         self.prior = prior
-        self.coplanar = CoplanarViews.of(rig, self.model)
+        self.coplanar = CoplanarViews.of(self.model)
         self.tracks = Tracks.none(len(self.model), parameters.sigma_a_px_s2)
         self.vehicle = Vehicle(parameters)
         self.limits = SolveLimits(parameters.max_sigma_m, np.deg2rad(parameters.max_sigma_deg))
@@ -122,7 +122,7 @@ class SpotTracker:
             if acquired is not None:
                 fit, point = acquired, points
                 uv, _ = matched_pixels(self.model, found, point)
-                turned = outside_first_search(self.model, self.tracks, self.parameters.r1_px, uv)
+                turned = outside_first_search(self.tracks, self.parameters.r1_px, uv)
         return _Matches(point, turned, matches.gain), fit
 
     def _match(self, found: Sequence[Detections | None]) -> _Matches:

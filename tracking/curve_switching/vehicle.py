@@ -288,7 +288,7 @@ def matched_pixels(model: SpotModel, found: Sequence[Detections | None], point: 
     return uv, cov
 
 
-def outside_first_search(model: SpotModel, tracks: Tracks, r1_px: float, uv_px: Array) -> Bools:
+def outside_first_search(tracks: Tracks, r1_px: float, uv_px: Array) -> Bools:
     """Which matched views (n,), uv_px (n, 2), lie outside their first search region or have no track: `turned`."""
     gap = np.linalg.norm(uv_px - tracks.x[:, :2], axis=-1)
     return ~np.isnan(uv_px[:, 0]) & ~(tracks.alive & (gap <= r1_px))
@@ -399,7 +399,7 @@ class RigidCheck:
         if wider is None or not wider.consistent(self.limits.p_false_alarm):
             point[new] = UNMATCHED
             return fit, point, turned
-        far = outside_first_search(self.model, tracks, self.parameters.r1_px, uv)
+        far = outside_first_search(tracks, self.parameters.r1_px, uv)
         return wider, point, np.where(np.isin(np.arange(len(point)), new), far, turned)
 
     def _add_missed(

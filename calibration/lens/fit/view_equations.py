@@ -66,7 +66,7 @@ class ViewEquations:
         line = term_of(table, found.used, model.fisheye, found.sigma_px).linearise(found.values)
         parts = {p.stack: p.jacobian for p in line.parts}
         shared = _shared(parts, model.free, board, table.circles is not None)
-        known = _prior_rows(table, found, board, shared.shape[-1])
+        known = _prior_rows(table, found, shared.shape[-1])
         view = table.view[found.used]
         return ViewEquations.of_rows(
             shared, parts["boards"], line.residuals, view, views, known, int(model.free.sum())
@@ -212,7 +212,7 @@ def _shared(parts: dict[str, Array], free: Bools, board: BoardFreedom, circles: 
     return np.concatenate([parts["intrinsics"][..., free], *(parts[n] for n in names)], axis=2)
 
 
-def _prior_rows(table: CornerTable, found: LensFit, board: BoardFreedom, q: int) -> Array:
+def _prior_rows(table: CornerTable, found: LensFit, q: int) -> Array:
     """Derivatives (n, q) of the priors on the lens and on the radius of circles."""
     rows = []
     for term in prior_terms(table, found.used, found.model, found.values):

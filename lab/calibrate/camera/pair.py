@@ -150,7 +150,6 @@ def calibrate_pair_folder(
     board: Board | str | Path,
     out: Path,
     options: PairOptions = PairOptions(),
-    today: datetime.date | None = None,
     progress: Progress | None = None,
 ) -> Outcome[CalibratedPair]:
     """Calibrate a pair from photographs of a board by both cameras; equal numbers in file names are one instant.
@@ -162,17 +161,16 @@ def calibrate_pair_folder(
         InputError: for pictures or a board that cannot be used.
         CalibrationError: if the photographs do not determine a camera or the pair.
     """
-    return run_step(_STEP, out, lambda: _solve((left, right), board, options, today, progress))
+    return run_step(_STEP, out, lambda: _solve((left, right), board, options, progress))
 
 
 def _solve(
     photos: tuple[Path | str, Path | str],
     board: Board | str | Path,
     options: PairOptions,
-    today: datetime.date | None,
     progress: Progress | None,
 ) -> Solved[CalibratedPair]:
-    day = today or datetime.date.today()
+    day = datetime.date.today()
     known = load_board_or_text(board) if isinstance(board, str | Path) else board
     sets, single = [], []
     for name, path in zip(options.names, photos, strict=True):

@@ -156,7 +156,7 @@ def scene_view(things: Sequence[SceneObject], title: str, view: str = LAB_VIEWS[
     far_first = sorted(range(len(things)), key=lambda i: float(np.nanmean(outlines[i] @ nearness)))
     out, labels = [svg.text(8, 15, title, "title")], []
     for i in far_first:
-        parts, label = _drawn(things[i], p, p.at(flat[i]))
+        parts, label = _drawn(things[i], p.at(flat[i]))
         out.append(parts)
         labels += [label] if label else []
     out += _placed(labels, p)
@@ -199,7 +199,7 @@ def outline(thing: SceneObject, reach: float) -> Array:
     return np.asarray(thing.place, dtype=float).reshape(1, 3)
 
 
-def _drawn(thing: SceneObject, p: svg.PlotArea, at: Array) -> tuple[str, tuple[float, float, str, str] | None]:
+def _drawn(thing: SceneObject, at: Array) -> tuple[str, tuple[float, float, str, str] | None]:
     """SVG of a thing, and its label: x, y, text, colour."""
     c = thing.colour
     tip = f"<title>{escape(thing.name)}</title>"

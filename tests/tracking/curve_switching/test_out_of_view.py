@@ -19,7 +19,7 @@ EXACT_PX = 1e-6
 def set_up(name: str):
     rig = RIGS[name]()
     model = SpotModel.of(rig)
-    return rig, model, CoplanarViews.of(rig, model)
+    return rig, model, CoplanarViews.of(model)
 
 
 @pytest.mark.parametrize("name", ["fan", "unequal-fan", "two-cameras-per-screen"])
@@ -96,7 +96,7 @@ def test_beams_are_coplanar_to_a_millimetre_and_a_milliradian(shift_m, tilt, any
     c = rig.beams["C"]
     moved = Beam("C", c.direction + np.array([0, 0, tilt]), c.point + np.array([0, 0, shift_m]))
     rig = replace(rig, beams={**rig.beams, "C": moved})
-    assert bool(CoplanarViews.of(rig, SpotModel.of(rig)).constructions) == any_left
+    assert bool(CoplanarViews.of(SpotModel.of(rig)).constructions) == any_left
 
 
 def test_moving_a_beams_point_along_its_line_changes_nothing():
@@ -109,6 +109,6 @@ def test_moving_a_beams_point_along_its_line_changes_nothing():
     seen = np.where((model.beam_of == 2)[:, None], np.nan, true)
     np.testing.assert_allclose(
         quadratic_positions(rig, model, coplanar, seen),
-        quadratic_positions(other, other_model, CoplanarViews.of(other, other_model), seen),
+        quadratic_positions(other, other_model, CoplanarViews.of(other_model), seen),
         atol=EXACT_PX,
     )

@@ -444,7 +444,7 @@ def test_a_detection_of_two_merged_spots_is_assigned_to_one_of_them():
 def test_with_the_papers_method_positions_outside_the_image_are_those_of_its_quadratic():
     run = simulate_points("smooth", 21, frames=120, clutter=0.0)
     t = Tracked(run, track(run, PAPER))
-    coplanar = CoplanarViews.of(run.rig, run.model)
+    coplanar = CoplanarViews.of(run.model)
     compared = 0
     for f in t.frames:
         seen = np.where(np.array([s.measured for s in f.status])[:, None], f.uv_px, np.nan)

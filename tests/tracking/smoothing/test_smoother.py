@@ -215,7 +215,7 @@ def test_a_start_that_the_tracker_could_not_label_is_labelled_from_later_frames(
 
 def test_labels_that_are_changed_or_left_open_have_events():
     seen = 0
-    for seed in (7003, 7007):
+    for seed in (7003,):
         _, causal, again, smoothed = both_passes("very-fast", seed)
         changed = 0
         for a, b in zip(causal, again, strict=True):
