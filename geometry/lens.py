@@ -85,19 +85,18 @@ def coefficient_jacobian(xy: Array, coefficients: Array, distorted: Array | None
     J[..., 0, 3], J[..., 1, 3] = r2 + 2 * x * x, 2 * x * y
     J[..., 0, 8], J[..., 0, 9] = r2, r4
     J[..., 1, 10], J[..., 1, 11] = r2, r4
+    if not (np.any(tau_x) or np.any(tau_y)):
+        bent = distort(xy, coefficients)[0] if distorted is None else distorted
+        J[..., 12], J[..., 13] = bent * bent[..., 1:], -bent * bent[..., :1]
+        return J
     T, dT = tilt_matrix(np.asarray(tau_x), np.asarray(tau_y)), _tilt_derivatives(np.asarray(tau_x), np.asarray(tau_y))
-    tilted = bool(np.any(tau_x) or np.any(tau_y))
-    if distorted is None or tilted:
-        untilted = np.array(coefficients, dtype=float)
-        untilted[..., 12:] = 0
-        bent, _ = distort(xy, untilted)
-    else:
-        bent = distorted
+    untilted = np.array(coefficients, dtype=float)
+    untilted[..., 12:] = 0
+    bent, _ = distort(xy, untilted)
     h = _turned(T, bent)
     out = h[..., :2] / h[..., 2:]
-    if tilted:
-        D = (T[..., :2, :2] - out[..., :, None] * T[..., 2:, :2]) / h[..., 2:, None]
-        J[..., :12] = D @ J[..., :12]
+    D = (T[..., :2, :2] - out[..., :, None] * T[..., 2:, :2]) / h[..., 2:, None]
+    J[..., :12] = D @ J[..., :12]
     for column in (0, 1):
         dh = _turned(dT[column], bent)
         J[..., 12 + column] = (dh[..., :2] - out * dh[..., 2:]) / h[..., 2:]

@@ -263,38 +263,33 @@ def _fitted_outlines(image: GreyImage, centres: Array, shapes: Array, blur: Arra
     scale = np.stack([np.ones_like(size)] * 2 + [1 / size] * 3 + [np.ones_like(size)] * 3, axis=1)
     x = np.concatenate([centres - whole, A.reshape(-1, 4)[:, [0, 1, 3]], np.zeros((len(A), 2)), blur[:, None]], axis=1)
     largest = np.array([0.5, 0.5, 0.05, 0.05, 0.05, 0.05, 0.05, 0.3]) * scale
-    J, B = (np.empty((*grey.shape, k), dtype=corner_refinement.SINGLE) for k in (8, 6))
-    B[..., 0] = weight
+    J, B = (np.empty((len(grey), k, most), dtype=corner_refinement.SINGLE) for k in (8, 6))
+    B[:, 0] = weight
+    place = np.swapaxes(place, 1, 2).astype(corner_refinement.SINGLE)  # (n, 2, m)
     for _ in range(_STEPS):
         y = x.astype(corner_refinement.SINGLE)
-        d = place.astype(corner_refinement.SINGLE) - y[:, None, :2]
+        d = place - y[:, :2, None]
         to_circle = y[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
-        w = d @ to_circle
-        length = np.maximum(np.linalg.norm(w, axis=-1), 1e-6)
-        w /= length[..., None]
-        normal = w @ to_circle
-        n = np.maximum(np.linalg.norm(normal, axis=-1), 1e-9)
-        cube = (w[..., 0] + 1j * w[..., 1]) ** 3
-        away = (length * (1 - y[:, None, 5] * cube.real - y[:, None, 6] * cube.imag) - 1) / n
+        w = to_circle @ d
+        length = np.maximum(np.hypot(w[:, 0], w[:, 1]), 1e-6)
+        w /= length[:, None]
+        normal = to_circle @ w
+        n = np.maximum(np.hypot(normal[:, 0], normal[:, 1]), 1e-9)
+        (p, q), (a, b) = np.moveaxis(w, 1, 0), (w * w).swapaxes(0, 1)
+        cube = np.stack([p * (a - 3 * b), q * (3 * a - b)], axis=1)  # of the complex number p + i q
+        away = (length * (1 - (y[:, None, 5:7] @ cube)[:, 0]) - 1) / n
         curved = np.linalg.det(to_circle)[:, None] ** 2 / n**3  # 1/px
         sigma = y[:, 7:]
         e = away / sigma + sigma * curved / 2  # blur displaces a curved edge towards its centre of curvature
-        B[..., 1:3] = weight[..., None] * d / size[:, None, None]
-        B[..., 3:] = B[..., :3] * erf(e / 2**0.5)[..., None]
+        B[:, 1:3] = weight[:, None] * d / size[:, None, None]
+        B[:, 3:] = B[:, :3] * erf(e / corner_refinement.SINGLE(2**0.5))[:, None]
         linear = corner_refinement.linear_part(B, grey)
-        g = (
-            (2 / np.pi) ** 0.5
-            * np.exp(-e * e / 2)
-            * (B[..., :3] @ linear[:, 3:].astype(corner_refinement.SINGLE))[..., 0]
-            / sigma
-        )
-        g = g[..., None] / n[..., None]
-        J[..., :2] = -g * normal
-        J[..., 2:5] = g * np.stack(
-            [w[..., 0] * d[..., 0], np.sum(w * d[..., ::-1], axis=-1), w[..., 1] * d[..., 1]], -1
-        )
-        J[..., 5:7] = -g * (length[..., None] * np.stack([cube.real, cube.imag], axis=-1))
-        J[..., 7] = g[..., 0] * n * (curved * sigma / 2 - away / sigma)
+        slope = np.swapaxes(linear[:, 3:], 1, 2).astype(corner_refinement.SINGLE) @ B[:, :3]
+        g = slope[:, 0] * corner_refinement.SINGLE((2 / np.pi) ** 0.5) * np.exp(-e * e / 2) / (sigma * n)
+        J[:, :2] = -g[:, None] * normal
+        J[:, 2], J[:, 3], J[:, 4] = g * p * d[:, 0], g * (p * d[:, 1] + q * d[:, 0]), g * q * d[:, 1]
+        J[:, 5:7] = -(g * length)[:, None] * cube
+        J[:, 7] = g * n * (curved * sigma / 2 - away / sigma)
         step = corner_refinement.step_of(J, B, grey, linear)
         x = x + np.clip(step, -largest, largest)
         x[:, 7] = np.maximum(x[:, 7], 0.25)

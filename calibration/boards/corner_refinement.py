@@ -88,34 +88,34 @@ def _saddles(
     from an edge over its sigma. The six linear parameters are eliminated. With t + Q(t) = d, Q of `bend`, edges are
     straight in t: in a window of 20 px the curved edges of a fisheye lens would displace corners by .04 px.
     """
-    v, u = (w.ravel().astype(SINGLE) for w in np.mgrid[-half : half + 1, -half : half + 1])
+    v, u = (w.ravel() for w in np.mgrid[-half : half + 1, -half : half + 1])
     whole = np.round(start).astype(int)
-    columns, rows = whole[:, :1] + u.astype(int), whole[:, 1:] + v.astype(int)
+    columns, rows = whole[:, :1] + u, whole[:, 1:] + v
     height, width = image.shape
     weight = ((columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)).astype(SINGLE)
     grey = weight * image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
-    C = bend.astype(SINGLE)
+    place, C = np.stack([u, v]).astype(SINGLE), np.swapaxes(bend, 1, 2).astype(SINGLE)
     x = np.concatenate([start - whole, edges], axis=1)
     largest = np.array([0.7, 0.7, 0.3, 0.3, 0.3, 0.3])
-    J, L = (np.empty((*grey.shape, 6), dtype=SINGLE) for _ in range(2))
-    L[..., 0] = weight
+    J, L = (np.empty((len(grey), 6, len(u)), dtype=SINGLE) for _ in range(2))
+    L[:, 0] = weight
     for _ in range(_STEPS):
         at = x.astype(SINGLE)
-        d = np.stack([u - at[:, :1], v - at[:, 1:2]], axis=-1)
+        d = place - at[:, :2, None]
         t = d - _quadratic(C, d - _quadratic(C, d))
-        cos, sin = np.cos(at[:, None, 2:4]), np.sin(at[:, None, 2:4])
-        along = np.stack([cos[:, 0], sin[:, 0]], axis=-1)
-        curved = np.sum(_quadratic(C, along) * np.stack([-sin[:, 0], cos[:, 0]], axis=-1), axis=-1)
-        # (n, m, 2): distances from the edges in sigmas; blur displaces a curved edge towards its centre of curvature
-        e = (cos * t[..., 1:] - sin * t[..., :1]) / at[:, None, 4:] - (at[:, 4:] * curved)[:, None]
-        S, slope = erf(e / 2**0.5), (2 / math.pi) ** 0.5 * np.exp(-e * e / 2) / at[:, None, 4:]
-        L[..., 1:3] = weight[..., None] * d / half
-        L[..., 3:] = L[..., :3] * (S[..., :1] * S[..., 1:])
+        cos, sin, sigma = np.cos(at[:, 2:4]), np.sin(at[:, 2:4]), at[:, 4:, None]
+        along, across = np.stack([cos, sin], axis=2), np.stack([-sin, cos], axis=2)  # (n, 2, 2): of each edge
+        curved = np.einsum("nij,nji->ni", across, _quadratic(C, np.swapaxes(along, 1, 2)))[..., None]
+        # (n, 2, m): distances from the edges in sigmas; blur displaces a curved edge towards its centre of curvature
+        e = across / sigma @ t - sigma * curved
+        S, slope = erf(e / SINGLE(2**0.5)), SINGLE((2 / math.pi) ** 0.5) * np.exp(-e * e / 2) / sigma
+        L[:, 1:3] = weight[:, None] * d / half
+        L[:, 3:] = L[:, :3] * (S[:, :1] * S[:, 1:])
         linear = linear_part(L, grey)
-        g = (L[..., :3] @ linear[:, 3:].astype(SINGLE)) * S[..., ::-1] * slope
-        J[..., 0], J[..., 1] = np.sum(g * sin, axis=-1), -np.sum(g * cos, axis=-1)
-        J[..., 2:4] = -g * (cos * t[..., :1] + sin * t[..., 1:])
-        J[..., 4:] = -g * e
+        g = (np.swapaxes(linear[:, 3:], 1, 2).astype(SINGLE) @ L[:, :3]) * S[:, ::-1] * slope
+        J[:, :2] = -np.swapaxes(across, 1, 2) @ g
+        J[:, 2:4] = -g * (along @ t)
+        J[:, 4:] = -g * e
         step = step_of(J, L, grey, linear)
         x = x + np.clip(step, -largest, largest)
         x[:, 4:] = np.clip(x[:, 4:], 0.25, half)
@@ -125,30 +125,30 @@ def _saddles(
 
 
 def linear_part(L: Pixelwise, grey: Pixelwise) -> Array:
-    """The linear parameters (n, k, 1) of n least-squares fits of L (n, m, k) to grey values (n, m)."""
-    return np.linalg.solve(_square(L), (np.swapaxes(L, 1, 2) @ grey[..., None]).astype(float))
+    """The linear parameters (n, k, 1) of n least-squares fits of L (n, k, m) to grey values (n, m)."""
+    return np.linalg.solve(_square(L), (L @ grey[..., None]).astype(float))
 
 
 def step_of(J: Pixelwise, L: Pixelwise, grey: Pixelwise, linear: Array) -> Array:
-    """The Gauss-Newton step (n, p) of the other parameters, with derivatives J (n, m, p); the linear ones eliminated.
+    """The Gauss-Newton step (n, p) of the other parameters, with derivatives J (n, p, m); the linear ones eliminated.
 
     Source: Kaufman (1975), "A variable projection method for solving separable nonlinear least squares problems", BIT.
     """
-    mixed = (np.swapaxes(L, 1, 2) @ J).astype(float)
-    N = (np.swapaxes(J, 1, 2) @ J).astype(float) - np.swapaxes(mixed, 1, 2) @ np.linalg.solve(_square(L), mixed)
-    N += (1e-3 * np.einsum("nii->ni", N)[:, None] + 1e-9) * np.eye(J.shape[-1])
-    left = grey[..., None] - L @ linear.astype(L.dtype)
-    return np.asarray(np.linalg.solve(N, (np.swapaxes(J, 1, 2) @ left).astype(float))[..., 0])
+    mixed = (L @ np.swapaxes(J, 1, 2)).astype(float)
+    N = (J @ np.swapaxes(J, 1, 2)).astype(float) - np.swapaxes(mixed, 1, 2) @ np.linalg.solve(_square(L), mixed)
+    N += (1e-3 * np.einsum("nii->ni", N)[:, None] + 1e-9) * np.eye(J.shape[1])
+    left = grey[:, None] - np.swapaxes(linear, 1, 2).astype(L.dtype) @ L
+    return np.asarray(np.linalg.solve(N, (J @ np.swapaxes(left, 1, 2)).astype(float))[..., 0])
 
 
 def _square(L: Pixelwise) -> Array:
-    return np.asarray((np.swapaxes(L, 1, 2) @ L).astype(float) + 1e-9 * np.eye(L.shape[-1]))
+    return np.asarray((L @ np.swapaxes(L, 1, 2)).astype(float) + 1e-9 * np.eye(L.shape[1]))
 
 
 def _quadratic(C: Pixelwise, t: Pixelwise) -> Pixelwise:
-    """(n, m, 2): the second-order displacement at offsets t (n, m, 2), px, with coefficients C (n, 3, 2), 1/px."""
-    x, y = t[..., 0], t[..., 1]
-    return np.stack([x * x, x * y, y * y], axis=-1) @ C
+    """(n, 2, m): the second-order displacement at offsets t (n, 2, m), px, with coefficients C (n, 2, 3), 1/px."""
+    x, y = t[:, 0], t[:, 1]
+    return C @ np.stack([x * x, x * y, y * y], axis=1)
 
 
 def _local_shape(grid: Array, known: Bools) -> Array:

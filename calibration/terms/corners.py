@@ -59,13 +59,13 @@ def centroid(outline: Array) -> tuple[Array, Array]:
 
     The nodes are the images of ON_CIRCLE, in that order. nan where a node is nan.
     """
-    middle = outline.mean(axis=1)
+    middle = np.full(NODES, 1 / NODES) @ outline
     x, y = np.moveaxis(outline - middle[:, None], -1, 0)  # (n, NODES)
     dx, dy = x @ _D.T, y @ _D.T
-    area = _W * np.sum(x * dy, axis=1)
+    area = _W * np.einsum("ij,ij->i", x, dy)
     with np.errstate(invalid="ignore", divide="ignore"):
-        cx = 0.5 * _W * np.sum(x * x * dy, axis=1) / area
-        cy = -0.5 * _W * np.sum(y * y * dx, axis=1) / area
+        cx = 0.5 * _W * np.einsum("ij,ij,ij->i", x, x, dy) / area
+        cy = -0.5 * _W * np.einsum("ij,ij,ij->i", y, y, dx) / area
         G = np.empty((len(outline), 2, NODES, 2))
         share = (_W / area)[:, None]
         G[:, 0, :, 0] = share * (x - cx[:, None]) * dy
@@ -113,9 +113,8 @@ class CornerTerm:
         """Predicted pixels (N, 2) of the corners; nan behind the camera."""
         out = np.empty((len(self), 2))
         for rows, outline in self._kinds(values):
-            placed = _Placed.of(self, values, rows, outline)
-            projected = self._projected(values, placed)
-            out[rows] = projected.pixels if outline is None else centroid(projected.pixels.reshape(-1, NODES, 2))[0]
+            pixels = self._projected(values, _Placed.of(self, values, rows, outline)).pixels
+            out[rows] = pixels[:, 0] if outline is None else centroid(pixels)[0]
         return out
 
     def linearise(self, values: Values) -> Linearised:
@@ -126,9 +125,10 @@ class CornerTerm:
             placed = _Placed.of(self, values, rows, outline)
             projected = self._projected(values, placed)
             by = self._derivatives(values, placed, projected)
-            pixels = projected.pixels
-            if outline is not None:
-                pixels, G = centroid(pixels.reshape(-1, NODES, 2))
+            if outline is None:
+                pixels, by = projected.pixels[:, 0], {name: J[:, 0] for name, J in by.items()}
+            else:
+                pixels, G = centroid(projected.pixels)
                 G = G.reshape(len(G), 2, 2 * NODES)
                 by = {name: G @ J.reshape(len(G), 2 * NODES, -1) for name, J in by.items()}
             residuals[rows] = (pixels - self.pixels[rows]) / self.sigma_px[rows, None]
@@ -144,20 +144,14 @@ class CornerTerm:
         """
         assert self.areas_px2 is not None
         centres = {name: stack for name, stack in values.items() if name not in ("radius", "print")}
-        placed = _Placed.of(self, centres, np.arange(len(self)), None)
-        by_place = self._by_board_point(centres, placed, self._projected(centres, placed))[..., :2]
+        placed = _Placed.of(self, centres, np.s_[:], None)
+        by_place = placed.turned(self._projected(centres, placed).d_point)[1][:, 0, :, :2]
         with np.errstate(invalid="ignore", divide="ignore"):
             squared = self.areas_px2 / (np.pi * np.abs(np.linalg.det(by_place)))
         out = np.zeros(len(values["warp"]))
         for board in np.unique(self.board[np.isfinite(squared)]):
             out[board] = np.sqrt(np.nanmedian(squared[self.board == board]))
         return out
-
-    def _by_board_point(self, values: Values, placed: _Placed, projected: Projected) -> Array:
-        """Derivatives (n, 2, 3) of the pixels by the points in the board's frame."""
-        R = pose_of(values, "cameras").rotation[placed.camera]
-        boards = pose_of(values, "boards").rotation[self.placement[placed.row]]
-        return np.asarray(projected.d_point @ R @ boards)
 
     def _index(self, stack: str) -> Ints:
         """The unknown (N,) of a stack on which each corner depends."""
@@ -168,47 +162,52 @@ class CornerTerm:
             return self.point
         return self.placement if stack == "boards" else self.camera
 
-    def _kinds(self, values: Values) -> list[tuple[Ints, Array | None]]:
+    def _kinds(self, values: Values) -> list[tuple[Ints | slice, Array | None]]:
         """The rows that are corners, with None, and the rows that are circles, with their radii (n,), m."""
-        if "radius" not in values:
-            return [(np.arange(len(self)), None)]
-        radius = array_of(values, "radius")[self.board, 0]
-        kinds = [(np.flatnonzero(radius == 0), None), (np.flatnonzero(radius != 0), radius[radius != 0])]
-        return [kind for kind in kinds if len(kind[0])]
+        radius = array_of(values, "radius")[self.board, 0] if "radius" in values else np.zeros(len(self))
+        if radius.all() or not radius.any():
+            return [(np.s_[:], radius if radius.any() else None)]
+        return [(np.flatnonzero(radius == 0), None), (np.flatnonzero(radius != 0), radius[radius != 0])]
 
     def _derivatives(self, values: Values, placed: _Placed, projected: Projected) -> Mapping[str, Array]:
-        """Derivatives (n, 2, dof) of the pixels by each stack."""
-        by_world_point = projected.d_point @ pose_of(values, "cameras").rotation[placed.camera]
-        by_board_point = self._by_board_point(values, placed, projected)
+        """Derivatives (n, k, 2, dof) of the pixels by each stack."""
+        by_world_point, by_board_point = placed.turned(projected.d_point)
         # d(R Exp(theta) x)/dtheta = -R [x]_x; with a row w of the derivative by the point: -w [x]_x = x cross w.
         out: dict[str, Callable[[], Array]] = {
-            "intrinsics": lambda: np.concatenate([projected.d_pinhole, projected.d_distortion], axis=2),
-            "boards": lambda: np.concatenate([by_world_point, cross(placed.on_board[:, None], by_board_point)], axis=2),
-            "cameras": lambda: np.concatenate(
-                [projected.d_point, cross(placed.in_world[:, None], by_world_point)], axis=2
+            "intrinsics": lambda: np.concatenate([projected.d_pinhole, projected.d_distortion], axis=-1),
+            "boards": lambda: np.concatenate(
+                [by_world_point, cross(placed.on_board[:, :, None], by_board_point)], axis=-1
             ),
-            "warp": lambda: by_board_point[..., 2:] * _bend(placed.from_middle)[:, None],
-            "stretch": lambda: by_board_point[..., :1] * placed.from_middle[:, None],
+            "cameras": lambda: np.concatenate(
+                [projected.d_point, cross(placed.in_world[:, :, None], by_world_point)], axis=-1
+            ),
+            "warp": lambda: by_board_point[..., 2:] * _bend(placed.from_middle)[:, :, None],
+            "stretch": lambda: by_board_point[..., :1] * placed.from_middle[:, :, None],
             "print": lambda: by_board_point,
             "radius": lambda: (by_board_point @ placed.by_radius[..., None])[..., :1],
         }
         return {name: by() for name, by in out.items() if name in values and name not in self.fixed}
 
     def _projected(self, values: Values, placed: _Placed) -> Projected:
-        """Pixels with derivatives.
+        """Pixels (n, k, 2) with derivatives.
 
         The cameras are processed one by one, so that what depends on the lens alone (the tilt of the sensor) is
         computed once per camera and not once for each of, say, twenty thousand corners. The fold of the lens model is
         ignored: a solve may pass through lenses that fold; `lens_models.folds_in_picture` checks the result.
         """
         lenses = array_of(values, "intrinsics")
-        n = len(placed.camera)
-        out = Projected(np.empty((n, 2)), np.empty((n, 2, 3)), np.empty((n, 2, 4)), np.empty((n, 2, 14)))
+
+        def by_camera(k: int, points: Array) -> Projected:
+            wide = np.asarray(self.fisheye[k]) if self.fisheye[k] else None
+            return project_points_full(points, lenses[k, :4], lenses[k, 4:], np.asarray(np.inf), wide)
+
+        if len(lenses) == 1:
+            return by_camera(0, placed.in_camera)
+        n = placed.in_camera.shape[:2]
+        out = Projected(np.empty((*n, 2)), np.empty((*n, 2, 3)), np.empty((*n, 2, 4)), np.empty((*n, 2, 14)))
         for k in np.unique(placed.camera):
             of_camera = placed.camera == k
-            wide = np.asarray(self.fisheye[k]) if self.fisheye[k] else None
-            points = placed.in_camera[of_camera]
-            one = project_points_full(points, lenses[k, :4], lenses[k, 4:], np.asarray(np.inf), wide)
+            one = by_camera(k, placed.in_camera[of_camera])
             out.pixels[of_camera], out.d_point[of_camera] = one.pixels, one.d_point
             out.d_pinhole[of_camera], out.d_distortion[of_camera] = one.d_pinhole, one.d_distortion
         return out
@@ -216,44 +215,49 @@ class CornerTerm:
 
 @dataclass(frozen=True, slots=True)
 class _Placed:
-    """The points of n corners in all frames, or NODES points on the outline of each circle in turn."""
+    """The points of n corners in all frames (k = 1), or k = NODES points on the outline of each of n circles."""
 
-    row: Ints  # (n,) index into the term
     camera: Ints  # (n,)
-    from_middle: Array  # (n, 2), m
-    on_board: Array  # (n, 3), m
-    in_world: Array  # (n, 3), m
-    in_camera: Array  # (n, 3), m
-    by_radius: Array  # (n, 3): d(on_board)/d(radius), 0 for corners
+    from_middle: Array  # (n, k, 2), m
+    on_board: Array  # (n, k, 3), m
+    in_world: Array  # (n, k, 3), m
+    in_camera: Array  # (n, k, 3), m
+    by_radius: Array  # (n, k, 3): d(on_board)/d(radius), 0 for corners
+    camera_from_world: Array  # (n, 3, 3), the rotation
+    world_from_board: Array  # (n, 3, 3), the rotation
 
     @staticmethod
-    def of(term: CornerTerm, values: Values, rows: Ints, radii: Array | None) -> _Placed:
+    def of(term: CornerTerm, values: Values, rows: Ints | slice, radii: Array | None) -> _Placed:
         """The points of some rows of a term; radii (rows,), m, of circles, None for corners."""
-        step = np.zeros((len(rows), 2))
-        if radii is not None:
-            rows = np.repeat(rows, NODES)
-            step = np.tile(ON_CIRCLE, (len(radii), 1))
-            radii = np.repeat(radii, NODES)
-        radius = 0.0 if radii is None else radii[:, None]
         board, placement, camera = term.board[rows], term.placement[rows], term.camera[rows]
-        warp = array_of(values, "warp")[board]
-        stretch = array_of(values, "stretch")[board] if "stretch" in values else np.zeros((len(rows), 2))
-        from_middle = term.from_middle[rows] + radius * step
-        on_board = term.points[rows].copy()
-        on_board[:, :2] += radius * step
+        step = np.zeros((1, 2)) if radii is None else ON_CIRCLE
+        offset = (np.zeros(1) if radii is None else radii)[:, None, None] * step
+        from_middle = term.from_middle[rows, None] + offset
+        on_board = term.points[rows, None].repeat(len(step), axis=1)
+        on_board[..., :2] += offset
         if "print" in values:
             assert term.point is not None
-            on_board += array_of(values, "print")[term.point[rows]]
-        on_board[:, 0] += np.sum(stretch * from_middle, axis=1)
-        on_board[:, 2] += np.sum(warp * _bend(from_middle), axis=1)
-        by_radius = np.zeros((len(rows), 3))
+            on_board += array_of(values, "print")[term.point[rows], None]
+        stretch = array_of(values, "stretch")[board, None] if "stretch" in values else np.zeros((1, 1, 2))
+        warp = array_of(values, "warp")[board, :, None]
+        on_board[..., 0] += stretch[..., 0] * from_middle[..., 0] + stretch[..., 1] * from_middle[..., 1]
+        on_board[..., 2] += (_bend(from_middle) @ warp)[..., 0]
+        by_radius = np.zeros(on_board.shape)
         if radii is not None:
-            by_radius[:, :2] = step
-            by_radius[:, 0] += np.sum(stretch * step, axis=1)
-            by_radius[:, 2] += np.sum(warp * _bend_slope(from_middle, step), axis=1)
-        in_world = pose_of(values, "boards")[placement].apply(on_board)
-        in_camera = pose_of(values, "cameras")[camera].apply(in_world)
-        return _Placed(rows, camera, from_middle, on_board, in_world, in_camera, by_radius)
+            by_radius[..., :2] = step
+            by_radius[..., 0] += stretch[..., 0] * step[:, 0] + stretch[..., 1] * step[:, 1]
+            by_radius[..., 2] += (_bend_slope(from_middle, step) @ warp)[..., 0]
+        boards, cameras = pose_of(values, "boards")[placement], pose_of(values, "cameras")[camera]
+        in_world = on_board @ np.swapaxes(boards.rotation, 1, 2) + boards.translation[:, None]
+        in_camera = in_world @ np.swapaxes(cameras.rotation, 1, 2) + cameras.translation[:, None]
+        return _Placed(
+            camera, from_middle, on_board, in_world, in_camera, by_radius, cameras.rotation, boards.rotation
+        )  # fmt: skip
+
+    def turned(self, d_point: Array) -> tuple[Array, Array]:
+        """Derivatives (n, k, 2, 3) of pixels by points in the world and on the board, from those in the camera."""
+        by_world = d_point.reshape(len(d_point), -1, 3) @ self.camera_from_world
+        return by_world.reshape(d_point.shape), (by_world @ self.world_from_board).reshape(d_point.shape)
 
 
 def single_camera(
@@ -289,13 +293,12 @@ def single_camera(
 
 
 def _bend(from_middle: Array) -> Array:
-    """Derivatives (N, 3), m^2, of the height of points (N, 2), m, by a, b and c of the warp."""
-    x, y = from_middle[:, 0], from_middle[:, 1]
-    return np.stack([x * x, x * y, y * y], axis=1)
+    """Derivatives (..., 3), m^2, of the height of points (..., 2), m, by a, b and c of the warp."""
+    x, y = from_middle[..., 0], from_middle[..., 1]
+    return np.stack([x * x, x * y, y * y], axis=-1)
 
 
 def _bend_slope(from_middle: Array, step: Array) -> Array:
-    """Derivatives (N, 3), m, of `_bend` along directions `step` (N, 2)."""
-
-    (x, y), (p, q) = from_middle.T, step.T
-    return np.stack([2 * x * p, x * q + y * p, 2 * y * q], axis=1)
+    """Derivatives (n, k, 3), m, of `_bend` at points (n, k, 2) along directions `step` (k, 2)."""
+    x, y, p, q = from_middle[..., 0], from_middle[..., 1], step[:, 0], step[:, 1]
+    return np.stack([2 * x * p, x * q + y * p, 2 * y * q], axis=-1)
