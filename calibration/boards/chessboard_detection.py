@@ -41,13 +41,15 @@ def find_chessboard(image: GreyImage, board: Chessboard, thorough: bool = True) 
     pale = low_contrast(image)
     if pale is not None:
         return pale
-    for grid in (_grids if thorough else _quick_grids)(image, board.columns, board.rows):
+    parts: list[Array] = []
+    size = (board.columns, board.rows)
+    for grid in _grids(image, *size, parts) if thorough else _quick_grids(image, *size):
         found = _measured(image, grid, board)
         if found is not None:
             return found
     if not thorough:
         return QUICK_SEARCH_FAILED
-    largest = _largest_grid(image)
+    largest = max(parts, key=lambda part: part.size, default=None)
     if largest is not None and sorted(largest.shape[:2]) == sorted((board.columns, board.rows)):
         turned = largest.shape[:2] != (board.rows, board.columns)
         found = _measured(image, np.swapaxes(largest, 0, 1) if turned else largest, board)
@@ -66,8 +68,8 @@ def _measured(image: GreyImage, grid: Array, board: Chessboard) -> BoardView | N
     return None if ordered is None else _checked(image, replace(fine, pixels=ordered), board)
 
 
-def _grids(image: GreyImage, columns: int, rows: int) -> Iterator[Array]:
-    """Candidates (rows, columns, 2), px, from the fastest methods first.
+def _grids(image: GreyImage, columns: int, rows: int, parts: list[Array]) -> Iterator[Array]:
+    """Candidates (rows, columns, 2), px, from the fastest methods first; parts: gets the chessboards of any size.
 
     The classical detector takes 0.03 s for 1920x1080 and cv2.findChessboardCornersSB 0.9 to 1.9 s; of 41 real pictures
     each finds 39, not the same ones. Smaller copies serve for pictures out of focus.
@@ -79,6 +81,10 @@ def _grids(image: GreyImage, columns: int, rows: int) -> Iterator[Array]:
         if max(copy.shape) > _QUICK_PX:
             copy = np.asarray(cv2.GaussianBlur(copy, (0, 0), _SMOOTH_PX), dtype=np.uint8)
         yield from _as_grid(cv2.findChessboardCorners(copy, size, flags=_CLASSIC), columns, rows, scale)
+        if scale == 1.0:
+            for part in _parts(image):
+                parts.append(part)
+                yield from _grown(image, part, rows, columns)
     first = next((s for s in sizes if s * max(image.shape) <= _QUICK_PX), sizes[-1])
     yield from _as_grid(cv2.findChessboardCornersSB(scaled(image, first), size, flags=_SECTORS), columns, rows, first)
     if first != 1.0:
@@ -171,8 +177,8 @@ def _checked(image: GreyImage, fine: Corners, board: Chessboard) -> BoardView | 
     larger = _goes_on(image, fine.pixels)
     if larger:
         return NotFound(
-            f"the chessboard continues {larger} beyond {board.columns}x{board.rows} inner corners; count the inner"
-            " corners along both sides again"
+            f"the chessboard continues {' and '.join(larger)} beyond {board.columns}x{board.rows} inner corners; count"
+            " the inner corners along both sides again"
         )
     apart = corner_refinement.spacing(fine.pixels)
     if fine.blur_px > BLUR_LIMIT * apart:
@@ -180,49 +186,82 @@ def _checked(image: GreyImage, fine: Corners, board: Chessboard) -> BoardView | 
     return BoardView(board.ids, fine.pixels.reshape(-1, 2), apart, fine.blur_px)
 
 
-def _goes_on(image: GreyImage, grid: Array) -> str:
-    """Sides on which more corners follow: 'to the right', ...; empty where the board ends.
+def _grown(image: GreyImage, part: Array, rows: int, columns: int) -> Iterator[Array]:
+    """The grid (rows, columns, 2), px, of which a part was found, if rows and columns follow where it lacks some.
 
-    At the next corner, predicted by the homography of the three outer rows, four squares must meet: the two on one
-    diagonal are darker than the others by the board's contrast. At the end of a board two of the four are its margin,
-    which halves the difference; outermost squares that are cut narrower give no difference.
+    At the rim of wide lenses squares are narrow and bent: every method then finds a part in most pictures, with wrong
+    corners in its outer lines, which are left out first.
     """
-    sides = {"above": grid, "below": grid[::-1], "to the left": np.swapaxes(grid, 0, 1)}
-    sides["to the right"] = np.swapaxes(grid[:, ::-1], 0, 1)
+    fine = corner_refinement.refined(image, part).pixels
+    while np.isnan(fine).any() and min(fine.shape[:2]) > 3:
+        worst = max(_SIDES, key=lambda side: np.isnan(_from_side(fine, side)[0]).sum())
+        fine = _from_side(_from_side(fine, worst)[1:], worst)
+    for shape in ((rows, columns), (columns, rows)):
+        grid = fine
+        while grid.shape[:2] != shape and np.all(np.less_equal(grid.shape[:2], shape)) and np.isfinite(grid).all():
+            lacks = np.less(grid.shape[:2], shape)
+            sides = [side for side in _goes_on(image, grid) if lacks[int(side in _ASIDE)]]
+            if not sides:
+                break
+            g = _from_side(grid, sides[0])
+            g = _from_side(np.concatenate([_next_line(g), g]), sides[0])
+            grid = corner_refinement.refined(image, g).pixels
+        if grid.shape[:2] == shape:
+            yield grid if shape == (rows, columns) else np.swapaxes(grid, 0, 1)
+
+
+_ASIDE = ("to the left", "to the right")
+_SIDES = ("above", "below", *_ASIDE)
+
+
+def _from_side(grid: Array, side: str) -> Array:
+    """The grid (rows, columns, 2) with the outermost line of a side first; the same again gives the grid back."""
+    if side in ("below", "to the right"):
+        grid = grid[::-1, ::-1]
+    return np.swapaxes(grid, 0, 1) if side in _ASIDE else grid
+
+
+def _next_line(grid: Array) -> Array:
+    """(1, columns, 2): the line before the first one, if each column goes on as a quadratic."""
+    return 3 * grid[:1] - 3 * grid[1:2] + grid[2:3]
+
+
+def _goes_on(image: GreyImage, grid: Array) -> list[str]:
+    """Sides on which more corners follow: "to the right", ...; empty where the board ends.
+
+    At the next corner four squares must meet: the two on one diagonal are darker than the others by the board's
+    contrast. At the end of a board two of the four are its margin, which halves the difference; outermost squares that
+    are cut narrower give no difference.
+    """
     names = []
-    for side, g in sides.items():
-        n = g.shape[1]
-        j, i = np.meshgrid(np.arange(n), np.arange(3))
-        found, _ = cv2.findHomography(np.stack([j, i], axis=-1).reshape(-1, 2).astype(float), g[:3].reshape(-1, 2), 0)
-        if found is None:
-            continue
-        H = np.asarray(found, dtype=float)
-        within, beyond = _crossing(image, H, n, 1), _crossing(image, H, n, -1)
+    for side in _SIDES:
+        g = _from_side(grid, side)
+        g = np.concatenate([_next_line(g), g[:3]])
+        beyond, within = _crossing(image, g, 0), _crossing(image, g, 2)
         like = beyond * np.sign(within) / np.median(np.abs(within[np.isfinite(within)]))
         if np.isfinite(like).sum() >= 3 and np.nanmedian(like) > 0.75 and np.nanmin(like) > 0.3:
             names.append(side)
-    return " and ".join(names)
+    return names
 
 
-def _crossing(image: GreyImage, H: Array, n: int, row: int) -> Array:
+def _crossing(image: GreyImage, grid: Array, row: int) -> Array:
     """Difference (n,), DN, by which one diagonal of the four squares at each corner of a row is darker; nan outside."""
-    total = np.zeros(n)
+    down, along = (np.asarray(np.gradient(grid, axis=k))[row] for k in (0, 1))
+    total = np.zeros(grid.shape[1])
     for dj, di in ((-1, -1), (1, 1), (-1, 1), (1, -1)):
-        places = np.column_stack([np.arange(n) + 0.22 * dj, np.full(n, row + 0.22 * di), np.ones(n)]) @ H.T
-        pixels = places[:, :2] / places[:, 2:]
+        pixels = grid[row] + 0.22 * (dj * along + di * down)
         grey = corner_refinement.sampled(image, pixels)
         outside = np.any((pixels < 0) | (pixels > np.array(image.shape[::-1]) - 1), axis=1)
         total += np.where(outside, np.nan, grey) * (-dj * di) / 2
     return total
 
 
-def _largest_grid(image: GreyImage) -> Array | None:
-    """The chessboard (rows, columns, 2), px, of any size with the most corners; None if there is none.
+def _parts(image: GreyImage) -> Iterator[Array]:
+    """Chessboards (rows, columns, 2), px, of any size, or parts of them.
 
     No method and no picture size always finds a whole board: in nine pictures each of the four combinations finds the
     whole one in six or seven, and together they find all.
     """
-    best: Array | None = None
     small = [s for s in scales(image) if s * max(image.shape) <= _QUICK_PX][:2]
     for scale in small or [scales(image)[-1]]:
         for flags in (_SECTORS, cv2.CALIB_CB_NORMALIZE_IMAGE):
@@ -232,11 +271,9 @@ def _largest_grid(image: GreyImage) -> Array | None:
             if not found or meta is None or meta.ndim < 2 or meta.size * 2 != corners.size:
                 continue
             grid = at_full_size(corners.reshape(*meta.shape[:2], 2).astype(float), scale)
-            if min(grid.shape[:2]) < 4 or abs(alternation(image, grid)) < _ALTERNATING:
-                continue  # 3x3 corners occur by chance in many pictures
-            if best is None or grid.size > best.size:
-                best = grid
-    return best
+            # 3x3 corners occur by chance in many pictures
+            if min(grid.shape[:2]) >= 4 and abs(alternation(image, grid)) >= _ALTERNATING:
+                yield grid
 
 
 def _other_size(grid: Array | None, board: Chessboard) -> NotFound:

@@ -23,6 +23,7 @@ from geometry.arrays import Array, Bools, Ints
 
 _REACH = 0.4  # half of the window, in distances of the nearest parallel edge, which would be included from 0.5 on
 _MOST_PX = 12  # half of the window: a larger one includes more curved edges, and takes longer
+_OFF = 0.3  # distances of parallel edges from where the others of its row and column have it: it is not that corner
 _SPARE = 2  # known corners around a corner beyond the coefficients of its curvature
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
 _STEPS = 8  # of the fit of saddles: most need two to four
@@ -49,6 +50,8 @@ def refined(image: GreyImage, grid: Array, known: Bools | None = None, reach: fl
     """
     rows, columns = grid.shape[:2]
     known = np.ones((rows, columns), dtype=bool) if known is None else known
+    by_others, off = _by_others(np.where(known[..., None], grid, np.nan))
+    grid = np.where((off > _OFF * edge_distance(grid, known))[..., None], by_others, grid)
     height = edge_distance(grid, known)
     half = np.clip(np.nan_to_num(reach * height, nan=2.0).astype(int), 2, _MOST_PX)
     out = np.full(grid.shape, np.nan)
@@ -72,6 +75,7 @@ def refined(image: GreyImage, grid: Array, known: Bools | None = None, reach: fl
                 good = np.linalg.norm(found - out[i, j], axis=1) <= max(1.0, 0.25 * size)
                 out[i, j], look[i, j] = np.where(good[:, None], found, out[i, j]), seen
     out[np.linalg.norm(out - grid, axis=-1) > np.maximum(1.5, 0.75 * half)] = np.nan
+    out[_by_others(out)[1] > _OFF * height] = np.nan
     look = look[np.isfinite(out).all(axis=-1)]
     if not len(look):
         return Corners(out, np.nan)
@@ -211,6 +215,31 @@ def _shape_of_block(grid: Array, known: Bools, at: Array, order: int) -> Array |
     squares = np.array([[p * p, p * q, q * q], [2 * p * r, p * s + q * r, 2 * q * s], [r * r, r * s, s * s]])
     steps = np.stack([w[:, 2] - w[:, 1], w[:, 4] - w[:, 3]], axis=1) @ taylor[:, 1:3]
     return np.concatenate([steps, np.moveaxis(squares, -1, 0) @ taylor[:, 3:]], axis=1)
+
+
+def _by_others(grid: Array) -> tuple[Array, Array]:
+    """Where the others of its row or column have each corner (rows, columns, 2), and how far it is off, px.
+
+    Of row and column, the one to which it is closer: where another corner of its row is wrong, the column shows that
+    this one is not. nan where an unknown corner, nan, or fewer than four are in both.
+    """
+    rows, columns = (_weights_of_others(n) for n in grid.shape[:2])
+    both = np.stack([columns @ grid, np.einsum("ij,jkc->ikc", rows, grid)])
+    off = np.linalg.norm(both - grid, axis=-1)
+    nearer = np.where(off[1] < np.nan_to_num(off[0], nan=np.inf), 1, 0)
+    return np.where(nearer[..., None], both[1], both[0]), np.where(nearer, off[1], off[0])
+
+
+@cache
+def _weights_of_others(n: int) -> Array:
+    """(n, n): each of n points in equal steps by the polynomial through its four nearest others; at the ends three."""
+    W = np.full((n, n), 0.0 if n >= 4 else np.nan)
+    if n >= 4:
+        W[0, 1:4] = W[-1, -2:-5:-1] = 3, -3, 1
+        W[1, [0, 2, 3]] = W[-2, [-1, -3, -4]] = 1 / 3, 1, -1 / 3
+        for k in range(2, n - 2):
+            W[k, k - 2 : k + 3] = np.array([-1, 4, 0, 4, -1]) / 6
+    return W
 
 
 def edge_distance(grid: Array, known: Bools) -> Array:

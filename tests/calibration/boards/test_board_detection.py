@@ -296,6 +296,25 @@ def test_a_part_of_a_chessboard_is_rejected_and_a_part_of_a_charuco_board_accept
     assert rms(view, photo) < 0.05 * px
 
 
+def test_the_rest_of_a_board_is_found_from_a_part_with_wrong_corners_in_its_outer_line():
+    """As OpenCV finds them at the rim of wide lenses."""
+    board = parse(CHESS)
+    photo = photograph(board, camera(FISHEYE), board_pose(board, (0.2, 0.8, 0.1), 1.1), look=CLEAN)
+    true = photo.pixels.reshape(6, 9, 2)
+    part = true[:5, 2:].copy()
+    part[4, :3] += 0.6 * (part[3, 1:4] - part[4, :3])
+    (whole,) = chessboard_detection._grown(photo.image, part, 6, 9)
+    np.testing.assert_allclose(whole, true, atol=0.1)
+
+
+def test_a_corner_that_starts_at_another_corner_is_measured_where_it_is():
+    board, photo = shot("chessboard:9x6:30mm")
+    true = photo.pixels.reshape(6, 9, 2)
+    start = true.copy()
+    start[2, 0] = true[3, 1]
+    np.testing.assert_allclose(corner_refinement.refined(photo.image, start).pixels, true, atol=0.05)
+
+
 def test_a_picture_of_another_type_raises():
     with pytest.raises(ValueError, match="expected a grey picture"):
         find_board(np.zeros((100, 100, 3), dtype=np.uint8), parse(CHESS))
