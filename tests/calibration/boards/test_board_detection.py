@@ -308,7 +308,7 @@ def test_the_rest_of_a_board_is_found_from_a_part_with_wrong_corners_in_its_oute
 
 
 def test_a_corner_that_starts_at_another_corner_is_measured_where_it_is():
-    board, photo = shot("chessboard:9x6:30mm")
+    photo = shot("chessboard:9x6:30mm")[1]
     true = photo.pixels.reshape(6, 9, 2)
     start = true.copy()
     start[2, 0] = true[3, 1]
