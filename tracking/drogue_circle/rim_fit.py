@@ -55,8 +55,9 @@ class RimPoints:
     any_radius_px: Array  # (n,) as radius_px, but also in hidden sectors
     inside: Bools  # (n,) the ray lies inside the picture
     spacing_px: float  # between neighbouring rays at the rim
-    shift_px: float = 0.0  # by which the radii are corrected for blur
+    blur_px: float = 0.0  # sigma of the blurred edge
     common_px: float = 0.0  # shift of all edges by a slope inside the target, whose size is not known; 0: none
+    beside_gap: Bools | None = None  # (n,) edges that fit, but are left out since an occluder may end next to them
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,10 +144,10 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
         common = abs(sigma**2 * inner / median(height[good]))
         common = common if common > _LEAST_COMMON_PX else 0.0
     if hidden is None:
-        return RimPoints(theta, radius, strength, radius, inside, spacing, shift, common)
+        return RimPoints(theta, radius, strength, radius, inside, spacing, sigma, common)
     own = ~hidden[(rows * len(hidden)) // n]
     seen = np.where(own, radius, np.nan)
-    return RimPoints(theta, seen, np.where(own, strength, np.nan), radius, inside, spacing, shift, common)
+    return RimPoints(theta, seen, np.where(own, strength, np.nan), radius, inside, spacing, sigma, common)
 
 
 def _beside(
@@ -170,13 +171,18 @@ def _beside(
     wide = 2 * round(_ALONG_PX * len(theta) / (4 * np.pi * max(rim.radius_px, 1.0))) + 1
     means = np.mean(slopes[good], axis=0)
     edge = np.abs(slopes - means) > _ANOTHER_PART * steep
-    around = np.tile(np.concatenate([slopes - means, edge], axis=1), (3, 1)).astype(np.float32)
-    mean = cv2.blur(around, (1, wide))[len(theta) : 2 * len(theta)]
+    mean = _along_rim(np.concatenate([slopes - means, edge], axis=1), wide)
     away = np.where((np.abs(means) > _ANOTHER * steep) | (mean[:, 2:] > 0), 0.0, mean[:, :2])
     # A Wiener filter: what is mostly noise is left out. The median of a squared normal error is .455 of its variance.
     noise = 0.455 * 2 * (crop.noise_dn / length) ** 2 * min(CORRELATED_PX / _ALONG_PX, 1.0)
     away *= np.maximum(1 - noise / np.maximum(np.median(away[good] ** 2, axis=0), 1e-12), 0.0)
     return away[:, 1] - away[:, 0], float(means[0])
+
+
+def _along_rim(values: Array, count: int) -> Array:
+    """Means of values (n, k) of the rays over `count` neighbours around the rim."""
+    n = len(values)
+    return np.asarray(cv2.blur(np.tile(values, (3, 1)).astype(np.float32), (1, count))[n : 2 * n], float)
 
 
 def _edge_width(ratios_px: Array, half_px: float, least_px: float) -> float:
@@ -203,6 +209,7 @@ _ELLIPSE_F = 8.0  # F value of its two parameters, above which they are kept
 _LEAST_DETERMINANT = 1e-6
 _ON_RIM_PX = 0.5  # least distance from the rim at which an edge counts as on it
 SECTORS = 32
+_GAP_SIGMAS, _END_SIGMAS = 1.0, 3.5  # half length of a gap of the rim, and of its ends, in sigmas of the blurred edge
 _FAR_PX = 0.7  # a last pass that moves the rim by more is repeated
 _ENOUGH_PX = 0.3  # a pass that moves the rim by less is not repeated
 _PASSES = ((4.0, 2.0), (2.5, 1.0), (2.0, 0.0))  # half width of the rays and least scale of the residuals, px
@@ -261,18 +268,17 @@ def fit_rim(
         if moved < _ENOUGH_PX:
             break
     points = rim_points(crop, rim, _PASSES[-1][0], coarse.polarity, hidden)
-    circle = _solve(rim, points, _PASSES[-1][1], oblique=False)
+    circle = _solve(rim, points, 0.0, oblique=False)
     if circle is not None and np.hypot(circle[0].u_px - rim.u_px, circle[0].v_px - rim.v_px) > _FAR_PX:
         rim = circle[0]
         points = rim_points(crop, rim, _PASSES[-1][0], coarse.polarity, hidden)
-        circle = _solve(rim, points, _PASSES[-1][1], oblique=False)
+        circle = _solve(rim, points, 0.0, oblique=False)
     if circle is None:
         return None
-    rim, weight = circle
-    if _looks_oblique(points, rim):
-        oblique = _oblique_fit(crop, rim, points, weight, coarse.polarity, hidden)
-        if oblique is not None:
-            rim, points, weight = oblique
+    solved = None
+    if _looks_oblique(points, circle[0]):
+        solved = _oblique_fit(crop, circle, points, coarse.polarity, hidden)
+    rim, points, weight = solved or _without_ends(rim, points, circle, oblique=False)
     return _described(rim, points, weight, coarse, min_coverage)
 
 
@@ -284,12 +290,17 @@ def _is_near(rim: Rim, coarse: CircleCandidate) -> bool:
 def _design(points: RimPoints, oblique: bool) -> Array:
     """Derivatives (n, 3 to 6) of the edges along the rays by u, v, radius, cos2 and sin2, and by the common shift.
 
-    A common slope inside the target moves an edge by the inverse of its own height, more than the mean radius.
+    A common slope inside the target moves an edge by the inverse of its own height, more than the mean radius. Heights
+    are means over a sixteenth of the rim: their own noise would determine the shift too well, and as too small.
     """
     theta, slope = points.theta, points.slope
     columns = [np.cos(theta), np.sin(theta), np.ones_like(theta)]
     columns += [np.cos(2 * theta), np.sin(2 * theta)] if oblique else []
-    columns += [np.nanmean(slope) / slope - 1] if points.common_px else []
+    if points.common_px:
+        seen = np.isfinite(slope)
+        mean = _along_rim(np.stack([np.where(seen, slope, 0.0), seen], axis=1), len(theta) // 16)
+        mean = np.where(seen, mean[:, 0] / np.maximum(mean[:, 1], 1e-6), np.nan)
+        columns += [np.nanmean(mean) / mean - 1]
     return np.stack(columns, axis=-1)
 
 
@@ -340,13 +351,33 @@ def _solve(rim: Rim, points: RimPoints, least_scale_px: float, oblique: bool) ->
     return Rim(rim.u_px + float(x[0]), rim.v_px + float(x[1]), *map(float, x[2 : 5 if oblique else 3])), full
 
 
+def _without_ends(
+    start: Rim, points: RimPoints, fitted: tuple[Rim, Array], oblique: bool
+) -> tuple[Rim, RimPoints, Array]:
+    """A fit from `start` without the edges next to gaps of the rim, if it is possible; with its points and weights.
+
+    The blurred corner of rim and occluder moves the edges near it, to one side: within 1 sigma of blur by .3 px, and
+    still at 3 sigma by .1 px (rings of 20 to 45 px, a fifth hidden by a plate).
+    """
+    gap, reach = (max(round(k * points.blur_px / points.spacing_px), 1) for k in (_GAP_SIGMAS, _END_SIGMAS))
+    missing = _along_rim((fitted[1] == 0)[:, None], 2 * gap + 1) > 0.99
+    near = _along_rim(missing, 2 * (gap + reach) + 1)[:, 0] > 0
+    own = near & (fitted[1] > 0)
+    if own.any():
+        trimmed = replace(points, radius_px=np.where(near, np.nan, points.radius_px), beside_gap=own)
+        again = _solve(start, trimmed, 0.0, oblique)
+        if again is not None:
+            return again[0], trimmed, again[1]
+    return fitted[0], points, fitted[1]
+
+
 def _oblique_fit(
-    crop: SmoothCrop, rim: Rim, points: RimPoints, weight: Array, polarity: int, hidden: Bools | None
+    crop: SmoothCrop, circle: tuple[Rim, Array], points: RimPoints, polarity: int, hidden: Bools | None
 ) -> tuple[Rim, RimPoints, Array] | None:
     """The fit with the two parameters of an ellipse, if they explain the residuals better than chance does."""
-    before = _sum_of_squares(rim, points, weight)
-    once = _solve(rim, points, 1.0, oblique=True)
-    if once is None or np.hypot(once[0].cos2_px, once[0].sin2_px) > 0.25 * rim.radius_px:
+    before = _sum_of_squares(circle[0], points, circle[1])
+    once = _solve(circle[0], points, 1.0, oblique=True)
+    if once is None or np.hypot(once[0].cos2_px, once[0].sin2_px) > 0.25 * circle[0].radius_px:
         return None
     again = rim_points(crop, once[0], 2.0, polarity, hidden)
     final = _solve(once[0], again, 0.0, oblique=True)
@@ -354,7 +385,7 @@ def _oblique_fit(
         return None
     independent = max(_independent(again, final[1]) - 5, 1.0)
     gained = before / max(_sum_of_squares(final[0], again, final[1]), 1e-12) - 1
-    return (final[0], again, final[1]) if 0.5 * gained * independent > _ELLIPSE_F else None
+    return _without_ends(once[0], again, final, oblique=True) if 0.5 * gained * independent > _ELLIPSE_F else None
 
 
 def _looks_oblique(points: RimPoints, rim: Rim) -> bool:
@@ -388,7 +419,8 @@ def _described(
 ) -> RimFit | None:
     """The fit with its covariance; None where it covers too little of the rim."""
     good = weight > 0
-    coverage = float(np.mean(good))
+    fits = good if points.beside_gap is None else good | points.beside_gap
+    coverage = float(np.mean(fits))
     if coverage < min_coverage:
         return None
     oblique = bool(rim.cos2_px or rim.sin2_px)
@@ -403,8 +435,8 @@ def _described(
     variance = max(float(np.mean(residual**2)), _LEAST_SIGMA_PX**2) * independent / (independent - count)
     covariance = variance * correlated * np.linalg.inv(A.T @ A + prior)
     covariance = symmetric(covariance[:3, :3]) + _MODEL_SIGMA_PX**2 * np.eye(3)
-    covariance[2, 2] += (_BLUR_SIGMA * points.shift_px) ** 2
-    rms = float(np.sqrt(np.mean(residual**2)))
+    covariance[2, 2] += (_BLUR_SIGMA * points.blur_px**2 / (2 * max(rim.radius_px, 1.0))) ** 2 + points.common_px**2
+    rms = float(np.sqrt(_sum_of_squares(rim, replace(points, radius_px=points.any_radius_px), fits)))
     slope = median(points.slope[good])
     on_rim = np.abs(points.any_radius_px - rim.radius_at(points.theta)) < max(3 * rms, _ON_RIM_PX)
     sector = np.arange(len(on_rim)) * SECTORS // len(on_rim)
