@@ -264,7 +264,7 @@ class _Adjustment:
 # residual. All frames together give d by least squares, beside a rotation of the right camera, which shifts all frames
 # equally. Source: ours.
 
-_FEWEST_FRAMES = 8
+FEWEST_CLOCK_FRAMES = 8
 _UNKNOWNS = 4  # the time and three rotations of the right camera
 
 
@@ -309,7 +309,7 @@ def clock_offset(pair: StereoPair, model: MarkerModel, frames: Sequence[FittedFr
         A, r, free, moved2 = part
         N, b, left, dof = N + A.T @ A, b + A.T @ r, left + float(r @ r), dof + free
         used.append((A, r, moved2))
-    if len(used) < _FEWEST_FRAMES:
+    if len(used) < FEWEST_CLOCK_FRAMES:
         return None
     scale = np.sqrt(np.maximum(np.diagonal(N), 1e-300))
     values, vectors = np.linalg.eigh(N / np.outer(scale, scale))

@@ -179,7 +179,7 @@ def _beside(
     return away[:, 1] - away[:, 0], float(means[0])
 
 
-def _along_rim(values: Array, count: int) -> Array:
+def _along_rim(values: Array | Bools, count: int) -> Array:
     """Means of values (n, k) of the rays over `count` neighbours around the rim."""
     n = len(values)
     return np.asarray(cv2.blur(np.tile(values, (3, 1)).astype(np.float32), (1, count))[n : 2 * n], float)
@@ -398,7 +398,7 @@ def _looks_oblique(points: RimPoints, rim: Rim) -> bool:
     return bool(2 * np.hypot(*both) > 0.7 * np.std(away))
 
 
-def _sum_of_squares(rim: Rim, points: RimPoints, weight: Array) -> float:
+def _sum_of_squares(rim: Rim, points: RimPoints, weight: Array | Bools) -> float:
     """Mean square of the residuals of the points with weight, px^2."""
     away = _residuals(rim, points)[weight > 0]
     return float(np.mean(away**2)) if away.size else np.inf

@@ -38,6 +38,8 @@ from lab.targets.stereo.run import (
 )
 from lab.targets.stereo.tables import write_tables
 from tracking.binocular.calibration_check import (
+    FEWEST_CLOCK_FRAMES,
+    FEWEST_FRAMES,
     MOST_FRAMES,
     FittedFrame,
     LabelledFrame,
@@ -51,7 +53,7 @@ from tracking.binocular.segmentation import is_grey, marker_candidates, prepared
 
 LEAST_MEASURED, GOOD_MEASURED = 0.1, 0.95  # shares of the frames, as for runs of laser spots
 GOOD_PICTURES = 0.95  # share of frames with a usable picture, per camera
-_ENOUGH, _FEWEST_SEEN = 4, 3  # markers of a picture that determine a pose, and frames with as many in both
+_ENOUGH, _FEWEST_SEEN = 4, 2  # markers of a picture that determine a pose, and frames with as many in both
 LARGEST_NEES = 20.0  # per number, of poses with an error of the calibration: above, the sigmas are of no use
 _MOST_NAMED = 4  # errors of the calibration in a message
 
@@ -126,6 +128,12 @@ def _has_markers(found: MarkerImages | None) -> bool:
 def _clock(results: StereoResults) -> Iterator[Finding]:
     clock = results.clock
     if clock is None:
+        if results.measured:
+            what = (
+                f"{len(results.measured)} measured frames do not show whether both cameras expose at the same time;"
+                f" needed are {FEWEST_CLOCK_FRAMES} with a measured pose before and after each"
+            )
+            yield finding("BP-W11", Level.WARN, what)
         return
     offset = f"{1000 * clock.offset_s:.2f} ± {1000 * clock.sigma_s:.2f} ms"
     if clock.significant and not _is_clock(results):
@@ -146,13 +154,18 @@ def _clock(results: StereoResults) -> Iterator[Finding]:
 def _calibration(results: StereoResults) -> Iterator[Finding]:
     """Errors of the pair's calibration; with a pair that states no covariance, the poses have no complete sigmas."""
     check = results.calibration
+    if check is None and results.measured:
+        what = f"the recording does not show whether {results.run.pair_path.name} is right"
+        what += f"; needed are {FEWEST_FRAMES} frames with four markers in each picture"
+        yield finding("BP-W11", Level.WARN, what)
     if check is not None and check.significant and not _is_clock(results):
         several = " or ".join(
             f"{s.name} by {s.value:+.{_decimals(s.sigma)}f} ± {s.sigma:.{_decimals(s.sigma)}f} {s.unit}"
             for s in check.suspects[:_MOST_NAMED]
         )
         apart = "; this recording does not separate them" if len(check.suspects) > 1 else ""
-        other = "" if check.left < GOOD_NOISE_SCALE**2 else "; it does not explain all: there is more than one error"
+        other = "; it does not explain all: there are more errors, or pictures of different times"
+        other = "" if check.left < GOOD_NOISE_SCALE**2 else other
         what = (
             f"the markers contradict {results.run.pair_path.name}: to be corrected: {several}{apart}{other}; poses move"
             f" by {format_length(check.change_m)} RMS"

@@ -48,6 +48,15 @@ def changed(drogue, folder, **fields):
     return folder
 
 
+def first_frames(run, count, shift=0):
+    """Leaves the first frames of a run, those of the right camera with other numbers."""
+    table = [r for r in rows(run, "detections.csv") if int(r["frame"]) < count]
+    with (run / "detections.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, table[0])
+        writer.writeheader()
+        writer.writerows({**r, "frame": int(r["frame"]) + shift * (r["camera"] == "right")} for r in table)
+
+
 def test_the_tables_have_the_columns_of_the_contract_and_a_row_per_frame(result):
     for name, header in (
         ("attitude.csv", columns.ATTITUDE), ("covariance.csv", columns.COVARIANCE), ("spots.csv", columns.SPOTS),
@@ -111,19 +120,27 @@ def test_unsynchronised_pictures_fail_the_run_and_say_by_how_much(tmp_path):
     assert any(f.code == "BP-W05" for f in outcome.findings)
 
 
-@pytest.mark.parametrize(("shift", "words"), [(4, "frames with markers in both pictures"), (200, "right: 200 to 206")])
-def test_frame_numbers_of_one_camera_that_are_shifted_fail_the_run(drogue, tmp_path, shift, words):
+@pytest.mark.parametrize(
+    ("frames", "shift", "words"), [(4, 2, "0 of 2 frames with markers in both pictures"), (7, 200, "right: 200 to 206")]
+)
+def test_frame_numbers_of_one_camera_that_are_shifted_fail_the_run(drogue, tmp_path, frames, shift, words):
     """Frames that only one camera has are measured by it alone: without the others they would seem right."""
     run = changed(drogue, tmp_path / "run")
     shutil.rmtree(run / "truth")
-    table = [r for r in rows(run, "detections.csv") if int(r["frame"]) < 7]
-    with (run / "detections.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, table[0])
-        writer.writeheader()
-        writer.writerows({**r, "frame": int(r["frame"]) + shift * (r["camera"] == "right")} for r in table)
+    first_frames(run, frames, shift)
     outcome = process_stereo_run(run, tmp_path / "out")
     assert outcome.exit_status == 4
     assert any(f.code == "BP-W09" and words in f.what for f in outcome.findings)
+
+
+@pytest.mark.parametrize(("frames", "untested"), [(2, 2), (6, 1), (12, 0)])
+def test_a_recording_too_short_to_test_the_pair_does_not_pass(drogue, tmp_path, frames, untested):
+    run = changed(drogue, tmp_path / "run")
+    first_frames(run, frames)
+    outcome = process_stereo_run(run, tmp_path / "out")
+    assert outcome.exit_status == 0
+    assert sum(f.code == "BP-W11" for f in outcome.findings) == untested
+    assert (outcome.verdict.status == "pass") == (untested == 0)
 
 
 def test_markers_that_are_not_where_run_yaml_says_are_reported(drogue, tmp_path):
