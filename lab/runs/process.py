@@ -22,7 +22,6 @@ from lab.findings.finding import verdict as verdict_of
 from lab.findings.outcome import Outcome, Verdict
 from lab.progress import Progress
 from lab.runs.clock_estimate import clock_findings
-from lab.runs.frames.clocked_frames import ClockedFrames
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.frames.row_records import row_records
 from lab.runs.model_check.frame_sampler import FrameSampler
@@ -70,14 +69,19 @@ def process_run(
         )
 
 
-def ready_run(run_folder: Path, overrides: Mapping[str, Any] | None = None, rig_path: Path | None = None) -> Run:
-    """A run that may be processed, with some tracker parameters replaced. rig_path: in place of the run's.
+def ready_run(
+    run_folder: Path,
+    overrides: Mapping[str, Any] | None = None,
+    rig_path: Path | None = None,
+    recording: bool = False,
+) -> Run:
+    """A run that may be processed, with some tracker parameters replaced. rig_path, recording: as of `load_run`.
 
     Raises:
         InputError: the run folder or an override is invalid.
         CalibrationError: its rig's calibration must not be used.
     """
-    run = load_run(run_folder, rig_path)
+    run = load_run(run_folder, rig_path, recording)
     if overrides:
         run = dataclasses.replace(run, tracker=with_overrides(run.tracker, overrides))
     recorded = datetime.date.today() if run.recorded is None else run.recorded
@@ -202,8 +206,8 @@ def write_tables(
 
 def rows_of(pipeline: Pipeline, processed: Iterable[Pair]) -> Iterable[Pair]:
     """The rows of the tables; where no camera has a clock of its own, each processed frame is one."""
-    reader, run = pipeline.reader, pipeline.run
-    if not isinstance(reader, ClockedFrames):
+    moments, run = pipeline.reader.moments, pipeline.run
+    if moments is None:
         return processed
     own = [name in run.clocks and run.clocks[name].times is not None for name in run.cameras]
-    return row_records(processed, reader.moments, tuple(run.cameras), own, SpotModel.of(run.rig).camera_of)
+    return row_records(processed, moments, tuple(run.cameras), own, SpotModel.of(run.rig).camera_of)

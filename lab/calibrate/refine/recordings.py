@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, takewhile
 from pathlib import Path
@@ -24,6 +24,7 @@ from lab.files.run.clocks import CameraClock, clocks_in
 from lab.files.run.run_file import Run
 from lab.findings.finding import Level, worst_first
 from lab.runs.frames.frames import FrameSet
+from lab.runs.frames.moments import Moment
 from lab.runs.frames.pipeline import FrameRecord, Frames, Pipeline
 from lab.runs.model_check.check import ModelCheck, check_model
 from lab.runs.model_check.frame_sampler import FrameSampler
@@ -129,6 +130,10 @@ class _FirstFrames:
     @property
     def expected_frames(self) -> int | None:
         return self.reader.expected_frames
+
+    @property
+    def moments(self) -> Sequence[Moment] | None:
+        return self.reader.moments
 
     def __iter__(self) -> Iterator[FrameSet]:
         return takewhile(lambda _: self.measured < self.enough, islice(self.reader, self.most))

@@ -19,9 +19,9 @@ from lab.files.text.csv_text import read_table
 UNIT_FACTOR = 50.0  # between the steps of the timestamps and of the frame rate, from which one of them is a mistake
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Times:
-    """Time of each frame: seconds since frame 0, at mid-exposure."""
+    """Time of each frame: seconds since frame 0, at mid-exposure. Of a run that is watched they come at its end."""
 
     frame_rate_hz: float
     frames: Ints | None = None  # (n,) increasing: the frames with a timestamp; None: a constant rate
@@ -168,20 +168,21 @@ def load_clock(
     where: str,
     rate_hz: float,
     height: int,
+    recording: bool = False,
 ) -> CameraClock | None:
     """The clock of a camera as run.yaml states it, ESTIMATE or seconds; None: that of the run.
 
     timestamps: the file's name, from the run folder. where: of the camera in run.yaml, for messages. rate_hz: of the
-    run; height: of the pictures, px. Raises InputError.
+    run; height: of the pictures, px. recording: the file is still being written. Raises InputError.
     """
     times: Times | None = None
     path: Path | None = None
     offset_prior_s = OFFSET_SIGMA_FRAMES / rate_hz if isinstance(offset_s, str) else 0.0
     if timestamps is not None:
         path = folder / timestamps
-        if not path.is_file():
+        if not recording and not path.is_file():
             raise InputError(f"{where}.timestamps: expected a table frame,t_s, found none at {path}")
-        times = load_times(path, rate_hz)
+        times = Times(rate_hz) if recording else load_times(path, rate_hz)
         rate_hz = 1 / times.usual_step_s
     row_time_prior_s = ROW_TIME_SIGMA / rate_hz / height if isinstance(row_time_s, str) else 0.0
     offset_s = 0.0 if isinstance(offset_s, str) else offset_s

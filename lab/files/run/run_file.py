@@ -124,10 +124,11 @@ def folder_of_run(given: Path) -> Path:
     return folder
 
 
-def load_run(run_folder: Path, rig_path: Path | None = None) -> Run:
+def load_run(run_folder: Path, rig_path: Path | None = None, recording: bool = False) -> Run:
     """Read and check run.yaml of a run folder, its rig and its timestamps; pictures are not opened.
 
-    rig_path: a rig.yaml in place of the one that run.yaml names.
+    rig_path: a rig.yaml in place of the one that run.yaml names. recording: the cameras' timestamps are still being
+    written, and are not read.
 
     Raises:
         InputError: with file, field, what was expected and what was found; FileError for several mistakes.
@@ -158,7 +159,10 @@ def load_run(run_folder: Path, rig_path: Path | None = None) -> Run:
             block, where = content.cameras[name], f"{path}: cameras.{name}"
             sources[name] = source_of(block, folder, where)
             rate_hz, height = content.frame_rate_hz, rig.cameras[name].image_size_px[1]
-            clock = load_clock(block.time_offset_s, block.row_time_s, block.timestamps, folder, where, rate_hz, height)
+            offset_s, row_time_s = block.time_offset_s, block.row_time_s
+            clock = load_clock(
+                offset_s, row_time_s, block.timestamps, folder, where, rate_hz, height, recording=recording
+            )
             if clock is not None:
                 clocks[name] = clock
         except InputError as error:

@@ -7,6 +7,7 @@ DETECTIONS = (
     "angle_deg", "cov_uv_px2",
 )  # fmt: skip
 PICTURE_TIME = "t_s"  # after the others, where a camera has a clock of its own: mid-exposure of its middle row
+PICTURES = "pictures"  # after the others, of a row of a watched run whose cameras have clocks: `camera:number ...`
 LIKENESS = "likeness"  # after the others, of single pictures only: see lab.runs.detect.picture_series.laser_likeness
 SPOTS = (
     "frame", "t_s", "camera", "spot", "u_px", "v_px", "sigma_u_px", "sigma_v_px", "status", "predicted_u_px",

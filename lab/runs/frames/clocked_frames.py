@@ -82,7 +82,12 @@ class ClockedFrames(FrameReader):
                     f" {rows_s[-1]:.6g} s, got times from {t_s[0]:.6g} to {t_s[-1]:.6g} s; are time_offset_s and the"
                     " timestamps in seconds on the run's clock?"
                 )
-        self.moments: tuple[Moment, ...] = tuple(plan_moments(rows, rows_s, own))
+        self._moments = tuple(plan_moments(rows, rows_s, own))
+
+    @property
+    def moments(self) -> tuple[Moment, ...]:
+        """By time."""
+        return self._moments
 
     @property
     def expected_frames(self) -> int | None:

@@ -104,6 +104,11 @@ class FrameReader:
         return max(ends) - self.first + 1
 
     @property
+    def moments(self) -> Sequence[Moment] | None:
+        """None: one for each frame."""
+        return None
+
+    @property
     def notes(self) -> list[str]:
         """Notes for the user of the results; complete once the iteration has ended."""
         out = list(self._notes) + list(self._ended.values())

@@ -7,8 +7,8 @@ row in the tables. Within a moment the trackers use every picture at its own ins
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -36,57 +36,72 @@ class Moment:
     pictures: Mapping[str, TimedPicture] = field(default_factory=dict)  # by camera
 
 
-def plan_moments(rows: Ints, rows_s: Array, cameras: Mapping[str, tuple[Ints, Array]]) -> list[Moment]:
+@dataclass(slots=True)
+class MomentPlanner:
+    """Makes the moments row after row, by time, from the pictures nearest to each row."""
+
+    step_s: float  # of the usual times between two pictures of each camera the shortest
+    _others: list[tuple[float, str, int]] = field(default_factory=list)  # instant, camera, number: without a row
+    _last: int | None = None  # the last row
+
+    def row(self, row: int, t_s: float, pictures: Mapping[str, Sequence[TimedPicture]]) -> Iterator[Moment]:
+        """The moments between the last row and this one, and the row's own. pictures: by camera, by time."""
+        of_row = {name: min(given, key=lambda p: abs(p.t_s - t_s)) for name, given in pictures.items() if given}
+        self.without_row({name: [p for p in given if p is not of_row[name]] for name, given in pictures.items()})
+        later = [one for one in self._others if one[0] >= t_s]
+        self._others = [one for one in self._others if one[0] < t_s]
+        yield from self._between_rows(row)
+        yield Moment(row, True, t_s, of_row)
+        self._others, self._last = later, row
+
+    def without_row(self, pictures: Mapping[str, Sequence[TimedPicture]]) -> None:
+        """Add pictures for which there is no row."""
+        self._others += [(p.t_s, name, p.number) for name, given in pictures.items() for p in given]
+
+    def rest(self) -> Iterator[Moment]:
+        """The moments after the last row."""
+        yield from self._between_rows(0)
+        self._others = []
+
+    def _between_rows(self, following: int) -> Iterator[Moment]:
+        """Moments for the pictures without a row; those close together share one."""
+        frame = following if self._last is None else self._last
+        moment: Moment | None = None
+        for t_s, name, number in sorted(self._others):
+            picture = {name: TimedPicture(number, t_s)}
+            if moment is not None and t_s - moment.t_s <= TOGETHER * self.step_s and name not in moment.pictures:
+                moment = replace(moment, pictures={**moment.pictures, **picture})
+                continue
+            if moment is not None:
+                yield moment
+            moment = Moment(frame, False, t_s, picture)
+        if moment is not None:
+            yield moment
+
+
+def plan_moments(rows: Ints, rows_s: Array, cameras: Mapping[str, tuple[Ints, Array]]) -> Iterator[Moment]:
     """The moments of a recording, by time.
 
     rows (r,): frame numbers of the tables; rows_s (r,): their instants, increasing. cameras: numbers (m,) of each
     camera's pictures and their instants (m,), increasing.
     """
-    of_row: list[dict[str, TimedPicture]] = [{} for _ in rows]
-    others: list[tuple[float, str, int]] = []
-    for name, (numbers, instants) in cameras.items():
-        row = _nearest_row(rows_s, instants)
-        for j in np.unique(row[row >= 0]).tolist():
-            here = np.flatnonzero(row == j)
-            best = int(here[np.argmin(np.abs(instants[here] - rows_s[j]))])
-            of_row[j][name] = TimedPicture(int(numbers[best]), float(instants[best]))
-            row[here] = -1
-            row[best] = j
-        others += [(float(instants[i]), name, int(numbers[i])) for i in np.flatnonzero(row < 0)]
-    moments = [
-        Moment(int(number), True, float(t_s), pictures)
-        for number, t_s, pictures in zip(rows, rows_s, of_row, strict=True)
-    ]
-    moments += _between_rows(sorted(others), rows, rows_s, _shortest_step(cameras))
-    return sorted(moments, key=lambda m: m.t_s)
-
-
-def _nearest_row(rows_s: Array, instants: Array) -> Ints:
-    """(m,): index of the row nearest to each instant (m,); -1 where it is farther than half a step from all rows."""
     steps = np.diff(rows_s)
-    middle = rows_s[:-1] + (0.5 + _TIE) * steps
-    out = np.searchsorted(middle, instants)
     first, last = (0.5 * steps[0], 0.5 * steps[-1]) if len(steps) else (np.inf, np.inf)
-    beyond = (instants < rows_s[0] - first * (1 - _TIE)) | (instants > rows_s[-1] + last * (1 + _TIE))
-    return np.where(beyond, -1, out)
+    limits = [rows_s[:1] - first * (1 - _TIE), rows_s[:-1] + (0.5 + _TIE) * steps, rows_s[-1:] + last * (1 + _TIE)]
+    timed, ends = {}, {}
+    for name, (numbers, instants) in cameras.items():
+        timed[name] = [TimedPicture(n, t_s) for n, t_s in zip(numbers.tolist(), instants.tolist(), strict=True)]
+        at = np.concatenate(limits)
+        ends[name] = [np.searchsorted(instants, at[0]), *np.searchsorted(instants, at[1:], side="right"), len(instants)]
+    usual = (float(np.median(np.diff(t))) for _, t in cameras.values() if len(t) > 1)
+    planner = MomentPlanner(min(usual, default=0.0))
+    planner.without_row({name: given[: ends[name][0]] for name, given in timed.items()})
+    for j, (row, t_s) in enumerate(zip(rows.tolist(), rows_s.tolist(), strict=True)):
+        yield from planner.row(row, t_s, {name: given[slice(*ends[name][j : j + 2])] for name, given in timed.items()})
+    planner.without_row({name: given[ends[name][-2] :] for name, given in timed.items()})
+    yield from planner.rest()
 
 
-def _shortest_step(cameras: Mapping[str, tuple[Ints, Array]]) -> float:
-    """Of the usual times between two pictures of each camera, s, the shortest."""
-    return min((float(np.median(np.diff(t))) for _, t in cameras.values() if len(t) > 1), default=0.0)
-
-
-def _between_rows(others: Sequence[tuple[float, str, int]], rows: Ints, rows_s: Array, step_s: float) -> list[Moment]:
-    """Moments for pictures (instant, camera, number) without a row; those close together share one."""
-    out: list[Moment] = []
-    interval = -1
-    for t_s, name, number in others:
-        before = int(np.searchsorted(rows_s, t_s, side="right"))
-        joins = bool(out) and before == interval and t_s - out[-1].t_s <= TOGETHER * step_s
-        if joins and name not in out[-1].pictures:
-            pictures = {**out[-1].pictures, name: TimedPicture(number, t_s)}
-            out[-1] = Moment(out[-1].frame, False, out[-1].t_s, pictures)
-            continue
-        interval = before
-        out.append(Moment(int(rows[max(before - 1, 0)]), False, t_s, {name: TimedPicture(number, t_s)}))
-    return out
+def row_of(t_s: float, rate_hz: float) -> int:
+    """The row of a constant rate that is nearest to an instant."""
+    return int(np.ceil(t_s * rate_hz - 0.5 - _TIE))

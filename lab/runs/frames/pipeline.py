@@ -51,6 +51,10 @@ class Frames(Protocol):
     def expected_frames(self) -> int | None:
         """Number of frames; None where unknown."""
 
+    @property
+    def moments(self) -> Sequence[Moment] | None:
+        """What is processed, complete once the iteration has ended; None: one moment for each frame."""
+
     def __iter__(self) -> Iterator[FrameSet]: ...
 
 

@@ -26,15 +26,19 @@ def row_records(
 ) -> Iterator[Pair]:
     """The rows of processed moments, in order.
 
-    cameras: names; own_times: whether each has times of its own; camera_of (n,): the camera of each view.
+    moments: complete when the first pair comes. cameras: names; own_times: whether each has times of its own;
+    camera_of (n,): the camera of each view.
     """
-    sources = _sources(moments, cameras, own_times)
-    rows = [i for i, moment in enumerate(moments) if moment.is_row]
+    sources: list[list[int]] = []
+    rows: list[int] = []
     kept: dict[int, Pair] = {}
     shown: list[ShownPicture] = []
     waiting: Pair | None = None
     following = 0
     for i, pair in enumerate(pairs):
+        if not rows:
+            sources = _sources(moments, cameras, own_times)
+            rows = [k for k, moment in enumerate(moments) if moment.is_row]
         kept[i] = pair
         shown += _shown(pair[0], cameras)
         while following < len(rows) and max(rows[following], *sources[following]) <= i:

@@ -99,7 +99,9 @@ class Board:
                 if tracked.status[v].measured
             }
             kept = list(self._pictures[name])
-            of_frame = next((one for one in kept if one[1] is found), None)
+            if found is None and record.moment is not None:  # a camera of another rate has no picture of this row
+                continue
+            of_frame = next((one for one in kept if found is not None and one[1].uv_px is found.uv_px), None)
             if of_frame is not None:
                 self._latest[name] = (*of_frame, labels)
             elif kept:  # the frames come late: the newest picture is shown before it has labels

@@ -17,6 +17,7 @@ from lab.pictures.live_source import LiveSource, open_live
 from lab.pictures.picture_file import UNREADABLE, MissingPicture, read_picture
 from lab.runs.watch.frame_clock import FolderPoll, FrameClock
 from lab.runs.watch.inbox import Inbox
+from lab.runs.watch.picture_times import TimesFollower
 
 POLL_S = 0.002  # between two polls of a folder ...
 _POLL_IDLE_S = 0.01  # ... and after _IDLE_S without a new picture
@@ -63,6 +64,7 @@ class FolderCamera:
     size_px: tuple[int, int]
     inbox: Inbox
     patience_s: float
+    times: TimesFollower | None = None  # of a camera with times of its own
     _pending: dict[int, _Pending] = field(default_factory=dict)
     _polled_s: float | None = None  # time.time() of the last poll; None: none yet
     _busy_s: float = field(default_factory=time.perf_counter)  # when a picture was last read
@@ -80,6 +82,8 @@ class FolderCamera:
     def poll_once(self) -> bool:
         """Find new pictures and read some of them. Returns whether there were any."""
         now_s = time.time()
+        if self.times is not None and (times := self.times.new()):
+            self.inbox.add_times(self.name, times)
         try:
             for number, name in self.poll.new():
                 self._pending[number] = _Pending(self.poll.folder / name, self._polled_s)

@@ -1,19 +1,22 @@
-"""Queues of the pictures of all cameras, and the rule when a frame is complete.
+"""Queues of the pictures of all cameras, and the rule when a row of the tables is complete.
 
-Each camera fills its queue in its own thread; one reader takes frame after frame.
+Without clocks of single cameras a row is a frame number, and its pictures are those of this number. Each camera fills
+its queue in its own thread; one reader takes row after row.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
 
 from lab.pictures.picture_file import DROPPED, GreyPicture, MissingPicture
+from lab.runs.frames.moments import TimedPicture
+from lab.runs.watch.picture_times import PictureTimes
 from tracking.detections import Detections
 
 MOST_WAITING = 64  # pictures per camera in memory; those of a folder beyond stay on disk
@@ -45,36 +48,43 @@ class CameraQueue:
     strays: list[int] = field(default_factory=list)
     given: int = 0  # pictures in total
     grey: bool = False  # whether pictures without detections are waiting
+    times: PictureTimes = field(default_factory=PictureTimes)
+    untimed: int = 0  # pictures that were dropped since their time did not come
 
-    def later_s(self, frame: int) -> float | None:
-        """Time (perf_counter) since which there has been a picture of a later frame; None without any."""
-        times = [w.seen_s for n, w in self.pictures.items() if n > frame]
-        times += [since for n, (since, _) in self.incomplete.items() if n > frame]
-        return min(times, default=None)
+    def later_s(self, row: int) -> float | None:
+        """Time (perf_counter) since which there has been a picture of a later row; None without any."""
+        seen = [(n, w.seen_s) for n, w in self.pictures.items()]
+        seen += [(n, since) for n, (since, _) in self.incomplete.items()]
+        return min((s for n, s in seen if (of := self.times.row(n)) is not None and of > row), default=None)
 
 
 def is_complete(
-    frame: int, queues: Sequence[CameraQueue], now_s: float, since_s: float, timeout_s: float, interval_s: float
+    row: int, queues: Sequence[CameraQueue], now_s: float, since_s: float, timeout_s: float, interval_s: float
 ) -> tuple[bool, list[CameraQueue]]:
-    """Whether a frame can be processed now, and the cameras that have timed out for it.
+    """Whether a row can be processed now, and the cameras that have timed out for it.
 
-    The wait for a camera ends when it has delivered the frame's picture, or has had a later one for a frame interval
-    (this one is dropped), or when the timeout has passed since another camera delivered the frame (and since `since_s`,
-    when the previous frame was taken). After a timeout the camera is not waited for until it delivers something.
+    The wait for a camera ends when it has delivered the row's pictures, or has had a later one for a frame interval
+    (this one is dropped), or when the timeout has passed since another camera delivered one (and since `since_s`, when
+    the previous row was taken). After a timeout the camera is not waited for until it delivers something.
     """
     waited_for = []
     first = []
     for queue in queues:
-        if frame in queue.pictures:
-            if isinstance(queue.pictures[frame].content, np.ndarray):
-                return False, []  # its points are being detected
-            first.append(queue.pictures[frame].seen_s)
+        due = queue.times.due(row)
+        here = [queue.pictures[n] for n in due if n in queue.pictures]
+        if any(isinstance(waiting.content, np.ndarray) for waiting in here):
+            return False, []  # its points are being detected
+        first += [waiting.seen_s for waiting in here]
+        whole = len(here) == len(due) and not queue.times.may_come(row)
+        if here and whole:
             continue
-        later = queue.later_s(frame)
+        later = queue.later_s(row)
         if later is not None:
             first.append(later)
+        if whole:
+            continue
         passed = later is not None and now_s - later >= interval_s
-        if frame in queue.incomplete or not (queue.ended or queue.timed_out or passed):
+        if any(n in queue.incomplete for n in due) or not (queue.ended or queue.timed_out or passed):
             waited_for.append(queue)
     if not first:
         return False, []
@@ -91,7 +101,7 @@ class Inbox:
         self.changed = threading.Condition()
         self.stopping = threading.Event()  # set to stop the cameras
         self.wanted = threading.Event()  # set to start devices; folders are polled from the start
-        self.next_frame: int | None = None  # the first that is not closed yet; None: not begun
+        self.next_row: int | None = None  # the first that is not closed yet; None: not begun
         self.last_seen_s: float | None = None  # when the latest picture of any camera came
         self._finders: Mapping[str, Finder] | None = None
         self._interval_s, self._timeout_s = interval_s, timeout_s
@@ -161,41 +171,72 @@ class Inbox:
         with self.changed:
             self.queues[camera].refused += 1
 
-    def take(self, frame: int) -> tuple[dict[str, Content], dict[str, float]]:
-        """Take a frame's pictures by camera, and close the frame.
+    def add_times(self, camera: str, times: list[tuple[int, float]]) -> None:
+        """Add times of a camera's pictures, numbers and s."""
+        with self.changed:
+            queue = self.queues[camera]
+            queue.times.add(times)
+            for number, _ in times:
+                row = queue.times.row(number)
+                if row is not None and self.next_row is not None and row < self.next_row:  # it comes too late
+                    queue.late += queue.pictures.pop(number, None) is not None
+                    queue.times.known.pop(number)
+            self.changed.notify_all()
+
+    def take(self, row: int) -> tuple[dict[str, list[tuple[TimedPicture, Content]]], dict[str, float]]:
+        """Take the pictures of a row by camera, in the order of their instants, and close the row.
 
         Also returns when (time.time()) they arrived; without those that are older than the watch.
         """
-        out: dict[str, Content] = {}
+        out: dict[str, list[tuple[TimedPicture, Content]]] = {name: [] for name in self.queues}
         arrived: dict[str, float] = {}
+        newest = max((queue.times.newest for queue in self.queues.values() if not queue.times.own), default=0)
         for name, queue in self.queues.items():
-            waiting = queue.pictures.pop(frame, None)
-            since_and_why = queue.incomplete.pop(frame, None)
-            if waiting is not None:
-                out[name] = waiting.content
+            for picture in queue.times.take(row):
+                if not queue.times.own and picture.number > newest:
+                    continue  # after the end of the recording
+                waiting = queue.pictures.pop(picture.number, None)
+                since_and_why = queue.incomplete.pop(picture.number, None)
+                if waiting is None:
+                    reason = DROPPED if since_and_why is None else since_and_why[1]
+                    out[name].append((picture, MissingPicture(reason)))
+                    continue
+                out[name].append((picture, waiting.content))
                 if waiting.arrived_s is not None:
-                    arrived[name] = waiting.arrived_s
-            else:
-                out[name] = MissingPicture(DROPPED if since_and_why is None else since_and_why[1])
-        self.next_frame = frame + 1
+                    arrived[name] = max(arrived.get(name, 0.0), waiting.arrived_s)
+            oldest_s = time.perf_counter() - self._timeout_s
+            for number in [n for n, w in queue.pictures.items() if queue.times.row(n) is None and w.seen_s < oldest_s]:
+                del queue.pictures[number]
+                queue.untimed += 1
+        self.next_row = row + 1
         return out, arrived
 
-    def has_later(self, frame: int) -> bool:
-        """Whether any camera has a picture of a later frame."""
-        return any(queue.later_s(frame) is not None for queue in self.queues.values())
+    def has_later(self, row: int) -> bool:
+        """Whether any camera has a picture of a later row."""
+        return any(queue.later_s(row) is not None for queue in self.queues.values())
+
+    def reaches(self, row: int) -> bool:
+        """Whether the tables have a row, by the pictures so far: the cameras without times of their own decide."""
+        times = [queue.times for queue in self.queues.values()]
+        return any(t.reaches(row) for t in [t for t in times if not t.own] or times)
+
+    def numbers(self) -> Iterator[tuple[CameraQueue, int]]:
+        """All pictures that have come, also incomplete ones."""
+        return ((queue, n) for queue in self.queues.values() for n in (*queue.pictures, *queue.incomplete))
 
     def _accepts(self, queue: CameraQueue, number: int, count: bool = True) -> bool:
-        """Register the arrival of a picture; False if its frame is closed, or so far ahead that it is a stray file."""
+        """Register the arrival of a picture; False if its row is closed, or so far ahead that it is a stray file."""
         self.last_seen_s = time.perf_counter()
         queue.timed_out = False
-        if self.next_frame is None:
-            return True
-        if number < self.next_frame:
-            queue.late += count
-            # A camera that lags by more than the timeout would delay every frame by it.
-            queue.timed_out = (self.next_frame - number) * self._interval_s > self._timeout_s
-            return False
-        if number > self.next_frame + LONGEST_GAP:
-            queue.strays += [number] * count
-            return False
+        row = queue.times.row(number)
+        if self.next_row is not None and row is not None:
+            if row < self.next_row:
+                queue.late += count
+                # A camera that lags by more than the timeout would delay every row by it.
+                queue.timed_out = (self.next_row - row) * self._interval_s > self._timeout_s
+                return False
+            if row > self.next_row + LONGEST_GAP:
+                queue.strays += [number] * count
+                return False
+        queue.times.newest = max(queue.times.newest, number)
         return True

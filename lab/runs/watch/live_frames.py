@@ -14,11 +14,14 @@ import numpy as np
 from lab.errors import BeamposeError, InputError
 from lab.files.run.detections_file import LONGEST_GAP
 from lab.files.run.run_file import FramesFolder, LiveDevice, Run
-from lab.pictures.picture_file import GreyPicture, MissingPicture
+from lab.pictures.picture_file import DROPPED, GreyPicture, MissingPicture
+from lab.runs.clock_estimate import ClockEstimate
 from lab.runs.frames.frames import FrameSet
+from lab.runs.frames.moments import Moment, MomentPlanner, TimedPicture
 from lab.runs.watch.cameras import DeviceCamera, FolderCamera, LiveCamera, in_thread, open_device
 from lab.runs.watch.frame_clock import FolderPoll
-from lab.runs.watch.inbox import CameraQueue, Inbox, is_complete
+from lab.runs.watch.inbox import CameraQueue, Content, Inbox, is_complete
+from lab.runs.watch.picture_times import complete_times, times_of
 
 FIRST = 6  # pictures of each camera for the estimate of the noise
 _ARRIVALS = 200  # frames whose arrivals are compared between cameras
@@ -48,11 +51,13 @@ class LiveFrames:
     # time.time() by camera, of the last frames
     arrivals: deque[dict[str, float]] = field(default_factory=lambda: deque(maxlen=_ARRIVALS))
     caught_up: bool = False  # whether the backlog of the start has been processed
+    moments: list[Moment] | None = field(init=False)  # of cameras with clocks of their own
     _cameras: dict[str, LiveCamera] = field(init=False)
     _stack: ExitStack = field(default_factory=ExitStack)
     _reasons: dict[str, Counter[str]] = field(default_factory=dict)
+    _contents: dict[tuple[str, int], Content] = field(default_factory=dict)  # of pictures whose moment is not made yet
     _failures: list[BaseException] = field(default_factory=list)
-    _first: int = 0
+    _first: int = 0  # row
 
     def __post_init__(self) -> None:
         """Raises InputError if a camera cannot be watched."""
@@ -64,12 +69,15 @@ class LiveFrames:
                 f"{self.run.path}: timestamps: expected none in a run that is watched, since they do not exist yet;"
                 " remove them: t_s is then frame / frame_rate_hz"
             )
-        if self.run.clocks:
+        estimate = ClockEstimate.of(self.run)
+        if estimate is not None and estimate.wide.any():
+            number = estimate.numbers[int(np.argmax(estimate.wide))]
             raise InputError(
-                f"{self.run.path}: cameras.{next(iter(self.run.clocks))}: expected no clocks of single cameras in a run"
-                " that is watched; take out time_offset_s, row_time_s (also of rig.yaml) and timestamps, or process the"
-                " recording with `beampose run` when it is complete"
+                f"{self.run.path}: cameras.{number.camera}: expected a known clock in a run that is watched, since to"
+                " estimate it takes several passes; process a recording with `beampose run`, and state the numbers"
+                " that it finds"
             )
+        self.moments = [] if self.run.clocks else None
         self._cameras = {name: self._camera(name) for name in self.run.cameras}
 
     def __enter__(self) -> LiveFrames:
@@ -89,7 +97,9 @@ class LiveFrames:
     def lost(self, camera: str) -> int:
         """Pictures of a camera that were lost, came too late, or were left out since they came too fast."""
         queue, source = self.inbox.queues[camera], self._cameras[camera]
-        return queue.refused + queue.late + (source.clock.lost if isinstance(source, DeviceCamera) else 0)
+        return (
+            queue.refused + queue.late + queue.untimed + (source.clock.lost if isinstance(source, DeviceCamera) else 0)
+        )
 
     @property
     def expected_frames(self) -> int | None:
@@ -109,6 +119,11 @@ class LiveFrames:
                 )
             if queue.refused:
                 out.append(f"{name}: {queue.refused} pictures were left out: they came faster than they are processed")
+            if queue.untimed:
+                out.append(
+                    f"{name}: {queue.untimed} pictures were left out: no time came for them within"
+                    f" {self.options.timeout_s:g} s"
+                )
             if queue.strays:
                 out.append(f"{name}: pictures with numbers far beyond all others were left out: {_some(queue.strays)}")
         return out
@@ -138,38 +153,71 @@ class LiveFrames:
             return self._first_pictures()
 
     def __iter__(self) -> Iterator[FrameSet]:
-        frame = self._first
+        row = self._first if self.inbox.next_row is None else self.inbox.next_row
         since = time.perf_counter()
+        steps = [queue.times.step_s or 1 / self.run.frame_rate_hz for queue in self.inbox.queues.values()]
+        planner = MomentPlanner(min(steps))
         try:
-            while self._wait_for(frame, since):
+            while self._wait_for(row, since):
                 with self.inbox.changed:
-                    images, arrived = self.inbox.take(frame)
-                    self.arrived_s[frame] = max(arrived.values(), default=None)
+                    given, arrived = self.inbox.take(row)
+                    self.arrived_s[row] = max(arrived.values(), default=None)
                     self.arrivals.append(arrived)
-                    self.caught_up |= not self.inbox.has_later(frame)
-                for name, content in images.items():
-                    if isinstance(content, MissingPicture):
-                        self._reasons[name][content.reason] += 1
-                yield FrameSet(frame, images)
-                frame += 1
+                    self.caught_up |= not self.inbox.has_later(row)
+                    is_row = row >= self._first and (self.moments is None or self.inbox.reaches(row))
+                for name, pictures in given.items():
+                    for _, content in pictures:
+                        if isinstance(content, MissingPicture):
+                            self._reasons[name][content.reason] += 1
+                if self.moments is None:
+                    yield FrameSet(row, {name: content for name, ((_, content),) in given.items()})
+                else:
+                    yield from self._at_moments(planner, row, given, is_row)
+                row += 1
                 since = time.perf_counter()
+            yield from self._sets(planner.rest())
+            complete_times(self.run)
         finally:
             self.inbox.stopping.set()
 
-    def _wait_for(self, frame: int, since: float) -> bool:
-        """Wait until a frame can be processed; False: the recording has ended before it."""
+    def _at_moments(
+        self,
+        planner: MomentPlanner,
+        row: int,
+        given: Mapping[str, list[tuple[TimedPicture, Content]]],
+        is_row: bool,
+    ) -> Iterator[FrameSet]:
+        """The moments up to a row, from the pictures nearest to it."""
+        self._contents |= {(name, p.number): content for name, of in given.items() for p, content in of}
+        pictures = {name: [p for p, _ in of] for name, of in given.items()}
+        if is_row:
+            yield from self._sets(planner.row(row, row / self.run.frame_rate_hz, pictures))
+        else:
+            planner.without_row(pictures)
+
+    def _sets(self, moments: Iterator[Moment]) -> Iterator[FrameSet]:
+        for moment in moments:
+            assert self.moments is not None
+            self.moments.append(moment)
+            images: dict[str, Content] = {name: MissingPicture(DROPPED) for name in self.run.cameras}
+            images |= {name: self._contents.pop((name, p.number)) for name, p in moment.pictures.items()}
+            yield FrameSet(moment.frame, images, moment)
+
+    def _wait_for(self, row: int, since: float) -> bool:
+        """Wait until a row can be processed; False: the recording has ended before it."""
         queues = list(self.inbox.queues.values())
         with self.inbox.changed:
             while True:
                 self._raise_failure()
                 now = time.perf_counter()
                 timeout = 0.0 if self.stop.is_set() else self.options.timeout_s
-                complete, now_timed_out = is_complete(frame, queues, now, since, timeout, 1 / self.run.frame_rate_hz)
-                if complete:
+                over = self._is_over(now, queues)
+                complete, now_timed_out = is_complete(row, queues, now, since, timeout, 1 / self.run.frame_rate_hz)
+                if complete and (self.moments is None or over or self.inbox.reaches(row)):
                     for queue in now_timed_out:
                         queue.timed_out = True
                     return True
-                if not self._anything_from(frame, queues) and self._is_over(now, queues):
+                if over and not self._anything_from(row):
                     return False
                 self.inbox.changed.wait(0.005)
 
@@ -178,13 +226,14 @@ class LiveFrames:
         idle = seen is not None and now - seen > self.options.idle_s
         return self.stop.is_set() or idle or all(queue.ended for queue in queues)
 
-    @staticmethod
-    def _anything_from(frame: int, queues: list[CameraQueue]) -> bool:
-        """Whether any camera has a complete picture of this frame or a later one."""
-        return any(number >= frame for queue in queues for number in queue.pictures)
+    def _anything_from(self, row: int) -> bool:
+        """Whether any camera has a complete picture of this row or a later one."""
+        rows = (queue.times.row(n) for queue in self.inbox.queues.values() for n in queue.pictures)
+        return any(of is not None and of >= row for of in rows)
 
     def _first_pictures(self) -> dict[str, list[GreyPicture]]:
-        numbers = sorted({n for queue in self.inbox.queues.values() for n in (*queue.pictures, *queue.incomplete)})
+        every = [(queue, n, row) for queue, n in self.inbox.numbers() if (row := queue.times.row(n)) is not None]
+        numbers = sorted({row for _, _, row in every})
         if not numbers:
             return {}
         gaps = np.diff(numbers)
@@ -194,12 +243,18 @@ class LiveFrames:
                 f" {numbers[int(np.argmax(gaps)) + 1]} among the first; is a stray file among them, or do the names"
                 " contain a time?"
             )
-        self._first = self.inbox.next_frame = numbers[0]
+        shared = [n for queue, n, _ in every if not queue.times.own]
+        own_s = [s for queue in self.inbox.queues.values() for s in queue.times.known.values()]
+        self._first = min(shared) if shared else max(int(np.ceil(min(own_s) * self.run.frame_rate_hz - 1e-6)), 0)
+        self.inbox.next_row = numbers[0]
+        for queue in self.inbox.queues.values():
+            queue.times.first = self._first
         return {name: self._usable(queue)[:FIRST] for name, queue in self.inbox.queues.items()}
 
     @staticmethod
     def _usable(queue: CameraQueue) -> list[GreyPicture]:
-        contents = [waiting.content for _, waiting in sorted(queue.pictures.items(), key=lambda item: item[0])]
+        waiting = [(n, w.content) for n, w in queue.pictures.items() if queue.times.row(n) is not None]
+        contents = [content for _, content in sorted(waiting, key=lambda item: item[0])]
         return [content for content in contents if isinstance(content, np.ndarray)]
 
     def _failed(self, error: BaseException) -> None:
@@ -213,7 +268,13 @@ class LiveFrames:
 
     def _camera(self, name: str) -> FolderCamera | DeviceCamera:
         source, size_px = self.run.cameras[name], self.run.rig.cameras[name].image_size_px
+        self.inbox.queues[name].times, follower = times_of(self.run, name)
         if isinstance(source, LiveDevice):
+            if follower is not None:
+                raise InputError(
+                    f"{self.run.path}: cameras.{name}.timestamps: expected none for a device, which writes no table;"
+                    " watch the folder that `beampose record` fills"
+                )
             try:
                 return open_device(name, source.device, size_px, self.inbox, self.run.frame_rate_hz)
             except BeamposeError as error:
@@ -223,7 +284,7 @@ class LiveFrames:
                 f"{self.run.path}: cameras.{name}: expected a folder of pictures or a device to watch, got"
                 f" {source.path}, which is read when it is complete: use `beampose run`"
             )
-        return FolderCamera(name, FolderPoll(source.path), size_px, self.inbox, self.options.timeout_s)
+        return FolderCamera(name, FolderPoll(source.path), size_px, self.inbox, self.options.timeout_s, follower)
 
 
 def _some(numbers: list[int]) -> str:

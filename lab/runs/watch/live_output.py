@@ -13,6 +13,7 @@ import numpy as np
 
 from lab.files.text import columns
 from lab.files.text.atomic_write import replacement_within
+from lab.files.text.csv_text import csv_word
 from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.tables import attitude_rows, pose_numbers
 from lab.runs.verdict.frame_checks import FrameChecks
@@ -81,17 +82,30 @@ class LiveOutput:
     line: Callable[[str], None] | None = None  # called with a line of status every second
     latency: Latency = field(default_factory=Latency)
     _file: TextIO | None = None
+    _pictures: dict[str, list[int]] = field(default_factory=dict)  # used since the last row, of cameras with clocks
     _counts: tuple[int, int] = (0, 0)  # frames, and measured ones
     _recent_ms: list[float] = field(default_factory=list)  # latencies since the last line
     _begun_s: float | None = None
     _said_s: float = 0.0  # when the last line was shown
 
     def write(self, record: FrameRecord) -> None:
-        """Write and send one frame."""
+        """Write and send one frame; of one without a row, only keep which pictures it has used."""
+        pictures = None
+        if record.moment is not None:
+            for name, found in zip(self.checks.rig.cameras, record.detections, strict=True):
+                if found is not None:
+                    self._pictures.setdefault(name, []).append(record.moment.pictures[name].number)
+            if not record.moment.is_row:
+                return
+            pictures, self._pictures = self._pictures, {}
         ((checked, _),) = self.checks.passed([(record, None)])
         if self._file is None:
-            self._file = self._opened()
-        self._file.write(attitude_rows([checked])[0])
+            self._file = self._opened(pictures is not None)
+        row = attitude_rows([checked])[0]
+        if pictures is not None:
+            used = " ".join(f"{name}:{number}" for name, of in pictures.items() for number in of)
+            row = f"{row[:-1]},{csv_word(used)}\n"
+        self._file.write(row)
         self._file.flush()
         arrived_s = self.frames.arrived_s.pop(record.frame, None)
         latency_ms = None if arrived_s is None else max(1e3 * (time.time() - arrived_s), 0.0)
@@ -99,6 +113,7 @@ class LiveOutput:
             (self.latency.steady if self.frames.caught_up else self.latency.start).append(latency_ms)
         if self.streams:
             content = frame_content(checked, latency_ms)
+            content |= {} if pictures is None else {columns.PICTURES: pictures}
             for stream in self.streams:
                 stream.send(content)
         if self.board is not None:
@@ -145,11 +160,12 @@ class LiveOutput:
         if self._file is not None:
             self._file.close()
 
-    def _opened(self) -> TextIO:
+    def _opened(self, with_pictures: bool) -> TextIO:
         """Open the live table in its own folder, which replaces earlier results."""
+        heads = (*columns.ATTITUDE, columns.PICTURES) if with_pictures else columns.ATTITUDE
         with replacement_within(self.out) as new:
             file = (new / LIVE_TABLE).open("w+", encoding="utf-8", newline="")
-            file.write(",".join(columns.ATTITUDE) + "\n")
+            file.write(",".join(heads) + "\n")
         return file
 
 

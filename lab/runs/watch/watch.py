@@ -77,7 +77,7 @@ def watch_run(
         BeamposeError: the run cannot be watched, or no picture came.
     """
     started = time.perf_counter()
-    run = ready_run(run_folder, overrides)
+    run = ready_run(run_folder, overrides, recording=True)
     if reprocess and any(isinstance(source, LiveDevice) for source in run.cameras.values()):
         raise InputError(
             f"{run.path}: cameras: expected folders of pictures to reprocess, got a device, which keeps none"

@@ -417,7 +417,7 @@ def test_a_silent_camera_times_out_once():
     assert complete(inbox, 0, 0.21) == (True, ["b"])
     inbox.queues["b"].timed_out = True
     assert complete(inbox, 1, 0.0) == (True, [])
-    inbox.next_frame = 1
+    inbox.next_row = 1
     inbox.put("b", 0, FOUND, None)  # it is late, but there again
     assert inbox.queues["b"].late == 1
     assert complete(inbox, 1, 0.0) == (False, [])
@@ -425,7 +425,7 @@ def test_a_silent_camera_times_out_once():
 
 def test_a_camera_that_lags_by_more_than_the_timeout_is_not_waited_for():
     inbox = inbox_with(("a", 100))
-    inbox.next_frame, inbox.queues["b"].timed_out = 100, True
+    inbox.next_row, inbox.queues["b"].timed_out = 100, True
     inbox.put("b", 70, FOUND, None)
     assert complete(inbox, 100, 0.0) == (True, [])
 
@@ -436,7 +436,7 @@ def test_no_frame_is_complete_before_any_camera_has_a_picture():
 
 def test_a_stray_number_is_ignored():
     inbox = inbox_with(("a", 5))
-    inbox.next_frame = 5
+    inbox.next_row = 5
     inbox.put("a", 90_000, FOUND, None)
     assert (inbox.queues["a"].strays, set(inbox.queues["a"].pictures)) == ([90_000], {5})
 
