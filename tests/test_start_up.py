@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -110,3 +111,14 @@ def test_a_short_run_never_loads_pandas_or_the_slow_parts_of_scipy_or_the_compil
 
 def test_python_does_not_search_for_cycles_while_the_program_ends():
     assert loaded(AT_EXIT, "--version") == {"True"}
+
+
+def test_the_linear_algebra_has_one_thread_unless_the_user_says_otherwise():
+    code = "import cli, os; print('THREADS', os.environ['OPENBLAS_NUM_THREADS'])"
+    for stated in ("", "2"):
+        free = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+        env = free | ({"OPENBLAS_NUM_THREADS": stated} if stated else {})
+        out = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT, env=env
+        )
+        assert out.stdout == f"THREADS {stated or 1}\n"
