@@ -109,8 +109,8 @@ def tolerant(run: Run) -> Run:
     seen = (np.diagonal(C) > 0) & finite(J, -1)
     J, C = J[seen], C[np.ix_(seen, seen)]
     left = np.eye(len(J)) - J @ np.linalg.pinv(J)
-    px = float(np.sqrt(np.trace(left @ C @ left) / max(np.trace(left), 1.0)))
-    px *= _EXPECTED
+    # Where the pose absorbs all errors, the rest is rounding, of either sign.
+    px = _EXPECTED * float(np.sqrt(max(np.trace(left @ C @ left), 0.0) / max(np.trace(left), 1.0)))
     return replace(run, tracker=replace(run.tracker, sigma_model_px=max(px, run.tracker.sigma_model_px)))
 
 

@@ -20,8 +20,10 @@ from geometry.rig import Rig
 from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import covariance_root, perturbed_rig
 from lab.calibrate.refine.prior_sigmas import stated_covariance
+from lab.calibrate.refine.recordings import tolerant, with_rig
 from lab.calibrate.refine.refine import refine_rig
 from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance, load_rig_file, save_rig
+from lab.files.run.run_file import load_run
 from lab.findings.finding import Level
 from lab.simulate.write import simulate
 
@@ -349,3 +351,23 @@ def test_a_rig_with_clocks_is_read_back_as_it_was_written(tmp_path):
     save_rig(rig, tmp_path / "rig.yaml")
     back = load_rig_file(tmp_path / "rig.yaml").rig.cameras[name]
     assert (back.time_offset_s, back.row_time_s) == (-0.0013, 8e-6)
+
+
+def test_a_prior_whose_pose_absorbs_all_errors_leaves_the_tracker_as_it_is(lab):
+    folder, runs, _, _ = lab
+    run = load_run(runs[0], folder / "rig.yaml")
+    spots = dict(list(run.rig.spots.items())[:3])
+    beams, screens = {s.beam for s in spots.values()}, {s.screen for s in spots.values()}
+    cameras = {n: c for n, c in run.rig.cameras.items() if c.screen in screens}
+    few = Rig(
+        {n: s for n, s in run.rig.screens.items() if n in screens},
+        dict(list(cameras.items())[:1]),
+        {n: b for n, b in run.rig.beams.items() if n in beams},
+        spots,
+    )
+    known = with_rig(replace(run, rig=few), few, run.covariance)
+    usual = known.tracker.sigma_model_px
+    for seed in range(20):
+        turn = 0.02 * np.random.default_rng(seed).normal(size=6)
+        prior = replace(known.prior, centre=known.prior.centre.plus(turn))
+        assert tolerant(replace(known, prior=prior)).tracker.sigma_model_px == pytest.approx(usual, abs=1e-3)
