@@ -120,7 +120,7 @@ class VarianceFactor:
 # Each camera has a list of places at which unlabelled points were found repeatedly. The density of false points there
 # is much higher than elsewhere, and that density is all that the search for labels uses. Source: ours.
 
-MAX_PLACES = 64  # per camera
+MAX_PLACES = 256  # per camera; photographs show some 70 points at rest
 RADIUS_SIGMAS, MIN_RADIUS_PX = 5.0, 0.4  # radius of a place in sigmas of a point, and at least
 MIN_SEEN = 4.0  # count from which on a place is taken for static
 SURE_LOG_DENSITY = -float(np.log(np.pi * MIN_RADIUS_PX**2))  # 1/px^2, of points that are known to be static
@@ -180,20 +180,20 @@ def static_log_density(places: StaticPlaces, uv: Array, noise_px2: Array, first:
 
 @compiled
 def update_places(
-    places: StaticPlaces, points: PicturePoints, assigned: Ints, expected: Array, camera_of: Ints
+    places: StaticPlaces, points: PicturePoints, assigned: Ints, expected: Array, camera_of: Ints, decay: float
 ) -> None:
     """Add one frame whose pose is known, in place.
 
     Points that are labelled, or lie near an expected spot, are left out. assigned (n,): row of each view's detection,
-    -1 without a label; expected (n, 2), px: pixels of the spots at the frame's pose.
+    -1 without a label; expected (n, 2), px: pixels of the spots at the frame's pose. decay: of the counts; 1: none.
     """
     uv, first = points.uv, points.first
     for c in range(first.shape[0] - 1):
         if not points.has_image[c]:
             continue
-        places.frames[c] = DECAY * places.frames[c] + 1.0
+        places.frames[c] = decay * places.frames[c] + 1.0
         for k in range(MAX_PLACES):
-            places.seen[c, k] *= DECAY
+            places.seen[c, k] *= decay
         for d in range(first[c], first[c + 1]):
             is_spot = False
             for i in range(assigned.shape[0]):
@@ -309,7 +309,7 @@ class PointStatistics:
         if measured:
             labels = np.where(assigned >= 0, assigned % BLENDED, -1)
             points = PicturePoints(frame.uv, self._noise_px2, frame.first, frame.has_image)
-            update_places(self._static, points, labels, summary.expected_px, self._camera)
+            update_places(self._static, points, labels, summary.expected_px, self._camera, DECAY)
         for v in np.flatnonzero(summary.use):
             size = frame.size_px[assigned[v]]
             if np.isfinite(size):

@@ -33,7 +33,7 @@ from tracking.rigid_body.models.information import run_shifts
 from tracking.smoothing.error_scale import ErrorScale, usual_sizes
 from tracking.smoothing.labels.continuity import continued, transfers_between_cameras
 from tracking.smoothing.labels.neighbouring_frames import connected, displaced, isolated, next_to
-from tracking.smoothing.labels.reassociation import RunObservation, reassociated, run_log_clutter
+from tracking.smoothing.labels.reassociation import RunObservation, reassociated, run_log_clutter, run_log_static
 from tracking.smoothing.labels.view_path import PathContext
 from tracking.smoothing.motion.process_noise import corner_offsets, corner_times, jump_sigmas, jump_variances
 from tracking.smoothing.motion.run_detections import (
@@ -376,7 +376,13 @@ class _Smoother:
         """Label each frame from the motion that the other frames give; whether any label changed."""
         ref, known = self.motion.ref, self.motion.known
         detection_model = DetectionModel(self.parameters.p_detect, self.parameters.p_blend)
-        run = RunObservation(self.views, self.view_table, detection_model, self.calibration_cov, self.detections)
+        noise_px2 = 0.5 * np.trace(self.rec.run_detections().cov, axis1=1, axis2=2) - self.rec.place_px2()
+        static = run_log_static(
+            self.views, self.view_table.camera, self.detections, noise_px2, self.assigned, ref, known
+        )
+        run = RunObservation(
+            self.views, self.view_table, detection_model, self.calibration_cov, self.detections, static
+        )
         found, probability, sigma_px = reassociated(
             run, self.assigned, ref, self.motion.pose_P, self.motion.weight, self._log_clutter(known),
             jump_sigmas(ref, self.rec.dt_s),

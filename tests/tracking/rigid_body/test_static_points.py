@@ -14,6 +14,7 @@ from tracking.detections import Detections
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.frame_summary import FrameSummary
 from tracking.rigid_body.online_estimates import (
+    DECAY,
     MIN_SEEN,
     PicturePoints,
     PointStatistics,
@@ -41,7 +42,7 @@ def after(places: StaticPlaces, path: Array, assigned: Array, expected: Array) -
     for at, spot in zip(path, expected, strict=True):
         uv = (at + SIGMA_PX * rng.normal(size=2))[None]
         points = PicturePoints(uv, noise(uv), FIRST, HAS_IMAGE)
-        update_places(places, points, assigned, spot[None], CAMERA_OF)
+        update_places(places, points, assigned, spot[None], CAMERA_OF, DECAY)
     return places
 
 
@@ -67,6 +68,15 @@ def test_a_reflection_becomes_static_within_a_few_frames():
     assert camera_1[0] == -np.inf
 
 
+def test_each_of_a_hundred_points_at_rest_is_static():
+    """Pictures in front of a photograph show some 70 of them."""
+    uv = np.stack(np.meshgrid(np.arange(100.0, 600.0, 50.0), np.arange(100.0, 600.0, 50.0)), axis=-1).reshape(-1, 2)
+    places, points = no_places(2), PicturePoints(uv, noise(uv), np.array([0, 100, 100]), HAS_IMAGE)
+    for _ in range(10):
+        update_places(places, points, NO_LABEL, FAR_PX, CAMERA_OF, DECAY)
+    assert np.isfinite(static_log_density(places, uv, noise(uv), points.first)).all()
+
+
 def test_a_spot_that_moves_without_a_label_is_not_static():
     places = after(no_places(2), MOVING, NO_LABEL, AWAY)
     assert all(density_at(places, at[None]) == -np.inf for at in MOVING)
@@ -88,7 +98,7 @@ def test_a_reflection_that_is_gone_is_forgotten():
     for frame in range(300):
         assert (density_at(places, STILL[:1]) > -np.inf) or frame > 50
         points = PicturePoints(none, noise(none), np.zeros(3, dtype=np.int64), HAS_IMAGE)
-        update_places(places, points, NO_LABEL, FAR_PX, CAMERA_OF)
+        update_places(places, points, NO_LABEL, FAR_PX, CAMERA_OF, DECAY)
     assert density_at(places, STILL[:1]) == -np.inf
 
 
@@ -99,7 +109,7 @@ def test_the_places_of_a_camera_without_a_picture_do_not_decay():
     for _ in range(500):
         no_picture = np.zeros(2, dtype=bool)
         points = PicturePoints(none, noise(none), np.zeros(3, dtype=np.int64), no_picture)
-        update_places(places, points, NO_LABEL, FAR_PX, CAMERA_OF)
+        update_places(places, points, NO_LABEL, FAR_PX, CAMERA_OF, DECAY)
     assert density_at(places, STILL[:1]) == before
 
 

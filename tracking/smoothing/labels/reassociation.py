@@ -7,6 +7,7 @@ wrong motion. Compiled. Source: ours.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.compilation.jit import compiled, compiled_in_caller
 from geometry.compiled_linalg import apply, block, column, hstack, multiply, pose_plus, solve, symmetrise
-from geometry.compiled_projection import Views, inside, project_view
+from geometry.compiled_projection import Views, inside, project_all, project_view
 from geometry.forward_model import SpotModel
 from tracking.rigid_body.association.frame_detections import (
     BLENDED,
@@ -32,6 +33,7 @@ from tracking.rigid_body.hypotheses.hypothesis_set import State, iterated_update
 from tracking.rigid_body.models.information import frame_information, single_frame_pose
 from tracking.rigid_body.models.motion import STATE
 from tracking.rigid_body.models.occlusion import joint_log_likelihood, marginal
+from tracking.rigid_body.online_estimates import PicturePoints, no_places, static_log_density, update_places
 from tracking.smoothing.motion.run_detections import Reference, RunDetections, labelled_points
 
 
@@ -81,6 +83,28 @@ def run_log_clutter(
     return np.ascontiguousarray(np.log(density)[:, model.camera_of])
 
 
+def run_log_static(
+    views: Views, camera_of: Ints, detections: RunDetections, noise_px2: Array, assigned: Ints, ref: Reference,
+    known: Bools,
+) -> Array:  # fmt: skip
+    """Log density (m,) of static points, 1/px^2, at each detection, from the known (T,) frames of the whole run.
+
+    camera_of (n,): of the views; noise_px2 (m,): as in PicturePoints. The tracker has to see a static point several
+    times; here its first frames profit from the later ones.
+    """
+    places = no_places(detections.has_image.shape[1])
+    expected, _ = project_all(views, ref.R, ref.t)
+    rows = [slice(int(a), int(b)) for a, b in pairwise(detections.begin)]
+    points = [
+        PicturePoints(detections.uv[r], noise_px2[r], first, there)
+        for r, first, there in zip(rows, detections.first, detections.has_image, strict=True)
+    ]
+    for k in np.flatnonzero(known):
+        labels = np.where(assigned[k] >= 0, assigned[k] % BLENDED, -1)
+        update_places(places, points[k], labels, expected[k], camera_of, 1.0)
+    return np.concatenate([np.zeros(0), *(static_log_density(places, p.uv, p.noise_px2, p.first) for p in points)])
+
+
 # Probability that a spot is not occluded if its screen is visible, by the neighbouring frames in which the screen was
 # visible: the spot was labelled in none of them, in one of two, in all.
 P_VISIBLE = np.array([0.2, 0.6, 0.98])
@@ -106,6 +130,7 @@ class RunObservation(NamedTuple):
     detection_model: DetectionModel
     calibration_cov: Array  # (n, 2, 2) px^2: covariance of the expected pixels due to calibration errors
     detections: RunDetections
+    log_static: Array  # (m,) log density of static points at each detection, 1/px^2
 
 
 class _Case(NamedTuple):
@@ -159,7 +184,7 @@ def reassociated(
         a, b = detections.begin[k], detections.begin[k + 1]
         frame = FrameDetections(
             detections.uv[a:b], detections.cov[a:b], detections.blend_px[a:b], detections.first[k],
-            detections.has_image[k], log_clutter[k], np.full(b - a, -np.inf), detections.size_px[a:b],
+            detections.has_image[k], log_clutter[k], run.log_static[a:b], detections.size_px[a:b],
             detections.usual_size_px, no_excess,
         )  # fmt: skip
         obs = Observation(
