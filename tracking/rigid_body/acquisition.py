@@ -457,8 +457,8 @@ class SearchSchedule:
     def _contradicts(self, best: Ints, found: Sequence[Detections | None]) -> bool:
         """Whether a camera has enough points, but none where several spots are expected; counts such frames.
 
-        After some frames without a measured pose the spots of all cameras count together: one or two labels agree with
-        almost any pose.
+        Those of all cameras count together, since with two beams none expects several. After some frames without a
+        measured pose fewer contradict: one or two labels agree with almost any pose.
         """
         missed, labelled = best == MISSED, best >= 0
         long = self._unmeasured >= LONG_UNMEASURED
@@ -472,6 +472,6 @@ class SearchSchedule:
             spare = len(f) - int(np.count_nonzero(labelled & mine))
             contradicts |= missing >= least and len(f) >= missing
             elsewhere += min(missing, max(spare, 0))
-        contradicts |= long and elsewhere >= MISSING_TO_DOUBT
+        contradicts |= elsewhere >= least
         self._contradicted = self._contradicted + 1 if contradicts else 0
         return contradicts
