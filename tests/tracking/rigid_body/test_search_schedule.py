@@ -71,6 +71,15 @@ def test_frames_that_contradict_the_hypothesis_are_searched_at_increasing_interv
     assert searched(tracking(), nothing, False, 45) == [*SEARCH_AT, 20, 40]
 
 
+def test_with_two_beams_the_missing_spots_of_both_cameras_contradict_together():
+    """A vehicle at rest that moves off at once was searched after ten frames: no camera expects three spots."""
+    two_of_each = np.full(N, -2)
+    for camera in range(2):
+        two_of_each[np.flatnonzero(camera == MODEL.camera_of)[:2]] = MISSED
+    assert searched(tracking(), two_of_each, False, 45, counts=(2, 2)) == [*SEARCH_AT, 20, 40]
+    assert searched(tracking(), two_of_each, False, 45, counts=(0, 4)) == []  # one screen is occluded
+
+
 def test_few_spots_that_nothing_contradicts_are_searched_seldom():
     one_camera = np.where(MODEL.camera_of == 0, FOUND_ALL, -2)
     assert searched(tracking(), one_camera, False, 110) == [50, 100]
