@@ -48,9 +48,9 @@ def exposure_sigmas(motion: Reference, jumped: Bools, exposure_s: float, dt: Arr
     """Sigmas (T, 6), m and rad, of the pose's mean over the exposure less that at its middle, beyond the offsets above.
 
     Where the velocities jump (`corner_offsets`), and where the acceleration of the motion is not that of its poses,
-    such as beside strong accelerations that are taken for jumps: their difference times T^2 / 24. The first value is
-    for both, the second without the jumps, which the covariances of the motion contain. Short exposures get 0.
-    Source: ours.
+    such as beside strong accelerations that are taken for jumps: their difference times T^2 / 24. Each component has
+    one of the two, since others may turn in a frame while it accelerates. The first value is for both, the second
+    without the jumps, which the covariances of the motion contain. Short exposures get 0. Source: ours.
     """
     corners = corner_offsets(motion, jumped, exposure_s, dt)
     other = np.zeros_like(corners)
@@ -60,7 +60,7 @@ def exposure_sigmas(motion: Reference, jumped: Bools, exposure_s: float, dt: Arr
         acceleration = (velocity[1:] - velocity[:-1]) / (0.5 * (dt[2:] + dt[1:-1]))[:, None]
         acceleration = acceleration[np.r_[0, 0 : len(dt) - 2, len(dt) - 3]]  # at the ends that of the nearest frames
         other = np.abs(acceleration - motion.m[:, 6:]) * exposure_s**2 / 24
-        other[corners.any(axis=1)] = 0.0
+        other[corners > 0] = 0.0
     return np.abs(corners) + other, other
 
 

@@ -8,7 +8,7 @@ from geometry.pose import Pose
 from lab.simulate.points import simulate_points
 from tracking.smoothing.motion.process_noise import with_errors_along_axes
 from tracking.smoothing.motion.run_detections import Reference
-from tracking.smoothing.systematic_errors import exposure_offsets, pose_shift
+from tracking.smoothing.systematic_errors import exposure_offsets, exposure_sigmas, pose_shift
 
 EXPOSURE_S = 0.02
 
@@ -87,3 +87,19 @@ def test_a_corner_outside_the_exposure_does_not_hide_one_inside_it():
     axes, _, _ = with_errors_along_axes(b, information, information @ error)
     assert error @ along @ error / 6 > 50
     assert error @ axes @ error / 6 < 1
+
+
+def test_a_component_that_accelerates_while_another_one_turns_has_the_offset_of_its_acceleration():
+    """Three beams shake at a quarter of the frame rate: the steps in which one axis turns are taken for jumps."""
+    dt, exposure_s, turn, acceleration = 0.04, 0.03, 0.5, 40.0
+    t = dt * np.arange(-3, 4)
+    places, m = np.zeros((7, 3)), np.zeros((7, 12))
+    places[:, 0], m[:, 0] = turn * np.abs(t) / 2, turn * np.sign(t) / 2
+    m[3, 0] = turn / 2
+    places[:, 1], m[:, 1] = acceleration * t**2 / 2, acceleration * t
+    m[2:4, 1] = 0.0  # its velocity does not jump with the other one's
+    motion = Reference(np.tile(np.eye(3), (7, 1, 1)), places, m)
+    both, without_jumps = exposure_sigmas(motion, np.arange(7) == 3, exposure_s, np.full(7, dt))
+    assert both[3, 0] == pytest.approx(turn * exposure_s / 8)
+    assert without_jumps[3, 0] == 0.0
+    assert both[3, 1] == without_jumps[3, 1] == pytest.approx(acceleration * exposure_s**2 / 24)
