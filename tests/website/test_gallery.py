@@ -28,7 +28,7 @@ def test_a_sight_names_a_mistake_codes_and_commands_that_exist():
 def mirrored():
     """A short recording of mirrored pictures, which `check` looks at."""
     sight = SIGHTS["mirrored-pictures"]
-    return replace(sight, commands=("check RUN",), recording={**sight.recording, "frames": 6})
+    return replace(sight, commands=("check RUN",), recording={**sight.recording, "frames": 12})
 
 
 def test_a_page_shows_what_the_command_printed_and_the_picture(mirrored, tmp_path):

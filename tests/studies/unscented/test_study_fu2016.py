@@ -10,7 +10,7 @@ from studies.fu2016 import DISTURBANCES, compare_fu2016, estimate, peaks, quiet_
 
 @pytest.fixture(scope="module")
 def study():
-    return compare_fu2016(seed=3, recordings=1, pictures=5)
+    return compare_fu2016(seed=3, recordings=1, pictures=13)
 
 
 @pytest.mark.parametrize("disturbance", DISTURBANCES[1:])
