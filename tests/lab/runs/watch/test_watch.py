@@ -37,6 +37,7 @@ from tracking.detections import Detections
 FRAMES = 24
 FAST = WatchOptions(idle_s=1.0, timeout_s=5.0)  # long enough that no camera times out on a busy machine
 IMPATIENT = WatchOptions(idle_s=1.5, timeout_s=1.0)
+PATIENT = WatchOptions(idle_s=60.0, timeout_s=5.0)  # ends when it is stopped
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +88,16 @@ def feed(recorded: Path, run: Path, given: Callable[[str, int], bool] = lambda c
         time.sleep(0.005)
 
 
+def feed_and_stop(recorded: Path, run: Path, out: Path, stop: threading.Event) -> bool:
+    """Copy the pictures and stop the watch when the live table has all frames. Whether it had them within 20 s."""
+    feed(recorded, run)
+    until = time.monotonic() + 20
+    while time.monotonic() < until and not _has_rows(out / LIVE_TABLE, FRAMES):
+        time.sleep(0.02)
+    stop.set()
+    return _has_rows(out / LIVE_TABLE, FRAMES)
+
+
 def watched(run: Path, out: Path, feeder: Callable[[], None], **options: object) -> Outcome[RunStatistics]:
     """Watch a run while a thread writes its pictures."""
     thread = threading.Thread(target=feeder)
@@ -104,22 +115,26 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 @pytest.fixture(scope="module")
 def followed(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict]]:
-    """The results of a watched run, and the lines received by UDP."""
+    """The results of a watched run that is stopped after its last picture, and the lines received by UDP."""
     run, ready = empty_copy(recorded, tmp_path_factory.mktemp("live") / "run"), threading.Event()
+    stop, all_there = threading.Event(), []
     load_compiled_code = watch._load_compiled_code
 
     def feeder() -> None:
         assert ready.wait(600)  # compiling takes minutes; without pictures the watch waits for ever
-        feed(recorded, run)
+        all_there.append(feed_and_stop(recorded, run, run.parent / "out", stop))
 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener, pytest.MonkeyPatch.context() as patch:
         patch.setattr(watch, "_load_compiled_code", lambda run: (load_compiled_code(run), ready.set()))
         listener.bind(("127.0.0.1", 0))
         listener.settimeout(0.5)
         address = f"127.0.0.1:{listener.getsockname()[1]}"
-        outcome = watched(run, run.parent / "out", feeder, udp=address, provenance={"command": "beampose watch"})
+        more = {"options": PATIENT, "stop": stop, "provenance": {"command": "beampose watch"}}
+        outcome = watched(run, run.parent / "out", feeder, udp=address, **more)
         lines = [json.loads(listener.recv(10_000)) for _ in range(FRAMES)]
     assert outcome.exit_status == 0, outcome.line()
+    assert all_there == [True]  # each frame is in the live table at once, not when a buffer is full
+    assert outcome.result.frames == FRAMES
     return run.parent / "out", lines
 
 
@@ -202,30 +217,17 @@ def test_dropped_and_damaged_pictures_are_treated_as_in_a_run(recorded, tmp_path
 
 def test_reprocessed_results_are_those_of_a_run(recorded, tmp_path):
     run = empty_copy(recorded, tmp_path / "run")
-    watched(run, tmp_path / "out", lambda: feed(recorded, run), reprocess=True)
+    out, stop = tmp_path / "out", threading.Event()
+    more = {"options": PATIENT, "stop": stop, "reprocess": True}
+    watched(run, out, lambda: feed_and_stop(recorded, run, out, stop), **more)
     process_run(recorded, tmp_path / "again")
     for name in ("attitude.csv", "attitude_causal.csv", "detections.csv"):
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
     assert len(rows(tmp_path / "out" / LIVE_TABLE)) == FRAMES
 
 
-def test_stopping_ends_the_recording_and_writes_the_results(recorded, tmp_path):
-    run, stop = empty_copy(recorded, tmp_path / "run"), threading.Event()
-    all_there = []
-
-    def feeder() -> None:
-        feed(recorded, run)
-        until = time.monotonic() + 20
-        while time.monotonic() < until and not _has_rows(tmp_path / "out" / LIVE_TABLE, FRAMES):
-            time.sleep(0.02)
-        all_there.append(_has_rows(tmp_path / "out" / LIVE_TABLE, FRAMES))
-        stop.set()
-
-    patient = WatchOptions(idle_s=60.0)
-    outcome = watched(run, tmp_path / "out", feeder, options=patient, stop=stop)
-    assert all_there == [True]  # each frame is in the live table at once, not when a buffer is full
-    assert outcome.result.frames == FRAMES
-    assert (tmp_path / "out/report.html").is_file()
+def test_stopping_ends_the_recording_and_writes_the_results(followed):
+    assert (followed[0] / "report.html").is_file()
 
 
 def _has_rows(path: Path, count: int) -> bool:
