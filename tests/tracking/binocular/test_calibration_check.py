@@ -79,6 +79,19 @@ def test_an_error_that_the_covariance_states_is_not_suspected():
     assert not check_calibration(StereoPair(wrong.cameras, stated), MODEL, approach()).significant
 
 
+def test_an_error_of_the_markers_places_that_is_stated_is_not_suspected_and_limits_what_is_known_of_the_baseline():
+    off = np.random.default_rng(8).normal(0, 0.002, MODEL.positions.shape)
+    stated = replace(MODEL, positions=MODEL.positions + off, sigma_m=0.002)
+    frames = approach(frames=12)
+    assert check_calibration(PAIR, replace(stated, sigma_m=0.0), frames).significant
+    check = check_calibration(PAIR, stated, frames)
+    assert not check.significant
+    # A larger target is the same as a longer baseline: the sigma of its scale, in per cent.
+    reach_m = np.linalg.norm(MODEL.positions - MODEL.positions.mean(axis=0))
+    (baseline,) = (s for s in check.suspects if s.name == "baseline")
+    assert baseline.sigma == pytest.approx(100 * 0.002 / reach_m, rel=0.15)
+
+
 def test_too_few_frames_are_not_tested():
     assert check_calibration(PAIR, MODEL, approach(frames=4)) is None
 
