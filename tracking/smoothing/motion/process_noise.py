@@ -145,21 +145,31 @@ WEAK_LOG_DET = 2 * 6 * np.log(1.5)
 SPEED_WINDOW_S = 0.5  # s: the size of a jump follows from the fastest motion within this time of it
 
 
-def jump_variances(ref: Reference, weak: Bools, measured: Bools, jumped: Bools, dt: Array) -> Array:
+def unobserved_steps(measured: Bools) -> Bools:
+    """(T,): steps in which a jump would not show. measured (T,): frames whose spots determine the pose.
+
+    The first measured frame after a gap does not show when a jump happened, and the second one does not show whether it
+    happened between the two.
+    """
+    out = ~measured
+    out[1:] |= ~measured[:-1]
+    out[2:] |= ~measured[:-2]
+    return out
+
+
+def jump_variances(
+    ref: Reference, weak: Bools, measured: Bools, jumped: Bools, dt: Array, excluded: Bools | None = None
+) -> Array:
     """Variances (T, 2) of the velocities' jump in each step, (m/s)^2 and (rad/s)^2, weighted with its probability.
 
     measured (T,): frames whose spots determine the pose; weak (T,): those that do so much worse than usual; jumped
-    (T,): steps with a known jump; dt (T,), s.
+    (T,): steps with a known jump; dt (T,), s; excluded (T,): unobserved steps in which there was none.
     """
     usual = float(np.median(dt[dt > 0])) if np.any(dt > 0) else SPEED_WINDOW_S
     window = max(1, min(round(SPEED_WINDOW_S / usual), len(dt)))
     size = jump_variance(largest_near(np.where(measured[:, None], speeds(ref.m), 0.0), window))
-    # The first measured frame after a gap does not show when a jump happened, and the second one does not show whether
-    # it happened between the two.
-    unobserved = ~measured
-    unobserved[1:] |= ~measured[:-1]
-    unobserved[2:] |= ~measured[:-2]
-    probability = np.where(unobserved, P_JUMP_OCCLUDED, 0.0)
+    possible = unobserved_steps(measured) if excluded is None else unobserved_steps(measured) & ~excluded
+    probability = np.where(possible, P_JUMP_OCCLUDED, 0.0)
     jumps = np.flatnonzero(jumped)
     weak = ~measured | weak
     for k in jumps:

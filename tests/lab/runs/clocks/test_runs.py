@@ -93,3 +93,15 @@ def test_four_spots_seen_by_free_running_cameras_are_found(tmp_path):
     write_recording(random_recording(1006, frames=12), tmp_path / "run")
     process_run(tmp_path / "run", tmp_path / "out")
     assert read_poses(tmp_path / "out").has("measured").sum() >= 8
+
+
+def test_a_gap_in_smooth_motion_does_not_make_the_frames_beside_it_vague(recording, tmp_path):
+    """In a gap the velocities may jump unseen; here the frames around it exclude that."""
+    shutil.copytree(recording, tmp_path / "run")
+    path = tmp_path / "run" / "detections.csv"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(line for line in lines if line.split(",")[0] not in ("20", "21")))
+    process_run(tmp_path / "run", tmp_path / "out")
+    poses = read_poses(tmp_path / "out")
+    sigma = np.linalg.norm(poses.sigma_ypr_deg, axis=1)
+    assert np.max(sigma[17:25]) < 4 * np.median(sigma)
