@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -104,6 +105,8 @@ def drawn_rig(rng: np.random.Generator, true: Rig, s: Sigmas, only: tuple[str, s
     for n, screen in true.screens.items():
         shift, turn = off("screens", n, s.screens)
         place = screen.world_from_screen
+        if only is not None:  # a motion in its own plane shows nowhere, and changes no pose
+            shift, turn = place.rotation[:, 2] * (place.rotation[:, 2] @ shift), turn * [1.0, 1.0, 0.0]
         screens[n] = replace(
             screen, world_from_screen=Pose(place.rotation @ rotations.exp(turn), place.translation + shift)
         )
@@ -315,6 +318,16 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
 
 
+NAMINGS = NAMED, AMONG, UNNAMED, WRONG_PART = "named alone", "named among others", "not named", "WRONG PART NAMED"
+
+
+def naming(moved: tuple[str, str], refined: Refinement) -> str:
+    """How the part that has moved is named, and which parts are."""
+    named = {(f"{e.fault.component}s", e.fault.name) for m in refined.moved for e in m.explanations}
+    word = UNNAMED if not named else NAMED if named == {moved} else AMONG if moved in named else WRONG_PART
+    return f"{' '.join(moved)} {word} ({', '.join(' '.join(part) for part in sorted(named))})"
+
+
 def described(refined: Refinement, true: Rig, used: bool) -> str:
     """The rig's figures. used: it did not fail."""
     nees, count = rig_nees(refined, true)
@@ -346,14 +359,7 @@ def one(seed: int, case: str, frames: int, true_labels: bool, clocks_s: float) -
             return f"refused in {time.process_time() - started:.1f} s: {error}"
         findings = refine_findings(result)
         level = verdict(findings)
-        moved = (
-            ""
-            if only is None
-            else f" true {only[0]} {only[1]}, named "
-            + ", ".join(
-                "/".join(f"{e.fault.component}s {e.fault.name}" for e in m.explanations) for m in result.refined.moved
-            )
-        )
+        moved = "" if only is None else f" {naming(only, result.refined)}"
         reported = "; ".join(f"{f.code} {f.what}" for f in findings if f.level > 0)[:160]
         text = f"{level.name} in {time.process_time() - started:.1f} s{moved}"
         return f"{text}{described(result.refined, true, level < Level.FAIL)} {reported}"
@@ -400,9 +406,17 @@ def main() -> None:
     parser.add_argument("--clocks", type=float, default=2e-3, metavar="SECONDS", help="sigma of the clocks' offsets")
     a = parser.parse_args()
     first, _, last = a.seeds.partition(":")
+    count: Counter[str] = Counter()
     for seed in range(int(first), int(last) if last else int(first) + 1):
         clocks_s = 0.0 if a.true_labels or a.case != "all" else a.clocks
-        print(f"{seed} {a.case}: {one(seed, a.case, a.frames, a.true_labels, clocks_s)}", flush=True)
+        text = one(seed, a.case, a.frames, a.true_labels, clocks_s)
+        count.update(
+            f"{kind} {word}" for kind in ("cameras", "screens", "beams") for word in NAMINGS
+            if f" {kind} " in text.split("(")[0] and f" {word} (" in text
+        )  # fmt: skip
+        print(f"{seed} {a.case}: {text}", flush=True)
+    for words, times in sorted(count.items()):
+        print(f"{words}: {times}")
 
 
 if __name__ == "__main__":
