@@ -91,6 +91,12 @@ def is_usable(found: Intrinsics | str) -> bool:
     return not isinstance(found, str) and verdict(findings_of(found)) < Level.FAIL
 
 
+def distinct_subsets(rng: np.random.Generator, views: int, most: int, count: int) -> list[Ints]:
+    """Random subsets of 5 to `most` of the views, at most `count`, none twice: of six views there are only seven."""
+    drawn = [rng.choice(views, rng.integers(5, most + 1), replace=False) for _ in range(count)]
+    return [np.array(rows) for rows in dict.fromkeys(tuple(np.sort(one).tolist()) for one in drawn)]
+
+
 def spread(values: list[float], sigmas: list[float], shares: list[float], whole: float) -> str:
     """RMS and robust spread of subsets about the whole set, in sigmas.
 
@@ -119,9 +125,9 @@ def bench_set(name: str, count: int, seed: int) -> None:
     sigmas: list[float] = []
     shares: list[float] = []
     failed = lost = 0
-    for _ in range(count):
-        size = int(rng.integers(5, min(13, table.views) + 1))
-        part = table.only_views(np.sort(rng.choice(table.views, size, replace=False)))
+    drawn = distinct_subsets(rng, table.views, min(13, table.views), count)
+    for rows in drawn:
+        size, part = len(rows), table.only_views(rows)
         found = calibrated(part)
         if not is_usable(found):
             failed += 1
@@ -136,7 +142,8 @@ def bench_set(name: str, count: int, seed: int) -> None:
     if count and not isinstance(whole, str):
         around = spread(values, sigmas, shares, float(whole.fit.lens[0]))
         print(
-            f"  {count} subsets: FAIL {failed}, of these where 4 or 5 do not {lost}; fx in sigmas {around}", flush=True
+            f"  {len(drawn)} subsets: FAIL {failed}, of these where 4 or 5 do not {lost}; fx in sigmas {around}",
+            flush=True,
         )
 
 
@@ -165,9 +172,9 @@ def bench_pair(name: str, count: int, seed: int) -> None:
     sigmas: list[float] = []
     shares: list[float] = []
     failed = lost = 0
-    for _ in range(count):
-        size = int(rng.integers(5, min(13, views - 1) + 1))
-        rows = np.sort(rng.choice(views, size, replace=False))
+    drawn = distinct_subsets(rng, views, min(13, views - 1), count)
+    for rows in drawn:
+        size = len(rows)
         found = solved(rows)
         if isinstance(found, str) or not found[2]:
             failed += 1
@@ -181,7 +188,9 @@ def bench_pair(name: str, count: int, seed: int) -> None:
         shares.append(size / views)
     if count and not isinstance(whole, str):
         around = spread(values, sigmas, shares, whole[0])
-        print(f"  {count} subsets: FAIL {failed}, of these where 4 or 5 do not {lost}; baseline in sigmas {around}")
+        print(
+            f"  {len(drawn)} subsets: FAIL {failed}, of these where 4 or 5 do not {lost}; baseline in sigmas {around}"
+        )
 
 
 def main(arguments: list[str]) -> None:

@@ -221,9 +221,6 @@ class Commands(click.Group):
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
         search_rarely()
-        # Before numpy is loaded. On matrices as small as those here, the threads of its linear algebra mostly wait for
-        # each other: with two, calibrating a camera takes 1.3 to 2.7 times the processor time.
-        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         _open_standard_streams()
         _show_log_on_a_terminal()
         with _quiet_when_the_reader_has_gone(), _stop_is_a_line(), stopped_by_signals(), _errors_are_lines():
