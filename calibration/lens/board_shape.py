@@ -21,7 +21,7 @@ from scipy.stats import chi2
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import seen_at
-from calibration.lens.fit.lens_adjustment import term_of
+from calibration.lens.fit.lens_adjustment import BRIEF, term_of
 from calibration.lens.fit.lens_fit import LensFit, fit
 from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, Values, board_as_stated
 from calibration.lens.fit.model_selection import EQUAL, difference_px
@@ -111,8 +111,8 @@ def board_test(table: CornerTable, found: LensFit, options: BoardShapeOptions = 
     Raises:
         AdjustmentError: not even the bend can be determined.
     """
-    flat = fit(table, found.used, found.model, {**found.values, **_stated_board(table, found)}, AS_STATED)
-    bent = fit(table, flat.used, flat.model, flat.values, BoardFreedom(warp=True))
+    flat = fit(table, found.used, found.model, {**found.values, **_stated_board(table, found)}, AS_STATED, limits=BRIEF)
+    bent = fit(table, flat.used, flat.model, flat.values, BoardFreedom(warp=True), limits=BRIEF)
     test = _Evidence.of(table, bent)
     warp, why = test.is_bent, test.why_bent
     if options.warp is not None:
@@ -129,7 +129,7 @@ def board_test(table: CornerTable, found: LensFit, options: BoardShapeOptions = 
         if options.stretch is not None:
             stretch, why = options.stretch, "as requested"
         if stretch or test.p_stretch < SIGNIFICANT:
-            freed = fit(table, kept.used, kept.model, kept.values, BoardFreedom(warp, stretch=True))
+            freed = fit(table, kept.used, kept.model, kept.values, BoardFreedom(warp, stretch=True), limits=BRIEF)
             change = _change_px(table, kept, freed)
             kept = freed if stretch else kept
         stretch_test = StretchTest(
@@ -254,7 +254,7 @@ def _points(
         return PointsTest(nothing, p, False, why), found
     board = BoardFreedom(found.board.warp, found.board.stretch, points=True)
     try:
-        freed = fit(table, found.used, found.model, found.values, board)
+        freed = fit(table, found.used, found.model, found.values, board, limits=BRIEF)
         left = ViewEquations.of(table, freed, AS_STATED).scatter()
         worse = _direction_sigma_px(table, freed) > EQUAL * _direction_sigma_px(table, found)
     except AdjustmentError as problem:
