@@ -2,11 +2,12 @@
 
     python -m bench.related_measurements.stereo_checks poses 5 10 20 30 --seed 1 --frames 12
     python -m bench.related_measurements.stereo_checks subsets 5 10 15 20 --seed 1 --markers 4
-    python -m bench.related_measurements.stereo_checks errors --seed 1 --frames 30
+    python -m bench.related_measurements.stereo_checks errors --seed 1 --frames 30 [--covariance]
 
 poses: NEES/6, bias and RMS by distance (m), time per frame, from ray-traced pictures. subsets: each choice of so many
 of the seven markers, alone at the start (three: after one frame with all). errors: one error of the stated calibration
-at a time, from centroids with .04 px noise; what the calibration check names, and the NEES.
+at a time, from centroids with .04 px noise; the verdict, what the calibration check names, and the NEES. covariance:
+pair.yaml states one (.2 px of each lens, .1 mm, .006 deg), which the errors exceed.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ from bench.related_measurements.stereo_generator import (
 from geometry.camera import Camera
 from geometry.pose import Pose
 from lab.files.run.truth import read_true_poses
-from lab.targets.stereo.process import add_truth, measure
+from lab.findings.outcome import Verdict
+from lab.targets.stereo.process import add_truth, findings_of, measure
 from lab.targets.stereo.run import StereoResults, load_stereo_run
 from tracking.binocular.marker_model import MarkerImages, MarkerModel, MatchParameters, StereoPair
 from tracking.binocular.pose_tracker import BinocularTracker
@@ -45,6 +47,8 @@ from tracking.statuses import PoseStatus
 
 CENTROID_NOISE_PX = {5: 0.016, 10: 0.027, 15: 0.045, 20: 0.062}  # of the pictures at these distances (m)
 WRONG_NEES = 40.0
+STATED = {f"cameras.{name}.{p}": 0.2 for name in ("left", "right") for p in ("fx", "fy", "cx", "cy")}
+STATED |= {f"cameras.right.{p}": 1e-4 for p in ("x_m", "y_m", "z_m", "rot_x_rad", "rot_y_rad", "rot_z_rad")}
 ERRORS = {
     "baseline": (-0.003, 0.01, -0.05), "yaw": (0.01, 0.03, -0.3), "pitch": (0.01, -0.05, 0.3),
     "roll": (0.01, -0.05, 0.3), "focal both": (0.002, -0.005, 0.02), "focal left": (0.002, -0.02),
@@ -138,21 +142,24 @@ def _errors() -> Iterator[tuple[str, float]]:
             yield kind, size
 
 
-def errors(frames: int, seed: int, work: Path) -> None:
+def errors(frames: int, seed: int, work: Path, sigmas: dict[str, float] | None) -> None:
     for i, (kind, size) in enumerate(_errors()):
         rng = np.random.default_rng([seed, 7])
         folder = work / str(i)
         write_recording(
-            folder, approach(frames, 20, 5, rng), stated_eyes(kind, size), rng, pictures=False, noise_px=0.04
-        )
+            folder, approach(frames, 20, 5, rng), stated_eyes(kind, size), rng, pictures=False, noise_px=0.04,
+            sigmas=sigmas,
+        )  # fmt: skip
         results, _ = processed(folder)
         check, nees = results.calibration, 0.0 if results.errors is None else results.errors.nees.mean()
+        verdict = Verdict(findings_of(results)).status
         words = "none" if check is None else "; ".join(
             f"{s.name} {s.value:.3f} +- {s.sigma:.3f} {s.unit} ({s.chi2:.0f})" for s in check.suspects
         )  # fmt: skip
         certain = "" if check is None else ", significant" if check.significant else ", not significant"
         print(
-            f"{kind} {size:g}: {len(results.measured)} of {frames} measured, NEES {nees:.0f}{certain}: {words}",
+            f"{kind} {size:g}: {verdict}, {len(results.measured)} of {frames} measured, NEES {nees:.0f}{certain}:"
+            f" {words}",
             flush=True,
         )
 
@@ -164,6 +171,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--frames", type=int, default=12)
     parser.add_argument("--markers", type=int, default=4)
+    parser.add_argument("--covariance", action="store_true")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as work:
         if given.what == "poses":
@@ -171,7 +179,7 @@ def main() -> None:
         elif given.what == "subsets":
             subsets(given.distances, given.markers, given.seed)
         else:
-            errors(given.frames, given.seed, Path(work))
+            errors(given.frames, given.seed, Path(work), STATED if given.covariance else None)
 
 
 if __name__ == "__main__":

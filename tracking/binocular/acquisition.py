@@ -232,7 +232,7 @@ def acquire(pair: StereoPair, model: MarkerModel, images: Images, p: MatchParame
     triples = marker_triples(model)
     # The first triples in both pictures, then the others: any four markers of eight contain four triples.
     for c, some in [(c, part) for part in (triples[:_FIRST_TRIPLES], triples[_FIRST_TRIPLES:]) for c in (0, 1)]:
-        if c == 0 and any(_explains_a_picture(f, model, images) for f in found):
+        if c == 0 and any(explains_a_picture(f, model, images) for f in found):
             break  # a camera that contradicts is not reconciled by other triples
         poses = _hypotheses(pair, model, images[c], ranked[c], c, some)
         tried += len(poses.translation)
@@ -247,7 +247,7 @@ def acquire(pair: StereoPair, model: MarkerModel, images: Images, p: MatchParame
     return [replace(f, evidence=f.evidence - np.log(max(tried, 1))) for f in found]
 
 
-def _explains_a_picture(found: LabelledPose, model: MarkerModel, images: Images) -> bool:
+def explains_a_picture(found: LabelledPose, model: MarkerModel, images: Images) -> bool:
     """Whether a pose explains nearly all candidates of one picture, or all its markers, and that not by chance.
 
     Three candidates give a pose, and among hundreds of hypotheses one explains a fourth one by chance.

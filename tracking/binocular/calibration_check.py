@@ -71,9 +71,14 @@ class CalibrationCheck:
     frames: int
 
     @property
+    def certain(self) -> bool:
+        """Whether the recording shows an error, be it small or not."""
+        return bool(self.suspects) and self.suspects[0].chi2 > _CERTAIN_CHI2
+
+    @property
     def significant(self) -> bool:
         """Whether an error is certain, and changes the poses by more than their sigmas."""
-        return bool(self.suspects) and self.suspects[0].chi2 > _CERTAIN_CHI2 and self.change_sigmas > 1
+        return self.certain and self.change_sigmas > 1
 
 
 def labelled_by_each(

@@ -16,6 +16,7 @@ from tracking.binocular.acquisition import (
     LabelledPose,
     acquire,
     distinct,
+    explains_a_picture,
     labelled_pose,
     mirrored,
     observations,
@@ -155,7 +156,7 @@ class BinocularTracker:
             return MISFIT
         if best.evidence < self._p.lead_nats:
             return NO_POSE
-        if self._contradicted(best):
+        if self._contradicted(best) or self._shows_another(best):
             return CONTRADICTED
         worst = np.sqrt([np.linalg.eigvalsh(best.fit.covariance[s, s])[-1] for s in (slice(0, 3), slice(3, 6))])
         if worst[0] > LOST_SIGMA_M or worst[1] > LOST_SIGMA_RAD:
@@ -170,6 +171,21 @@ class BinocularTracker:
             confirmed = int((best.index[c] >= 0).sum())
             if len(found) >= _ENOUGH_CANDIDATES and confirmed < min(_LEAST_CONFIRMED * expected, expected - 1):
                 return True
+        return False
+
+    def _shows_another(self, best: LabelledPose) -> bool:
+        """Whether a picture by itself shows nearly all its candidates as one target, and the best pose explains fewer.
+
+        Where the calibration is wrong the right pose misfits, and some triple of the markers fits another one.
+        """
+        if self._convincing(best, self._images):
+            return False
+        for c in (0, 1):
+            own = (self._images[0], MarkerImages.none()) if c == 0 else (MarkerImages.none(), self._images[1])
+            for found in acquire(self._pair, self._model, own, self._p)[:1]:
+                more = (found.index[c] >= 0).sum() > (best.index[c] >= 0).sum()
+                if more and explains_a_picture(found, self._model, own):
+                    return True
         return False
 
     def _both(

@@ -180,7 +180,7 @@ def _is_clock(results: StereoResults) -> bool:
     clock, check = results.clock, results.calibration
     if clock is None or not clock.significant:
         return False
-    return check is None or not check.significant or check.left > GOOD_NOISE_SCALE**2
+    return check is None or not check.certain or check.left > GOOD_NOISE_SCALE**2
 
 
 def _decimals(sigma: float) -> int:

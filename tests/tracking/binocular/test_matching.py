@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from geometry.pose import Pose
+from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed_camera
 from studies.zhou2020 import random_pose
 from tests.tracking.binocular.scenes import MODEL, PAIR, images, pose_at
 from tracking.binocular.acquisition import matching_pairs, mirrored
@@ -15,6 +16,7 @@ from tracking.binocular.marker_model import (
     MarkerModel,
     MatchParameters,
     SegmentationParameters,
+    StereoPair,
     project_markers,
 )
 from tracking.binocular.pose_tracker import AMBIGUOUS, NO_PICTURES, TOO_FEW, BinocularTracker
@@ -213,3 +215,17 @@ def test_two_equal_targets_are_ambiguous_until_one_is_followed():
     followed = tracker.step(0.04, both())
     assert followed.status is PoseStatus.MEASURED, followed.reason
     assert consistent(one, followed)
+
+
+@pytest.mark.parametrize("seed", [30, 45])
+def test_a_wrong_calibration_gives_no_turned_pose_of_half_of_the_markers(seed):
+    """Each picture alone shows the whole target; a pose of some markers that agrees in both is another one."""
+    names = [f"cameras.{c.name}.{p}" for c in PAIR.cameras for p in ("fx", "fy", "cx", "cy")]
+    names += [f"cameras.{PAIR.cameras[1].name}.rot_{a}_rad" for a in "xyz"]
+    covariance = RigCovariance(tuple(names), np.diag([0.2**2] * 8 + [1e-8] * 3))
+    pair = StereoPair((perturbed_camera(PAIR.cameras[0], {"cx": -2.0}), PAIR.cameras[1]), covariance)
+    rng = np.random.default_rng(seed)
+    angles, place = rng.uniform(-0.3, 0.3, 3), [rng.uniform(-1, 1), rng.uniform(-0.7, 0.7), rng.uniform(12, 20)]
+    pose = Pose.from_ypr(angles, np.array(place))
+    frame = BinocularTracker(pair, MODEL, P).step(0.0, images(pose, rng))
+    assert frame.status is not PoseStatus.MEASURED or np.abs(pose.minus(frame.pose)[3:]).max() < 0.3
