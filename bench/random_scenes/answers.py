@@ -88,6 +88,7 @@ class PointReader:
         self._scene = scene
         self.cameras = tuple(scene.rig.cameras)
         self.expected_frames = len(scene)
+        self.moments = None  # no camera has a clock of its own
         self.sources: dict[str, object] = {}
         self.notes: list[str] = []
 
