@@ -7,6 +7,7 @@ import dataclasses
 import datetime
 import re
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -325,6 +326,20 @@ def test_the_expected_accuracy_is_judged_by_the_worse_of_attitude_and_position(t
     assert [f.level for f in found] == [level, level]
     if level > Level.PASS:
         assert [f.why.rsplit("from ", 1)[1] for f in found] == ["beams", "the spots' noise"]
+
+
+@pytest.mark.parametrize(
+    ("screens", "beams", "together", "codes"),
+    [(1.0, 1.0, 1.5, ["BP-R03"]), (1.0, 1.0, 1.2, []), (1.4, 1.0, 1.5, []), (1.0, 1.4, 1.5, [])],
+)
+def test_steps_that_are_consistent_alone_and_not_together_contradict_each_other(screens, beams, together, codes):
+    """Factors of the residuals over their sigmas; a step that is inconsistent by itself has findings of its own."""
+    steps = SimpleNamespace(
+        screens=SimpleNamespace(fit=SimpleNamespace(variance_factor=screens)),
+        beams=SimpleNamespace(fit=SimpleNamespace(scale=beams)),
+        joint=SimpleNamespace(scales={"dots": 1.0, "spots": together}),
+    )
+    assert [f.code for f in rig_findings._contradiction(steps)] == codes
 
 
 def test_a_centre_without_a_pose_fails():

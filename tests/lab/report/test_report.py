@@ -509,6 +509,14 @@ class TestIndex:
         html = write_index(rows, tmp_path).read_text(encoding="utf-8")
         assert all(f'<span class="path">{place}/x</span>' in html for place in ("/a", "/b", "", "c"))
 
+    def test_a_further_column_shows_yes_or_no_words_and_numbers(self, tmp_path):
+        values = (True, "late", 12.0, 0.123456)
+        rows = [{**row, "lamp_on": value} for row, value in zip(self.ROWS, values, strict=True)]
+        html = write_index(rows, tmp_path).read_text(encoding="utf-8")
+        assert ">lamp on<" in html
+        cells = re.findall(r"<td[^>]*>([^<]*)</td>", html)
+        assert [cells.count(shown) for shown in ("yes", "late", "12", "0.1235")] == [1, 1, 1, 1]
+
     def test_the_index_of_an_empty_batch_says_so(self, tmp_path):
         assert "The batch has no runs." in write_index([], tmp_path).read_text(encoding="utf-8")
 
