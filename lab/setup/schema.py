@@ -88,7 +88,7 @@ def schema_of_block(block: type[Block], commented: type | None = None) -> Schema
     return {**out, "required": required} if required else out
 
 
-@functools.cache  # a schema asks for those of one block up to ten times, and its source is searched anew each time
+@functools.cache  # a schema asks for those of one block up to ten times, and its source is searched each time
 def comments_of(cls: type) -> Mapping[str, str]:
     """The comments behind the fields of a class and of those that it extends, by field; empty without their source."""
     found = {} if cls is object else {k: v for base in reversed(cls.__bases__) for k, v in comments_of(base).items()}
