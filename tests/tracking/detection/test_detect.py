@@ -2,13 +2,14 @@
 
 import time
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geometry.camera import SensorNoise
-from tests.tracking.rendering import Scene, Spot, expected, expose, photograph
+from tests.tracking.rendering import Scene, Spot, expected, expose, photograph, round_lights
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import NoiseModel
@@ -286,3 +287,19 @@ def test_noise_alone_gives_no_spots_in_megapixels(bits):
     for _ in range(3):
         image = np.rint(rng.normal(30 * scale, 2 * scale, (1024, 1280))).astype(np.uint8 if bits == 8 else np.uint16)
         assert len(find_spots(image, noise=NoiseModel((2.0 * scale) ** 2 + 1 / 12, 1e-9))) == 0
+
+
+def test_with_rows_and_columns_exchanged_the_spots_and_their_covariances_are_exchanged():
+    """Wide spots with grain, whose misfit depends on the place in the spot."""
+    rng = np.random.default_rng(1)
+    at = np.array([[50.3, 52.1], [148.2, 60.7], [60.4, 150.9], [140.6, 145.2]])
+    grain = cv2.GaussianBlur(rng.standard_normal((200, 200)), (0, 0), 1.5)
+    light = 10 + round_lights((200, 200), at, 150.0, 6.0) * (1 + 0.15 * grain / grain.std())
+    picture = np.clip(np.rint(light + rng.normal(0, 1.2, light.shape)), 0, 255).astype(np.uint8)
+    noise = NoiseModel.of(SensorNoise(gain_e_per_dn=100.0, read_noise_e=100.0, black_dn=0.0))
+    found, other = find_spots(picture, noise=noise), find_spots(np.ascontiguousarray(picture.T), noise=noise)
+    rows = [int(np.argmin(np.hypot(*(other.uv_px[:, ::-1] - place).T))) for place in found.uv_px]
+    assert sorted(rows) == [0, 1, 2, 3]
+    assert np.all(found.misfit > 0.9)
+    np.testing.assert_allclose(other.uv_px[rows][:, ::-1], found.uv_px, atol=1e-4)
+    np.testing.assert_allclose(other.cov_px2[rows][:, ::-1, ::-1], found.cov_px2, rtol=1e-3, atol=1e-6)
