@@ -193,10 +193,13 @@ def _lens_of_other(f: Files) -> None:
     a["camera_matrix"], a["distortion"] = dict(b["camera_matrix"]), list(b.get("distortion", []))
 
 
-def _lenses_exchanged(f: Files) -> None:
-    a, b = (f.rig["cameras"][n] for n in f.pair)
-    for key in ("camera_matrix", "distortion"):
-        a[key], b[key] = b[key], a[key]
+def _exchanged(*keys: str) -> Callable[[Files], None]:
+    def make(f: Files) -> None:
+        a, b = (f.rig["cameras"][n] for n in f.pair)
+        for key in keys:
+            a[key], b[key] = b[key], a[key]
+
+    return make
 
 
 def _focal_in_millimetres(f: Files) -> None:
@@ -240,7 +243,8 @@ CASES = (
     Case("two spots exchanged", "two spots of a screen", _spots_exchanged),
     Case("the ends of a beam exchanged", "ends? .*(exchanged|right)", _ends_exchanged),
     Case("lens of another camera", "same lens|has a wrong lens", _lens_of_other),
-    Case("two lenses exchanged", "each other's lens|wrong lens", _lenses_exchanged),
+    Case("two lenses exchanged", "each other's lens|wrong lens", _exchanged("camera_matrix", "distortion")),
+    Case("two cameras' places exchanged", "each other's (place|lens)", _exchanged("camera_from_world", "screen")),
     Case("millimetres, one camera", "millimetres", _poses(_millimetres, True, False, False)),
     Case("millimetres, all lengths", "millimetres", _rig_in_millimetres),
     Case("fx in millimetres", "millimetres", _focal_in_millimetres),

@@ -245,7 +245,7 @@ def _far(rig: Rig) -> tuple[list[str], list[str]]:
 
 
 def _lenses(rig: Rig) -> Iterator[Mistake]:
-    """Focal lengths in millimetres, and lenses of another camera."""
+    """Focal lengths in millimetres, and lenses or places of another camera."""
     short = [
         n for n, c in rig.cameras.items() if c.lens != FISHEYE and c.matrix[0, 0] < SHORT_FOCAL * c.image_size_px[0]
     ]
@@ -260,6 +260,17 @@ def _lenses(rig: Rig) -> Iterator[Mistake]:
         )
     for a, b in combinations(rig.cameras, 2):
         one, other = rig.cameras[a], rig.cameras[b]
+        if not (np.array_equal(one.matrix, other.matrix) and one.distortion == other.distortion):
+            pairs = ((a, one, other), (b, other, one))  # of equal cameras it would be that of exchanged pictures
+            yield Mistake(
+                "pose",
+                f"cameras `{a}` and `{b}` have each other's place",
+                f"exchange camera_from_world and screen of `{a}` and `{b}` in rig.yaml",
+                _with_cameras(
+                    rig,
+                    {n: replace(c, camera_from_world=d.camera_from_world, screen=d.screen) for n, c, d in pairs},
+                ),
+            )
         yield Mistake(
             "lens",
             f"cameras `{a}` and `{b}` have each other's lens (camera.yaml exchanged)",

@@ -120,6 +120,7 @@ def test_a_correct_set_up_is_fine(recording):
         ("camera_from_world inverted, one", "camera_from_world of camera `left` is world_from_camera: the inverse"),
         ("xyzw quaternions, all", "in the order x, y, z, w"),
         ("two lenses exchanged", "cameras `left` and `right` have each other's lens"),
+        ("two cameras' places exchanged", "cameras `left` and `right` have each other's place"),
         ("numbered from 1, another camera", "numbers one too"),
         ("fx in millimetres", "fx, fy of `left` (5.677) are in millimetres"),
         ("millimetres, one camera", "the lengths of camera_from_world of `left` are in millimetres"),
