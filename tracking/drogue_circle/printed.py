@@ -22,7 +22,7 @@ from tracking.drogue_circle.detectors import (
     edge_pixels,
 )
 from tracking.drogue_circle.kalman import PRINTED_P0, printed_coefficient, printed_step
-from tracking.drogue_circle.rim_fit import Appearance, disc_cells, first_appearance
+from tracking.drogue_circle.occlusion import Appearance, disc_cells, first_appearance
 from tracking.drogue_circle.tracker import CircleFrame, Wanted, acquire, nothing_known
 from tracking.kalman import transition
 from tracking.statuses import Cause, PoseStatus

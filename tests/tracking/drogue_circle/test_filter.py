@@ -14,7 +14,7 @@ from tracking.drogue_circle.kalman import (
     printed_coefficient,
     printed_step,
 )
-from tracking.drogue_circle.rim_fit import disc_cells, first_appearance
+from tracking.drogue_circle.occlusion import disc_cells, first_appearance
 from tracking.kalman import process_noise, propagate, transition, update
 
 SIGMA = np.array([0.3, 0.3, 0.05])
