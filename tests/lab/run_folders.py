@@ -7,7 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-# The cameras stand at (0, 0, -0.4) m, upside down, looking along -x, and at (0, 0, 0.4) m, looking along +x.
+# The cameras stand at (0, 0, -0.4) m, upside down, looking along -x, and near (0, 0, 0.4) m, looking along +x: places
+# that are the same after half a turn of the world would let cameras have each other's place without a sign.
 RIG = """\
 schema: beampose/rig/1
 screens:
@@ -30,7 +31,7 @@ cameras:
     image_size_px: [64, 48]
     camera_matrix: {fx: 40.0, fy: 40.0, cx: 31.5, cy: 23.5}
     distortion: [-0.05, 0.01, 1e-3, 0, 0]
-    camera_from_world: {quaternion_wxyz: [0.5, 0.5, -0.5, 0.5], translation_m: [0, 0.4, 0]}
+    camera_from_world: {quaternion_wxyz: [0.5, 0.5, -0.5, 0.5], translation_m: [0.03, 0.4, 0.05]}
 target:
   beams:
     A: {direction: [1.0, 0.0, 0.0], point_m: [0, 0, 0]}

@@ -16,7 +16,7 @@ from lab.files.text import columns
 from lab.targets.stereo.process import process_stereo_run
 from lab.targets.stereo.simulated_recording import write_stereo_recording
 
-FRAMES = 9  # of the recording of points
+FRAMES = 12  # of the recording of points
 
 
 def typed(*arguments):
