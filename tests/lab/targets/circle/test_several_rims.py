@@ -8,7 +8,6 @@ from studies.zhou2014 import approach
 from tracking.drogue_circle.detectors import CircleParameters, classical_detector
 from tracking.drogue_circle.tracker import Wanted, acquire
 
-
 DRAWN = [("side", 601), ("side", 610), ("side", 631), ("side", 632), ("front", 624), ("overcast", 607)]
 
 
