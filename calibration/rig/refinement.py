@@ -104,11 +104,6 @@ class HeldOut:
     p: float  # p-value of the data with the refined rig and its covariance
     log_density: tuple[float, float]  # of the data, with both rigs and their covariances
 
-    @property
-    def better(self) -> bool:
-        """Whether the refined rig predicts these data better."""
-        return self.log_density[1] > self.log_density[0] and self.chi2[1] <= self.chi2[0]
-
 
 @dataclass(frozen=True, slots=True)
 class Refinement:
