@@ -106,11 +106,11 @@ def _peaks_of_block(search: PeakSearch, row: int, column: int, min_sigmas: float
             if marks[k] == 0.0 or sum3[k] < max(sum3[k - 1], sum3[k + 1], sum3[k - _SIDE], sum3[k + _SIDE]):
                 continue
             height3 = sum3[k] - 9 * level
-            if height3 <= 0 or not _is_maximum(sum3, k):
+            u, v = left + j - _REACH, top + i - _REACH
+            if height3 <= 0 or not _is_maximum(sum3, k, u, v):
                 continue
             height2 = flat[_PAIRS + 1, k] - 4 * level
             height5, height7 = flat[_SUMS + 1, k] - 25 * level, flat[_SUMS + 2, k] - 49 * level
-            u, v = left + j - _REACH, top + i - _REACH
             limit = _hot_pixel_limit(image, u, v, noise, level + height3 / 9, scratch)
             if limit < np.inf:
                 height2 = _clipped_pairs(values, k, limit) - 4 * level
@@ -209,13 +209,16 @@ def _mark_significant(flat: Sums, least2: float, least3: float, least5: float, l
 
 
 @compiled
-def _is_maximum(values: Sums, k: int) -> bool:
-    """Whether no value among the 5x5 neighbours is larger, and no earlier one is equal."""
+def _is_maximum(values: Sums, k: int, u: int, v: int) -> bool:
+    """Whether no value among the 5x5 neighbours is larger, and no earlier one in the picture is equal.
+
+    u, v: the pixel of k. Outside the picture lies its mirror image, which is equal.
+    """
     here, higher = values[k], 0
     for a in range(-2, 3):
         for b in range(-2, 3):
-            other = values[k + a * _SIDE + b]
-            higher += 1 if other > here or (other == here and (a < 0 or (a == 0 and b < 0))) else 0
+            other, earlier = values[k + a * _SIDE + b], a < 0 or (a == 0 and b < 0)
+            higher += 1 if other > here or (other == here and earlier and v + a >= 0 and u + b >= 0) else 0
     return higher == 0
 
 

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import lab
 from geometry.camera import SensorNoise
 from tests.tracking.rendering import Scene, Spot, expected, expose, photograph, round_lights
 from tracking.detection.detect import find_spots
@@ -303,3 +304,20 @@ def test_with_rows_and_columns_exchanged_the_spots_and_their_covariances_are_exc
     assert np.all(found.misfit > 0.9)
     np.testing.assert_allclose(other.uv_px[rows][:, ::-1], found.uv_px, atol=1e-4)
     np.testing.assert_allclose(other.cov_px2[rows][:, ::-1, ::-1], found.cov_px2, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("width_px", [0.8, 1.5, 2.75])
+def test_a_spot_is_found_at_every_distance_from_every_edge_of_the_picture(width_px: float):
+    """Outside lies the mirror image of the picture, whose maxima are as high as those inside."""
+    size, away = 880, np.array([0, 0.25, 0.5, 0.75, 1, 1.25, *[1.5] * 6, 1.75, 2, 2.5, 3, 4])
+    along = 45.0 + 50 * np.arange(len(away))
+    sides = [(along, away), (away, along), (along, size - 1 - away), (size - 1 - away, along)]
+    true = np.concatenate([np.stack(side, axis=1) for side in sides])
+    v, u = np.mgrid[:size, :size]
+    picture = 20 + np.random.default_rng(1).normal(0, 1, (size, size))
+    for x, y in true:
+        near = (slice(max(int(y) - 20, 0), int(y) + 21), slice(max(int(x) - 20, 0), int(x) + 21))
+        picture[near] += 90 * np.exp(-((u[near] - x) ** 2 + (v[near] - y) ** 2) / (2 * width_px**2))
+    found = lab.find_spots(np.clip(np.round(picture), 0, 255).astype(np.uint8))[["u_px", "v_px"]].to_numpy()
+    off = np.linalg.norm(true[:, None] - found, axis=-1).min(axis=1)
+    assert true[off > 0.2].tolist() == []
