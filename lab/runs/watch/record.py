@@ -205,17 +205,23 @@ class CameraRecorder:
                 self.unwritten += 1
 
     def _write_one(self, folder: Path, number: int, t_s: float, picture: GreyPicture) -> None:
-        """Write a picture and its time: both or none. Raises OSError."""
-        path, part = folder / f"{number:06d}.png", folder / f".{number:06d}.part"
+        """Write a picture and its time: both or none. Raises OSError.
+
+        The time is first: a recording that is killed in between has a time without its picture, which counts as
+        dropped. A picture without its time would be an error of the run.
+        """
+        assert self._times is not None
+        part, end = folder / f".{number:06d}.part", os.fstat(self._times.fileno()).st_size
         try:
             part.write_bytes(encoded(picture))
-            os.replace(part, path)
             self._append(f"{number},{t_s:.6f}")
+            os.replace(part, folder / f"{number:06d}.png")
         except OSError:
             self.unwritten += 1
-            for left in (part, path):
-                with suppress(OSError):
-                    left.unlink(missing_ok=True)
+            with suppress(OSError):
+                os.truncate(self._times.fileno(), end)
+            with suppress(OSError):
+                part.unlink(missing_ok=True)
             raise
         self.written += 1
         if self.written == 1:
