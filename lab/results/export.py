@@ -50,17 +50,23 @@ class Exported:
     causal: bool
     poses: PoseTrack
     columns: Mapping[str, Array]  # attitude.csv by column, as in the file; statuses as words
+    measured_only: bool  # the format cannot mark a pose as predicted
     notes: list[str]  # what the format cannot carry, for the user
 
-    def kept(self, with_predicted: bool) -> Bools:
-        """(n,): the frames whose pose is written; notes the others."""
-        shown = self.poses.known if with_predicted else self.poses.has(PoseStatus.MEASURED)
+    @property
+    def shown(self) -> Bools:
+        """(n,): the frames whose pose is written."""
+        return self.poses.has(PoseStatus.MEASURED) if self.measured_only else self.poses.known
+
+    def kept(self) -> Bools:
+        """`shown`, of a format without frames that have no such pose; notes these."""
+        shown = self.shown
         missing = int(np.sum(~shown))
         if missing:
-            why = "no pose" if with_predicted else "no measured pose, and the format marks none"
+            why = "no measured pose, and the format marks none" if self.measured_only else "no pose"
             self.notes.append(f"{missing} of {len(shown)} frames not in the file: {why}")
         if not shown.any():
-            kind = "pose" if with_predicted else "measured pose"
+            kind = "measured pose" if self.measured_only else "pose"
             raise InputError(f"{self.name}: expected a frame with a {kind} to write, found none")
         return shown
 
@@ -90,13 +96,12 @@ def export(results: Path | str, to: str, out: Path | str | None = None, *, causa
     folder = ResultFolder.of_run(results)
     wanted = FORMATS[to]
     path = Path(out) if out is not None else Path(f"{results.resolve().name}{wanted.suffix}")
-    motion = _read(folder, causal, wanted.covariance)
+    motion = _read(folder, causal, wanted)
     wanted.write(motion, path)
-    written = motion.poses.has(PoseStatus.MEASURED) if wanted.measured_only else motion.poses.known
-    return Done(path, (f"{to}: {path} ({int(written.sum())} poses)",), tuple(motion.notes))
+    return Done(path, (f"{to}: {path} ({int(motion.shown.sum())} poses)",), tuple(motion.notes))
 
 
-def _read(results: ResultFolder, causal: bool, covariance: str) -> Exported:
+def _read(results: ResultFolder, causal: bool, wanted: Format) -> Exported:
     which = columns.CAUSAL if causal else ""
     path = results.folder / f"attitude{which}.csv"
     poses = results.causal if causal else results.poses
@@ -113,16 +118,16 @@ def _read(results: ResultFolder, causal: bool, covariance: str) -> Exported:
         "source": f"beampose {versions()['beampose']}, {path.name} of {summary.get('name', '')}",
         "verdict": str(summary.get("verdict", {}).get("status", "")),
         "rig": next((f"sha256 {i['sha256']}" for i in inputs if Path(str(i.get("path"))).name == rig), ""),
-        "conventions": " ".join([*CONVENTIONS, *([covariance] if covariance else [])]),
+        "conventions": " ".join([*CONVENTIONS, *([wanted.covariance] if wanted.covariance else [])]),
     }
-    return Exported(results.folder.resolve().name, about, causal, poses, values, [])
+    return Exported(results.folder.resolve().name, about, causal, poses, values, wanted.measured_only, [])
 
 
 # TUM: a line of t x y z qx qy qz qw for each pose.
 
 
 def _write_tum(motion: Exported, path: Path) -> None:
-    shown = motion.kept(with_predicted=False)
+    shown = motion.kept()
     lines = [f"# {name}: {text}" for name, text in motion.about.items()]
     lines += ["# t_s x_m y_m z_m qx qy qz qw"]
     rows = np.column_stack([motion.poses.t_s, _xyz_and_quaternion(motion.poses)])[shown]
@@ -208,7 +213,7 @@ def _write_rosbag2(motion: Exported, path: Path) -> None:
     bags = needed("rosbag2", "--to rosbag2", "rosbag2")
     types = needed("rosbag2", "--to rosbag2", "typesys")
     store = types.get_typestore(types.Stores.ROS2_HUMBLE)
-    motion.kept(with_predicted=True)
+    motion.kept()
     motion.notes.append("velocities and rates are not in the file")
     with atomic_folder(path, _is_ours) as work:
         inner = work / path.name  # the writer makes it, and names its database after it
@@ -267,7 +272,7 @@ def _ros_messages(motion: Exported, types: Mapping[str, Any]) -> Iterator[tuple[
 def _write_c3d(motion: Exported, path: Path) -> None:
     ezc3d = needed("c3d", "--to c3d")
     poses = motion.poses
-    motion.kept(with_predicted=True)
+    motion.kept()
     place = poses.frames - poses.frames[0]
     count = int(place[-1]) + 1
     if count > _MOST_C3D_FRAMES:

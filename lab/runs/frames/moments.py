@@ -88,10 +88,10 @@ def plan_moments(rows: Ints, rows_s: Array, cameras: Mapping[str, tuple[Ints, Ar
     steps = np.diff(rows_s)
     first, last = (0.5 * steps[0], 0.5 * steps[-1]) if len(steps) else (np.inf, np.inf)
     limits = [rows_s[:1] - first * (1 - _TIE), rows_s[:-1] + (0.5 + _TIE) * steps, rows_s[-1:] + last * (1 + _TIE)]
+    at = np.concatenate(limits)
     timed, ends = {}, {}
     for name, (numbers, instants) in cameras.items():
         timed[name] = [TimedPicture(n, t_s) for n, t_s in zip(numbers.tolist(), instants.tolist(), strict=True)]
-        at = np.concatenate(limits)
         ends[name] = [np.searchsorted(instants, at[0]), *np.searchsorted(instants, at[1:], side="right"), len(instants)]
     usual = (float(np.median(np.diff(t))) for _, t in cameras.values() if len(t) > 1)
     planner = MomentPlanner(min(usual, default=0.0))

@@ -218,7 +218,7 @@ class CameraRecorder:
             os.replace(part, folder / f"{number:06d}.png")
         except OSError:
             self.unwritten += 1
-            with suppress(OSError):
+            with suppress(OSError, ValueError):
                 os.truncate(self._times.fileno(), end)
             with suppress(OSError):
                 part.unlink(missing_ok=True)
@@ -228,16 +228,10 @@ class CameraRecorder:
             self.begun()
 
     def _append(self, line: str) -> None:
-        """Append a line to the table of times, whole or not at all. Raises OSError."""
+        """Append a line to the table of times. Raises OSError."""
         assert self._times is not None
-        end = os.fstat(self._times.fileno()).st_size
-        try:
-            self._times.write(f"{line}\n")
-            self._times.flush()
-        except OSError:
-            with suppress(OSError, ValueError):
-                os.truncate(self._times.fileno(), end)
-            raise
+        self._times.write(f"{line}\n")
+        self._times.flush()
 
 
 def record(
