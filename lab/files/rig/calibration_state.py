@@ -10,8 +10,9 @@ import pydantic
 
 from lab.errors import CalibrationError
 from lab.files.text.fields import Block, Integer, Lines, NonNegative, Number, Positive, Text, one_of, unexpected_value
+from lab.findings.finding import Level
 
-VERDICTS = ("PASS", "WARN", "FAIL")
+VERDICTS = tuple(level.name for level in Level)
 
 
 def iso_date(value: Any) -> datetime.date:
@@ -56,7 +57,7 @@ class CalibrationState(Block):
     @property
     def failed(self) -> bool:
         """Whether the verdict is FAIL: it must not be used."""
-        return self.verdict == "FAIL"
+        return self.verdict == Level.FAIL.name
 
     @property
     def reason(self) -> str:
