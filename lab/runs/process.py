@@ -20,6 +20,7 @@ from lab.files.text.dataclass_fields import with_overrides
 from lab.findings.finding import Level, worst_first
 from lab.findings.finding import verdict as verdict_of
 from lab.findings.outcome import Outcome, Verdict
+from lab.packages import versions
 from lab.progress import Progress
 from lab.runs.clock_estimate import clock_findings
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
@@ -33,7 +34,6 @@ from lab.runs.tables import TableWriter
 from lab.runs.verdict import quality
 from lab.runs.verdict.frame_checks import FrameChecks, Pair
 from lab.runs.verdict.run_statistics import CameraStatistics, RunStatistics
-from lab.versions import versions
 
 if TYPE_CHECKING:
     from lab.runs.model_check.check import ModelCheck

@@ -1,4 +1,4 @@
-"""Samples frames of a run of unknown length in bounded memory, while it is processed: for the model check, and others."""
+"""Samples frames of a run of unknown length in bounded memory while it is processed."""
 
 from __future__ import annotations
 
