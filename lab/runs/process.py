@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import datetime
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -23,7 +22,7 @@ from lab.findings.outcome import Outcome, Verdict
 from lab.packages import versions
 from lab.progress import Progress
 from lab.runs.clock_estimate import clock_findings
-from lab.runs.frames.pipeline import FrameRecord, Pipeline
+from lab.runs.frames.pipeline import FrameRecord, Pair, Pipeline
 from lab.runs.frames.row_records import row_records
 from lab.runs.model_check.frame_sampler import FrameSampler
 from lab.runs.run_log import RunLog, listening
@@ -32,7 +31,7 @@ from lab.runs.smoothing_pass import TrackingAndSmoothing
 from lab.runs.summary import processed_run
 from lab.runs.tables import TableWriter
 from lab.runs.verdict import quality
-from lab.runs.verdict.frame_checks import FrameChecks, Pair
+from lab.runs.verdict.frame_checks import FrameChecks
 from lab.runs.verdict.run_statistics import CameraStatistics, RunStatistics
 
 if TYPE_CHECKING:
@@ -84,10 +83,7 @@ def ready_run(
     run = load_run(run_folder, rig_path, recording)
     if overrides:
         run = dataclasses.replace(run, tracker=with_overrides(run.tracker, overrides))
-    recorded = datetime.date.today() if run.recorded is None else run.recorded
-    require_valid_calibration(
-        run.calibration, run.rig_path, recorded, "today" if run.recorded is None else "the recording's day"
-    )
+    require_valid_calibration(run.calibration, run.rig_path, run.recorded)
     load_run_truth(run)  # a mistake in it stops the run before the processing, not after it
     return run
 

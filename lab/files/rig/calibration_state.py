@@ -81,11 +81,9 @@ class CameraCalibration(CalibrationState):
 
 
 def require_valid_calibration(
-    state: CalibrationState | None, path: Path, on: datetime.date, what: str = "today"
+    state: CalibrationState | None, path: Path, recorded: datetime.date | None = None
 ) -> None:
-    """Checks that a calibration may be used on the day `on`; None (state unknown) may.
-
-    what: the name of that day in the message.
+    """Checks that a calibration may be used for a recording of that day, or of today; None (state unknown) may.
 
     Raises:
         CalibrationError: the verdict is FAIL, or the calibration is out of date (exit status 3).
@@ -97,6 +95,7 @@ def require_valid_calibration(
             f"{path}: calibration.verdict: FAIL{state.reason}: this calibration must not be used; correct the cause and"
             " calibrate again (`beampose calibrate rig`)"
         )
+    on, what = (datetime.date.today(), "today") if recorded is None else (recorded, "the recording's day")
     left = state.days_left(on)
     if left is not None and left < 0:
         raise CalibrationError(

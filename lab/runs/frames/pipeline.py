@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import numpy as np
 
@@ -80,6 +80,9 @@ class FrameRecord:
     tracked: TrackedFrame
     moment: Moment | None = None  # of a run whose cameras have clocks of their own ...
     pictures: tuple[ShownPicture, ...] | None = None  # ... and the pictures since the row before; None: one per camera
+
+
+Pair: TypeAlias = tuple[FrameRecord, FrameRecord | None]  # a frame, and the same in the causal pass
 
 
 def tracker_of(run: Run) -> Tracker:
