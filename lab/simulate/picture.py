@@ -202,4 +202,4 @@ def render(scene: Scene, sensor: Sensor, powers: LaserPowers, k: int, *, noisy: 
     value += np.float32(sensor.noise.black_dn)
     np.rint(value, out=value)
     np.clip(value, 0, sensor.full_dn, out=value)
-    return value.astype(np.uint8 if sensor.full_dn <= 255 else np.uint16)
+    return value.astype(np.uint8) if sensor.full_dn <= 255 else value.astype(np.uint16)

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array
-from tracking.drogue_circle.detectors import CircleCandidate, CircleDetector, Picture, Window, crop_bounds
+from tracking.drogue_circle.detectors import CircleCandidate, CircleDetector, Window, crop_bounds
+from tracking.noise import Picture
 
 Floats: TypeAlias = NDArray[np.float32]
 

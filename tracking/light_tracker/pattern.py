@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array
 from tracking import kalman
-from tracking.drogue_circle.detectors import Picture
 from tracking.light_tracker.frames import LightParameters, fisher
+from tracking.noise import Picture
 
 Floats: TypeAlias = NDArray[np.float32]
 

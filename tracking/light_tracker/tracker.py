@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geometry.arrays import Array
-from tracking.drogue_circle.detectors import CircleCandidate, CircleDetector, Picture, Window
+from tracking.drogue_circle.detectors import CircleCandidate, CircleDetector, Window
 from tracking.light_tracker.frames import (
     ABSENT_LOGIT,
     USUAL,
@@ -23,6 +23,7 @@ from tracking.light_tracker.frames import (
     within,
 )
 from tracking.light_tracker.pattern import WHOLE, Known, Match, Pattern, PatternState, is_clear, is_similar, unexplained
+from tracking.noise import Picture
 from tracking.statuses import Cause, PoseStatus
 
 # What is known of a drogue while it is followed.

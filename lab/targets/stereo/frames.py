@@ -16,8 +16,8 @@ from lab.files.run.detections_file import read_detections
 from lab.files.run.run_file import DetectionsTable, RecordedSource
 from lab.pictures.picture_file import DROPPED, ColourPicture, MissingPicture
 from lab.pictures.source import pictures
-from lab.report.frames.canvas import INK, Box, Canvas, bgr, light
-from lab.report.plot.svg import GREEN, ORANGE, image_uri
+from lab.report.frames.canvas import INK, Canvas, bgr, light
+from lab.report.plot.svg import GREEN, ORANGE, Box, image_uri
 from lab.runs.frames.frames import recorded_pictures
 from lab.targets.stereo.run import StereoRecord, StereoResults, StereoRun
 from tracking.binocular.marker_model import MarkerImages, project_markers

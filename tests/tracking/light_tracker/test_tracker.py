@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from tests.tracking.light_tracker.targets import SIZE, picture
-from tracking.drogue_circle.detectors import CircleCandidate, Picture, Window
+from tracking.drogue_circle.detectors import CircleCandidate, Window
 from tracking.light_tracker.frames import USUAL, DrogueFrame, LightParameters, Source
 from tracking.light_tracker.tracker import DrogueTracker
+from tracking.noise import Picture
 from tracking.statuses import Cause, PoseStatus
 
 Circle = tuple[float, float, float]
