@@ -47,13 +47,14 @@ def process_run(
     progress: Progress | None = None,
     more: Callable[[Run], Mapping[str, Any]] | None = None,
     rig_path: Path | None = None,
+    full_hash: bool = False,
 ) -> Outcome[RunStatistics]:
     """Process one run folder into the folder `out`: the tables, summary.json and report.html.
 
     overrides: tracker parameters that replace those of run.yaml. causal: the tables hold the causal estimates and
     nothing is smoothed; otherwise they hold the smoothed estimates, and attitude_causal.csv the causal ones.
     more: additional content of summary.json; called with the run before its processing. rig_path: a rig.yaml in place
-    of the run's.
+    of the run's. full_hash: the fingerprints of the inputs cover every byte of large files, too.
 
     Raises:
         BeamposeError: the run cannot be processed (CalibrationError: its rig's calibration must not be used); `out` is
@@ -64,8 +65,9 @@ def process_run(
     added = {} if more is None else more(run)
     with atomic_folder(out, may_replace=are_results) as work:
         return write_results(
-            Pipeline.of(run), work, Path(out), started, causal=causal, progress=progress, more=lambda: added
-        )
+            Pipeline.of(run), work, Path(out), started, causal=causal, progress=progress, more=lambda: added,
+            full_hash=full_hash,
+        )  # fmt: skip
 
 
 def ready_run(
@@ -97,13 +99,15 @@ def write_results(
     causal: bool = False,
     progress: Progress | None = None,
     more: Callable[[], Mapping[str, Any]] = dict,
+    full_hash: bool = False,
 ) -> Outcome[RunStatistics]:
     """Process a pipeline's frames into the folder `work`, which will become `out`.
 
     started: time.perf_counter() at the start of the command. more: additional content of summary.json, called last.
+    full_hash: as of `process_run`.
     """
     with listening() as log:
-        return _write_results(pipeline, work, out, started, log, causal, progress, more)
+        return _write_results(pipeline, work, out, started, log, causal, progress, more, full_hash)
 
 
 def _write_results(
@@ -115,6 +119,7 @@ def _write_results(
     causal: bool,
     progress: Progress | None,
     more: Callable[[], Mapping[str, Any]],
+    full_hash: bool,
 ) -> Outcome[RunStatistics]:
     run = pipeline.run
     log.start(run, versions())
@@ -134,7 +139,7 @@ def _write_results(
         log.conclude(verdict, content, time.perf_counter() - started)
         log.write(folder)
 
-    done = processed_run(pipeline, statistics, model_check, verdict, passes.smoothing, tables.errors, page)
+    done = processed_run(pipeline, statistics, model_check, verdict, passes.smoothing, tables.errors, page, full_hash)
     return done.write(work, out, started, added)
 
 
