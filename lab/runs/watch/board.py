@@ -23,12 +23,12 @@ from lab.pictures.picture_file import GreyPicture
 from lab.report.frames.canvas import ground
 from lab.report.html import environment
 from lab.report.plot.svg import grey_limits, stretched
-from lab.runs.frames.pipeline import CLIPPED, FrameRecord
+from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.model_check.check import check_sampled_frames
 from lab.runs.model_check.frame_sampler import FrameSampler
 from lab.runs.tables import pose_numbers
 from lab.runs.watch.background import ENDED
-from tracking.detections import Detections
+from tracking.detections import CLIPPED, Detections
 from tracking.statuses import PoseStatus
 
 if TYPE_CHECKING:
