@@ -14,7 +14,7 @@ from calibration.boards.board_view import QUICK_SEARCH_FAILED
 from geometry.camera import Camera
 from geometry.pose import Pose
 from lab.calibrate.camera import photos as photos_module
-from lab.calibrate.camera.photos import PhotoSet, find_in_photos, load_photos, origins_of
+from lab.calibrate.camera.photos import PhotoSet, as_8_bit, find_in_photos, load_photos, origins_of
 from lab.errors import InputError
 from lab.simulate.board_photo import PhotoSettings, photograph
 
@@ -153,3 +153,12 @@ def test_the_source_of_a_picture_follows_from_folder_video_or_name(picture):
     assert origins("cam0_001.png", "cam0_002.png", "cam1_001.png") == ("cam0", "cam0", "cam1")
     assert origins("cam_0.mp4", "cam_0.mp4", "cam_1.mp4") == ("cam_0.mp4", "cam_0.mp4", "cam_1.mp4")
     assert origins("l/01.png", "l/02.png", "r/01.png") == ("l/", "l/", "r/")
+
+
+def test_a_picture_of_16_bits_uses_all_grey_values_of_8_bits_but_for_a_thousandth_at_each_end():
+    """Linear between: a step of grey values is the same everywhere, whatever the camera's range."""
+    ramp = np.tile(np.linspace(900, 4900, 1001).round().astype(np.uint16), (4, 1))
+    ramp[0, 0], ramp[0, -1] = 0, 65535
+    shown = as_8_bit(ramp)[1].astype(int)
+    np.testing.assert_allclose(shown, np.linspace(0, 255, 1001), atol=1)
+    assert as_8_bit(ramp)[0, [0, -1]].tolist() == [0, 255]

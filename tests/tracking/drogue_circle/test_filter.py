@@ -10,6 +10,7 @@ import pytest
 from tests.tracking.drogue_circle.discs import covered, discs
 from tracking.drogue_circle.kalman import (
     FilterBank,
+    MotionModel,
     motion_models,
     printed_coefficient,
     printed_step,
@@ -24,6 +25,23 @@ def test_the_process_noise_is_that_of_an_acceleration_constant_in_a_step():
     a = np.random.default_rng(0).normal(0, SIGMA, (200_000, 3))
     moved = np.concatenate([0.5 * 4 * a, 2 * a], axis=1)  # dt = 2: dt^2/2 and dt
     np.testing.assert_allclose(process_noise(SIGMA, 2.0), np.cov(moved.T), atol=0.01)
+
+
+@pytest.mark.parametrize("dt", [1.0, 3.0])
+def test_a_jerk_constant_in_a_step_acts_on_place_rate_and_acceleration(dt):
+    """Of any size and along any axis; the place after many short steps of the motion is the same."""
+    jerk = np.array([0.02, 0.05, 0.01])
+    place, rate, acceleration = np.zeros(3), np.zeros(3), np.zeros(3)
+    steps = 20_000
+    for _ in range(steps):
+        acceleration = acceleration + jerk * dt / steps
+        rate = rate + acceleration * dt / steps
+        place = place + rate * dt / steps
+    noise = MotionModel(np.zeros(3), jerk).noise(dt)
+    moved = np.stack([place, rate, acceleration])  # 1 sigma of each state, all of one jerk
+    for axis in range(3):
+        rows = [axis, 3 + axis, 6 + axis]
+        np.testing.assert_allclose(noise[np.ix_(rows, rows)], np.outer(moved[:, axis], moved[:, axis]), rtol=1e-3)
 
 
 def test_a_measurement_counts_as_in_the_information_form():
