@@ -25,7 +25,7 @@ from tracking.noise_estimation.texture_shift import TextureShift, local_shifts, 
 from tracking.parameters import DetectParameters
 
 PICTURES = 15  # from which a background is made, spread over the recording
-_LEAST_PICTURES = 9
+_LEAST_PICTURES = 9  # usable ones
 _MANY_LIGHTS = 4  # at rest, from which the subtraction is used in any case: it spares their fits
 _LEAST_FOUND = 0.2  # further or better spots per picture from which the subtraction is used
 _MOSTLY = 0.7  # share of the pictures with lights that move, above which those at rest in all of them are no spots

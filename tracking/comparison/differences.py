@@ -13,10 +13,10 @@ from geometry.uncertainty.chi_square import chi2_limit
 from tracking.comparison.estimation import inverse_covariances
 from tracking.comparison.frame_alignment import GAP, Alignment, PoseSeries, interpolate, residuals
 
-_BLOCKS = 30
-_DRAWS = 200
-_MOST_FOR_MEDIAN = 20_000
-_LEAST_PER_BLOCK = 2
+_BLOCKS = 30  # of time, drawn with repetition: errors within one are correlated (block bootstrap)
+_DRAWS = 200  # the sigma of a figure is known to 5 %
+_MOST_FOR_MEDIAN = 20_000  # evenly spread: a limit of the time of the medians
+_LEAST_PER_BLOCK = 2  # rows: of short recordings the blocks are fewer, not shorter
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +170,7 @@ def longest_still(motion: PoseSeries, least: int) -> slice | None:
     return best if best.stop - best.start >= least else None
 
 
-LEAST_READINGS = 16
+LEAST_READINGS = 16  # of an Allan deviation: octaves up to averages over four
 _LARGEST_SHARE = 4  # averages over at most the length / 4
 
 

@@ -29,7 +29,7 @@ from tracking.comparison.frame_alignment import (
 
 # Candidates of the time offset between two motions, from the speeds, which do not depend on the frames.
 
-_MOST_POINTS = 1 << 15
+_MOST_POINTS = 1 << 15  # of both series: a limit of the correlation's time
 _LEAST_SHARE = 0.5  # of the shorter recording that must overlap
 _LEAST_CORRELATION = 0.5  # of the largest one, for a candidate
 
@@ -85,7 +85,7 @@ def offset_candidates(result: PoseSeries, reference: PoseSeries) -> list[float]:
 _SIGNIFICANT = 4.0  # sigmas by which the motion seen by both must exceed its noise, for the clocks
 _NOISE_FACTOR = 100.0  # information must exceed what noise alone feigns by this factor: a motion of ten sigmas
 _LARGEST_TURN_RAD = np.deg2rad(5.0)  # sigma above which a direction of the world's rotation counts as undetermined
-_LARGEST_LEVER_M = 1.0
+_LARGEST_LEVER_M = 1.0  # sigma above which a direction of the lever arm counts as undetermined
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,14 +196,14 @@ def _trace(stack: Array) -> Array:
 # Estimates time offset, clock rate and frame alignment by robust weighted least squares, with covariance.
 
 
-_OUTLIER_P = 1e-5
-_HUBER_P = 0.01
-_MOST_STEPS = 30
-_CANDIDATE_STEPS = 8
+_OUTLIER_P = 1e-5  # a frame beyond it is left out: one of 100,000 good ones
+_HUBER_P = 0.01  # a frame beyond it has a smaller weight
+_MOST_STEPS = 30  # a limit: the steps end where they are small
+_CANDIDATE_STEPS = 8  # enough to compare offsets of time
 _BLOCKS = 30
 _CANDIDATE_SAMPLES = 600  # of the result, where candidates of the offset are compared
 _SAME_FIT = 5.0  # sigmas of the residuals' variance within which two offsets explain their frames equally well
-LEAST_FRAMES = 8
+LEAST_FRAMES = 8  # fourteen unknowns, two or more numbers of each frame
 
 
 class NotComparableError(ValueError):

@@ -264,8 +264,8 @@ def jacobians(result: PoseSeries, reference: PoseSeries, alignment: Alignment, c
 
 _BASES = 5  # samples that are tried as the one to which the others are related: some may be outliers
 _TURNS = 24  # rotations about the main axis of the motion that are tried: one axis alone does not determine A
-_ALTERNATIONS = 8
-_MOST_SAMPLES = 400
+_ALTERNATIONS = 8  # between rotation and places: each lowers the misfit
+_MOST_SAMPLES = 400  # evenly spread: it is a start only
 
 
 def first_alignment(result: PoseSeries, reference: PoseSeries, start: Alignment, free: Bools) -> Alignment:
