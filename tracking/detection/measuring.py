@@ -177,7 +177,7 @@ def _start_again(peaks: Array, chosen: Ints, table: Array, limits: DetectionLimi
     Marks them in restarted (n,).
 
     On a sloping or textured background the window of the moments grows over the light beside a faint spot, or the fit
-    over that beside a saturated one; then it explains little.
+    over that beside a saturated one, or it shrinks to a grain of the light; then it explains little.
     """
     found = False
     for k in range(table.shape[0]):
@@ -185,7 +185,8 @@ def _start_again(peaks: Array, chosen: Ints, table: Array, limits: DetectionLimi
         spot[ACTIVE] = 0.0
         start = max(spot[START], _LEAST_START)
         poor = spot[EXPLAINED] < limits.min_explained
-        poor = poor and ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[1] > _OUTGROWN**2 * start
+        major2 = ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[1]
+        poor = poor and (major2 > _OUTGROWN**2 * start or major2 * _OUTGROWN < spot[START])
         if (spot[FLUX] > 0.0 and not poor) or spot[MOMENT_UU] >= _NOTHING or peak[WIDE_PEAK]:
             continue
         away = max(abs(spot[MOMENT_U] - peak[AT_U]), abs(spot[MOMENT_V] - peak[AT_V]))
