@@ -90,9 +90,11 @@ class BeamEnd:
         reach = REACH * (HALO_WIDTH * 0.7 if self.shape.halo else 1.0)
         margin = reach * np.sqrt(np.diag(covariance)) + 2
         size = np.array(self.camera.image_size_px)
-        low = np.maximum(np.floor(uv.min(axis=0) - margin), 0).astype(int)
-        high = np.minimum(np.ceil(uv.max(axis=0) + margin) + 1, size).astype(int)
-        if (low >= high).any():
+        beyond = int(np.ceil(REACH * self.blur_px))  # the lens brings light from beside the picture into it
+        low = np.maximum(np.floor(uv.min(axis=0) - margin), -beyond).astype(int)
+        high = np.minimum(np.ceil(uv.max(axis=0) + margin) + 1, size + beyond).astype(int)
+        first, last = np.maximum(low, 0), np.minimum(high, size)
+        if (first >= last).any():
             return None
         narrow = float(np.linalg.eigvalsh(covariance)[0]) - 1 / 12
         own = np.sqrt(max(narrow - self.blur_px**2, 0.0))
@@ -106,7 +108,8 @@ class BeamEnd:
             n = len(self.speckle)
             rows, columns = (np.floor(2 * (x + 0.5)).astype(int) % n for x in (v, u))
             fine = fine * self.speckle[np.ix_(rows, columns)]
-        return Patch(int(low[0]), int(low[1]), pixel_means(fine, parts))
+        (left, top), (right, bottom) = first - low, last - low
+        return Patch(int(first[0]), int(first[1]), pixel_means(fine, parts)[top:bottom, left:right])
 
     def _irradiance(self, world_from_body: Pose, x_m: Array, y_m: Array) -> Light:
         """Mean irradiance of the sub-exposures at points of the screen (h, w), relative to the axis at the waist."""

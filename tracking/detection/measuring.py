@@ -154,7 +154,7 @@ def _start_again(peaks: Peaks, chosen: Ints, table: Candidates, limits: Detectio
     Marks them in restarted (n,).
 
     On a sloping or textured background the window of the moments grows over the light beside a faint spot, or the fit
-    over that beside a saturated one; then it explains little.
+    over that beside a saturated one, or it shrinks to a grain of the light; then it explains little.
     """
     found = False
     for k in range(table.shape[0]):
@@ -162,7 +162,8 @@ def _start_again(peaks: Peaks, chosen: Ints, table: Candidates, limits: Detectio
         spot["active"] = 0.0
         start = max(spot["start"], _LEAST_START)
         poor = spot["explained"] < limits.min_explained
-        poor = poor and ellipse.eigenvalues(spot["uu"], spot["uv"], spot["vv"])[1] > _OUTGROWN**2 * start
+        major2 = ellipse.eigenvalues(spot["uu"], spot["uv"], spot["vv"])[1]
+        poor = poor and (major2 > _OUTGROWN**2 * start or major2 * _OUTGROWN < spot["start"])
         if (spot["flux"] > 0.0 and not poor) or spot["moment_uu"] >= _NOTHING or peak["wide"]:
             continue
         away = max(abs(spot["moment_u"] - peak["u"]), abs(spot["moment_v"] - peak["v"]))

@@ -66,12 +66,14 @@ _BY_NOISE = 3.0  # sigmas of the sum of squared noise on the squares of `is_roun
 _OF_TEXTURE = 0.7
 
 PEAK_SHARE = 0.75  # share of the threshold above which a peak is measured
-# Radii, px, of the circles on which the light of a line continues, and the numbers of points on them.
-_CIRCLES, _RING = (4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0), (12, 20, 28, 36, 52, 72, 108)
+# Radii, px, of the circles on which the light of a line continues, and the numbers of points on them. The last one is
+# for a narrow spot in a small even place, where only the first one shows nothing else.
+_CIRCLES, _RING = (4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 6.0), (12, 20, 28, 36, 52, 72, 108, 16)
+_IN_SMALL_PLACE = len(_CIRCLES) - 1
 _TURNS = [np.exp(2j * np.pi * np.arange(n) / n) for n in _RING]
 _ON_CIRCLES = np.concatenate([r * turn for r, turn in zip(_CIRCLES, _TURNS, strict=True)])
 _POINTS = np.rint(np.column_stack([_ON_CIRCLES.real, _ON_CIRCLES.imag])).astype(np.int64)  # (sum of _RING, 2), px
-_HIGHEST = (1.6, 1.9, 2.0, 2.1, 2.2, 2.4, 2.5)  # expected highest of as many normal deviates, in sigmas
+_HIGHEST = (1.6, 1.9, 2.0, 2.1, 2.2, 2.4, 2.5, 1.8)  # expected highest of as many normal deviates, in sigmas
 # The first circle outside a spot that is wide enough to raise the background from the search, and by this ratio.
 _OUTSIDE_WIDE, _RAISED = 5, 0.8
 # Of the texture around: an even place among objects has less than this on a circle, homogeneous texture never.
@@ -80,7 +82,7 @@ _SHARP_CIRCLES = 4  # of them, for what is about two pixels wide
 _CLEARLY_HIGH = 2.0  # times the threshold by the texture: for such a peak it does not matter how even its place is
 _LEAST_ON_RING = 3
 _ON_RING = 1.0  # sigmas of a pixel: three of the means
-MOST_ON_RING = _RING[-1]
+MOST_ON_RING = max(_RING)
 
 
 @compiled
@@ -99,6 +101,8 @@ def stands_out(image: Pixels, peak: Peak, noise: Noise, threshold_sigma: float, 
     high = peak["height"] >= _CLEARLY_HIGH * threshold_sigma * structure
     first = 0
     for k in range(len(_CIRCLES)):
+        if k == _IN_SMALL_PLACE and (not alone or second < np.inf):
+            break
         n = 0  # points inside the picture
         for i in range(first, first + _RING[k]):
             u, v = column + _POINTS[i, 0], row + _POINTS[i, 1]
@@ -114,7 +118,7 @@ def stands_out(image: Pixels, peak: Peak, noise: Noise, threshold_sigma: float, 
             if high:
                 return True
             alone, scatter = True, (highest - around) / _HIGHEST[k]
-            if k >= _OUTSIDE_WIDE and around < _RAISED * level:
+            if _OUTSIDE_WIDE <= k < _IN_SMALL_PLACE and around < _RAISED * level:
                 level = min(level, around)
             lowest, second = min(lowest, scatter), min(second, max(lowest, scatter))
     if second < _EVEN * peak["contrast"] * peak["level"]:

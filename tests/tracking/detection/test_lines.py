@@ -93,3 +93,37 @@ def test_a_clipped_light_as_wide_as_the_squares_of_a_board_is_found(core):
         light = 250.0 * np.exp(-0.5 * np.maximum(np.hypot(u - u0, v - v0) - core, 0.0) ** 2 / 3.0**2)
         gap = np.linalg.norm(points_on_board(light, seed) - (u0, v0), axis=-1)
         assert gap.min(initial=np.inf) < 0.1 * core
+
+
+def before_bright_surfaces(light: Array, at: Array, edges: list[tuple[float, float]], seed: int) -> Picture:
+    """An even surface of 24 grey values, bright ones beyond edges (direction, px from a point), squares on the left."""
+    v, u = np.mgrid[: SIZE[1], : SIZE[0]] * 1.0
+    mean = np.full(u.shape, 24.0)
+    for angle, away in edges:
+        mean[(u - at[0]) * np.cos(angle) + (v - at[1]) * np.sin(angle) > away] = 62.0
+    mean[:, :120] += np.where((np.floor(u / 12) + np.floor(v / 12)) % 2 > 0, 38.0, 0.0)[:, :120]
+    mean = cv2.GaussianBlur(mean, (0, 0), 0.8) + light
+    noisy = mean + np.random.default_rng(seed).normal(0.0, 1.0, mean.shape)
+    return np.rint(noisy).clip(0, 255).astype("u1")
+
+
+def is_found_before_bright_surfaces(sigma: float, edges: list[tuple[float, float]], seed: int) -> bool:
+    at = np.array([280.0, 180.0]) + np.random.default_rng(seed).uniform(-0.5, 0.5, 2)
+    light = expected(Scene([Spot(at[0], at[1], 20.0 if sigma < 2 else 33.0, sigma, sigma)], SIZE, 0.0))
+    picture = before_bright_surfaces(light, at, edges, seed)
+    points = find_spots(picture, noise=estimate_noise([picture]).model)
+    return bool(np.linalg.norm(points.uv_px - at, axis=-1).min(initial=np.inf) < 0.5)
+
+
+def test_a_narrow_spot_in_a_corner_between_bright_surfaces_is_found():
+    """Every circle of 8 px and more about it crosses a brighter surface."""
+    edges = [(1.93, 9.1), (3.5, 9.1)]
+    assert sum(is_found_before_bright_surfaces(1.1, edges, seed) for seed in range(12)) >= 10
+
+
+def test_a_wide_spot_in_a_corner_between_bright_surfaces_is_found():
+    """Their light in the window of its moments makes these shrink to a part of the spot."""
+    for seed in range(24):
+        rng = np.random.default_rng([seed, 3])
+        first, away = rng.uniform(0.0, 2 * np.pi), rng.uniform(20.0, 30.0)
+        assert is_found_before_bright_surfaces(4.4, [(first, away), (first + np.pi / 2, 1.2 * away)], seed)

@@ -215,11 +215,15 @@ def corner_offsets(ref: Reference, jumped: Bools, exposure_s: float, dt: Array) 
     frame or of the one before it, or beside a step that is also taken for a jump because of that offset. Each component
     turns where its straight lines before and after meet; if that is farther than an exposure from the middle of a
     frame, it has no error there. What shifts the instant by half an exposure, an error of the poses of half the
-    exposure times the jump, exceeds the offset. Source: ours.
+    exposure times the jump, exceeds the offset. In the first and the last frame nothing shows a jump: where the motion
+    has jumps, these may have the largest. Source: ours.
     """
     out = np.zeros((len(ref.t), 6))
     pose, t_s, steps = Pose(ref.R, ref.t), np.cumsum(dt), np.r_[jumped, False]
-    for k in (np.flatnonzero(jumped[1:] & (exposure_s > 0)) + 1).tolist():
+    jumps = np.flatnonzero(jumped[1:] & (exposure_s > 0)) + 1
+    if len(jumps):
+        out[[0, -1]] = np.abs(ref.m[jumps, :6] - ref.m[jumps - 1, :6]).max(axis=0) * exposure_s / 8
+    for k in jumps.tolist():
         for first, last in {(k - 1, k), (k - 1 - int(steps[k - 1]), k + int(steps[k + 1]))}:
             jump = ref.m[last, :6] - ref.m[first, :6]
             # The jump times the interval from the first frame to the corner.
