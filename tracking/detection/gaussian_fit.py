@@ -61,13 +61,9 @@ def fit_all(
         spot = table[i]
         if again and not spot["active"]:
             continue
-        spot["u"], spot["v"], spot["uu"], spot["uv"] = (
-            spot["moment_u"],
-            spot["moment_v"],
-            spot["moment_uu"],
-            spot["moment_uv"],
-        )
-        spot["vv"], spot["level"], spot["active"] = spot["moment_vv"], spot["background"], 1.0
+        spot["u"], spot["v"] = spot["moment_u"], spot["moment_v"]
+        spot["uu"], spot["uv"], spot["vv"] = spot["moment_uu"], spot["moment_uv"], spot["moment_vv"]
+        spot["level"], spot["active"] = spot["background"], 1.0
         spot["slope_u"] = spot["slope_v"] = 0.0
         spot["flux"] = max(spot["flux"], 1.0)
         if _has_diverged(spot, max_sigma):  # moments overestimate rather than underestimate the width

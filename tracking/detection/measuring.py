@@ -190,9 +190,8 @@ def _drop_background(table: Candidates, restarted: Bools) -> None:
         det = spot["uu"] * spot["vv"] - spot["uv"] ** 2
         height = spot["flux"] / (2 * pi * sqrt(det))
         a, b = spot["slope_u"], spot["slope_v"]
-        rise = sqrt(
-            a * a * spot["uu"] + 2 * a * b * spot["uv"] + b * b * spot["vv"]
-        )  # of the background over one sigma
+        # Of the background over one sigma.
+        rise = sqrt(a * a * spot["uu"] + 2 * a * b * spot["uv"] + b * b * spot["vv"])
         wide = ellipse.eigenvalues(spot["uu"], spot["uv"], spot["vv"])[1] > _OUTGROWN * spot["moment_uu"]
         if wide or height * _STEEPEST < rise:
             spot["flux"] = 0.0

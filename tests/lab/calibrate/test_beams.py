@@ -18,6 +18,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names
+from lab.calibrate.beams.beam_findings import bad_positions
 from lab.calibrate.beams.beams import calibrate_beams
 from lab.calibrate.beams.recordings import (
     SpotRows,
@@ -498,3 +499,10 @@ def test_a_project_without_cameras_names_the_command_that_needs_none(campaign, t
     write_mapping(content, project)
     with pytest.raises(InputError, match="cameras: expected one or more, got none; only `calibrate beams`"):
         load_project(project)
+
+
+def test_a_position_is_named_where_two_spots_and_more_than_half_of_them_are_excluded():
+    """One spot may be wrong by itself, and some of many; most of a position's mean that its pose is wrong."""
+    position = np.repeat([0, 1, 2, 3], [1, 10, 4, 3])
+    wrong = [0, *range(1, 6), 11, 12, 15, 16]  # one of one, five of ten, two of four, two of three
+    assert bad_positions(position, wrong, ("one", "half of ten", "half of four", "most")) == ["most"]
