@@ -382,3 +382,11 @@ def test_a_lens_that_no_camera_has_is_refused_with_its_name(fields, words):
 def test_a_value_of_another_form_is_refused_with_its_field(read, value, words):
     with pytest.raises(FormatError, match=f"K: expected .*{words}"):
         read(value, where="K")
+
+
+@pytest.mark.parametrize(
+    "content", ["['lensmodel', 'LENSMODEL_PINHOLE']", "{1: 2}", "{'lensmodel': 'x', (1,): 3}", "7"]
+)
+def test_a_cameramodel_that_is_no_dictionary_of_names_is_refused(content):
+    with pytest.raises(FormatError, match="expected a Python dictionary, got"):
+        parsed(mrcal, content)
