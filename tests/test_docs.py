@@ -159,10 +159,11 @@ def test_the_map_answers_a_newcomers_questions_with_paths():
     assert [wrong for line in questions for wrong in unclear_answers(line, ROOT)] == []
 
 
-def test_every_name_in_the_text_of_the_design_is_one_of_the_program():
+def test_every_name_in_the_text_of_the_design_and_of_the_theory_is_one_of_the_program():
     files = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
     code = set(re.findall(r"\w+", " ".join(path.read_text(encoding="utf-8") for path in files)))
-    names = re.findall(r"`([a-zA-Z]+_\w+)`", (ROOT / "docs" / "design.md").read_text(encoding="utf-8"))
+    pages = [ROOT / "docs" / "design.md", *sorted((ROOT / "docs" / "theory").glob("*.md"))]
+    names = [n for page in pages for n in re.findall(r"`([a-zA-Z]+_\w+)`", page.read_text(encoding="utf-8"))]
     assert len(names) > 20
     assert [name for name in names if name not in code] == []
 

@@ -20,7 +20,8 @@ PEAK = np.dtype(
         # px: half side of the square that the light around it fills, 1 for a narrow spot (search.find_separate_peaks)
         ("scale", np.float64),
         ("contrast", np.float64),  # of the texture there
-    ]
+    ],
+    align=True,
 )
 
 CANDIDATE = np.dtype(
@@ -65,7 +66,8 @@ CANDIDATE = np.dtype(
         ("usual_uv", np.float64),
         ("usual_vv", np.float64),
         ("usual_variance", np.float64),
-    ]
+    ],
+    align=True,
 )
 Peak: TypeAlias = np.void  # one PEAK
 Peaks: TypeAlias = NDArray[np.void]  # (n,) of PEAK
