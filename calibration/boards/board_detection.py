@@ -22,7 +22,8 @@ from calibration.boards.circle_detection import find_circles
 def find_board(image: GreyImage, board: Board, thorough: bool = True) -> BoardView | NotFound:
     """The board in a grey picture (h, w) of 8 bits.
 
-    closely: if False, only the fast methods are used, and the reason for a failure is not determined (NO_CLOSE_LOOK).
+    thorough: if False, only the fast methods are used, and the reason for a failure is not determined
+    (QUICK_SEARCH_FAILED).
     For 1280x1024 pixels without a board, a thorough search takes 2 to 5 s, a quick one 0.02 to 0.3 s.
 
     Raises:

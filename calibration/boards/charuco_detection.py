@@ -16,10 +16,11 @@ from calibration.boards.board_view import (
     GreyImage,
     NotFound,
     low_contrast,
+    scaled,
+    scales,
     too_blurred,
 )
 from calibration.boards.circle_detection import mapped
-from calibration.boards.pyramid import scaled, scales
 from geometry.arrays import Array, Ints
 
 _FEWEST = 6  # corners that do not all lie on one line: fewer do not contribute to the lens
@@ -49,7 +50,7 @@ class Markers:
 def find_charuco(image: GreyImage, board: Charuco, thorough: bool = True) -> BoardView | NotFound:
     """The visible inner corners, or the reason why there are too few. A part of the board is sufficient.
 
-    closely: if False, the reason for missing markers is not determined.
+    thorough: if False, the reason for missing markers is not determined.
     """
     printed, markers = _as_printed(image, board)
     if len(markers.ids) == 0:

@@ -17,11 +17,13 @@ from calibration.boards.board_view import (
     BoardView,
     GreyImage,
     NotFound,
+    at_full_size,
     low_contrast,
+    scaled,
+    scales,
     too_blurred,
 )
 from calibration.boards.corner_refinement import Corners
-from calibration.boards.pyramid import at_full_size, scaled, scales
 from geometry.arrays import Array
 
 _ALTERNATING = 0.9  # share of neighbouring squares that alternate in colour; real boards reach 1
@@ -36,7 +38,7 @@ _SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 def find_chessboard(image: GreyImage, board: Chessboard, thorough: bool = True) -> BoardView | NotFound:
     """All inner corners of a chessboard, or the reason why they were not found. A part of it is not sufficient.
 
-    closely: if False, only the classical detector is used, and the reason for a failure is not determined.
+    thorough: if False, only the classical detector is used, and the reason for a failure is not determined.
     """
     pale = low_contrast(image)
     if pale is not None:

@@ -22,11 +22,13 @@ from calibration.boards.board_view import (
     BoardView,
     GreyImage,
     NotFound,
+    at_full_size,
     low_contrast,
+    scaled,
+    scales,
     too_blurred,
 )
 from calibration.boards.chessboard_detection import upright
-from calibration.boards.pyramid import at_full_size, scaled, scales
 from geometry.arrays import Array, Ints
 
 _BIG_DOT = 1.35  # relative area of a corner circle, above which it marks the origin
@@ -55,7 +57,7 @@ class Ellipses:
 def find_circles(image: GreyImage, board: CircleGrid, thorough: bool = True) -> BoardView | NotFound:
     """All centres of a grid of circles, with the areas of the blobs, or the reason why they were not found.
 
-    closely: if False, the reason is not determined.
+    thorough: if False, the reason is not determined.
     """
     blobs = np.empty((0, 3))
     for scale in scales(image):
