@@ -73,6 +73,18 @@ def test_scatter_is_one_for_noise_and_larger_for_errors_common_to_a_photograph()
     assert factors[1] > 1.2
 
 
+def test_the_equations_at_other_values_are_those_of_the_residuals_there():
+    """Of linear residuals A x - b: their squares and gradients at any x, in any basis."""
+    rng = np.random.default_rng(3)
+    A, b, x, basis = rng.normal(size=(4, 6, 3)), rng.normal(size=(4, 6)), rng.normal(size=3), rng.normal(size=(3, 3))
+    S, g = np.swapaxes(A, 1, 2) @ A, -np.einsum("vri,vr->vi", A, b)
+    at_zero = ViewEquations(basis.T @ S @ basis, g @ basis, np.sum(b**2, axis=1), np.full(4, 6), np.arange(4), basis, 3)
+    left = A @ x - b
+    there = at_zero.moved(x)
+    np.testing.assert_allclose(there.chi2, np.sum(left**2, axis=1))
+    np.testing.assert_allclose(there.gradient, np.einsum("vri,vr->vi", A, left) @ basis)
+
+
 def drawn_apart(views: int, rng: np.random.Generator) -> tuple[np.ndarray, ViewEquations]:
     """The error (3,) of three unknowns by photographs that see unknowns of their own, and the equations there."""
     rows = rng.normal(0, 1, (views, 6, 3))
