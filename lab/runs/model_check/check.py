@@ -158,8 +158,8 @@ def findings_of(result: ModelCheckResult, model: SpotModel) -> tuple[Finding, ..
     if result.usual_views <= _VIEWS_OF_A_POSE and len(result.unseen) > result.usual_views:
         what = (
             f"{result.usual_views} spots are measured in most frames, as many as a pose needs, and"
-            f" {len(result.unseen)} others that the pose puts well inside the pictures are never found: nothing confirms"
-            " the poses"
+            f" {len(result.unseen)} others that the pose puts well inside the pictures are never found: nothing"
+            " confirms the poses"
         )
         findings.append(finding("BP-M05", Level.FAIL, what, variant="unconfirmed"))
     return worst_first(findings)
