@@ -20,9 +20,10 @@ from lab.targets.circle import CircleOptions
 from studies.comparison import Comparison, ComparisonRow, Figure
 from studies.drogue.render import render_drogue, rim_of
 from studies.drogue.scene import LIGHTS, DrogueBackground, DrogueScene, Occluder, ellipse_through
-from tracking.drogue_circle.detectors import CircleCandidate, CircleParameters, Picture, Window, classical_detector
+from tracking.drogue_circle.detectors import CircleCandidate, CircleParameters, Window, classical_detector
 from tracking.drogue_circle.printed import printed_measurement
 from tracking.drogue_circle.rim_fit import RimFit, fit_rim, smooth_crop
+from tracking.noise import Picture
 from tracking.statuses import PoseStatus
 
 # The experiment of Zhou (2014), section 4, with rendered drogues: an approach from 10 m in three lights.

@@ -20,7 +20,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from lab.extras import PACKAGES
+from lab.packages import PACKAGES
 from tests.paths import ROOT
 
 FLOORS = ("geometry", "tracking", "calibration", "lab", "studies", "cli")

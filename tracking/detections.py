@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
+from geometry.light_centroid import CentroidOffsets
+from tracking.noise import NoiseModel
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,3 +109,25 @@ class Detections:
         return Detections(
             np.asarray(uv_px, dtype=float), np.asarray(cov_px2, dtype=float), *(unknown.copy() for _ in range(5))
         )
+
+
+CLIPPED = 0.85  # of the range above the background: a spot whose peak is higher is taken to be clipped
+
+
+def on_beam_axes(
+    found: Detections, offsets: CentroidOffsets, noise: NoiseModel | None, saturation_dn: float
+) -> Detections:
+    """Detections (n) with positions shifted from the light's centroid to the image of the beam's axis.
+
+    saturation_dn: grey value at which the sensor clips.
+    """
+    if not len(found) or noise is None:
+        return found
+    c, s = np.cos(np.radians(found.angle_deg)), np.sin(np.radians(found.angle_deg))
+    major2, minor2 = found.major_px**2, found.minor_px**2
+    shape = np.stack([major2 * c**2 + minor2 * s**2, (major2 - minor2) * c * s, major2 * s**2 + minor2 * c**2], axis=-1)
+    clipped = found.peak > CLIPPED * (saturation_dn - noise.black_dn)
+    height = np.where(clipped, found.flux / (2 * np.pi * found.major_px * found.minor_px), found.peak)
+    brightness = noise.slope_dn * height / noise.floor_dn2
+    clip = np.where(clipped, found.peak / np.maximum(height, 1e-9), 1.0)
+    return replace(found, uv_px=found.uv_px - offsets.at(found.uv_px, shape, brightness, clip))

@@ -18,20 +18,20 @@ from scipy.spatial.transform import Rotation
 
 from geometry.arrays import Array
 from tracking.comparison.estimation import estimate_alignment
-from tracking.comparison.frame_alignment import Motion, residuals
+from tracking.comparison.frame_alignment import PoseSeries, residuals
 
 BLOCK_S = 10.0
 SIGMA_M, SIGMA_DEG = 0.002, 0.2  # of the camera's poses, for the weights of positions and attitudes
 
 
-def read(folder: Path, ending: str) -> Motion:
+def read(folder: Path, ending: str) -> PoseSeries:
     """The motion in the table with this ending."""
     path = next(folder.glob(f"*{ending}"))
     table = np.loadtxt(path, delimiter=",")
     table = table[np.concatenate([[True], np.diff(table[:, 0]) > 0])]
     sigmas = np.array([SIGMA_M] * 3 + [np.radians(SIGMA_DEG)] * 3)
     covariance = np.broadcast_to(np.diag(sigmas**2), (len(table), 6, 6))
-    return Motion(table[:, 0], Rotation.from_quat(table[:, 4:]).as_matrix(), table[:, 1:4], covariance)
+    return PoseSeries(table[:, 0], Rotation.from_quat(table[:, 4:]).as_matrix(), table[:, 1:4], covariance)
 
 
 def sizes(values: Array, digits: int) -> str:

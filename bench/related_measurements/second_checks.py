@@ -25,8 +25,9 @@ from geometry.arrays import Array
 from lab.targets.circle import CircleOptions
 from lab.targets.drogue import DrogueOptions
 from studies.learned_detector.samples import Sample
-from tracking.drogue_circle.detectors import Edge, Picture
+from tracking.drogue_circle.detectors import Edge
 from tracking.learned_detector.detector import WEIGHTS, find_drogues
+from tracking.noise import Picture
 from tracking.statuses import Cause, PoseStatus
 
 _CLEAR, _HELD = 30, 20  # frames before a probe comes, and after it has arrived

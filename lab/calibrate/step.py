@@ -20,8 +20,8 @@ from lab.files.text.atomic_write import atomic_folder, check_output_folder, earl
 from lab.files.text.json_text import write_json
 from lab.findings.finding import Finding, Level, counted, finding, first_sentence, reasons, verdict, worst_first
 from lab.findings.outcome import Outcome, Verdict
+from lab.packages import versions
 from lab.report.page import KeyFigure, Page, Section, made_with, write_page
-from lab.versions import versions
 
 R = TypeVar("R")
 SCHEMA = "beampose/calibration-summary/1"  # of summary.json

@@ -55,7 +55,6 @@ def run(
     /,
     run_folder: Path,
     out: Path,
-    full_hash: bool,
     refined: bool,
     verbose: bool,
     quiet: bool,
@@ -67,8 +66,6 @@ def run(
     Example:
         beampose run sample_runs/huo2015 --out results/huo2015
     """
-    from lab.files.run.fingerprints import fingerprints
-    from lab.files.run.run_file import Run
     from lab.runs.process import process_run
 
     process: Callable[..., Outcome[Any]] = process_run
@@ -77,13 +74,10 @@ def run(
 
         process = run_with_refined_rig
 
-    def more(of: Run) -> dict[str, Any]:
-        return provenance(ctx) | ({"inputs": fingerprints(of, full=True)} if full_hash else {})
-
     # Of the earlier results in this folder, with the option that makes it again.
     added = [(p, option) for name, option in _ADDED.items() for p in sorted(out.glob(name))]
     with shown(run_folder.name, verbose=verbose, quiet=quiet) as progress:
-        outcome = process(run_folder, out, progress=progress, more=more, **options)
+        outcome = process(run_folder, out, progress=progress, more=lambda _: provenance(ctx), **options)
     gone = "removed with the earlier results; make it again with `beampose report"
     conclude(outcome, quiet=quiet, notes=[f"{path}: {gone} {out} {option}`" for path, option in added])
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from lab.errors import InputError
-from lab.extras import needed
+from lab.packages import needed
 from lab.pictures.opencv import load_cv2, opened
 from lab.pictures.picture_file import GreyPicture, MissingPicture, require_format
 from lab.pictures.source import Grabbed, formatted, open_inputs, pictures, retrieved

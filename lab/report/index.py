@@ -27,13 +27,14 @@ from lab.errors import BeamposeError
 from lab.files.run.results import read_result_table, read_summary
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.yaml_text import read_mapping
+from lab.findings.finding import Level
 from lab.number_format import format_number
 from lab.report.html import environment
 from lab.report.plot import svg
 from lab.report.summary import VERDICTS, day_of, valid
 from tracking.statuses import PoseStatus
 
-_RANKS = {"error": 0, "fail": 1, "check": 2, "pass": 3}
+_LEVELS = tuple(level.word for level in Level)
 _ANGLES = ("yaw_deg", "pitch_deg", "roll_deg")
 _POSITION = ("x_m", "y_m", "z_m")
 _SIGMAS = ("sigma_yaw_deg", "sigma_pitch_deg", "sigma_roll_deg", "sigma_x_m", "sigma_y_m", "sigma_z_m")
@@ -67,8 +68,8 @@ class IndexedRun:
 
     @property
     def rank(self) -> int:
-        """0 for the worst verdict."""
-        return _RANKS.get(self.status, 0)
+        """0 without a verdict, then the worst first."""
+        return len(_LEVELS) - _LEVELS.index(self.status) if self.status in _LEVELS else 0
 
     @property
     def calibration_age(self) -> int | None:
@@ -302,7 +303,7 @@ def _trend(
         # A line of length zero with round ends is a dot: a tenth of the bytes of a circle.
         places = zip(p.X(day[which]).tolist(), p.Y(np.clip(values[which], lo, hi)).tolist(), strict=True)
         d = "".join(map("M%.0f %.0fh0".__mod__, places))
-        css = name if name in ("pass", "check", "fail") else "error"
+        css = name if name in _LEVELS else "error"
         out.append(f'<path class="dots {css}" d="{d}"/>')
     if np.nanmax(values) > hi:
         out.append(svg.text(p.X.b, 14, f"▲ up to {format_number(float(np.nanmax(values)))} {unit}", "end"))

@@ -15,11 +15,13 @@ from typing import Any, TypeAlias
 import numpy as np
 from markupsafe import Markup
 
+from lab.errors import RunError
 from lab.files.text.atomic_write import atomic_write_text
-from lab.findings.finding import Finding, verdict, worst_first
+from lab.files.text.error_text import printable
+from lab.findings.finding import ENTRIES, Finding, verdict, worst_first
 from lab.number_format import format_number
+from lab.packages import versions
 from lab.report.html import environment
-from lab.versions import versions
 
 FILE_NAME = "report.html"
 KeyFigure: TypeAlias = tuple[str, str, str]  # label, value with unit (px and mm), note
@@ -153,3 +155,35 @@ def _numeric(table: PageTable) -> list[bool]:
         bool(table.rows) and all(_NUMBER_TEXT.match(cell(row[k])) is not None for row in table.rows)
         for k in range(len(table.heads))
     ]
+
+
+# The report of a run that ended with an error: it says so, and why, instead of figures.
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """What is known of a run that ended with an error."""
+
+    name: str
+    message: str  # the error as the command line shows it: one plain line
+    run_folder: str = ""
+    code: str = RunError.code  # its explanation is shown
+    exit_status: int = RunError.exit_status
+    log: Sequence[str] = ()  # lines up to the error
+    files: Sequence[str] = ()  # in the folder of the results: of an earlier attempt, or incomplete
+    traceback: str = ""  # address of its file, relative to the report
+    earlier: bool = False  # the results of an earlier, successful processing were kept elsewhere
+
+
+def files_beside(report: Path) -> list[str]:
+    """The names of the files in the folder of a report, so that they are not taken for results of this attempt."""
+    return sorted(p.name for p in report.parent.iterdir() if p.is_file() and p.name != report.name)
+
+
+def write_failure_report(path: Path, failure: Failure) -> Path:
+    """Write the report of a failure as the HTML file `path`; returns the path. Raises InputError."""
+    text = environment().get_template("failure.html.j2").render(
+        f=failure, explanation=ENTRIES[failure.code], log=[printable(line) for line in failure.log]
+    )  # fmt: skip
+    atomic_write_text(text, path)
+    return path

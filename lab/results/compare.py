@@ -32,7 +32,7 @@ from tracking.comparison.differences import (
     statistic,
 )
 from tracking.comparison.estimation import Estimate, Free, NotComparableError, estimate_alignment
-from tracking.comparison.frame_alignment import BODY, GAP, LEVER, TRANSLATION, WORLD, Alignment, Motion
+from tracking.comparison.frame_alignment import BODY, GAP, LEVER, TRANSLATION, WORLD, Alignment, PoseSeries
 from tracking.statuses import PoseStatus
 
 # Reads the motion of a reference: a TUM file (`t x y z qx qy qz qw`) or a CSV table with named columns.
@@ -50,7 +50,7 @@ LATEST_S = 1e12  # 30,000 years: times in ns are beyond it
 class ReferenceMotion:
     """A motion with notes about how its file was read."""
 
-    motion: Motion
+    motion: PoseSeries
     notes: tuple[str, ...]
 
 
@@ -88,7 +88,7 @@ def _tum_lines(path: Path) -> list[tuple[int, list[str]]]:
 
 def _from_tum(
     path: Path, rows: list[tuple[int, list[str]]], sigma_m: float, sigma_deg: float
-) -> tuple[Motion, tuple[str, ...]]:
+) -> tuple[PoseSeries, tuple[str, ...]]:
     values = np.empty((len(rows), _TUM))
     for i, (line, fields) in enumerate(rows):
         try:
@@ -108,10 +108,10 @@ def _from_tum(
     rotation = _rotations(path, values[:, [7, 4, 5, 6]], lines)
     covariance = np.zeros((len(values), 6, 6))
     covariance[:] = np.diag([sigma_m**2] * 3 + [math.radians(sigma_deg) ** 2] * 3)
-    return Motion(values[:, 0], rotation, values[:, 1:4], covariance), ()
+    return PoseSeries(values[:, 0], rotation, values[:, 1:4], covariance), ()
 
 
-def _from_csv(path: Path, sigma_m: float, sigma_deg: float) -> tuple[Motion, tuple[str, ...]]:
+def _from_csv(path: Path, sigma_m: float, sigma_deg: float) -> tuple[PoseSeries, tuple[str, ...]]:
     table = read_table(path, ["t_s"], (*POSITION, *QUATERNION, *ANGLES, *SIGMAS))
     table.require_rows(["t_s", *QUATERNION])
     places = _all_or_none(table, POSITION)
@@ -146,7 +146,7 @@ def _from_csv(path: Path, sigma_m: float, sigma_deg: float) -> tuple[Motion, tup
         if absent:
             notes.append(f"The reference has no {' and no '.join(absent)}: taken as 0.")
     covariance = _stated(table, complete, rotation, sigma_m, sigma_deg)
-    return Motion(stacked[:, 0], rotation, position, covariance), tuple(notes)
+    return PoseSeries(stacked[:, 0], rotation, position, covariance), tuple(notes)
 
 
 def check_size(path: Path, lines: Ints, names: str, values: Array, most: float) -> None:
@@ -479,7 +479,7 @@ def compare(
     )
 
 
-def _motion_of(folder: Path) -> tuple[Ints, Motion, Motion]:
+def _motion_of(folder: Path) -> tuple[Ints, PoseSeries, PoseSeries]:
     """Frames (n,), motion with the noise part of the covariances, and with all of them, of the measured frames."""
     track = ResultFolder.of_run(folder).poses
     good = track.known & track.has(PoseStatus.MEASURED) & np.isfinite(track.covariance).all(axis=(1, 2))
@@ -503,8 +503,8 @@ def _motion_of(folder: Path) -> tuple[Ints, Motion, Motion]:
     noise = np.where(separable[:, None, None], rest, total)
     return (
         track.frames[rows],
-        Motion(track.t_s[rows], pose.rotation, pose.translation, noise),
-        Motion(track.t_s[rows], pose.rotation, pose.translation, total),
+        PoseSeries(track.t_s[rows], pose.rotation, pose.translation, noise),
+        PoseSeries(track.t_s[rows], pose.rotation, pose.translation, total),
     )
 
 
@@ -526,7 +526,7 @@ def _axes(found: Differences, used: Bools) -> tuple[AxisStatistic, ...]:
     return tuple(out)
 
 
-def _still(motion: Motion) -> StillStand | None:
+def _still(motion: PoseSeries) -> StillStand | None:
     """Allan deviations of yaw, pitch and roll over the longest stationary stretch; None where none is long enough."""
     where = longest_still(motion, LEAST_STILL)
     if where is None or motion.rotation is None:

@@ -12,6 +12,7 @@ from lab.files.text.csv_text import write_table
 from lab.files.text.json_text import write_json
 from lab.findings.outcome import Done, Verdict
 from lab.number_format import format_number, format_percent, format_with_sigma
+from lab.packages import versions
 from lab.report.page import Page, PageDrawing, PageTable, Section, made_with
 from lab.report.page import write_page as write_report
 from lab.report.plot import svg
@@ -26,7 +27,6 @@ from lab.results.compare import (
     lines_of,
     undetermined_lines,
 )
-from lab.versions import versions
 from tracking.comparison.frame_alignment import PARAMETERS
 
 # The tables of a comparison: differences.csv, allan.csv and comparison.json.

@@ -19,13 +19,12 @@ import numpy as np
 
 from geometry.arrays import Array, Bools
 from lab.errors import InputError
-from lab.extras import needed
 from lab.files.run.results import POSE_STATUSES, PoseTrack, ResultFolder, read_result_table
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder, atomic_write_bytes
 from lab.files.text.json_text import plain_value
 from lab.findings.outcome import Done
-from lab.versions import versions
+from lab.packages import needed, versions
 from tracking.statuses import PoseStatus
 
 CONVENTIONS = (

@@ -24,7 +24,7 @@ from lab.progress import Progress
 from lab.report.frames.canvas import Pixels, png
 from lab.report.frames.content import FrameContent, ResultData, frame_content, pictures_of, pose_words, read_result_data
 from lab.report.frames.sheet import Layout, Limits, limits_of, sheet
-from lab.runs.frames.frames import Picture, pictures_at
+from lab.runs.frames.frames import Recorded, pictures_at
 
 if TYPE_CHECKING:
     from lab.runs.frames.pipeline import FrameRecord, Pipeline
@@ -92,7 +92,7 @@ def chosen_cameras(data: ResultData, camera: str | None) -> list[str]:
 def _shown(data: ResultData, frame: int, camera: str | None) -> Shown:
     index = data.index_of(frame)
     cameras = chosen_cameras(data, camera)
-    pictures: dict[str, Picture] = {}
+    pictures: dict[str, Recorded] = {}
     if data.run is not None:
         pictures = {c: pictures_at(data.run, c, [frame])[frame] for c in cameras if c in data.run.cameras}
     content = frame_content(data, index, pictures, cameras)

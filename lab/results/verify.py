@@ -19,11 +19,11 @@ from lab.files.run.results import ResultFolder
 from lab.files.run.run_file import LiveDevice, Run
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.findings.outcome import Done
+from lab.packages import versions
 from lab.progress import Progress
 from lab.runs.frames.pipeline import Pipeline
 from lab.runs.process import write_tables
 from lab.runs.smoothing_pass import TrackingAndSmoothing
-from lab.versions import versions
 from tracking.parameters import TrackerParameters
 
 # What summary.json records of how a result was made, and whether its inputs are still the same.

@@ -474,8 +474,7 @@ def _describe_calibration(
 ) -> None:
     """Date and verdict of the calibration, and whether it may be used on the day of the recording (or today)."""
     try:
-        day = datetime.date.today() if recorded is None else recorded
-        require_valid_calibration(state, path, day, "today" if recorded is None else "the recording's day")
+        require_valid_calibration(state, path, recorded)
     except CalibrationError as error:
         findings.unusable += str(error).splitlines()
     text = "the rig file does not state when it was calibrated"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import datetime
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -20,9 +19,10 @@ from lab.files.text.dataclass_fields import with_overrides
 from lab.findings.finding import Level, worst_first
 from lab.findings.finding import verdict as verdict_of
 from lab.findings.outcome import Outcome, Verdict
+from lab.packages import versions
 from lab.progress import Progress
 from lab.runs.clock_estimate import clock_findings
-from lab.runs.frames.pipeline import FrameRecord, Pipeline
+from lab.runs.frames.pipeline import FrameRecord, Pair, Pipeline
 from lab.runs.frames.row_records import row_records
 from lab.runs.model_check.frame_sampler import FrameSampler
 from lab.runs.run_log import RunLog, listening
@@ -31,9 +31,8 @@ from lab.runs.smoothing_pass import TrackingAndSmoothing
 from lab.runs.summary import processed_run
 from lab.runs.tables import TableWriter
 from lab.runs.verdict import quality
-from lab.runs.verdict.frame_checks import FrameChecks, Pair
+from lab.runs.verdict.frame_checks import FrameChecks
 from lab.runs.verdict.run_statistics import CameraStatistics, RunStatistics
-from lab.versions import versions
 
 if TYPE_CHECKING:
     from lab.runs.model_check.check import ModelCheck
@@ -48,13 +47,14 @@ def process_run(
     progress: Progress | None = None,
     more: Callable[[Run], Mapping[str, Any]] | None = None,
     rig_path: Path | None = None,
+    full_hash: bool = False,
 ) -> Outcome[RunStatistics]:
     """Process one run folder into the folder `out`: the tables, summary.json and report.html.
 
     overrides: tracker parameters that replace those of run.yaml. causal: the tables hold the causal estimates and
     nothing is smoothed; otherwise they hold the smoothed estimates, and attitude_causal.csv the causal ones.
     more: additional content of summary.json; called with the run before its processing. rig_path: a rig.yaml in place
-    of the run's.
+    of the run's. full_hash: the fingerprints of the inputs cover every byte of large files, too.
 
     Raises:
         BeamposeError: the run cannot be processed (CalibrationError: its rig's calibration must not be used); `out` is
@@ -65,8 +65,9 @@ def process_run(
     added = {} if more is None else more(run)
     with atomic_folder(out, may_replace=are_results) as work:
         return write_results(
-            Pipeline.of(run), work, Path(out), started, causal=causal, progress=progress, more=lambda: added
-        )
+            Pipeline.of(run), work, Path(out), started, causal=causal, progress=progress, more=lambda: added,
+            full_hash=full_hash,
+        )  # fmt: skip
 
 
 def ready_run(
@@ -84,10 +85,7 @@ def ready_run(
     run = load_run(run_folder, rig_path, recording)
     if overrides:
         run = dataclasses.replace(run, tracker=with_overrides(run.tracker, overrides))
-    recorded = datetime.date.today() if run.recorded is None else run.recorded
-    require_valid_calibration(
-        run.calibration, run.rig_path, recorded, "today" if run.recorded is None else "the recording's day"
-    )
+    require_valid_calibration(run.calibration, run.rig_path, run.recorded)
     load_run_truth(run)  # a mistake in it stops the run before the processing, not after it
     return run
 
@@ -101,13 +99,15 @@ def write_results(
     causal: bool = False,
     progress: Progress | None = None,
     more: Callable[[], Mapping[str, Any]] = dict,
+    full_hash: bool = False,
 ) -> Outcome[RunStatistics]:
     """Process a pipeline's frames into the folder `work`, which will become `out`.
 
     started: time.perf_counter() at the start of the command. more: additional content of summary.json, called last.
+    full_hash: as of `process_run`.
     """
     with listening() as log:
-        return _write_results(pipeline, work, out, started, log, causal, progress, more)
+        return _write_results(pipeline, work, out, started, log, causal, progress, more, full_hash)
 
 
 def _write_results(
@@ -119,6 +119,7 @@ def _write_results(
     causal: bool,
     progress: Progress | None,
     more: Callable[[], Mapping[str, Any]],
+    full_hash: bool,
 ) -> Outcome[RunStatistics]:
     run = pipeline.run
     log.start(run, versions())
@@ -138,7 +139,7 @@ def _write_results(
         log.conclude(verdict, content, time.perf_counter() - started)
         log.write(folder)
 
-    done = processed_run(pipeline, statistics, model_check, verdict, passes.smoothing, tables.errors, page)
+    done = processed_run(pipeline, statistics, model_check, verdict, passes.smoothing, tables.errors, page, full_hash)
     return done.write(work, out, started, added)
 
 

@@ -17,7 +17,7 @@ from geometry.arrays import Array
 from lab.files.text.atomic_write import atomic_folder, earlier_results
 from lab.files.text.json_text import write_json
 from lab.findings.outcome import Outcome, Verdict
-from lab.versions import versions
+from lab.packages import versions
 
 R = TypeVar("R")
 

@@ -14,8 +14,8 @@ from lab.files.run.run_file import Run, VideoFile
 from lab.findings.finding import Finding, Level, finding, sentence, verdict
 from lab.number_format import format_number
 from lab.pictures.source import video_at
-from lab.runs.frames.even_sampler import BLOCK, EvenSampler
 from lab.runs.frames.frames import FrameSet
+from lab.runs.model_check.frame_sampler import BLOCK, EvenSampler
 from lab.runs.verdict.run_statistics import RunStatistics
 from tracking.detections import Detections
 from tracking.setup_mistakes.evidence import (

@@ -32,6 +32,7 @@ def processed_run(
     smoothing: SmoothingSummary | None,
     errors: Mapping[str, Any] | None,
     page: Callable[[Path, Mapping[str, Any]], object],
+    full_hash: bool = False,
 ) -> Processed[RunStatistics]:
     """A run whose tables are written. smoothing: None: causal only. errors: against truth; None without truth."""
     run, timings = pipeline.run, pipeline.timings
@@ -49,7 +50,7 @@ def processed_run(
             "prior": _prior_numbers(run),
             **({"clocks": _clock_numbers(run)} if run.clocks else {}),
         },
-        inputs=fingerprints(run),
+        inputs=fingerprints(run, full_hash),
         notes=_notes(pipeline, statistics),
         blocks={
             "run_folder": str(run.folder.resolve()),

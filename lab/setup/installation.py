@@ -12,7 +12,7 @@ from importlib.util import find_spec
 
 from lab.errors import CalibrationError, InputError, RunError
 from lab.findings.finding import Finding, Level, finding
-from lab.versions import versions
+from lab.packages import versions
 
 _FILE_CODE, _CALIBRATION_CODE = "BP-D10", "BP-D09"
 

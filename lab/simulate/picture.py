@@ -12,12 +12,12 @@ from geometry.arrays import Array
 from geometry.camera import SensorNoise
 from geometry.light_centroid import map_curvature
 from geometry.pose import Pose
+from lab.pictures.picture_file import GreyPicture
 from lab.simulate.points import exposure_instants, spot_images, spot_patch
 from lab.simulate.scenarios import Light
 from lab.simulate.scene import LIGHT, PIXELS, VISIBLE, Scene
 
 Floats32 = NDArray[np.float32]
-Picture = NDArray[np.uint8 | np.uint16]
 
 _GRAIN_SIGMAS_PX = (1.2, 9.0)  # of the reflectivity of the screen: fine and coarse, half of the variance each
 
@@ -185,7 +185,7 @@ def _speckle(rng: np.random.Generator, shape: tuple[int, int], light: Light) -> 
     return np.exp(factor * grain.astype(np.float64) - sigma**2 / 2)
 
 
-def render(scene: Scene, sensor: Sensor, powers: LaserPowers, k: int, *, noisy: bool = True) -> Picture:
+def render(scene: Scene, sensor: Sensor, powers: LaserPowers, k: int, *, noisy: bool = True) -> GreyPicture:
     """The picture of frame k: (h, w), uint8 up to 8 bits, otherwise uint16."""
     value, pieces = expected_light(scene, sensor, powers, k)
     if noisy:
@@ -202,4 +202,4 @@ def render(scene: Scene, sensor: Sensor, powers: LaserPowers, k: int, *, noisy: 
     value += np.float32(sensor.noise.black_dn)
     np.rint(value, out=value)
     np.clip(value, 0, sensor.full_dn, out=value)
-    return value.astype(np.uint8 if sensor.full_dn <= 255 else np.uint16)
+    return value.astype(np.uint8) if sensor.full_dn <= 255 else value.astype(np.uint16)

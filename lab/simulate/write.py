@@ -20,9 +20,10 @@ from lab.files.run.run_file import save_run
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import write_table
+from lab.pictures.picture_file import GreyPicture
 from lab.progress import Progress
 from lab.simulate.own_motion import along, placed
-from lab.simulate.picture import LaserPowers, Picture, Sensor, laser_powers, make_sensor, render
+from lab.simulate.picture import LaserPowers, Sensor, laser_powers, make_sensor, render
 from lab.simulate.points import simulate_points
 from lab.simulate.rigs import RIGS
 from lab.simulate.scenarios import LIGHTS, Scenario
@@ -274,7 +275,7 @@ def _write_videos(
             if not writer.isOpened():
                 raise InputError(f"{path.name}: this OpenCV cannot write {_VIDEO_CODEC} video; write PNG files instead")
 
-            def picture(k: int, sensor: Sensor = sensor) -> Picture:
+            def picture(k: int, sensor: Sensor = sensor) -> GreyPicture:
                 return render(scene, sensor, powers, k, noisy=noisy)
 
             try:

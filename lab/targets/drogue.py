@@ -21,7 +21,7 @@ from lab.runs.processed import quantiles
 from lab.targets.page import TimeAxis
 from lab.targets.target import Codes, Target, Track, TrackOptions, texts, track_pictures
 from tracking.learned_detector.detector import learned_detector
-from tracking.light_tracker.frames import DrogueFrame, LightParameters, Source
+from tracking.light_tracker.frames import DrogueFrame, LightParameters, MeasuredBy
 from tracking.light_tracker.tracker import DrogueTracker
 from tracking.statuses import PoseStatus
 
@@ -179,13 +179,13 @@ def _correlations(track: Track[DrogueFrame]) -> Array:
     return np.array([f.correlation for f in track.frames])
 
 
-def _sources(track: Track[DrogueFrame]) -> dict[Source, int]:
+def _sources(track: Track[DrogueFrame]) -> dict[MeasuredBy, int]:
     """Number of measured frames by source, all sources."""
     counts = Counter(f.source for f in track.frames if f.status is PoseStatus.MEASURED)
-    return {s: counts[s] for s in Source if s is not Source.NONE}
+    return {s: counts[s] for s in MeasuredBy if s is not MeasuredBy.NONE}
 
 
 def _checks(track: Track[DrogueFrame]) -> tuple[int, int]:
     """Checks of measured frames by the detector, and those that confirmed the drogue."""
     checked = [f for f in track.frames if f.status is PoseStatus.MEASURED and f.searched and not f.event]
-    return len(checked), sum(f.source is Source.BOTH for f in checked)
+    return len(checked), sum(f.source is MeasuredBy.BOTH for f in checked)

@@ -11,7 +11,7 @@ from geometry import rotations
 from geometry.arrays import Array, Bools, Ints
 from geometry.uncertainty.chi_square import chi2_limit
 from tracking.comparison.estimation import inverse_covariances
-from tracking.comparison.frame_alignment import GAP, Alignment, Motion, interpolate, residuals
+from tracking.comparison.frame_alignment import GAP, Alignment, PoseSeries, interpolate, residuals
 
 _BLOCKS = 30
 _DRAWS = 200
@@ -37,7 +37,7 @@ class Differences:
         return int(self.compared.sum())
 
 
-def differences(result: Motion, reference: Motion, alignment: Alignment, gap: float = GAP) -> Differences:
+def differences(result: PoseSeries, reference: PoseSeries, alignment: Alignment, gap: float = GAP) -> Differences:
     """Differences to the reference, interpolated at the result's times."""
     r = residuals(result, reference, alignment, gap)
     hidden = ~(r.known[:, None] & r.compared)
@@ -142,7 +142,7 @@ def chi_square(chi2: Array, freedom: int, used: Bools, parameters: int) -> ChiSq
     return ChiSquare(factor, factor * relative, float(np.mean(each <= chi2_limit(0.05, freedom))), len(rows))
 
 
-def longest_still(motion: Motion, least: int) -> slice | None:
+def longest_still(motion: PoseSeries, least: int) -> slice | None:
     """The longest stretch of consecutive evenly spaced times without motion beyond noise; None below `least` times.
 
     Means of ten samples before and after must agree within six sigmas of the stated noise of the angles.

@@ -19,7 +19,7 @@ from tracking.comparison.frame_alignment import (
     TRANSLATION,
     WORLD,
     Alignment,
-    Motion,
+    PoseSeries,
     Residuals,
     first_alignment,
     jacobians,
@@ -34,7 +34,7 @@ _LEAST_SHARE = 0.5  # of the shorter recording that must overlap
 _LEAST_CORRELATION = 0.5  # of the largest one, for a candidate
 
 
-def speeds_correlation(result: Motion, reference: Motion) -> tuple[Array, Array]:
+def speeds_correlation(result: PoseSeries, reference: PoseSeries) -> tuple[Array, Array]:
     """Time offsets (k,), s, reference minus result, and the correlation (k,) of the speeds at these offsets.
 
     Rotation rates are used if both motions have attitudes, otherwise velocities.
@@ -68,7 +68,7 @@ def speeds_correlation(result: Motion, reference: Motion) -> tuple[Array, Array]
     return offset[enough], r[enough]
 
 
-def offset_candidates(result: Motion, reference: Motion) -> list[float]:
+def offset_candidates(result: PoseSeries, reference: PoseSeries) -> list[float]:
     """Offsets at the six largest local maxima of the correlation of the speeds, best first."""
     offset, r = speeds_correlation(result, reference)
     if not len(r):
@@ -219,7 +219,7 @@ class Free:
     world: bool = True  # rotation A and translation c
     body: bool = True  # rotation B and lever arm l
 
-    def mask(self, result: Motion, reference: Motion) -> Bools:
+    def mask(self, result: PoseSeries, reference: PoseSeries) -> Bools:
         """(14,): the parameters that may change, as far as both motions have attitudes or positions."""
         free = np.zeros(len(PARAMETERS), dtype=bool)
         angles = result.rotation is not None and reference.rotation is not None
@@ -251,7 +251,7 @@ class Estimate:
 
 
 def estimate_alignment(
-    result: Motion, reference: Motion, free: Free | None = None, offset_s: float | None = None, gap: float = GAP
+    result: PoseSeries, reference: PoseSeries, free: Free | None = None, offset_s: float | None = None, gap: float = GAP
 ) -> Estimate:
     """The alignment of a reference to a result.
 
@@ -300,7 +300,7 @@ def estimate_alignment(
     return replace(final, other_offsets=others)
 
 
-def _in_common(result: Motion, reference: Motion) -> bool:
+def _in_common(result: PoseSeries, reference: PoseSeries) -> bool:
     return (result.rotation is not None and reference.rotation is not None) or (
         result.position_m is not None and reference.position_m is not None
     )
@@ -336,7 +336,7 @@ class _Weighted:
     scale: float
 
 
-def _weighted(result: Motion, reference: Motion, alignment: Alignment, gap: float) -> _Weighted | None:
+def _weighted(result: PoseSeries, reference: PoseSeries, alignment: Alignment, gap: float) -> _Weighted | None:
     r = residuals(result, reference, alignment, gap)
     if r.known.sum() < LEAST_FRAMES:
         return None
@@ -362,7 +362,7 @@ def inverse_covariances(r: Residuals, shared: float = 1.0) -> Array:
 
 
 def _fit(
-    result: Motion, reference: Motion, start: Alignment, mask: Bools, gap: float, steps: int = _MOST_STEPS
+    result: PoseSeries, reference: PoseSeries, start: Alignment, mask: Bools, gap: float, steps: int = _MOST_STEPS
 ) -> Estimate | None:
     """Huber's weights until convergence, then without the outliers. None where too few times are common."""
     alignment, what = start, None
@@ -396,13 +396,15 @@ def _fit(
     return Estimate(alignment, covariance, mask, what, w.scale, correlation, inliers & w.r.known, ())
 
 
-def _is_small(delta: Array, result: Motion) -> bool:
+def _is_small(delta: Array, result: PoseSeries) -> bool:
     """Whether a step changes the alignment by less than the residuals can show."""
     limit = np.array([1e-6 * result.step_s, 1e-6 * result.step_s / max(float(np.ptp(result.t_s)), 1e-9)])
     return bool(np.all(np.abs(delta[TIME]) < limit) and np.all(np.abs(delta[2:]) < 1e-10))
 
 
-def _information(result: Motion, reference: Motion, alignment: Alignment, w: _Weighted, weight: Array) -> Information:
+def _information(
+    result: PoseSeries, reference: PoseSeries, alignment: Alignment, w: _Weighted, weight: Array
+) -> Information:
     J, J_reference = jacobians(result, reference, alignment, w.r.compared)
     noise = w.r.result_covariance * max(w.scale, 1.0)
     return Information(J, J_reference, w.W * weight[:, None, None], noise * (weight > 0)[:, None, None])

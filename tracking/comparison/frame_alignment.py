@@ -19,7 +19,7 @@ _SLOPE_SAMPLES = 3  # on either side
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class PoseSeries:
     """Attitudes, positions or both at n rising times. Either may be absent, not both."""
 
     t_s: Array  # (n,), rising
@@ -36,9 +36,9 @@ class Motion:
     def __len__(self) -> int:
         return len(self.t_s)
 
-    def select(self, rows: Bools | Ints) -> Motion:
+    def select(self, rows: Bools | Ints) -> PoseSeries:
         """The motion at some of its times."""
-        return Motion(
+        return PoseSeries(
             self.t_s[rows],
             None if self.rotation is None else self.rotation[rows],
             None if self.position_m is None else self.position_m[rows],
@@ -61,7 +61,7 @@ class Interpolated:
     known: Bools  # (m,)
 
 
-def interpolate(motion: Motion, t_s: Array, gap: float = GAP) -> Interpolated:
+def interpolate(motion: PoseSeries, t_s: Array, gap: float = GAP) -> Interpolated:
     """The motion at times (m,): the cubic through four samples, a line at the ends and beside gaps.
 
     Rotations are interpolated as rotation vectors about the sample before. gap: in median steps; across longer ones
@@ -108,7 +108,7 @@ def _lagrange_weights(nodes: Array, t: Array, cubic: Bools) -> Array:
     return weights
 
 
-def rates(motion: Motion, gap: float = GAP) -> Array:
+def rates(motion: PoseSeries, gap: float = GAP) -> Array:
     """Velocity (m/s) and rotation rate (rad/s, body) of a motion, (n, 6); zero for what is absent or unknown.
 
     The slope of the samples up to three steps away, symmetric in time: the error of a sample and that of its rate are
@@ -185,7 +185,7 @@ class Alignment:
             [clocks, world, body, self.lever_m - other.lever_m, self.translation_m - other.translation_m]
         )
 
-    def applied(self, result: Motion) -> Motion:
+    def applied(self, result: PoseSeries) -> PoseSeries:
         """The result in the reference's frames, at the result's times."""
         rotation = None if result.rotation is None else self.world @ result.rotation @ self.body
         position = None
@@ -194,9 +194,9 @@ class Alignment:
             if result.rotation is not None:
                 point = point + result.rotation @ self.lever_m
             position = point @ self.world.T + self.translation_m
-        return Motion(result.t_s, rotation, position, self._turned_covariance(result))
+        return PoseSeries(result.t_s, rotation, position, self._turned_covariance(result))
 
-    def _turned_covariance(self, result: Motion) -> Array:
+    def _turned_covariance(self, result: PoseSeries) -> Array:
         J = np.zeros((len(result), 6, 6))
         J[:, :3, :3] = self.world
         if result.rotation is not None:
@@ -216,7 +216,7 @@ class Residuals:
     compared: Bools  # (6,): components that both motions have
 
 
-def residuals(result: Motion, reference: Motion, alignment: Alignment, gap: float = GAP) -> Residuals:
+def residuals(result: PoseSeries, reference: PoseSeries, alignment: Alignment, gap: float = GAP) -> Residuals:
     """Differences of the reference, interpolated at the result's times, to the aligned result."""
     aligned = alignment.applied(result)
     there = interpolate(reference, alignment.reference_time(result.t_s), gap)
@@ -232,7 +232,7 @@ def residuals(result: Motion, reference: Motion, alignment: Alignment, gap: floa
     return Residuals(values, aligned.covariance, there.covariance, known, compared)
 
 
-def jacobians(result: Motion, reference: Motion, alignment: Alignment, compared: Bools) -> tuple[Array, Array]:
+def jacobians(result: PoseSeries, reference: PoseSeries, alignment: Alignment, compared: Bools) -> tuple[Array, Array]:
     """Two Jacobians (n, 6, 14) of the residuals: with the rates of the result, and with those of the reference.
 
     The errors of the result's rates are uncorrelated with the residuals, those of the interpolated reference are not:
@@ -268,7 +268,7 @@ _ALTERNATIONS = 8
 _MOST_SAMPLES = 400
 
 
-def first_alignment(result: Motion, reference: Motion, start: Alignment, free: Bools) -> Alignment:
+def first_alignment(result: PoseSeries, reference: PoseSeries, start: Alignment, free: Bools) -> Alignment:
     """Frames of an alignment for the clocks of `start`; free (14,): which parameters may change.
 
     Rotation vectors, or centred positions, are turned onto each other (Kabsch 1976); what attitudes leave open, the
@@ -312,7 +312,7 @@ def first_alignment(result: Motion, reference: Motion, start: Alignment, free: B
 
 
 def _with_lever_arm(
-    start: Alignment, result: Motion, places: Array, noise: float, first: Array, free: Bools
+    start: Alignment, result: PoseSeries, places: Array, noise: float, first: Array, free: Bools
 ) -> list[Array]:
     """Rotations A for places of a point with an unknown lever arm, by alternating between A and the lever arm.
 
@@ -354,7 +354,7 @@ def _quarter_turns() -> list[Array]:
     return found
 
 
-def _misfit(result: Motion, reference: Motion, alignment: Alignment) -> float:
+def _misfit(result: PoseSeries, reference: PoseSeries, alignment: Alignment) -> float:
     """The median of the squared residuals over the mean variances."""
     r = residuals(result, reference, alignment)
     variances = np.diagonal(r.result_covariance + r.reference_covariance, axis1=1, axis2=2).mean(axis=0)
@@ -362,7 +362,7 @@ def _misfit(result: Motion, reference: Motion, alignment: Alignment) -> float:
     return float(np.median(d2)) if len(d2) else np.inf
 
 
-def _with_places(alignment: Alignment, result: Motion, places: Array, free: Bools) -> Alignment:
+def _with_places(alignment: Alignment, result: PoseSeries, places: Array, free: Bools) -> Alignment:
     """Lever arm and translation by linear least squares, twice: the second time without the worst tenth."""
     assert result.position_m is not None
     n = len(places)

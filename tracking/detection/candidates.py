@@ -28,6 +28,7 @@ from tracking.detection.pixels import (
     variance,
     with_texture,
 )
+from tracking.detection.table import Peaks
 from tracking.noise import BLOCK
 
 # Mean light of the four neighbours relative to the pixel's: 0.15 for the sharpest spot (1 px wide), 0 for a hot pixel.
@@ -40,13 +41,6 @@ _LINES, _SUMS, _PAIRS, _MARKS = 1, 4, 7, 9  # in the workspace of a block, see `
 _WEAK = 20.0  # sigmas: a weaker peak must also exceed the background's curvature ...
 _WEAK_SHARE = 0.7  # ... by this share of the threshold
 _WIDE_CLIP = 4.0  # sigmas above the background at which pixels are clipped in the search for wide faint spots
-
-
-# Columns of peaks (most, PEAK_COLUMNS): position, px; mean of 3x3 pixels above the background, and the background, DN;
-# 1 if only the mean of 8x8 pixels detects the peak; half side, px, of the square that the light around it fills, 1 for
-# a narrow spot (found by search.find_separate_peaks); contrast of the texture there.
-AT_U, AT_V, HEIGHT, LEVEL, WIDE, SCALE, CONTRAST = range(7)
-PEAK_COLUMNS = 7
 
 
 def block_workspace() -> Sums:
@@ -65,7 +59,7 @@ class PeakSearch(NamedTuple):
     blocks: Blocks
     workspace: Sums  # see `block_workspace`
     scratch: Array  # (16,)
-    peaks: Array  # (most, PEAK_COLUMNS), the peaks found
+    peaks: Peaks  # (most,), the peaks found
 
 
 @compiled
@@ -320,11 +314,11 @@ def _wide_peak(search: PeakSearch, row: int, column: int, min_sigmas: float, cou
 
 @compiled
 def _store_peak(
-    peaks: Array, row: int, u: int, v: int, height: float, level: float, wide: float, contrast: float
+    peaks: Peaks, row: int, u: int, v: int, height: float, level: float, wide: float, contrast: float
 ) -> None:
     peak = peaks[row]
-    peak[AT_U], peak[AT_V], peak[HEIGHT], peak[LEVEL], peak[WIDE], peak[SCALE] = u, v, height, level, wide, 1.0
-    peak[CONTRAST] = contrast
+    peak["u"], peak["v"], peak["height"], peak["level"], peak["wide"], peak["scale"] = u, v, height, level, wide, 1.0
+    peak["contrast"] = contrast
 
 
 @compiled

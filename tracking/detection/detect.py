@@ -12,21 +12,12 @@ from numpy.typing import ArrayLike
 from geometry.arrays import Array, Ints
 from geometry.camera import SensorNoise
 from tracking.detection.block_search import TEXTURE, Blocks, bin_pixels, find_highest_between, runs_of
-from tracking.detection.candidates import (
-    AT_U,
-    AT_V,
-    CONTRAST,
-    HEIGHT,
-    LEVEL,
-    PEAK_COLUMNS,
-    PeakSearch,
-    block_workspace,
-)
-from tracking.detection.measuring import DetectionLimits, measure
+from tracking.detection.candidates import PeakSearch, block_workspace
+from tracking.detection.measuring import DetectionLimits, Wings, measure
 from tracking.detection.pixels import TEXTURE_SHARE, Noise, Pixels
 from tracking.detection.regions import EVERYWHERE, boxes_of, margin_of, write_detections
 from tracking.detection.search import BORDER_BLOCKS, MAX_COMPARED, find_peaks_in, find_separate_peaks
-from tracking.detection.table import ALGEBRA, CELL_ROWS, COLUMNS, MOST_CELLS
+from tracking.detection.table import ALGEBRA, CANDIDATE, CELL_ROWS, MOST_CELLS, PEAK, Peaks
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.parameters import DetectParameters
@@ -149,14 +140,14 @@ class SpotFinder:
         self._searched = np.zeros((rows, columns), np.uint8)
         self._bright_blocks = np.zeros((rows * columns, 3), np.int64)
         self._workspace, self._scratch = block_workspace(), np.zeros(16)
-        self._peaks = np.zeros((4 * rows * columns, PEAK_COLUMNS))
+        self._peaks = np.zeros(4 * rows * columns, PEAK)
         self._separate, self._near, self._gaps = (
             np.zeros(4 * most, np.int64),
             np.zeros(MAX_COMPARED, np.int64),
             np.zeros(MAX_COMPARED),
         )
         self._cells, self._algebra = np.zeros((CELL_ROWS, MOST_CELLS)), np.zeros((ALGEBRA, 9, 10))
-        self._table, self._count, self._out = np.zeros((most, COLUMNS)), 0, np.zeros((most, 12))
+        self._table, self._count, self._out = np.zeros(most, CANDIDATE), 0, np.zeros((most, 12))
 
     def find(
         self,
@@ -199,11 +190,12 @@ class SpotFinder:
     def _measure(self, task: _Task, count: int, regions: Array) -> None:
         """Measure the separate spots among the first `count` peaks that lie in the regions (n, 3), or near them."""
         peaks = self._peaks[:count]
-        order = np.lexsort((peaks[:, AT_U], peaks[:, AT_V], -peaks[:, HEIGHT]))
+        order = np.lexsort((peaks["u"], peaks["v"], -peaks["height"]))
         if count > len(self._separate):  # bright objects have many peaks, which must not displace spots in even places
             first = np.argsort(_insignificance(peaks[order], task.model), kind="stable")[: len(self._separate)]
             order = order[np.sort(first)]
-        away = np.abs(peaks[:, None, :2] - regions[:, :2]).max(axis=2)
+        places = np.stack([peaks["u"], peaks["v"]], axis=-1)
+        away = np.abs(places[:, None] - regions[:, :2]).max(axis=2)
         wanted = (away <= regions[:, 2] + margin_of(regions)).any(axis=1)
         near, threshold = (self._near, self._gaps), task.limits.threshold_sigma
         n = find_separate_peaks(task.pixels, peaks, order, wanted, task.noise, threshold, self._separate, *near)
@@ -220,10 +212,10 @@ class SpotFinder:
         return Detections(rows[:, :2].copy(), cov, *columns[5:10], misfit=columns[10], chi2=columns[11])
 
 
-def _insignificance(peaks: Array, model: NoiseModel) -> Array:
+def _insignificance(peaks: Peaks, model: NoiseModel) -> Array:
     """(n,): the noise and structure at each peak relative to its height."""
-    structure = TEXTURE_SHARE * peaks[:, CONTRAST] * peaks[:, LEVEL]
-    return np.asarray((model.variance(peaks[:, LEVEL]) / 9.0 + structure**2) / peaks[:, HEIGHT] ** 2)
+    structure = TEXTURE_SHARE * peaks["contrast"] * peaks["level"]
+    return np.asarray((model.variance(peaks["level"]) / 9.0 + structure**2) / peaks["height"] ** 2)
 
 
 class _Task(NamedTuple):
@@ -246,7 +238,7 @@ class _Task(NamedTuple):
             float(parameters.min_sigma_px),
             float(parameters.max_sigma_px),
             float(parameters.min_explained),
-            np.array([p.near, p.near_px**2, p.far, p.uneven**2, *p.shape_px2, p.shape_sigma_px2**2], dtype=float),
+            Wings(*map(float, (p.near, p.near_px**2, p.far, p.uneven**2, *p.shape_px2, p.shape_sigma_px2**2))),
         )
         pixels = Pixels(image.view(np.uint8), image.itemsize, image.shape[1], image.shape[0])
         others = float(model.texture), float(model.banding_dn), float(model.compression_dn2)

@@ -15,41 +15,20 @@ from tracking.detection.normal_equations import accumulate, solve_normal
 from tracking.detection.pixels import VALID, Noise, Pixels, Window, insert_nearest, read_window, window_around
 from tracking.detection.quality import assess_fit, exclude_isolated_cells, gain_over_plane
 from tracking.detection.table import (
-    ACTIVE,
-    BACKGROUND,
-    CELL_SIZE,
-    COV_UV,
     FACTOR,
-    FLUX,
-    GAIN,
     GAPS,
-    HELD,
-    LEVEL,
-    MOMENT_U,
-    MOMENT_UU,
-    MOMENT_UV,
-    MOMENT_V,
-    MOMENT_VV,
     NEAR,
     NEIGHBOUR_LIGHT,
     NORMAL,
     RIGHT_SIDE,
     ROW,
-    SIGMA_FLUX,
-    SLOPE_U,
-    SLOPE_V,
     SOLUTION,
     STATE,
     USE,
-    UU,
-    UV,
     VALUES,
-    VAR_U,
-    VAR_V,
     VECTORS,
-    VV,
-    U,
-    V,
+    Candidate,
+    Candidates,
 )
 
 _STEPS = 12  # Gauss-Newton converges in three or four; a clipped spot, whose top is extrapolated, needs up to ten
@@ -66,43 +45,48 @@ _LEAST_VARIANCE = 0.02  # px^2: narrower spots cannot be distinguished from a po
 
 @compiled
 def fit_all(
-    image: Pixels, table: Array, noise: Noise, saturation: float, max_sigma: float, min_gain: float, again: bool,
+    image: Pixels, table: Candidates, noise: Noise, saturation: float, max_sigma: float, min_gain: float, again: bool,
     together: bool, cells: Array, algebra: Array,
 ) -> None:  # fmt: skip
-    """Fit all candidates of a picture (n, COLUMNS) together, in place, starting from their moments.
+    """Fit all candidates of a picture (n,) together, in place, starting from their moments.
 
     Gauss-Newton steps until the centres converge; clipped pixels, pixels outside and hot pixels are excluded, and the
     light of the neighbours is subtracted. A candidate that grows beyond `max_sigma`, px, diverges, or lowers chi-square
-    by less than `min_gain` is rejected: its flux becomes 0. again: only those with ACTIVE start from their moments; the
+    by less than `min_gain` is rejected: its flux becomes 0. again: only the active ones start from their moments; the
     others have been fitted. together: these are fitted further where the light of a neighbour has changed; otherwise
     they stay as they are.
     """
     n = table.shape[0]
     for i in range(n):
         spot = table[i]
-        if again and not spot[ACTIVE]:
+        if again and not spot["active"]:
             continue
-        spot[U], spot[V], spot[UU], spot[UV] = spot[MOMENT_U], spot[MOMENT_V], spot[MOMENT_UU], spot[MOMENT_UV]
-        spot[VV], spot[LEVEL], spot[ACTIVE] = spot[MOMENT_VV], spot[BACKGROUND], 1.0
-        spot[SLOPE_U] = spot[SLOPE_V] = 0.0
-        spot[FLUX] = max(spot[FLUX], 1.0)
+        spot["u"], spot["v"], spot["uu"], spot["uv"] = (
+            spot["moment_u"],
+            spot["moment_v"],
+            spot["moment_uu"],
+            spot["moment_uv"],
+        )
+        spot["vv"], spot["level"], spot["active"] = spot["moment_vv"], spot["background"], 1.0
+        spot["slope_u"] = spot["slope_v"] = 0.0
+        spot["flux"] = max(spot["flux"], 1.0)
         if _has_diverged(spot, max_sigma):  # moments overestimate rather than underestimate the width
-            spot[FLUX], spot[ACTIVE] = 0.0, 0.0
+            spot["flux"], spot["active"] = 0.0, 0.0
     for step in range(_STEPS):
         changed = False
         for i in range(n):
             spot = table[i]
-            if not spot[ACTIVE]:
+            if not spot["active"]:
                 continue
-            spot[ACTIVE], spot[CELL_SIZE] = 0.0, max(spot[CELL_SIZE], 1.0 * window_of(spot).cell)
+            spot["active"], spot["cell_size"] = 0.0, max(spot["cell_size"], 1.0 * window_of(spot).cell)
             moved = _step(image, table, i, noise, saturation, step == _STEPS - 1, cells, algebra)
             # Further steps do not turn noise into a spot.
-            if _has_diverged(spot, max_sigma) or (step >= 1 and spot[GAIN] < min_gain):
-                spot[FLUX] = 0.0
-            if spot[FLUX] <= 0.0:
+            if _has_diverged(spot, max_sigma) or (step >= 1 and spot["gain"] < min_gain):
+                spot["flux"] = 0.0
+            if spot["flux"] <= 0.0:
                 moved = True
             elif moved:
-                spot[ACTIVE] = 1.0
+                spot["active"] = 1.0
             changed = changed or moved
             if moved and together:
                 _reactivate_neighbours(table, i)
@@ -111,18 +95,18 @@ def fit_all(
 
 
 @compiled
-def _has_diverged(spot: Array, max_sigma: float) -> bool:
+def _has_diverged(spot: Candidate, max_sigma: float) -> bool:
     """Whether a spot has become too wide, or too far from its moments for their width and its own."""
-    major = ellipse.axes(spot[UU], spot[UV], spot[VV])[0]
+    major = ellipse.axes(spot["uu"], spot["uv"], spot["vv"])[0]
     if major > 1.5 * max_sigma:
         return True
-    away = sqrt((spot[U] - spot[MOMENT_U]) ** 2 + (spot[V] - spot[MOMENT_V]) ** 2)
-    return away > 3.0 + max(2.0 * ellipse.axes(spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV])[0], major)
+    away = sqrt((spot["u"] - spot["moment_u"]) ** 2 + (spot["v"] - spot["moment_v"]) ** 2)
+    return away > 3.0 + max(2.0 * ellipse.axes(spot["moment_uu"], spot["moment_uv"], spot["moment_vv"])[0], major)
 
 
 @compiled
 def _step(
-    image: Pixels, table: Array, i: int, noise: Noise, saturation: float, last: bool, cells: Array, algebra: Array
+    image: Pixels, table: Candidates, i: int, noise: Noise, saturation: float, last: bool, cells: Array, algebra: Array
 ) -> bool:
     """One Gauss-Newton step of one spot; whether it needs another one."""
     spot, X, b = table[i], algebra[SOLUTION], algebra[VECTORS, RIGHT_SIDE]
@@ -138,39 +122,39 @@ def _step(
     if exclude_isolated_cells(window, spot, cells):
         chi2 = accumulate(window, spot, noise, cells, algebra)
     frame = frame_of(window, spot)
-    if not _solve(frame, spot[HELD] > 0.0, algebra):
-        spot[FLUX] = 0.0
+    if not _solve(frame, spot["held"] > 0.0, algebra):
+        spot["flux"] = 0.0
         return True
-    before_u, before_v = spot[U], spot[V]
+    before_u, before_v = spot["u"], spot["v"]
     var_u, var_v, cov_uv = _centre_covariance(frame, X)
-    sigma_flux = spot[FLUX] * sqrt(_flux_variance(frame, X))
+    sigma_flux = spot["flux"] * sqrt(_flux_variance(frame, X))
     after = chi2
     for p in range(9):
         after -= X[p, 0] * b[p]
-    spot[GAIN] = gain_over_plane(algebra[NORMAL], b, chi2, after)
+    spot["gain"] = gain_over_plane(algebra[NORMAL], b, chi2, after)
     _advance(frame, spot, X)
-    du, dv = spot[U] - before_u, spot[V] - before_v
-    moved = _needs_another_step(du, var_u, spot[UU]) or _needs_another_step(dv, var_v, spot[VV])
+    du, dv = spot["u"] - before_u, spot["v"] - before_v
+    moved = _needs_another_step(du, var_u, spot["uu"]) or _needs_another_step(dv, var_v, spot["vv"])
     if variance_of_wings(spot) > 0.0:  # their start is far from the shape
         moved = moved or max(abs(X[3, 0]), abs(X[4, 0]), abs(X[5, 0])) > _SETTLED
     if not moved or last:
-        spot[VAR_U], spot[COV_UV], spot[VAR_V], spot[SIGMA_FLUX] = var_u, cov_uv, var_v, sigma_flux
+        spot["var_u"], spot["cov_uv"], spot["var_v"], spot["sigma_flux"] = var_u, cov_uv, var_v, sigma_flux
         assess_fit(window, frame, after, noise, cells, spot)
         if moved:  # the last step is added to the uncertainty of a centre that has not converged
-            spot[VAR_U], spot[COV_UV] = spot[VAR_U] + du * du, spot[COV_UV] + du * dv
-            spot[VAR_V] += dv * dv
+            spot["var_u"], spot["cov_uv"] = spot["var_u"] + du * du, spot["cov_uv"] + du * dv
+            spot["var_v"] += dv * dv
     return moved and not last
 
 
 @compiled
-def _add_light(window: Window, spot: Array, lights: Array, out: Array) -> None:
+def _add_light(window: Window, spot: Candidate, lights: Array, out: Array) -> None:
     """Add the light of another spot (9,), DN, to the cells (cells,) of a window. lights (cells,) is workspace."""
     pixel = window.cell**2 / 12.0
-    S = (spot[UU] + pixel, spot[UV], spot[VV] + pixel)
+    S = (spot["uu"] + pixel, spot["uv"], spot["vv"] + pixel)
     inverse = ellipse.inverse(S[0], S[1], S[2])
-    scale = spot[FLUX] / (2 * pi * sqrt(S[0] * S[2] - S[1] ** 2))
+    scale = spot["flux"] / (2 * pi * sqrt(S[0] * S[2] - S[1] ** 2))
     middle = 0.5 * (window.cell - 1)
-    u0, v0 = window.left + middle - spot[U], window.top + middle - spot[V]
+    u0, v0 = window.left + middle - spot["u"], window.top + middle - spot["v"]
     light = lights[: window.rows * window.columns]
     gaussian_window(inverse, u0, v0, float(window.cell), window.columns, light)
     for k in range(light.shape[0]):
@@ -178,7 +162,7 @@ def _add_light(window: Window, spot: Array, lights: Array, out: Array) -> None:
 
 
 @compiled
-def least_variance(spot: Array) -> float:
+def least_variance(spot: Candidate) -> float:
     """The least variance, px^2, of a spot in any direction: that of its wings is part of it."""
     return _LEAST_VARIANCE + variance_of_wings(spot)
 
@@ -198,18 +182,18 @@ def _half_width(variance: float) -> float:
 
 
 @compiled
-def window_of(spot: Array) -> Window:
-    """The window of a spot (9,): a rectangle, with larger cells for wide spots."""
-    half_u, half_v = _half_width(spot[UU]), _half_width(spot[VV])
+def window_of(spot: Candidate) -> Window:
+    """The window of a spot: a rectangle, with larger cells for wide spots."""
+    half_u, half_v = _half_width(spot["uu"]), _half_width(spot["vv"])
     half = max(half_u, half_v)
     cell, most = 1, 18
     if half > 18:
         # A long streak has cells of two pixels as well, because four would blur its narrow side.
-        slim = ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[0] < 9.0
+        slim = ellipse.eigenvalues(spot["uu"], spot["uv"], spot["vv"])[0] < 9.0
         cell, most = (2, 36) if half <= 36 or slim else (4, 24)
     columns = ceil(min(max(half_u / cell, _LEAST_HALF), most))
     rows = ceil(min(max(half_v / cell, _LEAST_HALF), most))
-    return window_around(spot[U], spot[V], columns, rows, cell)
+    return window_around(spot["u"], spot["v"], columns, rows, cell)
 
 
 @compiled
@@ -219,23 +203,23 @@ def reach_of(cell: int) -> float:
 
 
 @compiled
-def _gap(spot: Array, other: Array, window: Window) -> float:
+def _gap(spot: Candidate, other: Candidate, window: Window) -> float:
     """Pixels between the window of a spot and the light of another one; negative if the light reaches the window."""
-    du, dv = abs(spot[U] - other[U]), abs(spot[V] - other[V])
+    du, dv = abs(spot["u"] - other["u"]), abs(spot["v"] - other["v"])
     if max(du, dv) >= reach_of(window.cell):
         return np.inf
-    gap_u = du - 0.5 * window.cell * window.columns - 1.25 * _half_width(other[UU])
-    gap_v = dv - 0.5 * window.cell * window.rows - 1.25 * _half_width(other[VV])
+    gap_u = du - 0.5 * window.cell * window.columns - 1.25 * _half_width(other["uu"])
+    gap_v = dv - 0.5 * window.cell * window.rows - 1.25 * _half_width(other["vv"])
     return max(gap_u, gap_v)
 
 
 @compiled
-def _neighbours(table: Array, i: int, window: Window, near: Array, gaps: Array) -> int:
+def _neighbours(table: Candidates, i: int, window: Window, near: Array, gaps: Array) -> int:
     """The spots whose light reaches farthest into a window, into `near`; returns their number."""
     filled = 0
     for j in range(table.shape[0]):
-        far = max(abs(table[j, U] - table[i, U]), abs(table[j, V] - table[i, V])) >= reach_of(window.cell)
-        if j == i or far or table[j, FLUX] <= 0.0:
+        far = max(abs(table[j]["u"] - table[i]["u"]), abs(table[j]["v"] - table[i]["v"])) >= reach_of(window.cell)
+        if j == i or far or table[j]["flux"] <= 0.0:
             continue
         gap = _gap(table[i], table[j], window)
         if gap < 0:
@@ -244,14 +228,14 @@ def _neighbours(table: Array, i: int, window: Window, near: Array, gaps: Array) 
 
 
 @compiled
-def _reactivate_neighbours(table: Array, i: int) -> None:
+def _reactivate_neighbours(table: Candidates, i: int) -> None:
     """Mark the spots into whose windows spot i shines to be fitted again, because it has moved."""
     for j in range(table.shape[0]):
-        far = max(abs(table[j, U] - table[i, U]), abs(table[j, V] - table[i, V])) >= reach_of(4)
-        if j == i or far or table[j, ACTIVE] or table[j, FLUX] <= 0.0:
+        far = max(abs(table[j]["u"] - table[i]["u"]), abs(table[j]["v"] - table[i]["v"])) >= reach_of(4)
+        if j == i or far or table[j]["active"] or table[j]["flux"] <= 0.0:
             continue
         if _gap(table[j], table[i], window_of(table[j])) < 0:
-            table[j, ACTIVE] = 1.0
+            table[j]["active"] = 1.0
 
 
 @compiled
@@ -315,7 +299,7 @@ def _flux_variance(frame: PolynomialFrame, X: Array) -> float:
 
 
 @compiled
-def _advance(frame: PolynomialFrame, spot: Array, X: Array) -> None:
+def _advance(frame: PolynomialFrame, spot: Candidate, X: Array) -> None:
     """Apply the step, limited to one sigma of the spot in length, a factor 2.5 in its variances and 5 in its flux.
 
     With light F (1 + f) and a step d of the centre, the coefficient of the derivative is (1 + f) d, not d.
@@ -332,16 +316,18 @@ def _advance(frame: PolynomialFrame, spot: Array, X: Array) -> None:
     c, d = S[1] * q3 + S[2] * q4, S[1] * q4 + S[2] * q5
     duu, duv, dvv = 2 * (a * S[0] + b * S[1]), 2 * (a * S[1] + b * S[2]), 2 * (c * S[1] + d * S[2])
     pixel = 1 / 12.0
-    base = (spot[UU] + pixel, spot[UV], spot[VV] + pixel)
+    base = (spot["uu"] + pixel, spot["uv"], spot["vv"] + pixel)
     uu, uv, vv = ellipse.clip_in_metric(
         (base[0] + more * duu, base[1] + more * duv, base[2] + more * dvv), base, 0.4, 2.5
     )
     short = 1.0 / max(ellipse.mahalanobis(du, dv, base[0], base[1], base[2]), 1.0)
     du, dv = short * du, short * dv
-    spot[UU], spot[UV], spot[VV] = ellipse.clip_eigenvalues(uu - pixel, uv, vv - pixel, least_variance(spot), np.inf)
-    spot[SLOPE_U] += X[7, 0] / su
-    spot[SLOPE_V] += X[8, 0] / sv
-    spot[LEVEL] += X[6, 0] + spot[SLOPE_U] * du + spot[SLOPE_V] * dv
-    spot[U] += du
-    spot[V] += dv
-    spot[FLUX] *= 1.0 + f
+    spot["uu"], spot["uv"], spot["vv"] = ellipse.clip_eigenvalues(
+        uu - pixel, uv, vv - pixel, least_variance(spot), np.inf
+    )
+    spot["slope_u"] += X[7, 0] / su
+    spot["slope_v"] += X[8, 0] / sv
+    spot["level"] += X[6, 0] + spot["slope_u"] * du + spot["slope_v"] * dv
+    spot["u"] += du
+    spot["v"] += dv
+    spot["flux"] *= 1.0 + f

@@ -10,52 +10,12 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.compilation.jit import compiled, compiled_for_threads
 from tracking.detection import ellipse
-from tracking.detection.candidates import AT_U, AT_V, CONTRAST, HEIGHT, LEVEL, SCALE
-from tracking.detection.candidates import WIDE as WIDE_PEAK
 from tracking.detection.gaussian_fit import fit_all, least_variance
 from tracking.detection.moments import CENTRE_SHARE, compact_height, find_moments, start_variance
 from tracking.detection.pixels import Noise, Pixels, texture_variance, with_texture
 from tracking.detection.quality import light_beside
 from tracking.detection.regions import NARROWER, drop_duplicates
-from tracking.detection.table import (
-    ACCEPTED,
-    ACTIVE,
-    BACKGROUND,
-    CELL_SIZE,
-    CHI2,
-    COLUMNS,
-    COV_UV,
-    EXPLAINED,
-    EXPLAINED_HERE,
-    FAR_WING,
-    FLUX,
-    GAIN,
-    HELD,
-    MISFIT,
-    MOMENT_U,
-    MOMENT_UU,
-    MOMENT_UV,
-    MOMENT_V,
-    MOMENT_VV,
-    NEAR_WING,
-    PEAK,
-    SCRATCH,
-    SIGMA_FLUX,
-    SLOPE_U,
-    SLOPE_V,
-    START,
-    TEXTURE,
-    UNEVEN,
-    UU,
-    UV,
-    VAR_U,
-    VAR_V,
-    VV,
-    WIDE,
-    U,
-    V,
-)
-from tracking.detection.table import LEVEL as FITTED_LEVEL
+from tracking.detection.table import SCRATCH, Candidate, Candidates, Peaks
 
 # Least decrease of chi-square by a spot, relative to threshold^2. The maximum of noise over positions and shapes is
 # higher than at one position: with 1.0 a picture of 1280x1024 has 0.04 false points, with 1.1 fewer than 0.01.
@@ -82,6 +42,19 @@ NARROW_PX = 1.0  # sigma: in wider spots the centre of a Gaussian does not depen
 _FARTHEST = 0.5  # px: from the Gaussian's centre to that of the fit with wings
 
 
+class Wings(NamedTuple):
+    """The usual light of narrow spots, as in CANDIDATE."""
+
+    near: float
+    near_variance: float
+    far: float
+    uneven: float
+    uu: float
+    uv: float
+    vv: float
+    variance: float
+
+
 class DetectionLimits(NamedTuple):
     """tracking.parameters.DetectParameters for compiled code."""
 
@@ -90,28 +63,27 @@ class DetectionLimits(NamedTuple):
     min_sigma: float  # px
     max_sigma: float  # px
     min_explained: float
-    profile: Array  # (n,) of narrow spots: columns NEAR_WING to USUAL_VARIANCE of the table
+    wings: Wings  # of narrow spots
 
 
 @compiled_for_threads
 def measure(
     image: Pixels,
-    peaks: Array,
+    peaks: Peaks,
     chosen: Ints,
     noise: Noise,
     limits: DetectionLimits,
-    table: Array,
+    table: Candidates,
     cells: Array,
     algebra: Array,
 ) -> None:
-    """Measure the chosen peaks (n,) and write the results into table (n, COLUMNS)."""
+    """Measure the chosen peaks (n,) and write the results into table (n,)."""
     for k in range(chosen.shape[0]):
         peak, spot = peaks[chosen[k]], table[k]
-        spot[MOMENT_U], spot[MOMENT_V], spot[BACKGROUND] = peak[AT_U], peak[AT_V], peak[LEVEL]
-        spot[WIDE], spot[START], spot[HELD] = peak[WIDE_PEAK], start_variance(peak[SCALE]), 0.0
-        spot[TEXTURE], spot[MISFIT] = peak[CONTRAST], 0.0
-        for p in range(limits.profile.shape[0]):
-            spot[NEAR_WING + p] = 0.0
+        spot["moment_u"], spot["moment_v"], spot["background"] = peak["u"], peak["v"], peak["level"]
+        spot["wide"], spot["start"], spot["held"] = peak["wide"], start_variance(peak["scale"]), 0.0
+        spot["texture"], spot["misfit"] = peak["contrast"], 0.0
+        _set_wings(spot, Wings(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     find_moments(image, table, cells)
     least = _LEAST_GAIN * limits.threshold_sigma**2
     fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, False, True, cells, algebra)
@@ -128,50 +100,55 @@ def measure(
         _judge_unresolved(image, table, noise, limits)
     for k in range(chosen.shape[0]):
         spot = table[k]
-        here = with_texture(noise, spot[TEXTURE])
+        here = with_texture(noise, spot["texture"])
         accepted = _is_spot(image, spot, here, limits) or _is_compact(image, spot, here, limits, cells[SCRATCH])
-        spot[ACCEPTED] = 1.0 if accepted else 0.0
+        spot["accepted"] = 1.0 if accepted else 0.0
     drop_duplicates(table)
-    if limits.profile[0] > 0.0 or limits.profile[FAR_WING - NEAR_WING] > 0.0:
+    if limits.wings.near > 0.0 or limits.wings.far > 0.0:
         _fit_wings(image, table, noise, limits, cells, algebra)
 
 
 @compiled
+def _set_wings(spot: Candidate, wings: Wings) -> None:
+    spot["near_wing"], spot["near_variance"], spot["far_wing"] = wings.near, wings.near_variance, wings.far
+    spot["uneven"], spot["usual_variance"] = wings.uneven, wings.variance
+    spot["usual_uu"], spot["usual_uv"], spot["usual_vv"] = wings.uu, wings.uv, wings.vv
+
+
+@compiled
 def _fit_wings(
-    image: Pixels, table: Array, noise: Noise, limits: DetectionLimits, cells: Array, algebra: Array
+    image: Pixels, table: Candidates, noise: Noise, limits: DetectionLimits, cells: Array, algebra: Array
 ) -> None:
     """Fit the narrow spots again with the wings that they have in this camera; a Gaussian stays where that fails."""
     gaussian = table.copy()
     for k in range(table.shape[0]):
         spot = table[k]
-        spot[ACTIVE] = 0.0
-        det = spot[UU] * spot[VV] - spot[UV] ** 2
-        if not spot[ACCEPTED] or np.isnan(spot[SIGMA_FLUX]) or spot[CELL_SIZE] > 1.0 or det > NARROW_PX**4:
+        spot["active"] = 0.0
+        det = spot["uu"] * spot["vv"] - spot["uv"] ** 2
+        if not spot["accepted"] or np.isnan(spot["sigma_flux"]) or spot["cell_size"] > 1.0 or det > NARROW_PX**4:
             continue
-        for p in range(limits.profile.shape[0]):
-            spot[NEAR_WING + p] = limits.profile[p]
-        spot[MOMENT_U], spot[MOMENT_V], spot[HELD], spot[ACTIVE] = spot[U], spot[V], 0.0, 1.0
-        spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV] = ellipse.clip_eigenvalues(
-            spot[UU], spot[UV], spot[VV], 2.0 * least_variance(spot), np.inf
+        _set_wings(spot, limits.wings)
+        spot["moment_u"], spot["moment_v"], spot["held"], spot["active"] = spot["u"], spot["v"], 0.0, 1.0
+        spot["moment_uu"], spot["moment_uv"], spot["moment_vv"] = ellipse.clip_eigenvalues(
+            spot["uu"], spot["uv"], spot["vv"], 2.0 * least_variance(spot), np.inf
         )
     fit_all(image, table, noise, limits.saturation, limits.max_sigma, 0.0, True, False, cells, algebra)
     for k in range(table.shape[0]):
         spot = table[k]
-        if spot[NEAR_WING] + spot[FAR_WING] <= 0.0:
+        if spot["near_wing"] + spot["far_wing"] <= 0.0:
             continue
-        away = max(abs(spot[U] - gaussian[k, U]), abs(spot[V] - gaussian[k, V]))
-        unsure = max(spot[VAR_U], spot[VAR_V]) > _FARTHEST**2
-        if not spot[FLUX] > 0.0 or not spot[PEAK] > 0.0 or unsure or away > _FARTHEST:
-            for column in range(COLUMNS):
-                spot[column] = gaussian[k, column]
-        elif spot[UNEVEN] > 0.0:
+        away = max(abs(spot["u"] - gaussian[k]["u"]), abs(spot["v"] - gaussian[k]["v"]))
+        unsure = max(spot["var_u"], spot["var_v"]) > _FARTHEST**2
+        if not spot["flux"] > 0.0 or not spot["peak"] > 0.0 or unsure or away > _FARTHEST:
+            table[k] = gaussian[k]
+        elif spot["uneven"] > 0.0:
             # What the shape leaves belongs to the place within the pixel, and is no noise.
-            noise_share = (1.0 - gaussian[k, MISFIT]) * (gaussian[k, VAR_U] + gaussian[k, VAR_V])
-            spot[MISFIT] = max(spot[MISFIT], 1.0 - noise_share / (spot[VAR_U] + spot[VAR_V]))
+            noise_share = (1.0 - gaussian[k]["misfit"]) * (gaussian[k]["var_u"] + gaussian[k]["var_v"])
+            spot["misfit"] = max(spot["misfit"], 1.0 - noise_share / (spot["var_u"] + spot["var_v"]))
 
 
 @compiled
-def _start_again(peaks: Array, chosen: Ints, table: Array, limits: DetectionLimits, restarted: Bools) -> bool:
+def _start_again(peaks: Peaks, chosen: Ints, table: Candidates, limits: DetectionLimits, restarted: Bools) -> bool:
     """Give candidates whose moments or fits left their light a start from the peak and its scale; whether there are.
 
     Marks them in restarted (n,).
@@ -182,45 +159,47 @@ def _start_again(peaks: Array, chosen: Ints, table: Array, limits: DetectionLimi
     found = False
     for k in range(table.shape[0]):
         spot, peak = table[k], peaks[chosen[k]]
-        spot[ACTIVE] = 0.0
-        start = max(spot[START], _LEAST_START)
-        poor = spot[EXPLAINED] < limits.min_explained
-        major2 = ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[1]
-        poor = poor and (major2 > _OUTGROWN**2 * start or major2 * _OUTGROWN < spot[START])
-        if (spot[FLUX] > 0.0 and not poor) or spot[MOMENT_UU] >= _NOTHING or peak[WIDE_PEAK]:
+        spot["active"] = 0.0
+        start = max(spot["start"], _LEAST_START)
+        poor = spot["explained"] < limits.min_explained
+        major2 = ellipse.eigenvalues(spot["uu"], spot["uv"], spot["vv"])[1]
+        poor = poor and (major2 > _OUTGROWN**2 * start or major2 * _OUTGROWN < spot["start"])
+        if (spot["flux"] > 0.0 and not poor) or spot["moment_uu"] >= _NOTHING or peak["wide"]:
             continue
-        away = max(abs(spot[MOMENT_U] - peak[AT_U]), abs(spot[MOMENT_V] - peak[AT_V]))
-        high = ellipse.eigenvalues(spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV])[1]
+        away = max(abs(spot["moment_u"] - peak["u"]), abs(spot["moment_v"] - peak["v"]))
+        high = ellipse.eigenvalues(spot["moment_uu"], spot["moment_uv"], spot["moment_vv"])[1]
         if not poor and away * away < start and high < _OUTGROWN * start:
             continue
-        spot[MOMENT_U], spot[MOMENT_V] = peak[AT_U], peak[AT_V]
-        spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV] = start, 0.0, start
-        spot[FLUX], spot[ACTIVE] = 2 * pi * start * peak[HEIGHT], 1.0
+        spot["moment_u"], spot["moment_v"] = peak["u"], peak["v"]
+        spot["moment_uu"], spot["moment_uv"], spot["moment_vv"] = start, 0.0, start
+        spot["flux"], spot["active"] = 2 * pi * start * peak["height"], 1.0
         restarted[k] = found = True
     return found
 
 
 @compiled
-def _drop_background(table: Array, restarted: Bools) -> None:
+def _drop_background(table: Candidates, restarted: Bools) -> None:
     """Reject restarted fits (n,) that follow the background: wider than the peak, or no maximum on the slope.
 
     The curvature of a wide reflection fits a faint wide spot. A spot is brighter than its surroundings on all sides.
     """
     for k in range(table.shape[0]):
         spot = table[k]
-        if spot[FLUX] <= 0.0 or not restarted[k]:
+        if spot["flux"] <= 0.0 or not restarted[k]:
             continue
-        det = spot[UU] * spot[VV] - spot[UV] ** 2
-        height = spot[FLUX] / (2 * pi * sqrt(det))
-        a, b = spot[SLOPE_U], spot[SLOPE_V]
-        rise = sqrt(a * a * spot[UU] + 2 * a * b * spot[UV] + b * b * spot[VV])  # of the background over one sigma
-        wide = ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[1] > _OUTGROWN * spot[MOMENT_UU]
+        det = spot["uu"] * spot["vv"] - spot["uv"] ** 2
+        height = spot["flux"] / (2 * pi * sqrt(det))
+        a, b = spot["slope_u"], spot["slope_v"]
+        rise = sqrt(
+            a * a * spot["uu"] + 2 * a * b * spot["uv"] + b * b * spot["vv"]
+        )  # of the background over one sigma
+        wide = ellipse.eigenvalues(spot["uu"], spot["uv"], spot["vv"])[1] > _OUTGROWN * spot["moment_uu"]
         if wide or height * _STEEPEST < rise:
-            spot[FLUX] = 0.0
+            spot["flux"] = 0.0
 
 
 @compiled
-def _hold_unresolved(peaks: Array, chosen: Ints, table: Array, limits: DetectionLimits) -> bool:
+def _hold_unresolved(peaks: Peaks, chosen: Ints, table: Candidates, limits: DetectionLimits) -> bool:
     """Give fits that have collapsed a start with a width that is held; whether there are any.
 
     The width of a spot that is narrower than a pixel follows from the light in the neighbouring pixels alone. Noise, or
@@ -229,119 +208,123 @@ def _hold_unresolved(peaks: Array, chosen: Ints, table: Array, limits: Detection
     found = False
     for k in range(table.shape[0]):
         spot, peak = table[k], peaks[chosen[k]]
-        spot[ACTIVE] = 0.0
-        if spot[FLUX] <= 0.0 or peak[WIDE_PEAK]:
+        spot["active"] = 0.0
+        if spot["flux"] <= 0.0 or peak["wide"]:
             continue
-        major, minor, _ = ellipse.axes(spot[UU], spot[UV], spot[VV])
-        sigma = sqrt(max(spot[VAR_U], spot[VAR_V], 0.0))
+        major, minor, _ = ellipse.axes(spot["uu"], spot["uv"], spot["vv"])
+        sigma = sqrt(max(spot["var_u"], spot["var_v"], 0.0))
         if major > _UNRESOLVED or (minor >= limits.min_sigma and sigma < 0.5 * max(major, 0.5)):
             continue
-        spot[MOMENT_U], spot[MOMENT_V] = peak[AT_U], peak[AT_V]
-        spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV] = _NARROWEST**2, 0.0, _NARROWEST**2
-        spot[FLUX], spot[ACTIVE], spot[HELD] = 9.0 * peak[HEIGHT], 1.0, 1.0
+        spot["moment_u"], spot["moment_v"] = peak["u"], peak["v"]
+        spot["moment_uu"], spot["moment_uv"], spot["moment_vv"] = _NARROWEST**2, 0.0, _NARROWEST**2
+        spot["flux"], spot["active"], spot["held"] = 9.0 * peak["height"], 1.0, 1.0
         found = True
     return found
 
 
 @compiled
-def _judge_unresolved(image: Pixels, table: Array, noise: Noise, limits: DetectionLimits) -> None:
+def _judge_unresolved(image: Pixels, table: Candidates, noise: Noise, limits: DetectionLimits) -> None:
     """Reject fits with a held width that are weak or have no light beside two pixels; widen the others' covariance."""
     needed = _UNRESOLVED_GAIN * limits.threshold_sigma**2
     for k in range(table.shape[0]):
         spot = table[k]
-        if not spot[HELD] or spot[FLUX] <= 0.0:
+        if not spot["held"] or spot["flux"] <= 0.0:
             continue
-        spot[VAR_U], spot[VAR_V] = spot[VAR_U] + _WITHIN_PIXEL**2, spot[VAR_V] + _WITHIN_PIXEL**2
-        if spot[GAIN] < needed or light_beside(image, spot, noise, _NARROWEST) < _BESIDE:
-            spot[FLUX] = spot[UU] = spot[UV] = spot[VV] = 0.0
+        spot["var_u"], spot["var_v"] = spot["var_u"] + _WITHIN_PIXEL**2, spot["var_v"] + _WITHIN_PIXEL**2
+        if spot["gain"] < needed or light_beside(image, spot, noise, _NARROWEST) < _BESIDE:
+            spot["flux"] = spot["uu"] = spot["uv"] = spot["vv"] = 0.0
 
 
 @compiled
-def _merge_parts(table: Array) -> bool:
-    """Join fits that are parts of one light into one start of another fit, ACTIVE; whether there are any.
+def _merge_parts(table: Candidates) -> bool:
+    """Join fits that are parts of one light into one start of another fit, active; whether there are any.
 
     The sum of two equal Gaussians has two maxima only if they are more than two sigmas apart. Two fits that are nearer
     to each other and about equally wide were therefore not two lights, but speckle of one.
     """
     found = False
     for i in range(table.shape[0]):
-        table[i, ACTIVE] = 0.0
+        table[i]["active"] = 0.0
     for i in range(table.shape[0]):
         spot = table[i]
         for j in range(i + 1, table.shape[0]):
             other = table[j]
-            if not (spot[FLUX] > 0.0 and other[FLUX] > 0.0):
+            if not (spot["flux"] > 0.0 and other["flux"] > 0.0):
                 continue
-            own = (spot[UU] + 1 / 12) * (spot[VV] + 1 / 12) - spot[UV] ** 2
-            its = (other[UU] + 1 / 12) * (other[VV] + 1 / 12) - other[UV] ** 2
-            du, dv = other[U] - spot[U], other[V] - spot[V]
+            own = (spot["uu"] + 1 / 12) * (spot["vv"] + 1 / 12) - spot["uv"] ** 2
+            its = (other["uu"] + 1 / 12) * (other["vv"] + 1 / 12) - other["uv"] ** 2
+            du, dv = other["u"] - spot["u"], other["v"] - spot["v"]
             if min(own, its) < NARROWER**4 * max(own, its):
                 continue
-            uu, uv, vv = 0.5 * (spot[UU] + other[UU]), 0.5 * (spot[UV] + other[UV]), 0.5 * (spot[VV] + other[VV])
+            uu, uv, vv = (
+                0.5 * (spot["uu"] + other["uu"]),
+                0.5 * (spot["uv"] + other["uv"]),
+                0.5 * (spot["vv"] + other["vv"]),
+            )
             if ellipse.mahalanobis(du, dv, uu + 1 / 12, uv, vv + 1 / 12) < _PART_APART:
-                share = other[FLUX] / (spot[FLUX] + other[FLUX])
+                share = other["flux"] / (spot["flux"] + other["flux"])
                 between = share * (1.0 - share)
-                spot[MOMENT_U], spot[MOMENT_V] = spot[U] + share * du, spot[V] + share * dv
-                spot[MOMENT_UU] = (1.0 - share) * spot[UU] + share * other[UU] + between * du * du
-                spot[MOMENT_UV] = (1.0 - share) * spot[UV] + share * other[UV] + between * du * dv
-                spot[MOMENT_VV] = (1.0 - share) * spot[VV] + share * other[VV] + between * dv * dv
-                spot[U], spot[V] = spot[MOMENT_U], spot[MOMENT_V]
-                spot[UU], spot[UV], spot[VV] = spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV]
-                spot[FLUX], other[FLUX] = spot[FLUX] + other[FLUX], 0.0
-                other[MOMENT_UU], other[MOMENT_UV], other[MOMENT_VV] = _NOTHING, 0.0, _NOTHING
-                spot[ACTIVE], other[ACTIVE] = 1.0, 0.0
+                spot["moment_u"], spot["moment_v"] = spot["u"] + share * du, spot["v"] + share * dv
+                spot["moment_uu"] = (1.0 - share) * spot["uu"] + share * other["uu"] + between * du * du
+                spot["moment_uv"] = (1.0 - share) * spot["uv"] + share * other["uv"] + between * du * dv
+                spot["moment_vv"] = (1.0 - share) * spot["vv"] + share * other["vv"] + between * dv * dv
+                spot["u"], spot["v"] = spot["moment_u"], spot["moment_v"]
+                spot["uu"], spot["uv"], spot["vv"] = spot["moment_uu"], spot["moment_uv"], spot["moment_vv"]
+                spot["flux"], other["flux"] = spot["flux"] + other["flux"], 0.0
+                other["moment_uu"], other["moment_uv"], other["moment_vv"] = _NOTHING, 0.0, _NOTHING
+                spot["active"], other["active"] = 1.0, 0.0
                 found = True
     return found
 
 
 @compiled
-def _is_spot(image: Pixels, spot: Array, noise: Noise, limits: DetectionLimits) -> bool:
-    if not spot[FLUX] > 0.0:
+def _is_spot(image: Pixels, spot: Candidate, noise: Noise, limits: DetectionLimits) -> bool:
+    if not spot["flux"] > 0.0:
         return False
-    major, minor, _ = ellipse.axes(spot[UU], spot[UV], spot[VV])
-    sigma_u, sigma_v = sqrt(max(spot[VAR_U], 0.0)), sqrt(max(spot[VAR_V], 0.0))
-    amplitude = spot[FLUX] / (2 * pi * (major * minor + 1 / 12))
-    level = spot[BACKGROUND]
+    major, minor, _ = ellipse.axes(spot["uu"], spot["uv"], spot["vv"])
+    sigma_u, sigma_v = sqrt(max(spot["var_u"], 0.0)), sqrt(max(spot["var_v"], 0.0))
+    amplitude = spot["flux"] / (2 * pi * (major * minor + 1 / 12))
+    level = spot["background"]
     if major > _IN_BACKGROUND:
-        level = min(level, max(spot[FITTED_LEVEL], 0.5 * level))
+        level = min(level, max(spot["level"], 0.5 * level))
     structure = limits.threshold_sigma * sqrt(texture_variance(noise, level))
-    needed = _SPOT_GAIN * limits.threshold_sigma**2 * max(spot[CHI2] / _CHI2, 1.0)
+    needed = _SPOT_GAIN * limits.threshold_sigma**2 * max(spot["chi2"] / _CHI2, 1.0)
     # Texture around a faint spot is not a misfit of the spot if that is clearly higher than the grains.
-    clear = amplitude > _ABOVE_GRAINS * structure and spot[GAIN] > _CLEAR_GAIN * needed
+    clear = amplitude > _ABOVE_GRAINS * structure and spot["gain"] > _CLEAR_GAIN * needed
     return (
         amplitude > structure
-        and spot[GAIN] > needed
-        and spot[FLUX] > _SPOT_FLUX * limits.threshold_sigma * spot[SIGMA_FLUX]
-        and spot[PEAK] > 0.0
+        and spot["gain"] > needed
+        and spot["flux"] > _SPOT_FLUX * limits.threshold_sigma * spot["sigma_flux"]
+        and spot["peak"] > 0.0
         and major <= limits.max_sigma
         and minor >= limits.min_sigma
-        and (spot[EXPLAINED] >= limits.min_explained or (clear and spot[EXPLAINED_HERE] >= limits.min_explained))
+        and (spot["explained"] >= limits.min_explained or (clear and spot["explained_here"] >= limits.min_explained))
         and max(sigma_u, sigma_v) < 0.5 * max(major, 0.5)
-        and spot[U] > -0.5 - 3 * sigma_u
-        and spot[V] > -0.5 - 3 * sigma_v
-        and spot[U] < image.width - 0.5 + 3 * sigma_u
-        and spot[V] < image.height - 0.5 + 3 * sigma_v
+        and spot["u"] > -0.5 - 3 * sigma_u
+        and spot["v"] > -0.5 - 3 * sigma_v
+        and spot["u"] < image.width - 0.5 + 3 * sigma_u
+        and spot["v"] < image.height - 0.5 + 3 * sigma_v
     )
 
 
 @compiled
-def _is_compact(image: Pixels, spot: Array, noise: Noise, limits: DetectionLimits, scratch: Array) -> bool:
+def _is_compact(image: Pixels, spot: Candidate, noise: Noise, limits: DetectionLimits, scratch: Array) -> bool:
     """Whether a candidate that is not a Gaussian is a compact light; if so, its row is filled from the moments."""
-    uu, uv, vv = spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV]
+    uu, uv, vv = spot["moment_uu"], spot["moment_uv"], spot["moment_vv"]
     major, minor, _ = ellipse.axes(uu, uv, vv)
     # A candidate with a narrow fit is rejected: a hot pixel is compact and bright, too.
-    narrow = min(minor, ellipse.axes(spot[UU], spot[UV], spot[VV])[1]) < limits.min_sigma
+    narrow = min(minor, ellipse.axes(spot["uu"], spot["uv"], spot["vv"])[1]) < limits.min_sigma
     if narrow or major > limits.max_sigma:
         return False
-    if spot[GAIN] < limits.threshold_sigma**2:
+    if spot["gain"] < limits.threshold_sigma**2:
         return False
-    u, v = spot[MOMENT_U], spot[MOMENT_V]
+    u, v = spot["moment_u"], spot["moment_v"]
     height = compact_height(image, u, v, (uu, uv, vv), noise, limits.threshold_sigma, scratch)
     if height <= 0.0:
         return False
-    spot[U], spot[V], spot[UU], spot[UV], spot[VV] = u, v, uu, uv, vv
-    spot[FLUX] = 2 * pi * sqrt(max(uu * vv - uv * uv, 0.0)) * height
+    spot["u"], spot["v"], spot["uu"], spot["uv"], spot["vv"] = u, v, uu, uv, vv
+    spot["flux"] = 2 * pi * sqrt(max(uu * vv - uv * uv, 0.0)) * height
     share = CENTRE_SHARE**2
-    spot[VAR_U], spot[COV_UV], spot[VAR_V] = share * uu + 0.01, share * uv, share * vv + 0.01
-    spot[PEAK], spot[SIGMA_FLUX], spot[MISFIT] = height, np.nan, 1.0
+    spot["var_u"], spot["cov_uv"], spot["var_v"] = share * uu + 0.01, share * uv, share * vv + 0.01
+    spot["peak"], spot["sigma_flux"], spot["misfit"] = height, np.nan, 1.0
     return True

@@ -13,7 +13,6 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
-from tracking.detection.candidates import AT_U, AT_V, CONTRAST, HEIGHT, LEVEL
 from tracking.detection.ellipse import gaussian_window
 from tracking.detection.pixels import (
     OUTSIDE,
@@ -32,22 +31,7 @@ from tracking.detection.pixels import (
     window_around,
     with_texture,
 )  # fmt: skip
-from tracking.detection.table import (
-    BACKGROUND,
-    CELL_SIZE,
-    FLUX,
-    MOMENT_U,
-    MOMENT_UU,
-    MOMENT_UV,
-    MOMENT_V,
-    MOMENT_VV,
-    ROW,
-    SCRATCH,
-    START,
-    STATE,
-    VALUES,
-    WIDE,
-)
+from tracking.detection.table import ROW, SCRATCH, STATE, VALUES, Candidate, Candidates, Peak
 
 # Growing windows: half the number of cells, cell size, iterations, and the largest 1-sigma half axis (px) for each.
 _WINDOWS = ((9, 1, 3, 3.5), (18, 2, 5, 9.0), (18, 4, 5, np.inf))
@@ -102,19 +86,19 @@ MOST_ON_RING = max(_RING)
 
 
 @compiled
-def stands_out(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float, ring: Array) -> bool:
-    """Whether a peak is far higher than the light on a circle around it; lowers CONTRAST in an even place.
+def stands_out(image: Pixels, peak: Peak, noise: Noise, threshold_sigma: float, ring: Array) -> bool:
+    """Whether a peak is far higher than the light on a circle around it; lowers its contrast in an even place.
 
     On each circle around a part of an edge, a cable or another long line some light continues; fits of candidates on
     lines would grow over large windows and take most of the time. A spot, also a streak, is brighter than all light on
     a circle that is large enough. The structure of the background at a place is that on the second most even of such
     circles: what stands farther away does not matter. ring (MOST_ON_RING,) is workspace. Source: ours.
     """
-    here, column, row = peak[HEIGHT] + peak[LEVEL], int(peak[AT_U]), int(peak[AT_V])
-    sigma, alone, lowest, second = sqrt(variance(noise, peak[LEVEL])), False, np.inf, np.inf
-    level = peak[LEVEL]  # without the light of a wide spot, which is in the background from the search
-    structure = sqrt(texture_variance(with_texture(noise, peak[CONTRAST]), peak[LEVEL]))
-    high = peak[HEIGHT] >= _CLEARLY_HIGH * threshold_sigma * structure
+    here, column, row = peak["height"] + peak["level"], int(peak["u"]), int(peak["v"])
+    sigma, alone, lowest, second = sqrt(variance(noise, peak["level"])), False, np.inf, np.inf
+    level = peak["level"]  # without the light of a wide spot, which is in the background from the search
+    structure = sqrt(texture_variance(with_texture(noise, peak["contrast"]), peak["level"]))
+    high = peak["height"] >= _CLEARLY_HIGH * threshold_sigma * structure
     first = 0
     for k in range(len(_CIRCLES)):
         if k == _IN_SMALL_PLACE and (not alone or second < np.inf):
@@ -137,25 +121,25 @@ def stands_out(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float,
             if _OUTSIDE_WIDE <= k < _IN_SMALL_PLACE and around < _RAISED * level:
                 level = min(level, around)
             lowest, second = min(lowest, scatter), min(second, max(lowest, scatter))
-    if second < _EVEN * peak[CONTRAST] * peak[LEVEL]:
-        peak[CONTRAST] = second / max(peak[LEVEL], 1.0)
-    structure = sqrt(texture_variance(with_texture(noise, peak[CONTRAST]), level))
+    if second < _EVEN * peak["contrast"] * peak["level"]:
+        peak["contrast"] = second / max(peak["level"], 1.0)
+    structure = sqrt(texture_variance(with_texture(noise, peak["contrast"]), level))
     return alone and here - level >= PEAK_SHARE * threshold_sigma * structure
 
 
 @compiled
-def is_sharp(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float) -> bool:
-    """Whether a peak is far sharper than the structure around it; if so, CONTRAST is that of sharp structure.
+def is_sharp(image: Pixels, peak: Peak, noise: Noise, threshold_sigma: float) -> bool:
+    """Whether a peak is far sharper than the structure around it; if so, its contrast is that of sharp structure.
 
     Edges and objects have a high contrast in means of 3x3 pixels, of which a narrow spot fills only a part, but little
     light that exceeds all neighbours. The second lowest of the maxima on circles counts, as in `stands_out`.
     """
-    column, row, best = int(peak[AT_U]), int(peak[AT_V]), 0.0
+    column, row, best = int(peak["u"]), int(peak["v"]), 0.0
     for i in range(row - 1, row + 1):
         for j in range(column - 1, column + 1):
             best = max(best, _sharpness(image, j, i))
     # Speckle is on the light of a wider spot.
-    if best < max(threshold_sigma * sqrt(variance(noise, peak[LEVEL]) / 3.0), peak[HEIGHT]):
+    if best < max(threshold_sigma * sqrt(variance(noise, peak["level"]) / 3.0), peak["height"]):
         return False
     lowest, second = np.inf, np.inf
     first = 0
@@ -166,12 +150,12 @@ def is_sharp(image: Pixels, peak: Array, noise: Noise, threshold_sigma: float) -
         first += _RING[k]
         scatter = highest / _HIGHEST[k]
         lowest, second = min(lowest, scatter), min(second, max(lowest, scatter))
-    contrast = second / max(peak[LEVEL], 1.0)
-    if contrast > _EVEN * peak[CONTRAST]:  # the texture is as fine as the peak
+    contrast = second / max(peak["level"], 1.0)
+    if contrast > _EVEN * peak["contrast"]:  # the texture is as fine as the peak
         return False
-    if best < threshold_sigma * sqrt(texture_variance(with_texture(noise, contrast), peak[LEVEL])):
+    if best < threshold_sigma * sqrt(texture_variance(with_texture(noise, contrast), peak["level"])):
         return False
-    peak[CONTRAST] = contrast
+    peak["contrast"] = contrast
     return True
 
 
@@ -234,34 +218,34 @@ def start_variance(half_side: float) -> float:
 
 
 @compiled
-def find_moments(image: Pixels, table: Array, cells: Array) -> None:
-    """Moments and flux of candidates (n, COLUMNS), starting from MOMENT_U, MOMENT_V, START, above the BACKGROUND.
+def find_moments(image: Pixels, table: Candidates, cells: Array) -> None:
+    """Moments and flux of candidates (n,), starting from their moments' centre and `start`, above the background.
 
     Accurate to about a tenth of a pixel, which is enough to start a fit.
     Source: Bernstein & Jarvis (2002), "Shapes and shears, stars and smears", Astron. J. 123, section 3.
     """
     for i in range(table.shape[0]):
-        start = _START_WIDE if table[i, WIDE] else max(table[i, START], _START)
-        table[i, MOMENT_UU], table[i, MOMENT_UV], table[i, MOMENT_VV] = start, 0.0, start
+        start = _START_WIDE if table[i]["wide"] else max(table[i]["start"], _START)
+        table[i]["moment_uu"], table[i]["moment_uv"], table[i]["moment_vv"] = start, 0.0, start
     largest = 0.0
     for step in range(3):
         half, cell, rounds, limit = _WINDOWS[step]
         for i in range(table.shape[0]):
             spot = table[i]
             # Only candidates that have outgrown the previous window are measured in the next one.
-            high = ellipse.eigenvalues(spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV])[1]
-            if (step > 0 and high <= largest) or (step == 0 and (spot[WIDE] or high > limit**2)):
+            high = ellipse.eigenvalues(spot["moment_uu"], spot["moment_uv"], spot["moment_vv"])[1]
+            if (step > 0 and high <= largest) or (step == 0 and (spot["wide"] or high > limit**2)):
                 continue
-            spot[CELL_SIZE] = cell
-            window = window_around(spot[MOMENT_U], spot[MOMENT_V], half, half, cell)
+            spot["cell_size"] = cell
+            window = window_around(spot["moment_u"], spot["moment_v"], half, half, cell)
             # Clipped pixels are used: for a first width and centre a clipped top is better than missing pixels.
             read_window(image, window, np.inf, cells[VALUES], cells[STATE])
-            background = spot[BACKGROUND]
+            background = spot["background"]
             if cell > 1:  # the given background, a median over 40 px, is biased by a wide spot
                 background = _median_of_border(window, cells[VALUES], cells[STATE], cells[SCRATCH], background)
             _subtract_background(window, table, i, background, cells[VALUES], cells[STATE])
             for _ in range(rounds):
-                spot[FLUX] = cell * cell * _adapt_window(window, cells[VALUES], spot, cells[ROW:])
+                spot["flux"] = cell * cell * _adapt_window(window, cells[VALUES], spot, cells[ROW:])
         largest = limit**2
 
 
@@ -281,7 +265,9 @@ def _median_of_border(window: Window, values: Array, state: Array, scratch: Arra
 
 
 @compiled
-def _subtract_background(window: Window, table: Array, i: int, background: float, values: Array, state: Array) -> None:
+def _subtract_background(
+    window: Window, table: Candidates, i: int, background: float, values: Array, state: Array
+) -> None:
     """Subtract the background; cells outside and cells nearer to another candidate become 0."""
     cells = window.rows * window.columns
     for k in range(cells):
@@ -289,30 +275,30 @@ def _subtract_background(window: Window, table: Array, i: int, background: float
     reach = 1.0 * window.cell * window.columns
     middle = 0.5 * (window.cell - 1)
     for j in range(table.shape[0]):
-        du, dv = table[j, MOMENT_U] - table[i, MOMENT_U], table[j, MOMENT_V] - table[i, MOMENT_V]
+        du, dv = table[j]["moment_u"] - table[i]["moment_u"], table[j]["moment_v"] - table[i]["moment_v"]
         if j == i or max(abs(du), abs(dv)) >= reach:
             continue
         half = 0.5 * (du * du + dv * dv)
         for row in range(window.rows):
-            y = window.top + middle + row * window.cell - table[i, MOMENT_V]
+            y = window.top + middle + row * window.cell - table[i]["moment_v"]
             for column in range(window.columns):
-                x = window.left + middle + column * window.cell - table[i, MOMENT_U]
+                x = window.left + middle + column * window.cell - table[i]["moment_u"]
                 if x * du + y * dv > half:
                     values[row * window.columns + column] = 0.0
 
 
 @compiled
-def _adapt_window(window: Window, light: Array, spot: Array, lines: Array) -> float:
+def _adapt_window(window: Window, light: Array, spot: Candidate, lines: Array) -> float:
     """One iteration of the adaptive window; returns the flux, DN cells. lines (4, cells) is workspace.
 
     Under a window W a Gaussian S has the covariance (1/S + 1/W)^-1. If both are equal, the measured offset and flux are
     half the true ones, so they are doubled.
     """
     pixel = window.cell**2 / 12.0
-    W = (spot[MOMENT_UU] + pixel, spot[MOMENT_UV], spot[MOMENT_VV] + pixel)
+    W = (spot["moment_uu"] + pixel, spot["moment_uv"], spot["moment_vv"] + pixel)
     narrow = ellipse.inverse(*W)
     middle = 0.5 * (window.cell - 1)
-    u0, v0 = window.left + middle - spot[MOMENT_U], window.top + middle - spot[MOMENT_V]
+    u0, v0 = window.left + middle - spot["moment_u"], window.top + middle - spot["moment_v"]
     n = window.columns
     # Sums of the columns times y^0, y^1, y^2.
     weights, sum0, sum1, sum2 = lines[0, : n * window.rows], lines[1, :n], lines[2, :n], lines[3, :n]
@@ -338,10 +324,10 @@ def _adapt_window(window: Window, light: Array, spot: Array, lines: Array) -> fl
     a, b, c = ellipse.inverse(*seen)
     a, b, c = ellipse.inverse(a - narrow[0], b - narrow[1], c - narrow[2])
     short = 2.0 / max(2.0 * ellipse.mahalanobis(mu, mv, *W), 1.0)
-    spot[MOMENT_U] += short * mu
-    spot[MOMENT_V] += short * mv
+    spot["moment_u"] += short * mu
+    spot["moment_v"] += short * mv
     a, b, c = ellipse.clip_eigenvalues(a - pixel, b, c - pixel, 0.1, np.inf)
-    spot[MOMENT_UU], spot[MOMENT_UV], spot[MOMENT_VV] = a, b, c
+    spot["moment_uu"], spot["moment_uv"], spot["moment_vv"] = a, b, c
     return 2.0 * s0
 
 

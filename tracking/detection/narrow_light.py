@@ -17,25 +17,7 @@ from geometry.arrays import Array
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
 from tracking.detection.pixels import Window
-from tracking.detection.table import (
-    FAR_WING,
-    FLUX,
-    LINE,
-    NEAR_VARIANCE,
-    NEAR_WING,
-    NODES,
-    PART,
-    ROW,
-    USUAL_UU,
-    USUAL_UV,
-    USUAL_VARIANCE,
-    USUAL_VV,
-    UU,
-    UV,
-    VV,
-    U,
-    V,
-)  # fmt: skip
+from tracking.detection.table import LINE, NODES, PART, ROW, Candidate
 
 EXACT_PX2 = 0.9**2  # px^2: narrower spots are integrated over the pixels numerically
 FAR_PX2 = 2.0**2  # px^2: what the far wing adds: its light reaches the border of the window
@@ -62,38 +44,38 @@ class PolynomialFrame(NamedTuple):
 
 
 @compiled
-def frame_of(window: Window, spot: Array) -> PolynomialFrame:
-    """The frame of a spot (9,) in a window."""
+def frame_of(window: Window, spot: Candidate) -> PolynomialFrame:
+    """The frame of a spot in a window."""
     middle, pixel = 0.5 * (window.cell - 1), window.cell**2 / 12.0
-    narrow = ellipse.eigenvalues(spot[UU], spot[UV], spot[VV])[0] < EXACT_PX2
+    narrow = ellipse.eigenvalues(spot["uu"], spot["uv"], spot["vv"])[0] < EXACT_PX2
     exact = window.cell == 1 and (narrow or variance_of_wings(spot) > 0.0)
     if exact:
         pixel = 0.0
-    S = (spot[UU] + pixel, spot[UV], spot[VV] + pixel)
+    S = (spot["uu"] + pixel, spot["uv"], spot["vv"] + pixel)
     return PolynomialFrame(
-        window.left + middle - spot[U], window.top + middle - spot[V], sqrt(S[0]), sqrt(S[2]), S, exact
+        window.left + middle - spot["u"], window.top + middle - spot["v"], sqrt(S[0]), sqrt(S[2]), S, exact
     )
 
 
 @compiled
-def variance_of_wings(spot: Array) -> float:
+def variance_of_wings(spot: Candidate) -> float:
     """What the wings add to the variance of a spot's core, px^2."""
-    return spot[NEAR_WING] * spot[NEAR_VARIANCE] + spot[FAR_WING] * FAR_PX2
+    return spot["near_wing"] * spot["near_variance"] + spot["far_wing"] * FAR_PX2
 
 
 @compiled
-def exact_light(window: Window, frame: PolynomialFrame, spot: Array, cells: Array) -> None:
+def exact_light(window: Window, frame: PolynomialFrame, spot: Candidate, cells: Array) -> None:
     """The light of a spot and its derivatives, the means of each pixel, into cells[NODES:]."""
     S, more = frame.S, variance_of_wings(spot)
     if more <= 0.0:
-        _pixel_moments(window, frame, S, spot[FLUX], cells, NODES)
+        _pixel_moments(window, frame, S, spot["flux"], cells, NODES)
         return
-    near, far = spot[NEAR_WING], spot[FAR_WING]
+    near, far = spot["near_wing"], spot["far_wing"]
     out = cells[NODES : NODES + 6, : window.rows * window.columns]
     out[:] = 0.0
-    for share, added in ((1.0 - near - far, 0.0), (near, spot[NEAR_VARIANCE]), (far, FAR_PX2)):
+    for share, added in ((1.0 - near - far, 0.0), (near, spot["near_variance"]), (far, FAR_PX2)):
         part = (S[0] - more + added, S[1], S[2] - more + added)
-        _pixel_moments(window, frame, part, share * spot[FLUX], cells, PART)
+        _pixel_moments(window, frame, part, share * spot["flux"], cells, PART)
         M = _derivatives(frame, part)
         for p in range(6):
             for q in range(6):
@@ -186,18 +168,18 @@ def _derivatives(frame: PolynomialFrame, part: tuple[float, float, float]) -> Ar
 
 
 @compiled
-def add_usual_shape(frame: PolynomialFrame, spot: Array, N: Array, b: Array) -> None:
+def add_usual_shape(frame: PolynomialFrame, spot: Candidate, N: Array, b: Array) -> None:
     """Add the usual shape of narrow spots, with its scatter, to the normal equations, if it is known."""
-    if spot[USUAL_VARIANCE] <= 0.0:
+    if spot["usual_variance"] <= 0.0:
         return
     S, d = frame.S, np.zeros(3)
-    d[0], d[1], d[2] = spot[USUAL_UU] - S[0], spot[USUAL_UV] - S[1], spot[USUAL_VV] - S[2]
+    d[0], d[1], d[2] = spot["usual_uu"] - S[0], spot["usual_uv"] - S[1], spot["usual_vv"] - S[2]
     J = np.zeros((3, 3))
     for p, a, m, c in _second_degree(frame.su, frame.sv):
         T = ellipse.between(S, (a, m, c))
         J[p - 3, 0], J[p - 3, 1], J[p - 3, 2] = 2.0 * T[0], 2.0 * T[1], 2.0 * T[2]
-    far = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) / spot[USUAL_VARIANCE]
-    weight = 1.0 / (spot[USUAL_VARIANCE] * (1.0 + far / _TOLERANT))
+    far = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) / spot["usual_variance"]
+    weight = 1.0 / (spot["usual_variance"] * (1.0 + far / _TOLERANT))
     for p in range(3):
         for k in range(3):
             b[3 + p] += weight * J[p, k] * d[k]

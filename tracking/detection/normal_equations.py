@@ -20,8 +20,6 @@ from tracking.detection.pixels import Noise, Window, total_of_products
 from tracking.detection.table import (
     AT_X,
     AT_Y,
-    FLUX,
-    LEVEL,
     LIGHT,
     NEIGHBOUR_LIGHT,
     NODES,
@@ -29,13 +27,11 @@ from tracking.detection.table import (
     RESIDUAL,
     RIGHT_SIDE,
     SCRATCH,
-    SLOPE_U,
-    SLOPE_V,
-    UNEVEN,
     USE,
     VALUES,
     VECTORS,
     WEIGHT,
+    Candidate,
 )
 
 _POWERS_U, _POWERS_V = (0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)
@@ -54,7 +50,7 @@ _EDGEWORTH = 0.4  # cell^2 / variance above which the pixels' fourth cumulant is
 
 
 @compiled
-def accumulate(window: Window, spot: Array, noise: Noise, cells: Array, algebra: Array) -> float:
+def accumulate(window: Window, spot: Candidate, noise: Noise, cells: Array, algebra: Array) -> float:
     """Fill the normal matrix and right side at a spot, and the cells' light, weight and residual; returns chi-square.
 
     Columns: 1, x, y, x^2, x y, y^2 times the light, then 1, x, y, in the coordinates of `frame_of`. The weights follow
@@ -64,7 +60,7 @@ def accumulate(window: Window, spot: Array, noise: Noise, cells: Array, algebra:
     if frame.exact:
         return _accumulate_exact(window, frame, spot, noise, cells, algebra[NORMAL], algebra[VECTORS, RIGHT_SIDE])
     inverse = ellipse.inverse(frame.S[0], frame.S[1], frame.S[2])
-    scale = spot[FLUX] / (2 * np.pi * sqrt(frame.S[0] * frame.S[2] - frame.S[1] ** 2))
+    scale = spot["flux"] / (2 * np.pi * sqrt(frame.S[0] * frame.S[2] - frame.S[1] ** 2))
     cell, count = float(window.cell), window.rows * window.columns
     light, weight, residual = cells[LIGHT, :count], cells[WEIGHT, :count], cells[RESIDUAL, :count]
     x, y, product = cells[AT_X, :count], cells[AT_Y, :count], cells[NODES, :count]
@@ -100,14 +96,14 @@ def _fill_coordinates(window: Window, frame: PolynomialFrame, x: Array, y: Array
 
 @compiled
 def _weigh(
-    frame: PolynomialFrame, cell: float, spot: Array, noise: Noise, scale: float, x: Array, y: Array, cells: Array
+    frame: PolynomialFrame, cell: float, spot: Candidate, noise: Noise, scale: float, x: Array, y: Array, cells: Array
 ) -> None:
     """Light, residual and weight of the cells, from LIGHT / scale. Without branches and with few arrays in each loop,
     so that they are vectorised.
     """
     count = x.shape[0]
-    level, floor, slope, black = spot[LEVEL], noise.floor, noise.slope, noise.black
-    tilt_x, tilt_y, pixels = spot[SLOPE_U] * frame.su, spot[SLOPE_V] * frame.sv, cell * cell
+    level, floor, slope, black = spot["level"], noise.floor, noise.slope, noise.black
+    tilt_x, tilt_y, pixels = spot["slope_u"] * frame.su, spot["slope_v"] * frame.sv, cell * cell
     light, residual, weight = cells[LIGHT, :count], cells[RESIDUAL, :count], cells[WEIGHT, :count]
     others, values, use = cells[NEIGHBOUR_LIGHT, :count], cells[VALUES, :count], cells[USE, :count]
     for k in range(light.shape[0]):
@@ -191,7 +187,7 @@ def _integrate(
 
 @compiled
 def _accumulate_exact(
-    window: Window, frame: PolynomialFrame, spot: Array, noise: Noise, cells: Array, N: Array, b: Array
+    window: Window, frame: PolynomialFrame, spot: Candidate, noise: Noise, cells: Array, N: Array, b: Array
 ) -> float:
     """`accumulate` for a narrow spot, with light and derivatives integrated over each pixel by quadrature."""
     count = window.rows * window.columns
@@ -201,7 +197,7 @@ def _accumulate_exact(
     for k in range(light.shape[0]):
         light[k] = cells[NODES, k]
     _weigh(frame, 1.0, spot, noise, 1.0, x, y, cells)
-    weight, residual, uneven = cells[WEIGHT, :count], cells[RESIDUAL, :count], spot[UNEVEN]
+    weight, residual, uneven = cells[WEIGHT, :count], cells[RESIDUAL, :count], spot["uneven"]
     for k in range(weight.shape[0]):
         weight[k] /= 1.0 + weight[k] * uneven * light[k] * light[k]
     for p in range(9):

@@ -21,34 +21,7 @@ from tracking.detection.pixels import (
     total_of_products,
     variance,
 )
-from tracking.detection.table import (
-    CHI2,
-    COV_UV,
-    EXPLAINED,
-    EXPLAINED_HERE,
-    FLUX,
-    GAIN,
-    LEVEL,
-    LIGHT,
-    MISFIT,
-    NEIGHBOUR_LIGHT,
-    PEAK,
-    RESIDUAL,
-    SCRATCH,
-    SIGMA_FLUX,
-    SLOPE_U,
-    SLOPE_V,
-    STATE,
-    USE,
-    UU,
-    VALUES,
-    VAR_U,
-    VAR_V,
-    VV,
-    WEIGHT,
-    U,
-    V,
-)
+from tracking.detection.table import LIGHT, NEIGHBOUR_LIGHT, RESIDUAL, SCRATCH, STATE, USE, VALUES, WEIGHT, Candidate
 
 _OUTLIER = 6.0  # sigmas: least residual of a hot or dead pixel ...
 _ISOLATED = 2.5  # ... and its least ratio to the residuals of the neighbouring pixels
@@ -69,8 +42,10 @@ _LARGEST_SHIFT = 0.3  # widths: speckle of contrast 0.3 moves the centre by 0.14
 
 
 @compiled
-def assess_fit(window: Window, frame: PolynomialFrame, chi2: float, noise: Noise, cells: Array, spot: Array) -> None:
-    """Fill PEAK, CHI2, MISFIT and both EXPLAINED of a spot (COLUMNS,), which has its covariances and GAIN.
+def assess_fit(
+    window: Window, frame: PolynomialFrame, chi2: float, noise: Noise, cells: Array, spot: Candidate
+) -> None:
+    """Fill peak, chi-square, misfit and both shares explained of a spot, which has its covariances and gain.
 
     chi2: after the last step. The covariance is the Cramer-Rao bound of the model on entry; it is scaled by the factors
     of `_misfit`, as is the variance of the flux.
@@ -85,20 +60,24 @@ def assess_fit(window: Window, frame: PolynomialFrame, chi2: float, noise: Noise
     for k in range(count):
         if light[k] > _CORE * most and cells[STATE, k] != OUTSIDE:
             peak = max(peak, cells[RESIDUAL, k] + light[k])
-    spot[PEAK], spot[CHI2] = peak, chi2 / free
+    spot["peak"], spot["chi2"] = peak, chi2 / free
     # Chi-square scatters by sqrt(2 free): twice that is not counted as misfit, for the sake of faint spots.
     by_noise = free + 2.0 * sqrt(2.0 * free)
-    spot[EXPLAINED] = spot[GAIN] / (max(chi2 - by_noise, 0.0) + max(spot[GAIN], 1e-9))
+    spot["explained"] = spot["gain"] / (max(chi2 - by_noise, 0.0) + max(spot["gain"], 1e-9))
     by_structure = by_noise * max(_chi2_beside(count, most, cells), 1.0)
-    spot[EXPLAINED_HERE] = spot[GAIN] / (max(chi2 - by_structure, 0.0) + max(spot[GAIN], 1e-9))
+    spot["explained_here"] = spot["gain"] / (max(chi2 - by_structure, 0.0) + max(spot["gain"], 1e-9))
     width2 = sqrt(max(frame.S[0] * frame.S[2] - frame.S[1] ** 2, 0.0))
-    largest = _LARGEST_SHIFT**2 * width2 / max(0.5 * (spot[VAR_U] + spot[VAR_V]), 1e-300)
+    largest = _LARGEST_SHIFT**2 * width2 / max(0.5 * (spot["var_u"] + spot["var_v"]), 1e-300)
     by_compression, by_grain, of_flux = _misfit(window, frame, noise.compression, cells, used)
-    spot[SIGMA_FLUX] *= sqrt(1.0 + of_flux)
+    spot["sigma_flux"] *= sqrt(1.0 + of_flux)
     # Errors of compression are those of the picture's content: a spot at rest has the same in every picture.
     factor = 1.0 + by_compression + min(by_grain, largest)
-    spot[MISFIT] = 1.0 - 1.0 / factor
-    spot[VAR_U], spot[COV_UV], spot[VAR_V] = spot[VAR_U] * factor, spot[COV_UV] * factor, spot[VAR_V] * factor
+    spot["misfit"] = 1.0 - 1.0 / factor
+    spot["var_u"], spot["cov_uv"], spot["var_v"] = (
+        spot["var_u"] * factor,
+        spot["cov_uv"] * factor,
+        spot["var_v"] * factor,
+    )
 
 
 @compiled
@@ -115,7 +94,7 @@ def _chi2_beside(count: int, most: float, cells: Array) -> float:
 
 
 @compiled
-def exclude_isolated_cells(window: Window, spot: Array, cells: Array) -> bool:
+def exclude_isolated_cells(window: Window, spot: Candidate, cells: Array) -> bool:
     """Exclude cells with a large residual that all eight neighbours lack: hot or dead pixels, never part of a spot."""
     outlying, n, count, found = 0, window.columns, window.rows * window.columns, False
     residual, weight, size = cells[RESIDUAL, :count], cells[WEIGHT, :count], cells[SCRATCH, :count]
@@ -124,7 +103,7 @@ def exclude_isolated_cells(window: Window, spot: Array, cells: Array) -> bool:
         outlying += 1 if size[k] > _OUTLIER**2 else 0
     if outlying == 0:
         return False
-    narrow_spot, middle = min(spot[UU], spot[VV]) < 0.8**2, 0.5 * (window.cell - 1)
+    narrow_spot, middle = min(spot["uu"], spot["vv"]) < 0.8**2, 0.5 * (window.cell - 1)
     for r in range(window.rows):
         for c in range(n):
             k = r * n + c
@@ -133,8 +112,8 @@ def exclude_isolated_cells(window: Window, spot: Array, cells: Array) -> bool:
             most = size[k] / _ISOLATED**2  # of a neighbour; in most cases that in the row exceeds it
             if (c > 0 and size[k - 1] >= most) or (c < n - 1 and size[k + 1] >= most):
                 continue
-            u = window.left + middle + c * window.cell - spot[U]
-            v = window.top + middle + r * window.cell - spot[V]
+            u = window.left + middle + c * window.cell - spot["u"]
+            v = window.top + middle + r * window.cell - spot["v"]
             if narrow_spot and u * u + v * v < 1.8**2:  # the middle of a spot about one pixel wide is always isolated
                 continue
             around = 0.0
@@ -166,17 +145,17 @@ def gain_over_plane(N: Array, b: Array, before: float, chi2: float) -> float:
 
 
 @compiled
-def light_beside(image: Pixels, spot: Array, noise: Noise, width: float) -> float:
+def light_beside(image: Pixels, spot: Candidate, noise: Noise, width: float) -> float:
     """The light of a fitted narrow spot of sigma `width`, px, outside its two brightest pixels, in its own sigmas.
 
     A matched filter over 5x5 pixels. Hot pixels, which occur in pairs, have no light beside them.
     """
-    column, row = int(np.rint(spot[U])), int(np.rint(spot[V]))
+    column, row = int(np.rint(spot["u"])), int(np.rint(spot["v"]))
     product, power, first, second = 0.0, 0.0, (-1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)
     for i in range(max(row - 2, 0), min(row + 3, image.height)):
         for j in range(max(column - 2, 0), min(column + 3, image.width)):
-            light = spot[FLUX] * _within_pixel(j - spot[U], width) * _within_pixel(i - spot[V], width)
-            plane = spot[LEVEL] + spot[SLOPE_U] * (j - spot[U]) + spot[SLOPE_V] * (i - spot[V])
+            light = spot["flux"] * _within_pixel(j - spot["u"], width) * _within_pixel(i - spot["v"], width)
+            plane = spot["level"] + spot["slope_u"] * (j - spot["u"]) + spot["slope_v"] * (i - spot["v"])
             value = pixel(image, j, i)
             weight = light / variance(noise, plane + light)
             here = (value, weight * (value - plane), weight * light)

@@ -11,22 +11,7 @@ from geometry.arrays import Array, Ints
 from geometry.compilation.jit import compiled
 from tracking.detection import ellipse
 from tracking.detection.search import RADIUS
-from tracking.detection.table import (
-    ACCEPTED,
-    ACTIVE,
-    CHI2,
-    COV_UV,
-    FLUX,
-    MISFIT,
-    PEAK,
-    UU,
-    UV,
-    VAR_U,
-    VAR_V,
-    VV,
-    U,
-    V,
-)  # fmt: skip
+from tracking.detection.table import Candidates
 from tracking.noise import BLOCK
 
 NARROWER = 0.5  # a spot narrower than this share of another spot is not a duplicate of it
@@ -76,59 +61,59 @@ def in_a_region(regions: Array, u: float, v: float, more: float) -> bool:
 
 
 @compiled
-def brightest(table: Array) -> int:
-    """The row with the largest flux among the ACTIVE ones; -1 if there is none."""
+def brightest(table: Candidates) -> int:
+    """The row with the largest flux among the active ones; -1 if there is none."""
     best = -1
     for k in range(table.shape[0]):
-        if table[k, ACTIVE] and (best < 0 or table[k, FLUX] > table[best, FLUX]):
+        if table[k]["active"] and (best < 0 or table[k]["flux"] > table[best]["flux"]):
             best = k
     return best
 
 
 @compiled
-def drop_duplicates(table: Array) -> None:
+def drop_duplicates(table: Candidates) -> None:
     """Drop spots near the centre of a brighter spot of about the same width: one light detected twice.
 
     A much narrower spot is kept: a laser spot on a wide diffuse reflection has less flux, but is not part of it.
     """
     for k in range(table.shape[0]):
-        table[k, ACTIVE] = table[k, ACCEPTED]
+        table[k]["active"] = table[k]["accepted"]
     i = brightest(table)
     while i >= 0:
         spot = table[i]
-        spot[ACTIVE] = 0.0
-        uu, uv, vv = spot[UU] + 1 / 12, spot[UV], spot[VV] + 1 / 12
+        spot["active"] = 0.0
+        uu, uv, vv = spot["uu"] + 1 / 12, spot["uv"], spot["vv"] + 1 / 12
         area = uu * vv - uv * uv  # sigma^4, px^4
         for k in range(table.shape[0]):
             other = table[k]
-            if other[ACTIVE]:
-                du, dv = other[U] - spot[U], other[V] - spot[V]
+            if other["active"]:
+                du, dv = other["u"] - spot["u"], other["v"] - spot["v"]
                 inside = vv * du * du - 2 * uv * du * dv + uu * dv * dv < _SAME_SPOT**2 * area
-                own = (other[UU] + 1 / 12) * (other[VV] + 1 / 12) - other[UV] ** 2
+                own = (other["uu"] + 1 / 12) * (other["vv"] + 1 / 12) - other["uv"] ** 2
                 if inside and own > NARROWER**4 * area:
-                    other[ACCEPTED] = other[ACTIVE] = 0.0
+                    other["accepted"] = other["active"] = 0.0
         i = brightest(table)
 
 
 @compiled
-def write_detections(table: Array, regions: Array, out: Array) -> int:
+def write_detections(table: Candidates, regions: Array, out: Array) -> int:
     """Write the spots that lie in a region (n, 3) into `out`, largest flux first; returns their number.
 
     Columns of out (most, 12): u, v; cov uu, uv, vv; flux, peak, major, minor, angle; share of the covariance by misfit;
     chi-square.
     """
     for k in range(table.shape[0]):
-        found = table[k, ACCEPTED] and in_a_region(regions, table[k, U], table[k, V], 0.0)
-        table[k, ACTIVE] = 1.0 if found else 0.0
+        found = table[k]["accepted"] and in_a_region(regions, table[k]["u"], table[k]["v"], 0.0)
+        table[k]["active"] = 1.0 if found else 0.0
     count = 0
     i = brightest(table)
     while i >= 0:
         spot, row = table[i], out[count]
-        spot[ACTIVE] = 0.0
-        row[0], row[1], row[2], row[3] = spot[U], spot[V], spot[VAR_U], spot[COV_UV]
-        row[4], row[5], row[6] = spot[VAR_V], spot[FLUX], spot[PEAK]
-        row[7], row[8], row[9] = ellipse.axes(spot[UU], spot[UV], spot[VV])
-        row[10], row[11] = spot[MISFIT], spot[CHI2]
+        spot["active"] = 0.0
+        row[0], row[1], row[2], row[3] = spot["u"], spot["v"], spot["var_u"], spot["cov_uv"]
+        row[4], row[5], row[6] = spot["var_v"], spot["flux"], spot["peak"]
+        row[7], row[8], row[9] = ellipse.axes(spot["uu"], spot["uv"], spot["vv"])
+        row[10], row[11] = spot["misfit"], spot["chi2"]
         count += 1
         i = brightest(table)
     return count

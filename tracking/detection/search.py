@@ -20,16 +20,7 @@ from tracking.detection.block_search import (
     runs_of,
     sum_2x2,
 )
-from tracking.detection.candidates import (
-    AT_U,
-    AT_V,
-    HEIGHT,
-    LEVEL,
-    SCALE,
-    WIDE,
-    PeakSearch,
-    find_peaks,
-)
+from tracking.detection.candidates import PeakSearch, find_peaks
 from tracking.detection.moments import MOST_ON_RING, PEAK_SHARE, is_round, is_sharp, stands_out
 from tracking.detection.pixels import (
     Noise,
@@ -41,6 +32,7 @@ from tracking.detection.pixels import (
     pixel,
     variance,
 )
+from tracking.detection.table import Peak, Peaks
 
 BORDER_BLOCKS = 2  # blocks around a box that its search needs
 RADIUS = 48  # px: peaks farther apart than this are never parts of one spot of the largest size
@@ -96,7 +88,7 @@ def find_peaks_in(
 
 @compiled
 def find_separate_peaks(
-    image: Pixels, peaks: Array, order: Ints, wanted: Bools, noise: Noise, threshold_sigma: float, separate: Ints,
+    image: Pixels, peaks: Peaks, order: Ints, wanted: Bools, noise: Noise, threshold_sigma: float, separate: Ints,
     near: Ints, gaps: Array,
 ) -> int:  # fmt: skip
     """The rows of separate spots among the wanted peaks (n,), into `separate`; returns their number.
@@ -106,38 +98,38 @@ def find_separate_peaks(
     Between a peak and each of the nearest brighter ones the light must fall by `DIP` of the fainter peak, and by four
     sigmas of the difference of two means of nine pixels. Speckle makes deeper dips within a wide spot, so there the
     means of squares as large as the light around the peak must fall as well. A wide faint peak must have no other peak
-    within 16 px. Fills SCALE of the separate peaks. `near`, `gaps` (MAX_COMPARED,) are workspace. Source: ours.
+    within 16 px. Fills the scale of the separate peaks. `near`, `gaps` (MAX_COMPARED,) are workspace. Source: ours.
     """
     count, border, ring = 0, np.zeros(8), np.zeros(MOST_ON_RING)
     for place in range(order.shape[0]):
         i = order[place]
         if not wanted[i]:
             continue
-        if peaks[i, WIDE]:
+        if peaks[i]["wide"]:
             alone = not _has_neighbour(peaks, order, i)
         else:
             alone = True
-            needed = max(DIP * peaks[i, HEIGHT], 4.0 / 3.0 * sqrt(2.0) * sqrt(variance(noise, peaks[i, LEVEL])))
+            needed = max(DIP * peaks[i]["height"], 4.0 / 3.0 * sqrt(2.0) * sqrt(variance(noise, peaks[i]["level"])))
             for k in range(_nearest(peaks, i, order, place, near, gaps)):
-                lowest = _lowest_between(image, peaks, i, near[k], 1) - peaks[i, LEVEL]
-                least = max(needed, HALO_SHARE * peaks[near[k], HEIGHT])
-                alone = alone and peaks[i, HEIGHT] - lowest >= least
+                lowest = _lowest_between(image, peaks, i, near[k], 1) - peaks[i]["level"]
+                least = max(needed, HALO_SHARE * peaks[near[k]]["height"])
+                alone = alone and peaks[i]["height"] - lowest >= least
             if alone and stands_out(image, peaks[i], noise, threshold_sigma, ring):
-                sigma2 = variance(noise, peaks[i, LEVEL])
-                alone = is_round(image, int(peaks[i, AT_U]), int(peaks[i, AT_V]), sigma2, _ROUND)
+                sigma2 = variance(noise, peaks[i]["level"])
+                alone = is_round(image, int(peaks[i]["u"]), int(peaks[i]["v"]), sigma2, _ROUND)
             elif alone:
                 alone = is_sharp(image, peaks[i], noise, threshold_sigma)
             if alone:
                 level = _find_scale(image, peaks[i], border)
                 for k in range(_nearest(peaks, i, separate, count, near, gaps)):
-                    half = int(min(peaks[i, SCALE], peaks[near[k], SCALE]))
+                    half = int(min(peaks[i]["scale"], peaks[near[k]]["scale"]))
                     if half < _NARROW:
                         continue
                     if not alone:
                         break
                     j = near[k]
-                    here = _mean_of_square(image, peaks[i, AT_U], peaks[i, AT_V], half)
-                    there = _mean_of_square(image, peaks[j, AT_U], peaks[j, AT_V], half)
+                    here = _mean_of_square(image, peaks[i]["u"], peaks[i]["v"], half)
+                    there = _mean_of_square(image, peaks[j]["u"], peaks[j]["v"], half)
                     if here - there > _HIGHER * (here - level):
                         continue  # the other one is part of a brighter background
                     height = min(here, there) - level
@@ -150,31 +142,31 @@ def find_separate_peaks(
 
 
 @compiled
-def _find_scale(image: Pixels, peak: Array, border: Array) -> float:
-    """Fill SCALE of a peak: half side, px, of the largest square that its light fills; returns the background, DN.
+def _find_scale(image: Pixels, peak: Peak, border: Array) -> float:
+    """Fill the scale of a peak: half side, px, of the largest square that its light fills; returns the background, DN.
 
     The highest of nine neighbouring squares is taken, from small to large: a peak of speckle is far higher than the
     light around it and may be far from its middle. The background from the search, a median over 40 px, contains the
     light of a spot wider than that, so the lower one of it and the median of eight squares around the light is used.
     border (8,) is workspace.
     """
-    level, top, away = peak[LEVEL], peak[HEIGHT] + peak[LEVEL], _FIRST_SURROUNDINGS
-    u, v = peak[AT_U], peak[AT_V]
+    level, top, away = peak["level"], peak["height"] + peak["level"], _FIRST_SURROUNDINGS
+    u, v = peak["u"], peak["v"]
     for _ in range(2):
         level = min(level, _level_around(image, u, v, away, border))
         scale = 1
         for k in range(len(_HALF_SIDES)):
-            mean, u, v = _highest_square(image, peak[AT_U], peak[AT_V], _HALF_SIDES[k])
+            mean, u, v = _highest_square(image, peak["u"], peak["v"], _HALF_SIDES[k])
             if mean - level < _LEAST_FILLED * (top - level):
                 break
-            beside = 4 <= _HALF_SIDES[k] <= 8 and mean - peak[LEVEL] < _LEAST_BESIDE * peak[HEIGHT]
+            beside = 4 <= _HALF_SIDES[k] <= 8 and mean - peak["level"] < _LEAST_BESIDE * peak["height"]
             if beside or top - mean > _OUTLIER * _scatter_of_means(image, u, v, _HALF_SIDES[k]):
                 scale = 1
                 break
             halved, _, _ = _highest_square(image, u, v, _HALVED[k])
             if mean - level >= _FILLED[k] * (halved - level):
                 scale = _HALF_SIDES[k]
-        peak[SCALE], away = scale, _SURROUNDINGS * scale
+        peak["scale"], away = scale, _SURROUNDINGS * scale
         if away <= _FIRST_SURROUNDINGS:
             break
     return level
@@ -240,39 +232,35 @@ def _mean_of_square(image: Pixels, u: float, v: float, half: int) -> float:
 
 
 @compiled
-def _has_neighbour(peaks: Array, order: Ints, i: int) -> bool:
+def _has_neighbour(peaks: Peaks, order: Ints, i: int) -> bool:
     for place in range(order.shape[0]):
         j = order[place]
-        if (
-            not peaks[j, WIDE]
-            and abs(peaks[i, AT_U] - peaks[j, AT_U]) < 16
-            and abs(peaks[i, AT_V] - peaks[j, AT_V]) < 16
-        ):
+        if not peaks[j]["wide"] and abs(peaks[i]["u"] - peaks[j]["u"]) < 16 and abs(peaks[i]["v"] - peaks[j]["v"]) < 16:
             return True
     return False
 
 
 @compiled
-def _nearest(peaks: Array, i: int, rows: Ints, count: int, near: Ints, gaps: Array) -> int:
+def _nearest(peaks: Peaks, i: int, rows: Ints, count: int, near: Ints, gaps: Array) -> int:
     """The peaks nearest to peak i among the first `count` rows, at most MAX_COMPARED, into `near`; their number."""
     filled = 0
     for k in range(count):
         j = rows[k]
-        du, dv = peaks[i, AT_U] - peaks[j, AT_U], peaks[i, AT_V] - peaks[j, AT_V]
+        du, dv = peaks[i]["u"] - peaks[j]["u"], peaks[i]["v"] - peaks[j]["v"]
         gap = du * du + dv * dv
-        if not peaks[j, WIDE] and gap < RADIUS**2:
+        if not peaks[j]["wide"] and gap < RADIUS**2:
             filled = insert_nearest(near, gaps, filled, MAX_COMPARED, gap, j)
     return filled
 
 
 @compiled
-def _lowest_between(image: Pixels, peaks: Array, i: int, j: int, half: int) -> float:
+def _lowest_between(image: Pixels, peaks: Peaks, i: int, j: int, half: int) -> float:
     """The lowest mean of (2 half + 1)^2 pixels at eleven points on the line between two peaks, DN."""
     lowest = np.inf
     for k in range(1, 12):
         share = k / 12.0
-        u = peaks[i, AT_U] * (1 - share) + peaks[j, AT_U] * share
-        v = peaks[i, AT_V] * (1 - share) + peaks[j, AT_V] * share
+        u = peaks[i]["u"] * (1 - share) + peaks[j]["u"] * share
+        v = peaks[i]["v"] * (1 - share) + peaks[j]["v"] * share
         if half == 1:
             lowest = min(lowest, mean3(image, int(np.rint(u)), int(np.rint(v))))
         else:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Ints
+from tracking.noise import Picture
 
 
 class Edge(StrEnum):
@@ -61,9 +62,6 @@ class CircleParameters:
             )
         if not self.accelerations_px or min(self.accelerations_px) <= 0:
             raise ValueError(f"accelerations_px: expected positive numbers, got {self.accelerations_px}")
-
-
-Picture: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]  # (h, w), DN
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from geometry.arrays import Array, Bools
-from tracking.drogue_circle.detectors import Picture
 from tracking.drogue_circle.rim_fit import SECTORS, RimFit, median
+from tracking.noise import Picture
 
 _RINGS, _SECTORS = 10, SECTORS
 _MATCH = 3.0  # mean absolute deviations within which a cell looks as before

@@ -14,7 +14,6 @@ from geometry.arrays import Array
 from tracking.drogue_circle.detectors import (
     CircleDetector,
     CircleParameters,
-    Picture,
     Window,
     centre_votes,
     centres,
@@ -25,6 +24,7 @@ from tracking.drogue_circle.kalman import PRINTED_P0, printed_coefficient, print
 from tracking.drogue_circle.occlusion import Appearance, disc_cells, first_appearance
 from tracking.drogue_circle.tracker import CircleFrame, Wanted, acquire, nothing_known
 from tracking.kalman import transition
+from tracking.noise import Picture
 from tracking.statuses import Cause, PoseStatus
 
 _MOST_CENTRES = 200

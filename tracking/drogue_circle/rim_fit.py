@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools, symmetric
-from tracking.drogue_circle.detectors import CircleCandidate, Picture, Window, crop_bounds
+from tracking.drogue_circle.detectors import CircleCandidate, Window, crop_bounds
+from tracking.noise import Picture
 
 # Edge points of a rim with sub-pixel precision: the maximum of the slope along the gradient of a circle, on rays.
 

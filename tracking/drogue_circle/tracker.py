@@ -10,10 +10,11 @@ import cv2
 import numpy as np
 
 from geometry.arrays import Array, Bools
-from tracking.drogue_circle.detectors import CircleCandidate, CircleDetector, CircleParameters, Edge, Picture, Window
+from tracking.drogue_circle.detectors import CircleCandidate, CircleDetector, CircleParameters, Edge, Window
 from tracking.drogue_circle.kalman import FilterBank, motion_models
 from tracking.drogue_circle.occlusion import Appearance, RimHabit, disc_cells, first_appearance, is_clear
 from tracking.drogue_circle.rim_fit import CORRELATED_PX, RimFit, SmoothCrop, fit_rim, smooth_crop
+from tracking.noise import Picture
 from tracking.statuses import Cause, PoseStatus
 
 _MOST_FITTED = 24  # of the whole picture

@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array
-from tracking.drogue_circle.detectors import CircleCandidate, CircleDetector, Picture, Window, crop_bounds
+from tracking.drogue_circle.detectors import CircleCandidate, CircleDetector, Window, crop_bounds
+from tracking.noise import Picture
 
 Floats: TypeAlias = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
-class Level:
+class PyramidLevel:
     """A reduced picture (h, w) of 0 to 1, and its exact scales: sizes are whole numbers, so they differ a little."""
 
     grey: Floats
@@ -31,11 +32,11 @@ class Level:
         return float(np.sqrt(self.scale_u * self.scale_v))
 
 
-def pyramid(grey: Floats, scale: float, reaches_px: float, largest_px: float) -> list[Level]:
+def pyramid(grey: Floats, scale: float, reaches_px: float, largest_px: float) -> list[PyramidLevel]:
     """A picture (h, w) reduced to a scale, then by further factors of 2, the last one such that the largest drogue of
     interest is no larger than what a level reaches.
     """
-    levels: list[Level] = []
+    levels: list[PyramidLevel] = []
     full_height, full_width = grey.shape
     while True:
         width, height = max(round(scale * full_width), 1), max(round(scale * full_height), 1)
@@ -43,7 +44,7 @@ def pyramid(grey: Floats, scale: float, reaches_px: float, largest_px: float) ->
         reduced = source
         if source.shape != (height, width):
             reduced = np.asarray(cv2.resize(source, (width, height), interpolation=cv2.INTER_AREA), np.float32)
-        levels.append(Level(reduced, width / full_width, height / full_height))
+        levels.append(PyramidLevel(reduced, width / full_width, height / full_height))
         if reaches_px / scale >= largest_px:
             return levels
         scale /= 2
@@ -123,7 +124,7 @@ def find_drogues(
     return [DrogueCandidate(u, v, diameter, c) for c, u, v, diameter in found.tolist() if c >= min_confidence]
 
 
-def _of_level(level: Level, weights: Path) -> Array:
+def _of_level(level: PyramidLevel, weights: Path) -> Array:
     """Logit, u, v, diameter (n, 4) of the candidates of a level, in pixels of the picture."""
     found = _candidates(level.grey, weights)
     scales = np.array([level.scale_u, level.scale_v])

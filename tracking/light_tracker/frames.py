@@ -63,7 +63,7 @@ USUAL = LightParameters()
 # The drogue in one frame: status, cause, place, size, confidence and who measured it.
 
 
-class Source(Word):
+class MeasuredBy(Word):
     """What measured the drogue."""
 
     NONE = "", "nothing"
@@ -78,7 +78,7 @@ class DrogueFrame:
 
     status: PoseStatus
     cause: Cause
-    source: Source
+    source: MeasuredBy
     centre_px: Array  # (2,) of the rim's image
     rate_px: Array  # (2,) px/frame
     diameter_px: float
@@ -110,7 +110,7 @@ def nothing_known(cause: Cause, event: str = "", searched: str = "", found: int 
     """A lost frame."""
     nan = float("nan")
     return DrogueFrame(
-        PoseStatus.LOST, cause, Source.NONE, np.full(2, nan), np.full(2, nan), nan, np.full((2, 2), nan), nan, 0.0,
+        PoseStatus.LOST, cause, MeasuredBy.NONE, np.full(2, nan), np.full(2, nan), nan, np.full((2, 2), nan), nan, 0.0,
         nan, searched, found, event,
     )  # fmt: skip
 

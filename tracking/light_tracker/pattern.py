@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array
 from tracking import kalman
-from tracking.drogue_circle.detectors import Picture
 from tracking.light_tracker.frames import LightParameters, fisher
+from tracking.noise import Picture
 
 Floats: TypeAlias = NDArray[np.float32]
 
@@ -292,7 +292,7 @@ _HUBER_SIGMAS = 2.5  # a detection farther away than this has a smaller weight
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class PatternState:
     """State after a frame."""
 
     x: Array  # (4,) u, v of the pattern's centre, px, and their rates, px/frame
@@ -304,7 +304,7 @@ class Motion:
     sigma_a_px: float  # px/frame^2: 1-sigma acceleration, estimated from the innovations
 
     @classmethod
-    def started(cls, u_px: float, v_px: float, diameter_px: float, p: LightParameters) -> Motion:
+    def started(cls, u_px: float, v_px: float, diameter_px: float, p: LightParameters) -> PatternState:
         """At a detection."""
         speed = _START_SPEED[0] * diameter_px + _START_SPEED[1]
         # The pattern is cut out at the detection: its place is known, what the detection is wrong by is in the offset.
@@ -319,7 +319,7 @@ class Motion:
             p.sigma_a_diameters * diameter_px + p.sigma_a_px,
         )
 
-    def predicted(self, dt: float, misses: int, p: LightParameters) -> Motion:
+    def predicted(self, dt: float, misses: int, p: LightParameters) -> PatternState:
         """`dt` frames later. misses: frames in a row without a measurement."""
         start = p.sigma_a_diameters * self.diameter_px + p.sigma_a_px
         # A drogue sways: what its acceleration was before it was hidden is not what it is now.
@@ -331,7 +331,7 @@ class Motion:
             offset_variance=self.offset_variance + drift,
         )  # fmt: skip
 
-    def matched(self, match: Match, p: LightParameters, learn: bool = True) -> Motion:
+    def matched(self, match: Match, p: LightParameters, learn: bool = True) -> PatternState:
         """With a match. learn: adapt the acceleration to its innovation."""
         partly = _HIDDEN_VARIANCE / match.visible**2 if match.visible < WHOLE else 1.0
         R = partly * (_MATCH_FACTOR * match.covariance[:2, :2] + _MATCH_SIGMA_PX**2 * np.eye(2))
@@ -348,7 +348,7 @@ class Motion:
             self, x=x, P=P, log_diameter=size, size_variance=(1 - gain) * self.size_variance, sigma_a_px=sigma_a
         )
 
-    def detected(self, u_px: float, v_px: float, diameter_px: float, p: LightParameters) -> Motion:
+    def detected(self, u_px: float, v_px: float, diameter_px: float, p: LightParameters) -> PatternState:
         """With a detection beside a match: it corrects the offset."""
         away = (np.array([u_px, v_px]) - self.x[:2]) / self.diameter_px
         seen = np.array([*away, np.log(diameter_px) - self.log_diameter])
@@ -359,12 +359,12 @@ class Motion:
         gain = self.offset_variance / (self.offset_variance + noise)
         return replace(self, offset=self.offset + gain * innovation, offset_variance=(1 - gain) * self.offset_variance)
 
-    def moved(self, match: Match, p: LightParameters) -> Motion:
+    def moved(self, match: Match, p: LightParameters) -> PatternState:
         """Found at another place after a gap: at rest there, of the same size and offset."""
-        start = Motion.started(match.u_px, match.v_px, match.diameter_px, p)
+        start = PatternState.started(match.u_px, match.v_px, match.diameter_px, p)
         return replace(start, offset=self.offset, offset_variance=self.offset_variance)
 
-    def centred(self) -> Motion:
+    def centred(self) -> PatternState:
         """With the pattern cut out again at the rim."""
         x = np.concatenate([self.centre_px, self.x[2:]])
         size = float(np.log(self.rim_diameter_px))
@@ -432,7 +432,7 @@ class Known:
     pattern: Pattern
     usual: float  # running mean of Fisher's z of its matches
     confirmed: int  # detections
-    motion: Motion  # of its last frame: size, offset of the rim
+    motion: PatternState  # of its last frame: size, offset of the rim
 
     def found(self, picture: Picture, u_px: float, v_px: float, reach_px: float) -> Match | None:
         """Where it is within `reach_px` of a place; None where nothing looks like it, or several places do."""

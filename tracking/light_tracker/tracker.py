@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geometry.arrays import Array
-from tracking.drogue_circle.detectors import CircleCandidate, CircleDetector, Picture, Window
+from tracking.drogue_circle.detectors import CircleCandidate, CircleDetector, Window
 from tracking.light_tracker.frames import (
     ABSENT_LOGIT,
     USUAL,
     DrogueFrame,
     LightParameters,
-    Source,
+    MeasuredBy,
     features,
     fisher,
     logit,
@@ -22,7 +22,8 @@ from tracking.light_tracker.frames import (
     probability,
     within,
 )
-from tracking.light_tracker.pattern import WHOLE, Known, Match, Motion, Pattern, is_clear, is_similar, unexplained
+from tracking.light_tracker.pattern import WHOLE, Known, Match, Pattern, PatternState, is_clear, is_similar, unexplained
+from tracking.noise import Picture
 from tracking.statuses import Cause, PoseStatus
 
 # What is known of a drogue while it is followed.
@@ -36,7 +37,7 @@ _MOSTLY = 0.6  # visible share from which the agreement of this share counts
 class Track:
     """What is known of the drogue while it is followed."""
 
-    motion: Motion
+    motion: PatternState
     pattern: Pattern
     support: float  # running mean of the log odds of the checks
     usual: float = float("nan")  # running mean of Fisher's z of the matches' correlation
@@ -99,7 +100,7 @@ class DrogueTracker:
     parameters: LightParameters = USUAL
     near_px: tuple[float, float] | None = None  # of the first drogue, if the user knows it
     _track: Track | None = None
-    _last: Motion | None = None  # of the drogue that was lost
+    _last: PatternState | None = None  # of the drogue that was lost
     _ambiguous: bool = False
     trace: list[tuple[Array, Array]] | None = None  # if a list: gets inputs of the confidence, and the centre, px
 
@@ -127,7 +128,7 @@ class DrogueTracker:
             if match is not None:
                 track.take_back(track.before, match, self.parameters)
         track.since_check += 1
-        searched, found, source = "", 0, Source.LIGHT
+        searched, found, source = "", 0, MeasuredBy.LIGHT
         confidence = self._confidence(track, match)
         p = self.parameters
         due = track.since_check >= p.check_every or track.gap > 0
@@ -137,7 +138,7 @@ class DrogueTracker:
             best = self._confirming(track, seen, match)
             if best is not None:
                 match = self._confirm(track, picture, best, match)
-                source = Source.BOTH
+                source = MeasuredBy.BOTH
             elif match is not None:
                 track.unconfirmed += 1
                 track.support += _SUPPORT_RATE * (ABSENT_LOGIT - track.support)
@@ -230,7 +231,7 @@ class DrogueTracker:
         if pattern is None or match is None:
             return None
         track.before = track.known
-        track.motion = Motion.started(seen.u_px, seen.v_px, diameter, self.parameters)
+        track.motion = PatternState.started(seen.u_px, seen.v_px, diameter, self.parameters)
         track.pattern, track.usual, track.confirmed = pattern, float("nan"), 1
         track.unconfirmed, track.age = 0, 0.0
         return match
@@ -272,10 +273,18 @@ class DrogueTracker:
         return self._start(best, pattern, "picture", len(found), event)
 
     def _start(self, seen: CircleCandidate, pattern: Pattern, searched: str, found: int, event: str) -> DrogueFrame:
-        motion = Motion.started(seen.u_px, seen.v_px, 2 * seen.radius_px, self.parameters)
+        motion = PatternState.started(seen.u_px, seen.v_px, 2 * seen.radius_px, self.parameters)
         self._track = track = Track(motion, pattern, logit(seen.score), trusted=seen.score)
         return self._frame(
-            track, PoseStatus.MEASURED, Cause.NONE, Source.DETECTOR, seen.score, float("nan"), searched, found, event
+            track,
+            PoseStatus.MEASURED,
+            Cause.NONE,
+            MeasuredBy.DETECTOR,
+            seen.score,
+            float("nan"),
+            searched,
+            found,
+            event,
         )
 
     def _in_picture(self, picture: Picture) -> list[CircleCandidate]:
@@ -360,14 +369,14 @@ class DrogueTracker:
             return nothing_known(cause, event)
         sigma = float(np.sqrt(np.trace(motion.covariance) / 2))
         confidence = share * track.trusted * within(sigma, motion.rim_diameter_px)
-        return self._frame(track, PoseStatus.PREDICTED, cause, Source.NONE, confidence, float("nan"), "", 0)
+        return self._frame(track, PoseStatus.PREDICTED, cause, MeasuredBy.NONE, confidence, float("nan"), "", 0)
 
     @staticmethod
     def _frame(
         track: Track,
         status: PoseStatus,
         cause: Cause,
-        source: Source,
+        source: MeasuredBy,
         confidence: float,
         correlation: float,
         searched: str,

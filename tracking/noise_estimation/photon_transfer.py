@@ -17,8 +17,13 @@ import numpy as np
 from geometry.arrays import Array
 from tracking.detection.detect import find_spots
 from tracking.noise import FULL_SCALE_E, NoiseModel, Picture, quantile_variance
-from tracking.noise_estimation.block_steps import block_step
-from tracking.noise_estimation.grey_values import clipped_background, full_scale, grey_step, saturation_level
+from tracking.noise_estimation.grey_values import (
+    block_step,
+    clipped_background,
+    full_scale,
+    grey_step,
+    saturation_level,
+)
 from tracking.noise_estimation.levels import LEAST_PIXELS, LEVELS, SIDE, LevelVariances, level_variances
 from tracking.noise_estimation.spot_profile import spot_profile
 from tracking.noise_estimation.spot_residuals import SpotResiduals, residuals_of_spots

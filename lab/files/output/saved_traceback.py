@@ -40,7 +40,7 @@ def _text(error: BaseException) -> str:
 
 def _report(error: BaseException) -> str:
     """The traceback, and what is needed to repeat the command."""
-    from lab.versions import versions  # reads the installed packages: only needed here
+    from lab.packages import versions  # reads the installed packages: only needed here
 
     try:
         installed = ", ".join(f"{name} {number}" for name, number in versions().items())

@@ -10,8 +10,9 @@ import pydantic
 
 from lab.errors import CalibrationError
 from lab.files.text.fields import Block, Integer, Lines, NonNegative, Number, Positive, Text, one_of, unexpected_value
+from lab.findings.finding import Level
 
-VERDICTS = ("PASS", "WARN", "FAIL")
+VERDICTS = tuple(level.name for level in Level)
 
 
 def iso_date(value: Any) -> datetime.date:
@@ -56,7 +57,7 @@ class CalibrationState(Block):
     @property
     def failed(self) -> bool:
         """Whether the verdict is FAIL: it must not be used."""
-        return self.verdict == "FAIL"
+        return self.verdict == Level.FAIL.name
 
     @property
     def reason(self) -> str:
@@ -80,11 +81,9 @@ class CameraCalibration(CalibrationState):
 
 
 def require_valid_calibration(
-    state: CalibrationState | None, path: Path, on: datetime.date, what: str = "today"
+    state: CalibrationState | None, path: Path, recorded: datetime.date | None = None
 ) -> None:
-    """Checks that a calibration may be used on the day `on`; None (state unknown) may.
-
-    what: the name of that day in the message.
+    """Checks that a calibration may be used for a recording of that day, or of today; None (state unknown) may.
 
     Raises:
         CalibrationError: the verdict is FAIL, or the calibration is out of date (exit status 3).
@@ -96,6 +95,7 @@ def require_valid_calibration(
             f"{path}: calibration.verdict: FAIL{state.reason}: this calibration must not be used; correct the cause and"
             " calibrate again (`beampose calibrate rig`)"
         )
+    on, what = (datetime.date.today(), "today") if recorded is None else (recorded, "the recording's day")
     left = state.days_left(on)
     if left is not None and left < 0:
         raise CalibrationError(

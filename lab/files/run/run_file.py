@@ -66,7 +66,8 @@ class LiveDevice:
         return Path(f"device {self.device}")
 
 
-Source = FramesFolder | VideoFile | DetectionsTable | LiveDevice
+RecordedSource = FramesFolder | VideoFile | DetectionsTable
+Source = RecordedSource | LiveDevice
 
 
 @dataclass(frozen=True, slots=True)

@@ -159,7 +159,7 @@ def scene_view(things: Sequence[SceneObject], title: str, view: str = LAB_VIEWS[
         parts, label = _drawn(things[i], p.at(flat[i]))
         out.append(parts)
         labels += [label] if label else []
-    out += _placed(labels, p)
+    out += svg.names(labels, p)
     out += _axis_cross(p, to_drawing)
     long = svg.round_size(0.3 * float(span.max()))
     width = long * scale
@@ -199,20 +199,20 @@ def outline(thing: SceneObject, reach: float) -> Array:
     return np.asarray(thing.place, dtype=float).reshape(1, 3)
 
 
-def _drawn(thing: SceneObject, at: Array) -> tuple[str, tuple[float, float, str, str] | None]:
-    """SVG of a thing, and its label: x, y, text, colour."""
+def _drawn(thing: SceneObject, at: Array) -> tuple[str, tuple[float, float, str] | None]:
+    """SVG of a thing, and its name: x, y, words."""
     c = thing.colour
     tip = f"<title>{escape(thing.name)}</title>"
     if isinstance(thing, Frustum):
         d = svg.polyline(at[1:], closed=True) + svg.segments(np.repeat(at[:1], 4, axis=0), at[1:])
         shape = f'<path d="{d}" fill="{c}" fill-opacity="0.13" stroke="{c}" stroke-width="1.3">{tip}</path>'
-        return shape + f'<path d="{svg.dots(at[:1], 3)}" fill="{c}"/>', (*_pair(at[0]), thing.name, c)
+        return shape + f'<path d="{svg.dots(at[:1], 3)}" fill="{c}"/>', (*_pair(at[0]), thing.name)
     if isinstance(thing, Rectangle):
         width, opacity = (0.6, 0.03) if thing.faint else (1.5, 0.12)
         d = svg.polyline(at, closed=True)
         shape = f'<path d="{d}" fill="{c}" fill-opacity="{opacity}" stroke="{c}" stroke-width="{width}">{tip}</path>'
         topmost = at[int(np.argmin(at[:, 1]))]
-        return shape, None if thing.faint else (*_pair(topmost), thing.name, c)
+        return shape, None if thing.faint else (*_pair(topmost), thing.name)
     if isinstance(thing, Ray):
         d = svg.segments(at[:1], at[1:])
         return f'<path d="{d}" stroke="{c}" stroke-width="1.1" stroke-opacity="0.85">{tip}</path>', None
@@ -220,30 +220,11 @@ def _drawn(thing: SceneObject, at: Array) -> tuple[str, tuple[float, float, str,
         line = svg.line_path(at[:, 0], at[:, 1])
         return f'<path d="{line}" fill="none" stroke="{c}" stroke-width="1.1">{tip}</path>', None
     shape = f'<path d="{svg.dots(at, 3.2)}" fill="{c}" stroke="var(--paper)" stroke-width="0.6">{tip}</path>'
-    return shape, (*_pair(at[0]), thing.name, c)
+    return shape, (*_pair(at[0]), thing.name)
 
 
 def _pair(at: Array) -> tuple[float, float]:
     return float(at[0]), float(at[1])
-
-
-def _placed(labels: list[tuple[float, float, str, str]], p: svg.PlotArea) -> list[str]:
-    """Labels beside their things, shifted vertically so that none overlap; labels without a free place are omitted."""
-    out: list[str] = []
-    taken: list[tuple[float, float, float, float]] = []
-    for x, y, words, _ in labels[:60]:
-        wide = 6.2 * len(words) + 4
-        start = min(x + 7, p.width - wide - 4)
-        for shift in (-6, 12, -18, 24, -30, 36):
-            box = (start, y + shift - 10, start + wide, y + shift + 3)
-            if box[1] < 18 or box[3] > p.height - 4:
-                continue
-            if all(box[2] < t[0] or box[0] > t[2] or box[3] < t[1] or box[1] > t[3] for t in taken):
-                taken.append(box)
-                style = "fill:var(--ink);paint-order:stroke;stroke:var(--paper);stroke-width:3px"
-                out.append(svg.text(start, y + shift, words, "", style))
-                break
-    return out
 
 
 def _axis_cross(p: svg.PlotArea, to_drawing: Array) -> list[str]:

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools
-from lab.report.plot.svg import true_ranges
+from lab.report.plot.svg import Box, free_box, true_ranges
 
 Pixels: TypeAlias = NDArray[np.uint8]  # (h, w, 3), BGR
 Colour: TypeAlias = tuple[int, int, int]  # BGR
-Box: TypeAlias = tuple[float, float, float, float]  # left, top, right, bottom, px of the drawing
 
 PAPER, DESK, INK, SOFT, BLACK = (28, 24, 22), (14, 12, 11), (240, 237, 234), (182, 174, 168), (0, 0, 0)
 FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -149,15 +148,13 @@ class Canvas:
         """
         h, w = self.image.shape[:2]
         (x, y), (wide, tall) = at, text_size(words, size)
+        boxes: list[Box] = []
         for dx, dy in _SIDES:
-            left = x + 1.2 * gap if dx > 0 else x - 1.2 * gap - wide
-            base = y + dy * 0.8 * gap + tall / 2
-            best = (float(np.clip(left, 3, max(w - wide - 3, 3))), float(np.clip(base, tall + 3, h - 5)))
-            box = (best[0], best[1] - tall, best[0] + wide, best[1])
-            if not any(box[0] < t[2] and box[2] > t[0] and box[1] < t[3] and box[3] > t[1] for t in taken):
-                break
-        taken.append(box)
-        self.words(best, words, size, colour)
+            left = float(np.clip(x + 1.2 * gap if dx > 0 else x - 1.2 * gap - wide, 3, max(w - wide - 3, 3)))
+            base = float(np.clip(y + dy * 0.8 * gap + tall / 2, tall + 3, h - 5))
+            boxes.append((left, base - tall, left + wide, base))
+        box = free_box(boxes, taken) or boxes[-1]
+        self.words((box[0], box[3]), words, size, colour)
 
 
 def _dashes(places: Array, length: float) -> list[Array]:

@@ -26,7 +26,7 @@ from lab.files.run.results import (
 )
 from lab.files.run.run_file import FramesFolder, Run, VideoFile
 from lab.pictures.picture_file import GreyPicture, MissingPicture
-from lab.runs.frames.frames import Picture, pictures_of_rows
+from lab.runs.frames.frames import Recorded, pictures_of_rows
 from tracking.detections import Detections
 from tracking.statuses import PoseStatus, SpotStatus
 
@@ -203,7 +203,7 @@ class FrameContent:
 
 
 def frame_content(
-    data: ResultData, index: int, shown_by: Mapping[str, Picture], cameras: list[str], tail: int = 0
+    data: ResultData, index: int, shown_by: Mapping[str, Recorded], cameras: list[str], tail: int = 0
 ) -> FrameContent:
     """What is drawn of the frame with this index. shown_by: by camera. tail: frames of each spot's past."""
     poses = data.poses
@@ -263,7 +263,7 @@ def _with_sigma(value: float, sigma: float) -> str:
     return f"{value:.{decimals}f} +- {sigma:.{decimals}f}"
 
 
-def _reason(picture: Picture | None) -> str:
+def _reason(picture: Recorded | None) -> str:
     if picture is None or isinstance(picture, Detections):
         return "no picture: detected points"
     reason = str(getattr(picture, "reason", ""))
@@ -345,19 +345,19 @@ def _beam(data: ResultData, j: int, world_from_body: Pose) -> Array:
 # The pictures of several frames, one after the other, with a few read ahead.
 
 
-def pictures_of(run: Run | None, cameras: Sequence[str], frames: Sequence[int]) -> Iterator[dict[str, Picture]]:
+def pictures_of(run: Run | None, cameras: Sequence[str], frames: Sequence[int]) -> Iterator[dict[str, Recorded]]:
     """For each of the rising frame numbers the pictures of the cameras; those of points are left out.
 
     A camera whose pictures cannot be read has none, with the reason. Memory does not grow with the number of frames.
     """
     recorded = {} if run is None else {n: s for n, s in run.cameras.items() if isinstance(s, FramesFolder | VideoFile)}
     with ExitStack() as stack:
-        streams: dict[str, Iterator[Picture]] = {}
+        streams: dict[str, Iterator[Recorded]] = {}
         for camera in cameras:
             if run is not None and camera in recorded:
                 streams[camera] = stack.enter_context(closing(pictures_of_rows(run, camera, frames)))
         for _ in frames:
-            shown: dict[str, Picture] = {}
+            shown: dict[str, Recorded] = {}
             for camera, stream in streams.items():
                 try:
                     shown[camera] = next(stream)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import datetime
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import TypeAlias
@@ -74,6 +74,10 @@ def true_shares(mask: Bools, n_columns: int) -> list[tuple[float, float]]:
 # Coordinates are viewBox units, about one screen pixel each. Plots are written as text because importing matplotlib
 # takes 0.33 s of process time, as long as the whole report of a usual run (docs/decisions/figures.md).
 
+Box: TypeAlias = tuple[float, float, float, float]  # left, top, right, bottom
+_MOST_NAMES = 60  # in a drawing
+_NAME_SHIFTS = (-6, 12, -20, 26, -34, 40, -48, 54)  # of a name's base line from its thing, in order
+
 
 # The palette of Okabe & Ito: distinct with any kind of colour vision.
 BLUE, ORANGE, GREEN, VERMILLION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
@@ -108,6 +112,32 @@ def text(x: float, y: float, words: str, css: str = "", style: str = "") -> str:
     """A text element; the words are escaped. style: CSS, which takes precedence over the page's rules for text."""
     own = f' style="{escape(style)}"' if style else ""
     return f'<text x="{x:.1f}" y="{y:.1f}" class="{css}"{own}>{escape(words)}</text>'
+
+
+def free_box(boxes: Iterable[Box], taken: list[Box]) -> Box | None:
+    """The first of some boxes that covers none of the boxes `taken`, to which it is added; None without one."""
+    for box in boxes:
+        if not any(box[0] < t[2] and box[2] > t[0] and box[1] < t[3] and box[3] > t[1] for t in taken):
+            taken.append(box)
+            return box
+    return None
+
+
+def names(labels: Sequence[tuple[float, float, str]], p: PlotArea) -> list[str]:
+    """Names (x, y, words) beside their things, shifted up or down so that none overlap.
+
+    A name without a free place is left out.
+    """
+    out: list[str] = []
+    taken: list[Box] = []
+    for x, y, words in labels[:_MOST_NAMES]:
+        wide = 7.5 * len(words) + 4
+        start = min(x + 7, p.width - wide - 4)
+        places = ((start, y + shift - 11, start + wide, y + shift + 3) for shift in _NAME_SHIFTS)
+        box = free_box((b for b in places if b[1] >= 18 and b[3] <= p.height - 4), taken)
+        if box is not None:
+            out.append(text(box[0], box[3] - 3, words, "label"))
+    return out
 
 
 def vertical_text(x: float, y: float, words: str) -> str:

@@ -17,7 +17,7 @@ from lab.report.frames.content import CameraFrame, SpotMark, frame_content, resu
 from lab.report.plot import svg
 from lab.report.plot.svg import image_uri, true_ranges
 from lab.report.run.report_data import ReportData
-from lab.runs.frames.frames import Picture, pictures_at
+from lab.runs.frames.frames import Recorded, pictures_at
 from tracking.statuses import PoseStatus, SpotStatus
 
 MOST_PICTURES = 8
@@ -135,7 +135,7 @@ def pictures(m: ReportData, results: Path, selection: list[ShownEvent]) -> list[
     if not set(m.spots.views) <= set(SpotModel.of(m.run.rig).views):
         return []
     data = result_data(m.name, m.spots, m.poses, m.run, results)
-    read: dict[tuple[str, int], Picture] = {}
+    read: dict[tuple[str, int], Recorded] = {}
     for camera, source in m.run.cameras.items():
         frames = [int(m.spots.frames[e.index]) for e in selection if e.camera == camera]
         if not frames or isinstance(source, DetectionsTable | LiveDevice):

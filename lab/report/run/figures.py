@@ -321,7 +321,7 @@ def tracks_figure(m: ReportData, camera: str, zoom: ZoomData | None = None) -> s
             f"<title>the picture, {size[0]} × {size[1]} px</title></rect>"
         )
     out.append(f'<g clip-path="url(#{clip})">')
-    labels = []
+    labels, starts = [], []
     for i, j in enumerate(views):
         colour = TRACK_COLOURS[i % len(TRACK_COLOURS)]
         at = p.at(uv[:, i])
@@ -329,8 +329,11 @@ def tracks_figure(m: ReportData, camera: str, zoom: ZoomData | None = None) -> s
         inside = np.all((at > [left, top]) & (at < [left + wide, top + high]), axis=1)  # False for nan
         if inside.any():
             x, y = at[int(np.argmax(inside))].tolist()
-            labels.append((x, y, m.spots.views[j][1], colour))
-    out += ["</g>", *_labels(labels)]
+            labels.append((x, y, m.spots.views[j][1]))
+            starts.append(
+                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{colour}"><title>first position</title></circle>'
+            )
+    out += ["</g>", *starts, *svg.names(labels, p)]
     low, high_uv = np.array([p.X.lo, p.Y.lo]), np.array([p.X.hi, p.Y.hi])
     beyond = bool(np.any(np.isfinite(uv) & ((uv < low) | (uv > high_uv))))
     words = f"camera {camera}" + (" (parts of the tracks lie outside this drawing)" if beyond else "")
@@ -419,22 +422,6 @@ def _thinned_path(x: Array, y: Array, where: Bools) -> str:
                 keep.append(s)
         x, y = x[keep], y[keep]
     return svg.line_path(x, y)
-
-
-def _labels(labels: list[tuple[float, float, str, str]]) -> list[str]:
-    """Names at the first positions, moved down where two would overlap."""
-    placed: list[tuple[float, float]] = []
-    out = []
-    for x, y, spot, colour in labels:
-        lx, ly = x + 8, y - 6
-        while any(abs(lx - px) < 14 and abs(ly - py) < 14 for px, py in placed):
-            ly += 15
-        placed.append((lx, ly))
-        out.append(
-            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{colour}"><title>first position</title></circle>'
-            + svg.text(lx, ly, spot, "label", f"fill:{svg.INK}")
-        )
-    return out
 
 
 def _status_rows(m: ReportData) -> list[tuple[str, Ints, list[tuple[str, str]]]]:

@@ -20,11 +20,11 @@ from typing import Any
 import filelock
 
 from lab.errors import QUALITY_GATE_FAILED, BeamposeError, CalibrationError, InputError, RunError
-from lab.extras import needed
 from lab.files.text.atomic_write import atomic_write_bytes, made_folder
 from lab.files.text.csv_text import WORD_COLUMNS, text_of_field, write_table
 from lab.files.text.dataclass_fields import with_overrides
 from lab.files.text.json_text import read_json, require_regular_file, text_of_file
+from lab.packages import needed
 from lab.runs.batch.task import (
     COLUMNS,
     Task,

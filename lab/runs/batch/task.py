@@ -28,9 +28,9 @@ from lab.files.run.fingerprints import fingerprints
 from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.json_text import bytes_of_file, plain_value, read_json
+from lab.packages import versions
 from lab.runs.process import process_run
 from lab.runs.run_log import collected_lines
-from lab.versions import versions
 
 
 def listed_runs(given: Sequence[str | os.PathLike[str]], lists: Sequence[str | os.PathLike[str]] = ()) -> list[Path]:
@@ -356,7 +356,7 @@ def concluded(task: Task, outcome: TaskOutcome) -> TaskOutcome:
     if outcome.row["status"] != "error":
         _remove_error_files(task)
         return outcome
-    from lab.report.failure import Failure, write_failure_report  # imports the template engine
+    from lab.report.page import Failure, write_failure_report  # imports the template engine
 
     row, saved = outcome.row, task.error_file
     failure = Failure(

@@ -19,6 +19,7 @@ from lab.files.text.csv_text import csv_word
 from lab.files.text.dataclass_fields import with_overrides
 from lab.files.text.json_text import write_json
 from lab.findings.outcome import Done
+from lab.packages import versions
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import PictureSource, Video, open_inputs, pictures, pictures_of_frames
 from lab.progress import Progress
@@ -27,7 +28,6 @@ from lab.runs.detect.picture_series import PictureSeries
 from lab.runs.frames.sensor_noise import noise_frames
 from lab.runs.processed import quantiles
 from lab.runs.tables import detection_rows
-from lab.versions import versions
 from tracking.parameters import DetectParameters, TrackerParameters
 
 SCHEMA = "beampose/detect/1"

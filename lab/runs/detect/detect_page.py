@@ -15,7 +15,7 @@ import numpy as np
 from geometry.arrays import Array, Bools
 from lab.number_format import format_number
 from lab.pictures.picture_file import GreyPicture
-from lab.report.frames.canvas import PAPER, SOFT, Box, Canvas, Pixels, ground, png, text_size, write
+from lab.report.frames.canvas import PAPER, SOFT, Canvas, Pixels, ground, png, text_size, write
 from lab.report.page import Page, PageDrawing, PageTable, Section, made_with, write_page
 from lab.report.plot import svg
 from lab.report.plot.series import Line, time_panel
@@ -103,7 +103,7 @@ def _tile(one: _Kept, width: int, height: int) -> Pixels:
     grey = svg.stretched(one.picture, *svg.grey_limits(one.picture))
     canvas = Canvas(ground(grey, size, scale), np.array([-0.5, -0.5]), scale, 1.0)
     small = width < 400
-    taken: list[Box] = []
+    taken: list[svg.Box] = []
     for i, uv in enumerate(one.found.uv_px):
         major = float(one.found.major_px[i]) if np.isfinite(one.found.major_px[i]) else 1.0
         radius = max(3.5 * major * scale, 5.0 if small else 8.0)

@@ -22,7 +22,8 @@ from lab.pictures.source import PictureFiles, PictureSource, Video, list_folder,
 from lab.runs.frames.moments import Moment
 from tracking.detections import Detections
 
-Picture: TypeAlias = GreyPicture | Detections | MissingPicture
+# What a camera recorded for a frame.
+Recorded: TypeAlias = GreyPicture | Detections | MissingPicture
 
 BEYOND_PX = 32.0  # a fit may put the centre of a spot at the edge outside the picture, but never farther than this
 NAMED = 5  # frames that a note names for each kind of problem
@@ -33,7 +34,7 @@ class FrameSet:
     """The pictures of all cameras for one frame number."""
 
     frame: int
-    images: Mapping[str, Picture]  # by camera: grey (h, w) u8 or u16, detected points, or Missing
+    images: Mapping[str, Recorded]  # by camera: grey (h, w) u8 or u16, detected points, or Missing
     moment: Moment | None = None  # of a run whose cameras have clocks of their own
 
 
@@ -261,7 +262,7 @@ class FrameReader:
             if name not in self._ended and video.count is not None and frame < video.count:
                 self._ended[name] = f"{video.path}: ended after {frame} pictures; its header states {video.count}"
 
-    def _count(self, frame: int, images: Mapping[str, Picture]) -> None:
+    def _count(self, frame: int, images: Mapping[str, Recorded]) -> None:
         for camera, picture in images.items():
             if isinstance(picture, MissingPicture):
                 missing = self._missing.setdefault((camera, picture.reason), _MissingFrames())
@@ -275,7 +276,7 @@ def recorded_pictures(camera: str, source: FramesFolder | VideoFile) -> PictureS
     return video_at(source.path, camera) if isinstance(source, VideoFile) else list_folder(source.path, camera)
 
 
-def pictures_of_rows(run: Run, camera: str, rows: Sequence[int]) -> Generator[Picture, None, None]:
+def pictures_of_rows(run: Run, camera: str, rows: Sequence[int]) -> Generator[Recorded, None, None]:
     """One camera's picture of each of these rising rows of the tables, a few read ahead; a video from its start."""
     source = run.cameras[camera]
     if not isinstance(source, FramesFolder | VideoFile):
@@ -286,14 +287,14 @@ def pictures_of_rows(run: Run, camera: str, rows: Sequence[int]) -> Generator[Pi
     numbers = picture_numbers(run.clocks.get(camera), run.times, np.array(rows, dtype=np.int64))
     with closing(pictures(opened, size_px, wanted=np.unique(numbers[numbers >= 0]).tolist())) as stream:
         at = -1
-        picture: Picture = MissingPicture(DROPPED)
+        picture: Recorded = MissingPicture(DROPPED)
         for number in numbers.tolist():
             while at < number:
                 at, picture = next(stream, (number, MissingPicture(DROPPED)))
             yield picture if number == at >= 0 else MissingPicture(DROPPED)
 
 
-def pictures_at(run: Run, camera: str, rows: Iterable[int]) -> dict[int, Picture]:
+def pictures_at(run: Run, camera: str, rows: Iterable[int]) -> dict[int, Recorded]:
     """Some pictures of one camera, by the number of the row in the tables."""
     rising = sorted(set(rows))
     return dict(zip(rising, pictures_of_rows(run, camera, rising), strict=True))

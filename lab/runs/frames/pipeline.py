@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import numpy as np
 
@@ -17,8 +17,7 @@ from lab.pictures.picture_file import GreyPicture, MissingPicture
 from lab.runs.frames.clocked_frames import FoundPoints, open_frames
 from lab.runs.frames.frames import FrameSet
 from lab.runs.frames.moments import Moment
-from tracking.detections import Detections, PictureClock
-from tracking.noise import NoiseModel
+from tracking.detections import Detections, PictureClock, on_beam_axes
 from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.statuses import TrackedFrame
 
@@ -82,6 +81,9 @@ class FrameRecord:
     pictures: tuple[ShownPicture, ...] | None = None  # ... and the pictures since the row before; None: one per camera
 
 
+Pair: TypeAlias = tuple[FrameRecord, FrameRecord | None]  # a frame, and the same in the causal pass
+
+
 def tracker_of(run: Run) -> Tracker:
     """A new tracker of the run's method; without a prior it starts from all poses that show the spots."""
     prior = PosePrior.everywhere(run.rig) if run.prior is None else run.prior
@@ -103,7 +105,6 @@ class Timings:
 
 
 NEGLIGIBLE_S = 1e-9  # between a picture and its moment: rounding of times
-CLIPPED = 0.85  # of the range above the background: a spot whose peak is higher is taken to be clipped
 
 
 @dataclass(slots=True)
@@ -218,22 +219,3 @@ class Pipeline:
             return points
         middle = (self.run.rig.cameras[camera].image_size_px[1] - 1) / 2
         return replace(points, clock=PictureClock(delay_s, row_time_s, middle, *sigmas))
-
-
-def on_beam_axes(
-    found: Detections, offsets: CentroidOffsets, noise: NoiseModel | None, saturation_dn: float
-) -> Detections:
-    """Detections (n) with positions shifted from the light's centroid to the image of the beam's axis.
-
-    saturation_dn: grey value at which the sensor clips.
-    """
-    if not len(found) or noise is None:
-        return found
-    c, s = np.cos(np.radians(found.angle_deg)), np.sin(np.radians(found.angle_deg))
-    major2, minor2 = found.major_px**2, found.minor_px**2
-    shape = np.stack([major2 * c**2 + minor2 * s**2, (major2 - minor2) * c * s, major2 * s**2 + minor2 * c**2], axis=-1)
-    clipped = found.peak > CLIPPED * (saturation_dn - noise.black_dn)
-    height = np.where(clipped, found.flux / (2 * np.pi * found.major_px * found.minor_px), found.peak)
-    brightness = noise.slope_dn * height / noise.floor_dn2
-    clip = np.where(clipped, found.peak / np.maximum(height, 1e-9), 1.0)
-    return replace(found, uv_px=found.uv_px - offsets.at(found.uv_px, shape, brightness, clip))

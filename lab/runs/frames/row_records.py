@@ -9,16 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from geometry.arrays import Array, Ints
 from lab.runs.frames.moments import Moment
-from lab.runs.frames.pipeline import FrameRecord, ShownPicture
+from lab.runs.frames.pipeline import FrameRecord, Pair, ShownPicture
 from tracking.statuses import TrackedFrame
-
-Pair: TypeAlias = tuple[FrameRecord, FrameRecord | None]  # a frame, and the same in the causal pass
 
 
 def row_records(

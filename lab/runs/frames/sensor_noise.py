@@ -19,7 +19,7 @@ from tracking.background.static_background import StaticBackground
 from tracking.detection.detect import WIDE_PX, find_all_sizes, saturation_of
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
-from tracking.noise_estimation.colour_mosaic import mosaic_contrast
+from tracking.noise_estimation.grey_values import mosaic_contrast
 from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
 from tracking.noise_estimation.texture import is_limited_by_texture
 from tracking.parameters import DetectParameters

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
-from typing import TypeAlias
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty
-from lab.runs.frames.pipeline import FrameRecord
+from lab.runs.frames.pipeline import Pair
 from tracking.consistency import (
     SpotAgreement,
     against_causal,
@@ -60,8 +59,6 @@ class FrameRanges:
         more = len(self.ranges) - most
         return ", ".join(named) + (f" and {more} more range{'s' if more > 1 else ''}" if more > 0 else "")
 
-
-Pair: TypeAlias = tuple[FrameRecord, FrameRecord | None]  # a frame, and the same in the causal pass
 
 NOT_A_COVARIANCE, CONTRADICTION = "not_a_covariance", "contradiction"  # kinds of events
 _BLOCK = 64  # frames checked at once: one by one they take 0.8 ms each

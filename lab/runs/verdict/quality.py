@@ -15,7 +15,7 @@ from typing import Any
 from lab.findings.finding import Finding, Level, finding, level_above, sentence, verdict, worst_first
 from lab.findings.outcome import Verdict
 from lab.runs.verdict.frame_checks import FrameRanges
-from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, Cause, RunStatistics
+from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, FrameCause, RunStatistics
 
 # Share of the frames with enough visible spots: where the tracker missed more than half of them, it may not have
 # followed the vehicle in the others either. Frames with too few spots do not count.
@@ -139,7 +139,7 @@ def _measured(statistics: RunStatistics) -> list[Finding]:
     return [finding("BP-V03", level, what, variant="" if cause is None else cause.value, numbers=numbers)]
 
 
-def _causes_text(causes: Mapping[Cause, int]) -> str:
+def _causes_text(causes: Mapping[FrameCause, int]) -> str:
     """`30 with hidden spots, 4 without a picture of some camera`."""
     return ", ".join(f"{count} {cause.meaning}" for cause, count in list(causes.items())[:3])
 
@@ -156,7 +156,7 @@ def _why_never(statistics: RunStatistics) -> list[Finding]:
         what = f"the spots fit more than one pose. {sentence(statistics.tie_text).rstrip('.')}"
         return [finding("BP-V12", Level.FAIL, what, numbers=_frame_numbers(statistics.ties))]
     causes = statistics.causes
-    unexplained, few = causes.get(Cause.UNEXPLAINED, 0), causes.get(Cause.FEW_POINTS, 0)
+    unexplained, few = causes.get(FrameCause.UNEXPLAINED, 0), causes.get(FrameCause.FEW_POINTS, 0)
     per_frame = ", ".join(
         f"{f.points / f.pictures:.1f} per picture in camera {name}"
         for name, f in statistics.cameras.items()

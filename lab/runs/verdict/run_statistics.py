@@ -23,7 +23,7 @@ _USUAL_CLUTTER = 0.95  # quantile, over the measured frames, of the unlabelled p
 _MOST_POINTS = 50  # larger numbers of unlabelled points are counted as this number
 
 
-class Cause(Word):
+class FrameCause(Word):
     """Why a frame has no measured pose: the first that applies. Meaning: text that follows a number of such frames."""
 
     NO_PICTURE = "no_picture", "without a picture of some camera"
@@ -37,7 +37,7 @@ class Cause(Word):
 
 
 # Frames with enough visible spots: the tracker, not the recording, is the reason.
-MISSED = (Cause.CONTRADICTION, Cause.UNEXPLAINED, Cause.LABELS_OPEN)
+MISSED = (FrameCause.CONTRADICTION, FrameCause.UNEXPLAINED, FrameCause.LABELS_OPEN)
 
 
 @dataclass(slots=True)
@@ -131,7 +131,7 @@ class RunStatistics:
     first_pose: Pose | None = None  # the first that is measured
     first_measured: int = -1  # its frame
     _found: bool = False  # whether a pose has been found
-    _causes: Counter[tuple[Cause, int]] = field(default_factory=Counter)  # with the number of unlabelled points
+    _causes: Counter[tuple[FrameCause, int]] = field(default_factory=Counter)  # with the number of unlabelled points
     _surplus: Counter[int] = field(default_factory=Counter)  # unlabelled points of measured frames
 
     @property
@@ -204,24 +204,24 @@ class RunStatistics:
                 if labelled and measured and used is not None and not used[labelled].any():
                     camera.displaced.add(record.frame)
 
-    def _cause(self, record: FrameRecord) -> Cause:
+    def _cause(self, record: FrameRecord) -> FrameCause:
         tracked = record.tracked
         if any(found is None for found in record.detections):
-            return Cause.NO_PICTURE
+            return FrameCause.NO_PICTURE
         if any(event.kind == CONTRADICTION for event in tracked.events):
-            return Cause.CONTRADICTION
+            return FrameCause.CONTRADICTION
         given = np.array([s.measured for s in tracked.status])
         left_open = _labels_left_open(tracked)
         if left_open and given.sum() + left_open >= FEWEST_SPOTS:
-            return Cause.LABELS_OPEN
+            return FrameCause.LABELS_OPEN
         if tracked.pose is None:
-            return Cause.FEW_POINTS
+            return FrameCause.FEW_POINTS
         if sum(s.measured or s is SpotStatus.OCCLUDED for s in tracked.status) < FEWEST_SPOTS:
-            return Cause.OUT_OF_VIEW
-        return Cause.NOT_DETERMINED if given.sum() >= FEWEST_SPOTS else Cause.HIDDEN
+            return FrameCause.OUT_OF_VIEW
+        return FrameCause.NOT_DETERMINED if given.sum() >= FEWEST_SPOTS else FrameCause.HIDDEN
 
     @property
-    def causes(self) -> Mapping[Cause, int]:
+    def causes(self) -> Mapping[FrameCause, int]:
         """Number of frames without a measured pose by cause, the most frequent first.
 
         A frame whose unlabelled points exceed the usual clutter of measured frames by as many as a first pose needs
@@ -234,10 +234,10 @@ class RunStatistics:
             usual = surplus
             if below >= _USUAL_CLUTTER * total:
                 break
-        out: Counter[Cause] = Counter()
+        out: Counter[FrameCause] = Counter()
         for (cause, surplus), frames in self._causes.items():
-            shows_more = cause not in (Cause.NO_PICTURE, *MISSED) and surplus >= usual + self.min_spots
-            out[Cause.UNEXPLAINED if shows_more else cause] += frames
+            shows_more = cause not in (FrameCause.NO_PICTURE, *MISSED) and surplus >= usual + self.min_spots
+            out[FrameCause.UNEXPLAINED if shows_more else cause] += frames
         return dict(out.most_common())
 
     @property

@@ -17,18 +17,18 @@ from geometry.arrays import Array
 from geometry.forward_model import SpotModel
 from lab.files.run.run_file import Run
 from lab.files.text.json_text import plain_value
-from lab.findings.finding import first_sentence
+from lab.findings.finding import Level, first_sentence, verdict
 from lab.pictures.opencv import load_cv2
 from lab.pictures.picture_file import GreyPicture
 from lab.report.frames.canvas import ground
 from lab.report.html import environment
 from lab.report.plot.svg import grey_limits, stretched
-from lab.runs.frames.pipeline import CLIPPED, FrameRecord
+from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.model_check.check import check_sampled_frames
 from lab.runs.model_check.frame_sampler import FrameSampler
 from lab.runs.tables import pose_numbers
 from lab.runs.watch.background import ENDED
-from tracking.detections import Detections
+from tracking.detections import CLIPPED, Detections
 from tracking.statuses import PoseStatus
 
 if TYPE_CHECKING:
@@ -161,7 +161,7 @@ class Board:
             "offset_ms": self._offset_ms(name),
             "spots": [],
             "advice": "waiting for its first picture",
-            "level": "check",
+            "level": Level.WARN.word,
         }
         if name not in self._latest or self.pipeline is None:
             return out
@@ -178,7 +178,8 @@ class Board:
              round(float(found.major_px[i]), 2), bool(p > CLIPPED)]
             for i, p in zip(rows, peaks, strict=True)
         ]  # fmt: skip
-        out["advice"], out["level"] = exposure_advice(peaks, float(np.median(picture[::8, ::8])) / top, expected)
+        out["advice"], level = exposure_advice(peaks, float(np.median(picture[::8, ::8])) / top, expected)
+        out["level"] = level.word
         return out
 
     def _offset_ms(self, name: str) -> float | None:
@@ -206,28 +207,29 @@ class Board:
             found = self.check(check_sampled_frames, self.run.rig, sampler, self.run.covariance)
             worst = max(found.findings, key=lambda f: f.level, default=None)
             words = found.why_not or "the last seconds fit the rig" if worst is None else first_sentence(worst.what)
-            level = "" if found.why_not else "pass" if worst is None else worst.level.word
+            level = "" if found.why_not else verdict(found.findings).word
             self._word = {"words": words, "level": level, "remedy": "" if worst is None else worst.remedy}
 
 
-def exposure_advice(peaks: Array, background: float, expected: int) -> tuple[str, str]:
-    """What to change so that the spots are bright and not clipped, and a level: pass, check or fail.
+def exposure_advice(peaks: Array, background: float, expected: int) -> tuple[str, Level]:
+    """What to change so that the spots are bright and not clipped, and how severe it is.
 
     peaks (n,): of the spots, share of the sensor's range above black. background: share of the range. expected: spots.
     """
     clipped = int(np.count_nonzero(peaks > CLIPPED))
     if not len(peaks):
-        return ("no point found: are the lasers on, and is the lens open?", "fail") if expected else ("", "pass")
+        why = "no point found: are the lasers on, and is the lens open?"
+        return (why, Level.FAIL) if expected else ("", Level.PASS)
     if clipped:
-        return f"{clipped} of {len(peaks)} spots clipped: halve the exposure", "fail"
+        return f"{clipped} of {len(peaks)} spots clipped: halve the exposure", Level.FAIL
     if background > _BRIGHT:
-        return f"background at {100 * background:.0f} % of the range: less light in the room, or a filter", "check"
+        return f"background at {100 * background:.0f} % of the range: less light in the room, or a filter", Level.WARN
     if peaks.max() < _DIM:
         return (
             f"brightest spot at {100 * peaks.max():.0f} % of the range: expose {_GOOD / peaks.max():.1f} times as long",
-            "check",
+            Level.WARN,
         )
-    return f"brightest spot at {100 * peaks.max():.0f} % of the range: good", "pass"
+    return f"brightest spot at {100 * peaks.max():.0f} % of the range: good", Level.PASS
 
 
 def page_html(run: Run) -> str:

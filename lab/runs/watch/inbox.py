@@ -15,6 +15,7 @@ from typing import TypeAlias
 import numpy as np
 
 from lab.pictures.picture_file import DROPPED, GreyPicture, MissingPicture
+from lab.runs.frames.frames import Recorded
 from lab.runs.frames.moments import TimedPicture
 from lab.runs.watch.picture_times import PictureTimes
 from tracking.detections import Detections
@@ -22,7 +23,6 @@ from tracking.detections import Detections
 MOST_WAITING = 64  # pictures per camera in memory; those of a folder beyond stay on disk
 LONGEST_GAP = 10_000  # frame numbers: a picture this far ahead of the reader is a stray file
 
-Content: TypeAlias = GreyPicture | Detections | MissingPicture
 Finder: TypeAlias = Callable[[GreyPicture], Detections]
 
 
@@ -30,7 +30,7 @@ Finder: TypeAlias = Callable[[GreyPicture], Detections]
 class Waiting:
     """A picture that has arrived."""
 
-    content: Content
+    content: Recorded
     arrived_s: float | None  # time.time() at which it was complete; None: before the watch began
     seen_s: float  # time.perf_counter() at which its camera put it here
 
@@ -141,7 +141,7 @@ class Inbox:
                 self.changed.wait(0.05)
         self.catch_up(camera)
 
-    def put(self, camera: str, number: int, content: Content, arrived_s: float | None) -> None:
+    def put(self, camera: str, number: int, content: Recorded, arrived_s: float | None) -> None:
         """Add a camera's picture, or the reason why there is none."""
         self.catch_up(camera)
         if isinstance(content, np.ndarray):
@@ -183,12 +183,12 @@ class Inbox:
                     queue.times.known.pop(number)
             self.changed.notify_all()
 
-    def take(self, row: int) -> tuple[dict[str, list[tuple[TimedPicture, Content]]], dict[str, float]]:
+    def take(self, row: int) -> tuple[dict[str, list[tuple[TimedPicture, Recorded]]], dict[str, float]]:
         """Take the pictures of a row by camera, in the order of their instants, and close the row.
 
         Also returns when (time.time()) they arrived; without those that are older than the watch.
         """
-        out: dict[str, list[tuple[TimedPicture, Content]]] = {name: [] for name in self.queues}
+        out: dict[str, list[tuple[TimedPicture, Recorded]]] = {name: [] for name in self.queues}
         arrived: dict[str, float] = {}
         newest = max((queue.times.newest for queue in self.queues.values() if not queue.times.own), default=0)
         for name, queue in self.queues.items():

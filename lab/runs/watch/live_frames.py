@@ -16,11 +16,11 @@ from lab.files.run.detections_file import LONGEST_GAP
 from lab.files.run.run_file import FramesFolder, LiveDevice, Run
 from lab.pictures.picture_file import DROPPED, GreyPicture, MissingPicture
 from lab.runs.clock_estimate import ClockEstimate
-from lab.runs.frames.frames import FrameSet
+from lab.runs.frames.frames import FrameSet, Recorded
 from lab.runs.frames.moments import Moment, MomentPlanner, TimedPicture
 from lab.runs.watch.cameras import DeviceCamera, FolderCamera, LiveCamera, in_thread, open_device
 from lab.runs.watch.frame_clock import FolderPoll
-from lab.runs.watch.inbox import CameraQueue, Content, Inbox, is_complete
+from lab.runs.watch.inbox import CameraQueue, Inbox, is_complete
 from lab.runs.watch.picture_times import complete_times, times_of
 
 FIRST = 6  # pictures of each camera for the estimate of the noise
@@ -55,7 +55,7 @@ class LiveFrames:
     _cameras: dict[str, LiveCamera] = field(init=False)
     _stack: ExitStack = field(default_factory=ExitStack)
     _reasons: dict[str, Counter[str]] = field(default_factory=dict)
-    _contents: dict[tuple[str, int], Content] = field(default_factory=dict)  # of pictures whose moment is not made yet
+    _contents: dict[tuple[str, int], Recorded] = field(default_factory=dict)  # of pictures whose moment is not made yet
     _failures: list[BaseException] = field(default_factory=list)
     _first: int = 0  # row
 
@@ -184,7 +184,7 @@ class LiveFrames:
         self,
         planner: MomentPlanner,
         row: int,
-        given: Mapping[str, list[tuple[TimedPicture, Content]]],
+        given: Mapping[str, list[tuple[TimedPicture, Recorded]]],
         is_row: bool,
     ) -> Iterator[FrameSet]:
         """The moments up to a row, from the pictures nearest to it."""
@@ -199,7 +199,7 @@ class LiveFrames:
         for moment in moments:
             assert self.moments is not None
             self.moments.append(moment)
-            images: dict[str, Content] = {name: MissingPicture(DROPPED) for name in self.run.cameras}
+            images: dict[str, Recorded] = {name: MissingPicture(DROPPED) for name in self.run.cameras}
             images |= {name: self._contents.pop((name, p.number)) for name, p in moment.pictures.items()}
             yield FrameSet(moment.frame, images, moment)
 

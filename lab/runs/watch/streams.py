@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from typing import Any, Protocol
 
 from lab.errors import InputError
-from lab.extras import needed
 from lab.files.text.json_text import plain_value
+from lab.packages import needed
 from tracking.statuses import PoseStatus
 
 

@@ -13,13 +13,13 @@ import numpy as np
 from geometry.arrays import Array
 from lab.errors import InputError
 from lab.files.run.detections_file import read_detections
-from lab.files.run.run_file import DetectionsTable
+from lab.files.run.run_file import DetectionsTable, RecordedSource
 from lab.pictures.picture_file import DROPPED, ColourPicture, MissingPicture
 from lab.pictures.source import pictures
-from lab.report.frames.canvas import INK, Box, Canvas, bgr, light
-from lab.report.plot.svg import GREEN, ORANGE, image_uri
+from lab.report.frames.canvas import INK, Canvas, bgr, light
+from lab.report.plot.svg import GREEN, ORANGE, Box, image_uri
 from lab.runs.frames.frames import recorded_pictures
-from lab.targets.stereo.run import Source, StereoRecord, StereoResults, StereoRun
+from lab.targets.stereo.run import StereoRecord, StereoResults, StereoRun
 from tracking.binocular.marker_model import MarkerImages, project_markers
 
 # Annotated pairs of pictures for the report of a stereo run.
@@ -52,7 +52,9 @@ def _chosen(results: StereoResults) -> list[StereoRecord]:
     return sorted(few, key=lambda r: r.frame)
 
 
-def _pair_drawing(results: StereoResults, record: StereoRecord, content: tuple[Content, Content]) -> str:
+def _pair_drawing(
+    results: StereoResults, record: StereoRecord, content: tuple[RecordedMarkers, RecordedMarkers]
+) -> str:
     sides = [_side(results, record, content[c], c) for c in range(2)]
     height = max(h for _, h in sides)
     title = f"frame {record.frame}: left and right picture"
@@ -65,7 +67,7 @@ def _pair_drawing(results: StereoResults, record: StereoRecord, content: tuple[C
     )
 
 
-def _side(results: StereoResults, record: StereoRecord, content: Content, c: int) -> tuple[str, float]:
+def _side(results: StereoResults, record: StereoRecord, content: RecordedMarkers, c: int) -> tuple[str, float]:
     """One camera's cut-out as SVG, _SIDE wide, and its height."""
     camera = results.run.pair.cameras[c]
     name = f'<text x="2" y="14" class="title">{escape(camera.name)}</text>'
@@ -117,7 +119,7 @@ def _cut(uv: Array, size_px: tuple[int, int]) -> tuple[int, int, int, int]:
 # The frames of a stereo run: colour pictures or detected points of both cameras, by frame number.
 
 
-Content = ColourPicture | MarkerImages | MissingPicture
+RecordedMarkers = ColourPicture | MarkerImages | MissingPicture
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,12 +127,12 @@ class StereoFrame:
     """One frame number of both cameras, the left one first."""
 
     frame: int
-    content: tuple[Content, Content]
+    content: tuple[RecordedMarkers, RecordedMarkers]
 
 
 def _contents(
-    source: Source, name: str, size_px: tuple[int, int], wanted: Collection[int] | None
-) -> Iterator[tuple[int, Content]]:
+    source: RecordedSource, name: str, size_px: tuple[int, int], wanted: Collection[int] | None
+) -> Iterator[tuple[int, RecordedMarkers]]:
     """One camera's frames by increasing number. wanted: as for `stereo_frames`. Raises InputError."""
     if isinstance(source, DetectionsTable):
         table = read_detections(source.path)
@@ -161,7 +163,7 @@ def stereo_frames(run: StereoRun, wanted: Collection[int] | None = None) -> Iter
     frame: int | None = None
     while known := [f[0] for f in following if f is not None]:
         frame = min(known) if frame is None else frame + 1
-        content: list[Content] = []
+        content: list[RecordedMarkers] = []
         for c, side in enumerate(sides):
             at = following[c]
             if at is None or at[0] != frame:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -72,7 +71,7 @@ class LampsOptions(TrackOptions):
         if self.detector not in DETECTORS:
             raise InputError(f"--detector: expected one of {', '.join(DETECTORS)}, got {self.detector!r}")
         lens = load_lens(self.camera, self.camera_name)
-        require_valid_calibration(lens.calibration, self.camera, datetime.date.today())
+        require_valid_calibration(lens.calibration, self.camera)
         return lens
 
 

@@ -6,7 +6,6 @@ The verdict on a stereo run: findings with reason and remedy. A FAIL sets the ex
 from __future__ import annotations
 
 import dataclasses
-import datetime
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -219,8 +218,7 @@ def process_stereo_run(run_folder: Path, out: Path, progress: Progress | None = 
 def _processed(run_folder: Path, work: Path, progress: Progress | None) -> Processed[StereoResults]:
     """The run, whose tables are written into the folder `work`."""
     run = load_stereo_run(run_folder)
-    recorded = datetime.date.today() if run.recorded is None else run.recorded
-    require_valid_calibration(run.calibration, run.pair_path, recorded)
+    require_valid_calibration(run.calibration, run.pair_path, run.recorded)
     truth_path = run.folder / "truth" / "pose.csv"
     truth = read_true_poses(truth_path) if truth_path.is_file() else None
     results = measure(run, progress)

@@ -41,10 +41,9 @@ from lab.files.run.clocks import Times, load_times
 from lab.files.run.run_file import (
     RATE_RANGE_HZ,
     DetectionsTable,
-    FramesFolder,
     LiveDevice,
+    RecordedSource,
     SourceBlock,
-    VideoFile,
     folder_of_run,
     source_of,
 )
@@ -198,8 +197,6 @@ def _widest(x: Array) -> Sequence[int]:
 
 SCHEMA = "beampose/stereo/1"
 
-Source = FramesFolder | VideoFile | DetectionsTable
-
 
 @dataclass(frozen=True, slots=True)
 class StereoRun:
@@ -214,7 +211,7 @@ class StereoRun:
     frame_rate_hz: float
     times: Times
     times_path: Path | None
-    cameras: Mapping[str, Source]  # two, by name, the left one first
+    cameras: Mapping[str, RecordedSource]  # two, by name, the left one first
     parameters: BinocularParameters
     calibration: CalibrationState | None
     recorded: datetime.date | None
@@ -265,7 +262,7 @@ def load_stereo_run(run_folder: Path) -> StereoRun:
     cameras, covariance = of_two_cameras(file, names)
     times_path = None if content.timestamps is None else folder / content.timestamps
     target = load_target(content.target, folder, path)
-    sources: dict[str, Source] = {}
+    sources: dict[str, RecordedSource] = {}
     for name, block in content.cameras.items():
         source = source_of(block, folder, f"{path}: cameras.{name}")
         if isinstance(source, LiveDevice):

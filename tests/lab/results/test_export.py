@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 
 import lab
 from cli import main
-from lab.extras import PACKAGES
 from lab.files.text import columns
 from lab.files.text.csv_text import write_table
+from lab.packages import PACKAGES
 from lab.results.export import FORMATS
 from tests.paths import ROOT
 

@@ -11,6 +11,7 @@ from click.testing import CliRunner
 
 from cli import main
 from lab.errors import InputError
+from lab.files.run import fingerprints
 from lab.results.verify import difference_of, read_recorded, verify
 from lab.simulate.write import simulate
 
@@ -49,9 +50,17 @@ def test_an_unchanged_result_is_the_same(made):
     assert found.lines[0].startswith(f"SAME: {len(found.result.tables)} of {len(found.result.tables)} tables")
 
 
-def test_a_causal_result_is_computed_without_smoothing(made, tmp_path):
+def test_a_causal_result_with_full_fingerprints_is_computed_without_smoothing(made, tmp_path, monkeypatch):
     arguments = ["run", str(made / "run"), "--out", str(tmp_path / "out"), "--causal", "--full-hash"]
-    assert CliRunner().invoke(main, arguments).exit_code == 0
+    read: list[Path] = []
+    of_file = fingerprints._of_file
+    with monkeypatch.context() as m:
+        m.setattr(fingerprints, "MAX_HASHED_BYTES", 100)
+        m.setattr(fingerprints, "_of_file", lambda path, full: read.append(path) or of_file(path, full))
+        assert CliRunner().invoke(main, arguments).exit_code == 0
+    inputs = json.loads((tmp_path / "out" / "summary.json").read_text())["inputs"]
+    assert {entry["covers"] for entry in inputs} == {"contents"}
+    assert sorted(map(str, read)) == sorted(entry["path"] for entry in inputs)  # each once
     found = verify(tmp_path / "out")
     assert found.result.identical
     assert "attitude_causal.csv" not in found.result.tables

@@ -16,7 +16,7 @@ from lab.runs.verdict.quality import (
     LEAST_MEASURED_OF_SHOWN,
     judge,
 )
-from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, Cause, RunStatistics
+from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, FrameCause, RunStatistics
 
 FRAMES = 1000
 
@@ -35,7 +35,7 @@ def a_camera(**changed: object) -> CameraStatistics:
 
 def statistics_of(
     measured: int = FRAMES,
-    causes: dict[Cause, int] | None = None,
+    causes: dict[FrameCause, int] | None = None,
     cameras: dict[str, CameraStatistics] | None = None,
     **changed: object,
 ) -> RunStatistics:
@@ -45,7 +45,7 @@ def statistics_of(
     statistics.pose = Counter({"measured": measured, "predicted": FRAMES - measured})
     statistics._surplus[0] = measured
     if causes is None:
-        causes = {Cause.HIDDEN: FRAMES - measured} if measured < FRAMES else {}
+        causes = {FrameCause.HIDDEN: FRAMES - measured} if measured < FRAMES else {}
     statistics._causes.update({(cause, 0): count for cause, count in causes.items()})
     for name, value in changed.items():
         setattr(statistics, name, value)
@@ -79,7 +79,7 @@ def test_the_share_of_measured_frames_decides(measured, status):
     assert judge(statistics_of(measured)).status == status
 
 
-@pytest.mark.parametrize("cause", Cause)
+@pytest.mark.parametrize("cause", FrameCause)
 def test_only_missed_frames_fail_a_run_and_frames_with_too_few_spots_do_not(cause):
     """The results of a long occlusion are correct; visible spots that no pose explains are not a measurement."""
     measured = int(FRAMES * LEAST_MEASURED_OF_SHOWN) - 1
@@ -92,10 +92,10 @@ def test_only_missed_frames_fail_a_run_and_frames_with_too_few_spots_do_not(caus
 
 def test_the_share_of_missed_frames_is_relative_to_the_frames_with_enough_spots():
     """200 measured, 190 missed, 610 occluded: most frames with visible spots were measured."""
-    verdict = judge(statistics_of(200, {Cause.UNEXPLAINED: 190, Cause.HIDDEN: 610}))
+    verdict = judge(statistics_of(200, {FrameCause.UNEXPLAINED: 190, FrameCause.HIDDEN: 610}))
     assert verdict.status == "check"
     assert "of the others, 610 with hidden spots, 190 with enough points of light" in verdict.texts[0]
-    assert judge(statistics_of(200, {Cause.UNEXPLAINED: 210, Cause.HIDDEN: 590})).exit_status == 4
+    assert judge(statistics_of(200, {FrameCause.UNEXPLAINED: 210, FrameCause.HIDDEN: 590})).exit_status == 4
 
 
 @pytest.mark.parametrize(
@@ -118,7 +118,7 @@ def test_a_run_without_frames_is_a_failure():
 
 
 def never(**changed: object) -> Verdict:
-    arguments: dict[str, object] = {"causes": {Cause.UNEXPLAINED: FRAMES}} | changed
+    arguments: dict[str, object] = {"causes": {FrameCause.UNEXPLAINED: FRAMES}} | changed
     # mypy cannot know which argument each keyword is for.
     verdict = judge(statistics_of(0, **arguments))  # type: ignore[arg-type]
     assert verdict.exit_status == 4
@@ -145,13 +145,13 @@ def test_a_camera_without_any_detection_is_the_only_reason():
 
 def test_a_camera_without_any_picture_is_reported():
     gone = CameraStatistics(missing=ranges((0, FRAMES - 1)))
-    verdict = never(cameras={"left": a_camera(), "right": gone}, causes={Cause.NO_PICTURE: FRAMES})
+    verdict = never(cameras={"left": a_camera(), "right": gone}, causes={FrameCause.NO_PICTURE: FRAMES})
     assert kinds(verdict) == ["never_found", "no_pictures"]
     assert verdict.texts[1] == "camera right has no usable picture at all"
 
 
 def test_too_few_points_are_distinguished_from_points_that_do_not_fit():
-    verdict = never(causes={Cause.FEW_POINTS: 950, Cause.UNEXPLAINED: 50})
+    verdict = never(causes={FrameCause.FEW_POINTS: 950, FrameCause.UNEXPLAINED: 50})
     assert kinds(verdict) == ["never_found", "few_points"]
     assert "950 frames of 1000 show fewer than the 4 points" in verdict.texts[1]
 
@@ -165,7 +165,7 @@ def test_a_tie_is_reported_with_its_candidates():
 
 
 def test_frames_that_do_not_determine_the_pose_are_the_reason_without_any_other():
-    verdict = never(causes={Cause.NOT_DETERMINED: 700, Cause.OUT_OF_VIEW: 300})
+    verdict = never(causes={FrameCause.NOT_DETERMINED: 700, FrameCause.OUT_OF_VIEW: 300})
     assert verdict.texts[1].startswith("of 1000 frames, 700 whose spots do not determine the pose, 300 with fewer")
     assert "two screens" in verdict.remedy
 
@@ -254,7 +254,7 @@ def test_findings_of_the_model_check_count_by_their_level_and_keep_their_remedy(
 
 
 def test_failures_come_before_points_to_check():
-    statistics = statistics_of(300, {Cause.UNEXPLAINED: 700}, lost=ranges((100, 999)), own_spots=ranges((7, 7)))
+    statistics = statistics_of(300, {FrameCause.UNEXPLAINED: 700}, lost=ranges((100, 999)), own_spots=ranges((7, 7)))
     verdict = judge(statistics, noise_scale=6.0)
     assert verdict.exit_status == 4
     assert [e.level is Level.FAIL for e in verdict.findings] == [True, True, False, False]
@@ -264,7 +264,7 @@ def test_failures_come_before_points_to_check():
 
 
 def test_every_kind_of_reason_and_every_cause_has_a_remedy():
-    assert set(ENTRIES["BP-V03"].variants) == {cause.value for cause in Cause}
+    assert set(ENTRIES["BP-V03"].variants) == {cause.value for cause in FrameCause}
     assert all(entry.remedy for entry in ENTRIES.values())
 
 

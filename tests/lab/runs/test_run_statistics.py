@@ -10,7 +10,7 @@ import pytest
 from geometry.pose import Pose
 from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.verdict.frame_checks import CONTRADICTION, FrameRanges
-from lab.runs.verdict.run_statistics import CameraStatistics, Cause, RunStatistics
+from lab.runs.verdict.run_statistics import CameraStatistics, FrameCause, RunStatistics
 from tracking.detections import Detections
 from tracking.statuses import Event, PoseStatus, SpotStatus, TrackedFrame
 
@@ -59,32 +59,32 @@ OPEN = np.array([np.nan, np.nan, 0.6, 0.6, 0.6, 0.6])
 @pytest.mark.parametrize(
     ("record", "cause"),
     [
-        (a_record(1, PREDICTED, (SEEN,) * 3 + (SpotStatus.NO_IMAGE,) * 3, right=None), Cause.NO_PICTURE),
-        (a_record(1, PREDICTED, events=(Event(CONTRADICTION, ""),)), Cause.CONTRADICTION),
-        (a_record(1, PREDICTED, (SEEN, SEEN, *(HIDDEN,) * 4), probability=OPEN), Cause.LABELS_OPEN),
-        (a_record(1, PREDICTED, (SEEN, HIDDEN, *(OUT,) * 4), left=1, right=0), Cause.OUT_OF_VIEW),
-        (a_record(1, PREDICTED, (SEEN, SEEN, SEEN, *(OUT,) * 3), left=3, right=0), Cause.NOT_DETERMINED),
-        (a_record(1, PREDICTED, (HIDDEN,) * N, left=0, right=0), Cause.HIDDEN),
-        (a_record(1, LOST, (SpotStatus.LOST,) * N, left=1, right=2), Cause.FEW_POINTS),
-        (a_record(1, LOST, (SpotStatus.LOST,) * N), Cause.UNEXPLAINED),
+        (a_record(1, PREDICTED, (SEEN,) * 3 + (SpotStatus.NO_IMAGE,) * 3, right=None), FrameCause.NO_PICTURE),
+        (a_record(1, PREDICTED, events=(Event(CONTRADICTION, ""),)), FrameCause.CONTRADICTION),
+        (a_record(1, PREDICTED, (SEEN, SEEN, *(HIDDEN,) * 4), probability=OPEN), FrameCause.LABELS_OPEN),
+        (a_record(1, PREDICTED, (SEEN, HIDDEN, *(OUT,) * 4), left=1, right=0), FrameCause.OUT_OF_VIEW),
+        (a_record(1, PREDICTED, (SEEN, SEEN, SEEN, *(OUT,) * 3), left=3, right=0), FrameCause.NOT_DETERMINED),
+        (a_record(1, PREDICTED, (HIDDEN,) * N, left=0, right=0), FrameCause.HIDDEN),
+        (a_record(1, LOST, (SpotStatus.LOST,) * N, left=1, right=2), FrameCause.FEW_POINTS),
+        (a_record(1, LOST, (SpotStatus.LOST,) * N), FrameCause.UNEXPLAINED),
         # The pose is wrong, and there are six points where it does not expect any.
-        (a_record(1, PREDICTED, (HIDDEN,) * N), Cause.UNEXPLAINED),
-        (a_record(1, PREDICTED, (OUT,) * N), Cause.UNEXPLAINED),
+        (a_record(1, PREDICTED, (HIDDEN,) * N), FrameCause.UNEXPLAINED),
+        (a_record(1, PREDICTED, (OUT,) * N), FrameCause.UNEXPLAINED),
     ],
 )
 def test_each_frame_without_a_measured_pose_has_its_cause(record, cause):
     statistics = statistics_of(a_record(0), record)
     assert statistics.causes == {cause: 1}
-    assert statistics.missed == (cause in (Cause.CONTRADICTION, Cause.LABELS_OPEN, Cause.UNEXPLAINED))
+    assert statistics.missed == (cause in (FrameCause.CONTRADICTION, FrameCause.LABELS_OPEN, FrameCause.UNEXPLAINED))
 
 
 def test_the_usual_clutter_is_no_evidence_of_spots():
     """Six reflections in every picture: an occluded frame with these shows no spots; one with six more points does."""
     measured = [a_record(k, left=9) for k in range(20)]
     occluded = a_record(20, PREDICTED, (HIDDEN,) * N, left=6, right=0)
-    assert statistics_of(*measured, occluded).causes == {Cause.HIDDEN: 1}
+    assert statistics_of(*measured, occluded).causes == {FrameCause.HIDDEN: 1}
     assert statistics_of(*measured, replace(occluded, detections=(points(9), points(3)))).causes == {
-        Cause.UNEXPLAINED: 1
+        FrameCause.UNEXPLAINED: 1
     }
 
 

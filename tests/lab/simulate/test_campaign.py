@@ -186,3 +186,10 @@ def test_a_rig_that_is_neither_a_name_nor_a_file_is_an_error(rig, words, tmp_pat
     with pytest.raises(InputError, match=words):
         simulate_calibration(tmp_path / "campaign", rig=rig)
     assert not (tmp_path / "campaign").exists()
+
+
+def test_the_dots_are_spread_evenly_about_the_middle_of_each_screen():
+    c = draw_campaign(5)
+    for k, screen in enumerate(c.truth.screens.values()):
+        dots = screen.world_from_screen.inverse().apply(c.dots_surveyed[c.dot_screen == k])
+        np.testing.assert_allclose([dots.min(axis=0)[:2], dots.max(axis=0)[:2]], [[-2.2, -1.7], [2.2, 1.7]], atol=0.03)

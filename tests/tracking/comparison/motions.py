@@ -6,7 +6,7 @@ import numpy as np
 
 from geometry import rotations
 from geometry.arrays import Array
-from tracking.comparison.frame_alignment import Alignment, Motion
+from tracking.comparison.frame_alignment import Alignment, PoseSeries
 
 TRUTH = Alignment(
     offset_s=0.137,
@@ -28,7 +28,7 @@ def smooth(t: Array, axes: tuple[float, float, float] = (1, 1, 1), places: float
     return rotation, places * position
 
 
-def noisy(motion: Motion, sigma_m: float, sigma_rad: float, rng: np.random.Generator) -> Motion:
+def noisy(motion: PoseSeries, sigma_m: float, sigma_rad: float, rng: np.random.Generator) -> PoseSeries:
     """The motion with white noise, which its covariance states."""
     n = len(motion)
     noise = rng.standard_normal((n, 6)) * np.array([sigma_m] * 3 + [sigma_rad] * 3)
@@ -36,7 +36,7 @@ def noisy(motion: Motion, sigma_m: float, sigma_rad: float, rng: np.random.Gener
     covariance[:] = np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)
     assert motion.rotation is not None
     assert motion.position_m is not None
-    return Motion(
+    return PoseSeries(
         motion.t_s, motion.rotation @ rotations.exp(noise[:, 3:]), motion.position_m + noise[:, :3], covariance
     )
 
@@ -51,12 +51,12 @@ def recordings(
     reference_step_s: float = 0.025,
     result_sigmas: tuple[float, float] = (2e-4, 1e-4),
     reference_sigmas: tuple[float, float] = (1e-4, 5e-5),
-) -> tuple[Motion, Motion]:
+) -> tuple[PoseSeries, PoseSeries]:
     """A result, and a reference that is aligned to it by `truth`. Sigmas: m and rad."""
     rng = np.random.default_rng(seed)
     t = step_s * np.arange(frames)
     s = truth.offset_s - 0.3 + reference_step_s * np.arange(int((frames * step_s + 0.7) / reference_step_s))
     seen = (s - truth.offset_s + truth.rate * truth.middle_s) / (1 + truth.rate)
-    aligned = truth.applied(Motion(s, *move(seen), np.zeros((len(s), 6, 6))))
-    result = Motion(t, *move(t), np.zeros((len(t), 6, 6)))
+    aligned = truth.applied(PoseSeries(s, *move(seen), np.zeros((len(s), 6, 6))))
+    result = PoseSeries(t, *move(t), np.zeros((len(t), 6, 6)))
     return noisy(result, *result_sigmas, rng), noisy(aligned, *reference_sigmas, rng)

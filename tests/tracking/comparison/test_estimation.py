@@ -17,7 +17,7 @@ from tracking.comparison.frame_alignment import (
     TRANSLATION,
     WORLD,
     Alignment,
-    Motion,
+    PoseSeries,
     jacobians,
     residuals,
 )
@@ -33,12 +33,12 @@ def nees(found: list, truth: Alignment = TRUTH) -> float:
     return float(np.mean(each))
 
 
-def angles_only(motion: Motion) -> Motion:
-    return Motion(motion.t_s, motion.rotation, None, motion.covariance)
+def angles_only(motion: PoseSeries) -> PoseSeries:
+    return PoseSeries(motion.t_s, motion.rotation, None, motion.covariance)
 
 
-def places_only(motion: Motion) -> Motion:
-    return Motion(motion.t_s, None, motion.position_m, motion.covariance)
+def places_only(motion: PoseSeries) -> PoseSeries:
+    return PoseSeries(motion.t_s, None, motion.position_m, motion.covariance)
 
 
 def test_errors_of_all_fourteen_parameters_agree_with_their_covariance():
@@ -114,7 +114,7 @@ def test_one_outlier_in_twelve_hardly_changes_the_result():
     rotation, position = reference.rotation.copy(), reference.position_m.copy()
     rotation[bad] = rotation[bad] @ rotations.exp(rng.normal(0, 0.2, (len(bad), 3)))
     position[bad] += rng.normal(0, 0.3, (len(bad), 3))
-    e = estimate_alignment(result, Motion(reference.t_s, rotation, position, reference.covariance))
+    e = estimate_alignment(result, PoseSeries(reference.t_s, rotation, position, reference.covariance))
     error = TRUTH.minus(e.alignment)
     assert np.all(np.abs(error) < 5 * e.sigmas)
     assert 0.5 < e.inliers.mean() < 0.95
@@ -126,7 +126,7 @@ def test_correlated_errors_widen_the_sigmas():
     result, reference = recordings(6)
     white = rng.standard_normal((len(result), 3))
     slow = np.stack([np.convolve(white[:, k], np.ones(15) / np.sqrt(15), "same") for k in range(3)], -1)
-    drifting = Motion(
+    drifting = PoseSeries(
         result.t_s, smooth(result.t_s)[0] @ rotations.exp(1e-4 * slow), result.position_m, result.covariance
     )
     e = estimate_alignment(drifting, reference, offset_s=0.1)

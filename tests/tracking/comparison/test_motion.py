@@ -8,11 +8,11 @@ import pytest
 from geometry import rotations
 from tests.tracking.comparison.motions import TRUTH, recordings, smooth
 from tracking.comparison.differences import chi_square, differences, longest_still, statistic
-from tracking.comparison.frame_alignment import Motion, interpolate, rates
+from tracking.comparison.frame_alignment import PoseSeries, interpolate, rates
 
 
 def exact(t):
-    return Motion(t, *smooth(t), np.zeros((len(t), 6, 6)))
+    return PoseSeries(t, *smooth(t), np.zeros((len(t), 6, 6)))
 
 
 def test_the_cubic_reproduces_a_smooth_motion():
@@ -44,9 +44,9 @@ def test_rates_are_the_derivatives():
 
 def test_a_motion_needs_content_and_rising_times():
     with pytest.raises(ValueError, match="attitudes, positions"):
-        Motion(np.arange(3.0), None, None, np.zeros((3, 6, 6)))
+        PoseSeries(np.arange(3.0), None, None, np.zeros((3, 6, 6)))
     with pytest.raises(ValueError, match="rising"):
-        Motion(np.zeros(3), None, np.zeros((3, 3)), np.zeros((3, 6, 6)))
+        PoseSeries(np.zeros(3), None, np.zeros((3, 3)), np.zeros((3, 6, 6)))
 
 
 def test_differences_at_the_true_alignment_agree_with_the_stated_covariances():
@@ -80,7 +80,7 @@ def test_the_longest_stationary_stretch_is_found():
     rotation = rotations.exp(np.stack([0 * t, 0 * t, yaw], -1)) @ rotations.exp(noise)
     covariance = np.zeros((len(t), 6, 6))
     covariance[:] = 1e-8 * np.eye(6)
-    where = longest_still(Motion(t, rotation, None, covariance), 64)
+    where = longest_still(PoseSeries(t, rotation, None, covariance), 64)
     assert 5.0 <= t[where][0] < 5.5
     assert t[where][-1] == t[-1]
-    assert longest_still(Motion(t, rotation, None, covariance), 5000) is None
+    assert longest_still(PoseSeries(t, rotation, None, covariance), 5000) is None

@@ -15,36 +15,22 @@ from tracking.detection.normal_equations import accumulate, solve_normal
 from tracking.detection.pixels import CLIPPED, OUTSIDE, Noise, Pixels, Window, read_window, window_around
 from tracking.detection.table import (
     ALGEBRA,
-    BACKGROUND,
+    CANDIDATE,
     CELL_ROWS,
-    CHI2,
-    COLUMNS,
-    COV_UV,
-    FLUX,
     LIGHT,
-    MOMENT_U,
-    MOMENT_UU,
-    MOMENT_UV,
-    MOMENT_V,
-    MOMENT_VV,
     MOST_CELLS,
     NORMAL,
     RESIDUAL,
     RIGHT_SIDE,
-    SLOPE_V,
     USE,
-    UU,
-    VAR_U,
-    VAR_V,
     VECTORS,
     WEIGHT,
-    U,
-    V,
-)  # fmt: skip
+)
 
 px = 1.0
 NOISE = Noise(1.5**2 + 1 / 12, 1 / 30, 0.0, 0.0, 0.0, 0.0)
 sigmas = st.floats(0.3, 15)
+FITTED = ("u", "v", "uu", "uv", "vv", "flux", "level", "slope_u", "slope_v")
 
 
 def shape_of(major: float, minor: float, angle_deg: float) -> tuple[float, float, float]:
@@ -62,6 +48,17 @@ def workspace() -> tuple[np.ndarray, np.ndarray]:
     cells = np.zeros((CELL_ROWS, MOST_CELLS))
     cells[USE] = 1.0
     return cells, np.zeros((ALGEBRA, 9, 10))
+
+
+def candidate(*fitted: float) -> np.void:
+    table = np.zeros(1, CANDIDATE)
+    for name, value in zip(FITTED, fitted, strict=True):
+        table[name] = value
+    return table[0]
+
+
+def numbers(spot: np.void, *names: str) -> np.ndarray:
+    return np.array([spot[name] for name in names])
 
 
 def pixels(image: np.ndarray) -> Pixels:
@@ -119,8 +116,7 @@ def test_the_exponential_has_the_precision_of_floating_point_numbers():
 def test_pixels_integrate_the_gaussian(sigma, tolerance, phase):
     """Round spots factorise, so the error function gives the exact integral."""
     cells, algebra = workspace()
-    spot = np.zeros(COLUMNS)
-    spot[: SLOPE_V + 1] = [10 + phase, 10.0, sigma**2, 0, sigma**2, 1.0, 0, 0, 0]
+    spot = candidate(10 + phase, 10.0, sigma**2, 0.0, sigma**2, 1.0, 0.0, 0.0, 0.0)
     accumulate(Window(0, 0, 21, 21, 1), spot, NOISE, cells, algebra)
     edges = np.arange(22) - 0.5
 
@@ -147,17 +143,16 @@ def test_cells_of_two_pixels_are_means_of_four_and_have_states_for_clipped_and_m
 def test_the_normal_equations_agree_with_numerical_derivatives(minor):
     """With derivatives with respect to the nine parameters the decrease of chi-square is the same."""
     rng = np.random.default_rng(0)
-    spot = np.zeros(COLUMNS)
-    spot[: SLOPE_V + 1] = [9.7, 10.4, *shape_of(2.1, minor, 30.0), 900.0, 12.0, 0.1, -0.2]
+    spot = candidate(9.7, 10.4, *shape_of(2.1, minor, 30.0), 900.0, 12.0, 0.1, -0.2)
     window, (cells, algebra) = Window(2, 3, 17, 15, 1), workspace()
     n = 17 * 15
     cells[0, :n] = rng.uniform(0, 50, n)
     J = np.zeros((9, n))
-    for p in range(9):
+    for p, name in enumerate(FITTED):
         sides = []
         for sign in (1, -1):
             moved = spot.copy()
-            moved[p] += sign * 1e-4
+            moved[name] += sign * 1e-4
             accumulate(window, moved, NOISE, cells, algebra)
             sides.append(-cells[RESIDUAL, :n])
         J[p] = (sides[0] - sides[1]) / 2e-4
@@ -172,8 +167,8 @@ def test_the_normal_equations_agree_with_numerical_derivatives(minor):
 
 
 def start(spot: Spot, background: float) -> np.ndarray:
-    table = np.zeros((1, COLUMNS))
-    table[0, [MOMENT_U, MOMENT_V, BACKGROUND]] = np.rint(spot.u), np.rint(spot.v), background
+    table = np.zeros(1, CANDIDATE)
+    table["moment_u"], table["moment_v"], table["background"] = np.rint(spot.u), np.rint(spot.v), background
     return table
 
 
@@ -183,11 +178,11 @@ def test_without_noise_the_moments_are_close_to_the_truth_and_the_fit_reaches_it
     cells, algebra = workspace()
     table = start(spot, 1000.0)
     find_moments(image, table, cells)
-    assert np.abs(table[0, [MOMENT_U, MOMENT_V]] - [40.3, 30.8]).max() < 0.1 * px
+    assert np.abs(numbers(table[0], "moment_u", "moment_v") - [40.3, 30.8]).max() < 0.1 * px
     fit_all(image, table, Noise(1.0, 1.0, 1000.0, 0.0, 0.0, 0.0), 65535.0, 20.0, 0.0, False, True, cells, algebra)
-    assert np.abs(table[0, [U, V]] - [40.3, 30.8]).max() < 2e-4 * px
-    assert ellipse.axes(*table[0, UU : UU + 3]) == pytest.approx((3.1, 1.7, 25.0), abs=0.01)
-    assert table[0, FLUX] == pytest.approx(spot.flux, rel=1e-3)
+    assert np.abs(numbers(table[0], "u", "v") - [40.3, 30.8]).max() < 2e-4 * px
+    assert ellipse.axes(*numbers(table[0], "uu", "uv", "vv")) == pytest.approx((3.1, 1.7, 25.0), abs=0.01)
+    assert table[0]["flux"] == pytest.approx(spot.flux, rel=1e-3)
 
 
 def fitted(scene: Scene, seed: int, spot: Spot, hot: tuple[int, int] | None = None) -> np.ndarray:
@@ -206,9 +201,9 @@ def fitted(scene: Scene, seed: int, spot: Spot, hot: tuple[int, int] | None = No
 def test_a_hot_pixel_beside_or_in_a_spot_does_not_shift_it(hot):
     spot = Spot(30.3, 29.6, 100.0, 2.2, 2.0)
     clean, with_hot_pixel = (fitted(Scene([spot], (64, 60)), 5, spot, h) for h in (None, hot))
-    sigma = np.sqrt(clean[[VAR_U, VAR_V]])
-    assert (np.abs(clean[[U, V]] - with_hot_pixel[[U, V]]) < 1.0 * sigma).all()
-    assert with_hot_pixel[CHI2] < 1.4
+    sigma = np.sqrt(numbers(clean, "var_u", "var_v"))
+    assert (np.abs(numbers(clean, "u", "v") - numbers(with_hot_pixel, "u", "v")) < 1.0 * sigma).all()
+    assert with_hot_pixel["chi2"] < 1.4
 
 
 def test_a_flat_topped_spot_keeps_its_small_sigma_and_a_speckled_one_does_not():
@@ -217,11 +212,11 @@ def test_a_flat_topped_spot_keeps_its_small_sigma_and_a_speckled_one_does_not():
     flat = fitted(Scene([streak], (64, 60)), 1, streak)
     speckled = fitted(Scene([plain], (64, 60), speckle=0.2), 1, plain)
     smooth = fitted(Scene([plain], (64, 60)), 1, plain)
-    assert flat[CHI2] > 1.2
+    assert flat["chi2"] > 1.2
     scene = Scene([streak], (64, 60))
-    assert flat[[VAR_U, VAR_V]].sum() < 1.5 * np.trace(bound(streak, scene, expected(scene)))
-    assert speckled[[VAR_U, VAR_V]].sum() > 9 * smooth[[VAR_U, VAR_V]].sum()
-    assert abs(smooth[COV_UV]) < smooth[VAR_U]
+    assert numbers(flat, "var_u", "var_v").sum() < 1.5 * np.trace(bound(streak, scene, expected(scene)))
+    assert numbers(speckled, "var_u", "var_v").sum() > 9 * numbers(smooth, "var_u", "var_v").sum()
+    assert abs(smooth["cov_uv"]) < smooth["var_u"]
 
 
 def test_a_candidate_that_diverges_is_rejected():
@@ -229,9 +224,9 @@ def test_a_candidate_that_diverges_is_rejected():
     image[:, 40:] = 200  # an edge without a spot
     cells, algebra = workspace()
     table = start(Spot(40.0, 40.0, 1.0), 20.0)
-    table[0, [MOMENT_UU, MOMENT_UV, MOMENT_VV, FLUX]] = 4.0, 0.0, 4.0, 4000.0
+    table["moment_uu"], table["moment_uv"], table["moment_vv"], table["flux"] = 4.0, 0.0, 4.0, 4000.0
     fit_all(pixels(image), table, NOISE, 255.0, 5.0, 0.0, False, True, cells, algebra)
-    assert table[0, FLUX] == 0.0
+    assert table[0]["flux"] == 0.0
 
 
 @settings(max_examples=40)
@@ -256,4 +251,4 @@ def test_centres_are_not_biased_towards_pixel_centres(sigma, lock):
         table = start(spot, 1000.0)
         find_moments(image, table, cells)
         fit_all(image, table, Noise(100.0, 0.1, 1000.0, 0.0, 0.0, 0.0), 65535.0, 20.0, 0.0, False, True, cells, algebra)
-        assert np.abs(table[0, [U, V]] - [spot.u, spot.v]).max() < lock * px
+        assert np.abs(numbers(table[0], "u", "v") - [spot.u, spot.v]).max() < lock * px

@@ -9,7 +9,7 @@ from geometry.camera import SensorNoise
 from tests.tracking.rendering import Scene, Spot, photograph
 from tracking.detection.detect import find_spots
 from tracking.detection.measuring import _drop_background
-from tracking.detection.table import COLUMNS, FLUX, MOMENT_UU, MOMENT_VV, UU, VV
+from tracking.detection.table import CANDIDATE
 from tracking.noise import NoiseModel
 
 NOISE = SensorNoise(gain_e_per_dn=30.0, read_noise_e=45.0)
@@ -89,8 +89,8 @@ def test_hot_pixels_and_pairs_of_them_are_not_narrow_spots(height, pair):
 
 def test_only_a_fit_that_has_started_again_is_rejected_as_background():
     """The moments of a narrow spot are as round as a start from a peak: they are clipped at their least size."""
-    table = np.zeros((2, COLUMNS))
-    table[:, FLUX], table[:, UU], table[:, VV] = 100.0, 0.5, 0.5
-    table[:, MOMENT_UU] = table[:, MOMENT_VV] = 0.1
+    table = np.zeros(2, CANDIDATE)
+    table["flux"], table["uu"], table["vv"] = 100.0, 0.5, 0.5
+    table["moment_uu"] = table["moment_vv"] = 0.1
     _drop_background(table, np.array([False, True]))
-    assert table[:, FLUX].tolist() == [100.0, 0.0]
+    assert table["flux"].tolist() == [100.0, 0.0]

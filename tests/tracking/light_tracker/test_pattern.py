@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.tracking.light_tracker.targets import picture, texture
-from tracking.light_tracker.pattern import Pattern
+from tracking.light_tracker.pattern import Pattern, unexplained
 
 
 def started(diameter: float, u: float = 90.3, v: float = 70.8) -> Pattern:
@@ -86,3 +86,9 @@ def test_a_second_target_in_the_window_is_reported():
     assert alone is not None
     assert two is not None
     assert two.second > 0.9 > alone.second
+
+
+def test_even_a_perfect_match_leaves_a_variance():
+    assert 0 < unexplained(1.0) < 1e-5
+    assert unexplained(0.5) == 3.0
+    assert unexplained(-0.2) == unexplained(0.0) < np.inf

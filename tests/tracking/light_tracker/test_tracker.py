@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from tests.tracking.light_tracker.targets import SIZE, picture
-from tracking.drogue_circle.detectors import CircleCandidate, Picture, Window
-from tracking.light_tracker.frames import USUAL, DrogueFrame, LightParameters, Source
+from tracking.drogue_circle.detectors import CircleCandidate, Window
+from tracking.light_tracker.frames import USUAL, DrogueFrame, LightParameters, MeasuredBy
 from tracking.light_tracker.tracker import DrogueTracker
+from tracking.noise import Picture
 from tracking.statuses import Cause, PoseStatus
 
 Circle = tuple[float, float, float]
@@ -72,7 +73,7 @@ def test_the_detector_is_asked_in_few_frames_and_the_target_is_never_lost(diamet
     assert detector.whole <= 6  # the first picture, and every second check
     # Every fifth frame; more often in the first ones, until some checks have confirmed the target.
     assert 7 <= detector.windows <= 16
-    assert {f.source for f in frames} == {Source.DETECTOR, Source.BOTH, Source.LIGHT}
+    assert {f.source for f in frames} == {MeasuredBy.DETECTOR, MeasuredBy.BOTH, MeasuredBy.LIGHT}
     assert frames[0].event == "acquired"
     assert frames[-1].diameter_px == pytest.approx(diameter, rel=0.1)
     assert frames[-1].rate_px[0] == pytest.approx(1.7, abs=0.4)

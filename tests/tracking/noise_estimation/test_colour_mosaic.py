@@ -8,7 +8,7 @@ import pytest
 
 from geometry.arrays import Array
 from tracking.noise import Picture
-from tracking.noise_estimation.colour_mosaic import mosaic_contrast
+from tracking.noise_estimation.grey_values import mosaic_contrast
 
 SIZE = (300, 410)
 

@@ -14,8 +14,7 @@ from geometry.camera import SensorNoise
 from tests.tracking.rendering import Scene, Spot, photograph, round_lights
 from tracking.detection.detect import find_spots
 from tracking.noise import ROUNDING_DN2, NoiseModel, guess_noise
-from tracking.noise_estimation.block_steps import block_step
-from tracking.noise_estimation.grey_values import saturation_level
+from tracking.noise_estimation.grey_values import block_step, saturation_level
 from tracking.noise_estimation.photon_transfer import estimate_noise
 from tracking.rounding import clipped_normal, unrounded
 

@@ -14,9 +14,8 @@ from tests.tracking.rendering import round_lights
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
-from tracking.noise_estimation.objects import lights_and_lines
 from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
-from tracking.noise_estimation.texture_shift import LARGEST_SHARE, TextureShift
+from tracking.noise_estimation.texture_shift import LARGEST_SHARE, TextureShift, lights_and_lines
 
 SIZE = (400, 500)
 BACKGROUND, NOISE = 600.0, 3.0  # DN

@@ -89,7 +89,7 @@ DAY = datetime.date(2026, 3, 14)
 def test_a_calibration_may_be_used_up_to_its_last_day_and_not_after(tmp_path):
     state = CalibrationState(date=DAY, verdict="PASS", valid_until=DAY + datetime.timedelta(90))
     require_valid_calibration(state, tmp_path / "rig.yaml", DAY + datetime.timedelta(90))
-    words = r"valid_until: 2026-06-12 was 1 day before 2026-06-13 \(today\)"
+    words = r"valid_until: 2026-06-12 was 1 day before 2026-06-13 \(the recording's day\)"
     with pytest.raises(CalibrationError, match=words) as caught:
         require_valid_calibration(state, tmp_path / "rig.yaml", DAY + datetime.timedelta(91))
     assert caught.value.exit_status == 3

@@ -19,12 +19,12 @@ from lab.files.text import columns
 from lab.results.compare import UNDETERMINED, alignment_rows, compare, read_reference
 from lab.results.compare_page import DIFFERENCES, compare_and_write
 from tests.tracking.comparison.motions import TRUTH, recordings, smooth
-from tracking.comparison.frame_alignment import Motion
+from tracking.comparison.frame_alignment import PoseSeries
 
 SIMPLE = replace(TRUTH, rate=0.0)
 
 
-def write_results(folder: Path, motion: Motion) -> Path:
+def write_results(folder: Path, motion: PoseSeries) -> Path:
     """A result folder with the tables that a comparison reads."""
     folder.mkdir(parents=True)
     assert motion.rotation is not None
@@ -45,7 +45,7 @@ def write_results(folder: Path, motion: Motion) -> Path:
     return folder
 
 
-def write_tum(path: Path, motion: Motion) -> Path:
+def write_tum(path: Path, motion: PoseSeries) -> Path:
     assert motion.rotation is not None
     assert motion.position_m is not None
     w, x, y, z = rotations.quaternion_from_matrix(motion.rotation).T
@@ -66,7 +66,7 @@ def folder(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def motions() -> tuple[Motion, Motion]:
+def motions() -> tuple[PoseSeries, PoseSeries]:
     return recordings(1, truth=SIMPLE)
 
 
@@ -118,7 +118,7 @@ def test_an_encoder_with_one_angle_is_a_reference(folder):
     R, p = smooth(t, (1, 0, 0), places=0.0)
     covariance = np.zeros((len(t), 6, 6))
     covariance[:] = 1e-8 * np.eye(6)
-    noisy = Motion(t, R @ rotations.exp(1e-4 * rng.standard_normal((len(t), 3))), p, covariance)
+    noisy = PoseSeries(t, R @ rotations.exp(1e-4 * rng.standard_normal((len(t), 3))), p, covariance)
     result = write_results(folder / "turntable", noisy)
     encoder = np.rad2deg(rotations.ypr_from_matrix(smooth(t + 0.05, (1, 0, 0))[0])[:, 0]) + 30.0
     path = write_csv(folder / "encoder.csv", "t_s,yaw_deg", t, encoder)
@@ -134,7 +134,7 @@ def test_an_encoder_with_one_angle_is_a_reference(folder):
 
 
 def test_two_results_are_compared_frame_by_frame_without_alignment(folder, result, motions):
-    moved = Motion(
+    moved = PoseSeries(
         motions[0].t_s, motions[0].rotation, motions[0].position_m + np.array([1e-3, 0, 0]), motions[0].covariance
     )
     other = write_results(folder / "results" / "two", moved)
@@ -165,7 +165,7 @@ def test_a_stationary_stand_gets_allan_deviations_and_no_time_offset(folder):
 def test_a_reference_of_another_motion_is_reported_as_not_fitting(folder, result):
     t = np.arange(0, 7, 0.02)
     R, p = smooth(2.3 * t + 1.7, (-1.0, 2.0, 0.3))
-    path = write_tum(folder / "wrong.tum", Motion(t, R, p, np.zeros((len(t), 6, 6))))
+    path = write_tum(folder / "wrong.tum", PoseSeries(t, R, p, np.zeros((len(t), 6, 6))))
     outcome = compare_and_write(result, None, path, None)
     assert any("The recordings do not fit" in line for line in outcome.lines)
     assert outcome.lines[0].startswith("CHECK: ")

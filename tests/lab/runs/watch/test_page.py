@@ -16,6 +16,7 @@ import pytest
 import yaml
 
 from lab.errors import InputError
+from lab.findings.finding import Level
 from lab.runs.watch.board import exposure_advice
 from lab.runs.watch.live_frames import WatchOptions
 from lab.runs.watch.page_server import PageServer
@@ -173,11 +174,11 @@ def test_a_browser_that_reads_nothing_holds_up_nobody_and_a_late_one_gets_the_ne
 @pytest.mark.parametrize(
     ("peaks", "background", "words", "level"),
     [
-        ([], 0.02, "no point found", "fail"),
-        ([0.4, 0.95], 0.02, "1 of 2 spots clipped: halve the exposure", "fail"),
-        ([0.1, 0.13], 0.02, "brightest spot at 13 % of the range: expose 5.0 times as long", "check"),
-        ([0.5, 0.6], 0.4, "background at 40 % of the range", "check"),
-        ([0.5, 0.6], 0.02, "brightest spot at 60 % of the range: good", "pass"),
+        ([], 0.02, "no point found", Level.FAIL),
+        ([0.4, 0.95], 0.02, "1 of 2 spots clipped: halve the exposure", Level.FAIL),
+        ([0.1, 0.13], 0.02, "brightest spot at 13 % of the range: expose 5.0 times as long", Level.WARN),
+        ([0.5, 0.6], 0.4, "background at 40 % of the range", Level.WARN),
+        ([0.5, 0.6], 0.02, "brightest spot at 60 % of the range: good", Level.PASS),
     ],
 )
 def test_the_advice_on_exposure_says_what_to_change(peaks, background, words, level):

@@ -11,7 +11,7 @@ import time
 import pytest
 
 from lab.errors import InputError
-from lab.extras import PACKAGES
+from lab.packages import PACKAGES
 from lab.runs.watch.streams import opened
 from tracking.statuses import PoseStatus
 

@@ -9,8 +9,8 @@ from geometry.light_centroid import CentroidOffsets
 from geometry.planes import intersect_plane
 from geometry.pose import Pose
 from geometry.rig import Screen
-from lab.runs.frames.pipeline import on_beam_axes
 from tracking.detection.detect import find_spots
+from tracking.detections import on_beam_axes
 from tracking.noise import NoiseModel
 from tracking.parameters import DetectParameters
 

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from importlib.metadata import packages_distributions
 
-from lab.versions import versions
+from lab.packages import versions
 from tests.paths import ROOT
 from tests.test_architecture import FLOORS, foreign_packages
 
@@ -32,6 +32,6 @@ def test_every_imported_library_that_numbers_depend_on_has_its_version_recorded(
 
 
 def test_the_versions_are_found_without_importing_the_libraries():
-    code = "import sys, lab.versions as v; v.versions(); print({'numba', 'cv2', 'scipy'} & set(sys.modules))"
+    code = "import sys, lab.packages as v; v.versions(); print({'numba', 'cv2', 'scipy'} & set(sys.modules))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
     assert out.strip() == "set()"
