@@ -15,7 +15,7 @@ from tracking.rounding import clipped_normal
 Picture: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
 CLIPPED_SHARE = 0.02  # share of pixels at zero above which the background counts as clipped
-# Of the sigma: least median change between neighbours of which one is not zero, where hardly any and where all are zero.
+# Of the sigma: least median change between neighbours of which one is not zero, where hardly any and all are zero.
 # White noise changes by 0.95 and 0.3, noise in a JPEG of quality 75 by 0.4 and 0.4; black objects by less than 0.2.
 _LEAST_JUMP = 0.35, 0.15
 BLOCK = 8  # px: side of the blocks in which pictures are searched

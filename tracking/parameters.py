@@ -28,7 +28,7 @@ class LabelParameters:
     clutter_per_px2: float = 2e-5
     lead_nats: float = 3.0  # a pose must be exp(3) = 20 times as likely as the next one, otherwise it is a tie
     min_spots: int = 4  # three spots fit any labels exactly: only a fourth can contradict them
-    max_points: int = 30  # points per camera that are used; the brightest
+    max_points: int = 30  # points per camera that are used; those with the best signal to noise
     max_refined: int = 96  # candidate poses that are completed to all points; enough for 30 points per camera
     max_triples: int = 60_000  # sets of three points that are tried: 0.5 s; five false points per picture give 10,000
 

@@ -254,6 +254,7 @@ class ModelCheckResult:
     diagnosis: FaultDiagnosis | None = None  # None where not tested
     effects: tuple[tuple[Effect, ...], ...] = ()  # per suspected fault: of each of its explanations, in order
     unseen: tuple[UnseenView, ...] = ()
+    usual_views: int = 0  # views that are measured in at least half of the frames used
     noise_of_cameras: Mapping[str, float] = field(default_factory=dict)  # ratio of their errors to the stated sigmas
     stated_residual_scale: float = float("nan")  # residual scale before these ratios are applied
     frame_interval_s: float = float("nan")  # median
@@ -286,24 +287,26 @@ def evaluate_model(
     all_frames = linearise(model, recording, evenly_spaced(testable, MOST_FRAMES))
     groups = statistics(model, beams, recording, all_frames, calibration_px)
     unseen = unseen_views(model, recording, all_frames.frames)
+    usual = int(np.count_nonzero(recording.seen[all_frames.frames].mean(axis=0) >= 0.5))
     counts = len(all_frames.frames), len(lin.frames)
     if lin.dof <= 0:
-        return ModelCheckResult(*counts, NotTested.NO_REDUNDANCY, statistics=groups, unseen=unseen)
+        return ModelCheckResult(*counts, NotTested.NO_REDUNDANCY, statistics=groups, unseen=unseen, usual_views=usual)
     faults = possible_faults(rig, parameters)
     weighted = diagnose_with_noise_of_cameras(parameters, recording, lin, jacobian, faults)
     if weighted.diagnosis.unexplained:
-        usual = _usual_frames(lin)
-        few = linearise(model, recording, usual)
+        usual_frames = _usual_frames(lin)
+        few = linearise(model, recording, usual_frames)
         of_few = parameters.jacobian(recording, few)
         without = diagnose_with_noise_of_cameras(parameters, recording, few, of_few, faults)
         if not without.diagnosis.suspected_faults and not without.diagnosis.unexplained:
-            weighted, counts = without, (len(all_frames.frames), len(usual))
+            weighted, counts = without, (len(all_frames.frames), len(usual_frames))
     return ModelCheckResult(
         *counts,
         statistics=groups,
         diagnosis=weighted.diagnosis,
         effects=_effects(weighted, parameters, recording),
         unseen=unseen,
+        usual_views=usual,
         noise_of_cameras=dict(zip(model.camera_names, weighted.noise_of_cameras, strict=True)),
         stated_residual_scale=weighted.stated_residual_scale,
         frame_interval_s=float(np.median(np.diff(recording.t_s))),

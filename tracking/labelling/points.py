@@ -22,7 +22,7 @@ SAME_POINT = 6.0
 
 
 class Points(NamedTuple):
-    """m points of light that may be spots, ordered by camera; only the brightest of a crowded picture."""
+    """m points of light that may be spots, ordered by camera; only the clearest of a crowded picture."""
 
     uv: Array  # (m, 2) px
     cov: Array  # (m, 2, 2) px^2, as stated by the detections
@@ -32,6 +32,18 @@ class Points(NamedTuple):
     row: Ints  # (m,) row in that camera's detections
     log_density: Array  # (cameras,) log of the density of all points, 1/px^2
     log_unused: Array  # (cameras, most + 1): see `_log_unused`
+
+
+def clearest_first(found: Detections) -> Ints:
+    """The rows of points, by signal to noise: their width over the sigma of their centre; otherwise by flux.
+
+    Objects in front of which a spot shines are often brighter than it, but no Gaussian: their centre is uncertain. The
+    flux counts where widths are unknown or all sigmas are the same.
+    """
+    variance = np.trace(found.cov_px2, axis1=1, axis2=2)
+    clear = found.major_px * found.minor_px / variance
+    measured = len(found) > 1 and np.isfinite(clear).all() and np.ptp(variance) > 0
+    return np.argsort(-(clear if measured else np.nan_to_num(found.flux, nan=0.0)), kind="stable")
 
 
 def points_of(
@@ -57,27 +69,27 @@ def points_of(
         if found is not None and len(found):
             camera = rig.cameras[name]
             screen = rig.screens[camera.screen]
-            order = np.argsort(-np.nan_to_num(found.flux, nan=0.0), kind="stable")
+            order = clearest_first(found)
             if len(found) > parameters.max_points:
                 origin, rays = camera.rays(found.uv_px[order])
                 possible = np.flatnonzero(
                     reached(c, intersect_surface(origin, rays, screen.world_from_screen, screen.bow))
                 )
-                brightest = order[possible[: parameters.max_points]]
-                # The density of false points is that of all points at least as bright as these.
+                clearest = order[possible[: parameters.max_points]]
+                # The density of false points is that of all points at least as clear as these.
                 if len(possible) > parameters.max_points:
                     order = order[: possible[parameters.max_points]]
             else:
-                brightest = order
-            here = found.uv_px[brightest]
+                clearest = order
+            here = found.uv_px[clearest]
             origin, rays = camera.rays(here + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])[:, None])
             hits = intersect_surface(origin, rays, screen.world_from_screen, screen.bow)
             uv.append(here)
-            cov.append(found.cov_px2[brightest])
+            cov.append(found.cov_px2[clearest])
             world.append(hits[0])
             m_per_px.append(np.linalg.norm(hits[1:] - hits[0], axis=-1).max(axis=0))
-            row.append(brightest)
-            count = len(brightest)
+            row.append(clearest)
+            count = len(clearest)
             rivals = len(order)
             area = float(np.prod(camera.image_size_px))
             log_density[c] = np.log(rivals / area)
@@ -110,14 +122,14 @@ def _log_unused(count: int, area: float, expected: float, most: int) -> Array:
 class PointsOnScreens(NamedTuple):
     """The points that candidate poses are made from: a point seen by two cameras of one screen is entered once."""
 
-    point: Ints  # (k,) index into Points, ordered by screen, the brightest first
+    point: Ints  # (k,) index into Points, ordered by screen, the clearest first
     first: Ints  # (screens + 1,)
 
 
 def on_screens(points: Points, screen_of_camera: Ints, screens: int, sigma_px: float, most: int) -> PointsOnScreens:
     """The points of every screen, without duplicates.
 
-    screen_of_camera (cameras,): the screen that each camera observes; most: number of points per camera, the brightest;
+    screen_of_camera (cameras,): the screen that each camera observes; most: number of points per camera, the clearest;
     sigma_px: the model's error, in addition to a point's own.
     """
     sigma_m = points.m_per_px * np.sqrt(np.trace(points.cov, axis1=1, axis2=2) + 2 * sigma_px**2)

@@ -192,7 +192,7 @@ def _weights(
 # to this one.
 LARGEST_MODEL_ERROR = 2.0
 P_MISFIT = 1e-6  # probability that the correct labels are rejected because of their misfit
-FEWEST_POINTS = 6  # least number of points per camera that are used in a crowd; the brightest
+FEWEST_POINTS = 6  # least number of points per camera that are used in a crowd; the clearest
 LEAST_LIKELY = 25.0  # nats: labellings with a larger distance to the best are not reported
 
 
@@ -372,7 +372,7 @@ def _within_budget(
     """The points and the number of the plan's triples to be used, in one or two passes: `max_triples` sets of points.
 
     In a crowd the sets are divided among all points with few triples of spots, which are enough if most spots are
-    visible, and the brightest points with all triples. Spots are brighter than most false points, but reflections
+    visible, and the clearest points with all triples. Spots are clearer than most false points, but reflections
     may be brighter than they are. If the brightness is unknown, the first pass has all sets.
     """
     points, spot_geometry = problem.points, problem.spots

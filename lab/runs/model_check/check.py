@@ -122,6 +122,7 @@ def _fitted_fault(fitted: FittedFault, effect: Effect) -> dict[str, Any]:
 MATTERS_SIGMAS = 0.5  # in stated sigmas of a pose or a spot: a smaller bias is negligible against the stated sigma
 # A larger bias makes the stated sigmas wrong; the limit of the noise scale in lab/runs/verdict/quality.py is the same.
 WRONG_SIGMAS = 5.0
+_VIEWS_OF_A_POSE = 3  # which any three points of light can be
 _WHOLE_FRAME = 0.1  # of a frame interval: a delay this near to a whole number of frames suggests a wrong frame number
 
 
@@ -154,6 +155,13 @@ def findings_of(result: ModelCheckResult, model: SpotModel) -> tuple[Finding, ..
         if noisy is not None:
             findings.append(noisy)
     findings += [unseen_finding(u, model) for u in result.unseen]
+    if result.usual_views <= _VIEWS_OF_A_POSE and len(result.unseen) > result.usual_views:
+        what = (
+            f"{result.usual_views} spots are measured in most frames, as many as a pose needs, and"
+            f" {len(result.unseen)} others that the pose puts well inside the pictures are never found: nothing"
+            " confirms the poses"
+        )
+        findings.append(finding("BP-M05", Level.FAIL, what, variant="unconfirmed"))
     return worst_first(findings)
 
 

@@ -119,6 +119,19 @@ def test_a_spot_that_is_hardly_ever_measured_where_it_should_be_is_reported():
     assert check_model(run.rig, dataclasses.replace(recording, seen=seen)).findings == ()
 
 
+def test_poses_of_three_spots_while_four_others_are_never_found_fail():
+    run, recording = recorded("four-skew-beams", 5, frames=300)
+    seen = recording.seen.copy()
+    seen[:, 3:] = False
+    findings = check_model(run.rig, dataclasses.replace(recording, seen=seen)).findings
+    assert findings[0].level == Level.FAIL
+    assert "4 others that the pose puts well inside the pictures are never found" in findings[0].what
+    seen[:, 3] = recording.seen[:, 3]  # a fourth spot confirms the poses
+    findings = check_model(run.rig, dataclasses.replace(recording, seen=seen)).findings
+    assert len(findings) == 3
+    assert {f.level for f in findings} == {Level.WARN}
+
+
 def test_sigmas_that_are_stated_too_small_are_a_warning_with_the_factor():
     run, recording = recorded("smooth", 5, frames=300, claimed_px=NOISE_PX / 3)
     (finding,) = check_model(run.rig, recording).findings

@@ -305,3 +305,15 @@ def test_places_of_spots_in_compressed_pictures_have_the_stated_sigmas():
 @pytest.mark.parametrize("lab", [Lab(), Lab(gain=160.0, read_e=3.0), Lab(speed_px=0.0), Lab(flicker=0.03)])
 def test_pictures_without_compression_have_no_steps_of_blocks(lab):
     assert block_step(lab.pictures(3)) == 0.0
+
+
+def test_dark_objects_of_a_photograph_are_no_clipped_noise():
+    """A few of their pixels are zero, and the grey values of the darkest quarter scatter by 6; the noise is 1."""
+    rng = np.random.default_rng(3)
+    light = np.full((480, 640), 45.0)
+    light[:, :240] = 12.0 + cv2.GaussianBlur(rng.normal(0.0, 140.0, (480, 240)), (0, 0), 6.0)
+    still = np.clip(light, 0.0, None)
+    pictures = [np.rint(still + rng.normal(0.0, 1.0, still.shape)).clip(0, 255).astype(np.uint8) for _ in range(4)]
+    assert 0.005 < np.mean(pictures[0] == 0) < 0.05
+    assert estimate_noise(pictures).model.floor_dn2 == pytest.approx(1.0, rel=0.3)
+    assert guess_noise(pictures[0]).floor_dn2 < 2.0

@@ -6,7 +6,7 @@ import pytest
 from geometry.compiled_projection import project_all
 from geometry.pose import Pose
 from lab.simulate.points import simulate_points
-from tracking.smoothing.motion.process_noise import with_errors_along_axes
+from tracking.smoothing.motion.process_noise import corner_offsets, with_errors_along_axes
 from tracking.smoothing.motion.run_detections import Reference
 from tracking.smoothing.systematic_errors import exposure_offsets, exposure_sigmas, pose_shift
 
@@ -76,6 +76,20 @@ def test_components_that_turn_at_different_moments_of_an_exposure_are_both_withi
         np.testing.assert_allclose(np.linalg.inv(L), np.diag(sigma**2 + b**2), rtol=1e-9, atol=1e-18)
         np.testing.assert_allclose(np.linalg.solve(L, g), error, atol=1e-9)
         assert less == pytest.approx(error @ information @ error - error @ L @ error)
+
+
+def test_a_corner_in_the_first_or_last_exposure_of_a_zig_zag_is_within_its_sigma():
+    """What was before the first picture is not known: if the motion turns in the others, it may turn in that one."""
+    dt, exposure_s, turn = 0.04, 0.01, 0.6
+    t = dt * np.arange(9)
+    places, m = np.zeros((9, 3)), np.zeros((9, 12))
+    places[:, 0], m[:, 0] = turn * np.abs(t - t[4]) / 2, turn * np.sign(t - t[4] + 1e-9) / 2
+    motion = Reference(np.tile(np.eye(3), (9, 1, 1)), places, m)
+    sigmas = corner_offsets(motion, np.arange(9) == 4, exposure_s, np.full(9, dt))
+    error = turn * exposure_s / 8  # of the mean over an exposure that begins or ends with the turn in its middle
+    assert sigmas[[0, -1], 0] == pytest.approx(error)
+    assert not sigmas[[0, -1], 1:].any()
+    assert not corner_offsets(motion, np.zeros(9, dtype=bool), exposure_s, np.full(9, dt)).any()
 
 
 def test_a_corner_outside_the_exposure_does_not_hide_one_inside_it():
