@@ -120,8 +120,10 @@ def is_clipped_noise(first: NDArray[np.generic], second: NDArray[np.generic], si
     Black objects beside brighter ones have as wide a distribution of grey values, but nearly equal neighbours.
     """
     lit = np.maximum(first, second) > 0
+    if not lit.any():
+        return True
     least = float(np.interp(np.mean(first == 0), (0.0, 1.0), _LEAST_JUMP)) * sigma
-    return not lit.any() or bool(np.median(np.abs(second[lit].astype(float) - first[lit])) >= least)
+    return bool(np.median(np.abs(second[lit].astype(float) - first[lit])) >= least)
 
 
 def trimmed_variance(deviates: NDArray[Any]) -> float:
