@@ -307,7 +307,7 @@ def test_pictures_without_compression_have_no_steps_of_blocks(lab):
     assert block_step(lab.pictures(3)) == 0.0
 
 
-def test_dark_objects_of_a_photograph_are_no_clipped_noise():
+def test_black_objects_of_a_photograph_are_no_clipped_noise():
     """A few of their pixels are zero, and the grey values of the darkest quarter scatter by 6; the noise is 1."""
     rng = np.random.default_rng(3)
     light = np.full((480, 640), 45.0)
