@@ -192,7 +192,7 @@ def is_certain(fit: RimFit, largest_rms: tuple[float, float, float] = _LARGEST_R
     (share, px, seen_share), radius = largest_rms, fit.rim.radius_px
     seen_px = fit.coverage * radius
     largest = min(share * radius + px, seen_share * seen_px)
-    return bool(2 * np.pi * seen_px / CORRELATED_PX >= _LEAST_POINTS and fit.rms_px <= largest)
+    return bool(2 * np.pi * seen_px / CORRELATED_PX >= _LEAST_POINTS and fit.used_rms_px <= largest)
 
 
 def _may_be(c: CircleCandidate, wanted: Wanted) -> bool:
