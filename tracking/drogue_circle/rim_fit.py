@@ -222,12 +222,12 @@ class RimFit:
     rim: Rim
     covariance_px2: Array  # (3, 3) of u, v, radius
     coverage: float  # share of the whole rim with edge points that fit
-    rms_px: float  # of these points, also of those next to gaps
+    rms_px: float  # of these points
+    beside_gaps: float  # share of the whole rim with such points that the fit leaves out, since they are next to gaps
     slope_dn: float  # median slope of the rim, DN/px
     polarity: int
     score: float  # coverage, reduced by residuals
     sectors: Array  # (SECTORS,) share of the rays of a sector whose edge lies on the rim, hidden ones too
-    used_rms_px: float = 0.0  # of the edges that the fit uses: those next to gaps of the rim are left out
 
     @property
     def centre_and_radius(self) -> Array:
@@ -438,12 +438,12 @@ def _described(
     covariance = symmetric(covariance[:3, :3]) + _MODEL_SIGMA_PX**2 * np.eye(3)
     covariance[2, 2] += (_BLUR_SIGMA * points.blur_px**2 / (2 * max(rim.radius_px, 1.0))) ** 2 + points.common_px**2
     rms = float(np.sqrt(_sum_of_squares(rim, replace(points, radius_px=points.any_radius_px), fits)))
-    used_rms = float(np.sqrt(_sum_of_squares(rim, points, good)))
     slope = median(points.slope[good])
     on_rim = np.abs(points.any_radius_px - rim.radius_at(points.theta)) < max(3 * rms, _ON_RIM_PX)
     sector = np.arange(len(on_rim)) * SECTORS // len(on_rim)
     sectors = np.bincount(sector, on_rim, SECTORS) / np.maximum(np.bincount(sector, minlength=SECTORS), 1)
-    return RimFit(rim, covariance, coverage, rms, slope, coarse.polarity, coverage / (1 + rms), sectors, used_rms)
+    beside = coverage - float(np.mean(good))
+    return RimFit(rim, covariance, coverage, rms, beside, slope, coarse.polarity, coverage / (1 + rms), sectors)
 
 
 def _correlation_length(away: Array, good: Bools, spacing_px: float) -> float:
