@@ -75,7 +75,7 @@ def test_a_right_calibration_is_not_suspected_and_what_it_would_not_show_is_stat
     # Both focal lengths off by a third of the limit are hidden, by three times the limit they are named.
     share = check.hidden_focal_percent / 100
     for factor, shown in ((1 / 3, False), (3, True)):
-        off = {p: factor * share * LEFT.matrix[0, 0] for p in ("fx", "fy")}
+        off = dict.fromkeys(("fx", "fy"), factor * share * LEFT.matrix[0, 0])
         wrong = StereoPair((perturbed_camera(LEFT, off), perturbed_camera(RIGHT, off)))
         found = check_calibration(wrong, MODEL, approach())
         assert found.certain is shown
