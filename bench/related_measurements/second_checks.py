@@ -259,10 +259,11 @@ def point(seed: int, count: int) -> None:
     gaps, late, false, frames, nees, errors = 0, [], 0, 0, [], []
     for n in range(count):
         rng = np.random.default_rng(1000 * seed + n)
-        scene, look = render.background(str(rng.choice(["sky", "cloud"])), rng), render.face("plain", rng)
-        grey = scene.max() + 45 if look.bright > 100 else look.bright
-        look = render.replace(look, bright=min(grey, 250.0))
-        settings = PointOptions("brighter" if look.bright > 100 else "darker").settings()
+        kind = str(rng.choice(["sky", "cloud"]))
+        scene, look = render.background(kind, rng), render.face("plain", rng)
+        bright = look.bright > 100 and kind == "sky"  # clouds are as bright as that
+        look = render.replace(look, bright=scene.max() + 45 if bright else min(look.bright, 50.0))
+        settings = PointOptions("brighter" if bright else "darker").settings()
         circles, tracker, waits = motion(rng, True, (3.0, 8.0)), PointTracker(settings.track), None
         for k in range(150):
             circle = next(circles)
