@@ -75,8 +75,8 @@ def find_blobs(picture: Picture | NDArray[np.float32], parameters: BlobParameter
     of = place[labels[v, u]]
     u, v, of = u[of >= 0], v[of >= 0], of[of >= 0]
     # One level for all of a blob, which hides what is behind it: a slope of the background would move its centroid.
-    level = np.bincount(of, background[v, u]) / np.bincount(of)
-    weight = np.maximum(sign * (grey[v, u] - level[of]), 0.0)
+    behind = np.bincount(of, background[v, u]) / np.bincount(of)
+    weight = np.maximum(sign * (grey[v, u] - behind[of]), 0.0)
     found = _moments(u.astype(float), v.astype(float), of, weight, len(rows), sigma, limit)
     return found[np.argsort(-found.flux, kind="stable")]
 
