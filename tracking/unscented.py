@@ -151,6 +151,24 @@ def student_t(nis: float, m: int, dof: float = 4.0, p_full_weight: float = 1e-2,
     return min(1.0, (dof + chi2_limit(p_full_weight, m)) / (dof + nis)) ** power
 
 
+@dataclass(slots=True)
+class Lasting:
+    """A rule for disturbances of several steps: each measurement gets the least weight of its own and the last ones.
+
+    Amid a disturbance a measurement is near the prediction now and then by chance; it then pulls the state with full
+    weight. Start a new one with each filter. Source: ours; measured in docs/papers/fu2016.md.
+    """
+
+    rule: Rule = student_t
+    steps: int = 2  # that share the least weight, the present one included
+    _weights: list[float] = field(default_factory=list)
+
+    def __call__(self, nis: float, m: int) -> float:
+        """The weight of the next measurement."""
+        self._weights = [*self._weights, self.rule(nis, m)][-self.steps :]
+        return min(self._weights)
+
+
 @dataclass(frozen=True, slots=True)
 class Updated:
     """The result of an update with m numbers."""

@@ -6,6 +6,7 @@ python -m bench.related_measurements.second_checks edges SEED COUNT         thin
 python -m bench.related_measurements.second_checks consistency SEED COUNT   errors of centres against their sigmas
 python -m bench.related_measurements.second_checks approaches SEED COUNT    approaching drogues, by the light tracker
 python -m bench.related_measurements.second_checks detector SEED COUNT [WEIGHTS]  COUNT drogues of each scene
+python -m bench.related_measurements.second_checks point SEED COUNT         discs by the point tracker, hidden twice
 """
 
 from __future__ import annotations
@@ -24,10 +25,13 @@ from bench.related_measurements.learned_detector import is_right
 from geometry.arrays import Array
 from lab.targets.circle import CircleOptions
 from lab.targets.drogue import DrogueOptions
+from lab.targets.point import PointOptions
 from studies.learned_detector.samples import Sample
 from tracking.drogue_circle.detectors import Edge
 from tracking.learned_detector.detector import WEIGHTS, find_drogues
 from tracking.noise import Picture
+from tracking.single_target.blobs import find_blobs
+from tracking.single_target.point_tracker import PointTracker
 from tracking.statuses import Cause, PoseStatus
 
 _CLEAR, _HELD = 30, 20  # frames before a probe comes, and after it has arrived
@@ -251,6 +255,41 @@ def detector(seed: int, count: int, weights: Path = WEIGHTS) -> None:
     print(f"{1e3 * spent / n:.0f} ms of process time per picture")
 
 
+def point(seed: int, count: int) -> None:
+    """Discs of 3 to 8 px radius, 150 frames each, hidden for 10 and for 20: errors, gaps, false measurements."""
+    gaps, late, false, frames, nees, errors = 0, [], 0, 0, [], []
+    for n in range(count):
+        rng = np.random.default_rng(1000 * seed + n)
+        kind = str(rng.choice(["sky", "cloud"]))
+        scene, look = render.background(kind, rng), render.face("plain", rng)
+        bright = look.bright > 100 and kind == "sky"  # clouds are as bright as that
+        look = render.replace(look, bright=scene.max() + 45 if bright else min(look.bright, 50.0))
+        settings = PointOptions("brighter" if bright else "darker").settings()
+        circles, tracker, waits = motion(rng, True, (3.0, 8.0)), PointTracker(settings.track), None
+        for k in range(150):
+            circle = next(circles)
+            hidden = 50 <= k < 60 or 100 <= k < 120
+            picture = render.draw(scene, None if hidden else look, *circle, rng)
+            estimate = tracker.step(1.0, find_blobs(picture, settings.blobs))
+            frames += 1
+            away = estimate.x[:2] - circle[:2]
+            measured = estimate.status is PoseStatus.MEASURED
+            right = measured and not hidden and float(np.hypot(*away)) < 1.0
+            false += measured and not right
+            waits = k if hidden else waits
+            if right and k >= 10:
+                nees.append(away @ np.linalg.solve(estimate.P[:2, :2], away) / 2)
+                errors.append(np.hypot(*away))
+            if waits is not None and (right or k in (99, 149)) and not hidden:
+                late.append(k - waits - 1 if right else np.inf)
+                gaps, waits = gaps + 1, None
+    print(
+        f"{gaps} gaps: recovered at once {np.sum(np.array(late) == 0)}, within 3 frames"
+        f" {np.sum(np.array(late) <= 3)}, never {np.sum(np.isinf(late))}; {false} false of {frames} frames;"
+        f" NEES/2 {np.mean(nees):.2f}, RMS of the error {np.sqrt(np.mean(np.square(errors))):.3f} px"
+    )
+
+
 if __name__ == "__main__":
     what, *rest = sys.argv[1:] or [""]
     checks = {
@@ -260,6 +299,7 @@ if __name__ == "__main__":
         "approaches": approaches,
         "consistency": consistency,
         "detector": detector,
+        "point": point,
     }
     if what in checks and len(rest) == 2:
         checks[what](int(rest[0]), int(rest[1]))

@@ -2,19 +2,21 @@
 
     python -m bench.related_measurements.unscented --seeds 5000:5040
     python -m bench.related_measurements.unscented --pictures 5000:5004
-    python -m bench.related_measurements.unscented --rivals 5000:5040
+    python -m bench.related_measurements.unscented --rivals 5000:5040 --process 4
 
 Goals: peaks of position and velocity error at most 1/5 of the standard filter's (median of the recordings), quiet RMS
 at most 1.2 times the standard filter's. Exit status 1 where one is missed. --pictures: one recording
 of rendered pictures per seed through corners, RANSAC, pose and the Student-t filter; printed, without a goal.
 --rivals: peaks of the position error under five disturbances over those of the better of the standard filter and one
-that ignores the disturbed measurements.
+that ignores the disturbed measurements. --process: factor of the paper's process noise, for all of these filters.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -32,7 +34,22 @@ from studies.fu2016 import (
     run_pictures,
     simulate,
 )
-from tracking.unscented import P0, SPREAD, X0, Q, R, full_weight, gate, predict, process, selection, student_t, update
+from tracking.unscented import (
+    P0,
+    SPREAD,
+    X0,
+    Lasting,
+    Q,
+    R,
+    Rule,
+    full_weight,
+    gate,
+    predict,
+    process,
+    selection,
+    student_t,
+    update,
+)
 
 LARGEST_PEAK_RATIO, LARGEST_QUIET_RATIO = 0.2, 1.2
 SHAPES = ("burst", "ramp", "smooth bias", "oscillation", "outage")
@@ -90,18 +107,24 @@ def disturbed(seed: int, shape: str) -> tuple[Recording, np.ndarray]:
     return recording, on
 
 
-def rivals(seeds: range) -> None:
-    """Peaks and NEES/6 of the filters beside one that ignores the disturbed measurements."""
-    rules = {"standard": full_weight, "ignoring": full_weight, "gate": gate, "Student-t": student_t}
+def rivals(seeds: range, factor: float) -> None:
+    """Peaks and NEES/6 of the filters beside one that ignores the disturbed measurements; Q times a factor."""
+    rules: dict[str, Callable[[], Rule]] = {
+        "standard": lambda: full_weight,
+        "ignoring": lambda: full_weight,
+        "gate": lambda: gate,
+        "Student-t": lambda: student_t,
+        "lasting": lambda: Lasting(partial(student_t, p_full_weight=0.03, power=6.0)),
+    }
     for shape in SHAPES:
         peak, nees = {n: np.zeros(len(seeds)) for n in rules}, {n: np.zeros(len(seeds)) for n in rules}
         for i, seed in enumerate(seeds):
             recording, on = disturbed(seed, shape)
             steps = np.flatnonzero(on)
-            for name, rule in rules.items():
-                x, P = X0, P0
+            for name, make in rules.items():
+                x, P, rule = X0, P0, make()
                 for k, measured in enumerate(recording.measured[: steps[-1] + AFTER]):
-                    x, P = predict(x, P, process(DT_S), Q, SPREAD)
+                    x, P = predict(x, P, process(DT_S), factor * Q, SPREAD)
                     if not (name == "ignoring" and on[k]):
                         step = update(x, P, measured, selection, R, SPREAD, rule)
                         x, P = step.x, step.P
@@ -124,9 +147,10 @@ def main() -> int:
     parser.add_argument("--seeds", default="5000:5040", help="FIRST:LAST, one recording each")
     parser.add_argument("--pictures", help="FIRST:LAST: recordings of pictures instead")
     parser.add_argument("--rivals", help="FIRST:LAST: five disturbances, beside a filter that ignores them")
+    parser.add_argument("--process", type=float, default=1.0, help="factor of the process noise, with --rivals")
     arguments = parser.parse_args()
     if arguments.rivals:
-        rivals(range(*map(int, arguments.rivals.split(":"))))
+        rivals(range(*map(int, arguments.rivals.split(":"))), arguments.process)
         return 0
     if arguments.pictures:
         pictures(range(*map(int, arguments.pictures.split(":"))))

@@ -6,7 +6,9 @@ point adds to it, and a wrong focal length of one camera scales one picture. Eac
 poses, the covariance of the calibration and the survey of the markers as a prior, and compared by its chi-square.
 Errors whose chi-squares are within three sigma of the best are not separated by the recording, and all of them are
 named: a turn about the vertical axis and a shift of a principal point along the rows differ only at the edge of the
-picture, and the same error of both focal lengths is nearly a change of the distance.
+picture, and the same error of both focal lengths is nearly a change of the distance. With cameras side by side it is
+one for points: Z (1 + e) under f (1 + e) has the same images. Only the depth within the target contradicts it, by
+e B f d / Z^2 px for markers d apart in depth and a baseline B: what that does not show rests on the calibration alone.
 
 Source: ours; a test of single hypotheses by generalised least squares, as in calibration/model_check.
 """
@@ -39,6 +41,7 @@ _FEWEST_MARKERS = 4  # of each picture: three have several poses
 _STEPS = 6  # of Gauss-Newton
 _CERTAIN_CHI2 = 20.0  # that an error explains: 4.5 sigma
 _SEPARATED_CHI2 = 9.0  # that the best error explains more than another one: 3 sigma
+_BOTH = "focal length of both cameras"
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +72,7 @@ class CalibrationCheck:
     change_m: float  # RMS change of the position
     left: float  # chi-square per degree of freedom with the best one
     frames: int
+    hidden_focal_percent: float  # the largest common error of both focal lengths that the recording would not show
 
     @property
     def certain(self) -> bool:
@@ -134,7 +138,8 @@ def check_calibration(pair: StereoPair, model: MarkerModel, frames: Sequence[Lab
     change = best.poses.minus(base.poses)
     sigmas2 = np.einsum("ni,nij,nj->n", change, np.linalg.inv(base.covariances), change)
     moved = float(np.sqrt(np.mean(np.sum(change[:, :3] ** 2, axis=1))))
-    return CalibrationCheck(suspects, float(np.sqrt(np.mean(sigmas2) / 6)), moved, left, len(frames))
+    hidden = next((f.sigma * float(np.sqrt(_CERTAIN_CHI2 * variance)) for h, f in tried if h.name == _BOTH), np.inf)
+    return CalibrationCheck(suspects, float(np.sqrt(np.mean(sigmas2) / 6)), moved, left, len(frames), hidden)
 
 
 def _names(pair: StereoPair) -> list[str]:
@@ -165,7 +170,7 @@ def _hypotheses(pair: StereoPair) -> list[_Hypothesis]:
         values = dict(zip(POSE, moved.tolist(), strict=True))
         out.append(_Hypothesis(f"{words} between the cameras", "deg", change(right.name, values)))
     focal = [change(c.name, {"fx": c.matrix[0, 0] / 100, "fy": c.matrix[1, 1] / 100}) for c in pair.cameras]
-    out.append(_Hypothesis("focal length of both cameras", "%", focal[0] + focal[1]))
+    out.append(_Hypothesis(_BOTH, "%", focal[0] + focal[1]))
     for camera, longer_focus in zip(pair.cameras, focal, strict=True):
         out.append(_Hypothesis(f"focal length of {camera.name}", "%", longer_focus))
         out += [

@@ -224,6 +224,7 @@ class RimFit:
     covariance_px2: Array  # (3, 3) of u, v, radius
     coverage: float  # share of the whole rim with edge points that fit
     rms_px: float  # of these points
+    beside_gaps: float  # share of the whole rim with such points that the fit leaves out, since they are next to gaps
     slope_dn: float  # median slope of the rim, DN/px
     polarity: int
     score: float  # coverage, reduced by residuals
@@ -442,7 +443,8 @@ def _described(
     on_rim = np.abs(points.any_radius_px - rim.radius_at(points.theta)) < max(3 * rms, _ON_RIM_PX)
     sector = np.arange(len(on_rim)) * SECTORS // len(on_rim)
     sectors = np.bincount(sector, on_rim, SECTORS) / np.maximum(np.bincount(sector, minlength=SECTORS), 1)
-    return RimFit(rim, covariance, coverage, rms, slope, coarse.polarity, coverage / (1 + rms), sectors)
+    beside = coverage - float(np.mean(good))
+    return RimFit(rim, covariance, coverage, rms, beside, slope, coarse.polarity, coverage / (1 + rms), sectors)
 
 
 def _correlation_length(away: Array, good: Bools, spacing_px: float) -> float:

@@ -27,6 +27,7 @@ _LEAST_POINTS = 12  # independent edge points: texture often gives a short arc o
 # 22 px .01 to .023.
 _LARGEST_RMS = 0.012, 0.15, 0.026  # the last one a share of the seen radius
 _START_RMS = 0.05, 0.35, np.inf  # the same before `_best_near`: a mixture of rims has larger ones
+_CORNER_PX = 0.3  # error of an edge next to a gap of the rim, from the blurred corner of rim and occluder
 _EDGE_SHARE = 0.6  # score of another edge of a target, as a share of the best one's
 _THIN, _OPENING = 0.85, 0.9  # radii of the inner edge of a thin rim and of an opening, as shares of the outer edge's
 _REACH, _MOST_EDGES = 3.2, 10  # of the search for other edges: radii, and number
@@ -192,7 +193,7 @@ def is_certain(fit: RimFit, largest_rms: tuple[float, float, float] = _LARGEST_R
     """Whether a rim has enough precise edge points that texture does not imitate it."""
     (share, px, seen_share), radius = largest_rms, fit.rim.radius_px
     seen_px = fit.coverage * radius
-    largest = min(share * radius + px, seen_share * seen_px)
+    largest = np.hypot(min(share * radius + px, seen_share * seen_px), _CORNER_PX * np.sqrt(fit.beside_gaps))
     return bool(2 * np.pi * seen_px / CORRELATED_PX >= _LEAST_POINTS and fit.rms_px <= largest)
 
 

@@ -44,9 +44,9 @@ def find_blobs(picture: Picture | NDArray[np.float32], parameters: BlobParameter
     """
     grey = picture.astype(np.float32)
     side = 2 * (parameters.background_px // 2) + 1
-    contrast = grey - cv2.blur(grey, (side, side), borderType=cv2.BORDER_REFLECT)
-    if parameters.polarity == "darker":
-        contrast = -contrast
+    sign = np.float32(-1 if parameters.polarity == "darker" else 1)
+    background = cv2.blur(grey, (side, side), borderType=cv2.BORDER_REFLECT)
+    contrast = sign * (grey - background)
     sample = contrast[::_EVERY, ::_EVERY]
     sigma = max(float(_MAD_TO_SIGMA * np.median(np.abs(sample - np.median(sample)))), 0.3)  # 0.3 DN: rounding
     limit = max(parameters.threshold_sigma * sigma, parameters.threshold_share * float(contrast.max()))
@@ -73,7 +73,10 @@ def find_blobs(picture: Picture | NDArray[np.float32], parameters: BlobParameter
     place[rows] = np.arange(len(rows))
     v, u = np.nonzero(mask)
     of = place[labels[v, u]]
-    u, v, of, weight = u[of >= 0], v[of >= 0], of[of >= 0], np.maximum(contrast[v, u][of >= 0].astype(float), 0.0)
+    u, v, of = u[of >= 0], v[of >= 0], of[of >= 0]
+    # One level for all of a blob, which hides what is behind it: a slope of the background would move its centroid.
+    behind = np.bincount(of, background[v, u]) / np.bincount(of)
+    weight = np.maximum(sign * (grey[v, u] - behind[of]), 0.0)
     found = _moments(u.astype(float), v.astype(float), of, weight, len(rows), sigma, limit)
     return found[np.argsort(-found.flux, kind="stable")]
 

@@ -170,6 +170,11 @@ def _calibration(results: StereoResults) -> Iterator[Finding]:
             f" by {format_length(check.change_m)} RMS"
         )
         yield finding("BP-W06", Level.FAIL if check.change_sigmas**2 > LARGEST_NEES else Level.WARN, what)
+    if check is not None and not check.certain:
+        yield passed(
+            f"the markers show no error of {results.run.pair_path.name}; a common error of both focal lengths below"
+            f" {check.hidden_focal_percent:.2g} % would not show, since the distance changes with it"
+        )
     if results.run.pair.covariance is None:
         yield finding("BP-W10", Level.WARN, f"{results.run.pair_path.name} states no covariance of the calibration")
 

@@ -69,8 +69,17 @@ def test_an_error_of_the_calibration_is_named_with_its_size(pair, name, value, a
     assert check.left < 1.5
 
 
-def test_a_right_calibration_is_not_suspected():
-    assert not check_calibration(PAIR, MODEL, approach()).significant
+def test_a_right_calibration_is_not_suspected_and_what_it_would_not_show_is_stated():
+    check = check_calibration(PAIR, MODEL, approach())
+    assert not check.significant
+    # Both focal lengths off by a third of the limit are hidden, by three times the limit they are named.
+    share = check.hidden_focal_percent / 100
+    for factor, shown in ((1 / 3, False), (3, True)):
+        off = dict.fromkeys(("fx", "fy"), factor * share * LEFT.matrix[0, 0])
+        wrong = StereoPair((perturbed_camera(LEFT, off), perturbed_camera(RIGHT, off)))
+        found = check_calibration(wrong, MODEL, approach())
+        assert found.certain is shown
+        assert not shown or "focal length of both cameras" in {s.name for s in found.suspects}
 
 
 def test_an_error_that_the_covariance_states_is_not_suspected():

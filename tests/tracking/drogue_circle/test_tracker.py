@@ -8,7 +8,8 @@ import pytest
 from tests.tracking.drogue_circle.discs import covered, discs
 from tracking.drogue_circle.detectors import CircleCandidate, CircleParameters, classical_detector
 from tracking.drogue_circle.printed import PrintedTracker
-from tracking.drogue_circle.tracker import CircleTracker
+from tracking.drogue_circle.rim_fit import SECTORS, Rim, RimFit
+from tracking.drogue_circle.tracker import CircleTracker, is_certain
 from tracking.statuses import Cause, PoseStatus
 
 P = CircleParameters()
@@ -21,6 +22,16 @@ def new_tracker(**options):
 def place(k):
     """u, v, radius of frame k: steady motion and a slow approach."""
     return 60.0 + 1.3 * k, 50.0 + 0.6 * k, 16.0 + 0.1 * k
+
+
+@pytest.mark.parametrize(
+    ("rms_px", "beside_gaps", "certain"),
+    [(0.23, 0.0, True), (0.26, 0.0, False), (0.26, 0.2, True), (0.36, 0.2, False)],
+)
+def test_edges_next_to_gaps_may_be_off_by_the_corner_there_and_no_more(rms_px, beside_gaps, certain):
+    rim = Rim(50.0, 50.0, 10.6)  # .24 px is allowed for the others; circles of trees and clouds have .36 px and more
+    fit = RimFit(rim, np.eye(3), 0.88, rms_px, beside_gaps, 20.0, 1, 0.7, np.ones(SECTORS))
+    assert is_certain(fit) is certain
 
 
 def test_a_moving_disc_is_followed_with_its_rates():

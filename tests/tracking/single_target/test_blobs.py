@@ -28,6 +28,14 @@ def test_the_centroid_of_a_disc_is_its_centre(polarity, centre):
     assert found.major_px[0] == pytest.approx(4.5, rel=0.1)  # half the radius
 
 
+@pytest.mark.parametrize("polarity", ["darker", "brighter"])
+def test_a_slope_of_the_background_does_not_move_the_centroid(polarity):
+    ink, ground = (20.0, 140.0) if polarity == "darker" else (250.0, 120.0)
+    slope = ground + 0.4 * (np.arange(240) - 120.0) + np.zeros((180, 1))
+    found = find_blobs(disc((120.4, 90.2), 8.0, ground=slope, ink=ink), BlobParameters(polarity=polarity))
+    np.testing.assert_allclose(found.uv_px[0], (120.4, 90.2), atol=0.05)
+
+
 def test_16_bit_pictures_give_the_same_place():
     picture = disc((100.3, 80.6), 8.0)
     narrow, wide = (find_blobs(p, BlobParameters()) for p in (picture, picture.astype(np.uint16) * 256))

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from tracking.unscented import (
     SPREAD,
     X0,
+    Lasting,
     PrintedFilter,
     Spread,
     bearings,
@@ -150,11 +151,20 @@ def test_a_robust_update_equals_the_standard_one_for_a_likely_measurement_and_re
     assert np.linalg.eigvalsh(P - far.P)[0] >= -1e-12
 
 
-def test_the_student_t_update_recovers_from_a_state_that_is_wrong_and_too_certain():
+def test_a_lasting_rule_gives_a_likely_measurement_after_an_unlikely_one_the_weight_of_that():
+    rule, usual = Lasting(steps=3), [student_t(nis, 2) for nis in (1.0, 900.0, 2.0, 3.0, 4.0)]
+    assert [rule(nis, 2) for nis in (1.0, 900.0, 2.0, 3.0, 4.0)] == [1.0, usual[1], usual[1], usual[1], 1.0]
+    assert usual == [1.0, usual[1], 1.0, 1.0, 1.0]
+    assert usual[1] < 1e-3
+    assert Lasting()(900.0, 2) == usual[1]
+
+
+@pytest.mark.parametrize("rule", [student_t, Lasting()])
+def test_the_student_t_update_recovers_from_a_state_that_is_wrong_and_too_certain(rule):
     x, P = np.zeros(1), 1e-2 * np.eye(1)
     for _ in range(200):
         x, P = predict(x, P, np.copy, 1e-2 * np.eye(1))
-        step = update(x, P, np.array([5.0]), np.copy, 1e-2 * np.eye(1), rule=student_t)
+        step = update(x, P, np.array([5.0]), np.copy, 1e-2 * np.eye(1), rule=rule)
         x, P = step.x, step.P
     assert x[0] == pytest.approx(5.0, abs=0.1)
 
