@@ -118,8 +118,8 @@ def refine(
     """Refine a rig.
 
     covariance: of the rig's parameters; all others are held. recordings: with the views of this rig. start: an earlier
-    result, of other labels of the same recordings. stacks: those that are changed; the others keep their values and
-    their uncertainty.
+    result, of other labels of the same recordings; only then are parts that have moved searched for. stacks: those that
+    are changed; the others keep their values and their uncertainty.
 
     Raises:
         AdjustmentError: the recordings have too few frames, or the adjustment does not converge.
@@ -182,7 +182,7 @@ def refine(
         gain=np.maximum(gain, 0.0),
         directions=directions,
         p_change=known.excess(data)[0].p_value,
-        moved=MovedParts(rig, prior, terms, free, values, known, data).found(),
+        moved=() if start is None else MovedParts(rig, prior, terms, free, values, known).found(),
         held_out=_held_out(known, data, given_data, changed),
     )
 
