@@ -2,8 +2,8 @@
 
 With --estimate: errors with clocks that are estimated over those with the same clocks known.
 
-Each row: kind of clocks, ratio of the RMS attitude errors, also away from corners of the motion, NEES/6, wrong labels and
-found spots of both recordings.
+Each row: kind of clocks, ratio of the RMS attitude errors, also away from corners of the motion, NEES/6, wrong labels
+and found spots of both recordings.
 """
 
 from __future__ import annotations
@@ -130,9 +130,9 @@ def main() -> None:
         table.setdefault(KINDS[seed % len(KINDS)], []).append((ratio, off_corners, nees[0], nees[1]))
         print(
             f"{seed}: ratio {ratio:.3f}, away from corners {off_corners:.3f} ({rms[0]:.3g} / {rms[1]:.3g} deg,"
-            f" {both.sum()} of {np.isfinite(one.attitude_deg).sum()}), NEES/6 {nees[0]:.2f} ({nees[1]:.2f}),"
-            f" wrong {with_clocks.wrong} ({one.wrong}), found {with_clocks.found:.4f} ({one.found:.4f}), wrong poses {with_clocks.wrong_poses}"
-            f" ({one.wrong_poses}), {with_clocks.status} ({one.status}){_in_words(with_clocks)}: {r.text}",
+            f" {both.sum()} of {np.isfinite(one.attitude_deg).sum()}), NEES/6 {nees[0]:.2f} ({nees[1]:.2f}), wrong"
+            f" {with_clocks.wrong} ({one.wrong}), found {with_clocks.found:.4f} ({one.found:.4f}), wrong poses"
+            f" {with_clocks.wrong_poses} ({one.wrong_poses}), {with_clocks.status} ({one.status}){_in_words(with_clocks)}: {r.text}",
             flush=True,
         )
     for kind, rows in [*table.items(), ("all", [row for of_kind in table.values() for row in of_kind])]:
