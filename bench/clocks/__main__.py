@@ -132,8 +132,8 @@ def main() -> None:
             f"{seed}: ratio {ratio:.3f}, away from corners {off_corners:.3f} ({rms[0]:.3g} / {rms[1]:.3g} deg,"
             f" {both.sum()} of {np.isfinite(one.attitude_deg).sum()}), NEES/6 {nees[0]:.2f} ({nees[1]:.2f}), wrong"
             f" {with_clocks.wrong} ({one.wrong}), found {with_clocks.found:.4f} ({one.found:.4f}), wrong poses"
-            f" {with_clocks.wrong_poses} ({one.wrong_poses}), {with_clocks.status} ({one.status}){_in_words(with_clocks)}:"
-            f" {r.text}",
+            f" {with_clocks.wrong_poses} ({one.wrong_poses}), {with_clocks.status} ({one.status})"
+            f"{_in_words(with_clocks)}: {r.text}",
             flush=True,
         )
     for kind, rows in [*table.items(), ("all", [row for of_kind in table.values() for row in of_kind])]:
