@@ -154,6 +154,8 @@ def refine(
     terms = [RecordingTerm(rig, replace(r, cov_px2=r.cov_px2 * wider), free) for r in blocks]
     values = solve(values, [prior, *terms], free).values
     data = [t.reduced(values) for t in terms]
+    if not any(d.dof > 0 for d in data):
+        raise AdjustmentError("so many spots are outliers that the others only determine the poses")
     known = Knowledge(difference(prior, values), covariance_root(prior.covariance))
     changed = np.concatenate([np.full(values[s].dof, s in stacks) for s, _ in prior.at])
     after = known.with_data(data, changed)

@@ -13,6 +13,8 @@ import pytest
 import yaml
 from click.testing import CliRunner
 
+from bench import refine as bench
+from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.refinement import MOTIONS, further_motions
 from calibration.terms.rig_blocks import prior_of, stacks_of
 from cli import main
@@ -191,6 +193,15 @@ def test_a_wrong_focal_length_of_which_nothing_is_stated_is_named_and_not_absorb
         done.output
     )
     assert not (tmp_path / "new" / "rig.yaml").exists()
+
+
+def test_recordings_whose_spots_are_all_outliers_or_needed_by_their_poses_are_refused():
+    seed, sigmas = 6505, bench.Sigmas(clocks=0.0)
+    drawn, scenes, _ = bench.campaign(seed, 100, case=bench.MIRRORED)
+    rng = np.random.default_rng([seed, bench.RIG])
+    known, scenes = bench.changed(bench.MIRRORED, bench.drawn_rig(rng, drawn.rig, sigmas), scenes, rng)
+    with pytest.raises(AdjustmentError, match="so many spots are outliers"):
+        bench.refined_with_true_labels(known, bench.rig_covariance(known, sigmas), scenes[:3])
 
 
 def test_a_vehicle_at_rest_gives_no_confident_rig(lab, tmp_path):
