@@ -86,8 +86,8 @@ class MovedParts:
 
     def _selection(self) -> Array:
         """(p, q): where the q numbers of the prior are among all."""
-        sizes = [sum(self.values[stack].dof for stack, _ in at) for at in (self._at, self.prior.at)]
-        return np.eye(*sizes)
+        wider, stated = (sum(self.values[stack].dof for stack, _ in at) for at in (self._at, self.prior.at))
+        return np.eye(wider, stated)
 
     def _wider(self, known: Knowledge) -> Knowledge:
         wider = self._selection()
