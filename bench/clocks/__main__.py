@@ -2,7 +2,9 @@
 
 With --estimate: errors with clocks that are estimated over those with the same clocks known.
 
-Each row: kind of clocks, ratio of the RMS attitude errors, NEES/6, wrong labels and found spots of both recordings.
+Each row: kind of clocks; ratio of the RMS attitude errors, also away from corners of the motion; ratio of their stated
+sigmas; with --control the ratio of two recordings with one clock that differ in their noise alone; NEES/6, wrong labels
+and found spots of both recordings.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +27,8 @@ from tracking.statuses import PoseStatus
 
 SAME_SPOT_PX, SAME_SPOT_SIGMAS = 3.0, 5.0
 WRONG_POSE = 100.0  # NEES
+CORNER = 3  # frames about a corner of the motion that "away from corners" leaves out
+OTHER_NOISE = 1_000_000  # added to the seed
 EDGE = 3  # frames at both ends that are not compared: not all cameras have pictures there
 
 
@@ -33,6 +37,7 @@ class Figures:
     """Of one run."""
 
     attitude_deg: Array  # (T,) error of the measured poses; nan elsewhere
+    stated_deg: Array  # (T,) its sigma as stated
     nees: Array  # (T,) / 6, of all poses
     wrong: int  # labels
     found: float  # share of the visible spots that have their label
@@ -50,15 +55,17 @@ def figures(r: Recording, folder: Path, estimate: bool = False) -> Figures:
     true = r.pose_at(r.rows_s)[poses.frames]
     known = ~poses.has(PoseStatus.LOST)
     delta = true.minus(poses.world_from_body)
-    attitude, nees = np.full(len(r.hidden), np.nan), np.full(len(r.hidden), np.nan)
+    attitude, stated, nees = (np.full(len(r.hidden), np.nan) for _ in range(3))
     measured = poses.has(PoseStatus.MEASURED)
     attitude[poses.frames[measured]] = np.rad2deg(np.linalg.norm(delta[measured, 3:], axis=1))
+    turns = np.trace(poses.covariance[measured][:, 3:, 3:], axis1=1, axis2=2)
+    stated[poses.frames[measured]] = np.rad2deg(np.sqrt(turns))
     whole = np.linalg.solve(poses.covariance[known], delta[known][..., None])[..., 0]
     nees[poses.frames[known]] = np.sum(delta[known] * whole, axis=1) / 6
     wrong, right, visible = _labels(r, truth, spots)
     return Figures(
-        attitude, nees, wrong, right / max(visible, 1), int(np.sum(nees > WRONG_POSE / 6)), outcome.verdict.status,
-        _estimated(r, folder / "out"),
+        attitude, stated, nees, wrong, right / max(visible, 1), int(np.sum(nees > WRONG_POSE / 6)),
+        outcome.verdict.status, _estimated(r, folder / "out"),
     )  # fmt: skip
 
 
@@ -108,35 +115,47 @@ def main() -> None:
     parser.add_argument("--seeds", default="1:201", metavar="A:B")
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--estimate", action="store_true", help="clocks to be estimated, against the known ones")
+    parser.add_argument("--control", action="store_true", help="one clock with other noise, over one clock")
     a = parser.parse_args()
     first, _, last = a.seeds.partition(":")
     seeds = range(int(first), int(last) if last else int(first) + 1)
-    table: dict[str, list[tuple[float, float, float]]] = {}
+    table: dict[str, list[tuple[float, ...]]] = {}
     clocks: list[tuple[float, float, float]] = []
     for seed in seeds:
         r = random_recording(seed, a.frames)
         with tempfile.TemporaryDirectory() as name:
             with_clocks = figures(r, Path(name) / "clocks", a.estimate)
             one = figures(r if a.estimate else r.with_one_clock(), Path(name) / "one")
+            other = replace(r.with_one_clock(), seed=r.seed + OTHER_NOISE)
+            again = figures(other, Path(name) / "again") if a.control else None
         clocks += with_clocks.clocks
         both = np.isfinite(with_clocks.attitude_deg) & np.isfinite(one.attitude_deg)
         both[:EDGE] = both[-EDGE:] = False
-        rms = [np.sqrt(np.mean(f.attitude_deg[both] ** 2)) if both.any() else np.nan for f in (with_clocks, one)]
+        smooth = both & (np.abs(np.arange(len(both))[:, None] - r.corners).min(axis=1, initial=np.inf) > CORNER)
+        rms, away = ([_rms(f.attitude_deg[rows]) for f in (with_clocks, one)] for rows in (both, smooth))
         nees = [float(np.nanmean(f.nees)) if np.isfinite(f.nees).any() else np.nan for f in (with_clocks, one)]
-        ratio = float(rms[0] / max(rms[1], 1e-12))
-        table.setdefault(KINDS[seed % len(KINDS)], []).append((ratio, nees[0], nees[1]))
+        sigmas = [_rms(f.stated_deg[both]) for f in (with_clocks, one)]
+        chance = _rms(again.attitude_deg[both]) / rms[1] if again is not None else np.nan
+        ratio, off_corners, stated = (float(pair[0] / max(pair[1], 1e-12)) for pair in (rms, away, sigmas))
+        row = (ratio, off_corners, stated, chance, nees[0], nees[1])
+        table.setdefault(KINDS[seed % len(KINDS)], []).append(row)
         print(
-            f"{seed}: ratio {ratio:.3f} ({rms[0]:.3g} / {rms[1]:.3g} deg, {both.sum()} of"
-            f" {np.isfinite(one.attitude_deg).sum()}), NEES/6 {nees[0]:.2f} ({nees[1]:.2f}), wrong {with_clocks.wrong}"
-            f" ({one.wrong}), found {with_clocks.found:.4f} ({one.found:.4f}), wrong poses {with_clocks.wrong_poses}"
-            f" ({one.wrong_poses}), {with_clocks.status} ({one.status}){_in_words(with_clocks)}: {r.text}",
+            f"{seed}: ratio {ratio:.3f}, away from corners {off_corners:.3f}, stated {stated:.3f}, by chance"
+            f" {chance:.3f} ({rms[0]:.3g} / {rms[1]:.3g} deg,"
+            f" {both.sum()} of {np.isfinite(one.attitude_deg).sum()}), NEES/6 {nees[0]:.2f} ({nees[1]:.2f}), wrong"
+            f" {with_clocks.wrong} ({one.wrong}), found {with_clocks.found:.4f} ({one.found:.4f}), wrong poses"
+            f" {with_clocks.wrong_poses} ({one.wrong_poses}), {with_clocks.status} ({one.status})"
+            f"{_in_words(with_clocks)}: {r.text}",
             flush=True,
         )
     for kind, rows in [*table.items(), ("all", [row for of_kind in table.values() for row in of_kind])]:
-        ratio, nees, nees_one = np.array(rows).T
+        ratio, off_corners, stated_ratio, chances, nees, nees_one = np.array(rows).T
         print(
             f"{kind}: {len(rows)} recordings, ratio median {np.nanmedian(ratio):.3f},"
-            f" 95 % {np.nanquantile(ratio, 0.95):.3f}; NEES/6 mean {np.nanmean(nees):.2f}, median"
+            f" 95 % {np.nanquantile(ratio, 0.95):.3f}; away from corners {np.nanmedian(off_corners):.3f},"
+            f" {np.nanquantile(off_corners, 0.95):.3f}; stated {np.nanmedian(stated_ratio):.3f},"
+            f" {np.nanquantile(stated_ratio, 0.95):.3f}; by chance {np.nanmedian(chances):.3f},"
+            f" {np.nanquantile(chances, 0.95):.3f}; NEES/6 mean {np.nanmean(nees):.2f}, median"
             f" {np.nanmedian(nees):.2f} (compared {np.nanmean(nees_one):.2f}, {np.nanmedian(nees_one):.2f})"
         )
     if clocks:
@@ -147,6 +166,10 @@ def main() -> None:
             f" {100 * np.mean(away[known] < 1):.0f} %, beyond 3: {100 * np.mean(away[known] > 3):.1f} %, of all:"
             f" {100 * np.mean(away < 1):.0f} %, {100 * np.mean(away > 3):.1f} %"
         )
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
 
 
 def _in_words(f: Figures) -> str:

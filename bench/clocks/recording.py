@@ -70,6 +70,7 @@ class Recording:
     hidden: Bools  # (T, n)
     false: FalsePoints
     clocks: tuple[Clock, ...]
+    corners: Array  # (c,) frames, with fractions, at which the velocity jumps
     text: str
 
     @property
@@ -131,7 +132,7 @@ def _attempt(key: list[int], seed: int, frames: int) -> Recording | None:
     text = f"{kind}{clock_text}; {lab.text}; {rate:.0f} Hz, {motion.text}, {step:.2g} px/frame; noise {noise:.2g} px"
     return Recording(
         seed, lab.rig, rate, draw_prior(np.random.default_rng([*key, PRIOR]), poses[0]), pose_at,
-        np.full(len(camera_of), noise), hidden, false, clocks, f"{text}; {false.text}; {hidden_text}",
+        np.full(len(camera_of), noise), hidden, false, clocks, corners, f"{text}; {false.text}; {hidden_text}",
     )  # fmt: skip
 
 

@@ -169,12 +169,16 @@ def _best(
         change = left.fit(fault.kind, fault.name, ChangeCandidate(X @ fault.directions, fault.prior_sigma))
         alike = len({f.name for f in faults if f.component == fault.component})
         fitted.append(FittedFault(fault, change, change.evidence - 2 * float(np.log(alike))))
-    significant = [e for e in fitted if e.log_odds > 0 and e.change.p_value < P_FALSE_ALARM / len(faults)]
+    return most_probable([e for e in fitted if e.log_odds > 0 and e.change.p_value < P_FALSE_ALARM / len(faults)])
+
+
+def most_probable(significant: Sequence[FittedFault]) -> SuspectedFault | None:
+    """The most probable of some explanations, with those of other components that are as probable; None of none."""
     if not significant:
         return None
-    significant.sort(key=lambda e: -e.log_odds)
-    margin = max(DECISIVE, LINEARISATION_SHARE * significant[0].log_odds)
-    close = [e for e in significant if e.log_odds > significant[0].log_odds - margin]
+    ranked = sorted(significant, key=lambda e: -e.log_odds)
+    margin = max(DECISIVE, LINEARISATION_SHARE * ranked[0].log_odds)
+    close = [e for e in ranked if e.log_odds > ranked[0].log_odds - margin]
     # A pixel offset is a symptom: a component that explains it as well is the cause.
     close.sort(key=lambda e: e.fault.kind == PIXEL_OFFSET)
     best_of_component: dict[tuple[str, str], FittedFault] = {}

@@ -13,17 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.changes import USUAL_SIZES, ExcessResidual
-from calibration.least_squares.adjustment import AdjustmentError, At, Prior, Values, solve
-from calibration.model_check.fault_identification import SuspectedFault, compressed, search_faults
+from calibration.least_squares.adjustment import AdjustmentError, At, Values, solve
+from calibration.model_check.fault_identification import SuspectedFault
 from calibration.model_check.faults import (
-    BEAM,
-    CAMERA,
-    LASER_MOVED,
-    MOVED,
-    SCREEN,
-    TILTED,
-    PossibleFault,
     pixel_velocities,
 )
 from calibration.model_check.linearised_frames import (
@@ -31,9 +23,11 @@ from calibration.model_check.linearised_frames import (
     correlation_time,
     linearise,
 )
+from calibration.rig.knowledge import Knowledge, normal_equations
+from calibration.rig.moved_parts import MovedParts, difference
 from calibration.rig.recordings import STACKS, RecordingTerm, Reduced
 from calibration.terms.rig_blocks import BEAMS, CAMERAS, SCREENS, named_errors, names_at, prior_of, rig_of, stacks_of
-from geometry.arrays import Array, Bools, Ints, finite, skew
+from geometry.arrays import Array, Bools, finite
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.chi_square import chi2_limit
@@ -46,53 +40,6 @@ FOLDS = 5  # blocks of time of a single recording
 _P_OUTLIER = 1e-5  # probability that a correct spot is excluded
 _ROUNDS = 5  # of outliers and noise scales
 _CONVERGED = 0.02  # relative change of a noise scale in one round below which it has converged
-_LARGER = 3.0  # prior size of a change that the stated sigmas do not explain, in those sigmas
-
-
-@dataclass(frozen=True, slots=True)
-class Knowledge:
-    """What is known of p errors delta: a mean and a covariance L L^T."""
-
-    mean: Array  # (p,)
-    root: Array  # (p, r)
-
-    @property
-    def covariance(self) -> Array:
-        """(p, p)"""
-        return np.asarray(self.root @ self.root.T)
-
-    def with_data(self, data: Sequence[Reduced], changed: Bools | None = None) -> Knowledge:
-        """After some recordings.
-
-        changed (p,): the numbers that are changed; the others keep their mean and stay uncertain (Schmidt 1966,
-        "Application of state-space methods to navigation problems"). None: all.
-        """
-        S, g = normal_equations(data)
-        values, vectors = np.linalg.eigh(np.eye(self.root.shape[1]) + self.root.T @ S @ self.root)
-        root = self.root @ (vectors / np.sqrt(values))
-        step = root @ (root.T @ (g - S @ self.mean))
-        if changed is None or changed.all():
-            return Knowledge(self.mean + step, root)
-        gain = np.where(changed[:, None], root @ root.T, 0.0)
-        own = self.root - gain @ S @ self.root
-        return Knowledge(
-            self.mean + np.where(changed, step, 0.0), np.concatenate([own, gain @ compressed(S)[0].T], axis=1)
-        )
-
-    def excess(self, data: Sequence[Reduced]) -> tuple[ExcessResidual, Array, float]:
-        """What this does not explain of some recordings, the whitened X (q, p) that belongs to it, and ln p(data)."""
-        X, y = np.concatenate([d.X for d in data]), np.concatenate([d.y for d in data])
-        spread = X @ self.root
-        factor = np.linalg.cholesky(np.eye(len(y)) + spread @ spread.T)
-        white = np.linalg.solve(factor, y - X @ self.mean)
-        log_density = -0.5 * float(white @ white) - float(np.sum(np.log(np.diagonal(factor))))
-        return ExcessResidual.of_white(white), np.linalg.solve(factor, X), log_density
-
-
-def normal_equations(data: Sequence[Reduced]) -> tuple[Array, Array]:
-    """X^T X (p, p) and X^T y (p,) of some recordings."""
-    # The sums begin with the number 0, so that their type is not that of an array.
-    return sum(d.X.T @ d.X for d in data), sum(d.X.T @ d.y for d in data)  # type: ignore[return-value]
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,8 +118,8 @@ def refine(
     """Refine a rig.
 
     covariance: of the rig's parameters; all others are held. recordings: with the views of this rig. start: an earlier
-    result, of other labels of the same recordings. stacks: those that are changed; the others keep their values and
-    their uncertainty.
+    result, of other labels of the same recordings; only then are parts that have moved searched for. stacks: those that
+    are changed; the others keep their values and their uncertainty.
 
     Raises:
         AdjustmentError: the recordings have too few frames, or the adjustment does not converge.
@@ -207,13 +154,14 @@ def refine(
     terms = [RecordingTerm(rig, replace(r, cov_px2=r.cov_px2 * wider), free) for r in blocks]
     values = solve(values, [prior, *terms], free).values
     data = [t.reduced(values) for t in terms]
-    known = Knowledge(_difference(prior, values), covariance_root(prior.covariance))
+    if not any(d.dof > 0 for d in data):
+        raise AdjustmentError("so many spots are outliers that the others only determine the poses")
+    known = Knowledge(difference(prior, values), covariance_root(prior.covariance))
     changed = np.concatenate([np.full(values[s].dof, s in stacks) for s, _ in prior.at])
     after = known.with_data(data, changed)
     given_data = [t.reduced(stacks_of(rig)) for t in terms]
     S, _ = normal_equations(data)
     gain, vectors = np.linalg.eigh(known.root.T @ S @ known.root)
-    excess, X, _ = known.excess(data)
     names, T = named_errors(rig, values, prior.at)
     directions = known.root @ vectors
     after = _with_curvature(after, directions, gain, names, T)
@@ -235,8 +183,8 @@ def refine(
         correlation_frames=frames,
         gain=np.maximum(gain, 0.0),
         directions=directions,
-        p_change=excess.p_value,
-        moved=search_faults(excess, X, _parts(rig, values, prior, known))[0],
+        p_change=known.excess(data)[0].p_value,
+        moved=() if start is None else MovedParts(rig, prior, terms, free, values, known).found(),
         held_out=_held_out(known, data, given_data, changed),
     )
 
@@ -337,13 +285,6 @@ def _with_curvature(after: Knowledge, directions: Array, gain: Array, names: Seq
     return Knowledge(after.mean, (u * size)[:, : directions.shape[1]])
 
 
-def _difference(prior: Prior, values: Values) -> Array:
-    """The prior values minus the given ones (p,)."""
-    return np.concatenate(
-        [known.minus(values[s].pick(np.array([i])))[0] for (s, i), known in zip(prior.at, prior.values, strict=True)]
-    )
-
-
 def _held_out(
     known: Knowledge, data: Sequence[Reduced], given: Sequence[Reduced], changed: Bools
 ) -> tuple[HeldOut, ...]:
@@ -359,49 +300,3 @@ def _held_out(
         before = given[i].rest + float(given[i].y @ given[i].y)
         out.append(HeldOut((before, refined), d.dof, excess.p_value, (known.excess([d])[2], log_density)))
     return tuple(out)
-
-
-def _parts(rig: Rig, values: Values, prior: Prior, known: Knowledge) -> list[PossibleFault]:
-    """Every camera, screen and beam as the one that has changed by more than its stated sigma."""
-    model, place = SpotModel.of(rig), _places(prior.at, values)
-    sigmas = np.sqrt(np.diagonal(known.covariance))
-    screen_of = [rig.spots[s].screen for _, s in model.views]
-    out = []
-    for (stack, i), rows in place.items():
-        if stack not in (CAMERAS, SCREENS, BEAMS):
-            continue
-        turn, move = _LARGER * np.median(sigmas[rows[3:]]), _LARGER * np.median(sigmas[rows[:3]])
-        of = np.zeros((len(sigmas), 6 if stack == CAMERAS else 3 if stack == SCREENS else 4))
-        if stack == CAMERAS:
-            pose = list(rig.cameras.values())[i].camera_from_world
-            # A turn about the camera's centre, as in model_check/faults.py; the shift is that of the centre.
-            of[rows, :3] = np.concatenate([-skew(pose.translation), pose.rotation.T])
-            of[rows[:3], 3:] = np.eye(3)
-            centre = np.linalg.lstsq(of[rows], np.eye(6), rcond=None)[0]
-            own = centre @ known.covariance[np.ix_(rows, rows)] @ centre.T
-            turn, move = (_LARGER * np.sqrt(np.trace(own[k, k]) / 3) for k in (np.s_[:3], np.s_[3:]))
-            sizes = np.repeat([max(turn, USUAL_SIZES.turn_rad), max(move, USUAL_SIZES.move_m)], 3)
-            component, kind, name, views = CAMERA, MOVED, list(rig.cameras)[i], model.camera_of == i
-        elif stack == SCREENS:
-            of[rows[:3], 0] = list(rig.screens.values())[i].world_from_screen.rotation[:, 2]
-            of[rows[3:5], 1:] = np.eye(2)
-            sizes = np.repeat([max(move, USUAL_SIZES.move_m), max(turn, USUAL_SIZES.turn_rad)], (1, 2))
-            component, kind, name = SCREEN, TILTED, list(rig.screens)[i]
-            views = np.array([s == name for s in screen_of])
-        else:
-            of[rows] = np.eye(4)
-            turn, move = (_LARGER * np.max(sigmas[rows[k]]) for k in (np.s_[:2], np.s_[2:]))
-            sizes = np.repeat([max(turn, USUAL_SIZES.laser_rad), max(move, USUAL_SIZES.laser_m)], 2)
-            component, kind, name, views = BEAM, LASER_MOVED, list(rig.beams)[i], model.beam_of == i
-        if views.any():
-            out.append(PossibleFault(component, name, kind, of, sizes, views))
-    return out
-
-
-def _places(at: Sequence[At], values: Values) -> dict[At, Ints]:
-    """The positions of the numbers of each unknown in the vector of all."""
-    out, start = {}, 0
-    for a in at:
-        out[a] = start + np.arange(values[a[0]].dof)
-        start += values[a[0]].dof
-    return out

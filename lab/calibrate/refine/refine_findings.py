@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.model_check.fault_identification import FittedFault, SuspectedFault
-from calibration.model_check.faults import BEAM, CAMERA
+from calibration.model_check.faults import BEAM, CAMERA, ZOOMED
 from calibration.rig.refinement import FEWEST_FRAMES, Refinement
 from geometry.arrays import finite
 from geometry.rig import Rig
@@ -68,6 +68,9 @@ def _moved(suspected: SuspectedFault) -> str:
 
 def _part(e: FittedFault) -> str:
     """`camera `left` has moved by 20.1 ± 0.3 mm and turned by 5.0 ± 0.1 mrad`, beyond what is stated."""
+    if e.fault.kind == ZOOMED:
+        percent = 100 * np.array([e.change.delta[0], np.sqrt(e.change.covariance[0, 0])])
+        return f"the focal length of camera `{e.fault.name}` is wrong by {format_with_sigma(*percent.tolist())} %"
     delta, sigma = e.change.delta, np.sqrt(np.maximum(np.diagonal(e.change.covariance), 0.0))
     turn, move = (np.s_[:3], np.s_[3:]) if e.fault.component == CAMERA else (np.s_[1:], np.s_[:1])
     if e.fault.component == BEAM:

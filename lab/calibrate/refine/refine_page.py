@@ -117,7 +117,7 @@ def _held_out(result: RefineResult) -> Section:
     rows = [
         (
             result.runs[i].run.name if several else f"block {i + 1}",
-            float(np.sqrt(h.chi2[0] / h.dof)), float(np.sqrt(h.chi2[1] / h.dof)), h.p,
+            *(float(np.sqrt(chi2 / max(h.dof, 1))) for chi2 in h.chi2), h.p,
             h.log_density[1] - h.log_density[0],
         )
         for i, h in enumerate(r.held_out)

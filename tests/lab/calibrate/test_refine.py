@@ -13,6 +13,8 @@ import pytest
 import yaml
 from click.testing import CliRunner
 
+from bench import refine as bench
+from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.refinement import MOTIONS, further_motions
 from calibration.terms.rig_blocks import prior_of, stacks_of
 from cli import main
@@ -159,7 +161,11 @@ def test_only_the_named_groups_change_and_the_others_stay_uncertain(lab, cameras
 
 @pytest.mark.parametrize(
     ("part", "change"),
-    [("cameras.left-b", {"rot_x_rad": 0.01, "rot_y_rad": -0.01}), ("screens.right", {"z_m": 0.03, "rot_x_rad": 0.01})],
+    [
+        ("cameras.left-b", {"rot_x_rad": 0.01, "rot_y_rad": -0.01}),
+        ("screens.right", {"z_m": 0.03, "rot_x_rad": 0.01}),
+        ("screens.right", {"z_m": 0.006, "rot_y_rad": 0.002}),  # 3 sigmas: errors of all parts explain it as well
+    ],
 )
 def test_a_part_that_moved_by_more_than_stated_is_named_and_an_earlier_rig_stays(lab, tmp_path, part, change):
     folder, runs, true, _ = lab
@@ -175,6 +181,27 @@ def test_a_part_that_moved_by_more_than_stated_is_named_and_an_earlier_rig_stays
     assert (out / "rig.yaml").read_bytes() == (folder / "new" / "rig.yaml").read_bytes()
     assert (tmp_path / "new-failed" / "report.html").exists()
     assert not (tmp_path / "new-failed" / "rig.yaml").exists()
+
+
+def test_a_wrong_focal_length_of_which_nothing_is_stated_is_named_and_not_absorbed(lab, tmp_path):
+    _, runs, true, _ = lab
+    camera = true.cameras["left-b"]
+    longer = replace(camera, matrix=camera.matrix * np.array([[1.02, 1.0, 1.0], [1.0, 1.02, 1.0], [1.0, 1.0, 1.0]]))
+    write_known(replace(true, cameras={**true.cameras, "left-b": longer}), tmp_path / "rig.yaml")
+    done = typed("refine", *runs, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "new")
+    assert (done.exit_code, "the focal length of camera `left-b` is wrong by −" in done.output) == (3, True), (
+        done.output
+    )
+    assert not (tmp_path / "new" / "rig.yaml").exists()
+
+
+def test_recordings_whose_spots_are_all_outliers_or_needed_by_their_poses_are_refused():
+    seed, sigmas = 6505, bench.Sigmas(clocks=0.0)
+    drawn, scenes, _ = bench.campaign(seed, 100, case=bench.MIRRORED)
+    rng = np.random.default_rng([seed, bench.RIG])
+    known, scenes = bench.changed(bench.MIRRORED, bench.drawn_rig(rng, drawn.rig, sigmas), scenes, rng)
+    with pytest.raises(AdjustmentError, match="so many spots are outliers"):
+        bench.refined_with_true_labels(known, bench.rig_covariance(known, sigmas), scenes[:3])
 
 
 def test_a_vehicle_at_rest_gives_no_confident_rig(lab, tmp_path):
