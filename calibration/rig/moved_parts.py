@@ -53,14 +53,31 @@ class MovedParts:
     values: Values  # of the refined rig
     known: Knowledge  # of their errors before the recordings
 
-    def found(self) -> tuple[SuspectedFault, ...]:
-        """The parts that have moved, and wrong lenses; empty where the stated sigmas explain the recordings."""
+    def found(self) -> tuple[tuple[SuspectedFault, ...], dict[str, float]]:
+        """The parts that have moved, and wrong lenses; none where the stated sigmas explain the recordings.
+
+        Also the relative sigma with which the recordings, and that of another lens of the same make, show the focal
+        length of each camera of which nothing is stated.
+        """
         known, data, faults = self._wider(self.known), self._data(self.values), self._faults()
         excess, X, as_stated = known.excess(data)
         several = search_faults(excess, X, faults)[0]
+        lenses = self._lenses(excess, X, faults)
+        sigmas = {fit.fault.name: float(np.sqrt(fit.change.covariance[0, 0])) for fit in lenses}
+        return self._moved(known, data, faults, several, as_stated) or _wrong_lens(lenses), sigmas
+
+    def _moved(
+        self,
+        known: Knowledge,
+        data: Sequence[Reduced],
+        faults: Sequence[PossibleFault],
+        several: tuple[SuspectedFault, ...],
+        as_stated: float,
+    ) -> tuple[SuspectedFault, ...]:
+        """The parts that have moved, given those of the stated sigmas and ln p(data) with these."""
         alone = self._alone(known, data, faults)
         if alone is None:
-            return several or self._wrong_lens(excess, X, faults)
+            return several
         together = np.concatenate([known.root, *(_scaled(m.best.fault) for m in several)], axis=1)
         odds = 2 * (replace(known, root=together).log_density(data) - as_stated)
         return several if len(several) > 1 and odds > alone.best.log_odds else (alone,)
@@ -126,19 +143,21 @@ class MovedParts:
         known = self._wider(replace(self.known, mean=difference(self.prior, values)))
         return _fitted(fit.fault, known, self._data(values), nothing, count)
 
-    def _wrong_lens(
-        self, excess: ExcessResidual, X: Array, faults: Sequence[PossibleFault]
-    ) -> tuple[SuspectedFault, ...]:
-        """A focal length that the recordings contradict, where nothing is stated of it: it would not be refined."""
+    def _lenses(self, excess: ExcessResidual, X: Array, faults: Sequence[PossibleFault]) -> list[FittedFault]:
+        """The change of each focal length of which nothing is stated: it would not be refined."""
         stated = {list(self.rig.cameras)[i] for stack, i in self.prior.at if stack == INTRINSICS}
-        fits = [
+        return [
             FittedFault(f, change, change.evidence)
             for f in faults
             if f.kind == ZOOMED and f.name not in stated
             for change in [excess.fit(f.kind, f.name, ChangeCandidate(X @ f.directions, f.prior_sigma))]
         ]
-        found = most_probable([fit for fit in fits if fit.change.p_value < _P_ALONE / len(fits)])
-        return () if found is None else (found,)
+
+
+def _wrong_lens(fits: Sequence[FittedFault]) -> tuple[SuspectedFault, ...]:
+    """A focal length that the recordings contradict."""
+    found = most_probable([fit for fit in fits if fit.change.p_value < _P_ALONE / len(fits)])
+    return () if found is None else (found,)
 
 
 def _fitted(fault: PossibleFault, known: Knowledge, data: Sequence[Reduced], nothing: float, count: int) -> FittedFault:

@@ -73,6 +73,9 @@ class Refinement:
     directions: Array  # (p, r) these directions, as errors of one prior sigma
     p_change: float  # of the changes if the stated sigmas are right
     moved: tuple[SuspectedFault, ...]  # parts that have changed by more than that
+    lens_sigmas: Mapping[
+        str, float
+    ]  # relative, of focal lengths of which nothing is stated, as the recordings show them
     held_out: tuple[HeldOut, ...]
 
     @property
@@ -167,6 +170,7 @@ def refine(
     after = _with_curvature(after, directions, gain, names, T)
     matrix = T @ after.covariance @ T.T
     named = np.diagonal(matrix) > 0
+    moved, lenses = ((), {}) if start is None else MovedParts(rig, prior, terms, free, values, known).found()
     return Refinement(
         given=rig,
         rig=rig_of(rig, {s: v for s, v in values.items() if s in stacks}),
@@ -184,7 +188,8 @@ def refine(
         gain=np.maximum(gain, 0.0),
         directions=directions,
         p_change=known.excess(data)[0].p_value,
-        moved=() if start is None else MovedParts(rig, prior, terms, free, values, known).found(),
+        moved=moved,
+        lens_sigmas=lenses,
         held_out=_held_out(known, data, given_data, changed),
     )
 

@@ -20,6 +20,7 @@ from lab.runs.model_check.check import ModelCheck, p_text
 
 P_CHANGE = 1e-4  # p-value below which the stated sigmas do not explain the changes
 P_HELD_OUT = 1e-4  # p-value, of all held-out recordings together, below which they contradict the result
+UNCHECKED_FOCAL = 0.003  # relative sigma of a focal length above which it is not checked; as `calibrate camera` has it
 FEW_USED = 0.5  # share of a recording's frames that are used, below which it is reported
 # Codes of the model check that no refined rig may have: a fault, unexplained or correlated residuals.
 _CONTRADICTIONS = ("BP-M01", "BP-M02", "BP-M03")
@@ -38,7 +39,7 @@ class RefineResult:
 def refine_findings(result: RefineResult) -> tuple[Finding, ...]:
     """All findings."""
     r = result.refined
-    out = [*_changes(r), *_checks(result), *_held_out(r), *_used(result), *_held(r.given, result.prior)]
+    out = [*_changes(r), *_checks(result), *_held_out(r), *_used(result), *_held(r.given, result.prior), *_lenses(r)]
     noisy = {name: factor for name, factor in r.noise.items() if factor > NOISY}
     for name, factor in noisy.items():
         what = f"the spots of camera `{name}` scatter {format_number(factor, 2)} times as much as their sigmas state"
@@ -128,3 +129,15 @@ def _held(rig: Rig, prior: RigCovariance) -> list[Finding]:
         return []
     what = f"nothing is stated of {', '.join(held)}: they are held, and the result is relative to them"
     return [finding("BP-F05", Level.WARN, what)]
+
+
+def _lenses(r: Refinement) -> list[Finding]:
+    """Cameras whose focal length is neither stated with a sigma nor shown by the recordings."""
+    unknown = [f"cameras.{name}" for name, sigma in r.lens_sigmas.items() if sigma > UNCHECKED_FOCAL]
+    if not unknown or r.moved:
+        return []
+    what = (
+        f"nothing is stated of the focal lengths of {', '.join(unknown)}, and the recordings would not show an error of"
+        f" 1 %: the result is as right as they are"
+    )
+    return [finding("BP-F05", Level.WARN, what, variant="lens")]
