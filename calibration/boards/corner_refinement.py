@@ -23,6 +23,7 @@ from geometry.arrays import Array, Bools, Ints
 
 _REACH = 0.4  # half of the window, in distances of the nearest parallel edge, which would be included from 0.5 on
 _MOST_PX = 12  # half of the window: a larger one includes more curved edges, and takes longer
+_SAG_PX = 0.03  # by which edges curve in half of the window: their curvature is known to some per cent
 _OFF = 0.3  # distances of parallel edges from where the others of its row and column have it: it is not that corner
 _SPARE = 2  # known corners around a corner beyond the coefficients of its curvature
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
@@ -57,15 +58,15 @@ def refined(image: GreyImage, grid: Array, known: Bools | None = None, reach: fl
     out = np.full(grid.shape, np.nan)
     look = np.full((rows, columns, 4), np.nan)  # directions and sigmas of the edges
     within = known & np.all((grid >= 0) & (grid <= np.array(image.shape[::-1]) - 1), axis=-1)
-    sizes = np.unique(half[within]).tolist()
-    for size in sizes:
+    for size in np.unique(half[within]).tolist():
         which = within & (half == size)
         start = np.ascontiguousarray(grid[which], dtype=np.float32).reshape(-1, 1, 2)
         out[which] = cv2.cornerSubPix(image, start, (size, size), (-1, -1), _STOP).reshape(-1, 2)
+    window = np.minimum(half, _straight_px(_local_shape(out, within)))
     for small_px in _SMALL_PX:
         shape = _local_shape(out, within)
-        for size in sizes:
-            chosen = np.argwhere(within & (half == size))
+        for size in np.unique(window[within]).tolist():
+            chosen = np.argwhere(within & (window == size))
             for first in range(0, len(chosen), _AT_ONCE):
                 i, j = chosen[first : first + _AT_ONCE].T
                 steps, new = shape[i, j, :2], np.isnan(look[i, j, :1])
@@ -114,7 +115,9 @@ def _saddles(
         e = across / sigma @ t - sigma * curved
         S, slope = erf(e / SINGLE(2**0.5)), SINGLE((2 / math.pi) ** 0.5) * np.exp(-e * e / 2) / sigma
         L[:, 1:3] = weight[:, None] * d / half
-        L[:, 3:] = L[:, :3] * (S[:, :1] * S[:, 1:])
+        # Edges that do not cross at right angles: the first term of the tetrachoric series
+        peak, cos = slope * sigma, np.sum(across[:, 0] * across[:, 1], axis=1)
+        L[:, 3:] = L[:, :3] * (S[:, :1] * S[:, 1:] + cos[:, None, None] * (peak[:, :1] * peak[:, 1:]))
         linear = linear_part(L, grey)
         g = (np.swapaxes(linear[:, 3:], 1, 2).astype(SINGLE) @ L[:, :3]) * S[:, ::-1] * slope
         J[:, :2] = -np.swapaxes(across, 1, 2) @ g
@@ -217,28 +220,41 @@ def _shape_of_block(grid: Array, known: Bools, at: Array, order: int) -> Array |
     return np.concatenate([steps, np.moveaxis(squares, -1, 0) @ taylor[:, 3:]], axis=1)
 
 
+def _straight_px(shape: Array) -> Ints:
+    """Half of the largest windows (rows, columns), px, in which edges deviate from lines by less than _SAG_PX."""
+    along = shape[..., :2, :] / np.maximum(np.linalg.norm(shape[..., :2, :], axis=-1, keepdims=True), 1e-9)
+    x, y = along[..., 0], along[..., 1]
+    bend = np.einsum("...ek,...kc->...ec", np.stack([x * x, x * y, y * y], axis=-1), shape[..., 2:, :])
+    most = np.max(np.abs(bend[..., 0] * y - bend[..., 1] * x), axis=-1)
+    return np.asarray(np.sqrt(_SAG_PX / np.maximum(most, 1e-9)).astype(int).clip(2))
+
+
 def _by_others(grid: Array) -> tuple[Array, Array]:
     """Where the others of its row or column have each corner (rows, columns, 2), and how far it is off, px.
 
-    Of row and column, the one to which it is closer: where another corner of its row is wrong, the column shows that
-    this one is not. nan where an unknown corner, nan, or fewer than four are in both.
+    Of row and column, each by a curve of two orders, the one to which it is closer: where another corner of its row is
+    wrong, the column shows that this one is not, and squares near a wide lens grow along a line as a cubic does. nan
+    where an unknown corner, nan, or fewer than four are in all.
     """
     rows, columns = (_weights_of_others(n) for n in grid.shape[:2])
-    both = np.stack([columns @ grid, np.einsum("ij,jkc->ikc", rows, grid)])
-    off = np.linalg.norm(both - grid, axis=-1)
-    nearer = np.where(off[1] < np.nan_to_num(off[0], nan=np.inf), 1, 0)
-    return np.where(nearer[..., None], both[1], both[0]), np.where(nearer, off[1], off[0])
+    every = np.concatenate([np.einsum("wij,kjc->wkic", columns, grid), np.einsum("wij,jkc->wikc", rows, grid)])
+    off = np.linalg.norm(every - grid, axis=-1)
+    nearest = np.argmin(np.nan_to_num(off, nan=np.inf), axis=0)[None]
+    return np.take_along_axis(every, nearest[..., None], 0)[0], np.take_along_axis(off, nearest, 0)[0]
 
 
 @cache
 def _weights_of_others(n: int) -> Array:
-    """(n, n): each of n points in equal steps by the polynomial through its four nearest others; at the ends three."""
-    W = np.full((n, n), 0.0 if n >= 4 else np.nan)
+    """(2, n, n): each of n points in equal steps by the cubic of its nearest others; outer ones also by a quadratic."""
+    W = np.full((2, n, n), 0.0 if n >= 4 else np.nan)
     if n >= 4:
-        W[0, 1:4] = W[-1, -2:-5:-1] = 3, -3, 1
-        W[1, [0, 2, 3]] = W[-2, [-1, -3, -4]] = 1 / 3, 1, -1 / 3
+        W[:, 0, 1:4] = W[:, -1, -2:-5:-1] = 3, -3, 1
+        W[:, 1, [0, 2, 3]] = W[:, -2, [-1, -3, -4]] = 1 / 3, 1, -1 / 3
         for k in range(2, n - 2):
-            W[k, k - 2 : k + 3] = np.array([-1, 4, 0, 4, -1]) / 6
+            W[:, k, k - 2 : k + 3] = np.array([-1, 4, 0, 4, -1]) / 6
+    if n >= 5:
+        W[1, 0, 1:5] = W[1, -1, -2:-6:-1] = 4, -6, 4, -1
+        W[1, 1, [0, 2, 3, 4]] = W[1, -2, [-1, -3, -4, -5]] = 1 / 4, 3 / 2, -1, 1 / 4
     return W
 
 
