@@ -115,9 +115,7 @@ def _saddles(
         e = across / sigma @ t - sigma * curved
         S, slope = erf(e / SINGLE(2**0.5)), SINGLE((2 / math.pi) ** 0.5) * np.exp(-e * e / 2) / sigma
         L[:, 1:3] = weight[:, None] * d / half
-        # Edges that do not cross at right angles: the first term of the tetrachoric series
-        peak, cos = slope * sigma, np.sum(across[:, 0] * across[:, 1], axis=1)
-        L[:, 3:] = L[:, :3] * (S[:, :1] * S[:, 1:] + cos[:, None, None] * (peak[:, :1] * peak[:, 1:]))
+        L[:, 3:] = L[:, :3] * (S[:, :1] * S[:, 1:])
         linear = linear_part(L, grey)
         g = (np.swapaxes(linear[:, 3:], 1, 2).astype(SINGLE) @ L[:, :3]) * S[:, ::-1] * slope
         J[:, :2] = -np.swapaxes(across, 1, 2) @ g

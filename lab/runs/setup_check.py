@@ -21,7 +21,6 @@ from tracking.detections import Detections
 from tracking.setup_mistakes.evidence import (
     LEAST_FITTING,
     LEAST_POINTS,
-    SIGMA_PX,
     Comparison,
     Frames,
     compare,
@@ -66,13 +65,6 @@ class SampledFrames:
     def blocks(self) -> list[Block]:
         """The points of the frames."""
         return [[points_in(frame) for frame in block] for block in self.frames]
-
-    @property
-    def sigma_px(self) -> float:
-        """Of a point's coordinate, the median."""
-        variances = [found.variance_px2 for frame in self.even.kept for found in points_in(frame).values()]
-        every = np.concatenate(variances) if variances else np.zeros(0)
-        return float(np.sqrt(np.median(every))) if len(every) else SIGMA_PX
 
 
 def points_in(frame: FrameSet) -> dict[str, Detections]:
@@ -166,7 +158,7 @@ def mistakes_of_run(
     tested = not passes or unused or doubtful
     found = recorded_mistakes(run, pictures.blocks, explained=explained) if tested else ()
     if passes and not unused and verdict(found) is not Level.FAIL:
-        return (*hidden_by_symmetry(run, statistics, pictures.sigma_px), *of_files)
+        return (*hidden_by_symmetry(run, statistics), *of_files)
     # Of a run, all pictures show whether a camera is used, not only the sampled ones; without any pose none is.
     others = [f for f in found if f.code != UNUSED]
     if verdict(found) is Level.FAIL or not statistics.measured:
@@ -175,15 +167,12 @@ def mistakes_of_run(
     return (*unlabelled, *others, *of_files)
 
 
-def hidden_by_symmetry(run: Run, statistics: RunStatistics, sigma_px: float) -> tuple[Finding, ...]:
-    """Findings on mistakes with which another first pose within the prior explains a run without truth as well.
-
-    sigma_px: of points.
-    """
+def hidden_by_symmetry(run: Run, statistics: RunStatistics) -> tuple[Finding, ...]:
+    """Findings on mistakes with which another first pose within the prior explains a run without truth as well."""
     if statistics.first_pose is None or (run.folder / "truth" / "pose.csv").exists():
         return ()
     prior = PosePrior.everywhere(run.rig) if run.prior is None else run.prior
-    hidden = invisible_mistakes(run.rig, prior, run.tracker.labels, statistics.first_pose, sigma_px)
+    hidden = invisible_mistakes(run.rig, prior, run.tracker.labels, statistics.first_pose)
     return tuple(
         finding(
             "BP-M10",

@@ -211,8 +211,7 @@ TRIED = 2
 BESIDE = (0.05, 0.03, -0.04, 0.05, -0.03, 0.04)  # m and rad, from the first pose of a recording to one beside it ...
 STEPS = (1.0, -1.0, 0.3, -0.3, 0.1, -0.1)  # ... times the first of these with which most cameras see a spot, ...
 NEAR_M, NEAR_RAD = 0.3, 0.3  # ... whose counterpart is searched for this near that of the first
-SIGMA_PX = 0.1  # of the simulated points, where no recording states it; they are exact, and fit a symmetric rig ...
-LARGEST_RMS_PX = 0.02  # ... to less than this
+LARGEST_RMS_PX = 0.02  # to which a symmetric rig fits the simulated points, which are exact
 P_SAME = 1e-3  # poses of the same points that differ by less than errors of this probability are the same
 
 
@@ -232,18 +231,14 @@ class Invisible:
 
 
 def invisible_mistakes(
-    rig: Rig,
-    prior: PosePrior | None,
-    parameters: LabelParameters,
-    first: Pose | None = None,
-    sigma_px: float = SIGMA_PX,
+    rig: Rig, prior: PosePrior | None, parameters: LabelParameters, first: Pose | None = None
 ) -> Iterator[Invisible]:
     """The mistakes that a rig hides over the poses of a prior (without one: of a usual range).
 
-    first: of a recording, to which the prior refers; then only this pose and one beside it are tried. sigma_px: of
-    points.
+    first: of a recording, to which the prior refers; then only this pose and one beside it are tried. Points have the
+    usual error of a calibrated rig as their sigma: a mistake that changes less is none.
     """
-    model = SpotModel.of(rig)
+    model, sigma_px = SpotModel.of(rig), parameters.model_sigma_px
     prior = assumed_range(rig) if prior is None else prior
     # A pose on the axis of symmetry is the same with the mistake; the one beside it shows whether others differ.
     beside = np.outer((0.0, *STEPS), BESIDE)
