@@ -23,7 +23,6 @@ from geometry.arrays import Array, Bools, Ints
 
 _REACH = 0.4  # half of the window, in distances of the nearest parallel edge, which would be included from 0.5 on
 _MOST_PX = 12  # half of the window: a larger one includes more curved edges, and takes longer
-_SAG_PX = 0.03  # by which edges curve in half of the window: their curvature is known to some per cent
 _OFF = 0.3  # distances of parallel edges from where the others of its row and column have it: it is not that corner
 _SPARE = 2  # known corners around a corner beyond the coefficients of its curvature
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
@@ -58,15 +57,15 @@ def refined(image: GreyImage, grid: Array, known: Bools | None = None, reach: fl
     out = np.full(grid.shape, np.nan)
     look = np.full((rows, columns, 4), np.nan)  # directions and sigmas of the edges
     within = known & np.all((grid >= 0) & (grid <= np.array(image.shape[::-1]) - 1), axis=-1)
-    for size in np.unique(half[within]).tolist():
+    sizes = np.unique(half[within]).tolist()
+    for size in sizes:
         which = within & (half == size)
         start = np.ascontiguousarray(grid[which], dtype=np.float32).reshape(-1, 1, 2)
         out[which] = cv2.cornerSubPix(image, start, (size, size), (-1, -1), _STOP).reshape(-1, 2)
-    window = np.minimum(half, _straight_px(_local_shape(out, within)))
     for small_px in _SMALL_PX:
         shape = _local_shape(out, within)
-        for size in np.unique(window[within]).tolist():
-            chosen = np.argwhere(within & (window == size))
+        for size in sizes:
+            chosen = np.argwhere(within & (half == size))
             for first in range(0, len(chosen), _AT_ONCE):
                 i, j = chosen[first : first + _AT_ONCE].T
                 steps, new = shape[i, j, :2], np.isnan(look[i, j, :1])
@@ -216,15 +215,6 @@ def _shape_of_block(grid: Array, known: Bools, at: Array, order: int) -> Array |
     squares = np.array([[p * p, p * q, q * q], [2 * p * r, p * s + q * r, 2 * q * s], [r * r, r * s, s * s]])
     steps = np.stack([w[:, 2] - w[:, 1], w[:, 4] - w[:, 3]], axis=1) @ taylor[:, 1:3]
     return np.concatenate([steps, np.moveaxis(squares, -1, 0) @ taylor[:, 3:]], axis=1)
-
-
-def _straight_px(shape: Array) -> Ints:
-    """Half of the largest windows (rows, columns), px, in which edges deviate from lines by less than _SAG_PX."""
-    along = shape[..., :2, :] / np.maximum(np.linalg.norm(shape[..., :2, :], axis=-1, keepdims=True), 1e-9)
-    x, y = along[..., 0], along[..., 1]
-    bend = np.einsum("...ek,...kc->...ec", np.stack([x * x, x * y, y * y], axis=-1), shape[..., 2:, :])
-    most = np.max(np.abs(bend[..., 0] * y - bend[..., 1] * x), axis=-1)
-    return np.asarray(np.sqrt(_SAG_PX / np.maximum(most, 1e-9)).astype(int).clip(2))
 
 
 def _by_others(grid: Array) -> tuple[Array, Array]:
