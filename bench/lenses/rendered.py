@@ -37,7 +37,7 @@ BOARDS = {
     "acircles": "acircles:4x11:24mm",
     "charuco": "charuco:9x7:30mm:22mm:DICT_4X4_50",
 }
-LOOK = PhotoSettings(blur_px=0.7, noise_dn=2.0, samples=64)
+LOOK = PhotoSettings(blur_px=0.7, noise_dn=2.0)
 MOST_TILT_DEG = 65.0  # of a board against the line of sight: nobody photographs boards almost from the side
 
 

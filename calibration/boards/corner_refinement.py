@@ -220,25 +220,29 @@ def _shape_of_block(grid: Array, known: Bools, at: Array, order: int) -> Array |
 def _by_others(grid: Array) -> tuple[Array, Array]:
     """Where the others of its row or column have each corner (rows, columns, 2), and how far it is off, px.
 
-    Of row and column, the one to which it is closer: where another corner of its row is wrong, the column shows that
-    this one is not. nan where an unknown corner, nan, or fewer than four are in both.
+    Of row and column, each by a curve of two orders, the one to which it is closer: where another corner of its row is
+    wrong, the column shows that this one is not, and squares near a wide lens grow along a line as a cubic does. nan
+    where an unknown corner, nan, or fewer than four are in all.
     """
     rows, columns = (_weights_of_others(n) for n in grid.shape[:2])
-    both = np.stack([columns @ grid, np.einsum("ij,jkc->ikc", rows, grid)])
-    off = np.linalg.norm(both - grid, axis=-1)
-    nearer = np.where(off[1] < np.nan_to_num(off[0], nan=np.inf), 1, 0)
-    return np.where(nearer[..., None], both[1], both[0]), np.where(nearer, off[1], off[0])
+    every = np.concatenate([np.einsum("wij,kjc->wkic", columns, grid), np.einsum("wij,jkc->wikc", rows, grid)])
+    off = np.linalg.norm(every - grid, axis=-1)
+    nearest = np.argmin(np.nan_to_num(off, nan=np.inf), axis=0)[None]
+    return np.take_along_axis(every, nearest[..., None], 0)[0], np.take_along_axis(off, nearest, 0)[0]
 
 
 @cache
 def _weights_of_others(n: int) -> Array:
-    """(n, n): each of n points in equal steps by the polynomial through its four nearest others; at the ends three."""
-    W = np.full((n, n), 0.0 if n >= 4 else np.nan)
+    """(2, n, n): each of n points in equal steps by the cubic of its nearest others; outer ones also by a quadratic."""
+    W = np.full((2, n, n), 0.0 if n >= 4 else np.nan)
     if n >= 4:
-        W[0, 1:4] = W[-1, -2:-5:-1] = 3, -3, 1
-        W[1, [0, 2, 3]] = W[-2, [-1, -3, -4]] = 1 / 3, 1, -1 / 3
+        W[:, 0, 1:4] = W[:, -1, -2:-5:-1] = 3, -3, 1
+        W[:, 1, [0, 2, 3]] = W[:, -2, [-1, -3, -4]] = 1 / 3, 1, -1 / 3
         for k in range(2, n - 2):
-            W[k, k - 2 : k + 3] = np.array([-1, 4, 0, 4, -1]) / 6
+            W[:, k, k - 2 : k + 3] = np.array([-1, 4, 0, 4, -1]) / 6
+    if n >= 5:
+        W[1, 0, 1:5] = W[1, -1, -2:-6:-1] = 4, -6, 4, -1
+        W[1, 1, [0, 2, 3, 4]] = W[1, -2, [-1, -3, -4, -5]] = 1 / 4, 3 / 2, -1, 1 / 4
     return W
 
 

@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geometry import rotations
 from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
-from geometry.pose_solver.gauss_newton import whiten
+from geometry.pose_solver.gauss_newton import PoseFit, whiten
 from geometry.pose_solver.visibility import assumed_range, poses_within
 from geometry.rig import Rig
 from geometry.uncertainty.chi_square import chi2_limit
@@ -210,10 +209,10 @@ NAMES = "target"  # the kind of mistakes that may exchange names only
 POSES = 200  # of which the TRIED with the most visible spots are tried
 TRIED = 2
 BESIDE = (0.05, 0.03, -0.04, 0.05, -0.03, 0.04)  # m and rad, from the first pose of a recording to one beside it ...
+STEPS = (1.0, -1.0, 0.3, -0.3, 0.1, -0.1)  # ... times the first of these with which most cameras see a spot, ...
 NEAR_M, NEAR_RAD = 0.3, 0.3  # ... whose counterpart is searched for this near that of the first
-SIGMA_PX = 0.1  # of the simulated points; they are exact, and fit a symmetric rig ...
-LARGEST_RMS_PX = 0.02  # ... to less than this
-SAME_M, SAME_DEG = 1e-3, 0.01  # poses that differ by less are the same
+LARGEST_RMS_PX = 0.02  # to which a symmetric rig fits the simulated points, which are exact
+P_SAME = 1e-3  # poses of the same points that differ by less than errors of this probability are the same
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,11 +222,12 @@ class Invisible:
     mistake: Mistake
     off_m: float
     off_deg: float
+    chi2: float  # of the poses' difference, with the covariances of both
 
     @property
     def is_harmless(self) -> bool:
-        """Whether the poses are the same: only names are exchanged."""
-        return self.off_m < SAME_M and self.off_deg < SAME_DEG
+        """Whether the poses are the same to their sigmas, as where only names are exchanged."""
+        return self.chi2 < chi2_limit(P_SAME, 6)
 
 
 def invisible_mistakes(
@@ -235,40 +235,48 @@ def invisible_mistakes(
 ) -> Iterator[Invisible]:
     """The mistakes that a rig hides over the poses of a prior (without one: of a usual range).
 
-    first: of a recording, to which the prior refers; then only this pose and one beside it are tried.
+    first: of a recording, to which the prior refers; then only this pose and one beside it are tried. Points have the
+    usual error of a calibrated rig as their sigma: a mistake that changes less is none.
     """
-    model = SpotModel.of(rig)
+    model, sigma_px = SpotModel.of(rig), parameters.model_sigma_px
     prior = assumed_range(rig) if prior is None else prior
     # A pose on the axis of symmetry is the same with the mistake; the one beside it shows whether others differ.
-    poses = poses_within(prior, POSES) if first is None else first.plus(np.array([np.zeros(6), BESIDE]))
+    beside = np.outer((0.0, *STEPS), BESIDE)
+    poses = poses_within(prior, POSES) if first is None else first.plus(beside)
     views = np.count_nonzero(model.in_picture(model.project(poses)[0]).any(axis=0))
     for mistake in possible_mistakes(rig):
         late = any(change.later for change in mistake.pictures.values())
         if mistake.by_itself or late or not (mistake.kind == NAMES or mistake.has_effect(rig)):
             continue
         true = SpotModel.of(mistake.rig)
-        pixels = true.project(poses)[0]
+        pixels, jacobian = true.project(poses)
         seen = true.in_picture(pixels)
         if np.count_nonzero(seen.any(axis=0)) < views:
             continue  # such a rig would have spots that it never sees
         recorded = _recorded(mistake, true, pixels)
         off: list[Array] = []
-        rows = np.argsort(-seen.sum(axis=1), kind="stable")[:TRIED] if first is None else (0, 1)
+        # Where the camera with the mistake sees no spot, everything fits.
+        seeing = np.count_nonzero([seen[:, true.camera_of == c].any(axis=1) for c in set(true.camera_of)], axis=0)
+        if first is None:
+            rows = np.argsort(-seen.sum(axis=1), kind="stable")[:TRIED]
+        else:
+            rows = np.array([0, 1 + np.argmax(seeing[1:])])
         near = prior
         for k in rows:
-            points = _detections(mistake, true, recorded[k], seen[k])
+            points = _detections(mistake, true, recorded[k], seen[k], sigma_px)
             if sum(map(len, points.values())) < max(parameters.min_spots, 1):
                 break
             found = candidate_labellings(rig, model, points, near, parameters, most=1)
             if not found or not _explains_all(found[0], points):
                 break
-            other = found[0].fit.world_from_body
-            off.append(_off(other, poses[int(k)]))
+            pose, fit = poses[int(k)], found[0].fit
+            J = jacobian[k][seen[k]].reshape(-1, 6) / sigma_px
+            off.append(_off(fit, pose, np.linalg.pinv(J.T @ J, hermitian=True)))
             if first is not None:
-                near = PosePrior(other, NEAR_M, NEAR_RAD)
+                near = PosePrior(fit.world_from_body, NEAR_M, NEAR_RAD)
         if len(off) == TRIED:
             worst = np.max(off, axis=0)
-            yield Invisible(mistake, float(worst[0]), float(np.rad2deg(worst[1])))
+            yield Invisible(mistake, float(worst[0]), float(np.rad2deg(worst[1])), float(worst[2]))
 
 
 def _recorded(mistake: Mistake, model: SpotModel, pixels: Array) -> Array:
@@ -280,25 +288,29 @@ def _recorded(mistake: Mistake, model: SpotModel, pixels: Array) -> Array:
     return out
 
 
-def _detections(mistake: Mistake, model: SpotModel, recorded: Array, seen: Array) -> dict[str, Detections]:
+def _detections(
+    mistake: Mistake, model: SpotModel, recorded: Array, seen: Array, sigma_px: float
+) -> dict[str, Detections]:
     """The recorded points of one pose, by the camera under whose name they are recorded."""
     out = {}
     for c, name in enumerate(model.camera_names):
         uv = recorded[(model.camera_of == c) & seen]
         change = mistake.pictures.get(name)
         out[name if change is None else change.source] = Detections.at(
-            uv, np.tile(SIGMA_PX**2 * np.eye(2), (len(uv), 1, 1))
+            uv, np.tile(sigma_px**2 * np.eye(2), (len(uv), 1, 1))
         )
     return out
 
 
 def _explains_all(one: Labelling, points: dict[str, Detections]) -> bool:
-    """Whether every point has a label, and lies where the pose puts its spot."""
-    labelled = int(np.count_nonzero(one.point_of != NO_POINT))
-    return labelled == sum(map(len, points.values())) and one.fit.dof > 0 and one.fit.rms_px < LARGEST_RMS_PX
+    """Whether every point has a label, and lies where the pose, which they determine, puts its spot."""
+    fit, labelled = one.fit, int(np.count_nonzero(one.point_of != NO_POINT))
+    every = labelled == sum(map(len, points.values()))
+    return every and fit.dof > 0 and fit.observable and fit.rms_px < LARGEST_RMS_PX
 
 
-def _off(one: Pose, other: Pose) -> Array:
-    """Distance, m, and angle, rad, between two poses (2,)."""
-    turn = rotations.angle(one.rotation.T @ other.rotation)
-    return np.array([np.linalg.norm(one.translation - other.translation), float(turn)])
+def _off(fit: PoseFit, pose: Pose, covariance: Array) -> Array:
+    """Distance, m, and angle, rad, of a fitted pose from another one, and the chi-square of their difference (3,)."""
+    off = fit.world_from_body.minus(pose)
+    chi2 = off @ np.linalg.solve(fit.covariance + covariance, off)
+    return np.array([np.linalg.norm(off[:3]), np.linalg.norm(off[3:]), chi2])

@@ -391,3 +391,15 @@ def test_the_large_circle_of_the_robots_target_is_first_in_all_its_pictures():
             for x, y in ((u, v), other)
         ]
         assert black_share[0] > 1.8 * black_share[1]
+
+
+def test_a_corner_of_a_board_close_to_a_fisheye_lens_is_not_moved_to_where_a_quadratic_has_it():
+    """Squares of 30 to 230 px: the outermost corner is .34 squares from the quadratic of its row and of its column."""
+    board = parse("chessboard:9x6:30mm")
+    matrix = np.array([[420, 0, 639.5], [0, 420, 479.5], [0, 0, 1.0]])
+    near = Camera("c", "s", (1280, 960), matrix, (0.02, 0.0, 0.0, 0.0), Pose.identity(), lens=FISHEYE)
+    R = rotations.exp(np.array([0.12, 0.33, -0.12]))
+    photo = photograph(board, near, Pose(R, np.array([-0.039, 0.021, 0.076]) - R @ board.middle), look=CLEAN)
+    grid = photo.pixels.reshape(board.rows, board.columns, 2)
+    found = corner_refinement.refined(photo.image, grid + 0.3).pixels
+    assert np.max(np.linalg.norm(found - grid, axis=-1)) < 0.5  # 47 px if it is moved; its edges are strongly curved

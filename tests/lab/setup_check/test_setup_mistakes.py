@@ -234,6 +234,27 @@ def test_exchanged_beams_of_a_fan_change_names_only():
     assert all(one.is_harmless for one in beams)
 
 
+@pytest.mark.parametrize(
+    ("longer", "model_px", "harmless"), [(1e-4, 0.3, True), (1e-4, 0.003, False), (5e-4, 0.3, True)]
+)
+def test_poses_are_the_same_if_they_differ_by_less_than_their_sigmas(longer, model_px, harmless):
+    """Exchanged lenses that hardly differ: the poses are .3 mm and 1.3 mm off."""
+    rig = fan()
+    right = rig.cameras["right"]
+    matrix = right.matrix * np.array([[1 + longer, 1, 1], [1, 1 + longer, 1], [1, 1, 1]])
+    rig = replace(rig, cameras={**rig.cameras, "right": replace(right, matrix=matrix)})
+    first = Pose.from_ypr(np.deg2rad([1, 2, 0]), np.array([0.02, 0.01, 0]))
+    hidden = list(invisible_mistakes(rig, None, LabelParameters(model_sigma_px=model_px), first))
+    assert [one.is_harmless for one in hidden if "each other's lens" in one.mistake.what] == [harmless]
+
+
+def test_a_pose_with_which_the_mirrored_camera_sees_nothing_hides_no_mirror():
+    """The one spot of camera `right` is near the middle of its picture; from the pose 5 cm beside it sees none."""
+    scene = random_scene(91159)
+    hidden = invisible_mistakes(scene.known_rig, scene.prior, LabelParameters(), scene.poses[0])
+    assert [one.mistake.what for one in hidden] == ["beams `C` and `D` are exchanged"]
+
+
 def test_each_possible_mistake_can_be_undone():
     rig = unequal_fan()
     rng = np.random.default_rng(0)
