@@ -216,6 +216,9 @@ def test_a_vehicle_at_rest_gives_no_confident_rig(lab, tmp_path):
     white = np.linalg.lstsq(r.after.root, error, rcond=1e-9)[0]
     assert outcome.level == 2 or np.sum(white**2) < chi2_limit(0.001, len(white))
     assert np.sum(r.gain > 1) < np.sum(lab[3].result.refined.gain > 1)
+    unchecked = [f for f in outcome.findings if f.what.startswith("nothing is stated of the focal lengths")]
+    assert [(f.level, "cameras.left, cameras.right" in f.what) for f in unchecked] == [(Level.WARN, True)]
+    assert not any("focal lengths" in f.what for f in lab[3].findings)  # motion checks them
 
 
 def test_exchanged_cameras_are_refused_and_nothing_is_written(lab, tmp_path):
