@@ -34,7 +34,7 @@ class ErrorScale:
     misfit_share: Array  # (cameras,) least error by misfits of the fits (speckle, texture), as a share of the widths
     width_share: Array  # (cameras,) errors beyond the stated ones, as a share of the spots' widths (1 sigma)
     noise_scale: float  # ratio of the errors to the stated sigmas beyond these
-    factors: VarianceFactors  # of both parts of the stated variances
+    factors: VarianceFactors  # of the parts of the stated variances
 
     @staticmethod
     def of(
@@ -48,11 +48,11 @@ class ErrorScale:
         views, camera = model.numbers, model.camera_of
         misfit = usual_misfit(run, place_px2, assigned, camera)
         own = _cameras_of(run)
-        place = _place_variance(place_px2, run.size_px, misfit[own])
-        even = run._replace(cov=_with_more(run.cov, place - place_px2))
+        least = _least_variance(place_px2, run.size_px, misfit[own])
+        even = run._replace(cov=_with_more(run.cov, least))
 
         def factors_of(some: RunDetections) -> VarianceFactors:
-            return variance_factors(views, some, assigned, camera, place, calibration_cov, ref, measured)
+            return variance_factors(views, some, assigned, camera, place_px2, least, calibration_cov, ref, measured)
 
         seen = scattered_width_share(even, assigned, camera)
         wider = widened(even, seen)
@@ -60,7 +60,7 @@ class ErrorScale:
         if seen.any():
             seen = _less(seen, factors.noise, wider, even)
             factors = factors_of(widened(even, seen))
-        even = even._replace(cov=_within(factors, even.cov, place, own))
+        even = even._replace(cov=_within(factors, even.cov, place_px2, least, own))
         wider = widened(even, seen)
         # A vehicle at rest has few residuals that are independent of each other.
         usual = max(DEADBAND, 1 + 3 * np.sqrt(2 / max(factors.freedom, 1e-9)))
@@ -73,15 +73,16 @@ class ErrorScale:
 
         place_px2 (m,): part of the stated variances that belongs to the place. Unknown widths (nan) add nothing.
         """
-        place = _place_variance(place_px2, width_px, self.misfit_share[camera])
-        within = _within(self.factors, _with_more(stated, place - place_px2), place, camera)
+        least = _least_variance(place_px2, width_px, self.misfit_share[camera])
+        within = _within(self.factors, _with_more(stated, least), place_px2, least, camera)
         return _with_more(within, _variance_of_share(width_px, self.width_share[camera])) * self.noise_scale**2
 
     def place_px2(self, run: RunDetections, stated_px2: Array) -> Array:
         """(m,): variances of a run's detections that belong to their places."""
         camera = _cameras_of(run)
-        place = _place_variance(stated_px2, run.size_px, self.misfit_share[camera])
-        return place * self.factors.place[camera] * self.noise_scale**2
+        least = _least_variance(stated_px2, run.size_px, self.misfit_share[camera])
+        place = stated_px2 * self.factors.place[camera] + least * self.factors.misfit[camera]
+        return np.asarray(place * self.noise_scale**2)
 
     def of_run(self, run: RunDetections, place_px2: Array) -> Array:
         """Covariances (m, 2, 2) of all detections of a run."""
@@ -99,9 +100,9 @@ def _variance_of_share(width_px: Array, share: Array | float) -> Array:
     return np.asarray((share * np.where(np.isnan(width_px), 0.0, width_px)) ** 2)
 
 
-def _place_variance(stated_px2: Array, width_px: Array, share: Array | float) -> Array:
-    """(m,): variances, px^2, that belong to places: as stated, and at least those of a share of the widths (m,), px."""
-    return np.asarray(np.maximum(stated_px2, _variance_of_share(width_px, share)))
+def _least_variance(stated_px2: Array, width_px: Array, share: Array | float) -> Array:
+    """(m,): what is missing, px^2, in the stated variances of places to those of a share of the widths (m,), px."""
+    return np.asarray(np.maximum(_variance_of_share(width_px, share) - stated_px2, 0.0))
 
 
 def _with_more(cov: Array, variance_px2: Array) -> Array:
@@ -109,14 +110,16 @@ def _with_more(cov: Array, variance_px2: Array) -> Array:
     return np.asarray(cov + variance_px2[:, None, None] * np.eye(2))
 
 
-def _within(factors: VarianceFactors, cov: Array, place_px2: Array, camera: Ints | int) -> Array:
-    """Covariances (m, 2, 2) with both parts multiplied by their factors; their shape is kept.
+def _within(factors: VarianceFactors, cov: Array, place_px2: Array, least_px2: Array, camera: Ints | int) -> Array:
+    """Covariances (m, 2, 2) with their parts multiplied by their factors; their shape is kept.
 
-    place_px2 (m,): the part that belongs to places.
+    place_px2, least_px2 (m,): the parts that belong to places.
     """
-    share = np.minimum(place_px2 / np.maximum(0.5 * np.trace(cov, axis1=1, axis2=2), 1e-300), 1.0)
-    factor = (1 - share) * factors.noise[camera] + share * factors.place[camera]
-    return np.asarray(cov * factor[:, None, None])
+    own = np.maximum(0.5 * np.trace(cov, axis1=1, axis2=2), 1e-300)
+    place = np.minimum(place_px2 / own, 1.0)
+    least = np.minimum(least_px2 / own, 1.0 - place)
+    noise = (1 - place - least) * factors.noise[camera]
+    return np.asarray(cov * (noise + place * factors.place[camera] + least * factors.misfit[camera])[:, None, None])
 
 
 def _less(share: Array, factor: Array, wider: RunDetections, stated: RunDetections) -> Array:

@@ -29,10 +29,11 @@ _ROBUST = 9.0  # times its median: most that a square of a residual counts; norm
 
 
 class VarianceFactors(NamedTuple):
-    """Factors (cameras,) of the two parts of the spots' variances."""
+    """Factors (cameras,) of the three parts of the spots' variances."""
 
     noise: Array
-    place: Array  # of the part that belongs to places
+    place: Array  # of the part that is stated for each place
+    misfit: Array  # of the part that each spot has at least, which belongs to places, too
     freedom: float  # of the mean square of all residuals: twice its squared inverse scatter
 
 
@@ -42,28 +43,29 @@ class Squares(NamedTuple):
     ratio: Array
     noise: Array
     place: Array
+    misfit: Array
     known: Array  # errors of the calibration
     weight: Array  # number of independent pairs of coordinates that each stands for
 
 
 def variance_factors(
-    views: Views, run: RunDetections, assigned: Ints, camera_of: Ints, place_px2: Array, calibration_cov: Array,
-    ref: Reference, measured: Bools,
+    views: Views, run: RunDetections, assigned: Ints, camera_of: Ints, place_px2: Array, misfit_px2: Array,
+    calibration_cov: Array, ref: Reference, measured: Bools,
 ) -> VarianceFactors:  # fmt: skip
-    """The factors of both parts of the stated variances, as the residuals show them.
+    """The factors of the parts of the stated variances, as the residuals show them.
 
-    run: m detections of T frames; assigned (T, n): their labels; camera_of (n,): of the views; place_px2 (m,): part of
-    their variances that belongs to places; calibration_cov (n, 2, 2), px^2; ref (T,): motion near which the pose of
-    each frame is found.
+    run: m detections of T frames; assigned (T, n): their labels; camera_of (n,): of the views; place_px2, misfit_px2
+    (m,): parts of their variances that belong to places, as stated for each and what each has at least;
+    calibration_cov (n, 2, 2), px^2; ref (T,): motion near which the pose of each frame is found.
 
     Noise differs in every frame, errors of one place count once: a vehicle at rest has few residuals that are
     independent of each other. There the change of a residual from frame to frame shows the noise alone.
     """
-    noise, place = np.ones(run.has_image.shape[1]), np.ones(run.has_image.shape[1])
+    factors = np.ones((3, run.has_image.shape[1]))
     labelled = (assigned >= 0) & (assigned < BLENDED)
     frames = evenly_spread(np.flatnonzero(measured & (labelled.sum(axis=1) > 3)), _FRAMES)
     if not len(frames):
-        return VarianceFactors(noise, place, 0.0)
+        return VarianceFactors(factors[0], factors[1], factors[2], 0.0)
     some, assigned, labelled = run._replace(begin=run.begin[frames]), assigned[frames], labelled[frames]
     row = np.where(labelled, some.begin[:, None] + assigned, 0)
     near = Reference(ref.R[frames], ref.t[frames], ref.m[frames])
@@ -76,7 +78,8 @@ def variance_factors(
     size2, own = 0.5 * np.trace(cov, axis1=2, axis2=3), 0.5 * np.trace(run.cov[row], axis1=2, axis2=3)
     residual = np.where(usable[..., None], run.uv[row] - uv, np.nan)
     part = np.minimum(place_px2[row], own)
-    parts = np.stack([own - part, part], axis=-1) / size2[..., None]  # the rest is that of the calibration
+    least = np.minimum(misfit_px2[row], own - part)
+    parts = np.stack([own - part - least, part, least], axis=-1) / size2[..., None]  # the rest is the calibration's
     same = np.full(assigned.shape, np.nan)  # frames with the same error of a place
     rho = np.zeros((len(frames) - 1, assigned.shape[1]))  # correlation of such errors in successive frames
     measured_px = np.where(labelled[..., None], run.uv[row], np.nan)
@@ -86,40 +89,40 @@ def variance_factors(
     square = 0.5 * np.sum(residual**2, axis=-1) / (size2 * free)
     step = 0.5 * np.sum(np.diff(residual, axis=0) ** 2, axis=-1) / (size2 * free)[1:]
     weight = np.where(usable, free, 0.0)
-    of_place = float(np.sum(weight * parts[..., 1])) / max(float(weight.sum()), 1e-9)
-    every, places = 2 * float(weight.sum()), 2 * float(np.sum(weight / np.where(usable, same, 1.0)))
-    freedom = 1 / ((1 - of_place) ** 2 / max(every, 1e-9) + of_place**2 / max(places, 1e-9))
-    for camera in range(len(noise)):
+    of_place = float(np.sum(weight * parts[..., 1:].sum(axis=-1))) / max(float(weight.sum()), 1e-9)
+    every, independent = 2 * float(weight.sum()), 2 * float(np.sum(weight / np.where(usable, same, 1.0)))
+    freedom = 1 / ((1 - of_place) ** 2 / max(every, 1e-9) + of_place**2 / max(independent, 1e-9))
+    for camera in range(factors.shape[1]):
         at = usable & (camera_of == camera)
         pair = at[1:] & at[:-1] & (rho > _ALIKE)
+        of_step = (1 - rho)[..., None] * parts[1:, :, 1:]
+        known, once = 1 - parts[at].sum(axis=1), (free / same)[at]
+        noise, places, again = parts[1:][pair][:, 0], of_step[pair], (free - free / same)[1:][pair]
         both = [
-            Squares(square[at], parts[at][:, 0], parts[at][:, 1], 1 - parts[at].sum(axis=1), (free / same)[at]),
-            Squares(
-                0.5 * step[pair], parts[1:][pair][:, 0], ((1 - rho) * parts[1:, :, 1])[pair], np.zeros(pair.sum()),
-                (free - free / same)[1:][pair],
-            ),
-        ]  # fmt: skip
+            Squares(square[at], parts[at][:, 0], parts[at][:, 1], parts[at][:, 2], known, once),
+            Squares(0.5 * step[pair], noise, places[:, 0], places[:, 1], np.zeros(pair.sum()), again),
+        ]
         if np.count_nonzero(at):
             squares = Squares._make(np.concatenate(a) for a in zip(*both, strict=True))
-            noise[camera], place[camera] = likely_factors(squares)
-    return VarianceFactors(noise, place, freedom)
+            factors[:, camera] = likely_factors(squares)
+    return VarianceFactors(factors[0], factors[1], factors[2], freedom)
 
 
-def likely_factors(squares: Squares) -> tuple[float, float]:
-    """Means of the factors of noise and of errors of places under their posterior distribution.
+def likely_factors(squares: Squares) -> Array:
+    """Means (3,) of the factors of noise, of errors of places and of misfits under their posterior distribution.
 
-    Where places differ, the even ones show the noise and the others the factor. Before the residuals are seen both
-    factors are log-normal with a mean of 1.
+    Where places differ, the even ones show the noise and the others the factor. That each spot has a least error may
+    be wrong while the errors of single places, such as edges, are right: so its factor is its own. Before the residuals
+    are seen all factors are log-normal with a mean of 1.
     """
-    precision = 1 / (2 * np.log([_NOISE_FACTOR, PLACE_FACTOR])) ** 2
+    precision = 1 / (2 * np.log([_NOISE_FACTOR, PLACE_FACTOR, PLACE_FACTOR])) ** 2
     usual = x = -0.5 / precision
     for _ in range(_STEPS):
-        parts = np.stack([squares.noise, squares.place]) * np.exp(x)[:, None]
+        parts = np.stack([squares.noise, squares.place, squares.misfit]) * np.exp(x)[:, None]
         variance = np.maximum(parts.sum(axis=0) + squares.known, _LEAST_VARIANCE)
         slope, ratio = parts / variance, squares.ratio / variance
         ratio = np.minimum(ratio, _ROBUST * np.median(ratio))
         gradient = slope @ (squares.weight * (ratio - 1)) - precision * (x - usual)
         information = (squares.weight * slope) @ slope.T + np.diag(precision)
         x = x + np.clip(np.linalg.solve(information, gradient), -_LARGEST_STEP, _LARGEST_STEP)
-    noise, place = np.exp(x + 0.5 * np.diag(np.linalg.inv(information)))
-    return float(noise), float(place)
+    return np.asarray(np.exp(x + 0.5 * np.diag(np.linalg.inv(information))))
