@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,6 +39,7 @@ SURE_SPOTS = 5  # labels of a frame: false points often agree with the pose of f
 P_FIT = 1e-6  # probability that correct labels do not fit their sigmas
 LEAST_POINTS = 2  # points per picture, median, from which a camera without any label is reported
 LEAST_LABELLED = 0.5  # share of the spots that the poses put into a camera's pictures which have a label
+SAME_PX, MOST_CHANGED = 2.0, 1  # a point at the same place; false points that come or go between frames that are alike
 MODEL_PX = 0.03  # px: model error that is allowed beside the sigmas of the points (calibrations are no better)
 # A frame is searched with at most this effort: 60 mistakes are compared.
 MOST_POINTS, MOST_TRIPLES = 12, 3000
@@ -96,7 +97,7 @@ def compare(
 
     covariance: of the rig's calibration, if known.
     """
-    unlimited = parameters
+    unlimited, frames = parameters, replace(frames, blocks=_distinct(frames.blocks))
     parameters = replace(
         parameters,
         max_points=min(parameters.max_points, MOST_POINTS),
@@ -130,6 +131,29 @@ def compare(
         found = [] if given.is_certain else [one for one in found if _better(one[1], given)]
     limit = float(found[0][1].nats.sum()) - SAME_NATS if found else 0.0
     return Comparison(given, tuple(one for one in found if one[1].nats.sum() >= limit))
+
+
+def _distinct(blocks: Sequence[Block]) -> list[Block]:
+    """The blocks without those that show what an earlier one shows.
+
+    Of a vehicle at rest false points fit the pose of a mistake by chance in all frames alike, and hidden spots are
+    missing in all: such frames are one piece of evidence.
+    """
+    out: list[Block] = []
+    for block in blocks:
+        if not any(_moved(block[HERE], other[HERE]) <= MOST_CHANGED for other in out):
+            out.append(block)
+    return out
+
+
+def _moved(one: Mapping[str, Detections], other: Mapping[str, Detections]) -> int:
+    """The number of points of a frame that another frame does not have at the same place."""
+    count = 0
+    for name, found in one.items():
+        there = other.get(name, Detections.none()).uv_px
+        gap = np.linalg.norm(found.uv_px[:, None] - there, axis=-1).min(axis=1, initial=np.inf)
+        count += int(np.count_nonzero(gap > SAME_PX))
+    return count
 
 
 def _may_see(rig: Rig, prior: PosePrior | None, min_spots: int) -> bool:

@@ -31,6 +31,7 @@ from lab.runs.setup_check import SampledFrames, frames_of
 from lab.simulate.rigs import fan, unequal_fan
 from lab.simulate.write import simulate
 from tests.lab.run_folders import edit, write_run
+from tracking.detections import Detections
 from tracking.parameters import LabelParameters
 from tracking.setup_mistakes import evidence
 from tracking.setup_mistakes.evidence import MOST_POINTS, MOST_TRIPLES, compare, invisible_mistakes
@@ -360,3 +361,37 @@ def test_the_size_of_a_picture_shows_the_mistake(tmp_path, size, words):
     text, status = checked(run)
     assert status == 2
     assert words in text
+
+
+def test_of_a_vehicle_at_rest_a_false_point_that_fits_a_mistake_by_chance_counts_once():
+    """The spot of the third camera is not found; with the camera mirrored, a false point lies where it would be."""
+    scene = random_scene(60070)
+    model, pose, rng = SpotModel.of(scene.rig), scene.poses[0], np.random.default_rng(60070)
+    pixels = model.project(pose)[0]
+    seen, pictures, still = model.in_picture(pixels), SampledFrames(), {}
+    for c, (name, camera) in enumerate(scene.rig.cameras.items()):
+        mine = pixels[seen & (model.camera_of == c)]
+        hidden, spots = (mine, mine[:0]) if name == "third" else (mine[:0], mine)
+        false = rng.uniform([0, 0], camera.image_size_px, (8, 2))
+        still[name] = np.concatenate([spots, false, hidden + rng.normal(0, 25, hidden.shape)])
+    for k in range(40):
+        found = {}
+        for name, uv in still.items():
+            sigma = 2.0 if name == "third" else 0.03
+            found[name] = Detections.at(
+                uv + rng.normal(0, 0.03, uv.shape), np.tile(sigma**2 * np.eye(2), (len(uv), 1, 1))
+            )
+        pictures.add(k, found)
+    frames = frames_of(pictures.blocks, PosePrior(pose, 0.3, 0.3), LabelParameters().min_spots)
+    assert not compare(scene.rig, frames, LabelParameters()).found
+
+
+@pytest.mark.parametrize("name", ["mirrored left-right", "camera_from_world inverted, one"])
+def test_a_mistake_is_named_at_rest_without_a_false_point(tmp_path, name):
+    save_rig(calibrated(unequal_fan(), 1), tmp_path / "rig.yaml")
+    run = simulate(
+        "static", tmp_path / "run", seed=1, frames=FRAMES, detections_only=True, rig=tmp_path / "rig.yaml", clutter=0.0
+    )
+    (run / "truth").rename(tmp_path / "truth")
+    outcome = process_run(with_mistake(name, run, tmp_path / "wrong"), tmp_path / "out")
+    assert re.search(CASE[name].words, outcome.verdict.texts[0])
