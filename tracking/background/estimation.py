@@ -28,6 +28,7 @@ PICTURES = 15  # from which a background is made, spread over the recording
 _LEAST_PICTURES = 9  # usable ones
 _MANY_LIGHTS = 4  # at rest, from which the subtraction is used in any case: it spares their fits
 _LEAST_FOUND = 0.2  # further or better spots per picture from which the subtraction is used
+_ALWAYS = 0.9  # share of the pictures in which another light passes over one at rest, above which that is part of it
 _MOSTLY = 0.7  # share of the pictures with lights that move, above which those at rest in all of them are no spots
 # Contrast up to which the structure is that of the screen's surface, and modulates the spots' light in full. Of what is
 # more, prints or objects, the spots show a part: 0.25 to 0.57 where photographs modulate their light by up to 60 %.
@@ -132,8 +133,12 @@ def _with_shifts(
     widths = np.concatenate([np.sqrt(d.major_px * d.minor_px) for d in found])
     if not len(widths):  # spots may be at rest
         widths = np.sqrt(still.major_px * still.minor_px)
-    changed = np.array([background.lights.in_picture(p)[1] for p in pictures])
-    better = replace(background, fixed=np.asarray(~changed.any(axis=0) & moved))
+    changed, passed = np.array([background.lights.in_picture(p)[1:] for p in pictures]).swapaxes(0, 1)
+    # Where another light is in nearly all pictures, what rests is what the places of a light have in common that moves
+    # by less than its width: that place is searched in the pictures.
+    common = np.column_stack([still.uv_px, background.lights.half_px])[passed.mean(axis=0) > _ALWAYS]
+    unknown = np.concatenate([background.unknown, common])
+    better = replace(background, unknown=unknown, fixed=np.asarray(~changed.any(axis=0) & moved))
     if not len(widths):
         return better
     width = float(np.median(widths))

@@ -153,3 +153,27 @@ def test_the_light_of_a_spot_is_the_normal_density_of_its_ellipse_times_its_flux
     expected = flux * multivariate_normal([20.3, 31.8], covariance).pdf(np.column_stack([u, v]))
     np.testing.assert_allclose(light_at(spot, u, v), expected, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(light_at(spot.joined(spot, 2), u, v), 2 * expected, rtol=1e-4, atol=1e-6)
+
+
+def speckled_pictures(paths: Array, sigma_px: float, contrast: float, seed: int) -> list[Picture]:
+    """Pictures of spots at places (pictures, spots, 2) on a slightly textured screen that gives their light a grain."""
+    rng = np.random.default_rng(seed)
+    grain = [cv2.GaussianBlur(rng.standard_normal(SIZE), (0, 0), 1.2) for _ in range(2)]
+    screen, response = 20 * (1 + 0.018 * grain[0] / grain[0].std()), np.exp(contrast * grain[1] / grain[1].std())
+    mean = [screen + response * round_lights(SIZE, at, 60.0, sigma_px) for at in paths]
+    return [np.rint(m + 0.5 * rng.standard_normal(SIZE)).clip(0, 255).astype(np.uint8) for m in mean]
+
+
+@pytest.mark.parametrize("step_px", [3.0, 5.0, 8.0])
+def test_a_speckled_spot_that_makes_one_step_of_about_its_width_is_found_where_it_is(step_px):
+    """Half of the recording before the step, half after it: both places have light in common that never moves."""
+    paths = np.array([[100.3, 60.2], [180.3, 140.2], [260.3, 220.2], [59.3, 260.2]]) + np.zeros((46, 1, 2))
+    paths[23:] += step_px * np.array([0.6, 0.8])
+    found = found_in_all(speckled_pictures(paths, 3.5, 0.16, 5))
+    near = [
+        [np.count_nonzero(np.hypot(*(d.uv_px - at).T) < 7.0) for at in s] for d, s in zip(found, paths, strict=True)
+    ]
+    gap, sigma = errors(found, paths)
+    assert np.mean(np.array(near) == 1) > 0.95
+    assert gap.max() < 1.0
+    assert np.mean(gap < 3.5 * sigma) > 0.95
