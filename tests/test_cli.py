@@ -432,12 +432,18 @@ def fail_to_write() -> None:
     raise OSError(28, "No space left on device")
 
 
+def hears_signals() -> None:
+    """In the new process: `nohup make test` ignores SIGHUP, and so would the program, as it should."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals of POSIX")
 @pytest.mark.parametrize("sent", ["SIGTERM", "SIGHUP"])
 def test_a_run_that_is_stopped_by_a_signal_leaves_nothing_and_says_so(tmp_path, sent):
     simulate("smooth", tmp_path / "run", seed=5, frames=400, detections_only=True)
     command = [sys.executable, "-P", "-c", PROGRAM, "run", "run", "--out", "out"]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, cwd=tmp_path, preexec_fn=hears_signals, **pipes) as running:
         until = time.monotonic() + 120
         while time.monotonic() < until and not list(tmp_path.glob(".out.part-*/attitude.csv")):
             time.sleep(0.01)
@@ -464,7 +470,7 @@ def test_a_signal_within_a_compiled_function_is_no_unexpected_error(tmp_path):
     )
     (tmp_path / "rig.yaml").write_text("")
     command = [sys.executable, "-P", "-c", program, "check", "rig.yaml"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, preexec_fn=hears_signals)
     assert (done.returncode, done.stderr) == (129, "beampose: stopped by SIGHUP\n")
 
 
