@@ -60,5 +60,4 @@ class Knowledge:
 
 def normal_equations(data: Sequence[Reduced]) -> tuple[Array, Array]:
     """X^T X (p, p) and X^T y (p,) of some recordings."""
-    # The sums begin with the number 0, so that their type is not that of an array.
-    return sum(d.X.T @ d.X for d in data), sum(d.X.T @ d.y for d in data)  # type: ignore[return-value]
+    return np.sum([d.X.T @ d.X for d in data], axis=0), np.sum([d.X.T @ d.y for d in data], axis=0)

@@ -15,9 +15,7 @@ import numpy as np
 
 from calibration.least_squares.adjustment import AdjustmentError, At, Values, solve
 from calibration.model_check.fault_identification import SuspectedFault
-from calibration.model_check.faults import (
-    pixel_velocities,
-)
+from calibration.model_check.faults import pixel_velocities
 from calibration.model_check.linearised_frames import (
     ModelCheckRecording,
     correlation_time,
@@ -73,9 +71,7 @@ class Refinement:
     directions: Array  # (p, r) these directions, as errors of one prior sigma
     p_change: float  # of the changes if the stated sigmas are right
     moved: tuple[SuspectedFault, ...]  # parts that have changed by more than that
-    lens_sigmas: Mapping[
-        str, float
-    ]  # relative, of focal lengths of which nothing is stated, as the recordings show them
+    lens_sigmas: Mapping[str, float]  # of focal lengths of which nothing is stated, relative; by camera
     held_out: tuple[HeldOut, ...]
 
     @property

@@ -34,15 +34,14 @@ class Points(NamedTuple):
     log_unused: Array  # (cameras, most + 1): see `_log_unused`
 
 
-def clearest_first(found: Detections) -> Ints:
+def _clearest_first(found: Detections) -> Ints:
     """The rows of points, by signal to noise: their width over the sigma of their centre; otherwise by flux.
 
     Objects in front of which a spot shines are often brighter than it, but no Gaussian: their centre is uncertain. The
     flux counts where widths are unknown or all sigmas are the same.
     """
-    variance = np.trace(found.cov_px2, axis1=1, axis2=2)
-    clear = found.major_px * found.minor_px / variance
-    measured = len(found) > 1 and np.isfinite(clear).all() and np.ptp(variance) > 0
+    clear = found.major_px * found.minor_px / found.variance_px2
+    measured = len(found) > 1 and np.isfinite(clear).all() and np.ptp(found.variance_px2) > 0
     return np.argsort(-(clear if measured else np.nan_to_num(found.flux, nan=0.0)), kind="stable")
 
 
@@ -69,7 +68,7 @@ def points_of(
         if found is not None and len(found):
             camera = rig.cameras[name]
             screen = rig.screens[camera.screen]
-            order = clearest_first(found)
+            order = _clearest_first(found)
             if len(found) > parameters.max_points:
                 origin, rays = camera.rays(found.uv_px[order])
                 possible = np.flatnonzero(

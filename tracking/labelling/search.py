@@ -373,7 +373,7 @@ def _within_budget(
 
     In a crowd the sets are divided among all points with few triples of spots, which are enough if most spots are
     visible, and the clearest points with all triples. Spots are clearer than most false points, but reflections
-    may be brighter than they are. If the brightness is unknown, the first pass has all sets.
+    may be clearer than they are. If the brightness is unknown, the first pass has all sets.
     """
     points, spot_geometry = problem.points, problem.spots
     most, budget = parameters.max_points, parameters.max_triples

@@ -12,6 +12,7 @@ from calibration.rig.refinement import FEWEST_FRAMES, Refinement
 from geometry.arrays import finite
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, split_name
+from lab.calibrate.camera.camera_findings import FindingLimits
 from lab.calibrate.refine.prior_sigmas import BEAMS, CAMERAS, SCREENS, free_group
 from lab.calibrate.refine.recordings import LabelledRun
 from lab.findings.finding import Finding, Level, clause, finding, passed
@@ -20,7 +21,6 @@ from lab.runs.model_check.check import ModelCheck, p_text
 
 P_CHANGE = 1e-4  # p-value below which the stated sigmas do not explain the changes
 P_HELD_OUT = 1e-4  # p-value, of all held-out recordings together, below which they contradict the result
-UNCHECKED_FOCAL = 0.003  # relative sigma of a focal length above which it is not checked; as `calibrate camera` has it
 FEW_USED = 0.5  # share of a recording's frames that are used, below which it is reported
 # Codes of the model check that no refined rig may have: a fault, unexplained or correlated residuals.
 _CONTRADICTIONS = ("BP-M01", "BP-M02", "BP-M03")
@@ -133,11 +133,12 @@ def _held(rig: Rig, prior: RigCovariance) -> list[Finding]:
 
 def _lenses(r: Refinement) -> list[Finding]:
     """Cameras whose focal length is neither stated with a sigma nor shown by the recordings."""
-    unknown = [f"cameras.{name}" for name, sigma in r.lens_sigmas.items() if sigma > UNCHECKED_FOCAL]
+    most = FindingLimits().focal[0]
+    unknown = [f"cameras.{name}" for name, sigma in r.lens_sigmas.items() if sigma > most]
     if not unknown or r.moved:
         return []
     what = (
         f"nothing is stated of the focal lengths of {', '.join(unknown)}, and the recordings would not show an error of"
-        f" 1 %: the result is as right as they are"
+        " 1 %: the result is as right as they are"
     )
     return [finding("BP-F05", Level.WARN, what, variant="lens")]

@@ -122,7 +122,7 @@ def _fitted_fault(fitted: FittedFault, effect: Effect) -> dict[str, Any]:
 MATTERS_SIGMAS = 0.5  # in stated sigmas of a pose or a spot: a smaller bias is negligible against the stated sigma
 # A larger bias makes the stated sigmas wrong; the limit of the noise scale in lab/runs/verdict/quality.py is the same.
 WRONG_SIGMAS = 5.0
-_VIEWS_OF_A_POSE = 3  # which any three points of light can be
+_VIEWS_OF_A_POSE = 3  # spots that fit some pose whatever they are
 _WHOLE_FRAME = 0.1  # of a frame interval: a delay this near to a whole number of frames suggests a wrong frame number
 
 
