@@ -215,6 +215,37 @@ def test_formulas_use_only_numerical_packages(floor):
     assert foreign_packages(ROOT, floor) <= MAY_USE_FROM_OUTSIDE[floor]
 
 
+def numbers_without_a_word(text: str) -> list[str]:
+    """Names of the constants that are plain numbers without a comment: on their line, above their block, or below."""
+    lines, found = text.splitlines(), []
+    body = ast.parse(text).body
+    for node, after in zip(body, [*body, None][1:], strict=True):
+        if not isinstance(node, ast.Assign) or any(isinstance(n, ast.Name | ast.Call) for n in ast.walk(node.value)):
+            continue
+        names = [n.id for target in node.targets for n in ast.walk(target) if isinstance(n, ast.Name)]
+        numbers = [n for n in ast.walk(node.value) if isinstance(n, ast.Constant) and isinstance(n.value, int | float)]
+        above = node.lineno - 2
+        while above >= 0 and " = " in lines[above] and not lines[above].startswith("#"):
+            above -= 1
+        said = "#" in "".join(lines[node.lineno - 1 : node.end_lineno]) or lines[above].startswith("#")
+        if numbers and all(map(str.isupper, names)) and not said and not isinstance(after, ast.Expr):
+            found += names
+    return found
+
+
+def test_every_number_that_the_tracking_was_tuned_with_says_what_it_is():
+    found = {n: numbers_without_a_word(p.read_text()) for n, p in modules(ROOT).items() if floor_of(n) == "tracking"}
+    assert {name: numbers for name, numbers in found.items() if numbers} == {}
+
+
+def test_a_number_without_a_word_is_seen():
+    assert (
+        numbers_without_a_word("A = 1.0  # px\n# Of a pixel:\nB = 2\nC, D = 3, 4\nE = A + B\nF = 5.0\n'''Text.'''\n")
+        == []
+    )
+    assert numbers_without_a_word("A = 1.0  # px\nB = 2\nC, D = (3, 4), -5\n") == ["B", "C", "D"]
+
+
 def test_what_the_program_imports_is_declared_in_pyproject():
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = declared["optional-dependencies"]

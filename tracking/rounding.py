@@ -75,5 +75,6 @@ def _variance_in_time(sigma: float) -> float:
     return float(np.mean(share @ value**2 - (share @ value) ** 2))
 
 
+# Of the table, in steps of the numbers:
 _NOISE_STEPS = np.array([0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.8])
 _IN_TIME = np.array([0.0] + [_variance_in_time(float(s)) for s in _NOISE_STEPS[1:]])

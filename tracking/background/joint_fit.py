@@ -22,9 +22,9 @@ import numpy as np
 
 from geometry.arrays import Array
 
-_STEPS, _TRIES = 30, 8
+_STEPS, _TRIES = 30, 8  # limits: steps of the fit, and shorter trials of each
 _CONVERGED = 1e-5  # relative decrease of the cost
-_DAMPING, _LESS, _MORE = 1e-2, 1 / 6, 6.0
+_DAMPING, _LESS, _MORE = 1e-2, 1 / 6, 6.0  # of the steps: at the start, after a good and after a bad trial
 _NO_GAUSSIAN = 0.02  # error of the model, as a share of the peak: lasers flicker, and no light is quite a Gaussian
 MODULATED = 0.5, 0.4  # usual share of the light that the brightness of the surface modulates, and its sigma
 UNLIKE = 0.1  # sigma of the modulated share of different places

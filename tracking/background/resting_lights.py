@@ -23,7 +23,7 @@ _SAMPLES = 13  # largest number of pixels from the centre of a window to its sid
 _LARGEST_STEP = 0.25  # widths: a longer step of the centre is not linear
 _LARGEST_CHANGE = 0.3  # of the flux, as a share
 _MISFIT, _MISFIT_SIGMAS = 1.4, 5.0  # chi-square per degree of freedom of an unchanged light: factor, and its sigmas
-_PARAMETERS = 9
+_PARAMETERS = 9  # of a light: centre, flux, three of its shape, and the plane below it
 _BY_CHANCE = _MISFIT * (_PARAMETERS + _MISFIT_SIGMAS * (2.0 * _PARAMETERS) ** 0.5)  # decrease of chi-square by a step
 
 

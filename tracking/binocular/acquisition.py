@@ -406,7 +406,7 @@ def _coarse(pair: StereoPair, model: MarkerModel, flat: Sequence[Array], images:
 # from poses of three markers each (P3P), each also with the normal reflected, and keeps the least misfit. Source: ours.
 
 _STARTS = 3  # poses of three markers that are tried
-_TRIPLES = 4
+_TRIPLES = 4  # sets of three markers, of each camera, of which poses are computed
 _PLAUSIBLE_P, _CLEAR_CHI2 = 1e-3, 25.0  # misfit of a right pose, and how much larger that of a wrong one is
 
 

@@ -36,7 +36,7 @@ from tracking.binocular.marker_model import (
     project_markers,
 )
 
-MOST_FRAMES, FEWEST_FRAMES = 24, 5
+MOST_FRAMES, FEWEST_FRAMES = 24, 5  # that are used, evenly over the recording; with fewer nothing is concluded
 _FEWEST_MARKERS = 4  # of each picture: three have several poses
 _STEPS = 6  # of Gauss-Newton
 _CERTAIN_CHI2 = 20.0  # that an error explains: 4.5 sigma
@@ -274,7 +274,7 @@ class _Adjustment:
 # residual. All frames together give d by least squares, beside a rotation of the right camera, which shifts all frames
 # equally. Source: ours.
 
-FEWEST_CLOCK_FRAMES = 8
+FEWEST_CLOCK_FRAMES = 8  # with a pose and markers in both pictures: two per unknown
 _UNKNOWNS = 4  # the time and three rotations of the right camera
 
 

@@ -23,7 +23,7 @@ from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.parameters import DetectParameters
 
 _thread_local = threading.local()  # .finders: the last finders of each thread, by width, height, most points
-_MOST_FINDERS = 4
+_MOST_FINDERS = 4  # per thread: memory of 4 sizes of pictures, as many as the cameras of a usual rig
 
 WIDE_PX = 30.0  # sigma above which a light is sought in sums of pixels; a plain fit has windows for twice that
 _SIDE = 8  # px: side of the squares

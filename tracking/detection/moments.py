@@ -57,7 +57,7 @@ def _round_shapes(half: int) -> tuple[Array, Array]:
     return plane, shapes / np.linalg.norm(shapes, axis=1)[:, None]
 
 
-_HALF, _CLOSE = 7, 4
+_HALF, _CLOSE = 7, 4  # px to each side of the windows of the test
 _PLANE, _ROUND = _round_shapes(_HALF)
 _CLOSE_PLANE, _CLOSE_ROUND = _round_shapes(_CLOSE)  # for spots with others around them
 

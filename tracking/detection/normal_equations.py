@@ -34,7 +34,7 @@ from tracking.detection.table import (
     Candidate,
 )
 
-_POWERS_U, _POWERS_V = (0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)
+_POWERS_U, _POWERS_V = (0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)  # of the six terms of a quadratic
 _COLUMNS = (
     NODES,
     NODES + 1,

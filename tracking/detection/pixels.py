@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from geometry.arrays import Array
 from geometry.compilation.jit import compiled, compiled_for_sums
 
-OUTSIDE, CLIPPED, VALID = 0.0, 1.0, 2.0
+OUTSIDE, CLIPPED, VALID = 0.0, 1.0, 2.0  # states of a cell
 
 
 class Pixels(NamedTuple):

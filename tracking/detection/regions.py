@@ -17,7 +17,7 @@ from tracking.noise import BLOCK
 NARROWER = 0.5  # a spot narrower than this share of another spot is not a duplicate of it
 _SAME_SPOT = 1.5  # sigmas of a brighter spot: a second spot nearer to its centre is a duplicate
 MARGIN = 16  # px: largest distance of a peak from its spot's centre
-EVERYWHERE = np.array([[0.0, 0.0, 1e9]])
+EVERYWHERE = np.array([[0.0, 0.0, 1e9]])  # a region (u, v, radius), px
 
 
 def margin_of(regions: Array) -> Array:

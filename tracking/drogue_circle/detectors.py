@@ -110,7 +110,7 @@ _STRONG_PERCENTILE, _STRONG_SHARE, _WEAK_SHARE = 98.0, 0.35, 0.4  # of Canny's t
 _LEAST_GRADIENT = 24.0  # Sobel sum of a step of 6 DN in a picture stretched to 8 bits
 _ALIGNED = 0.9  # least cosine between gradient and radius
 _LEAST_SUPPORT = 0.15  # edge pixels per pixel of circumference
-_MOST_EDGES = 60_000
+_MOST_EDGES = 60_000  # pixels that vote; more are thinned evenly, since votes cost time and a rim has hundreds
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,8 +208,8 @@ def radii_of(
 # The classical detector: gradient votes in the window around a prediction, or in a pyramid of the whole picture.
 
 
-_CENTRES_OF_WINDOW, _CENTRES_OF_LEVEL = 3, 12
-_RADII_OF_CENTRE = 3
+_CENTRES_OF_WINDOW, _CENTRES_OF_LEVEL = 3, 12  # with the most votes, whose radii are sought
+_RADII_OF_CENTRE = 3  # with the most support, of each: a drogue has an outer rim, an inner one and an opening
 _LEAST_SIDE = 32  # px: smaller levels of the pyramid are not searched
 
 

@@ -27,7 +27,7 @@ from tracking.kalman import transition
 from tracking.noise import Picture
 from tracking.statuses import Cause, PoseStatus
 
-_MOST_CENTRES = 200
+_MOST_CENTRES = 200  # with the most votes, among which the one within the gate is sought
 _LOST_AFTER = 25  # frames without a measurement; the print has no such rule
 
 

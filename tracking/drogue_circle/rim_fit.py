@@ -16,7 +16,7 @@ from tracking.noise import Picture
 # Edge points of a rim with sub-pixel precision: the maximum of the slope along the gradient of a circle, on rays.
 
 _STEP_PX = 0.5  # sampling along a ray
-_LEAST_RAYS, _MOST_RAYS = 40, 256
+_LEAST_RAYS, _MOST_RAYS = 40, 256  # one per pixel of the circumference between these
 _OBLIQUE = 0.6  # largest tangential slope, as a share of the radial one: the edge crosses the rim at up to 31 degrees
 _MOST_BLUR = 1.2  # of the half width of the rays: a wider edge has no known height
 _LEAST_SHARE = 0.25  # of the median slope of the rim: weaker maxima are not the rim
@@ -207,9 +207,9 @@ _MODEL_SIGMA_PX = 0.005  # of the fit: rims are not exact circles
 _BLUR_SIGMA = 0.5  # 1 sigma of the correction for blur, as a share of it
 _ELLIPSE_COVERAGE = 0.7  # share of the rim that determines an ellipse
 _ELLIPSE_F = 8.0  # F value of its two parameters, above which they are kept
-_LEAST_DETERMINANT = 1e-6
+_LEAST_DETERMINANT = 1e-6  # of the normalised normal matrix: see `_solved`
 _ON_RIM_PX = 0.5  # least distance from the rim at which an edge counts as on it
-SECTORS = 32
+SECTORS = 32  # parts of a rim whose visibility is stated
 _GAP_SIGMAS, _END_SIGMAS = 1.0, 3.5  # half length of a gap of the rim, and of its ends, in sigmas of the blurred edge
 _FAR_PX = 0.7  # a last pass that moves the rim by more is repeated
 _ENOUGH_PX = 0.3  # a pass that moves the rim by less is not repeated

@@ -34,7 +34,7 @@ _REACH, _MOST_EDGES = 3.2, 10  # of the search for other edges: radii, and numbe
 _APART = 0.99  # radius of another edge, the same
 # Starts of `_best_near`: shift of the centre and change of the radius, as shares of the radius.
 _SHIFT, _SHIFTS, _GROWTH = 0.12, 6, (0.9, 1.0, 1.1)
-_MOST_SHIFT_PX = 3.0
+_MOST_SHIFT_PX = 3.0  # of a start: large drogues move by pixels, not by shares of their radius
 _ON_RIM = 0.03, 0.3  # of `_clean_share`: share of the radius, and least distance, px
 
 

@@ -58,12 +58,12 @@ def pyramid(grey: Floats, scale: float, reaches_px: float, largest_px: float) ->
 
 
 WEIGHTS = Path(__file__).with_name("weights.onnx")
-STRIDE = 4
+STRIDE = 4  # px of the picture per cell of the answer: from the layers of the network
 SMALLEST_PX, LARGEST_PX = 7.0, 40.0  # diameters that one level of the pyramid finds
 COARSEST_PX = 28.0  # the coarsest level shows the largest drogue no larger: there, its parts are no candidates
 MIN_CONFIDENCE = 0.05  # of a candidate
 MIN_LOGIT = -3.0  # of a candidate
-MAX_CANDIDATES = 20
+MAX_CANDIDATES = 20  # of a picture: the tracker considers a few
 SAME_SHARE = 0.5  # of the larger diameter: two centres nearer than this are one drogue
 ALIKE_RATIO, ALIKE_CONFIDENCE = 2.0, 0.5  # of the diameters and confidences of candidates whose mean is taken
 # What is smaller than a drogue by PART_RATIO and within PART_SHARE of its diameter from its centre is a part of it, if

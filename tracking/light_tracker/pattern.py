@@ -25,12 +25,12 @@ Floats: TypeAlias = NDArray[np.float32]
 SMALLEST_PX, LARGEST_PX = 9.0, 24.0  # diameter of the drogue in the pattern
 _REACH = 0.62  # of the pattern, in diameters: the rim and a little of what is around it
 _LARGEST_REACH = 4.0  # diameters of the largest pattern: half of the side of the largest window
-_ITERATIONS = 6
-_CONVERGED_PX = 0.01
+_ITERATIONS = 6  # a limit: the steps end where they are small
+_CONVERGED_PX = 0.01  # step below which the next one is no longer made: a third of the sigma of a match
 _MOST_SHIFT = 0.35  # of the diameter, away from the peak of the correlation
 _MOST_GROWTH = 0.25  # relative change of the diameter in one frame
 _HIDDEN_FACTOR = 2.0  # times the usual unexplained variance: from here on a part of the pattern is left out
-_ROBUST_ROUNDS = 2
+_ROBUST_ROUNDS = 2  # fits without the parts that differ, each with the parts that the one before left
 _LEAST_VISIBLE = 0.3  # share of the pattern; with less there is no match
 _TUKEY, _LEAST_SCALE = 4.7, 0.05  # residuals in usual sigmas of which the weight is zero; least sigma
 _LEAST_CONTRAST = 0.5  # DN: a window without any contrast matches nothing
@@ -280,7 +280,7 @@ def _second(scores: Floats, x: int, y: int, apart: float) -> float:
 
 _MATCH_SIGMA_PX = 0.03  # of a match, beside its own covariance
 _MATCH_FACTOR = 2.0  # of the covariance of a match: neighbouring pixels have related errors
-_MATCH_SIZE_SIGMA = 0.01
+_MATCH_SIZE_SIGMA = 0.01  # of the log diameter of a match, beside its own covariance
 _START_SPEED = 0.3, 5.0  # 1 sigma of the speed at the start: diameters and px per frame
 # Relative change of the acceleration per excess of a normalised innovation, its largest excess, and its limits relative
 # to the initial value: as in tracking/single_target/point_tracker.py.

@@ -56,7 +56,7 @@ FIRST_ACCELERATION, FIRST_ANGULAR_ACCELERATION = 30.0, 100.0  # m/s^2, rad/s^2
 # them, since with the fastest motion no pose of few spots can be distinguished from another. px/s where the prior's
 # centre shows no spot.
 SEARCH_SPEED, SEARCH_RATE, SEARCH_PX_S = 1.0, 1.0, 1500.0  # m/s, rad/s
-SEARCH_SHARES = (1.0, 0.2, 0.04)
+SEARCH_SHARES = (1.0, 0.2, 0.04)  # of these speeds, tried in turn where clocks differ
 # Largest motion of a spot in the error of a clock that is not known yet: a vehicle that moves faster is found later.
 SEARCH_CLOCK_PX = 8.0
 # Limits of the search around the last pose; beyond the second one a fan of beams looks like itself, turned.

@@ -231,7 +231,7 @@ def _fits(one: Labelling, model: SpotModel, points: dict[str, Detections]) -> bo
 
 NAMES = "target"  # the kind of mistakes that may exchange names only
 POSES = 200  # of which the TRIED with the most visible spots are tried
-TRIED = 2
+TRIED = 2  # poses that must both hide a mistake: one alone may hide it by chance
 BESIDE = (0.05, 0.03, -0.04, 0.05, -0.03, 0.04)  # m and rad, from the first pose of a recording to one beside it ...
 STEPS = (1.0, -1.0, 0.3, -0.3, 0.1, -0.1)  # ... times the first of these with which most cameras see a spot, ...
 NEAR_M, NEAR_RAD = 0.3, 0.3  # ... whose counterpart is searched for this near that of the first

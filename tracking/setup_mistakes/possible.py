@@ -19,7 +19,7 @@ from geometry.rig import Rig
 from geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from tracking.detections import Detections
 
-FEW_POSES = 40
+FEW_POSES = 40  # of the range, in which a mistake that changes any pixel shows
 # The points of consecutive pictures by camera: of the frame before, the frame itself and the frame after. A camera
 # without a picture is absent.
 Block = Sequence[Mapping[str, Detections]]

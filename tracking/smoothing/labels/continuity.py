@@ -42,7 +42,7 @@ from tracking.smoothing.motion.run_detections import RunDetections
 
 P_GONE = 0.1  # probability per frame that a spot (of a pair: one of the two, or both) is not visible any more
 MIN_PROBABILITY = 0.99  # of a label; and where the path from the other side does not lead to the point:
-MIN_ONE_SIDED_PROBABILITY = 0.995
+MIN_ONE_SIDED_PROBABILITY = 0.995  # (from one side alone)
 MIN_LAST_PROBABILITY = 0.9999  # of the last label of a path that ends, just where a false point is not rare
 CORNER_PROBABILITY = 0.998  # of the labels of a row of points that continues a path across a corner
 MIN_ROW_SIGMA_PX = 0.1  # least error of the extrapolation along a row, for slight curvature
@@ -198,7 +198,7 @@ class _Path(ViewPath):
 
 P_JUMP = 0.02  # probability per frame that a spot has moved by any distance that its speed allows
 PAIR_MIN_PROBABILITY = 0.999  # of the two labels; and where the pair's path from the other side does not lead there:
-PAIR_MIN_ONE_SIDED_PROBABILITY = 0.9999
+PAIR_MIN_ONE_SIDED_PROBABILITY = 0.9999  # (from one side alone)
 
 
 Transfer = Callable[[Array], Array]

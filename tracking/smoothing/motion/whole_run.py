@@ -48,7 +48,7 @@ from tracking.smoothing.motion.run_detections import (
 )
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD
 
-MAX_PASSES = 25
+MAX_PASSES = 25  # a limit: the passes end where nothing changes any more
 ROUNDING_NATS = 10.0  # by which rounding may raise the cost
 GLOBAL_PASSES = 5  # with one strength of the jerk for the whole run; then each window has its own
 FIRST_ADAPTING_PASSES, LATER_ADAPTING_PASSES = 14, 2  # after which the strength is kept: in the first and later rounds
