@@ -2,7 +2,7 @@
 
 A constant is a number with a decimal point that a module of tracking/ assigns to a name in capitals. Of a sample of
 them, each is multiplied by 2 or 1/2 in a copy of the program, which then processes the same recordings as the
-unchanged copy: random scenes as points and as pictures (bench/random_scenes, bench/random_pictures). Per constant:
+unchanged copy: one scene of each family of points and of pictures. Per constant:
 whether a table changed, how the errors changed (ratio of the RMS of the position and of the attitude, geometric mean
 over the recordings), NEES/6, measured poses, wrong labels and verdicts.
 
@@ -26,12 +26,21 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.random_pictures.command import picture_jobs
+from bench.random_pictures.render import Renderer
+from bench.random_pictures.scene import picture_scene
+from bench.random_pictures.write_folder import write_pictures
+from bench.random_scenes.families import FAMILIES as POINT_FAMILIES
+from bench.random_scenes.families import family_scene
+from bench.random_scenes.write_folder import write_run_folder
 from lab.errors import BeamposeError
+from lab.runs.process import process_run
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = ("background", "detection", "labelling", "noise_estimation", "rigid_body", "smoothing")
 PACKAGES = ("geometry", "tracking", "calibration", "lab")
-POINTS, PICTURES = 71000, 23000  # first seeds of the recordings
+POINTS, PICTURES = 71000, 23000  # seeds of the recordings
+SHORT = ("two-beams-25hz", "no-prior")  # families with fewer frames
 TABLES = ("attitude.csv", "spots.csv", "attitude_causal.csv")
 
 
@@ -72,23 +81,21 @@ def constants(folders: tuple[str, ...]) -> list[Constant]:
     return found
 
 
-def recordings(place: Path, points: int, pictures: int) -> list[Path]:
-    """Write the recordings that all copies process."""
-    command = [sys.executable, "-m", "bench.random_scenes", "--keep", str(place)]
-    for first, number, more in (
-        (POINTS, points, ["--frames", "120"]),
-        (PICTURES, pictures, ["--pictures", "--frames", "40"]),
-    ):
-        if number:
-            seeds = ["--seeds", f"{first}:{first + number}"]
-            subprocess.run([*command, *more, *seeds], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
-    return sorted(f.parent for f in place.rglob("run.yaml"))
+def recordings(place: Path) -> list[Path]:
+    """Write the recordings that all copies process: of each family of points and of pictures one."""
+    points = [
+        write_run_folder(family_scene(name, POINTS, None if name in SHORT else 120), place / f"points-{name}")
+        for name in POINT_FAMILIES
+    ]
+    pictures = picture_jobs(range(PICTURES, PICTURES + 1), "all", 24, None, False)
+    return points + [
+        write_pictures(Renderer(picture_scene(job.seed, job.family, job.frames)), place / f"pictures-{job.family}")
+        for job in pictures
+    ]
 
 
 def process(runs: list[Path]) -> list[dict]:
     """Process the runs with the code of this process, and what came of each."""
-    from lab.runs.process import process_run
-
     rows: list[dict] = []
     with tempfile.TemporaryDirectory(prefix="beampose-") as name:
         for k, run in enumerate(runs):
@@ -127,17 +134,18 @@ def processed_by(copy: Path, runs: list[Path]) -> list[dict] | str:
 
 def compared(usual: list[dict], rows: list[dict]) -> str:
     """One line: what the change did."""
-    if all(a.get("tables") == b.get("tables") for a, b in zip(usual, rows, strict=True)):
-        return "no table changed"
-    changed = sum(a.get("tables") != b.get("tables") for a, b in zip(usual, rows, strict=True))
-    pairs = [(a, b) for a, b in zip(usual, rows, strict=True) if a.get("position") and b.get("position")]
+    both = list(zip(usual, rows, strict=True))
+    changed = sum(a.get("tables") != b.get("tables") for a, b in both)
+    pairs = [(a, b) for a, b in both if a.get("position") and b.get("position")]
+    if not changed or not pairs:
+        return f"{changed} of {len(rows)} tables changed"
     ratios = [float(np.exp(np.mean([np.log(b[k] / a[k]) for a, b in pairs]))) for k in ("position", "rotation")]
-    least, most = min(b["nees"] / 6 for _, b in pairs), max(b["nees"] / 6 for _, b in pairs)
     totals = [sum(r.get(k) or 0 for r in rows) - sum(r.get(k) or 0 for r in usual) for k in ("measured", "wrong")]
-    verdicts = sum(a.get("status") != b.get("status") for a, b in zip(usual, rows, strict=True))
+    nees = [float(np.median([r["nees"] / 6 for r in side])) for side in zip(*pairs, strict=True)]
+    verdicts = sum(a.get("status") != b.get("status") for a, b in both)
     return (
-        f"{changed} of {len(rows)} tables changed; errors x {ratios[0]:.3f}, {ratios[1]:.3f}; "
-        f"NEES/6 {least:.2f} to {most:.2f}; measured {totals[0]:+d}, wrong labels {totals[1]:+d}, verdicts {verdicts}"
+        f"{changed} of {len(rows)} tables changed; errors x {ratios[0]:.3f}, {ratios[1]:.3f}; NEES/6 in the median "
+        f"{nees[0]:.2f} to {nees[1]:.2f}; measured {totals[0]:+d}, wrong labels {totals[1]:+d}, verdicts {verdicts}"
     )
 
 
@@ -147,8 +155,6 @@ def main() -> None:
     parser.add_argument("--sample", type=int, default=40, help="constants drawn (default 40)")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--folders", nargs="*", default=FOLDERS, choices=FOLDERS)
-    parser.add_argument("--points", type=int, default=8, help="recordings of points (default 8)")
-    parser.add_argument("--pictures", type=int, default=4, help="recordings of pictures (default 4)")
     parser.add_argument("--process", nargs="*", type=Path, help=argparse.SUPPRESS)
     a = parser.parse_args()
     if a.process is not None:
@@ -162,7 +168,7 @@ def main() -> None:
         copy = Path(name) / "program"
         for package in (*PACKAGES, "bench"):  # with the compiled code that is there
             shutil.copytree(ROOT / package, copy / package)
-        runs = recordings(Path(name) / "recordings", a.points, a.pictures)
+        runs = recordings(Path(name) / "recordings")
         usual = processed_by(copy, runs)
         assert isinstance(usual, list), usual
         print(f"{len(usual)} recordings; verdicts {[r.get('status') for r in usual]}", flush=True)
