@@ -52,7 +52,7 @@ from lab.runs.setup_check import (
 )
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters
-from tracking.setup_mistakes.evidence import ENOUGH, Invisible, invisible_mistakes
+from tracking.setup_mistakes.evidence import ENOUGH, NAMES, Invisible, invisible_mistakes
 from tracking.setup_mistakes.possible import SHOWN_BY, Block, possible_mistakes
 
 
@@ -184,17 +184,23 @@ def check_rig(
     if impossible:
         return
     kinds: dict[str, list[Invisible]] = {}
-    only_names = []
+    names: list[str] = []
+    harmless: list[str] = []
     for one in invisible_mistakes(rig, prior, parameters):
-        if one.is_harmless:
-            only_names.append(one.mistake.what.removesuffix(" are exchanged"))
+        if one.is_harmless and one.mistake.kind == NAMES:
+            names.append(one.mistake.what.removesuffix(" are exchanged"))
+        elif one.is_harmless:
+            harmless.append(one.mistake.what)
         else:
             kinds.setdefault(one.mistake.kind, []).append(one)
-    if only_names:
+    if len(rig.spots) > len(rig.screens):
+        names.append("two spots of a screen")
+    if names:
         findings.facts.append(
-            f"Exchanged names of {', of '.join(only_names)}, or of two spots of a screen: no recording shows them; the"
-            " poses are the same"
+            f"Exchanged names of {', or of '.join(names)}: no recording shows them; the poses are the same"
         )
+    if harmless:
+        findings.facts.append(f"No recording shows whether {', or whether '.join(harmless)}; the poses are the same")
     if with_truth:
         return
     for kind, those in kinds.items():

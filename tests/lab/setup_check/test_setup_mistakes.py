@@ -422,3 +422,8 @@ def test_at_rest_only_the_first_and_last_number_show_a_camera_that_is_numbered_f
     assert status == 0
     assert "have 12 frames each, numbered from 1 and from 0" in text
     assert "numbered from" not in checked(run)[0]
+
+
+def test_exchanged_spots_of_a_screen_are_said_to_be_invisible_where_no_beams_can_be_exchanged(tmp_path):
+    save_rig(random_scene(7113).known_rig, tmp_path / "rig.yaml")
+    assert "Exchanged names of two spots of a screen: no recording shows them" in checked(tmp_path / "rig.yaml")[0]
