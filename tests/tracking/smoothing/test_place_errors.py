@@ -219,6 +219,18 @@ def test_a_prediction_counts_where_the_residuals_hardly_show_errors_of_places():
     assert shown(many, 0.6, step_px=0.5) < 0.05
 
 
+def test_frames_in_motion_say_nothing_about_the_errors_of_a_vehicle_at_rest():
+    """Each of them shows another place once. The places at rest are few, and small errors in them may be chance."""
+    rng, rest, moving = np.random.default_rng(11), 36, 100
+    residual = rng.standard_normal((rest + moving, 8, 2))
+    residual[:rest] += 0.2 * rng.standard_normal((1, 8, 2))
+    uv = rng.uniform(0, 500, (1, 8, 2)) + np.zeros((rest + moving, 8, 2))
+    uv[rest:] += 30.0 * np.arange(1.0, moving + 1)[:, None, None]
+    width, averaged = np.full(8, 2.0), np.full(rest + moving, 12.0)
+    alone, both = (place_errors(residual[:k], uv[:k], width, averaged[:k], np.zeros(8), 0.3).share for k in (36, 136))
+    assert both == pytest.approx(alone, rel=0.3)
+
+
 def test_errors_of_places_that_nothing_predicted_count_where_the_residuals_show_them():
     rng = np.random.default_rng(9)
     same = np.tile(rng.standard_normal((1, 12, 2)), (60, 1, 1))
