@@ -85,7 +85,8 @@ class NoiseModel:
         """The model of pictures in so many steps per DN."""
         return replace(
             self, floor_dn2=self.floor_dn2 * steps**2, slope_dn=self.slope_dn * steps, black_dn=self.black_dn * steps,
-            least_dn2=self.least_dn2 * steps**2, banding_dn=self.banding_dn * steps, compression_dn2=self.compression_dn2 * steps**2,
+            least_dn2=self.least_dn2 * steps**2, banding_dn=self.banding_dn * steps,
+            compression_dn2=self.compression_dn2 * steps**2,
         )  # fmt: skip
 
     def texture_of_blocks(self, rows: int, columns: int) -> NDArray[np.float32] | float:

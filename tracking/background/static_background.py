@@ -168,7 +168,11 @@ class StaticBackground:
         brighter = np.maximum(model.variance(highest_of_blocks(plain)) - at_low, 0.0)
         uneven = np.asarray(np.sqrt(brighter / 9.0) / (TEXTURE_SHARE * level), np.float32)
         of_difference = replace(
-            once, floor_dn2=at_low * steps**2 * (1 + share), black_dn=level * steps, least_dn2=np.inf, texture=0.0,
+            once,
+            floor_dn2=at_low * steps**2 * (1 + share),
+            black_dn=level * steps,
+            least_dn2=np.inf,
+            texture=0.0,
             local_texture=uneven,
         )
         rows, columns = SAMPLE
@@ -292,7 +296,8 @@ class StaticBackground:
         peak = spots.peak / (self.steps * gain)
         bright = self.smooth[sampled] + self.structure[row, column]
         light_of_spot = _OF_PEAK * self.noise.slope_dn * peak
-        here, used = self.noise.variance(bright) + light_of_spot, self.noise.variance(self.low_dn) + gain * light_of_spot
+        used = self.noise.variance(self.low_dn) + gain * light_of_spot
+        here = self.noise.variance(bright) + light_of_spot
         own = self.shares[row, column]
         here *= gain**2 * (1 + own) / (1 + self._noise_share)
         covariance = spots.cov_px2 * (here / used)[:, None, None]
