@@ -145,7 +145,8 @@ class TextureShift:
         largest = _LARGEST_AT_REST if at_rest else LARGEST_SHARE
         sigma_px = self.sigma_px(width_px, found.peak / max(noise.black_dn, 1.0), brightness, light_px, largest)
         # The half of a light that is nearer to the camera looks larger: its axis is not in its middle.
-        sigma_px = np.hypot(sigma_px, _OBLIQUE * width_px**2 / self.half_diagonal_px)
+        wide_px2 = np.maximum(width_px**2 - _COARSE_PX**2, 0.0)
+        sigma_px = np.hypot(sigma_px, _OBLIQUE * wide_px2 / self.half_diagonal_px)
         axes = np.stack([found.major_px, found.minor_px, np.radians(found.angle_deg)])
         if at_rest:  # round
             axes = np.stack([width_px, width_px, np.zeros(len(found))])
