@@ -24,7 +24,7 @@ from geometry.pose_prior import PosePrior
 from geometry.rig import Beam, Rig, Screen, Spot
 from lab.simulate.rigs import DISTORTION, RIGS
 from tracking.detections import Detections
-from tracking.labelling.first_labels import NO_POINT, LabelResult, find_labels
+from tracking.labelling.first_labels import NO_POINT, FirstLabels, find_labels
 
 PRIOR = PosePrior(Pose.identity(), 1.0, float(np.deg2rad(30.0)))
 GOAL = ">= 0.97; <= 0.01; <= 3 s"
@@ -41,7 +41,7 @@ class Count:
     tie_with_truth: int = 0
     spent: list[float] | None = None
 
-    def take(self, result: LabelResult, model: SpotModel, origin: dict[str, Array], seconds: float) -> None:
+    def take(self, result: FirstLabels, model: SpotModel, origin: dict[str, Array], seconds: float) -> None:
         """Add a frame; origin: by camera, the view of each point."""
         self.spent = [*(self.spent or []), seconds]
         if result.chosen is not None:

@@ -39,7 +39,7 @@ from geometry.rig import Beam, Rig
 from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.calibrate.refine.refine import refine_rig
-from lab.calibrate.refine.refine_findings import RefineResult, refine_findings
+from lab.calibrate.refine.refine_findings import RefinedRig, refine_findings
 from lab.errors import BeamposeError
 from lab.files.rig.rig_file import load_rig
 from lab.files.run.results import read_poses
@@ -269,7 +269,7 @@ def with_true_labels(s: Scene) -> ModelCheckRecording:
     return ModelCheckRecording(s.t_s, np.isfinite(uv[..., 0]), uv, cov, s.poses)
 
 
-def refined_with_true_labels(known: Rig, covariance: RigCovariance, scenes: list[Scene]) -> RefineResult:
+def refined_with_true_labels(known: Rig, covariance: RigCovariance, scenes: list[Scene]) -> RefinedRig:
     """What the command computes behind the tracker."""
     recordings = [with_true_labels(s) for s in scenes]
     found = refine(known, covariance, recordings, refine(known, covariance, recordings))
@@ -277,7 +277,7 @@ def refined_with_true_labels(known: Rig, covariance: RigCovariance, scenes: list
     runs: Any = tuple(
         SimpleNamespace(run=SimpleNamespace(name=f"run{i}"), recording=r) for i, r in enumerate(recordings)
     )
-    return RefineResult(found, covariance, runs, checks)
+    return RefinedRig(found, covariance, runs, checks)
 
 
 def rig_nees(refined: Refinement, true: Rig) -> tuple[float, int]:

@@ -52,7 +52,7 @@ class DrogueFrame:
 
 
 @dataclass(frozen=True, slots=True)
-class LightResult:
+class LightFigures:
     """A tracker on the frames of one light."""
 
     light: str
@@ -135,7 +135,7 @@ def _circles(scene: DrogueScene) -> Array:
     return np.array([[*e.centre_px, e.major_px] for e in ellipses])
 
 
-def followed(seed: int, light: str, frames: int, forms: tuple[str, ...] = ("sound", "printed")) -> list[LightResult]:
+def followed(seed: int, light: str, frames: int, forms: tuple[str, ...] = ("sound", "printed")) -> list[LightFigures]:
     """Track the approach with each form of the tracker; both get the same pictures and no place of the first circle."""
     trackers = [CircleOptions(form=form, min_radius_px=10.0).tracker() for form in forms]
     own = [0] * len(forms)
@@ -155,7 +155,7 @@ def followed(seed: int, light: str, frames: int, forms: tuple[str, ...] = ("soun
     out = []
     for own_errors, count in zip(errors, measured, strict=True):
         good = np.array([e for e in own_errors if np.isfinite(e)])
-        out.append(LightResult(light, len(own_errors), len(good), count, good))
+        out.append(LightFigures(light, len(own_errors), len(good), count, good))
     return out
 
 
@@ -447,7 +447,7 @@ def compare_zhou2014(seed: int = 1, stills: int = STILLS, runs: int = RUNS, fram
     )
 
 
-def _light_rows(lights: dict[str, list[LightResult]]) -> list[ComparisonRow]:
+def _light_rows(lights: dict[str, list[LightFigures]]) -> list[ComparisonRow]:
     rows = []
     for light, (ours, printed) in lights.items():
         paper = PAPER_PERCENT[light]

@@ -12,7 +12,7 @@ from calibration.beams.beams import BeamCalibration, StandModel, calibrate_beams
 from calibration.beams.excitation import StandMotion, summary_of
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.joint import SPOTS, Joint, Measured, calibrate_jointly, jacobian, shares
-from calibration.screens.screens import ScreensResult
+from calibration.screens.screens import FittedScreens
 from calibration.terms.rig_blocks import BEAMS, POSES, STAND, SpotPixels, SpotTerm, named_errors
 from calibration.terms.surveyed import pose_of
 from geometry.arrays import Array, Ints, symmetric
@@ -173,13 +173,13 @@ def hold_out(measured: Measured, joint: Joint) -> HoldOut | None:
 class RigCalibration:
     """Results of the steps."""
 
-    screens: ScreensResult  # lenses, cameras, screens, control points and boards: all but the spots
+    screens: FittedScreens  # lenses, cameras, screens, control points and boards: all but the spots
     beams: BeamCalibration  # from the spots and the result of the first step
     measured: Measured
     joint: Joint  # the joint adjustment
 
 
-def calibrate_in_steps(screens: ScreensResult, spots: SpotPixels, stand: StandModel) -> RigCalibration:
+def calibrate_in_steps(screens: FittedScreens, spots: SpotPixels, stand: StandModel) -> RigCalibration:
     """Calibrate screens, then beams, then all together.
 
     screens: of screens/screens.py, the first step; its network's rig holds nominal beams and the spots too.

@@ -62,7 +62,7 @@ class ApproximatePosition:
 
 
 @dataclass(frozen=True, slots=True)
-class ScreenResult:
+class FittedSurface:
     """Surface of one screen, apart from its pose."""
 
     flatness: Flatness | None  # None: the screen has only a fixed board
@@ -72,12 +72,12 @@ class ScreenResult:
 
 
 @dataclass(frozen=True, slots=True)
-class ScreensResult:
+class FittedScreens:
     """Result of the calibration of screens and cameras."""
 
     network: Network
     fit: NetworkFit
-    screens: tuple[ScreenResult, ...]
+    screens: tuple[FittedSurface, ...]
     # camera -> a second pose that fits nearly as well
     second_poses: Mapping[int, ResectedPose] = field(default_factory=dict)
 
@@ -87,7 +87,7 @@ def calibrate(
     setups: Sequence[ScreenSetup],
     near: Mapping[int, ApproximatePosition] | None = None,
     held_screen: int | None = None,
-) -> ScreensResult:
+) -> FittedScreens:
     """Poses of all cameras and screens, their bows where significant, and the joint covariance.
 
     setups: one per screen. near: camera -> approximate position, which decides between two poses. Without a survey, the
@@ -116,16 +116,16 @@ def calibrate(
         for r in [_second_pose(found, chosen.get(c), near.get(c))]
         if r is not None
     }
-    return ScreensResult(complete, fit, tuple(results), second_poses)
+    return FittedScreens(complete, fit, tuple(results), second_poses)
 
 
 def _screen_starts(
     network: Network, setups: Sequence[ScreenSetup], chained: ChainedPoses
-) -> tuple[Network, dict[int, Pose], Array, list[ScreenResult]]:
+) -> tuple[Network, dict[int, Pose], Array, list[FittedSurface]]:
     """Frame, bow (screens, 3) and flatness of each screen with a scan or dots; and the network with their priors."""
     observed = [c.screen for c in network.rig.cameras.values()]
     frames: dict[int, Pose] = {}
-    results: list[ScreenResult] = []
+    results: list[FittedSurface] = []
     bows = np.zeros((len(setups), 3))
     scatter: dict[int, float] = {}
     off = np.zeros(len(network.control_points), dtype=bool)
@@ -141,11 +141,11 @@ def _screen_starts(
             if scan.flatness.chosen.bent:
                 bent.add(k)
             priors.append(_scan_prior(k, scan))
-            results.append(ScreenResult(scan.flatness, scan.xyz, scan.flatness.chosen.used, ()))
+            results.append(FittedSurface(scan.flatness, scan.xyz, scan.flatness.chosen.used, ()))
             continue
         control_points = np.flatnonzero(network.control_points.screen_of == k)
         if not len(control_points):
-            results.append(ScreenResult(None, np.empty((0, 3)), np.empty(0, dtype=bool), ()))
+            results.append(FittedSurface(None, np.empty((0, 3)), np.empty(0, dtype=bool), ()))
             continue
         pose, flatness = screen_of_dots(network, control_points, setup, seen_from, name)
         frames[k], bows[k] = pose, flatness.chosen.coefficients[3:]
@@ -153,7 +153,7 @@ def _screen_starts(
         off[control_points[~flatness.chosen.used]] = True
         if flatness.chosen.bent:
             bent.add(k)
-        results.append(ScreenResult(flatness, np.empty((0, 3)), flatness.chosen.used, tuple(control_points.tolist())))
+        results.append(FittedSurface(flatness, np.empty((0, 3)), flatness.chosen.used, tuple(control_points.tolist())))
     complete = replace(
         network,
         surface_scatter_m=scatter,
@@ -286,7 +286,7 @@ def _second_pose(
     return other if other.rms_px < _RULED_OUT * max(chosen.rms_px, 0.05) else None
 
 
-def _in_final_frame(result: ScreenResult, network: Network, fit: NetworkFit, screen: int) -> ScreenResult:
+def _in_final_frame(result: FittedSurface, network: Network, fit: NetworkFit, screen: int) -> FittedSurface:
     if not result.control_points:
         return result
     world_from_screen = list(fit.rig.screens.values())[screen].world_from_screen
@@ -294,7 +294,7 @@ def _in_final_frame(result: ScreenResult, network: Network, fit: NetworkFit, scr
     return replace(result, xyz=xyz)
 
 
-def spot_sigmas(result: ScreensResult, screen: int) -> Array:
+def spot_sigmas(result: FittedScreens, screen: int) -> Array:
     """Sigma, m, of the screen's surface along its normal at its points (m,)."""
     name = list(result.network.rig.screens)[screen]
     C, names = result.fit.covariance.matrix, result.fit.covariance.names
@@ -315,7 +315,7 @@ def spot_sigmas(result: ScreensResult, screen: int) -> Array:
     return np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", J, C, J), 0.0))
 
 
-def camera_sigmas(result: ScreensResult) -> dict[str, tuple[float, float]]:
+def camera_sigmas(result: FittedScreens) -> dict[str, tuple[float, float]]:
     """Sigmas of each camera's position (m) and attitude (rad), each the root of the sum over three axes."""
     names, C = result.fit.covariance.names, np.diagonal(result.fit.covariance.matrix)
     out = {}
@@ -325,7 +325,7 @@ def camera_sigmas(result: ScreensResult) -> dict[str, tuple[float, float]]:
     return out
 
 
-def pointing_sigmas_m(result: ScreensResult) -> dict[str, float]:
+def pointing_sigmas_m(result: FittedScreens) -> dict[str, float]:
     """Displacement, m (1 sigma, RMS of both directions), of the centre of each camera's screen by the pose's error."""
     out = {}
     names, C = result.fit.covariance.names, result.fit.covariance.matrix
@@ -410,7 +410,7 @@ def misfit(
     return misfit_of(result, near)
 
 
-def misfit_of(result: ScreensResult, near: Mapping[int, ApproximatePosition]) -> float:
+def misfit_of(result: FittedScreens, near: Mapping[int, ApproximatePosition]) -> float:
     """Misfit of a result, as in `misfit`."""
     out = float(np.sqrt(result.fit.variance_factor))
     if len(result.fit.used):

@@ -22,7 +22,7 @@ from lab.findings.outcome import Done
 from lab.pictures.overlay_video import write_overlay_video
 from lab.progress import Progress
 from lab.report.frames.canvas import Pixels, png
-from lab.report.frames.content import FrameContent, ResultData, frame_content, pictures_of, pose_words, read_result_data
+from lab.report.frames.content import DrawnFrame, ResultData, frame_content, pictures_of, pose_words, read_result_data
 from lab.report.frames.sheet import Layout, Limits, limits_of, sheet
 from lab.runs.frames.frames import Recorded, pictures_at
 
@@ -38,7 +38,7 @@ class Shown:
     """An annotated picture, and what could not be shown."""
 
     image: Pixels
-    content: FrameContent
+    content: DrawnFrame
     notes: tuple[str, ...]
 
 

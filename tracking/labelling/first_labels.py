@@ -77,7 +77,7 @@ def _only_here(model: SpotModel, view: int, uv: Array, uv_other: Array) -> bool:
 
 __all__ = [
     "NO_POINT",
-    "LabelResult",
+    "FirstLabels",
     "Labelling",
     "PosePrior",
     "candidate_labellings",
@@ -99,7 +99,7 @@ SAME_POSE = 0.01  # share of the picture's diagonal: poses that move no spot by 
 
 
 @dataclass(frozen=True, slots=True)
-class LabelResult:
+class FirstLabels:
     """The labels found, or why there are none. `candidates` are best first."""
 
     chosen: Labelling | None
@@ -132,7 +132,7 @@ def find_labels(
     prior: PosePrior | None = None,
     parameters: LabelParameters | None = None,
     calibration: RigUncertainty | None = None,
-) -> LabelResult:
+) -> FirstLabels:
     """Label the points of all cameras of one frame from a prior alone, or without one.
 
     Arguments as of `candidate_labellings`. The result is one labelling, a tie with its candidates, or the reason why
@@ -143,18 +143,18 @@ def find_labels(
     crowd = crowd_of_unknown_brightness(rig, model, detections, prior, parameters, limit)
     if crowd is not None:
         name, points = crowd
-        return LabelResult(
+        return FirstLabels(
             None, (), f"{points} points of light of camera {name!r}, without a flux that shows which may be spots"
         )
     count = sum(len(found) for found in detections.values())
     if count < parameters.min_spots:
-        return LabelResult(None, (), f"only {count} points of light, at least {parameters.min_spots} needed")
+        return FirstLabels(None, (), f"only {count} points of light, at least {parameters.min_spots} needed")
     best = candidate_labellings(rig, model, detections, prior, parameters, calibration)
     if not best:
         within = "that the rig can see" if prior is None else "within the prior"
-        return LabelResult(None, (), f"no pose {within} explains enough of the points")
+        return FirstLabels(None, (), f"no pose {within} explains enough of the points")
     if best[0].score < MIN_EVIDENCE_NATS:
-        return LabelResult(
+        return FirstLabels(
             None, (), f"false points alone would explain the best pose nearly as well (lead {best[0].score:.1f} nats)"
         )
     first = _without_odd_spots(model, detections, best[0], parameters, calibration)
@@ -192,7 +192,7 @@ def _without_odd_spots(
     return replace(one, fit=fit, point_of=point_of)
 
 
-def _decide(model: SpotModel, best: Sequence[Labelling], parameters: LabelParameters) -> LabelResult:
+def _decide(model: SpotModel, best: Sequence[Labelling], parameters: LabelParameters) -> FirstLabels:
     """Choose the best labelling, or report a tie. Spots that labellings of about the same pose dispute get no label."""
     first = best[0]
     here = model.project(first.fit.world_from_body)[0]
@@ -211,8 +211,8 @@ def _decide(model: SpotModel, best: Sequence[Labelling], parameters: LabelParame
     if len(rivals) > 1:
         lead = first.score - rivals[1].score
         reason = f"{len(rivals)} poses explain the points about equally well (lead {lead:.1f} nats)"
-        return LabelResult(None, tuple(rivals), reason)
-    return LabelResult(replace(first, point_of=labels), (first,), "")
+        return FirstLabels(None, tuple(rivals), reason)
+    return FirstLabels(replace(first, point_of=labels), (first,), "")
 
 
 def _disputed(model: SpotModel, labels: Ints, other: Ints, here: Array) -> Bools:

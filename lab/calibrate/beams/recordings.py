@@ -19,7 +19,7 @@ from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.project.point_files import StandPoses, read_poses
-from lab.files.project.project import Project, RecordingEntry
+from lab.files.project.project import Project, ProjectRecording
 from lab.files.run.clocks import ESTIMATE
 from lab.files.run.run_file import Run, load_run
 from lab.files.text.csv_table import Table
@@ -289,7 +289,7 @@ def read_recordings(project: Project, rig: Rig) -> Recordings:
 
 
 def _rows(
-    recording: RecordingEntry, known: StandPoses | None, project: Project, rig: Rig, notes: list[str]
+    recording: ProjectRecording, known: StandPoses | None, project: Project, rig: Rig, notes: list[str]
 ) -> SpotRows:
     if recording.spots is not None:
         rows = read_spot_table(recording.spots, rig, notes)
@@ -407,7 +407,7 @@ def limit_frames(rows: SpotRows, notes: list[str]) -> SpotRows:
     return SpotRows(rows.frame[used], rows.view[used], rows.pixels[used], rows.covariance[used])
 
 
-def _names(recording: RecordingEntry, frames: Ints, position_of: Ints, several: bool) -> list[str]:
+def _names(recording: ProjectRecording, frames: Ints, position_of: Ints, several: bool) -> list[str]:
     """Names of the positions: the frames, preceded by the recording's name if the project has several recordings."""
     label = ""
     if several:

@@ -22,7 +22,7 @@ from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.calibrate.refine import prior_sigmas
 from lab.calibrate.refine.prior_sigmas import GROUPS, free_group, stated_covariance
 from lab.calibrate.refine.recordings import LabelledRun, labelled, tolerant, with_rig
-from lab.calibrate.refine.refine_findings import RefineResult, refine_findings
+from lab.calibrate.refine.refine_findings import RefinedRig, refine_findings
 from lab.calibrate.refine.refine_page import changes_of_numbers, page_of, pixel_residuals
 from lab.calibrate.step import Solved, Step, run_step, state_of
 from lab.errors import CalibrationError, InputError
@@ -64,7 +64,7 @@ def refine_rig(
     sigmas: Mapping[str, Any] | None = None,
     today: datetime.date | None = None,
     progress: Progress | None = None,
-) -> Outcome[RefineResult]:
+) -> Outcome[RefinedRig]:
     """Refine a rig by recordings; write rig.yaml, residuals.csv and report.html into the folder `out`.
 
     The runs are tracked and smoothed with the given rig, and a second time with the first solution, which corrects
@@ -110,7 +110,7 @@ def _solve(
     sigmas: Mapping[str, Any],
     day: datetime.date,
     progress: Progress | None,
-) -> Solved[RefineResult]:
+) -> Solved[RefinedRig]:
     file = load_rig_file(rig_path)
     if file.calibration is not None:  # one that has expired may be refined
         require_valid_calibration(file.calibration, rig_path, file.calibration.date)
@@ -159,7 +159,7 @@ def _stacks(free: Sequence[str], prior: RigCovariance, rig_path: Path) -> set[st
 
 def _refined(
     runs: Sequence[Run], rig: Rig, prior: RigCovariance, stacks: set[str], progress: Progress | None
-) -> RefineResult:
+) -> RefinedRig:
     stages: tuple[tuple[int, ...], ...] = (*_FIRST_FRAMES, ())
 
     def all_labelled(runs: Sequence[Run], stage: int) -> list[LabelledRun]:
@@ -188,7 +188,7 @@ def _refined(
     except AdjustmentError as error:
         raise CalibrationError(f"the rig cannot be refined by these recordings: {error}") from None
     checks = tuple(r.check(refined.rig, refined.covariance) for r in second)
-    return RefineResult(refined, prior, tuple(second), checks)
+    return RefinedRig(refined, prior, tuple(second), checks)
 
 
 def _figures(r: Refinement) -> str:
@@ -212,7 +212,7 @@ def _rig_file(
     return replace(given, rig=r.rig, covariances=covariance_blocks(r.covariance), calibration=state, measured_as={})
 
 
-def _write_residuals(result: RefineResult, path: Path) -> None:
+def _write_residuals(result: RefinedRig, path: Path) -> None:
     r = result.refined
     views = r.rig.views()
     rows: list[list[object]] = []

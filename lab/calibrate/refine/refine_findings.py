@@ -27,7 +27,7 @@ _CONTRADICTIONS = ("BP-M01", "BP-M02", "BP-M03")
 
 
 @dataclass(frozen=True, slots=True)
-class RefineResult:
+class RefinedRig:
     """A refined rig with the recordings that it is from."""
 
     refined: Refinement
@@ -36,7 +36,7 @@ class RefineResult:
     checks: tuple[ModelCheck, ...]  # of each run with the refined rig
 
 
-def refine_findings(result: RefineResult) -> tuple[Finding, ...]:
+def refine_findings(result: RefinedRig) -> tuple[Finding, ...]:
     """All findings."""
     r = result.refined
     out = [*_changes(r), *_checks(result), *_held_out(r), *_used(result), *_held(r.given, result.prior), *_lenses(r)]
@@ -85,7 +85,7 @@ def _part(e: FittedFault) -> str:
     return f"{e.fault.component} `{e.fault.name}` has moved by {size(move)} mm and turned by {size(turn)} mrad"
 
 
-def _checks(result: RefineResult) -> list[Finding]:
+def _checks(result: RefinedRig) -> list[Finding]:
     out = []
     for run, check in zip(result.runs, result.checks, strict=True):
         bad = [f for f in check.findings if f.level > Level.PASS and f.code in _CONTRADICTIONS]
@@ -110,7 +110,7 @@ def _held_out(r: Refinement) -> list[Finding]:
     return [passed(f"{words}; they agree with its covariance, p {p_text(p)}")]
 
 
-def _used(result: RefineResult) -> list[Finding]:
+def _used(result: RefinedRig) -> list[Finding]:
     out = []
     for run in result.runs:
         kept = finite(run.recording.poses.translation, -1)

@@ -10,7 +10,7 @@ from calibration.terms.rig_blocks import prior_of
 from geometry.arrays import Array
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import CLOCK, POSE, ROW_TIME, split_name
-from lab.calibrate.refine.refine_findings import RefineResult
+from lab.calibrate.refine.refine_findings import RefinedRig
 from lab.number_format import format_number
 from lab.report.calibration.calibration_charts import correlation_matrix
 from lab.report.calibration.calibration_drawings import residual_field
@@ -20,7 +20,7 @@ from lab.report.page import KeyFigure, PageDrawing, PageTable, Section
 _MUCH_BETTER = 0.7  # of its sigma: what a further motion must at least leave to be named
 
 
-def page_of(result: RefineResult) -> tuple[list[KeyFigure], list[Section]]:
+def page_of(result: RefinedRig) -> tuple[list[KeyFigure], list[Section]]:
     """Key figures and sections of the report."""
     r = result.refined
     return _key_figures(r), [
@@ -49,7 +49,7 @@ def _key_figures(r: Refinement) -> list[KeyFigure]:
     return out
 
 
-def changes_of_numbers(result: RefineResult) -> Section:
+def changes_of_numbers(result: RefinedRig) -> Section:
     """The section with the change of each number."""
     r = result.refined
     prior, after = result.prior, r.covariance
@@ -80,7 +80,7 @@ def _unit(name: str) -> tuple[str, float]:
     return ("mm", 1e3) if parameter.endswith("_m") else ("mrad", 1e3) if is_angle else ("", 1.0)
 
 
-def _directions(result: RefineResult) -> Section:
+def _directions(result: RefinedRig) -> Section:
     r = result.refined
     conventions = r.conventions
     free = len(r.gain) - int(np.sum(r.gain > 1))
@@ -111,7 +111,7 @@ def _directions(result: RefineResult) -> Section:
     return Section("What the recordings determine", words, (), PageTable(heads, rows))
 
 
-def _held_out(result: RefineResult) -> Section:
+def _held_out(result: RefinedRig) -> Section:
     r = result.refined
     several = len(r.recordings) > 1
     rows = [

@@ -24,7 +24,7 @@ from calibration.rig.rig_figures import (
     in_mm,
     spot_sigma,
 )
-from calibration.screens.screens import ScreensResult
+from calibration.screens.screens import FittedScreens
 from calibration.terms.corners import CornerTerm
 from calibration.terms.surveyed import RecordTerm, array_of
 from geometry.arrays import Array
@@ -37,7 +37,7 @@ from lab.calibrate.beams.beam_findings import (
     stand_findings,
 )
 from lab.calibrate.beams.recordings import Recordings, read_recordings, stand_of
-from lab.calibrate.rig.rig_findings import RigResult, joint_findings
+from lab.calibrate.rig.rig_findings import CalibratedRig, joint_findings
 from lab.calibrate.rig.rig_page import page_of
 from lab.calibrate.screens.screen_findings import ScreenLimits, near_findings, network_findings, survey_findings
 from lab.calibrate.screens.screen_inputs import adjusted_screens, screen_inputs
@@ -131,7 +131,7 @@ def calibrate_rig(
     today: datetime.date | None = None,
     *,
     progress: Progress | None = None,
-) -> Outcome[RigResult]:
+) -> Outcome[CalibratedRig]:
     """Calibrate a whole rig; write rig.yaml, residuals.csv and report.html into the folder `out`.
 
     rig.yaml holds the verdict and the joint covariance of all parameters (in the target's block; cameras and screens
@@ -145,7 +145,7 @@ def calibrate_rig(
     return run_step(_STEP, out, lambda: _solve(Path(project_path), today, progress))
 
 
-def _solve(project_path: Path, today: datetime.date | None, progress: Progress | None) -> Solved[RigResult]:
+def _solve(project_path: Path, today: datetime.date | None, progress: Progress | None) -> Solved[CalibratedRig]:
     project = load_project(project_path)
     day = calibration_date(project, today)
     check_no_duplicates(project)
@@ -166,7 +166,7 @@ def _solve(project_path: Path, today: datetime.date | None, progress: Progress |
         held_out = hold_out(steps.measured, joint)
     except AdjustmentError:
         held_out = None
-    result = RigResult(steps, expected, held_out)
+    result = CalibratedRig(steps, expected, held_out)
     findings = (
         *near_findings(screens, inputs.near),
         *joint_findings(steps, recordings.names, expected, held_out),
@@ -195,7 +195,7 @@ def _solve(project_path: Path, today: datetime.date | None, progress: Progress |
     )
 
 
-def _figures(result: RigResult) -> str:
+def _figures(result: CalibratedRig) -> str:
     rig = result.steps.joint.rig
     out = f"{len(rig.cameras)} cameras, {len(rig.screens)} screens, {len(rig.beams)} beams"
     if result.expected is not None:
@@ -220,7 +220,7 @@ def _recordings(project: Project, lab: Rig) -> Recordings:
     return recordings
 
 
-def _solved(project: Project, screens: ScreensResult, recordings: Recordings) -> RigCalibration:
+def _solved(project: Project, screens: FittedScreens, recordings: Recordings) -> RigCalibration:
     try:
         return calibrate_in_steps(screens, recordings.spots, stand_of(project, recordings))
     except (AdjustmentError, ValueError) as error:

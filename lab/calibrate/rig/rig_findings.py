@@ -35,7 +35,7 @@ LIMITS = RigLimits()
 
 
 @dataclass(frozen=True, slots=True)
-class RigResult:
+class CalibratedRig:
     """A calibrated rig, and how accurate its poses are."""
 
     steps: RigCalibration

@@ -16,7 +16,7 @@ from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import split_name
 from lab.calibrate.beams.beam_findings import ARCSEC
 from lab.calibrate.beams.beams_page import beam_table
-from lab.calibrate.rig.rig_findings import RigResult
+from lab.calibrate.rig.rig_findings import CalibratedRig
 from lab.number_format import format_number
 from lab.report.calibration.calibration_charts import correlation_matrix, flatness_map, residual_histogram
 from lab.report.calibration.calibration_drawings import residual_field
@@ -32,7 +32,7 @@ _GAUGE_SIGMA = 3e-6  # m, rad: parameters with smaller sigmas are fixed by conve
 _TABLE_ROWS = 10  # held-out positions in the table
 
 
-def page_of(o: RigResult, nominal: Rig, positions: Sequence[str]) -> tuple[list[KeyFigure], list[Section]]:
+def page_of(o: CalibratedRig, nominal: Rig, positions: Sequence[str]) -> tuple[list[KeyFigure], list[Section]]:
     """Key figures and sections of the report. nominal: the rig with the beams as designed; positions: their names."""
     sections = [
         _expected(o),
@@ -49,7 +49,7 @@ def page_of(o: RigResult, nominal: Rig, positions: Sequence[str]) -> tuple[list[
     return _key_figures(o), [s for s in sections if s is not None]
 
 
-def _key_figures(o: RigResult) -> list[KeyFigure]:
+def _key_figures(o: CalibratedRig) -> list[KeyFigure]:
     joint, out = o.steps.joint, []
     if o.expected is not None:
         e = o.expected
@@ -74,7 +74,7 @@ def _key_figures(o: RigResult) -> list[KeyFigure]:
     return out
 
 
-def _expected(o: RigResult) -> Section | None:
+def _expected(o: CalibratedRig) -> Section | None:
     e = o.expected
     if e is None:
         return None
@@ -97,7 +97,7 @@ def _expected(o: RigResult) -> Section | None:
     return Section("Expected uncertainty of one frame", words, (), PageTable(heads, rows))
 
 
-def _shares(o: RigResult) -> Section | None:
+def _shares(o: CalibratedRig) -> Section | None:
     e = o.expected
     if e is None:
         return None
@@ -123,7 +123,7 @@ def _shares(o: RigResult) -> Section | None:
     return Section("Largest contributions", words, (), PageTable(heads, rows))
 
 
-def _held_out(o: RigResult, positions: Sequence[str]) -> Section | None:
+def _held_out(o: CalibratedRig, positions: Sequence[str]) -> Section | None:
     h = o.held_out
     if h is None:
         return None
@@ -150,7 +150,7 @@ def _held_out(o: RigResult, positions: Sequence[str]) -> Section | None:
     return Section("Held-out positions", words, drawings, PageTable(heads, rows))
 
 
-def _groups(o: RigResult) -> Section:
+def _groups(o: CalibratedRig) -> Section:
     joint = o.steps.joint
     rows = []
     for name, g in joint.groups.items():
@@ -181,7 +181,7 @@ def _groups(o: RigResult) -> Section:
     return Section("Consistency of the measurements", words, (), PageTable(heads, rows))
 
 
-def _residuals(o: RigResult) -> Section:
+def _residuals(o: CalibratedRig) -> Section:
     joint, measured = o.steps.joint, o.steps.measured
     cameras = list(joint.rig.cameras)
     views = joint.rig.views()
@@ -207,7 +207,7 @@ def _residuals(o: RigResult) -> Section:
 
 
 def _fields(
-    o: RigResult, what: str, pixels: Array, residuals: Array, camera_of: Ints, kept: Bools
+    o: CalibratedRig, what: str, pixels: Array, residuals: Array, camera_of: Ints, kept: Bools
 ) -> list[PageDrawing]:
     out = []
     for c, (name, camera) in enumerate(o.steps.joint.rig.cameras.items()):
@@ -220,7 +220,7 @@ def _fields(
     return out
 
 
-def _spot_pixels(o: RigResult, residuals: Array) -> Array:
+def _spot_pixels(o: CalibratedRig, residuals: Array) -> Array:
     """Residuals of spots (N, 2) in px, from normalised residuals (N, 2)."""
     roots = np.linalg.cholesky(o.steps.measured.spots.covariance)
     return np.asarray((roots @ residuals[..., None])[..., 0])
@@ -229,7 +229,7 @@ def _spot_pixels(o: RigResult, residuals: Array) -> Array:
 # Screens, beams, cameras and the correlations of their errors.
 
 
-def _screens(o: RigResult) -> Section | None:
+def _screens(o: CalibratedRig) -> Section | None:
     """Section on the poses and the flatness of the screens; None if the project has no screens."""
     joint = o.steps.joint
     drawings, rows = [], []
@@ -271,7 +271,7 @@ def _screens(o: RigResult) -> Section | None:
     return Section("Screens", words, drawings, PageTable(heads, rows))
 
 
-def _beams(o: RigResult, nominal: Rig) -> Section:
+def _beams(o: CalibratedRig, nominal: Rig) -> Section:
     """Section on the beams, compared with the nominal ones, and on the pose of the stand."""
     joint = o.steps.joint
     direction, offset = _beam_sigmas(joint)
@@ -293,7 +293,7 @@ def _beams(o: RigResult, nominal: Rig) -> Section:
     return Section("Beams", words, (), table)
 
 
-def _cameras(o: RigResult) -> Section:
+def _cameras(o: CalibratedRig) -> Section:
     """Section on the poses of the cameras and the change of their focal lengths."""
     joint = o.steps.joint
     sigmas = dict(zip(joint.covariance.names, np.sqrt(np.diagonal(joint.covariance.matrix)), strict=True))
@@ -334,7 +334,7 @@ def _centre_jacobian(R: Array, t: Array) -> Array:
     return np.array([[0, -c[2], c[1]], [c[2], 0, -c[0]], [-c[1], c[0], 0]])
 
 
-def _correlations(o: RigResult) -> Section:
+def _correlations(o: CalibratedRig) -> Section:
     """Section on the correlations of the parameters."""
     C = o.steps.joint.covariance
     sigma = np.sqrt(np.diagonal(C.matrix))
@@ -358,7 +358,7 @@ def _short_name(name: str) -> str:
     return f"{kind.removesuffix('s')} {thing} {bare}"
 
 
-def _lab(o: RigResult) -> Section:
+def _lab(o: CalibratedRig) -> Section:
     """Section with three views of the lab."""
     joint = o.steps.joint
     body = (

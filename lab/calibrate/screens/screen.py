@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.screens.screens import ScreensResult, pointing_sigmas_m, spot_sigmas
+from calibration.screens.screens import FittedScreens, pointing_sigmas_m, spot_sigmas
 from geometry.rig import Rig
 from lab.calibrate.screens.screen_findings import near_findings, network_findings, survey_findings
 from lab.calibrate.screens.screen_inputs import adjusted_screens, screen_inputs
@@ -30,7 +30,7 @@ RESIDUAL_COLUMNS = ("camera", "point", "u_px", "v_px", "residual_u_px", "residua
 DOT_COLUMNS = ("point", "screen", "x_m", "y_m", "z_m", "shift_x_m", "shift_y_m", "shift_z_m", "height_m", "used")
 
 
-def write_tables(result: ScreensResult, folder: Path) -> None:
+def write_tables(result: FittedScreens, folder: Path) -> None:
     """Write residuals.csv (a row per observation and per board corner) and dots.csv (a row per control point).
 
     Residuals are measured minus predicted; the `point` of a corner is the name of its board placement. Shifts are
@@ -80,7 +80,7 @@ _STEP = Step("screens", (DOTS, RESIDUALS), SCREENS)
 
 def calibrate_screen(
     project_path: Path, out: Path, today: datetime.date | None = None, *, progress: Progress | None = None
-) -> Outcome[ScreensResult]:
+) -> Outcome[FittedScreens]:
     """Calibrate the screens and the poses of the cameras of a project.
 
     Writes into `out`: screens.yaml; rig.yaml with the nominal beams, if the project has a target; residuals.csv,
@@ -94,7 +94,7 @@ def calibrate_screen(
     return run_step(_STEP, out, lambda: _solve(Path(project_path), today, progress))
 
 
-def _solve(project_path: Path, today: datetime.date | None, progress: Progress | None) -> Solved[ScreensResult]:
+def _solve(project_path: Path, today: datetime.date | None, progress: Progress | None) -> Solved[FittedScreens]:
     project = load_project(project_path)
     day = calibration_date(project, today)
     inputs = screen_inputs(project)
@@ -125,7 +125,7 @@ def _solve(project_path: Path, today: datetime.date | None, progress: Progress |
     )
 
 
-def _figures(result: ScreensResult) -> str:
+def _figures(result: FittedScreens) -> str:
     rig = result.fit.rig
     surface = 1e3 * max(float(np.max(spot_sigmas(result, k))) for k in range(len(rig.screens)))
     place = 1e3 * max(pointing_sigmas_m(result).values())
@@ -136,7 +136,7 @@ def _figures(result: ScreensResult) -> str:
 
 
 def _save(
-    project: Project, result: ScreensResult, findings: Sequence[Finding], day: datetime.date, folder: Path
+    project: Project, result: FittedScreens, findings: Sequence[Finding], day: datetime.date, folder: Path
 ) -> None:
     fit = result.fit
     state = state_of(findings, day, expiry_date(project, day), project.notes)

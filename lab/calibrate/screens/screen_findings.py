@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 
 from calibration.screens.network import classify_outliers
-from calibration.screens.screens import ApproximatePosition, ScreensResult, pointing_sigmas_m, spot_sigmas
+from calibration.screens.screens import ApproximatePosition, FittedScreens, pointing_sigmas_m, spot_sigmas
 from geometry.arrays import Array
 from lab.files.project.project import Project
 from lab.findings.finding import Finding, Level, finding, level_above, passed
@@ -30,7 +30,7 @@ class ScreenLimits:
 
 
 def network_findings(
-    result: ScreensResult, limits: ScreenLimits = ScreenLimits(), *, names_doubted: bool = False
+    result: FittedScreens, limits: ScreenLimits = ScreenLimits(), *, names_doubted: bool = False
 ) -> list[Finding]:
     """All findings of the adjustment; of equal level, causes before their effects.
 
@@ -44,7 +44,7 @@ def network_findings(
     return out
 
 
-def _agreement(result: ScreensResult, limits: ScreenLimits) -> Finding:
+def _agreement(result: FittedScreens, limits: ScreenLimits) -> Finding:
     fit = result.fit
     factor = float(np.sqrt(fit.variance_factor))
     if fit.dof <= 0:
@@ -56,7 +56,7 @@ def _agreement(result: ScreensResult, limits: ScreenLimits) -> Finding:
     return finding("BP-S02", level_above(factor, limits.factor_warn, limits.factor_fail), what, remedy=remedy)
 
 
-def _doubtful_lens(result: ScreensResult) -> str:
+def _doubtful_lens(result: FittedScreens) -> str:
     """The camera with the largest residuals, whose lens calibration may be another camera's."""
     s, fit = result.network.point_observations, result.fit
     if not len(s):
@@ -72,7 +72,7 @@ def _doubtful_lens(result: ScreensResult) -> str:
     return f"; camera {worst!r} has the largest residuals: its lens may be that of another camera" if worst else ""
 
 
-def _dots(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
+def _dots(result: FittedScreens, limits: ScreenLimits) -> list[Finding]:
     network, out = result.network, []
     wrong = classify_outliers(network, result.fit)
     reported: set[tuple[str, str]] = set()
@@ -106,7 +106,7 @@ def _dots(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
     return out
 
 
-def _surfaces(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
+def _surfaces(result: FittedScreens, limits: ScreenLimits) -> list[Finding]:
     out = []
     for name, screen in zip(result.network.rig.screens, result.screens, strict=True):
         if screen.flatness is None:
@@ -145,7 +145,7 @@ def _bulge(bow: Array, xyz: Array) -> float:
     return float(np.ptp(z))
 
 
-def _sigmas(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
+def _sigmas(result: FittedScreens, limits: ScreenLimits) -> list[Finding]:
     known = {
         f"screen {name!r}: its surface is known to {{}} (1 sigma, worst place)": float(np.max(spot_sigmas(result, k)))
         for k, name in enumerate(result.network.rig.screens)
@@ -161,7 +161,7 @@ def _sigmas(result: ScreensResult, limits: ScreenLimits) -> list[Finding]:
     ]
 
 
-def _second_poses(result: ScreensResult) -> list[Finding]:
+def _second_poses(result: FittedScreens) -> list[Finding]:
     names = list(result.network.rig.cameras)
     out = []
     for c, second in result.second_poses.items():
@@ -170,7 +170,7 @@ def _second_poses(result: ScreensResult) -> list[Finding]:
     return out
 
 
-def near_findings(result: ScreensResult, near: Mapping[int, ApproximatePosition]) -> list[Finding]:
+def near_findings(result: FittedScreens, near: Mapping[int, ApproximatePosition]) -> list[Finding]:
     """Whether cameras are at their approximate positions, measured by tape."""
     out = []
     for c, n in near.items():
@@ -181,7 +181,7 @@ def near_findings(result: ScreensResult, near: Mapping[int, ApproximatePosition]
     return out
 
 
-def survey_findings(project: Project, result: ScreensResult) -> list[Finding]:
+def survey_findings(project: Project, result: FittedScreens) -> list[Finding]:
     """Findings on shared lens files, and on control points that are off their screens or cover too little of them."""
     return [*_shared_lenses(project), *_coverage(project, result)]
 
@@ -198,7 +198,7 @@ def _shared_lenses(project: Project) -> list[Finding]:
     return out
 
 
-def _coverage(project: Project, result: ScreensResult) -> list[Finding]:
+def _coverage(project: Project, result: FittedScreens) -> list[Finding]:
     """Warnings for control points outside of their screen, and for screens that the points cover only partly."""
     out = []
     for (name, entry), screen in zip(project.screens.items(), result.screens, strict=True):

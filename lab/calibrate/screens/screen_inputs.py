@@ -21,9 +21,9 @@ from calibration.screens.network import ControlPoints, Network, PointObservation
 from calibration.screens.network_start import NotConnectedError
 from calibration.screens.screens import (
     ApproximatePosition,
+    FittedScreens,
     Scan,
     ScreenSetup,
-    ScreensResult,
     SurveyError,
     calibrate,
     diagnose_survey,
@@ -41,7 +41,7 @@ from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.calibrate.camera.photos import as_8_bit
 from lab.errors import CalibrationError, InputError
 from lab.files.project.point_files import Observations, Survey, read_observations, read_point_cloud, read_survey
-from lab.files.project.project import Cloud, FixedBoard, Project, ScreenEntry
+from lab.files.project.project import Cloud, FixedBoard, Project, ProjectScreen
 from lab.files.text.csv_text import MAX_SCAN_COORDINATE
 from lab.files.text.error_text import suggest_name
 from lab.pictures.picture_file import MissingPicture, read_picture
@@ -351,7 +351,7 @@ def _held_screen(project: Project) -> int:
 
 
 def _setup(
-    on: str, entry: ScreenEntry, survey: Survey, project: Project, scan: tuple[Scan, list[str]] | None
+    on: str, entry: ProjectScreen, survey: Survey, project: Project, scan: tuple[Scan, list[str]] | None
 ) -> ScreenSetup:
     control_points = None
     if entry.frame is not None:
@@ -372,7 +372,7 @@ def _setup(
     )
 
 
-def _scan(cloud: Cloud, entry: ScreenEntry, survey: Survey, project: Project) -> tuple[Scan, list[str]]:
+def _scan(cloud: Cloud, entry: ProjectScreen, survey: Survey, project: Project) -> tuple[Scan, list[str]]:
     """The scan of a screen in the world frame, and notes on it."""
     pose, covariance = None if cloud.world_from_cloud is None else cloud.world_from_cloud.pose(), None
     try:
@@ -455,7 +455,7 @@ _SUSPICIOUS_MISFIT = (
 _ACCEPTED_MISFIT = 2.0  # misfit below which a change to the survey is accepted as the explanation
 
 
-def adjusted_screens(project: Project, inputs: ScreenInputs, progress: Progress | None = None) -> ScreensResult:
+def adjusted_screens(project: Project, inputs: ScreenInputs, progress: Progress | None = None) -> FittedScreens:
     """Adjust cameras and screens to the survey; if they do not fit, find the mistake in the survey.
 
     progress: called with the number of changes to the survey that have been tried, and of all.

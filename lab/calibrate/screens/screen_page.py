@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.screens.screens import ScreensResult, camera_sigmas, pointing_sigmas_m, spot_sigmas
+from calibration.screens.screens import FittedScreens, camera_sigmas, pointing_sigmas_m, spot_sigmas
 from geometry.camera import pinhole_numbers
 from lab.files.project.project import Project
 from lab.files.rig.rig_file import covariance_blocks
@@ -24,7 +24,7 @@ from lab.report.page import (
 _MAX_ROWS = 400  # rows in the table of observations; residuals.csv has all
 
 
-def page_of(result: ScreensResult, project: Project, remarks: Sequence[str]) -> tuple[list[KeyFigure], list[Section]]:
+def page_of(result: FittedScreens, project: Project, remarks: Sequence[str]) -> tuple[list[KeyFigure], list[Section]]:
     """Key figures and sections of the report. remarks: on the scans."""
     sections = [
         _places(result),
@@ -37,7 +37,7 @@ def page_of(result: ScreensResult, project: Project, remarks: Sequence[str]) -> 
     return _key_figures(result), [*sections, Section("Scans", remarks)] if remarks else sections
 
 
-def _key_figures(result: ScreensResult) -> list[KeyFigure]:
+def _key_figures(result: FittedScreens) -> list[KeyFigure]:
     fit = result.fit
     out = []
     for k, name in enumerate(fit.rig.screens):
@@ -73,14 +73,14 @@ def _key_figures(result: ScreensResult) -> list[KeyFigure]:
     return out
 
 
-def _distance(result: ScreensResult, camera: str) -> float:
+def _distance(result: FittedScreens, camera: str) -> float:
     """Distance of a camera from the origin of its screen, m."""
     c = result.fit.rig.cameras[camera]
     screen = result.fit.rig.screens[c.screen].world_from_screen
     return float(np.linalg.norm(c.camera_from_world.apply(screen.translation)))
 
 
-def _places(result: ScreensResult) -> Section:
+def _places(result: FittedScreens) -> Section:
     fit, network = result.fit, result.network
     sigmas = camera_sigmas(result)
     pointing = pointing_sigmas_m(result)
@@ -103,7 +103,7 @@ def _places(result: ScreensResult) -> Section:
     return Section("Cameras", words, table=PageTable(heads, rows))
 
 
-def _screen(result: ScreensResult, project: Project, k: int) -> Section:
+def _screen(result: FittedScreens, project: Project, k: int) -> Section:
     name, screen = list(result.fit.rig.screens.items())[k]
     about = result.screens[k]
     normal, origin = screen.world_from_screen.rotation[:, 2], screen.world_from_screen.translation
@@ -163,7 +163,7 @@ def _vector(v: np.ndarray, digits: int) -> str:
     return "(" + ", ".join(f"{round(float(x), digits) + 0.0:.{digits}f}" for x in v) + ")"
 
 
-def _pixels(result: ScreensResult) -> Section:
+def _pixels(result: FittedScreens) -> Section:
     fit, network = result.fit, result.network
     drawings = []
     for i, (name, c) in enumerate(fit.rig.cameras.items()):
@@ -182,7 +182,7 @@ def _pixels(result: ScreensResult) -> Section:
     return Section("Pixels", words, drawings)
 
 
-def _observations(result: ScreensResult) -> Section:
+def _observations(result: FittedScreens) -> Section:
     """Section with the table of the observations, the largest residuals first."""
     network, fit = result.network, result.fit
     screens = list(fit.rig.screens)
@@ -204,7 +204,7 @@ def _observations(result: ScreensResult) -> Section:
     return Section("Observations of control points", words, table=PageTable(heads, rows[:_MAX_ROWS]))
 
 
-def _scene(result: ScreensResult) -> list[PageDrawing]:
+def _scene(result: FittedScreens) -> list[PageDrawing]:
     fit, network = result.fit, result.network
     things: list[SceneObject] = []
     for k, (name, screen) in enumerate(fit.rig.screens.items()):
@@ -218,7 +218,7 @@ def _scene(result: ScreensResult) -> list[PageDrawing]:
     return [PageDrawing(view) for view in scene_views(things, "Cameras, screens and control points", LAB_VIEWS)]
 
 
-def _correlations(result: ScreensResult) -> Section:
+def _correlations(result: FittedScreens) -> Section:
     blocks = covariance_blocks(result.fit.covariance)
     first = next(iter(result.fit.rig.cameras))
     block = blocks[f"cameras.{first}"]

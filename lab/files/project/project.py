@@ -161,7 +161,7 @@ _Two = Annotated[tuple[float, float], pydantic.PlainValidator(fields.numbers(2))
 _Bow = Annotated[str, pydantic.PlainValidator(fields.one_of(BOW))]
 
 
-class CameraEntry(fields.Block):
+class ProjectCamera(fields.Block):
     """A camera of the project: its calibrated lens, and its approximate position."""
 
     lens_path: _File = pydantic.Field(alias="intrinsics")
@@ -172,7 +172,7 @@ class CameraEntry(fields.Block):
     _lens: CameraFile = pydantic.PrivateAttr()
 
     @pydantic.model_validator(mode="after")
-    def _read_lens(self, info: pydantic.ValidationInfo) -> CameraEntry:
+    def _read_lens(self, info: pydantic.ValidationInfo) -> ProjectCamera:
         if info.context is not None:
             try:
                 self._lens = load_lens(self.lens_path, self.camera)
@@ -232,7 +232,7 @@ class ScreenFrame(fields.Block):
     origin_at_m: _Two = (0.0, 0.0)  # position of the dot `origin` in the screen's frame
 
 
-class ScreenEntry(fields.Block):
+class ProjectScreen(fields.Block):
     """A screen of the project and its measurements, except the dots of the survey."""
 
     size_m: Annotated[
@@ -308,7 +308,7 @@ class Stand(fields.Block):
         return float(np.radians(self.pose_sigma_deg))
 
 
-class RecordingEntry(fields.Block):
+class ProjectRecording(fields.Block):
     """Spots recorded at poses of the stand, static or moving."""
 
     run: Annotated[Path | None, pydantic.PlainValidator(_run_folder)] = None  # a run folder, or ...
@@ -317,7 +317,7 @@ class RecordingEntry(fields.Block):
     use_truth: Annotated[bool, pydantic.PlainValidator(fields.boolean)] = False  # the run's own truth/pose.csv
 
     @pydantic.model_validator(mode="after")
-    def _one_of_them(self, info: pydantic.ValidationInfo) -> RecordingEntry:
+    def _one_of_them(self, info: pydantic.ValidationInfo) -> ProjectRecording:
         if (self.run is None) == (self.spots is None):
             raise fields.field_error(f"expected run or spots, got {'both; keep one' if self.run else 'neither'}")
         if self.use_truth and (self.run is None or self.stated_poses is not None):
@@ -343,15 +343,15 @@ class Project(fields.Block):
     )
     date: Day | None = None  # of the measurements; without it, today
     valid_days: Annotated[int | None, pydantic.PlainValidator(_days)] = None  # without it, no limit
-    cameras: dict[_Name, CameraEntry] = {}  # noqa: RUF012 - frozen
-    screens: dict[_Name, ScreenEntry] = {}  # noqa: RUF012 - frozen
+    cameras: dict[_Name, ProjectCamera] = {}  # noqa: RUF012 - frozen
+    screens: dict[_Name, ProjectScreen] = {}  # noqa: RUF012 - frozen
     survey: _Files = ()  # point,x_m,y_m,z_m[,sigma_x_m,sigma_y_m,sigma_z_m][,screen]
     points: _Files = ()  # camera,point,u_px,v_px[,sigma_px]
     boards: list[SharedBoard] = []  # noqa: RUF012 - frozen
     world: fields.Word | None = None  # the screen whose frame is the world frame; without it, the frame of the survey
     target: TargetBlock | None = None  # as designed: start values of the calibration
     stand: Stand | None = None
-    recordings: list[RecordingEntry] = []  # noqa: RUF012 - frozen
+    recordings: list[ProjectRecording] = []  # noqa: RUF012 - frozen
     notes: fields.Text = ""
     _place: Path = pydantic.PrivateAttr(Path("calibration.yaml"))
 

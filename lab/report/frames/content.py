@@ -190,7 +190,7 @@ class CameraFrame:
 
 
 @dataclass(frozen=True, slots=True)
-class FrameContent:
+class DrawnFrame:
     """One frame of all cameras."""
 
     name: str
@@ -204,7 +204,7 @@ class FrameContent:
 
 def frame_content(
     data: ResultData, index: int, shown_by: Mapping[str, Recorded], cameras: list[str], tail: int = 0
-) -> FrameContent:
+) -> DrawnFrame:
     """What is drawn of the frame with this index. shown_by: by camera. tail: frames of each spot's past."""
     poses = data.poses
     code = int(poses.status[index])
@@ -226,7 +226,7 @@ def frame_content(
                 tuple(marks[j] for j in views),
             )
         )
-    return FrameContent(
+    return DrawnFrame(
         name=data.name,
         frame=int(poses.frames[index]),
         t_s=float(poses.t_s[index]),

@@ -27,7 +27,7 @@ from lab.report.frames.canvas import (
     text_size,
     write,
 )
-from lab.report.frames.content import SIGMAS, CameraFrame, FrameContent, SpotMark
+from lab.report.frames.content import SIGMAS, CameraFrame, DrawnFrame, SpotMark
 from lab.report.plot.svg import GREY, POSE_COLOURS, SPOT_COLOURS, YELLOW, grey_limits, stretched
 from tracking.statuses import SpotStatus
 
@@ -207,7 +207,7 @@ class Layout:
 
 
 def sheet(
-    content: FrameContent,
+    content: DrawnFrame,
     layout: Layout,
     cuts: bool = True,
     limits: Mapping[str, Limits] | None = None,
@@ -240,7 +240,7 @@ def sheet(
     return np.concatenate(parts)
 
 
-def _head(content: FrameContent, wide: int, layout: Layout, longest: str) -> Pixels:
+def _head(content: DrawnFrame, wide: int, layout: Layout, longest: str) -> Pixels:
     """Frame number, time, name of the run and pose, with room for the longest text of a pose."""
     line = layout.line
     when = f"   t = {content.t_s:.4f} s" if np.isfinite(content.t_s) else ""
@@ -295,7 +295,7 @@ def _camera_block(camera: CameraFrame, wide: int, layout: Layout, cuts: bool, li
     return np.concatenate(parts)
 
 
-def _legend(content: FrameContent, wide: int, layout: Layout, whole: bool) -> Pixels:
+def _legend(content: DrawnFrame, wide: int, layout: Layout, whole: bool) -> Pixels:
     """What the marks mean. whole: also those that are not drawn in this frame."""
     line, unit = layout.line, layout.unit
     marks = [m for c in content.cameras for m in c.marks]

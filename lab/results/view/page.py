@@ -21,7 +21,7 @@ from lab.findings.outcome import Done
 from lab.report.calibration.calibration_scene import Rectangle, outline, scene_views
 from lab.report.html import as_script, environment
 from lab.report.plot.svg import ORANGE, PURPLE
-from lab.results.view.scene import Content, View, edges, mesh_of, read_content, thinned, view_of, write_glb
+from lab.results.view.scene import RigAndPoses, View, edges, mesh_of, read_content, thinned, view_of, write_glb
 
 DEFAULT_OUT = Path("results", "view")
 MOST_MOMENTS = 800  # of the playback
@@ -110,7 +110,7 @@ def scene_data(view: View, index: int | None, most_moments: int = MOST_MOMENTS, 
     return {"lines": lines, "moments": _moments(content, indices, digits), "first": first}
 
 
-def _moments(content: Content, indices: Ints, digits: int) -> list[dict[str, Any]]:
+def _moments(content: RigAndPoses, indices: Ints, digits: int) -> list[dict[str, Any]]:
     """Frame, time, status, rays and spots (name, colour and place) of some poses: as View.moving, all at once."""
     rig, poses = content.rig, content.world_from_body[indices]
     model = SpotModel.of(rig)

@@ -39,7 +39,7 @@ from tracking.statuses import PoseStatus
 
 
 @dataclass(frozen=True, slots=True)
-class Content:
+class RigAndPoses:
     """A rig and F poses of the vehicle; for a rig alone, one in the middle of what it sees."""
 
     name: str
@@ -73,7 +73,7 @@ class Content:
         return int(known[np.flatnonzero(numbers == frame)[0]])
 
 
-def read_content(path: Path, rig_path: Path | None) -> Content:
+def read_content(path: Path, rig_path: Path | None) -> RigAndPoses:
     """A rig.yaml, a run folder (with the poses of its truth) or a results folder.
 
     rig_path: a rig.yaml in place of the one that the run names.
@@ -94,23 +94,23 @@ def read_content(path: Path, rig_path: Path | None) -> Content:
     return _without_poses(path.name, rig)
 
 
-def _of_results(results: Path, rig_path: Path | None) -> Content:
+def _of_results(results: Path, rig_path: Path | None) -> RigAndPoses:
     folder = ResultFolder(results)
     rig = load_rig(rig_path) if rig_path is not None else folder.run("name its rig: --rig rig.yaml").rig
     return content_of_poses(folder.name, rig, folder.poses)
 
 
-def content_of_poses(name: str, rig: Rig, track: PoseTrack) -> Content:
+def content_of_poses(name: str, rig: Rig, track: PoseTrack) -> RigAndPoses:
     """The poses of attitude.csv with the covariances of their positions."""
     covariance = track.covariance[:, :3, :3].copy()
     without = ~np.isfinite(covariance).all(axis=(1, 2))
     covariance[without] = track.sigma_position_m[without][:, :, None] ** 2 * np.eye(3)
     measured = track.has(PoseStatus.MEASURED)
     t_s = _times(track.frames, track.t_s)
-    return Content(name, "attitude.csv", rig, track.frames, t_s, track.world_from_body, covariance, measured)
+    return RigAndPoses(name, "attitude.csv", rig, track.frames, t_s, track.world_from_body, covariance, measured)
 
 
-def _of_run(path: Path, rig_path: Path | None) -> Content:
+def _of_run(path: Path, rig_path: Path | None) -> RigAndPoses:
     run = load_run(path)
     rig = run.rig if rig_path is None else load_rig(rig_path)
     truth = load_run_truth(run)
@@ -119,7 +119,7 @@ def _of_run(path: Path, rig_path: Path | None) -> Content:
         n = len(t.frame)
         poses = Pose.from_quaternion(t.quaternion_wxyz, t.position_m)
         unknown = np.full((n, 3, 3), np.nan)
-        return Content(run.name, "truth/pose.csv", rig, t.frame, t.t_s, poses, unknown, np.ones(n, dtype=bool))
+        return RigAndPoses(run.name, "truth/pose.csv", rig, t.frame, t.t_s, poses, unknown, np.ones(n, dtype=bool))
     if run.prior is None:
         return _without_poses(run.name, rig)
     centre = run.prior.centre
@@ -127,15 +127,17 @@ def _of_run(path: Path, rig_path: Path | None) -> Content:
     # An even spread within a cube has this variance along each axis.
     covariance = np.eye(3)[None] * run.prior.within_m**2 / 3
     one = np.zeros(1, dtype=np.int64)
-    return Content(run.name, "the prior of run.yaml", rig, one, np.zeros(1), poses, covariance, np.zeros(1, dtype=bool))
+    return RigAndPoses(
+        run.name, "the prior of run.yaml", rig, one, np.zeros(1), poses, covariance, np.zeros(1, dtype=bool)
+    )
 
 
-def _without_poses(name: str, rig: Rig) -> Content:
+def _without_poses(name: str, rig: Rig) -> RigAndPoses:
     """A rig with the vehicle in the middle of what it sees."""
     centre = assumed_range(rig).centre
     poses, unknown = Pose(centre.rotation[None], centre.translation[None]), np.full((1, 3, 3), np.nan)
     one = np.zeros(1, dtype=np.int64)
-    return Content(name, "", rig, one, np.zeros(1), poses, unknown, np.zeros(1, dtype=bool))
+    return RigAndPoses(name, "", rig, one, np.zeros(1), poses, unknown, np.zeros(1, dtype=bool))
 
 
 def workspace(rig: Rig, middle: Pose) -> Trail | None:
@@ -313,7 +315,7 @@ class Ellipsoid:
 class View:
     """A scene to be drawn."""
 
-    content: Content
+    content: RigAndPoses
     fixed: Sequence[SceneObject]  # screens, cameras and the trajectory
     ellipsoids: list[Ellipsoid]
     sigma_scale: float  # the ellipsoids' semi-axes over the sigmas
@@ -330,7 +332,7 @@ class View:
 
 
 def view_of(
-    content: Content,
+    content: RigAndPoses,
     index: int | None,
     sigma_scale: float | None = None,
     most_points: int = MOST_POINTS,
@@ -358,7 +360,7 @@ def view_of(
     return View(content, fixed, drawn, scale, len(ellipsoids) - len(drawn), reach, extent)
 
 
-def ellipsoid(content: Content, index: int, scale: float) -> Ellipsoid:
+def ellipsoid(content: RigAndPoses, index: int, scale: float) -> Ellipsoid:
     """The ellipsoid of `scale` sigmas of one pose's position; grey where the pose is predicted."""
     values, vectors = np.linalg.eigh(content.position_covariance[index])
     axes = vectors * np.sqrt(np.maximum(values, 0.0)) * scale
@@ -372,12 +374,12 @@ def thinned(indices: Ints, most: int) -> Ints:
     return indices[np.unique(np.linspace(0, len(indices) - 1, most).round().astype(np.int64))]
 
 
-def _trajectory(content: Content, most: int) -> Array:
+def _trajectory(content: RigAndPoses, most: int) -> Array:
     """Positions (n, 3), at most so many, at even steps of the frames, with nan where the pose is unknown."""
     return content.world_from_body.translation[thinned(np.arange(len(content.frames)), most)]
 
 
-def _scale(content: Content, indices: Ints, extent_m: float) -> float:
+def _scale(content: RigAndPoses, indices: Ints, extent_m: float) -> float:
     """A round factor with which the median sigma is a share of the scene; at least 1."""
     if not len(indices):
         return 1.0

@@ -14,7 +14,7 @@ from geometry.pose_prior import PosePrior
 from geometry.rig import Beam, Rig
 from lab.simulate.rigs import RIGS
 from tracking.detections import Detections
-from tracking.labelling.first_labels import NO_POINT, LabelResult, find_labels
+from tracking.labelling.first_labels import NO_POINT, FirstLabels, find_labels
 from tracking.parameters import LabelParameters
 
 NOISE_PX = 0.1
@@ -73,7 +73,7 @@ def photograph(
     return Picture(detections, origin)
 
 
-def wrong_labels(result: LabelResult, model: SpotModel, picture: Picture) -> list[str]:
+def wrong_labels(result: FirstLabels, model: SpotModel, picture: Picture) -> list[str]:
     """The spots with a wrong label."""
     assert result.chosen is not None
     return [
