@@ -102,7 +102,8 @@ class _Estimator:
         self.beside = np.zeros((len(self.dt), 6))  # of corner_offsets, at the reference of the last step
         self.steps: Steps | None = None  # at that reference; None: before the first step
         self.weak = np.zeros(len(self.dt), dtype=bool)  # (T,) see `jump_variances` ...
-        self.excluded = np.zeros(len(self.dt), dtype=bool)  # (T,) ... and this
+        self.excluded = np.zeros(len(self.dt), dtype=bool)  # (T,) ... this ...
+        self.sized = np.zeros(len(self.dt), dtype=bool)  # (T,) ... and this
         self.kept: tuple[Reference, tuple[Array, Array, Array]] | None = None  # of the last `_without_corners`
         self.fresh = motion.log_density is None
         self.log_density = self._first_density() if motion.log_density is None else motion.log_density[core].copy()
@@ -119,7 +120,10 @@ class _Estimator:
             density = self._density(out, interpolating=not adapting)
             if self.run.delays is not None:
                 self._open_steps(density)
+            known = self.jumped.copy()
             result, moved = self._step(density)
+            if self.run.delays is not None:
+                self.sized = known
             if not (np.isfinite(result.x).all() and np.isfinite(result.pose_P).all()):
                 if out is None:
                     raise FloatingPointError("the smoothing pass has no finite first step")
@@ -298,7 +302,7 @@ class _Estimator:
         if jumped.any():
             # For all later passes: a frame near the limit would be weak in every second one, and they would never end.
             self.weak |= weak_frames(L if self.run.delays is None else self._undelayed(ref), measured)
-        jump = jump_variances(ref, self.weak, measured, jumped, self.dt, self.excluded)
+        jump = jump_variances(ref, self.weak, measured, jumped, self.dt, self.excluded, self.sized)
         first = first_variance(ref, self.dt, bool(measured[0]))
         return RunInformation(L, g, self.dt, jump, jump / MANOEUVRE_S**2, first), float(chi2.sum())
 
@@ -354,7 +358,9 @@ class _Estimator:
 
     def _open_steps(self, density: Array) -> None:
         """Update the steps to jerk densities (T, 6) and to the jumps known so far."""
-        jump = jump_variances(self.ref, self.weak, self.measured, self.jumped, self.dt, self.excluded)
+        jump = jump_variances(
+            self.ref, self.weak, self.measured, self.jumped, self.dt, self.excluded, self.sized
+        )
         corners = corner_times(self.ref, self.jumped, self.dt)
         self.steps, self.kept = Steps(self.dt, np.ascontiguousarray(density), np.ascontiguousarray(jump), corners), None
 
