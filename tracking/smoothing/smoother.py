@@ -318,7 +318,7 @@ class _Smoother:
             return seen
         nowhere = np.zeros(len(self.rec), dtype=bool)
         jump = jump_variances(
-            motion.ref, nowhere, self.measured, motion.jumped, self.rec.dt_s, nowhere, motion.jumped
+            motion.ref, nowhere, self.measured, motion.jumped, self.rec.dt_s, nowhere, motion.jump_scale
         )
         corners = corner_times(motion.ref, motion.jumped, self.rec.dt_s)
         steps = Steps(self.rec.dt_s, np.exp(motion.log_density), np.ascontiguousarray(jump), corners)

@@ -158,19 +158,17 @@ def unobserved_steps(measured: Bools) -> Bools:
 
 
 def jump_variances(
-    ref: Reference, weak: Bools, measured: Bools, jumped: Bools, dt: Array, excluded: Bools, sized: Bools
+    ref: Reference, weak: Bools, measured: Bools, jumped: Bools, dt: Array, excluded: Bools, scale: Array
 ) -> Array:
     """Variances (T, 2) of the velocities' jump in each step, (m/s)^2 and (rad/s)^2, weighted with its probability.
 
     measured (T,): frames whose spots determine the pose; weak (T,): those that do so much worse than usual; jumped
-    (T,): steps with a known jump; dt (T,), s; excluded (T,): unobserved steps in which there was none; sized (T,):
-    known jumps that the reference has, of its size along each axis: that of the fastest motion would leave the poses
-    between pictures of different instants open by many times their noise.
+    (T,): steps with a known jump; dt (T,), s; excluded (T,): unobserved steps in which there was none; scale (T, 2): of
+    the variances of known jumps, which are otherwise those of the fastest motion.
     """
     usual = float(np.median(dt[dt > 0])) if np.any(dt > 0) else SPEED_WINDOW_S
     window = max(1, min(round(SPEED_WINDOW_S / usual), len(dt)))
     size = jump_variance(largest_near(np.where(measured[:, None], speeds(ref.m), 0.0), window))
-    own = speeds(np.diff(ref.m, axis=0, prepend=ref.m[:1])) ** 2
     probability = np.where(unobserved_steps(measured) & ~excluded, P_JUMP_OCCLUDED, 0.0)
     jumps = np.flatnonzero(jumped)
     weak = ~measured | weak
@@ -184,8 +182,8 @@ def jump_variances(
         share = 1.0 if first == last else max(1.0 / (last + 1 - first), P_JUMP_SHARED)
         probability[first : last + 1] = np.maximum(probability[first : last + 1], share)
         probability[k] = 1.0
-        if sized[k] and first == last:
-            size[k] = np.minimum(size[k], own[k])
+        if first == last:
+            size[k] *= scale[k]
     return np.asarray(probability[:, None] * size)
 
 
