@@ -367,9 +367,7 @@ class _Estimator:
 
     def _open_steps(self, density: Array) -> None:
         """Update the steps to jerk densities (T, 6) and to the jumps known so far."""
-        jump = jump_variances(
-            self.ref, self.weak, self.measured, self.jumped, self.dt, self.excluded, self.jump_scale
-        )
+        jump = jump_variances(self.ref, self.weak, self.measured, self.jumped, self.dt, self.excluded, self.jump_scale)
         corners = corner_times(self.ref, self.jumped, self.dt)
         self.steps, self.kept = Steps(self.dt, np.ascontiguousarray(density), np.ascontiguousarray(jump), corners), None
 
