@@ -167,8 +167,9 @@ def test_means_and_covariances_are_those_of_one_dense_gaussian(kind):
 )
 def test_energy_and_gamma_of_the_process_noise_agree_with_the_dense_gaussian(kind):
     """Of the jerk's share J of the noise covariance Q: energy r^T J r of the score r = Q^-1 w, w the noise's mean, and
-    its expectation tr(J (Q^-1 - Q^-1 cov(w) Q^-1)), the number of components of the jerk that the data determine. The same
-    of the share of the allowed jumps."""
+    its expectation tr(J (Q^-1 - Q^-1 cov(w) Q^-1)), the number of components of the jerk that the data determine.
+    The same of the share of the allowed jumps.
+    """
     run = RUNS[kind]()
     without_jumps = run.info._replace(
         velocity_jump=np.zeros_like(run.info.velocity_jump), acceleration_jump=np.zeros_like(run.info.velocity_jump)
