@@ -155,7 +155,9 @@ class _Estimator:
         times their noise. In runs whose pictures are of one instant each frame has its own pose.
         """
         step = (out.jump_energy + PSEUDO_COUNT) / (np.maximum(out.jump_gamma, 0.0) + PSEUDO_COUNT)
-        self.jump_scale[self.jumped] = np.minimum(self.jump_scale * step, 1.0)[self.jumped]
+        scale = np.where(self.jumped[:, None], np.minimum(self.jump_scale * step, 1.0), 0.0)
+        # Of jumps side by side the data choose one; which of the steps had it stays open.
+        self.jump_scale[self.jumped] = largest_near(scale, 1)[self.jumped]
 
     def _adapt(self, out: Interval, number: int, passes: int, new_jump: bool) -> bool:
         """Update the strength of the jerk after a pass; whether it is the last time."""
