@@ -171,7 +171,7 @@ def jump_variances(
     size = jump_variance(largest_near(np.where(measured[:, None], speeds(ref.m), 0.0), window))
     probability = np.where(unobserved_steps(measured) & ~excluded, P_JUMP_OCCLUDED, 0.0)
     jumps = np.flatnonzero(jumped)
-    weak = ~measured | weak
+    weak, sizes = ~measured | weak, np.zeros_like(size)
     for k in jumps:
         first, last = k, k
         while first > 1 and weak[first - 1]:
@@ -182,9 +182,12 @@ def jump_variances(
         share = 1.0 if first == last else max(1.0 / (last + 1 - first), P_JUMP_SHARED)
         probability[first : last + 1] = np.maximum(probability[first : last + 1], share)
         probability[k] = 1.0
-        if first == last:
-            size[k] *= scale[k]
-    return np.asarray(probability[:, None] * size)
+        if first == last and scale[k].min() < 1:
+            # Found by its motion alone, it may in truth be one step farther.
+            beside = slice(max(k - 1, 1), k + 2)
+            probability[beside] = np.maximum(probability[beside], P_JUMP_SHARED)
+            sizes[beside] = np.maximum(sizes[beside], size[k] * scale[k])
+    return np.asarray(probability[:, None] * np.where(sizes > 0, sizes, size))
 
 
 def new_jumps(shock: Array, jumped: Bools) -> Bools:
