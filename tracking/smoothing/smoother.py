@@ -317,7 +317,9 @@ class _Smoother:
         if self.delays is None or motion.log_density is None:
             return seen
         nowhere = np.zeros(len(self.rec), dtype=bool)
-        jump = jump_variances(motion.ref, nowhere, self.measured, motion.jumped, self.rec.dt_s)
+        jump = jump_variances(
+            motion.ref, nowhere, self.measured, motion.jumped, self.rec.dt_s, nowhere, motion.jump_scale
+        )
         corners = corner_times(motion.ref, motion.jumped, self.rec.dt_s)
         steps = Steps(self.rec.dt_s, np.exp(motion.log_density), np.ascontiguousarray(jump), corners)
         uv, cov = moved_detections(

@@ -167,7 +167,9 @@ def test_means_and_covariances_are_those_of_one_dense_gaussian(kind):
 )
 def test_energy_and_gamma_of_the_process_noise_agree_with_the_dense_gaussian(kind):
     """Of the jerk's share J of the noise covariance Q: energy r^T J r of the score r = Q^-1 w, w the noise's mean, and
-    its expectation tr(J (Q^-1 - Q^-1 cov(w) Q^-1)), the number of components of the jerk that the data determine."""
+    its expectation tr(J (Q^-1 - Q^-1 cov(w) Q^-1)), the number of components of the jerk that the data determine.
+    The same of the share of the allowed jumps.
+    """
     run = RUNS[kind]()
     without_jumps = run.info._replace(
         velocity_jump=np.zeros_like(run.info.velocity_jump), acceleration_jump=np.zeros_like(run.info.velocity_jump)
@@ -184,12 +186,18 @@ def test_energy_and_gamma_of_the_process_noise_agree_with_the_dense_gaussian(kin
         step = np.hstack([-F, np.eye(STATE)])
         both = slice(STATE * (k - 1), STATE * (k + 1))
         C = step @ P[both, both] @ step.T
+        jump_energy, jump_gamma = np.zeros(2), np.zeros(2)
         for axis in range(6):
             rows = [axis, axis + 6, axis + 12]
             inverse, share = np.linalg.inv(Q[np.ix_(rows, rows)]), jerk_share[np.ix_(rows, rows)]
             r, N = inverse @ w[rows], inverse - inverse @ C[np.ix_(rows, rows)] @ inverse
             assert out.energy[k, axis] == pytest.approx(r @ share @ r, rel=1e-4, abs=1e-4)
             assert out.gamma[k, axis] == pytest.approx(np.trace(share @ N), abs=1e-4)
+            jump = (Q - jerk_share)[np.ix_(rows, rows)]
+            jump_energy[axis // 3] += r @ jump @ r
+            jump_gamma[axis // 3] += np.trace(jump @ N)
+        np.testing.assert_allclose(out.jump_energy[k], jump_energy, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(out.jump_gamma[k], jump_gamma, atol=1e-4)
 
 
 def test_the_mean_energy_of_the_process_noise_is_the_number_of_determined_components():

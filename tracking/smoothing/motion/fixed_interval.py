@@ -118,6 +118,8 @@ class Interval(NamedTuple):
         Array  # (T, 6) by axis, of the step before: r^T Q r, where r is the score of the process noise, Q the jerk's
     )
     gamma: Array  # (T, 6) and its expectation tr(Q N): the number of noise components that the data determine
+    jump_energy: Array  # (T, 2) and the same two where Q is the allowed jump's, of the three axes of translation,
+    jump_gamma: Array  # (T, 2) and of rotation
     ends_P: Array  # (2, 18, 18) covariance of the whole state at the first and at the last frame
 
 
@@ -257,6 +259,8 @@ def _empty_interval(frames: int) -> Interval:
         np.zeros(frames),
         np.zeros((frames, 6)),
         np.zeros((frames, 6)),
+        np.zeros((frames, 2)),
+        np.zeros((frames, 2)),
         np.empty((2, STATE, STATE)),
     )
 
@@ -357,6 +361,13 @@ def _test_process_noise(info: RunInformation, jerk: Array, k: int, Y: Array, y: 
             + 2 * (pv * N[i, 6 + i] + pa * N[i, 12 + i] + va * N[6 + i, 12 + i]),
             0.0,
         )
+        pp, pv, pa, vv, va, aa = process_noise(
+            dt, 0.0, info.velocity_jump[k, i // 3], info.acceleration_jump[k, i // 3]
+        )
+        kind = i // 3
+        out.jump_energy[k, kind] += pp * p * p + vv * v * v + aa * a * a + 2 * (pv * p * v + pa * p * a + va * v * a)
+        out.jump_gamma[k, kind] += pp * N[i, i] + vv * N[6 + i, 6 + i] + aa * N_aa
+        out.jump_gamma[k, kind] += 2 * (pv * N[i, 6 + i] + pa * N[i, 12 + i] + va * N[6 + i, 12 + i])
         b[i] = h * p + v
         for j in range(6):
             B[i, j] = h * h * N[i, j] + h * (N[6 + i, j] + N[i, 6 + j]) + N[6 + i, 6 + j]

@@ -158,20 +158,20 @@ def unobserved_steps(measured: Bools) -> Bools:
 
 
 def jump_variances(
-    ref: Reference, weak: Bools, measured: Bools, jumped: Bools, dt: Array, excluded: Bools | None = None
+    ref: Reference, weak: Bools, measured: Bools, jumped: Bools, dt: Array, excluded: Bools, scale: Array
 ) -> Array:
     """Variances (T, 2) of the velocities' jump in each step, (m/s)^2 and (rad/s)^2, weighted with its probability.
 
     measured (T,): frames whose spots determine the pose; weak (T,): those that do so much worse than usual; jumped
-    (T,): steps with a known jump; dt (T,), s; excluded (T,): unobserved steps in which there was none.
+    (T,): steps with a known jump; dt (T,), s; excluded (T,): unobserved steps in which there was none; scale (T, 2): of
+    the variances of known jumps, which are otherwise those of the fastest motion.
     """
     usual = float(np.median(dt[dt > 0])) if np.any(dt > 0) else SPEED_WINDOW_S
     window = max(1, min(round(SPEED_WINDOW_S / usual), len(dt)))
     size = jump_variance(largest_near(np.where(measured[:, None], speeds(ref.m), 0.0), window))
-    possible = unobserved_steps(measured) if excluded is None else unobserved_steps(measured) & ~excluded
-    probability = np.where(possible, P_JUMP_OCCLUDED, 0.0)
+    probability = np.where(unobserved_steps(measured) & ~excluded, P_JUMP_OCCLUDED, 0.0)
     jumps = np.flatnonzero(jumped)
-    weak = ~measured | weak
+    weak, sizes = ~measured | weak, np.zeros_like(size)
     for k in jumps:
         first, last = k, k
         while first > 1 and weak[first - 1]:
@@ -182,7 +182,12 @@ def jump_variances(
         share = 1.0 if first == last else max(1.0 / (last + 1 - first), P_JUMP_SHARED)
         probability[first : last + 1] = np.maximum(probability[first : last + 1], share)
         probability[k] = 1.0
-    return np.asarray(probability[:, None] * size)
+        if first == last and scale[k].min() < 1:
+            # Found by its motion alone, it may in truth be one step farther.
+            beside = slice(max(k - 1, 1), k + 2)
+            probability[beside] = np.maximum(probability[beside], P_JUMP_SHARED)
+            sizes[beside] = np.maximum(sizes[beside], size[k] * scale[k])
+    return np.asarray(probability[:, None] * np.where(sizes > 0, sizes, size))
 
 
 def new_jumps(shock: Array, jumped: Bools) -> Bools:

@@ -462,6 +462,7 @@ class SmoothedMotion:
     log_density: Array | None  # (T, 6) logarithms of the jerk's spectral densities; None: not estimated yet
     interpolation_offset: float  # to be added to them for the interpolation between frames
     jumped: Bools  # (T,) the velocities jumped in the step before
+    jump_scale: Array  # (T, 2) of the variances of these jumps, as in `jump_variances`
     pose_P: Array  # (T, 6, 6)
     motion_P: Array  # (T, 6, 6) of the velocities
     known: Bools  # (T,) the pose is not lost
@@ -474,7 +475,8 @@ class SmoothedMotion:
         frames = len(ref.t)
         zero = np.zeros((frames, 6, 6))
         known = np.zeros(frames, dtype=bool)
-        return SmoothedMotion(ref, log_density, 0.0, jumped, zero, zero, known, np.zeros(frames))
+        scale = np.ones((frames, 2))
+        return SmoothedMotion(ref, log_density, 0.0, jumped, scale, zero, zero, known, np.zeros(frames))
 
     def without_covariances(self) -> SmoothedMotion:
         """What the next estimate starts from: less memory."""

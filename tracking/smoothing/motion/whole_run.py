@@ -24,6 +24,7 @@ from tracking.smoothing.motion.fixed_interval import (
     smoothed,
 )
 from tracking.smoothing.motion.process_noise import (
+    PSEUDO_COUNT,
     corner_offsets,
     corner_times,
     jump_variances,
@@ -102,7 +103,8 @@ class _Estimator:
         self.beside = np.zeros((len(self.dt), 6))  # of corner_offsets, at the reference of the last step
         self.steps: Steps | None = None  # at that reference; None: before the first step
         self.weak = np.zeros(len(self.dt), dtype=bool)  # (T,) see `jump_variances` ...
-        self.excluded = np.zeros(len(self.dt), dtype=bool)  # (T,) ... and this
+        self.excluded = np.zeros(len(self.dt), dtype=bool)  # (T,) ... this ...
+        self.jump_scale = motion.jump_scale[core].copy()  # (T, 2) ... and this
         self.kept: tuple[Reference, tuple[Array, Array, Array]] | None = None  # of the last `_without_corners`
         self.fresh = motion.log_density is None
         self.log_density = self._first_density() if motion.log_density is None else motion.log_density[core].copy()
@@ -125,6 +127,8 @@ class _Estimator:
                     raise FloatingPointError("the smoothing pass has no finite first step")
                 break
             out = result
+            if self.run.delays is not None and number >= NO_JUMPS_BEFORE:
+                self._size_jumps(out)
             sd = np.sqrt(np.maximum(np.diagonal(out.pose_P, axis1=1, axis2=2), 1e-30))
             converged = bool(np.all(np.abs(moved[:, :6]) < CONVERGED_SIGMAS * sd))
             new = np.zeros_like(self.jumped)
@@ -143,6 +147,17 @@ class _Estimator:
             at = self.ref, self.steps, self.core.start
             self.clocks = solve_clocks(self.run, self.assigned, self.weight[self.core], at, info, density)
         return self._extrapolated(out)
+
+    def _size_jumps(self, out: Interval) -> None:
+        """One step of the fixed point of `next_log_density` for the variance of each known jump.
+
+        A jump of the size of the fastest motion leaves the poses between pictures of different instants open by many
+        times their noise. In runs whose pictures are of one instant each frame has its own pose.
+        """
+        step = (out.jump_energy + PSEUDO_COUNT) / (np.maximum(out.jump_gamma, 0.0) + PSEUDO_COUNT)
+        scale = np.where(self.jumped[:, None], np.minimum(self.jump_scale * step, 1.0), 0.0)
+        # Of jumps side by side the data choose one; which of the steps had it stays open.
+        self.jump_scale[self.jumped] = largest_near(scale, 1)[self.jumped]
 
     def _adapt(self, out: Interval, number: int, passes: int, new_jump: bool) -> bool:
         """Update the strength of the jerk after a pass; whether it is the last time."""
@@ -298,7 +313,7 @@ class _Estimator:
         if jumped.any():
             # For all later passes: a frame near the limit would be weak in every second one, and they would never end.
             self.weak |= weak_frames(L if self.run.delays is None else self._undelayed(ref), measured)
-        jump = jump_variances(ref, self.weak, measured, jumped, self.dt, self.excluded)
+        jump = jump_variances(ref, self.weak, measured, jumped, self.dt, self.excluded, self.jump_scale)
         first = first_variance(ref, self.dt, bool(measured[0]))
         return RunInformation(L, g, self.dt, jump, jump / MANOEUVRE_S**2, first), float(chi2.sum())
 
@@ -354,7 +369,7 @@ class _Estimator:
 
     def _open_steps(self, density: Array) -> None:
         """Update the steps to jerk densities (T, 6) and to the jumps known so far."""
-        jump = jump_variances(self.ref, self.weak, self.measured, self.jumped, self.dt, self.excluded)
+        jump = jump_variances(self.ref, self.weak, self.measured, self.jumped, self.dt, self.excluded, self.jump_scale)
         corners = corner_times(self.ref, self.jumped, self.dt)
         self.steps, self.kept = Steps(self.dt, np.ascontiguousarray(density), np.ascontiguousarray(jump), corners), None
 
@@ -389,15 +404,15 @@ class _Estimator:
                 pose_P[k], motion_P[k] = at[3][:6, :6], at[3][6:12, 6:12]
         sd = np.sqrt(np.diagonal(pose_P, axis1=1, axis2=2))
         known = (sd[:, :3].max(axis=1) < LOST_SIGMA_M) & (sd[:, 3:].max(axis=1) < LOST_SIGMA_RAD)
-        jumped = self.motion.jumped.copy()
-        jumped[core] = self.jumped
+        jumped, scale = self.motion.jumped.copy(), self.motion.jump_scale.copy()
+        jumped[core], scale[core] = self.jumped, self.jump_scale
         clocks = self.clocks
         if clocks is not None:
             nearest = np.clip(np.arange(frames) - core.start, 0, core.stop - core.start - 1)
             clocks = replace(clocks, motion=clocks.motion[nearest])
         return SmoothedMotion(
-            Reference(R, t, m), log_density, self.interpolation_offset, jumped, pose_P, motion_P, known, self.weight,
-            clocks,
+            Reference(R, t, m), log_density, self.interpolation_offset, jumped, scale, pose_P, motion_P, known,
+            self.weight, clocks,
         )  # fmt: skip
 
 

@@ -105,3 +105,12 @@ def test_a_gap_in_smooth_motion_does_not_make_the_frames_beside_it_vague(recordi
     poses = read_poses(tmp_path / "out")
     sigma = np.linalg.norm(poses.sigma_ypr_deg, axis=1)
     assert np.max(sigma[17:25]) < 4 * np.median(sigma)
+
+
+def test_a_swing_that_begins_after_rest_leaves_no_frame_vague(tmp_path):
+    """Its first accelerations appear as velocity jumps, far smaller than those that the fastest motion would allow."""
+    write_recording(random_recording(3406, frames=60), tmp_path / "run")
+    process_run(tmp_path / "run", tmp_path / "out")
+    poses = read_poses(tmp_path / "out")
+    sigma = np.linalg.norm(poses.sigma_ypr_deg, axis=1)[3:-3]
+    assert np.max(sigma) < 20 * np.median(sigma)
