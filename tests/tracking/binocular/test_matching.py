@@ -175,7 +175,7 @@ def recording(delay_s, seed=7):
     """Fitted frames of a target that moves up and sideways at about 1 m/s, 25 Hz; right picture late."""
     rng, out = np.random.default_rng(seed), []
     cov = np.broadcast_to(NOISE_PX**2 * np.eye(2), (2, 7, 2, 2))
-    for t in np.arange(14) / 25:
+    for t in np.arange(40) / 25:
         poses = [
             Pose.from_ypr(
                 np.array([0.3 * np.sin(2 * s), 0.1, 0.2]), np.array([0.2 + 0.5 * np.sin(3 * s), 0.9 * s - 0.2, 8.0])
