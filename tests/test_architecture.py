@@ -53,12 +53,10 @@ def modules(root: Path) -> dict[str, Path]:
 
 
 def statements(tree: ast.AST, into_functions: bool) -> Iterator[ast.AST]:
-    """All nodes below, with or without those that run only when a function is called."""
-    if into_functions:
-        yield from ast.walk(tree)
-        return
+    """All statements below, with or without those that run only when a function is called."""
+    skipped = ast.expr if into_functions else ast.expr | ast.FunctionDef | ast.AsyncFunctionDef
     for node in ast.iter_child_nodes(tree):
-        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+        if not isinstance(node, skipped):
             yield node
             yield from statements(node, into_functions)
 

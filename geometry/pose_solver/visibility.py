@@ -14,7 +14,7 @@ from geometry.forward_model import SpotModel
 from geometry.planes import common_perpendicular, intersect_surface
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
-from geometry.pose_solver.gauss_newton import RANK_TOLERANCE, SolveLimits, covariance_of, fit_pose
+from geometry.pose_solver.gauss_newton import RANK_TOLERANCE, SolveLimits, covariances_of, fit_pose
 from geometry.pose_solver.three_spots import poses_from_three_spots
 from geometry.rig import Rig
 
@@ -241,11 +241,9 @@ def _sigmas(J: Array, limits: SolveLimits) -> tuple[Array, Array, Bools]:
     flat = J.reshape(len(J), -1, 6) / NOISE_PX
     normal = np.swapaxes(flat, -1, -2) @ flat
     sigma_m, sigma_rad = np.full(len(J), np.inf), np.full(len(J), np.inf)
-    for i, H in enumerate(normal):
-        covariance, observable = covariance_of(H)
-        if observable:
-            sigma_m[i] = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
-            sigma_rad[i] = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
+    covariances, observable = covariances_of(normal)
+    for sigma, part in ((sigma_m, slice(0, 3)), (sigma_rad, slice(3, 6))):
+        sigma[observable] = np.sqrt(np.linalg.eigvalsh(covariances[observable, part, part])[..., -1])
     return sigma_m, sigma_rad, (sigma_m <= limits.max_sigma_m) & (sigma_rad <= limits.max_sigma_rad)
 
 

@@ -1,6 +1,7 @@
 """Rendered pictures of spots with known truth, for tests and the benchmark. Shares no code with what it tests.
 
-A spot is integrated over each pixel by Gauss-Legendre nodes (4 x 4 per pixel; exact to 1e-5 of the peak at sigma 0.5).
+A spot is integrated over each pixel by Gauss-Legendre nodes (4 x 4 per pixel; exact to 1e-5 of the peak at sigma 0.5;
+of tilted ones 2 x 2 from a sigma of 20 px on, exact to 1e-8).
 """
 
 from __future__ import annotations
@@ -78,8 +79,9 @@ def light(spot: Spot, size: tuple[int, int]) -> tuple[NDArray, tuple[slice, slic
         )
         return spot.peak * np.outer(across, along), (slice(v0, v1), slice(u0, u1))
     a = np.radians(spot.angle)
-    uu = (np.arange(u0, u1)[:, None] + _NODES / 2).reshape(-1)
-    vv = (np.arange(v0, v1)[:, None] + _NODES / 2).reshape(-1)
+    nodes, weights = (_NODES, _WEIGHTS) if spot.minor < 20 else (np.array([-1.0, 1.0]) / np.sqrt(3), np.ones(2))
+    uu = (np.arange(u0, u1)[:, None] + nodes / 2).reshape(-1)
+    vv = (np.arange(v0, v1)[:, None] + nodes / 2).reshape(-1)
     du, dv = np.meshgrid(uu - spot.u, vv - spot.v)
     p, q = du * np.cos(a) + dv * np.sin(a), -du * np.sin(a) + dv * np.cos(a)
     if spot.streak:  # the mean over the motion in closed form
@@ -88,7 +90,7 @@ def light(spot: Spot, size: tuple[int, int]) -> tuple[NDArray, tuple[slice, slic
         total *= np.exp(-0.5 * (q / spot.minor) ** 2)
     else:
         total = np.exp(-0.5 * ((p / spot.major) ** 2 + (q / spot.minor) ** 2))
-    cells = total.reshape(v1 - v0, 4, u1 - u0, 4)
+    cells, w = total.reshape(v1 - v0, len(nodes), u1 - u0, len(nodes)), weights / 2
     return spot.peak * np.einsum("aibj,i,j->ab", cells, w, w), (slice(v0, v1), slice(u0, u1))
 
 

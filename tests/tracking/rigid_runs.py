@@ -239,9 +239,8 @@ def zig_zag(
     for length, velocity in zip(np.diff(knots), velocities, strict=False):
         at_knots.append(at_knots[-1].plus(velocity * length))
     piece = np.searchsorted(knots, t_s, side="right") - 1
-    poses = [at_knots[i].plus(velocities[i] * (t - knots[i])) for t, i in zip(t_s, piece, strict=True)]
-    turned = np.isin(np.arange(frames), before + 1)
-    return Pose(np.stack([p.rotation for p in poses]), np.stack([p.translation for p in poses])), t_s, turned
+    poses = Pose.stack(at_knots)[piece].plus(velocities[piece] * (t_s - knots[piece])[:, None])
+    return poses, t_s, np.isin(np.arange(frames), before + 1)
 
 
 def selected_frames(run: PointRun, frames: Ints) -> PointRun:

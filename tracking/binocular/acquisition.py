@@ -269,9 +269,9 @@ def distinct(found: list[LabelledPose]) -> list[LabelledPose]:
 
 def same_pose(one: Pose, other: Pose) -> bool:
     """Whether two poses are the same solution."""
-    turn = float(angle(one.rotation.T @ other.rotation))
     shift = float(np.linalg.norm(one.translation - other.translation))
-    return turn < _SAME_RAD and shift < _SAME_SHARE * (1 + float(np.linalg.norm(one.translation)))
+    near = shift < _SAME_SHARE * (1 + float(np.linalg.norm(one.translation)))  # cheaper, and mostly decides
+    return near and float(angle(one.rotation.T @ other.rotation)) < _SAME_RAD
 
 
 def mirrored(pair: StereoPair, model: MarkerModel, pose: Pose) -> Pose:
@@ -394,8 +394,8 @@ def _coarse(pair: StereoPair, model: MarkerModel, flat: Sequence[Array], images:
         for colour in np.unique(model.colour):
             own, same = np.flatnonzero(model.colour == colour), at[found.colour == colour]
             if len(same):
-                apart = uv[:, own, None] - same
-                nearest[:, own] = np.nan_to_num((apart * apart).sum(axis=-1).min(axis=2), nan=np.inf)
+                du, dv = (uv[:, own, i, None] - same[:, i] for i in (0, 1))
+                nearest[:, own] = np.nan_to_num((du * du + dv * dv).min(axis=2), nan=np.inf)
         score += np.maximum(0.0, 1 - nearest / gate2).sum(axis=1)
     return score
 

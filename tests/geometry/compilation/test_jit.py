@@ -139,9 +139,7 @@ def test_code_of_an_edited_source_is_never_run(program, first_two, tmp_path):
     """numba's own cache compares only outer.py, which stays as it is."""
     copy = tmp_path / "program"
     shutil.copytree(program, copy)
-    before = found(started(copy))
-    assert before["value"] == 20.0
-    folders = {before["folder"]}
+    folders = {Path(first_two[0]["folder"]).name}
     for edited, old, new, value in (
         ("geometry/inner.py", "FACTOR * by", "10 * FACTOR * by", 200.0),
         ("geometry/constants.py", "FACTOR = 10", "FACTOR = 100", 2000.0),
@@ -150,8 +148,8 @@ def test_code_of_an_edited_source_is_never_run(program, first_two, tmp_path):
         source.write_text(source.read_text().replace(old, new))
         after = found(started(copy))
         assert (after["value"], after["cold"]) == (value, [True, False])
-        assert after["folder"] not in folders
-        folders.add(after["folder"])
+        assert Path(after["folder"]).name not in folders
+        folders.add(Path(after["folder"]).name)
 
 
 def test_code_from_disk_is_inlined_into_a_caller_that_is_compiled_again(program, first_two, tmp_path):

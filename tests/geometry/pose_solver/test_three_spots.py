@@ -95,13 +95,17 @@ def lengths_by_descent(points: Array, rays: Array, world: Array, rng: np.random.
     return found
 
 
-@pytest.mark.parametrize("kind", ["any", "one point", "fan", "crossed ends"])
-def test_a_search_from_many_starts_finds_no_further_solution(kind):
+MOSTLY_ONE = "crossed ends"  # few of its problems have mirror solutions
+SLOW = [pytest.param(kind, 200, marks=pytest.mark.slow) for kind in ("any", "one point", "fan", MOSTLY_ONE)]
+
+
+@pytest.mark.parametrize(("kind", "count"), [("any", 20), ("one point", 20), ("fan", 20), (MOSTLY_ONE, 40), *SLOW])
+def test_a_search_from_many_starts_finds_no_further_solution(kind, count):
     rng = np.random.default_rng(3)
-    points, rays, world, _ = problems(kind, rng, 40)
+    points, rays, world, _ = problems(kind, rng, count)
     found = poses_from_three_spots(points, rays, world)
     several = 0
-    for k in range(40):
+    for k in range(count):
         slow = lengths_by_descent(points[k], rays[k], world[k], rng)
         assert np.isfinite(found.translation[k, :, 0]).sum() >= len(slow)
         several += len(slow) > 1

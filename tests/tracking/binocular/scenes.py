@@ -13,14 +13,9 @@ MODEL = drogue_markers()
 NOISE_PX = 0.1
 
 
-def images(pose, rng, hidden=((), ()), false=0, delay=None):
-    """Candidates of both pictures in random order, with hidden markers and false points near the target.
-
-    delay: the pose at which the right picture is taken, if it is another.
-    """
+def images(pose, rng, hidden=((), ()), false=0):
+    """Candidates of both pictures in random order, with hidden markers and false points near the target."""
     pixels = project_markers(PAIR, MODEL, pose)[0]
-    if delay is not None:
-        pixels[1] = project_markers(PAIR, MODEL, delay)[0][1]
     out = []
     for c in range(2):
         seen = np.setdiff1d(np.arange(len(MODEL)), hidden[c])

@@ -8,9 +8,10 @@ import pytest
 from geometry.pose import Pose
 from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed_camera
 from studies.zhou2020 import random_pose
-from tests.tracking.binocular.scenes import MODEL, PAIR, images, pose_at
+from tests.tracking.binocular.scenes import MODEL, NOISE_PX, PAIR, images, pose_at
 from tracking.binocular.acquisition import matching_pairs, mirrored
 from tracking.binocular.calibration_check import FittedFrame, clock_offset
+from tracking.binocular.joint_fit import MarkerObservations, fit_pose
 from tracking.binocular.marker_model import (
     MarkerImages,
     MarkerModel,
@@ -172,18 +173,18 @@ def test_the_mirrored_pose_has_nearly_the_same_images_of_a_flat_target_and_twice
 
 def recording(delay_s, seed=7):
     """Fitted frames of a target that moves up and sideways at about 1 m/s, 25 Hz; right picture late."""
-    rng, tracker, out = np.random.default_rng(seed), BinocularTracker(PAIR, MODEL, P), []
-    for i in range(14):
-        t = i / 25
-        pose, later = (
+    rng, out = np.random.default_rng(seed), []
+    cov = np.broadcast_to(NOISE_PX**2 * np.eye(2), (2, 7, 2, 2))
+    for t in np.arange(40) / 25:
+        poses = [
             Pose.from_ypr(
                 np.array([0.3 * np.sin(2 * s), 0.1, 0.2]), np.array([0.2 + 0.5 * np.sin(3 * s), 0.9 * s - 0.2, 8.0])
             )
             for s in (t, t + delay_s)
-        )
-        frame = tracker.step(t, images(pose, rng, delay=later))
-        if frame.fit is not None:
-            out.append(FittedFrame(t, frame.fit, frame.observed))
+        ]
+        pixels = np.stack([project_markers(PAIR, MODEL, pose)[0][c] for c, pose in enumerate(poses)])
+        observed = MarkerObservations(pixels + rng.normal(0, NOISE_PX, pixels.shape), cov)
+        out.append(FittedFrame(t, fit_pose(PAIR, MODEL, observed, poses[0]), observed))
     return out
 
 

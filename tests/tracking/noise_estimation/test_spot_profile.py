@@ -121,7 +121,7 @@ def test_what_it_leaves_of_the_light_is_in_the_sigma_and_belongs_to_the_place():
 
 
 def test_a_camera_uses_it_with_stated_noise_as_well():
-    shown, _ = recording(WINGED[0])
+    shown = recording(WINGED[0])[0][:2]
     camera = CameraNoise("left", SENSOR)
     camera.estimate_from(shown)
     profile = camera.estimate.model.profile

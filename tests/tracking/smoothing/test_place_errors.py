@@ -76,9 +76,9 @@ def test_few_spots_show_no_errors_of_places_but_the_texture_of_the_screen_does()
     """With four spots in eight coordinates a pose of six numbers absorbs most of a shift."""
     nees = {False: [], True: []}
     for seed in range(4):
+        plain = simulate_points("static", seed, frames=40, noise_px=0.05, clutter=0.0)
         for known, answers in nees.items():
-            run = simulate_points("static", seed, frames=40, noise_px=0.05, clutter=0.0)
-            run = only_views(textured(run, 0.02, 0.05, seed, known), 4)
+            run = only_views(textured(plain, 0.02, 0.05, seed, known), 4)
             frames, _ = smoothed_frames(run, tracked(run))
             answers.append(np.nanmean(assess(run, frames).nees) / 6)
     assert np.mean(nees[True]) < 1.5
@@ -89,9 +89,9 @@ def test_stated_errors_of_places_are_reduced_to_what_the_residuals_allow():
     """Clipped spots and backgrounds other than the screen predict ten times too much."""
     nees = {1.0: [], 10.0: []}
     for seed in range(2):
+        plain = simulate_points("huo2015", seed, frames=120, noise_px=0.05, clutter=0.0)
         for stated, answers in nees.items():
-            run = simulate_points("huo2015", seed, frames=120, noise_px=0.05, clutter=0.0)
-            run = textured(run, 0.02, 0.01, seed, True, stated)
+            run = textured(plain, 0.02, 0.01, seed, True, stated)
             frames, smoothed = smoothed_frames(run, tracked(run))
             answers.append(np.nanmean(assess(run, frames).nees) / 6)
             assert np.all(smoothed.errors.factors.place >= (0.7 if stated == 1 else 0.005))
