@@ -46,7 +46,7 @@ class BehindLights:
         show helps with the others.
         """
         # In black places the model leaves more than their noise: also there that of the background counts.
-        noise = replace(noise, least_dn2=np.inf)
+        noise = replace(noise, shadow_dn2=0.0)
         parts = _behind_each(pictures, strength, found, boxes, noise, None)
         modulation = _modulation([part.fit for part in parts], usual_dn)
         if modulation is not None:

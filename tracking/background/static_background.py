@@ -171,7 +171,7 @@ class StaticBackground:
             once,
             floor_dn2=at_low * steps**2 * (1 + share),
             black_dn=level * steps,
-            least_dn2=np.inf,
+            shadow_dn2=0.0,
             texture=0.0,
             local_texture=uneven,
         )

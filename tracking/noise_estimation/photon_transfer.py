@@ -106,8 +106,8 @@ def estimate_noise(pictures: Sequence[Picture], black_dn: float | None = None) -
         slope, slope_sigma = lines.slope(rounding)
     floor = lines.model(slope, rounding).floor_dn2
     lowest = min(float(levels.level.min(initial=background)), background) if levels.temporal else background
-    least = max(floor - slope * (background - lowest), rounding)
-    model = replace(first, slope_dn=slope, floor_dn2=floor, least_dn2=least)
+    shadow = min(slope * (background - lowest), floor - rounding)
+    model = replace(first, slope_dn=slope, floor_dn2=floor, shadow_dn2=shadow)
     floor_sigma = float(np.interp(slope, lines.slopes, lines.floor_sigma)) / model.floor_dn2
     # With hardly any noise on a background of few grey values their steps look like texture, unless it is larger.
     steps = banding(model.floor_dn2, rounding)
