@@ -44,7 +44,7 @@ class SpotProfile:
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Variance of a pixel of expected grey value v: floor_dn2 + slope_dn (v - black_dn), at least floor_dn2 - shadow_dn2."""
+    """Variance of a pixel that expects v DN: floor_dn2 + slope_dn (v - black_dn), at least floor_dn2 - shadow_dn2."""
 
     floor_dn2: float  # read noise and rounding, DN^2 (if estimated: all noise at the background's level)
     slope_dn: float  # DN^2 per DN: 1 / (electrons per DN)
