@@ -163,7 +163,8 @@ class StaticBackground:
         at_rest = find_spots(in_steps(mean, steps), replace(parameters, saturation_dn=(clips - 0.5) * steps), once)
         at_rest = replace(at_rest, flux=at_rest.flux / steps, peak=at_rest.peak / steps)
         # The difference has one level everywhere, and the noise of the picture.
-        low = float(np.quantile(plain[::8, ::8], _LOW))
+        # Of less noise than most pixels have, the misfits of all spots would count a second time.
+        low = max(float(np.quantile(plain[::8, ::8], _LOW)), model.black_dn)
         at_low = float(model.variance(low))
         brighter = np.maximum(model.variance(highest_of_blocks(plain)) - at_low, 0.0)
         uneven = np.asarray(np.sqrt(brighter / 9.0) / (TEXTURE_SHARE * level), np.float32)
