@@ -251,26 +251,32 @@ def tensor(values: np.ndarray) -> Any:
 
 BATCH = 32
 VALIDATION = 1000  # samples
+HARDNESS = (0.4, 4.0)  # range of the relative frequencies of samples
 
 
 def targets(truth: Array) -> tuple[Array, Array, Array]:
-    """Heat (n, s, s), regression (n, 3, s, s) and its weight (n, s, s) for truths (n, 3); s = SIZE_PX / STRIDE."""
+    """Heat (n, s, s), regression (n, 3, s, s) and its weight (n, s, s) for truths (n, k, 3); s = SIZE_PX / STRIDE."""
     side = SIZE_PX // STRIDE
     centres = STRIDE * np.arange(side) + (STRIDE - 1) / 2
-    u, v, diameter = (truth[:, i, None, None] for i in range(3))
-    du, dv = u - centres[None, None, :], v - centres[None, :, None]
-    sigma = np.maximum(0.08 * diameter, 1.6)
-    heat = np.nan_to_num(np.exp(-0.5 * (du**2 + dv**2) / sigma**2))
-    # The cell that holds the centre is a full positive.
-    inside = (np.abs(du) <= STRIDE / 2) & (np.abs(dv) <= STRIDE / 2)
-    heat = np.where(inside, 1.0, heat)
-    size = np.broadcast_to(np.log(diameter), heat.shape)
-    values = np.nan_to_num(np.stack([du / STRIDE + 0 * dv, dv / STRIDE + 0 * du, size], axis=1))
+    heat, values = np.zeros((len(truth), side, side)), np.zeros((len(truth), 3, side, side))
+    for own in np.moveaxis(truth.reshape(len(truth), -1, 3), 1, 0):
+        u, v, diameter = (own[:, i, None, None] for i in range(3))
+        du, dv = u - centres[None, None, :], v - centres[None, :, None]
+        sigma = np.maximum(0.08 * diameter, 1.6)
+        near = np.nan_to_num(np.exp(-0.5 * (du**2 + dv**2) / sigma**2))
+        # The cell that holds the centre is a full positive.
+        near = np.where((np.abs(du) <= STRIDE / 2) & (np.abs(dv) <= STRIDE / 2), 1.0, near)
+        answer = np.stack([du / STRIDE + 0 * dv, dv / STRIDE + 0 * du, np.log(diameter) + 0 * near], axis=1)
+        values = np.where((near > heat)[:, None], answer, values)
+        heat = np.maximum(heat, near)
     return heat, values, (heat > 0.3).astype(float)
 
 
-def loss(out: Any, heat: Any, values: Any, weight: Any) -> Any:
-    """Focal loss of the heat (Law & Deng 2018, CornerNet) and L1 of offset and log diameter where a centre is."""
+def loss(out: Any, heat: Any, values: Any, weight: Any) -> tuple[Any, Any]:
+    """Focal loss of the heat (Law & Deng 2018, CornerNet) and L1 of offset and log diameter where a centre is.
+
+    Also the part (n,) of each sample in the former.
+    """
     import torch
     from torch.nn import functional
 
@@ -281,7 +287,7 @@ def loss(out: Any, heat: Any, values: Any, weight: Any) -> Any:
     count = positive.sum().clamp(min=1.0)
     step = functional.l1_loss(out[:, 1:], values, reduction="none")
     scaled = step * torch.tensor([1.0, 1.0, 3.0])[None, :, None, None] * weight[:, None]
-    return -gain.sum() / count + scaled.sum() / weight.sum().clamp(min=1.0)
+    return -gain.sum() / count + scaled.sum() / weight.sum().clamp(min=1.0), -gain.detach().sum(dim=(1, 2))
 
 
 def train(plan: Plan, out: Path) -> None:
@@ -291,15 +297,19 @@ def train(plan: Plan, out: Path) -> None:
     images, truth = rendered(plan.samples, plan.seed, out / "samples")
     held_images, held_truth = middle(*rendered(VALIDATION, plan.seed + 1, out / "samples"))
     held_targets = [tensor(t) for t in targets(held_truth)]
+    hardness = np.ones(len(images))  # hard samples are drawn more often (Shrivastava 2016); 1 after an interruption
 
     def batch_loss(model: Any, rng: np.random.Generator) -> Any:
-        rows = rng.integers(0, len(images), BATCH)
+        rows = rng.choice(len(images), BATCH, p=hardness / hardness.sum())
         pictures, wanted = augmented(images[rows], truth[rows], rng)
         shown = tensor(pictures[:, None]).to(memory_format=torch.channels_last)
-        return loss(model(shown), *map(tensor, targets(wanted)))
+        value, parts = loss(model(shown), *map(tensor, targets(wanted)))
+        share = parts.numpy() / max(float(parts.mean()), 1e-9)
+        hardness[rows] = (0.5 * hardness[rows] + 0.5 * share).clip(*HARDNESS)
+        return value
 
     def validate(model: Any) -> float:
-        return float(loss(model(tensor(held_images[:, None])), *held_targets))
+        return float(loss(model(tensor(held_images[:, None])), *held_targets)[0])
 
     torch.manual_seed(plan.seed)
     model = fit(make_network(plan.network), batch_loss, validate, plan, out)
