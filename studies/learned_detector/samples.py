@@ -374,7 +374,7 @@ def _paint_hose(rng: np.random.Generator, picture: Floats32, start: Array, radiu
 
 
 def _paint_decoy(rng: np.random.Generator, picture: Floats32, diameters_px: tuple[float, float]) -> None:
-    """What a drogue is not: a plain disc or ball, a thin ring, a flat ellipse, half a ring, a polygon, a square, a star.
+    """What a drogue is not: a plain disc or ball, a thin ring, a flat ellipse, half a ring, a square, a star, a roof.
 
     Small plain discs are none: a small drogue looks like one.
     """

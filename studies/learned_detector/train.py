@@ -2,7 +2,7 @@
 
 Needs the extra `training` (torch, onnx). The weights of the package were made by
 
-    python -m studies.learned_detector.train --out build/detector --samples 28000 --epochs 28 --seed 2020 --bf16
+    python -m studies.learned_detector.train --out build/detector --samples 12000 --epochs 20 --seed 2020
 
 and copied to tracking/learned_detector/. The same seed gives the same samples; sums in another order change the
 weights in their last digits on another machine. A run that was interrupted continues from the files of its folder.
@@ -216,7 +216,10 @@ def _keep(parts: dict[str, Any], plan: Plan, out: Path, log: list[dict[str, floa
 
 
 def _continued(parts: dict[str, Any], plan: Plan, out: Path) -> tuple[list[dict[str, float]], float]:
-    """Log and process time of the checkpoint of the same plan, whose state is loaded; without one, nothing and 0."""
+    """Log and process time of the checkpoint of the same plan, whose state is loaded; without one, nothing and 0.
+
+    A plan with more epochs prolongs a run: its learning rate goes on where it would be after as many epochs.
+    """
     import torch
 
     path = out / "checkpoint.pt"
@@ -224,8 +227,9 @@ def _continued(parts: dict[str, Any], plan: Plan, out: Path) -> tuple[list[dict[
     if not path.is_file():
         return [], 0.0
     kept = torch.load(path, weights_only=True)
-    if kept["plan"] != asdict(plan):
+    if {**kept["plan"], "epochs": plan.epochs} != asdict(plan):
         return [], 0.0
+    kept["schedule"] = {name: kept["schedule"][name] for name in ("last_epoch", "_step_count")}
     for name, part in parts.items():
         part.load_state_dict(kept[name])
     return list(kept["log"]), float(kept["spent"])
@@ -322,8 +326,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="studies.learned_detector.train", description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--network", choices=NETWORKS, default=SMALL)
-    parser.add_argument("--samples", type=int, default=28000)
-    parser.add_argument("--epochs", type=int, default=28)
+    parser.add_argument("--samples", type=int, default=12000)
+    parser.add_argument("--epochs", type=int, default=20)
     parser.add_argument("--seed", type=int, default=2020)
     parser.add_argument("--bf16", action="store_true", help="layers in bfloat16, for processors that have it")
     a = parser.parse_args()
