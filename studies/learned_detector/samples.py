@@ -190,7 +190,7 @@ def draw_sample(
     """A random picture (size_px: width, height) whose drogue has a diameter in a range (log-uniform).
 
     unseen: with a background that training never shows. empty: without a drogue; None: at random. beside: largest
-    number of further drogues, which cost no time in training.
+    number of further drogues, which cost no time in training; with them comes what is no drogue (`_paint_decoy`).
     """
     if empty is None:
         empty = bool(rng.random() < EMPTY_SHARE)
@@ -206,7 +206,7 @@ def draw_sample(
     if unseen and not empty:
         return Sample(grey.astype(np.uint8), (u, v), diameter)
     truth = [] if empty else [(u, v, diameter)]
-    for _ in range(int(rng.integers(0, 7)) if painted else 0):
+    for _ in range(int(rng.integers(0, 7)) if painted and beside else 0):
         _paint_decoy(rng, grey, diameters_px)
     for number in range(0 if empty else 1 + beside):
         own = truth[0] if number == 0 else _place(rng, size_px, diameters_px)
