@@ -197,10 +197,10 @@ def draw_sample(
     u, v, diameter = _place(rng, size_px, diameters_px)
     painted = empty or (not unseen and rng.random() < PAINTED_SHARE)
     if painted:
-        colours = background_picture(_background(rng, size_px, unseen), size_px)
+        colours: np.ndarray = background_picture(_background(rng, size_px, unseen), size_px)
     else:
         drawn = render_drogue(_scene(rng, size_px, (u, v), diameter, unseen), rng)
-        colours, (u, v) = drawn.image.astype(np.float32), drawn.ellipse.centre_px.tolist()
+        colours, (u, v) = drawn.image, drawn.ellipse.centre_px.tolist()
         diameter = 2 * drawn.ellipse.major_px
     grey = np.asarray(cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY), np.float32)
     if unseen and not empty:
@@ -225,8 +225,9 @@ def _place(
     """Centre u, v and diameter, px, of a drogue that is for the most part in the picture, if it is no larger."""
     width, height = size_px
     diameter = float(np.exp(rng.uniform(*np.log(diameters_px))))
-    spare = 0.3 * diameter if min(width, height) > 1.5 * diameter else 0.0
-    u, v = rng.uniform([spare] * 2, [width - 1 - spare, height - 1 - spare])
+    u, v = rng.uniform([0.0, 0.0], [width - 1.0, height - 1.0])
+    if min(width, height) > 1.5 * diameter:
+        u, v = rng.uniform([0.3 * diameter] * 2, [width - 1 - 0.3 * diameter, height - 1 - 0.3 * diameter])
     return float(u), float(v), diameter
 
 
@@ -250,13 +251,17 @@ def _scene(
     light = DrogueLight((float(towards[0]), float(towards[1]), float(towards[2])), ambient, float(1 - ambient))
     shade = rng.uniform(0.35, 1.0)
     # The test keeps the look of standard drogues; training has inner parts of all levels.
-    ribs, lining, coupling = (120, 38, 90) if unseen else rng.uniform([30, 5, 20], [250, 150, 255]).tolist()
+    usual = DrogueLook()
+    inner = (usual.rib_bgr, usual.lining_bgr, usual.coupling_bgr)
+    if not unseen:
+        rib, lining, coupling = rng.uniform([30, 5, 20], [250, 150, 255]).tolist()
+        inner = ((rib,) * 3, (lining,) * 3, (coupling,) * 3)
     look = DrogueLook(
         canopy_bgr=(225 * shade, 228 * shade, 230 * shade),
         canopy_inner=float(rng.uniform(0.72 if unseen else 0.55, 0.88)),
-        rib_bgr=(ribs,) * 3,
-        lining_bgr=(lining,) * 3,
-        coupling_bgr=(coupling,) * 3,
+        rib_bgr=inner[0],
+        lining_bgr=inner[1],
+        coupling_bgr=inner[2],
         hose_radius=0.1 if unseen else float(rng.uniform(0.04, 0.2)),
         gore_contrast=float(rng.uniform(0.0, 0.3)),
         ribs=int(rng.integers(10, 25)),
@@ -287,7 +292,6 @@ def _paint_drogue(rng: np.random.Generator, picture: Floats32, centre: tuple[flo
 
     Lengths in radii of the rim; its plane is tilted about an axis across `axis`, in whose direction deeper parts move.
     """
-    u0, v0 = centre
     radius, fine = diameter / 2, int(np.clip(np.ceil(60 / diameter), 2, 6))
     turn, tilt = rng.uniform(0, 2 * np.pi), np.radians(min(abs(rng.normal(0, 16)), 40))
     axis, deep = np.array([np.cos(turn), np.sin(turn)]), rng.uniform(0.3, 1.4)
@@ -303,8 +307,8 @@ def _paint_drogue(rng: np.random.Generator, picture: Floats32, centre: tuple[flo
     low = np.floor(np.array(centre)).astype(int) - round(0.9 * diameter) - 3
     n = 2 * round(0.9 * diameter) + 7
     points = (np.arange(n * fine) + 0.5) / fine - 0.5
-    x = ((points + low[0] - u0) / radius)[None, :].astype(np.float32)
-    y = ((points + low[1] - v0) / radius)[:, None].astype(np.float32)
+    x = ((points + low[0] - centre[0]) / radius)[None, :].astype(np.float32)
+    y = ((points + low[1] - centre[1]) / radius)[:, None].astype(np.float32)
     across, along0 = y * axis[0] - x * axis[1], x * axis[0] + y * axis[1]
     along = along0 / np.cos(tilt)
     rho, theta = np.hypot(along, across), np.arctan2(y, x)
@@ -340,19 +344,15 @@ def _paint_drogue(rng: np.random.Generator, picture: Floats32, centre: tuple[flo
     if rng.random() < 0.15:  # a shadow across it
         level[x * np.cos(towards) + y * np.sin(towards) > rng.uniform(-0.7, 0.7)] *= np.float32(rng.uniform(0.3, 0.9))
     level += np.float32(rng.uniform(0, 0.5) * (rng.random() < 0.4)) * (picture.mean() - level)  # haze
-    size = (n, n)
-    cover = cv2.resize(alpha, size, interpolation=cv2.INTER_AREA)
-    paint = cv2.resize(level * alpha, size, interpolation=cv2.INTER_AREA)
+    cover = cv2.resize(alpha, (n, n), interpolation=cv2.INTER_AREA)
+    paint = cv2.resize(level * alpha, (n, n), interpolation=cv2.INTER_AREA)
     if rng.random() < 0.35:
         motion = np.zeros((2 * n + 1, 2 * n + 1), np.float32)
-        step = rng.normal(0, 0.05 * diameter, 2)
-        line = np.round(16 * (n + np.outer([-1, 1], step))).astype(int)
+        line = np.round(16 * (n + np.outer([-1, 1], rng.normal(0, 0.05 * diameter, 2)))).astype(int)
         cv2.line(motion, tuple(line[0].tolist()), tuple(line[1].tolist()), 1.0, 1, cv2.LINE_AA, 4)
-        kernel = motion[n - 4 : n + 5, n - 4 : n + 5]
-        kernel = kernel / kernel.sum()
+        kernel = motion[n - 4 : n + 5, n - 4 : n + 5] / motion[n - 4 : n + 5, n - 4 : n + 5].sum()
         cover, paint = cv2.filter2D(cover, -1, kernel), cv2.filter2D(paint, -1, kernel)
-    height, width = picture.shape
-    first, last = np.maximum(low, 0), np.minimum(low + n, [width, height])
+    first, last = np.maximum(low, 0), np.minimum(low + n, picture.shape[::-1])
     part = (slice(first[1] - low[1], last[1] - low[1]), slice(first[0] - low[0], last[0] - low[0]))
     piece = picture[first[1] : last[1], first[0] : last[0]]
     piece += paint[part] - cover[part] * piece
@@ -415,7 +415,8 @@ def _exposed(rng: np.random.Generator, picture: Floats32, diameter: float) -> Gr
     blur = float(rng.uniform(0.3, 1.0) + (rng.random() < 0.25) * rng.uniform(0, 0.05) * diameter)
     seen = np.asarray(cv2.GaussianBlur(picture, (0, 0), blur), np.float32)
     if rng.random() < 0.4:
-        seen = 255 * (np.clip(seen, 0, 255) / 255) ** np.float32(np.exp(rng.normal(0, 0.3)))
+        share = np.clip(seen, 0, 255) / 255
+        seen = np.asarray(255 * share ** np.exp(rng.normal(0, 0.3)), np.float32)
     noise = rng.standard_normal(picture.shape, dtype=np.float32)
     if rng.random() < 0.25:
         noise = np.asarray(2 * cv2.GaussianBlur(noise, (0, 0), 0.7), np.float32)

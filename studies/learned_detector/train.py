@@ -1,11 +1,9 @@
 """`python -m studies.learned_detector.train --out DIR`: trains the learned detector and exports it.
 
-Needs the extra `training` (torch, onnx). The weights of the package were made by
-
-    python -m studies.learned_detector.train --out build/detector --samples 12000 --epochs 20 --seed 2020
-
-and copied to tracking/learned_detector/. The same seed gives the same samples; sums in another order change the
-weights in their last digits on another machine. A run that was interrupted continues from the files of its folder.
+Needs the extra `training` (torch, onnx). The weights of the package are of an earlier recipe
+(docs/papers/zhou2020_detector.md, which has the figures of the present one, too). The same seed gives the same samples;
+sums in another order change the weights in their last digits on another machine. A run that was interrupted continues
+from the files of its folder, and one that has ended goes on with more epochs.
 """
 
 from __future__ import annotations
