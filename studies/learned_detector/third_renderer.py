@@ -84,7 +84,7 @@ def face(kind: str, rng: np.random.Generator, hose: bool = True) -> Panels:
     light = rng.normal(0, 1, 3) - [0, 0, 1]
     light /= np.linalg.norm(light)
     ambient = rng.uniform(0.3, 0.8)
-    tilt = cv2.Rodrigues(np.radians(rng.uniform(-14, 14, 3)))[0]
+    tilt = np.asarray(cv2.Rodrigues(np.radians(rng.uniform(-14, 14, 3)))[0], float)
     corners, levels = [], []
 
     def add(rows: list[tuple[float, float, float]], level: float) -> None:
