@@ -65,15 +65,6 @@ class Mistake:
         frames = zip(_points_of(self.rig, poses), _points_of(given, poses), strict=True)
         return not all(np.array_equal(a, b) for a, b in frames)
 
-    def cameras(self, given: Rig) -> set[int]:
-        """Indices of the cameras whose pictures, lens, place or screen the mistake changes."""
-        screens = {n for n, s in given.screens.items() if self.rig.screens[n] is not s}
-        return {
-            i
-            for i, (n, c) in enumerate(given.cameras.items())
-            if n in self.pictures or self.rig.cameras[n] is not c or c.screen in screens
-        }
-
     def points(self, block: Block) -> dict[str, Detections]:
         """The points of the frame in the middle of a block, by camera, as they are without the mistake."""
         out = {}
@@ -141,12 +132,10 @@ def possible_mistakes(rig: Rig, prior: PosePrior | None = None) -> list[Mistake]
 def _pictures(rig: Rig) -> Iterator[Mistake]:
     """Pictures that are not those of the camera, of this size, orientation or number."""
     for a, b in combinations(rig.cameras, 2):
-        alike = _equal_lenses(rig.cameras[a], rig.cameras[b])
         yield Mistake(
             "exchanged",
-            f"the pictures of cameras `{a}` and `{b}` are exchanged" + alike * ", or they have each other's place",
-            f"exchange the names of `{a}` and `{b}` in run.yaml or in the table of points"
-            + alike * ", or their camera_from_world and screen in rig.yaml",
+            f"the pictures of cameras `{a}` and `{b}` are exchanged",
+            f"exchange the names of `{a}` and `{b}` in run.yaml or in the table of points",
             rig,
             {a: PictureChange(b), b: PictureChange(a)},
         )
@@ -271,7 +260,7 @@ def _lenses(rig: Rig) -> Iterator[Mistake]:
         )
     for a, b in combinations(rig.cameras, 2):
         one, other = rig.cameras[a], rig.cameras[b]
-        if not _equal_lenses(one, other):
+        if not (np.array_equal(one.matrix, other.matrix) and one.distortion == other.distortion):
             pairs = ((a, one, other), (b, other, one))  # of equal cameras it would be that of exchanged pictures
             yield Mistake(
                 "pose",
@@ -391,10 +380,6 @@ def _with_camera_poses(rig: Rig, poses: Mapping[str, Pose]) -> Rig:
 def _with_screen_poses(rig: Rig, poses: Mapping[str, Pose]) -> Rig:
     screens = {n: replace(rig.screens[n], world_from_screen=pose) for n, pose in poses.items()}
     return replace(rig, screens={**rig.screens, **screens})
-
-
-def _equal_lenses(one: Camera, other: Camera) -> bool:
-    return np.array_equal(one.matrix, other.matrix) and one.distortion == other.distortion
 
 
 def _with_lens_of(camera: Camera, other: Camera) -> Camera:
