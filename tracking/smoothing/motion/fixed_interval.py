@@ -328,6 +328,23 @@ def _combine(out: Interval, k: int, x: Array, filtered_P: Array, Y: Array, y: Ar
     return P
 
 
+@compiled
+def _score_test(
+    noise: tuple[float, float, float, float, float, float], r: Array, N: Array, N_aa: float, i: int
+) -> tuple[float, float]:
+    """r^T Q r and tr(Q N) of the noise Q of axis i, as `process_noise` gives it; N_aa: of its acceleration."""
+    pp, pv, pa, vv, va, aa = noise
+    p, v, a = r[i], r[6 + i], r[12 + i]
+    energy = pp * p * p + vv * v * v + aa * a * a + 2 * (pv * p * v + pa * p * a + va * v * a)
+    gamma = (
+        pp * N[i, i]
+        + vv * N[6 + i, 6 + i]
+        + aa * N_aa
+        + 2 * (pv * N[i, 6 + i] + pa * N[i, 12 + i] + va * N[6 + i, 12 + i])
+    )
+    return energy, gamma
+
+
 @compiled_in_caller
 def _test_process_noise(info: RunInformation, jerk: Array, k: int, Y: Array, y: Array, P: Array, out: Interval) -> None:
     """Write row k of `out.shock`, `out.energy` and `out.gamma`: tests of the process noise of the step before frame k.
@@ -346,28 +363,20 @@ def _test_process_noise(info: RunInformation, jerk: Array, k: int, Y: Array, y: 
     B, b = np.empty((6, 6)), np.empty(6)
     h = 0.5 * dt
     for i in range(6):
-        # Of the jerk alone: the variances of an allowed jump say nothing about the jerk's strength.
-        pp, pv, pa, vv, va, aa = process_noise(dt, jerk[k, i], 0.0, 0.0)
-        p, v, a = r[i], r[6 + i], r[12 + i]
+        p, v = r[i], r[6 + i]
         N_aa = 0.0
         for j in range(STATE):
             N_aa += Y[12 + i, j] * PY[j, 12 + i]
         N_aa = Y[12 + i, 12 + i] - N_aa
-        out.energy[k, i] = pp * p * p + vv * v * v + aa * a * a + 2 * (pv * p * v + pa * p * a + va * v * a)
-        out.gamma[k, i] = max(
-            pp * N[i, i]
-            + vv * N[6 + i, 6 + i]
-            + aa * N_aa
-            + 2 * (pv * N[i, 6 + i] + pa * N[i, 12 + i] + va * N[6 + i, 12 + i]),
-            0.0,
-        )
-        pp, pv, pa, vv, va, aa = process_noise(
-            dt, 0.0, info.velocity_jump[k, i // 3], info.acceleration_jump[k, i // 3]
-        )
+        # Of the jerk alone: the variances of an allowed jump say nothing about the jerk's strength.
+        out.energy[k, i], gamma = _score_test(process_noise(dt, jerk[k, i], 0.0, 0.0), r, N, N_aa, i)
+        out.gamma[k, i] = max(gamma, 0.0)
         kind = i // 3
-        out.jump_energy[k, kind] += pp * p * p + vv * v * v + aa * a * a + 2 * (pv * p * v + pa * p * a + va * v * a)
-        out.jump_gamma[k, kind] += pp * N[i, i] + vv * N[6 + i, 6 + i] + aa * N_aa
-        out.jump_gamma[k, kind] += 2 * (pv * N[i, 6 + i] + pa * N[i, 12 + i] + va * N[6 + i, 12 + i])
+        if info.velocity_jump[k, kind] > 0:
+            jump = process_noise(dt, 0.0, info.velocity_jump[k, kind], info.acceleration_jump[k, kind])
+            energy, gamma = _score_test(jump, r, N, N_aa, i)
+            out.jump_energy[k, kind] += energy
+            out.jump_gamma[k, kind] += gamma
         b[i] = h * p + v
         for j in range(6):
             B[i, j] = h * h * N[i, j] + h * (N[6 + i, j] + N[i, 6 + j]) + N[6 + i, 6 + j]
