@@ -82,6 +82,7 @@ class ErrorScale:
         camera = _cameras_of(run)
         least = _least_variance(stated_px2, run.size_px, self.misfit_share[camera])
         place = stated_px2 * self.factors.place[camera] + least * self.factors.misfit[camera]
+        place += _variance_of_share(run.size_px, self.width_share[camera])  # speckle and texture that were not stated
         return np.asarray(place * self.noise_scale**2)
 
     def of_run(self, run: RunDetections, place_px2: Array) -> Array:

@@ -78,7 +78,10 @@ def place_errors(
         # The poses absorb part of the residuals, which reduces the degrees of freedom.
         place = _SHARES * (1 - absorbed)
         expected = place / (place + (1 - _SHARES) * (1 - absorbed / float(np.median(np.maximum(averaged, 1.0)))))
-        free = 2 * (1 - absorbed) * float(np.sum(labelled / np.maximum(best.same_error_frames, 1.0)))
+        # A place counts with its pairs of frames: one that a moving spot passes in a single frame shows nothing.
+        frames = np.where(labelled, np.maximum(best.same_error_frames, 1.0), 1.0)
+        places = float(np.sum(frames - 1) ** 2 / np.sum(frames * (frames - 1) ** 2))
+        free = 2 * (1 - absorbed) * places
         # The statistic is a mean square of `free` means over places, less that by noise: a multiple of chi-square.
         by_noise = np.sqrt(0.25 * free / best.expected / (1 - absorbed))
         mean_square = max(best.near / best.expected + by_noise, _LEAST_SQUARE * by_noise)

@@ -15,7 +15,8 @@ from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
 from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
-from tracking.noise_estimation.texture_shift import LARGEST_SHARE, TextureShift, lights_and_lines
+from tracking.noise_estimation.texture_shift import LARGEST_SHARE, TextureShift, lights_and_lines, shifts_at_rest
+from tracking.parameters import DetectParameters
 
 SIZE = (400, 500)
 BACKGROUND, NOISE = 600.0, 3.0  # DN
@@ -228,3 +229,32 @@ def test_wide_reflections_do_not_show_the_grain_of_the_spots(spot_px):
     alone, both = (TextureShift.none().with_lights([found] * 6).misfit_share for found in (of_spots, with_reflections))
     assert both == pytest.approx(alone, nan_ok=True)
     assert np.isnan(both) == (spot_px < 1.8)  # narrower ones do not show it at all
+
+
+def test_a_light_at_rest_beside_the_picture_has_the_errors_of_its_border():
+    """Only the slope of a lamp outside is in the picture, and its fit lies there."""
+    beside, border = np.array([[-12.0, 80.0], [470.0, 411.5]]), np.array([[0.0, 80.0], [470.0, SIZE[0] - 1.0]])
+    background = (BACKGROUND * screen(0.04, 1.5, 2)).astype(np.float32)
+    lights = [replace(Detections.at(at, np.tile(np.eye(2), (2, 1, 1))), major_px=w, minor_px=w)
+              for at in (beside, border) for w in (np.full(2, 2.0),)]  # fmt: skip
+    found, expected = (shifts_at_rest(background, np.ones_like(background), some) for some in lights)
+    assert np.all(found == expected)
+    assert found.min() > 0
+
+
+def test_wide_lights_on_an_even_wall_are_not_known_better_than_an_oblique_view_allows():
+    """A round light of 12 px in a plane at 30 degrees, 1,000 px before a pinhole: its axis is not where the fit is."""
+    even = estimated(0.0, 1.0, 5).texture_shift
+    y, x = np.mgrid[-60:60:0.1, -60:60:0.1]
+    depth = 1000.0 + x * np.sin(np.pi / 6)
+    u, v = 1000.0 * x * np.cos(np.pi / 6) / depth, 1000.0 * y / depth
+    weight = np.exp(-0.5 * (x**2 + y**2) / 12.0**2)
+    light = np.histogram2d(v.ravel(), u.ravel(), bins=[np.arange(-70.5, 71)] * 2, weights=weight.ravel())[0]
+    noise = np.random.default_rng(3).standard_normal(light.shape)
+    picture = np.rint(20 + 40 * light / light.max() + noise).astype(np.uint8)
+    model = NoiseModel(1.0, 0.0, 20.0)
+    found = find_spots(picture, DetectParameters(), model)
+    assert len(found) == 1
+    away = float(np.hypot(*(found.uv_px[0] - 70.0)))
+    assert away > 3.5 * np.sqrt(found.variance_px2[0])
+    assert away < 2.5 * np.sqrt(even.added_to(found, model).variance_px2[0])
