@@ -44,7 +44,7 @@ class SpotProfile:
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Variance of one pixel of expected grey value v: floor_dn2 + slope_dn (v - black_dn), the floor below black_dn."""
+    """Variance of a pixel that expects v DN: floor_dn2 + slope_dn (v - black_dn), at least floor_dn2 - shadow_dn2."""
 
     floor_dn2: float  # read noise and rounding, DN^2 (if estimated: all noise at the background's level)
     slope_dn: float  # DN^2 per DN: 1 / (electrons per DN)
@@ -56,6 +56,7 @@ class NoiseModel:
     # compressed pictures. A spot's centre is such a mean, so detection uses `of_means`
     compression_dn2: float = 0.0  # variance that lossy compression adds to pixels with light, whose details it rounds
     profile: SpotProfile = SpotProfile()  # of narrow spots
+    shadow_dn2: float = 0.0  # of the floor: what places with less light than the background lack, at most
     # (n, m): texture of each block of BLOCK x BLOCK pixels, at most `texture`; None: that everywhere
     local_texture: NDArray[np.float32] | None = field(default=None, compare=False, repr=False)
 
@@ -77,13 +78,15 @@ class NoiseModel:
     def of_means(self) -> NoiseModel:
         """The model of independent pixels whose means have the variance of this one's."""
         c = self.correlation
-        return replace(self, floor_dn2=c * self.floor_dn2, slope_dn=c * self.slope_dn, correlation=1.0)
+        floor, shadow = c * self.floor_dn2, c * self.shadow_dn2
+        return replace(self, floor_dn2=floor, slope_dn=c * self.slope_dn, shadow_dn2=shadow, correlation=1.0)
 
     def in_steps(self, steps: float) -> NoiseModel:
         """The model of pictures in so many steps per DN."""
         return replace(
             self, floor_dn2=self.floor_dn2 * steps**2, slope_dn=self.slope_dn * steps, black_dn=self.black_dn * steps,
-            banding_dn=self.banding_dn * steps, compression_dn2=self.compression_dn2 * steps**2,
+            shadow_dn2=self.shadow_dn2 * steps**2, banding_dn=self.banding_dn * steps,
+            compression_dn2=self.compression_dn2 * steps**2,
         )  # fmt: skip
 
     def texture_of_blocks(self, rows: int, columns: int) -> NDArray[np.float32] | float:
@@ -93,7 +96,8 @@ class NoiseModel:
 
     def variance(self, level_dn: ArrayLike) -> Array:
         """Variance, DN^2, of pixels with the given expected grey values, DN, any shape."""
-        return self.floor_dn2 + self.slope_dn * np.maximum(np.asarray(level_dn) - self.black_dn, 0.0)
+        rise = self.slope_dn * (np.asarray(level_dn) - self.black_dn)
+        return self.floor_dn2 + np.maximum(rise, -self.shadow_dn2)
 
 
 def guess_noise(image: Picture) -> NoiseModel:

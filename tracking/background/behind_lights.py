@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,6 +45,8 @@ class BehindLights:
         strength (n,): of the lights; usual_dn: brightness of the surface. The modulation that most lights of a camera
         show helps with the others.
         """
+        # In black places the model leaves more than their noise: also there that of the background counts.
+        noise = replace(noise, shadow_dn2=0.0)
         parts = _behind_each(pictures, strength, found, boxes, noise, None)
         modulation = _modulation([part.fit for part in parts], usual_dn)
         if modulation is not None:

@@ -53,7 +53,9 @@ class RestingLights:
         pixels = np.concatenate([np.zeros(0, np.int64), *(w.pixels for w in windows)])
         slopes = np.concatenate([np.zeros((_PARAMETERS, 0)), *(w.slopes for w in windows)], axis=1)
         light = mean.ravel()[pixels].astype(float)
-        weight = np.where(light < saturation_dn, 1.0 / noise.of_means.variance(light), 0.0)
+        # In black places a light at rest changes by more than their noise: also there that of the background counts.
+        variance = replace(noise.of_means, shadow_dn2=0.0).variance(light)
+        weight = np.where(light < saturation_dn, 1.0 / variance, 0.0)
         inverse = np.zeros((len(found), _PARAMETERS, _PARAMETERS))
         for i, (start, count) in enumerate(zip(starts, counts, strict=True)):
             own = np.s_[start : start + count]

@@ -52,6 +52,7 @@ _LEAST_MODULATION = 0.1  # of the light by the surface: less is not undone
 _MODULATION = (0.25, 4.0)  # of the light, at most
 _LEAST_SIGMA = 0.005  # widths: least error of a light at rest, which is no Gaussian
 _NOT_UNDONE = 0.2  # share of the modulation's errors
+_OF_PEAK = 0.3  # of the shot noise at the peak: what counts for the centre, where a fit's weights are of other noise
 TRIED = 3  # every such picture shows whether there are further spots
 _WIDE_PX = 4.0  # a narrower light is in few of the sampled pixels
 
@@ -162,12 +163,18 @@ class StaticBackground:
         at_rest = find_spots(in_steps(mean, steps), replace(parameters, saturation_dn=(clips - 0.5) * steps), once)
         at_rest = replace(at_rest, flux=at_rest.flux / steps, peak=at_rest.peak / steps)
         # The difference has one level everywhere, and the noise of the picture.
-        low = float(np.quantile(plain[::8, ::8], _LOW))
-        brighter = model.slope_dn * np.maximum(highest_of_blocks(plain) - max(low, model.black_dn), 0.0)
+        # Of less noise than most pixels have, the misfits of all spots would count a second time.
+        low = max(float(np.quantile(plain[::8, ::8], _LOW)), model.black_dn)
+        at_low = float(model.variance(low))
+        brighter = np.maximum(model.variance(highest_of_blocks(plain)) - at_low, 0.0)
         uneven = np.asarray(np.sqrt(brighter / 9.0) / (TEXTURE_SHARE * level), np.float32)
-        black = level - max(low - model.black_dn, 0.0)
         of_difference = replace(
-            once, floor_dn2=once.floor_dn2 * (1 + share), black_dn=black * steps, texture=0.0, local_texture=uneven
+            once,
+            floor_dn2=at_low * steps**2 * (1 + share),
+            black_dn=level * steps,
+            shadow_dn2=0.0,
+            texture=0.0,
+            local_texture=uneven,
         )
         rows, columns = SAMPLE
         blind = cv2.dilate(mean - np.minimum(plain, level), np.ones((3, 3))) > 1 / steps
@@ -289,8 +296,9 @@ class StaticBackground:
         gain = 1.0 if self.gain is None else self.gain[row, column] / 2.0**GAIN_BITS
         peak = spots.peak / (self.steps * gain)
         bright = self.smooth[sampled] + self.structure[row, column]
-        light_of_spot = 0.5 * self.noise.slope_dn * peak
-        here, used = (self.noise.variance(at) + light_of_spot for at in (bright, np.full(len(spots), self.low_dn)))
+        light_of_spot = _OF_PEAK * self.noise.slope_dn * peak
+        used = self.noise.variance(self.low_dn) + gain * light_of_spot
+        here = self.noise.variance(bright) + light_of_spot
         own = self.shares[row, column]
         here *= gain**2 * (1 + own) / (1 + self._noise_share)
         covariance = spots.cov_px2 * (here / used)[:, None, None]

@@ -104,7 +104,10 @@ def estimate_noise(pictures: Sequence[Picture], black_dn: float | None = None) -
         found = [find_spots(p, DetectParameters(max_detections=_MOST_SPOTS), first) for p in usable]
         lines.add(residuals_of_spots(usable, found, top))
         slope, slope_sigma = lines.slope(rounding)
-    model = replace(first, slope_dn=slope, floor_dn2=lines.model(slope, rounding).floor_dn2)
+    floor = lines.model(slope, rounding).floor_dn2
+    lowest = min(float(levels.level.min(initial=background)), background) if levels.temporal else background
+    shadow = min(slope * (background - lowest), floor - rounding)
+    model = replace(first, slope_dn=slope, floor_dn2=floor, shadow_dn2=shadow)
     floor_sigma = float(np.interp(slope, lines.slopes, lines.floor_sigma)) / model.floor_dn2
     # With hardly any noise on a background of few grey values their steps look like texture, unless it is larger.
     steps = banding(model.floor_dn2, rounding)

@@ -106,6 +106,28 @@ def test_a_board_that_modulates_spots_by_half_does_not_shift_them(length_px, lar
     assert np.sqrt(np.mean((gap / sigma) ** 2) / 2) < 1.25
 
 
+@pytest.mark.parametrize("modulated", [0.0, 0.6])
+def test_spots_on_black_and_on_white_have_the_noise_of_the_light_there(modulated):
+    """20 electrons per grey value: a seventh of the photon noise of white is left on black."""
+    rng, along = np.random.default_rng(7), np.arange(45.0)[:, None, None]
+    wall = np.where(X < 200, WHITE, BLACK) * np.ones(SIZE)
+    start = np.array([[x, y] for x in (60.0, 120.0, 260.0, 320.0) for y in (40.0, 120.0, 200.0)])
+    paths, lamps = start + along * np.array([0.7, 1.3]), np.array([[x, 290.0] for x in (60.0, 150.0, 250.0, 340.0)])
+    pictures = []
+    for at in paths:
+        light = round_lights(SIZE, np.concatenate([at, lamps]), 60.0, 2.0)
+        electrons = 20 * (wall - 4 + (1 - modulated * (1 - wall / WHITE)) * light)
+        pictures.append(np.clip(np.rint(rng.poisson(electrons) / 20 + 4), 0, 255).astype(np.uint8))
+    ratio: list[list[float]] = [[], []]
+    for found, at in zip(found_in_all(pictures), paths, strict=True):
+        for i, place in enumerate(at):
+            near = int(np.hypot(*(found.uv_px - place).T).argmin())
+            assert found.place_px2 is not None
+            noise_px2 = found.variance_px2[near] - found.place_px2[near]
+            ratio[i // 6].append(np.sum((found.uv_px[near] - place) ** 2) / 2 / noise_px2)
+    assert np.mean(ratio, axis=1) == pytest.approx(1.15, abs=0.35)
+
+
 @pytest.mark.parametrize("away_px", [2.5, 5.0, 8.0])
 @pytest.mark.parametrize("angle_deg", [0, 90])
 def test_a_spot_that_rests_beside_an_edge_is_found_although_nothing_moves(away_px, angle_deg):

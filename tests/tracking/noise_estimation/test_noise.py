@@ -93,6 +93,19 @@ def test_noise_is_estimated_from_pictures_of_spots_at_rest(gain, read):
         assert 0.8 * truth < model.variance(level) < 1.3 * truth
 
 
+@pytest.mark.parametrize("read_e", [3.0, 12.0])
+def test_black_places_of_a_scene_have_the_noise_of_their_light(read_e):
+    """A board whose black squares have an eighth of the light: a photon noise of a third."""
+    lab = Lab(texture=0.0, details=0, background=64.0, gain=20.0, read_e=read_e)
+    rng, light = np.random.default_rng(4), np.full((400, 520), lab.background)
+    light[:, 320:] /= 8
+    noise = np.sqrt(light * lab.gain + lab.read_e**2) / lab.gain
+    pictures = [np.rint(light + lab.black + noise * rng.standard_normal(light.shape)) for _ in range(6)]
+    model = estimate_noise([p.astype(np.uint8) for p in pictures]).model
+    for level in (68.0, 12.0):
+        assert lab.variance(level) / 1.3 < model.variance(level) < 1.3 * lab.variance(level)
+
+
 @pytest.mark.parametrize(
     "lab",
     [
