@@ -37,7 +37,7 @@ from tracking.detections import Detections
 FRAMES = 24
 FAST = WatchOptions(idle_s=1.0, timeout_s=5.0)  # long enough that no camera times out on a busy machine
 IMPATIENT = WatchOptions(idle_s=1.5, timeout_s=1.0)
-PATIENT = WatchOptions(idle_s=60.0, timeout_s=5.0)  # ends when it is stopped
+PATIENT = WatchOptions(idle_s=60.0, timeout_s=60.0)  # ends when it is stopped; no camera times out
 
 
 @pytest.fixture(scope="module")
