@@ -29,6 +29,7 @@ _LEAST_PICTURES = 9  # usable ones
 _MANY_LIGHTS = 4  # at rest, from which the subtraction is used in any case: it spares their fits
 _LEAST_FOUND = 0.2  # further or better spots per picture from which the subtraction is used
 _ALWAYS = 0.9  # share of the pictures in which another light passes over one at rest, above which that is part of it
+_WIDER = 2.0  # widths of the lights that move, at most, of what the places of one of them have in common
 _MOSTLY = 0.7  # share of the pictures with lights that move, above which those at rest in all of them are no spots
 # Contrast up to which the structure is that of the screen's surface, and modulates the spots' light in full. Of what is
 # more, prints or objects, the spots show a part: 0.25 to 0.57 where photographs modulate their light by up to 60 %.
@@ -130,18 +131,18 @@ def _with_shifts(
     if not moved:
         background = background.with_lights_on_edges(mean, modulation)
     still = background.lights.found
+    still_px = np.sqrt(still.major_px * still.minor_px)
     widths = np.concatenate([np.sqrt(d.major_px * d.minor_px) for d in found])
-    if not len(widths):  # spots may be at rest
-        widths = np.sqrt(still.major_px * still.minor_px)
+    width = float(np.median(widths if len(widths) else still_px)) if len(widths) + len(still) else 0.0  # spots may rest
     changed, passed = np.array([background.lights.in_picture(p)[1:] for p in pictures]).swapaxes(0, 1)
     # Where another light is in nearly all pictures, what rests is what the places of a light have in common that moves
-    # by less than its width: that place is searched in the pictures.
-    common = np.column_stack([still.uv_px, background.lights.half_px])[passed.mean(axis=0) > _ALWAYS]
+    # by less than its width: that place is searched in the pictures. A wider one is an object, a square of a board.
+    always = (passed.mean(axis=0) > _ALWAYS) & (still_px < _WIDER * width)
+    common = np.column_stack([still.uv_px, background.lights.half_px])[always]
     unknown = np.concatenate([background.unknown, common])
     better = replace(background, unknown=unknown, fixed=np.asarray(~changed.any(axis=0) & moved))
-    if not len(widths):
+    if not width:
         return better
-    width = float(np.median(widths))
     mean = background.plain()
     own = (background.shares * background.noise.variance(mean)).astype(np.float32)
     share = replace(shift, misfit_share=float("nan")).with_lights(found).misfit_share

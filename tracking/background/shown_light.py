@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools
+from tracking.background.places import AROUND_SPOT
+from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
 
 SAMPLE = (10, 11)  # rows and columns: every such pixel shows how much of the structure is in a picture
@@ -112,14 +114,24 @@ class ShownLight:
         return _median(share), above, structure, clear, variance
 
 
-def fits_around(clear: Bools, left2: _Values) -> Bools:
-    """(a, b): where what a picture leaves, squared sigmas, is noise: somebody in front of the screen is not.
+def fits_around(clear: Bools, left2: _Values, spots: Detections) -> Bools:
+    """(n,): whether what a picture leaves around spots, squared sigmas, is noise: before a person it is more.
 
-    clear: the pixels of the sample that count. A moving light is in few of them.
+    clear: the pixels of the sample that count; those of the spots, which explain them, do not.
     """
+    clear = clear.copy()
+    widths, more = AROUND_SPOT
+    for at, reach in zip(spots.uv_px[:, ::-1] / SAMPLE, widths * spots.major_px + more, strict=True):
+        most = np.ceil(reach / np.array(SAMPLE)).astype(int)
+        rows, columns = (np.arange(max(int(x) - m, 0), int(x) + m + 2) for x, m in zip(at, most, strict=True))
+        away2 = ((rows - at[0]) * SAMPLE[0])[:, None] ** 2 + ((columns - at[1]) * SAMPLE[1]) ** 2
+        part = clear[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        part &= away2[: part.shape[0], : part.shape[1]] > reach**2
     count = _sums(clear.astype(np.float32))
     least = _LARGEST_MISFIT**2 * count + _BY_CHANCE * np.sqrt(2 * count)
-    return np.asarray(_sums(np.where(clear, np.minimum(left2, np.float32(_MOST_LEFT**2)), np.float32(0.0))) <= least)
+    fits = _sums(np.where(clear, np.minimum(left2, np.float32(_MOST_LEFT**2)), np.float32(0.0))) <= least
+    row, column = (np.clip(spots.uv_px[:, 1 - i] // SAMPLE[i], 0, n - 1).astype(int) for i, n in enumerate(fits.shape))
+    return np.asarray(fits[row, column])
 
 
 def _sums(values: _Values) -> _Values:

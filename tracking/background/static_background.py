@@ -27,7 +27,6 @@ from tracking.background.mean_pictures import (
 )
 from tracking.background.places import (
     AROUND_LIGHT,
-    AROUND_SPOT,
     SAME_LIGHT,
     inside,
     near_each,
@@ -54,7 +53,6 @@ _LEAST_SIGMA = 0.005  # widths: least error of a light at rest, which is no Gaus
 _NOT_UNDONE = 0.2  # share of the modulation's errors
 _OF_PEAK = 0.3  # of the shot noise at the peak: what counts for the centre, where a fit's weights are of other noise
 TRIED = 3  # every such picture shows whether there are further spots
-_WIDE_PX = 4.0  # a narrower light is in few of the sampled pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,13 +281,9 @@ class StaticBackground:
                 cv2.subtract(np.full_like(difference, 2 * int(self.level_dn * self.steps)), difference)
             )
         spots = find_spots(difference, replace(parameters, saturation_dn=float(top)), model, regions)
-        wide = spots.major_px > _WIDE_PX
-        if wide.any():  # its pixels are explained
-            clear = clear & ~places_of(spots[wide], picture.shape, AROUND_SPOT)[:: SAMPLE[0], :: SAMPLE[1]]
-        fits = fits_around(clear, left2)
         row, column = (nearest(spots.uv_px[:, i], picture.shape[1 - i]) for i in (1, 0))
-        sampled = np.minimum(row // SAMPLE[0], len(fits) - 1), np.minimum(column // SAMPLE[1], fits.shape[1] - 1)
-        kept = ~self.blind[row, column] & fits[sampled]
+        sampled = np.minimum(row // SAMPLE[0], len(clear) - 1), np.minimum(column // SAMPLE[1], clear.shape[1] - 1)
+        kept = ~self.blind[row, column] & fits_around(clear, left2, spots)
         spots, row, column, sampled = spots[kept], row[kept], column[kept], (sampled[0][kept], sampled[1][kept])
         if not len(spots):
             return spots
@@ -299,13 +293,13 @@ class StaticBackground:
         light_of_spot = _OF_PEAK * self.noise.slope_dn * peak
         used = self.noise.variance(self.low_dn) + gain * light_of_spot
         here = self.noise.variance(bright) + light_of_spot
-        own = self.shares[row, column]
-        here *= gain**2 * (1 + own) / (1 + self._noise_share)
+        errors = self.shares[row, column]
+        here *= gain**2 * (1 + errors) / (1 + self._noise_share)
         covariance = spots.cov_px2 * (here / used)[:, None, None]
         spots = replace(spots, flux=spots.flux / (self.steps * gain), peak=peak, cov_px2=covariance)
         # The background's own noise is the same in all pictures.
         noise_share = 1.0 if spots.misfit is None else 1 - spots.misfit
-        fixed = own / (1 + own) * noise_share * spots.variance_px2
+        fixed = errors / (1 + errors) * noise_share * spots.variance_px2
         shifts = self._shifts_at(spots)
         if shifts is not None and self.gain is not None:
             shifts *= _NOT_UNDONE

@@ -25,14 +25,14 @@ Y, X = np.mgrid[: SIZE[0], : SIZE[1]]
 BOARD = BLACK + (WHITE - BLACK) / (1 + np.exp(-3 * np.sin(np.pi * X / CELL) * np.sin(np.pi * Y / CELL) * CELL / 4))
 
 
-def board_pictures(paths: Array, sigma_px: float, modulated: float, seed: int) -> list[Picture]:
+def board_pictures(paths: Array, sigma_px: float, modulated: float, seed: int, board: Array = BOARD) -> list[Picture]:
     """Pictures of spots at places (pictures, spots, 2), whose light the board modulates by this share."""
     rng = np.random.default_rng(seed)
-    response = 1 - modulated * (1 - BOARD / WHITE)
+    response = 1 - modulated * (1 - board / WHITE)
     pictures = []
     for at in paths:
         light = round_lights(SIZE, at, 90.0, sigma_px)
-        pictures.append(np.clip(np.rint(BOARD + response * light + NOISE * rng.standard_normal(SIZE)), 0, 255))
+        pictures.append(np.clip(np.rint(board + response * light + NOISE * rng.standard_normal(SIZE)), 0, 255))
     return [p.astype(np.uint8) for p in pictures]
 
 
@@ -78,6 +78,17 @@ def test_the_sigmas_follow_the_edges_whether_or_not_they_modulate_the_spots(modu
     assert gap.max() < 1.0
     assert np.median(sigma[even]) < 0.03 < 0.2 * sigma.max()
     assert np.sqrt(np.mean((gap[even] / sigma[even]) ** 2) / 2) == pytest.approx(1.0, abs=0.25)
+    assert np.sqrt(np.mean((gap / sigma) ** 2) / 2) < 1.25
+
+
+@pytest.mark.parametrize("white", [40.0, 70.0])
+def test_spots_that_stay_in_front_of_bright_squares_are_measured_in_the_difference(white):
+    """The squares resemble wide lights at rest, over which spots pass in all pictures; little else shows the board."""
+    board = 4 + (white - 4) * (BOARD - BLACK) / (WHITE - BLACK)
+    paths = np.array([[60.0, 60.0], [100.0, 100.0], [140.0, 60.0], [180.0, 100.0], [220.0, 140.0]])
+    paths = paths + np.linspace(-0.5, 0.5, 45)[:, None, None] * [24.0, 18.0]
+    gap, sigma = errors(found_in_all(board_pictures(paths, 3.0, 0.3, 6, board)), paths)
+    assert gap.max() < 0.3
     assert np.sqrt(np.mean((gap / sigma) ** 2) / 2) < 1.25
 
 
