@@ -28,7 +28,7 @@ _LARGEST_MISFIT = 1.3  # sigma of what is left over that of the noise; above it 
 
 _SOME = (slice(None, None, 2), slice(None, None, 2))  # of the sample, for medians over the whole picture
 _Values = NDArray[np.float32]
-# Light of a picture relative to the background; on the sample: what is clear of lights, and squared sigmas left there.
+# Light of a picture relative to the background; on the sample: what is clear of lights, and what is left there, sigmas.
 Shown: TypeAlias = tuple[float, Bools, _Values]
 
 
@@ -88,9 +88,8 @@ class ShownLight:
         if not _LEAST_LIGHT < light < _MOST_LIGHT:
             return None
         left = above - np.float32(light) * structure
-        left *= left
-        left /= variance * np.float32(1 + light**2 * self.noise_share)
-        if 1.4826**2 * _median(left[_SOME][clear[_SOME]]) > _LARGEST_MISFIT**2:
+        left /= np.sqrt(variance * np.float32(1 + light**2 * self.noise_share))
+        if 1.4826 * _median(np.abs(left[_SOME][clear[_SOME]])) > _LARGEST_MISFIT:
             return None
         return light, clear, left
 
@@ -114,10 +113,11 @@ class ShownLight:
         return _median(share), above, structure, clear, variance
 
 
-def fits_around(clear: Bools, left2: _Values, spots: Detections) -> Bools:
-    """(n,): whether what a picture leaves around spots, squared sigmas, is noise: before a person it is more.
+def fits_around(clear: Bools, left: _Values, spots: Detections) -> Bools:
+    """(n,): whether what a picture leaves around spots, sigmas, is noise about its mean: before a person it is more.
 
-    clear: the pixels of the sample that count; those of the spots, which explain them, do not.
+    clear: the pixels of the sample that count; those of the spots do not: they explain them. The light of wide spots
+    is in what `left` has been reduced by.
     """
     clear = clear.copy()
     widths, more = AROUND_SPOT
@@ -127,9 +127,11 @@ def fits_around(clear: Bools, left2: _Values, spots: Detections) -> Bools:
         away2 = ((rows - at[0]) * SAMPLE[0])[:, None] ** 2 + ((columns - at[1]) * SAMPLE[1]) ** 2
         part = clear[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         part &= away2[: part.shape[0], : part.shape[1]] > reach**2
-    count = _sums(clear.astype(np.float32))
+    counted = clear.astype(np.float32)
+    left = left - cv2.blur(left * counted, _SMOOTH) / np.maximum(cv2.blur(counted, _SMOOTH), np.float32(1e-3))
+    count = _sums(counted)
     least = _LARGEST_MISFIT**2 * count + _BY_CHANCE * np.sqrt(2 * count)
-    fits = _sums(np.where(clear, np.minimum(left2, np.float32(_MOST_LEFT**2)), np.float32(0.0))) <= least
+    fits = _sums(counted * np.minimum(left * left, np.float32(_MOST_LEFT**2))) <= least
     row, column = (np.clip(spots.uv_px[:, 1 - i] // SAMPLE[i], 0, n - 1).astype(int) for i, n in enumerate(fits.shape))
     return np.asarray(fits[row, column])
 

@@ -264,7 +264,7 @@ class StaticBackground:
         inverted: bool = False, regions: NDArray[np.float64] | None = None,
     ) -> Detections:  # fmt: skip
         """`spots_in`, with the result of `ShownLight.in_picture`."""
-        light, clear, left2 = fit
+        light, clear, left = fit
         model, more = self.model, 0.0
         if abs(light - 1) > LEAST_CHANGE:
             own, more = self._noise_share, (1 - light) * self.steps
@@ -283,7 +283,7 @@ class StaticBackground:
         spots = find_spots(difference, replace(parameters, saturation_dn=float(top)), model, regions)
         row, column = (nearest(spots.uv_px[:, i], picture.shape[1 - i]) for i in (1, 0))
         sampled = np.minimum(row // SAMPLE[0], len(clear) - 1), np.minimum(column // SAMPLE[1], clear.shape[1] - 1)
-        kept = ~self.blind[row, column] & fits_around(clear, left2, spots)
+        kept = ~self.blind[row, column] & fits_around(clear, left, spots)
         spots, row, column, sampled = spots[kept], row[kept], column[kept], (sampled[0][kept], sampled[1][kept])
         if not len(spots):
             return spots
