@@ -128,10 +128,10 @@ def fits_around(clear: Bools, left: _Values, spots: Detections) -> Bools:
         part = clear[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         part &= away2[: part.shape[0], : part.shape[1]] > reach**2
     counted = clear.astype(np.float32)
-    left = left - cv2.blur(left * counted, _SMOOTH) / np.maximum(cv2.blur(counted, _SMOOTH), np.float32(1e-3))
-    count = _sums(counted)
+    means = cv2.blur(left * counted, _SMOOTH) / np.maximum(cv2.blur(counted, _SMOOTH), np.float32(1e-3))
+    count, left2 = _sums(counted), np.square(left - means)
     least = _LARGEST_MISFIT**2 * count + _BY_CHANCE * np.sqrt(2 * count)
-    fits = _sums(counted * np.minimum(left * left, np.float32(_MOST_LEFT**2))) <= least
+    fits = _sums(np.asarray(counted * np.minimum(left2, _MOST_LEFT**2), np.float32)) <= least
     row, column = (np.clip(spots.uv_px[:, 1 - i] // SAMPLE[i], 0, n - 1).astype(int) for i, n in enumerate(fits.shape))
     return np.asarray(fits[row, column])
 
