@@ -27,6 +27,7 @@ from tracking.background.mean_pictures import (
 )
 from tracking.background.places import (
     AROUND_LIGHT,
+    AROUND_SPOT,
     SAME_LIGHT,
     inside,
     near_each,
@@ -212,13 +213,27 @@ class StaticBackground:
         apart = np.asarray(~same.any(axis=1))
         known, _ = self._known(shift)
         rest = replace(lights, cov_px2=known.cov_px2, place_px2=known.place_px2, at_rest=known.at_rest)
-        boxes = np.concatenate([self.unknown, np.column_stack([self.lights.found.uv_px, self.lights.half_px])[changed]])
+        of_changed = np.column_stack([self.lights.found.uv_px, self.lights.half_px])[changed]
+        boxes = np.concatenate([self.unknown, of_changed])
         if not len(boxes):
             return spots[apart], rest
         again = find_spots(picture, parameters, self.noise, boxes)
         again = shift.added_to(again, self.noise, self._shifts_at(again))
+        # The picture may not show a faint spot on a structure that the difference does not have.
+        alone = (
+            inside(of_changed, spots) & ~inside(self.unknown, spots) & ~near_each(spots, again, AROUND_SPOT).any(axis=1)
+        )
         found = spots[apart & ~inside(boxes, spots)].joined(again, parameters.max_detections)
+        found = found.joined(self._beside_lights(spots[apart & alone]), parameters.max_detections)
         return found, rest[~changed & ~inside(boxes, rest)]
+
+    def _beside_lights(self, spots: Detections) -> Detections:
+        """Spots with the error, at most, by the light at rest that the background has subtracted with them."""
+        near = near_each(spots, self.lights.found, AROUND_LIGHT)
+        share = np.minimum(near @ self.lights.found.flux / spots.flux, 1.0)
+        more = share**2 * spots.major_px * spots.minor_px
+        place = more if spots.place_px2 is None else spots.place_px2 + more
+        return replace(spots, cov_px2=spots.cov_px2 + more[:, None, None] * np.eye(2), place_px2=place)
 
     def _known(self, shift: TextureShift) -> tuple[Detections, TextureShift]:
         """The lights at rest in the mean picture, with the errors that they have in each picture; errors of others."""

@@ -92,6 +92,23 @@ def test_spots_that_stay_in_front_of_bright_squares_are_measured_in_the_differen
     assert np.sqrt(np.mean((gap / sigma) ** 2) / 2) < 1.25
 
 
+@pytest.mark.parametrize("away_px", [4.0, 5.0])
+def test_a_narrow_light_beside_an_edge_that_becomes_brighter_and_moves_is_found(away_px):
+    """A single picture does not show it beside the edge, and the background contains half of its light."""
+    rng, board = np.random.default_rng(3), 33 + 31 * (BOARD - BLACK) / (WHITE - BLACK)
+    at_rest = np.array([[80.0, 60.0], [120.0, 100.0], [160.0, 60.0], [240.0, 140.0]]) + [away_px, 0.0]
+    brighter = np.arange(45) % 3 == 1  # not in the pictures that the background is made from
+    paths = at_rest + 0.3 * brighter[:, None, None]
+    pictures = []
+    for at, peak in zip(paths, np.where(brighter, 18.0, 9.0), strict=True):
+        light = board + round_lights(SIZE, at, float(peak), 1.1) + rng.standard_normal(SIZE)
+        pictures.append(np.clip(np.rint(light), 0, 255).astype(np.uint8))
+    found = found_in_all(pictures)
+    gap, sigma = errors([d for d, own in zip(found, brighter, strict=True) if own], paths[brighter])
+    assert gap.max() < 1.0
+    assert np.sqrt(np.mean((gap / sigma) ** 2) / 2) < 1.25
+
+
 def test_a_wide_bright_spot_is_no_person_in_front_of_the_board():
     lamps = np.broadcast_to(np.array([[340.0, 40.0], [350.0, 280.0], [40.0, 280.0], [200.0, 40.0]]), (45, 4, 2))
     paths = np.concatenate([over_edges(45, 120.0)[:, :1] + [60.0, 60.0], lamps], axis=1)
