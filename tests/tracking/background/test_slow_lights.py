@@ -96,7 +96,7 @@ def test_spots_that_stay_in_front_of_bright_squares_are_measured_in_the_differen
 def test_a_narrow_light_beside_an_edge_that_becomes_brighter_and_moves_is_found(away_px):
     """A single picture does not show it beside the edge, and the background contains half of its light."""
     rng, board = np.random.default_rng(3), 33 + 31 * (BOARD - BLACK) / (WHITE - BLACK)
-    at_rest = np.array([[80.0, 60.0], [120.0, 100.0], [160.0, 60.0], [240.0, 140.0]]) + [away_px, 0.0]
+    at_rest = np.array([80.0, 120.0, 160.0, 240.0, 60.0, 100.0, 60.0, 140.0]).reshape(2, 4).T + np.array([away_px, 0.0])
     brighter = np.arange(45) % 3 == 1  # not in the pictures that the background is made from
     paths = at_rest + 0.3 * brighter[:, None, None]
     pictures = []
