@@ -256,6 +256,7 @@ class _Seen:
     """What the pictures of one camera contain."""
 
     frames: list[int] = field(default_factory=list)  # frames with a usable picture
+    shown: list[int] = field(default_factory=list)  # of these, those that are no empty lists of points
     kinds: set[str] = field(default_factory=set)
     points: int = 0
     brightest: int = 0  # DN
@@ -334,6 +335,8 @@ def _count(seen: _Seen, frame: int, picture: object) -> None:
             seen.size = picture.reason
         return
     seen.frames.append(frame)
+    if not isinstance(picture, Detections) or len(picture):
+        seen.shown.append(frame)
     if isinstance(picture, Detections):
         seen.kinds.add("points")
         seen.points += len(picture)
@@ -347,12 +350,13 @@ def _compare_cameras(findings: Findings, seen: dict[str, _Seen]) -> None:
     """Reports frames that some cameras have and others lack."""
     if len(seen) < 2:
         return
-    ranges = {name: (min(s.frames), max(s.frames), len(s.frames)) for name, s in seen.items() if s.frames}
+    ranges = {name: (min(s.shown), max(s.shown), len(s.frames)) for name, s in seen.items() if s.shown}
     for (a, one), (b, other) in combinations(ranges.items(), 2):
         if one[2] == other[2] and one[0] != other[0] and one[1] - one[0] == other[1] - other[0]:
             findings.remarks.append(
-                f"cameras: {a!r} and {b!r} have {one[2]} pictures each, numbered from {one[0]} and from {other[0]}: the"
-                " same number must be the same instant. Film one flash with both: it must have the same number"
+                f"cameras: {a!r} and {b!r} have {one[1] - one[0] + 1} frames each, numbered from {one[0]} and from"
+                f" {other[0]}: the same number must be the same instant. Film one flash with both: it must have the"
+                " same number"
             )
     in_all = set.intersection(*(set(s.frames) for s in seen.values()))
     in_any = set.union(*(set(s.frames) for s in seen.values()))

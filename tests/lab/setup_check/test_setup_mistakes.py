@@ -397,6 +397,14 @@ def test_a_mistake_is_named_at_rest_without_a_false_point(tmp_path, name):
     assert re.search(CASE[name].words, outcome.verdict.texts[0])
 
 
+def test_at_rest_only_the_first_and_last_number_show_a_camera_that_is_numbered_from_one(tmp_path):
+    run = simulate("static", tmp_path / "run", seed=1, frames=12, detections_only=True)
+    text, status = checked(with_mistake("numbered from 1, one camera", run, tmp_path / "wrong"))
+    assert status == 0
+    assert "have 12 frames each, numbered from 1 and from 0" in text
+    assert "numbered from" not in checked(run)[0]
+
+
 def test_exchanged_spots_of_a_screen_are_said_to_be_invisible_where_no_beams_can_be_exchanged(tmp_path):
     save_rig(random_scene(7113).known_rig, tmp_path / "rig.yaml")
     assert "Exchanged names of two spots of a screen: no recording shows them" in checked(tmp_path / "rig.yaml")[0]
