@@ -44,7 +44,6 @@ from lab.progress import Progress
 from lab.runs.frames.clocked_frames import open_frames
 from lab.runs.frames.frames import FrameReader, pictures_at
 from lab.runs.setup_check import (
-    FRAMES,
     SampledFrames,
     mistakes_by_themselves,
     points_in,
@@ -53,7 +52,7 @@ from lab.runs.setup_check import (
 )
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters
-from tracking.setup_mistakes.evidence import NAMES, Invisible, invisible_mistakes
+from tracking.setup_mistakes.evidence import ENOUGH, NAMES, Invisible, invisible_mistakes
 from tracking.setup_mistakes.possible import SHOWN_BY, Block, possible_mistakes
 
 
@@ -227,7 +226,7 @@ def _blocks(run: Run, sampler: SampledFrames) -> list[Block]:
     blocks = sampler.frames
     filmed = [name for name, source in run.cameras.items() if not isinstance(source, DetectionsTable)]
     if filmed and blocks:
-        chosen = np.unique(np.linspace(0, len(blocks) - 1, FRAMES).round().astype(int))
+        chosen = np.unique(np.linspace(0, len(blocks) - 1, ENOUGH).round().astype(int))
         blocks = [blocks[i] for i in chosen]
     numbers = [frame.frame for block in blocks for frame in block]
     found = _detected(run, filmed, numbers) if filmed else {}

@@ -19,6 +19,7 @@ from lab.runs.model_check.frame_sampler import BLOCK, EvenSampler
 from lab.runs.verdict.run_statistics import RunStatistics
 from tracking.detections import Detections
 from tracking.setup_mistakes.evidence import (
+    ENOUGH,
     LEAST_FITTING,
     LEAST_POINTS,
     Comparison,
@@ -29,7 +30,7 @@ from tracking.setup_mistakes.evidence import (
 from tracking.setup_mistakes.possible import HERE, SHOWN_BY, Block, possible_mistakes
 
 UNUSED = "BP-M07"  # code of the finding on a camera of which no point is labelled
-FRAMES = 6  # of a recording, with which mistakes are tested
+FRAMES = 2 * ENOUGH  # of a recording, with which mistakes are tested at most
 MOST_KEPT = 90  # frames from which they are chosen
 FEWEST, PART = 10, 0.6  # points, and the share of width and height that they do not exceed in part of a picture
 SAME_RATE = 0.02  # relative difference of frame rates, above which they are not the same
@@ -83,9 +84,11 @@ def frames_of(blocks: Sequence[Block], prior: PosePrior | None, min_spots: int) 
         return None
     full = rows[counts[rows] >= np.median(counts[rows])]
     steps = [max(_moved_px(b[HERE], b[0]), _moved_px(b[-1], b[HERE])) for b in blocks]
-    moved = full[np.argsort([-steps[i] for i in full], kind="stable")][: FRAMES // 2]
-    even = full[np.unique(np.linspace(0, len(full) - 1, FRAMES).round().astype(int))]
-    chosen = list(dict.fromkeys([*rows[rows == 0], *moved, *even]))[:FRAMES]
+    moved = full[np.argsort([-steps[i] for i in full], kind="stable")]
+    chosen: list[int] = []
+    for count in (ENOUGH, FRAMES):
+        even = full[np.unique(np.linspace(0, len(full) - 1, count).round().astype(int))]
+        chosen = list(dict.fromkeys([*chosen, *rows[rows == 0], *moved[: count // 2], *even]))[:count]
     return Frames([blocks[i] for i in chosen], prior, at_start=bool(chosen[0] == 0))
 
 
