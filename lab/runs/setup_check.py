@@ -21,6 +21,7 @@ from tracking.detections import Detections
 from tracking.setup_mistakes.evidence import (
     ENOUGH,
     LEAST_FITTING,
+    LEAST_LABELLED,
     LEAST_POINTS,
     Comparison,
     Frames,
@@ -115,16 +116,20 @@ def recorded_mistakes(run: Run, blocks: Sequence[Block], *, explained: bool = Fa
         n for n, c in zip(run.rig.cameras, given.points.sum(axis=0), strict=True) if c >= LEAST_POINTS * len(given.fits)
     ]
     lenses = same_lenses(run.rig, seen) if given.fits.mean() < LEAST_FITTING else ()
-    return (*found, *lenses, *_parts_of_pictures(run.rig, blocks))
+    labelled = (given.fits[:, None] & (given.labelled > 0)).mean(axis=0)
+    left = [n for n, share in zip(run.rig.cameras, labelled, strict=True) if share < LEAST_LABELLED]
+    return (*found, *lenses, *_parts_of_pictures(run.rig, left, blocks))
 
 
-def _parts_of_pictures(rig: Rig, blocks: Sequence[Block]) -> tuple[Finding, ...]:
+def _parts_of_pictures(rig: Rig, names: Sequence[str], blocks: Sequence[Block]) -> tuple[Finding, ...]:
     """Findings on cameras whose points all lie in the upper left part of the picture, as in cropped pictures.
 
     Of a recording that nothing explains: the corner of the crop is not known, so that it cannot be undone.
+    names: of the cameras whose points few frames explain.
     """
     out = []
-    for name, camera in rig.cameras.items():
+    for name in names:
+        camera = rig.cameras[name]
         parts = [block[HERE][name].uv_px for block in blocks if name in block[HERE]]
         uv = np.concatenate(parts) if parts else np.zeros((0, 2))
         if len(uv) < FEWEST or np.any(uv.max(axis=0) > PART * np.array(camera.image_size_px)):

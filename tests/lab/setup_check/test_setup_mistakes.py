@@ -16,6 +16,7 @@ import yaml
 from bench.mistakes.mistakes import CASES, read, turned_aside, write
 from bench.mistakes.recordings import calibrated
 from bench.random_scenes.scene import random_scene
+from bench.random_scenes.write_folder import write_run_folder
 from geometry.arrays import Array
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
@@ -435,6 +436,13 @@ def test_of_a_vehicle_at_rest_a_false_point_that_fits_a_mistake_by_chance_counts
         pictures.add(k, found)
     frames = frames_of(pictures.blocks, PosePrior(pose, 0.3, 0.3), LabelParameters().min_spots)
     assert not compare(scene.rig, frames, LabelParameters()).found
+
+
+def test_cameras_whose_points_have_labels_are_not_cropped(tmp_path):
+    """At rest: spots are hidden in two of six sampled frames, and lie in a corner of two pictures."""
+    run = write_run_folder(random_scene(94026), tmp_path / "run")
+    (run / "truth").rename(tmp_path / "truth")
+    assert "cropped" not in checked(run)[0]
 
 
 @pytest.mark.parametrize("name", ["mirrored left-right", "camera_from_world inverted, one"])
