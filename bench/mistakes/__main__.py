@@ -35,6 +35,7 @@ from lab.runs.verdict.run_statistics import RunStatistics
 from lab.runs.verdict.score import measured_errors, normalised_squares
 
 CODES = ("BP-M06", "BP-M07", "BP-M08", "BP-M10", "BP-V20")  # of findings on mistakes
+ALARMS = r"\(BP-M0[678]\)|numbered from"  # in the lines of `check`
 FLOOR = 1e-5  # m and rad: poses that agree with the truth to this are right
 COLUMNS = ("check", "verdict", "harmless", "CHECK unnamed", "FAIL unnamed", "PASS wrong")
 
@@ -159,7 +160,7 @@ def run_correct(seeds: Sequence[int]) -> None:
         a = answer(run, folder / "out", truth)
         statuses[a.status] += 1
         seconds += a.seconds
-        said = [line.strip() for line in a.checked.splitlines() if "MISTAKE" in line]
+        said = [line.strip() for line in a.checked.splitlines() if re.search(ALARMS, line)]
         if said or set(a.codes) & set(CODES):
             alarms += 1
             print(f"seed {seed}: {a.status}: {'; '.join(said)} | {a.texts[:400]}", flush=True)

@@ -44,7 +44,6 @@ from lab.progress import Progress
 from lab.runs.frames.clocked_frames import open_frames
 from lab.runs.frames.frames import FrameReader, pictures_at
 from lab.runs.setup_check import (
-    FRAMES,
     SampledFrames,
     mistakes_by_themselves,
     points_in,
@@ -53,7 +52,7 @@ from lab.runs.setup_check import (
 )
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters
-from tracking.setup_mistakes.evidence import NAMES, Invisible, invisible_mistakes
+from tracking.setup_mistakes.evidence import ENOUGH, NAMES, Invisible, invisible_mistakes
 from tracking.setup_mistakes.possible import SHOWN_BY, Block, possible_mistakes
 
 
@@ -227,7 +226,7 @@ def _blocks(run: Run, sampler: SampledFrames) -> list[Block]:
     blocks = sampler.frames
     filmed = [name for name, source in run.cameras.items() if not isinstance(source, DetectionsTable)]
     if filmed and blocks:
-        chosen = np.unique(np.linspace(0, len(blocks) - 1, FRAMES).round().astype(int))
+        chosen = np.unique(np.linspace(0, len(blocks) - 1, ENOUGH).round().astype(int))
         blocks = [blocks[i] for i in chosen]
     numbers = [frame.frame for block in blocks for frame in block]
     found = _detected(run, filmed, numbers) if filmed else {}
@@ -256,6 +255,7 @@ class _Seen:
     """What the pictures of one camera contain."""
 
     frames: list[int] = field(default_factory=list)  # frames with a usable picture
+    shown: list[int] = field(default_factory=list)  # of these, those that are no empty lists of points
     kinds: set[str] = field(default_factory=set)
     points: int = 0
     brightest: int = 0  # DN
@@ -334,6 +334,8 @@ def _count(seen: _Seen, frame: int, picture: object) -> None:
             seen.size = picture.reason
         return
     seen.frames.append(frame)
+    if not isinstance(picture, Detections) or len(picture):
+        seen.shown.append(frame)
     if isinstance(picture, Detections):
         seen.kinds.add("points")
         seen.points += len(picture)
@@ -347,12 +349,13 @@ def _compare_cameras(findings: Findings, seen: dict[str, _Seen]) -> None:
     """Reports frames that some cameras have and others lack."""
     if len(seen) < 2:
         return
-    ranges = {name: (min(s.frames), max(s.frames), len(s.frames)) for name, s in seen.items() if s.frames}
+    ranges = {name: (min(s.shown), max(s.shown), len(s.frames)) for name, s in seen.items() if s.shown}
     for (a, one), (b, other) in combinations(ranges.items(), 2):
         if one[2] == other[2] and one[0] != other[0] and one[1] - one[0] == other[1] - other[0]:
             findings.remarks.append(
-                f"cameras: {a!r} and {b!r} have {one[2]} pictures each, numbered from {one[0]} and from {other[0]}: the"
-                " same number must be the same instant. Film one flash with both: it must have the same number"
+                f"cameras: {a!r} and {b!r} have {one[1] - one[0] + 1} frames each, numbered from {one[0]} and from"
+                f" {other[0]}: the same number must be the same instant. Film one flash with both: it must have the"
+                " same number"
             )
     in_all = set.intersection(*(set(s.frames) for s in seen.values()))
     in_any = set.union(*(set(s.frames) for s in seen.values()))

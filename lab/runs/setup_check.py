@@ -19,7 +19,9 @@ from lab.runs.model_check.frame_sampler import BLOCK, EvenSampler
 from lab.runs.verdict.run_statistics import RunStatistics
 from tracking.detections import Detections
 from tracking.setup_mistakes.evidence import (
+    ENOUGH,
     LEAST_FITTING,
+    LEAST_LABELLED,
     LEAST_POINTS,
     Comparison,
     Frames,
@@ -29,7 +31,7 @@ from tracking.setup_mistakes.evidence import (
 from tracking.setup_mistakes.possible import HERE, SHOWN_BY, Block, possible_mistakes
 
 UNUSED = "BP-M07"  # code of the finding on a camera of which no point is labelled
-FRAMES = 6  # of a recording, with which mistakes are tested
+FRAMES = 2 * ENOUGH  # of a recording, with which mistakes are tested at most
 MOST_KEPT = 90  # frames from which they are chosen
 FEWEST, PART = 10, 0.6  # points, and the share of width and height that they do not exceed in part of a picture
 SAME_RATE = 0.02  # relative difference of frame rates, above which they are not the same
@@ -83,9 +85,11 @@ def frames_of(blocks: Sequence[Block], prior: PosePrior | None, min_spots: int) 
         return None
     full = rows[counts[rows] >= np.median(counts[rows])]
     steps = [max(_moved_px(b[HERE], b[0]), _moved_px(b[-1], b[HERE])) for b in blocks]
-    moved = full[np.argsort([-steps[i] for i in full], kind="stable")][: FRAMES // 2]
-    even = full[np.unique(np.linspace(0, len(full) - 1, FRAMES).round().astype(int))]
-    chosen = list(dict.fromkeys([*rows[rows == 0], *moved, *even]))[:FRAMES]
+    moved = full[np.argsort([-steps[i] for i in full], kind="stable")]
+    chosen: list[int] = []
+    for count in (ENOUGH, FRAMES):
+        even = full[np.unique(np.linspace(0, len(full) - 1, count).round().astype(int))]
+        chosen = list(dict.fromkeys([*chosen, *rows[rows == 0], *moved[: count // 2], *even]))[:count]
     return Frames([blocks[i] for i in chosen], prior, at_start=bool(chosen[0] == 0))
 
 
@@ -112,16 +116,20 @@ def recorded_mistakes(run: Run, blocks: Sequence[Block], *, explained: bool = Fa
         n for n, c in zip(run.rig.cameras, given.points.sum(axis=0), strict=True) if c >= LEAST_POINTS * len(given.fits)
     ]
     lenses = same_lenses(run.rig, seen) if given.fits.mean() < LEAST_FITTING else ()
-    return (*found, *lenses, *_parts_of_pictures(run.rig, blocks))
+    labelled = (given.fits[:, None] & (given.labelled > 0)).mean(axis=0)
+    left = [n for n, share in zip(run.rig.cameras, labelled, strict=True) if share < LEAST_LABELLED]
+    return (*found, *lenses, *_parts_of_pictures(run.rig, left, blocks))
 
 
-def _parts_of_pictures(rig: Rig, blocks: Sequence[Block]) -> tuple[Finding, ...]:
+def _parts_of_pictures(rig: Rig, names: Sequence[str], blocks: Sequence[Block]) -> tuple[Finding, ...]:
     """Findings on cameras whose points all lie in the upper left part of the picture, as in cropped pictures.
 
     Of a recording that nothing explains: the corner of the crop is not known, so that it cannot be undone.
+    names: of the cameras whose points few frames explain.
     """
     out = []
-    for name, camera in rig.cameras.items():
+    for name in names:
+        camera = rig.cameras[name]
         parts = [block[HERE][name].uv_px for block in blocks if name in block[HERE]]
         uv = np.concatenate(parts) if parts else np.zeros((0, 2))
         if len(uv) < FEWEST or np.any(uv.max(axis=0) > PART * np.array(camera.image_size_px)):

@@ -34,6 +34,7 @@ MORE_LABELS = 0.5  # per frame, that fit a pose: a mistake must explain more poi
 SAME_NATS = 10.0  # mistakes nearer to the best are named with it
 LONGEST_SEARCH = 2  # frames with which all mistakes are compared; fewer where one of them leads
 BEST = 5  # mistakes that are compared with all frames
+ENOUGH = 6  # frames; further ones are used only where these show no mistake and one leads
 LEAST_FITTING = 0.75  # share of the frames that a set-up must explain to their sigmas
 SURE_SPOTS = 5  # labels of a frame: false points often agree with the pose of four
 P_FIT = 1e-6  # probability that correct labels do not fit their sigmas
@@ -75,6 +76,11 @@ class Explained:
         many = self.labelled.sum(axis=1) >= SURE_SPOTS
         return self.good and bool((self.fits & many).mean() >= LEAST_FITTING)
 
+    @property
+    def first(self) -> Explained:
+        """Of the first frame only."""
+        return Explained(*(getattr(self, name)[:1] for name in Explained.__slots__))
+
     def with_few_labels(self, share: float = 0.0) -> tuple[int, ...]:
         """Cameras with points whose labels are at most this share of the spots that they should see."""
         enough = np.median(self.points, axis=0) >= LEAST_POINTS
@@ -104,17 +110,28 @@ def compare(
         max_triples=min(parameters.max_triples, MOST_TRIPLES),
     )
     as_given = Mistake("", "", "", rig)
-    given = explained(as_given, frames, parameters, covariance)
-    if given.is_certain:
+    given = explained(as_given, replace(frames, blocks=frames.blocks[:ENOUGH]), parameters, covariance)
+    certain = given.is_certain
+    if certain and _first_is_in_prior(given, frames):
         return Comparison(given, ())
     left: list[tuple[Mistake, Explained | None]] = [
         (m, None)
         for m in possible_mistakes(rig, frames.prior)
-        if m.rig is rig or (m.has_effect(rig) and _may_see(m.rig, frames.prior, parameters.min_spots))
+        if (m.rig is rig or (m.has_effect(rig) and _may_see(m.rig, frames.prior, parameters.min_spots)))
+        and (m.prior is not None or not certain)
     ]
     whole: list[tuple[Mistake, Explained]] = []
     for k, block in enumerate(frames.blocks):
         one = Frames([block], frames.prior, frames.at_start and k == 0)
+        if k >= ENOUGH:
+            if any(_better(m, e, rig, given) for m, e in whole):
+                frames = replace(frames, blocks=frames.blocks[:k])
+                break
+            # Where many frames are needed the vehicle hardly moves, and hidden spots look like another number.
+            left = [(m, s) for m, s in left if m.kind != "numbers"]
+            if not left:
+                return Comparison(given, ())
+            given = _joined(given, explained(as_given, one, parameters, covariance))
         whole = [(m, _joined(s, explained(m, one, parameters, covariance))) for m, s in left]
         gains = [float(s.nats.sum() - given.nats[: k + 1].sum()) for _, s in whole]
         order = sorted(range(len(whole)), key=lambda i: -gains[i])
@@ -124,13 +141,31 @@ def compare(
             order = order[:BEST]
         left = [*(whole[i] for i in order)]
     whole.sort(key=lambda one: -float(one[1].nats.sum()))
-    found = [one for one in whole if _better(one[1], given)]
+    found = [one for one in whole if _better(*one, rig, given)]
     if found:
         # In a crowd the limited search misses poses by chance, which is no evidence for a mistake.
         given = explained(as_given, frames, unlimited, covariance)
-        found = [] if given.is_certain else [one for one in found if _better(one[1], given)]
+        if given.is_certain and _first_is_in_prior(given, frames):
+            return Comparison(given, ())
+        found = [one for one in found if _better(*one, rig, given)]
+        # Of a vehicle at rest pictures without a hidden spot fit as well, whichever way they are numbered.
+        found = [
+            (m, e)
+            for m, e in found
+            if m.kind != "numbers"
+            or e.nats.sum() - explained(m.opposite, frames, parameters, covariance).nats.sum() >= LEAD_NATS
+        ]
     limit = float(found[0][1].nats.sum()) - SAME_NATS if found else 0.0
-    return Comparison(given, tuple(one for one in found if one[1].nats.sum() >= limit))
+    # Where the rig explains all frames but the first, a prior that excludes it is named only if it is in other units:
+    # the search for the first pose reports any other.
+    return Comparison(
+        given, tuple((m, e) for m, e in found if e.nats.sum() >= limit and not (certain and m.kind == "prior"))
+    )
+
+
+def _first_is_in_prior(given: Explained, frames: Frames) -> bool:
+    """Whether a pose within the prior explains the first frame, the only one that a prior refers to."""
+    return not frames.at_start or frames.prior is None or bool(given.nats[0] > 0)
 
 
 def _distinct(blocks: Sequence[Block]) -> list[Block]:
@@ -173,17 +208,25 @@ def _joined(one: Explained | None, more: Explained) -> Explained:
     return Explained(*(np.concatenate(pair) for pair in pairs))
 
 
-def _better(one: Explained, given: Explained) -> bool:
-    """Whether a mistake explains the frames that show a pose, and better than the set-up as given."""
+def _better(mistake: Mistake, one: Explained, rig: Rig, given: Explained) -> bool:
+    """Whether a mistake explains the frames that show a pose, and better than the set-up as given.
+
+    Of a prior only the first frame, to which it refers.
+    """
+    if mistake.prior is not None:
+        one, given = one.first, given.first
     shows = one.nats > 0
     fitting = bool(shows.any()) and float(one.fits[shows].mean()) >= LEAST_FITTING
-    # A rig with a camera that looks elsewhere is likelier than one whose camera should see spots and does not.
-    more = one.labelled[one.fits].sum() - given.labelled[given.fits].sum() >= MORE_LABELS * len(one.fits)
-    all_cameras = set(one.with_few_labels(LEAST_LABELLED)) <= set(given.with_few_labels(LEAST_LABELLED))
+    # A rig with a camera that looks elsewhere is likelier than one whose camera should see spots and does not. Without
+    # the mistake no camera loses its labels, and one that the mistake concerns has some.
+    before = given.labelled[given.fits].sum(axis=0)
+    few = set(one.with_few_labels(LEAST_LABELLED))
+    lost = {c for c in few if one.labelled[:, c].sum() < before[c]} - set(given.with_few_labels(LEAST_LABELLED))
+    unused = bool(few) and few >= mistake.cameras(rig) != set()
+    more = one.labelled[one.fits].sum() - before.sum() >= MORE_LABELS * len(one.fits)
     seen = one.labelled.sum() >= LEAST_SEEN * one.expected.sum()
-    return (
-        fitting and bool(more) and bool(seen) and all_cameras and float(one.nats.sum() - given.nats.sum()) >= LEAD_NATS
-    )
+    leads = float(one.nats.sum() - given.nats.sum()) >= LEAD_NATS
+    return fitting and bool(more) and bool(seen) and not lost and not unused and leads
 
 
 def explained(

@@ -65,6 +65,21 @@ class Mistake:
         frames = zip(_points_of(self.rig, poses), _points_of(given, poses), strict=True)
         return not all(np.array_equal(a, b) for a, b in frames)
 
+    @property
+    def opposite(self) -> Mistake:
+        """Numbers that are wrong in the other direction."""
+        changes = {n: replace(c, later=-c.later) for n, c in self.pictures.items()}
+        return replace(self, pictures=changes)
+
+    def cameras(self, given: Rig) -> set[int]:
+        """Indices of the cameras whose pictures, lens, place or screen the mistake changes."""
+        screens = {n for n, s in given.screens.items() if self.rig.screens[n] is not s}
+        return {
+            i
+            for i, (n, c) in enumerate(given.cameras.items())
+            if n in self.pictures or self.rig.cameras[n] is not c or c.screen in screens
+        }
+
     def points(self, block: Block) -> dict[str, Detections]:
         """The points of the frame in the middle of a block, by camera, as they are without the mistake."""
         out = {}
@@ -132,10 +147,12 @@ def possible_mistakes(rig: Rig, prior: PosePrior | None = None) -> list[Mistake]
 def _pictures(rig: Rig) -> Iterator[Mistake]:
     """Pictures that are not those of the camera, of this size, orientation or number."""
     for a, b in combinations(rig.cameras, 2):
+        alike = _equal_lenses(rig.cameras[a], rig.cameras[b])
         yield Mistake(
             "exchanged",
-            f"the pictures of cameras `{a}` and `{b}` are exchanged",
-            f"exchange the names of `{a}` and `{b}` in run.yaml or in the table of points",
+            f"the pictures of cameras `{a}` and `{b}` are exchanged" + alike * ", or they have each other's place",
+            f"exchange the names of `{a}` and `{b}` in run.yaml or in the table of points"
+            + alike * ", or their camera_from_world and screen in rig.yaml",
             rig,
             {a: PictureChange(b), b: PictureChange(a)},
         )
@@ -260,7 +277,7 @@ def _lenses(rig: Rig) -> Iterator[Mistake]:
         )
     for a, b in combinations(rig.cameras, 2):
         one, other = rig.cameras[a], rig.cameras[b]
-        if not (np.array_equal(one.matrix, other.matrix) and one.distortion == other.distortion):
+        if not _equal_lenses(one, other):
             pairs = ((a, one, other), (b, other, one))  # of equal cameras it would be that of exchanged pictures
             yield Mistake(
                 "pose",
@@ -312,22 +329,25 @@ def _prior(rig: Rig, prior: PosePrior | None) -> Iterator[Mistake]:
         return
     ypr = prior.centre.ypr
     degrees = Pose.from_ypr(np.rad2deg(ypr), prior.centre.translation)
-    wide = min(float(np.rad2deg(prior.within_rad)), np.pi)
-    for centre, within, words in (
-        (degrees, wide, "yaw_pitch_roll_deg and within_deg are"),
-        (degrees, prior.within_rad, "yaw_pitch_roll_deg is"),
-        (prior.centre, wide, "within_deg is"),
+    turned, wide = (float(np.rad2deg(angle)) for angle in (np.abs(ypr).max(), prior.within_rad))
+    # The numbers as written must be angles in radians, or every attitude would be tried for any wrong prior.
+    are_angles, is_range = turned <= 2 * np.pi, wide <= np.pi
+    for possible, centre, within, words in (
+        (are_angles and is_range, degrees, wide, "yaw_pitch_roll_deg and within_deg are"),
+        (are_angles, degrees, prior.within_rad, "yaw_pitch_roll_deg is"),
+        (is_range, prior.centre, wide, "within_deg is"),
     ):
-        yield Mistake(
-            "prior",
-            f"prior: {words} in radians",
-            "write it in degrees in run.yaml",
-            rig,
-            prior=replace(prior, centre=centre, within_rad=within),
-        )
+        if possible:
+            yield Mistake(
+                "unit",
+                f"prior: {words} in radians",
+                "write it in degrees in run.yaml",
+                rig,
+                prior=replace(prior, centre=centre, within_rad=within),
+            )
     if prior.within_m > FAR_M or _is_far(prior.centre, _middle(rig)):
         yield Mistake(
-            "prior",
+            "unit",
             "prior: position_m or within_m is in millimetres",
             "write it in metres in run.yaml",
             rig,
@@ -380,6 +400,10 @@ def _with_camera_poses(rig: Rig, poses: Mapping[str, Pose]) -> Rig:
 def _with_screen_poses(rig: Rig, poses: Mapping[str, Pose]) -> Rig:
     screens = {n: replace(rig.screens[n], world_from_screen=pose) for n, pose in poses.items()}
     return replace(rig, screens={**rig.screens, **screens})
+
+
+def _equal_lenses(one: Camera, other: Camera) -> bool:
+    return np.array_equal(one.matrix, other.matrix) and one.distortion == other.distortion
 
 
 def _with_lens_of(camera: Camera, other: Camera) -> Camera:

@@ -16,6 +16,7 @@ import yaml
 from bench.mistakes.mistakes import CASES, read, turned_aside, write
 from bench.mistakes.recordings import calibrated
 from bench.random_scenes.scene import random_scene
+from bench.random_scenes.write_folder import write_run_folder
 from geometry.arrays import Array
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
@@ -34,7 +35,7 @@ from tests.lab.run_folders import edit, write_run
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters
 from tracking.setup_mistakes import evidence
-from tracking.setup_mistakes.evidence import MOST_POINTS, MOST_TRIPLES, compare, invisible_mistakes
+from tracking.setup_mistakes.evidence import MOST_POINTS, MOST_TRIPLES, Frames, compare, invisible_mistakes
 from tracking.setup_mistakes.possible import possible_mistakes
 
 FRAMES = 45
@@ -126,6 +127,7 @@ def test_a_correct_set_up_is_fine(recording):
         ("fx in millimetres", "fx, fy of `left` (5.677) are in millimetres"),
         ("millimetres, one camera", "the lengths of camera_from_world of `left` are in millimetres"),
         ("prior in millimetres", "prior: position_m or within_m is in millimetres"),
+        ("prior in radians", "prior: yaw_pitch_roll_deg and within_deg are in radians"),
     ],
 )
 def test_a_mistake_that_the_recording_shows_is_a_problem_at_check(recording, tmp_path, name, words):
@@ -226,6 +228,56 @@ def test_poses_that_the_limited_search_misses_in_a_crowd_are_no_evidence_for_a_m
     assert not compare(scene.known_rig, frames, limited, scene.covariance).given.is_certain
     found = compare(scene.known_rig, frames, LabelParameters(), scene.covariance)
     assert not found.found
+
+
+@pytest.mark.parametrize(("seed", "camera"), [(6113, "left"), (5113, "left1")])
+def test_turned_pictures_are_named_although_spots_are_hidden_or_few(monkeypatch, seed, camera):
+    """6113: half of the spots of another camera are hidden. 5113: six frames with four spots are no evidence.
+
+    Inverted transforms of the camera explain them as well as leaving it out does: no point of it has a label.
+    """
+    scene, pictures = random_scene(seed, 40), SampledFrames()
+    end = np.array(scene.rig.cameras[camera].image_size_px) - 1
+    for k in range(len(scene)):
+        found = dict(zip(scene.rig.cameras, scene.found(k), strict=True))
+        pictures.add(k, found | {camera: replace(found[camera], uv_px=end - found[camera].uv_px)})
+    frames = frames_of(pictures.blocks, scene.prior, LabelParameters().min_spots)
+    mine = [m for m in possible_mistakes(scene.known_rig) if f"camera `{camera}`" in m.what]
+    monkeypatch.setattr(evidence, "possible_mistakes", lambda *_: mine)
+    found = compare(scene.known_rig, frames, LabelParameters(), scene.covariance).found
+    assert [m.what for m, _ in found] == [f"the pictures of camera `{camera}` are turned by 180 deg"]
+
+
+@pytest.mark.parametrize(("hidden", "before"), [((1, 2, 3), True), ((1, 7, 8, 9), False)])
+def test_hidden_spots_of_a_vehicle_at_rest_are_no_wrong_numbers(hidden, before):
+    """The spot of camera `left` is missing in some frames, and not in the picture after.
+
+    before: nor in the picture before, so that either number explains the frame. Otherwise only one of the first six
+    frames looks wrongly numbered.
+    """
+    scene, rng, blocks = random_scene(68015), np.random.default_rng(0), []
+    model = SpotModel.of(scene.known_rig)
+    pixels = model.project(scene.poses[0])[0]
+    for k in range(12):
+        shown = [before or k not in hidden, k not in hidden, True]
+        blocks.append([])
+        for left in shown:
+            points = {}
+            for c, (name, camera) in enumerate(scene.known_rig.cameras.items()):
+                mine = pixels[(model.camera_of == c) & model.in_picture(pixels) & (left or name != "left")]
+                false = rng.uniform(0, camera.image_size_px, (2, 2))
+                uv = np.concatenate([mine + rng.normal(0, 0.01, mine.shape), false])
+                points[name] = Detections.at(uv, np.tile(1e-4 * np.eye(2), (len(uv), 1, 1)))
+            blocks[-1].append(points)
+    frames = Frames(blocks, scene.prior, at_start=True)
+    assert not compare(scene.known_rig, frames, LabelParameters(), scene.covariance).found
+
+
+def test_a_wrong_prior_whose_angles_are_too_large_for_radians_is_not_in_radians(recording, tmp_path):
+    files = read(recording)
+    files.run["prior"] |= {"position_m": [1.0, 0, 0], "within_m": 0.3, "within_deg": 4.0}
+    text, _ = checked(write(files, tmp_path / "run"))
+    assert "radians" not in text
 
 
 def test_exchanged_beams_of_a_fan_change_names_only():
@@ -386,6 +438,13 @@ def test_of_a_vehicle_at_rest_a_false_point_that_fits_a_mistake_by_chance_counts
     assert not compare(scene.rig, frames, LabelParameters()).found
 
 
+def test_cameras_whose_points_have_labels_are_not_cropped(tmp_path):
+    """At rest: spots are hidden in two of six sampled frames, and lie in a corner of two pictures."""
+    run = write_run_folder(random_scene(94026), tmp_path / "run")
+    (run / "truth").rename(tmp_path / "truth")
+    assert "cropped" not in checked(run)[0]
+
+
 @pytest.mark.parametrize("name", ["mirrored left-right", "camera_from_world inverted, one"])
 def test_a_mistake_is_named_at_rest_without_a_false_point(tmp_path, name):
     save_rig(calibrated(unequal_fan(), 1), tmp_path / "rig.yaml")
@@ -395,6 +454,14 @@ def test_a_mistake_is_named_at_rest_without_a_false_point(tmp_path, name):
     (run / "truth").rename(tmp_path / "truth")
     outcome = process_run(with_mistake(name, run, tmp_path / "wrong"), tmp_path / "out")
     assert re.search(CASE[name].words, outcome.verdict.texts[0])
+
+
+def test_at_rest_only_the_first_and_last_number_show_a_camera_that_is_numbered_from_one(tmp_path):
+    run = simulate("static", tmp_path / "run", seed=1, frames=12, detections_only=True)
+    text, status = checked(with_mistake("numbered from 1, one camera", run, tmp_path / "wrong"))
+    assert status == 0
+    assert "have 12 frames each, numbered from 1 and from 0" in text
+    assert "numbered from" not in checked(run)[0]
 
 
 def test_exchanged_spots_of_a_screen_are_said_to_be_invisible_where_no_beams_can_be_exchanged(tmp_path):
