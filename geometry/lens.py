@@ -7,6 +7,8 @@ tests compare with cv2.projectPoints and cv2.fisheye.projectPoints.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.polynomial import polynomial as poly
 
@@ -148,6 +150,7 @@ def tilt_matrix(tau_x: Array, tau_y: Array) -> Array:
     return _along_axis(R) @ R
 
 
+@lru_cache(maxsize=256)  # a camera is made again for each step of an adjustment, mostly with the same lens
 def fold_limit(distortion: tuple[float, ...]) -> float:
     """The squared normalised radius at which the distorted image stops growing in some direction; inf if it never does.
 
@@ -233,6 +236,7 @@ def fisheye_coefficient_jacobian(xy: Array, coefficients: Array) -> Array:
     return J
 
 
+@lru_cache(maxsize=256)
 def fisheye_fold_limit(distortion: tuple[float, ...]) -> float:
     """As `fold_limit`, for the fisheye model: inf where the radius grows up to 90 deg off the axis."""
     k1, k2, k3, k4 = padded(distortion)[:4]

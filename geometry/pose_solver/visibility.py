@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations, permutations
 
 import numpy as np
@@ -113,6 +115,13 @@ def assumed_range(rig: Rig) -> PosePrior:
 
     The origin, unless fewer than MIN_SPOTS are in view there: what a rig with a mistake sees elsewhere means nothing.
     """
+    return _assumed_range(pickle.dumps(rig))
+
+
+@lru_cache(maxsize=8)
+def _assumed_range(content: bytes) -> PosePrior:
+    """As `assumed_range`, of a pickled rig: it is asked for once for each mistake that a rig may have."""
+    rig: Rig = pickle.loads(content)
     model = SpotModel.of(rig)
     seen = model.spot_of[model.in_picture(model.project(Pose.identity())[0])]
     centre = Pose.identity() if len(np.unique(seen)) >= MIN_SPOTS else middle_of_view(rig)

@@ -12,7 +12,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from lab.simulate.scenarios import PriorRegion, Scenario
-from lab.simulate.scene import POINT_NOISE, VISIBLE, compose, scenario_with
+from lab.simulate.scene import POINT_NOISE, VISIBLE, Scene, compose, scenario_with
 from tracking.detections import Detections
 
 # Shape and brightness of a laser spot in a picture, and its light integrated over pixels and exposure.
@@ -192,7 +192,11 @@ def simulate_points(
     Raises:
         InputError: an unknown scenario, or an argument out of range.
     """
-    scene = compose(scenario_with(scenario, clutter=clutter), seed, frames, picture_scale, rig)
+    return points_of(compose(scenario_with(scenario, clutter=clutter), seed, frames, picture_scale, rig), noise_px)
+
+
+def points_of(scene: Scene, noise_px: float) -> PointRun:
+    """A scene as points, with noise of `noise_px`, 1 sigma per axis."""
     model, false = scene.model, scene.clutter_points
     n, cameras = len(model), range(len(model.camera_names))
     first_false = np.searchsorted(false.frame, np.arange(len(scene.frame) + 1))
@@ -200,7 +204,7 @@ def simulate_points(
     detections, origins = [], []
     for k in range(len(scene.frame)):
         some = slice(first_false[k], first_false[k + 1])
-        rng = np.random.default_rng([seed, POINT_NOISE, k])
+        rng = np.random.default_rng([scene.seed, POINT_NOISE, k])
         # Noise is drawn for all views, so that it does not depend on which spots are occluded.
         uv = np.concatenate([scene.uv_px[k], false.uv_px[some]])
         uv = uv + noise_px * rng.standard_normal(uv.shape)
@@ -213,7 +217,7 @@ def simulate_points(
         origins.append(tuple(of[r] for r in rows))
     return PointRun(
         name=scene.scenario.name,
-        seed=seed,
+        seed=scene.seed,
         rig=scene.rig,
         model=model,
         prior=scene.scenario.prior,

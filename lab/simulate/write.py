@@ -13,7 +13,6 @@ import numpy as np
 
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from lab.files.run.run_file import save_run
@@ -24,7 +23,7 @@ from lab.pictures.picture_file import GreyPicture
 from lab.progress import Progress
 from lab.simulate.own_motion import along, placed
 from lab.simulate.picture import LaserPowers, Sensor, laser_powers, make_sensor, render
-from lab.simulate.points import simulate_points
+from lab.simulate.points import points_of
 from lab.simulate.rigs import RIGS
 from lab.simulate.scenarios import LIGHTS, Scenario
 from lab.simulate.scene import Scene, compose, scenario_with
@@ -113,7 +112,7 @@ def simulate(
         save_rig(RigFile(scene.rig, measured_as=forms) if known is None else known, folder / "rig.yaml")
         write_truth(scene, folder / "truth")
         if detections_only:
-            _write_detections(scene, noise_px, picture_scale, true_rig, folder / "detections.csv")
+            _write_detections(scene, noise_px, folder / "detections.csv")
             sources = {name: {"detections": "detections.csv"} for name in scene.model.camera_names}
         else:
             write = _write_videos if video else _write_pictures
@@ -199,10 +198,8 @@ def write_truth(scene: Scene, folder: Path) -> None:
     )
 
 
-def _write_detections(scene: Scene, noise_px: float, picture_scale: float, rig: Rig | None, path: Path) -> None:
-    run = simulate_points(
-        scene.scenario, scene.seed, frames=len(scene.frame), noise_px=noise_px, picture_scale=picture_scale, rig=rig
-    )
+def _write_detections(scene: Scene, noise_px: float, path: Path) -> None:
+    run = points_of(scene, noise_px)
 
     def rows() -> Iterator[tuple[object, ...]]:
         for k, pictures in enumerate(run.detections):

@@ -23,15 +23,20 @@ NOISE = NoiseModel(1.0, 0.02, 10.0)
 
 
 PLACE, SPREAD_M = np.array([0.15, -0.1]), 0.03  # of the beam on its screen, m
+REACH_PX = 48  # from the beam's axis, beyond which its light is below 1e-9
 
 
 @pytest.fixture(scope="module")
 def light() -> np.ndarray:
-    """The mean light of the beam in each pixel, 1 at its axis, from sixteen rays per pixel."""
-    fine = (np.arange(4 * SIZE[0]) - 1.5) / 4, (np.arange(4 * SIZE[1]) - 1.5) / 4
+    """The mean light of the beam in each pixel, 1 at its axis, from sixteen rays per pixel; 0 far from the beam."""
+    out = np.zeros((SIZE[1], SIZE[0]))
+    first = np.rint(CAMERA.project(SCREEN.world_from_screen.apply(np.array([*PLACE, 0.0])))).astype(int) - REACH_PX
+    fine = (4 * first[:, None] + np.arange(8 * REACH_PX) - 1.5) / 4
     origin, direction = CAMERA.rays(np.stack(np.meshgrid(*fine), axis=-1))
     away2 = np.sum((intersect_plane(origin, direction, SCREEN.world_from_screen) - PLACE) ** 2, axis=-1)
-    return np.exp(-0.5 * away2 / SPREAD_M**2).reshape(SIZE[1], 4, SIZE[0], 4).mean(axis=(1, 3))
+    near = np.exp(-0.5 * away2 / SPREAD_M**2).reshape(2 * REACH_PX, 4, 2 * REACH_PX, 4).mean(axis=(1, 3))
+    out[first[1] : first[1] + 2 * REACH_PX, first[0] : first[0] + 2 * REACH_PX] = near
+    return out
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -255,16 +256,21 @@ class RigPlan:
         )
 
 
-_plans: list[tuple[Rig, int, RigPlan]] = []
+_plans: list[tuple[Rig, int, bytes, RigPlan]] = []
 
 
 def plan_of(rig: Rig, model: SpotModel, min_spots: int) -> RigPlan:
-    """The plan of a rig, cached for the last few rigs; `model` is made of the rig."""
-    for known, least, plan in _plans:
+    """The plan of a rig, cached for the last few rigs; `model` is made of the rig.
+
+    Runs that are processed one after the other mostly have the same rig, each read from its file.
+    """
+    for known, least, _, plan in _plans:
         if known is rig and least == min_spots:
             return plan
-    plan = RigPlan.of(rig, model, min_spots)
-    _plans.insert(0, (rig, min_spots, plan))
+    content = pickle.dumps((rig, min_spots))
+    equal = (plan for _, _, known, plan in _plans if known == content)
+    plan = next(equal, None) or RigPlan.of(rig, model, min_spots)
+    _plans.insert(0, (rig, min_spots, content, plan))
     del _plans[8:]
     return plan
 

@@ -198,10 +198,10 @@ def _low_latency() -> Iterator[None]:
     """Threads switch after 0.5 ms instead of 5, and the garbage collector ignores existing objects.
 
     Otherwise a thread with a new picture waits for most of a tracking step, and a full collection takes several frames.
+    What is garbage already stays until the end: little, and the collection delays the start.
     """
     switch_interval_s = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
-    gc.collect()
     gc.freeze()
     try:
         yield

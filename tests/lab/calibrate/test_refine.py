@@ -188,7 +188,7 @@ def test_a_wrong_focal_length_of_which_nothing_is_stated_is_named_and_not_absorb
     camera = true.cameras["left-b"]
     longer = replace(camera, matrix=camera.matrix * np.array([[1.02, 1.0, 1.0], [1.0, 1.02, 1.0], [1.0, 1.0, 1.0]]))
     write_known(replace(true, cameras={**true.cameras, "left-b": longer}), tmp_path / "rig.yaml")
-    done = typed("refine", *runs, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "new")
+    done = typed("refine", runs[0], "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "new")
     assert (done.exit_code, "the focal length of camera `left-b` is wrong by −" in done.output) == (3, True), (
         done.output
     )

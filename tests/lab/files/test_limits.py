@@ -7,6 +7,7 @@ import re
 import time
 
 import pytest
+import yaml
 
 from lab.errors import InputError
 from lab.files.project.point_files import read_point_cloud
@@ -61,6 +62,27 @@ def test_a_hostile_yaml_text_is_refused_in_a_line_and_at_once(text, words):
 
 def test_aliases_that_stand_for_few_values_are_read():
     assert parse_mapping("a: &a {x: [1, 2]}\nb: {<<: *a, y: 3}\nc: *a", "f")["b"] == {"x": [1, 2], "y": 3}
+
+
+@pytest.mark.parametrize(
+    "text", ["a:\t1", "a: [b?c]", "a: {b?: 1}", "a: [1\t,2]", "a: [x:, y]", "a: [x:y, -, 1e-3]", "a: 1\na: 2", "a: 'b"]
+)
+def test_a_text_has_the_same_values_or_message_without_libyaml(text, monkeypatch):
+    def outcome():
+        try:
+            return parse_mapping(text, "run.yaml")
+        except InputError as error:
+            return str(error)
+
+    given = outcome()
+    monkeypatch.setattr(yaml, "__with_libyaml__", False)
+    assert outcome() == given
+
+
+def test_a_rig_of_a_calibration_is_the_same_without_libyaml(monkeypatch):
+    given = read_mapping(CALIBRATED / "rig.yaml")
+    monkeypatch.setattr(yaml, "__with_libyaml__", False)
+    assert read_mapping(CALIBRATED / "rig.yaml") == given
 
 
 def test_deep_brackets_on_the_command_line_are_refused_in_a_line():

@@ -27,7 +27,7 @@ from tests.tracking.labelling.test_first_labels import (
 from tracking.detections import Detections
 from tracking.labelling.first_labels import NO_POINT, candidate_labellings, find_labels
 from tracking.labelling.points import points_of
-from tracking.labelling.search import TIMES, RigPlan, VisiblePoses, covering
+from tracking.labelling.search import TIMES, RigPlan, VisiblePoses, covering, plan_of
 from tracking.parameters import LabelParameters
 
 WIDE = PosePrior(Pose.identity(), 1.0, np.deg2rad(30))
@@ -413,3 +413,13 @@ def test_spots_that_are_fainter_than_all_false_points_are_found():
         assert result.chosen is not None
         assert wrong_labels(result, model, picture) == []
         assert np.count_nonzero(result.chosen.point_of != NO_POINT) >= 6
+
+
+def test_equal_rigs_share_their_plan_and_a_rig_that_differs_in_a_digit_has_its_own():
+    rig = RIGS["fan"]()
+    camera = next(iter(rig.cameras.values()))
+    other = replace(rig, cameras={**rig.cameras, camera.name: replace(camera, matrix=camera.matrix * (1 + 1e-15))})
+    plan, same, own = (plan_of(r, SpotModel.of(r), 3) for r in (rig, RIGS["fan"](), other))
+    assert same is plan
+    assert own is not plan
+    assert plan_of(rig, SpotModel.of(rig), 4) is not plan
