@@ -6,6 +6,7 @@ python -m bench.related_measurements.second_checks edges SEED COUNT         thin
 python -m bench.related_measurements.second_checks consistency SEED COUNT   errors of centres against their sigmas
 python -m bench.related_measurements.second_checks approaches SEED COUNT    approaching drogues, by the light tracker
 python -m bench.related_measurements.second_checks detector SEED COUNT [WEIGHTS]  COUNT drogues of each scene
+python -m bench.related_measurements.second_checks third SEED COUNT [WEIGHTS]  the same with the renderer of validation
 python -m bench.related_measurements.second_checks point SEED COUNT         discs by the point tracker, hidden twice
 """
 
@@ -16,16 +17,19 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
+from bench.related_measurements import second_renderer
 from bench.related_measurements import second_renderer as render
 from bench.related_measurements.learned_detector import is_right
 from geometry.arrays import Array
 from lab.targets.circle import CircleOptions
 from lab.targets.drogue import DrogueOptions
 from lab.targets.point import PointOptions
+from studies.learned_detector import third_renderer
 from studies.learned_detector.samples import Sample
 from tracking.drogue_circle.detectors import Edge
 from tracking.learned_detector.detector import WEIGHTS, find_drogues
@@ -223,7 +227,7 @@ def approaches(seed: int, count: int) -> None:
         )
 
 
-def detector(seed: int, count: int, weights: Path = WEIGHTS) -> None:
+def detector(seed: int, count: int, weights: Path = WEIGHTS, render: Any = second_renderer) -> None:
     """The learned detector at a confidence of .5; half of the drogues have 9 to 15 px, the others 15 to 200."""
     cv2.setNumThreads(1)
     spent, n = 0.0, 0
@@ -253,6 +257,11 @@ def detector(seed: int, count: int, weights: Path = WEIGHTS) -> None:
             f" {false[0] / count:.3f}, per picture of a drogue {false[1] / count:.3f}"
         )
     print(f"{1e3 * spent / n:.0f} ms of process time per picture")
+
+
+def third(seed: int, count: int, weights: Path = WEIGHTS) -> None:
+    """The same with the renderer of validation, which chooses between trainings."""
+    detector(seed, count, weights, third_renderer)
 
 
 def point(seed: int, count: int) -> None:
@@ -299,11 +308,12 @@ if __name__ == "__main__":
         "approaches": approaches,
         "consistency": consistency,
         "detector": detector,
+        "third": third,
         "point": point,
     }
     if what in checks and len(rest) == 2:
         checks[what](int(rest[0]), int(rest[1]))
-    elif what == "detector" and len(rest) == 3:
-        detector(int(rest[0]), int(rest[1]), Path(rest[2]))
+    elif what in ("detector", "third") and len(rest) == 3:
+        (third if what == "third" else detector)(int(rest[0]), int(rest[1]), Path(rest[2]))
     else:
         sys.exit(__doc__)

@@ -1,11 +1,9 @@
 """`python -m studies.learned_detector.train --out DIR`: trains the learned detector and exports it.
 
-Needs the extra `training` (torch, onnx). The weights of the package were made by
-
-    python -m studies.learned_detector.train --out build/detector --samples 28000 --epochs 28 --seed 2020 --bf16
-
-and copied to tracking/learned_detector/. The same seed gives the same samples; sums in another order change the
-weights in their last digits on another machine. A run that was interrupted continues from the files of its folder.
+Needs the extra `training` (torch, onnx). The weights of the package are of an earlier recipe
+(docs/papers/zhou2020_detector.md, which has the figures of the present one, too). The same seed gives the same samples;
+sums in another order change the weights in their last digits on another machine. A run that was interrupted continues
+from the files of its folder, and one that has ended goes on with more epochs.
 """
 
 from __future__ import annotations
@@ -216,7 +214,10 @@ def _keep(parts: dict[str, Any], plan: Plan, out: Path, log: list[dict[str, floa
 
 
 def _continued(parts: dict[str, Any], plan: Plan, out: Path) -> tuple[list[dict[str, float]], float]:
-    """Log and process time of the checkpoint of the same plan, whose state is loaded; without one, nothing and 0."""
+    """Log and process time of the checkpoint of the same plan, whose state is loaded; without one, nothing and 0.
+
+    A plan with more epochs prolongs a run: its learning rate goes on where it would be after as many epochs.
+    """
     import torch
 
     path = out / "checkpoint.pt"
@@ -224,8 +225,9 @@ def _continued(parts: dict[str, Any], plan: Plan, out: Path) -> tuple[list[dict[
     if not path.is_file():
         return [], 0.0
     kept = torch.load(path, weights_only=True)
-    if kept["plan"] != asdict(plan):
+    if {**kept["plan"], "epochs": plan.epochs} != asdict(plan):
         return [], 0.0
+    kept["schedule"] = {name: kept["schedule"][name] for name in ("last_epoch", "_step_count")}
     for name, part in parts.items():
         part.load_state_dict(kept[name])
     return list(kept["log"]), float(kept["spent"])
@@ -251,26 +253,32 @@ def tensor(values: np.ndarray) -> Any:
 
 BATCH = 32
 VALIDATION = 1000  # samples
+HARDNESS = (0.4, 4.0)  # range of the relative frequencies of samples
 
 
 def targets(truth: Array) -> tuple[Array, Array, Array]:
-    """Heat (n, s, s), regression (n, 3, s, s) and its weight (n, s, s) for truths (n, 3); s = SIZE_PX / STRIDE."""
+    """Heat (n, s, s), regression (n, 3, s, s) and its weight (n, s, s) for truths (n, k, 3); s = SIZE_PX / STRIDE."""
     side = SIZE_PX // STRIDE
     centres = STRIDE * np.arange(side) + (STRIDE - 1) / 2
-    u, v, diameter = (truth[:, i, None, None] for i in range(3))
-    du, dv = u - centres[None, None, :], v - centres[None, :, None]
-    sigma = np.maximum(0.08 * diameter, 1.6)
-    heat = np.nan_to_num(np.exp(-0.5 * (du**2 + dv**2) / sigma**2))
-    # The cell that holds the centre is a full positive.
-    inside = (np.abs(du) <= STRIDE / 2) & (np.abs(dv) <= STRIDE / 2)
-    heat = np.where(inside, 1.0, heat)
-    size = np.broadcast_to(np.log(diameter), heat.shape)
-    values = np.nan_to_num(np.stack([du / STRIDE + 0 * dv, dv / STRIDE + 0 * du, size], axis=1))
+    heat, values = np.zeros((len(truth), side, side)), np.zeros((len(truth), 3, side, side))
+    for own in np.moveaxis(truth.reshape(len(truth), -1, 3), 1, 0):
+        u, v, diameter = (own[:, i, None, None] for i in range(3))
+        du, dv = u - centres[None, None, :], v - centres[None, :, None]
+        sigma = np.maximum(0.08 * diameter, 1.6)
+        near = np.nan_to_num(np.exp(-0.5 * (du**2 + dv**2) / sigma**2))
+        # The cell that holds the centre is a full positive.
+        near = np.where((np.abs(du) <= STRIDE / 2) & (np.abs(dv) <= STRIDE / 2), 1.0, near)
+        answer = np.stack([du / STRIDE + 0 * dv, dv / STRIDE + 0 * du, np.log(diameter) + 0 * near], axis=1)
+        values = np.where((near > heat)[:, None], answer, values)
+        heat = np.maximum(heat, near)
     return heat, values, (heat > 0.3).astype(float)
 
 
-def loss(out: Any, heat: Any, values: Any, weight: Any) -> Any:
-    """Focal loss of the heat (Law & Deng 2018, CornerNet) and L1 of offset and log diameter where a centre is."""
+def loss(out: Any, heat: Any, values: Any, weight: Any) -> tuple[Any, Any]:
+    """Focal loss of the heat (Law & Deng 2018, CornerNet) and L1 of offset and log diameter where a centre is.
+
+    Also the part (n,) of each sample in the former.
+    """
     import torch
     from torch.nn import functional
 
@@ -281,7 +289,7 @@ def loss(out: Any, heat: Any, values: Any, weight: Any) -> Any:
     count = positive.sum().clamp(min=1.0)
     step = functional.l1_loss(out[:, 1:], values, reduction="none")
     scaled = step * torch.tensor([1.0, 1.0, 3.0])[None, :, None, None] * weight[:, None]
-    return -gain.sum() / count + scaled.sum() / weight.sum().clamp(min=1.0)
+    return -gain.sum() / count + scaled.sum() / weight.sum().clamp(min=1.0), -gain.detach().sum(dim=(1, 2))
 
 
 def train(plan: Plan, out: Path) -> None:
@@ -291,15 +299,19 @@ def train(plan: Plan, out: Path) -> None:
     images, truth = rendered(plan.samples, plan.seed, out / "samples")
     held_images, held_truth = middle(*rendered(VALIDATION, plan.seed + 1, out / "samples"))
     held_targets = [tensor(t) for t in targets(held_truth)]
+    hardness = np.ones(len(images))  # hard samples are drawn more often (Shrivastava 2016); 1 after an interruption
 
     def batch_loss(model: Any, rng: np.random.Generator) -> Any:
-        rows = rng.integers(0, len(images), BATCH)
+        rows = rng.choice(len(images), BATCH, p=hardness / hardness.sum())
         pictures, wanted = augmented(images[rows], truth[rows], rng)
         shown = tensor(pictures[:, None]).to(memory_format=torch.channels_last)
-        return loss(model(shown), *map(tensor, targets(wanted)))
+        value, parts = loss(model(shown), *map(tensor, targets(wanted)))
+        share = parts.numpy() / max(float(parts.mean()), 1e-9)
+        hardness[rows] = (0.5 * hardness[rows] + 0.5 * share).clip(*HARDNESS)
+        return value
 
     def validate(model: Any) -> float:
-        return float(loss(model(tensor(held_images[:, None])), *held_targets))
+        return float(loss(model(tensor(held_images[:, None])), *held_targets)[0])
 
     torch.manual_seed(plan.seed)
     model = fit(make_network(plan.network), batch_loss, validate, plan, out)
@@ -312,8 +324,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="studies.learned_detector.train", description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--network", choices=NETWORKS, default=SMALL)
-    parser.add_argument("--samples", type=int, default=28000)
-    parser.add_argument("--epochs", type=int, default=28)
+    parser.add_argument("--samples", type=int, default=12000)
+    parser.add_argument("--epochs", type=int, default=20)
     parser.add_argument("--seed", type=int, default=2020)
     parser.add_argument("--bf16", action="store_true", help="layers in bfloat16, for processors that have it")
     a = parser.parse_args()

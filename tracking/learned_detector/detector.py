@@ -74,7 +74,7 @@ _LEAST_SIDE_PX, _MULTIPLE = 64, 8
 
 # Confidence by calibration: share of right candidates among those of a logit, a logistic curve fitted on validation
 # pictures (bench/related_measurements/learned_detector.py --calibrate, seed 5).
-CALIBRATION_SLOPE, CALIBRATION_OFFSET = 4.557, -2.074
+CALIBRATION_SLOPE, CALIBRATION_OFFSET = 5.077, -4.170
 
 
 @dataclass(frozen=True, slots=True)
