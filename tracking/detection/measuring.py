@@ -11,8 +11,8 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.compilation.jit import compiled, compiled_for_threads
 from tracking.detection import ellipse
 from tracking.detection.gaussian_fit import fit_all, least_variance
-from tracking.detection.moments import CENTRE_SHARE, compact_height, find_moments, start_variance
-from tracking.detection.pixels import Noise, Pixels, texture_variance, with_texture
+from tracking.detection.moments import CENTRE_SHARE, at_half_height, compact_height, find_moments, start_variance
+from tracking.detection.pixels import Noise, Pixels, pixel, texture_variance, with_texture
 from tracking.detection.quality import light_beside
 from tracking.detection.regions import NARROWER, drop_duplicates
 from tracking.detection.table import SCRATCH, Candidate, Candidates, Peaks
@@ -29,6 +29,8 @@ _LEAST_GAIN = 0.7  # decrease of chi-square relative to threshold^2 below which 
 _PART_APART = 2.0  # sigmas: fits that are nearer to each other are parts of one light
 _MERGES = 2  # times at most that parts are joined
 _LEAST_START = 2.0  # px^2: least variance of that start
+_SATURATED = 0.97  # of the saturation: compression rounds a flat top
+_LARGEST_CORE = 16  # px: half side of the square in which a saturated light is higher than half of its peak
 _OUTGROWN = 4.0  # variance of the moments over that of the start above which they have left the light
 _STEEPEST = 0.6065  # exp(-1/2): slope of a Gaussian at one sigma, in heights per sigma
 _NARROWEST = 0.35  # px: width of a spot that the pixels do not resolve; with the pixel's own it is 0.45
@@ -92,7 +94,7 @@ def measure(
             break
         fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, True, cells, algebra)
     restarted = np.zeros(chosen.shape[0], np.bool_)
-    if _start_again(peaks, chosen, table, limits, restarted):
+    if _start_again(image, peaks, chosen, table, limits, restarted):
         fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, False, cells, algebra)
         _drop_background(table, restarted)
     if _hold_unresolved(peaks, chosen, table, limits):
@@ -148,10 +150,17 @@ def _fit_wings(
 
 
 @compiled
-def _start_again(peaks: Peaks, chosen: Ints, table: Candidates, limits: DetectionLimits, restarted: Bools) -> bool:
+def _start_again(
+    image: Pixels,
+    peaks: Peaks,
+    chosen: Ints,
+    table: Candidates,
+    limits: DetectionLimits,
+    restarted: Bools,
+) -> bool:
     """Give candidates whose moments or fits left their light a start from the peak and its scale; whether there are.
 
-    Marks them in restarted (n,).
+    Marks them in restarted (n,). A saturated light starts from its pixels above half of its height.
 
     On a sloping or textured background the window of the moments grows over the light beside a faint spot, or the fit
     over that beside a saturated one, or it shrinks to a grain of the light; then it explains little.
@@ -173,6 +182,8 @@ def _start_again(peaks: Peaks, chosen: Ints, table: Candidates, limits: Detectio
         spot["moment_u"], spot["moment_v"] = peak["u"], peak["v"]
         spot["moment_uu"], spot["moment_uv"], spot["moment_vv"] = start, 0.0, start
         spot["flux"], spot["active"] = 2 * pi * start * peak["height"], 1.0
+        if pixel(image, int(peak["u"]), int(peak["v"])) >= _SATURATED * limits.saturation:
+            at_half_height(image, peak, _LARGEST_CORE, spot)
         restarted[k] = found = True
     return found
 

@@ -41,6 +41,8 @@ _RADII = (0.4, 0.8, 2.4, 2.8, 3.2)  # sigmas of the moments' ellipse: two in the
 # Error of the centre relative to the ellipse's sigma. On the three saturated laser spots of the real pictures the
 # moments and the middle of the core differ by 0.05 to 0.15.
 CENTRE_SHARE = 0.15
+_OF_HALF = 2.885  # variance of a Gaussian over that of its pixels above half of its height: 2 / ln 2
+_FEWEST = 5  # such pixels, that a start is taken from
 _THRESHOLD_FACTOR = 1.5  # factor on the noise in the detection threshold, because no fit confirms the spot
 
 _STEPS, _SIGMAS = (1, 2, 4, 8), (0.6, 1.0, 1.6, 2.5)  # px; of these steps
@@ -329,6 +331,45 @@ def _adapt_window(window: Window, light: Array, spot: Candidate, lines: Array) -
     a, b, c = ellipse.clip_eigenvalues(a - pixel, b, c - pixel, 0.1, np.inf)
     spot["moment_uu"], spot["moment_uv"], spot["moment_vv"] = a, b, c
     return 2.0 * s0
+
+
+@compiled
+def at_half_height(image: Pixels, peak: Peak, half: int, spot: Candidate) -> None:
+    """Set the moments of a spot to those of the connected pixels above half of a peak, and its flux accordingly.
+
+    As they are where these pixels are few, or reach a side of the square of so many px to each side. Source: ours.
+    """
+    side = 2 * half + 1
+    left, top = int(peak["u"]) - half, int(peak["v"]) - half
+    least = peak["level"] + 0.5 * peak["height"]
+    seen, waiting = np.zeros(side * side, np.uint8), np.zeros(side * side, np.int64)
+    waiting[0] = half * side + half
+    seen[waiting[0]] = 1
+    done, count = 0, 1
+    n, u, v, uu, uv, vv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    while done < count:
+        k = waiting[done]
+        done += 1
+        i, j = k // side, k % side
+        if i == 0 or j == 0 or i == side - 1 or j == side - 1:
+            return
+        n, x, y = n + 1.0, float(j - half), float(i - half)
+        u, v, uu, uv, vv = u + x, v + y, uu + x * x, uv + x * y, vv + y * y
+        for step in (-side, -1, 1, side):
+            other = k + step
+            column, row = left + other % side, top + other // side
+            inside = 0 <= column < image.width and 0 <= row < image.height
+            if inside and not seen[other] and pixel(image, column, row) > least:
+                seen[other], waiting[count] = 1, other
+                count += 1
+    if n < _FEWEST:
+        return
+    u, v = u / n, v / n
+    uu, uv, vv = _OF_HALF * (uu / n - u * u), _OF_HALF * (uv / n - u * v), _OF_HALF * (vv / n - v * v)
+    spot["moment_u"], spot["moment_v"] = peak["u"] + u, peak["v"] + v
+    spot["moment_uu"], spot["moment_uv"], spot["moment_vv"] = ellipse.clip_eigenvalues(uu, uv, vv, 0.5, np.inf)
+    det = spot["moment_uu"] * spot["moment_vv"] - spot["moment_uv"] ** 2
+    spot["flux"] = 2 * pi * sqrt(det) * peak["height"]
 
 
 @compiled

@@ -113,3 +113,19 @@ def test_a_faint_spot_far_above_the_grains_of_its_screen_is_found():
         points = find_spots(picture, noise=NoiseModel(0.12, 0.005, 7.0, 0.02))
         found += bool(len(points)) and float(np.linalg.norm(points.uv_px - [130.3, 100.6], axis=1).min()) < 1.5
     assert found >= 19
+
+
+@pytest.mark.parametrize("corner", [(-9, -2), (-11, 3), (-8, 30)])
+@pytest.mark.parametrize("radius_px", [5, 7, 8])
+def test_a_saturated_spot_beside_the_edge_of_an_object_is_found(corner, radius_px):
+    """A disc with a halo on a card, beside a black box: a Gaussian that grows over the edge of the box fits better."""
+    v, u = np.mgrid[:320, :400].astype(float)
+    away = np.hypot(u - 200.3, v - 199.8)
+    light = np.where((u < 200 + corner[0]) & (v < 200 + corner[1]), 18.0, 85.0)
+    light += 300 / (1 + np.exp(2.2 * (away - radius_px))) + 25 * np.exp(-0.5 * (away / (1.3 * radius_px)) ** 2)
+    noise = 0.5 * np.random.default_rng(1).standard_normal(light.shape)
+    picture = np.clip(np.rint(cv2.GaussianBlur(light, (0, 0), 0.7) + noise), 0, 255).astype(np.uint8)
+    found = find_spots(picture, DetectParameters(saturation_dn=255.0))
+    assert len(found) == 1
+    error = float(np.hypot(*(found.uv_px[0] - [200.3, 199.8])))
+    assert error < min(1.2, 3 * float(np.sqrt(found.variance_px2[0])))
