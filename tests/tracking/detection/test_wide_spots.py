@@ -10,6 +10,7 @@ from geometry.arrays import Array
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import NoiseModel
+from tracking.parameters import DetectParameters
 
 WIDTH, HEIGHT = 240, 200
 BACKGROUND, FLOOR, SLOPE = 60.0, 1.5, 0.027  # DN, DN^2, DN
