@@ -1,9 +1,9 @@
 """`python -m studies.learned_detector.train --out DIR`: trains the learned detector and exports it.
 
-Needs the extra `training` (torch, onnx). The weights of the package are of an earlier recipe
-(docs/papers/zhou2020_detector.md, which has the figures of the present one, too). The same seed gives the same samples;
-sums in another order change the weights in their last digits on another machine. A run that was interrupted continues
-from the files of its folder, and one that has ended goes on with more epochs.
+Needs the extra `training` (torch, onnx). docs/papers/zhou2020_detector.md has the command that made the weights of the
+package, and their figures. The same seed gives the same samples; sums in another order change the weights in their last
+digits on another machine. A run that was interrupted continues from the files of its folder, and one that has ended
+goes on with more epochs.
 """
 
 from __future__ import annotations
