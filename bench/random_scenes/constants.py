@@ -40,7 +40,6 @@ ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = ("background", "detection", "labelling", "noise_estimation", "rigid_body", "smoothing")
 PACKAGES = ("geometry", "tracking", "calibration", "lab")
 POINTS, PICTURES = 71000, 23000  # seeds of the recordings
-SHORT = ("two-beams-25hz", "no-prior")  # families with fewer frames
 TABLES = ("attitude.csv", "spots.csv", "attitude_causal.csv")
 
 
@@ -83,10 +82,7 @@ def constants(folders: tuple[str, ...]) -> list[Constant]:
 
 def recordings(place: Path) -> list[Path]:
     """Write the recordings that all copies process: of each family of points and of pictures one."""
-    points = [
-        write_run_folder(family_scene(name, POINTS, None if name in SHORT else 120), place / f"points-{name}")
-        for name in POINT_FAMILIES
-    ]
+    points = [write_run_folder(family_scene(name, POINTS, None), place / f"points-{name}") for name in POINT_FAMILIES]
     pictures = picture_jobs(range(PICTURES, PICTURES + 1), "all", 24, None, False)
     return points + [
         write_pictures(Renderer(picture_scene(job.seed, job.family, job.frames)), place / f"pictures-{job.family}")
