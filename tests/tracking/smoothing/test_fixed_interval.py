@@ -69,7 +69,7 @@ def drawn(
     dt[3 * frames // 4] = 2 * DT  # a frame was dropped
     sizes = np.full((frames, 2), jumps)
     first = np.repeat([0.02, 0.02, 0.5, 0.5, 5.0, 5.0], 3) ** 2
-    info = RunInformation(L, np.zeros((frames, 6)), dt, sizes, 100 * sizes, first)
+    info = RunInformation(L, np.zeros((frames, 6)), dt, sizes, 100 * sizes, unknown_moments(frames), first)
     jerk = np.array(np.broadcast_to(jerk, (frames, 6)), order="C")  # as in the program: no second machine code
     x = np.sqrt(first) * rng.normal(size=STATE)
     true, g = np.empty((frames, STATE)), np.zeros((frames, 6))
@@ -254,14 +254,14 @@ def test_the_size_of_the_chunks_does_not_change_the_result(chunk, monkeypatch):
 def test_a_run_of_several_chunks_has_no_error_where_they_meet():
     one, times = drawn(8, 516), 16  # drawing all frames takes ten seconds
     ref = Reference(*(np.concatenate([a] * times) for a in one.ref))
-    info = RunInformation(*(np.concatenate([a] * times) for a in one.info[:5]), one.info.first_variance)
+    info = RunInformation(*(np.concatenate([a] * times) for a in one.info[:6]), one.info.first_variance)
     run = Run(ref, info, np.tile(one.jerk, (times, 1)), np.tile(one.true, (times, 1)))
     x, pose_P, *_ = smoothed(run.ref, run.info, run.jerk)
     meet = 8 * fixed_interval.CHUNK
     assert len(x) >= max(meet + 40, fixed_interval.MOST_FRAMES_AT_ONCE + 1)
     # The frames near the seam by themselves: frames 20 frames away change less than a thousandth of a sigma.
     part = slice(meet - 100, meet + 40)
-    info = RunInformation(*(a[part] for a in run.info[:5]), run.info.first_variance)
+    info = RunInformation(*(a[part] for a in run.info[:6]), run.info.first_variance)
     alone_x, alone_P, *_ = smoothed(Reference(*(a[part] for a in run.ref)), info, run.jerk[part])
     sigma = np.sqrt(np.diagonal(pose_P, axis1=1, axis2=2))[part]
     seam = slice(70, 120)

@@ -20,7 +20,7 @@ STATE = 18  # numbers of the error state
 
 @compiled
 def process_noise(
-    dt: float, jerk: float, velocity_jump: float, acceleration_jump: float
+    dt: float, jerk: float, velocity_jump: float, acceleration_jump: float, later: float = -1.0, spread: float = 0.0
 ) -> tuple[float, float, float, float, float, float]:
     """Covariance that a step of dt (s) adds to one axis: entries pp, pv, pa, vv, va, aa.
 
@@ -29,11 +29,22 @@ def process_noise(
     unknown moment of the step. With the moment uniformly distributed a velocity jump of variance J adds
     J [[dt^2/3, dt/2], [dt/2, 1]] to pose and velocity: the same as white acceleration of density J/dt (at a corner
     between two frames the vehicle leaves the old direction before it reaches the new one). Likewise a jump of the
-    acceleration is white jerk.
+    acceleration is white jerk. later, spread: the jump of the velocity is so long before the end of the step, s, and its
+    sigma; -1: unknown.
 
     Source: Bar-Shalom, Li & Kirubarajan (2001), sec. 6.2.3 (white jerk); the uniform moment: ours.
     """
     q = jerk + acceleration_jump / dt
+    if later >= 0.0:
+        v = velocity_jump
+        return (
+            q * dt**5 / 20 + v * (later * later + spread * spread),
+            q * dt**4 / 8 + v * later,
+            q * dt**3 / 6,
+            q * dt**3 / 3 + v,
+            q * dt**2 / 2,
+            q * dt,
+        )
     w = velocity_jump / dt
     return (
         q * dt**5 / 20 + w * dt**3 / 3,
@@ -92,19 +103,23 @@ def propagated(R: Array, t: Array, m: Array, dt: float, turn: Array) -> tuple[Ar
 
 @compiled
 def predicted(
-    R: Array, t: Array, m: Array, P: Array, dt: float, jerk: Array, velocity_jump: Array, acceleration_jump: Array
-) -> tuple[Array, Array, Array, Array, Array]:
+    R: Array, t: Array, m: Array, P: Array, dt: float, jerk: Array, velocity_jump: Array, acceleration_jump: Array,
+    later: float = -1.0, spread: float = 0.0,
+) -> tuple[Array, Array, Array, Array, Array]:  # fmt: skip
     """Prediction over a step of dt (s): R, t, m, P and the transition matrix F (18, 18) of the error state.
 
     jerk (6,): spectral densities of the white jerk, (m/s^3)^2/Hz of the three axes of world, then (rad/s^3)^2/Hz of
     those of body. velocity_jump (2,): variances of a jump of the velocities at an unknown moment of the step, (m/s)^2
-    of the translation and (rad/s)^2 of the rotation. acceleration_jump (2,): the same of the accelerations.
+    of the translation and (rad/s)^2 of the rotation. acceleration_jump (2,): the same of the accelerations. later,
+    spread: of `process_noise`.
     """
     F, turn = transition(m, dt)
     out = _transformed(F, P)
     if dt > 0.0:
         for i in range(6):
-            pp, pv, pa, vv, va, aa = process_noise(dt, jerk[i], velocity_jump[i // 3], acceleration_jump[i // 3])
+            pp, pv, pa, vv, va, aa = process_noise(
+                dt, jerk[i], velocity_jump[i // 3], acceleration_jump[i // 3], later, spread
+            )
             out[i, i] += pp
             out[i, i + 6] += pv
             out[i + 6, i] += pv

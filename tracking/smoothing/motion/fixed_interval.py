@@ -37,10 +37,14 @@ from tracking.smoothing.motion.run_detections import Reference
 
 
 @compiled
-def noise_root(dt: float, jerk: float, velocity_jump: float, acceleration_jump: float) -> Array:
+def noise_root(
+    dt: float, jerk: float, velocity_jump: float, acceleration_jump: float, later: float = -1.0, spread: float = 0.0
+) -> Array:
     """Lower triangular root (3, 3) of one axis' process noise."""
     Q = np.empty((3, 3))
-    Q[0, 0], Q[0, 1], Q[0, 2], Q[1, 1], Q[1, 2], Q[2, 2] = process_noise(dt, jerk, velocity_jump, acceleration_jump)
+    Q[0, 0], Q[0, 1], Q[0, 2], Q[1, 1], Q[1, 2], Q[2, 2] = process_noise(
+        dt, jerk, velocity_jump, acceleration_jump, later, spread
+    )
     Q[1, 0], Q[2, 0], Q[2, 1] = Q[0, 1], Q[0, 2], Q[1, 2]
     return cholesky(Q)
 
@@ -104,6 +108,7 @@ class RunInformation(NamedTuple):
     dt: Array  # (T,) s since the frame before
     velocity_jump: Array  # (T, 2) variances of the velocities' jump in that step, (m/s)^2 and (rad/s)^2
     acceleration_jump: Array  # (T, 2) variances of the accelerations' jump
+    moment: Array  # (T, 2) s: how long before the end of the step the velocities jump, -1: unknown; and its sigma
     first_variance: Array  # (18,) variances of the first frame's deviation
 
 
@@ -135,6 +140,8 @@ def _predict(ref: Reference, info: RunInformation, jerk: Array, k: int, x: Array
         jerk[k],
         info.velocity_jump[k],
         info.acceleration_jump[k],
+        info.moment[k, 0],
+        info.moment[k, 1],
     )
     x_new = apply(F, x)
     d = pose_minus(R, t, ref.R[k], ref.t[k])
@@ -200,7 +207,12 @@ def _predict_backward(
             y,
             axis,
             noise_root(
-                info.dt[k], jerk[k, axis], info.velocity_jump[k, axis // 3], info.acceleration_jump[k, axis // 3]
+                info.dt[k],
+                jerk[k, axis],
+                info.velocity_jump[k, axis // 3],
+                info.acceleration_jump[k, axis // 3],
+                info.moment[k, 0],
+                info.moment[k, 1],
             ),
         )
     F, turn = transition(ref.m[k - 1], info.dt[k])
@@ -373,7 +385,14 @@ def _test_process_noise(info: RunInformation, jerk: Array, k: int, Y: Array, y: 
         out.gamma[k, i] = max(gamma, 0.0)
         kind = i // 3
         if info.velocity_jump[k, kind] > 0:
-            jump = process_noise(dt, 0.0, info.velocity_jump[k, kind], info.acceleration_jump[k, kind])
+            jump = process_noise(
+                dt,
+                0.0,
+                info.velocity_jump[k, kind],
+                info.acceleration_jump[k, kind],
+                info.moment[k, 0],
+                info.moment[k, 1],
+            )
             energy, gamma = _score_test(jump, r, N, N_aa, i)
             out.jump_energy[k, kind] += energy
             out.jump_gamma[k, kind] += gamma
@@ -431,7 +450,14 @@ def motion_cost(ref: Reference, info: RunInformation, jerk: Array) -> float:
         R, t, m = propagated(ref.R[k - 1], ref.t[k - 1], ref.m[k - 1], info.dt[k], turn)
         d = pose_minus(ref.R[k], ref.t[k], R, t)
         for i in range(6):
-            root = noise_root(info.dt[k], jerk[k, i], info.velocity_jump[k, i // 3], info.acceleration_jump[k, i // 3])
+            root = noise_root(
+                info.dt[k],
+                jerk[k, i],
+                info.velocity_jump[k, i // 3],
+                info.acceleration_jump[k, i // 3],
+                info.moment[k, 0],
+                info.moment[k, 1],
+            )
             w[0], w[1], w[2] = d[i], ref.m[k, i] - m[i], ref.m[k, 6 + i] - m[6 + i]
             for a in range(3):
                 s = w[a]

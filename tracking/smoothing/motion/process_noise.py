@@ -157,36 +157,54 @@ def unobserved_steps(measured: Bools) -> Bools:
     return out
 
 
+def open_steps(k: int, vague: Bools, scale: Array) -> tuple[int, int]:
+    """The first and the last step that may have the known jump of step k.
+
+    vague (T,): frames that do not determine the pose, or much worse than usual; scale (T, 2): as in `jump_variances`.
+    """
+    first, last = k, k
+    while first > 1 and vague[first - 1]:
+        first -= 1
+    while last < len(vague) - 1 and vague[last]:
+        last += 1
+    if first == last and scale[k].min() < 1:
+        # Found by its motion alone, it may in truth be one step farther.
+        first, last = max(k - 1, 1), min(k + 1, len(vague) - 1)
+    return first, last
+
+
+def largest_jumps(ref: Reference, measured: Bools, dt: Array) -> Array:
+    """Variances (T, 2) of jumps as large as the fastest motion near each step, (m/s)^2 and (rad/s)^2."""
+    usual = float(np.median(dt[dt > 0])) if np.any(dt > 0) else SPEED_WINDOW_S
+    window = max(1, min(round(SPEED_WINDOW_S / usual), len(dt)))
+    return jump_variance(largest_near(np.where(measured[:, None], speeds(ref.m), 0.0), window))
+
+
 def jump_variances(
-    ref: Reference, weak: Bools, measured: Bools, jumped: Bools, dt: Array, excluded: Bools, scale: Array
+    ref: Reference, weak: Bools, measured: Bools, jumped: Bools, dt: Array, excluded: Bools, scale: Array, moment: Array
 ) -> Array:
     """Variances (T, 2) of the velocities' jump in each step, (m/s)^2 and (rad/s)^2, weighted with its probability.
 
     measured (T,): frames whose spots determine the pose; weak (T,): those that do so much worse than usual; jumped
     (T,): steps with a known jump; dt (T,), s; excluded (T,): unobserved steps in which there was none; scale (T, 2): of
-    the variances of known jumps, which are otherwise those of the fastest motion.
+    the variances of known jumps, which are otherwise those of the fastest motion; moment (T, 2): of RunInformation.
     """
-    usual = float(np.median(dt[dt > 0])) if np.any(dt > 0) else SPEED_WINDOW_S
-    window = max(1, min(round(SPEED_WINDOW_S / usual), len(dt)))
-    size = jump_variance(largest_near(np.where(measured[:, None], speeds(ref.m), 0.0), window))
-    probability = np.where(unobserved_steps(measured) & ~excluded, P_JUMP_OCCLUDED, 0.0)
-    jumps = np.flatnonzero(jumped)
-    weak, sizes = ~measured | weak, np.zeros_like(size)
-    for k in jumps:
-        first, last = k, k
-        while first > 1 and weak[first - 1]:
-            first -= 1
-        while last < len(dt) - 1 and weak[last]:
-            last += 1
+    size = largest_jumps(ref, measured, dt)
+    known = largest_near(moment[:, 0] >= 0, 1)
+    probability = np.where(unobserved_steps(measured) & ~excluded & ~known, P_JUMP_OCCLUDED, 0.0)
+    vague, sizes = ~measured | weak, np.zeros_like(size)
+    for k in np.flatnonzero(jumped):
+        probability[k] = 1.0
+        if moment[k, 0] >= 0:
+            sizes[k] = size[k] * scale[k]
+            continue
+        first, last = open_steps(k, vague, scale)
+        some = slice(first, last + 1)
         # The jump is in one of the steps between the frames that determine the pose well.
         share = 1.0 if first == last else max(1.0 / (last + 1 - first), P_JUMP_SHARED)
-        probability[first : last + 1] = np.maximum(probability[first : last + 1], share)
-        probability[k] = 1.0
-        if first == last and scale[k].min() < 1:
-            # Found by its motion alone, it may in truth be one step farther.
-            beside = slice(max(k - 1, 1), k + 2)
-            probability[beside] = np.maximum(probability[beside], P_JUMP_SHARED)
-            sizes[beside] = np.maximum(sizes[beside], size[k] * scale[k])
+        probability[some] = np.maximum(probability[some], share)
+        if scale[k].min() < 1 and not vague[k - 1] and not vague[k]:
+            sizes[some] = np.maximum(sizes[some], size[k] * scale[k])
     return np.asarray(probability[:, None] * np.where(sizes > 0, sizes, size))
 
 

@@ -36,6 +36,11 @@ class Reference(NamedTuple):
     m: Array  # (T, 12)
 
 
+def unknown_moments(frames: int) -> Array:
+    """(T, 2): moments of jumps, as in RunInformation, of which none is known."""
+    return np.tile([-1.0, 0.0], (frames, 1))
+
+
 def speeds(m: Array) -> Array:
     """Speeds (..., 2), m/s and rad/s, of motions (..., 12)."""
     return np.stack([np.linalg.norm(m[..., :3], axis=-1), np.linalg.norm(m[..., 3:6], axis=-1)], axis=-1)
@@ -209,8 +214,10 @@ class Steps(NamedTuple):
     jerk: Array  # (F, 6) spectral densities of the white jerk
     velocity_jump: Array  # (F, 2) variances of the velocities' jump
     corner_s: Array  # (F, 2) when they jump, s after the step's begin; nan: not known
+    moment: Array  # (F, 2) of RunInformation
 
 
+CORNER_SIGMAS = 2.0  # of a known moment of a jump: as near to it, a spot may be on either side
 CORNER_SHARE = 0.05  # of a step: how much nearer to a frame than the corner a spot must be to belong to the same line
 
 
@@ -222,10 +229,34 @@ def _open_variance(steps: Steps, k: int, axis: int, after: float) -> float:
     step = k + 1 if after > 0.0 else k
     if 0 < step < steps.dt.shape[0] and steps.dt[step] > 0.0:
         corner, dt = steps.corner_s[step, axis // 3], steps.dt[step]
+        later, spread = steps.moment[step]
+        if later >= 0.0:
+            beyond = s - (dt - later if after > 0.0 else later)
+            if beyond > -CORNER_SIGMAS * spread:
+                beyond = max(beyond, 0.0)
+                out += steps.velocity_jump[step, axis // 3] * (beyond * beyond + spread * spread)
+            return out
         beyond = s - (corner if after > 0.0 else dt - corner)
         if not beyond < -CORNER_SHARE * dt:
             out += steps.velocity_jump[step, axis // 3] / dt * s**3 / 3
     return out
+
+
+@compiled_in_caller
+def _on_its_side(steps: Steps, k: int, after: float) -> tuple[int, float]:
+    """The frame whose state a spot `after` seconds from frame k follows from, and its time after that one, s.
+
+    Frame k, or the next one on the other side of a jump whose moment is known.
+    """
+    if after > 0.0 and k + 1 < steps.dt.shape[0]:
+        later = steps.moment[k + 1, 0]
+        if later >= 0.0 and after > steps.dt[k + 1] - later:
+            return k + 1, after - steps.dt[k + 1]
+    elif after < 0.0 and k > 0:
+        later = steps.moment[k, 0]
+        if later >= 0.0 and -after > later:
+            return k - 1, after + steps.dt[k]
+    return k, after
 
 
 @compiled
@@ -263,8 +294,8 @@ def _weighted_spot(
     i: int,
     noise: Array,
     calibration_cov: Array,
-    delays: Delays,
-    d: int,
+    after: float,
+    row_time: float,
     ref: Reference,
     steps: Steps,
     k: int,
@@ -272,16 +303,16 @@ def _weighted_spot(
     J: Array,
     H: Array,
 ) -> tuple[bool, Array, float, float, float]:
-    """Whether view i is projected at the instant of point d, its motion as of `timed_spot`, and its weight.
+    """Whether view i is projected `after` seconds from frame k, its motion as of `timed_spot`, and a point's weight.
 
-    noise, calibration_cov (2, 2), px^2: of the point, and of the view. k: frame of ref and steps. at, J, H receive what
-    `timed_spot` writes. The weight is the upper triangle of the inverse of the covariance, 1/px^2.
+    noise, calibration_cov (2, 2), px^2: of the point, and of the view; row_time: of its picture. k: frame of ref and
+    steps. at, J, H receive what `timed_spot` writes. The weight is the upper triangle of the inverse of the covariance,
+    1/px^2.
     """
-    after = delays.after_s[d]
     projected, m = timed_spot(views, i, ref.R[k], ref.t[k], ref.m[k], after, at, J, H)
     if not projected:
         return False, m, 0.0, 0.0, 0.0
-    uu, both, vv = _covariance(noise, J, m, delays.row_time_s[d], steps, k, after)
+    uu, both, vv = _covariance(noise, J, m, row_time, steps, k, after)
     uu, both, vv = uu + calibration_cov[0, 0], both + calibration_cov[0, 1], vv + calibration_cov[1, 1]
     w0, w1, w2, _ = inverse_2x2(uu, both, vv)
     return True, m, w0, w1, w2
@@ -311,12 +342,13 @@ def delayed_information(
             if not use[i]:
                 continue
             d = detections.begin[start + k] + assigned[start + k, i]
+            j, after = _on_its_side(steps, k, delays.after_s[d])
             projected, _, w0, w1, w2 = _weighted_spot(
-                views, i, noise[i], calibration_cov[i], delays, d, ref, steps, k, at, J, H
+                views, i, noise[i], calibration_cov[i], after, delays.row_time_s[d], ref, steps, j, at, J, H
             )
             if not projected:
                 continue
-            chi2[k] += add_spot(L[k], g[k], H, w0, w1, w2, uv[i, 0] - at[0], uv[i, 1] - at[1])
+            chi2[j] += add_spot(L[j], g[j], H, w0, w1, w2, uv[i, 0] - at[0], uv[i, 1] - at[1])
     return L, g, chi2
 
 
@@ -347,7 +379,7 @@ def timed_rows(
                 continue
             d = detections.begin[start + k] + assigned[start + k, i]
             projected, m, w0, w1, w2 = _weighted_spot(
-                views, i, noise[i], calibration_cov[i], delays, d, ref, steps, k, at, J, one
+                views, i, noise[i], calibration_cov[i], delays.after_s[d], delays.row_time_s[d], ref, steps, k, at, J, one
             )
             if not projected:
                 continue
@@ -386,7 +418,8 @@ def moved_detections(
                 continue
             for row in range(detections.first[k, c], detections.first[k, c + 1]):
                 d = detections.begin[k] + row
-                R, t, m = state_after(ref.R[k], ref.t[k], ref.m[k], delays.after_s[d])
+                own, after = _on_its_side(steps, k, delays.after_s[d])
+                R, t, m = state_after(ref.R[own], ref.t[own], ref.m[own], after)
                 view, nearest = -1, np.inf
                 for i in range(n):
                     if camera[i] != c or not project_view(views, i, R, t, there, J):
@@ -399,14 +432,14 @@ def moved_detections(
                 if view < 0 or not project_view(views, view, ref.R[k], ref.t[k], here, J):
                     continue
                 project_view(views, view, R, t, there, J)
-                uu, both, vv = _covariance(detections.cov[d], J, m, delays.row_time_s[d], steps, k, delays.after_s[d])
+                uu, both, vv = _covariance(detections.cov[d], J, m, delays.row_time_s[d], steps, own, after)
                 cov[d, 0, 0], cov[d, 0, 1], cov[d, 1, 0], cov[d, 1, 1] = uu, both, both, vv
                 for a in range(2):
                     uv[d, a] += here[a] - there[a]
                     for b in range(2):
                         for i in range(6):
                             for j in range(6):
-                                cov[d, a, b] += delays.after_s[d] ** 2 * J[a, i] * velocity_P[k, i, j] * J[b, j]
+                                cov[d, a, b] += delays.after_s[d] ** 2 * J[a, i] * velocity_P[own, i, j] * J[b, j]
     return uv, cov
 
 
@@ -462,7 +495,8 @@ class SmoothedMotion:
     log_density: Array | None  # (T, 6) logarithms of the jerk's spectral densities; None: not estimated yet
     interpolation_offset: float  # to be added to them for the interpolation between frames
     jumped: Bools  # (T,) the velocities jumped in the step before
-    jump_scale: Array  # (T, 2) of the variances of these jumps, as in `jump_variances`
+    jump_scale: Array  # (T, 2) of the variances of these jumps, as in `jump_variances` ...
+    moment: Array  # (T, 2) ... and when they are, as in RunInformation
     pose_P: Array  # (T, 6, 6)
     motion_P: Array  # (T, 6, 6) of the velocities
     known: Bools  # (T,) the pose is not lost
@@ -475,8 +509,8 @@ class SmoothedMotion:
         frames = len(ref.t)
         zero = np.zeros((frames, 6, 6))
         known = np.zeros(frames, dtype=bool)
-        scale = np.ones((frames, 2))
-        return SmoothedMotion(ref, log_density, 0.0, jumped, scale, zero, zero, known, np.zeros(frames))
+        scale, moment = np.ones((frames, 2)), unknown_moments(frames)
+        return SmoothedMotion(ref, log_density, 0.0, jumped, scale, moment, zero, zero, known, np.zeros(frames))
 
     def without_covariances(self) -> SmoothedMotion:
         """What the next estimate starts from: less memory."""

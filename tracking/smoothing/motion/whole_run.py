@@ -23,19 +23,23 @@ from tracking.smoothing.motion.fixed_interval import (
     motion_cost,
     smoothed,
 )
+from tracking.smoothing.motion.jump_moments import MOMENT_SIGMAS, JumpMoment, find_moment
 from tracking.smoothing.motion.process_noise import (
     PSEUDO_COUNT,
     corner_offsets,
     corner_times,
     jump_variances,
+    largest_jumps,
     largest_near,
     new_jumps,
     next_log_density,
+    open_steps,
     unobserved_steps,
     weak_frames,
     with_errors_along_axes,
 )
 from tracking.smoothing.motion.run_detections import (
+    CORNER_SIGMAS,
     ClockSolution,
     Reference,
     SmoothedMotion,
@@ -63,6 +67,10 @@ P_JUMP_OUTSIDE = 0.15  # probability of a velocity jump in each frame that is ex
 MAX_DISTANCE = 12  # frames: spots farther from any measured frame are not used
 GAP_FRAMES = 15  # on both sides of a gap that show whether the velocities have jumped in it
 NO_JUMP_NATS = 5.0  # by which a motion without a jump is more likely, from which there was none (p < 1 % of 5 %)
+MOMENT_ROUNDS = 4  # in which the moment of a jump is found, each with the spots that were too near to it before
+EITHER_SIDE_SIGMAS = 3.0  # of such a moment: as near to it, a spot may be on either side
+VAGUE_STEPS = 0.15  # a moment whose sigma is larger than this part of a step is not used
+NO_LIMIT = 1e4  # of a jump's variance: spots that are open by it have no weight
 INTERPOLATION_OFFSETS = (-2.0, -4.0, -6.0)  # of log q: tried for the interpolation between frames
 
 
@@ -104,7 +112,9 @@ class _Estimator:
         self.steps: Steps | None = None  # at that reference; None: before the first step
         self.weak = np.zeros(len(self.dt), dtype=bool)  # (T,) see `jump_variances` ...
         self.excluded = np.zeros(len(self.dt), dtype=bool)  # (T,) ... this ...
-        self.jump_scale = motion.jump_scale[core].copy()  # (T, 2) ... and this
+        self.jump_scale = motion.jump_scale[core].copy()  # (T, 2) ... this ...
+        self.moment = motion.moment[core].copy()  # (T, 2) ... and this
+        self.settled = np.zeros(len(self.dt), dtype=bool)  # (T,) jumps whose moments these passes have found
         self.kept: tuple[Reference, tuple[Array, Array, Array]] | None = None  # of the last `_without_corners`
         self.fresh = motion.log_density is None
         self.log_density = self._first_density() if motion.log_density is None else motion.log_density[core].copy()
@@ -137,7 +147,7 @@ class _Estimator:
                 self.jumped |= new
             if adapting:
                 adapting = not self._adapt(out, number, number - first + 1, bool(new.any()))
-                if not adapting and self._hidden_jumps_excluded():
+                if not adapting and (self._hidden_jumps_excluded() | self._find_moments(density)):
                     adapting, first = True, number + 1  # the jerk has to explain what the jumps did
             elif converged and not new.any():
                 break
@@ -198,6 +208,78 @@ class _Estimator:
             gained = log_likelihood(ref, without, density[part]) - log_likelihood(ref, some, density[part])
             self.excluded[first:end] = gained > NO_JUMP_NATS
         return bool((hidden & self.excluded).any())
+
+    def _find_moments(self, density: Array) -> bool:
+        """When the velocities jump, of each jump that several steps may have; jerk densities (T, 6). Whether any changed.
+
+        Where it stays open, the poses beside it are vague in runs whose pictures are of different instants. Jumps whose
+        steps overlap may be one.
+        """
+        if self.run.delays is None or self.steps is None:
+            return False
+        groups, found = self._unsettled_jumps(), dict[int, JumpMoment]()
+        if not groups:
+            return False
+        largest, before = largest_jumps(self.ref, self.measured, self.dt), self.moment.copy()
+        for _ in range(MOMENT_ROUNDS):
+            info = self._information_without(groups, largest, found)
+            for i, (jumps, inside) in enumerate(groups):
+                if i in found and not found[i].improved:
+                    continue
+                change = (self.ref.m[inside.stop - 1, :6] - self.ref.m[inside.start - 1, :6]).reshape(2, 3)
+                size = np.maximum(largest[jumps[0]] * self.jump_scale[jumps].max(axis=0), np.mean(change**2, axis=1))
+                moment = find_moment(self.ref, info, density, (inside.start, inside.stop - 1), size)
+                if moment is not None:
+                    found[i] = moment.after(found.get(i))
+                elif i in found:
+                    del found[i]
+        for i, (jumps, inside) in enumerate(groups):
+            self.moment[inside] = -1.0, 0.0
+            if i not in found or found[i].sigma_s > VAGUE_STEPS * self.dt[found[i].step]:
+                continue
+            moment, k = found[i], found[i].step
+            self.jumped[jumps], self.jumped[k], self.excluded[inside], self.settled[k] = False, True, True, True
+            self.moment[k] = moment.later_s, MOMENT_SIGMAS * moment.sigma_s
+            self.jump_scale[k] = np.minimum(moment.size / np.maximum(largest[k], 1e-300), 1.0)
+            self.log_density[moment.part] = np.log(moment.density)
+        return not np.array_equal(before, self.moment)
+
+    def _unsettled_jumps(self) -> list[tuple[Ints, slice]]:
+        """Jumps whose moments this run of passes has not found, with the steps that may have each; one by one."""
+        vague, out = ~self.measured | self.weak, list[tuple[Ints, slice]]()
+        for k in np.flatnonzero(self.jumped & ~self.settled).tolist():
+            known = self.moment[k, 0] >= 0
+            first, last = (max(k - 1, 1), min(k + 1, len(vague) - 1)) if known else open_steps(k, vague, self.jump_scale)
+            if out and first < out[-1][1].stop:
+                out[-1] = np.append(out[-1][0], k), slice(out[-1][1].start, max(last + 1, out[-1][1].stop))
+            else:
+                out.append((np.array([k]), slice(first, last + 1)))
+        return out
+
+    def _information_without(
+        self, groups: list[tuple[Ints, slice]], largest: Array, found: dict[int, JumpMoment]
+    ) -> RunInformation:
+        """`_information`, where the spots that may be on either side of these jumps have no weight.
+
+        found: moments, so far, of some groups; of the others all spots in their steps may be on either side.
+        """
+        steps, kept = self.steps, self.moment
+        assert steps is not None
+        jump, moment, unknown = steps.velocity_jump.copy(), self.moment.copy(), self.moment.copy()
+        for i, (_, inside) in enumerate(groups):
+            unknown[inside], moment[inside] = (-1.0, 0.0), (-1.0, 0.0)
+            if i not in found:
+                jump[inside] = NO_LIMIT * largest[inside]
+                continue
+            k = found[i].step
+            jump[inside], jump[k] = 0.0, NO_LIMIT * largest[k]
+            moment[k] = found[i].later_s, EITHER_SIDE_SIGMAS / CORNER_SIGMAS * found[i].sigma_s
+        nowhere = np.full_like(steps.corner_s, np.nan)
+        self.steps = steps._replace(corner_s=nowhere, velocity_jump=jump, moment=moment)
+        self.moment, self.kept = unknown, None
+        info, _ = self._information(self.ref)
+        self.steps, self.moment, self.kept = steps, kept, None
+        return info
 
     # -- strength of the jerk -----------------------------------------------------------------------------------------
 
@@ -313,9 +395,9 @@ class _Estimator:
         if jumped.any():
             # For all later passes: a frame near the limit would be weak in every second one, and they would never end.
             self.weak |= weak_frames(L if self.run.delays is None else self._undelayed(ref), measured)
-        jump = jump_variances(ref, self.weak, measured, jumped, self.dt, self.excluded, self.jump_scale)
+        jump = jump_variances(ref, self.weak, measured, jumped, self.dt, self.excluded, self.jump_scale, self.moment)
         first = first_variance(ref, self.dt, bool(measured[0]))
-        return RunInformation(L, g, self.dt, jump, jump / MANOEUVRE_S**2, first), float(chi2.sum())
+        return RunInformation(L, g, self.dt, jump, jump / MANOEUVRE_S**2, self.moment, first), float(chi2.sum())
 
     def _spot_information(self, ref: Reference) -> tuple[Array, Array, Array]:
         """Information of the used spots at a reference: normal matrices (T, s, s), vectors (T, s), chi-squares (T,).
@@ -365,13 +447,15 @@ class _Estimator:
     def _steps(self) -> Steps:
         """What the motion leaves open within each step; nothing before the first pass."""
         none = np.zeros((len(self.dt), 6))
-        return Steps(self.dt, none, none[:, :2].copy(), none[:, :2].copy()) if self.steps is None else self.steps
+        return Steps(self.dt, none, none[:, :2].copy(), none[:, :2].copy(), self.moment) if self.steps is None else self.steps
 
     def _open_steps(self, density: Array) -> None:
         """Update the steps to jerk densities (T, 6) and to the jumps known so far."""
-        jump = jump_variances(self.ref, self.weak, self.measured, self.jumped, self.dt, self.excluded, self.jump_scale)
+        jump = jump_variances(self.ref, self.weak, self.measured, self.jumped, self.dt, self.excluded, self.jump_scale, self.moment)
         corners = corner_times(self.ref, self.jumped, self.dt)
-        self.steps, self.kept = Steps(self.dt, np.ascontiguousarray(density), np.ascontiguousarray(jump), corners), None
+        moment = self.moment.copy()
+        self.steps = Steps(self.dt, np.ascontiguousarray(density), np.ascontiguousarray(jump), corners, moment)
+        self.kept = None
 
     # -- result -------------------------------------------------------------------------------------------------------
 
@@ -405,13 +489,14 @@ class _Estimator:
         sd = np.sqrt(np.diagonal(pose_P, axis1=1, axis2=2))
         known = (sd[:, :3].max(axis=1) < LOST_SIGMA_M) & (sd[:, 3:].max(axis=1) < LOST_SIGMA_RAD)
         jumped, scale = self.motion.jumped.copy(), self.motion.jump_scale.copy()
-        jumped[core], scale[core] = self.jumped, self.jump_scale
+        moment = self.motion.moment.copy()
+        jumped[core], scale[core], moment[core] = self.jumped, self.jump_scale, self.moment
         clocks = self.clocks
         if clocks is not None:
             nearest = np.clip(np.arange(frames) - core.start, 0, core.stop - core.start - 1)
             clocks = replace(clocks, motion=clocks.motion[nearest])
         return SmoothedMotion(
-            Reference(R, t, m), log_density, self.interpolation_offset, jumped, scale, pose_P, motion_P, known,
+            Reference(R, t, m), log_density, self.interpolation_offset, jumped, scale, moment, pose_P, motion_P, known,
             self.weight, clocks,
         )  # fmt: skip
 

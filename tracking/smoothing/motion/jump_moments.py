@@ -1,0 +1,127 @@
+"""When the velocities jump: where the motions before and after the jump meet.
+
+In runs whose pictures are of different instants the poses beside a jump follow from the motion on its side. As long as
+several steps may have the jump, the poses between them are on neither side, and known much worse than by the spots'
+noise. The likelihood of the moment is that of the run with a jump at that moment, with the motion integrated out; it is
+a parabola where the moment is known to a part of a step, and its curvature is the variance. Source: ours; the profile
+likelihood of a change point, e.g. Basseville & Nikiforov (1993), "Detection of Abrupt Changes", chapter 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from geometry.arrays import Array
+from tracking.rigid_body.online_estimates import MANOEUVRE_S
+from tracking.smoothing.motion.fixed_interval import RunInformation, log_likelihood
+from tracking.smoothing.motion.run_detections import Reference
+
+MOMENT_SIGMAS = 2.0  # of a moment, as a sigma: the same spots tell the moment, and then the motion with it
+_AROUND = 12  # frames on both sides of the steps that show when the jump is
+_SPREADS = (0.5, 0.1, 0.02)  # of a step: sigmas of the moment with which it is found, one after the other
+_PARABOLAS = 4  # with each of these, at most
+_NARROWER = 0.5  # of the distances, for the next sigma
+_IMPROVED = 0.8  # of the sigma before
+_CALM = 0.25  # quantile of the jerk about a jump
+_LEAST = 0.25  # of the last of these sigmas: the least one of a moment
+
+
+@dataclass(frozen=True, slots=True)
+class JumpMoment:
+    """When the velocities jump."""
+
+    step: int
+    later_s: float  # how long before the end of the step
+    sigma_s: float
+    part: slice  # of the run's frames: those about the jump, with ...
+    density: Array  # (F, 6) ... the jerk with which a jump at one moment explains them best
+    size: Array  # (2,) variances of the jump
+    improved: bool = True  # more spots may say more
+
+    def after(self, before: JumpMoment | None) -> JumpMoment:
+        """This moment, found with more spots than `before`."""
+        return replace(self, improved=before is None or self.sigma_s < _IMPROVED * before.sigma_s)
+
+
+def find_moment(
+    ref: Reference, info: RunInformation, density: Array, steps: tuple[int, int], size: Array
+) -> JumpMoment | None:
+    """The moment of a jump; None: not known.
+
+    ref, info, density (T, 6): of a run in which some steps (first, last) may have the jump, whose variances are size
+    (2,). The spots of these steps count as if the motion within them was open. None also where the run with a jump at
+    one moment is less likely than that in which all of these steps are open: the motion turns for longer.
+
+    Where a jump was not known before, a strong jerk may have explained it: the jerk of the calmer frames is tried, too.
+    """
+    first, last = steps
+    part = slice(max(first - _AROUND, 0), min(last + _AROUND, len(info.dt)))
+    some = info._replace(**{name: getattr(info, name)[part] for name in info._fields[:-1]})
+    near = Reference(*(np.ascontiguousarray(a[part]) for a in ref))
+    usual = np.ascontiguousarray(density[part])
+    calm = np.minimum(usual, np.quantile(usual, _CALM, axis=0))
+    inside = slice(first - part.start, last + 1 - part.start)
+    best, most = None, log_likelihood(near, some, usual)
+    for jerk in (usual, calm):
+        found = _search(_Around(near, some, jerk, inside, size))
+        if found is not None and found[0] > most:
+            most, step, later, sigma = found
+            best = JumpMoment(part.start + step, later, sigma, part, jerk, size)
+    return best
+
+
+@dataclass(frozen=True, slots=True)
+class _Around:
+    """The frames about some steps that may have a jump."""
+
+    ref: Reference
+    info: RunInformation
+    jerk: Array
+    inside: slice
+    size: Array  # (2,)
+
+    def nats(self, ends_s: Array, at_s: float, spread_s: float) -> float:
+        """Log-likelihood of a jump at a moment with a sigma, s; ends_s: of the steps."""
+        info, inside = self.info, self.inside
+        jump, moment = info.velocity_jump.copy(), info.moment.copy()
+        jump[inside], moment[inside] = 0.0, (-1.0, 0.0)
+        step = self.step(ends_s, at_s)
+        jump[step], moment[step] = self.size, (max(ends_s[step] - at_s, 0.0), spread_s)
+        with_jump = info._replace(velocity_jump=jump, acceleration_jump=jump / MANOEUVRE_S**2, moment=moment)
+        return log_likelihood(self.ref, with_jump, self.jerk)
+
+    def step(self, ends_s: Array, at_s: float) -> int:
+        """The step that contains a moment."""
+        return int(np.clip(np.searchsorted(ends_s, at_s), self.inside.start, self.inside.stop - 1))
+
+
+def _search(around: _Around) -> tuple[float, int, float, float] | None:
+    """Log-likelihood, nats, step, time before its end and sigma, s, of the most likely moment."""
+    inside, ends = around.inside, np.cumsum(around.info.dt)
+    start, end, dt = ends[inside.start - 1], ends[inside.stop - 1], float(np.median(around.info.dt[inside]))
+    at, apart = 0.5 * (start + end), dt
+    for share in _SPREADS:
+        spread = share * dt
+        for _ in range(_PARABOLAS):
+            low, middle, high = (around.nats(ends, at + d, spread) for d in (-apart, 0.0, apart))
+            curvature = (low + high - 2 * middle) / apart**2
+            if not curvature < 0:
+                return None
+            move = 0.5 * (low - high) / (apart * curvature)
+            at += move
+            if not start - 0.5 * dt < at < end + 0.5 * dt:
+                return None
+            sigma = float(np.sqrt(-1 / curvature))
+            apart = min(apart, max(sigma, spread))
+            if abs(move) < apart:
+                break
+        else:
+            return None
+        apart *= _NARROWER
+    sigma = float(np.sqrt(max(sigma**2 - spread**2, (_LEAST * spread) ** 2)))
+    if not (start <= at <= end and sigma < 0.5 * (end - start)):
+        return None
+    step = around.step(ends, at)
+    return around.nats(ends, at, MOMENT_SIGMAS * sigma), step, float(max(ends[step] - at, 0.0)), sigma
