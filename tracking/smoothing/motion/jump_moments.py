@@ -46,13 +46,14 @@ class JumpMoment:
 
 
 def find_moment(
-    ref: Reference, info: RunInformation, density: Array, steps: tuple[int, int], size: Array
+    ref: Reference, info: RunInformation, density: Array, steps: tuple[int, int], size: Array, slack_nats: float = 0.0
 ) -> JumpMoment | None:
     """The moment of a jump; None: not known.
 
     ref, info, density (T, 6): of a run in which some steps (first, last) may have the jump, whose variances are size
     (2,). The spots of these steps count as if the motion within them was open. None also where the run with a jump at
-    one moment is less likely than that in which all of these steps are open: the motion turns for longer.
+    one moment is less likely, by more than a slack, than that in which all of these steps are open: the motion turns for
+    longer.
 
     Where a jump was not known before, a strong jerk may have explained it: the jerk of the calmer frames is tried, too.
     """
@@ -63,7 +64,7 @@ def find_moment(
     usual = np.ascontiguousarray(density[part])
     calm = np.minimum(usual, np.quantile(usual, _CALM, axis=0))
     inside = slice(first - part.start, last + 1 - part.start)
-    best, most = None, log_likelihood(near, some, usual)
+    best, most = None, log_likelihood(near, some, usual) - slack_nats
     for jerk in (usual, calm):
         found = _search(_Around(near, some, jerk, inside, size))
         if found is not None and found[0] > most:

@@ -69,6 +69,8 @@ GAP_FRAMES = 15  # on both sides of a gap that show whether the velocities have 
 NO_JUMP_NATS = 5.0  # by which a motion without a jump is more likely, from which there was none (p < 1 % of 5 %)
 MOMENT_ROUNDS = 4  # in which the moment of a jump is found, each with the spots that were too near to it before
 EITHER_SIDE_SIGMAS = 3.0  # of such a moment: as near to it, a spot may be on either side
+EARLIER_STEPS = 0.1  # least sigma of a moment that was found with other labels, in steps
+FIRST_SLACK_NATS = 3.0  # by which a jump at one moment may at first be less likely than at an open one
 VAGUE_STEPS = 0.15  # a moment whose sigma is larger than this part of a step is not used
 NO_LIMIT = 1e4  # of a jump's variance: spots that are open by it have no weight
 INTERPOLATION_OFFSETS = (-2.0, -4.0, -6.0)  # of log q: tried for the interpolation between frames
@@ -217,18 +219,20 @@ class _Estimator:
         """
         if self.run.delays is None or self.steps is None:
             return False
-        groups, found = self._unsettled_jumps(), dict[int, JumpMoment]()
+        groups = self._unsettled_jumps()
         if not groups:
             return False
+        found = {i: known for i, (jumps, _) in enumerate(groups) if (known := self._known_moment(jumps)) is not None}
         largest, before = largest_jumps(self.ref, self.measured, self.dt), self.moment.copy()
-        for _ in range(MOMENT_ROUNDS):
+        for number in range(MOMENT_ROUNDS):
             info = self._information_without(groups, largest, found)
             for i, (jumps, inside) in enumerate(groups):
                 if i in found and not found[i].improved:
                     continue
                 change = (self.ref.m[inside.stop - 1, :6] - self.ref.m[inside.start - 1, :6]).reshape(2, 3)
                 size = np.maximum(largest[jumps[0]] * self.jump_scale[jumps].max(axis=0), np.mean(change**2, axis=1))
-                moment = find_moment(self.ref, info, density, (inside.start, inside.stop - 1), size)
+                slack = FIRST_SLACK_NATS if number < MOMENT_ROUNDS - 1 else 0.0
+                moment = find_moment(self.ref, info, density, (inside.start, inside.stop - 1), size, slack)
                 if moment is not None:
                     found[i] = moment.after(found.get(i))
                 elif i in found:
@@ -243,6 +247,15 @@ class _Estimator:
             self.jump_scale[k] = np.minimum(moment.size / np.maximum(largest[k], 1e-300), 1.0)
             self.log_density[moment.part] = np.log(moment.density)
         return not np.array_equal(before, self.moment)
+
+    def _known_moment(self, jumps: Ints) -> JumpMoment | None:
+        """The moment that earlier labels gave for some jumps that may be one, less certain."""
+        known = jumps[self.moment[jumps, 0] >= 0]
+        if not len(known):
+            return None
+        k, dt = int(known[0]), self.dt[known[0]]
+        sigma = max(self.moment[k, 1], EARLIER_STEPS * dt)
+        return JumpMoment(k, self.moment[k, 0], sigma, slice(0, 0), np.zeros((0, 6)), np.zeros(2))
 
     def _unsettled_jumps(self) -> list[tuple[Ints, slice]]:
         """Jumps whose moments this run of passes has not found, with the steps that may have each; one by one."""
