@@ -12,7 +12,14 @@ from lab.simulate.rigs import RIGS
 from tracking.detections import PictureClock
 from tracking.rigid_body.models.information import exposed_after, picture_shifts, timed_spot
 from tracking.rigid_body.models.motion import state_after
-from tracking.smoothing.motion.run_detections import Delays, Reference, RunDetections, Steps, moved_detections
+from tracking.smoothing.motion.run_detections import (
+    Delays,
+    Reference,
+    RunDetections,
+    Steps,
+    moved_detections,
+    unknown_moments,
+)
 
 MODEL = SpotModel.of(RIGS["four-skew-beams"]())
 R, T = np.eye(3), np.zeros(3)

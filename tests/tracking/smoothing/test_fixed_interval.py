@@ -18,7 +18,7 @@ from tracking.smoothing.motion.fixed_interval import (
     smoothed,
 )
 from tracking.smoothing.motion.process_noise import SHOCK_SEPARATION
-from tracking.smoothing.motion.run_detections import Reference, shifted
+from tracking.smoothing.motion.run_detections import Reference, shifted, unknown_moments
 
 DT = 0.01
 JERK = np.repeat([20.0, 60.0], 3) ** 2
