@@ -73,6 +73,7 @@ EARLIER_STEPS = 0.1  # least sigma of a moment that was found with other labels,
 FIRST_SLACK_NATS = 3.0  # by which a jump at one moment may at first be less likely than at an open one
 VAGUE_STEPS = 0.15  # a moment whose sigma is larger than this part of a step is not used
 NO_LIMIT = 1e4  # of a jump's variance: spots that are open by it have no weight
+MOST_OWN = 0.9  # share of what is known of a pose that its own spots may have for these to be left out
 INTERPOLATION_OFFSETS = (-2.0, -4.0, -6.0)  # of log q: tried for the interpolation between frames
 
 
@@ -337,23 +338,33 @@ class _Estimator:
         interior = self._interior(out)
         if not interior.any():
             return 0.0
-        best, value = 0.0, self._leave_one_out(info, 0.0, interior)
+        by_others = None
+        if self.run.delays is not None:
+            # Where the spots of a frame are also what the velocities are known by, they would count twice.
+            own = np.linalg.eigvals(out.pose_P @ _of_poses(info.information)).real.max(axis=1)
+            by_others = (interior & (own < MOST_OWN))[:, None, None]
+            if 2 * by_others.sum() < interior.sum():
+                return 0.0
+        best, value = 0.0, self._leave_one_out(info, 0.0, interior, by_others)
         for offset in INTERPOLATION_OFFSETS:
-            likelihood = self._leave_one_out(info, offset, interior)
+            likelihood = self._leave_one_out(info, offset, interior, by_others)
             if likelihood < value:
                 break
             best, value = offset, likelihood
         for offset in (best - 1.0, best + 1.0):
             if offset < 0:
-                likelihood = self._leave_one_out(info, offset, interior)
+                likelihood = self._leave_one_out(info, offset, interior, by_others)
                 if likelihood > value:
                     best, value = offset, likelihood
         return best
 
-    def _leave_one_out(self, info: RunInformation, offset: float, interior: Bools) -> float:
+    def _leave_one_out(
+        self, info: RunInformation, offset: float, interior: Bools, by_others: Bools | None = None
+    ) -> float:
         out = smoothed(self.ref, info, np.exp(self.log_density + offset * interior[:, None]))
         # Of spots that were not exposed at the instant of their frame, what they say about the pose.
-        of_poses = info._replace(information=_of_poses(info.information), vector=_of_poses(info.vector))
+        left_out = _of_poses(info.information) if by_others is None else _of_poses(info.information) * by_others
+        of_poses = info._replace(information=left_out, vector=_of_poses(info.vector))
         value = float(leave_one_out_log_likelihood(out.x, out.pose_P, of_poses))
         return value if np.isfinite(value) else -np.inf
 
