@@ -318,13 +318,17 @@ class _Smoother:
             return seen
         nowhere = np.zeros(len(self.rec), dtype=bool)
         jump = jump_variances(
-            motion.ref, nowhere, self.measured, motion.jumped, self.rec.dt_s, nowhere, motion.jump_scale,
+            motion.ref,
+            nowhere,
+            self.measured,
+            motion.jumped,
+            self.rec.dt_s,
+            nowhere,
+            motion.jump_scale,
             motion.moment,
         )
         corners = corner_times(motion.ref, motion.jumped, self.rec.dt_s)
-        steps = Steps(
-            self.rec.dt_s, np.exp(motion.log_density), np.ascontiguousarray(jump), corners, motion.moment
-        )
+        steps = Steps(self.rec.dt_s, np.exp(motion.log_density), np.ascontiguousarray(jump), corners, motion.moment)
         uv, cov = moved_detections(
             self.views, self.view_table.camera, seen, self.delays, self.assigned, motion.ref, motion.motion_P, steps
         )

@@ -67,7 +67,9 @@ def test_points_are_moved_to_their_frames_instant_as_their_spots_move():
     first = np.searchsorted(MODEL.camera_of, [[0, 1, 2]])
     seen = RunDetections(uv, cov, np.zeros(n), np.array([0, n]), first, np.ones((1, 2), bool), np.ones(n), np.ones(n))
     delays = Delays(np.full(n, after), np.zeros(n), np.array([[[after, 0.0, 511.5]] * 2]))
-    steps = Steps(np.array([0.01]), np.full((1, 6), jerk), np.zeros((1, 2)), np.full((1, 2), np.nan), unknown_moments(1))
+    steps = Steps(
+        np.array([0.01]), np.full((1, 6), jerk), np.zeros((1, 2)), np.full((1, 2), np.nan), unknown_moments(1)
+    )
     labels = np.where(np.arange(n) % 2, np.arange(n) - first[0, MODEL.camera_of], -1)[None]
     motion, velocity_P = Reference(R[None], T[None], M[None]), np.eye(6)[None] * 0.1**2
     moved = moved_detections(MODEL.numbers, MODEL.camera_of, seen, delays, labels, motion, velocity_P, steps)

@@ -29,7 +29,7 @@ def process_noise(
     unknown moment of the step. With the moment uniformly distributed a velocity jump of variance J adds
     J [[dt^2/3, dt/2], [dt/2, 1]] to pose and velocity: the same as white acceleration of density J/dt (at a corner
     between two frames the vehicle leaves the old direction before it reaches the new one). Likewise a jump of the
-    acceleration is white jerk. later, spread: the jump of the velocity is so long before the end of the step, s, and its
+    acceleration is white jerk. later, spread: how long before the end of the step the velocity jumps, s, and its
     sigma; -1: unknown.
 
     Source: Bar-Shalom, Li & Kirubarajan (2001), sec. 6.2.3 (white jerk); the uniform moment: ours.

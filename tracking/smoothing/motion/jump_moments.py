@@ -39,10 +39,13 @@ class JumpMoment:
     density: Array  # (F, 6) ... the jerk with which a jump at one moment explains them best
     size: Array  # (2,) variances of the jump
     improved: bool = True  # more spots may say more
+    rounds: int = 1  # in which it was found one after the other, each with the spots that were too near to it before
 
     def after(self, before: JumpMoment | None) -> JumpMoment:
         """This moment, found with more spots than `before`."""
-        return replace(self, improved=before is None or self.sigma_s < _IMPROVED * before.sigma_s)
+        if before is None:
+            return self
+        return replace(self, improved=self.sigma_s < _IMPROVED * before.sigma_s, rounds=before.rounds + 1)
 
 
 def find_moment(
@@ -50,10 +53,9 @@ def find_moment(
 ) -> JumpMoment | None:
     """The moment of a jump; None: not known.
 
-    ref, info, density (T, 6): of a run in which some steps (first, last) may have the jump, whose variances are size
-    (2,). The spots of these steps count as if the motion within them was open. None also where the run with a jump at
-    one moment is less likely, by more than a slack, than that in which all of these steps are open: the motion turns for
-    longer.
+    ref, info, density (T, 6): of a run in which some steps (first, last) may have the jump, of variances size (2,). The
+    spots of these steps count as if the motion within them was open. None also where the run with a jump at one moment
+    is less likely, by more than a slack, than that in which all of these steps are open: the motion turns for longer.
 
     Where a jump was not known before, a strong jerk may have explained it: the jerk of the calmer frames is tried, too.
     """

@@ -193,7 +193,7 @@ def jump_variances(
     known = largest_near(moment[:, 0] >= 0, 1)
     probability = np.where(unobserved_steps(measured) & ~excluded & ~known, P_JUMP_OCCLUDED, 0.0)
     vague, sizes = ~measured | weak, np.zeros_like(size)
-    for k in np.flatnonzero(jumped):
+    for k in np.flatnonzero(jumped).tolist():
         probability[k] = 1.0
         if moment[k, 0] >= 0:
             sizes[k] = size[k] * scale[k]

@@ -379,7 +379,18 @@ def timed_rows(
                 continue
             d = detections.begin[start + k] + assigned[start + k, i]
             projected, m, w0, w1, w2 = _weighted_spot(
-                views, i, noise[i], calibration_cov[i], delays.after_s[d], delays.row_time_s[d], ref, steps, k, at, J, one
+                views,
+                i,
+                noise[i],
+                calibration_cov[i],
+                delays.after_s[d],
+                delays.row_time_s[d],
+                ref,
+                steps,
+                k,
+                at,
+                J,
+                one,
             )
             if not projected:
                 continue

@@ -213,7 +213,7 @@ class _Estimator:
         return bool((hidden & self.excluded).any())
 
     def _find_moments(self, density: Array) -> bool:
-        """When the velocities jump, of each jump that several steps may have; jerk densities (T, 6). Whether any changed.
+        """Find when the velocities jump, where several steps may have the jump; whether any changed. density (T, 6): of jerk.
 
         Where it stays open, the poses beside it are vague in runs whose pictures are of different instants. Jumps whose
         steps overlap may be one.
@@ -225,10 +225,11 @@ class _Estimator:
             return False
         found = {i: known for i, (jumps, _) in enumerate(groups) if (known := self._known_moment(jumps)) is not None}
         largest, before = largest_jumps(self.ref, self.measured, self.dt), self.moment.copy()
+        none = set[int]()  # groups that have no moment, as the spots near it have shown
         for number in range(MOMENT_ROUNDS):
             info = self._information_without(groups, largest, found)
             for i, (jumps, inside) in enumerate(groups):
-                if i in found and not found[i].improved:
+                if i in none or (i in found and not found[i].improved):
                     continue
                 change = (self.ref.m[inside.stop - 1, :6] - self.ref.m[inside.start - 1, :6]).reshape(2, 3)
                 size = np.maximum(largest[jumps[0]] * self.jump_scale[jumps].max(axis=0), np.mean(change**2, axis=1))
@@ -236,13 +237,14 @@ class _Estimator:
                 moment = find_moment(self.ref, info, density, (inside.start, inside.stop - 1), size, slack)
                 if moment is not None:
                     found[i] = moment.after(found.get(i))
-                elif i in found:
-                    del found[i]
+                elif i in found and found.pop(i).rounds > 0:
+                    none.add(i)
         for i, (jumps, inside) in enumerate(groups):
             self.moment[inside] = -1.0, 0.0
-            if i not in found or found[i].sigma_s > VAGUE_STEPS * self.dt[found[i].step]:
+            moment = found.get(i)
+            if moment is None or moment.rounds < 2 or moment.sigma_s > VAGUE_STEPS * self.dt[moment.step]:
                 continue
-            moment, k = found[i], found[i].step
+            k = moment.step
             self.jumped[jumps], self.jumped[k], self.excluded[inside], self.settled[k] = False, True, True, True
             self.moment[k] = moment.later_s, MOMENT_SIGMAS * moment.sigma_s
             self.jump_scale[k] = np.minimum(moment.size / np.maximum(largest[k], 1e-300), 1.0)
@@ -256,14 +258,15 @@ class _Estimator:
             return None
         k, dt = int(known[0]), self.dt[known[0]]
         sigma = max(self.moment[k, 1], EARLIER_STEPS * dt)
-        return JumpMoment(k, self.moment[k, 0], sigma, slice(0, 0), np.zeros((0, 6)), np.zeros(2))
+        return JumpMoment(k, self.moment[k, 0], sigma, slice(0, 0), np.zeros((0, 6)), np.zeros(2), rounds=0)
 
     def _unsettled_jumps(self) -> list[tuple[Ints, slice]]:
         """Jumps whose moments this run of passes has not found, with the steps that may have each; one by one."""
         vague, out = ~self.measured | self.weak, list[tuple[Ints, slice]]()
         for k in np.flatnonzero(self.jumped & ~self.settled).tolist():
             known = self.moment[k, 0] >= 0
-            first, last = (max(k - 1, 1), min(k + 1, len(vague) - 1)) if known else open_steps(k, vague, self.jump_scale)
+            beside = max(k - 1, 1), min(k + 1, len(vague) - 1)
+            first, last = beside if known else open_steps(k, vague, self.jump_scale)
             if out and first < out[-1][1].stop:
                 out[-1] = np.append(out[-1][0], k), slice(out[-1][1].start, max(last + 1, out[-1][1].stop))
             else:
@@ -419,7 +422,7 @@ class _Estimator:
         if jumped.any():
             # For all later passes: a frame near the limit would be weak in every second one, and they would never end.
             self.weak |= weak_frames(L if self.run.delays is None else self._undelayed(ref), measured)
-        jump = jump_variances(ref, self.weak, measured, jumped, self.dt, self.excluded, self.jump_scale, self.moment)
+        jump = self._jump_variances(ref)
         first = first_variance(ref, self.dt, bool(measured[0]))
         return RunInformation(L, g, self.dt, jump, jump / MANOEUVRE_S**2, self.moment, first), float(chi2.sum())
 
@@ -458,6 +461,12 @@ class _Estimator:
         self.kept = ref, (L, g, chi2)
         return L, g, chi2
 
+    def _jump_variances(self, ref: Reference) -> Array:
+        """`jump_variances` (T, 2) at a reference."""
+        return jump_variances(
+            ref, self.weak, self.measured, self.jumped, self.dt, self.excluded, self.jump_scale, self.moment
+        )
+
     def _undelayed(self, ref: Reference) -> Array:
         """Normal matrices (T, 6, 6) as if all spots were of the instants of their frames.
 
@@ -470,15 +479,16 @@ class _Estimator:
 
     def _steps(self) -> Steps:
         """What the motion leaves open within each step; nothing before the first pass."""
+        if self.steps is not None:
+            return self.steps
         none = np.zeros((len(self.dt), 6))
-        return Steps(self.dt, none, none[:, :2].copy(), none[:, :2].copy(), self.moment) if self.steps is None else self.steps
+        return Steps(self.dt, none, none[:, :2].copy(), none[:, :2].copy(), self.moment)
 
     def _open_steps(self, density: Array) -> None:
         """Update the steps to jerk densities (T, 6) and to the jumps known so far."""
-        jump = jump_variances(self.ref, self.weak, self.measured, self.jumped, self.dt, self.excluded, self.jump_scale, self.moment)
+        jump = np.ascontiguousarray(self._jump_variances(self.ref))
         corners = corner_times(self.ref, self.jumped, self.dt)
-        moment = self.moment.copy()
-        self.steps = Steps(self.dt, np.ascontiguousarray(density), np.ascontiguousarray(jump), corners, moment)
+        self.steps = Steps(self.dt, np.ascontiguousarray(density), jump, corners, self.moment.copy())
         self.kept = None
 
     # -- result -------------------------------------------------------------------------------------------------------

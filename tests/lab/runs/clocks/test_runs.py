@@ -5,12 +5,16 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from bench.clocks.recording import random_recording, write_recording
+from bench.clocks.__main__ import figures
+from bench.clocks.recording import Recording, random_recording, write_recording
+from geometry.arrays import Array
+from geometry.pose import Pose
 from lab.files.run.results import read_poses
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
@@ -114,3 +118,33 @@ def test_a_swing_that_begins_after_rest_leaves_no_frame_vague(tmp_path):
     poses = read_poses(tmp_path / "out")
     sigma = np.linalg.norm(poses.sigma_ypr_deg, axis=1)[3:-3]
     assert np.max(sigma) < 20 * np.median(sigma)
+
+
+@pytest.mark.parametrize("seed", [4000, 4033])
+def test_beside_corners_the_attitude_is_as_accurate_as_with_one_clock(seed, tmp_path):
+    """The pictures around a corner are before or after it: each belongs to the motion on its side."""
+    r = random_recording(seed, frames=80)
+    own, one = figures(r, tmp_path / "own"), figures(r.with_one_clock(), tmp_path / "one")
+    both = np.isfinite(own.attitude_deg) & np.isfinite(one.attitude_deg)
+    both[:3] = both[-3:] = False
+    assert np.count_nonzero((r.corners > 3) & (r.corners < 77)) >= 3
+    assert both.sum() >= 70
+    assert np.mean(own.attitude_deg[both] ** 2) < 1.5**2 * np.mean(one.attitude_deg[both] ** 2)
+    assert np.nanmean(own.nees) < 1.5
+
+
+def rounded(r: Recording, frames: float) -> Recording:
+    """The recording of a motion whose corners take some frames: the mean over as many."""
+
+    def pose_at(t_s: Array) -> Pose:
+        here, around_s = r.pose_at(t_s), np.linspace(-0.5, 0.5, 9) * frames / r.rate_hz
+        return here.plus(np.mean([r.pose_at(t_s + s).minus(here) for s in around_s], axis=0))
+
+    return replace(r, pose_at=pose_at)
+
+
+@pytest.mark.parametrize("frames", [1.0, 3.0])
+def test_turns_that_take_some_frames_are_not_taken_for_corners(frames, tmp_path):
+    own = figures(rounded(random_recording(4000, frames=80), frames), tmp_path)
+    assert np.nanmean(own.nees) < 1.5
+    assert np.nanmax(own.nees) < 8
