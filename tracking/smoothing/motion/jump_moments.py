@@ -18,13 +18,14 @@ from tracking.rigid_body.online_estimates import MANOEUVRE_S
 from tracking.smoothing.motion.fixed_interval import RunInformation, log_likelihood
 from tracking.smoothing.motion.run_detections import Reference
 
-MOMENT_SIGMAS = 2.0  # of a moment, as a sigma: the same spots tell the moment, and then the motion with it
+MOMENT_SIGMAS = 2.0  # of a moment, as a sigma: the same spots show the moment and then the motion
 _AROUND = 12  # frames on both sides of the steps that show when the jump is
 _SPREADS = (0.5, 0.1, 0.02)  # of a step: sigmas of the moment with which it is found, one after the other
 _PARABOLAS = 4  # with each of these, at most
 _NARROWER = 0.5  # of the distances, for the next sigma
 _IMPROVED = 0.8  # of the sigma before
 _CALM = 0.25  # quantile of the jerk about a jump
+_STRONG = 4.0  # times that: a jerk that a jump may have caused
 _LEAST = 0.25  # of the last of these sigmas: the least one of a moment
 
 
@@ -67,7 +68,7 @@ def find_moment(
     calm = np.minimum(usual, np.quantile(usual, _CALM, axis=0))
     inside = slice(first - part.start, last + 1 - part.start)
     best, most = None, log_likelihood(near, some, usual) - slack_nats
-    for jerk in (usual, calm):
+    for jerk in (usual, calm) if np.any(usual > _STRONG * calm) else (usual,):
         found = _search(_Around(near, some, jerk, inside, size))
         if found is not None and found[0] > most:
             most, step, later, sigma = found

@@ -213,7 +213,7 @@ class _Estimator:
         return bool((hidden & self.excluded).any())
 
     def _find_moments(self, density: Array) -> bool:
-        """Find when the velocities jump, where several steps may have the jump; whether any changed. density (T, 6): of jerk.
+        """Find when the velocities jump, where several steps may; whether any changed. density (T, 6): of the jerk.
 
         Where it stays open, the poses beside it are vague in runs whose pictures are of different instants. Jumps whose
         steps overlap may be one.
