@@ -170,7 +170,18 @@ class _Estimator:
         step = (out.jump_energy + PSEUDO_COUNT) / (np.maximum(out.jump_gamma, 0.0) + PSEUDO_COUNT)
         scale = np.where(self.jumped[:, None], np.minimum(self.jump_scale * step, 1.0), 0.0)
         # Of jumps side by side the data choose one; which of the steps had it stays open.
-        self.jump_scale[self.jumped] = largest_near(scale, 1)[self.jumped]
+        scale = largest_near(scale, 1)
+        vague, largest = ~self.measured | self.weak, largest_jumps(self.ref, self.measured, self.dt)
+        for k in np.flatnonzero(self.jumped & (self.moment[:, 0] < 0)).tolist():
+            # Where several steps may have the jump it explains less than it is.
+            first, last = open_steps(k, vague, self.jump_scale)
+            scale[k] = np.maximum(scale[k], self._change(first, last) / np.maximum(largest[k], 1e-300))
+        self.jump_scale[self.jumped] = np.minimum(scale, 1.0)[self.jumped]
+
+    def _change(self, first: int, last: int) -> Array:
+        """Mean squares (2,) of how much the velocities change over some steps, of translation and of rotation."""
+        change = (self.ref.m[last, :6] - self.ref.m[first - 1, :6]).reshape(2, 3)
+        return np.asarray(np.mean(change**2, axis=1))
 
     def _adapt(self, out: Interval, number: int, passes: int, new_jump: bool) -> bool:
         """Update the strength of the jerk after a pass; whether it is the last time."""
@@ -231,8 +242,8 @@ class _Estimator:
             for i, (jumps, inside) in enumerate(groups):
                 if i in none or (i in found and not found[i].improved):
                     continue
-                change = (self.ref.m[inside.stop - 1, :6] - self.ref.m[inside.start - 1, :6]).reshape(2, 3)
-                size = np.maximum(largest[jumps[0]] * self.jump_scale[jumps].max(axis=0), np.mean(change**2, axis=1))
+                change = self._change(inside.start, inside.stop - 1)
+                size = np.maximum(largest[jumps[0]] * self.jump_scale[jumps].max(axis=0), change)
                 slack = FIRST_SLACK_NATS if number < MOMENT_ROUNDS - 1 else 0.0
                 moment = find_moment(self.ref, info, density, (inside.start, inside.stop - 1), size, slack)
                 if moment is not None:
