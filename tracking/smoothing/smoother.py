@@ -516,6 +516,10 @@ class _Smoother:
         shifts: Array | None = None
         if self.delays is not None:
             shifts = run_shifts(self.views, self.view_table.camera, self.delays.clocks, final.R, final.t, final.m)
+            # A spot on the other side of a velocity jump has moved as the motion there.
+            k, view = np.nonzero(assigned >= 0)
+            rows = self.detections.begin[k] + assigned[k, view] % BLENDED
+            shifts[k, view] = self.seen.uv[rows] - self.detections.uv[rows]
         spots = ReportedSpots.of(
             self.model, self.parameters, poses, covariance + self.systematic, self.calibration_cov,
             (self.rec.run_detections(), self.rec.place_px2()), (assigned, self.errors), (offsets, of_spots), shifts,
