@@ -8,6 +8,7 @@ Source: ours.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -71,6 +72,9 @@ MOMENT_ROUNDS = 4  # in which the moment of a jump is found, each with the spots
 EITHER_SIDE_SIGMAS = 3.0  # of such a moment: as near to it, a spot may be on either side
 EARLIER_STEPS = 0.1  # least sigma of a moment that was found with other labels, in steps
 FIRST_SLACK_NATS = 3.0  # by which a jump at one moment may at first be less likely than at an open one
+APART_FRAMES = 1  # between the steps of two jumps, from which one does not disturb the moment of the other
+NEGLIGIBLE_JUMP = 1e-3  # of the variance of the fastest motion
+LEAST_SPREAD = 0.1  # of a step: no real corner is in one instant
 VAGUE_STEPS = 0.15  # a moment whose sigma is larger than this part of a step is not used
 NO_LIMIT = 1e4  # of a jump's variance: spots that are open by it have no weight
 MOST_OWN = 0.9  # share of what is known of a pose that its own spots may have for these to be left out
@@ -250,17 +254,36 @@ class _Estimator:
                     found[i] = moment.after(found.get(i))
                 elif i in found and found.pop(i).rounds > 0:
                     none.add(i)
+        for i in self._uncertain(groups, found):
+            found.pop(i, None)
         for i, (jumps, inside) in enumerate(groups):
             self.moment[inside] = -1.0, 0.0
             moment = found.get(i)
-            if moment is None or moment.rounds < 2 or moment.sigma_s > VAGUE_STEPS * self.dt[moment.step]:
+            if moment is None:
                 continue
             k = moment.step
             self.jumped[jumps], self.jumped[k], self.excluded[inside], self.settled[k] = False, True, True, True
-            self.moment[k] = moment.later_s, MOMENT_SIGMAS * moment.sigma_s
+            self.moment[k] = moment.later_s, max(MOMENT_SIGMAS * moment.sigma_s, LEAST_SPREAD * self.dt[k])
             self.jump_scale[k] = np.minimum(moment.size / np.maximum(largest[k], 1e-300), 1.0)
             self.log_density[moment.part] = np.log(moment.density)
         return not np.array_equal(before, self.moment)
+
+    def _uncertain(self, groups: list[tuple[Ints, slice]], found: dict[int, JumpMoment]) -> set[int]:
+        """Which of the groups have no certain moment.
+
+        One that the spots near it have not confirmed is none, nor is one beside a jump whose moment is not known: the
+        motion between the two is known too little.
+        """
+        out = {
+            i for i in range(len(groups))
+            if i not in found or found[i].rounds < 2 or found[i].sigma_s > VAGUE_STEPS * self.dt[found[i].step]
+        }  # fmt: skip
+        beside = set[int]()
+        for i, j in pairwise(range(len(groups))):
+            if groups[j][1].start - groups[i][1].stop < APART_FRAMES:
+                real = [self.jump_scale[groups[k][0]].max() > NEGLIGIBLE_JUMP for k in (i, j)]
+                beside |= {a for a, b, there in ((i, j, real[1]), (j, i, real[0])) if b in out and there}
+        return out | beside
 
     def _known_moment(self, jumps: Ints) -> JumpMoment | None:
         """The moment that earlier labels gave for some jumps that may be one, less certain."""
