@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 from calibration.budget import (
     BEAM_DIRECTIONS,
@@ -141,7 +141,7 @@ def expanded(variances: Array, degrees_of_freedom: Array) -> Expanded:
     with np.errstate(divide="ignore", invalid="ignore"):
         effective = total**2 / np.sum(variances**2 / dof, axis=0)
     effective = np.where(np.isfinite(effective), effective, np.inf)
-    factor = np.asarray(stats.t.ppf(0.5 + 0.5 * COVERAGE, effective), dtype=np.float64)
+    factor = np.asarray(stdtrit(effective, 0.5 + 0.5 * COVERAGE), dtype=np.float64)
     combined = np.sqrt(np.maximum(total, 0.0))
     return Expanded(combined, effective, factor, factor * combined)
 

@@ -38,6 +38,15 @@ except SystemExit as done:
 print("FIRST", *sorted(first))
 print("LOADED", *sorted(sys.modules))
 """
+# All modules of some packages, given as words.
+EVERYTHING = """
+import importlib, pkgutil, sys
+for name in {arguments!r}:
+    package = importlib.import_module(name)
+    for module in pkgutil.walk_packages(package.__path__, name + "."):
+        importlib.import_module(module.name)
+print("LOADED", *sorted(sys.modules))
+"""
 # What an exit handler finds that runs after those of the program.
 AT_EXIT = """
 import atexit, gc
@@ -107,6 +116,12 @@ def test_a_short_run_never_loads_pandas_or_the_slow_parts_of_scipy_or_the_compil
     after = points_run["LOADED"]
     assert {"jinja2", "lab.report.run.page"} <= after
     assert after & (SLOW_SCIPY | COMPILER | {"pandas", "cv2", "unittest"}) == set()
+
+
+def test_no_calibration_loads_the_distributions_of_scipy_which_take_as_long_as_all_else():
+    after = loaded(EVERYTHING, "calibration", "lab.calibrate")
+    assert {"scipy.special", "lab.calibrate.step"} <= after
+    assert not any(name.startswith("scipy.stats") for name in after)
 
 
 def test_python_does_not_search_for_cycles_while_the_program_ends():

@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.lens.fit.corner_table import CornerTable
@@ -234,7 +234,7 @@ def _change_px(table: CornerTable, first: LensFit, second: LensFit) -> float:
 
 def _p_value(found: Array, C: Array) -> float:
     """P-value of numbers whose true values are 0 and whose errors have this covariance."""
-    return float(chi2.sf(float(found @ np.linalg.solve(C, found)), len(found)))
+    return float(chdtrc(len(found), float(found @ np.linalg.solve(C, found))))
 
 
 def _points(
@@ -295,7 +295,7 @@ def _p_of_points(table: CornerTable, found: LensFit, factor: float, used: Bools)
     np.add.at(g, table.point[used], np.einsum("nij,ni->nj", J, line.residuals))
     seen = np.linalg.det(H) > 0
     score = float(np.sum(g[seen] * np.linalg.solve(H[seen], g[seen][..., None])[..., 0]))
-    return float(chi2.sf(score, 2 * int(seen.sum())))
+    return float(chdtrc(2 * int(seen.sum()), score))
 
 
 def _without_similarity(points: Array, off: Array) -> Array:

@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
-from scipy.special import chdtri
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtrc, chdtri
 
 from calibration.beams.beams import StandModel
 from calibration.least_squares.adjustment import Adjusted, At, Cauchy, Free, Limits, Poses, Prior, Term, Values, solve
@@ -147,7 +146,7 @@ def group_fit(name: str, A: Array, chi2: float, count: int, C: Array) -> GroupFi
     if redundancy <= LEAST_REDUNDANCY or variance <= 0:
         return GroupFit(name, count, max(redundancy, 0.0), chi2, float("nan"))
     unit, dof = variance / (2 * redundancy), 2 * redundancy**2 / variance
-    return GroupFit(name, count, redundancy, chi2, float(chi2_distribution.sf(chi2 / unit, dof)))
+    return GroupFit(name, count, redundancy, chi2, float(chdtrc(dof, chi2 / unit)))
 
 
 def shares(informations: Mapping[str, Array], C: Array, effect: Array) -> dict[str, Array]:

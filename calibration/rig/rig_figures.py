@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtrc
 
 from calibration.beams.beams import BeamCalibration, StandModel, calibrate_beams
 from calibration.beams.excitation import StandMotion, summary_of
@@ -165,7 +165,7 @@ def hold_out(measured: Measured, joint: Joint) -> HoldOut | None:
         np.array(sigmas)[order],
         chi2,
         dof,
-        float(chi2_distribution.sf(chi2, dof)),
+        float(chdtrc(dof, chi2)),
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import chi2, f
+from scipy.special import chdtrc, fdtrc
 
 from geometry.arrays import Array, Bools, cross, normalised
 from geometry.pose import Pose
@@ -149,7 +149,7 @@ def fit_surface(
         _, left = _least_squares(A[use], xyz[use, 2], np.hypot(own[use], scatter))
         return float(np.sum((left / np.hypot(own[use], scatter)) ** 2))
 
-    p_fits = float(chi2.sf(misfit(0.0), dof)) if dof else 1.0
+    p_fits = float(chdtrc(dof, misfit(0.0))) if dof else 1.0
     scatter = scatter_m if scatter_m is not None else 0.0
     if scatter_m is None and p_fits < SIGNIFICANT:
         top = 10 * float(np.std(xyz[use, 2])) + float(np.max(own[use]))
@@ -195,8 +195,8 @@ def _p_flat(flat: Surface, bent: Surface, sigma_m: Array, scatter_m: float | Non
     gain = float(np.sum((flat.heights_m[use] / sigma) ** 2) - np.sum((bent.heights_m[use] / sigma) ** 2))
     dof = int(np.sum(use)) - 6
     if scatter_m is not None or bent.scatter_m == 0 or dof < 1:
-        return float(chi2.sf(max(gain, 0.0), 3))
-    return float(f.sf(max(gain, 0.0) / 3, 3, dof))
+        return float(chdtrc(3, max(gain, 0.0)))
+    return float(fdtrc(3, dof, max(gain, 0.0) / 3))
 
 
 def _inliers_of_surface(xyz: Array, sigma_m: Array, bent: bool, scatter_m: float | None) -> Bools:

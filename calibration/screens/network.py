@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtrc
 
 from calibration.least_squares.adjustment import (
     Adjusted,
@@ -303,7 +303,7 @@ def _fit(
 ) -> NetworkFit:
     rig = rig_of(network.rig, found.values)
     chi2, dof = found.chi2, found.dof
-    p_fits = float(chi2_distribution.sf(chi2, dof)) if dof > 0 else 1.0
+    p_fits = float(chdtrc(dof, chi2)) if dof > 0 else 1.0
     factor = chi2 / dof if dof > 0 and p_fits < SIGNIFICANT else 1.0
     names, T = named_errors(rig, found.values, list(at))
     covariance = T @ found.covariance(list(at)) @ T.T * factor

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from geometry import rotations
 from geometry.arrays import Array, Bools, Ints
@@ -211,8 +211,8 @@ def allan_deviation(readings: Array, step_s: float) -> AllanDeviation:
     slope = _slopes(deviation)
     freedom = np.array([_freedom(n + 1, m, s) for m, s in zip(averaged.tolist(), slope.tolist(), strict=True)])
     tail = 0.025  # limits of 95 %
-    low = deviation * np.sqrt(freedom / np.asarray(chi2.ppf(1 - tail, freedom), dtype=float))
-    high = deviation * np.sqrt(freedom / np.asarray(chi2.ppf(tail, freedom), dtype=float))
+    low = deviation * np.sqrt(freedom / np.asarray(2 * gammaincinv(freedom / 2, 1 - tail), dtype=float))
+    high = deviation * np.sqrt(freedom / np.asarray(2 * gammaincinv(freedom / 2, tail), dtype=float))
     return AllanDeviation(np.asarray(averaged * step_s, dtype=float), averaged, deviation, low, high, freedom, slope)
 
 

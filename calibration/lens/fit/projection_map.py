@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from calibration.lens.fit.lens_models import LensModel, fold_r2, undistorted
 from geometry.arrays import Array
@@ -113,7 +113,7 @@ def difference(at: ProjectionMap, delta: Array, C: Array) -> Difference:
         rms_px=float(np.sqrt(found)),
         expected_rms_px=float(np.sqrt(expected)),
         rms_mm=float(np.sqrt(np.nanmean(np.sum(mm**2, axis=-1)))),
-        p_value=float(chi2.sf(found / expected * dof, dof)),
+        p_value=float(chdtrc(dof, found / expected * dof)),
     )
 
 

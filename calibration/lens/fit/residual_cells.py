@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_fit import LensFit
@@ -33,6 +33,6 @@ def beyond_noise(cells: Array, count: Ints, noise_px: float) -> tuple[float, flo
     full = count > 0
     score = float(np.sum(count[full, None] * cells[full] ** 2)) / noise_px**2
     dof = 2 * int(full.sum())
-    p = float(chi2.sf(score, dof))
+    p = float(chdtrc(dof, score))
     left = noise_px * np.sqrt(max(score - dof, 0.0) / (2 * count.sum()))
     return p, float(left) if p < SIGNIFICANT else 0.0

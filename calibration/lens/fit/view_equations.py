@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.lens.fit.corner_table import CornerTable
@@ -194,7 +194,7 @@ class ViewEquations:
         squares = float(np.sum(C**2) + np.sum(np.sum(squared, axis=0) ** 2) - np.sum(squared**2))
         dof = expected**2 / max(squares, 1e-300)
         ratio = measured / expected if expected > 0 else 1.0
-        return Scatter(float(np.sqrt(ratio)), float(chi2.sf(ratio * dof, dof)))
+        return Scatter(float(np.sqrt(ratio)), float(chdtrc(dof, ratio * dof)))
 
 
 def scattered(found: LensFit, equations: ViewEquations, factor: float) -> Array:
