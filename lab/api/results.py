@@ -177,8 +177,8 @@ class Results:
     def residuals(self) -> pd.DataFrame:
         """Measured minus projected place (px) of each measured spot: frame, t_s, camera, spot, du_px, dv_px.
 
-        Projected from the pose of the frame, where that is measured. Raises InputError where the run folder is not
-        there.
+        Projected from the pose of the frame, where that is measured; nan for cameras with clocks of their own. Raises
+        InputError where the run folder is not there.
         """
         spots = self._read.spots
         residual = pose_residuals(spots, self._read.poses, self._run)[0]

@@ -99,13 +99,15 @@ def read_report_data(
         run_folder=folder,
         truth=tables.truth,
         errors=summary.errors if tables.truth is None else tables.errors,
-        residual_px=residual_px,
+        residual_px=residual_px if residual_px is not None and np.isfinite(residual_px).any() else None,
         residual_share=residual_share,
     )
 
 
 def pose_residuals(spots: SpotGrid, poses: PoseTrack, run: Run) -> tuple[Array | None, float | None]:
     """(F, V, 2): measured pixel minus projection from the frame's measured pose, or nan; and `residual_share`.
+
+    nan also for cameras with clocks of their own: the tables do not state how the spot moved between picture and pose.
 
     The residual of a measurement with covariance R that was used for a pose of covariance P has the covariance
     R - J P J^T, for a pose from one frame, filtered or smoothed. The share is its mean ratio to R. The calibration's
@@ -118,13 +120,14 @@ def pose_residuals(spots: SpotGrid, poses: PoseTrack, run: Run) -> tuple[Array |
     rows = model.subset(np.array([place[view] for view in spots.views], dtype=np.int64))
     out = np.full(spots.uv_px.shape, np.nan)
     use: Bools = poses.known & poses.has(PoseStatus.MEASURED)
+    of_instant = np.array([camera not in run.clocks for camera, _ in spots.views])
     noise = poses.covariance - np.nan_to_num(poses.systematic)
     removed, count = 0.0, 0
     for start in range(0, len(spots.frames), _FRAMES_AT_ONCE):
         part = start + np.flatnonzero(use[start : start + _FRAMES_AT_ONCE])
         if len(part):
             projected, J = rows.project(poses.world_from_body[part])
-            out[part] = np.where(spots.measured[part][..., None], spots.uv_px[part] - projected, np.nan)
+            out[part] = np.where((spots.measured[part] & of_instant)[..., None], spots.uv_px[part] - projected, np.nan)
             with np.errstate(invalid="ignore"):  # nan for views without a projection
                 shares = np.einsum("fvij,fjk,fvik->fvi", J, noise[part], J) / spots.sigma_px[part] ** 2
             shares = shares[np.isfinite(shares) & np.isfinite(out[part])]

@@ -113,7 +113,13 @@ def _model(fit: ModelFit | None) -> Evidence:
 def _residuals(m: ReportData) -> list[Evidence]:
     """The residuals by camera and by beam: median, px, and RMS over the size expected from the stated sigmas."""
     if m.residual_px is None or m.run is None or not m.residual_share:
-        return [Evidence(None, "Residuals", "not known without the run folder's rig, or without a measured pose")]
+        return [
+            Evidence(
+                None,
+                "Residuals",
+                "not known without the run folder's rig or a measured pose, nor for cameras with clocks of their own",
+            )
+        ]
     beams = {name: spot.beam for name, spot in m.run.rig.spots.items()}
     out = []
     for name, groups in (

@@ -54,6 +54,13 @@ def test_every_row_is_measured_and_the_verdict_passes(results):
     assert content["parameters"]["clocks"]["right"]["time_offset_s"] == pytest.approx(0.013)
 
 
+def test_the_report_has_no_residuals_of_pictures_at_other_instants_than_the_poses(results):
+    """The motion in between would pass for a residual of pixels, a hundred times as large as expected."""
+    page = (results / "report.html").read_text()
+    assert "Residuals by camera" not in page
+    assert "cameras with clocks of their own" in page
+
+
 def test_without_the_clocks_the_same_recording_fails(recording, tmp_path):
     shutil.copytree(recording, tmp_path / "run")
     text = (recording / "run.yaml").read_text()
