@@ -118,7 +118,7 @@ def test_a_short_run_never_loads_pandas_or_the_slow_parts_of_scipy_or_the_compil
     assert after & (SLOW_SCIPY | COMPILER | {"pandas", "cv2", "unittest"}) == set()
 
 
-def test_no_calibration_loads_the_distributions_of_scipy_which_take_as_long_as_all_else():
+def test_no_calibration_loads_the_distributions_of_scipy():
     after = loaded(EVERYTHING, "calibration", "lab.calibrate")
     assert {"scipy.special", "lab.calibrate.step"} <= after
     assert not any(name.startswith("scipy.stats") for name in after)

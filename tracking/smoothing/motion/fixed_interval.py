@@ -128,6 +128,20 @@ class Interval(NamedTuple):
     ends_P: Array  # (2, 18, 18) covariance of the whole state at the first and at the last frame
 
 
+@compiled_in_caller
+def _root_of_step(info: RunInformation, jerk: Array, k: int, axis: int) -> Array:
+    """`noise_root` of an axis of the step before frame k, of which jerk (T, 6) is the density."""
+    kind = axis // 3
+    return noise_root(
+        info.dt[k],
+        jerk[k, axis],
+        info.velocity_jump[k, kind],
+        info.acceleration_jump[k, kind],
+        info.moment[k, 0],
+        info.moment[k, 1],
+    )
+
+
 @compiled
 def _predict(ref: Reference, info: RunInformation, jerk: Array, k: int, x: Array, P: Array) -> tuple[Array, Array]:
     """Prediction from frame k - 1 to frame k: deviation (18,) and covariance (18, 18)."""
@@ -202,19 +216,7 @@ def _predict_backward(
 ) -> tuple[Array, Array]:
     """Information about frame k - 1 from all frames from k on, given that about frame k; overwrites Y and y."""
     for axis in range(6):
-        subtract_noise(
-            Y,
-            y,
-            axis,
-            noise_root(
-                info.dt[k],
-                jerk[k, axis],
-                info.velocity_jump[k, axis // 3],
-                info.acceleration_jump[k, axis // 3],
-                info.moment[k, 0],
-                info.moment[k, 1],
-            ),
-        )
+        subtract_noise(Y, y, axis, _root_of_step(info, jerk, k, axis))
     F, turn = transition(ref.m[k - 1], info.dt[k])
     R, t, m = propagated(ref.R[k - 1], ref.t[k - 1], ref.m[k - 1], info.dt[k], turn)
     away = np.empty(STATE)
@@ -450,14 +452,7 @@ def motion_cost(ref: Reference, info: RunInformation, jerk: Array) -> float:
         R, t, m = propagated(ref.R[k - 1], ref.t[k - 1], ref.m[k - 1], info.dt[k], turn)
         d = pose_minus(ref.R[k], ref.t[k], R, t)
         for i in range(6):
-            root = noise_root(
-                info.dt[k],
-                jerk[k, i],
-                info.velocity_jump[k, i // 3],
-                info.acceleration_jump[k, i // 3],
-                info.moment[k, 0],
-                info.moment[k, 1],
-            )
+            root = _root_of_step(info, jerk, k, i)
             w[0], w[1], w[2] = d[i], ref.m[k, i] - m[i], ref.m[k, 6 + i] - m[6 + i]
             for a in range(3):
                 s = w[a]
