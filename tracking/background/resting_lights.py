@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools, Ints
+from geometry.compilation.jit import compiled_for_threads
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
 
@@ -29,43 +30,59 @@ _BY_CHANCE = _MISFIT * (_PARAMETERS + _MISFIT_SIGMAS * (2.0 * _PARAMETERS) ** 0.
 
 @dataclass(frozen=True, slots=True)
 class RestingLights:
-    """n lights of the mean of some pictures (h, w) with N pixels in their windows, one window after the other."""
+    """n lights of the mean of some pictures (h, w) with N pixels in their windows, one window after the other.
+
+    A step's parameters are factors: of a light times 1, x, y, x^2, xy, y^2, and of 1, x, y, with x, y from its centre
+    in its width.
+    """
 
     found: Detections  # (n,), in the mean picture
     half_px: Array  # (n,), half sides of the windows
-    pixels: Ints  # (N,), places in a flat picture
+    windows: Ints  # (n, 5), first row and column, their numbers, and the pixels from one to the next
+    width_px: Array  # (n,)
     mean: NDArray[np.float32]  # (N,), DN
     weight: NDArray[np.float32]  # (N,), 1/DN^2; 0: clipped
-    slopes: NDArray[np.float32]  # (9, N), DN: by centre, flux, shape and background
-    starts: Ints  # (n,), of the windows
+    light: NDArray[np.float32]  # (N,), DN
     free: Array  # (n,), degrees of freedom
     inverse: Array  # (n, 9, 9), of the normal matrices
+    centre_of: Array  # (n, 2, 2), px: centre by the factors of x and y
     flux_of: Array  # (n, 9): relative flux by the parameters
     clips_dn: float  # of the sensor
 
     @staticmethod
     def of(mean: NDArray[Any], found: Detections, noise: NoiseModel, saturation_dn: float) -> RestingLights:
         """The lights found in a mean picture (h, w), with covariances as of a single one. noise: of its pixels."""
+        n = len(found)
         half = np.maximum(_WINDOW[0] * found.major_px + 1, 0) + _WINDOW[1]
-        windows = [_Window.of(mean.shape, found, i, half[i]) for i in range(len(found))]
-        counts = np.array([len(w.pixels) for w in windows], dtype=np.int64)
-        starts = np.concatenate([[0], np.cumsum(counts)])[:-1].astype(np.int64)
-        pixels = np.concatenate([np.zeros(0, np.int64), *(w.pixels for w in windows)])
-        slopes = np.concatenate([np.zeros((_PARAMETERS, 0)), *(w.slopes for w in windows)], axis=1)
-        light = mean.ravel()[pixels].astype(float)
+        windows, inverse = np.zeros((n, 5), np.int64), np.zeros((n, _PARAMETERS, _PARAMETERS))
+        used, centre_of, flux_of = np.zeros(n), np.zeros((n, 2, 2)), np.zeros((n, _PARAMETERS))
+        turn = np.deg2rad(found.angle_deg)
+        axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]).transpose(2, 0, 1)
+        size2 = np.column_stack([found.major_px, found.minor_px]) ** 2 + 1 / 12
+        width = size2.prod(axis=1) ** 0.25
         # In black places a light at rest changes by more than their noise: also there that of the background counts.
-        variance = replace(noise.of_means, shadow_dn2=0.0).variance(light)
-        weight = np.where(light < saturation_dn, 1.0 / variance, 0.0)
-        inverse = np.zeros((len(found), _PARAMETERS, _PARAMETERS))
-        for i, (start, count) in enumerate(zip(starts, counts, strict=True)):
-            own = np.s_[start : start + count]
-            normal = (slopes[:, own] * weight[own]) @ slopes[:, own].T
-            inverse[i] = np.linalg.pinv(normal, hermitian=True)
-        used = np.add.reduceat(weight > 0, starts) if len(found) else np.zeros(0)
-        flux_of = np.array([w.flux_of for w in windows]).reshape(-1, _PARAMETERS)
+        noise = replace(noise.of_means, shadow_dn2=0.0)
+        seen, weights, lights = ([np.zeros(0)] for _ in range(3))
+        for i in range(n):
+            rows, columns, apart = _window(mean.shape, found.uv_px[i], half[i])
+            windows[i] = rows[0], columns[0], len(rows), len(columns), apart
+            y, x = (d.ravel() for d in np.meshgrid(rows, columns, indexing="ij"))
+            d = np.array([x - found.uv_px[i, 0], y - found.uv_px[i, 1]]) / width[i]
+            covariance = axes[i] * (size2[i] / width[i] ** 2) @ axes[i].T
+            form = np.exp(-0.5 * np.einsum("in,ij,jn->n", d, np.linalg.inv(covariance), d))
+            light = found.flux[i] / (2 * np.pi * width[i] ** 2) * form
+            plane = np.array([np.ones_like(d[0]), *d])
+            slopes = np.concatenate([light * plane, light * d[0] * d, [light * d[1] ** 2], plane])
+            value = mean[y, x].astype(float)
+            weight = np.where(value < saturation_dn, 1.0 / noise.variance(value), 0.0)
+            inverse[i] = np.linalg.pinv((slopes * weight) @ slopes.T, hermitian=True)
+            used[i], centre_of[i] = np.count_nonzero(weight), covariance * width[i]
+            flux_of[i, :6] = 1.0, 0.0, 0.0, covariance[0, 0], covariance[0, 1], covariance[1, 1]
+            for of, values in ((seen, value), (weights, weight), (lights, light)):
+                of.append(values)
         return RestingLights(
-            found, half, pixels, light.astype(np.float32), weight.astype(np.float32), slopes.astype(np.float32), starts,
-            np.maximum(used - _PARAMETERS, 1.0), inverse, flux_of, saturation_dn,
+            found, half, windows, width, _joined(seen), _joined(weights), _joined(lights),
+            np.maximum(used - _PARAMETERS, 1.0), inverse, centre_of, flux_of, saturation_dn,
         )  # fmt: skip
 
     def in_picture(self, picture: Picture, fixed: Bools | None = None) -> tuple[Detections, Bools, Bools]:
@@ -77,95 +94,78 @@ class RestingLights:
         where the mean shows it. So does a faint light of which a single picture shows no more than that it has not
         changed.
         """
-        found, (changed, passed) = self.found, np.zeros((2, len(self.found)), dtype=bool)
-        if not len(found):
-            return found, changed, passed
-        residual = picture.ravel()[self.pixels].astype(np.float32) - self.mean
-        if fixed is not None and fixed.any():
-            chi2 = np.add.reduceat(residual * residual * self.weight, self.starts)
-            differs = np.flatnonzero(~fixed | (chi2 > self._largest_chi2))
-            if len(differs):
-                some, rows = self._some(differs)
-                measured, changed[differs], passed[differs] = some._measured(residual[rows])
-                uv_px, flux = found.uv_px.copy(), found.flux.copy()
-                uv_px[differs], flux[differs] = measured.uv_px, measured.flux
-                found = replace(found, uv_px=uv_px, flux=flux)
-            return found, changed, passed
-        return self._measured(residual)
-
-    @property
-    def _largest_chi2(self) -> Array:
-        """(n,): of an unchanged light."""
-        return np.asarray(_MISFIT * (1.0 + _MISFIT_SIGMAS * np.sqrt(2.0 / self.free)) * self.free)
-
-    @property
-    def _ends(self) -> Ints:
-        """(n,), of the windows."""
-        return np.append(self.starts[1:], len(self.pixels))
-
-    def _some(self, lights: Ints) -> tuple[RestingLights, Ints]:
-        """Some of the lights, and the rows of their pixels."""
-        rows = np.concatenate([np.arange(self.starts[i], self._ends[i]) for i in lights])
-        counts = (self._ends - self.starts)[lights]
-        return RestingLights(
-            self.found[lights], self.half_px[lights], self.pixels[rows], self.mean[rows], self.weight[rows],
-            self.slopes[:, rows], np.cumsum(counts) - counts, self.free[lights], self.inverse[lights],
-            self.flux_of[lights], self.clips_dn,
-        ), rows  # fmt: skip
-
-    def _measured(self, residual: NDArray[np.float32]) -> tuple[Detections, Bools, Bools]:
-        """As `in_picture`, from what a picture shows more than the mean, (N,) DN."""
-        weighted = residual * self.weight
-        right = np.array([self.slopes[:, a:b] @ weighted[a:b] for a, b in zip(self.starts, self._ends, strict=True)])
+        sums = np.zeros((len(self.found), _PARAMETERS + 3))
+        centre = self.found.uv_px
+        _add(picture, centre, self.windows, self.width_px, self.mean, self.weight, self.light, sums)
+        right, (whole, darkness, darker) = sums[:, :_PARAMETERS], sums[:, _PARAMETERS:].T
         step = np.einsum("nij,nj->ni", self.inverse, right)
         gain = np.einsum("ni,ni->n", step, right)
-        chi2 = np.add.reduceat(residual * weighted, self.starts) - gain
-        more = np.einsum("ni,ni->n", self.flux_of, step)
-        misfit = chi2 > self._largest_chi2
-        passed = misfit.copy()
-        if passed.any():
-            less = (residual < 0) & (self.weight > 0)
-            darker = np.maximum(np.add.reduceat(less, self.starts, dtype=float), 1.0)
-            allowed = _MISFIT * (1.0 + _MISFIT_SIGMAS * np.sqrt(2.0 / darker))
-            passed &= np.add.reduceat(residual * weighted * less, self.starts) < allowed * darker
-        far = np.linalg.norm(step[:, :2], axis=1) > _LARGEST_STEP * self.found.minor_px
+        more, moved = np.einsum("ni,ni->n", self.flux_of, step), np.einsum("nij,nj->ni", self.centre_of, step[:, 1:3])
+        largest = _largest_chi2(self.free)
+        same = fixed & (whole <= largest) if fixed is not None and len(fixed) else np.zeros(len(right), dtype=bool)
+        misfit = (whole - gain > largest) & ~same
+        passed = misfit & (darkness < _largest_chi2(np.maximum(darker, 1.0)))
+        far = np.linalg.norm(moved, axis=1) > _LARGEST_STEP * self.found.minor_px
         far |= np.abs(more) > _LARGEST_CHANGE
-        changed = misfit | (far & (gain > _BY_CHANCE))
-        stays = passed | (far & ~changed)
-        step, more = np.where(stays[:, None], 0.0, step), np.where(stays, 0.0, more)
-        found = replace(self.found, uv_px=self.found.uv_px + step[:, :2], flux=self.found.flux * (1.0 + more))
+        changed = misfit | (far & (gain > _BY_CHANCE) & ~same)
+        stays = passed | same | (far & ~changed)
+        moved, more = np.where(stays[:, None], 0.0, moved), np.where(stays, 0.0, more)
+        found = replace(self.found, uv_px=centre + moved, flux=self.found.flux * (1.0 + more))
         return found, np.asarray(changed & ~passed), np.asarray(passed)
 
 
-@dataclass(frozen=True, slots=True)
-class _Window:
-    pixels: Ints  # (m,)
-    slopes: Array  # (9, m)
-    flux_of: Array  # (9,)
+def _largest_chi2(free: Array) -> Array:
+    """(n,): of an unchanged light with these degrees of freedom."""
+    return _MISFIT * (1.0 + _MISFIT_SIGMAS * np.sqrt(2.0 / free)) * free
 
-    @staticmethod
-    def of(shape: tuple[int, ...], found: Detections, i: int, half: float) -> _Window:
-        """The window of a light, and the slopes of a Gaussian with its size."""
-        (u0, v0), apart = found.uv_px[i], max(int(half) // _SAMPLES, 1)
-        reach = int(half) // apart * apart
-        columns = np.arange(round(u0) - reach, round(u0) + reach + 1, apart)
-        rows = np.arange(round(v0) - reach, round(v0) + reach + 1, apart)
-        columns, rows = columns[(columns >= 0) & (columns < shape[1])], rows[(rows >= 0) & (rows < shape[0])]
-        v, u = (x.ravel() for x in np.meshgrid(rows, columns, indexing="ij"))
-        turn = np.deg2rad(found.angle_deg[i])
-        axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-        size2 = np.array([found.major_px[i], found.minor_px[i]]) ** 2 + 1 / 12
-        inverse = axes / size2 @ axes.T
-        d = np.array([u - u0, v - v0])
-        p, q = inverse @ d
-        shape_of = np.exp(-0.5 * (p * d[0] + q * d[1]))
-        light = found.flux[i] / (2 * np.pi * np.sqrt(size2.prod())) * shape_of
-        scale = size2.prod() ** 0.25
-        slopes = np.array([
-            light * p, light * q, light, light * (p * scale) ** 2, light * p * q * scale**2, light * (q * scale) ** 2,
-            np.ones_like(p), d[0] / scale, d[1] / scale,
-        ])  # fmt: skip
-        flux_of = np.zeros(_PARAMETERS)
-        flux_of[2] = 1.0
-        flux_of[3:6] = scale**2 * np.array([inverse[0, 0], inverse[0, 1], inverse[1, 1]])
-        return _Window(np.asarray(v * shape[1] + u, np.int64), slopes, flux_of)
+
+def _joined(parts: list[Array]) -> NDArray[np.float32]:
+    return np.concatenate(parts, dtype=np.float32)
+
+
+def _window(shape: tuple[int, ...], uv_px: Array, half: float) -> tuple[Ints, Ints, int]:
+    """Rows and columns of a picture (h, w) around a light, and the pixels from one to the next."""
+    apart = max(int(half) // _SAMPLES, 1)
+    reach = int(half) // apart * apart
+    columns, rows = (np.arange(round(x) - reach, round(x) + reach + 1, apart) for x in uv_px)
+    return rows[(rows >= 0) & (rows < shape[0])], columns[(columns >= 0) & (columns < shape[1])], apart
+
+
+@compiled_for_threads
+def _add(
+    picture: Picture, uv_px: Array, windows: Ints, width_px: Array, mean: NDArray[np.float32],
+    weight: NDArray[np.float32], light: NDArray[np.float32], sums: Array,
+) -> None:  # fmt: skip
+    """Add up the windows of n lights in a picture (h, w): what it shows more than the mean by its slopes (n, 9).
+
+    After these chi-square, the part of it in pixels that are darker than the mean, and their number. Row by row, since
+    the sums of a row by x are those of all slopes.
+    """
+    at = 0
+    for i in range(len(windows)):
+        row, column, rows, columns, apart = windows[i]
+        out = sums[i]
+        for r in range(rows):
+            y = (row + r * apart - uv_px[i, 1]) / width_px[i]
+            pixels = picture[row + r * apart]
+            of_light = by_x = by_xx = of_plane = plane_x = chi2 = darkness = darker = 0.0
+            for c in range(columns):
+                x = (column + c * apart - uv_px[i, 0]) / width_px[i]
+                residual = np.float64(pixels[column + c * apart]) - mean[at]
+                weighted = residual * weight[at]
+                lit = weighted * light[at]
+                of_light += lit
+                by_x += lit * x
+                by_xx += lit * x * x
+                of_plane += weighted
+                plane_x += weighted * x
+                chi2 += residual * weighted
+                darkness += min(residual, 0.0) * weighted
+                darker += np.float64(weighted < 0)
+                at += 1
+            of_row = of_light, by_x, y * of_light, by_xx, y * by_x, y * y * of_light, of_plane, plane_x, y * of_plane
+            for k in range(9):
+                out[k] += of_row[k]
+            out[9] += chi2
+            out[10] += darkness
+            out[11] += darker

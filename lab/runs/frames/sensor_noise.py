@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -26,6 +28,7 @@ from tracking.parameters import DetectParameters
 
 VIDEO_PICTURES = (0, 1, 8, 9, 16, 17)  # used for the estimate: the end of a video cannot be read without all of it
 VIDEO_FRAMES = 60  # at the start of a video from which its static background is made
+_AT_ONCE = 4  # cameras whose backgrounds are made at the same time: each takes up to 40 pictures of memory
 _BLANK = 3  # consecutive pictures without any point after which the noise model is checked
 _BLANK_AGAIN = 50  # it is checked again after this many more
 _CONTRADICTION = 2.0  # ratio of the stated to the estimated background variance from which a note is made
@@ -190,26 +193,28 @@ def _scalars(model: NoiseModel) -> dict[str, Any]:
 
 def camera_noises(run: Run, reader: FrameReader) -> dict[str, CameraNoise]:
     """Each camera's noise at the start of a run; cameras with tables of points have no entry."""
-    out = {}
-    for name, camera in run.rig.cameras.items():
-        if name not in reader.sources:
-            continue
-        out[name] = CameraNoise(name, camera.noise)
-        source, size_px = reader.sources[name], camera.image_size_px
-        shown = pictures_of_frames(source, noise_frames(source), size_px)
-        out[name].estimate_from([p for p in shown.values() if isinstance(p, np.ndarray)])
-        if out[name].shows_structure:
-            if isinstance(source, PictureFiles):
-                wanted = evenly_spread(source.numbers, PICTURES).tolist()
-            else:
-                wanted = list(range(0, VIDEO_FRAMES, VIDEO_FRAMES // PICTURES))
-            shown |= pictures_of_frames(source, [k for k in wanted if k not in shown], size_px)
-            spread = [shown[k] for k in wanted]
-            out[name].make_background([p for p in spread if isinstance(p, np.ndarray)], run.tracker.detect)
-        if isinstance(source, PictureFiles):
-            source.keep(shown)
+    out = {name: CameraNoise(name, own.noise) for name, own in run.rig.cameras.items() if name in reader.sources}
+    with ThreadPoolExecutor(min(max(len(out), 1), os.cpu_count() or 1, _AT_ONCE)) as pool:
+        list(pool.map(lambda own: _prepare(own, run, reader.sources[own.camera]), out.values()))
     share_texture(list(out.values()))
     return out
+
+
+def _prepare(noise: CameraNoise, run: Run, source: PictureSource) -> None:
+    """Estimate a camera's noise, and make its static background where that may show more."""
+    size_px = run.rig.cameras[noise.camera].image_size_px
+    shown = pictures_of_frames(source, noise_frames(source), size_px)
+    noise.estimate_from([p for p in shown.values() if isinstance(p, np.ndarray)])
+    if noise.shows_structure:
+        if isinstance(source, PictureFiles):
+            wanted = evenly_spread(source.numbers, PICTURES).tolist()
+        else:
+            wanted = list(range(0, VIDEO_FRAMES, VIDEO_FRAMES // PICTURES))
+        shown |= pictures_of_frames(source, [k for k in wanted if k not in shown], size_px)
+        spread = [shown[k] for k in wanted]
+        noise.make_background([p for p in spread if isinstance(p, np.ndarray)], run.tracker.detect)
+    if isinstance(source, PictureFiles):
+        source.keep(shown)
 
 
 def share_texture(cameras: Sequence[CameraNoise]) -> None:

@@ -11,11 +11,14 @@ import pickle
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
+from geometry.arrays import evenly_spread
 from lab.cycle_search import search_rarely
 from lab.pictures.picture_file import GreyPicture
 from lab.runs.frames.sensor_noise import VIDEO_FRAMES, CameraNoise
@@ -25,7 +28,7 @@ from tracking.parameters import DetectParameters
 
 _SPACING = VIDEO_FRAMES // PICTURES  # pictures from one that is kept to the next, at first
 _UNFIT = 20  # consecutive pictures that do not fit the background after which the camera or the light has changed
-_NICE = 10  # priority of the process: a background may come later, a pose may not
+_NICE = 10  # priority of the process where it cannot run in idle time only: a background may come later, a pose may not
 ENDED = (OSError, EOFError, pickle.UnpicklingError)
 _PROTOCOL = 5  # of pickle: arrays are written and read in place, and the interpreter is free meanwhile
 
@@ -69,6 +72,7 @@ class FunctionProcess:
             # Not multiprocessing, which would run the program's main module again. The imports take a second of a core.
             program = (
                 "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN);"  # Ctrl-C: the watch decides
+                " hasattr(os, 'SCHED_IDLE') and os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0));"
                 f" hasattr(os, 'nice') and os.nice({_NICE}); sys.path[:] = {sys.path!r};"
                 f" from {__name__} import serve; serve()"
             )
@@ -95,17 +99,30 @@ def serve() -> None:
 class LiveBackground:
     """Keeps some of a camera's pictures and makes the background of them while others are processed.
 
-    The kept pictures are spread over the time since the start, twice as far apart after each background: so it contains
-    ever less of a light that moves slowly, and the cost per picture falls. After a change of the scene it starts again.
+    The kept pictures are spread over the time since the start, twice as far apart whenever there are enough: so it
+    contains ever less of a light that moves slowly, and the cost per picture falls. After a change of the scene it
+    starts again.
     """
 
     noise: CameraNoise
     parameters: DetectParameters
     make: Callable[..., StaticBackground | None]  # from the arguments of `static_background`
+    has_time: Callable[[], bool] = lambda: True  # whether a better one may be made: not while pictures wait
+    at_once: bool = False  # without a background pictures come faster than they are searched
     _kept: list[GreyPicture] = field(default_factory=list)
     _spacing: int = _SPACING
-    _since: int = 0  # pictures since the last one that was kept
+    _next: int = 1  # the picture from now on that is kept
     _thread: threading.Thread | None = None  # waits for the background that is being made
+
+    def begin(self, pictures: Sequence[GreyPicture]) -> None:
+        """Make the background of the camera's first pictures at once, before `add` receives them.
+
+        For cameras whose pictures come faster than they are searched without a background, also later.
+        """
+        self.at_once = True
+        first = [pictures[i] for i in evenly_spread(np.arange(len(pictures)), PICTURES)]
+        self.noise.make_background(first, self.parameters)
+        self._kept, self._spacing, self._next = first[::2], 2 * self._spacing, len(pictures) + 1
 
     def add(self, picture: GreyPicture) -> None:
         """Count a picture after its points have been detected, in the camera's thread."""
@@ -113,18 +130,22 @@ class LiveBackground:
             return
         busy = self._thread is not None and self._thread.is_alive()
         if self.noise.unfit >= _UNFIT and not busy:
-            self._kept, self._spacing, self._since = [], _SPACING, 0
+            self._kept, self._spacing, self._next = [], _SPACING, 1
             self.noise.background, self.noise.unfit = None, 0
-        if self._since % self._spacing == 0 and len(self._kept) < PICTURES:
+        self._next -= 1
+        if self._next <= 0 and len(self._kept) < PICTURES:
             self._kept.append(picture)
-            self._since = 0
-        self._since += 1
-        if len(self._kept) == PICTURES and not busy:
+            self._next = self._spacing
+        if len(self._kept) < PICTURES or busy:
+            return
+        if self.at_once and self.noise.background is None:
+            self.noise.make_background(self._kept, self.parameters)
+        elif self.noise.background is None or self.has_time():
             self._thread = threading.Thread(
                 target=self._make, args=(list(self._kept),), name=f"background-{self.noise.camera}", daemon=True
             )
             self._thread.start()
-            self._kept, self._spacing = self._kept[::2], 2 * self._spacing
+        self._kept, self._spacing = self._kept[::2], 2 * self._spacing
 
     def _make(self, pictures: list[GreyPicture]) -> None:
         with suppress(*ENDED):  # the earlier background stays

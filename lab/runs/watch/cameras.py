@@ -36,6 +36,10 @@ class LiveCamera(Protocol):
         """Put pictures into the inbox; runs in its own thread."""
 
     @property
+    def unread(self) -> int:
+        """Pictures that have come and were not read yet."""
+
+    @property
     def notes(self) -> list[str]:
         """Notes for the user of the results; complete once `run` has ended."""
 
@@ -100,6 +104,10 @@ class FolderCamera:
         if done:
             self._busy_s = time.perf_counter()
         return done > 0
+
+    @property
+    def unread(self) -> int:
+        return len(self._pending)
 
     @property
     def notes(self) -> list[str]:
@@ -180,6 +188,10 @@ class DeviceCamera:
                 self.inbox.put(self.name, number, self.source.picture(self.size_px), arrived_s)
         finally:
             self.source.release()
+
+    @property
+    def unread(self) -> int:
+        return 0  # a device loses them
 
     @property
     def notes(self) -> list[str]:

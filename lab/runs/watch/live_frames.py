@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
@@ -26,6 +26,7 @@ from lab.runs.watch.picture_times import complete_times, times_of
 FIRST = 6  # pictures of each camera for the estimate of the noise
 _ARRIVALS = 200  # frames whose arrivals are compared between cameras
 _START_S = 0.5  # longest wait for them, or the time of eight frames if that is more
+_LATEST = 1.5  # times as long as some pictures take at the run's rate: then the wait for more of them ends
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,20 +138,33 @@ class LiveFrames:
             InputError: the file names contain no frame numbers.
         """
         self.inbox.wanted.set()
+        self._wait_for_pictures(FIRST, max(_START_S, 8 / self.run.frame_rate_hz, self.options.timeout_s))
+        with self.inbox.changed:
+            return self._first_pictures()
+
+    def more(self, cameras: Collection[str], count: int) -> dict[str, list[GreyPicture]]:
+        """Wait until each of some cameras has `count` pictures that were not searched, at most MOST_WAITING of them.
+
+        They stay in the inbox. Fewer where a camera lags, or the recording ends: the others' pictures would be lost.
+        """
+        self._wait_for_pictures(count, max(_START_S, _LATEST * count / self.run.frame_rate_hz), cameras)
+        with self.inbox.changed:
+            return {name: self._usable(self.inbox.queues[name]) for name in cameras}
+
+    def _wait_for_pictures(self, count: int, patience_s: float, cameras: Collection[str] | None = None) -> None:
+        """Wait for this many pictures of each camera, at most so long after the first one."""
+        wanted = [queue for name, queue in self.inbox.queues.items() if cameras is None or name in cameras]
         begun: float | None = None
-        patience = max(_START_S, 8 / self.run.frame_rate_hz, self.options.timeout_s)
         with self.inbox.changed:
             while True:
                 self._raise_failure()
-                counts = [self._usable(queue) for queue in self.inbox.queues.values()]
-                if begun is None and any(queue.pictures for queue in self.inbox.queues.values()):
+                if begun is None and any(queue.pictures for queue in wanted):
                     begun = time.perf_counter()
                 waited = 0.0 if begun is None else time.perf_counter() - begun
-                over = self.stop.is_set() or all(queue.ended for queue in self.inbox.queues.values())
-                if min(len(c) for c in counts) >= FIRST or waited > patience or over:
-                    break
+                over = self.stop.is_set() or all(queue.ended for queue in wanted)
+                if min(len(self._usable(queue)) for queue in wanted) >= count or waited > patience_s or over:
+                    return
                 self.inbox.changed.wait(0.05)
-            return self._first_pictures()
 
     def __iter__(self) -> Iterator[FrameSet]:
         row = self._first if self.inbox.next_row is None else self.inbox.next_row
@@ -163,7 +177,8 @@ class LiveFrames:
                     given, arrived = self.inbox.take(row)
                     self.arrived_s[row] = max(arrived.values(), default=None)
                     self.arrivals.append(arrived)
-                    self.caught_up |= not self.inbox.has_later(row)
+                    unread = sum(camera.unread for camera in self._cameras.values())
+                    self.caught_up |= not (unread or self.inbox.has_later(row))
                     is_row = row >= self._first and (self.moments is None or self.inbox.reaches(row))
                 for name, pictures in given.items():
                     for _, content in pictures:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import logging
+import os
 import sys
 import threading
 import time
@@ -27,7 +28,7 @@ from lab.findings.outcome import Outcome
 from lab.pictures.picture_file import GreyPicture
 from lab.progress import Progress
 from lab.runs.frames.pipeline import Pipeline, tracker_of
-from lab.runs.frames.sensor_noise import CameraNoise
+from lab.runs.frames.sensor_noise import VIDEO_FRAMES, CameraNoise
 from lab.runs.process import ready_run, write_results
 from lab.runs.smoothing_pass import TRACKING
 from lab.runs.verdict.frame_checks import FrameChecks
@@ -38,12 +39,16 @@ from lab.runs.watch.live_output import LiveOutput, is_live_table
 from lab.runs.watch.streams import opened
 from tracking.background.estimation import PICTURES, static_background
 from tracking.detections import Detections
+from tracking.parameters import DetectParameters
 
 if TYPE_CHECKING:
     from lab.runs.watch.board import Board
 
 _log = logging.getLogger("beampose")
 _SWITCH_INTERVAL_S = 0.0005
+# Share of a frame interval and of a camera's part of the cores that a search without a background may take. Pictures
+# that take longer wait for the first background: a backlog of searches costs more time than the background.
+_BUSY = 0.5
 
 
 def watch_run(
@@ -133,18 +138,32 @@ def _started(
     if not first:
         raise RunError(f"{run.path}: expected pictures while the run was watched, got none")
     noise = {name: CameraNoise(name, camera.noise) for name, camera in run.rig.cameras.items()}
+    detect, make = run.tracker.detect, partial(process.call, static_background)
+    backgrounds = {name: LiveBackground(own, detect, make, lambda: frames.caught_up) for name, own in noise.items()}
+    longest_s = _BUSY / run.frame_rate_hz * min((os.cpu_count() or 1) / len(noise), 1.0)
     with ThreadPoolExecutor(max(len(first), 1)) as pool:  # in parallel, since pictures queue up meanwhile
         list(pool.map(lambda name: noise[name].estimate_from(first[name]), first))
+        slow = [name for name, own in noise.items() if _search_s(own, first.get(name, ()), detect) > longest_s]
+        more = frames.more(slow, VIDEO_FRAMES) if slow else {}
+        list(pool.map(lambda name: backgrounds[name].begin(more[name]), more))
     if any(own.shows_structure for own in noise.values()):
         process.start()
     pipeline = Pipeline(run, frames, tracker_of(run), noise, output.write)
-    detect, make = run.tracker.detect, partial(process.call, static_background)
     board = output.board
     if board is not None:
         board.pipeline = pipeline
-    finders = {name: _Finder(pipeline, name, LiveBackground(own, detect, make), board) for name, own in noise.items()}
+    finders = {name: _Finder(pipeline, name, background, board) for name, background in backgrounds.items()}
     frames.inbox.set_finders(finders)
     return pipeline, finders
+
+
+def _search_s(noise: CameraNoise, pictures: Sequence[GreyPicture], parameters: DetectParameters) -> float:
+    """Process time of a search without a background, s; 0 where none can be made."""
+    if not (noise.shows_structure and len(pictures)):
+        return 0.0
+    clock = time.thread_time()
+    noise.detect(pictures[-1], parameters)
+    return time.thread_time() - clock
 
 
 @dataclass(slots=True)

@@ -240,7 +240,7 @@ def test_equal_numbers_of_triggered_cameras_are_one_instant(monkeypatch, tmp_pat
 
 def test_clocks_that_stand_still_or_are_missing_give_rising_times(monkeypatch, tmp_path, rig):
     # The last time is late: on a busy machine the other camera, whose times are those of arrival, may start late.
-    cameras = {"left": Fake([0.0, 0.02, 0.02, 0.01, 5.0]), "right": Fake([None] * 5)}
+    cameras = {"left": Fake([0.0, 0.02, 0.02, 0.01, 60.0]), "right": Fake([None] * 5)}
     done = recorded(monkeypatch, tmp_path / "run", cameras, rig=rig, rate_hz=50.0)
     assert {len(n) for n in valid(tmp_path / "run").values()} == {5}
     assert "right: the camera states no times; those of arrival are used" in done.notes

@@ -9,6 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ from lab.runs.watch.inbox import MOST_WAITING, Inbox, is_complete
 from lab.runs.watch.live_frames import FIRST, WatchOptions
 from lab.runs.watch.live_output import LIVE_TABLE, Latency
 from lab.runs.watch.watch import watch_run
+from lab.simulate.scenarios import SCENARIOS, Light
 from lab.simulate.write import simulate
 from tracking.detections import Detections
 
@@ -182,6 +184,21 @@ def test_a_watch_that_has_not_kept_up_says_what_became_of_the_pictures(latency, 
     said = [line for line in latency.lines() if "faster than they were processed" in line]
     assert bool(said) == late
     assert all(f"{latency.as_mapping()['last'] / 1e3:.1f} s after" in line and "are all used" in line for line in said)
+
+
+def test_pictures_that_come_faster_than_they_are_searched_wait_for_the_first_background(tmp_path):
+    """On a rough screen spots are found in front of a background only: here from the first picture on."""
+    rough = replace(SCENARIOS["smooth"], light=Light(texture=0.12, peak_dn=20.0, background_dn=40.0))
+    run = simulate(rough, tmp_path / "run", seed=3, frames=70, picture_scale=0.25)
+    shown = {}
+    for rate_hz in (10.0, 10_000.0):
+        text = yaml.safe_load((run / "run.yaml").read_text("utf-8"))
+        (run / "run.yaml").write_text(yaml.safe_dump({**text, "frame_rate_hz": rate_hz, "exposure_s": 1e-5}), "utf-8")
+        watch_run(run, tmp_path / "out", options=FAST)
+        first = [row for row in rows(tmp_path / "out" / "detections.csv") if int(row["frame"]) < 30]
+        shown[rate_hz] = [sum(row["camera"] == name for row in first) / 30 for name in ("left", "right")]
+    assert max(shown[10.0]) < 1.0
+    assert min(shown[10_000.0]) > 3.0
 
 
 def test_a_camera_that_stops_does_not_stop_the_other(recorded, tmp_path):
