@@ -11,6 +11,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from calibration.boards.board_detection import find_board
@@ -231,6 +232,7 @@ def main(arguments: list[str]) -> None:
     first = int(arguments[1]) if len(arguments) > 1 else 1
     kinds = arguments[2:] or [f"{lens}-{board}" for lens in LENSES for board in BOARDS]
     every: list[Row] = []
+    cv2.setNumThreads(1)  # as the commands do, which search several photographs at a time
     for kind in kinds:
         lens, board = kind.split("-")
         rows = []

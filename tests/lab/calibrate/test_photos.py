@@ -97,8 +97,10 @@ def test_copies_of_a_picture_without_a_board_do_not_hide_the_reason(tmp_path):
         find_in_photos([tmp_path], BOARD)
 
 
-def test_only_the_first_pictures_without_a_board_are_searched_thoroughly(tmp_path, picture, monkeypatch):
+@pytest.mark.parametrize("at_once", [1, 4])
+def test_only_the_first_pictures_without_a_board_are_searched_thoroughly(at_once, tmp_path, picture, monkeypatch):
     """Once a picture shows the board, the others are searched thoroughly too, so that no board is missed."""
+    monkeypatch.setattr(photos_module, "_AT_ONCE", at_once)
     searches = []
     wall = np.random.default_rng(0).integers(60, 190, picture.shape).astype(np.uint8)
 
@@ -126,7 +128,12 @@ def test_only_the_first_pictures_without_a_board_are_searched_thoroughly(tmp_pat
     assert {reason for _, reason in found.refused} == {found.refused[0][1]}
 
 
-def test_a_video_that_shows_a_charuco_board_now_and_then_has_the_reasons_of_three_frames_only(tmp_path):
+@pytest.mark.parametrize("at_once", [1, 2, 4])
+def test_a_video_that_shows_a_charuco_board_now_and_then_has_the_reasons_of_three_frames_only(
+    at_once, tmp_path, monkeypatch
+):
+    """However many frames are searched at a time."""
+    monkeypatch.setattr(photos_module, "_AT_ONCE", at_once)
     board = parse("charuco:5x4:40mm:30mm:DICT_4X4_50")
     camera = Camera("c", "s", (400, 300), np.array([[500.0, 0, 200], [0, 500, 150], [0, 0, 1]]), (), Pose.identity())
     seen = photograph(
@@ -135,11 +142,13 @@ def test_a_video_that_shows_a_charuco_board_now_and_then_has_the_reasons_of_thre
     wall = np.random.default_rng(0).integers(60, 190, seen.shape).astype(np.uint8)
     for k in range(12):
         cv2.imwrite(str(tmp_path / f"{k}.png"), seen + np.uint8(k) if k % 4 == 3 else np.roll(wall, k))
+    threads = cv2.getNumThreads()
     found = find_in_photos([tmp_path], board)
     assert [name for name, _ in found.views] == ["3.png", "7.png", "11.png"]
     quick = [name for name, reason in found.refused if reason == QUICK_SEARCH_FAILED.reason]
     assert quick == ["2.png", "5.png", "6.png", "8.png", "9.png", "10.png"]
     assert "(3 of 3, first 0.png)" in found.line()
+    assert cv2.getNumThreads() == threads
 
 
 def test_the_source_of_a_picture_follows_from_folder_video_or_name(picture):
