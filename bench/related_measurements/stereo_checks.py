@@ -3,11 +3,13 @@
     python -m bench.related_measurements.stereo_checks poses 5 10 20 30 --seed 1 --frames 12
     python -m bench.related_measurements.stereo_checks subsets 5 10 15 20 --seed 1 --markers 4
     python -m bench.related_measurements.stereo_checks errors --seed 1 --frames 30 [--covariance]
+    python -m bench.related_measurements.stereo_checks approach 15 5 --seed 1 --frames 100
 
-poses: NEES/6, bias and RMS by distance (m), time per frame, from ray-traced pictures. subsets: each choice of so many
-of the seven markers, alone at the start (three: after one frame with all). errors: one error of the stated calibration
-at a time, from centroids with .04 px noise; the verdict, what the calibration check names, and the NEES. covariance:
-pair.yaml states one (.2 px of each lens, .1 mm, .006 deg), which the errors exceed.
+poses: NEES/6, bias and RMS by distance (m), time per frame, from ray-traced pictures; each frame is a first one.
+subsets: each choice of so many of the seven markers, alone at the start (three: after one frame with all). errors: one
+error of the stated calibration at a time, from centroids with .04 px noise; the verdict, what the calibration check
+names, and the NEES. covariance: pair.yaml states one (.2 px of each lens, .1 mm, .006 deg), which the errors exceed.
+approach: frames per second.
 """
 
 from __future__ import annotations
@@ -79,6 +81,20 @@ def poses(distances: list[float], frames: int, seed: int, work: Path) -> None:
         print(
             f"{z:g} m: {len(results.measured)} of {frames} measured, {figures}, {1e3 * seconds / frames:.0f} ms/frame"
         )
+
+
+def along_approach(far: float, near: float, frames: int, seed: int, work: Path) -> None:
+    """Frames per second of one recording, the target of which comes nearer, from files to poses."""
+    rng = np.random.default_rng([seed, int(far), int(near)])
+    write_recording(work / "run", approach(frames, far, near, rng), true_eyes(), rng)
+    processed(work / "run")  # compiles
+    clock = time.perf_counter()
+    results, seconds = processed(work / "run")
+    took = time.perf_counter() - clock
+    print(
+        f"{far:g} to {near:g} m: {len(results.measured)} of {frames} measured; {frames / took:.0f} frames per second,"
+        f" {1e3 * seconds / frames:.0f} ms of process time per frame"
+    )
 
 
 def subsets(distances: list[float], markers: int, seed: int) -> None:
@@ -166,7 +182,7 @@ def errors(frames: int, seed: int, work: Path, sigmas: dict[str, float] | None) 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("poses", "subsets", "errors"))
+    parser.add_argument("what", choices=("poses", "subsets", "errors", "approach"))
     parser.add_argument("distances", nargs="*", type=float, default=[5.0, 10.0, 20.0])
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--frames", type=int, default=12)
@@ -178,6 +194,8 @@ def main() -> None:
             poses(given.distances, given.frames, given.seed, Path(work))
         elif given.what == "subsets":
             subsets(given.distances, given.markers, given.seed)
+        elif given.what == "approach":
+            along_approach(given.distances[0], given.distances[-1], given.frames, given.seed, Path(work))
         else:
             errors(given.frames, given.seed, Path(work), STATED if given.covariance else None)
 
