@@ -367,8 +367,9 @@ def one(seed: int, case: str, frames: int, true_labels: bool, clocks_s: float) -
         text += described(result.refined, true, level < Level.FAIL)
         if case == "all" and level < Level.FAIL:
             r = result.refined
+            given = replace(scenes[3], known_rig=r.rig, covariance=r.covariance)
             with tempfile.TemporaryDirectory() as name:
-                text += fourth(Path(name), scenes[3], true, replace(scenes[3], known_rig=r.rig, covariance=r.covariance), r)
+                text += fourth(Path(name), scenes[3], true, given, r)
         return f"{text} {reported}"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -392,7 +393,7 @@ def one(seed: int, case: str, frames: int, true_labels: bool, clocks_s: float) -
 
 
 def fourth(folder: Path, last: Scene, true: Rig, given: Scene, refined: Refinement, rig: Path | None = None) -> str:
-    """The fourth recording with the true and with the refined rig: figures. rig: a file that replaces that of `given`."""
+    """Figures of the fourth recording with the true and the refined rig. rig: a file that replaces that of `given`."""
     write_run_folder(replace(last, known_rig=true, covariance=None), folder / "true")
     write_run_folder(given, folder / "refined")
     if rig is not None:
@@ -415,7 +416,7 @@ def fourth(folder: Path, last: Scene, true: Rig, given: Scene, refined: Refineme
 
 
 def expected_errors(r: Refinement, last: Scene) -> tuple[float, float]:
-    """RMS of attitude, rad, and position, m, that the refined rig's covariance causes in a recording, no conventions."""
+    """RMS of attitude, rad, and position, m, that the rig's covariance causes in a recording, without conventions."""
     recording = with_true_labels(last)
     free = {name: np.zeros((len(v), v.dof), dtype=bool) for name, v in r.values.items()}
     for stack, i in r.at:

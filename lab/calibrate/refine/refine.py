@@ -50,7 +50,7 @@ COLUMNS = (
 _STEP = Step("refinement by recordings", (RESIDUALS,), RIG)
 # Frames of each run for the first solutions, at most and with a pose: each solution only has to be good enough to label
 # the frames of the next. While the rig is off by 10 px, half of the spots get no label and a frame takes 0.1 s.
-_FIRST_FRAMES = ((40, 20), (100, 100))
+_FIRST_FRAMES = ((40, 20), (100, 50))
 _STACKS_OF = {
     prior_sigmas.CAMERAS: (CAMERAS,), prior_sigmas.SCREENS: (SCREENS, BOWS), prior_sigmas.BEAMS: (BEAMS,),
     prior_sigmas.LENS: (INTRINSICS,), prior_sigmas.CLOCKS: (OFFSETS,), prior_sigmas.SHUTTER: (ROW_TIMES,),
