@@ -30,10 +30,12 @@ from bench.random_scenes.scene import Scene, composed, draw_prior, fitted_motion
 from bench.random_scenes.write_folder import write_run_folder
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.model_check.linearised_frames import ModelCheckRecording
-from calibration.rig.refinement import Refinement, refine
-from calibration.terms.rig_blocks import stacks_of
+from calibration.rig.recordings import RecordingTerm
+from calibration.rig.refinement import FEWEST_SPOTS, Refinement, refine
+from calibration.terms.rig_blocks import rig_of, stacks_of
 from geometry import rotations
 from geometry.arrays import Array, skew
+from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig
 from geometry.uncertainty.chi_square import chi2_limit
@@ -362,7 +364,13 @@ def one(seed: int, case: str, frames: int, true_labels: bool, clocks_s: float) -
         moved = "" if only is None else f" {naming(only, result.refined)}"
         reported = "; ".join(f"{f.code} {f.what}" for f in findings if f.level > 0)[:160]
         text = f"{level.name} in {time.process_time() - started:.1f} s{moved}"
-        return f"{text}{described(result.refined, true, level < Level.FAIL)} {reported}"
+        text += described(result.refined, true, level < Level.FAIL)
+        if case == "all" and level < Level.FAIL:
+            r = result.refined
+            given = replace(scenes[3], known_rig=r.rig, covariance=r.covariance)
+            with tempfile.TemporaryDirectory() as name:
+                text += fourth(Path(name), scenes[3], true, given, r)
+        return f"{text} {reported}"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for i, scene in enumerate(scenes[:3]):
@@ -379,21 +387,48 @@ def one(seed: int, case: str, frames: int, true_labels: bool, clocks_s: float) -
         written = (folder / "new" / "rig.yaml").is_file()
         out += described(refined, true, written)
         if written:
-            last = scenes[3]
-            write_run_folder(replace(last, known_rig=true, covariance=None), folder / "true")
-            process_run(folder / "true", folder / "true-out")
-            write_run_folder(replace(last, known_rig=true, covariance=None), folder / "refined")
-            (folder / "refined" / "rig.yaml").write_bytes((folder / "new" / "rig.yaml").read_bytes())
-            load_rig(folder / "refined" / "rig.yaml")
-            process_run(folder / "refined", folder / "refined-out")
-            (at, best, _), (with_it, ours, nees) = (pose_errors(folder / f"{n}-out", last) for n in ("true", "refined"))
-            both, i, k = np.intersect1d(at, with_it, return_indices=True)
-            poses = last.poses[both]
-            raw = rms(ours[k][:, 3:]) / rms(best[i][:, 3:])
-            a, b = without_frames(ours[k], poses), without_frames(best[i], poses)
-            out += f", attitude ratio {rms(a[:, 3:]) / rms(b[:, 3:]):.3f} position {rms(a[:, :3]) / rms(b[:, :3]):.3f}"
-            out += f" (with conventions {raw:.1f}), NEES/6 {np.mean(nees):.3f}, frames {len(with_it)} of {len(at)}"
+            given = replace(scenes[3], known_rig=true, covariance=None)
+            out += fourth(folder, scenes[3], true, given, refined, folder / "new" / "rig.yaml")
     return f"{out} {reported}"
+
+
+def fourth(folder: Path, last: Scene, true: Rig, given: Scene, refined: Refinement, rig: Path | None = None) -> str:
+    """Figures of the fourth recording with the true and the refined rig. rig: a file that replaces that of `given`."""
+    write_run_folder(replace(last, known_rig=true, covariance=None), folder / "true")
+    write_run_folder(given, folder / "refined")
+    if rig is not None:
+        (folder / "refined" / "rig.yaml").write_bytes(rig.read_bytes())
+        load_rig(folder / "refined" / "rig.yaml")
+    for name in ("true", "refined"):
+        process_run(folder / name, folder / f"{name}-out")
+    (at, best, _), (with_it, ours, nees) = (pose_errors(folder / f"{n}-out", last) for n in ("true", "refined"))
+    both, i, k = np.intersect1d(at, with_it, return_indices=True)
+    poses = last.poses[both]
+    raw = rms(ours[k][:, 3:]) / rms(best[i][:, 3:])
+    a, b = without_frames(ours[k], poses), without_frames(best[i], poses)
+    ratios, expected = np.array([rms(a[:, n]) / rms(b[:, n]) for n in (np.s_[3:], np.s_[:3])]), []
+    for part, e in zip((np.s_[3:], np.s_[:3]), expected_errors(refined, last), strict=True):
+        expected.append(np.sqrt(1 + (e / rms(b[:, part])) ** 2))
+    return (
+        f", attitude ratio {ratios[0]:.3f} position {ratios[1]:.3f} (expected {expected[0]:.3f}, {expected[1]:.3f};"
+        f" with conventions {raw:.1f}), NEES/6 {np.mean(nees):.3f}, frames {len(with_it)} of {len(at)}"
+    )
+
+
+def expected_errors(r: Refinement, last: Scene) -> tuple[float, float]:
+    """RMS of attitude, rad, and position, m, that the rig's covariance causes in a recording, without conventions."""
+    recording = with_true_labels(last)
+    free = {name: np.zeros((len(v), v.dof), dtype=bool) for name, v in r.values.items()}
+    for stack, i in r.at:
+        free[stack][i] = True
+    frames = np.flatnonzero(recording.usable.sum(axis=1) >= FEWEST_SPOTS)
+    term = RecordingTerm(r.given, recording.at(frames), free)
+    lin = term.reduced(r.values).lin
+    D = lin.pose_shift(lin.W @ term._derivatives(SpotModel.of(rig_of(r.given, r.values)), lin, r.values))
+    draws = np.random.default_rng(1).normal(size=(20, r.after.root.shape[1])) @ r.after.root.T
+    errors = [without_frames(D @ e, last.poses[frames]) for e in draws]
+    angle, place = (float(np.sqrt(np.mean([rms(e[:, part]) ** 2 for e in errors]))) for part in (np.s_[3:], np.s_[:3]))
+    return angle, place
 
 
 def main() -> None:

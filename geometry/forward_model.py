@@ -21,7 +21,7 @@ import numba
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints, cross, skew
-from geometry.camera import FISHEYE, in_picture, pinhole_numbers, project_points_full
+from geometry.camera import FISHEYE, Projected, in_picture, pinhole_numbers, project_points, project_points_full
 from geometry.compiled_projection import VIEW, Views, lens_codes, project_all
 from geometry.lens import padded, tilt_matrix
 from geometry.pose import Pose
@@ -228,26 +228,35 @@ class SpotModel:
         the fold of its lens. Pixels outside the picture are returned too. The pose and the Jacobian are as in `hits`.
         """
         R, t = world_from_body.rotation, world_from_body.translation
-        stack = np.broadcast_shapes(R.shape[:-2], t.shape[:-1])
+        stack = R.shape[:-2]
+        if stack != t.shape[:-1]:
+            stack = np.broadcast_shapes(stack, t.shape[:-1])
+            R, t = np.broadcast_to(R, (*stack, 3, 3)), np.broadcast_to(t, (*stack, 3))
         # Copies, because read-only arrays have another type for numba, which would compile a second time for them.
         uv, J = project_all(
             self.numbers,
-            np.array(np.broadcast_to(R, (*stack, 3, 3)), dtype=np.float64, order="C").reshape(-1, 3, 3),
-            np.array(np.broadcast_to(t, (*stack, 3)), dtype=np.float64, order="C").reshape(-1, 3),
+            np.array(R, dtype=np.float64, order="C").reshape(-1, 3, 3),
+            np.array(t, dtype=np.float64, order="C").reshape(-1, 3),
         )
         n = len(self)
         return uv.reshape(*stack, n, 2), J.reshape(*stack, n, 2, 6)
 
-    def derivatives(self, world_from_body: Pose) -> SpotDerivatives:
+    def derivatives(self, world_from_body: Pose, of_lens: bool = True) -> SpotDerivatives:
         """As `project`, with the derivatives by everything in the rig that a calibration determines.
 
         The pose may be a stack (...). Without a projection the pixel is nan and the derivatives are undefined.
+        of_lens: whether those by the numbers of the lenses are needed; otherwise they are 0.
         """
         m = self._intersect(world_from_body)
         R_c, R_s = self.camera_rotation, self.screen_rotation
         in_camera = (R_c @ m.hit[..., None])[..., 0] + self.camera_translation
         safe = np.where(m.good[..., None], in_camera, [0.0, 0.0, 1.0])
-        projected = project_points_full(safe, self.pinhole, self.distortion, self.fold_r2, self.fisheye)
+        lens = self.pinhole, self.distortion, self.fold_r2, self.fisheye
+        if of_lens:
+            projected = project_points_full(safe, *lens)
+        else:
+            none = [np.zeros((*safe.shape[:-1], 2, k)) for k in (4, 14)]
+            projected = Projected(*project_points(safe, *lens), *none)
         d_hit = projected.d_point @ R_c  # px per m of the lit point, in world
         # If the screen moves by delta at the lit point, the point moves along the ray by d (n.delta) / (n.d).
         carried = m.d[..., :, None] * (m.normal / m.along[..., None])[..., None, :]

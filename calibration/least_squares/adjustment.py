@@ -248,6 +248,7 @@ class Limits:
 
     steps: int = 60  # largest number of steps
     small_step_sigmas: float = 1e-3  # converged if a step is shorter than this, in sigmas of all unknowns together
+    damping: float = 1e-4  # of the first step, relative to the diagonal of the normal matrix
 
 
 class AdjustmentError(ValueError):
@@ -358,7 +359,7 @@ def solve(
     if not all(np.isfinite(line.residuals).all() for line in lines):
         raise AdjustmentError("some measurement cannot be predicted from the start values")
     cost = _cost(terms, lines)
-    damping = 1e-4
+    damping = limits.damping
     for _ in range(limits.steps):
         H, g = _normal_equations(terms, lines, columns)
         first = damping

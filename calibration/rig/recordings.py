@@ -41,6 +41,7 @@ from geometry.uncertainty.rig_uncertainty import unlimited
 
 STACKS = (INTRINSICS, CAMERAS, SCREENS, BOWS, BEAMS, OFFSETS, ROW_TIMES)
 _POSE_STEPS = 3  # Gauss-Newton steps of the poses: from 5 mrad and 10 mm the second one is shorter than 1e-6
+_LAST_STEP = 1e-6  # m, rad: the next one, which is about the square, is below rounding
 _LARGEST_STEP = np.array([0.3] * 3 + [0.2] * 3)  # m, rad: a pose that would move farther is not determined
 
 
@@ -68,6 +69,7 @@ class RecordingTerm:
     free: Mapping[str, Bools]  # per stack (k, dof): the numbers that are unknown
     at: tuple[At, ...] = field(init=False)  # the unknowns of which some number is free: p numbers in total
     loss: Loss | None = None
+    _last: list[tuple[Values, Reduced]] = field(init=False, repr=False, compare=False, default_factory=list)
 
     def __post_init__(self) -> None:
         at = [(s, int(i)) for s in STACKS if s in self.free for i in np.flatnonzero(self.free[s].any(axis=1))]
@@ -88,7 +90,9 @@ class RecordingTerm:
         return Linearised(np.full_like(residual, np.nan)[None] if lost else residual[None], parts)
 
     def reduced(self, values: Values) -> Reduced:
-        """The recording at these values of the rig, without its poses."""
+        """The recording at these values of the rig, without its poses. Of the last values it is kept."""
+        if self._last and self._last[0][0] is values:
+            return self._last[0][1]
         model = unlimited(SpotModel.of(rig_of(self.rig, values)))
         clocks = np.concatenate([array_of(values, s) for s in (OFFSETS, ROW_TIMES)], axis=1)[model.camera_of]
         lin = with_own_poses(model, with_clocks(model, self.recording, clocks))
@@ -98,11 +102,12 @@ class RecordingTerm:
         X, V = compressed(flat.T @ flat)
         y = V @ (flat.T @ left.ravel())
         rest = max(float(left.ravel() @ left.ravel() - y @ y), 0.0)
-        return Reduced(X, y, rest, lin.dof, lin, left)
+        self._last[:] = [(values, Reduced(X, y, rest, lin.dof, lin, left))]
+        return self._last[0][1]
 
     def _derivatives(self, model: SpotModel, lin: LinearisedFrames, values: Values) -> Array:
         """d(pixels)/d(unknowns) (K, n, 2, p); 0 for spots that are not used, and for numbers that are not free."""
-        d = model.derivatives(lin.poses)
+        d = model.derivatives(lin.poses, of_lens=any(stack == INTRINSICS for stack, _ in self.at))
         screens = list(self.rig.screens)
         screen_of = np.array([screens.index(self.rig.spots[s].screen) for _, s in model.views], dtype=np.int64)
         B = lines_in(values).basis[model.beam_of]
@@ -145,6 +150,8 @@ def with_own_poses(model: SpotModel, recording: ModelCheckRecording) -> Linearis
     for _ in range(_POSE_STEPS):
         lin = linearised_at(model, frames, poses, used, none, recording.uv_px, W)
         step = lin.pose_shift(lin.residual)
-        small = np.all(np.abs(step) < _LARGEST_STEP, axis=-1)
-        poses = poses.plus(np.where(small[:, None], step, 0.0))
+        step = np.where(np.all(np.abs(step) < _LARGEST_STEP, axis=-1, keepdims=True), step, 0.0)
+        poses = poses.plus(step)
+        if np.all(np.abs(step) < _LAST_STEP):
+            break
     return linearised_at(model, frames, poses, used, none, recording.uv_px, W)

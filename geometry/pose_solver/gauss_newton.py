@@ -13,6 +13,17 @@ from typing import Protocol
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints, symmetric
+from geometry.compilation.jit import compiled
+from geometry.compiled_linalg import (
+    apply,
+    dot,
+    multiply,
+    pose_minus,
+    pose_plus,
+    solve,
+    transposed_apply,
+    transposed_multiply,
+)
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.uncertainty.chi_square import chi2_limit
@@ -143,7 +154,7 @@ def fit_pose(
     fit = _fit(model, rows, pixels, covariances, start, common)
     if fit is None:
         return None
-    error_of_start = fit.world_from_body.minus(start)
+    error_of_start = pose_minus(*_arrays(fit.world_from_body), *_arrays(start))
     if np.linalg.norm(error_of_start[:3]) < NEAR_M and np.linalg.norm(error_of_start[3:]) < NEAR_RAD:
         return fit
     common = calibration.at(fit.world_from_body)
@@ -160,23 +171,20 @@ def _fit(
 ) -> PoseFit | None:
     """As `fit_pose`, with the covariance (2n, 2n), px^2, of all pixels due to the calibration's errors, or None."""
     if common is None:
-        W = whiten(covariances)
+        W = _blocks(whiten(covariances))
     else:
-        root = np.linalg.cholesky(_blocks(covariances) + common[np.ix_(coordinates_of(rows), coordinates_of(rows))])
-        W = np.linalg.inv(root)
-    pose, damping = start, 0.0
+        S = common[np.ix_(coordinates_of(rows), coordinates_of(rows))]
+        W = np.linalg.inv(np.linalg.cholesky(_blocks(covariances) + S))
+    pose, damping = Pose(*_arrays(start)), 0.0
     terms = _terms(model, rows, pixels, W, pose)
     if terms is None:
         return None
     H, g, cost, residuals, projected, J = terms
     for _ in range(_MOST_ITERATIONS):
-        scale = np.maximum(np.diagonal(H), 1e-12 * np.trace(H))
-        # The smallest damping affects only directions that no spot observes; elsewhere it is far below rounding.
-        step = np.asarray(np.linalg.solve(H + np.diag((damping + 1e-14) * scale), g), dtype=np.float64)
-        gain = float(step @ g)
+        step, gain = _damped_step(H, g, damping)
         if not np.isfinite(gain):
             return None
-        trial = pose.plus(step)
+        trial = Pose(*pose_plus(pose.rotation, pose.translation, step))
         trial_terms = _terms(model, rows, pixels, W, trial)
         if trial_terms is None or trial_terms[2] > cost * (1 + 1e-9) + 1e-12:
             damping = max(10 * damping, 1e-3)
@@ -193,7 +201,6 @@ def _fit(
     dof = 2 * len(rows) - 6
     K, systematic, share = np.zeros((6, 2 * len(rows))), np.zeros((6, 6)), 0.0
     if common is not None and observable:
-        S = common[np.ix_(coordinates_of(rows), coordinates_of(rows))]
         A = W @ J[rows].reshape(-1, 6)
         K = covariance @ A.T @ W
         systematic = symmetric(K @ S @ K.T)
@@ -234,20 +241,40 @@ def _terms(
 ) -> tuple[Array, Array, float, Array, Array, Array] | None:
     """Normal matrix (6, 6), right-hand side (6,), cost, residuals (m, 2), px, pixels (n, 2) and Jacobians (n, 2, 6).
 
-    W: whitening matrices (m, 2, 2) of independent spots, or (2m, 2m) of correlated ones. None if a spot has no
-    projection.
+    W (2m, 2m): whitening matrix. None if a spot has no projection.
     """
     projected, J = model.project(pose)
     residuals = pixels - projected[rows]
     if np.isnan(residuals).any():
         return None
-    if W.ndim == 3:
-        r = (W @ residuals[..., None])[..., 0].ravel()
-        A = (W @ J[rows]).reshape(-1, 6)
-    else:
-        r = W @ residuals.ravel()
-        A = W @ J[rows].reshape(-1, 6)
-    return A.T @ A, A.T @ r, float(r @ r), residuals, projected, J
+    H, g, cost = _normal_equations(W, np.ascontiguousarray(J[rows].reshape(-1, 6)), residuals.ravel())
+    return H, g, cost, residuals, projected, J
+
+
+@compiled
+def _normal_equations(W: Array, J: Array, residuals: Array) -> tuple[Array, Array, float]:
+    """Normal matrix (6, 6), right-hand side (6,) and cost of residuals (k,) with Jacobian J (k, 6), whitened by W."""
+    A, r = multiply(W, J), apply(W, residuals)
+    return transposed_multiply(A, A), transposed_apply(A, r), dot(r, r)
+
+
+@compiled
+def _damped_step(H: Array, g: Array, damping: float) -> tuple[Array, float]:
+    """Levenberg-Marquardt step (6,), and the cost that it gains; not finite where H (6, 6) is 0."""
+    A, trace = H.copy(), 0.0
+    for i in range(6):
+        trace += H[i, i]
+    for i in range(6):
+        # The smallest damping affects only directions that no spot observes; elsewhere it is far below rounding.
+        A[i, i] += (damping + 1e-14) * max(H[i, i], 1e-12 * trace)
+    x, _ = solve(A, g.copy().reshape(6, 1))
+    step = x[:, 0].copy()
+    return step, dot(step, g)
+
+
+def _arrays(pose: Pose) -> tuple[Array, Array]:
+    """Rotation and translation for compiled functions: copies, since read-only arrays are of another type."""
+    return np.array(pose.rotation, dtype=float, order="C"), np.array(pose.translation, dtype=float)
 
 
 def covariance_of(H: Array) -> tuple[Array, bool]:

@@ -97,7 +97,8 @@ def _moved_px(here: Mapping[str, Detections], before: Mapping[str, Detections]) 
     """How far a quarter of the points of a camera have moved at most, px; other points may be false."""
     pairs = ((found, before[name]) for name, found in here.items() if name in before)
     away = (np.linalg.norm(a.uv_px[:, None] - b.uv_px, axis=-1).min(axis=1) for a, b in pairs if len(a) and len(b))
-    return max((float(np.quantile(one, 0.25)) for one in away), default=0.0)
+    # As np.quantile, which takes .05 ms.
+    return max((float(np.interp((len(d) - 1) / 4, np.arange(len(d)), np.sort(d))) for d in away), default=0.0)
 
 
 def recorded_mistakes(run: Run, blocks: Sequence[Block], *, explained: bool = False) -> tuple[Finding, ...]:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from calibration.least_squares.adjustment import (
     AdjustmentError,
     Cauchy,
+    Limits,
     Linearised,
     Lines,
     Loss,
@@ -64,6 +65,31 @@ def dense(term: Linear, at: np.ndarray) -> np.ndarray:
 
 
 START = {"x": Vectors(np.zeros((7, 2))), "y": Vectors(np.zeros((1, 3)))}
+
+
+@dataclass
+class Counted:
+    """Two numbers whose difference is known to 1e-4 of their sum; how often it was linearised."""
+
+    count: int = 0
+    loss: Loss | None = None
+
+    def linearise(self, values: Values) -> Linearised:
+        self.count += 1
+        J = np.array([[1.0, 1.0], [1e-4, -1e-4]])
+        r = J @ values["x"].array[0] - J @ [3.0, 1.0] * 1e3
+        return Linearised(r[None], [Part("x", np.zeros(1, dtype=int), J[None])])
+
+
+def test_weak_directions_take_one_step_with_little_damping_and_several_with_the_usual_one():
+    counts = []
+    for limits in (Limits(), Limits(damping=1e-12)):
+        term = Counted()
+        found = solve({"x": Vectors(np.zeros((1, 2)))}, [term], {"x": True}, limits)
+        # The size of the last step is 1e-3 sigmas; the weak direction has sigmas of 7e3.
+        np.testing.assert_allclose(found.values["x"].array[0], [3e3, 1e3], atol=10)
+        counts.append(term.count)
+    assert counts[1] <= 3 < counts[0]
 
 
 @settings(max_examples=30)

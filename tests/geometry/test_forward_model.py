@@ -76,6 +76,19 @@ def test_the_compiled_and_the_numpy_implementation_agree(seed):
     np.testing.assert_allclose(found.pose[good], J[good], rtol=1e-9, atol=1e-9)
 
 
+@settings(max_examples=10, deadline=None)
+@given(seed=seeds)
+def test_derivatives_without_those_of_the_lens_are_the_others_unchanged(seed):
+    rng = np.random.default_rng(seed)
+    model, pose = SpotModel.of(uncommon_rig(rng)), random_pose(rng, 0.3, 0.3)
+    every, others = model.derivatives(pose), model.derivatives(pose, of_lens=False)
+    for name in ("pixels", "pose", "camera", "screen", "bow", "direction", "point"):
+        np.testing.assert_array_equal(getattr(others, name), getattr(every, name))
+    assert not others.pinhole.any()
+    assert not others.distortion.any()
+    assert every.pinhole.any()
+
+
 def test_most_spots_of_the_random_scenes_have_a_projection():
     """Otherwise the tests of this file would compare nan with nan."""
     rng = np.random.default_rng(7)

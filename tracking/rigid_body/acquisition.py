@@ -45,7 +45,7 @@ from tracking.rigid_body.hypotheses.hypothesis_set import (
     iterated_update,
 )
 from tracking.rigid_body.models.information import has_clocks
-from tracking.rigid_body.models.motion import predicted
+from tracking.rigid_body.models.motion import ANY_MOMENT, predicted
 from tracking.rigid_body.models.occlusion import MISSED, joint_log_likelihood, marginal, predict, update
 from tracking.statuses import Event
 
@@ -237,7 +237,7 @@ def predicted_hypothesis(h: Hypotheses, k: int, dt_s: float, dynamics: Dynamics,
     """Hypothesis k of the frame before, predicted over dt_s."""
     none = np.zeros(2)
     jumps = (dynamics.velocity_jump, dynamics.acceleration_jump) if manoeuvre else (none, none)
-    R, t, m, P, _ = predicted(h.R[k], h.t[k], h.m[k], h.P[k], dt_s, dynamics.jerk, *jumps)
+    R, t, m, P, _ = predicted(h.R[k], h.t[k], h.m[k], h.P[k], dt_s, dynamics.jerk, *jumps, *ANY_MOMENT)
     return State(R, t, m, P)
 
 

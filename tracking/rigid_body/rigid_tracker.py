@@ -23,7 +23,7 @@ from dataclasses import replace
 import numpy as np
 
 from geometry.arrays import Array, Ints
-from geometry.compiled_projection import Views, project_all
+from geometry.compiled_projection import Views
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
@@ -82,7 +82,13 @@ from tracking.rigid_body.hypotheses.hypothesis_set import (
     state_of,
 )
 from tracking.rigid_body.label_confirmation import FrameHypotheses, LabelConfirmation
-from tracking.rigid_body.models.information import clocks_of, has_clocks, picture_shifts, single_frame_pose
+from tracking.rigid_body.models.information import (
+    add_clock_errors,
+    clocks_of,
+    has_clocks,
+    picture_shifts,
+    single_frame_pose,
+)
 from tracking.rigid_body.models.occlusion import MISSED
 from tracking.rigid_body.online_estimates import AdaptiveProcessNoise, PointStatistics, VarianceFactor
 from tracking.statuses import Event, TrackedFrame
@@ -234,21 +240,12 @@ class RigidTracker:
         Each moves as the spot nearest to it. As noise of its own in each picture this error hardly biases the pose:
         along the motion the other cameras decide.
         """
-        uv, J = project_all(views, state.R[None], state.t[None])
-        speed = J[0] @ state.m[:6]
-        unknown2 = J[0] @ velocity_P @ np.swapaxes(J[0], -1, -2)
+        errors = [(0.0, 0.0, 0.0) if k is None else (k.sigma_s, k.row_sigma_s, k.middle_row) for k in self._clocks]
         cov = self._stated_cov.copy()
-        for c, clock in enumerate(self._clocks):
-            rows = slice(int(frame.first[c]), int(frame.first[c + 1]))
-            mine = np.flatnonzero((self._view_table.camera == c) & np.isfinite(uv[0]).all(axis=1))
-            if clock is None or rows.start == rows.stop or not len(mine):
-                continue
-            gap = np.linalg.norm(frame.uv[rows, None] - uv[0, mine], axis=-1)
-            nearest, variance = mine[gap.argmin(axis=1)], clock.variance_s2(frame.uv[rows, 1])
-            less = SEARCH_CLOCK_PX**2 / (0.5 * np.trace(unknown2[nearest], axis1=1, axis2=2) + 1e-12)
-            moved = speed[nearest][:, :, None] * speed[nearest][:, None, :]
-            cov[rows] += variance[:, None, None] * moved
-            cov[rows] += np.minimum(variance, less)[:, None, None] * unknown2[nearest]
+        add_clock_errors(
+            views, self._view_table.camera, np.array(errors), state.R, state.t, state.m, velocity_P, frame.first,
+            frame.uv, SEARCH_CLOCK_PX, cov,
+        )  # fmt: skip
         return cov
 
     def _at_candidate(self, obs: Observation, pose: Pose, unknown: Start) -> Observation:

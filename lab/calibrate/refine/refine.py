@@ -8,12 +8,14 @@ from __future__ import annotations
 import datetime
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calibration.least_squares.adjustment import AdjustmentError
+from calibration.model_check.linearised_frames import ModelCheckRecording
 from calibration.rig.refinement import Refinement, refine
 from calibration.terms.rig_blocks import BEAMS, BOWS, CAMERAS, INTRINSICS, OFFSETS, ROW_TIMES, SCREENS
 from geometry.forward_model import SpotModel
@@ -48,7 +50,7 @@ COLUMNS = (
 _STEP = Step("refinement by recordings", (RESIDUALS,), RIG)
 # Frames of each run for the first solutions, at most and with a pose: each solution only has to be good enough to label
 # the frames of the next. While the rig is off by 10 px, half of the spots get no label and a frame takes 0.1 s.
-_FIRST_FRAMES = ((40, 20), (100, 100))
+_FIRST_FRAMES = ((40, 20), (100, 50))
 _STACKS_OF = {
     prior_sigmas.CAMERAS: (CAMERAS,), prior_sigmas.SCREENS: (SCREENS, BOWS), prior_sigmas.BEAMS: (BEAMS,),
     prior_sigmas.LENS: (INTRINSICS,), prior_sigmas.CLOCKS: (OFFSETS,), prior_sigmas.SHUTTER: (ROW_TIMES,),
@@ -162,26 +164,25 @@ def _refined(
 ) -> RefinedRig:
     stages: tuple[tuple[int, ...], ...] = (*_FIRST_FRAMES, ())
 
-    def all_labelled(runs: Sequence[Run], stage: int) -> list[LabelledRun]:
-        out = []
-        for i, run in enumerate(runs):
-            if progress is not None:
-                progress(stage * len(runs) + i, len(stages) * len(runs), run.name)
-            out.append(labelled(run, *stages[stage], judged=stage > 0))
-        return out
+    def of_stage(run: Run, i: int, stage: int) -> LabelledRun:
+        if progress is not None:
+            progress(stage * len(runs) + i, len(stages) * len(runs), run.name)
+        return labelled(run, *stages[stage], judged=stage > 0)
 
     try:
-        now = list(runs)
-        for stage in range(len(_FIRST_FRAMES)):
-            some = all_labelled([tolerant(run) for run in now], stage)
+        now = rig, prior
+        latest: dict[int, ModelCheckRecording] = {}  # of each run
+        for stage, i in product(range(len(_FIRST_FRAMES)), range(len(runs))):
+            # Each run is labelled with what those before it have shown.
+            latest[i] = of_stage(tolerant(with_rig(runs[i], *now)), i, stage).in_views_of(rig)
             try:
-                start = refine(rig, prior, [r.in_views_of(rig) for r in some], stacks=stacks)
+                start = refine(rig, prior, list(latest.values()), stacks=stacks)
             except AdjustmentError:
-                if stage > 0:
+                if stage > 0 and i == len(runs) - 1:
                     raise
                 continue  # the first few frames have too few labels
-            now = [with_rig(run, start.rig, start.covariance) for run in runs]
-        second = all_labelled(now, len(_FIRST_FRAMES))
+            now = start.rig, start.covariance
+        second = [of_stage(with_rig(run, *now), i, len(_FIRST_FRAMES)) for i, run in enumerate(runs)]
         model = SpotModel.of(start.rig)
         recordings = [with_place_errors(r.in_views_of(rig), model) for r in second]
         refined = refine(rig, prior, recordings, start, stacks)

@@ -10,7 +10,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from lab.simulate.rigs import RIGS
 from tracking.detections import PictureClock
-from tracking.rigid_body.models.information import exposed_after, picture_shifts, timed_spot
+from tracking.rigid_body.models.information import add_clock_errors, exposed_after, picture_shifts, timed_spot
 from tracking.rigid_body.models.motion import state_after
 from tracking.smoothing.motion.run_detections import (
     Delays,
@@ -56,6 +56,24 @@ def test_the_covariance_of_a_shift_is_that_of_the_way_in_that_time():
     _, cov = picture_shifts(MODEL.numbers, MODEL.camera_of, clocks, R, T, np.zeros(12), np.eye(6) * 0.1**2)
     J = MODEL.project(Pose(R, T))[1]
     np.testing.assert_allclose(cov, (0.1 * 0.004) ** 2 * J @ np.swapaxes(J, 1, 2), rtol=1e-9)
+
+
+def test_an_unknown_instant_widens_each_point_along_the_way_of_its_spot():
+    clock = PictureClock(0.0, 1.5e-5, 511.5, 0.002, 2e-6)
+    late = np.flatnonzero(MODEL.camera_of == 1)
+    errors = np.array([[0.0, 0.0, 511.5], [clock.sigma_s, clock.row_sigma_s, clock.middle_row]])
+    spots, J = (a[late] for a in MODEL.project(Pose(R, T)))
+    speed, v = J @ M[:6], spots[:, 1]
+    cov, none, first = np.zeros((2 + len(late), 2, 2)), np.zeros((2, 2)), np.array([0, 2, 2 + len(late)])
+    uv = np.concatenate([none, spots + 0.1])  # two points of the first camera, whose clock is known
+    add_clock_errors(MODEL.numbers, MODEL.camera_of, errors, R, T, M, NO_P, first, uv, 8.0, cov)
+    np.testing.assert_array_equal(cov[:2], 0.0)
+    expected = clock.variance_s2(v + 0.1)[:, None, None] * speed[:, :, None] * speed[:, None, :]
+    np.testing.assert_allclose(cov[2:], expected, rtol=1e-9)
+    # What is open about the velocity adds the way in that time, up to a limit.
+    wide = np.zeros_like(cov)
+    add_clock_errors(MODEL.numbers, MODEL.camera_of, errors, R, T, 0 * M, np.eye(6) * 1e6, first, uv, 8.0, wide)
+    np.testing.assert_allclose(np.trace(wide[2:], axis1=1, axis2=2) / 2, 8.0**2, rtol=1e-9)
 
 
 def test_points_are_moved_to_their_frames_instant_as_their_spots_move():

@@ -253,6 +253,44 @@ def picture_shifts(
 
 
 @compiled
+def add_clock_errors(
+    views: Views, camera: Ints, errors: Array, R: Array, t: Array, m: Array, P: Array, first: Ints, uv: Array,
+    most_px: float, cov: Array,
+) -> None:  # fmt: skip
+    """Add the motion of points uv (d, 2) in the errors of their clocks to their covariances cov (d, 2, 2), px^2.
+
+    Each moves as the spot of its camera that is nearest to it. errors (cameras, 3): sigmas, s, of the delay and of the
+    row time, and the middle row; first (cameras + 1,): where the points of each camera begin; m, P: as of
+    `picture_shifts`. What P leaves open moves a point by at most most_px.
+    """
+    n = camera.shape[0]
+    at, J = np.empty((n, 2)), np.empty((n, 2, 6))
+    for i in range(n):
+        project_view(views, i, R, t, at[i], J[i])
+    for c in range(errors.shape[0]):
+        for d in range(first[c], first[c + 1]):
+            nearest, least = -1, np.inf
+            for i in range(n):
+                away = (uv[d, 0] - at[i, 0]) ** 2 + (uv[d, 1] - at[i, 1]) ** 2
+                if camera[i] == c and away < least:
+                    nearest, least = i, away
+            if nearest < 0:
+                continue
+            variance = errors[c, 0] ** 2 + ((uv[d, 1] - errors[c, 2]) * errors[c, 1]) ** 2
+            speed, open2 = np.zeros(2), np.zeros((2, 2))
+            for a in range(2):
+                for j in range(6):
+                    speed[a] += J[nearest, a, j] * m[j]
+                    for b in range(2):
+                        for k in range(6):
+                            open2[a, b] += J[nearest, a, j] * P[j, k] * J[nearest, b, k]
+            less = most_px**2 / (0.5 * (open2[0, 0] + open2[1, 1]) + 1e-12)
+            for a in range(2):
+                for b in range(2):
+                    cov[d, a, b] += variance * speed[a] * speed[b] + min(variance, less) * open2[a, b]
+
+
+@compiled
 def run_shifts(views: Views, camera: Ints, clocks: Array, R: Array, t: Array, m: Array) -> Array:
     """Shifts (T, n, 2), px, as of `picture_shifts`, of T frames: clocks (T, cameras, 3), R (T, 3, 3), t, m (T, 12)."""
     frames, n = t.shape[0], views.shape[0]

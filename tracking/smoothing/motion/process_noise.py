@@ -8,7 +8,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools
 from geometry.pose import Pose
-from tracking.rigid_body.models.motion import process_noise
+from tracking.rigid_body.models.motion import ANY_MOMENT, process_noise
 from tracking.rigid_body.online_estimates import jump_variance
 from tracking.smoothing.motion.fixed_interval import Interval
 from tracking.smoothing.motion.run_detections import Reference, speeds
@@ -287,6 +287,6 @@ def jump_sigmas(ref: Reference, dt: Array) -> Array:
     out = np.empty((len(dt), 6))
     for k in range(len(dt)):
         for i in range(2):
-            variance = process_noise(float(max(step[k], 1e-9)), 0.0, float(size[k, i]), 0.0)[0]
+            variance = process_noise(float(max(step[k], 1e-9)), 0.0, float(size[k, i]), 0.0, *ANY_MOMENT)[0]
             out[k, 3 * i : 3 * i + 3] = np.sqrt(variance)
     return out

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from tracking.rigid_body.models.motion import STATE, predicted
+from tracking.rigid_body.models.motion import ANY_MOMENT, STATE, predicted
 from tracking.rigid_body.online_estimates import MANOEUVRE_S, jump_variance
 from tracking.smoothing.motion.clocks import solve_clocks
 from tracking.smoothing.motion.fixed_interval import (
@@ -550,7 +550,7 @@ class _Estimator:
             at = (R[start].copy(), t[start].copy(), m[start] * flip[6:], P * np.outer(flip, flip))
             density = np.exp(log_density[start])
             for k, step in steps:
-                R_k, t_k, m_k, P_k, _ = predicted(*at, step, density, size, size / MANOEUVRE_S**2)
+                R_k, t_k, m_k, P_k, _ = predicted(*at, step, density, size, size / MANOEUVRE_S**2, *ANY_MOMENT)
                 at = (R_k, t_k, m_k, P_k)
                 R[k], t[k], m[k] = at[0], at[1], at[2] * flip[6:]
                 pose_P[k], motion_P[k] = at[3][:6, :6], at[3][6:12, 6:12]
