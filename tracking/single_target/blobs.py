@@ -50,7 +50,7 @@ def find_blobs(picture: Picture | NDArray[np.float32], parameters: BlobParameter
     sample = contrast[::_EVERY, ::_EVERY]
     sigma = max(float(_MAD_TO_SIGMA * np.median(np.abs(sample - np.median(sample)))), 0.3)  # 0.3 DN: rounding
     limit = max(parameters.threshold_sigma * sigma, parameters.threshold_share * float(contrast.max()))
-    mask = np.asarray(contrast > limit, dtype=np.uint8)
+    mask = _outlines(contrast, limit)
     if parameters.close_px > 1:
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (parameters.close_px, parameters.close_px))
         mask = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel), dtype=np.uint8)
@@ -60,6 +60,7 @@ def find_blobs(picture: Picture | NDArray[np.float32], parameters: BlobParameter
     h, w = picture.shape
     good = (longest >= parameters.min_size_px) & (longest <= parameters.max_size_px)
     good &= (left > 0) & (top > 0) & (left + wide < w) & (top + high < h)
+    good &= np.bincount(labels[contrast > limit], minlength=count) > 0
     good[0] = False  # the background
     for row in np.flatnonzero(good & (longest >= parameters.background_px)).tolist():
         x0, y0 = max(int(left[row]) - _RING_PX, 0), max(int(top[row]) - _RING_PX, 0)
@@ -79,6 +80,19 @@ def find_blobs(picture: Picture | NDArray[np.float32], parameters: BlobParameter
     weight = np.maximum(sign * (grey[v, u] - behind[of]), 0.0)
     found = _moments(u.astype(float), v.astype(float), of, weight, len(rows), sigma, limit)
     return found[np.argsort(-found.flux, kind="stable")]
+
+
+def _outlines(contrast: NDArray[np.float32], limit: float) -> NDArray[np.uint8]:
+    """The pixels (h, w) of blobs whose peak is above the limit: those above it, and above half of the peak.
+
+    Before a structured background the limit is near the peak: the pixels above it are a random part of the target.
+    """
+    count, labels = cv2.connectedComponents(np.asarray(contrast > 0.5 * limit, dtype=np.uint8), connectivity=8)
+    inside = labels > 0
+    peak = np.zeros(count, np.float32)
+    np.maximum.at(peak, labels[inside], contrast[inside])
+    least = np.where(peak > limit, np.minimum(0.5 * peak, limit), np.inf)
+    return np.asarray(contrast > least[labels], dtype=np.uint8)
 
 
 def _is_an_edge(
