@@ -21,6 +21,7 @@ class BlobParameters:
     polarity: Literal["darker", "brighter"] = "darker"
     background_px: int = 61  # px: side of the square whose mean is the background; larger than the target
     close_px: int = 5  # px: gaps up to this width join parts of a blob; 0: none
+    # With 6, parts of clouds are taken for the target: 34 false measurements per 1,000 frames before them, with 8 none.
     threshold_sigma: float = 8.0  # least contrast in sigmas of the background's noise ...
     threshold_share: float = 0.3  # ... and as a share of the picture's largest contrast: shadows are fainter
     min_size_px: float = 3.0  # px: longest side of the blob's box; below it is noise
@@ -87,13 +88,13 @@ def _outlines(contrast: NDArray[np.float32], limit: float) -> NDArray[np.uint8]:
 
     Before a structured background the limit is near the peak: the pixels above it are a random part of the target.
     """
-    count, parts = cv2.connectedComponents(np.asarray(contrast > 0.5 * limit, dtype=np.uint8), connectivity=8)
-    labels = parts.astype(np.int32)
-    inside = labels > 0
-    peak = np.zeros(count, np.float32)
-    np.maximum.at(peak, labels[inside], contrast[inside])
-    least = np.where(peak > limit, np.minimum(0.5 * peak, limit), np.inf)
-    return np.asarray(contrast > least[labels], dtype=np.uint8)
+    mask = np.asarray(contrast > 0.5 * limit, dtype=np.uint8)
+    count, labels = cv2.connectedComponents(mask, connectivity=8)
+    inside = mask > 0
+    of, values, peak = labels[inside].astype(np.int32), contrast[inside], np.zeros(count, np.float32)
+    np.maximum.at(peak, of, values)
+    mask[inside] = values > np.where(peak > limit, np.minimum(0.5 * peak, limit), np.inf)[of]
+    return mask
 
 
 def _is_an_edge(
