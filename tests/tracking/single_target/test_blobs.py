@@ -63,10 +63,13 @@ def test_the_stronger_blob_comes_first():
     np.testing.assert_allclose(found.uv_px, [(150, 90), (60, 80)], atol=0.2)
 
 
-def test_the_stated_sigma_is_that_of_the_noise():
-    centres = np.array([find_blobs(disc((100.2, 80.4), 9.0, seed=k), BlobParameters()).uv_px[0] for k in range(40)])
-    stated = np.sqrt(find_blobs(disc((100.2, 80.4), 9.0), BlobParameters()).cov_px2[0, 0, 0])
-    assert stated / 2.5 < centres[:, 0].std() < 1.5 * stated
+@pytest.mark.parametrize(("radius", "noise"), [(4.0, 1.5), (9.0, 1.5), (9.0, 5.0)])
+def test_the_stated_sigma_is_that_of_the_errors_at_all_places_between_the_pixels(radius, noise):
+    centres = np.array([100.0, 80.0]) + np.random.default_rng(3).uniform(-0.5, 0.5, (40, 2))
+    found = [find_blobs(disc(c, radius, noise=noise, seed=k), BlobParameters()) for k, c in enumerate(centres)]
+    errors = np.array([f.uv_px[0] for f in found]) - centres
+    stated = np.sqrt(np.mean([f.cov_px2[0, 0, 0] for f in found]))
+    assert stated / 2.5 < errors[:, 0].std() < 1.5 * stated
 
 
 @pytest.mark.parametrize("polarity", ["darker", "brighter"])

@@ -77,6 +77,33 @@ def test_a_black_target_in_pictures_is_tracked_through_missing_pictures(folder, 
     assert not any(word in page for word in ("http://", "https://", ">nan", "None"))
 
 
+def clouds(seed, sky=120.0, cloud=200.0):
+    """Broken clouds before the sky, (180, 240), DN, with structure of all sizes from 4 to 30 px."""
+    rng, out = np.random.default_rng(seed), np.zeros((180, 240))
+    for share, size_px in ((1.0, 30), (0.4, 10), (0.2, 4)):
+        part = cv2.GaussianBlur(rng.normal(size=out.shape), (0, 0), size_px)
+        out += share * (part - part.mean()) / part.std()
+    return sky + (cloud - sky) / (1 + np.exp(-6 * out))
+
+
+@pytest.mark.parametrize("detector", ["darker", "brighter"])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_disc_before_clouds_has_its_own_centre_in_all_frames_in_which_it_is_measured(detector, seed, tmp_path):
+    source, scene = tmp_path / "disc", clouds(seed)
+    source.mkdir()
+    v, u = np.mgrid[:180, :240]
+    for k in range(FRAMES):
+        cover = np.clip(6.5 - np.hypot(u - 2 * path_of(k)[0], v - path_of(k)[1]), 0, 1)
+        shown = scene * (1 - cover) + 25 * cover + np.random.default_rng(k).normal(0, 3, u.shape)
+        shown = np.clip(shown if detector == "darker" else 255 - shown, 0, 255).round().astype(np.uint8)
+        cv2.imwrite(str(source / f"{k:04d}.png"), shown)
+    CliRunner().invoke(main, ["track", "point", str(source), "--out", str(tmp_path / "out"), "--detector", detector])
+    places = {k: (r["u_px"], r["v_px"]) for k, r in enumerate(rows_of(tmp_path / "out")) if r["status"] == "measured"}
+    errors = [np.hypot(float(u) - 2 * path_of(k)[0], float(v) - path_of(k)[1]) for k, (u, v) in places.items()]
+    assert len(errors) >= 5
+    assert max(errors) < 0.5
+
+
 def test_the_summary_has_what_other_results_have(folder, tmp_path):
     track_target(PointTarget(PointOptions("darker")), folder, tmp_path / "out")
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
