@@ -7,7 +7,7 @@ python -m bench.related_measurements.second_checks consistency SEED COUNT   erro
 python -m bench.related_measurements.second_checks approaches SEED COUNT    approaching drogues, by the light tracker
 python -m bench.related_measurements.second_checks detector SEED COUNT [WEIGHTS]  COUNT drogues of each scene
 python -m bench.related_measurements.second_checks third SEED COUNT [WEIGHTS]  the same with the renderer of validation
-python -m bench.related_measurements.second_checks point SEED COUNT         discs by the point tracker, hidden twice
+python -m bench.related_measurements.second_checks point SEED COUNT [NAME=NUMBER]   discs by the point tracker
 """
 
 from __future__ import annotations
@@ -264,8 +264,10 @@ def third(seed: int, count: int, weights: Path = WEIGHTS) -> None:
     detector(seed, count, weights, third_renderer)
 
 
-def point(seed: int, count: int) -> None:
+def point(seed: int, count: int, setting: str = "") -> None:
     """Discs of 3 to 8 px radius, 150 frames each, hidden for 10 and for 20: errors, gaps, false measurements."""
+    name, _, value = setting.partition("=")
+    overrides = {name: float(value) if "." in value else int(value)} if setting else {}
     gaps, late, false, frames, nees, errors = 0, [], 0, 0, [], []
     for n in range(count):
         rng = np.random.default_rng(1000 * seed + n)
@@ -273,7 +275,7 @@ def point(seed: int, count: int) -> None:
         scene, look = render.background(kind, rng), render.face("plain", rng)
         bright = look.bright > 100 and kind == "sky"  # clouds are as bright as that
         look = render.replace(look, bright=scene.max() + 45 if bright else min(look.bright, 50.0))
-        settings = PointOptions("brighter" if bright else "darker").settings()
+        settings = PointOptions("brighter" if bright else "darker", overrides=overrides).settings()
         circles, tracker, waits = motion(rng, True, (3.0, 8.0)), PointTracker(settings.track), None
         for k in range(150):
             circle = next(circles)
@@ -313,6 +315,8 @@ if __name__ == "__main__":
     }
     if what in checks and len(rest) == 2:
         checks[what](int(rest[0]), int(rest[1]))
+    elif what == "point" and len(rest) == 3:
+        point(int(rest[0]), int(rest[1]), rest[2])
     elif what in ("detector", "third") and len(rest) == 3:
         (third if what == "third" else detector)(int(rest[0]), int(rest[1]), Path(rest[2]))
     else:

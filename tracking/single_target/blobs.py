@@ -21,7 +21,8 @@ class BlobParameters:
     polarity: Literal["darker", "brighter"] = "darker"
     background_px: int = 61  # px: side of the square whose mean is the background; larger than the target
     close_px: int = 5  # px: gaps up to this width join parts of a blob; 0: none
-    # With 6, parts of clouds are taken for the target: 34 false measurements per 1,000 frames before them, with 8 none.
+    # With 6, parts of clouds are taken for the target: 25 false measurements per 1,000 frames, with 8 none
+    # (second_checks point 93 40 blobs.threshold_sigma=6.0).
     threshold_sigma: float = 8.0  # least contrast in sigmas of the background's noise ...
     threshold_share: float = 0.3  # ... and as a share of the picture's largest contrast: shadows are fainter
     min_size_px: float = 3.0  # px: longest side of the blob's box; below it is noise
