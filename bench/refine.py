@@ -1,7 +1,7 @@
 """Rigs refined from recordings, against the true rig: `python -m bench.refine --seeds 1:41`.
 
 Each seed is a random lab (bench/random_scenes) and four recordings of points. The program is given a rig that is off by
-a draw of its stated sigmas, refines it from three recordings, and measures the fourth with the result. The offsets of
+a draw of its stated sigmas, refines it from three recordings, and measures a fourth with the result. The offsets of
 all cameras but the first, whose instants are the recordings' own, are off as well. Printed per rig: RMS of the poses of
 the fourth recording over that with the true rig, NEES of the rig and of the poses, and the verdict.
 The projection and the errors of the rig (about each camera's own centre) share no code with the program.
@@ -338,10 +338,10 @@ def described(refined: Refinement, true: Rig, used: bool) -> str:
     return f"{', CONFIDENT AND WRONG' * wrong}, rig NEES {nees:.3f} of {count}, {determined}"
 
 
-def one(seed: int, case: str, frames: int, true_labels: bool, clocks_s: float) -> str:
-    """A rig refined and used; a line of figures."""
+def one(seed: int, case: str, frames: int, true_labels: bool, clocks_s: float, recordings: int = 3) -> str:
+    """A rig refined by so many recordings and used in another one; a line of figures."""
     s = Sigmas(clocks=clocks_s)
-    lab, scenes, _ = campaign(seed, frames, clocks_s=s.clocks, case=case)
+    lab, scenes, _ = campaign(seed, frames, recordings + 1, s.clocks, case)
     rng = np.random.default_rng([seed, RIG])
     true, only = lab.rig, None
     if case == MOVED:
@@ -356,7 +356,7 @@ def one(seed: int, case: str, frames: int, true_labels: bool, clocks_s: float) -
     if true_labels:
         started = time.process_time()
         try:
-            result = refined_with_true_labels(known, covariance, scenes[:3])
+            result = refined_with_true_labels(known, covariance, [*scenes[:3], *scenes[4:]])
         except AdjustmentError as error:
             return f"refused in {time.process_time() - started:.1f} s: {error}"
         findings = refine_findings(result)
@@ -439,12 +439,13 @@ def main() -> None:
     parser.add_argument("--case", default="all", choices=CASES)
     parser.add_argument("--true-labels", action="store_true", help="without the tracker, and without clocks")
     parser.add_argument("--clocks", type=float, default=2e-3, metavar="SECONDS", help="sigma of the clocks' offsets")
+    parser.add_argument("--recordings", type=int, default=3, help="that refine, with --true-labels")
     a = parser.parse_args()
     first, _, last = a.seeds.partition(":")
     count: Counter[str] = Counter()
     for seed in range(int(first), int(last) if last else int(first) + 1):
         clocks_s = 0.0 if a.true_labels or a.case != "all" else a.clocks
-        text = one(seed, a.case, a.frames, a.true_labels, clocks_s)
+        text = one(seed, a.case, a.frames, a.true_labels, clocks_s, a.recordings)
         count.update(
             f"{kind} {word}" for kind in ("cameras", "screens", "beams") for word in NAMINGS
             if f" {kind} " in text.split("(")[0] and f" {word} (" in text
