@@ -28,15 +28,19 @@ from tracking.parameters import DetectParameters
 
 _SPACING = VIDEO_FRAMES // PICTURES  # pictures from one that is kept to the next, at first
 _UNFIT = 20  # consecutive pictures that do not fit the background after which the camera or the light has changed
-_NICE = 10  # priority of the process where it cannot run in idle time only: a background may come later, a pose may not
+_NICE = 10  # priority of the process: a background may come later, a pose may not
 ENDED = (OSError, EOFError, pickle.UnpicklingError)
 _PROTOCOL = 5  # of pickle: arrays are written and read in place, and the interpreter is free meanwhile
 
 
 @dataclass(slots=True)
 class FunctionProcess:
-    """Calls functions in another process, one at a time. Used as a context manager."""
+    """Calls functions in another process, one at a time. Used as a context manager.
 
+    in_idle_time: only while a core is idle, where the system knows such a priority.
+    """
+
+    in_idle_time: bool = False
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _process: subprocess.Popen[bytes] | None = None
     _ended: bool = False
@@ -72,7 +76,8 @@ class FunctionProcess:
             # Not multiprocessing, which would run the program's main module again. The imports take a second of a core.
             program = (
                 "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN);"  # Ctrl-C: the watch decides
-                " hasattr(os, 'SCHED_IDLE') and os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0));"
+                f" {self.in_idle_time} and hasattr(os, 'SCHED_IDLE')"
+                " and os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0));"
                 f" hasattr(os, 'nice') and os.nice({_NICE}); sys.path[:] = {sys.path!r};"
                 f" from {__name__} import serve; serve()"
             )

@@ -95,7 +95,7 @@ def watch_run(
         output = LiveOutput(Path(out), frames, FrameChecks(run.rig, run.covariance), sending, board, line)
         stack.callback(output.close)
         with frames, _low_latency():
-            pipeline, finders = _started(run, frames, output, stack.enter_context(FunctionProcess()))
+            pipeline, finders = _started(run, frames, output, stack.enter_context(FunctionProcess(True)))
             if reprocess:
                 for done, _ in enumerate(pipeline.records(), start=1):
                     if progress is not None:
