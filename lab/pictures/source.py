@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 AHEAD = 8  # pictures of a camera read before they are requested: 10 MB of 1280x1024, whatever the recording's length
 KEPT_BYTES = 1 << 25  # of a camera's pictures that are read before the others
-THREADS = min(4, os.cpu_count() or 1)  # pictures decoded at once
+THREADS = min(4, os.cpu_count() or 1)  # pictures decoded or searched for boards, and cameras prepared, at once: memory
 _LARGEST_COUNT = 2**40  # of pictures in a video's header; a larger one is wrong
 _RATE_RANGE_HZ = (0.01, 1e6)  # a rate outside it in a video's header is not one
 _LAST_NUMBER = re.compile(r"([0-9]+)[^0-9]*$")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import glob
 import hashlib
-import os
 import re
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -25,6 +24,7 @@ from geometry.arrays import Array, Ints
 from lab.errors import InputError
 from lab.files.text.csv_text import read_table
 from lab.files.text.json_text import text_of_file
+from lab.pictures import source
 from lab.pictures.picture_file import PICTURE_SUFFIXES, UNREADABLE, GreyPicture, MissingPicture, read_picture
 from lab.pictures.source import pictures, video_at
 from lab.progress import Progress
@@ -39,7 +39,6 @@ _THOROUGH_SEARCHES = 2
 # For the other types the quick search misses no board; it only gives no reason, and three reasons are enough: ten took
 # two thirds of the time of a video.
 _REASONS = 3
-_AT_ONCE = min(os.cpu_count() or 1, 4)  # pictures that are searched at a time: each takes up to ten times its memory
 _DUPLICATE = "the same picture as "
 
 
@@ -168,7 +167,7 @@ class _Search:
     quick: list[str] = field(default_factory=list)  # pictures without a board after the quick search alone
     _without: int = 0  # pictures without a board after the thorough search
     _waiting: deque[tuple[str, GreyImage, bool, Future[BoardView | NotFound]]] = field(default_factory=deque)
-    _pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(_AT_ONCE))
+    _pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(source.THREADS))
     _threads: int = field(default_factory=cv2.getNumThreads)  # of OpenCV
 
     def __enter__(self) -> _Search:
@@ -181,7 +180,7 @@ class _Search:
 
     def search(self, name: str, picture: GreyPicture) -> None:
         """Search a picture; until one shows the board, one by one."""
-        self.settle(_AT_ONCE - 1 if self.views else 0)
+        self.settle(source.THREADS - 1 if self.views else 0)
         image, thorough = as_8_bit(picture), self._is_thorough(sum(waiting[2] for waiting in self._waiting))
         self._waiting.append((name, image, thorough, self._pool.submit(find_board, image, self.board, thorough)))
 

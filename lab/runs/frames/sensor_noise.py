@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,6 +13,7 @@ import numpy as np
 from geometry.arrays import evenly_spread
 from geometry.camera import SensorNoise
 from lab.files.run.run_file import Run
+from lab.pictures import source as picture_source
 from lab.pictures.source import PictureFiles, PictureSource, pictures_of_frames
 from lab.runs.frames.frames import FrameReader
 from tracking.background.estimation import PICTURES, static_background
@@ -28,7 +28,6 @@ from tracking.parameters import DetectParameters
 
 VIDEO_PICTURES = (0, 1, 8, 9, 16, 17)  # used for the estimate: the end of a video cannot be read without all of it
 VIDEO_FRAMES = 60  # at the start of a video from which its static background is made
-_AT_ONCE = 4  # cameras whose backgrounds are made at the same time: each takes up to 40 pictures of memory
 _BLANK = 3  # consecutive pictures without any point after which the noise model is checked
 _BLANK_AGAIN = 50  # it is checked again after this many more
 _CONTRADICTION = 2.0  # ratio of the stated to the estimated background variance from which a note is made
@@ -194,7 +193,7 @@ def _scalars(model: NoiseModel) -> dict[str, Any]:
 def camera_noises(run: Run, reader: FrameReader) -> dict[str, CameraNoise]:
     """Each camera's noise at the start of a run; cameras with tables of points have no entry."""
     out = {name: CameraNoise(name, own.noise) for name, own in run.rig.cameras.items() if name in reader.sources}
-    with ThreadPoolExecutor(min(max(len(out), 1), os.cpu_count() or 1, _AT_ONCE)) as pool:
+    with ThreadPoolExecutor(picture_source.THREADS) as pool:  # each camera takes up to 40 pictures of memory
         list(pool.map(lambda own: _prepare(own, run, reader.sources[own.camera]), out.values()))
     share_texture(list(out.values()))
     return out

@@ -16,6 +16,7 @@ from geometry.pose import Pose
 from lab.calibrate.camera import photos as photos_module
 from lab.calibrate.camera.photos import PhotoSet, as_8_bit, find_in_photos, load_photos, origins_of
 from lab.errors import InputError
+from lab.pictures import source
 from lab.simulate.board_photo import PhotoSettings, photograph
 
 BOARD = parse("chessboard:9x6:25mm")
@@ -100,7 +101,7 @@ def test_copies_of_a_picture_without_a_board_do_not_hide_the_reason(tmp_path):
 @pytest.mark.parametrize("at_once", [1, 4])
 def test_only_the_first_pictures_without_a_board_are_searched_thoroughly(at_once, tmp_path, picture, monkeypatch):
     """Once a picture shows the board, the others are searched thoroughly too, so that no board is missed."""
-    monkeypatch.setattr(photos_module, "_AT_ONCE", at_once)
+    monkeypatch.setattr(source, "THREADS", at_once)
     searches = []
     wall = np.random.default_rng(0).integers(60, 190, picture.shape).astype(np.uint8)
 
@@ -133,7 +134,7 @@ def test_a_video_that_shows_a_charuco_board_now_and_then_has_the_reasons_of_thre
     at_once, tmp_path, monkeypatch
 ):
     """However many frames are searched at a time."""
-    monkeypatch.setattr(photos_module, "_AT_ONCE", at_once)
+    monkeypatch.setattr(source, "THREADS", at_once)
     board = parse("charuco:5x4:40mm:30mm:DICT_4X4_50")
     camera = Camera("c", "s", (400, 300), np.array([[500.0, 0, 200], [0, 500, 150], [0, 0, 1]]), (), Pose.identity())
     seen = photograph(
