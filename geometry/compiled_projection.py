@@ -243,6 +243,44 @@ def _distorted(v: Views, i: int, x: float, y: float) -> tuple[float, float, floa
     return bx, by, a, b, c, e
 
 
+@compiled
+def undistort_all(v: Views, target: Array) -> Array:
+    """Normalised points (n, 2) whose distortion by the polynomial lens of v[0] is `target` (n, 2); nan without one.
+
+    Newton's method from the target itself. Each step is shortened until the point stays inside the fold and the
+    residual does not grow.
+    """
+    lens = v[0]
+    limit = np.sqrt(lens["fold_r2"]) * (1 - 1e-9)
+    out = np.empty_like(target)
+    for i in range(len(target)):
+        radius = np.sqrt(target[i, 0] ** 2 + target[i, 1] ** 2)
+        inside_fold = min(1.0, 0.7 * limit / max(radius, 1e-300))
+        x, y = target[i, 0] * inside_fold, target[i, 1] * inside_fold
+        bx, by, xx, xy, yx, yy = _distorted(v, 0, x, y)
+        du, dv = target[i, 0] - bx, target[i, 1] - by
+        for _ in range(60):
+            det = xx * yy - xy * yx
+            if abs(det) < 1e-12:
+                det = 1e-12
+            step_x, step_y = (yy * du - xy * dv) / det, (xx * dv - yx * du) / det
+            moved = False
+            for _ in range(12):
+                px, py = x + step_x, y + step_y
+                bx, by, axx, axy, ayx, ayy = _distorted(v, 0, px, py)
+                eu, ev = target[i, 0] - bx, target[i, 1] - by
+                if eu * eu + ev * ev <= du * du + dv * dv and np.sqrt(px * px + py * py) < limit:
+                    x, y, xx, xy, yx, yy, du, dv = px, py, axx, axy, ayx, ayy, eu, ev
+                    moved = abs(step_x) > 1e-15 or abs(step_y) > 1e-15
+                    break
+                step_x, step_y = step_x / 2, step_y / 2
+            if not moved:
+                break
+        found = np.sqrt(du * du + dv * dv) < 1e-9 and x * x + y * y < lens["fold_r2"] and xx * yy - xy * yx > 0.0
+        out[i, 0], out[i, 1] = (x, y) if found else (np.nan, np.nan)
+    return out
+
+
 def lens_codes(distortion: Array, fisheye: Bools) -> Array:
     """The field `lens` of VIEW (n,), from distortion numbers (n, 14) and whether they are the fisheye model's (n,)."""
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.polynomial import polynomial as poly
 
 from geometry.arrays import Array, Bools
+from geometry.compiled_projection import VIEW, lens_codes, undistort_all
 
 N_DISTORTION = 14
 ALLOWED_LENGTHS = (0, 4, 5, 8, 12, 14)
@@ -246,55 +247,15 @@ def fisheye_fold_limit(distortion: tuple[float, ...]) -> float:
 
 
 def undistort(target: Array, coefficients: Array, fold_r2: float, fisheye: bool = False) -> Array:
-    """Normalised points (n, 2) whose distortion is `target` (n, 2); nan where there is none inside the fold.
-
-    Newton's method from the target itself. Each step is shortened until the point stays inside the fold and the
-    residual decreases.
-    """
-    target = np.asarray(target, dtype=float)
+    """Normalised points (n, 2) whose distortion is `target` (n, 2); nan where there is none inside the fold."""
+    target = np.array(target, dtype=np.float64, order="C")
     coefficients = np.asarray(coefficients, dtype=float)
-    if not np.any(coefficients) and not fisheye:
-        return target.copy()
     if fisheye:
         return _undistort_fisheye(target, coefficients, fold_r2)
-    r_limit = np.sqrt(fold_r2) * (1 - 1e-9)
-    radius = np.linalg.norm(target, axis=-1, keepdims=True)
-    x = target * np.minimum(1.0, 0.7 * r_limit / np.maximum(radius, 1e-300))
-    out, J = distort(x, coefficients)
-    residual = target - out
-    left = np.arange(len(x))  # points that still move
-    for _ in range(60):
-        step = _newton_step(J[left], residual[left])
-        size = np.sum(residual[left] ** 2, axis=-1)
-        moved = np.zeros(len(left), dtype=bool)
-        trying = np.arange(len(left))
-        for _ in range(12):
-            which = left[trying]
-            trial = x[which] + step[trying]
-            t_out, t_J = distort(trial, coefficients)
-            t_residual = target[which] - t_out
-            worse = (np.sum(t_residual * t_residual, -1) > size[trying]) | ~(np.linalg.norm(trial, axis=-1) < r_limit)
-            better = ~worse
-            x[which[better]], residual[which[better]], J[which[better]] = trial[better], t_residual[better], t_J[better]
-            moved[trying[better]] = (np.abs(step[trying[better]]) > 1e-15).any(-1)
-            trying = trying[worse]
-            if not len(trying):
-                break
-            step[trying] /= 2
-        left = left[moved]
-        if not len(left):
-            break
-    good = (np.linalg.norm(residual, axis=-1) < 1e-9) & is_one_to_one(x, J, np.asarray(fold_r2))
-    return np.where(good[:, None], x, np.nan)
-
-
-def _newton_step(J: Array, residual: Array) -> Array:
-    """Solutions (n, 2) of J (n, 2, 2) step = residual (n, 2)."""
-    det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-    det = np.where(np.abs(det) < 1e-12, 1e-12, det)
-    u = J[..., 1, 1] * residual[..., 0] - J[..., 0, 1] * residual[..., 1]
-    v = J[..., 0, 0] * residual[..., 1] - J[..., 1, 0] * residual[..., 0]
-    return np.stack([u / det, v / det], axis=-1)
+    lens = np.zeros(1, VIEW)
+    lens["distortion"], lens["tilt"], lens["fold_r2"] = coefficients, tilt_matrix(*coefficients[-2:]), fold_r2
+    lens["lens"] = lens_codes(coefficients, np.asarray(False))
+    return undistort_all(lens, target)
 
 
 def _undistort_fisheye(target: Array, coefficients: Array, fold_r2: float) -> Array:
