@@ -256,11 +256,12 @@ class RigPlan:
         )
 
 
+MOST_PLANS = 128  # kept; the mistakes of a set-up (tracking/setup_mistakes) are 60 rigs that are searched in turn
 _plans: list[tuple[Rig, int, bytes, RigPlan]] = []
 
 
 def plan_of(rig: Rig, model: SpotModel, min_spots: int) -> RigPlan:
-    """The plan of a rig, cached for the last few rigs; `model` is made of the rig.
+    """The plan of a rig, cached for the last rigs; `model` is made of the rig.
 
     Runs that are processed one after the other mostly have the same rig, each read from its file.
     """
@@ -271,7 +272,7 @@ def plan_of(rig: Rig, model: SpotModel, min_spots: int) -> RigPlan:
     equal = (plan for _, _, known, plan in _plans if known == content)
     plan = next(equal, None) or RigPlan.of(rig, model, min_spots)
     _plans.insert(0, (rig, min_spots, content, plan))
-    del _plans[8:]
+    del _plans[MOST_PLANS:]
     return plan
 
 
