@@ -13,7 +13,7 @@ import numpy as np
 from numpy.polynomial import polynomial as poly
 
 from geometry.arrays import Array, Bools
-from geometry.compiled_projection import VIEW, lens_codes, undistort_all
+from geometry.compiled_projection import VIEW, distort_all, lens_codes, undistort_all
 
 N_DISTORTION = 14
 ALLOWED_LENGTHS = (0, 4, 5, 8, 12, 14)
@@ -31,31 +31,21 @@ def distort(xy: Array, coefficients: Array) -> tuple[Array, Array]:
 
     xy (..., 2): X/Z and Y/Z in the camera frame. coefficients (..., 14), broadcast against the points' leading axes.
     """
-    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tau_x, tau_y = np.moveaxis(coefficients, -1, 0)
-    x, y = xy[..., 0], xy[..., 1]
-    r2 = x * x + y * y
-    numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    radial = numerator / denominator
-    # Derivatives with respect to r2.
-    d_numerator = k1 + r2 * (2 * k2 + 3 * r2 * k3)
-    d_denominator = k4 + r2 * (2 * k5 + 3 * r2 * k6)
-    d_radial = (d_numerator - radial * d_denominator) / denominator
-    prism_x, prism_y = r2 * (s1 + r2 * s2), r2 * (s3 + r2 * s4)
-    d_prism_x, d_prism_y = s1 + 2 * r2 * s2, s3 + 2 * r2 * s4
-
-    out = np.empty(np.broadcast_shapes(xy.shape, (*np.shape(k1), 2)))
-    out[..., 0] = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + prism_x
-    out[..., 1] = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + prism_y
-    J = np.empty((*out.shape, 2))
-    mixed = 2 * x * y * d_radial + 2 * p1 * x + 2 * p2 * y
-    J[..., 0, 0] = radial + 2 * x * x * d_radial + 2 * p1 * y + 6 * p2 * x + 2 * x * d_prism_x
-    J[..., 0, 1] = mixed + 2 * y * d_prism_x
-    J[..., 1, 0] = mixed + 2 * x * d_prism_y
-    J[..., 1, 1] = radial + 2 * y * y * d_radial + 6 * p1 * y + 2 * p2 * x + 2 * y * d_prism_y
+    out, J = _in_rows(xy, coefficients, fisheye=False)
+    tau_x, tau_y = coefficients[..., 12], coefficients[..., 13]
     if np.any(tau_x) or np.any(tau_y):
         return _tilt(out, J, tau_x, tau_y)
     return out, J
+
+
+def _in_rows(xy: Array, coefficients: Array, fisheye: bool) -> tuple[Array, Array]:
+    """`distort_all` of stacks of points (..., 2), with coefficients (..., 14) broadcast against them."""
+    stack = np.broadcast_shapes(xy.shape[:-1], coefficients.shape[:-1])
+    k = coefficients if coefficients.ndim == 1 else np.broadcast_to(coefficients, (*stack, N_DISTORTION))
+    # Copies, because read-only arrays have another type for numba, which would compile a second time for them.
+    points = np.array(np.broadcast_to(xy, (*stack, 2)), dtype=np.float64, order="C").reshape(-1, 2)
+    out, J = distort_all(points, np.array(k, dtype=np.float64, order="C").reshape(-1, N_DISTORTION), fisheye)
+    return out.reshape(*stack, 2), J.reshape(*stack, 2, 2)
 
 
 def _tilt(xy: Array, J: Array, tau_x: Array, tau_y: Array) -> tuple[Array, Array]:
@@ -211,19 +201,7 @@ def distort_fisheye(xy: Array, coefficients: Array) -> tuple[Array, Array]:
 
     coefficients (..., 14): k1, k2, k3, k4 and zeros. Source: OpenCV, calib3d, "Fisheye camera model".
     """
-    k = coefficients
-    r2 = np.sum(xy * xy, axis=-1)
-    on_axis = r2 < 1e-16
-    r = np.sqrt(np.where(on_axis, 1.0, r2))
-    t = np.arctan(r)
-    t2 = t * t
-    td = t * (1 + t2 * (k[..., 0] + t2 * (k[..., 1] + t2 * (k[..., 2] + t2 * k[..., 3]))))
-    d_td = 1 + t2 * (3 * k[..., 0] + t2 * (5 * k[..., 1] + t2 * (7 * k[..., 2] + t2 * 9 * k[..., 3])))
-    scale = np.where(on_axis, 1.0, td / r)
-    # (d(scale)/dr) / r, the factor of the outer product of xy.
-    growth = np.where(on_axis, 0.0, (d_td / (1 + r * r) - td / r) / (r * r))
-    J = scale[..., None, None] * np.eye(2) + growth[..., None, None] * xy[..., :, None] * xy[..., None, :]
-    return scale[..., None] * xy, J
+    return _in_rows(xy, coefficients, fisheye=True)
 
 
 def fisheye_coefficient_jacobian(xy: Array, coefficients: Array) -> Array:
