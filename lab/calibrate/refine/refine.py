@@ -164,10 +164,15 @@ def _refined(
 ) -> RefinedRig:
     stages: tuple[tuple[int, ...], ...] = (*_FIRST_FRAMES, ())
 
+    search = True
+
     def of_stage(run: Run, i: int, stage: int) -> LabelledRun:
+        nonlocal search
         if progress is not None:
             progress(stage * len(runs) + i, len(stages) * len(runs), run.name)
-        return labelled(run, *stages[stage], judged=stage > 0)
+        found = labelled(run, *stages[stage], search=search)
+        search &= not found.searched  # all mistakes take 15 s: once
+        return found
 
     try:
         now = rig, prior

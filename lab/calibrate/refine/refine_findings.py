@@ -117,6 +117,9 @@ def _used(result: RefinedRig) -> list[Finding]:
         if kept.mean() < FEW_USED:
             what = f"{run.run.name}: {kept.sum()} of {kept.size} frames have a measured pose"
             out.append(finding("BP-F07", Level.WARN, what))
+        for name in run.unlabelled:
+            what = f"{run.run.name}: which points of camera `{name}` are its spots is open, and none has a label"
+            out.append(finding("BP-F07", Level.WARN, what, variant="camera"))
     return out
 
 
