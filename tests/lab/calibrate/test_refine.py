@@ -25,6 +25,7 @@ from geometry.uncertainty.rig_uncertainty import covariance_root, perturbed_rig
 from lab.calibrate.refine.prior_sigmas import stated_covariance
 from lab.calibrate.refine.recordings import labelled, tolerant, with_rig
 from lab.calibrate.refine.refine import refine_rig
+from lab.calibrate.refine.refine_findings import refine_findings
 from lab.errors import CalibrationError
 from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance, load_rig_file, save_rig
 from lab.files.run.run_file import load_run
@@ -206,6 +207,17 @@ def test_a_camera_whose_points_may_be_its_spots_is_left_out_and_the_recording_us
     third = [camera == "third" for camera, _ in known.views()]
     assert (found.unlabelled, found.recording.seen[:, third].any()) == (("third",), False)
     assert np.isfinite(found.recording.poses.translation[:, 0]).sum() > 10
+
+
+def test_a_recording_of_which_no_frame_has_a_pose_contradicts_the_rig(lab):
+    result = lab[3].result
+    first = result.runs[0].recording
+    poses = replace(first.poses, translation=np.full_like(first.poses.translation, np.nan))
+    lost = replace(result.runs[0], recording=replace(first, poses=poses))
+    found = refine_findings(replace(result, runs=(lost, *result.runs[1:])))
+    assert [(f.level, f.what) for f in found if f.code == "BP-F07"] == [
+        (Level.FAIL, "two-cameras-per-screen-0: 0 of 60 frames have a measured pose")
+    ]
 
 
 def test_a_wrong_focal_length_of_which_nothing_is_stated_is_named_and_not_absorbed(lab, tmp_path):

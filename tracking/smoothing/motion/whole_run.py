@@ -398,7 +398,7 @@ class _Estimator:
     def _leave_one_out(
         self, info: RunInformation, offset: float, interior: Bools, by_others: Bools | None = None
     ) -> float:
-        out = smoothed(self.ref, info, np.exp(self.log_density + offset * interior[:, None]))
+        out = smoothed(self.ref, info, np.exp(self.log_density + offset * interior[:, None]), tested=False)
         # Of spots that were not exposed at the instant of their frame, what they say about the pose.
         left_out = _of_poses(info.information) if by_others is None else _of_poses(info.information) * by_others
         of_poses = info._replace(information=left_out, vector=_of_poses(info.vector))
@@ -418,7 +418,7 @@ class _Estimator:
         limit = cost + ROUNDING_NATS * (1 + 1e-3 * abs(cost))
         out = smoothed(self.ref, info, density)
         for damping in DAMPING:
-            x = out.x if np.isinf(damping) else smoothed(self.ref, _damped(info, damping), density).x
+            x = out.x if np.isinf(damping) else smoothed(self.ref, _damped(info, damping), density, tested=False).x
             moved = self._corrected(x, info, damping, density, limit)
             if moved is not None:
                 self.ref = moved
@@ -439,7 +439,7 @@ class _Estimator:
         for correction in range(MAX_CORRECTIONS + 1):
             if correction > 0:
                 L, g, _ = self._spot_information(moved)
-                x = smoothed(moved, _damped(info._replace(information=L, vector=g), damping), density).x
+                x = smoothed(moved, _damped(info._replace(information=L, vector=g), damping), density, tested=False).x
             if not np.isfinite(x).all():
                 return None
             moved = shifted(moved, x)
