@@ -138,7 +138,8 @@ class _Estimator:
             density = self._density(out, interpolating=not adapting)
             if self.run.delays is not None:
                 self._open_steps(density)
-            result, moved = self._step(density)
+            # Without a jump, only the passes that estimate the strength of the jerk use the tests of the noise.
+            result, moved = self._step(density, adapting or not self.run.adapt_jerk or bool(self.jumped.any()))
             if not (np.isfinite(result.x).all() and np.isfinite(result.pose_P).all()):
                 if out is None:
                     raise FloatingPointError("the smoothing pass has no finite first step")
@@ -407,8 +408,8 @@ class _Estimator:
 
     # -- Gauss-Newton -------------------------------------------------------------------------------------------------
 
-    def _step(self, density: Array) -> tuple[Interval, Array]:
-        """One damped Gauss-Newton step, which moves the reference.
+    def _step(self, density: Array, tested: bool) -> tuple[Interval, Array]:
+        """One damped Gauss-Newton step, which moves the reference. tested: as for `smoothed`.
 
         Returns the undamped smoother's result at the reference before the step, and how far each frame moved (T, 18).
         """
@@ -416,7 +417,7 @@ class _Estimator:
         cost = 0.5 * chi2 + motion_cost(self.ref, info, density)
         # Damping is against steps that leave the linear region; rounding alone makes some nats.
         limit = cost + ROUNDING_NATS * (1 + 1e-3 * abs(cost))
-        out = smoothed(self.ref, info, density)
+        out = smoothed(self.ref, info, density, tested)
         for damping in DAMPING:
             x = out.x if np.isinf(damping) else smoothed(self.ref, _damped(info, damping), density, tested=False).x
             moved = self._corrected(x, info, damping, density, limit)
