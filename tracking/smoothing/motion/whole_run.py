@@ -250,7 +250,8 @@ class _Estimator:
                 change = self._change(inside.start, inside.stop - 1)
                 size = np.maximum(largest[jumps[0]] * self.jump_scale[jumps].max(axis=0), change)
                 slack = FIRST_SLACK_NATS if number < MOMENT_ROUNDS - 1 else 0.0
-                moment = find_moment(self.ref, info, density, (inside.start, inside.stop - 1), size, slack)
+                steps = inside.start, inside.stop - 1
+                moment = find_moment(self.ref, info, density, steps, size, slack, found.get(i))
                 if moment is not None:
                     found[i] = moment.after(found.get(i))
                 elif i in found and found.pop(i).rounds > 0:
