@@ -119,9 +119,9 @@ def _search(around: _Around, before: tuple[int, float, float] | None = None) -> 
     """
     inside, ends = around.inside, np.cumsum(around.info.dt)
     start, end, dt = ends[inside.start - 1], ends[inside.stop - 1], float(np.median(around.info.dt[inside]))
-    at, apart, spreads = 0.5 * (start + end), dt, _SPREADS
+    at, apart, spreads = 0.5 * (start + end), dt, list(_SPREADS)
     if before is not None:
-        spreads = _SPREADS[-1:]
+        spreads = spreads[-1:]
         at, apart = float(ends[before[0]]) - before[1], max(before[2], spreads[0] * dt)
     for share in spreads:
         spread = share * dt
