@@ -1,10 +1,9 @@
 """The compiled implementation of the forward model: pixels of a rig's views and their Jacobian by the pose.
 
-The forward model is geometry/forward_model.py; start there. Its `SpotModel.project` calls `project_all` of this module,
-and the trackers' compiled loops call `project_view`. The same geometry stands a second time in
-numpy, in `SpotModel.hits` and `SpotModel.derivatives` with camera.project_points_full: calibrations need derivatives by
-every number of the rig, over stacks of poses, and run seldom. tests/geometry/test_forward_model.py compares both with
-each other, and this one with a plain computation by other means.
+The forward model is geometry/forward_model.py; start there. Its `SpotModel.project` and `SpotModel.derivatives` call
+`project_all` and `derivatives_all` of this module, and the trackers' compiled loops call `project_view`. The lit points
+stand a second time in numpy, in `SpotModel.hits`, and the lenses in lens.py, with derivatives by their numbers.
+tests/geometry/test_forward_model.py compares both with each other, and this one with a computation by other means.
 """
 
 from __future__ import annotations
@@ -88,12 +87,81 @@ def project_with_covariances(v: Views, R: Array, t: Array, P: Array) -> tuple[Ar
 
 
 @compiled
+def derivatives_all(
+    v: Views, sign: Array, R: Array, t: Array
+) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array]:
+    """Pixels (m, n, 2) of n views for poses R (m, 3, 3), t (m, 3), m, and what SpotDerivatives has but the lens.
+
+    v, sign (1 or m, n): the views of all poses, or of each; sign as in SpotModel. Then the derivatives (m, n, 2, .) by
+    the pose, camera, screen, bow, direction and point, and the lit points (m, n, 3) in the cameras' frames, (0, 0, 1)
+    without a projection. nan and 0 as in `project_all`.
+    """
+    m, n = R.shape[0], v.shape[1]
+    uv, pose, camera = np.full((m, n, 2), np.nan), np.zeros((m, n, 2, 6)), np.zeros((m, n, 2, 6))
+    screen, bow, in_camera = np.zeros((m, n, 2, 6)), np.zeros((m, n, 2, 3)), np.zeros((m, n, 3))
+    direction, point = np.zeros((m, n, 2, 3)), np.zeros((m, n, 2, 3))
+    d, normal, hit, on_screen = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for k in range(m):
+        j = k if v.shape[0] > 1 else 0
+        of_pose = v[j]
+        for i in range(n):
+            view = of_pose[i]
+            in_camera[k, i, 2] = 1.0
+            there, u_along, v_along = _project(of_pose, i, R[k], t[k], uv[k, i], pose[k, i])
+            if not there:
+                uv[k, i, 0] = uv[k, i, 1] = np.nan
+                pose[k, i] = 0.0
+                continue
+            length, _ = _lit_point(of_pose, i, R[k], t[k], d, normal, hit)
+            S, s0, C = view["screen_rotation"], view["screen_origin"], view["camera_rotation"]
+            for a in range(3):
+                c = C[a, 0] * hit[0] + C[a, 1] * hit[1] + C[a, 2] * hit[2]
+                in_camera[k, i, a] = c + view["camera_translation"][a]
+                on_screen[a] = S[0, a] * (hit[0] - s0[0]) + S[1, a] * (hit[1] - s0[1]) + S[2, a] * (hit[2] - s0[2])
+            x, y = on_screen[0], on_screen[1]
+            for row in range(2):
+                # If the screen moves by delta at the lit point, the point moves along the ray by (n.delta) / (n.d).
+                along = u_along if row == 0 else v_along
+                n0, n1, n2 = along * normal[0], along * normal[1], along * normal[2]
+                by_hit = pose[k, i, row]
+                g0, g1, g2 = by_hit[0] + n0, by_hit[1] + n1, by_hit[2] + n2  # px per m of the lit point, in world
+                _by_frame(camera[k, i, row], C, g0, g1, g2, hit, True)
+                _by_frame(screen[k, i, row], S, n0, n1, n2, on_screen, False)
+                raised = n0 * S[0, 2] + n1 * S[1, 2] + n2 * S[2, 2]
+                bow[k, i, row, 0], bow[k, i, row, 1], bow[k, i, row, 2] = raised * x * x, raised * x * y, raised * y * y
+                for a in range(3):
+                    p = by_hit[0] * R[k, 0, a] + by_hit[1] * R[k, 1, a] + by_hit[2] * R[k, 2, a]
+                    point[k, i, row, a], direction[k, i, row, a] = p, sign[j, i] * length * p
+    return uv, pose, camera, screen, bow, direction, point, in_camera
+
+
+@compiled
+def _by_frame(out: Array, F: Array, g0: float, g1: float, g2: float, at: Array, into: bool) -> None:
+    """Writes the derivative (6,) by the error of a transform's translation and rotation, from that by a point in world.
+
+    F (3, 3): the transform's rotation, into or from a part's frame. g: px per m of the point in world, at (3,), m: the
+    point in the frame that the transform is applied to.
+    """
+    for a in range(3):
+        out[a] = F[a, 0] * g0 + F[a, 1] * g1 + F[a, 2] * g2 if into else (g0, g1, g2)[a]
+    # By a turn theta: F [theta]x at = -F [at]x theta.
+    h0, h1, h2 = g0, g1, g2
+    if not into:
+        h0 = F[0, 0] * g0 + F[1, 0] * g1 + F[2, 0] * g2
+        h1 = F[0, 1] * g0 + F[1, 1] * g1 + F[2, 1] * g2
+        h2 = F[0, 2] * g0 + F[1, 2] * g1 + F[2, 2] * g2
+    out[3] = at[1] * h2 - at[2] * h1
+    out[4] = at[2] * h0 - at[0] * h2
+    out[5] = at[0] * h1 - at[1] * h0
+
+
+@compiled
 def project_view(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> bool:
     """Writes the pixel of view i to uv (2,) and its Jacobian to J (2, 6); False, nan and 0 if there is no projection.
 
     R (3, 3), t (3,), m: world_from_body.
     """
-    if _project(v, i, R, t, uv, J):
+    if _project(v, i, R, t, uv, J)[0]:
         return True
     for row in range(2):
         uv[row] = np.nan
@@ -103,11 +171,64 @@ def project_view(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> b
 
 
 @compiled
-def _project(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> bool:
-    """As `project_view`, but leaves uv and J undefined if there is no projection."""
-    # Intersection of the ray, in world, with the screen.
+def _project(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> tuple[bool, float, float]:
+    """As `project_view`, but leaves uv and J undefined if there is no projection.
+
+    Then how far u and v move, px, if the surface moves by 1 m along its normal: the spot moves along the ray.
+    """
     view = v[i]
-    origin, d, normal, hit, lever = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    d, normal, hit, lever = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    length, facing = _lit_point(v, i, R, t, d, normal, hit)
+    if not length > 0.0:
+        return False, 0.0, 0.0
+    S, s0 = view["screen_rotation"], view["screen_origin"]
+    for a in range(3):
+        lever[a] = hit[a] - t[a]
+    for a in range(2):
+        along = S[0, a] * (hit[0] - s0[0]) + S[1, a] * (hit[1] - s0[1]) + S[2, a] * (hit[2] - s0[2])
+        if not abs(along) <= view["half_size"][a]:
+            return False, 0.0, 0.0
+    # Image of the lit point in the camera.
+    C = view["camera_rotation"]
+    x = C[0, 0] * hit[0] + C[0, 1] * hit[1] + C[0, 2] * hit[2] + view["camera_translation"][0]
+    y = C[1, 0] * hit[0] + C[1, 1] * hit[1] + C[1, 2] * hit[2] + view["camera_translation"][1]
+    z = C[2, 0] * hit[0] + C[2, 1] * hit[1] + C[2, 2] * hit[2] + view["camera_translation"][2]
+    if not z > 1e-9:
+        return False, 0.0, 0.0
+    x, y = x / z, y / z
+    bx, by, xx, xy, yx, yy = _distorted(v, i, x, y)  # and the Jacobian [[xx, xy], [yx, yy]] of the distortion
+    if view["lens"] != 0 and not (x * x + y * y < view["fold_r2"] and xx * yy - xy * yx > 0.0):
+        return False, 0.0, 0.0
+    fx, fy = view["pinhole"][0], view["pinhole"][1]
+    uv[0] = fx * bx + view["pinhole"][2] + view["shift"][0]
+    uv[1] = fy * by + view["pinhole"][3] + view["shift"][1]
+    # d(pixel)/d(hit), in world, row by row; the component of the vehicle's motion along the ray has no effect.
+    u_along = v_along = 0.0
+    for row in range(2):
+        gx, gy = (fx * xx / z, fx * xy / z) if row == 0 else (fy * yx / z, fy * yy / z)
+        gz = -(gx * x + gy * y)
+        g0 = gx * C[0, 0] + gy * C[1, 0] + gz * C[2, 0]
+        g1 = gx * C[0, 1] + gy * C[1, 1] + gz * C[2, 1]
+        g2 = gx * C[0, 2] + gy * C[1, 2] + gz * C[2, 2]
+        along_ray = (g0 * d[0] + g1 * d[1] + g2 * d[2]) / facing
+        u_along, v_along = (along_ray, 0.0) if row == 0 else (u_along, along_ray)
+        g0, g1, g2 = g0 - along_ray * normal[0], g1 - along_ray * normal[1], g2 - along_ray * normal[2]
+        J[row, 0], J[row, 1], J[row, 2] = g0, g1, g2
+        # g . ((R e_k) x lever) = (lever x g) . (R e_k)
+        c0, c1, c2 = lever[1] * g2 - lever[2] * g1, lever[2] * g0 - lever[0] * g2, lever[0] * g1 - lever[1] * g0
+        for k in range(3):
+            J[row, 3 + k] = c0 * R[0, k] + c1 * R[1, k] + c2 * R[2, k]
+    return True, u_along, v_along
+
+
+@compiled_in_caller
+def _lit_point(v: Views, i: int, R: Array, t: Array, d: Array, normal: Array, hit: Array) -> tuple[float, float]:
+    """Length, m, of a ray to its screen, and normal . ray; 0 if it is parallel to the screen.
+
+    Writes the ray, the surface's normal and the lit point, all (3,), in world, to d, normal and hit.
+    """
+    view = v[i]
+    origin = np.empty(3)
     S, s0 = view["screen_rotation"], view["screen_origin"]
     facing = height = 0.0
     for a in range(3):
@@ -116,50 +237,13 @@ def _project(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> bool:
         normal[a] = S[a, 2]
         facing += normal[a] * d[a]
         height += normal[a] * (s0[a] - origin[a])
-    if abs(facing) <= 1e-12:
-        return False
-    length = height / facing
-    if view["bow"][0] != 0.0 or view["bow"][1] != 0.0 or view["bow"][2] != 0.0:
+    length = height / facing if abs(facing) > 1e-12 else 0.0
+    if length != 0.0 and (view["bow"][0] != 0.0 or view["bow"][1] != 0.0 or view["bow"][2] != 0.0):
         length = _intersect_bent(v, i, origin, d, length, normal)
         facing = normal[0] * d[0] + normal[1] * d[1] + normal[2] * d[2]
-    if not length > 0.0:
-        return False
     for a in range(3):
         hit[a] = origin[a] + length * d[a]
-        lever[a] = hit[a] - t[a]
-    for a in range(2):
-        along = S[0, a] * (hit[0] - s0[0]) + S[1, a] * (hit[1] - s0[1]) + S[2, a] * (hit[2] - s0[2])
-        if not abs(along) <= view["half_size"][a]:
-            return False
-    # Image of the lit point in the camera.
-    C = view["camera_rotation"]
-    x = C[0, 0] * hit[0] + C[0, 1] * hit[1] + C[0, 2] * hit[2] + view["camera_translation"][0]
-    y = C[1, 0] * hit[0] + C[1, 1] * hit[1] + C[1, 2] * hit[2] + view["camera_translation"][1]
-    z = C[2, 0] * hit[0] + C[2, 1] * hit[1] + C[2, 2] * hit[2] + view["camera_translation"][2]
-    if not z > 1e-9:
-        return False
-    x, y = x / z, y / z
-    bx, by, xx, xy, yx, yy = _distorted(v, i, x, y)  # and the Jacobian [[xx, xy], [yx, yy]] of the distortion
-    if view["lens"] != 0 and not (x * x + y * y < view["fold_r2"] and xx * yy - xy * yx > 0.0):
-        return False
-    fx, fy = view["pinhole"][0], view["pinhole"][1]
-    uv[0] = fx * bx + view["pinhole"][2] + view["shift"][0]
-    uv[1] = fy * by + view["pinhole"][3] + view["shift"][1]
-    # d(pixel)/d(hit), in world, row by row; the component of the vehicle's motion along the ray has no effect.
-    for row in range(2):
-        gx, gy = (fx * xx / z, fx * xy / z) if row == 0 else (fy * yx / z, fy * yy / z)
-        gz = -(gx * x + gy * y)
-        g0 = gx * C[0, 0] + gy * C[1, 0] + gz * C[2, 0]
-        g1 = gx * C[0, 1] + gy * C[1, 1] + gz * C[2, 1]
-        g2 = gx * C[0, 2] + gy * C[1, 2] + gz * C[2, 2]
-        along_ray = (g0 * d[0] + g1 * d[1] + g2 * d[2]) / facing
-        g0, g1, g2 = g0 - along_ray * normal[0], g1 - along_ray * normal[1], g2 - along_ray * normal[2]
-        J[row, 0], J[row, 1], J[row, 2] = g0, g1, g2
-        # g . ((R e_k) x lever) = (lever x g) . (R e_k)
-        c0, c1, c2 = lever[1] * g2 - lever[2] * g1, lever[2] * g0 - lever[0] * g2, lever[0] * g1 - lever[1] * g0
-        for k in range(3):
-            J[row, 3 + k] = c0 * R[0, k] + c1 * R[1, k] + c2 * R[2, k]
-    return True
+    return length, facing
 
 
 @compiled

@@ -3,13 +3,11 @@
 The pose transforms each beam to world, the beam's ray intersects its screen, and the camera projects the lit point. The
 solver, the trackers, the simulator and the calibrations all use this model. It has two implementations:
 
-- `SpotModel.project`, compiled (geometry/compiled_projection.py): pixels and their Jacobian by the pose, for the
-  solver, trackers and simulator, which call it several times per frame;
-- `SpotModel.hits` and `SpotModel.derivatives`, numpy: lit points, and derivatives by every number of the rig, for
-  calibrations and their covariances.
+- `SpotModel.project` and `SpotModel.derivatives`, compiled (geometry/compiled_projection.py): pixels and their Jacobian
+  by the pose, and by every number of the rig, for solver, trackers, simulator and calibrations;
+- `SpotModel.hits`, numpy: lit points with their Jacobian, for drawings and searches.
 
-tests/geometry/test_forward_model.py compares the pixels and pose Jacobians of both
-(test_the_compiled_and_the_numpy_implementation_agree).
+tests/geometry/test_forward_model.py compares both.
 """
 
 from __future__ import annotations
@@ -20,9 +18,9 @@ from typing import Any
 import numba
 import numpy as np
 
-from geometry.arrays import Array, Bools, Ints, cross, skew
-from geometry.camera import FISHEYE, Projected, in_picture, pinhole_numbers, project_points, project_points_full
-from geometry.compiled_projection import VIEW, Views, lens_codes, project_all
+from geometry.arrays import Array, Bools, Ints, cross
+from geometry.camera import FISHEYE, in_picture, pinhole_numbers, project_points_full
+from geometry.compiled_projection import VIEW, Views, derivatives_all, lens_codes, project_all
 from geometry.lens import padded, tilt_matrix
 from geometry.pose import Pose
 from geometry.rig import Rig
@@ -51,12 +49,8 @@ class _Intersection:
     """Intersections of n rays with their screens, for poses (...)."""
 
     R: Array  # (..., 1, 3, 3) world from body
-    d: Array  # (..., n, 3) the ray in world
     t: Array  # (..., n) m, the ray's length to the screen
     hit: Array  # (..., n, 3) m, in world
-    on_screen: Array  # (..., n, 3) m, the same in the screen's frame
-    normal: Array  # (..., n, 3) the surface's normal there, in world; not of unit length on a bent screen
-    along: Array  # (..., n) normal . d; 1 where the ray is parallel to the screen
     oblique: Array  # (..., n, 3, 3) the projection along the ray onto the surface
     good: Bools  # (..., n) whether the ray meets the screen within its extent
 
@@ -201,7 +195,7 @@ class SpotModel:
         good = ahead & (t > 0) & np.all(np.abs(on_screen[..., :2]) <= self.half_size, axis=-1)
         along = np.where(ahead, facing, 1.0)
         oblique = np.eye(3) - d[..., :, None] * normal[..., None, :] / along[..., None, None]
-        return _Intersection(R, d, t, hit, on_screen, normal, along, oblique, good)
+        return _Intersection(R, t, hit, oblique, good)
 
     def _intersect_bent(self, p: Array, d: Array, t: Array) -> tuple[Array, Array]:
         """Lengths (..., n), m, of rays to bent screens, and the surface normals there (..., n, 3), in world.
@@ -227,57 +221,48 @@ class SpotModel:
         nan where no projection exists: the beam misses its screen, or the lit point lies behind the camera or beyond
         the fold of its lens. Pixels outside the picture are returned too. The pose and the Jacobian are as in `hits`.
         """
-        R, t = world_from_body.rotation, world_from_body.translation
-        stack = R.shape[:-2]
-        if stack != t.shape[:-1]:
-            stack = np.broadcast_shapes(stack, t.shape[:-1])
-            R, t = np.broadcast_to(R, (*stack, 3, 3)), np.broadcast_to(t, (*stack, 3))
-        # Copies, because read-only arrays have another type for numba, which would compile a second time for them.
-        uv, J = project_all(
-            self.numbers,
-            np.array(R, dtype=np.float64, order="C").reshape(-1, 3, 3),
-            np.array(t, dtype=np.float64, order="C").reshape(-1, 3),
-        )
+        R, t, stack = _stacked(world_from_body)
+        uv, J = project_all(self.numbers, R, t)
         n = len(self)
         return uv.reshape(*stack, n, 2), J.reshape(*stack, n, 2, 6)
 
     def derivatives(self, world_from_body: Pose, of_lens: bool = True) -> SpotDerivatives:
         """As `project`, with the derivatives by everything in the rig that a calibration determines.
 
-        The pose may be a stack (...). Without a projection the pixel is nan and the derivatives are undefined.
+        The pose may be a stack (...); of a model whose arrays have rows (k, n, ...), pose i sees the views of row i.
+        Without a projection the pixel is nan and the derivatives are undefined.
         of_lens: whether those by the numbers of the lenses are needed; otherwise they are 0.
         """
-        m = self._intersect(world_from_body)
-        R_c, R_s = self.camera_rotation, self.screen_rotation
-        in_camera = (R_c @ m.hit[..., None])[..., 0] + self.camera_translation
-        safe = np.where(m.good[..., None], in_camera, [0.0, 0.0, 1.0])
-        lens = self.pinhole, self.distortion, self.fold_r2, self.fisheye
+        R, t, stack = _stacked(world_from_body, self.numbers.shape[:-1])
+        n = self.numbers.shape[-1]
+        arrays = derivatives_all(self.numbers.reshape(-1, n), self.sign.reshape(-1, n), R, t)
+        uv, pose, camera, screen, bow, direction, point, in_camera = (a.reshape(*stack, *a.shape[1:]) for a in arrays)
         if of_lens:
-            projected = project_points_full(safe, *lens)
+            projected = project_points_full(in_camera, self.pinhole, self.distortion, self.fold_r2, self.fisheye)
+            lens = projected.d_pinhole, projected.d_distortion
         else:
-            none = [np.zeros((*safe.shape[:-1], 2, k)) for k in (4, 14)]
-            projected = Projected(*project_points(safe, *lens), *none)
-        d_hit = projected.d_point @ R_c  # px per m of the lit point, in world
-        # If the screen moves by delta at the lit point, the point moves along the ray by d (n.delta) / (n.d).
-        carried = m.d[..., :, None] * (m.normal / m.along[..., None])[..., None, :]
-        x, y = m.on_screen[..., 0], m.on_screen[..., 1]
-        bulge = R_s[..., :, 2:] * np.stack([x * x, x * y, y * y], axis=-1)[..., None, :]
-        d_screen = np.concatenate([np.broadcast_to(np.eye(3), carried.shape), -(R_s @ skew(m.on_screen))], axis=-1)
-        d_camera = np.concatenate([np.broadcast_to(np.eye(3), carried.shape), -(R_c @ skew(m.hit))], axis=-1)
-        d_point = d_hit @ m.oblique @ m.R
-        return SpotDerivatives(
-            pixels=np.where(m.good[..., None], projected.pixels, np.nan),
-            pose=d_hit @ self._hit_jacobian(m),
-            pinhole=projected.d_pinhole,
-            distortion=projected.d_distortion,
-            camera=projected.d_point @ d_camera,
-            screen=d_hit @ carried @ d_screen,
-            bow=d_hit @ carried @ bulge,
-            direction=(self.sign * m.t)[..., None, None] * d_point,
-            point=d_point,
-        )
+            lens = np.zeros((*uv.shape, 4)), np.zeros((*uv.shape, 14))
+        return SpotDerivatives(uv, pose, *lens, camera, screen, bow, direction, point)
 
     def in_picture(self, pixels: Array, margin_px: float = 0.0) -> Bools:
         """Whether pixels (..., n, 2) lie in their cameras' pictures, or at most the margin outside; False for nan."""
 
         return in_picture(pixels, self.image_size_px, margin_px)
+
+
+def _stacked(poses: Pose, rows: tuple[int, ...] = ()) -> tuple[Array, Array, tuple[int, ...]]:
+    """Rotations (m, 3, 3) and translations (m, 3), m, of a stack of poses, and the shape of the stack.
+
+    rows: a shape that the stack must have at least.
+    """
+    R, t = poses.rotation, poses.translation
+    stack = R.shape[:-2]
+    if stack != t.shape[:-1] or len(stack) < len(rows):
+        stack = np.broadcast_shapes(stack, t.shape[:-1], rows)
+        R, t = np.broadcast_to(R, (*stack, 3, 3)), np.broadcast_to(t, (*stack, 3))
+    # Copies, because read-only arrays have another type for numba, which would compile a second time for them.
+    return (
+        np.array(R, dtype=np.float64, order="C").reshape(-1, 3, 3),
+        np.array(t, dtype=np.float64, order="C").reshape(-1, 3),
+        stack,
+    )

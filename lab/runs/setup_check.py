@@ -110,7 +110,7 @@ def recorded_mistakes(run: Run, blocks: Sequence[Block], *, explained: bool = Fa
     if frames is None:
         return ()
     compared = compare(run.rig, frames, run.tracker.labels, run.covariance)
-    found, given = _findings(compared, run.rig), compared.given
+    found, given = findings_of(compared, run.rig), compared.given
     if compared.found or given.good or explained:
         return found
     seen = [
@@ -254,7 +254,8 @@ def mistakes_by_themselves(rig: Rig, prior: PosePrior | None) -> tuple[Finding, 
     )
 
 
-def _findings(compared: Comparison, rig: Rig) -> tuple[Finding, ...]:
+def findings_of(compared: Comparison, rig: Rig) -> tuple[Finding, ...]:
+    """Findings on mistakes that explain frames better, or on cameras whose points the rig does not explain."""
     given = compared.given
     if compared.found:
         best = compared.found[0][1]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any
@@ -18,26 +19,31 @@ from geometry.arrays import Array, finite
 from geometry.forward_model import SpotModel
 from geometry.pose_solver.visibility import assumed_range
 from geometry.rig import Rig
+from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import CLOCK, RigCovariance, RigUncertainty, is_known, unlimited
 from lab.errors import CalibrationError
 from lab.files.run.clocks import CameraClock, clocks_in
 from lab.files.run.run_file import Run
-from lab.findings.finding import Level, worst_first
+from lab.findings.finding import Finding, Level
 from lab.runs.frames.frames import FrameSet
 from lab.runs.frames.moments import Moment
 from lab.runs.frames.pipeline import FrameRecord, Frames, Pipeline
 from lab.runs.model_check.check import ModelCheck, check_model
 from lab.runs.model_check.frame_sampler import FrameSampler
-from lab.runs.setup_check import UNUSED, SampledFrames, mistakes_of_run
+from lab.runs.setup_check import DOUBTFUL, SampledFrames, findings_of, frames_of, mistakes_by_themselves, unused_finding
 from lab.runs.smoothing_pass import TrackingAndSmoothing
 from lab.runs.verdict.frame_checks import FrameChecks
 from lab.runs.verdict.run_statistics import CameraStatistics, RunStatistics
-from tracking.statuses import PoseStatus
+from tracking.detections import Detections
+from tracking.setup_mistakes.evidence import LEAST_POINTS, compare
+from tracking.statuses import PoseStatus, SpotStatus
 
 LEAST_MEASURED = 0.9  # share of frames with a measured pose, below which usual mistakes of the set-up are tested
 # Share of the residuals that the errors of the rig cause, as sigma of the tracker's model: with all of it, or none,
 # rigs that are off by 10 px keep fewer labels (measured: 0.1 to 0.3 of the whole error, half of what no pose absorbs).
 _EXPECTED = 0.5
+_P_SPOT = 1e-6  # probability that a spot is farther from its prediction than its camera's stated errors allow
+_IN_REACH = 0.5  # share of a camera's spots that have a point nearer: the others may be hidden
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +53,8 @@ class LabelledRun:
     run: Run
     recording: ModelCheckRecording  # of the run's own cameras; long recordings are thinned
     frames: int  # of the run
+    unlabelled: tuple[str, ...] = ()  # cameras whose points may be spots, and of which none has a label
+    searched: bool = False  # whether mistakes of the set-up have been searched for, and none was found
 
     def in_views_of(self, rig: Rig) -> ModelCheckRecording:
         """The recording with the views of a rig that has further cameras."""
@@ -143,19 +151,50 @@ class _FirstFrames:
         self.measured += record.tracked.pose_status is PoseStatus.MEASURED
 
 
-def labelled(run: Run, most: int | None = None, enough: int = 0, *, judged: bool = True) -> LabelledRun:
+@dataclass(slots=True)
+class _SpotsInReach:
+    """Whether the points of cameras without labels may be their spots."""
+
+    views: tuple[tuple[str, str], ...]  # camera and spot
+    expected: Counter[str] = field(default_factory=Counter)  # spots that the pose puts into the camera's pictures
+    near: Counter[str] = field(default_factory=Counter)  # of these, with a point where the stated errors allow it
+
+    def count(self, record: FrameRecord, points: Mapping[str, Detections | None]) -> None:
+        """Count the next frame."""
+        tracked = record.tracked
+        if tracked.pose_status is not PoseStatus.MEASURED or tracked.predicted_cov_px2 is None:
+            return
+        for v in (v for v, status in enumerate(tracked.status) if status is SpotStatus.OCCLUDED):
+            name = self.views[v][0]
+            found = points[name]
+            if found is None or not len(found) or not np.isfinite(tracked.predicted_px[v]).all():
+                continue
+            off = found.uv_px - tracked.predicted_px[v]
+            z2 = np.sum(
+                off * np.linalg.solve(tracked.predicted_cov_px2[v] + found.cov_px2, off[..., None])[..., 0], axis=1
+            )
+            self.expected[name] += 1
+            self.near[name] += bool(z2.min() < chi2_limit(_P_SPOT, 2))
+
+    def allows(self, name: str) -> bool:
+        """Whether the points of a camera may be its spots."""
+        return self.expected[name] > 0 and self.near[name] >= _IN_REACH * self.expected[name]
+
+
+def labelled(run: Run, most: int | None = None, enough: int = 0, *, search: bool = True) -> LabelledRun:
     """Track and smooth a run with its rig. most: number of frames after which it ends, or after `enough` with poses.
 
-    judged: usual mistakes of the set-up are tested where few frames have a pose.
+    search: whether mistakes of the set-up are searched for where few frames have a pose or a camera has few labels.
 
     Raises:
         CalibrationError: the recording shows a mistake in the set-up, such as exchanged cameras, which no refinement
-            may absorb, or no pose at all.
+            may absorb, or a camera without a spot where its stated errors allow it, or there is no frame at all.
     """
     camera_of = SpotModel.of(run.rig).camera_of
     sampler, pictures = FrameSampler(with_predicted=most is not None), SampledFrames()
     cameras = {name: CameraStatistics() for name in run.rig.cameras}
     statistics = RunStatistics(cameras, SpotModel.of(run.rig).views, run.tracker.labels.min_spots)
+    reach = _SpotsInReach(statistics.views)
     with tempfile.TemporaryDirectory(prefix="beampose-refine-") as work:
         passes = TrackingAndSmoothing.of(Pipeline.of(run), Path(work))
         if most is not None:
@@ -163,21 +202,40 @@ def labelled(run: Run, most: int | None = None, enough: int = 0, *, judged: bool
             passes.pipeline.reader, passes.pipeline.on_record = first, first.count
         with contextlib.closing(passes.records()) as records:
             for record, _ in FrameChecks(run.rig, run.covariance).passed(records):
+                points = dict(zip(run.rig.cameras, record.detections, strict=True))
                 sampler.add_record(record, camera_of, run.tracker)
-                pictures.add(record.frame, dict(zip(run.rig.cameras, record.detections, strict=True)))
+                pictures.add(record.frame, points)
                 statistics.add(record)
+                reach.count(record, points)
     recording = sampler.recording()
-    passes_well = statistics.measured > LEAST_MEASURED * statistics.frames
-    mistakes = mistakes_of_run(run, statistics, pictures, passes=passes_well or not judged)
-    worst = next(iter(worst_first(mistakes)), None)
-    # A camera without labels in the first frames may have them later, with a better rig.
-    if worst is not None and (worst.level is Level.FAIL or (most is None and worst.code == UNUSED)):
-        raise CalibrationError(f"{run.folder}: {worst.what}. {worst.remedy}")
     if recording is None:
         raise CalibrationError(f"{run.folder}: there is no frame at all")
+    # A camera without labels in the first frames may have them later, with a better rig.
+    judged = most is None and statistics.measured > 0
+    unused = [n for n, c in cameras.items() if judged and c.points >= LEAST_POINTS * c.pictures and not c.found]
+    wrong = [n for n in unused if not reach.allows(n)]
+    few = statistics.measured <= LEAST_MEASURED * statistics.frames
+    doubtful = most is None and any(c.unlabelled + len(c.displaced) >= DOUBTFUL for c in cameras.values())
+    found, searched = mistakes_by_themselves(run.rig, run.prior), False
+    if search and (few or wrong or doubtful):
+        more, searched = _searched(run, pictures)
+        found = (*found, *more)
+    found = (*found, *(unused_finding(n, cameras[n].points, cameras[n].pictures) for n in wrong))
+    if found:
+        raise CalibrationError(f"{run.folder}: {found[0].what}. {found[0].remedy}")
     if passes.clocks is not None:
         model, estimated = SpotModel.of(run.rig), passes.pipeline.run
         clock_s = _clocks_of(run.rig) + (_clocks_in_use(estimated) - _clocks_in_use(run))
         velocity = np.nan_to_num(pixel_velocities(model, recording, np.arange(len(recording.seen))))
         recording = replace(recording, velocity_px_s=velocity, clock_s=clock_s[model.camera_of])
-    return LabelledRun(run, recording, statistics.frames)
+    return LabelledRun(run, recording, statistics.frames, tuple(unused), searched)
+
+
+def _searched(run: Run, pictures: SampledFrames) -> tuple[tuple[Finding, ...], bool]:
+    """Mistakes of the set-up that sampled frames show, and whether all were tested and none found."""
+    frames = frames_of(pictures.blocks, run.prior, run.tracker.labels.min_spots)
+    if frames is None:
+        return (), False
+    compared = compare(run.rig, frames, run.tracker.labels, run.covariance)
+    found = tuple(f for f in findings_of(compared, run.rig) if f.level is Level.FAIL)
+    return found, not found and not compared.given.is_certain

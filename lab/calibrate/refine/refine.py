@@ -164,10 +164,15 @@ def _refined(
 ) -> RefinedRig:
     stages: tuple[tuple[int, ...], ...] = (*_FIRST_FRAMES, ())
 
+    search = True
+
     def of_stage(run: Run, i: int, stage: int) -> LabelledRun:
+        nonlocal search
         if progress is not None:
             progress(stage * len(runs) + i, len(stages) * len(runs), run.name)
-        return labelled(run, *stages[stage], judged=stage > 0)
+        found = labelled(run, *stages[stage], search=search)
+        search &= not found.searched  # all mistakes take 15 s: once
+        return found
 
     try:
         now = rig, prior
@@ -221,7 +226,12 @@ def _write_residuals(result: RefinedRig, path: Path) -> None:
         run = result.runs[i if len(r.recordings) > 1 else 0].run.name
         recording, before, after = r.of_data(i), pixel_residuals(r.given_data[i]), pixel_residuals(d)
         sigma = np.sqrt(np.diagonal(recording.cov_px2, axis1=-2, axis2=-1))
-        for k, v in np.argwhere(d.lin.used):
-            numbers = [*recording.uv_px[k, v], *before[k, v], *after[k, v], *sigma[k, v]]
-            rows.append([csv_word(run), f"{recording.t_s[k]:.9g}", *views[v], *(f"{x:.6g}" for x in numbers)])
+        used = d.lin.used
+        numbers = np.concatenate([a[used] for a in (recording.uv_px, before, after, sigma)], axis=-1).tolist()
+        frame, view = (i.tolist() for i in np.nonzero(used))
+        times = [f"{t:.9g}" for t in recording.t_s]
+        rows += [
+            [csv_word(run), times[k], *views[v], *(f"{x:.6g}" for x in one)]
+            for k, v, one in zip(frame, view, numbers, strict=True)
+        ]
     write_table(path, COLUMNS, rows)

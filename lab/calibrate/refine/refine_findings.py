@@ -116,7 +116,11 @@ def _used(result: RefinedRig) -> list[Finding]:
         kept = finite(run.recording.poses.translation, -1)
         if kept.mean() < FEW_USED:
             what = f"{run.run.name}: {kept.sum()} of {kept.size} frames have a measured pose"
-            out.append(finding("BP-F07", Level.WARN, what))
+            # Where the rig that the others gave explains no frame at all, it is wrong or not this recording's.
+            out.append(finding("BP-F07", Level.WARN if kept.any() else Level.FAIL, what))
+        for name in run.unlabelled:
+            what = f"{run.run.name}: which points of camera `{name}` are its spots is open, and none has a label"
+            out.append(finding("BP-F07", Level.WARN, what, variant="camera"))
     return out
 
 

@@ -14,6 +14,7 @@ import yaml
 from click.testing import CliRunner
 
 from bench import refine as bench
+from bench.random_scenes.write_folder import write_run_folder
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.refinement import MOTIONS, further_motions
 from calibration.terms.rig_blocks import prior_of, stacks_of
@@ -22,12 +23,15 @@ from geometry.rig import Rig
 from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import covariance_root, perturbed_rig
 from lab.calibrate.refine.prior_sigmas import stated_covariance
-from lab.calibrate.refine.recordings import tolerant, with_rig
+from lab.calibrate.refine.recordings import labelled, tolerant, with_rig
 from lab.calibrate.refine.refine import refine_rig
+from lab.calibrate.refine.refine_findings import refine_findings
+from lab.errors import CalibrationError
 from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance, load_rig_file, save_rig
 from lab.files.run.run_file import load_run
 from lab.findings.finding import Level
 from lab.simulate.write import simulate
+from tracking.setup_mistakes import evidence
 
 SIGMAS = {
     "cameras.position_m": 0.003, "cameras.rotation_deg": 0.1, "screens.position_m": 0.002, "screens.rotation_deg": 0.05,
@@ -181,6 +185,39 @@ def test_a_part_that_moved_by_more_than_stated_is_named_and_an_earlier_rig_stays
     assert (out / "rig.yaml").read_bytes() == (folder / "new" / "rig.yaml").read_bytes()
     assert (tmp_path / "new-failed" / "report.html").exists()
     assert not (tmp_path / "new-failed" / "rig.yaml").exists()
+
+
+def test_a_camera_without_a_spot_where_it_may_be_is_named_after_one_search_for_mistakes(lab, tmp_path, monkeypatch):
+    _, runs, true, _ = lab
+    searches, every = [], evidence.possible_mistakes
+    monkeypatch.setattr(evidence, "possible_mistakes", lambda *a: searches.append(a) or every(*a))
+    moved = perturbed_rig(true, ["cameras.left-b.rot_x_rad", "cameras.left-b.rot_y_rad"], np.array([0.05, -0.05]))
+    save_rig(RigFile(moved, covariance_blocks(stated_covariance(moved, None, SIGMAS, tmp_path))), tmp_path / "rig.yaml")
+    with pytest.raises(CalibrationError, match="camera `left-b`: none of its 180 points in 60 pictures is the spot"):
+        refine_rig(runs, tmp_path / "rig.yaml", tmp_path / "new")
+    assert len(searches) == 1
+
+
+def test_a_camera_whose_points_may_be_its_spots_is_left_out_and_the_recording_used(tmp_path):
+    seed, sigmas = 821, bench.Sigmas()  # the camera `third` sees one spot, whose place is uncertain by 100 px
+    drawn, scenes, _ = bench.campaign(seed, 75, clocks_s=sigmas.clocks)
+    known = bench.drawn_rig(np.random.default_rng([seed, bench.RIG]), drawn.rig, sigmas)
+    write_run_folder(replace(scenes[1], known_rig=known, covariance=bench.rig_covariance(known, sigmas)), tmp_path)
+    found = labelled(load_run(tmp_path), search=False)
+    third = [camera == "third" for camera, _ in known.views()]
+    assert (found.unlabelled, found.recording.seen[:, third].any()) == (("third",), False)
+    assert np.isfinite(found.recording.poses.translation[:, 0]).sum() > 10
+
+
+def test_a_recording_of_which_no_frame_has_a_pose_contradicts_the_rig(lab):
+    result = lab[3].result
+    first = result.runs[0].recording
+    poses = replace(first.poses, translation=np.full_like(first.poses.translation, np.nan))
+    lost = replace(result.runs[0], recording=replace(first, poses=poses))
+    found = refine_findings(replace(result, runs=(lost, *result.runs[1:])))
+    assert [(f.level, f.what) for f in found if f.code == "BP-F07"] == [
+        (Level.FAIL, "two-cameras-per-screen-0: 0 of 60 frames have a measured pose")
+    ]
 
 
 def test_a_wrong_focal_length_of_which_nothing_is_stated_is_named_and_not_absorbed(lab, tmp_path):

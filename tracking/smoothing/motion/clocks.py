@@ -73,11 +73,11 @@ def solve_clocks(
         B[part] = np.einsum("knai,knaj->kij", H, Wd)
         C += np.einsum("knai,knaj->ij", d, Wd)
         b += np.einsum("knai,kna->i", Wd, e)
-    x = smoothed(ref, info, density).x
+    x = smoothed(ref, info, density, tested=False).x
     G = np.empty((frames, info.vector.shape[1], p))  # change of the states by the numbers, with the sign of B
     for i, size in enumerate(clocks.sigma_s):
         moved = info._replace(vector=np.ascontiguousarray(info.vector + B[..., i] * size))
-        G[..., i] = (smoothed(ref, moved, density).x - x) / size
+        G[..., i] = (smoothed(ref, moved, density, tested=False).x - x) / size
     precision = np.diag(1 / clocks.sigma_s**2)
     S = C - np.einsum("kis,kit->st", B, G) + precision
     right = b - np.einsum("kis,ki->s", B, x) + precision @ clocks.mean_s

@@ -233,8 +233,10 @@ def _predict_backward(
 
 
 @compiled
-def smoothed(ref: Reference, info: RunInformation, jerk: Array) -> Interval:
+def smoothed(ref: Reference, info: RunInformation, jerk: Array, tested: bool = True) -> Interval:
     """Fixed-interval smoother: deviations and covariances of all frames, and test quantities of the process noise.
+
+    tested: whether those are needed; without them a pass takes two thirds of the time.
 
     jerk (T, 6): spectral densities, as in motion.py, of the step before each frame. The shock is the test of de Jong &
     Penzer (1998), "Diagnosing shocks in time series", for an impulse in the middle of the step. energy and gamma are
@@ -259,7 +261,8 @@ def smoothed(ref: Reference, info: RunInformation, jerk: Array) -> Interval:
                 y[a] += info.vector[k, a]
                 for b in range(info.vector.shape[1]):
                     Y[a, b] += info.information[k, a, b]
-            _test_process_noise(info, jerk, k, Y, y, P, out)
+            if tested:
+                _test_process_noise(info, jerk, k, Y, y, P, out)
             Y, y = _predict_backward(ref, info, jerk, k, Y, y)
     return out
 

@@ -50,13 +50,22 @@ class JumpMoment:
 
 
 def find_moment(
-    ref: Reference, info: RunInformation, density: Array, steps: tuple[int, int], size: Array, slack_nats: float = 0.0
+    ref: Reference,
+    info: RunInformation,
+    density: Array,
+    steps: tuple[int, int],
+    size: Array,
+    slack_nats: float = 0.0,
+    before: JumpMoment | None = None,
 ) -> JumpMoment | None:
     """The moment of a jump; None: not known.
 
     ref, info, density (T, 6): of a run in which some steps (first, last) may have the jump, of variances size (2,). The
     spots of these steps count as if the motion within them was open. None also where the run with a jump at one moment
     is less likely, by more than a slack, than that in which all of these steps are open: the motion turns for longer.
+
+    before: the moment found with fewer spots. Spots near a jump that count for one side contradict a moment that is
+    farther off than its sigma, and the likelihood is no parabola there: the search begins at that moment.
 
     Where a jump was not known before, a strong jerk may have explained it: the jerk of the calmer frames is tried, too.
     """
@@ -69,7 +78,9 @@ def find_moment(
     inside = slice(first - part.start, last + 1 - part.start)
     best, most = None, log_likelihood(near, some, usual) - slack_nats
     for jerk in (usual, calm) if np.any(usual > _STRONG * calm) else (usual,):
-        found = _search(_Around(near, some, jerk, inside, size))
+        around = _Around(near, some, jerk, inside, size)
+        found = None if before is None else _search(around, (before.step - part.start, before.later_s, before.sigma_s))
+        found = found or _search(around)
         if found is not None and found[0] > most:
             most, step, later, sigma = found
             best = JumpMoment(part.start + step, later, sigma, part, jerk, size)
@@ -101,12 +112,18 @@ class _Around:
         return int(np.clip(np.searchsorted(ends_s, at_s), self.inside.start, self.inside.stop - 1))
 
 
-def _search(around: _Around) -> tuple[float, int, float, float] | None:
-    """Log-likelihood, nats, step, time before its end and sigma, s, of the most likely moment."""
+def _search(around: _Around, before: tuple[int, float, float] | None = None) -> tuple[float, int, float, float] | None:
+    """Log-likelihood, nats, step, time before its end and sigma, s, of the most likely moment.
+
+    before: the last three of a moment at which the search begins.
+    """
     inside, ends = around.inside, np.cumsum(around.info.dt)
     start, end, dt = ends[inside.start - 1], ends[inside.stop - 1], float(np.median(around.info.dt[inside]))
-    at, apart = 0.5 * (start + end), dt
-    for share in _SPREADS:
+    at, apart, spreads = 0.5 * (start + end), dt, list(_SPREADS)
+    if before is not None:
+        spreads = spreads[-1:]
+        at, apart = float(ends[before[0]]) - before[1], max(before[2], spreads[0] * dt)
+    for share in spreads:
         spread = share * dt
         for _ in range(_PARABOLAS):
             low, middle, high = (around.nats(ends, at + d, spread) for d in (-apart, 0.0, apart))

@@ -138,7 +138,8 @@ class _Estimator:
             density = self._density(out, interpolating=not adapting)
             if self.run.delays is not None:
                 self._open_steps(density)
-            result, moved = self._step(density)
+            # Without a jump, only the passes that estimate the strength of the jerk use the tests of the noise.
+            result, moved = self._step(density, adapting or not self.run.adapt_jerk or bool(self.jumped.any()))
             if not (np.isfinite(result.x).all() and np.isfinite(result.pose_P).all()):
                 if out is None:
                     raise FloatingPointError("the smoothing pass has no finite first step")
@@ -249,7 +250,8 @@ class _Estimator:
                 change = self._change(inside.start, inside.stop - 1)
                 size = np.maximum(largest[jumps[0]] * self.jump_scale[jumps].max(axis=0), change)
                 slack = FIRST_SLACK_NATS if number < MOMENT_ROUNDS - 1 else 0.0
-                moment = find_moment(self.ref, info, density, (inside.start, inside.stop - 1), size, slack)
+                steps = inside.start, inside.stop - 1
+                moment = find_moment(self.ref, info, density, steps, size, slack, found.get(i))
                 if moment is not None:
                     found[i] = moment.after(found.get(i))
                 elif i in found and found.pop(i).rounds > 0:
@@ -398,7 +400,7 @@ class _Estimator:
     def _leave_one_out(
         self, info: RunInformation, offset: float, interior: Bools, by_others: Bools | None = None
     ) -> float:
-        out = smoothed(self.ref, info, np.exp(self.log_density + offset * interior[:, None]))
+        out = smoothed(self.ref, info, np.exp(self.log_density + offset * interior[:, None]), tested=False)
         # Of spots that were not exposed at the instant of their frame, what they say about the pose.
         left_out = _of_poses(info.information) if by_others is None else _of_poses(info.information) * by_others
         of_poses = info._replace(information=left_out, vector=_of_poses(info.vector))
@@ -407,8 +409,8 @@ class _Estimator:
 
     # -- Gauss-Newton -------------------------------------------------------------------------------------------------
 
-    def _step(self, density: Array) -> tuple[Interval, Array]:
-        """One damped Gauss-Newton step, which moves the reference.
+    def _step(self, density: Array, tested: bool) -> tuple[Interval, Array]:
+        """One damped Gauss-Newton step, which moves the reference. tested: as for `smoothed`.
 
         Returns the undamped smoother's result at the reference before the step, and how far each frame moved (T, 18).
         """
@@ -416,9 +418,9 @@ class _Estimator:
         cost = 0.5 * chi2 + motion_cost(self.ref, info, density)
         # Damping is against steps that leave the linear region; rounding alone makes some nats.
         limit = cost + ROUNDING_NATS * (1 + 1e-3 * abs(cost))
-        out = smoothed(self.ref, info, density)
+        out = smoothed(self.ref, info, density, tested)
         for damping in DAMPING:
-            x = out.x if np.isinf(damping) else smoothed(self.ref, _damped(info, damping), density).x
+            x = out.x if np.isinf(damping) else smoothed(self.ref, _damped(info, damping), density, tested=False).x
             moved = self._corrected(x, info, damping, density, limit)
             if moved is not None:
                 self.ref = moved
@@ -439,7 +441,7 @@ class _Estimator:
         for correction in range(MAX_CORRECTIONS + 1):
             if correction > 0:
                 L, g, _ = self._spot_information(moved)
-                x = smoothed(moved, _damped(info._replace(information=L, vector=g), damping), density).x
+                x = smoothed(moved, _damped(info._replace(information=L, vector=g), damping), density, tested=False).x
             if not np.isfinite(x).all():
                 return None
             moved = shifted(moved, x)

@@ -140,6 +140,15 @@ def test_beside_corners_the_attitude_is_as_accurate_as_with_one_clock(seed, tmp_
     assert np.nanmean(own.nees) < 1.5
 
 
+def test_a_corner_at_the_instant_of_a_frame_keeps_its_moment_when_the_spots_beside_it_count(tmp_path):
+    """The spots beside it contradict any moment that is farther off than a part of a step."""
+    r = random_recording(8204, frames=80)
+    assert r.corners[0] == pytest.approx(7.0, abs=1e-9)
+    beside = figures(r, tmp_path).attitude_deg
+    assert np.nanmax(beside[6:10]) < 5 * np.nanmedian(beside)
+    assert np.isfinite(beside[6:10]).all()
+
+
 def rounded(r: Recording, frames: float) -> Recording:
     """The recording of a motion whose corners take some frames: the mean over as many."""
 
