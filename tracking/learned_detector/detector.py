@@ -130,7 +130,8 @@ def find_drogues(
     levels = pyramid(grey, SMALLEST_PX / max(smallest_px, SMALLEST_PX), COARSEST_PX, top)
     found = np.concatenate([_of_level(level, weights or WEIGHTS) for level in levels])
     found[:, 0] = 1 / (1 + np.exp(-(FIRST_SLOPE * found[:, 0] + FIRST_OFFSET)))
-    found = _distinct(_without_parts(found[found[:, 0] >= FIRST_CONFIDENCE]))[:MOST_LOOKED_AT]
+    found = found[np.argsort(-found[:, 0], kind="stable")][:MOST_LOOKED_AT]
+    found = found[found[:, 0] >= FIRST_CONFIDENCE]
     whole = PyramidLevel(grey, 1.0, 1.0)
     found = np.array([_seen_again(row, [whole, *levels], weights or WEIGHTS) for row in found]).reshape(-1, 4)
     found = _distinct(_without_parts(found[found[:, 0] >= min(min_confidence, WHOLE_CONFIDENCE)]))
