@@ -2,8 +2,9 @@
 
 Rendered pictures of 640 x 480 with a drogue of 9 to 200 px before backgrounds that no training picture shows. The
 threshold is the one with 0.1 false detections per frame. Beside it: cv2.HoughCircles with its best threshold.
-`--calibrate` fits the logistic curve of the confidence on other pictures, with backgrounds as in training. `--weights`
-measures another network, such as the paper's layout, trained by studies/learned_detector/train.py.
+`--calibrate` fits the logistic curve of the confidence on other pictures: as in training, and half as many of the
+renderer that chose between trainings. `--weights` measures another network, such as the paper's layout, trained by
+studies/learned_detector/train.py.
 """
 
 from __future__ import annotations
@@ -12,11 +13,13 @@ import argparse
 import time
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from geometry.arrays import Array, Bools
+from studies.learned_detector import third_renderer
 from studies.learned_detector.samples import Sample, draw_sample
 from tracking.learned_detector.detector import WEIGHTS, DrogueCandidate, find_drogues
 
@@ -35,6 +38,17 @@ def is_right(sample: Sample, found: DrogueCandidate) -> bool:
     error = np.hypot(found.u_px - sample.centre_px[0], found.v_px - sample.centre_px[1])
     ratio = found.diameter_px / sample.diameter_px
     return bool(error <= RIGHT_SHARE * sample.diameter_px and 1 / 1.5 < ratio < 1.5)
+
+
+def drawn(render: Any, kind: str, seed: int, k: int) -> Sample:
+    """Picture k of a renderer before one of its backgrounds: every second one without a drogue, half of these small."""
+    rng = np.random.default_rng([seed, k])
+    scene, look = render.background(kind, rng), render.face("drogue", rng, hose=True)
+    small, shown = k % 4 < 2, k % 2 == 0
+    diameter = float(np.exp(rng.uniform(*np.log((9, 15) if small else (15, 200)))))
+    u, v = (rng.uniform(0.6 * diameter, side - 0.6 * diameter) for side in render.SIZE)
+    picture = render.draw(scene, look if shown else None, u, v, diameter / 2, rng)
+    return Sample(picture, (u, v), diameter if shown else float("nan"))
 
 
 def scored(samples: list[Sample], found: list[list[DrogueCandidate]]) -> tuple[Array, Bools, Array]:
@@ -109,6 +123,9 @@ def main() -> None:
         draw_sample(rng, SIZE_PX, DIAMETERS_PX, unseen=not a.calibrate, empty=None if a.calibrate else False)
         for _ in range(a.frames)
     ]
+    if a.calibrate:
+        kinds = third_renderer.BACKGROUNDS
+        samples += [drawn(third_renderer, kinds[k % len(kinds)], a.seed, k // len(kinds)) for k in range(a.frames // 2)]
     start = time.process_time()
     found = [find_drogues(s.image, DIAMETERS_PX[0], DIAMETERS_PX[1], LEAST_CONFIDENCE, a.weights) for s in samples]
     learned_s = time.process_time() - start
@@ -118,11 +135,11 @@ def main() -> None:
         print(f"slope and offset relative to the present ones: {slope:.3f}, {offset:.3f}")
     recall, threshold = recall_at(samples, confidence, right, FALSE_PER_FRAME)
     used = right & (confidence >= threshold)
-    print(f"{a.frames} frames, seed {a.seed}: recall {recall:.4f} at {FALSE_PER_FRAME} false detections per frame")
+    print(f"{len(samples)} frames, seed {a.seed}: recall {recall:.4f} at {FALSE_PER_FRAME} false detections per frame")
     centre = 100 * error[used] if used.any() else np.array([np.nan])
     print(f"  (confidence {threshold:.3f} and more); centre error, share of the diameter: median")
     print(f"  {np.median(centre):.2f} %, 95 % {np.quantile(centre, 0.95):.2f} %")
-    print(f"  {1e3 * learned_s / a.frames:.0f} ms per frame, process time, one thread")
+    print(f"  {1e3 * learned_s / len(samples):.0f} ms per frame, process time, one thread")
     print("reliability (confidence, share right, number):")
     for mean, share, number in reliability(confidence, right):
         print(f"  {mean:.2f} {share:.2f} {number}")
@@ -131,10 +148,10 @@ def main() -> None:
     hough_s = time.process_time() - start
     score, ok, _ = scored(samples, circles)
     known, _ = recall_at(samples, score, ok, FALSE_PER_FRAME)
-    print(f"cv2.HoughCircles: recall {known:.4f}, {1e3 * hough_s / a.frames:.0f} ms per frame")
+    print(f"cv2.HoughCircles: recall {known:.4f}, {1e3 * hough_s / len(samples):.0f} ms per frame")
     for low, high in ((9, 15), (15, 40), (40, 100), (100, 200)):
         size = np.array([s.diameter_px for s in samples])
-        own = [i for i in range(a.frames) if low <= size[i] < high]
+        own = [i for i in range(len(samples)) if low <= size[i] < high]
         hits = sum(any(is_right(samples[i], c) and c.confidence >= threshold for c in found[i]) for i in own)
         print(f"  {low} to {high} px: {hits} of {len(own)}")
 

@@ -24,13 +24,12 @@ import numpy as np
 
 from bench.related_measurements import second_renderer
 from bench.related_measurements import second_renderer as render
-from bench.related_measurements.learned_detector import is_right
+from bench.related_measurements.learned_detector import drawn, is_right
 from geometry.arrays import Array
 from lab.targets.circle import CircleOptions
 from lab.targets.drogue import DrogueOptions
 from lab.targets.point import PointOptions
 from studies.learned_detector import third_renderer
-from studies.learned_detector.samples import Sample
 from tracking.drogue_circle.detectors import Edge
 from tracking.learned_detector.detector import WEIGHTS, find_drogues
 from tracking.noise import Picture
@@ -235,21 +234,17 @@ def detector(seed: int, count: int, weights: Path = WEIGHTS, render: Any = secon
         hits: dict[bool, list[bool]] = {True: [], False: []}
         false, ratios, away = [0, 0], [], []
         for k in range(2 * count):
-            rng = np.random.default_rng([seed, k])
-            scene, look = render.background(kind, rng), render.face("drogue", rng, hose=True)
-            small, shown = k % 4 < 2, k % 2 == 0
-            diameter = float(np.exp(rng.uniform(*np.log((9, 15) if small else (15, 200)))))
-            u, v = (rng.uniform(0.6 * diameter, side - 0.6 * diameter) for side in render.SIZE)
-            picture = render.draw(scene, look if shown else None, u, v, diameter / 2, rng)
+            sample = drawn(render, kind, seed, k)
+            diameter, shown = sample.diameter_px, bool(np.isfinite(sample.diameter_px))
             start = time.process_time()
-            found = find_drogues(picture, 9.0, 200.0, 0.5, weights)
+            found = find_drogues(sample.image, 9.0, 200.0, 0.5, weights)
             spent, n = spent + time.process_time() - start, n + 1
-            right = [c for c in found if shown and is_right(Sample(picture, (u, v), diameter), c)]
+            right = [c for c in found if is_right(sample, c)]
             false[shown] += len(found) - len(right[:1])
             if shown:
-                hits[small].append(bool(right))
+                hits[diameter < 15].append(bool(right))
             ratios += [c.diameter_px / diameter for c in right[:1]]
-            away += [np.hypot(c.u_px - u, c.v_px - v) / diameter for c in right[:1]]
+            away += [np.hypot(*np.subtract((c.u_px, c.v_px), sample.centre_px)) / diameter for c in right[:1]]
         print(
             f"{kind}: recall {np.mean(hits[True] + hits[False]):.3f}, at 9 to 15 px {np.mean(hits[True]):.3f}; diameter"
             f" {100 * (np.median(ratios) - 1):+.1f} % in the median; centre, RMS"

@@ -30,6 +30,8 @@ class BlobParameters:
 
 
 _MAD_TO_SIGMA = 1.4826  # of a Gaussian
+# A square of this share of background_px as well, for blobs of up to half of that: clouds change less within it.
+_NARROW = 0.67
 _EVERY = 4  # every 4th row and column is enough for the noise
 # A target larger than the background's square has contrast along its edge only. Such an edge is as bright as the blob
 # on its inner side and as the background on its outer one: both on this share of its surroundings.
@@ -44,8 +46,19 @@ def find_blobs(picture: Picture | NDArray[np.float32], parameters: BlobParameter
     covariance of a centroid is that of the contrast's noise; errors of the outline are not part of it. Blobs that touch
     the picture's edge are left out, since their centroid is not that of the target.
     """
+    wide = parameters.background_px
+    narrow = round(_NARROW * wide)
+    small = _blobs_before(picture, replace(parameters, max_size_px=min(parameters.max_size_px, narrow / 2)), narrow)
+    found = _blobs_before(picture, parameters, wide)
+    apart = np.linalg.norm(small.uv_px[:, None] - found.uv_px, axis=-1) > narrow / 4
+    found = found.joined(small[apart.all(axis=1)], len(small) + len(found))
+    return found[np.argsort(-found.flux, kind="stable")]
+
+
+def _blobs_before(picture: Picture | NDArray[np.float32], parameters: BlobParameters, square_px: int) -> Detections:
+    """The blobs of a picture (h, w) before a background that is the mean of a square with this side."""
     grey = picture.astype(np.float32)
-    side = 2 * (parameters.background_px // 2) + 1
+    side = 2 * (square_px // 2) + 1
     sign = np.float32(-1 if parameters.polarity == "darker" else 1)
     background = cv2.blur(grey, (side, side), borderType=cv2.BORDER_REFLECT)
     contrast = sign * (grey - background)
@@ -80,8 +93,7 @@ def find_blobs(picture: Picture | NDArray[np.float32], parameters: BlobParameter
     # One level for all of a blob, which hides what is behind it: a slope of the background would move its centroid.
     behind = np.bincount(of, background[v, u]) / np.bincount(of)
     weight = np.maximum(sign * (grey[v, u] - behind[of]), 0.0)
-    found = _moments(u.astype(float), v.astype(float), of, weight, len(rows), sigma, limit)
-    return found[np.argsort(-found.flux, kind="stable")]
+    return _moments(u.astype(float), v.astype(float), of, weight, len(rows), sigma, limit)
 
 
 def _outlines(contrast: NDArray[np.float32], limit: float) -> NDArray[np.uint8]:

@@ -89,8 +89,23 @@ def test_the_coupling_and_a_marker_are_parts_of_their_drogue():
 def test_a_drogue_whose_coupling_is_more_confident_is_found_whole(monkeypatch):
     rows = np.array([[1.0, 100, 100, 160], [3.0, 102, 100, 40]])  # logit, centre and diameter
     monkeypatch.setattr(detector, "_of_level", lambda level, weights: rows)
+    monkeypatch.setattr(detector, "_seen_again", lambda row, levels, weights: row)
     found = find_drogues(np.zeros((240, 320), np.uint8))
     assert [c.diameter_px for c in found] == pytest.approx([160])
+
+
+def test_a_second_look_corrects_a_candidate_and_rejects_one_beside_the_drogue(samples):
+    right = 0
+    for sample in samples:
+        (u, v), diameter = sample.centre_px, sample.diameter_px
+        levels = detector.pyramid(np.asarray(sample.image / 255, np.float32), 1.0, 28.0, 240.0)
+        rough = np.array([0.5, u + 0.1 * diameter, v - 0.1 * diameter, 1.2 * diameter])
+        c, u_seen, v_seen, size = detector._seen_again(rough, levels, detector.WEIGHTS).tolist()
+        right += c > 0.5 and np.hypot(u_seen - u, v_seen - v) < 0.08 * diameter and abs(size / diameter - 1) < 0.2
+        beside = np.array([0.5, u + 1.5 * diameter, v, diameter])
+        if u + 2 * diameter < 320:
+            assert detector._seen_again(beside, levels, detector.WEIGHTS)[0] < 0.5
+    assert right >= 0.75 * len(samples)
 
 
 def test_the_figures_of_the_bench_follow_from_the_candidates(samples):
