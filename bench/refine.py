@@ -277,7 +277,8 @@ def refined_with_true_labels(known: Rig, covariance: RigCovariance, scenes: list
     found = refine(known, covariance, recordings, refine(known, covariance, recordings))
     checks = tuple(check_model(found.rig, r, found.covariance) for r in recordings)
     runs: Any = tuple(
-        SimpleNamespace(run=SimpleNamespace(name=f"run{i}"), recording=r) for i, r in enumerate(recordings)
+        SimpleNamespace(run=SimpleNamespace(name=f"run{i}"), recording=r, unlabelled=())
+        for i, r in enumerate(recordings)
     )
     return RefinedRig(found, covariance, runs, checks)
 
