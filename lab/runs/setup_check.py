@@ -101,15 +101,20 @@ def _moved_px(here: Mapping[str, Detections], before: Mapping[str, Detections]) 
     return max((float(np.interp((len(d) - 1) / 4, np.arange(len(d)), np.sort(d))) for d in away), default=0.0)
 
 
+def compared_with_mistakes(run: Run, blocks: Sequence[Block]) -> Comparison | None:
+    """How well the rig and its possible mistakes explain sampled frames of a recording; None without such frames."""
+    frames = frames_of(blocks, run.prior, run.tracker.labels.min_spots)
+    return None if frames is None else compare(run.rig, frames, run.tracker.labels, run.covariance)
+
+
 def recorded_mistakes(run: Run, blocks: Sequence[Block], *, explained: bool = False) -> tuple[Finding, ...]:
     """Findings on mistakes that sampled frames of a recording show.
 
     explained: whether the rig leaves nothing but random errors of the recording: sigmas of points are then too small.
     """
-    frames = frames_of(blocks, run.prior, run.tracker.labels.min_spots)
-    if frames is None:
+    compared = compared_with_mistakes(run, blocks)
+    if compared is None:
         return ()
-    compared = compare(run.rig, frames, run.tracker.labels, run.covariance)
     found, given = findings_of(compared, run.rig), compared.given
     if compared.found or given.good or explained:
         return found
@@ -159,12 +164,10 @@ def mistakes_of_run(
     poses hardly use a camera, and for mistakes that its symmetry hides. explained: as in `recorded_mistakes`.
     """
     of_files = (*mistakes_by_themselves(run.rig, run.prior), *rates_of_videos(run))
-    cameras = statistics.cameras
-    unused = [n for n, c in cameras.items() if c.points >= LEAST_POINTS * max(c.pictures, 1) and not c.found]
-    doubtful = any(c.unlabelled + len(c.displaced) >= DOUBTFUL for c in cameras.values())
+    cameras, unused = statistics.cameras, unused_cameras(statistics)
     if verdict(of_files) is Level.FAIL:
         return of_files
-    tested = not passes or unused or doubtful
+    tested = not passes or unused or has_doubtful_pictures(statistics)
     found = recorded_mistakes(run, pictures.blocks, explained=explained) if tested else ()
     if passes and not unused and verdict(found) is not Level.FAIL:
         return (*hidden_by_symmetry(run, statistics), *of_files)
@@ -174,6 +177,17 @@ def mistakes_of_run(
         return (*others, *of_files)
     unlabelled = [unused_finding(n, cameras[n].points, cameras[n].pictures) for n in unused]
     return (*unlabelled, *others, *of_files)
+
+
+def unused_cameras(statistics: RunStatistics) -> list[str]:
+    """Cameras with points in their pictures, of which no point is labelled."""
+    cameras = statistics.cameras.items()
+    return [n for n, c in cameras if c.points >= LEAST_POINTS * max(c.pictures, 1) and not c.found]
+
+
+def has_doubtful_pictures(statistics: RunStatistics) -> bool:
+    """Whether a camera has pictures in which none of its spots is found where the poses put it."""
+    return any(c.unlabelled + len(c.displaced) >= DOUBTFUL for c in statistics.cameras.values())
 
 
 def hidden_by_symmetry(run: Run, statistics: RunStatistics) -> tuple[Finding, ...]:

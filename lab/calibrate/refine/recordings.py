@@ -30,12 +30,19 @@ from lab.runs.frames.moments import Moment
 from lab.runs.frames.pipeline import FrameRecord, Frames, Pipeline
 from lab.runs.model_check.check import ModelCheck, check_model
 from lab.runs.model_check.frame_sampler import FrameSampler
-from lab.runs.setup_check import DOUBTFUL, SampledFrames, findings_of, frames_of, mistakes_by_themselves, unused_finding
+from lab.runs.setup_check import (
+    SampledFrames,
+    compared_with_mistakes,
+    findings_of,
+    has_doubtful_pictures,
+    mistakes_by_themselves,
+    unused_cameras,
+    unused_finding,
+)
 from lab.runs.smoothing_pass import TrackingAndSmoothing
 from lab.runs.verdict.frame_checks import FrameChecks
 from lab.runs.verdict.run_statistics import CameraStatistics, RunStatistics
 from tracking.detections import Detections
-from tracking.setup_mistakes.evidence import LEAST_POINTS, compare
 from tracking.statuses import PoseStatus, SpotStatus
 
 LEAST_MEASURED = 0.9  # share of frames with a measured pose, below which usual mistakes of the set-up are tested
@@ -206,16 +213,16 @@ def labelled(run: Run, most: int | None = None, enough: int = 0, *, search: bool
                 sampler.add_record(record, camera_of, run.tracker)
                 pictures.add(record.frame, points)
                 statistics.add(record)
-                reach.count(record, points)
+                if most is None:
+                    reach.count(record, points)
     recording = sampler.recording()
     if recording is None:
         raise CalibrationError(f"{run.folder}: there is no frame at all")
     # A camera without labels in the first frames may have them later, with a better rig.
-    judged = most is None and statistics.measured > 0
-    unused = [n for n, c in cameras.items() if judged and c.points >= LEAST_POINTS * c.pictures and not c.found]
+    unused = unused_cameras(statistics) if most is None and statistics.measured else []
     wrong = [n for n in unused if not reach.allows(n)]
     few = statistics.measured <= LEAST_MEASURED * statistics.frames
-    doubtful = most is None and any(c.unlabelled + len(c.displaced) >= DOUBTFUL for c in cameras.values())
+    doubtful = most is None and has_doubtful_pictures(statistics)
     found, searched = mistakes_by_themselves(run.rig, run.prior), False
     if search and (few or wrong or doubtful):
         more, searched = _searched(run, pictures)
@@ -233,9 +240,8 @@ def labelled(run: Run, most: int | None = None, enough: int = 0, *, search: bool
 
 def _searched(run: Run, pictures: SampledFrames) -> tuple[tuple[Finding, ...], bool]:
     """Mistakes of the set-up that sampled frames show, and whether all were tested and none found."""
-    frames = frames_of(pictures.blocks, run.prior, run.tracker.labels.min_spots)
-    if frames is None:
+    compared = compared_with_mistakes(run, pictures.blocks)
+    if compared is None:
         return (), False
-    compared = compare(run.rig, frames, run.tracker.labels, run.covariance)
     found = tuple(f for f in findings_of(compared, run.rig) if f.level is Level.FAIL)
     return found, not found and not compared.given.is_certain
