@@ -39,12 +39,12 @@ class Browser:
         )
         os.close(to_read)
         os.close(to_write)
-        self._buffer, self._number, self._session = b"", 0, None
+        self._buffer, self._number, self._session, self._downloads_done = b"", 0, None, 0
         target = self.send("Target.createTarget", url="about:blank")["targetId"]
         self._session = self.send("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Log"):
             self.send(f"{domain}.enable")
-        self.send("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(downloads))
+        self.send("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(downloads), eventsEnabled=True)
 
     def close(self) -> None:
         self._process.kill()
@@ -79,6 +79,8 @@ class Browser:
             self.console.append(" ".join(str(a.get("value")) for a in known["args"]))
         elif message.get("method") == "Log.entryAdded":
             self.console.append(known["entry"]["text"])
+        elif message.get("method") == "Browser.downloadProgress":
+            self._downloads_done += known["state"] == "completed"
         return message
 
     def open(self, address: str, width: int = 1200, height: int = 800, night: bool = False) -> None:
@@ -87,6 +89,16 @@ class Browser:
         self.console.clear()
         self.send("Page.navigate", url=address)
         self.until("document.readyState === 'complete'")
+
+    def reload(self) -> None:
+        """Load the page once more; a question asked right after the command would still be answered by the old one."""
+        self.get("window.isBeforeReload = true")
+        self.send("Page.reload")
+        self.until("!window.isBeforeReload && document.readyState === 'complete'")
+
+    def _state(self) -> str:
+        shown = self.get("[location.href, document.readyState, document.body?.innerText.slice(0, 500)].join(' | ')")
+        return f"console: {self.console}; page: {shown}"
 
     def size(self, width: int, height: int, night: bool = False) -> None:
         self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
@@ -103,7 +115,7 @@ class Browser:
         """The value of an expression as soon as it is true."""
         end = time.monotonic() + limit_s
         while not (value := self.get(expression)):
-            assert time.monotonic() < end, f"not true after {limit_s} s: {expression}"
+            assert time.monotonic() < end, f"not true after {limit_s} s: {expression}; {self._state()}"
             time.sleep(0.03)
         return value
 
@@ -144,11 +156,14 @@ class Browser:
         return None
 
     def download(self, name: str) -> bytes:
-        """A file that the page has downloaded; it is removed."""
-        file, end = self.downloads / name, time.monotonic() + _LIMIT_S
-        while not file.is_file():
-            assert time.monotonic() < end, f"{name} was not downloaded"
-            time.sleep(0.03)
+        """A file that the page has downloaded; it is removed.
+
+        Chromium first reserves the name with an empty file: a file of that name is not yet the content.
+        """
+        while not self._downloads_done:
+            self._message()
+        self._downloads_done -= 1
+        file = self.downloads / name
         content = file.read_bytes()
         file.unlink()
         return content

@@ -88,7 +88,7 @@ def test_points_are_clicked_named_downloaded_and_still_there_after_a_reload(tmp_
     for row in rows:
         assert np.hypot(*np.subtract([float(row["u_px"]), float(row["v_px"])], PLACES[row["point"]])) < 0.05
         assert 0.001 < float(row["sigma_px"]) < 0.05
-    browser.send("Page.reload")
+    browser.reload()
     browser.until("document.getElementById('count')?.textContent.startsWith('2 named')")
     assert "2 names of your last visit" in said(browser)
     assert table_of(browser) == rows
