@@ -146,14 +146,14 @@ def _with_shifts(
     mean = background.plain()
     own = (background.shares * background.noise.variance(mean)).astype(np.float32)
     share = replace(shift, misfit_share=float("nan")).with_lights(found).misfit_share
-    part = 1.0 if background.noise.texture < _OF_SURFACE else _OF_OBJECTS
+    part = shift.over_light * (1.0 if background.noise.texture < _OF_SURFACE else _OF_OBJECTS)
     # What no Gaussian explains, a board or a lamp, is a part of the surface for the lights that move over it.
     off = np.zeros(len(still)) if still.misfit is None else np.sqrt(still.misfit * still.variance_px2)
     gaussian = off < _LARGEST_MISFIT * np.sqrt(still.major_px * still.minor_px)
     _subtract(still[gaussian], mean, own)
     shifts_px = np.float32(part) * local_shifts(mean, own, width)
     _subtract(still[~gaussian], mean, own)
-    rest_shifts_px = shifts_at_rest(mean, own, still)
+    rest_shifts_px = shift.over_light * shifts_at_rest(mean, own, still)
     return replace(better, spot_px=width, shifts_px=shifts_px, rest_shifts_px=rest_shifts_px, misfit_share=share)
 
 

@@ -45,6 +45,7 @@ class ShownLight:
     noise: NoiseModel  # of the pictures
     noise_share: float  # variance of the background's own noise over that of a picture
     reference: float = 1.0  # what of the structure, which contains noise, the pictures show; 0: too little to measure
+    in_mean: float = 0.0  # what a picture shows besides if its own noise is in the structure
 
     @staticmethod
     def of(
@@ -69,8 +70,9 @@ class ShownLight:
             return replace(first, reference=0.0)
         where = plain > 0
         of_noise = float(np.mean(noise.variance(smooth[where]))) / count
-        reference = float(np.median(lights)) - of_noise / max(float(np.mean(seen[where] ** 2)), 1e-12)
-        return replace(first, reference=reference if reference > _LEAST_LIGHT else 0.0)
+        in_mean = of_noise / max(float(np.mean(seen[where] ** 2)), 1e-12)
+        reference = float(np.median(lights)) - in_mean
+        return replace(first, reference=reference if reference > _LEAST_LIGHT else 0.0, in_mean=in_mean)
 
     def in_picture(self, picture: Picture) -> Shown | None:
         """How much of the structure a picture shows, relative to the background, and what it leaves.
@@ -83,7 +85,9 @@ class ShownLight:
         light /= self.reference or 1.0
         power = float(np.sum(np.square(clear * structure)))
         sigma = _EFFICIENCY * float(np.sqrt(_median(variance[_SOME]) / max(power, 1e-12))) / (self.reference or 1.0)
-        if not self.reference or abs(light - 1) < max(LEAST_CHANGE, _CLEAR_SIGMAS * sigma):
+        usual = max(LEAST_CHANGE, _CLEAR_SIGMAS * sigma)
+        # Whether a picture is one of those in the mean is not known here: both of its lights are usual.
+        if not self.reference or -usual < light - 1 < usual + self.in_mean / self.reference:
             light = 1.0
         if not _LEAST_LIGHT < light < _MOST_LIGHT:
             return None

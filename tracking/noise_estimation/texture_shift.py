@@ -46,8 +46,10 @@ _FEWEST_PLACES = 500  # samples of the filters' outputs without lights and lines
 # 1.2 px, which shifts spots of 1.6 px with a brightness of 4.6 by 0.9 of what it does with equal weights.
 _WEIGHTED = 0.145
 _UNSURE = 0.02  # of the noise of the mean picture, which is subtracted: usual error of its estimate
+_SURROUNDINGS = 6.0  # widths: of a spot, beyond the reach of the kernel
 _SAMPLED = 3  # px: step of the sample of the filters' outputs
 LARGEST_SHARE = 0.25  # of the spot's width: a larger error is not assumed; faint spots on texture have half of it
+_IN_BACKGROUND = 2.0, 4.0  # shift of a fit by the background over that by its light: at edges, on coarse texture
 _LARGEST_AT_REST = 1.0  # the same of a light at rest, whose fit absorbs structure of its own width
 
 
@@ -63,6 +65,7 @@ class TextureShift:
     # Usual error of the lights in the pictures by misfits of their fits, as a share of their widths; nan: too few
     # lights that are wide enough to show it
     misfit_share: float = float("nan")
+    over_light: float = 1.0  # ratio of the background's level, which contains the black level, to its light
 
     @staticmethod
     def none() -> TextureShift:
@@ -71,13 +74,9 @@ class TextureShift:
 
     @staticmethod
     def usual(picture: Picture) -> TextureShift:
-        """For pictures (h, w) that cannot show it: little texture, and a lens that transmits less light to the corners.
-
-        Half way to the corner a light of sigma s is shifted by s^2 times the fall of the light over its distance.
-        """
-        half_diagonal = 0.5 * float(np.hypot(*picture.shape))
-        light = tuple(float(np.hypot(_USUAL_TEXTURE * w, _USUAL_FALL * w**2 / half_diagonal)) for w in _WIDTHS_PX)
-        return TextureShift(_WIDTHS_PX, light, tuple(0.0 for _ in _WIDTHS_PX), False, half_diagonal)
+        """For pictures (h, w) that cannot show it: little texture."""
+        light, none = tuple(_USUAL_TEXTURE * w for w in _WIDTHS_PX), tuple(0.0 for _ in _WIDTHS_PX)
+        return TextureShift(_WIDTHS_PX, light, none, False, 0.5 * float(np.hypot(*picture.shape)))
 
     def with_lights(self, found: Sequence[Detections]) -> TextureShift:
         """These errors with `misfit_share` from the lights found in pictures.
@@ -122,8 +121,9 @@ class TextureShift:
         light = 0.5 * p * np.interp(at + 0.5 * np.log(2 / p), widths, self.light_px)
         background = np.interp(at, widths, self.background_px)
         if light_px is not None:
-            # At an edge the kernel in the background moves the fit twice as far as that in the light.
-            background = 2.0 * light_px * (max(self.background_px) > 0)
+            # As many times as far as the kernel in the light as elsewhere; at an edge twice as far.
+            times = background / np.maximum(np.interp(at, widths, self.light_px), 1e-9)
+            background = np.clip(times, *_IN_BACKGROUND) * light_px * (max(self.background_px) > 0)
             light = np.sqrt(0.5 * p) * light_px
         return np.minimum(light + background / np.maximum(contrast, 1e-3), largest * np.asarray(width_px))
 
@@ -143,9 +143,12 @@ class TextureShift:
         width_px, brightness = np.sqrt(found.major_px * found.minor_px), noise.slope_dn * found.peak / noise.floor_dn2
         largest = _LARGEST_AT_REST if at_rest else LARGEST_SHARE
         sigma_px = self.sigma_px(width_px, found.peak / max(noise.black_dn, 1.0), brightness, light_px, largest)
-        # The half of a light that is nearer to the camera looks larger: its axis is not in its middle.
-        wide_px2 = np.maximum(width_px**2 - _COARSE_PX**2, 0.0)
-        sigma_px = np.hypot(sigma_px, _OBLIQUE * wide_px2 / self.half_diagonal_px)
+        # A lens transmits less light to the corners: half way to them a light of sigma s is shifted by s^2 times the
+        # fall of the light over its distance. The half of a wide light that is nearer to the camera looks larger: its
+        # axis is not in its middle.
+        narrow_px2 = np.minimum(width_px**2, _COARSE_PX**2)
+        uneven_px2 = _USUAL_FALL * narrow_px2 + _OBLIQUE * (width_px**2 - narrow_px2)
+        sigma_px = np.hypot(sigma_px, uneven_px2 / self.half_diagonal_px)
         axes = np.stack([found.major_px, found.minor_px, np.radians(found.angle_deg)])
         if at_rest:  # round
             axes = np.stack([width_px, width_px, np.zeros(len(found))])
@@ -224,7 +227,7 @@ def texture_shift(
         light.append(light[-1] if shifts is None else max(cell * shifts[0], light[-1]))
         around.append(around[-1] if shifts is None else max(cell * shifts[1], around[-1]))
     half_diagonal = 0.5 * float(np.hypot(*mean.shape))
-    return TextureShift(_WIDTHS_PX, tuple(more * x for x in light), tuple(around), True, half_diagonal)
+    return TextureShift(_WIDTHS_PX, tuple(more * x for x in light), tuple(around), True, half_diagonal, over_light=more)
 
 
 def _without_rows_and_columns(texture: NDArray[Any], objects: NDArray[np.uint8]) -> NDArray[Any]:
@@ -268,39 +271,60 @@ def _filtered(texture: NDArray[Any], odd: Array, smooth: Array) -> list[NDArray[
 
 
 def local_shifts(
-    background: NDArray[np.float32], variance: NDArray[np.float32] | float, width_px: float
+    background: NDArray[np.float32], variance: NDArray[np.float32] | float, width_px: float, absorbed: bool = False
 ) -> NDArray[np.float32]:
     """Sigmas, px, of a spot of this width at each place of a known background (h, w), by the texture in its light.
 
     That of the surroundings of a pixel, as large as the spot, as if the background were the screen, lit evenly. Where
     it is not, or is lit by other lamps as well, the errors are smaller: an upper bound, of which the residuals show how
-    much is true. variance, DN^2: of the background's own noise.
+    much is true. variance (h, w), DN^2: of the background's own errors. Where they hide the texture, as behind a bright
+    light, it is that of the wider surroundings: the mean of both, each with the inverse square of its error. absorbed:
+    a fit has taken up structure of the background; then it is at least that of the wider surroundings.
     """
-    reach = int(np.ceil(_REACH * width_px / np.sqrt(2)))
+    reach = _reach(width_px)
     odd, smooth = _kernels(width_px, 2, reach)
     light = np.maximum(cv2.sepFilter2D(background, cv2.CV_32F, smooth / smooth.sum(), smooth / smooth.sum()), 1.0)
     moved = [(x / light) ** 2 for x in _filtered(background, odd, smooth)]
-    noise = variance * np.sum(odd**2) * np.sum(smooth**2) / light**2
+    everywhere = np.broadcast_to(np.asarray(variance, np.float32), background.shape)
+    noise = sum(_filtered(everywhere, odd**2, smooth**2)) / (2 * light**2)
+    seen = 0.5 * (moved[0] + moved[1]) - noise
     side = 2 * int(np.ceil(width_px)) + 1
-    return np.asarray(np.sqrt(np.maximum(cv2.blur(0.5 * (moved[0] + moved[1]) - noise, (side, side)), 0.0)), np.float32)
+    here, error = cv2.blur(seen, (side, side)), cv2.blur(noise, (side, side))
+    usual = max(float(np.median(noise)), 1e-30)
+    weight = (usual / (usual + noise)) ** 2
+    wide = 2 * _wider(width_px) + 1
+    around = cv2.blur(weight * seen, (wide, wide)) / cv2.blur(weight, (wide, wide))
+    around = np.maximum(around, 0.0)
+    share = around**2 / np.maximum(around**2 + error**2, np.float32(1e-30))
+    if absorbed:
+        here = np.maximum(here, around)
+    return np.asarray(np.sqrt(np.maximum(share * here + (1 - share) * around, 0.0)), np.float32)
+
+
+def _reach(width_px: float) -> int:
+    """Half side, px, of the kernel in the light of a spot."""
+    return int(np.ceil(_REACH * width_px / np.sqrt(2)))
+
+
+def _wider(width_px: float) -> int:
+    """Half side, px, of the surroundings of a spot that show the texture where its own light hides it."""
+    return _reach(width_px) + int(np.ceil(_SURROUNDINGS * width_px))
 
 
 def shifts_at_rest(background: NDArray[np.float32], variance: NDArray[np.float32], lights: Detections) -> Array:
     """(n,) px: `local_shifts` at the places of lights, of a light as wide as each.
 
-    background, variance (h, w): as there, without the lights. A fit takes up structure under its light as if it were
-    light, so that not all of it is left: of 465 lights in front of photographs 1.5 % were farther off than 3 of these
-    sigmas. With surroundings of 1.5 widths 0.4 % were, and usual sigmas a quarter too large.
+    background, variance (h, w): as there, without the lights, whose fits have taken up structure as if it were light.
     """
     out = np.zeros(len(lights))
     # The fit of a light at the border may lie beyond it.
     places = np.clip(np.rint(lights.uv_px), 0, np.array(background.shape[::-1]) - 1).astype(int)
     for i, (u, v) in enumerate(places):
         width = max(float(np.sqrt(lights.major_px[i] * lights.minor_px[i])), _NARROWEST_PX)
-        half = int(np.ceil(_REACH * width / np.sqrt(2))) + int(np.ceil(width)) + 1
+        half = _wider(width) + _reach(width) + 1
         top, left = max(v - half, 0), max(u - half, 0)
         part = np.s_[top : v + half + 1, left : u + half + 1]
-        here = local_shifts(background[part], variance[part], width)
+        here = local_shifts(background[part], variance[part], width, absorbed=True)
         out[i] = here[v - top, u - left]
     return out
 

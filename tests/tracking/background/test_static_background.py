@@ -26,8 +26,8 @@ LEVEL, NOISE, TEXTURE = 20.0, 0.8, 0.04  # DN, DN, share of the level
 USUAL = DetectParameters()
 
 
-def reflectance(seed: int, texture: float) -> Array:
-    smooth = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal(SIZE), (0, 0), 0.6)
+def reflectance(seed: int, texture: float, grain_px: float = 0.6) -> Array:
+    smooth = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal(SIZE), (0, 0), grain_px)
     return np.asarray(1 + texture * smooth / smooth.std())
 
 
@@ -56,10 +56,10 @@ class Recording:
     @staticmethod
     def of(
         centres: Array, peak: float, seed: int = 3, scale: float = 1.0, light: Array | None = None,
-        texture: float = TEXTURE,
+        texture: float = TEXTURE, grain_px: float = 0.6,
     ) -> Recording:  # fmt: skip
         """scale: grey values per DN of an 8-bit picture; light (pictures,): of the background, relative to LEVEL."""
-        rng, screen = np.random.default_rng(seed + 1000), reflectance(seed, texture)
+        rng, screen = np.random.default_rng(seed + 1000), reflectance(seed, texture, grain_px)
         light = np.ones(len(centres)) if light is None else light
         kind = np.uint8 if scale == 1 else np.uint16
         pictures = []
@@ -129,6 +129,42 @@ def test_the_light_of_the_room_may_change():
     recall, false, _ = judged(recording, background, range(45))
     assert recall > 0.9
     assert false < 0.3
+
+
+def test_constant_light_is_constant_though_the_noise_of_a_picture_is_in_the_mean_that_contains_it():
+    """Texture fainter than the noise, in large pictures, which measure their light precisely."""
+    rng, size = np.random.default_rng(2), (720, 960)
+    screen = LEVEL + 0.3 * cv2.GaussianBlur(rng.standard_normal(size), (0, 0), 1.5) * 5
+    pictures = [np.rint(screen + NOISE * rng.standard_normal(size)).astype(np.uint8) for _ in range(30)]
+    lower, mean = mean_pictures.means_of(pictures[::2])
+    model = NoiseModel(NOISE**2, 0.0, LEVEL)
+    for fixed in (lower, mean):
+        background = StaticBackground.of_mean(fixed, pictures[::2], model, USUAL).with_light(pictures[::2])
+        shown = [background.shown.in_picture(p) for p in pictures]
+        assert {None if s is None else s[0] for s in shown} == {1.0}
+
+
+@pytest.mark.parametrize(("peak", "sigma_px"), [(150.0, 1.1), (40.0, 1.6)])
+@pytest.mark.parametrize("grain_px", [0.6, 1.5, 2.5])
+def test_lights_at_rest_have_errors_of_their_places_which_their_own_light_hides(peak, sigma_px, grain_px):
+    """Texture under a light is in its fit; what is left shows nothing of it."""
+    square, (u, v) = [], np.meshgrid(np.arange(40.0, 460, 60), np.arange(160.0, 340, 60))
+    for seed in range(3):
+        still = np.stack([u.ravel(), v.ravel()], axis=-1)
+        still += np.random.default_rng(seed).uniform(-0.5, 0.5, still.shape)
+        recording = Recording.of(path(15, 3, 4.0, seed) - [0.0, 40.0], 60.0, seed=seed, grain_px=grain_px)
+        lit = reflectance(seed, TEXTURE, grain_px) * light_of(still, peak, sigma_px)
+        pictures = [np.rint(p + lit).astype(np.uint8) for p in recording.pictures]
+        estimate = estimate_noise(pictures[:2] + pictures[-2:], black_dn=0.0)
+        recording = replace(recording, pictures=pictures, estimate=estimate)
+        background = recording.background()
+        assert background is not None
+        found = recording.found_in(background, 0)
+        for centre in still:
+            gap = found.uv_px - centre
+            i = int(np.argmin(np.hypot(*gap.T)))
+            square.append(gap[i] @ np.linalg.solve(found.cov_px2[i], gap[i]) / 2)
+    assert 0.6 < np.mean(square) < 1.5
 
 
 def test_a_camera_that_was_knocked_shows_no_further_spots():

@@ -15,7 +15,13 @@ from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
 from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
-from tracking.noise_estimation.texture_shift import LARGEST_SHARE, TextureShift, lights_and_lines, shifts_at_rest
+from tracking.noise_estimation.texture_shift import (
+    LARGEST_SHARE,
+    TextureShift,
+    lights_and_lines,
+    local_shifts,
+    shifts_at_rest,
+)
 from tracking.parameters import DetectParameters
 
 SIZE = (400, 500)
@@ -200,6 +206,34 @@ def test_the_fall_of_the_light_towards_the_corners_shifts_wide_spots():
     usual = width**2 * 2 * 0.2 * 125 / 250**2  # px, at half the distance to the edge
     assert np.all(level < 0.1 * usual)
     assert np.all(np.abs(np.log(falling / usual)) < np.log(2))
+
+
+@pytest.mark.parametrize("sigma_px", [2.0, 3.0])
+def test_the_fall_of_the_light_towards_the_corners_is_in_the_sigmas_of_precise_narrow_spots(sigma_px):
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    fall = 1 - 0.2 * ((x - 250) ** 2 + (y - 200) ** 2) / (250**2 + 200**2)
+    shift = estimate_noise(pictures(fall, 0.0, 4)).texture_shift
+    centres, light = spots(sigma_px, 30000.0, 1)
+    model, square = NoiseModel(NOISE**2, 0.0, BACKGROUND), []
+    found = shift.added_to(find_spots(pictures(fall, light, 1)[0], noise=model), model)
+    for centre in centres:
+        gap = found.uv_px - centre
+        i = int(np.argmin(np.hypot(*gap.T)))
+        square.append(gap[i] @ np.linalg.solve(found.cov_px2[i], gap[i]) / 2)
+    assert 0.3 < np.mean(square) < 1.5
+
+
+@pytest.mark.parametrize("width_px", [1.2, 2.5])
+def test_where_the_background_is_not_known_spots_have_the_errors_of_the_surroundings(width_px):
+    background = (BACKGROUND * screen(0.04, 1.5, 2)).astype(np.float32)
+    usual = local_shifts(background, 0.0, width_px)
+    hidden = np.zeros(SIZE, bool)
+    hidden[60::100, 60::100] = True
+    hidden = cv2.dilate(hidden.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    variance = np.where(hidden, np.float32((10 * BACKGROUND) ** 2), np.float32(1.0))
+    for wrong in (-BACKGROUND, 20 * BACKGROUND):
+        there = local_shifts(np.where(hidden, np.float32(wrong), background), variance, width_px)[60::100, 60::100]
+        assert np.all(np.abs(np.log(there / np.sqrt(np.mean(usual**2)))) < np.log(1.7))
 
 
 def test_noise_alone_predicts_next_to_nothing():
