@@ -24,6 +24,8 @@ _LEAST_CHANGES = 20  # changes of the widths in a camera from which their scatte
 _RESOLVED_PX = 1.8  # width of a spot from which its fit shows misfits
 _LEAST_OF_VIEW = 6  # changes from which a view counts
 _MEDIAN_CHI2 = 0.4549364  # median of chi-square with one degree of freedom
+_LAGS = 1, 2, 4, 8, 16  # frames between the compared widths of a spot
+_APART = 2.0  # widths between places with different errors
 _CLEAR_SCATTER = 2.0  # ratio of the widths' variance to the stated one from which it is used
 
 
@@ -193,35 +195,48 @@ def scattered_width_share(run: RunDetections, assigned: Ints, camera_of: Ints) -
 
     Whatever changes the light from place to place (noise, texture, speckle) shifts a fitted Gaussian and changes its
     width by the same amount: the derivatives with respect to both have the same norm once that of the amplitude is
-    projected out. A width's second difference over three frames therefore has six times the variance of a coordinate of
-    the centre. It needs no other spot, and motion that is steady in the picture cancels. Errors that last for three
-    frames do not show: a lower bound. Source: ours; measured on 60 random recordings, where both scatters have a
-    correlation of 0.96 and agree within 20 % (1 sigma).
+    projected out. The second difference of three widths therefore has six times the variance of a coordinate of the
+    centre. It needs no other spot, and motion that is steady in the picture cancels. Errors that last are compared over
+    as many frames as the spot needs to move by two widths; those of a spot at rest do not show: a lower bound. Source:
+    ours; measured on 60 random recordings, where both scatters have a correlation of 0.96 and agree within 20 %
+    (1 sigma).
     """
     labelled = (assigned >= 0) & (assigned < BLENDED)
     row = np.where(labelled, run.begin[: len(assigned), None] + assigned, 0)
     size = np.where(labelled, run.size_px[row], np.nan) if len(run.size_px) else np.full(row.shape, np.nan)
-    change = size[2:] - 2 * size[1:-1] + size[:-2]
-    square, width2 = change**2 / 6, size[1:-1] ** 2
-    known = np.isfinite(change)
-    stated = np.full(change.shape, np.nan)
-    stated[known] = np.linalg.eigvalsh(run.cov[row[1:-1][known]])[:, 1]
     out = np.zeros(run.has_image.shape[1])
-    for camera in range(len(out)):
-        some: list[int] = [
-            int(i) for i in np.flatnonzero(camera_of == camera) if np.count_nonzero(known[:, i]) >= _LEAST_OF_VIEW
-        ]
-        if np.count_nonzero(known[:, some]) < _LEAST_CHANGES:
-            continue
-
-        # The mean over the views: speckle may show in the sigmas of wide spots and not in those of narrow ones.
-        def ratio(share: float, some: list[int] = some) -> float:
-            return float(np.mean(np.nanmedian(square[:, some] / (stated + share**2 * width2)[:, some], axis=0))) / (
-                _MEDIAN_CHI2
+    farther = np.zeros(len(out), bool)  # compared in different places of the screen
+    for lag in (x for x in _LAGS if 2 * x < len(size)):
+        middle = np.s_[lag : len(size) - lag]
+        change = size[2 * lag :] - 2 * size[middle] + size[: -2 * lag]
+        if lag > 1:
+            uv = run.uv[row]
+            moved = np.minimum(
+                *(np.linalg.norm(uv[end] - uv[middle], axis=-1) for end in (np.s_[2 * lag :], np.s_[: -2 * lag]))
             )
+            change[moved < _APART * size[middle]] = np.nan
+        square, width2 = change**2 / 6, size[middle] ** 2
+        known = np.isfinite(change)
+        stated = np.full(change.shape, np.nan)
+        stated[known] = np.linalg.eigvalsh(run.cov[row[middle][known]])[:, 1]
+        for camera in range(len(out)):
+            some: list[int] = [
+                int(i) for i in np.flatnonzero(camera_of == camera) if np.count_nonzero(known[:, i]) >= _LEAST_OF_VIEW
+            ]
+            if farther[camera] or np.count_nonzero(known[:, some]) < _LEAST_CHANGES:
+                continue
+            farther[camera] = lag > 1
 
-        if ratio(0.0) > _CLEAR_SCATTER:
-            out[camera] = _share_with(ratio)
+            # The mean over the views: speckle may show in the sigmas of wide spots and not in those of narrow ones.
+            def ratio(
+                share: float, some: list[int] = some, square: Array = square, stated: Array = stated,
+                width2: Array = width2,
+            ) -> float:  # fmt: skip
+                of_views = np.nanmedian(square[:, some] / (stated + share**2 * width2)[:, some], axis=0)
+                return float(np.mean(of_views)) / _MEDIAN_CHI2
+
+            if ratio(0.0) > _CLEAR_SCATTER:
+                out[camera] = max(_share_with(ratio), out[camera])
     return out
 
 

@@ -56,6 +56,19 @@ def test_unlabelled_and_blended_points_and_unknown_widths_do_not_count():
     assert share_of(wild._replace(size_px=np.full(LABELS.size, np.nan)), LABELS) == [0.0]
 
 
+def test_errors_that_last_while_a_spot_moves_by_less_than_its_width_show_in_places_farther_apart():
+    """A spot that moves by a fifth of its width per frame has nearly the same error in the next frame."""
+    rng, views = np.random.default_rng(5), 20
+    moved = 0.2 * WIDTH * (np.arange(FRAMES)[:, None] - np.arange(FRAMES))
+    alike = np.linalg.cholesky(np.exp(-0.25 * (moved / WIDTH) ** 2) + 1e-6 * np.eye(FRAMES))
+    slow = detections(WIDTH * (1 + 0.1 * alike @ rng.normal(size=(FRAMES, views))), 0.02)
+    uv = np.stack([0.2 * WIDTH * np.repeat(np.arange(FRAMES), views), np.zeros(FRAMES * views)], axis=-1)
+    labels, cameras = np.tile(np.arange(views), (FRAMES, 1)), np.zeros(views, dtype=np.int64)
+    # The median of few independent changes is larger in the mean.
+    assert scattered_width_share(slow._replace(uv=uv), labels, cameras) == pytest.approx([0.11], rel=0.2)
+    assert scattered_width_share(slow, labels, cameras) == [0.0]  # at rest such changes are those of the light
+
+
 def test_errors_that_only_narrow_spots_hide_add_to_their_camera_alone():
     """One of two cameras, and in it one of three views whose sigmas contain the errors."""
     rng = np.random.default_rng(3)
