@@ -203,8 +203,10 @@ def scattered_width_share(run: RunDetections, assigned: Ints, camera_of: Ints) -
     """
     labelled = (assigned >= 0) & (assigned < BLENDED)
     row = np.where(labelled, run.begin[: len(assigned), None] + assigned, 0)
-    size = np.where(labelled, run.size_px[row], np.nan) if len(run.size_px) else np.full(row.shape, np.nan)
     out = np.zeros(run.has_image.shape[1])
+    if not len(run.size_px):
+        return out
+    size = np.where(labelled, run.size_px[row], np.nan)
     farther = np.zeros(len(out), bool)  # compared in different places of the screen
     for lag in (x for x in _LAGS if 2 * x < len(size)):
         middle = np.s_[lag : len(size) - lag]
