@@ -240,8 +240,8 @@ def explained(
     model = SpotModel.of(rig)
     calibration = None if covariance is None else RigUncertainty(rig, model, covariance)
     K, c = len(frames.blocks), len(rig.cameras)
-    counts = (np.zeros((K, c), dtype=np.int64) for _ in range(3))
-    out = Explained(np.zeros(K), np.zeros(K, dtype=bool), *counts, np.zeros(K, dtype=np.int64))
+    counts = [np.zeros((K, c), dtype=np.int64) for _ in range(3)]
+    out = Explained(np.zeros(K), np.zeros(K, dtype=bool), counts[0], counts[1], counts[2], np.zeros(K, dtype=np.int64))
     changed = np.array([rig.spots[spot].beam in mistake.beams for _, spot in model.views], dtype=bool)
     for k, block in enumerate(frames.blocks):
         prior = (mistake.prior or frames.prior) if k == 0 and frames.at_start else None
