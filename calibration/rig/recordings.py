@@ -18,6 +18,7 @@ from calibration.model_check.linearised_frames import (
     LinearisedFrames,
     ModelCheckRecording,
     clock_derivatives,
+    evenly_spaced,
     linearised_at,
     whitening,
     with_clocks,
@@ -93,17 +94,40 @@ class RecordingTerm:
         """The recording at these values of the rig, without its poses. Of the last values it is kept."""
         if self._last and self._last[0][0] is values:
             return self._last[0][1]
-        model = unlimited(SpotModel.of(rig_of(self.rig, values)))
-        clocks = np.concatenate([array_of(values, s) for s in (OFFSETS, ROW_TIMES)], axis=1)[model.camera_of]
-        lin = with_own_poses(model, with_clocks(model, self.recording, clocks))
+        lin, flat = self.slopes(values, values)
         left = lin.residual_part(lin.residual)
-        free = lin.residual_part(lin.W @ self._derivatives(model, lin, values))
-        flat = free.reshape(-1, free.shape[-1])
         X, V = compressed(flat.T @ flat)
         y = V @ (flat.T @ left.ravel())
         rest = max(float(left.ravel() @ left.ravel() - y @ y), 0.0)
         self._last[:] = [(values, Reduced(X, y, rest, lin.dof, lin, left))]
         return self._last[0][1]
+
+    def thinned(self, most: int) -> RecordingTerm:
+        """At most so many of the frames, at least six, with covariances as if they were all."""
+        rows = evenly_spaced(np.arange(len(self.recording.seen)), max(most, 6))
+        some = self.recording.at(rows)
+        share = len(rows) / len(self.recording.seen)
+        return replace(self, recording=replace(some, cov_px2=some.cov_px2 * share))
+
+    def moved(self, values: Values, errors: Array) -> Values:
+        """The values with these errors (p,) of the unknowns."""
+        steps = {s: np.zeros((len(values[s]), values[s].dof)) for s, _ in self.at}
+        start = 0
+        for stack, i in self.at:
+            steps[stack][i] = errors[start : start + values[stack].dof]
+            start += values[stack].dof
+        return {**values, **{s: values[s].plus(step) for s, step in steps.items()}}
+
+    def slopes(self, values: Values, about: Values) -> tuple[LinearisedFrames, Array]:
+        """The recording at these values, and its derivatives (K n 2, p) without what the poses absorb, whitened.
+
+        about: the values to whose errors the derivatives belong.
+        """
+        model = unlimited(SpotModel.of(rig_of(self.rig, values)))
+        clocks = np.concatenate([array_of(values, s) for s in (OFFSETS, ROW_TIMES)], axis=1)[model.camera_of]
+        lin = with_own_poses(model, with_clocks(model, self.recording, clocks))
+        free = lin.residual_part(lin.W @ self._derivatives(model, lin, about))
+        return lin, free.reshape(-1, free.shape[-1])
 
     def _derivatives(self, model: SpotModel, lin: LinearisedFrames, values: Values) -> Array:
         """d(pixels)/d(unknowns) (K, n, 2, p); 0 for spots that are not used, and for numbers that are not free."""

@@ -29,13 +29,14 @@ from geometry.arrays import Array, Bools, finite
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.chi_square import chi2_limit
-from geometry.uncertainty.rig_uncertainty import RigCovariance, covariance_root, split_name, unlimited
+from geometry.uncertainty.rig_uncertainty import RigCovariance, covariance_root, unlimited
 
 FEWEST_FRAMES = 30  # of a recording: a shorter one is not used
 _FEWEST_AT_FIRST = 10  # of a first solution, which is for labels
 FEWEST_SPOTS = 4  # of a frame: three spots leave nothing that the pose does not absorb
 FOLDS = 5  # blocks of time of a single recording
 _P_OUTLIER = 1e-5  # probability that a correct spot is excluded
+_CURVED_FRAMES = 30  # of all recordings, which stand for all frames in errors of second order
 _ROUNDS = 5  # of outliers and noise scales
 # Where values are near the solution. With the usual 1e-4 each step reaches directions that are ten times weaker than
 # those of the step before: seven steps in place of two. The prior keeps the normal matrix regular.
@@ -167,7 +168,7 @@ def refine(
     gain, vectors = np.linalg.eigh(known.root.T @ S @ known.root)
     names, T = named_errors(rig, values, prior.at)
     directions = known.root @ vectors
-    after = _with_curvature(after, directions, gain, names, T)
+    after = _with_curvature(after, known, terms, values, changed)
     matrix = T @ after.covariance @ T.T
     named = np.diagonal(matrix) > 0
     moved, lenses = ((), {}) if start is None else MovedParts(rig, prior, terms, free, values, known).found()
@@ -271,23 +272,28 @@ def _correlation(data: Sequence[Reduced]) -> float:
     return max(correlation_time(np.where(d.lin.used[..., None], d.left, np.nan).reshape(len(d.left), -1)) for d in data)
 
 
-def _with_curvature(after: Knowledge, directions: Array, gain: Array, names: Sequence[str], T: Array) -> Knowledge:
-    """What is known with the errors that are of second order in the turns of the parts.
+def _with_curvature(
+    after: Knowledge, known: Knowledge, terms: Sequence[RecordingTerm], values: Values, changed: Bools
+) -> Knowledge:
+    """What is known with the errors of second order, which uncertain directions cause in well determined ones.
 
-    A turn by an angle moves a part across its lever by the angle, and along it by half of its square. So no direction,
-    (p, r) of one prior sigma each, is known better than by half of the largest uncertain turn, in prior sigmas. Many
-    frames of little noise determine some directions to 1 / 2500 of the prior to first order: these were off by six
-    sigmas (two beams, cameras of 3 mrad).
+    The residuals of an error e are X e + H(e, e) / 2. The estimate takes the second part for an error of first order,
+    P X^T H(e, e) / 2 with the covariance P: with errors of 3 mrad, and two of three cameras on one screen, directions
+    known to 1/200 of the prior were off by 8.5 sigmas. H is from differences of X over one sigma, of some frames that
+    stand for all. Its variances are increased such that three sigmas include what an error of three sigmas causes,
+    9/4 H^2, since squares of normal errors have long tails (their mean square is 3/4 H^2).
     """
-    variance = np.diagonal(T @ after.covariance @ T.T)
-    turns: dict[str, float] = {}
-    for name, v in zip(names, variance.tolist(), strict=True):
-        kind, part, parameter = split_name(name)
-        if parameter.startswith(("rot_", "direction")):
-            turns[f"{kind}.{part}"] = turns.get(f"{kind}.{part}", 0.0) + v
-    lacking = np.maximum(max(turns.values(), default=0.0) / 4 - 1 / (1 + np.maximum(gain, 0.0)), 0.0)
-    u, size, _ = np.linalg.svd(np.concatenate([after.root, directions * np.sqrt(lacking)], axis=1), full_matrices=False)
-    return Knowledge(after.mean, (u * size)[:, : directions.shape[1]])
+    few = [t.thinned(_CURVED_FRAMES // len(terms)) for t in terms]
+
+    def slopes(v: Values) -> Array:
+        return np.concatenate([t.slopes(v, values)[1] for t in few])
+
+    X, root = slopes(values), known.with_data([t.reduced(values) for t in few]).root
+    gain = np.where(changed[:, None], root @ root.T, 0.0) @ X.T
+    H = np.stack([gain @ (slopes(terms[0].moved(values, e)) - X) @ after.root for e in after.root.T], axis=1)
+    H = 3 / 4 * (H + np.swapaxes(H, 1, 2)).reshape(len(H), -1)
+    u, size, _ = np.linalg.svd(np.concatenate([after.root, covariance_root(H @ H.T)], axis=1), full_matrices=False)
+    return Knowledge(after.mean, (u * size)[:, : known.root.shape[1]])
 
 
 def _held_out(

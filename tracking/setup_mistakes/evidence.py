@@ -64,6 +64,7 @@ class Explained:
     labelled: Ints  # (K, c) points with a label, by camera
     expected: Ints  # (K, c) spots that the pose puts into the picture
     points: Ints  # (K, c)
+    changed: Ints  # (K,) points with the label of a spot that the mistake changes
 
     @property
     def good(self) -> bool:
@@ -155,6 +156,8 @@ def compare(
             if m.kind != "numbers"
             or e.nats.sum() - explained(m.opposite, frames, parameters, covariance).nats.sum() >= LEAD_NATS
         ]
+    # Beams whose ends are exchanged hardly ever meet a screen: such a rig explains what one without these beams does.
+    found = [(m.elsewhere if m.beams and not e.changed.any() else m, e) for m, e in found]
     limit = float(found[0][1].nats.sum()) - SAME_NATS if found else 0.0
     # Where the rig explains all frames but the first, a prior that excludes it is named only if it is in other units:
     # the search for the first pose reports any other.
@@ -237,8 +240,9 @@ def explained(
     model = SpotModel.of(rig)
     calibration = None if covariance is None else RigUncertainty(rig, model, covariance)
     K, c = len(frames.blocks), len(rig.cameras)
-    counts = (np.zeros((K, c), dtype=np.int64) for _ in range(3))
-    out = Explained(np.zeros(K), np.zeros(K, dtype=bool), *counts)
+    counts = [np.zeros((K, c), dtype=np.int64) for _ in range(3)]
+    out = Explained(np.zeros(K), np.zeros(K, dtype=bool), counts[0], counts[1], counts[2], np.zeros(K, dtype=np.int64))
+    changed = np.array([rig.spots[spot].beam in mistake.beams for _, spot in model.views], dtype=bool)
     for k, block in enumerate(frames.blocks):
         prior = (mistake.prior or frames.prior) if k == 0 and frames.at_start else None
         points = mistake.points(block)
@@ -252,6 +256,7 @@ def explained(
         out.nats[k] = best.score
         given = best.point_of != NO_POINT
         out.labelled[k] = np.bincount(model.camera_of[given], minlength=c)
+        out.changed[k] = np.count_nonzero(given & changed)
         in_view = model.in_picture(best.fit.projected_px)
         out.expected[k] = np.bincount(model.camera_of[in_view], minlength=c)
         out.fits[k] = _fits(best, model, points) if calibration is None else best.fit.consistent(P_FIT)

@@ -56,6 +56,7 @@ class Mistake:
     pictures: Mapping[str, PictureChange] = field(default_factory=dict)  # by camera; others are as recorded
     prior: PosePrior | None = None  # as it is without the mistake; None: as given
     by_itself: bool = False  # numbers of the files show it, without a recording
+    beams: tuple[str, ...] = ()  # whose spots it changes
 
     def has_effect(self, given: Rig) -> bool:
         """Whether the mistake changes more than names: the pictures, the prior, or the points of some pose."""
@@ -70,6 +71,12 @@ class Mistake:
         """Numbers that are wrong in the other direction."""
         changes = {n: replace(c, later=-c.later) for n, c in self.pictures.items()}
         return replace(self, pictures=changes)
+
+    @property
+    def elsewhere(self) -> Mistake:
+        """What frames show that only a rig without the spots of its beams explains: these are not where it says."""
+        what = f"no spot of beam {_names(self.beams)} is where the rig puts it: its direction or point is wrong"
+        return replace(self, what=what, remedy="calibrate the beams again (`beampose calibrate beams`)")
 
     def cameras(self, given: Rig) -> set[int]:
         """Indices of the cameras whose pictures, lens, place or screen the mistake changes."""
@@ -312,6 +319,7 @@ def _target(rig: Rig) -> Iterator[Mistake]:
             f"beams `{a}` and `{b}` are exchanged",
             "exchange their direction and point_m in rig.yaml",
             replace(rig, beams={**rig.beams, a: replace(other, name=a), b: replace(one, name=b)}),
+            beams=(a, b),
         )
     for a in rig.beams:
         beam = rig.beams[a]
@@ -320,6 +328,7 @@ def _target(rig: Rig) -> Iterator[Mistake]:
             f"the ends of beam `{a}` are exchanged",
             "exchange + and - of its spots, or reverse its direction, in rig.yaml",
             replace(rig, beams={**rig.beams, a: replace(beam, direction=-beam.direction)}),
+            beams=(a,),
         )
 
 
@@ -385,7 +394,7 @@ def _each_and_all(names: Mapping[str, object], word: str = "camera") -> Iterator
         yield f"all {word}s", list(names)
 
 
-def _names(names: list[str]) -> str:
+def _names(names: Sequence[str]) -> str:
     return ", ".join(f"`{n}`" for n in names)
 
 

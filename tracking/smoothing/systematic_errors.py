@@ -84,7 +84,7 @@ def calibration_errors(
 
     The smoother weights each spot with its noise and the first of these. The pose that follows from such weights moves
     with the calibration's errors by (J^T W J)^-1 J^T W: the same in every frame with these spots, so that no averaging
-    reduces it. A frame without such a pose has the covariance of the frame before.
+    reduces it. A frame without such a pose has the covariance of the frame before, or of the first one that has it.
     """
     n, frames = len(rec.model), len(rec)
     calibration_cov = np.zeros((n, 2, 2))
@@ -114,7 +114,9 @@ def calibration_errors(
         if gain is not None and C is not None:
             rows, G = gain
             both = coordinates_of(rows)
-            latest = G @ C[np.ix_(both, both)] @ G.T
+            before, latest = latest, G @ C[np.ix_(both, both)] @ G.T
+            if not before.any():  # the frames before this one have poses only of the smoothing pass
+                systematic[:k] = latest
             _, _, cov = labelled_points(detections, k, assigned[k], np.zeros_like(calibration_cov))
             share[k] = share_without_calibration(J[k][rows], cov[rows], calibration_cov[rows])
         systematic[k] = latest

@@ -17,7 +17,7 @@ from calibration.model_check.faults import pixel_velocities
 from calibration.model_check.linearised_frames import ModelCheckRecording, with_clocks
 from geometry.arrays import Array, finite
 from geometry.forward_model import SpotModel
-from geometry.pose_solver.visibility import assumed_range
+from geometry.pose_solver.visibility import assumed_range, poses_within
 from geometry.rig import Rig
 from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import CLOCK, RigCovariance, RigUncertainty, is_known, unlimited
@@ -49,6 +49,7 @@ LEAST_MEASURED = 0.9  # share of frames with a measured pose, below which usual 
 # Share of the residuals that the errors of the rig cause, as sigma of the tracker's model: with all of it, or none,
 # rigs that are off by 10 px keep fewer labels (measured: 0.1 to 0.3 of the whole error, half of what no pose absorbs).
 _EXPECTED = 0.5
+_POSES = 2000  # of the prior, of which the one that shows most spots tells how large the residuals are
 _P_SPOT = 1e-6  # probability that a spot is farther from its prediction than its camera's stated errors allow
 _IN_REACH = 0.5  # share of a camera's spots that have a point nearer: the others may be hidden
 
@@ -118,7 +119,9 @@ def tolerant(run: Run) -> Run:
     model = SpotModel.of(run.rig)
     if run.covariance is None:
         return run
-    pose = (assumed_range(run.rig) if run.prior is None else run.prior).centre
+    # The centre of a wide prior may show no spot at all.
+    poses = poses_within(assumed_range(run.rig) if run.prior is None else run.prior, _POSES)
+    pose = poses[int(np.argmax(model.in_picture(model.project(poses)[0]).sum(axis=1)))]
     C = RigUncertainty(run.rig, model, run.covariance).at(pose)
     J = unlimited(model).project(pose)[1].reshape(-1, 6)
     seen = (np.diagonal(C) > 0) & finite(J, -1)

@@ -420,6 +420,15 @@ def test_a_rig_with_clocks_is_read_back_as_it_was_written(tmp_path):
     assert (back.time_offset_s, back.row_time_s) == (-0.0013, 8e-6)
 
 
+def test_a_prior_whose_centre_shows_no_spot_expects_the_residuals_of_the_poses_in_it(lab):
+    folder, runs, _, _ = lab
+    run = load_run(runs[0], folder / "rig.yaml")
+    aside = replace(run.prior, centre=run.prior.centre.plus(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.2])), within_rad=1.5)
+    usual, found = (tolerant(replace(run, prior=p)).tracker.sigma_model_px for p in (run.prior, aside))
+    assert usual > 0.5
+    assert found == pytest.approx(usual, rel=0.5)
+
+
 def test_a_prior_whose_pose_absorbs_all_errors_leaves_the_tracker_as_it_is(lab):
     folder, runs, _, _ = lab
     run = load_run(runs[0], folder / "rig.yaml")

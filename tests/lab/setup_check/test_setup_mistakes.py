@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 import yaml
 
+from bench import refine as bench
 from bench.mistakes.mistakes import CASES, read, turned_aside, write
 from bench.mistakes.recordings import calibrated
 from bench.random_scenes.scene import random_scene
@@ -21,7 +22,7 @@ from geometry.arrays import Array
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
-from geometry.rig import Rig
+from geometry.rig import Beam, Rig
 from lab.calibrate.camera.photos import _frames
 from lab.files.project.project import Cloud
 from lab.files.rig.rig_file import save_rig
@@ -467,3 +468,27 @@ def test_at_rest_only_the_first_and_last_number_show_a_camera_that_is_numbered_f
 def test_exchanged_spots_of_a_screen_are_said_to_be_invisible_where_no_beams_can_be_exchanged(tmp_path):
     save_rig(random_scene(7113).known_rig, tmp_path / "rig.yaml")
     assert "Exchanged names of two spots of a screen: no recording shows them" in checked(tmp_path / "rig.yaml")[0]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "rows", "words"),
+    [
+        ("moved", (1, 20, 40, 58), "no spot of beam `B` is where the rig puts it: its direction or point is wrong"),
+        ("reversed", (1, 30, 58), "the ends of beam `B` are exchanged"),
+    ],
+)
+def test_a_beam_that_has_moved_is_not_one_whose_ends_are_exchanged(monkeypatch, wrong, rows, words):
+    """A reversed beam hardly ever meets a screen: such a rig explains all points but this beam's."""
+    monkeypatch.setattr(evidence, "possible_mistakes", lambda rig, _: [m for m in possible_mistakes(rig) if m.beams])
+    lab, (scene,), _ = bench.campaign(8308, 60, recordings=1)
+    beam, stated = lab.rig.beams["B"], None
+    if wrong == "reversed":
+        changed = replace(beam, direction=-beam.direction)
+    else:  # by 13 mrad and 18 mm, where 1 mrad and 1 mm are stated
+        turned = beam.direction + np.array([0.0, -0.003, -0.0126])
+        changed = Beam("B", turned / np.linalg.norm(turned), beam.point + np.array([-0.007, 0.0, 0.0165]))
+        stated = bench.rig_covariance(lab.rig, bench.Sigmas(clocks=0.0))
+    rig = replace(lab.rig, beams={**lab.rig.beams, "B": changed})
+    blocks = [[dict(zip(rig.cameras, scene.detections[k + i], strict=True)) for i in (-1, 0, 1)] for k in rows]
+    found = compare(rig, Frames(blocks, None, at_start=False), LabelParameters(), stated).found
+    assert [m.what for m, _ in found] == [words]

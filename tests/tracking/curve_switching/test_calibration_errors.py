@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -142,6 +144,17 @@ def test_calibration_errors_are_not_counted_twice():
         assert f.pose_systematic is not None
         shares.append(1 - np.trace(np.linalg.solve(f.pose_covariance, f.pose_systematic)) / 6)
     assert 0 < np.mean(shares) < 0.2  # 0.31 if the calibration counts as noise too
+
+
+def test_poses_before_the_first_that_the_tracker_measured_state_the_calibration_errors():
+    run = simulate_points("two-cameras-per-screen", 3, frames=20, noise_px=0.01, clutter=0.0)
+    nothing = tuple(points[:0] for points in run.detections[0])
+    run = replace(run, detections=[nothing, nothing, *run.detections[2:]])
+    covariance = covariance_of(run.rig)
+    frames, _ = smoothed_frames(run, tracked(run, covariance=covariance), covariance=covariance)
+    sizes = [np.trace(np.linalg.solve(frames[2].pose_systematic, f.pose_systematic)) / 6 for f in frames[:2]]
+    assert all(f.pose is not None for f in frames[:2])
+    np.testing.assert_allclose(sizes, 1.0, rtol=0.1)
 
 
 @pytest.mark.slow
