@@ -364,14 +364,16 @@ class PatternState:
         innovation = seen - self.offset
         usual = _detection_noise(self.diameter_px, p)
         nis = innovation**2 / (self.offset_variance + self.noise_scale * usual)
-        noise = self.noise_scale * usual * np.maximum(nis / _HUBER_SIGMAS**2, 1.0)
-        gain = self.offset_variance / (self.offset_variance + noise)
         nis[:2] = nis[:2].mean()
-        scale = np.clip(self.noise_scale * np.exp(_NOISE_RATE * (np.minimum(nis, _MOST_NIS) - 1)), *_NOISE_RANGE)
+        change = np.exp(_NOISE_RATE * (np.minimum(nis, _MOST_NIS) - 1))
+        scale = np.clip(self.noise_scale * change, *_NOISE_RANGE)
+        change = scale / self.noise_scale
         # The detections before had the same scatter, and so has what they gave.
-        variance = (1 - gain) * self.offset_variance * scale / self.noise_scale
+        variance = self.offset_variance * change
+        noise = scale * usual * np.maximum(nis / change / _HUBER_SIGMAS**2, 1.0)
+        gain = variance / (variance + noise)
         return replace(
-            self, offset=self.offset + gain * innovation, offset_variance=variance, noise_scale=scale,
+            self, offset=self.offset + gain * innovation, offset_variance=(1 - gain) * variance, noise_scale=scale,
             common_variance=_COMMON * scale * usual,
         )  # fmt: skip
 
