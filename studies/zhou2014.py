@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -415,7 +416,9 @@ def compare_zhou2014(seed: int = 1, stills: int = STILLS, runs: int = RUNS, fram
     """The table and the figures of Zhou (2014). With more pictures: bench/related_measurements/circle.py."""
     errors = still_errors(seed, stills)
     hidden = [hidden_run(1000 * seed + k) for k in range(runs)]
-    lights = {light: followed(seed, light, frames) for light in PAPER_PERCENT}
+    with ThreadPoolExecutor(len(PAPER_PERCENT)) as pool:
+        tracked = pool.map(lambda light: followed(seed, light, frames), PAPER_PERCENT)
+        lights = dict(zip(PAPER_PERCENT, tracked, strict=True))
     cost = cost_ratio(seed)
     return Comparison(
         title="Zhou, Sun, Bing & Yang (2014): tracking of an aerial refuelling drogue",

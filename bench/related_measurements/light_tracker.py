@@ -160,7 +160,7 @@ def reliability_of(records: list[Record]) -> None:
 
 
 def calibrated(seed: int, count: int, frames: int) -> None:
-    """Fit the coefficients of the confidence by maximum likelihood and print them."""
+    """Fit the coefficients of the confidence by maximum likelihood; print their line of tracking/light_tracker."""
     inputs: list[Array] = []
     right: list[bool] = []
     for i in range(count):
@@ -178,7 +178,7 @@ def calibrated(seed: int, count: int, frames: int) -> None:
     x, y = np.array(inputs), np.array(right)
     print(f"{len(y)} matches, {y.mean():.4f} right")
     coefficients = logistic(x, y, SIGNS)
-    print(dict(zip(FEATURES, coefficients.round(2).tolist(), strict=True)))
+    print(f"COEFFICIENTS = {tuple(coefficients.round(2).tolist())}  # of {FEATURES}")
     p = 1 / (1 + np.exp(-x @ coefficients))
     for mean, share, number in reliability(p, y):
         print(f"  {mean:.3f} {share:.3f} {number}")

@@ -194,10 +194,16 @@ def render_drogue(scene: DrogueScene, rng: np.random.Generator) -> DroguePicture
     if scene.blur_px > 0:
         cv2.GaussianBlur(picture, (0, 0), scene.blur_px, dst=picture, borderType=cv2.BORDER_REPLICATE)
     if scene.noise_dn > 0:
-        sigma = np.float32(scene.noise_dn) * np.sqrt(0.25 + (0.75 / 128) * np.maximum(picture, 0))
-        picture += sigma * rng.standard_normal(picture.shape, dtype=np.float32)
-    image = np.clip(np.rint(picture), 0, 255).astype(np.uint8)
-    return _with_truth(scene, image, rim)
+        # In place: fresh arrays of this size cost as much time as what is computed in them.
+        sigma = np.maximum(picture, 0)
+        sigma *= 0.75 / 128
+        sigma += 0.25
+        np.sqrt(sigma, out=sigma)
+        sigma *= np.float32(scene.noise_dn)
+        sigma *= rng.standard_normal(picture.shape, dtype=np.float32)
+        picture += sigma
+    np.clip(np.rint(picture, out=picture), 0, 255, out=picture)
+    return _with_truth(scene, picture.astype(np.uint8), rim)
 
 
 def _with_truth(scene: DrogueScene, image: np.ndarray, rim: Array) -> DroguePicture:

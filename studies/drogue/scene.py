@@ -208,7 +208,9 @@ def ellipse_through(points_px: Array) -> Ellipse:
     mean = points.mean(axis=0)
     scale = float(np.sqrt(np.mean(np.sum((points - mean) ** 2, axis=1))))
     x, y = ((points - mean) / scale).T
-    a, b, c, d, e, f = np.linalg.svd(np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)], axis=1))[2][-1]
+    a, b, c, d, e, f = np.linalg.svd(
+        np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)], axis=1), full_matrices=False
+    )[2][-1]
     M = np.array([[a, b / 2], [b / 2, c]])
     if np.linalg.det(M) <= 0:
         raise ValueError("the points lie on no ellipse")

@@ -37,9 +37,10 @@ class LightParameters:
     sigma_a_diameters: float = 0.03  # diameters/frame^2: 1-sigma acceleration ...
     sigma_a_px: float = 0.3  # ... and this much in px: motion of the camera
     sigma_growth: float = 0.02  # 1 sigma of the relative change of the diameter per frame
-    detection_sigma: float = 0.015  # of a detected centre, per axis, in diameters
-    detection_size_sigma: float = 0.15  # of the logarithm of a detected diameter
-    offset_drift: float = 0.006  # per frame, in diameters: motion of the rim's centre in the pattern
+    detection_sigma: float = 0.007  # of a detected centre, per axis, in diameters ...
+    detection_sigma_px: float = 0.1  # ... and this much in px: .7 % at 100 px, 1.3 % at 9 px
+    detection_size_sigma: float = 0.1  # of the logarithm of a detected diameter
+    offset_drift: float = 0.004  # per frame, in diameters: motion of the rim's centre in the pattern
     search_after: int = 3  # frames without a measurement after which the detector searches the whole picture
     most_predicted: int = 50  # frames without a measurement after which the drogue is lost
     most_unseen: int = 100  # frames without a detection after which a drogue that is not measured is lost, too
@@ -127,7 +128,7 @@ def nothing_known(cause: Cause, event: str = "", searched: str = "", found: int 
 RIGHT_SHARE = 0.25  # of the diameter
 FEATURES = ("1", "support", "confirmed", "unconfirmed")
 SIGNS = (0, 1, 1, -1)  # of the coefficients: more of a good sign never lowers the confidence
-COEFFICIENTS = (-0.29, 0.83, 1.62, -1.3)  # of the features
+COEFFICIENTS = (1.24, 1.46, 1.02, -0.12)  # of the features
 ABSENT_LOGIT = -2.0  # of a check without a detection, in the running mean of the checks
 _CAP = 0.995  # of correlations: above it, noise decides
 _MOST_CONFIRMED = 10  # checks in a row that count: further ones say nothing new

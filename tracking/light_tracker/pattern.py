@@ -149,7 +149,7 @@ class Pattern:
         # Of unit variance, the part that the pattern does not explain, over its degrees of freedom; `normal` belongs to
         # weights of sum 1, so it is divided by the effective number of pixels.
         pixels = visible / float((self.weights**2).sum())
-        covariance = min(left, 2 * usual / visible) / max(pixels - 5, 1) * part.normal[:3, :3]
+        covariance = unexplained(agreement) / max(pixels - 5, 1) * part.normal[:3, :3]
         to_px = np.array([place[2] / window.scale] * 2 + [1.0])
         covariance = covariance * to_px[:, None] * to_px
         u, v = window.outside(*place[:2])
@@ -276,18 +276,21 @@ def _second(scores: Floats, x: int, y: int, apart: float) -> float:
 # The centre moves with a nearly constant velocity (the filter of tracking/kalman.py), the logarithm of the diameter is
 # a random walk. A match is accurate to a few hundredths of a pixel, but its pattern drifts with tilt and light; a
 # detection has an error of some percent of the diameter, but does not drift. So the offset between the two is a state
-# of its own: detections correct the drift, and their errors average out. Source: ours.
+# of its own: detections correct the drift, and their errors average out in part. Their size depends on the drogue, its
+# tilt and its background (.6 to 3 % of the diameter, in 48 sequences of two renderers): the variance is estimated from
+# the innovations. An error that all detections of one drogue have in common shows in no innovation; in these sequences
+# it grows with the others, so its variance is stated as _COMMON times theirs. Source: ours.
 
 _MATCH_SIGMA_PX = 0.03  # of a match, beside its own covariance
-_MATCH_FACTOR = 2.0  # of the covariance of a match: neighbouring pixels have related errors
 _MATCH_SIZE_SIGMA = 0.01  # of the log diameter of a match, beside its own covariance
 _START_SPEED = 0.3, 5.0  # 1 sigma of the speed at the start: diameters and px per frame
 # Relative change of the acceleration per excess of a normalised innovation, its largest excess, and its limits relative
 # to the initial value: as in tracking/single_target/point_tracker.py.
 _LEARNING_RATE, _MOST_NIS = 0.1, 6.0
 _SIGMA_A_RANGE = 0.1, 10.0
+_COMMON = 2.0  # variance of the error that all detections have in common, over that of each
+_NOISE_RATE, _NOISE_RANGE = 0.3, (0.2, 10.0)  # the same of the noise of detections, which are few
 WHOLE = 0.9  # visible share of a pattern of which nothing is hidden
-_HIDDEN_VARIANCE = 10.0  # of the covariance of a match of which a part is hidden
 _HUBER_SIGMAS = 2.5  # a detection farther away than this has a smaller weight
 
 
@@ -302,6 +305,8 @@ class PatternState:
     offset: Array  # (3,) of the rim from the pattern: u, v in diameters, logarithm of the diameter
     offset_variance: Array  # (3,)
     sigma_a_px: float  # px/frame^2: 1-sigma acceleration, estimated from the innovations
+    noise_scale: Array  # (3,) of the variance of detections, estimated from the innovations
+    common_variance: Array  # (3,) of the error of `offset` that all detections have in common
 
     @classmethod
     def started(cls, u_px: float, v_px: float, diameter_px: float, p: LightParameters) -> PatternState:
@@ -309,14 +314,17 @@ class PatternState:
         speed = _START_SPEED[0] * diameter_px + _START_SPEED[1]
         # The pattern is cut out at the detection: its place is known, what the detection is wrong by is in the offset.
         P = np.diag([_MATCH_SIGMA_PX**2, _MATCH_SIGMA_PX**2, speed**2, speed**2])
+        noise = _detection_noise(diameter_px, p)
         return cls(
             np.array([u_px, v_px, 0.0, 0.0]),
             P,
             float(np.log(diameter_px)),
             _MATCH_SIZE_SIGMA**2,
             np.zeros(3),
-            _offset_noise(p),
+            noise,
             p.sigma_a_diameters * diameter_px + p.sigma_a_px,
+            np.ones(3),
+            _COMMON * noise,
         )
 
     def predicted(self, dt: float, misses: int, p: LightParameters) -> PatternState:
@@ -325,7 +333,7 @@ class PatternState:
         # A drogue sways: what its acceleration was before it was hidden is not what it is now.
         sigma_a = self.sigma_a_px if not misses else max(self.sigma_a_px, start)
         x, P = kalman.predict(self.x, self.P, dt, np.asarray(sigma_a))
-        drift = np.array([p.offset_drift, p.offset_drift, p.offset_drift]) ** 2 * dt
+        drift = p.offset_drift**2 * dt
         return replace(
             self, x=x, P=P, size_variance=self.size_variance + p.sigma_growth**2 * dt,
             offset_variance=self.offset_variance + drift,
@@ -333,15 +341,16 @@ class PatternState:
 
     def matched(self, match: Match, p: LightParameters, learn: bool = True) -> PatternState:
         """With a match. learn: adapt the acceleration to its innovation."""
-        partly = _HIDDEN_VARIANCE / match.visible**2 if match.visible < WHOLE else 1.0
-        R = partly * (_MATCH_FACTOR * match.covariance[:2, :2] + _MATCH_SIGMA_PX**2 * np.eye(2))
+        whole = match.visible >= WHOLE
+        partly = 1.0 if whole else 1 / match.visible**2
+        R = partly * (match.covariance[:2, :2] + _MATCH_SIGMA_PX**2 * np.eye(2))
         z = np.array([match.u_px, match.v_px])
         nis = float(kalman.innovation(self.x, self.P, z, R)[2])
         x, P = kalman.update(self.x, self.P, z, R)
         start = p.sigma_a_diameters * self.diameter_px + p.sigma_a_px
-        change = float(np.exp(_LEARNING_RATE * (min(nis / 2, _MOST_NIS) - 1))) if learn and partly == 1.0 else 1.0
+        change = float(np.exp(_LEARNING_RATE * (min(nis / 2, _MOST_NIS) - 1))) if learn and whole else 1.0
         sigma_a = float(np.clip(self.sigma_a_px * change, *np.multiply(_SIGMA_A_RANGE, start)))
-        r = _MATCH_FACTOR * float(match.covariance[2, 2]) * partly + _MATCH_SIZE_SIGMA**2 * partly
+        r = partly * (float(match.covariance[2, 2]) + _MATCH_SIZE_SIGMA**2)
         gain = self.size_variance / (self.size_variance + r)
         size = self.log_diameter + gain * (float(np.log(match.diameter_px)) - self.log_diameter)
         return replace(
@@ -353,16 +362,32 @@ class PatternState:
         away = (np.array([u_px, v_px]) - self.x[:2]) / self.diameter_px
         seen = np.array([*away, np.log(diameter_px) - self.log_diameter])
         innovation = seen - self.offset
-        noise = _offset_noise(p)
-        sigma = np.sqrt(self.offset_variance + noise)
-        noise = noise * np.maximum(np.abs(innovation) / (_HUBER_SIGMAS * sigma), 1.0) ** 2
-        gain = self.offset_variance / (self.offset_variance + noise)
-        return replace(self, offset=self.offset + gain * innovation, offset_variance=(1 - gain) * self.offset_variance)
+        usual = _detection_noise(self.diameter_px, p)
+        nis = innovation**2 / (self.offset_variance + self.noise_scale * usual)
+        nis[:2] = nis[:2].mean()
+        change = np.exp(_NOISE_RATE * (np.minimum(nis, _MOST_NIS) - 1))
+        scale = np.clip(self.noise_scale * change, *_NOISE_RANGE)
+        change = scale / self.noise_scale
+        # The detections before had the same scatter, and so has what they gave.
+        variance = self.offset_variance * change
+        noise = scale * usual * np.maximum(nis / change / _HUBER_SIGMAS**2, 1.0)
+        gain = variance / (variance + noise)
+        return replace(
+            self, offset=self.offset + gain * innovation, offset_variance=(1 - gain) * variance, noise_scale=scale,
+            common_variance=_COMMON * scale * usual,
+        )  # fmt: skip
 
     def moved(self, match: Match, p: LightParameters) -> PatternState:
         """Found at another place after a gap: at rest there, of the same size and offset."""
         start = PatternState.started(match.u_px, match.v_px, match.diameter_px, p)
-        return replace(start, offset=self.offset, offset_variance=self.offset_variance)
+        return start.with_offset_of(self)
+
+    def with_offset_of(self, other: PatternState) -> PatternState:
+        """This motion, with the offset of another state and all that is known of it."""
+        return replace(
+            self, offset=other.offset, offset_variance=other.offset_variance, noise_scale=other.noise_scale,
+            common_variance=other.common_variance,
+        )  # fmt: skip
 
     def centred(self) -> PatternState:
         """With the pattern cut out again at the rim."""
@@ -388,12 +413,13 @@ class PatternState:
     @property
     def covariance(self) -> Array:
         """(2, 2) of the rim's centre, px^2."""
-        return self.P[:2, :2] + self.diameter_px**2 * np.diag(self.offset_variance[:2])
+        return self.P[:2, :2] + self.diameter_px**2 * np.diag((self.offset_variance + self.common_variance)[:2])
 
     @property
     def sigma_diameter_px(self) -> float:
         """Of the rim."""
-        return self.rim_diameter_px * float(np.sqrt(self.size_variance + self.offset_variance[2]))
+        variance = self.size_variance + self.offset_variance[2] + self.common_variance[2]
+        return self.rim_diameter_px * float(np.sqrt(variance))
 
     @property
     def sigma_px(self) -> float:
@@ -401,8 +427,10 @@ class PatternState:
         return float(np.sqrt(max(self.P[0, 0], self.P[1, 1])))
 
 
-def _offset_noise(p: LightParameters) -> Array:
-    return np.array([p.detection_sigma, p.detection_sigma, p.detection_size_sigma]) ** 2
+def _detection_noise(diameter_px: float, p: LightParameters) -> Array:
+    """Variance (3,) of u, v (diameters) and log diameter of a detection."""
+    centre = p.detection_sigma**2 + (p.detection_sigma_px / diameter_px) ** 2
+    return np.array([centre, centre, p.detection_size_sigma**2])
 
 
 # The appearance of a drogue that detections confirmed, kept while a newer one is not confirmed.

@@ -149,9 +149,7 @@ class DrogueTracker:
                 track.blind, track.gap = 0, max(track.gap - 1, 0)  # it may be the drogue: later frames decide
             else:
                 track.count_blind()
-                track.motion = replace(
-                    predicted, offset=track.motion.offset, offset_variance=track.motion.offset_variance
-                )
+                track.motion = predicted.with_offset_of(track.motion)
             return self._missed(track, picture, cause, match, searched, found, confidence)
         doubted = track.unconfirmed > 0 and track.unconfirmed % p.most_unconfirmed == 0
         if track.since_check == 0 and (doubted or track.checks % p.picture_every == 0):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -109,6 +110,17 @@ def test_the_ellipse_is_the_conic_of_the_projected_circle(place, tilt):
     # The image of the circle's centre is another point as soon as the circle is tilted.
     away = float(np.hypot(*(truth.centre_px - centre)))
     assert away < 1e-9 if tilt == (0.0, 0.0, 0.0) else 0.5 < away < 5
+
+
+def test_an_ellipse_through_many_points_takes_memory_in_proportion_to_their_number():
+    t = np.linspace(0, 2 * np.pi, 4000)
+    points = np.stack([30 + 20 * np.cos(t), 40 + 10 * np.sin(t)], axis=1)
+    tracemalloc.start()
+    ellipse = ellipse_through(points)
+    peak_mb = tracemalloc.get_traced_memory()[1] / 1e6
+    tracemalloc.stop()
+    np.testing.assert_allclose([*ellipse.centre_px, ellipse.major_px, ellipse.minor_px], [30, 40, 20, 10], rtol=1e-9)
+    assert peak_mb < 3  # a square matrix of 4,000 rows has 128 MB, and took half of the time of each picture
 
 
 def test_an_ellipse_needs_five_points_on_one():

@@ -59,6 +59,19 @@ def test_of_a_target_half_hidden_the_visible_half_is_matched():
     assert np.hypot(match.u_px - 93.3, match.v_px - 70.8) < 0.5
 
 
+def test_the_sigma_of_a_half_hidden_target_is_the_scatter_of_its_errors():
+    pattern, errors, sigmas = started(40.0), [], []
+    for seed in range(40):
+        u = 90.3 + 0.37 * (seed % 7)
+        later = picture([(u, 70.8, 40.0)], seed=seed, noise=6.0, hidden=(u + 26, 70.8, 40.0))
+        match = pattern.find(later, 91.0, 71.0, 40.0, 4.0, usual=0.1)
+        assert match is not None
+        assert match.visible < 0.95
+        errors.append(match.u_px - u)
+        sigmas.append(np.sqrt(match.covariance[0, 0]))
+    assert 0.5 < np.std(errors) / np.mean(sigmas) < 2.0
+
+
 def test_where_the_target_is_not_the_correlation_is_low():
     match = started(15.0).find(picture([]), 90.3, 70.8, 15.0, 10.0)
     assert match is None or match.correlation < 0.8

@@ -101,6 +101,16 @@ def test_the_errors_of_the_detections_average_out():
     assert np.sqrt(np.diag(frames[-1].covariance)).max() < 0.06 * 14
 
 
+def test_the_sigma_of_the_centre_is_that_of_the_detections_whatever_their_scatter_is():
+    ratios = []
+    for share in (0.005, 0.01, 0.03):
+        frames, _ = followed(60, Detector(share), parameters=LightParameters(check_every=1))
+        ratios.append(np.sqrt(frames[-1].covariance[0, 0]) / (share * 14.0))
+    # Of errors without a common part a third would do: that it is not there, no innovation shows.
+    assert min(ratios) > 0.7
+    assert max(ratios) < 2.0
+
+
 def test_a_hidden_target_is_predicted_and_found_again():
     def hidden(k: int) -> bool:
         return 20 <= k < 25

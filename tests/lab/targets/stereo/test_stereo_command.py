@@ -10,10 +10,13 @@ import pytest
 import yaml
 from click.testing import CliRunner
 
+from bench.related_measurements.stereo_checks import STATED, processed, stated_eyes
+from bench.related_measurements.stereo_generator import approach, write_recording
 from cli import main
 from lab.errors import InputError
 from lab.files.text import columns
-from lab.targets.stereo.process import process_stereo_run
+from lab.findings.outcome import Verdict
+from lab.targets.stereo.process import findings_of, process_stereo_run
 from lab.targets.stereo.simulated_recording import write_stereo_recording
 
 FRAMES = 12  # of the recording of points
@@ -270,3 +273,15 @@ def test_colour_videos_give_the_markers_that_their_pictures_show(tmp_path):
     done = process_stereo_run(run, tmp_path / "out")
     assert len(rows(done.out, "detections.csv")) >= 10
     assert np.abs(done.result.errors.range_m).max() < 0.3
+
+
+def test_a_long_recording_shows_an_error_of_both_focal_lengths_that_few_of_its_frames_do_not(tmp_path):
+    """1 %, of which the depth within the target shows .35 % (1 sigma) in 24 frames."""
+    rng, places = np.random.default_rng(3), approach(150, 20, 5, np.random.default_rng(4))
+    eyes = stated_eyes("focal both", 0.01)
+    write_recording(tmp_path / "run", places, eyes, rng, pictures=False, noise_px=0.04, sigmas=STATED)
+    results, _ = processed(tmp_path / "run")
+    assert Verdict(findings_of(results)).status != "pass"
+    (suspect,) = results.calibration.suspects
+    assert suspect.name == "focal length of both cameras"
+    assert suspect.value == pytest.approx(-1, abs=3 * suspect.sigma)
