@@ -127,6 +127,15 @@ class TextureShift:
             light = np.sqrt(0.5 * p) * light_px
         return np.minimum(light + background / np.maximum(contrast, 1e-3), largest * np.asarray(width_px))
 
+    def _fall_per_px(self) -> float:
+        """Relative change of the light per pixel, since a lens transmits less to the corners: it shifts by s^2 of it.
+
+        The usual one half way to the corner, or what the background shows in the shift of the narrowest coarse width.
+        """
+        usual = _USUAL_FALL / self.half_diagonal_px
+        coarse = [i for i, w in enumerate(self.widths_px) if w > _COARSE_PX] if self.known else []
+        return min(usual, self.light_px[coarse[0]] / self.widths_px[coarse[0]] ** 2) if coarse else usual
+
     def added_to(
         self, found: Detections, noise: NoiseModel, light_px: Array | None = None, at_rest: bool = False
     ) -> Detections:
@@ -143,12 +152,10 @@ class TextureShift:
         width_px, brightness = np.sqrt(found.major_px * found.minor_px), noise.slope_dn * found.peak / noise.floor_dn2
         largest = _LARGEST_AT_REST if at_rest else LARGEST_SHARE
         sigma_px = self.sigma_px(width_px, found.peak / max(noise.black_dn, 1.0), brightness, light_px, largest)
-        # A lens transmits less light to the corners: half way to them a light of sigma s is shifted by s^2 times the
-        # fall of the light over its distance. The half of a wide light that is nearer to the camera looks larger: its
-        # axis is not in its middle.
+        # The half of a wide light that is nearer to the camera looks larger: its axis is not in its middle.
         narrow_px2 = np.minimum(width_px**2, _COARSE_PX**2)
-        uneven_px2 = _USUAL_FALL * narrow_px2 + _OBLIQUE * (width_px**2 - narrow_px2)
-        sigma_px = np.hypot(sigma_px, uneven_px2 / self.half_diagonal_px)
+        uneven_px = self._fall_per_px() * narrow_px2 + _OBLIQUE * (width_px**2 - narrow_px2) / self.half_diagonal_px
+        sigma_px = np.hypot(sigma_px, uneven_px)
         axes = np.stack([found.major_px, found.minor_px, np.radians(found.angle_deg)])
         if at_rest:  # round
             axes = np.stack([width_px, width_px, np.zeros(len(found))])

@@ -221,6 +221,8 @@ def test_the_fall_of_the_light_towards_the_corners_is_in_the_sigmas_of_precise_n
         i = int(np.argmin(np.hypot(*gap.T)))
         square.append(gap[i] @ np.linalg.solve(found.cov_px2[i], gap[i]) / 2)
     assert 0.3 < np.mean(square) < 1.5
+    even = estimate_noise(pictures(np.ones(SIZE), 0.0, 4)).texture_shift
+    assert np.all(even.added_to(found, model).place_px2 < 0.2 * found.place_px2)
 
 
 @pytest.mark.parametrize("width_px", [1.2, 2.5])
