@@ -49,7 +49,7 @@ LEAST_MEASURED = 0.9  # share of frames with a measured pose, below which usual 
 # Share of the residuals that the errors of the rig cause, as sigma of the tracker's model: with all of it, or none,
 # rigs that are off by 10 px keep fewer labels (measured: 0.1 to 0.3 of the whole error, half of what no pose absorbs).
 _EXPECTED = 0.5
-_POSES = 2000  # of the prior, of which the one that shows most spots tells how large the residuals are
+_POSES = 2000  # of the prior, the one that shows most spots gives the size of the residuals
 _P_SPOT = 1e-6  # probability that a spot is farther from its prediction than its camera's stated errors allow
 _IN_REACH = 0.5  # share of a camera's spots that have a point nearer: the others may be hidden
 
