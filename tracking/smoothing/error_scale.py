@@ -206,21 +206,16 @@ def scattered_width_share(run: RunDetections, assigned: Ints, camera_of: Ints) -
     out = np.zeros(run.has_image.shape[1])
     if not len(run.size_px):
         return out
-    size = np.where(labelled, run.size_px[row], np.nan)
+    size, uv = np.where(labelled, run.size_px[row], np.nan), run.uv[row]
+    largest = np.linalg.eigvalsh(run.cov)[row, 1]
     farther = np.zeros(len(out), bool)  # compared in different places of the screen
     for lag in (x for x in _LAGS if 2 * x < len(size)):
-        middle = np.s_[lag : len(size) - lag]
-        change = size[2 * lag :] - 2 * size[middle] + size[: -2 * lag]
+        before, middle, after = np.s_[: -2 * lag], np.s_[lag : len(size) - lag], np.s_[2 * lag :]
+        change = size[after] - 2 * size[middle] + size[before]
         if lag > 1:
-            uv = run.uv[row]
-            moved = np.minimum(
-                *(np.linalg.norm(uv[end] - uv[middle], axis=-1) for end in (np.s_[2 * lag :], np.s_[: -2 * lag]))
-            )
+            moved = np.minimum(*(np.linalg.norm(uv[end] - uv[middle], axis=-1) for end in (before, after)))
             change[moved < _APART * size[middle]] = np.nan
-        square, width2 = change**2 / 6, size[middle] ** 2
-        known = np.isfinite(change)
-        stated = np.full(change.shape, np.nan)
-        stated[known] = np.linalg.eigvalsh(run.cov[row[middle][known]])[:, 1]
+        square, width2, known, stated = change**2 / 6, size[middle] ** 2, np.isfinite(change), largest[middle]
         for camera in range(len(out)):
             some: list[int] = [
                 int(i) for i in np.flatnonzero(camera_of == camera) if np.count_nonzero(known[:, i]) >= _LEAST_OF_VIEW
