@@ -39,6 +39,7 @@ from tracking.binocular.marker_model import (
 # Frames that are used, evenly over the recording: the sigma of each error falls with the square root of their number
 # (of both focal lengths .35 % with 24, .09 % with 400, which take 1 s more); with the fewest nothing is concluded.
 MOST_FRAMES, FEWEST_FRAMES = 400, 5
+MOST_ALONE = 24  # frames whose pictures are labelled each alone
 _FEWEST_MARKERS = 4  # of each picture: three have several poses
 _STEPS = 6  # of Gauss-Newton
 _CERTAIN_CHI2 = 20.0  # that an error explains: 4.5 sigma

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from geometry.arrays import evenly_spread
 from geometry.pose import Pose
 from lab.errors import InputError
 from lab.files.rig.calibration_state import require_valid_calibration
@@ -39,6 +40,7 @@ from lab.targets.stereo.tables import write_tables
 from tracking.binocular.calibration_check import (
     FEWEST_CLOCK_FRAMES,
     FEWEST_FRAMES,
+    MOST_ALONE,
     MOST_FRAMES,
     FittedFrame,
     LabelledFrame,
@@ -292,20 +294,23 @@ def measure(run: StereoRun, progress: Progress | None = None) -> StereoResults:
 def _labelled(results: StereoResults) -> list[LabelledFrame]:
     """Some frames with markers in both pictures, evenly spaced: their images, labelled.
 
-    The labels of a measured pose are used where it explains all candidates. Otherwise each picture is labelled alone:
-    an error of the calibration makes a pose refuse images.
+    The labels of a measured pose are used where it explains all candidates. Otherwise each picture of a few frames is
+    labelled alone, which takes long: an error of the calibration makes a pose refuse images.
     """
     run, model = results.run, results.run.target.model
     both = [r for r in results.records if all(f is not None and len(f) >= _ENOUGH for f in r.candidates)]
-    some = [both[int(i)] for i in np.unique(np.linspace(0, len(both) - 1, MOST_FRAMES).astype(int))] if both else []
+    some, alone = (evenly_spread(np.arange(len(both)), most).tolist() for most in (MOST_FRAMES, MOST_ALONE))
     out = []
-    for record in some:
+    for k in sorted({*some, *alone}):
+        record = both[k]
         t, (left, right) = record.tracked, record.candidates
         assert left is not None
         assert right is not None
         expected = min(len(left), len(model)) + min(len(right), len(model))
         if record.measured and t.pose is not None and t.observed is not None and (t.index >= 0).sum() >= expected:
             out.append(LabelledFrame(t.observed, t.pose))
+            continue
+        if k not in alone:
             continue
         start = t.pose if record.measured else None
         found = labelled_by_each(run.pair, model, (left, right), start, run.parameters.match)
