@@ -250,7 +250,7 @@ def _shift(texture: NDArray[Any], objects: NDArray[np.uint8], sigma_px: float, p
 
     objects (h, w): 1 where something else than texture is seen; the filter does not reach these places.
     """
-    reach = int(np.ceil(_REACH * sigma_px / np.sqrt(power)))
+    reach = _reach(sigma_px, power)
     inner = reach + 2 * BLOCK
     if min(texture.shape) < 2 * inner + 4 * _SAMPLED:
         return 0.0
@@ -308,9 +308,9 @@ def local_shifts(
     return np.asarray(np.sqrt(np.maximum(share * here + (1 - share) * around, 0.0)), np.float32)
 
 
-def _reach(width_px: float) -> int:
-    """Half side, px, of the kernel in the light of a spot."""
-    return int(np.ceil(_REACH * width_px / np.sqrt(2)))
+def _reach(width_px: float, power: int = 2) -> int:
+    """Half side, px, of the kernel with G^power; 2: that in the light of a spot."""
+    return int(np.ceil(_REACH * width_px / np.sqrt(power)))
 
 
 def _wider(width_px: float) -> int:
@@ -345,7 +345,7 @@ def _coarse_shifts(
     Places near a light are left out.
     """
     cells = cv2.resize(mean, (mean.shape[1] // cell, mean.shape[0] // cell), interpolation=cv2.INTER_AREA)
-    reach = int(np.ceil(_REACH * sigma_px))
+    reach = _reach(sigma_px, 1)
     if min(cells.shape) < 2 * reach + 2 * _SAMPLED:
         return None
     level = np.maximum(cv2.blur(cv2.medianBlur(cells, 5), (2 * reach + 1, 2 * reach + 1)), 1.0)
