@@ -46,28 +46,34 @@ class Corners:
     blur_px: float  # median sigma of the edges, including the width of a pixel; nan if no corner was found
 
 
-def refined(image: GreyImage, grid: Array, known: Bools | None = None, reach: float = _REACH) -> Corners:
+def refined(
+    image: GreyImage, grid: Array, known: Bools | None = None, reach: float = _REACH, again: Bools | None = None
+) -> Corners:
     """Corners measured from approximate ones (rows, columns, 2), px, to the point where four squares meet.
 
     known (rows, columns): which corners exist, None for all. reach: half of the window in distances of parallel edges;
-    smaller if something else is printed in the squares.
+    smaller if something else is printed in the squares. again (rows, columns): which of them to measure, None for all;
+    the others stay where they are, unless the grid shows that they are wrong.
     """
     rows, columns = grid.shape[:2]
     known = np.ones((rows, columns), dtype=bool) if known is None else known
     by_others, off = _by_others(np.where(known[..., None], grid, np.nan))
-    grid = np.where((off > _OFF * edge_distance(grid, known))[..., None], by_others, grid)
+    moved = known & (off > _OFF * edge_distance(grid, known))
+    grid = np.where(moved[..., None], by_others, grid)
     height = edge_distance(grid, known)
     half = np.clip(np.nan_to_num(reach * height, nan=2.0).astype(int), 2, _MOST_PX)
     out = np.full(grid.shape, np.nan)
     look = np.full((rows, columns, 4), np.nan)  # directions and sigmas of the edges
-    within = known & np.all((grid >= 0) & (grid <= np.array(image.shape[::-1]) - 1), axis=-1)
+    inside = known & np.all((grid >= 0) & (grid <= np.array(image.shape[::-1]) - 1), axis=-1)
+    out[inside] = grid[inside]
+    within = inside if again is None else inside & (again | moved)
     sizes = np.unique(half[within]).tolist()
     for size in sizes:
         which = within & (half == size)
         start = np.ascontiguousarray(grid[which], dtype=np.float32).reshape(-1, 1, 2)
         out[which] = cv2.cornerSubPix(image, start, (size, size), (-1, -1), _STOP).reshape(-1, 2)
     for small_px in _SMALL_PX:
-        shape = local_shape(out, within, (image.shape[1], image.shape[0]))
+        shape = local_shape(out, inside, (image.shape[1], image.shape[0]))
         for size in sizes:
             chosen = np.argwhere(within & (half == size))
             for first in range(0, len(chosen), _AT_ONCE):
@@ -80,7 +86,7 @@ def refined(image: GreyImage, grid: Array, known: Bools | None = None, reach: fl
                 out[i, j], look[i, j] = np.where(good[:, None], found, out[i, j]), seen
     out[np.linalg.norm(out - grid, axis=-1) > np.maximum(1.5, 0.75 * half)] = np.nan
     out[_by_others(out)[1] > _OFF * height] = np.nan
-    look = look[np.isfinite(out).all(axis=-1)]
+    look = look[np.isfinite(out).all(axis=-1) & within]
     if not len(look):
         return Corners(out, np.nan)
     return Corners(out, float(np.median(look[:, 2:])))
