@@ -1,7 +1,8 @@
 """Measurement of chessboard corners to some thousandths of a pixel, and of the blur of their edges.
 
-A corner is where two edges cross. In a window around it, the product of two blurred steps is fitted to the pixels as
-they are, without interpolation; the fit is symmetric, so that contrast, blur and its shape do not move the corner.
+A corner is where two edges cross. In a window around it, two blurred steps are fitted to the pixels as they are,
+without interpolation; the fit is symmetric, so that contrast, blur and its shape do not move the corner. Without noise
+corners are within .0001 px RMS under any lens, also of narrow squares, whose edges cross aslant.
 RMS error per coordinate in ideal saddles with a contrast of 170 DN and blur of 0.7 px, window of 13, 29 and 41 px:
 0.001, 0.001, 0.000 px without noise and 0.007, 0.004, 0.003 px with noise of 2 DN, which is the bound; of
 cv2.cornerSubPix 0.018, 0.016, 0.015 and 0.023, 0.018, 0.017 px, mostly by its bilinear interpolation. Ours.
@@ -16,21 +17,24 @@ from functools import cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import comb, erf
+from scipy.special import erf
 
 from calibration.boards.board_view import GreyImage
-from geometry.arrays import Array, Bools, Ints
+from calibration.boards.grid_shape import local_shape
+from geometry.arrays import Array, Bools
 
 _REACH = 0.4  # half of the window, in distances of the nearest parallel edge, which would be included from 0.5 on
 _MOST_PX = 12  # half of the window: a larger one includes more curved edges, and takes longer
 _OFF = 0.3  # distances of parallel edges from where the others of its row and column have it: it is not that corner
-_SPARE = 2  # known corners around a corner beyond the coefficients of its curvature
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
 _STEPS = 8  # of the fit of saddles: most need two to four
 _SMALL_PX = (0.01, 1e-3)  # last step in each of two passes: the curvature is first that of less accurate corners
 _BLUR_PX = 0.9  # start value of the edges' sigma
 SINGLE = np.float32  # of sums over pixels: their rounding moves a corner by less than 1e-5 px, in half of the time
 Pixelwise = NDArray[np.floating]
+_NEAR = 4.0  # sigmas: where farther from one of the edges, their crossing is not seen
+_MOST_COSINE = 0.98  # of the angle between edges: others start on one line, and have no corner
+_NODES = np.polynomial.legendre.leggauss(4)  # of an integral: 1e-4 of edges that cross at 26 deg, less of others
 _AT_ONCE = 64  # corners: their arrays stay in the processor's cache
 
 
@@ -42,28 +46,34 @@ class Corners:
     blur_px: float  # median sigma of the edges, including the width of a pixel; nan if no corner was found
 
 
-def refined(image: GreyImage, grid: Array, known: Bools | None = None, reach: float = _REACH) -> Corners:
+def refined(
+    image: GreyImage, grid: Array, known: Bools | None = None, reach: float = _REACH, again: Bools | None = None
+) -> Corners:
     """Corners measured from approximate ones (rows, columns, 2), px, to the point where four squares meet.
 
     known (rows, columns): which corners exist, None for all. reach: half of the window in distances of parallel edges;
-    smaller if something else is printed in the squares.
+    smaller if something else is printed in the squares. again (rows, columns): which of them to measure, None for all;
+    the others stay where they are, unless the grid shows that they are wrong.
     """
     rows, columns = grid.shape[:2]
     known = np.ones((rows, columns), dtype=bool) if known is None else known
     by_others, off = _by_others(np.where(known[..., None], grid, np.nan))
-    grid = np.where((off > _OFF * edge_distance(grid, known))[..., None], by_others, grid)
+    moved = known & (off > _OFF * edge_distance(grid, known))
+    grid = np.where(moved[..., None], by_others, grid)
     height = edge_distance(grid, known)
     half = np.clip(np.nan_to_num(reach * height, nan=2.0).astype(int), 2, _MOST_PX)
     out = np.full(grid.shape, np.nan)
     look = np.full((rows, columns, 4), np.nan)  # directions and sigmas of the edges
-    within = known & np.all((grid >= 0) & (grid <= np.array(image.shape[::-1]) - 1), axis=-1)
+    inside = known & np.all((grid >= 0) & (grid <= np.array(image.shape[::-1]) - 1), axis=-1)
+    out[inside] = grid[inside]
+    within = inside if again is None else inside & (again | moved)
     sizes = np.unique(half[within]).tolist()
     for size in sizes:
         which = within & (half == size)
         start = np.ascontiguousarray(grid[which], dtype=np.float32).reshape(-1, 1, 2)
         out[which] = cv2.cornerSubPix(image, start, (size, size), (-1, -1), _STOP).reshape(-1, 2)
     for small_px in _SMALL_PX:
-        shape = _local_shape(out, within)
+        shape = local_shape(out, inside, (image.shape[1], image.shape[0]))
         for size in sizes:
             chosen = np.argwhere(within & (half == size))
             for first in range(0, len(chosen), _AT_ONCE):
@@ -76,7 +86,7 @@ def refined(image: GreyImage, grid: Array, known: Bools | None = None, reach: fl
                 out[i, j], look[i, j] = np.where(good[:, None], found, out[i, j]), seen
     out[np.linalg.norm(out - grid, axis=-1) > np.maximum(1.5, 0.75 * half)] = np.nan
     out[_by_others(out)[1] > _OFF * height] = np.nan
-    look = look[np.isfinite(out).all(axis=-1)]
+    look = look[np.isfinite(out).all(axis=-1) & within]
     if not len(look):
         return Corners(out, np.nan)
     return Corners(out, float(np.median(look[:, 2:])))
@@ -87,10 +97,10 @@ def _saddles(
 ) -> tuple[Array, Array]:
     """Corners (n, 2), px, with directions and sigmas of the two edges (n, 4), by least squares.
 
-    start (n, 2), px, and edges (n, 4), rad and px: start values; bend (n, 3, 2): the curvature of `_local_shape`. Grey
-    values are (b + b' d) + (c + c' d) S1 S2 at the offset d from the corner, with S the error function of the distance
-    from an edge over its sigma. The six linear parameters are eliminated. With t + Q(t) = d, Q of `bend`, edges are
-    straight in t: in a window of 20 px the curved edges of a fisheye lens would displace corners by .04 px.
+    start (n, 2), px, and edges (n, 4), rad and px: start values; bend (n, 3, 2): the curvature of `local_shape`. Grey
+    values are (b + b' d) + (c + c' d) M at the offset d from the corner, M the mean of the product of the signs of the
+    two sides, blurred (`_crossing`). The six linear parameters are eliminated. Edges are parabolas in the picture: in a
+    window of 20 px the curved edges of a fisheye lens would displace corners by .04 px if they were taken for straight.
     """
     v, u = (w.ravel() for w in np.mgrid[-half : half + 1, -half : half + 1])
     whole = np.round(start).astype(int)
@@ -106,19 +116,19 @@ def _saddles(
     for _ in range(_STEPS):
         at = x.astype(SINGLE)
         d = place - at[:, :2, None]
-        t = d - _quadratic(C, d - _quadratic(C, d))
         cos, sin, sigma = np.cos(at[:, 2:4]), np.sin(at[:, 2:4]), at[:, 4:, None]
         along, across = np.stack([cos, sin], axis=2), np.stack([-sin, cos], axis=2)  # (n, 2, 2): of each edge
         curved = np.einsum("nij,nji->ni", across, _quadratic(C, np.swapaxes(along, 1, 2)))[..., None]
+        s = along @ d
         # (n, 2, m): distances from the edges in sigmas; blur displaces a curved edge towards its centre of curvature
-        e = across / sigma @ t - sigma * curved
-        S, slope = erf(e / SINGLE(2**0.5)), SINGLE((2 / math.pi) ** 0.5) * np.exp(-e * e / 2) / sigma
+        e = (across @ d - curved * s * s) / sigma - sigma * curved
+        M, by = _crossing(e, np.einsum("ni,ni->n", across[:, 0], across[:, 1]))
         L[:, 1:3] = weight[:, None] * d / half
-        L[:, 3:] = L[:, :3] * (S[:, :1] * S[:, 1:])
+        L[:, 3:] = L[:, :3] * M[:, None]
         linear = linear_part(L, grey)
-        g = (np.swapaxes(linear[:, 3:], 1, 2).astype(SINGLE) @ L[:, :3]) * S[:, ::-1] * slope
+        g = (np.swapaxes(linear[:, 3:], 1, 2).astype(SINGLE) @ L[:, :3]) * by / sigma
         J[:, :2] = -np.swapaxes(across, 1, 2) @ g
-        J[:, 2:4] = -g * (along @ t)
+        J[:, 2:4] = -g * s
         J[:, 4:] = -g * e
         step = step_of(J, L, grey, linear)
         x = x + np.clip(step, -largest, largest)
@@ -126,6 +136,35 @@ def _saddles(
         if np.max(np.abs(step[:, :2])) < small_px:
             break
     return whole + x[:, :2], x[:, 2:]
+
+
+def _crossing(e: Pixelwise, cosine: Pixelwise) -> tuple[Pixelwise, Pixelwise]:
+    """Mean (n, m) of sign(e1 + x1) sign(e2 + x2), and its derivatives by e1 and e2 (n, 2, m).
+
+    e (n, 2, m): distances from the two edges in sigmas of the blur. x: the blur, normal with sigma 1 across each edge;
+    the two are correlated by the cosine (n,) of the angle between the edges' normals, so that the mean is the product
+    of the two error functions only of edges at right angles. The product displaces corners of narrow squares, whose
+    edges cross aslant, by .017 px RMS.
+
+    Source: the derivative by the correlation is Plackett's (1954), "A reduction formula for normal multivariate
+    integrals", Biometrika 41; integrated over its arc sine as in Drezner & Wesolowsky (1990).
+    """
+    S = erf(e / SINGLE(2**0.5))
+    by = S[:, ::-1] * (SINGLE((2 / math.pi) ** 0.5) * np.exp(-e * e / 2))
+    mean = S[:, 0] * S[:, 1]
+    k, pixel = np.nonzero(np.max(np.abs(e), axis=1) < _NEAR)
+    a, b, rho = e[k, 0, pixel], e[k, 1, pixel], np.clip(cosine, -_MOST_COSINE, _MOST_COSINE)[k]
+    angle = np.arcsin(rho)
+    added = np.zeros(len(k), dtype=SINGLE)
+    for node, weight in zip(*_NODES, strict=True):
+        sin = np.sin(SINGLE((node + 1) / 2) * angle)
+        added += SINGLE(weight / math.pi) * np.exp((sin * a * b - (a * a + b * b) / 2) / (1 - sin * sin))
+    mean[k, pixel] += angle * added
+    narrower = np.sqrt(2 * (1 - rho * rho))
+    for n, (one, other) in enumerate(((a, b), (b, a))):
+        normal = SINGLE((2 / math.pi) ** 0.5) * np.exp(-one * one / 2)
+        by[k, n, pixel] = erf((other - rho * one) / narrower) * normal
+    return mean, by
 
 
 def linear_part(L: Pixelwise, grey: Pixelwise) -> Array:
@@ -153,68 +192,6 @@ def _quadratic(C: Pixelwise, t: Pixelwise) -> Pixelwise:
     """(n, 2, m): the second-order displacement at offsets t (n, 2, m), px, with coefficients C (n, 2, 3), 1/px."""
     x, y = t[:, 0], t[:, 1]
     return C @ np.stack([x * x, x * y, y * y], axis=1)
-
-
-def _local_shape(grid: Array, known: Bools) -> Array:
-    """(rows, columns, 5, 2): the steps along rows and columns, px, and the curvature of the grid at each corner.
-
-    Of a quartic of the homography of the corners of five rows and columns around, or of a quadratic of that of three
-    where too few are known. The curvature, 1/px, is the coefficients of x², xy, y² of the displacement from the linear
-    part, along which edges are straight. Where still too few are known it is 0, and the steps are those of all corners.
-    With a cubic in place of the quartic, outer corners of a fisheye's picture are displaced by .003 px.
-    """
-    out = np.zeros((*known.shape, 5, 2))
-    row, column = np.nonzero(known)
-    if len(row):
-        flat = np.stack([np.ones(len(row)), column, row], axis=1)
-        out[..., :2, :] = np.linalg.lstsq(flat, grid[known], rcond=None)[0][1:]
-    done = ~known
-    for order, across in ((4, 5), (2, 3)):
-        left = np.argwhere(~done)
-        first = np.maximum(np.minimum(left - across // 2, np.array(known.shape) - across), 0)
-        for corner in np.unique(first, axis=0):
-            block = np.s_[corner[0] : corner[0] + across, corner[1] : corner[1] + across]
-            at = left[np.all(first == corner, axis=1)]
-            shape = _shape_of_block(grid[block], known[block], (at - corner)[:, ::-1], order)
-            if shape is not None:
-                out[*at.T], done[*at.T] = shape, True
-    return out
-
-
-@cache
-def _powers(order: int) -> tuple[Ints, Ints, Array]:
-    """Powers of x and y (k, 2) of a polynomial, those of its derivatives by 1, x, y, x^2, xy, y^2, and their factors.
-
-    Factors (6, k) over the factorials of the derivative's powers: those of Taylor's coefficients.
-    """
-    powers = np.array([(n - k, k) for n in range(order + 1) for k in range(n + 1)])
-    by = powers[:6, None]
-    return powers, np.maximum(powers - by, 0), np.prod(comb(powers, by), axis=-1)
-
-
-def _shape_of_block(grid: Array, known: Bools, at: Array, order: int) -> Array | None:
-    """`_local_shape` (m, 5, 2) at corners (m, 2), column and row, of a block by its known ones; None if too few."""
-    b, a = np.nonzero(known)
-    powers, lower, factor = _powers(order)
-    if min(len(np.unique(a)), len(np.unique(b))) <= order or len(a) < len(powers) + _SPARE:
-        return None
-    to = grid[known]
-    H, _ = cv2.findHomography(np.stack([a, b], axis=1).astype(float), to, 0)
-    if H is None:
-        return None
-    around = at[:, None] + np.array([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1]])  # (m, 5, 2)
-    w, seen = (p @ H[:, :2].T + H[:, 2] for p in (around, np.stack([a, b], axis=1)))
-    w, seen = w[..., :2] / w[..., 2:], seen[:, :2] / seen[:, 2:]
-    middle, size = seen.mean(axis=0), np.ptp(seen, axis=0).max() / 2
-    w, seen = (w - middle) / size, (seen - middle) / size
-    X = np.linalg.lstsq(np.prod(seen[:, None] ** powers, axis=-1), to, rcond=None)[0]
-    # (m, 6, 2): Taylor's coefficients of 1, x, y, x^2, xy, y^2 at each corner
-    taylor = (np.prod(w[:, None, None, 0] ** lower, axis=-1) * factor) @ X
-    L = np.linalg.inv(taylor[:, 1:3])  # offset in px times L: that of w
-    (p, q), (r, s) = np.moveaxis(L, 0, -1)
-    squares = np.array([[p * p, p * q, q * q], [2 * p * r, p * s + q * r, 2 * q * s], [r * r, r * s, s * s]])
-    steps = np.stack([w[:, 2] - w[:, 1], w[:, 4] - w[:, 3]], axis=1) @ taylor[:, 1:3]
-    return np.concatenate([steps, np.moveaxis(squares, -1, 0) @ taylor[:, 3:]], axis=1)
 
 
 def _by_others(grid: Array) -> tuple[Array, Array]:

@@ -307,7 +307,7 @@ def test_the_rest_of_a_board_is_found_from_a_part_with_wrong_corners_in_its_oute
     part = true[:5, 2:].copy()
     part[4, :3] += 0.6 * (part[3, 1:4] - part[4, :3])
     (whole,) = chessboard_detection._grown(photo.image, part, 6, 9)
-    np.testing.assert_allclose(whole, true, atol=0.1)
+    np.testing.assert_allclose(whole.pixels, true, atol=0.1)
 
 
 def test_a_corner_that_starts_at_another_corner_is_measured_where_it_is():
