@@ -112,25 +112,25 @@ def camera_matrix(pinhole: Array | Sequence[float]) -> Array:
 
 
 def project_points(
-    points_camera: Array, pinhole: Array, distortion: Array, fold_r2: Array, fisheye: Bools | None = None
+    points_camera: Array, pinhole: Array, distortion: Array, fold_r2: Array, fisheye: Bools
 ) -> tuple[Array, Array]:
     """Pixels (..., 2) and d(pixel)/d(point) (..., 2, 3), px/m, of points (..., 3), m, in the camera frame.
 
-    pinhole (..., 4): fx, fy, cx, cy; distortion (..., 14); fold_r2 (...); fisheye (...), None: no camera is one. All
-    are broadcast against the points, so that one call serves points of several cameras. nan behind the camera (z <= 0)
+    pinhole (..., 4): fx, fy, cx, cy; distortion (..., 14); fold_r2 (...); fisheye (...). All are
+    broadcast against the points, so that one call serves points of several cameras. nan behind the camera (z <= 0)
     or beyond the fold.
     """
     return _projected(points_camera, pinhole, distortion, fold_r2, fisheye)[:2]
 
 
 def _projected(
-    points_camera: Array, pinhole: Array, distortion: Array, fold_r2: Array, fisheye: Bools | None
+    points_camera: Array, pinhole: Array, distortion: Array, fold_r2: Array, fisheye: Bools
 ) -> tuple[Array, Array, Array, Array]:
     """As `project_points`, then the normalised points (..., 2) and the distorted ones (..., 2)."""
     xy, z, in_front = _on_image_plane(points_camera)
     focal, centre = pinhole[..., :2], pinhole[..., 2:]
-    if distortion.any() or (fisheye is not None and np.any(fisheye)):
-        distorted, J_lens = _distorted(xy, distortion, fisheye)
+    if distortion.any() or np.any(fisheye):
+        distorted, J_lens = lens.distort(xy, distortion, fisheye)
         good = in_front & lens.is_one_to_one(xy, J_lens, fold_r2)
         J_xy = focal[..., :, None] * J_lens
     else:
@@ -154,11 +154,11 @@ class Projected:
 
 
 def project_points_full(
-    points_camera: Array, pinhole: Array, distortion: Array, fold_r2: Array, fisheye: Bools | None = None
+    points_camera: Array, pinhole: Array, distortion: Array, fold_r2: Array, fisheye: Bools
 ) -> Projected:
     """As `project_points`, with the derivatives with respect to the camera's numbers too: for calibrations."""
     pixels, d_point, xy, distorted = _projected(points_camera, pinhole, distortion, fold_r2, fisheye)
-    if fisheye is None or not np.any(fisheye):
+    if not np.any(fisheye):
         d_coefficients = lens.coefficient_jacobian(xy, distortion, distorted)
     else:
         d_coefficients = lens.fisheye_coefficient_jacobian(xy, distortion)
@@ -177,16 +177,3 @@ def _on_image_plane(points_camera: Array) -> tuple[Array, Array, Bools]:
     in_front = z > 1e-9
     z = np.where(in_front, z, 1.0)
     return points_camera[..., :2] / z[..., None], z, in_front
-
-
-def _distorted(xy: Array, distortion: Array, fisheye: Bools | None) -> tuple[Array, Array]:
-    """Distorted normalised points and their Jacobians, each by the model of its camera."""
-
-    if fisheye is None or not np.any(fisheye):
-        return lens.distort(xy, distortion)
-    wide, J_wide = lens.distort_fisheye(xy, distortion)
-    if np.all(fisheye):
-        return wide, J_wide
-    distorted, J = lens.distort(xy, distortion)
-    which = np.asarray(fisheye)[..., None]
-    return np.where(which, wide, distorted), np.where(which[..., None], J_wide, J)

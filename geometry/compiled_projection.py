@@ -1,14 +1,14 @@
 """The compiled implementation of the forward model: pixels of a rig's views and their Jacobian by the pose.
 
 The forward model is geometry/forward_model.py; start there. Its `SpotModel.project` and `SpotModel.derivatives` call
-`project_all` and `derivatives_all` of this module, and the trackers' compiled loops call `project_view`. The lit points
-stand a second time in numpy, in `SpotModel.hits`, and the lenses in lens.py, with derivatives by their numbers.
-tests/geometry/test_forward_model.py compares both with each other, and this one with a computation by other means.
+`project_all`, `derivatives_all` and `lit_points`, and the trackers' compiled loops call `project_view`. The lenses
+stand a second time in lens.py, with derivatives by their numbers. tests/geometry/test_forward_model.py compares with a
+computation by other means.
 """
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,22 @@ VIEW = np.dtype(
     align=True,
 )
 Views: TypeAlias = NDArray[np.void]  # (n,) of VIEW
+
+
+class _LitPoint(NamedTuple):
+    """Where a ray meets its screen, in world. Numbers and no arrays, because each array is allocated and counted."""
+
+    length: float  # m, of the ray; 0: it is parallel to the screen
+    facing: float  # normal . ray
+    dx: float  # the ray
+    dy: float
+    dz: float
+    nx: float  # the surface's normal
+    ny: float
+    nz: float
+    x: float  # m, the lit point
+    y: float
+    z: float
 
 
 @compiled
@@ -100,19 +116,20 @@ def derivatives_all(
     uv, pose, camera = np.full((m, n, 2), np.nan), np.zeros((m, n, 2, 6)), np.zeros((m, n, 2, 6))
     screen, bow, in_camera = np.zeros((m, n, 2, 6)), np.zeros((m, n, 2, 3)), np.zeros((m, n, 3))
     direction, point = np.zeros((m, n, 2, 3)), np.zeros((m, n, 2, 3))
-    d, normal, hit, on_screen = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    hit, on_screen = np.empty(3), np.empty(3)
     for k in range(m):
         j = k if v.shape[0] > 1 else 0
         of_pose = v[j]
         for i in range(n):
             view = of_pose[i]
             in_camera[k, i, 2] = 1.0
-            there, u_along, v_along = _project(of_pose, i, R[k], t[k], uv[k, i], pose[k, i])
+            lit = _lit_point(of_pose, i, R[k], t[k])
+            there, u_along, v_along = _image(of_pose, i, R[k], t[k], lit, uv[k, i], pose[k, i])
             if not there:
                 uv[k, i, 0] = uv[k, i, 1] = np.nan
                 pose[k, i] = 0.0
                 continue
-            length, _ = _lit_point(of_pose, i, R[k], t[k], d, normal, hit)
+            hit[0], hit[1], hit[2] = lit.x, lit.y, lit.z
             S, s0, C = view["screen_rotation"], view["screen_origin"], view["camera_rotation"]
             for a in range(3):
                 c = C[a, 0] * hit[0] + C[a, 1] * hit[1] + C[a, 2] * hit[2]
@@ -122,7 +139,7 @@ def derivatives_all(
             for row in range(2):
                 # If the screen moves by delta at the lit point, the point moves along the ray by (n.delta) / (n.d).
                 along = u_along if row == 0 else v_along
-                n0, n1, n2 = along * normal[0], along * normal[1], along * normal[2]
+                n0, n1, n2 = along * lit.nx, along * lit.ny, along * lit.nz
                 by_hit = pose[k, i, row]
                 g0, g1, g2 = by_hit[0] + n0, by_hit[1] + n1, by_hit[2] + n2  # px per m of the lit point, in world
                 _by_frame(camera[k, i, row], C, g0, g1, g2, hit, True)
@@ -131,7 +148,7 @@ def derivatives_all(
                 bow[k, i, row, 0], bow[k, i, row, 1], bow[k, i, row, 2] = raised * x * x, raised * x * y, raised * y * y
                 for a in range(3):
                     p = by_hit[0] * R[k, 0, a] + by_hit[1] * R[k, 1, a] + by_hit[2] * R[k, 2, a]
-                    point[k, i, row, a], direction[k, i, row, a] = p, sign[j, i] * length * p
+                    point[k, i, row, a], direction[k, i, row, a] = p, sign[j, i] * lit.length * p
     return uv, pose, camera, screen, bow, direction, point, in_camera
 
 
@@ -161,7 +178,7 @@ def project_view(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> b
 
     R (3, 3), t (3,), m: world_from_body.
     """
-    if _project(v, i, R, t, uv, J)[0]:
+    if _image(v, i, R, t, _lit_point(v, i, R, t), uv, J)[0]:
         return True
     for row in range(2):
         uv[row] = np.nan
@@ -171,28 +188,43 @@ def project_view(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> b
 
 
 @compiled
-def _project(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> tuple[bool, float, float]:
-    """As `project_view`, but leaves uv and J undefined if there is no projection.
+def lit_points(v: Views, R: Array, t: Array) -> Array:
+    """Lit points (m, n, 3), m, in world, of n views for poses R (m, 3, 3), t (m, 3), m; nan beside the screen."""
+    m, n = R.shape[0], v.shape[0]
+    out = np.full((m, n, 3), np.nan)
+    for k in range(m):
+        for i in range(n):
+            lit = _lit_point(v, i, R[k], t[k])
+            if _on_screen(v, i, lit):
+                out[k, i, 0], out[k, i, 1], out[k, i, 2] = lit.x, lit.y, lit.z
+    return out
+
+
+@compiled_in_caller
+def _on_screen(v: Views, i: int, lit: _LitPoint) -> bool:
+    """Whether the ray of view i meets its screen ahead and within its extent."""
+    view = v[i]
+    S, s0 = view["screen_rotation"], view["screen_origin"]
+    x, y, z = lit.x - s0[0], lit.y - s0[1], lit.z - s0[2]
+    across = S[0, 0] * x + S[1, 0] * y + S[2, 0] * z
+    down = S[0, 1] * x + S[1, 1] * y + S[2, 1] * z
+    return lit.length > 0.0 and abs(across) <= view["half_size"][0] and abs(down) <= view["half_size"][1]
+
+
+@compiled
+def _image(v: Views, i: int, R: Array, t: Array, lit: _LitPoint, uv: Array, J: Array) -> tuple[bool, float, float]:
+    """As `project_view`, of the lit point, but leaves uv and J undefined if there is no projection.
 
     Then how far u and v move, px, if the surface moves by 1 m along its normal: the spot moves along the ray.
     """
     view = v[i]
-    d, normal, hit, lever = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    length, facing = _lit_point(v, i, R, t, d, normal, hit)
-    if not length > 0.0:
+    if not _on_screen(v, i, lit):
         return False, 0.0, 0.0
-    S, s0 = view["screen_rotation"], view["screen_origin"]
-    for a in range(3):
-        lever[a] = hit[a] - t[a]
-    for a in range(2):
-        along = S[0, a] * (hit[0] - s0[0]) + S[1, a] * (hit[1] - s0[1]) + S[2, a] * (hit[2] - s0[2])
-        if not abs(along) <= view["half_size"][a]:
-            return False, 0.0, 0.0
     # Image of the lit point in the camera.
     C = view["camera_rotation"]
-    x = C[0, 0] * hit[0] + C[0, 1] * hit[1] + C[0, 2] * hit[2] + view["camera_translation"][0]
-    y = C[1, 0] * hit[0] + C[1, 1] * hit[1] + C[1, 2] * hit[2] + view["camera_translation"][1]
-    z = C[2, 0] * hit[0] + C[2, 1] * hit[1] + C[2, 2] * hit[2] + view["camera_translation"][2]
+    x = C[0, 0] * lit.x + C[0, 1] * lit.y + C[0, 2] * lit.z + view["camera_translation"][0]
+    y = C[1, 0] * lit.x + C[1, 1] * lit.y + C[1, 2] * lit.z + view["camera_translation"][1]
+    z = C[2, 0] * lit.x + C[2, 1] * lit.y + C[2, 2] * lit.z + view["camera_translation"][2]
     if not z > 1e-9:
         return False, 0.0, 0.0
     x, y = x / z, y / z
@@ -204,61 +236,61 @@ def _project(v: Views, i: int, R: Array, t: Array, uv: Array, J: Array) -> tuple
     uv[1] = fy * by + view["pinhole"][3] + view["shift"][1]
     # d(pixel)/d(hit), in world, row by row; the component of the vehicle's motion along the ray has no effect.
     u_along = v_along = 0.0
+    lx, ly, lz = lit.x - t[0], lit.y - t[1], lit.z - t[2]  # the lever from the vehicle's origin
     for row in range(2):
         gx, gy = (fx * xx / z, fx * xy / z) if row == 0 else (fy * yx / z, fy * yy / z)
         gz = -(gx * x + gy * y)
         g0 = gx * C[0, 0] + gy * C[1, 0] + gz * C[2, 0]
         g1 = gx * C[0, 1] + gy * C[1, 1] + gz * C[2, 1]
         g2 = gx * C[0, 2] + gy * C[1, 2] + gz * C[2, 2]
-        along_ray = (g0 * d[0] + g1 * d[1] + g2 * d[2]) / facing
+        along_ray = (g0 * lit.dx + g1 * lit.dy + g2 * lit.dz) / lit.facing
         u_along, v_along = (along_ray, 0.0) if row == 0 else (u_along, along_ray)
-        g0, g1, g2 = g0 - along_ray * normal[0], g1 - along_ray * normal[1], g2 - along_ray * normal[2]
+        g0, g1, g2 = g0 - along_ray * lit.nx, g1 - along_ray * lit.ny, g2 - along_ray * lit.nz
         J[row, 0], J[row, 1], J[row, 2] = g0, g1, g2
         # g . ((R e_k) x lever) = (lever x g) . (R e_k)
-        c0, c1, c2 = lever[1] * g2 - lever[2] * g1, lever[2] * g0 - lever[0] * g2, lever[0] * g1 - lever[1] * g0
+        c0, c1, c2 = ly * g2 - lz * g1, lz * g0 - lx * g2, lx * g1 - ly * g0
         for k in range(3):
             J[row, 3 + k] = c0 * R[0, k] + c1 * R[1, k] + c2 * R[2, k]
     return True, u_along, v_along
 
 
 @compiled_in_caller
-def _lit_point(v: Views, i: int, R: Array, t: Array, d: Array, normal: Array, hit: Array) -> tuple[float, float]:
-    """Length, m, of a ray to its screen, and normal . ray; 0 if it is parallel to the screen.
-
-    Writes the ray, the surface's normal and the lit point, all (3,), in world, to d, normal and hit.
-    """
+def _lit_point(v: Views, i: int, R: Array, t: Array) -> _LitPoint:
+    """Where the ray of view i meets its screen, of any extent, for a pose R (3, 3), t (3,), m."""
     view = v[i]
-    origin = np.empty(3)
-    S, s0 = view["screen_rotation"], view["screen_origin"]
-    facing = height = 0.0
-    for a in range(3):
-        origin[a] = R[a, 0] * view["point"][0] + R[a, 1] * view["point"][1] + R[a, 2] * view["point"][2] + t[a]
-        d[a] = R[a, 0] * view["ray"][0] + R[a, 1] * view["ray"][1] + R[a, 2] * view["ray"][2]
-        normal[a] = S[a, 2]
-        facing += normal[a] * d[a]
-        height += normal[a] * (s0[a] - origin[a])
+    S, s0, p, r = view["screen_rotation"], view["screen_origin"], view["point"], view["ray"]
+    ox = R[0, 0] * p[0] + R[0, 1] * p[1] + R[0, 2] * p[2] + t[0]  # where the ray starts
+    oy = R[1, 0] * p[0] + R[1, 1] * p[1] + R[1, 2] * p[2] + t[1]
+    oz = R[2, 0] * p[0] + R[2, 1] * p[1] + R[2, 2] * p[2] + t[2]
+    dx = R[0, 0] * r[0] + R[0, 1] * r[1] + R[0, 2] * r[2]
+    dy = R[1, 0] * r[0] + R[1, 1] * r[1] + R[1, 2] * r[2]
+    dz = R[2, 0] * r[0] + R[2, 1] * r[1] + R[2, 2] * r[2]
+    nx, ny, nz = S[0, 2], S[1, 2], S[2, 2]
+    facing = nx * dx + ny * dy + nz * dz
+    height = nx * (s0[0] - ox) + ny * (s0[1] - oy) + nz * (s0[2] - oz)
     length = height / facing if abs(facing) > 1e-12 else 0.0
     if length != 0.0 and (view["bow"][0] != 0.0 or view["bow"][1] != 0.0 or view["bow"][2] != 0.0):
-        length = _intersect_bent(v, i, origin, d, length, normal)
-        facing = normal[0] * d[0] + normal[1] * d[1] + normal[2] * d[2]
-    for a in range(3):
-        hit[a] = origin[a] + length * d[a]
-    return length, facing
+        length, nx, ny, nz = _intersect_bent(v, i, ox, oy, oz, dx, dy, dz, length)
+        facing = nx * dx + ny * dy + nz * dz
+    return _LitPoint(length, facing, dx, dy, dz, nx, ny, nz, ox + length * dx, oy + length * dy, oz + length * dz)
 
 
 @compiled
-def _intersect_bent(v: Views, i: int, origin: Array, d: Array, length: float, normal: Array) -> float:
-    """Length, m, of a ray to a bent screen; writes the surface's normal there, in world, to `normal`.
+def _intersect_bent(
+    v: Views, i: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, length: float
+) -> tuple[float, float, float, float]:
+    """Length, m, of a ray d from a point o, m, to the bent screen of view i, and the surface's normal there, in world.
 
-    Newton's method from the flat screen, at the given length.
+    Newton's method from the flat screen, at the given length: a bow of centimetres over metres converges to rounding in
+    two or three steps; the fourth is for larger bows.
     """
     view = v[i]
     S, s0 = view["screen_rotation"], view["screen_origin"]
     a, b, c = view["bow"][0], view["bow"][1], view["bow"][2]
     p, q = np.empty(3), np.empty(3)
     for k in range(3):
-        p[k] = S[0, k] * (origin[0] - s0[0]) + S[1, k] * (origin[1] - s0[1]) + S[2, k] * (origin[2] - s0[2])
-        q[k] = S[0, k] * d[0] + S[1, k] * d[1] + S[2, k] * d[2]
+        p[k] = S[0, k] * (ox - s0[0]) + S[1, k] * (oy - s0[1]) + S[2, k] * (oz - s0[2])
+        q[k] = S[0, k] * dx + S[1, k] * dy + S[2, k] * dz
     for _ in range(4):
         x, y = p[0] + length * q[0], p[1] + length * q[1]
         height = p[2] + length * q[2] - (a * x * x + b * x * y + c * y * y)
@@ -266,9 +298,12 @@ def _intersect_bent(v: Views, i: int, origin: Array, d: Array, length: float, no
         length -= height / (slope if abs(slope) > 1e-12 else 1.0)
     x, y = p[0] + length * q[0], p[1] + length * q[1]
     nx, ny = -(2 * a * x + b * y), -(b * x + 2 * c * y)
-    for k in range(3):
-        normal[k] = S[k, 0] * nx + S[k, 1] * ny + S[k, 2]
-    return length
+    return (
+        length,
+        S[0, 0] * nx + S[0, 1] * ny + S[0, 2],
+        S[1, 0] * nx + S[1, 1] * ny + S[1, 2],
+        S[2, 0] * nx + S[2, 1] * ny + S[2, 2],
+    )
 
 
 @compiled
@@ -339,15 +374,15 @@ def _fisheye(k: Array, x: float, y: float) -> tuple[float, float, float, float, 
 
 
 @compiled
-def distort_all(xy: Array, k: Array, fisheye: bool) -> tuple[Array, Array]:
+def distort_all(xy: Array, k: Array, fisheye: Bools) -> tuple[Array, Array]:
     """Distorted points (n, 2) and Jacobians (n, 2, 2) of normalised points xy (n, 2), without the sensor's tilt.
 
-    k (1 or n, 14): the coefficients of all points, or of each.
+    k (1 or n, 14), fisheye (1 or n): the coefficients of all points, or of each, and whose model's they are.
     """
     out, J = np.empty_like(xy), np.empty((len(xy), 2, 2))
     for i in range(len(xy)):
-        own = k[i if len(k) > 1 else 0]
-        point = _fisheye(own, xy[i, 0], xy[i, 1]) if fisheye else _polynomial(own, xy[i, 0], xy[i, 1])
+        own, wide = k[i if len(k) > 1 else 0], fisheye[i if len(fisheye) > 1 else 0]
+        point = _fisheye(own, xy[i, 0], xy[i, 1]) if wide else _polynomial(own, xy[i, 0], xy[i, 1])
         out[i, 0], out[i, 1], J[i, 0, 0], J[i, 0, 1], J[i, 1, 0], J[i, 1, 1] = point
     return out, J
 

@@ -1,13 +1,11 @@
 """The forward model: from a pose of the vehicle to the pixels of its spots, with Jacobians.
 
 The pose transforms each beam to world, the beam's ray intersects its screen, and the camera projects the lit point. The
-solver, the trackers, the simulator and the calibrations all use this model. It has two implementations:
+solver, the trackers, the simulator and the calibrations all use this model, compiled (geometry/compiled_projection.py):
 
-- `SpotModel.project` and `SpotModel.derivatives`, compiled (geometry/compiled_projection.py): pixels and their Jacobian
-  by the pose, and by every number of the rig, for solver, trackers, simulator and calibrations;
-- `SpotModel.hits`, numpy: lit points with their Jacobian, for drawings and searches.
-
-tests/geometry/test_forward_model.py compares both.
+- `SpotModel.hits`: lit points on the screens, for drawings and searches;
+- `SpotModel.project`: pixels and their Jacobian by the pose, for solver, trackers and simulator;
+- `SpotModel.derivatives`: the Jacobian by every number of the rig as well, for calibrations.
 """
 
 from __future__ import annotations
@@ -18,9 +16,9 @@ from typing import Any
 import numba
 import numpy as np
 
-from geometry.arrays import Array, Bools, Ints, cross
+from geometry.arrays import Array, Bools, Ints
 from geometry.camera import FISHEYE, in_picture, pinhole_numbers, project_points_full
-from geometry.compiled_projection import VIEW, Views, derivatives_all, lens_codes, project_all
+from geometry.compiled_projection import VIEW, Views, derivatives_all, lens_codes, lit_points, project_all
 from geometry.lens import padded, tilt_matrix
 from geometry.pose import Pose
 from geometry.rig import Rig
@@ -42,17 +40,6 @@ class SpotDerivatives:
     bow: Array  # (..., n, 2, 3) of the screen's bow
     direction: Array  # (..., n, 2, 3) of the beam's direction, in body; 0 along the beam
     point: Array  # (..., n, 2, 3) of the beam's point, m, in body; 0 along the beam
-
-
-@dataclass(frozen=True, slots=True)
-class _Intersection:
-    """Intersections of n rays with their screens, for poses (...)."""
-
-    R: Array  # (..., 1, 3, 3) world from body
-    t: Array  # (..., n) m, the ray's length to the screen
-    hit: Array  # (..., n, 3) m, in world
-    oblique: Array  # (..., n, 3, 3) the projection along the ray onto the surface
-    good: Bools  # (..., n) whether the ray meets the screen within its extent
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,73 +140,20 @@ class SpotModel:
             **per_view,
         )
 
-    def hits(self, world_from_body: Pose) -> tuple[Array, Array]:
-        """Lit points on the screens, in world (..., n, 3), m, and their Jacobian (..., n, 3, 6).
+    def hits(self, world_from_body: Pose) -> Array:
+        """Lit points on the screens, in world (..., n, 3), m. The pose may be a stack (...).
 
-        The pose may be a stack (...). The Jacobian is with respect to the pose error [dt (m, world), dtheta (rad,
-        body)], section 1 of the file contract. nan where a ray is parallel to its screen, points away from it or
-        passes beside its extent.
+        nan where a ray is parallel to its screen, points away from it or passes beside its extent.
         """
-        m = self._intersect(world_from_body)
-        return np.where(m.good[..., None], m.hit, np.nan), self._hit_jacobian(m)
-
-    def _hit_jacobian(self, m: _Intersection) -> Array:
-        """The Jacobian (..., n, 3, 6) of the lit points, as in `hits`."""
-        # A small motion of the ray along itself has no effect, so the motion is projected along the ray:
-        # d(hit) = (I - d n^T / (n.d)) (d(p) + t d(d)), and with theta in body: d(p) + t d(d) = dt - R [q]x dtheta,
-        # where q = point + t ray is the lit point in body.
-        q = self.point + m.t[..., None] * self.ray
-        J = np.empty((*m.hit.shape, 6))
-        J[..., :3] = m.oblique
-        # The columns of -R [q]x are R (e_i x q) = (R e_i) x (R q).
-        lever = (m.R @ q[..., None])[..., 0]
-        columns = cross(np.swapaxes(m.R, -1, -2), lever[..., None, :])  # (..., n, 3 axes, 3)
-        J[..., 3:] = m.oblique @ np.swapaxes(columns, -1, -2)
-        return J
-
-    def _intersect(self, world_from_body: Pose) -> _Intersection:
-        """Intersections of the rays with their screens."""
-        R = world_from_body.rotation[..., None, :, :]
-        p = (R @ self.point[..., None])[..., 0] + world_from_body.translation[..., None, :]
-        d = (R @ self.ray[..., None])[..., 0]
-        normal = self.screen_rotation[..., 2]
-        facing = np.sum(normal * d, axis=-1)
-        height = np.sum(normal * (self.screen_origin - p), axis=-1)
-        ahead = np.abs(facing) > 1e-12
-        t = height / np.where(ahead, facing, 1.0)
-        if self.bow.any():
-            t, normal = self._intersect_bent(p, d, t)
-            facing = np.sum(normal * d, axis=-1)
-        hit = p + t[..., None] * d
-        on_screen = ((hit - self.screen_origin)[..., None, :] @ self.screen_rotation)[..., 0, :]
-        good = ahead & (t > 0) & np.all(np.abs(on_screen[..., :2]) <= self.half_size, axis=-1)
-        along = np.where(ahead, facing, 1.0)
-        oblique = np.eye(3) - d[..., :, None] * normal[..., None, :] / along[..., None, None]
-        return _Intersection(R, t, hit, oblique, good)
-
-    def _intersect_bent(self, p: Array, d: Array, t: Array) -> tuple[Array, Array]:
-        """Lengths (..., n), m, of rays to bent screens, and the surface normals there (..., n, 3), in world.
-
-        p, d: (..., n, 3), m and unit, in world; t (..., n), m: lengths to the flat screens. Newton's method from there:
-        a bow of centimetres over metres converges to rounding in two or three steps; the fourth is for larger bows.
-        """
-        a, b, c = np.moveaxis(self.bow, -1, 0)
-        p_s = ((p - self.screen_origin)[..., None, :] @ self.screen_rotation)[..., 0, :]
-        d_s = (d[..., None, :] @ self.screen_rotation)[..., 0, :]
-        for _ in range(4):
-            x, y = p_s[..., 0] + t * d_s[..., 0], p_s[..., 1] + t * d_s[..., 1]
-            height = p_s[..., 2] + t * d_s[..., 2] - (a * x * x + b * x * y + c * y * y)
-            slope = d_s[..., 2] - (2 * a * x + b * y) * d_s[..., 0] - (b * x + 2 * c * y) * d_s[..., 1]
-            t = t - height / np.where(np.abs(slope) > 1e-12, slope, 1.0)
-        x, y = p_s[..., 0] + t * d_s[..., 0], p_s[..., 1] + t * d_s[..., 1]
-        normal = np.stack([-(2 * a * x + b * y), -(b * x + 2 * c * y), np.ones_like(x)], axis=-1)
-        return t, (self.screen_rotation @ normal[..., None])[..., 0]
+        R, t, stack = _stacked(world_from_body)
+        return np.asarray(lit_points(self.numbers, R, t).reshape(*stack, len(self), 3))
 
     def project(self, world_from_body: Pose) -> tuple[Array, Array]:
         """Distorted pixels (..., n, 2) and their Jacobian (..., n, 2, 6), px per m and px per rad.
 
         nan where no projection exists: the beam misses its screen, or the lit point lies behind the camera or beyond
-        the fold of its lens. Pixels outside the picture are returned too. The pose and the Jacobian are as in `hits`.
+        the fold of its lens. Pixels outside the picture are returned too. The pose may be a stack (...). The Jacobian
+        is with respect to the pose error [dt (m, world), dtheta (rad, body)], section 1 of the file contract.
         """
         R, t, stack = _stacked(world_from_body)
         uv, J = project_all(self.numbers, R, t)

@@ -26,26 +26,24 @@ def padded(distortion: tuple[float, ...]) -> Array:
     return out
 
 
-def distort(xy: Array, coefficients: Array) -> tuple[Array, Array]:
+def distort(xy: Array, coefficients: Array, fisheye: Bools | bool = False) -> tuple[Array, Array]:
     """Distorted normalised points (..., 2) and d(distorted)/d(xy) (..., 2, 2).
 
-    xy (..., 2): X/Z and Y/Z in the camera frame. coefficients (..., 14), broadcast against the points' leading axes.
+    xy (..., 2): X/Z and Y/Z in the camera frame. coefficients (..., 14), broadcast against the points' leading axes, as
+    fisheye (...): whether they are the fisheye model's, k1, k2, k3, k4 and zeros. Its radius of an angle t off the axis
+    is t (1 + k1 t^2 + k2 t^4 + ...). Source: OpenCV, calib3d, "Fisheye camera model".
     """
-    out, J = _in_rows(xy, coefficients, fisheye=False)
-    tau_x, tau_y = coefficients[..., 12], coefficients[..., 13]
-    if np.any(tau_x) or np.any(tau_y):
-        return _tilt(out, J, tau_x, tau_y)
-    return out, J
-
-
-def _in_rows(xy: Array, coefficients: Array, fisheye: bool) -> tuple[Array, Array]:
-    """`distort_all` of stacks of points (..., 2), with coefficients (..., 14) broadcast against them."""
-    stack = np.broadcast_shapes(xy.shape[:-1], coefficients.shape[:-1])
+    wide = np.asarray(fisheye, dtype=bool)
+    stack = np.broadcast_shapes(xy.shape[:-1], coefficients.shape[:-1], wide.shape)
     k = coefficients if coefficients.ndim == 1 else np.broadcast_to(coefficients, (*stack, N_DISTORTION))
+    wide = wide if wide.ndim == 0 else np.broadcast_to(wide, stack)
     # Copies, because read-only arrays have another type for numba, which would compile a second time for them.
     points = np.array(np.broadcast_to(xy, (*stack, 2)), dtype=np.float64, order="C").reshape(-1, 2)
-    out, J = distort_all(points, np.array(k, dtype=np.float64, order="C").reshape(-1, N_DISTORTION), fisheye)
-    return out.reshape(*stack, 2), J.reshape(*stack, 2, 2)
+    k = np.array(k, dtype=np.float64, order="C").reshape(-1, N_DISTORTION)
+    rows, J_rows = distort_all(points, k, np.array(wide, order="C").reshape(-1))
+    out, J = rows.reshape(*stack, 2), J_rows.reshape(*stack, 2, 2)
+    tau_x, tau_y = np.where(wide, 0.0, coefficients[..., 12]), np.where(wide, 0.0, coefficients[..., 13])
+    return _tilt(out, J, tau_x, tau_y) if np.any(tau_x) or np.any(tau_y) else (out, J)
 
 
 def _tilt(xy: Array, J: Array, tau_x: Array, tau_y: Array) -> tuple[Array, Array]:
@@ -58,8 +56,9 @@ def _tilt(xy: Array, J: Array, tau_x: Array, tau_y: Array) -> tuple[Array, Array
 
 
 def coefficient_jacobian(xy: Array, coefficients: Array, distorted: Array | None = None) -> Array:
-    """d(distorted)/d(coefficients) (..., 2, 14) of `distort`; xy (..., 2) and coefficients (..., 14) as there.
+    """d(distorted)/d(coefficients) (..., 2, 14) of `distort` by the perspective model.
 
+    xy (..., 2) and coefficients (..., 14) as there.
     distorted (..., 2): the result of `distort`, if it is known.
     """
     k1, k2, _, _, k3, k4, k5, k6, *_, tau_x, tau_y = np.moveaxis(coefficients, -1, 0)
@@ -196,16 +195,8 @@ def is_one_to_one(xy: Array, jacobian: Array, fold_r2: Array) -> Bools:
     return (r2 < fold_r2) & (det > 0)
 
 
-def distort_fisheye(xy: Array, coefficients: Array) -> tuple[Array, Array]:
-    """As `distort`, for OpenCV's fisheye model: the radius of an angle t off the axis is t (1 + k1 t^2 + k2 t^4 + ...).
-
-    coefficients (..., 14): k1, k2, k3, k4 and zeros. Source: OpenCV, calib3d, "Fisheye camera model".
-    """
-    return _in_rows(xy, coefficients, fisheye=True)
-
-
 def fisheye_coefficient_jacobian(xy: Array, coefficients: Array) -> Array:
-    """d(distorted)/d(coefficients) (..., 2, 14) of `distort_fisheye`."""
+    """d(distorted)/d(coefficients) (..., 2, 14) of `distort` by the fisheye model."""
     r = np.linalg.norm(xy, axis=-1)
     t = np.arctan(r)
     unit = xy / np.where(r > 1e-8, r, 1.0)[..., None]

@@ -198,7 +198,7 @@ class CornerTerm:
         lenses = array_of(values, "intrinsics")
 
         def by_camera(k: int, points: Array) -> Projected:
-            wide = np.asarray(self.fisheye[k]) if self.fisheye[k] else None
+            wide = np.asarray(self.fisheye[k])
             return project_points_full(points, lenses[k, :4], lenses[k, 4:], np.asarray(np.inf), wide)
 
         if len(lenses) == 1:

@@ -43,7 +43,7 @@ def alternative_poses(model: SpotModel, world_from_body: Pose, rows: Ints | Sequ
     """
     views = np.asarray(rows, dtype=np.int64)
     target, J = model.project(world_from_body)
-    places = model.hits(world_from_body)[0]
+    places = model.hits(world_from_body)
     views = views[np.isfinite(target[views, 0])]
     triple = _best_triple(model, J, views)
     if triple is None:
@@ -225,7 +225,7 @@ def visibility_of(rig: Rig, prior: PosePrior, limits: SolveLimits, count: int = 
     pixels, J = model.project(poses)
     seen = np.asarray(model.in_picture(pixels))
     projected = np.isfinite(pixels[..., 0])
-    hits = np.isfinite(model.hits(poses)[0][..., 0])
+    hits = np.isfinite(model.hits(poses)[..., 0])
     sigma_m, sigma_rad, good = _sigmas(np.where(seen[..., None, None], J, 0.0), limits)
     cameras, spots = np.array([c for c, _ in model.views]), np.array([s for _, s in model.views])
     return Visibility(

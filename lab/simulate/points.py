@@ -53,14 +53,14 @@ def spot_images(model: SpotModel, world_from_body: Pose, sigma_m: float, blur_px
     sigma_m: of the beam, half its 1/e^2 radius. blur_px: sigma of the blur of the lens. nan where there is no
     projection.
     """
-    hit = model.hits(world_from_body)[0]
+    hit = model.hits(world_from_body)
     uv = model.project(world_from_body)[0]
     direction = (world_from_body.rotation @ model.ray[..., None])[..., 0]
     axes = model.screen_rotation[..., :2]
     in_camera = (model.camera_rotation @ hit[..., None])[..., 0] + model.camera_translation
     seen = np.isfinite(uv[:, 0])
     in_camera = np.where(seen[:, None], in_camera, [0.0, 0.0, 1.0])
-    J = project_points(in_camera, model.pinhole, model.distortion, model.fold_r2)[1]
+    J = project_points(in_camera, model.pinhole, model.distortion, model.fold_r2, model.fisheye)[1]
     A = J @ (model.camera_rotation @ axes)  # (n, 2, 2) px per m of the screen
     covariance = A @ on_screen_covariance(direction, axes, sigma_m) @ np.swapaxes(A, -1, -2) + blur_px**2 * np.eye(2)
     # A diffuse (Lambertian) screen: the camera receives power times cosine over squared distance.

@@ -33,11 +33,15 @@ N = len(PLACES)
 
 def seen(places: np.ndarray, zoom: float = 0.0) -> np.ndarray:
     pinhole = pinhole_numbers(CAMERA) * [1 + zoom, 1 + zoom, 1, 1]
-    return project_points_full(places, pinhole, padded(CAMERA.distortion), np.asarray(CAMERA.fold_r2)).pixels
+    return project_points_full(
+        places, pinhole, padded(CAMERA.distortion), np.asarray(CAMERA.fold_r2), np.asarray(False)
+    ).pixels
 
 
 def columns():
-    lens = project_points_full(PLACES, pinhole_numbers(CAMERA), padded(CAMERA.distortion), np.asarray(CAMERA.fold_r2))
+    lens = project_points_full(
+        PLACES, pinhole_numbers(CAMERA), padded(CAMERA.distortion), np.asarray(CAMERA.fold_r2), np.asarray(False)
+    )
     return camera_columns(PLACES, lens.d_point, lens.d_pinhole, pinhole_numbers(CAMERA)[:2])
 
 

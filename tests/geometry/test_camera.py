@@ -101,7 +101,7 @@ def test_one_call_projects_points_of_several_cameras_with_the_jacobian_of_differ
     pinholes = np.array([pinhole_numbers(c) for c in cameras])
     lenses = np.array([padded(c.distortion) for c in cameras])
     folds = np.array([c.fold_r2 for c in cameras])
-    pixels, J = project_points(points, pinholes, lenses, folds)
+    pixels, J = project_points(points, pinholes, lenses, folds, np.asarray(False))
     for i, c in enumerate(cameras):
         np.testing.assert_allclose(pixels[i], c.project(points[i]), rtol=0, atol=1e-10)
         differences = numeric_jacobian(c.project, points[i])

@@ -152,19 +152,18 @@ class CameraNumbers:
     pinhole: Array  # (2, 1, 4)
     distortion: Array  # (2, 1, 14)
     fold_r2: Array  # (2, 1)
-    fisheye: Bools | None  # (2, 1); None: neither camera is one
+    fisheye: Bools  # (2, 1)
 
     @staticmethod
     def of(cameras: tuple[Camera, Camera]) -> CameraNumbers:
         """Of two cameras."""
-        wide = np.array([[c.lens == FISHEYE] for c in cameras])
         return CameraNumbers(
             np.stack([c.camera_from_world.rotation for c in cameras]),
             np.stack([c.camera_from_world.translation for c in cameras]),
             np.stack([pinhole_numbers(c) for c in cameras])[:, None],
             np.stack([padded(c.distortion) for c in cameras])[:, None],
             np.array([[c.fold_r2] for c in cameras]),
-            wide if wide.any() else None,
+            np.array([[c.lens == FISHEYE] for c in cameras]),
         )
 
 

@@ -90,7 +90,7 @@ def rational_of_fisheye(numbers: Array, widest_rad: float) -> Array:
     angle = np.linspace(0, min(widest_rad, np.deg2rad(80)), 200)[1:]
     r2 = np.tan(angle) ** 2
     points = np.stack([np.tan(angle), 0 * angle], axis=1)
-    scale = lens.distort_fisheye(points, np.broadcast_to(numbers[4:], (len(angle), 14)))[0][:, 0] / points[:, 0]
+    scale = lens.distort(points, np.broadcast_to(numbers[4:], (len(angle), 14)), True)[0][:, 0] / points[:, 0]
     powers = np.stack([r2, r2**2, r2**3], axis=1)
     weight = (1 / (1 + r2**3))[:, None]
     A = np.concatenate([powers, -scale[:, None] * powers], axis=1) * weight

@@ -361,7 +361,7 @@ def compare_still(
     by_pose = d.pose.reshape(2 * n, 6)
     if pose is not None:
         C = C + by_pose @ pose[1] @ by_pose.T
-    hits = part.hits(world_from_body)[0]
+    hits = part.hits(world_from_body)
     residual = (still.pixels - d.pixels).ravel()
     return PixelComparison(
         camera=tuple(c for c, _ in part.views),

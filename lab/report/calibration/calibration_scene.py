@@ -92,16 +92,14 @@ def rig_things(rig: Rig, world_from_body: Pose | None = None, others: Pose | Non
     """
     things: list[SceneObject] = []
     model = SpotModel.of(rig)
-    hits = np.full((len(model), 3), np.nan) if world_from_body is None else model.hits(world_from_body)[0]
+    hits = np.full((len(model), 3), np.nan) if world_from_body is None else model.hits(world_from_body)
     for screen in rig.screens.values():
         size = screen.size_m
         if size is None:
             on_screen = np.array([s.screen == screen.name for s in (rig.spots[v] for _, v in model.views)], dtype=bool)
             half = 1.2 * _reach(hits[on_screen], screen.world_from_screen, 1.0)
             if others is not None:
-                half = np.maximum(
-                    half, 1.2 * _reach(model.hits(others)[0][:, on_screen], screen.world_from_screen, 0.99)
-                )
+                half = np.maximum(half, 1.2 * _reach(model.hits(others)[:, on_screen], screen.world_from_screen, 0.99))
             half = np.maximum(half, 0.5)
             size = (2 * float(half[0]), 2 * float(half[1]))
         things.append(Rectangle(f"screen {screen.name}", screen.world_from_screen, size))

@@ -114,7 +114,7 @@ def _moments(content: RigAndPoses, indices: Ints, digits: int) -> list[dict[str,
     """Frame, time, status, rays and spots (name, colour and place) of some poses: as View.moving, all at once."""
     rig, poses = content.rig, content.world_from_body[indices]
     model = SpotModel.of(rig)
-    hits = model.hits(poses)[0]
+    hits = model.hits(poses)
     starts = {b.name: poses.apply(b.point) for b in rig.beams.values()} if len(indices) else {}
     out = []
     for k, i in enumerate(indices.tolist()):

@@ -244,7 +244,7 @@ def test_the_misprint_in_equation_12_misses_by_hundreds_of_pixels():
     literal, meant = [], []
     for _ in range(200):
         pose = random_pose(rng, 1.0, np.deg2rad(30))
-        hit = model.hits(pose)[0]
+        hit = model.hits(pose)
         A, B, C = (hit[row[s]] for s in ("2", "1", "3"))
         truth = model.project(pose)[0][row["3"]]
         if np.isnan(hit).any() or np.isnan(truth).any():

@@ -18,7 +18,7 @@ from lab.files.run.truth import load_truth
 from lab.files.text.csv_text import csv_text, read_table
 from lab.files.text.error_text import is_formula, name_of_path, printable
 from lab.files.text.json_text import has_schema
-from lab.files.text.yaml_text import parse_mapping, parse_value, read_mapping
+from lab.files.text.yaml_text import parse_mapping, parse_value, read_mapping, write_mapping
 from lab.pictures.source import open_video
 from lab.runs.batch.batch import read_rows
 from lab.runs.batch.task import allotted, listed_runs
@@ -83,6 +83,22 @@ def test_a_rig_of_a_calibration_is_the_same_without_libyaml(monkeypatch):
     given = read_mapping(CALIBRATED / "rig.yaml")
     monkeypatch.setattr(yaml, "__with_libyaml__", False)
     assert read_mapping(CALIBRATED / "rig.yaml") == given
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        read_mapping(CALIBRATED / "rig.yaml"),
+        {"a b": [1.0, -0.0, 1e-300, float("nan"), -float("inf"), 10**20, None, True, "1e3", "yes", "~", "2026-01-01"]},
+        {"a": {"b": "two\nlines\n", "c": " x ", "d": "#no: comment", "e": "\u00fc\u2013\U0001f642", "f": "x\ty?"}},
+        {"many": [f"word {i}, with a comma" for i in range(60)], "deep": [[1, 2], {"x": []}, {}, {"y": {"z": "-"}}]},
+    ],
+)
+def test_a_file_is_written_the_same_without_libyaml(content, tmp_path, monkeypatch):
+    write_mapping(content, tmp_path / "given.yaml")
+    monkeypatch.setattr(yaml, "__with_libyaml__", False)
+    write_mapping(content, tmp_path / "without.yaml")
+    assert (tmp_path / "without.yaml").read_bytes() == (tmp_path / "given.yaml").read_bytes()
 
 
 def test_deep_brackets_on_the_command_line_are_refused_in_a_line():

@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import norm
 
-from geometry.camera import Camera
+from geometry.camera import FISHEYE, Camera
 from geometry.forward_model import SpotModel
 from geometry.light_centroid import map_curvature
 from geometry.planes import intersect_plane
@@ -131,7 +131,7 @@ def traced(view, pose, sigma_m):
     camera = RIG.cameras[MODEL.views[view][0]]
     camera_from_world = camera.camera_from_world
     direction = pose.rotation @ MODEL.ray[view]
-    hit = MODEL.hits(pose)[0][view]
+    hit = MODEL.hits(pose)[view]
     a, b = (g.ravel() for g in np.meshgrid(*2 * [np.linspace(-5, 5, 81)]))
     weight = np.exp(-(a**2 + b**2) / 2)
     across = np.linalg.svd(direction[None])[2][1:]
@@ -160,6 +160,23 @@ def test_the_ellipse_in_the_picture_agrees_with_rays_traced_through_opencv(pose,
     np.testing.assert_allclose(found, covariance, atol=1e-3 * np.trace(covariance))
     # Not a circle, for which the angle would not be tested.
     assert np.linalg.eigvalsh(found)[1] > 1.05 * np.linalg.eigvalsh(found)[0]
+
+
+def test_the_ellipse_in_the_picture_of_a_fisheye_lens_agrees_with_points_of_the_screen_through_opencv():
+    numbers = (0.03, -0.01, 0.002, -5e-4)
+    wide = {n: replace(c, lens=FISHEYE, distortion=numbers) for n, c in RIG.cameras.items()}
+    model = SpotModel.of(replace(RIG, cameras=wide))
+    pose, sigma_m, step = POSES[1], 0.0055, 1e-4
+    hits, found = model.hits(pose), spot_images(model, pose, sigma_m, 0.0)
+    for view in (0, 1, 3, 4):
+        camera, axes = wide[model.views[view][0]], model.screen_rotation[view][:, :2]
+        beside = hits[view] + step * np.concatenate([axes, -axes], axis=1).T
+        at = (cv2.Rodrigues(camera.camera_from_world.rotation)[0], camera.camera_from_world.translation)
+        uv = cv2.fisheye.projectPoints(beside[:, None], *at, camera.matrix, np.array(numbers))[0][:, 0]
+        by_screen = (uv[:2] - uv[2:]).T / (2 * step)
+        on_screen = on_screen_covariance(pose.rotation @ model.ray[view], axes, sigma_m)
+        expected = by_screen @ on_screen @ by_screen.T
+        np.testing.assert_allclose(found.covariance_px2[view], expected, rtol=1e-4, atol=1e-4 * np.trace(expected))
 
 
 @pytest.mark.parametrize("pose", POSES)

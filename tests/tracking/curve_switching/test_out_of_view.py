@@ -73,11 +73,11 @@ def test_a_beam_that_misses_its_screen_gets_no_position():
     """Rotated until the third beam is parallel to the screens: neither the rigid body nor eq. (14) has a spot there."""
     rig, model, coplanar = set_up("fan")
     pose = random_pose(np.random.default_rng(5), 0.0, 0.0).from_ypr(np.deg2rad([68.0, 0, 0]), np.zeros(3))
-    world = model.hits(pose)[0]
+    world = model.hits(pose)
     assert np.isfinite(world[[0, 1, 3, 4]]).all()
     # At 88 deg from the normal beam C's spot is hundreds of metres away; beyond 90 deg there is none.
     pose = pose.from_ypr(np.deg2rad([71.0, 0, 0]), np.zeros(3))
-    hit = model.hits(pose)[0]
+    hit = model.hits(pose)
     assert np.isnan(hit[[2, 5]]).all()
     seen = model.project(pose)[0]
     if np.isfinite(seen[[0, 1, 3, 4]]).all():

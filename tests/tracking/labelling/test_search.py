@@ -354,7 +354,7 @@ def test_points_on_a_curved_screen_agree_with_the_forward_model():
     rig = replace(flat, screens={n: replace(s, bow=(0.01, 0.004, -0.008)) for n, s in flat.screens.items()})
     model = SpotModel.of(rig)
     pose = Pose.from_ypr(np.array([0.05, 0.02, 0.0]), np.array([0.1, 0.1, 0.0]))
-    uv, hits = model.project(pose)[0], model.hits(pose)[0]
+    uv, hits = model.project(pose)[0], model.hits(pose)
     found = {n: Detections.at(uv[model.camera_of == c], np.tile(0.01 * np.eye(2), (3, 1, 1)))
              for c, n in enumerate(model.camera_names)}  # fmt: skip
     points = points_of(rig, model, found, LabelParameters(), lambda _, places: np.isfinite(places[:, 0]))

@@ -76,7 +76,7 @@ def test_the_beams_end_where_the_forward_model_says(content):
     index = content.at_frame(None)
     view = view_of(content, index)
     ends = np.array([t.end for t in view.moving(index) if hasattr(t, "end")])
-    hits = SpotModel.of(content.rig).hits(content.world_from_body[index])[0]
+    hits = SpotModel.of(content.rig).hits(content.world_from_body[index])
     hits = np.unique(hits[np.isfinite(hits).all(axis=1)].round(9), axis=0)
     np.testing.assert_allclose(np.unique(ends.round(9), axis=0), hits, atol=1e-9)
 
