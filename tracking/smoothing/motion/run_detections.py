@@ -508,6 +508,7 @@ class SmoothedMotion:
     jumped: Bools  # (T,) the velocities jumped in the step before
     jump_scale: Array  # (T, 2) of the variances of these jumps, as in `jump_variances` ...
     moment: Array  # (T, 2) ... and when they are, as in RunInformation
+    excluded: Bools  # (T,) the velocities did not jump in the step before, although it was not observed
     pose_P: Array  # (T, 6, 6)
     motion_P: Array  # (T, 6, 6) of the velocities
     known: Bools  # (T,) the pose is not lost
@@ -521,7 +522,9 @@ class SmoothedMotion:
         zero = np.zeros((frames, 6, 6))
         known = np.zeros(frames, dtype=bool)
         scale, moment = np.ones((frames, 2)), unknown_moments(frames)
-        return SmoothedMotion(ref, log_density, 0.0, jumped, scale, moment, zero, zero, known, np.zeros(frames))
+        return SmoothedMotion(
+            ref, log_density, 0.0, jumped, scale, moment, known.copy(), zero, zero, known, np.zeros(frames)
+        )
 
     def without_covariances(self) -> SmoothedMotion:
         """What the next estimate starts from: less memory."""

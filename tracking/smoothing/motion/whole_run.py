@@ -203,7 +203,7 @@ class _Estimator:
         return last
 
     def _hidden_jumps_excluded(self) -> bool:
-        """Find gaps in which the frames around them exclude a velocity jump; whether there are more than before.
+        """Find steps in which the frames around them exclude a hidden jump; whether there are more than before.
 
         A jump that may be hidden in a gap leaves open where the spots beside it were at their frames' instants: by
         .2 px at 5 px per frame, where a spot is known to .01 px. Runs whose pictures are of one instant do without.
@@ -213,20 +213,31 @@ class _Estimator:
         info, _ = self._information(self.ref)
         density, hidden = np.exp(self.log_density), unobserved_steps(self.measured) & ~self.excluded
         edges = np.flatnonzero(np.diff(np.r_[False, hidden, False].astype(np.int8)))
-        for first, end in edges.reshape(-1, 2).tolist():
-            part = slice(max(first - GAP_FRAMES, 0), min(end + GAP_FRAMES, len(hidden)))
-            if self.jumped[first:end].any():
-                continue
-            some = info._replace(**{name: getattr(info, name)[part] for name in info._fields[:-1]})
-            none = np.zeros_like(some.velocity_jump)
-            none[: first - part.start], none[end - part.start :] = (
-                some.velocity_jump[: first - part.start], some.velocity_jump[end - part.start :],
-            )  # fmt: skip
-            without = some._replace(velocity_jump=none, acceleration_jump=none / MANOEUVRE_S**2)
-            ref = Reference(*(np.ascontiguousarray(a[part]) for a in self.ref))
-            gained = log_likelihood(ref, without, density[part]) - log_likelihood(ref, some, density[part])
-            self.excluded[first:end] = gained > NO_JUMP_NATS
+        ranges = [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
+        while ranges:
+            first, end = ranges.pop()
+            if self._nats_without_hidden_jumps(info, density, first, end) > NO_JUMP_NATS:
+                self.excluded[first:end] = True
+            elif end - first > 1:
+                # A slow camera leaves all steps of a recording unobserved: a jump in one of them says nothing of others.
+                middle = (first + end) // 2
+                ranges += [(middle, end), (first, middle)]
         return bool((hidden & self.excluded).any())
+
+    def _nats_without_hidden_jumps(self, info: RunInformation, density: Array, first: int, end: int) -> float:
+        """By how much the run is more likely if no jump is hidden in the steps from `first` to before `end`."""
+        part = slice(max(first - GAP_FRAMES, 0), min(end + GAP_FRAMES, len(self.dt)))
+        ref = Reference(*(np.ascontiguousarray(a[part]) for a in self.ref))
+        some = info._replace(**{name: getattr(info, name)[part] for name in info._fields[:-1]})
+        excluded, before = self.excluded.copy(), self.excluded
+        excluded[first:end] = True
+        nats = []
+        for self.excluded in (before, excluded):
+            jump = np.ascontiguousarray(self._jump_variances(self.ref)[part])
+            open_to_jumps = some._replace(velocity_jump=jump, acceleration_jump=jump / MANOEUVRE_S**2)
+            nats.append(log_likelihood(ref, open_to_jumps, density[part]))
+        self.excluded = before
+        return nats[1] - nats[0]
 
     def _find_moments(self, density: Array) -> bool:
         """Find when the velocities jump, where several steps may; whether any changed. density (T, 6): of the jerk.
@@ -561,13 +572,15 @@ class _Estimator:
         jumped, scale = self.motion.jumped.copy(), self.motion.jump_scale.copy()
         moment = self.motion.moment.copy()
         jumped[core], scale[core], moment[core] = self.jumped, self.jump_scale, self.moment
+        excluded = np.zeros(frames, dtype=bool)
+        excluded[core] = self.excluded
         clocks = self.clocks
         if clocks is not None:
             nearest = np.clip(np.arange(frames) - core.start, 0, core.stop - core.start - 1)
             clocks = replace(clocks, motion=clocks.motion[nearest])
         return SmoothedMotion(
-            Reference(R, t, m), log_density, self.interpolation_offset, jumped, scale, moment, pose_P, motion_P, known,
-            self.weight, clocks,
+            Reference(R, t, m), log_density, self.interpolation_offset, jumped, scale, moment, excluded, pose_P,
+            motion_P, known, self.weight, clocks,
         )  # fmt: skip
 
 
