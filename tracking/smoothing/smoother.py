@@ -281,7 +281,14 @@ class _Smoother:
             every, ref, steady = self._first_motion(seen, ref)
             labels = well_known(every, seen, labels)
         self.errors = ErrorScale.of(
-            model, seen._replace(uv=every.uv), place_px2, labels, self.calibration_cov, ref, steady, every.cov - seen.cov
+            model,
+            seen._replace(uv=every.uv),
+            place_px2,
+            labels,
+            self.calibration_cov,
+            ref,
+            steady,
+            every.cov - seen.cov,
         )
         # Where the pictures show the points, and where these would have been at the instants of the frames.
         self.seen = self.detections = seen._replace(

@@ -328,13 +328,16 @@ def delayed_information(
     ref: Reference,
     steps: Steps,
     start: int,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """Normal matrices (F, 18, 18), vectors (F, 18) and chi-squares (F,) of the labelled spots at a reference motion.
+
+    Also the sums (F,) of the log determinants of their covariances.
 
     assigned (T, n); ref, steps: F frames from frame `start` on.
     """
     frames, n = ref.t.shape[0], assigned.shape[1]
     L, g, chi2 = np.zeros((frames, STATE, STATE)), np.zeros((frames, STATE)), np.zeros(frames)
+    log_det = np.zeros(frames)
     at, J, H, no_cov = np.empty(2), np.empty((2, 6)), np.empty((2, STATE)), np.zeros((n, 2, 2))
     for k in range(frames):
         use, uv, noise = labelled_points(detections, start + k, assigned[start + k], no_cov)
@@ -349,7 +352,8 @@ def delayed_information(
             if not projected:
                 continue
             chi2[j] += add_spot(L[j], g[j], H, w0, w1, w2, uv[i, 0] - at[0], uv[i, 1] - at[1])
-    return L, g, chi2
+            log_det[j] -= np.log(w0 * w2 - w1 * w1)
+    return L, g, chi2, log_det
 
 
 @compiled
