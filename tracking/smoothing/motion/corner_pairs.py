@@ -1,4 +1,4 @@
-"""When the velocities jump twice within a few steps: the step of a turntable that takes about one frame.
+"""Velocity jumps in close succession: two within a few steps, as of a turntable, and many, which are none.
 
 The motion between the two jumps is only seen by the spots in between, so that these decide, each by the motion on its
 side of both jumps: the spots' information is computed again for every pair of moments. The likelihood is that of the
@@ -14,7 +14,7 @@ from itertools import product
 
 import numpy as np
 
-from geometry.arrays import Array, Ints
+from geometry.arrays import Array, Bools, Ints
 from tracking.rigid_body.online_estimates import MANOEUVRE_S
 from tracking.smoothing.motion.fixed_interval import RunInformation, log_likelihood
 from tracking.smoothing.motion.jump_moments import MOMENT_SIGMAS, JumpMoment, calm_jerk
@@ -31,6 +31,8 @@ _ROUNDED = (
     0.4,
 )  # of a step: spreads of the moments, of which the most likely is kept: a turn may be smooth
 _LONGEST_DIFFERENCE = 0.25  # of a step: for the curvature
+_CLOSE, _LEAST_JUMPS = 4, 4  # steps between two jumps, and jumps, of a close succession
+_JERKS = np.exp(-2.0 * np.arange(8))  # of the strength with which the jerk makes such jumps in one step
 _CURVATURES = 3  # times that it is computed, over about one sigma
 
 
@@ -40,7 +42,8 @@ class Stretch:
 
     run: WholeRun
     assigned: Ints  # (T, n) labels of the run
-    start: int  # the first of these frames
+    start: int  # the first of these frames in the run
+    part: slice  # these frames in the run's estimated part
     ref: Reference  # F frames
     steps: Steps  # F frames, as known so far
     weight: Array  # (F,) of the spots of each frame
@@ -79,6 +82,33 @@ class Stretch:
         moment[rows] = np.column_stack([np.maximum(ends[rows] - at_s, 0.0), spread_s])
         return self.nats(jerk, jump, moment)
 
+    def jerk_without_jumps(self, jump: Array, sizes: Array, least_nats: float) -> Array | None:
+        """The most likely jerk densities (F, 6) without the jumps inside; None where it is less likely than that.
+
+        jump (F, 2): the variances of the other jumps; sizes (6,): of these.
+        """
+        best, nats = None, least_nats
+        moment, inside = self.steps.moment.copy(), self.inside
+        moment[inside] = -1.0, 0.0
+        dt = float(np.median(self.steps.dt[inside]))
+        for share in _JERKS:
+            jerk = self.steps.jerk.copy()
+            jerk[inside] = np.maximum(jerk[inside], share * 3 * sizes / dt**3)  # a velocity changes by q dt^3 / 3
+            if (value := self.nats(jerk, jump, moment)) > nats:
+                best, nats = jerk, value
+        return best
+
+
+def successions(jumped: Bools) -> list[tuple[int, int]]:
+    """The steps, first and end, about jumps (T,) in close succession."""
+    out = list[list[int]]()
+    for k in np.flatnonzero(jumped).tolist():
+        if out and k - out[-1][-1] <= _CLOSE:
+            out[-1].append(k)
+        else:
+            out.append([k])
+    return [(max(one[0] - 1, 1), min(one[-1] + 2, len(jumped))) for one in out if len(one) >= _LEAST_JUMPS]
+
 
 def find_pair(stretch: Stretch, before: tuple[JumpMoment, JumpMoment] | None = None) -> tuple[JumpMoment, ...]:
     """The moments of two jumps; empty where motion that is open within these steps explains the spots better.
@@ -106,9 +136,8 @@ def find_pair(stretch: Stretch, before: tuple[JumpMoment, JumpMoment] | None = N
         return ()
     sigma = wider[int(np.argmax(nats))]
     rows = np.searchsorted(stretch.ends_s, at)
-    part = slice(stretch.start, stretch.start + len(stretch.steps.dt))
     return tuple(
-        JumpMoment(int(row), float(stretch.ends_s[row] - one), float(s), part, jerk, stretch.size)
+        JumpMoment(int(row), float(stretch.ends_s[row] - one), float(s), stretch.part, jerk, stretch.size)
         for row, one, s in zip(rows, at, sigma, strict=True)
     )
 

@@ -14,7 +14,7 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from tracking.rigid_body.online_estimates import MANOEUVRE_S, jump_variance
 from tracking.smoothing.motion.clocks import solve_clocks
-from tracking.smoothing.motion.corner_pairs import Stretch, find_pair
+from tracking.smoothing.motion.corner_pairs import Stretch, find_pair, successions
 from tracking.smoothing.motion.extrapolation import extrapolated
 from tracking.smoothing.motion.fixed_interval import (
     Interval,
@@ -80,10 +80,12 @@ NO_JUMP_NATS = 5.0  # by which a motion without a jump is more likely, from whic
 MOMENT_ROUNDS = 4  # in which the moment of a jump is found, each with the spots that were too near to it before
 EITHER_SIDE_SIGMAS = 3.0  # of such a moment: as near to it, a spot may be on either side
 FIRST_SLACK_NATS = 3.0  # by which a jump at one moment may at first be less likely than at an open one
+JUMP_NATS = 3.0  # by which each jump in close succession must make a run more likely than a stronger jerk does
 NEGLIGIBLE_JUMP = 1e-3  # of the variance of the fastest motion
 LEAST_SPREAD = 0.1  # of a step: no real corner is in one instant
 NO_LIMIT = 1e4  # of a jump's variance: spots that are open by it have no weight
 MOST_OWN = 0.9  # share of what is known of a pose that its own spots may have for these to be left out
+OFFSET_BLOCK = 20  # frames that share an offset, or have none
 INTERPOLATION_OFFSETS = (-2.0, -4.0, -6.0)  # of log q: tried for the interpolation between frames
 
 
@@ -128,6 +130,7 @@ class _Estimator:
         self.jump_scale = motion.jump_scale[core].copy()  # (T, 2) ... this ...
         self.moment = motion.moment[core].copy()  # (T, 2) ... and this
         self.settled = np.zeros(len(self.dt), dtype=bool)  # (T,) jumps whose moments these passes have found
+        self.turning = np.zeros(len(self.dt), dtype=bool)  # (T,) steps whose jumps a stronger jerk has replaced
         self.no_pair = set[tuple[int, int]]()  # steps, first and end, in which two jumps were searched
         self.kept: tuple[Reference, tuple[Array, Array, Array]] | None = None  # of the last `_without_corners`
         self.fresh = motion.log_density is None
@@ -158,11 +161,13 @@ class _Estimator:
             converged = bool(np.all(np.abs(moved[:, :6]) < CONVERGED_SIGMAS * sd))
             new = np.zeros_like(self.jumped)
             if (adapting or not self.run.adapt_jerk) and number >= NO_JUMPS_BEFORE:
-                new = new_jumps(out.shock, self.jumped)
+                new = new_jumps(out.shock, self.jumped) & ~self.turning
                 self.jumped |= new
             if adapting:
                 adapting = not self._adapt(out, number, number - first + 1, bool(new.any()))
-                if not adapting and (self._hidden_jumps_excluded() | self._find_moments(density)):
+                if not adapting and (
+                    self._turns_found() or (self._hidden_jumps_excluded() | self._find_moments(density))
+                ):
                     adapting, first = True, number + 1  # the jerk has to explain what the jumps did
             elif converged and not new.any():
                 break
@@ -207,7 +212,51 @@ class _Estimator:
         last = settled or passes >= (FIRST_ADAPTING_PASSES if self.fresh else LATER_ADAPTING_PASSES)
         if last and self.fresh:
             self.interpolation_offset = self._best_interpolation_offset(out)
+        if last and self.run.delays is not None and self.interpolation_offset < 0.0:
+            self.interior = self._smoother_than_white(out)
         return last
+
+    def _turns_found(self) -> bool:
+        """Replace jumps in close succession by a stronger jerk where that explains the spots; whether any are.
+
+        A vehicle that rests and then swings has the strength of the rest at first, and a jump in every second step.
+        """
+        if self.run.delays is None or self.steps is None:
+            return False
+        found, largest = False, largest_jumps(self.ref, self.measured, self.dt)
+        for first, end in successions(self.jumped):
+            stretch, jumps = self._stretch(first, end), self.jumped[first:end].copy()
+            nats = stretch.nats(stretch.steps.jerk, stretch.steps.velocity_jump, stretch.steps.moment)
+            kept, self.jumped[first:end] = self.moment[first:end].copy(), False
+            self.moment[first:end] = -1.0, 0.0
+            jerk = stretch.jerk_without_jumps(
+                np.ascontiguousarray(self._jump_variances(self.ref)[stretch.part]),
+                np.repeat((largest * self.jump_scale)[first:end][jumps].max(axis=0), 3),
+                nats - JUMP_NATS * np.count_nonzero(jumps),
+            )
+            if jerk is None:
+                self.jumped[first:end], self.moment[first:end] = jumps, kept
+                continue
+            self.log_density[stretch.part], self.jump_scale[first:end] = np.log(jerk), 1.0
+            self.turning[first:end], found = True, True
+        return found
+
+    def _stretch(self, first: int, end: int, size: Array | None = None) -> Stretch:
+        """The frames about some steps. size (2,): variances of the jumps that are searched for there."""
+        assert self.steps is not None
+        part = slice(max(first - AROUND, 0), min(end + AROUND, len(self.dt)))
+        weight = np.where(self.used[self.core], np.where(self.measured, 1.0, PARTIAL_WEIGHT), 0.0)
+        ref = Reference(*(np.ascontiguousarray(a[part]) for a in self.ref))
+        steps = Steps(*(np.ascontiguousarray(a[part]) for a in self.steps))
+        steps = steps._replace(
+            jerk=np.exp(self.log_density[part]), moment=self.moment[part].copy(),
+            velocity_jump=np.ascontiguousarray(self._jump_variances(self.ref)[part]),
+        )  # fmt: skip
+        return Stretch(
+            self.run, self.assigned, self.core.start + part.start, part, ref, steps, weight[part],
+            first_variance(self.ref, self.dt, bool(self.measured[0])), slice(first - part.start, end - part.start),
+            np.zeros(2) if size is None else size,
+        )  # fmt: skip
 
     def _hidden_jumps_excluded(self) -> bool:
         """Find steps in which the frames around them exclude a hidden jump; whether there are more than before.
@@ -307,8 +356,7 @@ class _Estimator:
 
         known: the moments found with other labels.
         """
-        assert self.steps is not None
-        group, steps = groups[i], self.steps
+        group = groups[i]
         first = max(group.inside.start - 1, groups[i - 1].inside.stop if i > 0 else 1)
         end = min(group.inside.stop + 1, groups[i + 1].inside.start if i + 1 < len(groups) else len(self.dt))
         # The spots in between decide: without the pictures of some camera too few do. A search that has failed fails
@@ -317,17 +365,8 @@ class _Estimator:
         if end - first < 2 or not every or (first, end) in self.no_pair:
             return
         self.no_pair.add((first, end))
-        part = slice(max(first - AROUND, 0), min(end + AROUND, len(self.dt)))
-        weight = np.where(self.used[self.core], np.where(self.measured, 1.0, PARTIAL_WEIGHT), 0.0)
-        ref = Reference(*(np.ascontiguousarray(a[part]) for a in self.ref))
-        near = Steps(*(np.ascontiguousarray(a[part]) for a in steps))
-        jump = np.ascontiguousarray(self._jump_variances(self.ref)[part])
-        near = near._replace(jerk=np.exp(self.log_density[part]), velocity_jump=jump, moment=self.moment[part].copy())
-        stretch = Stretch(
-            self.run, self.assigned, self.core.start + part.start, ref, near, weight[part],
-            first_variance(self.ref, self.dt, bool(self.measured[0])), slice(first - part.start, end - part.start),
-            self._size(group, largest),
-        )  # fmt: skip
+        stretch = self._stretch(first, end, self._size(group, largest))
+        part = stretch.part
         start = None if known is None else [replace(m, step=m.step - part.start) for m in known]
         found = find_pair(stretch, None if start is None else (start[0], start[1]))
         if found and all(m.sigma_s < 2 * VAGUE_STEPS * self.dt[part][m.step] for m in found):
@@ -422,6 +461,25 @@ class _Estimator:
                 if likelihood > value:
                     best, value = offset, likelihood
         return best
+
+    def _smoother_than_white(self, out: Interval) -> Bools:
+        """(T,): frames of which the others predict more with less jerk; the offset is that of the whole run.
+
+        A vehicle that rests and then swings rests most of the time. Runs whose pictures are of one instant do without.
+        """
+        info, _ = self._information(self.ref)
+        known_by_others = np.linalg.eigvals(out.pose_P @ _of_poses(info.information)).real.max(axis=1) < MOST_OWN
+        interior, by_others = self._interior(out), known_by_others[:, None, None]
+        better = np.zeros(len(interior), dtype=bool)
+        both = [smoothed(self.ref, info, np.exp(self.log_density + offset * interior[:, None]), tested=False)
+                for offset in (0.0, self.interpolation_offset)]  # fmt: skip
+        L, g = _of_poses(info.information) * by_others, _of_poses(info.vector)
+        for first in range(0, len(better), OFFSET_BLOCK):
+            b = slice(first, first + OFFSET_BLOCK)
+            some = info._replace(information=L[b], vector=g[b], dt=info.dt[b])
+            white, less = (float(leave_one_out_log_likelihood(a.x[b], a.pose_P[b], some)) for a in both)
+            better[b] = less > white
+        return better
 
     def _leave_one_out(
         self, info: RunInformation, offset: float, interior: Bools, by_others: Bools | None = None
