@@ -31,7 +31,7 @@ _ROUNDED = (
     0.4,
 )  # of a step: spreads of the moments, of which the most likely is kept: a turn may be smooth
 _LONGEST_DIFFERENCE = 0.25  # of a step: for the curvature
-_CLOSE, _LEAST_JUMPS = 4, 4  # steps between two jumps, and jumps, of a close succession
+_CLOSE, _LEAST_JUMPS = 6, 3  # steps between two jumps, and jumps, of a close succession
 _JERKS = np.exp(-2.0 * np.arange(8))  # of the strength with which the jerk makes such jumps in one step
 _CURVATURES = 3  # times that it is computed, over about one sigma
 
