@@ -19,11 +19,11 @@ from tracking.smoothing.motion.extrapolation import extrapolated
 from tracking.smoothing.motion.fixed_interval import (
     Interval,
     RunInformation,
-    leave_one_out_log_likelihood,
     log_likelihood,
     motion_cost,
     smoothed,
 )
+from tracking.smoothing.motion.interpolation import Interpolation, of_poses
 from tracking.smoothing.motion.jump_moments import (
     AROUND,
     MOMENT_SIGMAS,
@@ -84,9 +84,6 @@ JUMP_NATS = 3.0  # by which each jump in close succession must make a run more l
 NEGLIGIBLE_JUMP = 1e-3  # of the variance of the fastest motion
 LEAST_SPREAD = 0.1  # of a step: no real corner is in one instant
 NO_LIMIT = 1e4  # of a jump's variance: spots that are open by it have no weight
-MOST_OWN = 0.9  # share of what is known of a pose that its own spots may have for these to be left out
-OFFSET_BLOCK = 20  # frames that share an offset, or have none
-INTERPOLATION_OFFSETS = (-2.0, -4.0, -6.0)  # of log q: tried for the interpolation between frames
 
 
 def estimate(
@@ -211,9 +208,9 @@ class _Estimator:
         settled = number >= GLOBAL_PASSES + 1 and change < CONVERGED_LOG_DENSITY and not new_jump
         last = settled or passes >= (FIRST_ADAPTING_PASSES if self.fresh else LATER_ADAPTING_PASSES)
         if last and self.fresh:
-            self.interpolation_offset = self._best_interpolation_offset(out)
+            self.interpolation_offset = self._interpolation(out).best_offset(self.run.delays is not None)
         if last and self.run.delays is not None and self.interpolation_offset < 0.0:
-            self.interior = self._smoother_than_white(out)
+            self.interior = self._interpolation(out).frames_better_with(self.interpolation_offset)
         return last
 
     def _turns_found(self) -> bool:
@@ -426,70 +423,19 @@ class _Estimator:
         self.interior &= self._interior(out)
         return np.exp(self.log_density + self.interpolation_offset * self.interior[:, None])
 
+    def _interpolation(self, out: Interval) -> Interpolation:
+        info, _ = self._information(self.ref)
+        return Interpolation(self.ref, info, self.log_density, self._interior(out), out.pose_P)
+
     def _interior(self, out: Interval) -> Bools:
         """(T,): frames farther than twice the smoother's memory from any gap, jump or end."""
         info, _ = self._information(self.ref)
-        share = np.einsum("kij,kji->k", out.pose_P, _of_poses(info.information))[self.measured]
+        share = np.einsum("kij,kji->k", out.pose_P, of_poses(info.information))[self.measured]
         usual = float(np.median(share)) / 6 if len(share) else 1.0
         memory = int(np.clip(np.ceil(2 / max(usual, 1e-3)), 3, 200))
         edge: Bools = np.concatenate([[True], ~self.measured | self.jumped, [True]])
         near: Bools = largest_near(edge, memory)[1:-1]
         return ~near
-
-    def _best_interpolation_offset(self, out: Interval) -> float:
-        """Offset of log q with the largest leave-one-out likelihood: each frame predicted by all others."""
-        info, _ = self._information(self.ref)
-        interior = self._interior(out)
-        if not interior.any():
-            return 0.0
-        by_others = None
-        if self.run.delays is not None:
-            # Where the spots of a frame are also what the velocities are known by, they would count twice.
-            own = np.linalg.eigvals(out.pose_P @ _of_poses(info.information)).real.max(axis=1)
-            by_others = (interior & (own < MOST_OWN))[:, None, None]
-            if 2 * by_others.sum() < interior.sum():
-                return 0.0
-        best, value = 0.0, self._leave_one_out(info, 0.0, interior, by_others)
-        for offset in INTERPOLATION_OFFSETS:
-            likelihood = self._leave_one_out(info, offset, interior, by_others)
-            if likelihood < value:
-                break
-            best, value = offset, likelihood
-        for offset in (best - 1.0, best + 1.0):
-            if offset < 0:
-                likelihood = self._leave_one_out(info, offset, interior, by_others)
-                if likelihood > value:
-                    best, value = offset, likelihood
-        return best
-
-    def _smoother_than_white(self, out: Interval) -> Bools:
-        """(T,): frames of which the others predict more with less jerk; the offset is that of the whole run.
-
-        A vehicle that rests and then swings rests most of the time. Runs whose pictures are of one instant do without.
-        """
-        info, _ = self._information(self.ref)
-        known_by_others = np.linalg.eigvals(out.pose_P @ _of_poses(info.information)).real.max(axis=1) < MOST_OWN
-        interior, by_others = self._interior(out), known_by_others[:, None, None]
-        better = np.zeros(len(interior), dtype=bool)
-        both = [smoothed(self.ref, info, np.exp(self.log_density + offset * interior[:, None]), tested=False)
-                for offset in (0.0, self.interpolation_offset)]  # fmt: skip
-        L, g = _of_poses(info.information) * by_others, _of_poses(info.vector)
-        for first in range(0, len(better), OFFSET_BLOCK):
-            b = slice(first, first + OFFSET_BLOCK)
-            some = info._replace(information=L[b], vector=g[b], dt=info.dt[b])
-            white, less = (float(leave_one_out_log_likelihood(a.x[b], a.pose_P[b], some)) for a in both)
-            better[b] = less > white
-        return better
-
-    def _leave_one_out(
-        self, info: RunInformation, offset: float, interior: Bools, by_others: Bools | None = None
-    ) -> float:
-        out = smoothed(self.ref, info, np.exp(self.log_density + offset * interior[:, None]), tested=False)
-        # Of spots that were not exposed at the instant of their frame, what they say about the pose.
-        left_out = _of_poses(info.information) if by_others is None else _of_poses(info.information) * by_others
-        of_poses = info._replace(information=left_out, vector=_of_poses(info.vector))
-        value = float(leave_one_out_log_likelihood(out.x, out.pose_P, of_poses))
-        return value if np.isfinite(value) else -np.inf
 
     # -- Gauss-Newton -------------------------------------------------------------------------------------------------
 
@@ -641,13 +587,6 @@ def _damped(info: RunInformation, damping: float) -> RunInformation:
     """Levenberg's damping: as if each frame's pose had been measured at the reference, with this sigma (m and rad)."""
     pose = np.diag(_padded(np.ones(6), info.vector[0]))
     return info._replace(information=info.information + pose / damping**2)
-
-
-def _of_poses(a: Array) -> Array:
-    """The part (..., 6) or (..., 6, 6) about the poses of vectors (T, s) or matrices (T, s, s)."""
-    if a.shape[1] == 6:
-        return a
-    return np.ascontiguousarray(a[:, :6] if a.ndim == 2 else a[:, :6, :6])
 
 
 def _padded(b: Array, like: Array) -> Array:
