@@ -328,15 +328,9 @@ class _Smoother:
             return seen
         nowhere = np.zeros(len(self.rec), dtype=bool)
         jump = jump_variances(
-            motion.ref,
-            nowhere,
-            self.measured,
-            motion.jumped,
-            self.rec.dt_s,
-            motion.excluded,
-            motion.jump_scale,
+            motion.ref, nowhere, self.measured, motion.jumped, self.rec.dt_s, motion.excluded, motion.jump_scale,
             motion.moment,
-        )
+        )  # fmt: skip
         corners = corner_times(motion.ref, motion.jumped, self.rec.dt_s)
         steps = Steps(self.rec.dt_s, np.exp(motion.log_density), np.ascontiguousarray(jump), corners, motion.moment)
         uv, cov = moved_detections(
