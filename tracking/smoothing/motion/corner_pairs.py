@@ -30,6 +30,7 @@ _ROUNDED = (
     0.2,
     0.4,
 )  # of a step: spreads of the moments, of which the most likely is kept: a turn may be smooth
+_ROUND_NATS = 10.0  # by which corners must be more likely than a turn with a stronger jerk, which they resemble
 _LONGEST_DIFFERENCE = 0.25  # of a step: for the curvature
 _CLOSE, _LEAST_JUMPS = 6, 3  # steps between two jumps, and jumps, of a close succession
 _JERKS = np.exp(-2.0 * np.arange(8))  # of the strength with which the jerk makes such jumps in one step
@@ -82,12 +83,12 @@ class Stretch:
         moment[rows] = np.column_stack([np.maximum(ends[rows] - at_s, 0.0), spread_s])
         return self.nats(jerk, jump, moment)
 
-    def jerk_without_jumps(self, jump: Array, sizes: Array, least_nats: float) -> Array | None:
-        """The most likely jerk densities (F, 6) without the jumps inside; None where it is less likely than that.
+    def without_jumps(self, jump: Array, sizes: Array) -> tuple[float, Array]:
+        """The most likely jerk densities (F, 6) without the jumps inside, and before them their log-likelihood.
 
         jump (F, 2): the variances of the other jumps; sizes (6,): of these.
         """
-        best, nats = None, least_nats
+        best, nats = self.steps.jerk, -np.inf
         moment, inside = self.steps.moment.copy(), self.inside
         moment[inside] = -1.0, 0.0
         dt = float(np.median(self.steps.dt[inside]))
@@ -96,7 +97,7 @@ class Stretch:
             jerk[inside] = np.maximum(jerk[inside], share * 3 * sizes / dt**3)  # a velocity changes by q dt^3 / 3
             if (value := self.nats(jerk, jump, moment)) > nats:
                 best, nats = jerk, value
-        return best
+        return nats, best
 
 
 def successions(jumped: Bools) -> list[tuple[int, int]]:
@@ -129,10 +130,13 @@ def find_pair(stretch: Stretch, before: tuple[JumpMoment, JumpMoment] | None = N
     sigma = _sigmas(stretch, jerk, at, dt)
     if sigma is None:
         return ()
+    others = stretch.steps.velocity_jump.copy()
+    others[stretch.inside] = 0.0
+    turn_nats, _ = stretch.without_jumps(others, np.repeat(stretch.size, 3))
     open_nats = stretch.nats(usual, stretch.steps.velocity_jump, stretch.steps.moment)
     wider = [np.maximum(sigma, share * dt / MOMENT_SIGMAS) for share in _ROUNDED]
     nats = [stretch.nats_of_pair(jerk, at, MOMENT_SIGMAS * one) for one in wider]
-    if not max(nats) > open_nats:
+    if not max(nats) > max(open_nats, turn_nats + _ROUND_NATS):
         return ()
     sigma = wider[int(np.argmax(nats))]
     rows = np.searchsorted(stretch.ends_s, at)

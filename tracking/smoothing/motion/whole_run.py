@@ -226,12 +226,10 @@ class _Estimator:
             nats = stretch.nats(stretch.steps.jerk, stretch.steps.velocity_jump, stretch.steps.moment)
             kept, self.jumped[first:end] = self.moment[first:end].copy(), False
             self.moment[first:end] = -1.0, 0.0
-            jerk = stretch.jerk_without_jumps(
-                np.ascontiguousarray(self._jump_variances(self.ref)[stretch.part]),
-                np.repeat((largest * self.jump_scale)[first:end][jumps].max(axis=0), 3),
-                nats - JUMP_NATS * np.count_nonzero(jumps),
-            )
-            if jerk is None:
+            others = np.ascontiguousarray(self._jump_variances(self.ref)[stretch.part])
+            sizes = np.repeat((largest * self.jump_scale)[first:end][jumps].max(axis=0), 3)
+            turn_nats, jerk = stretch.without_jumps(others, sizes)
+            if not turn_nats > nats - JUMP_NATS * np.count_nonzero(jumps):
                 self.jumped[first:end], self.moment[first:end] = jumps, kept
                 continue
             self.log_density[stretch.part], self.jump_scale[first:end] = np.log(jerk), 1.0
