@@ -269,9 +269,12 @@ class _Estimator:
             first, end = ranges.pop()
             if self._nats_without_hidden_jumps(info, density, first, end) > NO_JUMP_NATS:
                 self.excluded[first:end] = True
-            elif end - first > 1:
-                # A slow camera leaves all steps of a recording unobserved: a jump in one says nothing of the others.
-                middle = (first + end) // 2
+                continue
+            # A slow camera leaves all steps of a recording unobserved: a jump in one says nothing of the others. Within
+            # a gap it does: nothing shows in which of its steps a jump is.
+            apart = np.flatnonzero(self.measured[first : end - 1]) + first + 1
+            if len(apart):
+                middle = int(apart[np.argmin(np.abs(2 * apart - first - end))])
                 ranges += [(middle, end), (first, middle)]
         return bool((hidden & self.excluded).any())
 
