@@ -32,7 +32,7 @@ _ROUNDED = (
 )  # of a step: spreads of the moments, of which the most likely is kept: a turn may be smooth
 _ROUND_NATS = 10.0  # by which corners must be more likely than a turn with a stronger jerk, which they resemble
 _LONGEST_DIFFERENCE = 0.25  # of a step: for the curvature
-_CLOSE, _LEAST_JUMPS = 6, 3  # steps between two jumps, and jumps, of a close succession
+_CLOSE, _LEAST_JUMPS = 6, 5  # steps between two jumps, and jumps, of a close succession
 _JERKS = np.exp(-2.0 * np.arange(8))  # of the strength with which the jerk makes such jumps in one step
 _CURVATURES = 3  # times that it is computed, over about one sigma
 
