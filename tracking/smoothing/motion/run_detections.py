@@ -508,7 +508,8 @@ class SmoothedMotion:
 
     ref: Reference
     log_density: Array | None  # (T, 6) logarithms of the jerk's spectral densities; None: not estimated yet
-    interpolation_offset: float  # to be added to them for the interpolation between frames
+    interpolation_offset: float  # to be added to them for the interpolation between frames ...
+    smoother: Bools  # (T,) ... about these
     jumped: Bools  # (T,) the velocities jumped in the step before
     jump_scale: Array  # (T, 2) of the variances of these jumps, as in `jump_variances` ...
     moment: Array  # (T, 2) ... and when they are, as in RunInformation
@@ -527,7 +528,7 @@ class SmoothedMotion:
         known = np.zeros(frames, dtype=bool)
         scale, moment = np.ones((frames, 2)), unknown_moments(frames)
         return SmoothedMotion(
-            ref, log_density, 0.0, jumped, scale, moment, known.copy(), zero, zero, known, np.zeros(frames)
+            ref, log_density, 0.0, ~known, jumped, scale, moment, known.copy(), zero, zero, known, np.zeros(frames)
         )
 
     def without_covariances(self) -> SmoothedMotion:

@@ -134,7 +134,8 @@ class _Estimator:
         self.log_density = self._first_density() if motion.log_density is None else motion.log_density[core].copy()
         self.interpolation_offset = motion.interpolation_offset
         self.clocks: ClockSolution | None = None
-        self.interior = np.ones(len(self.dt), dtype=bool)  # (T,) frames that all passes so far found to be interior
+        self.smoother = motion.smoother[core].copy()
+        self.interior = self.smoother.copy()  # (T,) frames that all passes so far found to be interior
 
     def run_passes(self) -> SmoothedMotion:
         """Passes until nothing changes."""
@@ -209,8 +210,9 @@ class _Estimator:
         last = settled or passes >= (FIRST_ADAPTING_PASSES if self.fresh else LATER_ADAPTING_PASSES)
         if last and self.fresh:
             self.interpolation_offset = self._interpolation(out).best_offset(self.run.delays is not None)
-        if last and self.run.delays is not None and self.interpolation_offset < 0.0:
-            self.interior = self._interpolation(out).frames_better_with(self.interpolation_offset)
+            if self.run.delays is not None and self.interpolation_offset < 0.0:
+                self.smoother = self._interpolation(out).frames_better_with(self.interpolation_offset)
+                self.interior = self.smoother.copy()
         return last
 
     def _turns_found(self) -> bool:
@@ -572,15 +574,16 @@ class _Estimator:
         known = (sd[:, :3].max(axis=1) < LOST_SIGMA_M) & (sd[:, 3:].max(axis=1) < LOST_SIGMA_RAD)
         jumped, scale = self.motion.jumped.copy(), self.motion.jump_scale.copy()
         moment, excluded = self.motion.moment.copy(), np.zeros(frames, dtype=bool)
+        smoother = self.motion.smoother.copy()
         jumped[core], scale[core], moment[core] = self.jumped, self.jump_scale, self.moment
-        excluded[core] = self.excluded
+        excluded[core], smoother[core] = self.excluded, self.smoother
         clocks = self.clocks
         if clocks is not None:
             nearest = np.clip(np.arange(frames) - core.start, 0, core.stop - core.start - 1)
             clocks = replace(clocks, motion=clocks.motion[nearest])
         return SmoothedMotion(
-            ref, log_density, self.interpolation_offset, jumped, scale, moment, excluded, pose_P, motion_P, known,
-            self.weight, clocks,
+            ref, log_density, self.interpolation_offset, smoother, jumped, scale, moment, excluded, pose_P, motion_P,
+            known, self.weight, clocks,
         )  # fmt: skip
 
 
