@@ -219,3 +219,15 @@ def test_a_swing_after_a_long_rest_is_no_succession_of_jumps(seed, frames, tmp_p
     assert swings.sum() > 15
     assert rms(own.attitude_deg[swings]) < 1.3 * rms(one.attitude_deg[swings])
     assert np.nanmean(own.nees) < 1.6
+
+
+@pytest.mark.parametrize("gap", [slice(12, 26), slice(8, 22)])
+def test_a_turn_in_a_gap_in_which_nothing_is_seen_is_covered(gap, tmp_path):
+    """That it is in one half of the gap does not exclude it from the other."""
+    r = random_recording(6005, frames=60)
+    assert gap.start < r.corners[0] < r.corners[1] < gap.stop
+    hidden = r.hidden.copy()
+    hidden[gap] = True
+    own = figures(replace(r, hidden=hidden), tmp_path)
+    assert np.isfinite(own.attitude_deg[gap]).sum() <= 2
+    assert np.nanmax(own.nees) < 8
