@@ -117,12 +117,14 @@ def refine(
     recordings: Sequence[ModelCheckRecording],
     start: Refinement | None = None,
     stacks: Collection[str] = STACKS,
+    for_labels: bool = False,
 ) -> Refinement:
     """Refine a rig.
 
     covariance: of the rig's parameters; all others are held. recordings: with the views of this rig. start: an earlier
     result, of other labels of the same recordings; only then are parts that have moved searched for. stacks: those that
-    are changed; the others keep their values and their uncertainty.
+    are changed; the others keep their values and their uncertainty. for_labels: the rig is only used to label the
+    recordings again; errors of second order, which spots do not show beside the tracker's own limits, are left out.
 
     Raises:
         AdjustmentError: the recordings have too few frames, or the adjustment does not converge.
@@ -168,7 +170,8 @@ def refine(
     gain, vectors = np.linalg.eigh(known.root.T @ S @ known.root)
     names, T = named_errors(rig, values, prior.at)
     directions = known.root @ vectors
-    after = _with_curvature(after, known, terms, values, changed)
+    if not for_labels:
+        after = _with_curvature(after, known, terms, values, changed)
     matrix = T @ after.covariance @ T.T
     named = np.diagonal(matrix) > 0
     moved, lenses = ((), {}) if start is None else MovedParts(rig, prior, terms, free, values, known).found()

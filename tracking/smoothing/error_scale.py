@@ -26,6 +26,7 @@ _LEAST_OF_VIEW = 6  # changes from which a view counts
 _MEDIAN_CHI2 = 0.4549364  # median of chi-square with one degree of freedom
 _LAGS = 1, 2, 4, 8, 16  # frames between the compared widths of a spot
 _APART = 2.0  # widths between places with different errors
+MOST_MOTION = 2.0  # ratio of a moved detection's variance to its own, up to which its residual shows its own errors
 _CLEAR_SCATTER = 2.0  # ratio of the widths' variance to the stated one from which it is used
 
 
@@ -41,11 +42,12 @@ class ErrorScale:
     @staticmethod
     def of(
         model: SpotModel, run: RunDetections, place_px2: Array, assigned: Ints, calibration_cov: Array, ref: Reference,
-        measured: Bools,
+        measured: Bools, motion_cov: Array,
     ) -> ErrorScale:  # fmt: skip
         """The corrections from the labelled spots of T frames, with their single-frame poses near a reference motion.
 
-        place_px2 (m,): variances of the detections that belong to their places; calibration_cov (n, 2, 2).
+        place_px2 (m,): variances of the detections that belong to their places; calibration_cov (n, 2, 2). motion_cov
+        (m, 2, 2): of where the detections are at the instants of their frames, beyond their own.
         """
         views, camera = model.numbers, model.camera_of
         misfit = usual_misfit(run, place_px2, assigned, camera)
@@ -54,7 +56,9 @@ class ErrorScale:
         even = run._replace(cov=_with_more(run.cov, least))
 
         def factors_of(some: RunDetections) -> VarianceFactors:
-            return variance_factors(views, some, assigned, camera, place_px2, least, calibration_cov, ref, measured)
+            return variance_factors(
+                views, some, assigned, camera, place_px2, least, calibration_cov, ref, measured, motion_cov
+            )
 
         seen = scattered_width_share(even, assigned, camera)
         wider = widened(even, seen)
@@ -64,6 +68,7 @@ class ErrorScale:
             factors = factors_of(widened(even, seen))
         even = even._replace(cov=_within(factors, even.cov, place_px2, least, own))
         wider = widened(even, seen)
+        wider = wider._replace(cov=wider.cov + motion_cov)
         # A vehicle at rest has few residuals that are independent of each other.
         usual = max(DEADBAND, 1 + 3 * np.sqrt(2 / max(factors.freedom, 1e-9)))
         more = width_share(views, wider, assigned, calibration_cov, ref, measured, usual)
@@ -268,6 +273,18 @@ def _mean_variance_factor(
         if count > 3:
             shares.append(chi2 / (2 * count - 6))
     return float(np.mean(np.minimum(shares, 3 * np.median(shares)))) if shares else 1.0
+
+
+def well_known(moved: RunDetections, seen: RunDetections, assigned: Ints) -> Ints:
+    """The labels (T, n) of the detections that say something about their own errors.
+
+    moved: the detections where they would have been at the instants of their frames. Where the motion in between is
+    less certain than the detections, residuals are those of the motion.
+    """
+    certain = np.trace(moved.cov, axis1=1, axis2=2) <= MOST_MOTION * np.trace(seen.cov, axis1=1, axis2=2)
+    rows = seen.begin[: len(assigned), None] + np.maximum(assigned, 0) % BLENDED
+    labelled = assigned >= 0
+    return np.where(labelled & certain[np.where(labelled, rows, 0)], assigned, -1)
 
 
 def usual_sizes(detections: RunDetections, assigned: Ints) -> Array:

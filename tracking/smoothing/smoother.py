@@ -30,7 +30,7 @@ from tracking.parameters import TrackerParameters
 from tracking.rigid_body.association.frame_detections import BLENDED, DetectionModel, ViewTable, distinct_spots
 from tracking.rigid_body.hypotheses.hypothesis_set import MAX_CHECKING_SIGMA_PX, MIN_REDUNDANT_SPOTS, SURE_PROBABILITY
 from tracking.rigid_body.models.information import run_shifts
-from tracking.smoothing.error_scale import ErrorScale, usual_sizes
+from tracking.smoothing.error_scale import ErrorScale, usual_sizes, well_known
 from tracking.smoothing.labels.continuity import continued, transfers_between_cameras
 from tracking.smoothing.labels.neighbouring_frames import connected, displaced, isolated, next_to
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated, run_log_clutter, run_log_static
@@ -276,10 +276,20 @@ class _Smoother:
         seen = seen._replace(usual_size_px=usual_sizes(seen, self.assigned))
         self.calibration_cov, self.systematic, self.noise_share = calibration_errors(rec, seen, self.assigned, ref)
         place_px2 = rec.place_px2()
-        every, steady = seen, self.measured
+        every, steady, labels = seen, self.measured, self.assigned
         if self.delays is not None:
             every, ref, steady = self._first_motion(seen, ref)
-        self.errors = ErrorScale.of(model, every, place_px2, self.assigned, self.calibration_cov, ref, steady)
+            labels = well_known(every, seen, labels)
+        self.errors = ErrorScale.of(
+            model,
+            seen._replace(uv=every.uv),
+            place_px2,
+            labels,
+            self.calibration_cov,
+            ref,
+            steady,
+            every.cov - seen.cov,
+        )
         # Where the pictures show the points, and where these would have been at the instants of the frames.
         self.seen = self.detections = seen._replace(
             cov=self.errors.of_run(seen, place_px2) + parameters.sigma_model_px**2 * np.eye(2)
@@ -318,15 +328,9 @@ class _Smoother:
             return seen
         nowhere = np.zeros(len(self.rec), dtype=bool)
         jump = jump_variances(
-            motion.ref,
-            nowhere,
-            self.measured,
-            motion.jumped,
-            self.rec.dt_s,
-            nowhere,
-            motion.jump_scale,
+            motion.ref, nowhere, self.measured, motion.jumped, self.rec.dt_s, motion.excluded, motion.jump_scale,
             motion.moment,
-        )
+        )  # fmt: skip
         corners = corner_times(motion.ref, motion.jumped, self.rec.dt_s)
         steps = Steps(self.rec.dt_s, np.exp(motion.log_density), np.ascontiguousarray(jump), corners, motion.moment)
         uv, cov = moved_detections(

@@ -50,13 +50,14 @@ class Squares(NamedTuple):
 
 def variance_factors(
     views: Views, run: RunDetections, assigned: Ints, camera_of: Ints, place_px2: Array, misfit_px2: Array,
-    calibration_cov: Array, ref: Reference, measured: Bools,
+    calibration_cov: Array, ref: Reference, measured: Bools, motion_cov: Array,
 ) -> VarianceFactors:  # fmt: skip
     """The factors of the parts of the stated variances, as the residuals show them.
 
     run: m detections of T frames; assigned (T, n): their labels; camera_of (n,): of the views; place_px2, misfit_px2
     (m,): parts of their variances that belong to places, as stated for each and what each has at least;
-    calibration_cov (n, 2, 2), px^2; ref (T,): motion near which the pose of each frame is found.
+    calibration_cov (n, 2, 2), px^2; ref (T,): motion near which the pose of each frame is found; motion_cov (m, 2, 2),
+    px^2: further covariances of the detections, which are known.
 
     Noise differs in every frame, errors of one place count once: a vehicle at rest has few residuals that are
     independent of each other. There the change of a residual from frame to frame shows the noise alone.
@@ -69,17 +70,18 @@ def variance_factors(
     some, assigned, labelled = run._replace(begin=run.begin[frames]), assigned[frames], labelled[frames]
     row = np.where(labelled, some.begin[:, None] + assigned, 0)
     near = Reference(ref.R[frames], ref.t[frames], ref.m[frames])
-    fits = fit_frames(views, some, assigned, calibration_cov, near)
+    total = run.cov + motion_cov
+    fits = fit_frames(views, some._replace(cov=total), assigned, calibration_cov, near)
     uv, J = project_all(views, fits.R, fits.t)
     P = np.linalg.pinv(fits.information, hermitian=True)
-    cov = run.cov[row] + calibration_cov
+    cov = total[row] + calibration_cov
     free = 1 - 0.5 * np.einsum("knia,kab,knjb,knji->kn", J, P, J, np.linalg.inv(cov))  # share not taken by the pose
     usable = labelled & np.isfinite(uv).all(axis=-1) & (free > 0)
     size2, own = 0.5 * np.trace(cov, axis1=2, axis2=3), 0.5 * np.trace(run.cov[row], axis1=2, axis2=3)
     residual = np.where(usable[..., None], run.uv[row] - uv, np.nan)
     part = np.minimum(place_px2[row], own)
     least = np.minimum(misfit_px2[row], own - part)
-    parts = np.stack([own - part - least, part, least], axis=-1) / size2[..., None]  # the rest is the calibration's
+    parts = np.stack([own - part - least, part, least], axis=-1) / size2[..., None]  # the rest is known
     same = np.full(assigned.shape, np.nan)  # frames with the same error of a place
     rho = np.zeros((len(frames) - 1, assigned.shape[1]))  # correlation of such errors in successive frames
     measured_px = np.where(labelled[..., None], run.uv[row], np.nan)

@@ -181,7 +181,7 @@ def _refined(
             # Each run is labelled with what those before it have shown.
             latest[i] = of_stage(tolerant(with_rig(runs[i], *now)), i, stage).in_views_of(rig)
             try:
-                start = refine(rig, prior, list(latest.values()), stacks=stacks)
+                start = refine(rig, prior, list(latest.values()), stacks=stacks, for_labels=True)
             except AdjustmentError:
                 if stage > 0 and i == len(runs) - 1:
                     raise

@@ -5,9 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from geometry.pose import Pose
+from lab.simulate.rigs import RIGS
+from tests.tracking.rigid_runs import RIGID, dt_of, found_in, recording_of, tracked
 from tracking.rigid_body.association.frame_detections import BLENDED
-from tracking.smoothing.error_scale import scattered_width_share, widened
-from tracking.smoothing.motion.run_detections import RunDetections
+from tracking.smoothing.error_scale import ErrorScale, scattered_width_share, well_known, widened
+from tracking.smoothing.motion.run_detections import Reference, RunDetections
+from tracking.smoothing.recording import TrackedRecording
 
 FRAMES, VIEWS, WIDTH = 60, 3, 2.0
 
@@ -89,3 +93,26 @@ def test_errors_that_only_narrow_spots_hide_add_to_their_camera_alone():
     added = np.trace(widened(found, share).cov - found.cov, axis1=1, axis2=2).reshape(FRAMES, 2 * VIEWS)
     assert np.all(added[:, :VIEWS] > 0)
     assert np.all(added[:, VIEWS:] == 0)
+
+
+@pytest.mark.parametrize("uncertain", [0.0, 1.0])
+def test_motion_between_pictures_that_is_better_than_stated_does_not_make_the_spots_more_certain(uncertain):
+    """uncertain: the share of the frames to whose instants the spots were moved by a motion with stated sigmas."""
+    frames, stated = 40, 6.0  # stated: sigma of that motion, over that of the spots
+    pose = Pose.from_ypr(np.deg2rad([7.0, 0.0, 0.0]), np.zeros(3))
+    every = Pose(np.tile(pose.rotation, (frames, 1, 1)), np.tile(pose.translation, (frames, 1)))
+    run = recording_of(RIGS["four-skew-beams"](), every, np.arange(frames) / 80, 0.05, 2)
+    recording = TrackedRecording(run.rig, RIGID)
+    for k, frame in enumerate(tracked(run)):
+        recording.append(dt_of(run, k), found_in(run, k), frame)
+    found, labels = recording.run_detections(), recording.assigned
+    n = len(run.model)
+    motion = found.cov * stated**2 * (np.random.default_rng(1).random(len(found.uv)) < uncertain)[:, None, None]
+    moved = found._replace(cov=found.cov + motion)
+    ref = Reference(every.rotation, every.translation, np.zeros((frames, 12)))
+    errors = ErrorScale.of(
+        run.model, found, np.zeros(len(found.uv)), well_known(moved, found, labels), np.zeros((n, 2, 2)), ref,
+        np.ones(frames, dtype=bool), motion,
+    )  # fmt: skip
+    assert errors.factors.noise == pytest.approx(np.ones(len(errors.factors.noise)), abs=0.15)
+    assert errors.noise_scale == 1.0

@@ -11,6 +11,7 @@ from lab.simulate.rigs import RIGS
 from tests.tracking.rigid_runs import RIGID, dt_of, found_in, recording_of, tracked
 from tracking.smoothing.motion import whole_run
 from tracking.smoothing.motion.fixed_interval import Interval
+from tracking.smoothing.motion.interpolation import Interpolation
 from tracking.smoothing.motion.run_detections import SmoothedMotion, WholeRun, spot_information, straight_between
 from tracking.smoothing.motion.whole_run import MAX_PASSES, _Estimator, estimate
 from tracking.smoothing.recording import TrackedRecording
@@ -105,5 +106,5 @@ def test_the_passes_end_where_the_memory_lies_between_two_numbers_of_frames(monk
         return found
 
     monkeypatch.setattr(_Estimator, "_interior", alternating)
-    monkeypatch.setattr(_Estimator, "_best_interpolation_offset", lambda *_: -4.0)
+    monkeypatch.setattr(Interpolation, "best_offset", lambda *_: -4.0)
     assert passes_over_a_corner(1.0, monkeypatch) < MAX_PASSES

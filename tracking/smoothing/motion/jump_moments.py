@@ -10,16 +10,21 @@ likelihood of a change point, e.g. Basseville & Nikiforov (1993), "Detection of 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
-from geometry.arrays import Array
+from geometry.arrays import Array, Bools, Ints
 from tracking.rigid_body.online_estimates import MANOEUVRE_S
 from tracking.smoothing.motion.fixed_interval import RunInformation, log_likelihood
+from tracking.smoothing.motion.process_noise import open_steps
 from tracking.smoothing.motion.run_detections import Reference
 
+VAGUE_STEPS = 0.15  # a moment whose sigma is larger than this part of a step is not used
+EARLIER_STEPS = 0.1  # least sigma of a moment that was found with other labels, in steps
+APART_FRAMES = 1  # between the steps of two jumps, from which one does not disturb the moment of the other
 MOMENT_SIGMAS = 2.0  # of a moment, as a sigma: the same spots show the moment and then the motion
-_AROUND = 12  # frames on both sides of the steps that show when the jump is
+AROUND = 12  # frames on both sides of the steps that show when the jump is
 _SPREADS = (0.5, 0.1, 0.02)  # of a step: sigmas of the moment with which it is found, one after the other
 _PARABOLAS = 4  # with each of these, at most
 _NARROWER = 0.5  # of the distances, for the next sigma
@@ -70,14 +75,13 @@ def find_moment(
     Where a jump was not known before, a strong jerk may have explained it: the jerk of the calmer frames is tried, too.
     """
     first, last = steps
-    part = slice(max(first - _AROUND, 0), min(last + _AROUND, len(info.dt)))
+    part = slice(max(first - AROUND, 0), min(last + AROUND, len(info.dt)))
     some = info._replace(**{name: getattr(info, name)[part] for name in info._fields[:-1]})
     near = Reference(*(np.ascontiguousarray(a[part]) for a in ref))
     usual = np.ascontiguousarray(density[part])
-    calm = np.minimum(usual, np.quantile(usual, _CALM, axis=0))
     inside = slice(first - part.start, last + 1 - part.start)
     best, most = None, log_likelihood(near, some, usual) - slack_nats
-    for jerk in (usual, calm) if np.any(usual > _STRONG * calm) else (usual,):
+    for jerk in calm_jerk(usual):
         around = _Around(near, some, jerk, inside, size)
         found = None if before is None else _search(around, (before.step - part.start, before.later_s, before.sigma_s))
         found = found or _search(around)
@@ -85,6 +89,66 @@ def find_moment(
             most, step, later, sigma = found
             best = JumpMoment(part.start + step, later, sigma, part, jerk, size)
     return best
+
+
+def calm_jerk(usual: Array) -> tuple[Array, ...]:
+    """Densities of the jerk (F, 6) about a jump: as estimated and, where some is strong, that of the calmer frames."""
+    calm = np.minimum(usual, np.quantile(usual, _CALM, axis=0))
+    return (usual, calm) if np.any(usual > _STRONG * calm) else (usual,)
+
+
+@dataclass(frozen=True, slots=True)
+class JumpGroup:
+    """Jumps that may be one, or two."""
+
+    jumps: Ints  # (j,) steps in which they were found
+    inside: slice  # the steps that may have them
+
+    def known(self, moment: Array, dt: Array) -> tuple[JumpMoment, ...]:
+        """The moments (T, 2) that earlier labels gave for them, less certain; dt (T,), s."""
+        return tuple(
+            JumpMoment(
+                k, moment[k, 0], max(moment[k, 1], EARLIER_STEPS * dt[k]), slice(0, 0), np.zeros((0, 6)), np.zeros(2),
+                rounds=0,
+            )
+            for k in self.jumps.tolist() if moment[k, 0] >= 0
+        )  # fmt: skip
+
+
+def jump_groups(jumped: Bools, moment: Array, vague: Bools, scale: Array) -> list[JumpGroup]:
+    """Jumps (T,), one by one, with the steps that may have each; moment (T, 2): where known.
+
+    vague, scale: of `open_steps`.
+    """
+    out = list[JumpGroup]()
+    for k in np.flatnonzero(jumped).tolist():
+        beside = max(k - 1, 1), min(k + 1, len(vague) - 1)
+        first, last = beside if moment[k, 0] >= 0 else open_steps(k, vague, scale)
+        if out and first < out[-1].inside.stop:
+            before = out[-1]
+            out[-1] = JumpGroup(
+                np.append(before.jumps, k), slice(before.inside.start, max(last + 1, before.inside.stop))
+            )
+        else:
+            out.append(JumpGroup(np.array([k]), slice(first, last + 1)))
+    return out
+
+
+def uncertain_groups(groups: list[JumpGroup], found: dict[int, JumpMoment], dt: Array, real: list[np.bool]) -> set[int]:
+    """Which of the groups have no certain moment.
+
+    One that the spots near it have not confirmed is none, nor is one beside a jump whose moment is not known: the
+    motion between the two is known too little. real: the group's jump is not negligible.
+    """
+    out = {
+        i for i in range(len(groups))
+        if i not in found or found[i].rounds < 2 or found[i].sigma_s > VAGUE_STEPS * dt[found[i].step]
+    }  # fmt: skip
+    beside = set[int]()
+    for i, j in pairwise(range(len(groups))):
+        if groups[j].inside.start - groups[i].inside.stop < APART_FRAMES:
+            beside |= {a for a, b, there in ((i, j, real[j]), (j, i, real[i])) if b in out and there}
+    return out | beside
 
 
 @dataclass(frozen=True, slots=True)

@@ -328,13 +328,16 @@ def delayed_information(
     ref: Reference,
     steps: Steps,
     start: int,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """Normal matrices (F, 18, 18), vectors (F, 18) and chi-squares (F,) of the labelled spots at a reference motion.
+
+    Also the sums (F,) of the log determinants of their covariances.
 
     assigned (T, n); ref, steps: F frames from frame `start` on.
     """
     frames, n = ref.t.shape[0], assigned.shape[1]
     L, g, chi2 = np.zeros((frames, STATE, STATE)), np.zeros((frames, STATE)), np.zeros(frames)
+    log_det = np.zeros(frames)
     at, J, H, no_cov = np.empty(2), np.empty((2, 6)), np.empty((2, STATE)), np.zeros((n, 2, 2))
     for k in range(frames):
         use, uv, noise = labelled_points(detections, start + k, assigned[start + k], no_cov)
@@ -349,7 +352,8 @@ def delayed_information(
             if not projected:
                 continue
             chi2[j] += add_spot(L[j], g[j], H, w0, w1, w2, uv[i, 0] - at[0], uv[i, 1] - at[1])
-    return L, g, chi2
+            log_det[j] -= np.log(w0 * w2 - w1 * w1)
+    return L, g, chi2, log_det
 
 
 @compiled
@@ -504,10 +508,12 @@ class SmoothedMotion:
 
     ref: Reference
     log_density: Array | None  # (T, 6) logarithms of the jerk's spectral densities; None: not estimated yet
-    interpolation_offset: float  # to be added to them for the interpolation between frames
+    interpolation_offset: float  # to be added to them for the interpolation between frames ...
+    smoother: Bools  # (T,) ... about these
     jumped: Bools  # (T,) the velocities jumped in the step before
     jump_scale: Array  # (T, 2) of the variances of these jumps, as in `jump_variances` ...
     moment: Array  # (T, 2) ... and when they are, as in RunInformation
+    excluded: Bools  # (T,) the velocities did not jump in the step before, although it was not observed
     pose_P: Array  # (T, 6, 6)
     motion_P: Array  # (T, 6, 6) of the velocities
     known: Bools  # (T,) the pose is not lost
@@ -521,7 +527,9 @@ class SmoothedMotion:
         zero = np.zeros((frames, 6, 6))
         known = np.zeros(frames, dtype=bool)
         scale, moment = np.ones((frames, 2)), unknown_moments(frames)
-        return SmoothedMotion(ref, log_density, 0.0, jumped, scale, moment, zero, zero, known, np.zeros(frames))
+        return SmoothedMotion(
+            ref, log_density, 0.0, ~known, jumped, scale, moment, known.copy(), zero, zero, known, np.zeros(frames)
+        )
 
     def without_covariances(self) -> SmoothedMotion:
         """What the next estimate starts from: less memory."""

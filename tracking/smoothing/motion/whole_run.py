@@ -8,23 +8,32 @@ Source: ours.
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from tracking.rigid_body.models.motion import ANY_MOMENT, STATE, predicted
 from tracking.rigid_body.online_estimates import MANOEUVRE_S, jump_variance
 from tracking.smoothing.motion.clocks import solve_clocks
+from tracking.smoothing.motion.corner_pairs import Stretch, find_pair, successions
+from tracking.smoothing.motion.extrapolation import extrapolated
 from tracking.smoothing.motion.fixed_interval import (
     Interval,
     RunInformation,
-    leave_one_out_log_likelihood,
     log_likelihood,
     motion_cost,
     smoothed,
 )
-from tracking.smoothing.motion.jump_moments import MOMENT_SIGMAS, JumpMoment, find_moment
+from tracking.smoothing.motion.interpolation import Interpolation, of_poses
+from tracking.smoothing.motion.jump_moments import (
+    AROUND,
+    MOMENT_SIGMAS,
+    VAGUE_STEPS,
+    JumpGroup,
+    JumpMoment,
+    find_moment,
+    jump_groups,
+    uncertain_groups,
+)
 from tracking.smoothing.motion.process_noise import (
     PSEUDO_COUNT,
     corner_offsets,
@@ -70,15 +79,11 @@ GAP_FRAMES = 15  # on both sides of a gap that show whether the velocities have 
 NO_JUMP_NATS = 5.0  # by which a motion without a jump is more likely, from which there was none (p < 1 % of 5 %)
 MOMENT_ROUNDS = 4  # in which the moment of a jump is found, each with the spots that were too near to it before
 EITHER_SIDE_SIGMAS = 3.0  # of such a moment: as near to it, a spot may be on either side
-EARLIER_STEPS = 0.1  # least sigma of a moment that was found with other labels, in steps
 FIRST_SLACK_NATS = 3.0  # by which a jump at one moment may at first be less likely than at an open one
-APART_FRAMES = 1  # between the steps of two jumps, from which one does not disturb the moment of the other
+JUMP_NATS = 3.0  # by which each jump in close succession must make a run more likely than a stronger jerk does
 NEGLIGIBLE_JUMP = 1e-3  # of the variance of the fastest motion
 LEAST_SPREAD = 0.1  # of a step: no real corner is in one instant
-VAGUE_STEPS = 0.15  # a moment whose sigma is larger than this part of a step is not used
 NO_LIMIT = 1e4  # of a jump's variance: spots that are open by it have no weight
-MOST_OWN = 0.9  # share of what is known of a pose that its own spots may have for these to be left out
-INTERPOLATION_OFFSETS = (-2.0, -4.0, -6.0)  # of log q: tried for the interpolation between frames
 
 
 def estimate(
@@ -122,12 +127,15 @@ class _Estimator:
         self.jump_scale = motion.jump_scale[core].copy()  # (T, 2) ... this ...
         self.moment = motion.moment[core].copy()  # (T, 2) ... and this
         self.settled = np.zeros(len(self.dt), dtype=bool)  # (T,) jumps whose moments these passes have found
+        self.turning = np.zeros(len(self.dt), dtype=bool)  # (T,) steps whose jumps a stronger jerk has replaced
+        self.no_pair = set[tuple[int, int]]()  # steps, first and end, in which two jumps were searched
         self.kept: tuple[Reference, tuple[Array, Array, Array]] | None = None  # of the last `_without_corners`
         self.fresh = motion.log_density is None
         self.log_density = self._first_density() if motion.log_density is None else motion.log_density[core].copy()
         self.interpolation_offset = motion.interpolation_offset
         self.clocks: ClockSolution | None = None
-        self.interior = np.ones(len(self.dt), dtype=bool)  # (T,) frames that all passes so far found to be interior
+        self.smoother = motion.smoother[core].copy()
+        self.interior = self.smoother.copy()  # (T,) frames that all passes so far found to be interior
 
     def run_passes(self) -> SmoothedMotion:
         """Passes until nothing changes."""
@@ -151,11 +159,13 @@ class _Estimator:
             converged = bool(np.all(np.abs(moved[:, :6]) < CONVERGED_SIGMAS * sd))
             new = np.zeros_like(self.jumped)
             if (adapting or not self.run.adapt_jerk) and number >= NO_JUMPS_BEFORE:
-                new = new_jumps(out.shock, self.jumped)
+                new = new_jumps(out.shock, self.jumped) & ~self.turning
                 self.jumped |= new
             if adapting:
                 adapting = not self._adapt(out, number, number - first + 1, bool(new.any()))
-                if not adapting and (self._hidden_jumps_excluded() | self._find_moments(density)):
+                if not adapting and (
+                    self._turns_found() or (self._hidden_jumps_excluded() | self._find_moments(density))
+                ):
                     adapting, first = True, number + 1  # the jerk has to explain what the jumps did
             elif converged and not new.any():
                 break
@@ -199,11 +209,54 @@ class _Estimator:
         settled = number >= GLOBAL_PASSES + 1 and change < CONVERGED_LOG_DENSITY and not new_jump
         last = settled or passes >= (FIRST_ADAPTING_PASSES if self.fresh else LATER_ADAPTING_PASSES)
         if last and self.fresh:
-            self.interpolation_offset = self._best_interpolation_offset(out)
+            self.interpolation_offset = self._interpolation(out).best_offset(self.run.delays is not None)
+            if self.run.delays is not None and self.interpolation_offset < 0.0:
+                self.smoother = self._interpolation(out).frames_better_with(self.interpolation_offset)
+                self.interior = self.smoother.copy()
         return last
 
+    def _turns_found(self) -> bool:
+        """Replace jumps in close succession by a stronger jerk where that explains the spots; whether any are.
+
+        A vehicle that rests and then swings has the strength of the rest at first, and a jump in every second step.
+        """
+        if self.run.delays is None or self.steps is None:
+            return False
+        found, largest = False, largest_jumps(self.ref, self.measured, self.dt)
+        for first, end in successions(self.jumped):
+            stretch, jumps = self._stretch(first, end), self.jumped[first:end].copy()
+            nats = stretch.nats(stretch.steps.jerk, stretch.steps.velocity_jump, stretch.steps.moment)
+            kept, self.jumped[first:end] = self.moment[first:end].copy(), False
+            self.moment[first:end] = -1.0, 0.0
+            others = np.ascontiguousarray(self._jump_variances(self.ref)[stretch.part])
+            sizes = np.repeat((largest * self.jump_scale)[first:end][jumps].max(axis=0), 3)
+            turn_nats, jerk = stretch.without_jumps(others, sizes)
+            if not turn_nats > nats - JUMP_NATS * np.count_nonzero(jumps):
+                self.jumped[first:end], self.moment[first:end] = jumps, kept
+                continue
+            self.log_density[stretch.part], self.jump_scale[first:end] = np.log(jerk), 1.0
+            self.turning[first:end], found = True, True
+        return found
+
+    def _stretch(self, first: int, end: int, size: Array | None = None) -> Stretch:
+        """The frames about some steps. size (2,): variances of the jumps that are searched for there."""
+        assert self.steps is not None
+        part = slice(max(first - AROUND, 0), min(end + AROUND, len(self.dt)))
+        weight = np.where(self.used[self.core], np.where(self.measured, 1.0, PARTIAL_WEIGHT), 0.0)
+        ref = Reference(*(np.ascontiguousarray(a[part]) for a in self.ref))
+        steps = Steps(*(np.ascontiguousarray(a[part]) for a in self.steps))
+        steps = steps._replace(
+            jerk=np.exp(self.log_density[part]), moment=self.moment[part].copy(),
+            velocity_jump=np.ascontiguousarray(self._jump_variances(self.ref)[part]),
+        )  # fmt: skip
+        return Stretch(
+            self.run, self.assigned, self.core.start + part.start, part, ref, steps, weight[part],
+            first_variance(self.ref, self.dt, bool(self.measured[0])), slice(first - part.start, end - part.start),
+            np.zeros(2) if size is None else size,
+        )  # fmt: skip
+
     def _hidden_jumps_excluded(self) -> bool:
-        """Find gaps in which the frames around them exclude a velocity jump; whether there are more than before.
+        """Find steps in which the frames around them exclude a hidden jump; whether there are more than before.
 
         A jump that may be hidden in a gap leaves open where the spots beside it were at their frames' instants: by
         .2 px at 5 px per frame, where a spot is known to .01 px. Runs whose pictures are of one instant do without.
@@ -213,104 +266,115 @@ class _Estimator:
         info, _ = self._information(self.ref)
         density, hidden = np.exp(self.log_density), unobserved_steps(self.measured) & ~self.excluded
         edges = np.flatnonzero(np.diff(np.r_[False, hidden, False].astype(np.int8)))
-        for first, end in edges.reshape(-1, 2).tolist():
-            part = slice(max(first - GAP_FRAMES, 0), min(end + GAP_FRAMES, len(hidden)))
-            if self.jumped[first:end].any():
+        ranges = [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
+        while ranges:
+            first, end = ranges.pop()
+            if self._nats_without_hidden_jumps(info, density, first, end) > NO_JUMP_NATS:
+                self.excluded[first:end] = True
                 continue
-            some = info._replace(**{name: getattr(info, name)[part] for name in info._fields[:-1]})
-            none = np.zeros_like(some.velocity_jump)
-            none[: first - part.start], none[end - part.start :] = (
-                some.velocity_jump[: first - part.start], some.velocity_jump[end - part.start :],
-            )  # fmt: skip
-            without = some._replace(velocity_jump=none, acceleration_jump=none / MANOEUVRE_S**2)
-            ref = Reference(*(np.ascontiguousarray(a[part]) for a in self.ref))
-            gained = log_likelihood(ref, without, density[part]) - log_likelihood(ref, some, density[part])
-            self.excluded[first:end] = gained > NO_JUMP_NATS
+            # A slow camera leaves all steps of a recording unobserved: a jump in one says nothing of the others. Within
+            # a gap it does: nothing shows in which of its steps a jump is.
+            apart = np.flatnonzero(self.measured[first : end - 1]) + first + 1
+            if len(apart):
+                middle = int(apart[np.argmin(np.abs(2 * apart - first - end))])
+                ranges += [(middle, end), (first, middle)]
         return bool((hidden & self.excluded).any())
+
+    def _nats_without_hidden_jumps(self, info: RunInformation, density: Array, first: int, end: int) -> float:
+        """By how much the run is more likely if no jump is hidden in the steps from `first` to before `end`."""
+        part = slice(max(first - GAP_FRAMES, 0), min(end + GAP_FRAMES, len(self.dt)))
+        ref = Reference(*(np.ascontiguousarray(a[part]) for a in self.ref))
+        some = info._replace(**{name: getattr(info, name)[part] for name in info._fields[:-1]})
+        excluded, before = self.excluded.copy(), self.excluded
+        excluded[first:end] = True
+        nats = []
+        for self.excluded in (before, excluded):
+            jump = np.ascontiguousarray(self._jump_variances(self.ref)[part])
+            open_to_jumps = some._replace(velocity_jump=jump, acceleration_jump=jump / MANOEUVRE_S**2)
+            nats.append(log_likelihood(ref, open_to_jumps, density[part]))
+        self.excluded = before
+        return nats[1] - nats[0]
 
     def _find_moments(self, density: Array) -> bool:
         """Find when the velocities jump, where several steps may; whether any changed. density (T, 6): of the jerk.
 
         Where it stays open, the poses beside it are vague in runs whose pictures are of different instants. Jumps whose
-        steps overlap may be one.
+        steps overlap may be one, or two.
         """
         if self.run.delays is None or self.steps is None:
             return False
-        groups = self._unsettled_jumps()
+        groups = jump_groups(self.jumped & ~self.settled, self.moment, ~self.measured | self.weak, self.jump_scale)
         if not groups:
             return False
-        found = {i: known for i, (jumps, _) in enumerate(groups) if (known := self._known_moment(jumps)) is not None}
+        pairs = {i: known for i, group in enumerate(groups) if len(known := group.known(self.moment, self.dt)) == 2}
+        found = {
+            i: known[0] for i, group in enumerate(groups) if len(known := group.known(self.moment, self.dt)) == 1
+        }  # fmt: skip
         largest, before = largest_jumps(self.ref, self.measured, self.dt), self.moment.copy()
-        none = set[int]()  # groups that have no moment, as the spots near it have shown
+        none = set(pairs)  # groups that have not one moment, as the spots near it have shown
         for number in range(MOMENT_ROUNDS):
             info = self._information_without(groups, largest, found)
-            for i, (jumps, inside) in enumerate(groups):
+            for i, group in enumerate(groups):
                 if i in none or (i in found and not found[i].improved):
                     continue
-                change = self._change(inside.start, inside.stop - 1)
-                size = np.maximum(largest[jumps[0]] * self.jump_scale[jumps].max(axis=0), change)
+                size, steps = self._size(group, largest), (group.inside.start, group.inside.stop - 1)
                 slack = FIRST_SLACK_NATS if number < MOMENT_ROUNDS - 1 else 0.0
-                steps = inside.start, inside.stop - 1
                 moment = find_moment(self.ref, info, density, steps, size, slack, found.get(i))
                 if moment is not None:
                     found[i] = moment.after(found.get(i))
                 elif i in found and found.pop(i).rounds > 0:
                     none.add(i)
-        for i in self._uncertain(groups, found):
+        real = [self.jump_scale[group.jumps].max() > NEGLIGIBLE_JUMP for group in groups]
+        for i in uncertain_groups(groups, found, self.dt, real):
             found.pop(i, None)
-        for i, (jumps, inside) in enumerate(groups):
-            self.moment[inside] = -1.0, 0.0
-            moment = found.get(i)
-            if moment is None:
-                continue
+        for i, group in enumerate(groups):
+            self.moment[group.inside] = -1.0, 0.0
+            if i in found:
+                self._settle(group.jumps, group.inside, (found[i],), largest)
+        for i in range(len(groups)):
+            if i not in found and real[i]:
+                self._find_pair(groups, i, largest, pairs.get(i))
+        return not np.array_equal(before, self.moment)
+
+    def _size(self, group: JumpGroup, largest: Array) -> Array:
+        """Variances (2,) of the jump of a group."""
+        change = self._change(group.inside.start, group.inside.stop - 1)
+        return np.maximum(largest[group.jumps[0]] * self.jump_scale[group.jumps].max(axis=0), change)
+
+    def _settle(self, jumps: Ints, inside: slice, moments: tuple[JumpMoment, ...], largest: Array) -> None:
+        """Replace some jumps by those at these moments, which are the only ones in some steps."""
+        self.jumped[jumps], self.excluded[inside] = False, True
+        for moment in moments:
             k = moment.step
-            self.jumped[jumps], self.jumped[k], self.excluded[inside], self.settled[k] = False, True, True, True
+            self.jumped[k] = self.settled[k] = True
             self.moment[k] = moment.later_s, max(MOMENT_SIGMAS * moment.sigma_s, LEAST_SPREAD * self.dt[k])
             self.jump_scale[k] = np.minimum(moment.size / np.maximum(largest[k], 1e-300), 1.0)
             self.log_density[moment.part] = np.log(moment.density)
-        return not np.array_equal(before, self.moment)
 
-    def _uncertain(self, groups: list[tuple[Ints, slice]], found: dict[int, JumpMoment]) -> set[int]:
-        """Which of the groups have no certain moment.
+    def _find_pair(self, groups: list[JumpGroup], i: int, largest: Array, known: tuple[JumpMoment, ...] | None) -> None:
+        """Find the moments of two jumps in place of those of a group that has not one moment.
 
-        One that the spots near it have not confirmed is none, nor is one beside a jump whose moment is not known: the
-        motion between the two is known too little.
+        known: the moments found with other labels.
         """
-        out = {
-            i for i in range(len(groups))
-            if i not in found or found[i].rounds < 2 or found[i].sigma_s > VAGUE_STEPS * self.dt[found[i].step]
-        }  # fmt: skip
-        beside = set[int]()
-        for i, j in pairwise(range(len(groups))):
-            if groups[j][1].start - groups[i][1].stop < APART_FRAMES:
-                real = [self.jump_scale[groups[k][0]].max() > NEGLIGIBLE_JUMP for k in (i, j)]
-                beside |= {a for a, b, there in ((i, j, real[1]), (j, i, real[0])) if b in out and there}
-        return out | beside
-
-    def _known_moment(self, jumps: Ints) -> JumpMoment | None:
-        """The moment that earlier labels gave for some jumps that may be one, less certain."""
-        known = jumps[self.moment[jumps, 0] >= 0]
-        if not len(known):
-            return None
-        k, dt = int(known[0]), self.dt[known[0]]
-        sigma = max(self.moment[k, 1], EARLIER_STEPS * dt)
-        return JumpMoment(k, self.moment[k, 0], sigma, slice(0, 0), np.zeros((0, 6)), np.zeros(2), rounds=0)
-
-    def _unsettled_jumps(self) -> list[tuple[Ints, slice]]:
-        """Jumps whose moments this run of passes has not found, with the steps that may have each; one by one."""
-        vague, out = ~self.measured | self.weak, list[tuple[Ints, slice]]()
-        for k in np.flatnonzero(self.jumped & ~self.settled).tolist():
-            known = self.moment[k, 0] >= 0
-            beside = max(k - 1, 1), min(k + 1, len(vague) - 1)
-            first, last = beside if known else open_steps(k, vague, self.jump_scale)
-            if out and first < out[-1][1].stop:
-                out[-1] = np.append(out[-1][0], k), slice(out[-1][1].start, max(last + 1, out[-1][1].stop))
-            else:
-                out.append((np.array([k]), slice(first, last + 1)))
-        return out
+        group = groups[i]
+        first = max(group.inside.start - 1, groups[i - 1].inside.stop if i > 0 else 1)
+        end = min(group.inside.stop + 1, groups[i + 1].inside.start if i + 1 < len(groups) else len(self.dt))
+        # The spots in between decide: without the pictures of some camera too few do. A search that has failed fails
+        # again while the same steps are open.
+        every = self.run.detections.has_image[self.core][first - 1 : end + 1].all()
+        if end - first < 2 or not every or (first, end) in self.no_pair:
+            return
+        self.no_pair.add((first, end))
+        stretch = self._stretch(first, end, self._size(group, largest))
+        part = stretch.part
+        start = None if known is None else [replace(m, step=m.step - part.start) for m in known]
+        found = find_pair(stretch, None if start is None else (start[0], start[1]))
+        if found and all(m.sigma_s < 2 * VAGUE_STEPS * self.dt[part][m.step] for m in found):
+            moments = tuple(replace(m, step=m.step + part.start, part=part) for m in found)
+            self._settle(group.jumps, slice(first, end), moments, largest)
 
     def _information_without(
-        self, groups: list[tuple[Ints, slice]], largest: Array, found: dict[int, JumpMoment]
+        self, groups: list[JumpGroup], largest: Array, found: dict[int, JumpMoment]
     ) -> RunInformation:
         """`_information`, where the spots that may be on either side of these jumps have no weight.
 
@@ -319,7 +383,8 @@ class _Estimator:
         steps, kept = self.steps, self.moment
         assert steps is not None
         jump, moment, unknown = steps.velocity_jump.copy(), self.moment.copy(), self.moment.copy()
-        for i, (_, inside) in enumerate(groups):
+        for i, group in enumerate(groups):
+            inside = group.inside
             unknown[inside], moment[inside] = (-1.0, 0.0), (-1.0, 0.0)
             if i not in found:
                 jump[inside] = NO_LIMIT * largest[inside]
@@ -361,51 +426,19 @@ class _Estimator:
         self.interior &= self._interior(out)
         return np.exp(self.log_density + self.interpolation_offset * self.interior[:, None])
 
+    def _interpolation(self, out: Interval) -> Interpolation:
+        info, _ = self._information(self.ref)
+        return Interpolation(self.ref, info, self.log_density, self._interior(out), out.pose_P)
+
     def _interior(self, out: Interval) -> Bools:
         """(T,): frames farther than twice the smoother's memory from any gap, jump or end."""
         info, _ = self._information(self.ref)
-        share = np.einsum("kij,kji->k", out.pose_P, _of_poses(info.information))[self.measured]
+        share = np.einsum("kij,kji->k", out.pose_P, of_poses(info.information))[self.measured]
         usual = float(np.median(share)) / 6 if len(share) else 1.0
         memory = int(np.clip(np.ceil(2 / max(usual, 1e-3)), 3, 200))
         edge: Bools = np.concatenate([[True], ~self.measured | self.jumped, [True]])
         near: Bools = largest_near(edge, memory)[1:-1]
         return ~near
-
-    def _best_interpolation_offset(self, out: Interval) -> float:
-        """Offset of log q with the largest leave-one-out likelihood: each frame predicted by all others."""
-        info, _ = self._information(self.ref)
-        interior = self._interior(out)
-        if not interior.any():
-            return 0.0
-        by_others = None
-        if self.run.delays is not None:
-            # Where the spots of a frame are also what the velocities are known by, they would count twice.
-            own = np.linalg.eigvals(out.pose_P @ _of_poses(info.information)).real.max(axis=1)
-            by_others = (interior & (own < MOST_OWN))[:, None, None]
-            if 2 * by_others.sum() < interior.sum():
-                return 0.0
-        best, value = 0.0, self._leave_one_out(info, 0.0, interior, by_others)
-        for offset in INTERPOLATION_OFFSETS:
-            likelihood = self._leave_one_out(info, offset, interior, by_others)
-            if likelihood < value:
-                break
-            best, value = offset, likelihood
-        for offset in (best - 1.0, best + 1.0):
-            if offset < 0:
-                likelihood = self._leave_one_out(info, offset, interior, by_others)
-                if likelihood > value:
-                    best, value = offset, likelihood
-        return best
-
-    def _leave_one_out(
-        self, info: RunInformation, offset: float, interior: Bools, by_others: Bools | None = None
-    ) -> float:
-        out = smoothed(self.ref, info, np.exp(self.log_density + offset * interior[:, None]), tested=False)
-        # Of spots that were not exposed at the instant of their frame, what they say about the pose.
-        left_out = _of_poses(info.information) if by_others is None else _of_poses(info.information) * by_others
-        of_poses = info._replace(information=left_out, vector=_of_poses(info.vector))
-        value = float(leave_one_out_log_likelihood(out.x, out.pose_P, of_poses))
-        return value if np.isfinite(value) else -np.inf
 
     # -- Gauss-Newton -------------------------------------------------------------------------------------------------
 
@@ -486,7 +519,7 @@ class _Estimator:
         if run.delays is None:
             L, g, chi2 = spot_information(run.views, run.detections, self.assigned, run.calibration_cov, ref, start)
         else:
-            L, g, chi2 = delayed_information(
+            L, g, chi2, _ = delayed_information(
                 run.views, run.detections, run.delays, self.assigned, run.calibration_cov, ref, self._steps(), start
             )
         unused = ~self.used[self.core]
@@ -531,43 +564,26 @@ class _Estimator:
 
     def _extrapolated(self, out: Interval) -> SmoothedMotion:
         """The motion of all frames: the core's, and the prediction from its ends, forward and backward in time."""
-        core, dt, frames = self.core, self.run.dt, len(self.run.dt)
-        R, t, m = (np.array(a) for a in self.motion.ref)
-        R[core], t[core], m[core] = self.ref
-        pose_P, motion_P = np.empty((frames, 6, 6)), np.empty((frames, 6, 6))
-        pose_P[core], motion_P[core] = out.pose_P, out.motion_P
+        core, frames = self.core, len(self.run.dt)
         log_density = np.empty((frames, 6))
         log_density[core] = self.log_density
         log_density[: core.start], log_density[core.stop :] = self.log_density[0], self.log_density[-1]
         jump = P_JUMP_OUTSIDE * jump_variance(speeds(self.ref.m[[0, -1]]))  # at the core's first frame, and at its last
-        last = core.stop - 1
-        forward = [(k, dt[k]) for k in range(core.stop, frames)]
-        backward = [(k, dt[k + 1]) for k in range(core.start - 1, -1, -1)]
-        for start, P, steps, sign, size in (
-            (last, out.ends_P[1], forward, 1.0, jump[1]),
-            (core.start, out.ends_P[0], backward, -1.0, jump[0]),
-        ):
-            flip = np.ones(STATE)
-            flip[6:12] = sign  # time reversed: velocities change sign, accelerations do not
-            at = (R[start].copy(), t[start].copy(), m[start] * flip[6:], P * np.outer(flip, flip))
-            density = np.exp(log_density[start])
-            for k, step in steps:
-                R_k, t_k, m_k, P_k, _ = predicted(*at, step, density, size, size / MANOEUVRE_S**2, *ANY_MOMENT)
-                at = (R_k, t_k, m_k, P_k)
-                R[k], t[k], m[k] = at[0], at[1], at[2] * flip[6:]
-                pose_P[k], motion_P[k] = at[3][:6, :6], at[3][6:12, 6:12]
+        ref, pose_P, motion_P = extrapolated(self.motion.ref, core, self.ref, out, self.run.dt, log_density, jump)
         sd = np.sqrt(np.diagonal(pose_P, axis1=1, axis2=2))
         known = (sd[:, :3].max(axis=1) < LOST_SIGMA_M) & (sd[:, 3:].max(axis=1) < LOST_SIGMA_RAD)
         jumped, scale = self.motion.jumped.copy(), self.motion.jump_scale.copy()
-        moment = self.motion.moment.copy()
+        moment, excluded = self.motion.moment.copy(), np.zeros(frames, dtype=bool)
+        smoother = self.motion.smoother.copy()
         jumped[core], scale[core], moment[core] = self.jumped, self.jump_scale, self.moment
+        excluded[core], smoother[core] = self.excluded, self.smoother
         clocks = self.clocks
         if clocks is not None:
             nearest = np.clip(np.arange(frames) - core.start, 0, core.stop - core.start - 1)
             clocks = replace(clocks, motion=clocks.motion[nearest])
         return SmoothedMotion(
-            Reference(R, t, m), log_density, self.interpolation_offset, jumped, scale, moment, pose_P, motion_P, known,
-            self.weight, clocks,
+            ref, log_density, self.interpolation_offset, smoother, jumped, scale, moment, excluded, pose_P, motion_P,
+            known, self.weight, clocks,
         )  # fmt: skip
 
 
@@ -575,13 +591,6 @@ def _damped(info: RunInformation, damping: float) -> RunInformation:
     """Levenberg's damping: as if each frame's pose had been measured at the reference, with this sigma (m and rad)."""
     pose = np.diag(_padded(np.ones(6), info.vector[0]))
     return info._replace(information=info.information + pose / damping**2)
-
-
-def _of_poses(a: Array) -> Array:
-    """The part (..., 6) or (..., 6, 6) about the poses of vectors (T, s) or matrices (T, s, s)."""
-    if a.shape[1] == 6:
-        return a
-    return np.ascontiguousarray(a[:, :6] if a.ndim == 2 else a[:, :6, :6])
 
 
 def _padded(b: Array, like: Array) -> Array:

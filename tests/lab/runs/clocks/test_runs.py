@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.clocks.__main__ import figures
+from bench.clocks.__main__ import Figures, figures
 from bench.clocks.recording import Recording, random_recording, write_recording
 from geometry.arrays import Array
 from geometry.pose import Pose
 from lab.files.run.results import read_poses
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
+from tracking.smoothing.smoother import _Smoother
 
 FRAMES, SEED = 40, 3
 
@@ -163,4 +164,70 @@ def rounded(r: Recording, frames: float) -> Recording:
 def test_turns_that_take_some_frames_are_not_taken_for_corners(frames, tmp_path):
     own = figures(rounded(random_recording(4000, frames=80), frames), tmp_path)
     assert np.nanmean(own.nees) < 1.5
+    assert np.nanmax(own.nees) < 8
+
+
+def compared(r: Recording, folder: Path) -> tuple[Figures, Figures, Array]:
+    """The recording with its clocks and with one, and the frames (T,) that have measured poses in both."""
+    own, one = figures(r, folder / "own"), figures(r.with_one_clock(), folder / "one")
+    both = np.isfinite(own.attitude_deg) & np.isfinite(one.attitude_deg)
+    both[:3] = both[-3:] = False
+    return own, one, both
+
+
+def rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def test_slow_cameras_lose_no_poses_where_nothing_jumps(tmp_path, monkeypatch):
+    """One camera of full rate and two of 30 Hz: jumps could hide in every step, and there are some in a few steps.
+
+    Residuals of spots that were moved to their frames by a motion that is known worse are not those of the spots.
+    """
+    smoothers = list[_Smoother]()
+    monkeypatch.setattr(_Smoother, "result", lambda s, *a, f=_Smoother.result: smoothers.append(s) or f(s, *a))
+    own, one, both = compared(random_recording(6007, frames=100), tmp_path)
+    moved, seen = (np.sqrt(np.trace(d.cov, axis1=1, axis2=2)) for d in (smoothers[0].detections, smoothers[0].seen))
+    assert np.median(moved / seen) < 1.5  # a jump that is excluded does not make the way to the frames uncertain
+    measured = np.isfinite(one.attitude_deg).sum()
+    assert measured > 40
+    assert np.isfinite(own.attitude_deg).sum() > 0.85 * measured
+    assert np.median(own.attitude_deg[both]) < 1.3 * np.median(one.attitude_deg[both])
+    assert np.nanmean(own.nees) < 1.5
+
+
+def test_a_turn_that_takes_about_a_frame_is_as_long_as_it_is(tmp_path):
+    """A turntable: one jump explains neither the rest before it and after it nor the spots in between."""
+    r = random_recording(6005, frames=80)
+    steps = np.diff(r.corners)[::2]
+    assert np.allclose(steps, steps[0])
+    assert 1.0 < steps[0] < 1.5
+    own, one, both = compared(r, tmp_path)
+    # Rows during a turn have fewer spots than those of one clock, since each camera sees another part of it.
+    assert rms(own.attitude_deg[both]) < 3.0 * rms(one.attitude_deg[both])
+    resting = both & (np.abs(np.arange(80)[:, None] - 0.5 * (r.corners[:-1:2] + r.corners[1::2])).min(axis=1) > 0.8)
+    assert rms(own.attitude_deg[resting]) < 1.3 * rms(one.attitude_deg[resting])
+    assert np.nanmean(own.nees) < 1.5
+
+
+@pytest.mark.parametrize(("seed", "frames"), [(6003, 200), (6002, 200)])
+def test_a_swing_after_a_long_rest_is_no_succession_of_jumps(seed, frames, tmp_path):
+    r = random_recording(seed, frames=frames)
+    assert len(r.corners) == 1
+    own, one, both = compared(r, tmp_path)
+    swings = both & (np.arange(frames) > r.corners[0] + 3)
+    assert swings.sum() > 15
+    assert rms(own.attitude_deg[swings]) < 1.3 * rms(one.attitude_deg[swings])
+    assert np.nanmean(own.nees) < 1.6
+
+
+@pytest.mark.parametrize("gap", [slice(12, 26), slice(8, 22)])
+def test_a_turn_in_a_gap_in_which_nothing_is_seen_is_covered(gap, tmp_path):
+    """That it is in one half of the gap does not exclude it from the other."""
+    r = random_recording(6005, frames=60)
+    assert gap.start < r.corners[0] < r.corners[1] < gap.stop
+    hidden = r.hidden.copy()
+    hidden[gap] = True
+    own = figures(replace(r, hidden=hidden), tmp_path)
+    assert np.isfinite(own.attitude_deg[gap]).sum() <= 2
     assert np.nanmax(own.nees) < 8
