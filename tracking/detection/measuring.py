@@ -11,11 +11,18 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.compilation.jit import compiled, compiled_for_threads
 from tracking.detection import ellipse
 from tracking.detection.gaussian_fit import fit_all, least_variance
-from tracking.detection.moments import CENTRE_SHARE, at_half_height, compact_height, find_moments, start_variance
+from tracking.detection.moments import (
+    CENTRE_SHARE,
+    at_half_height,
+    compact_height,
+    find_moments,
+    light_ends,
+    start_variance,
+)
 from tracking.detection.pixels import Noise, Pixels, pixel, texture_variance, with_texture
 from tracking.detection.quality import light_beside
 from tracking.detection.regions import NARROWER, drop_duplicates
-from tracking.detection.table import SCRATCH, Candidate, Candidates, Peaks
+from tracking.detection.table import SCRATCH, Candidate, Candidates, Peak, Peaks
 
 # Least decrease of chi-square by a spot, relative to threshold^2. The maximum of noise over positions and shapes is
 # higher than at one position: with 1.0 a picture of 1280x1024 has 0.04 false points, with 1.1 fewer than 0.01.
@@ -32,9 +39,13 @@ _LEAST_START = 2.0  # px^2: least variance of that start
 _SATURATED = 0.97  # of the saturation: compression rounds a flat top
 _LARGEST_CORE = 16  # px: half side of the square in which a saturated light is higher than half of its peak
 _OUTGROWN = 4.0  # variance of the moments over that of the start above which they have left the light
+# Most light around a compact light, relative to its height: anywhere, and in an even place. Around a grain of speckle
+# there is more.
+_CLEAR, _EVEN = 0.5, 0.25
 _STEEPEST = 0.6065  # exp(-1/2): slope of a Gaussian at one sigma, in heights per sigma
 _NARROWEST = 0.35  # px: width of a spot that the pixels do not resolve; with the pixel's own it is 0.45
 _UNRESOLVED = 1.0  # px: of a wider fit the centre is known
+_STRETCHED = 3.0  # px: beside an edge a fit that collapses across it becomes up to so long
 _BESIDE = 3.0  # sigmas: least light of such a spot outside its two brightest pixels, which may be hot
 _UNRESOLVED_GAIN = 2.0  # least decrease of its chi-square, relative to threshold^2: few pixels have longer tails
 _WITHIN_PIXEL = 0.03  # px: error of the centre if the held width is a tenth of a pixel wrong
@@ -103,7 +114,11 @@ def measure(
     for k in range(chosen.shape[0]):
         spot = table[k]
         here = with_texture(noise, spot["texture"])
-        accepted = _is_spot(image, spot, here, limits) or _is_compact(image, spot, here, limits, cells[SCRATCH])
+        accepted = _is_spot(image, spot, here, limits)
+        if not (accepted and _is_as_wide(spot)):
+            core = _is_core(image, peaks[chosen[k]], table[k : k + 1], here, limits, cells[SCRATCH])
+            accepted = accepted or core
+        accepted = accepted or _is_compact(image, spot, here, limits, _CLEAR, cells[SCRATCH])
         spot["accepted"] = 1.0 if accepted else 0.0
     drop_duplicates(table)
     if limits.wings.near > 0.0 or limits.wings.far > 0.0:
@@ -223,7 +238,8 @@ def _hold_unresolved(peaks: Peaks, chosen: Ints, table: Candidates, limits: Dete
             continue
         major, minor, _ = ellipse.axes(spot["uu"], spot["uv"], spot["vv"])
         sigma = sqrt(max(spot["var_u"], spot["var_v"], 0.0))
-        if major > _UNRESOLVED or (minor >= limits.min_sigma and sigma < 0.5 * max(major, 0.5)):
+        collapsed = minor < limits.min_sigma and major < _STRETCHED and peak["scale"] <= 1.0
+        if not collapsed and (major > _UNRESOLVED or sigma < 0.5 * max(major, 0.5)):
             continue
         spot["moment_u"], spot["moment_v"] = peak["u"], peak["v"]
         spot["moment_uu"], spot["moment_uv"], spot["moment_vv"] = _NARROWEST**2, 0.0, _NARROWEST**2
@@ -318,8 +334,42 @@ def _is_spot(image: Pixels, spot: Candidate, noise: Noise, limits: DetectionLimi
 
 
 @compiled
-def _is_compact(image: Pixels, spot: Candidate, noise: Noise, limits: DetectionLimits, scratch: Array) -> bool:
-    """Whether a candidate that is not a Gaussian is a compact light; if so, its row is filled from the moments."""
+def _is_as_wide(spot: Candidate) -> bool:
+    """Whether a fit is about as wide as the light from which it started."""
+    major2 = ellipse.eigenvalues(spot["uu"], spot["uv"], spot["vv"])[1]
+    return bool(major2 <= _OUTGROWN**2 * max(spot["start"], _LEAST_START))
+
+
+@compiled
+def _is_core(
+    image: Pixels, peak: Peak, spot: Candidates, noise: Noise, limits: DetectionLimits, scratch: Array
+) -> bool:
+    """Whether the pixels above half of a peak are a compact light in an even place; if so, they fill its row.
+
+    Over an edge beside a light the window of its moments grows, and a fit too: what it then describes is the edge.
+    spot (1,): the candidate.
+    """
+    before, start = spot.copy(), max(spot[0]["start"], _LEAST_START)
+    at_half_height(image, peak, _LARGEST_CORE, spot[0])
+    wide2, found = 0.5 * (spot[0]["moment_uu"] + spot[0]["moment_vv"]), spot[0]["flux"] != before[0]["flux"]
+    as_wide = not peak["wide"] and found and start < _OUTGROWN * wide2 and wide2 < _OUTGROWN * start
+    if as_wide and _is_compact(image, spot[0], noise, limits, _EVEN, scratch):
+        as_wide = light_ends(image, spot[0], _EVEN * spot[0]["peak"], scratch)
+    else:
+        as_wide = False
+    if not as_wide:
+        spot[0] = before[0]
+    return bool(as_wide)
+
+
+@compiled
+def _is_compact(
+    image: Pixels, spot: Candidate, noise: Noise, limits: DetectionLimits, most: float, scratch: Array
+) -> bool:
+    """Whether a candidate that is not a Gaussian is a compact light; if so, its row is filled from the moments.
+
+    most: as in `compact_height`.
+    """
     uu, uv, vv = spot["moment_uu"], spot["moment_uv"], spot["moment_vv"]
     major, minor, _ = ellipse.axes(uu, uv, vv)
     # A candidate with a narrow fit is rejected: a hot pixel is compact and bright, too.
@@ -329,7 +379,7 @@ def _is_compact(image: Pixels, spot: Candidate, noise: Noise, limits: DetectionL
     if spot["gain"] < limits.threshold_sigma**2:
         return False
     u, v = spot["moment_u"], spot["moment_v"]
-    height = compact_height(image, u, v, (uu, uv, vv), noise, limits.threshold_sigma, scratch)
+    height = compact_height(image, u, v, (uu, uv, vv), noise, limits.threshold_sigma, most, scratch)
     if height <= 0.0:
         return False
     spot["u"], spot["v"], spot["uu"], spot["uv"], spot["vv"] = u, v, uu, uv, vv

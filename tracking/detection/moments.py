@@ -153,7 +153,7 @@ def is_sharp(image: Pixels, peak: Peak, noise: Noise, threshold_sigma: float) ->
         scatter = highest / _HIGHEST[k]
         lowest, second = min(lowest, scatter), min(second, max(lowest, scatter))
     contrast = second / max(peak["level"], 1.0)
-    if contrast > _EVEN * peak["contrast"]:  # the texture is as fine as the peak
+    if contrast > _EVEN * max(peak["contrast"], noise.texture):  # the texture is as fine as the peak
         return False
     if best < threshold_sigma * sqrt(texture_variance(with_texture(noise, contrast), peak["level"])):
         return False
@@ -373,14 +373,31 @@ def at_half_height(image: Pixels, peak: Peak, half: int, spot: Candidate) -> Non
 
 
 @compiled
+def light_ends(image: Pixels, spot: Candidate, most_dn: float, scratch: Array) -> bool:
+    """Whether the light falls by at most so many DN from three to six widths of a spot, in the median of directions.
+
+    The top of a wide light looks compact, but falls on. scratch (8,) is workspace.
+    """
+    step, n = sqrt(0.5 * (spot["uu"] + spot["vv"])), 0
+    for octant in range(8):
+        p, q = step * cos(octant * pi / 4), step * sin(octant * pi / 4)
+        u, v = int(np.rint(spot["u"] + 6.0 * p)), int(np.rint(spot["v"] + 6.0 * q))
+        if 0 < u < image.width - 1 and 0 < v < image.height - 1:
+            near = mean3(image, int(np.rint(spot["u"] + 3.0 * p)), int(np.rint(spot["v"] + 3.0 * q)))
+            scratch[n] = near - mean3(image, u, v)
+            n += 1
+    return n == 0 or nth_smallest(scratch, n, n // 2) <= most_dn
+
+
+@compiled
 def compact_height(
     image: Pixels, u: float, v: float, shape: tuple[float, float, float], noise: Noise, threshold_sigma: float,
-    scratch: Array,
+    most: float, scratch: Array,
 ) -> float:  # fmt: skip
     """Height, DN, of a compact core above the ring around it; 0 if the light does not fall off in all directions.
 
-    shape: the ellipse, px^2. The core must exceed the ring around it in each of eight directions by at least half the
-    median excess, which excludes edges, corners and ridges. scratch (32,) is workspace. Source: ours.
+    shape: the ellipse, px^2. In each of eight directions the ring around the core must have at most the share `most` of
+    the median excess, which excludes edges, corners and ridges. scratch (32,) is workspace. Source: ours.
     """
     uu, uv, vv = ellipse.clip_eigenvalues(shape[0], shape[1], shape[2], 0.1, np.inf)
     l11 = sqrt(uu)
@@ -407,6 +424,6 @@ def compact_height(
     core, background = 0.5 * (scratch[7] + scratch[8]), 0.5 * (scratch[27] + scratch[28])
     above = core - background
     sigma2 = _THRESHOLD_FACTOR**2 * variance(noise, background) + _OF_TEXTURE**2 * texture_variance(noise, background)
-    if core - highest < 0.5 * above or above <= threshold_sigma * sqrt(sigma2):
+    if highest - background > most * above or above <= threshold_sigma * sqrt(sigma2):
         return 0.0
     return above

@@ -12,7 +12,13 @@ from geometry.compiled_projection import project_all
 from geometry.forward_model import SpotModel
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.acquisition import predicted_hypothesis
-from tracking.rigid_body.association.frame_detections import BLENDED, Observation, chosen_points, distinct_spots
+from tracking.rigid_body.association.frame_detections import (
+    BLENDED,
+    FrameDetections,
+    Observation,
+    chosen_points,
+    distinct_spots,
+)
 from tracking.rigid_body.hypotheses.hypothesis_set import (
     MAX_CHECKING_SIGMA_PX,
     MAX_THREE_SPOT_SIGMA_PX,
@@ -31,7 +37,37 @@ from tracking.rigid_body.models.information import well_controlled
 MANY_SPOTS = 6  # with so many, an uncontrolled spot concerns only its own label
 # Of a first acquisition against "all points are false"; false points reach it with exp(-7) = 1e-3 per frame.
 MIN_EVIDENCE_NATS = 7.0
+MAX_EVIDENCE, MIN_EVIDENCE = 50.0, -5.0  # nats; a first hypothesis with less evidence is dropped
+MOVED_SIGMAS = 5.0  # of a point, from where it was counted: less is a point at rest, as false points are
 WIDE_SIGMA = 10.0  # m, rad: of a prior that does not matter
+
+
+class FirstEvidence:
+    """Evidence for a vehicle against "all points are false", until a pose is measured; over frames it adds up.
+
+    False points at rest are in the same places in each frame: one frame of them says as much as many. So do the spots
+    of a vehicle at rest. Source: ours.
+    """
+
+    def __init__(self, views: int) -> None:
+        self.nats = 0.0
+        self._counted = np.full((views, 2), np.nan)  # px, where the points were whose evidence counted last
+
+    def add(self, frame: FrameDetections, assigned: Ints, nats: float, continued: bool) -> bool:
+        """Add a frame's best assignment (n,); False if the evidence is too small. continued: not found just now."""
+        seen = assigned >= 0
+        rows = assigned[seen] % BLENDED
+        away2 = np.sum((frame.uv[rows] - self._counted[seen]) ** 2, axis=1)
+        rests = np.all(away2 < MOVED_SIGMAS**2 * np.trace(frame.cov[rows], axis1=1, axis2=2))
+        if not continued or not rests:
+            self._counted[seen] = frame.uv[rows]
+        if continued:
+            nats = self.nats + (min(nats, 0.0) if rests else nats)
+        self.nats = min(nats, MAX_EVIDENCE)
+        if self.nats < MIN_EVIDENCE:
+            self.nats = 0.0
+            return False
+        return True
 
 
 @dataclass(frozen=True, slots=True)

@@ -81,7 +81,7 @@ from tracking.rigid_body.hypotheses.hypothesis_set import (
     prune_and_merge,
     state_of,
 )
-from tracking.rigid_body.label_confirmation import FrameHypotheses, LabelConfirmation
+from tracking.rigid_body.label_confirmation import FirstEvidence, FrameHypotheses, LabelConfirmation
 from tracking.rigid_body.models.information import (
     add_clock_errors,
     clocks_of,
@@ -94,7 +94,6 @@ from tracking.rigid_body.online_estimates import AdaptiveProcessNoise, PointStat
 from tracking.statuses import Event, TrackedFrame
 
 P_NEW = 1e-3  # probability per frame that the vehicle is not where any hypothesis predicts it
-MAX_EVIDENCE, MIN_EVIDENCE = 50.0, -5.0  # nats; a first hypothesis with less evidence is dropped
 # Other hypotheses make a pose of few spots a prediction if they add more than this share of the frame's own variance.
 AMBIGUOUS_SHARE = 9.0
 STATIC_SEARCH_INTERVAL = 5  # every so many searches use static points as well
@@ -129,7 +128,7 @@ class RigidTracker:
         self._last_pose: Pose | None = None  # the last measured one ...
         self._last_pose_age_s = 0.0  # ... and its age; before there is one, the time since the first frame
         self._saw_any = False  # the frame before had labelled spots
-        self._evidence = 0.0  # nats, of the best hypothesis against "all points are false", until a pose is measured
+        self._evidence = FirstEvidence(n)
         self._begun = False
         self._stated_cov = np.zeros((0, 2, 2))  # of the present frame's detections
         self._clocks: list[PictureClock | None] = []  # by camera, of its pictures
@@ -184,15 +183,15 @@ class RigidTracker:
         if old is not None and dt_s > 0:
             count = add_mirror_solutions(children, count, obs, model, old, self.process_noise.dynamics, dt_s)
         if self._last_pose is None:
-            evidence = float(np.max(children.hypotheses.log_weight[:count]))
-            self._evidence = min(evidence + (0.0 if old is None else self._evidence), MAX_EVIDENCE)
-            if self._evidence < MIN_EVIDENCE:
-                self._hypotheses, self._evidence = None, 0.0
+            k = int(np.argmax(children.hypotheses.log_weight[:count]))
+            nats = float(children.hypotheses.log_weight[k])
+            if not self._evidence.add(obs.frame, children.assigned[k], nats, old is not None):
+                self._hypotheses = None
                 return lost_frame(n, predicted_px, events)
         self._hypotheses, kept, probability, spread = prune_and_merge(children, count)
         h = FrameHypotheses(
             dt_s, old, self._hypotheses, children, kept, probability, spread, searched, self._last_pose is None,
-            self._evidence,
+            self._evidence.nats,
         )  # fmt: skip
         if obs.timed:  # what this frame says about the velocities counts for where its spots have moved
             state = state_of(self._hypotheses, 0)
@@ -280,7 +279,7 @@ class RigidTracker:
         static_too = self._schedule.searches % STATIC_SEARCH_INTERVAL == 0
         candidates = self._acquisition.labellings(obs.frame, found, prior, first, static_too, events)
         # A vehicle that was never measured may as well appear now; else it is rarely off all predictions.
-        log_weight = 0.0 if self._hypotheses is None else -self._evidence if first else float(np.log(P_NEW))
+        log_weight = 0.0 if self._hypotheses is None else -self._evidence.nats if first else float(np.log(P_NEW))
         visibilities = len(self.model) + self._groups
         shares = SEARCH_SHARES if obs.timed else SEARCH_SHARES[:1]
         starts = [unknown_vehicle(prior, log_weight, visibilities, share) for share in shares]

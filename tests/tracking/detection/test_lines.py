@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import cv2
 import numpy as np
 import pytest
@@ -127,3 +129,40 @@ def test_a_wide_spot_in_a_corner_between_bright_surfaces_is_found():
         rng = np.random.default_rng([seed, 3])
         first, away = rng.uniform(0.0, 2 * np.pi), rng.uniform(20.0, 30.0)
         assert is_found_before_bright_surfaces(4.4, [(first, away), (first + np.pi / 2, 1.2 * away)], seed)
+
+
+@pytest.mark.parametrize("core_px", [3.5, 5.0])
+def test_a_light_on_a_small_bright_disc_is_found_at_its_own_place(core_px):
+    """A fit that grows over the disc's edge describes the disc: it is as wide as that, and its centre lies far away."""
+    v, u = np.mgrid[: SIZE[1], : SIZE[0]] * 1.0
+    found, drawn = 0, 0
+    for halo, edge_px, seed in itertools.product((0.0, 15.0), (10.0, 13.0, 16.0), range(8)):
+        u0, v0, turn = 240.3 + seed, 180.7, 0.5 + 1.3 * seed
+        centre = u0 - np.cos(turn) * (45.0 - edge_px), v0 - np.sin(turn) * (45.0 - edge_px)
+        disc = np.where(np.hypot(u - centre[0], v - centre[1]) < 45.0, 100.0, 66.0)
+        away = np.hypot(u - u0, v - v0)
+        mean = cv2.GaussianBlur(disc, (0, 0), 1.0) + halo * (away < 10.0) + 60.0 * np.exp(-0.5 * (away / core_px) ** 2)
+        picture = np.rint(mean + np.random.default_rng(seed).normal(0.0, 0.8, u.shape)).clip(0, 255).astype("u1")
+        uv = find_spots(picture, noise=estimate_noise([picture]).model).uv_px
+        found += np.linalg.norm(uv - (u0, v0), axis=1).min(initial=np.inf) < 1.0
+        drawn += 1
+    assert found >= 0.8 * drawn
+
+
+@pytest.mark.parametrize("contrast", [0.14, 0.2])
+def test_a_spot_on_an_even_sheet_of_paper_is_found(contrast):
+    """The smooth background is wrong beside edges, by a part of their height: that is no texture of the paper."""
+    found, drawn = 0, 0
+    middles = np.array([(60.0 + 100.0 * (k % 4), 60.0 + 100.0 * (k // 4)) for k in range(12)])
+    for seed in range(3):
+        places = middles + np.random.default_rng(seed).uniform(-12.0, 12.0, (12, 2))
+        paper = np.full(SIZE[::-1], 30.0)
+        for left, top in (middles - 36.0).astype(int):
+            paper[top : top + 72, left : left + 72] = 200.0
+        light = expected(Scene([Spot(u, v, 200.0 * contrast, 1.4, 1.4) for u, v in places], SIZE, 0.0))
+        mean = cv2.GaussianBlur(paper, (0, 0), 0.8) + light
+        picture = np.rint(mean + np.random.default_rng(seed).normal(0.0, 1.0, mean.shape)).clip(0, 255).astype("u1")
+        uv = find_spots(picture, noise=estimate_noise([picture]).model).uv_px
+        gap = np.linalg.norm(uv[:, None] - places, axis=-1)
+        found, drawn = found + int(np.sum(gap.min(axis=0, initial=np.inf) < 0.5)), drawn + len(places)
+    assert found >= 0.95 * drawn
