@@ -24,12 +24,8 @@ _GRID = 0.5  # of a step: distance of the moments that are tried first ...
 _GRID_SPREAD = 0.25  # ... and their sigma
 _SHORTEST = 0.01  # of a step: length of the last steps of the search ...
 _SPREAD = 0.02  # ... and sigma of the moments
-_ROUNDED = (
-    0.02,
-    0.1,
-    0.2,
-    0.4,
-)  # of a step: spreads of the moments, of which the most likely is kept: a turn may be smooth
+# Of a step: spreads of the moments, of which the most likely is kept: a turn may be smooth.
+_ROUNDED = (0.02, 0.1, 0.2, 0.4)
 _ROUND_NATS = 10.0  # by which corners must be more likely than a turn with a stronger jerk, which they resemble
 _LONGEST_DIFFERENCE = 0.25  # of a step: for the curvature
 _CLOSE, _LEAST_JUMPS = 6, 5  # steps between two jumps, and jumps, of a close succession
