@@ -1,8 +1,8 @@
-"""Strength of the jerk between frames, below that of the best prediction of the next frame.
+"""The motion between frames, and before the first and after the last one whose spots are used.
 
 Between frames a motion without jerk at high frequencies, as of all heavy bodies, is smoother than white jerk. How much
-is found by predicting each frame from all others. Source: ours; the leave-one-out predictive likelihood: Geisser & Eddy
-(1979), "A predictive approach to model selection", JASA 74.
+is found by predicting each frame from all others; beyond the frames the motion is predicted from them. Source: ours;
+the leave-one-out predictive likelihood: Geisser & Eddy (1979), "A predictive approach to model selection", JASA 74.
 """
 
 from __future__ import annotations
@@ -12,7 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.arrays import Array, Bools
-from tracking.smoothing.motion.fixed_interval import RunInformation, leave_one_out_log_likelihood, smoothed
+from tracking.rigid_body.models.motion import ANY_MOMENT, STATE, predicted
+from tracking.rigid_body.online_estimates import MANOEUVRE_S
+from tracking.smoothing.motion.fixed_interval import (
+    Interval,
+    RunInformation,
+    leave_one_out_log_likelihood,
+    smoothed,
+)
 from tracking.smoothing.motion.run_detections import Reference
 
 MOST_OWN = 0.9  # share of what is known of a pose that its own spots may have for these to be left out
@@ -95,3 +102,35 @@ def of_poses(a: Array) -> Array:
     if a.shape[1] == 6:
         return a
     return np.ascontiguousarray(a[:, :6] if a.ndim == 2 else a[:, :6, :6])
+
+
+def extrapolated(
+    whole: Reference, core: slice, ref: Reference, out: Interval, dt: Array, log_density: Array, jump: Array
+) -> tuple[Reference, Array, Array]:
+    """The motion of T frames, and covariances (T, 6, 6) of poses and velocities.
+
+    whole: any motion of all frames; ref, out: the estimate for those of `core`; dt (T,), s; log_density (T, 6): of the
+    jerk; jump (2, 2): variances of the velocities' jump in each step before the core, and after it.
+    """
+    frames = len(dt)
+    R, t, m = (np.array(a) for a in whole)
+    R[core], t[core], m[core] = ref
+    pose_P, motion_P = np.empty((frames, 6, 6)), np.empty((frames, 6, 6))
+    pose_P[core], motion_P[core] = out.pose_P, out.motion_P
+    last = core.stop - 1
+    forward = [(k, dt[k]) for k in range(core.stop, frames)]
+    backward = [(k, dt[k + 1]) for k in range(core.start - 1, -1, -1)]
+    for start, P, steps, sign, size in (
+        (last, out.ends_P[1], forward, 1.0, jump[1]),
+        (core.start, out.ends_P[0], backward, -1.0, jump[0]),
+    ):
+        flip = np.ones(STATE)
+        flip[6:12] = sign  # time reversed: velocities change sign, accelerations do not
+        at = (R[start].copy(), t[start].copy(), m[start] * flip[6:], P * np.outer(flip, flip))
+        density = np.exp(log_density[start])
+        for k, step in steps:
+            R_k, t_k, m_k, P_k, _ = predicted(*at, step, density, size, size / MANOEUVRE_S**2, *ANY_MOMENT)
+            at = (R_k, t_k, m_k, P_k)
+            R[k], t[k], m[k] = at[0], at[1], at[2] * flip[6:]
+            pose_P[k], motion_P[k] = at[3][:6, :6], at[3][6:12, 6:12]
+    return Reference(R, t, m), pose_P, motion_P

@@ -15,7 +15,6 @@ from geometry.arrays import Array, Bools, Ints
 from tracking.rigid_body.online_estimates import MANOEUVRE_S, jump_variance
 from tracking.smoothing.motion.clocks import solve_clocks
 from tracking.smoothing.motion.corner_pairs import Stretch, find_pair, successions
-from tracking.smoothing.motion.extrapolation import extrapolated
 from tracking.smoothing.motion.fixed_interval import (
     Interval,
     RunInformation,
@@ -23,7 +22,7 @@ from tracking.smoothing.motion.fixed_interval import (
     motion_cost,
     smoothed,
 )
-from tracking.smoothing.motion.interpolation import Interpolation, of_poses
+from tracking.smoothing.motion.interpolation import Interpolation, extrapolated, of_poses
 from tracking.smoothing.motion.jump_moments import (
     AROUND,
     MOMENT_SIGMAS,
