@@ -140,10 +140,12 @@ def _planar_pose(points: Array, flat: Array) -> Pose | None:
         good, rotvec, t = cv2.solvePnP(points - origin, flat, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
     except cv2.error:
         return None
+    if not good:  # then the rotation is an empty array
+        return None
     R = np.asarray(cv2.Rodrigues(rotvec)[0], dtype=float)
     t = np.asarray(t, dtype=float).ravel() - R @ origin
     depth = points @ R[2] + t[2]
-    return Pose(R, t) if good and np.isfinite(t).all() and np.all(depth > 0) else None
+    return Pose(R, t) if np.isfinite(t).all() and np.all(depth > 0) else None
 
 
 def _flattened(table: CornerTable, lens: Array, fisheye: bool) -> tuple[Array, Bools]:

@@ -244,3 +244,14 @@ def test_400_views_take_less_than_20_s_of_processor_time():
     result = calibrate_intrinsics(table)
     assert time.process_time() - start < 20
     assert result.model == LensModel(5)
+
+
+def test_a_photograph_of_one_row_and_one_corner_more_does_not_stop_the_calibration():
+    """No pose of a plane follows from them, as from the few corners of a wide picture that a first lens can flatten."""
+    table = photographs(Scene(views=10), 1)
+    row = (table.points[:, 1] == 0.0) | (table.point == 9)  # 9: the first corner of the second row
+    kept = (table.view > 0) | row
+    partial = replace(table, view=table.view[kept], point=table.point[kept], pixels=table.pixels[kept])
+    assert np.count_nonzero(partial.view == 0) == 10
+    found = calibrate_intrinsics(partial, FIVE)
+    assert found.fit.lens[0] == pytest.approx(typical().fit.lens[0], rel=1e-3)
