@@ -238,8 +238,9 @@ def _hold_unresolved(peaks: Peaks, chosen: Ints, table: Candidates, limits: Dete
             continue
         major, minor, _ = ellipse.axes(spot["uu"], spot["uv"], spot["vv"])
         sigma = sqrt(max(spot["var_u"], spot["var_v"], 0.0))
-        collapsed = minor < limits.min_sigma and major < _STRETCHED and peak["scale"] <= 1.0
-        if not collapsed and (major > _UNRESOLVED or sigma < 0.5 * max(major, 0.5)):
+        stretched = minor < limits.min_sigma and major < _STRETCHED and peak["scale"] <= 1.0
+        resolved = major > _UNRESOLVED or (minor >= limits.min_sigma and sigma < 0.5 * max(major, 0.5))
+        if resolved and not stretched:
             continue
         spot["moment_u"], spot["moment_v"] = peak["u"], peak["v"]
         spot["moment_uu"], spot["moment_uv"], spot["moment_vv"] = _NARROWEST**2, 0.0, _NARROWEST**2
@@ -353,13 +354,11 @@ def _is_core(
     at_half_height(image, peak, _LARGEST_CORE, spot[0])
     wide2, found = 0.5 * (spot[0]["moment_uu"] + spot[0]["moment_vv"]), spot[0]["flux"] != before[0]["flux"]
     as_wide = not peak["wide"] and found and start < _OUTGROWN * wide2 and wide2 < _OUTGROWN * start
-    if as_wide and _is_compact(image, spot[0], noise, limits, _EVEN, scratch):
-        as_wide = light_ends(image, spot[0], _EVEN * spot[0]["peak"], scratch)
-    else:
-        as_wide = False
-    if not as_wide:
-        spot[0] = before[0]
-    return bool(as_wide)
+    compact = as_wide and _is_compact(image, spot[0], noise, limits, _EVEN, scratch)
+    if compact and light_ends(image, spot[0], _EVEN * spot[0]["peak"], scratch):
+        return True
+    spot[0] = before[0]
+    return False
 
 
 @compiled
