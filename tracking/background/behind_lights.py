@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools, Ints
-from tracking.background.joint_fit import UNLIKE, JointFit, Modulation, fitted
-from tracking.background.places import inside
+from tracking.background.joint_fit import UNLIKE, JointFit, Modulation, fitted, mean_of
+from tracking.background.places import AROUND_LIGHT, SAME_LIGHT, inside, near_each
 from tracking.detections import Detections
 from tracking.noise import NoiseModel
 
@@ -20,8 +20,11 @@ _LARGEST_PATH = 12.0  # half side, in widths of the light
 _LEAST_PICTURES, _LEAST_SHARE = 6, 2 / 3  # of the pictures that show the light
 _AROUND = 1.5  # widths beyond the box that are fitted
 _SAMPLES, _MOST_SAMPLES = 3.0, 2500  # pixels that are fitted: per width of the light, and in all
+_USUAL_FITS = 2.0  # as many fits as the usual scatter counts
 _LARGEST_SIGMA = 0.1  # of the camera's modulated share
 _LACKS = 0.5  # of the height, by which a picture without the light is darker
+_MOST_PASSING = 10  # lights on uneven ground that are fitted: those that show the modulation best
+_ALSO_BRIGHT, _SELDOM = 0.3, 0.2  # of the brightest's flux: a second light in the box; share of the pictures with it
 _LIT = 1e-3  # of the peak: there the background comes from the fit
 
 
@@ -38,21 +41,21 @@ class BehindLights:
     @staticmethod
     def of(
         pictures: Sequence[NDArray[Any]], strength: Array, found: Sequence[Detections], boxes: Array,
-        noise: NoiseModel, usual_dn: float,
+        noise: NoiseModel, usual_dn: float, passing: Sequence[JointFit] = (),
     ) -> BehindLights:  # fmt: skip
         """From the points found in each of n pictures inside boxes (k, 3): u, v and half side, px.
 
         strength (n,): of the lights; usual_dn: brightness of the surface. The modulation that most lights of a camera
-        show helps with the others.
+        show, and those that pass (`passing_lights`), helps with the others.
         """
         # In black places the model leaves more than their noise: also there that of the background counts.
         noise = replace(noise, shadow_dn2=0.0)
-        parts = _behind_each(pictures, strength, found, boxes, noise, None)
-        modulation = _modulation([part.fit for part in parts], usual_dn)
+        parts = _behind_each(pictures, strength, found, boxes, noise, _modulation(passing, usual_dn))
+        modulation = _modulation([*(part.fit for part in parts), *passing], usual_dn)
         if modulation is not None:
             parts = _behind_each(pictures, strength, found, boxes, noise, modulation)
         if not parts:
-            return BehindLights(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0), None)
+            return BehindLights(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0), modulation)
         row, column = np.concatenate([p.row for p in parts]), np.concatenate([p.column for p in parts])
         level, share = np.concatenate([p.level_dn for p in parts]), np.concatenate([p.share for p in parts])
         return BehindLights(row, column, level, share, modulation)
@@ -64,13 +67,77 @@ class BehindLights:
         return out
 
 
+def passing_lights(
+    pictures: Sequence[NDArray[Any]], strength: Array, found: Sequence[Detections], background: NDArray[np.float32],
+    count: Ints, noise: NoiseModel,
+) -> list[JointFit]:  # fmt: skip
+    """Fits of single lights on uneven ground that other pictures show without them.
+
+    found: the lights of each of n pictures; background (h, w), DN, the mean of `count` (h, w) pictures without a light.
+    """
+    noise = replace(noise, shadow_dn2=0.0)
+    every = [
+        (_shown_by(background, count, d[i : i + 1], noise), k, i) for k, d in enumerate(found) for i in range(len(d))
+    ]
+    fits: list[JointFit] = []
+    used = Detections.none()  # two lights in one place have the same errors
+    for _, k, i in sorted((x for x in every if x[0] > 1 / UNLIKE), reverse=True):
+        light = found[k][i : i + 1]
+        if len(used) == _MOST_PASSING:
+            break
+        others = np.arange(len(found[k])) != i
+        if near_each(light, used, SAME_LIGHT).any() or near_each(light, found[k][others], AROUND_LIGHT).any():
+            continue
+        used = used.joined(light, _MOST_PASSING)
+        width = float(np.sqrt(light.major_px[0] * light.minor_px[0]))
+        values, uv = _around([pictures[k]], np.array([*light.uv_px[0], width]), _AROUND * width, _step(width))
+        column, row = uv.T.astype(np.int64)
+        variance = noise.variance(values)
+        empty = background[row, column].astype(float), count[row, column] / variance[0]
+        fit = fitted(
+            uv, values, variance, light.uv_px, width, float(light.peak[0]), empty, strength=strength[k, None, None]
+        )
+        if fit is not None:
+            fits.append(fit)
+    return fits
+
+
+def _step(width_px: float) -> int:
+    """Every such pixel of a light of this width is fitted."""
+    return max(int(width_px / _SAMPLES), 1)
+
+
+def _shown_by(background: NDArray[np.float32], count: Ints, light: Detections, noise: NoiseModel) -> float:
+    """How precisely a light on the ground (h, w), DN, can show the share that this modulates: 1 / sigma, about."""
+    reach = max(float(light.major_px[0]), 1.0)
+    (left, top), (right, low) = (light.uv_px[0] + more for more in (-reach, reach))
+    box = np.s_[max(int(top), 0) : max(int(low) + 2, 0), max(int(left), 0) : max(int(right) + 2, 0)]
+    part = background[box]
+    if not part.size or not count[box].any():
+        return 0.0
+    level = max(float(np.mean(part)), 1.0)
+    own = float(noise.variance(level)) / float(np.mean(count[box]))
+    clear = float(light.peak[0]) * np.sqrt(part.size / float(noise.variance(level + light.peak[0])))
+    return float(np.sqrt(max(float(np.var(part)) - 2 * own, 0.0))) / level * clear
+
+
 def _modulation(fits: Sequence[JointFit], level_dn: float) -> Modulation | None:
-    """The modulation of all lights of a camera. Those on even ground do not show it."""
+    """The modulation of all lights of a camera: the weighted median, and the scatter, known beforehand to be usual.
+
+    Lights on even ground do not show it.
+    """
     share, variance = np.array([fit.modulated_share(level_dn) for fit in fits]).reshape(-1, 2).T
-    information = float(np.sum(1 / (variance + UNLIKE**2)))
-    if information < 1 / (UNLIKE**2 + _LARGEST_SIGMA**2):
+    weight = 1 / (variance + UNLIKE**2)
+    if float(np.sum(weight)) < 1 / (UNLIKE**2 + _LARGEST_SIGMA**2):
         return None
-    return Modulation(float(np.clip(np.sum(share / (variance + UNLIKE**2)) / information, 0.0, 1.0)), level_dn)
+    order = np.argsort(share)
+    upto = np.cumsum(weight[order]) / np.sum(weight)
+    middle = float(np.interp(0.5, upto - 0.5 * weight[order] / np.sum(weight), share[order]))
+    middle = float(np.clip(middle, 0.0, 1.0))
+    # Each fit counts by how precisely it shows the scatter.
+    clear = (UNLIKE**2 * weight) ** 2
+    scatter = _USUAL_FITS * UNLIKE**2 + float(np.sum(clear * np.maximum((share - middle) ** 2 - variance, 0.0)))
+    return Modulation(middle, level_dn, float(np.sqrt(scatter / (_USUAL_FITS + max(float(np.sum(clear)) - 1, 0.0)))))
 
 
 class _Part(NamedTuple):
@@ -102,6 +169,9 @@ def _behind_one(
     shown = [k for k, d in enumerate(here) if len(d)]
     if len(shown) < max(_LEAST_PICTURES, _LEAST_SHARE * len(pictures)):
         return None
+    together = [np.count_nonzero(here[k].flux > _ALSO_BRIGHT * here[k].flux.max()) > 1 for k in shown]
+    if np.mean(together) > _SELDOM:
+        return None
     brightest = [here[k][here[k].flux == here[k].flux.max()][:1] for k in shown]
     width = float(np.median([np.sqrt(d.major_px[0] * d.minor_px[0]) for d in brightest]))
     if box[2] > _LARGEST_PATH * width:
@@ -115,10 +185,11 @@ def _behind_one(
     some, strength = [pictures[k] for k in there], strength[there, None]
     empty = [p for k, p in enumerate(pictures) if lacks[k] and k not in shown]
     side = 2 * (box[2] + _AROUND * width)
-    step = max(int(width / _SAMPLES), int(np.ceil(side / np.sqrt(_MOST_SAMPLES))), 1)
+    step = max(_step(width), int(np.ceil(side / np.sqrt(_MOST_SAMPLES))))
     values, uv = _around(some, box, _AROUND * width, step)
     without = _around(empty, box, _AROUND * width, step)[0] if empty else np.zeros((0, len(uv)))
-    fit = fitted(uv, values, noise.variance(values), places, width, height, without, modulation, strength)
+    variance = noise.variance(values)
+    fit = fitted(uv, values, variance, places, width, height, mean_of(without, variance), modulation, strength)
     return None if fit is None else _whole(some, strength, empty, box, width, fit, noise)
 
 
@@ -139,7 +210,8 @@ def _whole(
     """All pixels that the light of a fit reaches. empty: pictures without it."""
     values, uv = _around(pictures, box, 2 * _AROUND * width, 1)
     without = _around(empty, box, 2 * _AROUND * width, 1)[0] if empty else np.zeros((0, len(uv)))
-    level, information, light = fit.behind(uv, values, noise.variance(values), without, strength)
+    variance = noise.variance(values)
+    level, information, light = fit.behind(uv, values, variance, mean_of(without, variance), strength)
     lit = light > _LIT
     column, row = uv[lit].astype(np.int64).T
     return _Part(row, column, level[lit], fit.share + 1 / np.maximum(information[lit], 1e-3), fit)

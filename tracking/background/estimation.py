@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array
-from tracking.background.behind_lights import LARGEST_PATH_PX, BehindLights
+from tracking.background.behind_lights import LARGEST_PATH_PX, BehindLights, passing_lights
 from tracking.background.joint_fit import Modulation
 from tracking.background.mean_pictures import MOST_BYTES, means_of, smooth_part, usable
 from tracking.background.places import AROUND_LIGHT, AROUND_SPOT, ON_LIGHT, SAME_LIGHT, near_each, places_of
@@ -36,6 +36,7 @@ _MOSTLY = 0.7  # share of the pictures with lights that move, above which those 
 _OF_SURFACE, _OF_OBJECTS = 0.1, 0.4
 _CLEARLY_BETTER = 0.5  # ratio of the variances of two measurements of a spot
 _SETTLED = 0.01  # sigmas of a pixel: the background behind a light that changes by less is the last one
+_LEAST_LEFT = 0.05  # of the modulation, what is not undone: the surface is seen blurred, and in other light
 # Error of a light by the misfit of its fit, in widths: of spots at most .01, of objects .1 to .5.
 _LARGEST_MISFIT = 0.05
 _NO_GAUSSIAN = 0.02  # share of a light at rest that a Gaussian leaves in a pixel; it is no structure of the background
@@ -99,7 +100,10 @@ def _without_slow_lights(
     paths = boxes[boxes[:, 2] < LARGEST_PATH_PX]
     here = [_spots_at(better, p, paths, shift, fit) for p, fit in zip(pictures, fits, strict=True)]
     known = slow[slow.known]
-    behind = BehindLights.of(equal, strength, here, boxes, background.noise, better.usual_dn())
+    count = np.full(mean.shape, len(pictures))
+    count[slow.row, slow.column] = slow.count * slow.known
+    passing = passing_lights(equal, strength, found, mean, count, background.noise)
+    behind = BehindLights.of(equal, strength, here, boxes, background.noise, better.usual_dn(), passing)
     mean[behind.row, behind.column] = behind.level_dn
     slow = slow[~slow.known & ~behind.covers(mean.shape)[slow.row, slow.column]]
     if len(slow.row):
@@ -146,12 +150,16 @@ def _with_shifts(
     mean = background.plain()
     own = (background.shares * background.noise.variance(mean)).astype(np.float32)
     share = replace(shift, misfit_share=float("nan")).with_lights(found).misfit_share
-    part = shift.over_light * (1.0 if background.noise.texture < _OF_SURFACE else _OF_OBJECTS)
     # What no Gaussian explains, a board or a lamp, is a part of the surface for the lights that move over it.
     off = np.zeros(len(still)) if still.misfit is None else np.sqrt(still.misfit * still.variance_px2)
     gaussian = off < _LARGEST_MISFIT * np.sqrt(still.major_px * still.minor_px)
     _subtract(still[gaussian], mean, own)
-    shifts_px = np.float32(part) * local_shifts(mean, own, width)
+    if modulation is None:
+        part = shift.over_light * (1.0 if background.noise.texture < _OF_SURFACE else _OF_OBJECTS)
+        shifts_px = np.float32(part) * local_shifts(mean, own, width)
+    else:
+        part = np.hypot(modulation.unlike, (1.0 if background.gain is None else _LEAST_LEFT) * modulation.share)
+        shifts_px = np.float32(part) * local_shifts(*modulation.sensitivity(mean, own), width)
     _subtract(still[~gaussian], mean, own)
     rest_shifts_px = shift.over_light * shifts_at_rest(mean, own, still)
     return replace(better, spot_px=width, shifts_px=shifts_px, rest_shifts_px=rest_shifts_px, misfit_share=share)

@@ -19,6 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geometry.arrays import Array
 
@@ -27,7 +28,8 @@ _CONVERGED = 1e-5  # relative decrease of the cost
 _DAMPING, _LESS, _MORE = 1e-2, 1 / 6, 6.0  # of the steps: at the start, after a good and after a bad trial
 _NO_GAUSSIAN = 0.02  # error of the model, as a share of the peak: lasers flicker, and no light is quite a Gaussian
 MODULATED = 0.5, 0.4  # usual share of the light that the brightness of the surface modulates, and its sigma
-UNLIKE = 0.1  # sigma of the modulated share of different places
+UNLIKE = 0.1  # usual sigma of the modulated share of different places
+_DARKEST = 0.1  # of the usual light: what is left of it on black ground, at least
 _ROUNDS = 2  # of the texture's size and the fit
 _LEAST_TEXTURE, _FIRST_TEXTURE = 2.0, 20.0  # DN
 _ALIKE = 2.0  # texture is alike over some pixels: fewer of them are independent
@@ -45,11 +47,28 @@ class Modulation:
 
     share: float
     level_dn: float  # B0
+    unlike: float = UNLIKE  # sigma of the share, by which places differ
 
     def at(self, level_dn: float) -> tuple[float, float]:
         """The share where the surface has this brightness, and the sigma by which places differ."""
         more = self.share * level_dn / self.level_dn
-        return more / (1 - self.share + more), UNLIKE
+        return more / (1 - self.share + more), self.unlike
+
+    def response(self, surface: Array | NDArray[np.float32]) -> Array:
+        """The light where the surface has these brightnesses, DN, over that where it is B0."""
+        return np.asarray(np.maximum(1 - self.share + self.share * surface / self.level_dn, _DARKEST), float)
+
+    def sensitivity(
+        self, surface: NDArray[np.float32], variance: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """A surface (h, w) whose logarithm is the change of a light's logarithm by the share, and its variance.
+
+        surface, variance (h, w): brightness, DN, and its variance, DN^2.
+        """
+        response = self.response(surface)
+        change = np.exp((surface / self.level_dn - 1) / response)
+        own = variance * (change / (self.level_dn * response**2)) ** 2
+        return np.asarray(change, np.float32), np.asarray(own, np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,38 +205,38 @@ class JointFit:
         return more / (p + more), float(slope @ self.strength_cov @ slope)
 
     def behind(
-        self, uv: Array, values: Array, variance: Array, empty: Array | None = None, strength: Array | float = 1.0
+        self, uv: Array, values: Array, variance: Array, empty: tuple[Array, Array], strength: Array | float = 1.0
     ) -> tuple[Array, Array, Array]:
         """The background (m,), DN, its information in pictures (m,), and the light, (m,), highest of all pictures.
 
-        uv (m, 2): pixels; values, variance (n, m): of the pictures there, DN and DN^2; empty (k, m): of pictures
-        without the light; strength (n, 1).
+        uv (m, 2): pixels; values, variance (n, m): of the pictures there, DN and DN^2; empty: as `mean_of` returns
+        them; strength (n, 1).
         """
-        pixels = _Pixels(uv, values, variance, 1.0, self.light.plain, MODULATED, *_mean_of(empty, variance), strength)
+        pixels = _Pixels(uv, values, variance, 1.0, self.light.plain, MODULATED, *empty, strength)
         seen = pixels.seen(self.light)
         return seen.behind, seen.information * variance.mean(axis=0), seen.light_of.max(axis=0)
 
 
-def _mean_of(empty: Array | None, variance: Array) -> tuple[Array, Array]:
+def mean_of(empty: Array, variance: Array) -> tuple[Array, Array]:
     """The mean (m,) of pictures (k, m) without the light, and its information, given variances (n, m) of others."""
-    if empty is None or not len(empty):
+    if not len(empty):
         return np.zeros(variance.shape[1]), np.zeros(variance.shape[1])
     return empty.mean(axis=0), len(empty) / variance.min(axis=0)
 
 
 def fitted(
     uv: Array, values: Array, variance: Array, places: Array, width_px: float, height_dn: float,
-    empty: Array | None = None, modulation: Modulation | None = None, strength: Array | float = 1.0,
+    empty: tuple[Array, Array], modulation: Modulation | None = None, strength: Array | float = 1.0,
 ) -> JointFit | None:  # fmt: skip
     """A light in n pictures that starts from these places (n, 2), width and height; None: it does not explain them.
 
-    uv (m, 2): pixels around it; values, variance (n, m): of the pictures there, DN and DN^2; empty (k, m): of pictures
-    without the light. modulation: as other lights show it. strength (n, 1): of the light in each picture.
+    uv (m, 2): pixels around it; values, variance (n, m): of the pictures there, DN and DN^2; empty: what pictures
+    without the light show (`mean_of`). modulation: as other lights show it. strength (n, 1): of the light in each one.
     """
     low = np.sort(values, axis=0)[: max(len(values) // 2, 1)].mean(axis=0)
     usual = float(np.median(low))
     expected = MODULATED if modulation is None else modulation.at(max(usual, 1.0))
-    pixels = _Pixels(uv, values, variance, max(usual, 1.0), height_dn, expected, *_mean_of(empty, variance), strength)
+    pixels = _Pixels(uv, values, variance, max(usual, 1.0), height_dn, expected, *empty, strength)
     origin, inverse = uv.mean(axis=0), 1 / width_px
     light = JointLight(
         places, np.array([inverse, 0.0, inverse]), (1 - expected[0]) * height_dn,
@@ -257,7 +276,9 @@ def _checked(pixels: _Pixels, light: JointLight, width_px: float) -> JointFit | 
     """The fit, if it explains the pictures and the mean place is known."""
     n, m = pixels.values.shape
     seen = pixels.seen(light)
-    chi2 = float(np.sum(seen.residual[:n] ** 2)) / max(n * m - m - 2 * n, 1)
+    known = pixels.empty_information > 0  # there other pictures show the background, too
+    squares = np.sum(seen.residual[:n] ** 2) + np.sum(seen.residual[n + 1] ** 2)
+    chi2 = float(squares) / max(n * m + np.count_nonzero(known) - m - 2 * n, 1)
     widths = light.widths_px
     normal, _ = pixels.normal(light, seen)
     covariance = np.linalg.pinv(normal, hermitian=True)

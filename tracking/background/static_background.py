@@ -51,7 +51,6 @@ _AS_WIDE = 0.7  # of a light at rest: what is in its middle and as wide is that 
 _LEAST_MODULATION = 0.1  # of the light by the surface: less is not undone
 _MODULATION = (0.25, 4.0)  # of the light, at most
 _LEAST_SIGMA = 0.005  # widths: least error of a light at rest, which is no Gaussian
-_NOT_UNDONE = 0.2  # share of the modulation's errors
 _OF_PEAK = 0.3  # of the shot noise at the peak: what counts for the centre, where a fit's weights are of other noise
 TRIED = 3  # every such picture shows whether there are further spots
 
@@ -120,7 +119,7 @@ class StaticBackground:
         share, plain = modulation.share, self.plain()
         if share < _LEAST_MODULATION:
             return self
-        factor = 1 / np.clip(1 - share + share * plain / modulation.level_dn, *_MODULATION)
+        factor = 1 / np.clip(modulation.response(plain), *_MODULATION)
         gain = np.rint(factor * 2**GAIN_BITS).astype(np.uint16)
         variance = np.asarray(factor**2 * self.noise.variance(plain), np.float32)
         more = np.maximum(highest_of_blocks(variance) - float(self.noise.variance(self.low_dn)), 0.0)
@@ -316,8 +315,6 @@ class StaticBackground:
         noise_share = 1.0 if spots.misfit is None else 1 - spots.misfit
         fixed = errors / (1 + errors) * noise_share * spots.variance_px2
         shifts = self._shifts_at(spots)
-        if shifts is not None and self.gain is not None:
-            shifts *= _NOT_UNDONE
         spots = self._known(shift)[1].added_to(spots, self.noise, shifts)
         place = np.zeros(len(spots)) if spots.place_px2 is None else spots.place_px2
         return replace(spots, place_px2=place + fixed)

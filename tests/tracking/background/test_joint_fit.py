@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from geometry.arrays import Array
-from tracking.background.behind_lights import BehindLights
-from tracking.background.joint_fit import JointFit, Modulation, fitted
+from tracking.background.behind_lights import BehindLights, passing_lights
+from tracking.background.joint_fit import JointFit, Modulation, fitted, mean_of
 from tracking.detection.detect import find_spots
+from tracking.detections import Detections
 from tracking.noise import NoiseModel
 from tracking.parameters import DetectParameters
 
@@ -18,6 +21,7 @@ Y, X = (x.astype(float) for x in np.mgrid[:SIDE, :SIDE])
 UV = np.column_stack([X.ravel(), Y.ravel()])
 EDGE = 15.0 + 45.0 / (1 + np.exp(-3 * (X + 0.4 * Y - 1.4 * MIDDLE - 1.0)))  # DN, through the middle
 WIDTH, HEIGHT = 2.4, 90.0  # px, DN
+NONE = np.zeros((0, SIDE * SIDE))  # pictures without the light
 OFF = np.array([0.5, -0.3])  # px: of the places that a search found
 
 
@@ -36,7 +40,8 @@ def pictures(at: Array, background: Array, modulated: float, seed: int = 1) -> A
 
 def fit_of(seen: Array, start: Array, empty: Array | None = None) -> JointFit | None:
     values = seen.reshape(len(seen), -1)
-    return fitted(UV, values, np.full(values.shape, NOISE**2), start, 3.0, 0.7 * HEIGHT, empty)
+    variance = np.full(values.shape, NOISE**2)
+    return fitted(UV, values, variance, start, 3.0, 0.7 * HEIGHT, mean_of(NONE if empty is None else empty, variance))
 
 
 @pytest.mark.parametrize("modulated", [0.0, 0.6, 0.9])
@@ -46,7 +51,9 @@ def test_a_light_that_moves_by_half_its_width_is_separated_from_an_edge_under_it
     seen = pictures(at, EDGE, modulated)
     fit = fit_of(seen, at + OFF)
     assert fit is not None
-    behind, _, _ = fit.behind(UV, seen.reshape(len(seen), -1), np.full((len(seen), len(UV)), NOISE**2))
+    behind, _, _ = fit.behind(
+        UV, seen.reshape(len(seen), -1), np.full((len(seen), len(UV)), NOISE**2), mean_of(NONE, NONE)
+    )
     assert np.abs(fit.light.places.mean(axis=0) - MIDDLE).max() < 0.1
     assert np.abs(fit.light.places - at).max() < 0.2
     assert np.sqrt(np.mean((behind.reshape(X.shape) - EDGE) ** 2)) < 0.7
@@ -72,7 +79,8 @@ def test_the_error_that_all_places_share_is_stated_and_not_much_larger_than_it_i
         more = np.random.default_rng(100 + seed).standard_normal((len(at), SIDE, SIDE))
         seen = pictures(at, EDGE, 0.6, seed) + np.sqrt(noise**2 - NOISE**2) * more
         values = seen.reshape(len(seen), -1)
-        fit = fitted(UV, values, np.full(values.shape, noise**2), at + OFF, 3.0, 0.7 * HEIGHT)
+        variance = np.full(values.shape, noise**2)
+        fit = fitted(UV, values, variance, at + OFF, 3.0, 0.7 * HEIGHT, mean_of(NONE, variance))
         assert fit is not None
         error = fit.light.places - at
         mean2.append(np.mean(error.mean(axis=0) ** 2))
@@ -88,12 +96,14 @@ def test_pictures_scaled_to_equal_light_of_the_room_show_lights_of_other_strengt
     light = pictures(at, slope, 0.4, 1) - slope
     seen = slope + light / room[:, None, None] + 0.1 * NOISE * rng.standard_normal(light.shape)
     values = seen.reshape(len(seen), -1)
-    fit = fitted(UV, values, np.full(values.shape, NOISE**2), at + OFF, 3.0, 0.7 * HEIGHT, strength=1 / room[:, None])
+    variance = np.full(values.shape, NOISE**2)
+    none = mean_of(NONE, variance)
+    fit = fitted(UV, values, variance, at + OFF, 3.0, 0.7 * HEIGHT, none, strength=1 / room[:, None])
     assert fit is not None
     assert np.abs(fit.light.places - at).max() < 0.1
     share, variance = fit.modulated_share(20.0)
     assert abs(share - 0.4 * 20 / 60 / (0.6 + 0.4 * 20 / 60)) < max(3 * np.sqrt(variance), 0.1)
-    alike = fitted(UV, values, np.full(values.shape, NOISE**2), at + OFF, 3.0, 0.7 * HEIGHT)
+    alike = fitted(UV, values, variance, at + OFF, 3.0, 0.7 * HEIGHT, none)
     assert alike is None or np.abs(alike.light.places - at).max() > 0.2
 
 
@@ -119,3 +129,28 @@ def test_the_modulation_that_one_light_shows_helps_with_the_others():
     nowhere = BehindLights.of(list(seen), np.ones(len(seen)), found, np.array([[3.0, 3.0, 2.0]]), noise, 40.0)
     assert nowhere.modulation is None
     assert not nowhere.covers((SIDE, SIDE)).any()
+
+
+@pytest.mark.parametrize(("modulated", "others"), [(0.0, 0.0), (0.6, 0.0), (0.6, 0.3)])
+def test_lights_that_pass_over_edges_show_the_modulation_and_how_unlike_their_places_are(modulated, others):
+    """Every other one lies on ground that modulates it by another share."""
+    rng, side = np.random.default_rng(6), 240
+    y, x = np.mgrid[:side, :side].astype(float)
+    ground = (20.0 + 40.0 * (np.sin(x / 6) > 0)).astype(np.float32)
+    at = np.array([[40.0 + 12 * k, 40.0 + 14 * (k % 5)] for k in range(12)])
+    found, seen = [], []
+    for k, (u, v) in enumerate(at):
+        own = modulated - others * (k % 2)
+        light = (1 - own + own * ground / 60) * HEIGHT * np.exp(-0.5 * ((x - u) ** 2 + (y - v) ** 2) / WIDTH**2)
+        seen.append(ground + light + NOISE * rng.standard_normal(ground.shape))
+        spot = Detections.at(np.array([[u, v]]) + OFF, np.eye(2)[None])
+        found.append(replace(spot, major_px=np.array([2.6]), minor_px=np.array([2.3]), peak=np.array([80.0])))
+    count = np.full(ground.shape, 11)
+    fits = passing_lights(seen, np.ones(12), found, ground, count, NoiseModel(NOISE**2, 0.0, 15.0))
+    box = np.array([[3.0, 3.0, 2.0]])
+    shown = BehindLights.of(seen, np.ones(12), found, box, NoiseModel(NOISE**2, 0.0, 15.0), 60.0, fits).modulation
+    assert shown is not None
+    assert shown.share == pytest.approx(modulated - 0.5 * others, abs=0.03 + 0.6 * others)
+    assert (shown.unlike > 0.1) == (others > 0)
+    even = np.full_like(ground, 30.0)
+    assert not passing_lights(seen, np.ones(12), found, even, count, NoiseModel(NOISE**2, 0.0, 15.0))
