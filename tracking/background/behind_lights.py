@@ -21,7 +21,7 @@ _LEAST_PICTURES, _LEAST_SHARE = 6, 2 / 3  # of the pictures that show the light
 _AROUND = 1.5  # widths beyond the box that are fitted
 _SAMPLES, _MOST_SAMPLES = 3.0, 2500  # pixels that are fitted: per width of the light, and in all
 _USUAL_FITS = 2.0  # as many fits as the usual scatter counts
-_LARGEST_SIGMA = 0.1  # of the camera's modulated share
+_LARGEST_SIGMA = 0.1  # of the modulated share: of a light that passes, and of a camera
 _LACKS = 0.5  # of the height, by which a picture without the light is darker
 _MOST_PASSING = 10  # lights on uneven ground that are fitted: those that show the modulation best
 _ALSO_BRIGHT, _SELDOM = 0.3, 0.2  # of the brightest's flux: a second light in the box; share of the pictures with it
@@ -69,11 +69,12 @@ class BehindLights:
 
 def passing_lights(
     pictures: Sequence[NDArray[Any]], strength: Array, found: Sequence[Detections], background: NDArray[np.float32],
-    count: Ints, noise: NoiseModel,
+    count: Ints, noise: NoiseModel, usual_dn: float,
 ) -> list[JointFit]:  # fmt: skip
-    """Fits of single lights on uneven ground that other pictures show without them.
+    """Fits of single lights on uneven ground that other pictures show without them, where they show the modulation.
 
-    found: the lights of each of n pictures; background (h, w), DN, the mean of `count` (h, w) pictures without a light.
+    found: the lights of each of n pictures; background (h, w), DN, the mean of `count` (h, w) pictures without a light;
+    usual_dn: its usual brightness.
     """
     noise = replace(noise, shadow_dn2=0.0)
     every = [

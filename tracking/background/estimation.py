@@ -36,7 +36,9 @@ _MOSTLY = 0.7  # share of the pictures with lights that move, above which those 
 _OF_SURFACE, _OF_OBJECTS = 0.1, 0.4
 _CLEARLY_BETTER = 0.5  # ratio of the variances of two measurements of a spot
 _SETTLED = 0.01  # sigmas of a pixel: the background behind a light that changes by less is the last one
-_LEAST_LEFT = 0.05  # of the modulation, what is not undone: the surface is seen blurred, and in other light
+# Of the modulation, what is not undone: by edges, since the surface is seen blurred and in other light, at least; by
+# texture as fine as the spots, since the background also shows the offsets of the pixels.
+_LEAST_LEFT, _OF_TEXTURE = 0.05, 0.2
 # Error of a light by the misfit of its fit, in widths: of spots at most .01, of objects .1 to .5.
 _LARGEST_MISFIT = 0.05
 _NO_GAUSSIAN = 0.02  # share of a light at rest that a Gaussian leaves in a pixel; it is no structure of the background
@@ -102,8 +104,9 @@ def _without_slow_lights(
     known = slow[slow.known]
     count = np.full(mean.shape, len(pictures))
     count[slow.row, slow.column] = slow.count * slow.known
-    passing = passing_lights(equal, strength, found, mean, count, background.noise)
-    behind = BehindLights.of(equal, strength, here, boxes, background.noise, better.usual_dn(), passing)
+    usual_dn = better.usual_dn()
+    passing = passing_lights(equal, strength, found, mean, count, background.noise, usual_dn)
+    behind = BehindLights.of(equal, strength, here, boxes, background.noise, usual_dn, passing)
     mean[behind.row, behind.column] = behind.level_dn
     slow = slow[~slow.known & ~behind.covers(mean.shape)[slow.row, slow.column]]
     if len(slow.row):
@@ -154,11 +157,12 @@ def _with_shifts(
     off = np.zeros(len(still)) if still.misfit is None else np.sqrt(still.misfit * still.variance_px2)
     gaussian = off < _LARGEST_MISFIT * np.sqrt(still.major_px * still.minor_px)
     _subtract(still[gaussian], mean, own)
-    if modulation is None:
-        part = shift.over_light * (1.0 if background.noise.texture < _OF_SURFACE else _OF_OBJECTS)
+    undone, even = background.gain is not None, background.noise.texture < _OF_SURFACE
+    if modulation is None or even:
+        part = shift.over_light * (_OF_TEXTURE if undone else 1.0 if even else _OF_OBJECTS)
         shifts_px = np.float32(part) * local_shifts(mean, own, width)
     else:
-        part = np.hypot(modulation.unlike, (1.0 if background.gain is None else _LEAST_LEFT) * modulation.share)
+        part = np.hypot(modulation.unlike, (_LEAST_LEFT if undone else 1.0) * modulation.share)
         shifts_px = np.float32(part) * local_shifts(*modulation.sensitivity(mean, own), width)
     _subtract(still[~gaussian], mean, own)
     rest_shifts_px = shift.over_light * shifts_at_rest(mean, own, still)

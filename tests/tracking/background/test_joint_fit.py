@@ -146,11 +146,11 @@ def test_lights_that_pass_over_edges_show_the_modulation_and_how_unlike_their_pl
         spot = Detections.at(np.array([[u, v]]) + OFF, np.eye(2)[None])
         found.append(replace(spot, major_px=np.array([2.6]), minor_px=np.array([2.3]), peak=np.array([80.0])))
     count = np.full(ground.shape, 11)
-    fits = passing_lights(seen, np.ones(12), found, ground, count, NoiseModel(NOISE**2, 0.0, 15.0))
+    fits = passing_lights(seen, np.ones(12), found, ground, count, NoiseModel(NOISE**2, 0.0, 15.0), 60.0)
     box = np.array([[3.0, 3.0, 2.0]])
     shown = BehindLights.of(seen, np.ones(12), found, box, NoiseModel(NOISE**2, 0.0, 15.0), 60.0, fits).modulation
     assert shown is not None
     assert shown.share == pytest.approx(modulated - 0.5 * others, abs=0.03 + 0.6 * others)
     assert (shown.unlike > 0.1) == (others > 0)
     even = np.full_like(ground, 30.0)
-    assert not passing_lights(seen, np.ones(12), found, even, count, NoiseModel(NOISE**2, 0.0, 15.0))
+    assert not passing_lights(seen, np.ones(12), found, even, count, NoiseModel(NOISE**2, 0.0, 15.0), 60.0)
