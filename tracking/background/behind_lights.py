@@ -98,7 +98,7 @@ def passing_lights(
         fit = fitted(
             uv, values, variance, light.uv_px, width, float(light.peak[0]), empty, strength=strength[k, None, None]
         )
-        if fit is not None:
+        if fit is not None and fit.modulated_share(usual_dn)[1] < _LARGEST_SIGMA**2:
             fits.append(fit)
     return fits
 
