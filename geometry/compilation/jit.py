@@ -75,7 +75,7 @@ def _compiled(function: Function, release_gil: bool, fastmath: Any = False, inli
     if numba_internals is not None:
         if cached is not None:
             numba_internals.keep_on_disk(dispatcher, function, cached)
-        numba_internals.treat_literals_as_numbers(dispatcher)
+        numba_internals.compile_as_needed(dispatcher)
     return dispatcher
 
 

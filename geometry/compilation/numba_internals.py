@@ -18,7 +18,9 @@ from weakref import WeakValueDictionary
 import numba
 from numba.core import codegen, environment
 from numba.core.caching import FunctionCache
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]  # written in C, without types
+from numba.core.sigutils import normalize_signature
 from numba.core.types import unliteral
 
 _NEEDED = {
@@ -36,7 +38,7 @@ _NEEDED = {
     ),
     "_nrt_python": (_nrt_python, ("c_helpers",)),
     "environment": (environment, ("Environment", "_rebuild_env", "lookup_environment")),
-    "dispatcher": (type(numba.njit(lambda: None)), ("get_call_template",)),
+    "dispatcher": (type(numba.njit(lambda: None)), ("add_overload", "compile", "get_call_template")),
 }  # fmt: skip
 _missing = [
     f"{place}.{name}" for place, (found, names) in _NEEDED.items() for name in names if not hasattr(found, name)
@@ -116,8 +118,9 @@ class _Library(codegen.JITCodeLibrary):
     def _of(cls, generator: Any, state: tuple[Any, ...], called: dict[str, _Library]) -> _Library:
         """The code of a state, made ready; the functions that it calls are."""
         name, symbol, machine_code, environments, bitcode = state
-        if symbol in _callable:
-            return _callable[symbol]
+        known = _callable.get(symbol)
+        if known is not None and known._state()[2] == machine_code:
+            return known
         library: Any = cls(generator, name)
         library._called, library._large, library._unparsed = dict(called), symbol, bitcode
         library.enable_object_caching()
@@ -154,6 +157,7 @@ class _Cache(FunctionCache):
 
     def __init__(self, function: Callable, folder: Path) -> None:
         self._function, self._folder, self._is_open = function, folder, False
+        self.for_python = True  # whether the code that is looked for must have what a call by Python needs
 
     def _open(self) -> None:
         settings: Any = numba.config
@@ -174,11 +178,12 @@ class _Cache(FunctionCache):
         try:
             # Not FunctionCache.load_overload: it first imports what numba needs to compile, as numba does again there.
             with self._guard_against_spurious_io_errors():
-                return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]  # numba has no types
+                found = self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]  # numba has no types
         except Exception:  # unpickling a truncated file raises almost anything
             with suppress(OSError):
                 self.flush()  # type: ignore[no-untyped-call]  # numba has no types
             return None
+        return None if found is not None and self.for_python and not _is_for_python(found) else found
 
     def save_overload(self, sig: Any, data: Any) -> None:
         with suppress(OSError):  # for instance a full disk: the code is compiled, only not kept
@@ -236,16 +241,58 @@ def keep_on_disk(dispatcher: Any, function: Callable, folder: Path) -> None:
     dispatcher._cache = _Cache(function, folder)
 
 
-def treat_literals_as_numbers(dispatcher: Any) -> None:
-    """Makes calls with a literal argument, `f(x, 0)`, use the code for any number.
+class _Calls:
+    """Compiles a function for its callers, which differ in what they need (docs/decisions/numba.md).
 
-    numba would compile the function once more for each literal, and for the first value of a variable such as
-    `count = 0`, and discard some of these versions: a sixth of all compilations (docs/decisions/numba.md).
+    A call with a literal argument, `f(x, 0)`, uses the code for any number. numba would compile the function once more
+    for each literal, and for the first value of a variable such as `count = 0`, and discard some of these versions.
+
+    Compiled code does not need the code by which Python calls the function (converted arguments, its lock); numba
+    compiles that too, for each function. Here it is compiled, with the function, when Python calls the function.
     """
-    of_types = dispatcher.get_call_template
-    plain: Any = unliteral
 
-    def of_plain_types(args: Any, kws: Any) -> Any:
-        return of_types([plain(a) for a in args], {name: plain(a) for name, a in kws.items()})
+    def __init__(self, dispatcher: Any) -> None:
+        self._dispatcher, self._by_compiled_code = dispatcher, False
+        self._template, self._compile = dispatcher.get_call_template, dispatcher.compile
+        self._add = dispatcher.add_overload
+        dispatcher.get_call_template, dispatcher.compile = self.template, self.compile
+        dispatcher.add_overload = self.add
 
-    dispatcher.get_call_template = of_plain_types
+    def template(self, args: Any, kws: Any) -> Any:
+        """For a call by code that is being compiled."""
+        plain: Any = unliteral
+        with global_compiler_lock:
+            self._by_compiled_code = True
+            try:
+                return self._template([plain(a) for a in args], {name: plain(a) for name, a in kws.items()})
+            finally:
+                self._by_compiled_code = False
+
+    def compile(self, signature: Any) -> Any:
+        """For a call by Python, and within `template`."""
+        dispatcher = self._dispatcher
+        with global_compiler_lock:
+            for_python = not self._by_compiled_code
+            args, _ = normalize_signature(signature)  # type: ignore[no-untyped-call]  # numba has no types
+            if for_python and args in dispatcher.overloads and not _is_for_python(dispatcher.overloads[args]):
+                del dispatcher.overloads[args]
+            dispatcher.targetoptions["no_cpython_wrapper"] = not for_python
+            if isinstance(dispatcher._cache, _Cache):
+                dispatcher._cache.for_python = for_python
+            return self._compile(signature)
+
+    def add(self, compiled: Any) -> None:
+        if _is_for_python(compiled):
+            self._add(compiled)
+        else:
+            self._dispatcher.overloads[tuple(compiled.signature.args)] = compiled
+
+
+def _is_for_python(compiled: Any) -> bool:
+    """Whether Python can call a compiled version of a function."""
+    return bool(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_cpython_wrapper_name))
+
+
+def compile_as_needed(dispatcher: Any) -> None:
+    """Makes a compiled function (numba's dispatcher) compile what its callers need, and no more."""
+    _Calls(dispatcher)
