@@ -198,7 +198,7 @@ def test_code_from_disk_imports_nothing_that_only_a_compilation_needs(program, t
     ]  # fmt: skip
 
 
-STEPS = "".join(f"    x = math.sin(x + {k}) * x\n    if x > {k + 2}: raise ValueError('step {k}')\n" for k in range(60))
+STEPS = "".join(f"    x = math.sin(x + {k}) * x\n    if x > {k + 2}: raise ValueError('step {k}')\n" for k in range(30))
 SLOPES = f"""
 import math
 from geometry.compilation.jit import compiled
