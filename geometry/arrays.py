@@ -19,8 +19,13 @@ def normalised(vectors: Array) -> Array:
     return vectors / np.where(length > 0, length, 1.0)
 
 
+def evenly_spaced(rows: Ints, most: int) -> Ints:
+    """At most so many of the rows, evenly spaced, with the first and the last: those nearest to equal steps."""
+    return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).round().astype(np.int64)]
+
+
 def evenly_spread(rows: Ints, most: int) -> Ints:
-    """At most so many of the rows, evenly spaced."""
+    """As `evenly_spaced`, but the rows before equal steps."""
     return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(np.int64)]
 
 

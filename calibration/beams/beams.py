@@ -43,7 +43,7 @@ from calibration.terms.rig_blocks import (
     stacks_of,
 )
 from calibration.terms.surveyed import pose_of
-from geometry.arrays import Array, Bools, normalised
+from geometry.arrays import Array, Bools, evenly_spaced, normalised
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Spot
@@ -250,7 +250,7 @@ def _start(rig: Rig, spots: SpotPixels, stand: StandModel, nominal: bool) -> tup
                 "neither world_from_stand nor nominal beams are known: give one of the two as a start value"
             )
         count = len(stand.stand_from_body.translation)
-        few = np.unique(np.linspace(0, count - 1, min(count, _FOR_THE_STAND)).round().astype(np.int64))
+        few = evenly_spaced(np.arange(count), _FOR_THE_STAND)
         place = np.full(count, -1, dtype=np.int64)
         place[few] = np.arange(len(few))
         there = spots.pick(place[spots.position] >= 0)

@@ -15,9 +15,8 @@ import numpy as np
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import seen_at
 from calibration.lens.fit.lens_fit import LensFit
-from calibration.lens.fit.model_selection import ModelSelection
+from calibration.lens.fit.model_selection import ModelSelection, beyond_noise, cell_means
 from calibration.lens.fit.projection_map import ProjectionMap
-from calibration.lens.fit.residual_cells import beyond_noise, cell_means
 from geometry.arrays import Array
 
 

@@ -36,12 +36,11 @@ from calibration.model_check.linearised_frames import (
     ModelCheckRecording,
     UnseenView,
     correlation_time,
-    evenly_spaced,
     linearise,
     unseen_views,
     whitening,
 )
-from geometry.arrays import Array, Ints, finite
+from geometry.arrays import Array, Ints, evenly_spaced, finite
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.chi_square import gamma_quantile

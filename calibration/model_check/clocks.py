@@ -18,10 +18,9 @@ from calibration.model_check.linearised_frames import (
     ModelCheckRecording,
     clock_derivatives,
     correlation_time,
-    evenly_spaced,
     linearise,
 )
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array, Bools, evenly_spaced
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance

@@ -90,13 +90,6 @@ def clock_derivatives(model: SpotModel, uv_px: Array, velocity_px_s: Array) -> A
     return np.stack([velocity_px_s, velocity_px_s * later[..., None]], axis=-1)
 
 
-def evenly_spaced(candidates: Ints, most: int) -> Ints:
-    """At most `most` of the given frames, evenly spaced, including the first and the last."""
-    if len(candidates) <= most:
-        return candidates
-    return candidates[np.unique(np.round(np.linspace(0, len(candidates) - 1, most)).astype(np.int64))]
-
-
 def whitening(covariances: Array, where: Bools) -> Array:
     """W (..., 2, 2) with W C W^T = I where `where` (...) is true; 0 elsewhere."""
     safe = np.where(where[..., None, None], covariances, np.eye(2))

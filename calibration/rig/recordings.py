@@ -18,7 +18,6 @@ from calibration.model_check.linearised_frames import (
     LinearisedFrames,
     ModelCheckRecording,
     clock_derivatives,
-    evenly_spaced,
     linearised_at,
     whitening,
     with_clocks,
@@ -35,7 +34,7 @@ from calibration.terms.rig_blocks import (
     rig_of,
 )
 from calibration.terms.surveyed import array_of
-from geometry.arrays import Array, Bools, Ints, finite
+from geometry.arrays import Array, Bools, Ints, evenly_spaced, finite
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import unlimited

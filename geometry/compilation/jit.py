@@ -59,6 +59,7 @@ def compiled_for_sums(function: Function) -> Function:
 def _compiled(function: Function, release_gil: bool, fastmath: Any = False, inline: str = "never") -> Function:
     settings: Any = numba.config
     options: Any = {"error_model": "numpy", "nogil": release_gil, "fastmath": fastmath, "inline": inline}
+    options["no_cfunc_wrapper"] = True  # nothing written in C calls them
     if settings.DISABLE_JIT:
         return numba.njit(function, **options)
     folder = Path(function.__code__.co_filename).parent
@@ -74,7 +75,7 @@ def _compiled(function: Function, release_gil: bool, fastmath: Any = False, inli
     if numba_internals is not None:
         if cached is not None:
             numba_internals.keep_on_disk(dispatcher, function, cached)
-        numba_internals.treat_literals_as_numbers(dispatcher)
+        numba_internals.compile_as_needed(dispatcher)
     return dispatcher
 
 

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from geometry import rotations
-from geometry.arrays import Ints
+from geometry.arrays import Ints, evenly_spaced
 from geometry.forward_model import SpotModel
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver import visibility
@@ -226,8 +226,7 @@ def _blocks(run: Run, sampler: SampledFrames) -> list[Block]:
     blocks = sampler.frames
     filmed = [name for name, source in run.cameras.items() if not isinstance(source, DetectionsTable)]
     if filmed and blocks:
-        chosen = np.unique(np.linspace(0, len(blocks) - 1, ENOUGH).round().astype(int))
-        blocks = [blocks[i] for i in chosen]
+        blocks = [blocks[i] for i in evenly_spaced(np.arange(len(blocks)), ENOUGH)]
     numbers = [frame.frame for block in blocks for frame in block]
     found = _detected(run, filmed, numbers) if filmed else {}
     return [[points_in(frame) | found.get(frame.frame, {}) for frame in block] for block in blocks]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from geometry.arrays import evenly_spaced
 from geometry.camera import Camera
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
@@ -88,7 +89,7 @@ def frames_of(blocks: Sequence[Block], prior: PosePrior | None, min_spots: int) 
     moved = full[np.argsort([-steps[i] for i in full], kind="stable")]
     chosen: list[int] = []
     for count in (ENOUGH, FRAMES):
-        even = full[np.unique(np.linspace(0, len(full) - 1, count).round().astype(int))]
+        even = evenly_spaced(full, count)
         chosen = list(dict.fromkeys([*chosen, *rows[rows == 0], *moved[: count // 2], *even]))[:count]
     return Frames([blocks[i] for i in chosen], prior, at_start=bool(chosen[0] == 0))
 

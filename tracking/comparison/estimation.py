@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.signal import fftconvolve
 
-from geometry.arrays import Array, Bools, symmetric
+from geometry.arrays import Array, Bools, evenly_spaced, symmetric
 from geometry.uncertainty.chi_square import chi2_limit
 from tracking.comparison.frame_alignment import (
     BODY,
@@ -269,7 +269,7 @@ def estimate_alignment(
     offsets = [0.0 if offset_s is None else offset_s]
     if free.offset and offset_s is None:
         offsets += offset_candidates(result, reference)
-    thin = result.select(np.unique(np.linspace(0, len(result) - 1, _CANDIDATE_SAMPLES).round().astype(int)))
+    thin = result.select(evenly_spaced(np.arange(len(result)), _CANDIDATE_SAMPLES))
     found: list[Estimate] = []
     for offset in dict.fromkeys(offsets):
         start = Alignment.identity(offset, middle)

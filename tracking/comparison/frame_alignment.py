@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geometry import rotations
-from geometry.arrays import Array, Bools, Ints, skew
+from geometry.arrays import Array, Bools, Ints, evenly_spaced, skew
 
 GAP = 2.5  # times the median step: no interpolation across longer gaps
 _BEYOND_ENDS = 0.01  # steps by which a time may lie before the first or after the last sample
@@ -398,7 +398,7 @@ def _main_axis(stack: Array) -> Array:
 def _by_attitude(start: Alignment, R: Array, Q: Array, noise: float, free: Bools) -> Alignment:
     """A and B with Q = A R B for attitudes (n, 3, 3): the best of several samples to which the others are related."""
     best, found = np.inf, (start.world, start.body)
-    for i in np.unique(np.linspace(0, len(R) - 1, _BASES).round().astype(int)).tolist():
+    for i in evenly_spaced(np.arange(len(R)), _BASES).tolist():
         world, body = found if best < np.inf else (start.world, start.body)
         if free[WORLD].all():
             world = _turn(rotations.log(R @ R[i].T), rotations.log(Q @ Q[i].T), noise)

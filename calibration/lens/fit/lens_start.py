@@ -18,7 +18,7 @@ from calibration.lens.fit.lens_fit import FEWEST_CORNERS
 from calibration.lens.fit.lens_models import LensModel, folds_in_picture, undistorted
 from calibration.lens.fit.lens_parameters import AS_STATED, Values, lens_of, values_of
 from calibration.terms.corners import INTRINSICS_COUNT
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, evenly_spaced
 from geometry.camera import FISHEYE
 from geometry.pose import Pose
 
@@ -76,7 +76,7 @@ def _spread_out(table: CornerTable) -> Ints:
     usable = np.flatnonzero(table.counts() >= FEWEST_CORNERS)
     if not len(usable):
         raise StartError(f"no view has {FEWEST_CORNERS} corners or more")
-    return usable[np.unique(np.linspace(0, len(usable) - 1, TRIAL_VIEWS).round().astype(np.int64))]
+    return evenly_spaced(usable, TRIAL_VIEWS)
 
 
 def _guesses(table: CornerTable, fisheye: bool) -> Sequence[float]:

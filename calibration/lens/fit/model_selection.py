@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtrc
 
 from calibration.least_squares.adjustment import AdjustmentError, Vectors
 from calibration.lens.fit.corner_table import CornerTable
@@ -31,9 +32,8 @@ from calibration.lens.fit.lens_models import (
 )
 from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, Values
 from calibration.lens.fit.projection_map import ProjectionMap, projection_map
-from calibration.lens.fit.residual_cells import SIGNIFICANT, beyond_noise, cell_means
 from calibration.lens.fit.view_equations import ViewEquations
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array, Bools, Ints
 from geometry.camera import project_points_full
 
 RATIONAL = LensModel(8)
@@ -44,6 +44,9 @@ OVERFIT = 3.0  # error in held-out photographs over the noise from which on a mo
 EQUAL = 1.1  # ratio of expected errors up to which the model with fewer coefficients is chosen ...
 PLAUSIBLE = 0.01  # ... if its probability is not smaller
 PLAUSIBLE_NOISE = 0.05  # p-value of mean residuals above which models of 8 and 12 coefficients are not tried
+SIGNIFICANT = 1e-3  # p-value of the mean residuals below which the lens model is wrong
+_CORNERS_PER_CELL = 12
+_MOST_COLUMNS = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,3 +333,30 @@ def _schwarz_criterion(table: CornerTable, found: LensFit, gate_px: float) -> fl
     missed = np.minimum(np.nan_to_num(np.linalg.norm(found.residuals, axis=1), nan=np.inf), gate_px)
     n = 2 * len(table)
     return n * float(np.log(max(np.sum(missed**2) / n, 1e-18))) + found.model.coefficients * np.log(n)
+
+
+# Mean residuals in cells of the picture, which are noise if the lens model is right.
+
+
+def cell_means(table: CornerTable, found: LensFit) -> tuple[Array, Ints]:
+    """Mean residuals (rows, columns, 2), px, and the number of residuals in each cell."""
+    width, height = table.image_size_px
+    pixels, residuals = table.pixels[found.used], found.residuals[found.used]
+    columns = int(np.clip(np.sqrt(len(pixels) / _CORNERS_PER_CELL * width / height), 3, _MOST_COLUMNS))
+    rows = max(2, round(columns * height / width))
+    j = np.clip(((pixels[:, 0] + 0.5) / width * columns).astype(int), 0, columns - 1)
+    i = np.clip(((pixels[:, 1] + 0.5) / height * rows).astype(int), 0, rows - 1)
+    total, count = np.zeros((rows, columns, 2)), np.zeros((rows, columns), dtype=np.int64)
+    np.add.at(total, (i, j), residuals)
+    np.add.at(count, (i, j), 1)
+    return np.where(count[..., None] > 0, total / np.maximum(count, 1)[..., None], np.nan), count
+
+
+def beyond_noise(cells: Array, count: Ints, noise_px: float) -> tuple[float, float]:
+    """P-value of such means if they are noise, and the RMS (per coordinate, px) of what exceeds it."""
+    full = count > 0
+    score = float(np.sum(count[full, None] * cells[full] ** 2)) / noise_px**2
+    dof = 2 * int(full.sum())
+    p = float(chdtrc(dof, score))
+    left = noise_px * np.sqrt(max(score - dof, 0.0) / (2 * count.sum()))
+    return p, float(left) if p < SIGNIFICANT else 0.0

@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 
 from calibration.beams.beams import StandModel
 from calibration.terms.rig_blocks import SpotPixels
-from geometry.arrays import Array, Ints
+from geometry.arrays import Array, Ints, evenly_spaced
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
@@ -403,7 +403,7 @@ def limit_frames(rows: SpotRows, notes: list[str]) -> SpotRows:
     if len(frames) <= MAX_UNKNOWN_POSES:
         return rows
     notes.append(f"{MAX_UNKNOWN_POSES} of {len(frames)} frames without a pose were used, evenly spaced")
-    used = np.isin(rows.frame, frames[np.linspace(0, len(frames) - 1, MAX_UNKNOWN_POSES).round().astype(np.int64)])
+    used = np.isin(rows.frame, evenly_spaced(frames, MAX_UNKNOWN_POSES))
     return SpotRows(rows.frame[used], rows.view[used], rows.pixels[used], rows.covariance[used])
 
 

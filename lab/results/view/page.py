@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from geometry.arrays import Array, Ints
+from geometry.arrays import Array, Ints, evenly_spaced
 from geometry.forward_model import SpotModel
 from lab.files.text.atomic_write import atomic_write_text, made_folder
 from lab.findings.outcome import Done
 from lab.report.calibration.calibration_scene import Rectangle, outline, scene_views
 from lab.report.html import as_script, environment
 from lab.report.plot.svg import ORANGE, PURPLE
-from lab.results.view.scene import RigAndPoses, View, edges, mesh_of, read_content, thinned, view_of, write_glb
+from lab.results.view.scene import RigAndPoses, View, edges, mesh_of, read_content, view_of, write_glb
 
 DEFAULT_OUT = Path("results", "view")
 MOST_MOMENTS = 800  # of the playback
@@ -105,7 +105,7 @@ def scene_data(view: View, index: int | None, most_moments: int = MOST_MOMENTS, 
     for e in view.ellipsoids:
         lines += [{"c": e.colour, "n": "", "f": False, "p": _rounded(c.places, digits)} for c in e.circles()]
     content = view.content
-    indices = thinned(np.flatnonzero(content.known), most_moments)
+    indices = evenly_spaced(np.flatnonzero(content.known), most_moments)
     first = 0 if index is None else min(int(np.searchsorted(indices, index)), len(indices) - 1)
     return {"lines": lines, "moments": _moments(content, indices, digits), "first": first}
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, evenly_spaced
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.visibility import assumed_range
@@ -345,7 +345,7 @@ def view_of(
     pose = None if index is None else content.world_from_body[index]
     known = np.flatnonzero(content.known)
     space = None if content.poses_from or pose is None else workspace(content.rig, pose)
-    others = content.world_from_body[thinned(known, _SIZING)] if len(known) > 1 else None
+    others = content.world_from_body[evenly_spaced(known, _SIZING)] if len(known) > 1 else None
     fixed: list[SceneObject] = [t for t in rig_things(content.rig, pose, others) if not isinstance(t, Ray | Marker)]
     if len(known) > 1:
         fixed.append(Trail("trajectory", _trajectory(content, most_points), PURPLE))
@@ -355,7 +355,7 @@ def view_of(
     extent = float(np.ptp(points[np.isfinite(points).all(axis=1)], axis=0).max())
     with_sigma = known[np.isfinite(content.position_covariance[known]).all(axis=(1, 2))]
     scale = _scale(content, with_sigma, extent) if sigma_scale is None else sigma_scale
-    ellipsoids = [ellipsoid(content, int(i), scale) for i in thinned(with_sigma, most_ellipsoids)]
+    ellipsoids = [ellipsoid(content, int(i), scale) for i in evenly_spaced(with_sigma, most_ellipsoids)]
     drawn = [e for e in ellipsoids if np.linalg.norm(e.axes, axis=0).max() <= _LARGEST * extent]
     return View(content, fixed, drawn, scale, len(ellipsoids) - len(drawn), reach, extent)
 
@@ -367,16 +367,9 @@ def ellipsoid(content: RigAndPoses, index: int, scale: float) -> Ellipsoid:
     return Ellipsoid(content.world_from_body.translation[index], axes, PURPLE if content.measured[index] else GREY)
 
 
-def thinned(indices: Ints, most: int) -> Ints:
-    """At most so many of the indices, evenly spread, with the first and the last."""
-    if len(indices) <= most:
-        return indices
-    return indices[np.unique(np.linspace(0, len(indices) - 1, most).round().astype(np.int64))]
-
-
 def _trajectory(content: RigAndPoses, most: int) -> Array:
     """Positions (n, 3), at most so many, at even steps of the frames, with nan where the pose is unknown."""
-    return content.world_from_body.translation[thinned(np.arange(len(content.frames)), most)]
+    return content.world_from_body.translation[evenly_spaced(np.arange(len(content.frames)), most)]
 
 
 def _scale(content: RigAndPoses, indices: Ints, extent_m: float) -> float:

@@ -7,7 +7,8 @@ import pytest
 
 from calibration.model_check.check import nis_band
 from calibration.model_check.faults import FaultParameters, possible_faults
-from calibration.model_check.linearised_frames import correlation_time, evenly_spaced, linearise
+from calibration.model_check.linearised_frames import correlation_time, linearise
+from geometry.arrays import evenly_spaced
 from geometry.forward_model import SpotModel
 from geometry.pose_solver.gauss_newton import fit_pose
 from tests.calibration.model_check.model_scenes import one_camera, recorded, turned

@@ -198,6 +198,73 @@ def test_code_from_disk_imports_nothing_that_only_a_compilation_needs(program, t
     ]  # fmt: skip
 
 
+STEPS = "".join(f"    x = math.sin(x + {k}) * x\n    if x > {k + 2}: raise ValueError('step {k}')\n" for k in range(30))
+SLOPES = f"""
+import math
+from geometry.compilation.jit import compiled
+
+@compiled
+def slope(x):
+{STEPS}    return x
+
+@compiled
+def hill(x):
+{STEPS}    return x + slope(x)
+
+@compiled
+def steeper(x):
+    return 2 * slope(x)
+"""
+USE_SLOPES = """
+import sys
+from numba.core import event
+begun = []
+event.register("numba:compile", type("Count", (event.Listener,), {
+    "on_start": lambda _, e: begun.append(e.data["dispatcher"].py_func.__name__), "on_end": lambda _, e: None
+})())
+from floor import caller
+from geometry import slopes
+errors = 0
+try:
+    caller.climbed(1e9)
+except ValueError as error:
+    errors = str(error)
+value = caller.climbed(0.5)
+codes = [one.library for one in caller.climbed.overloads.values()]
+copied = [f.name for code in codes for f in code.get_defined_functions() if "slope" in f.name or "hill" in f.name]
+print(value == caller.climbed.py_func(0.5), errors, copied, [n for n in begun if not n.startswith(("impl", "_"))])
+"""
+
+
+def test_a_large_function_is_called_and_not_copied(program, tmp_path):
+    """Compiled, from disk, called by one that is compiled again, and that from disk: with its errors.
+
+    What Python calls after a compiled function has called it is compiled once more, and kept as that.
+    """
+    copy = tmp_path / "program"
+    shutil.copytree(program, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    (copy / "geometry" / "slopes.py").write_text(SLOPES)
+    caller = copy / "floor" / "caller.py"
+    printed = []
+    for factor in (1.0, 3.0):
+        caller.write_text(
+            "from geometry.compilation.jit import compiled\nfrom geometry.slopes import hill, steeper\n\n"
+            f"@compiled\ndef climbed(x):\n    return {factor} * hill(x) + steeper(x)\n"
+        )
+        for _ in range(2):
+            done = subprocess.run(
+                [sys.executable, "-c", USE_SLOPES], cwd=copy,
+                env={**os.environ, "PYTHONPATH": str(copy)}, capture_output=True, text=True, timeout=60,
+            )  # fmt: skip
+            printed.append((done.stdout.strip(), done.stderr))
+    assert printed == [
+        ("True step 0 [] ['climbed', 'hill', 'slope', 'steeper', 'hill', 'steeper']", ""),  # the last two for Python
+        ("True step 0 [] []", ""),
+        ("True step 0 [] ['climbed']", ""),
+        ("True step 0 [] []", ""),
+    ]
+
+
 def test_with_a_numba_that_has_other_internals_code_is_kept_and_never_that_of_an_edited_source(program, tmp_path):
     copy = tmp_path / "program"
     shutil.copytree(program, copy, ignore=shutil.ignore_patterns("__pycache__"))
