@@ -139,6 +139,17 @@ def test_while_the_target_is_hidden_nothing_that_resembles_it_a_little_is_follow
         assert gone == (frame.status is not PoseStatus.MEASURED), k
 
 
+@pytest.mark.parametrize("known", [1, 2, 18])
+def test_what_replaces_the_target_in_one_frame_and_looks_different_is_no_measurement(known):
+    """Between two checks, and where the pattern has never been found again."""
+    detector = Detector()
+    tracker = DrogueTracker(detector)
+    for k in range(known + 3):
+        detector.circles = [path(k)] if k < known else []
+        image = picture(detector.circles, seed=k, alike=None if k < known else path(k))
+        assert (k < known) == (tracker.step(image).status is PoseStatus.MEASURED), k
+
+
 def test_a_target_found_again_beside_what_hid_it_is_followed_when_that_has_gone():
     """The detector sees it once, half hidden, and misses it afterwards: it looks as before the occlusion again."""
     detector = Detector()
