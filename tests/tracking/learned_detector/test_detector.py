@@ -115,7 +115,8 @@ def test_the_figures_of_the_bench_follow_from_the_candidates(samples):
     assert reliability(score, right)[-1][2] == 1
     rng = np.random.default_rng(1)
     p = rng.uniform(0.02, 0.98, 20000)
-    slope, offset = calibration(p, rng.random(20000) < p)
+    inputs = np.stack([np.log(p / (1 - p)), np.ones_like(p)], axis=1)
+    slope, offset = calibration(inputs, rng.random(20000) < p, np.ones_like(p))
     assert abs(slope - 1) < 0.05
     assert abs(offset) < 0.05
     assert not is_right(samples[0], DrogueCandidate(*samples[0].centre_px, 3 * samples[0].diameter_px, 1.0))
