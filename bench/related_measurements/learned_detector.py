@@ -17,6 +17,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.optimize import minimize
 
 from geometry.arrays import Array, Bools
 from studies.learned_detector import third_renderer
@@ -94,14 +95,19 @@ def hough(sample: Sample) -> list[DrogueCandidate]:
     return [DrogueCandidate(float(u), float(v), 2 * float(r), 1 / (1 + k)) for k, (u, v, r) in enumerate(circles[0])]
 
 
-def calibration(inputs: Array, right: Bools, weight: Array) -> Array:
-    """Logistic curve (k,) of the probability over inputs (n, k), by maximum likelihood (Platt 1999)."""
-    curve = np.zeros(inputs.shape[1])
-    for _ in range(50):
-        p = 1 / (1 + np.exp(-np.clip(inputs @ curve, -30, 30)))
-        H = (inputs * (weight * np.maximum(p * (1 - p), 1e-9))[:, None]).T @ inputs
-        curve += np.clip(np.linalg.solve(H + 1e-6 * np.eye(len(curve)), inputs.T @ (weight * (right - p))), -1, 1)
-    return curve
+def logistic(x: Array, y: Bools, signs: tuple[int, ...], weight: Array | float = 1.0, ridge: float = 1.0) -> Array:
+    """Coefficients (n,) of the logistic curve of inputs (m, n) and answers (m,), by maximum likelihood (Platt 1999).
+
+    signs (n,): 1 or -1 where a coefficient may not have the other sign, else 0.
+    """
+
+    def cost(c: Array) -> tuple[float, Array]:
+        z = x @ c
+        loss = np.sum(weight * (np.logaddexp(0, z) - y * z)) + 0.5 * ridge * c @ c
+        return float(loss), x.T @ (weight * (1 / (1 + np.exp(-z)) - y)) + ridge * c
+
+    bounds = [(0.0 if s > 0 else None, 0.0 if s < 0 else None) for s in signs]
+    return np.asarray(minimize(cost, np.zeros(x.shape[1]), jac=True, bounds=bounds, method="L-BFGS-B").x)
 
 
 def fitted(samples: list[Sample], weight: Array, weights: Path) -> tuple[Array, float]:
@@ -119,7 +125,7 @@ def fitted(samples: list[Sample], weight: Array, weights: Path) -> tuple[Array, 
             of.append(share)
             enlarged = seen[:, 4] > _ENLARGED
             growth += (sizes / seen[:, 4])[enlarged].tolist() if ok and enlarged.any() else []
-    return calibration(np.array(inputs), np.array(right), np.array(of)), float(np.median(growth))
+    return logistic(np.array(inputs), np.array(right), (0, 0, 0), np.array(of)), float(np.median(growth))
 
 
 def reliability(confidence: Array, right: Bools) -> list[tuple[float, float, int]]:

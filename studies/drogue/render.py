@@ -328,13 +328,11 @@ def _layer(scene: DrogueScene, low: np.ndarray, high: np.ndarray, n: int) -> tup
 
 def _rays(scene: DrogueScene, u: Array, v: Array) -> tuple[Floats32, Floats32, Floats32, Floats32]:
     """Slopes and points in the plane of the rim (surfaces.py) of rays through the grid u x v, each (len(v) len(u),)."""
-    camera, pose = scene.camera, scene.camera_from_drogue
-    inverse = pose.inverse()
+    inverse = scene.camera_from_drogue.inverse()
     origin = inverse.translation / scene.radius_m
     x, y = _normalised(scene, u, v)
     R = inverse.rotation
     dx, dy, dz = (R[i, 0] * x + R[i, 1] * y + R[i, 2] for i in range(3))
-    del camera
     mx, my = dx / dz, dy / dz
     x0, y0 = origin[0] - origin[2] * mx, origin[1] - origin[2] * my
     return tuple(np.asarray(a, np.float32).ravel() for a in (mx, my, x0, y0))  # type: ignore[return-value]
