@@ -124,7 +124,7 @@ def fitted(samples: list[Sample], weight: Array, weights: Path) -> tuple[Array, 
             right.append(ok)
             of.append(share)
             enlarged = seen[:, 4] > _ENLARGED
-            growth += (sizes / seen[:, 4])[enlarged].tolist() if ok and enlarged.any() else []
+            growth += (sizes[enlarged] / seen[enlarged, 4]).tolist() if ok else []
     return logistic(np.array(inputs), np.array(right), (0, 0, 0), np.array(of)), float(np.median(growth))
 
 
