@@ -3,7 +3,7 @@
 Rendered pictures of 640 x 480 with a drogue of 9 to 200 px before backgrounds that no training picture shows. The
 threshold is the one with 0.1 false detections per frame. Beside it: cv2.HoughCircles with its best threshold.
 `--calibrate` fits CALIBRATION and GROWTH of the detector on other pictures, as in training and of the renderer that
-chose between trainings, and prints them: those of the package are from `--frames 500 --seed 9 --calibrate`.
+chose between trainings, and prints them (`--frames 500 --seed 9`; docs/papers/zhou2020_detector.md has the answer).
 `--weights` measures another network, such as the paper's layout, trained by studies/learned_detector/train.py.
 """
 
