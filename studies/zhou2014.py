@@ -89,17 +89,16 @@ def approach(seed: int, light: str, frames: int, scale: int = 1) -> Iterator[Dro
         pose, rate = _pose(k / RATE_HZ, k / max(frames, _LEAST_FRAMES), phase)
         distance = float(pose.translation[2])
         moved = focal / distance * rate[:2] * EXPOSURE_S
-        # The texture is mirrored at its edges: the background moves to and fro.
-        shift = 60 * np.sin(drift * k / 60)
+        # The texture is mirrored at its edges: the background moves to and fro, by whole pixels, which are copied.
+        shift = np.rint(60 * np.sin(drift * k / 60))
         scene = DrogueScene(
-            camera, pose, RADIUS_M, light=LIGHTS[light], blur_px=0.8, noise_dn=3.0,
+            camera, pose, RADIUS_M, light=LIGHTS[light], blur_px=0.8, noise_dn=2.0,
             background=DrogueBackground(kind, look, (float(shift[0]), float(shift[1]))),
             motion_px=(float(moved[0]), float(moved[1])),
             occluders=_probe(camera, pose, k, float(side[k // _PERIOD])),
         )  # fmt: skip
-        drawn = render_drogue(scene, rng)
-        grey = cv2.cvtColor(drawn.image, cv2.COLOR_BGR2GRAY).astype(np.uint8, copy=False)
-        yield DrogueFrame(grey, _circles(scene), drawn.hidden)
+        drawn = render_drogue(scene, rng, grey=True)
+        yield DrogueFrame(drawn.image, _circles(scene), drawn.hidden)
 
 
 def _pose(t_s: float, share: float, phase: Array) -> tuple[Pose, Array]:

@@ -2,9 +2,9 @@
 
 Rendered pictures of 640 x 480 with a drogue of 9 to 200 px before backgrounds that no training picture shows. The
 threshold is the one with 0.1 false detections per frame. Beside it: cv2.HoughCircles with its best threshold.
-`--calibrate` fits the logistic curve of the confidence on other pictures: as in training, and half as many of the
-renderer that chose between trainings. `--weights` measures another network, such as the paper's layout, trained by
-studies/learned_detector/train.py.
+`--calibrate` fits CALIBRATION and GROWTH of the detector on other pictures, as in training and of the renderer that
+chose between trainings, and prints them (`--frames 500 --seed 9`; docs/papers/zhou2020_detector.md has the answer).
+`--weights` measures another network, such as the paper's layout, trained by studies/learned_detector/train.py.
 """
 
 from __future__ import annotations
@@ -17,11 +17,19 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.optimize import minimize
 
 from geometry.arrays import Array, Bools
 from studies.learned_detector import third_renderer
 from studies.learned_detector.samples import Sample, draw_sample
-from tracking.learned_detector.detector import WEIGHTS, DrogueCandidate, find_drogues
+from tracking.learned_detector.detector import (
+    WEIGHTS,
+    DrogueCandidate,
+    features,
+    find_drogues,
+    first_candidates,
+    looked_at,
+)
 
 SIZE_PX = (640, 480)
 DIAMETERS_PX = (9.0, 200.0)
@@ -29,6 +37,8 @@ FALSE_PER_FRAME = 0.1
 RIGHT_SHARE = 0.25  # of the diameter: largest error of the centre of a right detection
 BINS = 8
 LEAST_CONFIDENCE = 0.005  # of the candidates that the threshold is chosen from
+_THIRD, _THIRD_SEED, _THIRD_WEIGHT = 600, 42, 0.5  # pictures of the third renderer for the calibration
+_ENLARGED = 0.3  # log enlargement from which a look shows how much it blurs
 
 
 def is_right(sample: Sample, found: DrogueCandidate) -> bool:
@@ -85,17 +95,37 @@ def hough(sample: Sample) -> list[DrogueCandidate]:
     return [DrogueCandidate(float(u), float(v), 2 * float(r), 1 / (1 + k)) for k, (u, v, r) in enumerate(circles[0])]
 
 
-def calibration(confidence: Array, right: Bools) -> tuple[float, float]:
-    """Slope and offset of the logistic curve over the logit of the confidence, by maximum likelihood (Platt 1999)."""
-    x = np.log(np.clip(confidence, 1e-9, 1 - 1e-9) / np.clip(1 - confidence, 1e-9, 1))
-    a, b = 1.0, 0.0
-    for _ in range(50):
-        p = 1 / (1 + np.exp(-(a * x + b)))
-        w = np.maximum(p * (1 - p), 1e-9)
-        J = np.stack([x, np.ones_like(x)], axis=1)
-        step = np.linalg.solve(J.T @ (w[:, None] * J) + 1e-6 * np.eye(2), J.T @ (right - p))
-        a, b = a + float(step[0]), b + float(step[1])
-    return a, b
+def logistic(x: Array, y: Bools, signs: tuple[int, ...], weight: Array | float = 1.0, ridge: float = 1.0) -> Array:
+    """Coefficients (n,) of the logistic curve of inputs (m, n) and answers (m,), by maximum likelihood (Platt 1999).
+
+    signs (n,): 1 or -1 where a coefficient may not have the other sign, else 0.
+    """
+
+    def cost(c: Array) -> tuple[float, Array]:
+        z = x @ c
+        loss = np.sum(weight * (np.logaddexp(0, z) - y * z)) + 0.5 * ridge * c @ c
+        return float(loss), x.T @ (weight * (1 / (1 + np.exp(-z)) - y)) + ridge * c
+
+    bounds = [(0.0 if s > 0 else None, 0.0 if s < 0 else None) for s in signs]
+    return np.asarray(minimize(cost, np.zeros(x.shape[1]), jac=True, bounds=bounds, method="L-BFGS-B").x)
+
+
+def fitted(samples: list[Sample], weight: Array, weights: Path) -> tuple[Array, float]:
+    """CALIBRATION (3,) and GROWTH of the detector, from weighted pictures."""
+    inputs, right, of, growth = [], [], [], []
+    for sample, share in zip(samples, weight.tolist(), strict=True):
+        rows, levels = first_candidates(sample.image, *DIAMETERS_PX, weights)
+        for row in rows:
+            seen = looked_at(row, levels, weights)
+            u, v = seen[:, 1:3].mean(axis=0).tolist()
+            sizes = seen[:, 3] - np.log(sample.diameter_px)  # nan without a drogue
+            ok = is_right(sample, DrogueCandidate(u, v, float(np.exp(seen[:, 3].mean())), 1.0))
+            inputs.append(features(row, seen))
+            right.append(ok)
+            of.append(share)
+            enlarged = seen[:, 4] > _ENLARGED
+            growth += (sizes[enlarged] / seen[enlarged, 4]).tolist() if ok else []
+    return logistic(np.array(inputs), np.array(right), (0, 0, 0), np.array(of)), float(np.median(growth))
 
 
 def reliability(confidence: Array, right: Bools) -> list[tuple[float, float, int]]:
@@ -125,14 +155,14 @@ def main() -> None:
     ]
     if a.calibrate:
         kinds = third_renderer.BACKGROUNDS
-        samples += [drawn(third_renderer, kinds[k % len(kinds)], a.seed, k // len(kinds)) for k in range(a.frames // 2)]
+        samples += [drawn(third_renderer, kinds[k % len(kinds)], _THIRD_SEED, k // len(kinds)) for k in range(_THIRD)]
+        weight = np.where(np.arange(len(samples)) < a.frames, 1.0, _THIRD_WEIGHT)
+        curve, growth = fitted(samples, weight, a.weights)
+        print(f"CALIBRATION = {np.round(curve, 2).tolist()}, GROWTH = {growth:.2f}")
     start = time.process_time()
     found = [find_drogues(s.image, DIAMETERS_PX[0], DIAMETERS_PX[1], LEAST_CONFIDENCE, a.weights) for s in samples]
     learned_s = time.process_time() - start
     confidence, right, error = scored(samples, found)
-    if a.calibrate:
-        slope, offset = calibration(confidence, right)
-        print(f"slope and offset relative to the present ones: {slope:.3f}, {offset:.3f}")
     recall, threshold = recall_at(samples, confidence, right, FALSE_PER_FRAME)
     used = right & (confidence >= threshold)
     print(f"{len(samples)} frames, seed {a.seed}: recall {recall:.4f} at {FALSE_PER_FRAME} false detections per frame")

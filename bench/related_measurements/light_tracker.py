@@ -20,11 +20,10 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from scipy.optimize import minimize
 
 from bench.related_measurements.drogue_sequences import SequenceFrame, moving_drogue
-from bench.related_measurements.learned_detector import reliability
-from geometry.arrays import Array, Bools
+from bench.related_measurements.learned_detector import logistic, reliability
+from geometry.arrays import Array
 from tracking.learned_detector.detector import find_drogues, learned_detector
 from tracking.light_tracker.frames import FEATURES, RIGHT_SHARE, SIGNS, LightParameters
 from tracking.light_tracker.tracker import DrogueTracker
@@ -182,22 +181,6 @@ def calibrated(seed: int, count: int, frames: int) -> None:
     p = 1 / (1 + np.exp(-x @ coefficients))
     for mean, share, number in reliability(p, y):
         print(f"  {mean:.3f} {share:.3f} {number}")
-
-
-def logistic(x: Array, y: Bools, signs: tuple[int, ...], ridge: float = 1.0) -> Array:
-    """Coefficients (n,) of the logistic curve of inputs (m, n) and answers (m,), by maximum likelihood.
-
-    signs (n,): 1 or -1 where a coefficient may not have the other sign, else 0.
-    """
-
-    def cost(c: Array) -> tuple[float, Array]:
-        z = x @ c
-        p = 1 / (1 + np.exp(-z))
-        loss = np.logaddexp(0, z).sum() - z[y].sum() + 0.5 * ridge * c @ c
-        return float(loss), x.T @ (p - y) + ridge * c
-
-    bounds = [(0.0 if s > 0 else None, 0.0 if s < 0 else None) for s in signs]
-    return np.asarray(minimize(cost, np.zeros(x.shape[1]), jac=True, bounds=bounds, method="L-BFGS-B").x)
 
 
 def main() -> None:

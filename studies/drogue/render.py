@@ -181,8 +181,8 @@ _GRID_PX = 8  # step of the grid on which a distorted lens is inverted
 _SHIFT = 6  # bits of sub-pixel positions in OpenCV's drawing functions
 
 
-def render_drogue(scene: DrogueScene, rng: np.random.Generator) -> DroguePicture:
-    """The picture of a scene; `rng` draws the noise only."""
+def render_drogue(scene: DrogueScene, rng: np.random.Generator, grey: bool = False) -> DroguePicture:
+    """The picture of a scene; `rng` draws the noise only. grey: of a grey camera, at a third of the time."""
     width, height = scene.camera.image_size_px
     picture = background_picture(scene.background, (width, height))
     _draw_hose(picture, scene)
@@ -191,6 +191,8 @@ def render_drogue(scene: DrogueScene, rng: np.random.Generator) -> DroguePicture
     _draw_basket(picture, scene, rim, mean_bgr)
     for occluder in scene.occluders:
         _draw_occluder(picture, occluder)
+    if grey:
+        picture = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.float32)
     if scene.blur_px > 0:
         cv2.GaussianBlur(picture, (0, 0), scene.blur_px, dst=picture, borderType=cv2.BORDER_REPLICATE)
     if scene.noise_dn > 0:
@@ -326,13 +328,11 @@ def _layer(scene: DrogueScene, low: np.ndarray, high: np.ndarray, n: int) -> tup
 
 def _rays(scene: DrogueScene, u: Array, v: Array) -> tuple[Floats32, Floats32, Floats32, Floats32]:
     """Slopes and points in the plane of the rim (surfaces.py) of rays through the grid u x v, each (len(v) len(u),)."""
-    camera, pose = scene.camera, scene.camera_from_drogue
-    inverse = pose.inverse()
+    inverse = scene.camera_from_drogue.inverse()
     origin = inverse.translation / scene.radius_m
     x, y = _normalised(scene, u, v)
     R = inverse.rotation
     dx, dy, dz = (R[i, 0] * x + R[i, 1] * y + R[i, 2] for i in range(3))
-    del camera
     mx, my = dx / dz, dy / dz
     x0, y0 = origin[0] - origin[2] * mx, origin[1] - origin[2] * my
     return tuple(np.asarray(a, np.float32).ravel() for a in (mx, my, x0, y0))  # type: ignore[return-value]

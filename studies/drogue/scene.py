@@ -171,7 +171,7 @@ class Ellipse:
 class DroguePicture:
     """A picture and its truth at mid-exposure."""
 
-    image: ColourPicture  # (h, w, 3)
+    image: ColourPicture  # (h, w, 3); (h, w) of a grey camera
     centre_px: Array  # (2,) image of the centre of the rim
     ellipse: Ellipse  # image of the rim; its centre differs from `centre_px` by the perspective
     radius_px: float  # semi-major axis: independent of the tilt, to first order

@@ -110,6 +110,7 @@ _STRONG_PERCENTILE, _STRONG_SHARE, _WEAK_SHARE = 98.0, 0.35, 0.4  # of Canny's t
 _LEAST_GRADIENT = 24.0  # Sobel sum of a step of 6 DN in a picture stretched to 8 bits
 _ALIGNED = 0.9  # least cosine between gradient and radius
 _LEAST_SUPPORT = 0.15  # edge pixels per pixel of circumference
+_VOTES_AT_ONCE = 300_000  # arrays that fit the processor's cache: all at once take eight times as long
 _MOST_EDGES = 60_000  # pixels that vote; more are thinned evenly, since votes cost time and a rim has hundreds
 
 
@@ -162,10 +163,12 @@ def centre_votes(
     height, width = bottom - top, right - left
     radii = np.arange(np.floor(radii_px[0]), np.ceil(radii_px[1]) + 1)
     radii = np.concatenate([radii, -radii]).astype(np.float32)[:, None]
-    x = np.rint(edges.x.astype(np.float32) + radii * edges.along_x.astype(np.float32)).astype(np.int32) - left
-    y = np.rint(edges.y.astype(np.float32) + radii * edges.along_y.astype(np.float32)).astype(np.int32) - top
-    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    votes = np.bincount(y[inside] * width + x[inside], minlength=height * width)
+    u, v, along_u, along_v = (a.astype(np.float32) for a in (edges.x, edges.y, edges.along_x, edges.along_y))
+    votes = np.zeros(height * width, dtype=np.int64)
+    for some in np.array_split(radii, len(radii) * len(edges) // _VOTES_AT_ONCE + 1):
+        x, y = np.rint(u + some * along_u).astype(np.int32) - left, np.rint(v + some * along_v).astype(np.int32) - top
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        votes += np.bincount(y[inside] * width + x[inside], minlength=height * width)
     cells = votes.reshape(height, width).astype(np.float32)
     if not smooth:
         return cells

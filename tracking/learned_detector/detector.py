@@ -122,25 +122,32 @@ def find_drogues(
     Raises:
         ValueError: the picture is not grey, or the file of the weights is damaged.
     """
+    weights = weights or WEIGHTS
+    rows, levels = first_candidates(picture, smallest_px, largest_px, weights)
+    found = np.array([_seen_again(row, levels, weights) for row in rows]).reshape(-1, 4)
+    found = _distinct(_without_parts(found[found[:, 0] >= min(min_confidence, WHOLE_CONFIDENCE)]))
+    return [DrogueCandidate(u, v, diameter, c) for c, u, v, diameter in found.tolist() if c >= min_confidence]
+
+
+def first_candidates(
+    picture: Picture, smallest_px: float, largest_px: float | None, weights: Path
+) -> tuple[Array, list[PyramidLevel]]:
+    """What is looked at again: confidence, u, v, diameter (n, 4), and the picture with its levels."""
     if picture.ndim != 2:
         raise ValueError(f"picture: expected a grey picture (h, w), got the shape {picture.shape}")
     full = 255 if picture.dtype == np.uint8 else max(int(picture.max()), 1)
     grey = np.asarray(picture, dtype=np.float32) / np.float32(full)
     top = float(min(picture.shape)) if largest_px is None else largest_px
     levels = pyramid(grey, SMALLEST_PX / max(smallest_px, SMALLEST_PX), COARSEST_PX, top)
-    found = np.concatenate([_of_level(level, weights or WEIGHTS) for level in levels])
+    found = np.concatenate([_of_level(level, weights) for level in levels])
     found[:, 0] = 1 / (1 + np.exp(-(FIRST_SLOPE * found[:, 0] + FIRST_OFFSET)))
     found = found[np.argsort(-found[:, 0], kind="stable")][:MOST_LOOKED_AT]
-    found = found[found[:, 0] >= FIRST_CONFIDENCE]
-    whole = PyramidLevel(grey, 1.0, 1.0)
-    found = np.array([_seen_again(row, [whole, *levels], weights or WEIGHTS) for row in found]).reshape(-1, 4)
-    found = _distinct(_without_parts(found[found[:, 0] >= min(min_confidence, WHOLE_CONFIDENCE)]))
-    return [DrogueCandidate(u, v, diameter, c) for c, u, v, diameter in found.tolist() if c >= min_confidence]
+    return found[found[:, 0] >= FIRST_CONFIDENCE], [PyramidLevel(grey, 1.0, 1.0), *levels]
 
 
-def _seen_again(row: Array, levels: list[PyramidLevel], weights: Path) -> Array:
-    """A candidate (4,), confidence, u, v, diameter, after it was shown to the network in each of LOOKS_PX."""
-    confidence, u, v, diameter = row.tolist()
+def looked_at(row: Array, levels: list[PyramidLevel], weights: Path) -> Array:
+    """Logit, u, v, log diameter and log enlargement (looks, 5) of a candidate (4,), shown in each of LOOKS_PX."""
+    _, u, v, diameter = row.tolist()
     half, first = (LOOK_SIDE_PX - 1) / 2, (LOOK_SIDE_PX // STRIDE - LOOK_CELLS) // 2
     seen = []
     for look_px in LOOKS_PX:
@@ -155,11 +162,21 @@ def _seen_again(row: Array, levels: list[PyramidLevel], weights: Path) -> Array:
         i, j = np.unravel_index(np.argmax(cells[0]), cells[0].shape)
         logit, du, dv, size_log = cells[:, i, j].tolist()
         away = (STRIDE * (np.array([j + du, i + dv]) + 0.5 - LOOK_CELLS / 2)) / scale
-        growth = GROWTH * max(np.log(scale), 0.0)
-        seen.append([logit, u + away[0], v + away[1], size_log - np.log(scale) - growth])
-    logit, u, v, size_log = np.mean(seen, axis=0).tolist()
-    before = np.log(confidence / max(1 - confidence, 1e-9))
-    return np.array([1 / (1 + np.exp(-np.dot(CALIBRATION, (1.0, logit, before)))), u, v, np.exp(size_log)])
+        seen.append([logit, u + away[0], v + away[1], size_log - np.log(scale), max(np.log(scale), 0.0)])
+    return np.array(seen)
+
+
+def features(row: Array, seen: Array) -> Array:
+    """The inputs (3,) of the confidence: 1, the mean logit of the looks, and the log odds before them."""
+    return np.array([1.0, seen[:, 0].mean(), np.log(row[0] / max(1 - row[0], 1e-9))])
+
+
+def _seen_again(row: Array, levels: list[PyramidLevel], weights: Path) -> Array:
+    """A candidate (4,), confidence, u, v, diameter, after it was shown to the network again."""
+    seen = looked_at(row, levels, weights)
+    u, v = seen[:, 1:3].mean(axis=0)
+    size_log = (seen[:, 3] - GROWTH * seen[:, 4]).mean()
+    return np.array([1 / (1 + np.exp(-np.dot(CALIBRATION, features(row, seen)))), u, v, np.exp(size_log)])
 
 
 def _of_level(level: PyramidLevel, weights: Path) -> Array:

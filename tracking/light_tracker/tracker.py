@@ -70,9 +70,8 @@ class Track:
         self.blind, self.gap = self.blind + 1, min(self.gap + 1, LONGEST_GAP)
 
     def resembles(self, match: Match) -> bool:
-        """Whether a match is about as good as the ones before."""
-        z = fisher(match.agreement if match.visible > _MOSTLY else match.correlation)
-        return bool(np.isnan(self.usual)) or is_similar(self.usual, z)  # nan: a new pattern
+        """Whether a match is about as good as the ones before; of a new pattern (nan), whether it is good."""
+        return is_similar(self.usual, fisher(match.agreement if match.visible > _MOSTLY else match.correlation))
 
 
 # Tracks one drogue: the detector acquires it and checks every few frames, the light tracker follows it in between.
@@ -131,7 +130,9 @@ class DrogueTracker:
         searched, found, source = "", 0, MeasuredBy.LIGHT
         confidence = self._confidence(track, match)
         p = self.parameters
-        due = track.since_check >= p.check_every or track.gap > 0
+        # Something in front of the drogue can match in part: what looks different needs the detector's word.
+        different = match is not None and not track.resembles(match)
+        due = track.since_check >= p.check_every or track.gap > 0 or different
         if match is None or due or confidence < p.hand_back_confidence:
             seen = self._seen(track, picture)
             searched, found, track.since_check, track.checks = "window", len(seen), 0, track.checks + 1
@@ -139,6 +140,8 @@ class DrogueTracker:
             if best is not None:
                 match = self._confirm(track, picture, best, match)
                 source = MeasuredBy.BOTH
+            elif different:
+                match = None
             elif match is not None:
                 track.unconfirmed += 1
                 track.support += _SUPPORT_RATE * (ABSENT_LOGIT - track.support)
@@ -255,7 +258,9 @@ class DrogueTracker:
         inputs = features(track.support, track.confirmed, track.unconfirmed)
         if self.trace is not None:
             self.trace.append((inputs, track.motion.centre_px))
-        return probability(inputs)
+        # A match says that the object is the one detected, not what it is: one detection is as sure as it was.
+        most = 1.0 if track.confirmed > 1 else 1 / (1 + np.exp(-track.support))
+        return min(probability(inputs), float(most))
 
     def _acquired(self, picture: Picture) -> DrogueFrame:
         """Search the whole picture."""

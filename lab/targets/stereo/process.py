@@ -173,12 +173,20 @@ def _calibration(results: StereoResults) -> Iterator[Finding]:
         )
         yield finding("BP-W06", Level.FAIL if check.change_sigmas**2 > LARGEST_NEES else Level.WARN, what)
     if check is not None and not check.certain:
-        yield passed(
-            f"the markers show no error of {results.run.pair_path.name}; a common error of both focal lengths below"
-            f" {check.hidden_focal_percent:.2g} % would not show, since the distance changes with it"
-        )
+        yield passed(f"the markers show no error of {results.run.pair_path.name}; {_not_shown(results)}")
     if results.run.pair.covariance is None:
         yield finding("BP-W10", Level.WARN, f"{results.run.pair_path.name} states no covariance of the calibration")
+
+
+def _not_shown(results: StereoResults) -> str:
+    """The error of the pair that this recording leaves to its calibration, in words; empty without a test."""
+    check = results.calibration
+    if check is None:
+        return ""
+    return (
+        f"a common error of both focal lengths below {check.hidden_focal_percent:.2g} % would not show and changes all"
+        f" distances alike, they rest on {results.run.pair_path.name}"
+    )
 
 
 def _is_clock(results: StereoResults) -> bool:
@@ -240,7 +248,7 @@ def _processed(run_folder: Path, work: Path, progress: Progress | None) -> Proce
         schema=SUMMARY_SCHEMA,
         name=run.name,
         result=results,
-        verdict=Verdict(findings),
+        verdict=Verdict(findings, _not_shown(results)),
         frames=len(results.records),
         measured=len(results.measured),
         frame_rate_hz=run.frame_rate_hz,

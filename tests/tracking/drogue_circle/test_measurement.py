@@ -15,6 +15,7 @@ from tracking.drogue_circle.detectors import (
     CircleParameters,
     Edge,
     Window,
+    centre_votes,
     classical_detector,
     edge_pixels,
     radii_of,
@@ -157,3 +158,14 @@ def test_the_covariance_is_that_of_the_errors():
     for hidden in (0.0, 0.2, 0.4):
         assert 0.6 < np.mean(errors.nees_centre[errors.hidden == hidden]) / 2 < 1.7
     assert errors.median("ours") < 0.2 < min(errors.median("opencv"), errors.median("printed"))
+
+
+@pytest.mark.parametrize("area", [(0, 120, 0, 160), (30, 60, -5, 40)])
+def test_votes_are_the_same_however_many_are_counted_at_once(area, monkeypatch):
+    edges = edge_pixels(discs([(80.0, 60.0, 25.0)]), 1.0)
+    expected = centre_votes(edges, (8.0, 50.0), area)
+    for count in (1, 7 * len(edges)):
+        monkeypatch.setattr("tracking.drogue_circle.detectors._VOTES_AT_ONCE", count)
+        np.testing.assert_array_equal(centre_votes(edges, (8.0, 50.0), area), expected)
+    place = np.unravel_index(np.argmax(centre_votes(edges, (8.0, 50.0), (0, 120, 0, 160))), (120, 160))
+    np.testing.assert_allclose(place, (60, 80), atol=2)

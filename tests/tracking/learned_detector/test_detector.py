@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.related_measurements.learned_detector import calibration, is_right, recall_at, reliability
+from bench.related_measurements.learned_detector import is_right, logistic, recall_at, reliability
 from studies.learned_detector.samples import draw_sample
 from tracking.drogue_circle.detectors import Window
 from tracking.learned_detector import detector
@@ -115,7 +115,8 @@ def test_the_figures_of_the_bench_follow_from_the_candidates(samples):
     assert reliability(score, right)[-1][2] == 1
     rng = np.random.default_rng(1)
     p = rng.uniform(0.02, 0.98, 20000)
-    slope, offset = calibration(p, rng.random(20000) < p)
+    inputs = np.stack([np.log(p / (1 - p)), np.ones_like(p)], axis=1)
+    slope, offset = logistic(inputs, rng.random(20000) < p, (0, 0))
     assert abs(slope - 1) < 0.05
     assert abs(offset) < 0.05
     assert not is_right(samples[0], DrogueCandidate(*samples[0].centre_px, 3 * samples[0].diameter_px, 1.0))

@@ -139,6 +139,30 @@ def test_while_the_target_is_hidden_nothing_that_resembles_it_a_little_is_follow
         assert gone == (frame.status is not PoseStatus.MEASURED), k
 
 
+@pytest.mark.parametrize("known", [1, 2, 18])
+def test_what_replaces_the_target_in_one_frame_and_looks_different_is_no_measurement(known):
+    """Between two checks, and where the pattern has never been found again."""
+    detector = Detector()
+    tracker = DrogueTracker(detector)
+    for k in range(known + 3):
+        detector.circles = [path(k)] if k < known else []
+        image = picture(detector.circles, seed=k, alike=None if k < known else path(k))
+        assert (k < known) == (tracker.step(image).status is PoseStatus.MEASURED), k
+
+
+@pytest.mark.parametrize("score", [0.6, 0.8, 0.95])
+def test_an_object_that_was_detected_once_is_never_surer_than_that_detection(score):
+    """Its pattern, cut out of the picture before, is found again whatever it is."""
+    detector = Detector(confidence=score)
+    tracker = DrogueTracker(detector)
+    for k in range(6):
+        detector.circles = [path(k)] if k == 0 else []
+        frame = tracker.step(picture([path(k)], seed=k))
+        assert frame.confidence <= score + 1e-9
+    # Below 0.9 the detector is asked again in each frame; it does not see the object any more.
+    assert (frame.status is PoseStatus.MEASURED) == (score > 0.9)
+
+
 def test_a_target_found_again_beside_what_hid_it_is_followed_when_that_has_gone():
     """The detector sees it once, half hidden, and misses it afterwards: it looks as before the occlusion again."""
     detector = Detector()

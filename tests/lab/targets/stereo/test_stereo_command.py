@@ -94,6 +94,10 @@ def test_the_summary_has_fingerprints_versions_and_the_verdict_of_the_exit_statu
     assert summary["verdict"]["exit_status"] == result.exit_status == 0
     assert summary["verdict"]["status"] == "pass"
     assert {e["level"] for e in summary["verdict"]["evidence"]} == {"pass"}
+    # What no recording shows is on the line, also of a PASS.
+    shown = f"both focal lengths below {result.result.calibration.hidden_focal_percent:.2g} % would not show"
+    assert result.said.startswith("PASS")
+    assert shown in result.said
     assert {"run.yaml", "pair.yaml", "detections.csv"} <= {i["path"].rsplit("/", 1)[-1] for i in summary["inputs"]}
     assert "numpy" in summary["versions"]
     report = (result.out / "report.html").read_text(encoding="utf-8")
