@@ -222,7 +222,7 @@ def _term(single: tuple[Intrinsics, Intrinsics], placements: Sequence[Ints]) -> 
         camera=np.repeat(np.arange(2), counts),
         placement=np.concatenate([p[u] for p, u in zip(placements, used, strict=True)]).astype(np.int64),
         board=np.zeros(total, dtype=np.int64),
-        sigma_px=np.repeat([s.fit.sigma_px for s in single], counts),
+        sigma_px=np.concatenate([s.fit.sigma_px * s.table.noise[u] for s, u in zip(single, used, strict=True)]),
         fisheye=np.array([s.model.fisheye for s in single]),
         point=np.concatenate([t.point[u] for t, u in zip(tables, used, strict=True)]),
     )

@@ -12,11 +12,11 @@ from calibration.least_squares.adjustment import AdjustmentError, Poses
 from calibration.lens.board_shape import BoardShapeOptions, BoardTest, board_test
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import coverage_of, spread_deg
-from calibration.lens.fit.lens_fit import FEWEST_CORNERS, LensFit, robust_fit, used_views
+from calibration.lens.fit.lens_fit import FEWEST_CORNERS, LensFit, robust_fit, used_views, with_view_noise
 from calibration.lens.fit.lens_models import LensModel, folds_in_picture
 from calibration.lens.fit.lens_parameters import AS_STATED, BOARD_BLOCKS, BoardFreedom, Values, board_as_stated
 from calibration.lens.fit.lens_start import StartError, start
-from calibration.lens.fit.model_selection import RATIONAL, ModelCandidate, inliers_of_rich_models, select_model
+from calibration.lens.fit.model_selection import ModelCandidate, inliers_of_rich_models, select_model
 from calibration.lens.fit.projection_map import Difference, ProjectionMap, difference, projection_map
 from calibration.lens.fit.view_equations import BEND_PROBABLE, SCATTER_SIGNIFICANT, ViewEquations, scattered
 from calibration.lens.intrinsics_result import Intrinsics, Origins
@@ -70,8 +70,12 @@ def calibrate_intrinsics(table: CornerTable, options: IntrinsicsOptions | None =
 
 
 def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
-    starts = _starts(table, options.lens)
+    starts = _starts(table)
     used, rich = inliers_of_rich_models(table, starts, options.lens)
+    weighted = with_view_noise(table, rich[0])
+    if weighted is not table:
+        table = weighted
+        used, rich = inliers_of_rich_models(table, [(f.model, f.values) for f in rich], options.lens)
     shape = _shape(table, rich[0], options)
     free = AS_STATED if shape is None else shape.free
     as_found = (rich[0] if shape is None else shape.fit).values
@@ -114,13 +118,14 @@ def _check_enough(table: CornerTable) -> None:
         )
 
 
-def _starts(table: CornerTable, lens: LensModel | None) -> list[tuple[LensModel, Values]]:
-    """Start values for each kind of lens that may be chosen."""
-    # The start of a rational model for a wide lens is a fisheye: five coefficients do not describe it.
-    kinds = (False, True) if lens is None or lens.coefficients >= RATIONAL.coefficients else (lens.fisheye,)
+def _starts(table: CornerTable) -> list[tuple[LensModel, Values]]:
+    """Start values for each kind of lens: what is found of the board does not depend on the model that is asked for.
+
+    The start of a rational model for a wide lens is a fisheye: five coefficients do not describe it.
+    """
     out: list[tuple[LensModel, Values]] = []
     errors = []
-    for fisheye in kinds:
+    for fisheye in (False, True):
         try:
             out.append(start(table, fisheye))
         except StartError as error:

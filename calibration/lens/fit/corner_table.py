@@ -30,6 +30,7 @@ class CornerTable:
     views: int
     image_size_px: tuple[int, int]
     circles: CircleAreas | None = None  # None: the points are not circles
+    view_noise: Array | None = None  # (V,): of a view's corners, in units of that of the set; None: the same in all
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.pixels).all():
@@ -66,6 +67,11 @@ class CornerTable:
         """(N, 3), m: position of each corner on the board."""
         return self.board_points[self.point]
 
+    @property
+    def noise(self) -> Array:
+        """(N,): of each corner, in units of that of the set."""
+        return np.ones(len(self)) if self.view_noise is None else self.view_noise[self.view]
+
     def counts(self, used: Bools | None = None) -> Ints:
         """(V,): number of corners of each view; of the used ones (N,) only, if given."""
         view = self.view if used is None else self.view[used]
@@ -92,6 +98,7 @@ class CornerTable:
             len(views),
             self.image_size_px,
             self._circles_of(order),
+            None if self.view_noise is None else self.view_noise[views],
         )
 
     def _circles_of(self, rows: Ints) -> CircleAreas | None:

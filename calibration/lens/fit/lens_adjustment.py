@@ -54,7 +54,7 @@ def term_of(
         table.points[used],
         table.middle,
         table.view[used],
-        sigma_px,
+        sigma_px * table.noise[used],
         fisheye,
         loss,
         table.point[used],

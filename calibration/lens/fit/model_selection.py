@@ -320,17 +320,20 @@ def _rich_fit(table: CornerTable, model: LensModel, values: Values, reasons: lis
 
 
 def as_rational(table: CornerTable, found: LensFit) -> Values:
-    """The values of a fit, with its lens approximated by a rational one."""
+    """The values of a fit, with its lens approximated by a rational one as far out as corners were seen.
+
+    Also those that it rejects: where the approximation folds before them, they could not be predicted.
+    """
     if not found.model.fisheye:
         return found.values
-    inside = np.linalg.norm((table.pixels[found.used] - found.lens[2:4]) / found.lens[:2], axis=1)
-    lens = rational_of_fisheye(found.lens, float(inside.max()))
+    x, y, z = found.poses[table.view].apply(table.points).T
+    lens = rational_of_fisheye(found.lens, float(np.nanmax(np.arctan2(np.hypot(x, y), z))))
     return {**found.values, "intrinsics": Vectors(lens[None])}
 
 
 def _schwarz_criterion(table: CornerTable, found: LensFit, gate_px: float) -> float:
     """Schwarz's information criterion over all corners, with residuals limited to the gate."""
-    missed = np.minimum(np.nan_to_num(np.linalg.norm(found.residuals, axis=1), nan=np.inf), gate_px)
+    missed = np.minimum(np.nan_to_num(np.linalg.norm(found.residuals, axis=1) / table.noise, nan=np.inf), gate_px)
     n = 2 * len(table)
     return n * float(np.log(max(np.sum(missed**2) / n, 1e-18))) + found.model.coefficients * np.log(n)
 

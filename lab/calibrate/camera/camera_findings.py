@@ -30,7 +30,8 @@ class FindingLimits:
     focal: tuple[float, float] = (0.003, 0.02)  # relative sigma of the focal length
     overfit: tuple[float, float] = (1.5, OVERFIT)  # hold-out error over the noise
     views: int = 8
-    p_value: float = 0.01  # of the halves' difference, and of the scatter between photographs
+    p_value: float = 0.01  # of the halves' difference
+    scatter_p_value: float = 0.05  # of the scatter between photographs
     origins_p_value: float = 0.02  # of the difference between photographs that the user names differently
     halves_px: float = 1.0  # a significant difference larger than this fails
     map_px: tuple[float, float] = (0.5, UNKNOWN_PX)  # projection uncertainty, 90 % quantile over the picture
@@ -59,7 +60,7 @@ def findings_of(c: Intrinsics, limits: FindingLimits = LIMITS) -> tuple[Finding,
         _overfit(c, limits),
         _halves(c, limits),
         _origins(c, limits),
-        _scatter(c),
+        _scatter(c, limits),
         _map(c, limits),
         _model_uncertainty(c, limits),
         _warp(c, limits),
@@ -226,7 +227,7 @@ def _origins(c: Intrinsics, limits: FindingLimits) -> Finding | None:
     )
 
 
-def _scatter(c: Intrinsics) -> Finding:
+def _scatter(c: Intrinsics, limits: FindingLimits) -> Finding:
     what = (
         f"The lens parameters scatter from photograph to photograph by {c.scatter.factor:.2f} times what the corners'"
         " noise explains"
@@ -234,6 +235,8 @@ def _scatter(c: Intrinsics) -> Finding:
     if c.correlated_noise == 1:
         return passed(f"{what} (p = {c.scatter.p_value:.2g}).")
     what += f" (p = {c.scatter.p_value:.1g}); the sigmas include it."
+    if c.scatter.p_value >= limits.scatter_p_value:
+        return passed(what)
     return finding("BP-L23", Level.WARN, what)
 
 
