@@ -33,7 +33,7 @@ from calibration.lens.fit.lens_models import (
 from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, Values
 from calibration.lens.fit.projection_map import ProjectionMap, projection_map
 from calibration.lens.fit.view_equations import ViewEquations
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools
 from geometry.camera import project_points_full
 
 RATIONAL = LensModel(8)
@@ -341,21 +341,23 @@ def _schwarz_criterion(table: CornerTable, found: LensFit, gate_px: float) -> fl
 # Mean residuals in cells of the picture, which are noise if the lens model is right.
 
 
-def cell_means(table: CornerTable, found: LensFit) -> tuple[Array, Ints]:
-    """Mean residuals (rows, columns, 2), px, and the number of residuals in each cell."""
+def cell_means(table: CornerTable, found: LensFit) -> tuple[Array, Array]:
+    """Mean residuals (rows, columns, 2), px, and the number of residuals in each cell, by their weights."""
     width, height = table.image_size_px
     pixels, residuals = table.pixels[found.used], found.residuals[found.used]
     columns = int(np.clip(np.sqrt(len(pixels) / _CORNERS_PER_CELL * width / height), 3, _MOST_COLUMNS))
     rows = max(2, round(columns * height / width))
     j = np.clip(((pixels[:, 0] + 0.5) / width * columns).astype(int), 0, columns - 1)
     i = np.clip(((pixels[:, 1] + 0.5) / height * rows).astype(int), 0, rows - 1)
-    total, count = np.zeros((rows, columns, 2)), np.zeros((rows, columns), dtype=np.int64)
-    np.add.at(total, (i, j), residuals)
-    np.add.at(count, (i, j), 1)
-    return np.where(count[..., None] > 0, total / np.maximum(count, 1)[..., None], np.nan), count
+    total, count = np.zeros((rows, columns, 2)), np.zeros((rows, columns))
+    weight = 1 / table.noise[found.used] ** 2
+    np.add.at(total, (i, j), weight[:, None] * residuals)
+    np.add.at(count, (i, j), weight)
+    with np.errstate(invalid="ignore"):
+        return total / count[..., None], count
 
 
-def beyond_noise(cells: Array, count: Ints, noise_px: float) -> tuple[float, float]:
+def beyond_noise(cells: Array, count: Array, noise_px: float) -> tuple[float, float]:
     """P-value of such means if they are noise, and the RMS (per coordinate, px) of what exceeds it."""
     full = count > 0
     score = float(np.sum(count[full, None] * cells[full] ** 2)) / noise_px**2
