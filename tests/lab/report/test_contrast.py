@@ -49,7 +49,7 @@ def test_the_formula_gives_the_known_values():
     assert contrast("#767676", "#fff") == pytest.approx(4.54, abs=0.005)
 
 
-@pytest.mark.parametrize(("page", "medium"), product(PAGES, MEDIA))
+@pytest.mark.parametrize(("page", "medium"), list(product(PAGES, MEDIA)))
 def test_text_and_links_are_readable_on_every_ground(page, medium):
     colours = variables(page, medium)
     low = {
