@@ -100,9 +100,11 @@ class _Library(codegen.JITCodeLibrary):
         """What is kept of this code: name, symbol if it is large, machine code, environments (constants), bitcode."""
         if self._stored is not None:
             return self._stored
-        name, _, (machine_code, bitcode) = super().serialize_using_object_code()  # type: ignore[no-untyped-call]
+        state: Any = super().serialize_using_object_code()  # type: ignore[no-untyped-call]  # numba has no types
+        name, _, (machine_code, bitcode) = state
         names = [v.name for v in self._final_module.global_variables if v.name.startswith(_ENVIRONMENT)]
-        used = [environment.lookup_environment(one) for one in names]  # type: ignore[no-untyped-call]
+        lookup: Any = environment.lookup_environment
+        used = [lookup(one) for one in names]
         environments = tuple(one for one in used if one is not None and one.can_cache())
         return name, self._large, machine_code, environments, None if self._large else bitcode
 

@@ -76,7 +76,7 @@ def passing_lights(
     found: the lights of each of n pictures; background (h, w), DN, the mean of `count` (h, w) pictures without a light;
     usual_dn: its usual brightness.
     """
-    noise = replace(noise, shadow_dn2=0.0)
+    noise = replace(noise, shadow_dn2=0.0)  # as in BehindLights.of
     every = [
         (_shown_by(background, count, d[i : i + 1], noise), k, i) for k, d in enumerate(found) for i in range(len(d))
     ]
@@ -188,9 +188,9 @@ def _behind_one(
     side = 2 * (box[2] + _AROUND * width)
     step = max(_step(width), int(np.ceil(side / np.sqrt(_MOST_SAMPLES))))
     values, uv = _around(some, box, _AROUND * width, step)
-    without = _around(empty, box, _AROUND * width, step)[0] if empty else np.zeros((0, len(uv)))
     variance = noise.variance(values)
-    fit = fitted(uv, values, variance, places, width, height, mean_of(without, variance), modulation, strength)
+    without = _without(empty, box, _AROUND * width, step, variance)
+    fit = fitted(uv, values, variance, places, width, height, without, modulation, strength)
     return None if fit is None else _whole(some, strength, empty, box, width, fit, noise)
 
 
@@ -210,12 +210,18 @@ def _whole(
 ) -> _Part:  # fmt: skip
     """All pixels that the light of a fit reaches. empty: pictures without it."""
     values, uv = _around(pictures, box, 2 * _AROUND * width, 1)
-    without = _around(empty, box, 2 * _AROUND * width, 1)[0] if empty else np.zeros((0, len(uv)))
     variance = noise.variance(values)
-    level, information, light = fit.behind(uv, values, variance, mean_of(without, variance), strength)
+    without = _without(empty, box, 2 * _AROUND * width, 1, variance)
+    level, information, light = fit.behind(uv, values, variance, without, strength)
     lit = light > _LIT
     column, row = uv[lit].astype(np.int64).T
     return _Part(row, column, level[lit], fit.share + 1 / np.maximum(information[lit], 1e-3), fit)
+
+
+def _without(empty: Sequence[NDArray[Any]], box: Array, more: float, step: int, variance: Array) -> tuple[Array, Array]:
+    """What pictures without the light show where others have this variance (n, m): as `mean_of`."""
+    values = _around(empty, box, more, step)[0] if empty else np.zeros((0, variance.shape[1]))
+    return mean_of(values, variance)
 
 
 def _around(pictures: Sequence[NDArray[Any]], box: Array, more: float, step: int) -> tuple[Array, Array]:
