@@ -58,8 +58,8 @@ def with_lights_on_edges(
     same = near_each(again, found, SAME_LIGHT)
     chi2 = [np.ones(len(d)) if d.chi2 is None else np.maximum(d.chi2, 1.0) for d in (again, found)]
     better = same & (chi2[1] > _BETTER * chi2[0][:, None])
-    used = np.asarray(~same.any(axis=1) | better.any(axis=1))
-    kept = found[np.asarray(~better.any(axis=0))]
+    used = np.asarray(~(same & ~better).any(axis=1))
+    kept = found[np.asarray(~better[used].any(axis=0))]
     return kept.joined(again[used], len(found) + len(again)) if len(kept) else again[used]
 
 

@@ -219,10 +219,9 @@ class StaticBackground:
         again = find_spots(picture, parameters, self.noise, boxes)
         again = shift.added_to(again, self.noise, self._shifts_at(again))
         # The picture may not show a faint spot on a structure that the difference does not have.
-        alone = (
-            inside(of_changed, spots) & ~inside(self.unknown, spots) & ~near_each(spots, again, AROUND_SPOT).any(axis=1)
-        )
-        found = spots[apart & ~inside(boxes, spots)].joined(again, parameters.max_detections)
+        in_box = inside(boxes, spots)
+        alone = in_box & ~near_each(spots, again, AROUND_SPOT).any(axis=1)
+        found = spots[apart & ~in_box].joined(again, parameters.max_detections)
         found = found.joined(self._beside_lights(spots[apart & alone]), parameters.max_detections)
         return found, rest[~changed & ~inside(boxes, rest)]
 

@@ -50,6 +50,8 @@ _SURROUNDINGS = 6.0  # widths: of a spot, beyond the reach of the kernel
 _SAMPLED = 3  # px: step of the sample of the filters' outputs
 LARGEST_SHARE = 0.25  # of the spot's width: a larger error is not assumed; faint spots on texture have half of it
 _IN_BACKGROUND = 2.0, 4.0  # shift of a fit by the background over that by its light: at edges, on coarse texture
+_OWN, _RING = 1.5, (2.2, 5.5)  # widths: the surroundings of a light at rest, and the ring around them
+_NOISIER = 4.0  # times the usual noise: places of which a light at rest hides the structure
 _LARGEST_AT_REST = 1.0  # the same of a light at rest, whose fit absorbs structure of its own width
 
 
@@ -278,34 +280,35 @@ def _filtered(texture: NDArray[Any], odd: Array, smooth: Array) -> list[NDArray[
 
 
 def local_shifts(
-    background: NDArray[np.float32], variance: NDArray[np.float32] | float, width_px: float, absorbed: bool = False
+    background: NDArray[np.float32], variance: NDArray[np.float32] | float, width_px: float
 ) -> NDArray[np.float32]:
     """Sigmas, px, of a spot of this width at each place of a known background (h, w), by the texture in its light.
 
     That of the surroundings of a pixel, as large as the spot, as if the background were the screen, lit evenly. Where
     it is not, or is lit by other lamps as well, the errors are smaller: an upper bound, of which the residuals show how
     much is true. variance (h, w), DN^2: of the background's own errors. Where they hide the texture, as behind a bright
-    light, it is that of the wider surroundings: the mean of both, each with the inverse square of its error. absorbed:
-    a fit has taken up structure of the background; then it is at least that of the wider surroundings.
+    light, it is that of the wider surroundings: the mean of both, each with the inverse square of its error.
     """
-    reach = _reach(width_px)
-    odd, smooth = _kernels(width_px, 2, reach)
-    light = np.maximum(cv2.sepFilter2D(background, cv2.CV_32F, smooth / smooth.sum(), smooth / smooth.sum()), 1.0)
-    moved = [(x / light) ** 2 for x in _filtered(background, odd, smooth)]
-    everywhere = np.broadcast_to(np.asarray(variance, np.float32), background.shape)
-    noise = sum(_filtered(everywhere, odd**2, smooth**2)) / (2 * light**2)
-    seen = 0.5 * (moved[0] + moved[1]) - noise
-    side = 2 * int(np.ceil(width_px)) + 1
+    seen, noise = _squared_shifts(background, variance, width_px)
+    side, wide = 2 * int(np.ceil(width_px)) + 1, 2 * _wider(width_px) + 1
     here, error = cv2.blur(seen, (side, side)), cv2.blur(noise, (side, side))
     usual = max(float(np.median(noise)), 1e-30)
     weight = (usual / (usual + noise)) ** 2
-    wide = 2 * _wider(width_px) + 1
-    around = cv2.blur(weight * seen, (wide, wide)) / cv2.blur(weight, (wide, wide))
-    around = np.maximum(around, 0.0)
+    around = np.maximum(cv2.blur(weight * seen, (wide, wide)) / cv2.blur(weight, (wide, wide)), 0.0)
     share = around**2 / np.maximum(around**2 + error**2, np.float32(1e-30))
-    if absorbed:
-        here = np.maximum(here, around)
     return np.asarray(np.sqrt(np.maximum(share * here + (1 - share) * around, 0.0)), np.float32)
+
+
+def _squared_shifts(
+    background: NDArray[np.float32], variance: NDArray[np.float32] | float, width_px: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(h, w), px^2: squares of the shifts of such spots without what the errors cause, and that; as `local_shifts`."""
+    odd, smooth = _kernels(width_px, 2, _reach(width_px))
+    light = np.maximum(cv2.sepFilter2D(background, cv2.CV_32F, smooth / smooth.sum(), smooth / smooth.sum()), 1.0)
+    moved = [(x / light) ** 2 for x in _filtered(background, odd, smooth)]
+    everywhere = np.broadcast_to(np.asarray(variance, np.float32), background.shape)
+    noise = np.asarray(sum(_filtered(everywhere, odd**2, smooth**2)) / (2 * light**2), np.float32)
+    return np.asarray(0.5 * (moved[0] + moved[1]) - noise, np.float32), noise
 
 
 def _reach(width_px: float, power: int = 2) -> int:
@@ -319,9 +322,11 @@ def _wider(width_px: float) -> int:
 
 
 def shifts_at_rest(background: NDArray[np.float32], variance: NDArray[np.float32], lights: Detections) -> Array:
-    """(n,) px: `local_shifts` at the places of lights, of a light as wide as each.
+    """(n,) px: as `local_shifts`, at the places of lights at rest, each as wide as it is.
 
-    background, variance (h, w): as there, without the lights, whose fits have taken up structure as if it were light.
+    background, variance (h, w): as there, without the lights. Their fits have taken up structure as if it were light.
+    So it is at least as large as the usual one of the ring around each. An edge that crosses the ring is not in it: it
+    would be seen on both sides if the light hid a part.
     """
     out = np.zeros(len(lights))
     # The fit of a light at the border may lie beyond it.
@@ -331,8 +336,16 @@ def shifts_at_rest(background: NDArray[np.float32], variance: NDArray[np.float32
         half = _wider(width) + _reach(width) + 1
         top, left = max(v - half, 0), max(u - half, 0)
         part = np.s_[top : v + half + 1, left : u + half + 1]
-        here = local_shifts(background[part], variance[part], width, absorbed=True)
-        out[i] = here[v - top, u - left]
+        seen, noise = _squared_shifts(background[part], variance[part], width)
+        rows, columns = np.ogrid[: seen.shape[0], : seen.shape[1]]
+        away = np.hypot(columns + left - u, rows + top - v) / width
+        inner, ring = away < _OWN, (away > _RING[0]) & (away < _RING[1])
+        clear = ring & (noise < _NOISIER * np.median(noise))
+        ring = clear if clear.any() else ring
+        around = max(float(np.median(seen[ring])) / np.log(2), 0.0) if ring.any() else 0.0
+        # Its own noise hides structure that is weaker.
+        share = around**2 / max(around**2 + float(noise[inner].mean()) ** 2, 1e-30)
+        out[i] = np.sqrt(share * max(float(seen[inner].mean()), around) + (1 - share) * around)
     return out
 
 

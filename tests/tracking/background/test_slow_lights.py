@@ -12,10 +12,12 @@ from scipy.stats import multivariate_normal
 from geometry.arrays import Array
 from tests.tracking.rendering import round_lights
 from tracking.background.estimation import PICTURES, static_background
+from tracking.background.lights_on_edges import with_lights_on_edges
 from tracking.background.slow_lights import light_at
+from tracking.background.static_background import StaticBackground
 from tracking.detections import Detections
 from tracking.noise import Picture
-from tracking.noise_estimation.photon_transfer import estimate_noise
+from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
 from tracking.parameters import DetectParameters
 
 SIZE, CELL = (320, 400), 40
@@ -36,11 +38,16 @@ def board_pictures(paths: Array, sigma_px: float, modulated: float, seed: int, b
     return [p.astype(np.uint8) for p in pictures]
 
 
-def found_in_all(pictures: list[Picture]) -> list[Detections]:
+def background_of(pictures: list[Picture]) -> tuple[StaticBackground, NoiseEstimate]:
     estimate = estimate_noise(pictures[:2] + pictures[-2:])
     some = pictures[:: len(pictures) // PICTURES][:PICTURES]
     background = static_background(some, estimate.model, estimate.texture_shift, USUAL)
     assert background is not None
+    return background, estimate
+
+
+def found_in_all(pictures: list[Picture]) -> list[Detections]:
+    background, estimate = background_of(pictures)
     out = [background.found_in(p, USUAL, estimate.texture_shift) for p in pictures]
     return [d for d in out if d is not None]
 
@@ -239,3 +246,46 @@ def test_a_speckled_spot_that_makes_one_step_of_about_its_width_is_found_where_i
     assert np.mean(np.array(near) == 1) > 0.95
     assert gap.max() < 1.0
     assert np.mean(gap < 3.5 * sigma) > 0.95
+
+
+@pytest.mark.parametrize("away_px", [6.0, 8.0, 12.0])
+@pytest.mark.parametrize("modulated", [0.0, 0.5])
+def test_a_spot_at_rest_on_an_even_square_is_one_point_whose_sigma_is_not_that_of_the_edge_beside_it(
+    away_px, modulated
+):
+    """An edge that the light hid would be seen on both sides of it."""
+    across, along = np.array([40.0, 80.0, 160.0, 280.0]) + away_px, np.array([140.0, 60.0, 180.0, 100.0])
+    at = np.concatenate([np.column_stack([across, along]), np.column_stack([along[:3], across[:3]])])
+    paths = np.broadcast_to(at, (45, *at.shape))
+    found = found_in_all(board_pictures(paths, 1.4, modulated, 9))
+    gap, sigma = errors(found, paths)
+    assert (gap / sigma).max() < 4.0
+    assert sigma.max() < 0.3
+    for d in found[::15]:
+        assert [np.count_nonzero(np.hypot(*(d.uv_px - place).T) < 1.4) for place in at] == [1] * len(at)
+
+
+def test_a_spot_at_rest_that_a_wide_object_contains_is_not_found_a_second_time():
+    """No Gaussian explains the object; without straight structures the spot in it is found again."""
+    at = np.array([[100.0, 60.0], [180.0, 140.0]]) + 6.0
+    pictures = board_pictures(np.broadcast_to(at, (15, *at.shape)), 1.4, 0.3, 12)
+    background, _ = background_of(pictures)
+    spots = background.lights.found
+    spots = spots[np.array([int(np.hypot(*(spots.uv_px - place).T).argmin()) for place in at])]
+    square = replace(spots[:1], uv_px=at[:1] - 6.0, flux=np.array([3e4]), chi2=np.array([300.0]))
+    square = replace(square, major_px=np.array([12.0]), minor_px=np.array([12.0]))
+    mean = np.mean(pictures, axis=0).astype(np.float32)
+    found = with_lights_on_edges(mean, spots.joined(square, 3), background.noise, USUAL, background.steps, 255.0)
+    assert [np.count_nonzero(np.hypot(*(found.uv_px - place).T) < 1.4) for place in at] == [1, 1]
+
+
+def test_a_spot_that_only_the_difference_shows_is_found_where_the_pictures_are_searched():
+    """What an edge leaves may look like the part that the places of a light have in common."""
+    paths = np.broadcast_to(np.array([80.0 + 3.5, 60.0]), (45, 1, 2)) + np.arange(45.0)[:, None, None] * [0.0, 0.4]
+    pictures = board_pictures(paths, 1.0, 0.3, 13)
+    background, estimate = background_of(pictures)
+    searched = replace(background, unknown=np.array([[80.0, 65.0, 13.0]]))
+    for picture, at in zip(pictures[:30], paths, strict=False):
+        found = searched.found_in(picture, USUAL, estimate.texture_shift)
+        assert found is not None
+        assert np.hypot(*(found.uv_px - at[0]).T).min() < 0.3
