@@ -29,6 +29,31 @@ _LIT = 1e-3  # of the peak: there the background comes from the fit
 
 
 @dataclass(frozen=True, slots=True)
+class Exposures:
+    """n pictures (h, w) of one camera in equal light of the room."""
+
+    pictures: Sequence[NDArray[Any]]
+    strength: Array  # (n,), of the lights
+    noise: NoiseModel
+    usual_dn: float  # light of the surface, above black
+    black_dn: float  # grey value without light
+
+    def around(self, which: Sequence[int] | Ints, box: Array, more: float, step: int) -> tuple[Array, Array, Array]:
+        """Light above black, DN, and its variances (k, m) in some pictures, in pixels (m, 2) around a box.
+
+        `more`: px to each side; every `step`-th pixel.
+        """
+        (height, width), half = self.pictures[0].shape, box[2] + more
+        rows = np.arange(max(int(box[1] - half), 0), min(int(box[1] + half) + 1, height), step)
+        columns = np.arange(max(int(box[0] - half), 0), min(int(box[0] + half) + 1, width), step)
+        v, u = (x.ravel() for x in np.meshgrid(rows, columns, indexing="ij"))
+        values = np.array([self.pictures[k][v, u] for k in which], dtype=float).reshape(-1, len(u))
+        # In black places the model leaves more than their noise: also there that of the background counts.
+        variance = replace(self.noise, shadow_dn2=0.0).variance(values)
+        return values - self.black_dn, variance, np.column_stack([u, v]).astype(float)
+
+
+@dataclass(frozen=True, slots=True)
 class BehindLights:
     """The m pixels of a picture (h, w) behind such lights."""
 
@@ -36,29 +61,25 @@ class BehindLights:
     column: Ints  # (m,)
     level_dn: Array  # (m,): the background
     share: Array  # (m,): variance of its errors over that of a picture's noise
+    response: Array  # (m,): the light over that on usual ground, as the fits of the lights show it
     modulation: Modulation | None  # of the lights by the surface; None: they do not show it
 
     @staticmethod
     def of(
-        pictures: Sequence[NDArray[Any]], strength: Array, found: Sequence[Detections], boxes: Array,
-        noise: NoiseModel, usual_dn: float, passing: Sequence[JointFit] = (),
-    ) -> BehindLights:  # fmt: skip
-        """From the points found in each of n pictures inside boxes (k, 3): u, v and half side, px.
+        seen: Exposures, found: Sequence[Detections], boxes: Array, passing: Sequence[JointFit] = ()
+    ) -> BehindLights:
+        """From the points found in each picture inside boxes (k, 3): u, v and half side, px.
 
-        strength (n,): of the lights; usual_dn: brightness of the surface. The modulation that most lights of a camera
-        show, and those that pass (`passing_lights`), helps with the others.
+        The modulation that most lights of a camera show, and those that pass (`passing_lights`), helps with the others.
         """
-        # In black places the model leaves more than their noise: also there that of the background counts.
-        noise = replace(noise, shadow_dn2=0.0)
-        parts = _behind_each(pictures, strength, found, boxes, noise, _modulation(passing, usual_dn))
-        modulation = _modulation([*(part.fit for part in parts), *passing], usual_dn)
+        parts = _behind_each(seen, found, boxes, _modulation(passing, seen))
+        modulation = _modulation([*(part.fit for part in parts), *passing], seen)
         if modulation is not None:
-            parts = _behind_each(pictures, strength, found, boxes, noise, modulation)
-        if not parts:
-            return BehindLights(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0), modulation)
-        row, column = np.concatenate([p.row for p in parts]), np.concatenate([p.column for p in parts])
-        level, share = np.concatenate([p.level_dn for p in parts]), np.concatenate([p.share for p in parts])
-        return BehindLights(row, column, level, share, modulation)
+            parts = _behind_each(seen, found, boxes, modulation)
+        columns = zip(*(part[:-1] for part in parts), strict=True) if parts else [[np.zeros(0)]] * 5
+        row, column, level, share, response = (np.concatenate(values) for values in columns)
+        at = row.astype(np.int64), column.astype(np.int64)
+        return BehindLights(*at, level, share, response, modulation)
 
     def covers(self, shape: tuple[int, ...]) -> Bools:
         """(h, w): its pixels."""
@@ -68,18 +89,16 @@ class BehindLights:
 
 
 def passing_lights(
-    pictures: Sequence[NDArray[Any]], strength: Array, found: Sequence[Detections], background: NDArray[np.float32],
-    count: Ints, noise: NoiseModel, usual_dn: float,
-) -> list[JointFit]:  # fmt: skip
+    seen: Exposures, found: Sequence[Detections], background: NDArray[np.float32], count: Ints
+) -> list[JointFit]:
     """Fits of single lights on uneven ground that other pictures show without them, where they show the modulation.
 
-    found: the lights of each of n pictures; background (h, w), DN, the mean of `count` (h, w) pictures without a light;
-    usual_dn: its usual brightness.
+    found: the lights of each picture; background (h, w), DN, the mean of `count` (h, w) pictures without a light.
     """
-    noise = replace(noise, shadow_dn2=0.0)  # as in BehindLights.of
     every = [
-        (_shown_by(background, count, d[i : i + 1], noise), k, i) for k, d in enumerate(found) for i in range(len(d))
-    ]
+        (_shown_by(background - seen.black_dn, count, d[i : i + 1], seen), k, i)
+        for k, d in enumerate(found) for i in range(len(d))
+    ]  # fmt: skip
     fits: list[JointFit] = []
     used = Detections.none()  # two lights in one place have the same errors
     for _, k, i in sorted((x for x in every if x[0] > 1 / UNLIKE), reverse=True):
@@ -91,14 +110,14 @@ def passing_lights(
             continue
         used = used.joined(light, _MOST_PASSING)
         width = float(np.sqrt(light.major_px[0] * light.minor_px[0]))
-        values, uv = _around([pictures[k]], np.array([*light.uv_px[0], width]), _AROUND * width, _step(width))
+        box = np.array([*light.uv_px[0], width])
+        values, variance, uv = seen.around([k], box, _AROUND * width, _step(width))
         column, row = uv.T.astype(np.int64)
-        variance = noise.variance(values)
-        empty = background[row, column].astype(float), count[row, column] / variance[0]
+        empty = background[row, column].astype(float) - seen.black_dn, count[row, column] / variance[0]
         fit = fitted(
-            uv, values, variance, light.uv_px, width, float(light.peak[0]), empty, strength=strength[k, None, None]
+            uv, values, variance, light.uv_px, width, float(light.peak[0]), empty, strength=seen.strength[k, None, None]
         )
-        if fit is not None and fit.modulated_share(usual_dn)[1] < _LARGEST_SIGMA**2:
+        if fit is not None and fit.modulated_share(seen.usual_dn)[1] < _LARGEST_SIGMA**2:
             fits.append(fit)
     return fits
 
@@ -108,8 +127,8 @@ def _step(width_px: float) -> int:
     return max(int(width_px / _SAMPLES), 1)
 
 
-def _shown_by(background: NDArray[np.float32], count: Ints, light: Detections, noise: NoiseModel) -> float:
-    """How precisely a light on the ground (h, w), DN, can show the share that this modulates: 1 / sigma, about."""
+def _shown_by(background: NDArray[np.float32], count: Ints, light: Detections, seen: Exposures) -> float:
+    """How precisely a light on ground (h, w), DN above black, shows the share that this modulates: about 1 / sigma."""
     reach = max(float(light.major_px[0]), 1.0)
     (left, top), (right, low) = (light.uv_px[0] + more for more in (-reach, reach))
     box = np.s_[max(int(top), 0) : max(int(low) + 2, 0), max(int(left), 0) : max(int(right) + 2, 0)]
@@ -117,17 +136,18 @@ def _shown_by(background: NDArray[np.float32], count: Ints, light: Detections, n
     if not part.size or not count[box].any():
         return 0.0
     level = max(float(np.mean(part)), 1.0)
-    own = float(noise.variance(level)) / float(np.mean(count[box]))
-    clear = float(light.peak[0]) * np.sqrt(part.size / float(noise.variance(level + light.peak[0])))
+    dark, lit = seen.noise.variance(level + seen.black_dn + np.array([0.0, light.peak[0]]))
+    own = float(dark) / float(np.mean(count[box]))
+    clear = float(light.peak[0]) * np.sqrt(part.size / float(lit))
     return float(np.sqrt(max(float(np.var(part)) - 2 * own, 0.0))) / level * clear
 
 
-def _modulation(fits: Sequence[JointFit], level_dn: float) -> Modulation | None:
+def _modulation(fits: Sequence[JointFit], seen: Exposures) -> Modulation | None:
     """The modulation of all lights of a camera: the weighted median, and the scatter, known beforehand to be usual.
 
     Lights on even ground do not show it.
     """
-    share, variance = np.array([fit.modulated_share(level_dn) for fit in fits]).reshape(-1, 2).T
+    share, variance = np.array([fit.modulated_share(seen.usual_dn) for fit in fits]).reshape(-1, 2).T
     weight = 1 / (variance + UNLIKE**2)
     if float(np.sum(weight)) < 1 / (UNLIKE**2 + _LARGEST_SIGMA**2):
         return None
@@ -138,7 +158,8 @@ def _modulation(fits: Sequence[JointFit], level_dn: float) -> Modulation | None:
     # Each fit counts by how precisely it shows the scatter.
     clear = (UNLIKE**2 * weight) ** 2
     scatter = _USUAL_FITS * UNLIKE**2 + float(np.sum(clear * np.maximum((share - middle) ** 2 - variance, 0.0)))
-    return Modulation(middle, level_dn, float(np.sqrt(scatter / (_USUAL_FITS + max(float(np.sum(clear)) - 1, 0.0)))))
+    unlike = float(np.sqrt(scatter / (_USUAL_FITS + max(float(np.sum(clear)) - 1, 0.0))))
+    return Modulation(middle, seen.usual_dn, unlike, seen.black_dn)
 
 
 class _Part(NamedTuple):
@@ -148,27 +169,26 @@ class _Part(NamedTuple):
     column: Ints
     level_dn: Array
     share: Array
+    response: Array
     fit: JointFit
 
 
 def _behind_each(
-    pictures: Sequence[NDArray[Any]], strength: Array, found: Sequence[Detections], boxes: Array, noise: NoiseModel,
-    modulation: Modulation | None,
-) -> list[_Part]:  # fmt: skip
-    parts = [_behind_one(pictures, strength, found, box, noise, modulation) for box in boxes]
+    seen: Exposures, found: Sequence[Detections], boxes: Array, modulation: Modulation | None
+) -> list[_Part]:
+    parts = [_behind_one(seen, found, box, modulation) for box in boxes]
     return [part for part in parts if part is not None]
 
 
 def _behind_one(
-    pictures: Sequence[NDArray[Any]], strength: Array, found: Sequence[Detections], box: Array, noise: NoiseModel,
-    modulation: Modulation | None,
-) -> _Part | None:  # fmt: skip
+    seen: Exposures, found: Sequence[Detections], box: Array, modulation: Modulation | None
+) -> _Part | None:
     """The pixels behind the brightest light in a box; None: no fit."""
     if box[2] > LARGEST_PATH_PX:
         return None
     here = [d[inside(box[None], d)] for d in found]
     shown = [k for k, d in enumerate(here) if len(d)]
-    if len(shown) < max(_LEAST_PICTURES, _LEAST_SHARE * len(pictures)):
+    if len(shown) < max(_LEAST_PICTURES, _LEAST_SHARE * len(found)):
         return None
     together = [np.count_nonzero(here[k].flux > _ALSO_BRIGHT * here[k].flux.max()) > 1 for k in shown]
     if np.mean(together) > _SELDOM:
@@ -179,55 +199,37 @@ def _behind_one(
         return None
     places = np.concatenate([d.uv_px for d in brightest])
     height, middle = float(np.median([d.peak[0] for d in brightest])), np.median(places, axis=0)
-    lacks = _lacking(pictures, shown, middle, width) > _LACKS * height
+    lacks = _lacking(seen, shown, middle, width) > _LACKS * height
     # What is found in the middle although the light has left is an edge.
     true = ~(lacks[shown] & (np.linalg.norm(places - middle, axis=1) < width))
     there, places = np.array(shown)[true], places[true]
-    some, strength = [pictures[k] for k in there], strength[there, None]
-    empty = [p for k, p in enumerate(pictures) if lacks[k] and k not in shown]
+    empty = np.flatnonzero(lacks & ~np.isin(np.arange(len(found)), shown))
     side = 2 * (box[2] + _AROUND * width)
     step = max(_step(width), int(np.ceil(side / np.sqrt(_MOST_SAMPLES))))
-    values, uv = _around(some, box, _AROUND * width, step)
-    variance = noise.variance(values)
-    without = _without(empty, box, _AROUND * width, step, variance)
+    values, variance, uv = seen.around(there, box, _AROUND * width, step)
+    without = mean_of(seen.around(empty, box, _AROUND * width, step)[0], variance)
+    strength = seen.strength[there, None]
     fit = fitted(uv, values, variance, places, width, height, without, modulation, strength)
-    return None if fit is None else _whole(some, strength, empty, box, width, fit, noise)
+    return None if fit is None else _whole(seen, there, empty, box, width, fit)
 
 
-def _lacking(pictures: Sequence[NDArray[Any]], shown: Sequence[int], place: Array, width: float) -> Array:
+def _lacking(seen: Exposures, shown: Sequence[int], place: Array, width: float) -> Array:
     """(n,), DN: by how much less light of this width each picture has at a place than most of those shown.
 
     Where a vehicle rests for a part of the recording, the other pictures show the background behind its lights.
     """
-    values, uv = _around(pictures, np.array([*place, width]), width, 1)
+    values, _, uv = seen.around(range(len(seen.pictures)), np.array([*place, width]), width, 1)
     light = np.exp(-0.5 * np.sum((uv - place) ** 2, axis=1) / width**2)
     return np.asarray((np.median(values[shown], axis=0) - values) @ light / np.sum(light**2))
 
 
-def _whole(
-    pictures: Sequence[NDArray[Any]], strength: Array, empty: Sequence[NDArray[Any]], box: Array, width: float,
-    fit: JointFit, noise: NoiseModel,
-) -> _Part:  # fmt: skip
-    """All pixels that the light of a fit reaches. empty: pictures without it."""
-    values, uv = _around(pictures, box, 2 * _AROUND * width, 1)
-    variance = noise.variance(values)
-    without = _without(empty, box, 2 * _AROUND * width, 1, variance)
-    level, information, light = fit.behind(uv, values, variance, without, strength)
+def _whole(seen: Exposures, there: Ints, empty: Ints, box: Array, width: float, fit: JointFit) -> _Part:
+    """All pixels that the light of a fit to some pictures reaches. empty: pictures without it."""
+    values, variance, uv = seen.around(there, box, 2 * _AROUND * width, 1)
+    without = mean_of(seen.around(empty, box, 2 * _AROUND * width, 1)[0], variance)
+    level, information, light = fit.behind(uv, values, variance, without)
     lit = light > _LIT
     column, row = uv[lit].astype(np.int64).T
-    return _Part(row, column, level[lit], fit.share + 1 / np.maximum(information[lit], 1e-3), fit)
-
-
-def _without(empty: Sequence[NDArray[Any]], box: Array, more: float, step: int, variance: Array) -> tuple[Array, Array]:
-    """What pictures without the light show where others have this variance (n, m): as `mean_of`."""
-    values = _around(empty, box, more, step)[0] if empty else np.zeros((0, variance.shape[1]))
-    return mean_of(values, variance)
-
-
-def _around(pictures: Sequence[NDArray[Any]], box: Array, more: float, step: int) -> tuple[Array, Array]:
-    """Values (n, m) of n pictures in a box that is larger by so many px, every `step`-th pixel, and pixels (m, 2)."""
-    (height, width), half = pictures[0].shape, box[2] + more
-    rows = np.arange(max(int(box[1] - half), 0), min(int(box[1] + half) + 1, height), step)
-    columns = np.arange(max(int(box[0] - half), 0), min(int(box[0] + half) + 1, width), step)
-    v, u = (x.ravel() for x in np.meshgrid(rows, columns, indexing="ij"))
-    return np.array([p[v, u] for p in pictures], dtype=float), np.column_stack([u, v]).astype(float)
+    share = fit.share + 1 / np.maximum(information[lit], 1e-3)
+    own = Modulation(fit.modulated_share(seen.usual_dn)[0], seen.usual_dn)
+    return _Part(row, column, level[lit] + seen.black_dn, share, own.response(level[lit]), fit)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array
-from tracking.background.behind_lights import LARGEST_PATH_PX, BehindLights, passing_lights
+from tracking.background.behind_lights import LARGEST_PATH_PX, BehindLights, Exposures, passing_lights
 from tracking.background.joint_fit import Modulation
 from tracking.background.mean_pictures import MOST_BYTES, means_of, smooth_part, usable
 from tracking.background.places import AROUND_LIGHT, AROUND_SPOT, ON_LIGHT, SAME_LIGHT, near_each, places_of
@@ -104,9 +104,9 @@ def _without_slow_lights(
     known = slow[slow.known]
     count = np.full(mean.shape, len(pictures))
     count[slow.row, slow.column] = slow.count * slow.known
-    usual_dn = better.usual_dn()
-    passing = passing_lights(equal, strength, found, mean, count, background.noise, usual_dn)
-    behind = BehindLights.of(equal, strength, here, boxes, background.noise, usual_dn, passing)
+    light_dn = better.usual_dn() / shift.over_light
+    seen = Exposures(equal, strength, background.noise, light_dn, better.usual_dn() - light_dn)
+    behind = BehindLights.of(seen, here, boxes, passing_lights(seen, found, mean, count))
     mean[behind.row, behind.column] = behind.level_dn
     slow = slow[~slow.known & ~behind.covers(mean.shape)[slow.row, slow.column]]
     if len(slow.row):
@@ -118,7 +118,7 @@ def _without_slow_lights(
     better.shares[behind.row, behind.column] = behind.share
     better = better.with_light(pictures)
     if behind.modulation is not None:
-        better = better.with_modulation(behind.modulation)
+        better = better.with_modulation(behind.modulation, (behind.row, behind.column), behind.response)
     return _with_shifts(better, mean, pictures, moved, shift, behind.modulation)
 
 

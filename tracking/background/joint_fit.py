@@ -5,13 +5,14 @@ background is the same in all of them: of the pictures k at a pixel x,
 
     g_k(x) = B(x) + (p + q B(x)) s_k G(x - c_k),
 
-with a Gaussian G of peak 1 and one size for all pictures, and known strengths s_k of the light (1, unless the pictures
-were scaled to equal light of the room). The light falls on the surface whose own brightness is B, so
-the surface modulates it: q > 0. B is linear in this equation and is eliminated at each pixel; p, q, the size and the
-places c_k are found by Gauss-Newton steps. A bright light is so determined to a few hundredths of a pixel by a motion
-of half its width, on any background. What the motion leaves open is decided by a plane: B differs from it by as much as
-the found background does. Source: ours; the elimination is the variable projection of Golub & Pereyra (1973), SIAM J.
-Numer. Anal. 10, 413, in the approximation of Kaufman (1975), BIT 15, 49.
+with a Gaussian G of peak 1 and one size for all pictures, and strengths s_k of the light that are known to about a
+percent, since lasers flicker (1, unless the pictures were scaled to equal light of the room). The light falls on the
+surface whose own brightness is B, so the surface modulates it: q > 0. B is linear in this equation and is eliminated at
+each pixel; p, q, the size, the strengths and the places c_k are found by Gauss-Newton steps. A bright light is so
+determined to a few hundredths of a pixel by a motion of half its width, on any background. What the motion leaves open
+is decided by a plane: B differs from it by as much as the found background does. Source: ours; the elimination is the
+variable projection of Golub & Pereyra (1973), SIAM J. Numer. Anal. 10, 413, in the approximation of Kaufman (1975), BIT
+15, 49.
 """
 
 from __future__ import annotations
@@ -26,7 +27,10 @@ from geometry.arrays import Array
 _STEPS, _TRIES = 30, 8  # limits: steps of the fit, and shorter trials of each
 _CONVERGED = 1e-5  # relative decrease of the cost
 _DAMPING, _LESS, _MORE = 1e-2, 1 / 6, 6.0  # of the steps: at the start, after a good and after a bad trial
-_NO_GAUSSIAN = 0.02  # error of the model, as a share of the peak: lasers flicker, and no light is quite a Gaussian
+_NO_GAUSSIAN = 0.02  # error of the model, as a share of the peak: no light is quite a Gaussian
+# Sigma of the strengths, as a share: half of what laser diodes show. The pictures measure it to a tenth of that, and
+# lights that do not flicker stay as well known.
+_FLICKER = 0.005
 MODULATED = 0.5, 0.4  # usual share of the light that the brightness of the surface modulates, and its sigma
 UNLIKE = 0.1  # usual sigma of the modulated share of different places
 _DARKEST = 0.1  # of the usual light: what is left of it on black ground, at least
@@ -43,30 +47,32 @@ _LARGEST_CHANGE = 3.0  # of the width, as a factor, from the start
 
 @dataclass(frozen=True, slots=True)
 class Modulation:
-    """How the brightness of a surface modulates lights: to 1 - share + share B / B0 where it is B instead of B0."""
+    """How the light of a surface modulates lights: to 1 - share + share B / B0 where it is B instead of B0."""
 
     share: float
-    level_dn: float  # B0
+    level_dn: float  # B0, above black
     unlike: float = UNLIKE  # sigma of the share, by which places differ
+    black_dn: float = 0.0  # grey value without light
 
     def at(self, level_dn: float) -> tuple[float, float]:
-        """The share where the surface has this brightness, and the sigma by which places differ."""
+        """The share where the surface has this light, DN above black, and the sigma by which places differ."""
         more = self.share * level_dn / self.level_dn
         return more / (1 - self.share + more), self.unlike
 
     def response(self, surface: Array | NDArray[np.float32]) -> Array:
-        """The light where the surface has these brightnesses, DN, over that where it is B0."""
-        return np.asarray(np.maximum(1 - self.share + self.share * surface / self.level_dn, _DARKEST), float)
+        """The light where the surface has these grey values, DN, over that where it is B0."""
+        lit = (surface - self.black_dn) / self.level_dn
+        return np.asarray(np.maximum(1 - self.share + self.share * lit, _DARKEST), float)
 
     def sensitivity(
         self, surface: NDArray[np.float32], variance: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """A surface (h, w) whose logarithm is the change of a light's logarithm by the share, and its variance.
 
-        surface, variance (h, w): brightness, DN, and its variance, DN^2.
+        surface, variance (h, w): grey value, DN, and its variance, DN^2.
         """
         response = self.response(surface)
-        change = np.exp((surface / self.level_dn - 1) / response)
+        change = np.exp(((surface - self.black_dn) / self.level_dn - 1) / response)
         own = variance * (change / (self.level_dn * response**2)) ** 2
         return np.asarray(change, np.float32), np.asarray(own, np.float32)
 
@@ -82,6 +88,7 @@ class JointLight:
     plane: Array  # (3,): the background's, DN and DN per px, about `origin`
     origin: Array  # (2,) px
     texture_dn: float  # sigma of the background about the plane
+    strength: Array  # (n, 1)
 
     @property
     def widths_px(self) -> Array:
@@ -91,9 +98,11 @@ class JointLight:
 
     def _moved(self, step: Array) -> JointLight:
         n = len(self.places)
+        places, plane, strength = np.split(step[5:], [2 * n, 2 * n + 3])
         return replace(
             self, plain=self.plain + step[0], modulated=self.modulated + step[1], shape=self.shape + step[2:5],
-            places=self.places + step[5 : 5 + 2 * n].reshape(n, 2), plane=self.plane + step[5 + 2 * n :],
+            places=self.places + places.reshape(n, 2), plane=self.plane + plane,
+            strength=self.strength + strength[:, None],
         )  # fmt: skip
 
 
@@ -102,21 +111,22 @@ class _Pixels:
     """What n pictures show at m pixels."""
 
     uv: Array  # (m, 2)
-    values: Array  # (n, m), DN
+    values: Array  # (n, m), DN above black
     variance: Array  # (n, m), DN^2, of the noise
-    usual: float  # DN, of the background
+    usual: float  # DN above black, of the background
     height: float  # DN, of the light
     modulated: tuple[float, float]  # expected share of the light, and its sigma
     empty: Array  # (m,) DN, of pictures without the light: their mean, and the information of that, 1/DN^2
     empty_information: Array  # (m,)
-    strength: Array | float = 1.0  # (n, 1)
+    strength: Array  # (n, 1): expected
 
     def seen(self, light: JointLight) -> _Seen:
         """A light in these pixels."""
         l11, l21, l22 = light.shape
         du, dv = (self.uv[:, i] - light.places[:, i : i + 1] for i in (0, 1))
         along, across = l11 * du + l21 * dv, l22 * dv
-        light_of = self.strength * np.exp(-0.5 * (along**2 + across**2))
+        form = np.exp(-0.5 * (along**2 + across**2))
+        light_of = light.strength * form
         weight = 1 / (self.variance + (_NO_GAUSSIAN * self.height * light_of) ** 2)
         slope = 1 + light.modulated * light_of
         about = self.uv - light.origin
@@ -136,13 +146,16 @@ class _Pixels:
         height = light.plain + modulated
         share, sigma = self.modulated
         usual = np.array([(modulated - share * height) / sigma, 0.5 * (height - self.height)]) / self.height
-        return _Seen(du, dv, along, across, light_of, root, slope, behind, information, residual, usual)
+        flicker = ((light.strength - self.strength) / (_FLICKER * self.strength)).ravel()
+        usual = np.concatenate([usual, flicker])
+        return _Seen(du, dv, along, across, form, light_of, root, slope, behind, information, residual, usual)
 
     def normal(self, light: JointLight, seen: _Seen) -> tuple[Array, Array]:
         """Normal matrix and right side of the step, with the background eliminated."""
         n, m = self.values.shape
-        size = 5 + 2 * n + 3
-        weighted = (light.plain + light.modulated * seen.behind) * seen.light_of * seen.root
+        size = 5 + 2 * n + 3 + n
+        height = (light.plain + light.modulated * seen.behind) * seen.root
+        weighted = height * seen.light_of
         slopes = np.zeros((size, n + 2, m))
         slopes[0, :n], slopes[1, :n] = seen.light_of * seen.root, seen.light_of * seen.behind * seen.root
         slopes[2, :n] = -weighted * seen.along * seen.du
@@ -151,17 +164,19 @@ class _Pixels:
         each = np.arange(n)
         slopes[5 + 2 * each, each], slopes[6 + 2 * each, each] = seen.place_slopes(light)
         about = self.uv - light.origin
-        slopes[5 + 2 * n :, n] = -np.stack([np.ones(m), *about.T]) / light.texture_dn
+        slopes[5 + 2 * n : -n, n] = -np.stack([np.ones(m), *about.T]) / light.texture_dn
+        slopes[size - n + each, each] = height * seen.form
         by_background = np.concatenate([
             seen.slope * seen.root, np.full((1, m), 1 / light.texture_dn), np.sqrt(self.empty_information)[None],
         ])  # fmt: skip
         by_background /= np.sqrt(seen.information)
         slopes -= (slopes * by_background).sum(axis=1)[:, None] * by_background
         flat = slopes.reshape(size, -1)
-        usual = np.zeros((2, size))
+        usual = np.zeros((2 + n, size))
         share, sigma = self.modulated
         usual[0, :2] = np.array([-share, (1 - share) * self.usual]) / (sigma * self.height)
         usual[1, :2] = np.array([1, self.usual]) / (2 * self.height)
+        usual[2 + each, size - n + each] = 1 / (_FLICKER * self.strength.ravel())
         return flat @ flat.T + usual.T @ usual, flat @ seen.residual.ravel() - usual.T @ seen.usual
 
 
@@ -171,13 +186,14 @@ class _Seen:
     dv: Array
     along: Array  # (n, m), widths
     across: Array
+    form: Array  # (n, m): of a peak of 1
     light_of: Array  # (n, m): of a peak of `strength`
     root: Array  # (n, m): of the weights, 1/DN
     slope: Array  # (n, m): by the background
     behind: Array  # (m,) DN: the background
     information: Array  # (m,) 1/DN^2
     residual: Array  # (n + 2, m), sigmas
-    usual: Array  # (2,), sigmas
+    usual: Array  # (2 + n,), sigmas
 
     @property
     def cost(self) -> float:
@@ -205,14 +221,14 @@ class JointFit:
         return more / (p + more), float(slope @ self.strength_cov @ slope)
 
     def behind(
-        self, uv: Array, values: Array, variance: Array, empty: tuple[Array, Array], strength: Array | float = 1.0
+        self, uv: Array, values: Array, variance: Array, empty: tuple[Array, Array]
     ) -> tuple[Array, Array, Array]:
         """The background (m,), DN, its information in pictures (m,), and the light, (m,), highest of all pictures.
 
-        uv (m, 2): pixels; values, variance (n, m): of the pictures there, DN and DN^2; empty: as `mean_of` returns
-        them; strength (n, 1).
+        uv (m, 2): pixels; values, variance (n, m): of the pictures there, as in `fitted`; empty: as `mean_of` returns
+        them.
         """
-        pixels = _Pixels(uv, values, variance, 1.0, self.light.plain, MODULATED, *empty, strength)
+        pixels = _Pixels(uv, values, variance, 1.0, self.light.plain, MODULATED, *empty, self.light.strength)
         seen = pixels.seen(self.light)
         return seen.behind, seen.information * variance.mean(axis=0), seen.light_of.max(axis=0)
 
@@ -230,17 +246,20 @@ def fitted(
 ) -> JointFit | None:  # fmt: skip
     """A light in n pictures that starts from these places (n, 2), width and height; None: it does not explain them.
 
-    uv (m, 2): pixels around it; values, variance (n, m): of the pictures there, DN and DN^2; empty: what pictures
-    without the light show (`mean_of`). modulation: as other lights show it. strength (n, 1): of the light in each one.
+    uv (m, 2): pixels around it; values, variance (n, m): of the pictures there, DN above black, since light modulates
+    light, and DN^2; empty: what pictures without the light show (`mean_of`). modulation: as other lights show it.
+    strength (n, 1): of the light in each one.
     """
     low = np.sort(values, axis=0)[: max(len(values) // 2, 1)].mean(axis=0)
     usual = float(np.median(low))
     expected = MODULATED if modulation is None else modulation.at(max(usual, 1.0))
+    strength = np.broadcast_to(strength, (len(values), 1)).astype(float)
     pixels = _Pixels(uv, values, variance, max(usual, 1.0), height_dn, expected, *empty, strength)
     origin, inverse = uv.mean(axis=0), 1 / width_px
     light = JointLight(
         places, np.array([inverse, 0.0, inverse]), (1 - expected[0]) * height_dn,
         expected[0] * height_dn / pixels.usual, np.array([usual, 0.0, 0.0]), origin, _ALIKE * _FIRST_TEXTURE,
+        strength,
     )  # fmt: skip
     for _ in range(_ROUNDS):
         light = _descended(pixels, light)
@@ -278,7 +297,7 @@ def _checked(pixels: _Pixels, light: JointLight, width_px: float) -> JointFit | 
     seen = pixels.seen(light)
     known = pixels.empty_information > 0  # there other pictures show the background, too
     squares = np.sum(seen.residual[:n] ** 2) + np.sum(seen.residual[n + 1] ** 2)
-    chi2 = float(squares) / max(n * m + np.count_nonzero(known) - m - 2 * n, 1)
+    chi2 = float(squares) / max(n * m + np.count_nonzero(known) - m - 3 * n, 1)
     widths = light.widths_px
     normal, _ = pixels.normal(light, seen)
     covariance = np.linalg.pinv(normal, hermitian=True)

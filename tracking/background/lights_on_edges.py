@@ -79,7 +79,7 @@ class _Search:
         self, behind: NDArray[np.float32], modulated: bool = True, boxes: Array | None = None
     ) -> Detections:
         """Those in front of a background (h, w). modulated: its brightness modulates them; boxes: of `find_spots`."""
-        steps, share = self.steps, self.modulation.share
+        steps, share, black = self.steps, self.modulation.share, np.float32(self.modulation.black_dn)
         once = replace(self.noise.in_steps(steps), texture=0.0, local_texture=None)
         clips = np.iinfo(np.uint16).max // steps
         raised = np.empty(behind.shape, np.uint16)
@@ -87,7 +87,7 @@ class _Search:
             part = np.s_[top : top + STRIP]
             light = self.mean[part] - behind[part]
             if modulated:
-                of_surface = share * behind[part] / np.float32(self.modulation.level_dn)
+                of_surface = share * (behind[part] - black) / np.float32(self.modulation.level_dn)
                 light /= np.maximum(1 - share + of_surface, _LEAST_FACTOR)
             light += np.float32(self.level_dn)
             light[self.clipped[part]] = clips

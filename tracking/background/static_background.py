@@ -110,8 +110,8 @@ class StaticBackground:
         """Variance of the background's own noise over that of a picture."""
         return _MEAN_VARIANCE / self.pictures
 
-    def with_modulation(self, modulation: Modulation) -> StaticBackground:
-        """The background whose surface modulates the lights that fall on it.
+    def with_modulation(self, modulation: Modulation, at: tuple[Ints, Ints], response: Array) -> StaticBackground:
+        """The background whose surface modulates the lights that fall on it; known responses (m,) at some pixels.
 
         The light of a spot is brighter on its side on the brighter part of the surface. In the difference this is
         undone: spots are where their light is, not where the surface is bright. Darker places are noisier then.
@@ -119,7 +119,9 @@ class StaticBackground:
         share, plain = modulation.share, self.plain()
         if share < _LEAST_MODULATION:
             return self
-        factor = 1 / np.clip(modulation.response(plain), *_MODULATION)
+        factor = modulation.response(plain)
+        factor[at] = response
+        factor = 1 / np.clip(factor, *_MODULATION)
         gain = np.rint(factor * 2**GAIN_BITS).astype(np.uint16)
         variance = np.asarray(factor**2 * self.noise.variance(plain), np.float32)
         more = np.maximum(highest_of_blocks(variance) - float(self.noise.variance(self.low_dn)), 0.0)

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from geometry.arrays import Array
-from tracking.background.behind_lights import BehindLights, passing_lights
+from tracking.background.behind_lights import BehindLights, Exposures, passing_lights
 from tracking.background.joint_fit import JointFit, Modulation, fitted, mean_of
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
@@ -121,12 +122,14 @@ def test_the_modulation_that_one_light_shows_helps_with_the_others():
     even = np.rint(pictures(at, np.full(X.shape, 20.0), 0.6)).astype(np.uint8)
     found = [find_spots(p, DetectParameters(), noise) for p in even]
     box = np.array([[MIDDLE, MIDDLE, 9.0]])
-    behind = BehindLights.of(list(seen), np.ones(len(seen)), found, box, noise, 40.0)
+    behind = BehindLights.of(Exposures(list(seen), np.ones(len(seen)), noise, 40.0, 0.0), found, box)
     expected = 0.6 * 40 / 60 / (0.4 + 0.6 * 40 / 60)
     assert behind.modulation is not None
     assert behind.modulation.share == pytest.approx(expected, abs=0.1)
     assert np.abs(behind.level_dn - EDGE[behind.row, behind.column]).max() < 3.0
-    nowhere = BehindLights.of(list(seen), np.ones(len(seen)), found, np.array([[3.0, 3.0, 2.0]]), noise, 40.0)
+    nowhere = BehindLights.of(
+        Exposures(list(seen), np.ones(len(seen)), noise, 40.0, 0.0), found, np.array([[3.0, 3.0, 2.0]])
+    )
     assert nowhere.modulation is None
     assert not nowhere.covers((SIDE, SIDE)).any()
 
@@ -146,11 +149,51 @@ def test_lights_that_pass_over_edges_show_the_modulation_and_how_unlike_their_pl
         spot = Detections.at(np.array([[u, v]]) + OFF, np.eye(2)[None])
         found.append(replace(spot, major_px=np.array([2.6]), minor_px=np.array([2.3]), peak=np.array([80.0])))
     count = np.full(ground.shape, 11)
-    fits = passing_lights(seen, np.ones(12), found, ground, count, NoiseModel(NOISE**2, 0.0, 15.0), 60.0)
+    pictures = Exposures(seen, np.ones(12), NoiseModel(NOISE**2, 0.0, 15.0), 60.0, 0.0)
+    fits = passing_lights(pictures, found, ground, count)
     box = np.array([[3.0, 3.0, 2.0]])
-    shown = BehindLights.of(seen, np.ones(12), found, box, NoiseModel(NOISE**2, 0.0, 15.0), 60.0, fits).modulation
+    shown = BehindLights.of(pictures, found, box, fits).modulation
     assert shown is not None
     assert shown.share == pytest.approx(modulated - 0.5 * others, abs=0.03 + 0.6 * others)
     assert (shown.unlike > 0.1) == (others > 0)
     even = np.full_like(ground, 30.0)
-    assert not passing_lights(seen, np.ones(12), found, even, count, NoiseModel(NOISE**2, 0.0, 15.0), 60.0)
+    assert not passing_lights(pictures, found, even, count)
+
+
+@pytest.mark.parametrize("length_px", [1.5, 3.0])
+def test_a_light_that_flickers_by_a_percent_is_measured_as_precisely_as_one_that_does_not(length_px):
+    """On texture as fine as the light, which the surface modulates in full."""
+    rng = np.random.default_rng(8)
+    squares: list[list[float]] = [[], []]
+    for seed in range(10):
+        grain = gaussian_filter(rng.standard_normal(X.shape), 3.0)
+        ground = 20.0 * (1 + 0.04 * grain / np.std(grain))
+        at, flicker = places(length_px), 0.01 * rng.standard_normal((15, 1, 1))
+        steady = pictures(at, ground, 0.0, seed)
+        light = HEIGHT * np.exp(-0.5 * ((X - at[:, :1, None]) ** 2 + (Y - at[:, 1:, None]) ** 2) / WIDTH**2)
+        for own, share in zip(squares, (0 * flicker, flicker), strict=True):
+            seen = steady + ((ground / 20.0) * (1 + share) - 1) * light
+            fit = fit_of(seen, at + OFF)
+            assert fit is not None
+            own.append(float(np.mean((fit.light.places - at) ** 2)))
+    still, flickers = np.sqrt(np.mean(squares, axis=1))
+    assert flickers < 1.25 * still
+
+
+def test_light_modulates_light_and_the_black_level_is_none():
+    """The surface modulates the lights in full; 12 of its 30 grey values are there without light."""
+    rng, at = np.random.default_rng(9), places(10.0)
+    ground = 18.0 * (1 + 0.3 * np.sin(X / 4))
+    noisy = [12.0 + ground / 18.0 * (18.0 + light) for light in pictures(at, 0 * X, 0.0, 3)]
+    seen = [p + NOISE * rng.standard_normal(p.shape) for p in noisy]
+    found = [Detections.at(uv[None] + OFF, np.eye(2)[None]) for uv in at]
+    found = [replace(d, major_px=np.array([2.6]), minor_px=np.array([2.3]), peak=np.array([80.0])) for d in found]
+    found = [replace(d, flux=np.array([1000.0])) for d in found]
+    noise, box = NoiseModel(NOISE**2, 0.0, 30.0), np.array([[MIDDLE, MIDDLE, 9.0]])
+    shown = [
+        BehindLights.of(Exposures(seen, np.ones(15), noise, 30.0 - black_dn, black_dn), found, box).modulation
+        for black_dn in (0.0, 12.0)
+    ]
+    more = [m.response(np.array([30.0, 33.6])) for m in shown if m is not None]  # a fifth more light
+    assert more[-1] == pytest.approx([1.0, 1.2], abs=0.02)
+    assert len(more) == 1 or more[0][1] < 1.17
