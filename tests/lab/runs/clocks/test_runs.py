@@ -16,7 +16,6 @@ from bench.clocks.recording import Recording, random_recording, write_recording
 from geometry.arrays import Array
 from geometry.pose import Pose
 from lab.files.run.results import read_poses
-from lab.runs import process
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
 from tracking.smoothing.smoother import _Smoother
@@ -35,12 +34,6 @@ def results(recording, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("results") / "out"
     process_run(recording, out)
     return out
-
-
-@pytest.fixture
-def no_search(monkeypatch) -> None:
-    """The search for mistakes of the set-up adds findings and changes no pose, and takes longer than all the rest."""
-    monkeypatch.setattr(process, "mistakes_of_run", lambda *_, **__: ())
 
 
 def attitude_rms_deg(folder: Path) -> float:
