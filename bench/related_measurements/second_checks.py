@@ -22,9 +22,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bench.related_measurements import second_renderer, third_renderer
-from bench.related_measurements import second_renderer as render
 from bench.related_measurements.learned_detector import drawn, is_right
+from bench.related_measurements.renderers import second_renderer, third_renderer
+from bench.related_measurements.renderers import second_renderer as render
 from geometry.arrays import Array
 from lab.targets.circle import CircleOptions
 from lab.targets.drogue import DrogueOptions
