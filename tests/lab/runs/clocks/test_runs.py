@@ -219,7 +219,7 @@ def test_a_turn_that_takes_about_a_frame_is_as_long_as_it_is(tmp_path):
 
 
 @pytest.mark.usefixtures("no_search")
-@pytest.mark.parametrize(("seed", "frames"), [(6003, 200), (6002, 200)])
+@pytest.mark.parametrize(("seed", "frames"), [pytest.param(6003, 200, marks=pytest.mark.slow), (6002, 200)])
 def test_a_swing_after_a_long_rest_is_no_succession_of_jumps(seed, frames, tmp_path):
     r = random_recording(seed, frames=frames)
     assert len(r.corners) == 1
