@@ -30,6 +30,11 @@ def format_with_sigma(value: float, sigma: float, signed: bool = False) -> str:
     return text.replace("-", "\u2212")
 
 
+def format_count(count: int, thing: str) -> str:
+    """`1 frame`, `2 frames`."""
+    return f"{count} {thing}" if count == 1 else f"{count} {thing}s"
+
+
 def format_percent(share: float | None) -> str:
     """A share as a percentage. 0 % and 100 % mean exactly none and all: other shares get enough decimals."""
     if share is None or not np.isfinite(share):

@@ -38,3 +38,11 @@ def loaded_open3d() -> None:
         open3d()
     except MissingOpen3DError as error:
         pytest.skip(str(error))
+
+
+@pytest.fixture
+def no_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No search for mistakes of the set-up: it adds findings and changes no pose, and may take longer than all else."""
+    from lab.runs import process
+
+    monkeypatch.setattr(process, "mistakes_of_run", lambda *_, **__: ())

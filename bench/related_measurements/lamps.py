@@ -22,7 +22,7 @@ import yaml
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
-from bench.related_measurements.second_renderer import background, field
+from bench.related_measurements.renderers.second_renderer import background, field
 from cli import main as beampose
 from geometry.arrays import Array
 

@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 from scipy.optimize import minimize
 
+from bench.related_measurements.renderers import third_renderer
 from geometry.arrays import Array, Bools
-from studies.learned_detector import third_renderer
 from studies.learned_detector.samples import Sample, draw_sample
 from tracking.learned_detector.detector import (
     WEIGHTS,

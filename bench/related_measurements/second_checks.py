@@ -22,14 +22,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bench.related_measurements import second_renderer
-from bench.related_measurements import second_renderer as render
 from bench.related_measurements.learned_detector import drawn, is_right
+from bench.related_measurements.renderers import second_renderer, third_renderer
+from bench.related_measurements.renderers import second_renderer as render
 from geometry.arrays import Array
 from lab.targets.circle import CircleOptions
 from lab.targets.drogue import DrogueOptions
 from lab.targets.point import PointOptions
-from studies.learned_detector import third_renderer
 from tracking.drogue_circle.detectors import Edge
 from tracking.learned_detector.detector import WEIGHTS, find_drogues
 from tracking.noise import Picture

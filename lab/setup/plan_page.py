@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +15,9 @@ from lab import number_format
 from lab.files.text.csv_text import write_table
 from lab.number_format import format_angle, format_length, format_percent
 from lab.report.calibration.calibration_scene import rig_things, scene_views
-from lab.report.page import (
-    KeyFigure,
-    PageDrawing,
-    PageTable,
-    Section,
-)
+from lab.report.page import KeyFigure, PageDrawing, PageTable, Section
 from lab.report.plot.maps import colours, heat_map, hex_colour
-from lab.report.plot.svg import BLUE, number, text
+from lab.report.plot.svg import BLUE, figure, number, text, vertical_text
 from lab.setup.plan_findings import (
     CORRELATION,
     TOTAL_CALIBRATION,
@@ -43,14 +37,7 @@ _MAX_LABELLED_COLUMNS = 15  # with more columns the cells are too small for a nu
 
 
 def cell_map(
-    values: Array,
-    x: Array,
-    y: Array,
-    title: str,
-    *,
-    x_name: str,
-    y_name: str,
-    low_is_bad: bool = False,
+    values: Array, x: Array, y: Array, title: str, *, x_name: str, y_name: str, low_is_bad: bool = False
 ) -> str:
     """Values on a grid as coloured cells with their numbers.
 
@@ -91,9 +78,8 @@ def cell_map(
         for j in range(0, rows, -(-rows // 12))
     ]
     out.append(text(_LEFT + _WIDE / 2, bottom + 30, x_name, "mid"))
-    turned = f'transform="translate(12 {_TOP + _HIGH / 2:.1f}) rotate(-90)"'
-    out.append(f'<text x="0" y="0" class="mid" {turned}>{escape(y_name)}</text>')
-    return _svg(out, title, bottom + 38)
+    out.append(vertical_text(12, _TOP + _HIGH / 2, y_name))
+    return figure(540, bottom + 38, title, out)
 
 
 def share_bars(parts: Sequence[tuple[str, float]], title: str) -> str:
@@ -108,7 +94,7 @@ def share_bars(parts: Sequence[tuple[str, float]], title: str) -> str:
         out.append(text(left - 8, y + 11, name, "end"))
         out.append(f'<rect x="{left}" y="{y}" width="{size:.1f}" height="14" fill="{BLUE}"{pale}/>')
         out.append(text(left + size + 6, y + 11, format_percent(share)))
-    return _svg(out, title, 30 + step * len(parts))
+    return figure(540, 30 + step * len(parts), title, out)
 
 
 def _cell(value: float) -> str:
@@ -117,11 +103,6 @@ def _cell(value: float) -> str:
 
 def _plain(value: float) -> str:
     return number(round(float(value), 4) + 0.0)
-
-
-def _svg(parts: Sequence[str], title: str, height: float) -> str:
-    name = escape(title, quote=True)
-    return f'<svg class="plot" viewBox="0 0 540 {height:.0f}" role="img" aria-label="{name}">{"".join(parts)}</svg>'
 
 
 # Tables of a plan: plan.csv, a row for each pose, and effects.csv, a row for each error of the calibration.

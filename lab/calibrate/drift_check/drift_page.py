@@ -25,7 +25,7 @@ from lab.calibrate.drift_check.drift_comparison import (
 from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.rig_file import RigFile
 from lab.findings.finding import Finding, Level, finding, passed
-from lab.number_format import format_number
+from lab.number_format import format_count, format_number
 from lab.report.calibration.calibration_charts import DriftLine, drift_chart
 from lab.report.calibration.calibration_drawings import corners_overlay
 from lab.report.calibration.calibration_scene import Marker, rig_things, scene_views
@@ -45,18 +45,14 @@ def state_findings(state: CalibrationState | None, today: datetime.date, warning
         out.append(finding("BP-C03", Level.WARN, f"the calibration is dated {state.date}, after today ({today})"))
     left = state.days_left(today)
     if left is not None and left < 0:
-        what = f"the calibration expired on {state.valid_until}, {_days(-left)} ago"
+        what = f"the calibration expired on {state.valid_until}, {format_count(-left, 'day')} ago"
         out.append(finding("BP-C04", Level.FAIL, what))
     elif left is not None and left <= warning_days:
-        what = f"the calibration expires on {state.valid_until}, in {_days(left)}"
+        what = f"the calibration expires on {state.valid_until}, in {format_count(left, 'day')}"
         out.append(finding("BP-C05", Level.WARN, what))
     else:
         out.append(passed(f"calibrated on {state.date}, {state.validity}"))
     return out
-
-
-def _days(count: int) -> str:
-    return f"{count} day{'s' if count != 1 else ''}"
 
 
 def unchecked_finding(cameras: Sequence[str]) -> Finding:

@@ -13,6 +13,7 @@ import numpy as np
 from geometry.forward_model import SpotModel
 from lab.errors import BeamposeError
 from lab.files.run.run_file import DetectionsTable, LiveDevice, VideoFile
+from lab.number_format import format_count
 from lab.report.frames.content import CameraFrame, SpotMark, frame_content, result_data
 from lab.report.plot import svg
 from lab.report.plot.svg import image_uri, true_ranges
@@ -67,7 +68,7 @@ def _spot_events(m: ReportData, j: int) -> list[ShownEvent]:
         if a > 0 and measured[a - 1]:
             out.append(ShownEvent(a, camera, spot, "exit", _for_frames(f"spot {spot} leaves the picture", a, b)))
         if b < len(measured) and measured[b]:
-            words = f"spot {spot} returns after {_frames(b - a)} out of view"
+            words = f"spot {spot} returns after {format_count(b - a, 'frame')} out of view"
             out.append(ShownEvent(b, camera, spot, "return", words))
     out += [
         ShownEvent(a, camera, spot, "occluded", _for_frames(f"spot {spot} is expected in view but not found", a, b))
@@ -93,12 +94,8 @@ def _noted(m: ReportData) -> list[ShownEvent]:
     return out
 
 
-def _frames(n: int) -> str:
-    return "1 frame" if n == 1 else f"{n} frames"
-
-
 def _for_frames(what: str, start: int, stop: int) -> str:
-    return f"{what}, for {_frames(stop - start)}"
+    return f"{what}, for {format_count(stop - start, 'frame')}"
 
 
 def selected(m: ReportData, found: list[ShownEvent]) -> list[ShownEvent]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from html import escape
 
 import numpy as np
@@ -35,6 +36,11 @@ def pose_shades(m: ReportData) -> tuple[Shade, ...]:
     )
 
 
+def _of_poses(m: ReportData, zoom: ZoomData | None) -> partial[str]:
+    """A `time_panel` over the times of the poses, with their statuses."""
+    return partial(time_panel, m.pose_times, shades=pose_shades(m), time_name=m.time_name, zoom=zoom, row=0)
+
+
 def nees_figure(m: ReportData, zoom: ZoomData | None = None) -> str:
     """The normalised estimation error squared over time; empty without truth."""
     delta = m.pose_errors
@@ -43,24 +49,18 @@ def nees_figure(m: ReportData, zoom: ZoomData | None = None) -> str:
     nees = normalised_squares(delta, m.poses.covariance)
     if not np.isfinite(nees).any():
         return ""
-    t = m.pose_times
     n = np.ones(len(nees))
     usual = nees[np.isfinite(nees)]
     top = max(25.0, min(float(usual.max()) * 1.08, 2.0 * float(np.percentile(usual, 99))))
     # Chi-squared with 6 degrees of freedom lies in 1.237 .. 14.449 with a probability of 95 %.
-    return time_panel(
-        t,
+    return _of_poses(m, zoom)(
         "NEES: squared pose error over its covariance; mean 6 if the stated uncertainty is correct, band: 95 %",
         "",
         lines=(Line(nees, svg.BLUE, "NEES", 0.8), Line(6.0 * n, svg.GREEN, "6, the expected mean", 1.4, "6 4")),
         bands=(Band(1.237 * n, 14.449 * n, svg.GREEN, "95 % of the frames if the covariance is correct", 0.15),),
-        shades=pose_shades(m),
         y_range=(0.0, top),
         width=1090,
         height=140,
-        time_name=m.time_name,
-        zoom=zoom,
-        row=0,
     )
 
 
@@ -124,19 +124,13 @@ def rms_figure(m: ReportData, zoom: ZoomData | None = None) -> str:
     p = m.poses
     if not np.isfinite(p.rms_px).any():
         return ""
-    t = m.pose_times
     top = min(1.08 * float(np.nanmax(p.rms_px)), 4.0 * float(np.nanpercentile(p.rms_px, 99)))
-    over_time = time_panel(
-        t,
+    over_time = _of_poses(m, zoom)(
         "residual of the pose, RMS over the spots used",
         "px",
         lines=(Line(p.rms_px, svg.BLUE, "rms_px of attitude.csv", 0.9),),
-        shades=pose_shades(m),
         y_range=(0.0, max(top, 1e-6)),
         height=_RMS_HEIGHT,
-        time_name=m.time_name,
-        zoom=zoom,
-        row=0,
     )
     if m.residual_px is None:
         limits = 0.0, max(float(np.nanpercentile(p.rms_px, 99.5)) * 1.2, 1e-9)
@@ -243,23 +237,16 @@ def _rows(
 
 def _row(m: ReportData, zoom: ZoomData | None, c: _Curve, measured: Bools, last: bool) -> str:
     """Two panels: the value with its band, and the uncertainty with the known errors."""
-    t, shades, height = m.pose_times, pose_shades(m), 128 if last else 104
-    value = time_panel(
-        t,
+    panel = partial(_of_poses(m, zoom), height=128 if last else 104, with_time=last)
+    value = panel(
         c.name,
         c.unit,
         lines=(Line(c.value, svg.BLUE, c.name, 1.3),),
         bands=(Band.about(c.value, c.sigma, 3.0, svg.SKY, "\u00b13\u03c3", 0.45),),
-        shades=shades,
         # Only the bands of measured poses set the range: that of a long prediction would flatten the rest.
         y_range=svg.padded_range(
             np.concatenate([c.value, (c.value - 3 * c.sigma)[measured], (c.value + 3 * c.sigma)[measured]])
         ),
-        height=height,
-        with_time=last,
-        time_name=m.time_name,
-        zoom=zoom,
-        row=0,
         fit=True,
     )
     shown = c.sigma[measured] if measured.any() else c.sigma
@@ -275,8 +262,7 @@ def _row(m: ReportData, zoom: ZoomData | None, c: _Curve, measured: Bools, last:
             lines.append(Line(factor * errors, colour, name, width))
             if np.isfinite(errors[measured]).any():
                 limit = max(limit, svg.robust_range(factor * errors[measured])[1])
-    uncertainty = time_panel(
-        t,
+    uncertainty = panel(
         f"{c.name}: \u00b1\u03c3, \u00b13\u03c3" + (" and error" if c.error is not None else ""),
         unit,
         lines=tuple(lines),
@@ -284,13 +270,7 @@ def _row(m: ReportData, zoom: ZoomData | None, c: _Curve, measured: Bools, last:
             Band.about(0.0, c.sigma, 3 * factor, svg.SKY, "\u00b13\u03c3", 0.35),
             Band.about(0.0, c.sigma, factor, svg.BLUE, "\u00b1\u03c3", 0.35),
         ),
-        shades=shades,
         y_range=(-limit, limit),
-        height=height,
-        with_time=last,
-        time_name=m.time_name,
-        zoom=zoom,
-        row=0,
     )
     return value + uncertainty
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools
 from lab.findings.finding import Level, first_sentence, verdict
-from lab.number_format import format_number, format_percent
+from lab.number_format import format_count, format_number, format_percent
 from lab.report.plot.svg import true_ranges
 from lab.report.run.model_fit import ModelFit
 from lab.report.run.report_data import ReportData
@@ -63,13 +63,10 @@ def _poses(m: ReportData) -> Evidence | None:
     if not gaps:
         return Evidence(Level.PASS, "Poses", f"measured in all {len(measured)} frames")
     first, stop = max(gaps, key=lambda gap: gap[1] - gap[0])
-    words = f"measured in {format_percent(float(measured.mean()))} of the frames; longest gap {_count(stop - first)}"
+    gap = format_count(stop - first, "frame")
+    words = f"measured in {format_percent(float(measured.mean()))} of the frames; longest gap {gap}"
     level = Level.FAIL if not measured.any() else Level.WARN if measured.mean() < _SURE else Level.PASS
     return Evidence(level, "Poses", words, time_link(m, first, stop - 1), f"frame {m.poses.frames[first]}")
-
-
-def _count(n: int) -> str:
-    return f"{n} frame{'s' if n != 1 else ''}"
 
 
 def _calibration(m: ReportData) -> Evidence:
@@ -103,7 +100,7 @@ def _model(fit: ModelFit | None) -> Evidence:
         words = (
             "deviations within the stated uncertainty" if worst is Level.PASS else "the residuals do not fit the rig"
         )
-    words += f" ({_count(fit.frames)} tested)" if fit.frames is not None else ""
+    words += f" ({format_count(fit.frames, 'frame')} tested)" if fit.frames is not None else ""
     found = "; ".join(first_sentence(f.what) for f in fit.findings[:2]) + (
         "; and more" if len(fit.findings) > 2 else ""
     )

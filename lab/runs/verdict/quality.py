@@ -14,6 +14,7 @@ from typing import Any
 
 from lab.findings.finding import Finding, Level, finding, level_above, sentence, verdict, worst_first
 from lab.findings.outcome import Verdict
+from lab.number_format import format_count
 from lab.runs.verdict.frame_checks import FrameRanges
 from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, FrameCause, RunStatistics
 
@@ -173,12 +174,12 @@ def _why_never(statistics: RunStatistics) -> list[Finding]:
         return [finding("BP-V10", Level.FAIL, what, numbers=numbers)]
     if few or unexplained:
         what = (
-            f"{_frames(few)} of {statistics.frames} show fewer than the {statistics.min_spots} points of light that a"
-            f" first pose needs ({per_frame})"
+            f"{format_count(few, 'frame')} of {statistics.frames} show fewer than the {statistics.min_spots} points of"
+            f" light that a first pose needs ({per_frame})"
         )
         return [finding("BP-V09", Level.FAIL, what, numbers=numbers)]
     if causes:
-        what = f"of {_frames(statistics.frames)}, {_causes_text(causes)}"
+        what = f"of {format_count(statistics.frames, 'frame')}, {_causes_text(causes)}"
         return [finding("BP-V03", Level.FAIL, what, variant=next(iter(causes)).value, numbers=numbers)]
     return []
 
@@ -190,9 +191,10 @@ def _cameras(statistics: RunStatistics) -> list[Finding]:
         numbers = {"camera": name, **camera.as_mapping()}
         out += _pictures(name, camera, statistics)
         if len(camera.displaced) >= LEAST_DISPLACED:
+            where = f"{format_count(len(camera.displaced), 'frame')} ({camera.displaced.as_text()})"
             what = (
-                f"camera {name}: in {_frames(len(camera.displaced))} ({camera.displaced.as_text()}) none of its spots"
-                " is where the other cameras put it: the camera or its screen has moved during the recording"
+                f"camera {name}: in {where} none of its spots is where the other cameras put it: the camera or its"
+                " screen has moved during the recording"
             )
             out.append(finding("BP-V19", Level.WARN, what, numbers=numbers))
         if not camera.pictures:
@@ -228,11 +230,13 @@ def _pictures(name: str, camera: CameraStatistics, statistics: RunStatistics) ->
     if first[0] == statistics.first_frame:
         count = first[1] - first[0] + 1
         scattered -= count
-        out["BP-V05"] = f"starts late: it has no picture of the first {_frames(count)}"
+        out["BP-V05"] = f"starts late: it has no picture of the first {format_count(count, 'frame')}"
     if last[1] == statistics.last_frame:
         count = last[1] - last[0] + 1
         scattered -= count
-        out["BP-V06"] = f"stopped before the end: it has no picture from frame {last[0]} on ({_frames(count)})"
+        out["BP-V06"] = (
+            f"stopped before the end: it has no picture from frame {last[0]} on ({format_count(count, 'frame')})"
+        )
     if scattered > (1 - GOOD_PICTURES) * statistics.frames:
         out["BP-V07"] = f"has no usable picture in {scattered} of {statistics.frames} frames"
     return [finding(code, Level.WARN, f"camera {name} {what}", numbers=numbers) for code, what in out.items()]
@@ -261,18 +265,19 @@ def _interruptions(statistics: RunStatistics) -> list[Finding]:
     if statistics.measured and len(statistics.lost):
         never = statistics.lost.ranges[-1][1] == statistics.last_frame
         after = "it was not found again" if never else "it was found again each time"
-        what = f"the vehicle was lost in {_frames(len(statistics.lost))} ({statistics.lost.as_text()}); {after}"
+        which = f"{format_count(len(statistics.lost), 'frame')} ({statistics.lost.as_text()})"
+        what = f"the vehicle was lost in {which}; {after}"
         numbers = {**_frame_numbers(statistics.lost), "found_again": statistics.found_again}
         out.append(finding("BP-V13", Level.WARN, what, numbers=numbers))
     for ranges, against in ((statistics.own_spots, "their own spots"), (statistics.causal, "the causal pass")):
         if len(ranges):
             what = (
-                f"the poses of {_frames(len(ranges))} ({ranges.as_text()}) contradict {against}: they are reported as"
-                " predicted, with wider sigmas"
+                f"the poses of {format_count(len(ranges), 'frame')} ({ranges.as_text()}) contradict {against}: they are"
+                " reported as predicted, with wider sigmas"
             )
             out.append(finding("BP-V14", Level.WARN, what, numbers=_frame_numbers(ranges)))
     if len(statistics.invalid):
-        which = f"{_frames(len(statistics.invalid))} ({statistics.invalid.as_text()})"
+        which = f"{format_count(len(statistics.invalid), 'frame')} ({statistics.invalid.as_text()})"
         what = f"covariances of {which} are not positive definite"
         out.append(finding("BP-V15", Level.WARN, what, numbers=_frame_numbers(statistics.invalid)))
     return out
@@ -280,7 +285,3 @@ def _interruptions(statistics: RunStatistics) -> list[Finding]:
 
 def _frame_numbers(ranges: FrameRanges) -> dict[str, Any]:
     return {"frames": [list(r) for r in ranges]}
-
-
-def _frames(count: int) -> str:
-    return f"{count} frame{'s' if count != 1 else ''}"

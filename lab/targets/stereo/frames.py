@@ -17,7 +17,7 @@ from lab.files.run.run_file import DetectionsTable, RecordedSource
 from lab.pictures.picture_file import DROPPED, ColourPicture, MissingPicture
 from lab.pictures.source import pictures
 from lab.report.frames.canvas import INK, Canvas, bgr, light
-from lab.report.plot.svg import GREEN, ORANGE, Box, image_uri
+from lab.report.plot.svg import GREEN, ORANGE, Box, figure, image_uri
 from lab.runs.frames.frames import recorded_pictures
 from lab.targets.stereo.run import StereoRecord, StereoResults, StereoRun
 from tracking.binocular.marker_model import MarkerImages, project_markers
@@ -58,13 +58,8 @@ def _pair_drawing(
     sides = [_side(results, record, content[c], c) for c in range(2)]
     height = max(h for _, h in sides)
     title = f"frame {record.frame}: left and right picture"
-    parts = "".join(
-        f'<g transform="translate({c * (_SIDE + 20):.0f} 0)">{text}</g>' for c, (text, _) in enumerate(sides)
-    )
-    return (
-        f'<svg class="plot" viewBox="0 0 {2 * _SIDE + 20:.0f} {height:.0f}" role="img" aria-label="{escape(title)}">'
-        f"<title>{escape(title)}</title>{parts}</svg>"
-    )
+    parts = [f'<g transform="translate({c * (_SIDE + 20):.0f} 0)">{text}</g>' for c, (text, _) in enumerate(sides)]
+    return figure(2 * _SIDE + 20, height, title, parts)
 
 
 def _side(results: StereoResults, record: StereoRecord, content: RecordedMarkers, c: int) -> tuple[str, float]:

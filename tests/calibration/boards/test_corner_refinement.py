@@ -23,7 +23,7 @@ LENSES = {
     "pincushion": (PERSPECTIVE, 500.0, (0.25, 0.05, -5e-4, 3e-4, 0.0)),
     "fisheye": (FISHEYE, 215.0, (0.03, -0.01, 0.002, -5e-4)),
 }
-CELLS = 6  # per pixel and axis, of the rendered light
+CELLS = 4  # per pixel and axis, of the rendered light
 
 
 def camera(lens: str) -> Camera:
@@ -49,7 +49,7 @@ def light_without_noise(board: Chessboard, near: Camera, at: Pose, sigma_px: flo
     """Grey values (h, w): a pixel is the mean of CELLS^2 cells, a cell the share of the squares on which it lies.
 
     The plane of the board is that of rays through the corners of cells, so that this shares no code with
-    `board_photo`, and is finer: corners are where the camera model has them to 5e-5 px.
+    `board_photo`, and is finer: corners are where the camera model has them to 1e-4 px RMS.
     """
     grid = true_grid(board, near, at)
     low, high = np.floor(grid.min(axis=(0, 1))) - 16, np.ceil(grid.max(axis=(0, 1))) + 17

@@ -10,6 +10,7 @@ import pytest
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
+from lab.calibrate.camera.camera import figures_of
 from lab.calibrate.camera.camera_findings import findings_of
 from lab.findings.finding import Level, verdict
 from tests.calibration.lens.lens_scenes import TRUTH, Scene, photographs
@@ -34,6 +35,9 @@ def test_a_board_printed_longer_along_x_is_reported_and_does_not_bias_the_lens()
     assert c.board.stretch is not None
     assert c.board.stretch.corrected
     assert abs(c.board.stretch.stretch - 0.005) < 4 * c.board.stretch.sigma[0]
+    figures = figures_of(c)
+    assert figures["board_stretch_percent"] == pytest.approx(0.5, abs=4 * figures["board_stretch_sigma_percent"])
+    assert figures["board_stretch_corrected"] == 1.0
     assert np.all(errors_in_sigmas(c) < 3.5)
     assert verdict(findings_of(c)) < Level.FAIL
     about = next(f for f in findings_of(c) if "longer than stated" in f.what)
@@ -48,6 +52,7 @@ def test_a_true_board_is_taken_as_stated():
     assert c.board is not None
     assert c.board.stretch is not None
     assert not c.board.stretch.corrected
+    assert figures_of(c)["board_stretch_corrected"] == 0.0
     assert not c.board.points.corrected
     assert not np.any(c.fit.stretch)
 

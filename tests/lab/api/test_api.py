@@ -129,6 +129,21 @@ def test_a_camera_without_a_picture_is_not_a_camera_without_points(processed, ru
     assert statuses["none"] & statuses["empty"] == set() or statuses == {"none": {"lost"}, "empty": {"lost"}}
 
 
+def test_places_with_a_sigma_of_their_own_are_the_rows_of_a_table_with_it(processed, run_folder):
+    first, poses = processed.detections.query("frame == 0"), []
+    for sigma_px in (0.1, 0.4):
+        table = first.assign(sigma_u_px=sigma_px, sigma_v_px=sigma_px, cov_uv_px2=0.0)
+        for places in (False, True):
+            points = {c: rows[["u_px", "v_px"]].to_numpy() if places else rows for c, rows in table.groupby("camera")}
+            tracker = lab.Tracker(run_folder / "rig.yaml", prior=load_run(run_folder).prior, covariance=False)
+            done = tracker.step(0.0, points, sigma_px=sigma_px)
+            assert str(done.pose_status) == "measured"
+            poses.append(np.sqrt(np.diag(done.pose_covariance)))
+    np.testing.assert_allclose(poses[1], poses[0], rtol=1e-9)
+    np.testing.assert_allclose(poses[3], poses[2], rtol=1e-9)
+    assert np.all(poses[3] > 1.5 * poses[1])
+
+
 def test_a_temporary_result_lasts_as_long_as_its_object(run_folder):
     run = lab.process(run_folder, causal=True)
     folder = run.folder

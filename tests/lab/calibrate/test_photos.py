@@ -129,7 +129,7 @@ def test_only_the_first_pictures_without_a_board_are_searched_thoroughly(at_once
     assert {reason for _, reason in found.refused} == {found.refused[0][1]}
 
 
-@pytest.mark.parametrize("at_once", [1, 2, 4])
+@pytest.mark.parametrize("at_once", [1, pytest.param(2, marks=pytest.mark.slow), 4])
 def test_a_video_that_shows_a_charuco_board_now_and_then_has_the_reasons_of_three_frames_only(
     at_once, tmp_path, monkeypatch
 ):

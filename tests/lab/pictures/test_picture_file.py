@@ -255,6 +255,16 @@ def test_a_jpeg_without_an_end_marker_or_a_frame_header_is_unreadable(capfd):
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize(("bits", "named"), [(12, True), (16, False)])
+def test_a_jpeg_of_twelve_bits_is_named_and_one_of_sixteen_is_left_to_the_decoder(bits, named, capfd):
+    data = bytearray(cv2.imencode(".jpg", noise())[1].tobytes())
+    data[data.index(b"\xff\xc0") + 4] = bits
+    reason = decode(bytes(data), SIZE).reason
+    assert reason.startswith("unreadable: ")
+    assert (f"{bits} bit numbers, expected 8 or 16 bits" in reason) == named
+    assert capfd.readouterr() == ("", "")
+
+
 # Hostile headers ------------------------------------------------------------------------------------------------
 
 

@@ -21,6 +21,7 @@ from lab.report.calibration import calibration_drawings as draw
 from lab.report.calibration import calibration_scene as scene
 from lab.report.page import LARGEST_BYTES, Page, PageDrawing, PageTable, Section, cell, html_of, write_page
 from lab.report.plot.maps import contour_levels, contour_lines, heat_map, value_range
+from lab.report.plot.svg import image_area
 from tests.geometry.scenes import paper_rig
 
 SIZE = (640, 480)
@@ -284,3 +285,17 @@ def test_the_outlines_of_rays_trails_and_markers_are_their_own_places():
     np.testing.assert_array_equal(scene.outline(scene.Ray("r", a, b), 1.0), [a, b])
     np.testing.assert_array_equal(scene.outline(scene.Trail("t", np.array([a, b, a])), 1.0), [a, b, a])
     np.testing.assert_array_equal(scene.outline(scene.Marker("m", b), 1.0), [b])
+
+
+def test_the_cells_of_a_coverage_map_lie_where_their_corners_are():
+    """All of them in the right half: its cells fill it, and those of the left half are crossed out."""
+    u, v = np.meshgrid(np.arange(SIZE[0] / 2, SIZE[0], 4.0), np.arange(0.0, SIZE[1], 4.0))
+    text = draw.coverage_map(SIZE, np.stack([u.ravel(), v.ravel()], axis=-1))
+    found = re.findall(r'<rect x="([\d.]+)" y="([\d.]+)" width="([\d.]+)" height="([\d.]+)" fill="#', text)
+    x, y, width, height = np.array(found, dtype=float).T
+    left, top, wide, high = image_area(SIZE).box
+    assert x.min() == pytest.approx(left + wide / 2, abs=0.2)
+    assert np.max(x + width) == pytest.approx(left + wide, abs=0.2)
+    assert (y.min(), np.max(y + height)) == (pytest.approx(top, abs=0.2), pytest.approx(top + high, abs=0.2))
+    assert np.sum(width * height) == pytest.approx(wide * high / 2, rel=0.02)
+    assert text.count('stroke-opacity="0.8"/>') == len(x)

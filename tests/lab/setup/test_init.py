@@ -28,10 +28,13 @@ LAYOUTS = [
 ]
 
 
-MANY_BEAMS = pytest.param(Layout(cameras=3, screens=3, beams=12), marks=pytest.mark.slow)
+MANY_BEAMS = [
+    pytest.param(Layout(cameras=3, screens=3, beams=12), marks=pytest.mark.slow),
+    pytest.param(Layout(cameras=4, screens=2, beams=5), marks=pytest.mark.slow),
+]
 
 
-@pytest.mark.parametrize("layout", [*LAYOUTS, MANY_BEAMS], ids=str)
+@pytest.mark.parametrize("layout", [*(layout for layout in LAYOUTS if layout.beams != 5), *MANY_BEAMS], ids=str)
 def test_the_files_pass_the_check_without_a_remark(tmp_path, layout):
     started = start(tmp_path / "lab", layout, 50.0)
     for path in (started.result, *([started.result / "rig.yaml"] if layout == Layout() else [])):

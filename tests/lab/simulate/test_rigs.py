@@ -26,3 +26,13 @@ def test_a_smaller_picture_shows_the_same_at_the_same_share_of_its_sides(scale):
         )
         assert camera.image_size_px == tuple(round(scale * n) for n in whole.image_size_px)
         np.testing.assert_allclose(camera.project(points) + 0.5, scale * (whole.project(points) + 0.5), atol=1e-9)
+
+
+@pytest.mark.parametrize(("one", "other"), [("left-a", "right-a"), ("left-b", "right-b")])
+def test_half_a_turn_about_z_maps_the_cameras_of_one_screen_onto_those_of_the_other(one, other):
+    """The rig is symmetric: what symmetry hides is tested with it."""
+    rig = RIGS["two-cameras-per-screen"]()
+    a, b = (rig.cameras[name].camera_from_world.inverse() for name in (one, other))
+    half = np.diag([-1.0, -1.0, 1.0])
+    np.testing.assert_allclose(half @ a.translation, b.translation, atol=1e-12)
+    np.testing.assert_allclose(half @ a.rotation, b.rotation, atol=1e-12)

@@ -133,7 +133,15 @@ def scattered(rng: np.random.Generator, cameras: tuple[bool, bool], most: int) -
 ONE, BOTH = (True, False), (True, True)
 
 
-@pytest.mark.parametrize(("cameras", "most", "seeds"), [(ONE, 4, range(60)), (BOTH, 3, range(60, 70))])
+@pytest.mark.parametrize(
+    ("cameras", "most", "seeds"),
+    [
+        (ONE, 4, range(30)),
+        (BOTH, 3, range(60, 66)),
+        pytest.param(ONE, 4, range(30, 60), marks=pytest.mark.slow),
+        pytest.param(BOTH, 3, range(66, 70), marks=pytest.mark.slow),
+    ],
+)
 def test_the_search_finds_the_best_of_all_assignments(cameras, most, seeds):
     compared = 0
     for seed in seeds:

@@ -100,6 +100,7 @@ def test_a_camera_of_another_rate_needs_only_its_times(recording, tmp_path):
     assert attitude_rms_deg(tmp_path / "out") < 0.1
 
 
+@pytest.mark.usefixtures("no_search")
 def test_four_spots_seen_by_free_running_cameras_are_found(tmp_path):
     """If the first search allowed for the fastest motion alone, no pose could be distinguished from false points."""
     write_recording(random_recording(1006, frames=12), tmp_path / "run")
@@ -107,6 +108,7 @@ def test_four_spots_seen_by_free_running_cameras_are_found(tmp_path):
     assert read_poses(tmp_path / "out").has("measured").sum() >= 8
 
 
+@pytest.mark.usefixtures("no_search")
 def test_a_gap_in_smooth_motion_does_not_make_the_frames_beside_it_vague(recording, tmp_path):
     """In a gap the velocities may jump unseen; here the frames around it exclude that."""
     shutil.copytree(recording, tmp_path / "run")
@@ -119,6 +121,7 @@ def test_a_gap_in_smooth_motion_does_not_make_the_frames_beside_it_vague(recordi
     assert np.max(sigma[17:25]) < 4 * np.median(sigma)
 
 
+@pytest.mark.usefixtures("no_search")
 def test_a_swing_that_begins_after_rest_leaves_no_frame_vague(tmp_path):
     """Its first accelerations appear as velocity jumps, far smaller than those that the fastest motion would allow."""
     write_recording(random_recording(3406, frames=60), tmp_path / "run")
@@ -128,6 +131,7 @@ def test_a_swing_that_begins_after_rest_leaves_no_frame_vague(tmp_path):
     assert np.max(sigma) < 20 * np.median(sigma)
 
 
+@pytest.mark.usefixtures("no_search")
 @pytest.mark.parametrize("seed", [4000, 4033])
 def test_beside_corners_the_attitude_is_as_accurate_as_with_one_clock(seed, tmp_path):
     """The pictures around a corner are before or after it: each belongs to the motion on its side."""
@@ -141,6 +145,7 @@ def test_beside_corners_the_attitude_is_as_accurate_as_with_one_clock(seed, tmp_
     assert np.nanmean(own.nees) < 1.5
 
 
+@pytest.mark.usefixtures("no_search")
 def test_a_corner_at_the_instant_of_a_frame_keeps_its_moment_when_the_spots_beside_it_count(tmp_path):
     """The spots beside it contradict any moment that is farther off than a part of a step."""
     r = random_recording(8204, frames=80)
@@ -160,9 +165,10 @@ def rounded(r: Recording, frames: float) -> Recording:
     return replace(r, pose_at=pose_at)
 
 
-@pytest.mark.parametrize("frames", [1.0, 3.0])
-def test_turns_that_take_some_frames_are_not_taken_for_corners(frames, tmp_path):
-    own = figures(rounded(random_recording(4000, frames=80), frames), tmp_path)
+@pytest.mark.usefixtures("no_search")
+@pytest.mark.parametrize(("turn", "frames"), [(1.0, 40), (3.0, 80)])
+def test_turns_that_take_some_frames_are_not_taken_for_corners(turn, frames, tmp_path):
+    own = figures(rounded(random_recording(4000, frames=frames), turn), tmp_path)
     assert np.nanmean(own.nees) < 1.5
     assert np.nanmax(own.nees) < 8
 
@@ -179,6 +185,7 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
+@pytest.mark.usefixtures("no_search")
 def test_slow_cameras_lose_no_poses_where_nothing_jumps(tmp_path, monkeypatch):
     """One camera of full rate and two of 30 Hz: jumps could hide in every step, and there are some in a few steps.
 
@@ -196,6 +203,7 @@ def test_slow_cameras_lose_no_poses_where_nothing_jumps(tmp_path, monkeypatch):
     assert np.nanmean(own.nees) < 1.5
 
 
+@pytest.mark.usefixtures("no_search")
 def test_a_turn_that_takes_about_a_frame_is_as_long_as_it_is(tmp_path):
     """A turntable: one jump explains neither the rest before it and after it nor the spots in between."""
     r = random_recording(6005, frames=80)
@@ -210,7 +218,8 @@ def test_a_turn_that_takes_about_a_frame_is_as_long_as_it_is(tmp_path):
     assert np.nanmean(own.nees) < 1.5
 
 
-@pytest.mark.parametrize(("seed", "frames"), [(6003, 200), (6002, 200)])
+@pytest.mark.usefixtures("no_search")
+@pytest.mark.parametrize(("seed", "frames"), [pytest.param(6003, 200, marks=pytest.mark.slow), (6002, 200)])
 def test_a_swing_after_a_long_rest_is_no_succession_of_jumps(seed, frames, tmp_path):
     r = random_recording(seed, frames=frames)
     assert len(r.corners) == 1
@@ -221,6 +230,7 @@ def test_a_swing_after_a_long_rest_is_no_succession_of_jumps(seed, frames, tmp_p
     assert np.nanmean(own.nees) < 1.6
 
 
+@pytest.mark.usefixtures("no_search")
 @pytest.mark.parametrize("gap", [slice(12, 26), slice(8, 22)])
 def test_a_turn_in_a_gap_in_which_nothing_is_seen_is_covered(gap, tmp_path):
     """That it is in one half of the gap does not exclude it from the other."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.related_measurements import second_renderer as render
+from bench.related_measurements.renderers import second_renderer as render
 from tracking.drogue_circle.detectors import CircleParameters, classical_detector
 from tracking.drogue_circle.tracker import Wanted, acquire
 

@@ -10,7 +10,7 @@ import yaml
 from click.testing import CliRunner
 
 from bench.related_measurements.lamps import judged, write_recording
-from bench.related_measurements.second_renderer import background
+from bench.related_measurements.renderers.second_renderer import background
 from cli import main
 
 
