@@ -170,6 +170,8 @@ def mistakes_of_run(
         return of_files
     tested = not passes or unused or has_doubtful_pictures(statistics)
     found = recorded_mistakes(run, pictures.blocks, explained=explained) if tested else ()
+    # Where the poses put no spot into a camera's pictures, its points are false ones.
+    unused = [n for n in unused if cameras[n].expected or not statistics.measured]
     if passes and not unused and verdict(found) is not Level.FAIL:
         return (*hidden_by_symmetry(run, statistics), *of_files)
     # Of a run, all pictures show whether a camera is used, not only the sampled ones; without any pose none is.
@@ -285,8 +287,9 @@ def findings_of(compared: Comparison, rig: Rig) -> tuple[Finding, ...]:
         return (finding("BP-M06", Level.FAIL, what, why=why, remedy=sentence("; or ".join(remedies))),)
     if given.good:
         return ()
-    names, points = list(rig.cameras), given.points.sum(axis=0)
-    return tuple(unused_finding(names[c], int(points[c]), len(given.fits)) for c in given.with_few_labels())
+    names, points, expected = list(rig.cameras), given.points.sum(axis=0), given.expected.sum(axis=0)
+    few = [c for c in given.with_few_labels() if expected[c] or not given.fits.any()]
+    return tuple(unused_finding(names[c], int(points[c]), len(given.fits)) for c in few)
 
 
 def unused_finding(camera: str, points: int, pictures: int) -> Finding:

@@ -23,6 +23,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Beam, Rig
+from geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from lab.calibrate.camera.photos import _frames
 from lab.files.project.project import Cloud
 from lab.files.rig.rig_file import save_rig
@@ -330,6 +331,31 @@ def test_a_camera_whose_points_are_never_labelled_is_reported(tmp_path, recordin
     outcome = process_run(write(files, tmp_path / "run"), tmp_path / "out")
     assert outcome.verdict.status == "check"
     assert any("camera `third`: none of its" in text for text in outcome.verdict.texts)
+
+
+@pytest.mark.parametrize("aside_deg", [0.0, 180.0])
+def test_false_points_of_a_camera_are_reported_only_where_the_poses_put_spots_into_its_pictures(
+    tmp_path, recording, aside_deg
+):
+    """A third camera beside the left one, or with its back to it, that sees four false points per picture."""
+    files = read(recording)
+    left = files.rig["cameras"]["left"]
+    third = yaml.safe_load(yaml.safe_dump(left))
+    pose = Pose(matrix_from_quaternion(np.array(left["camera_from_world"]["quaternion_wxyz"])), np.zeros(3))
+    turned = Pose.from_ypr(np.radians([0.0, aside_deg, 0.0]), np.zeros(3)) @ pose
+    third["camera_from_world"]["quaternion_wxyz"] = quaternion_from_matrix(turned.rotation).tolist()
+    files.rig["cameras"]["third"] = third
+    files.run["cameras"]["third"] = {"detections": "detections.csv"}
+    rng, first = np.random.default_rng(3), files.rows[0]
+    uv = rng.uniform(20, 400, (FRAMES, 4, 2)).tolist()
+    files.rows += [
+        {**first, "camera": "third", "frame": k, "u_px": u, "v_px": v} for k, four in enumerate(uv) for u, v in four
+    ]
+    run = write(files, tmp_path / "run")
+    outcome = process_run(run, tmp_path / "out")
+    said = "camera `third`: none of its"
+    assert any(said in text for text in outcome.verdict.texts) == (aside_deg == 0)
+    assert (said in checked(run)[0]) == (aside_deg == 0)
 
 
 def video(path: Path, size: tuple[int, int] = (64, 48), rate: float = 25.0, fourcc: str = "FFV1") -> Path:
