@@ -124,7 +124,7 @@ def recorded_mistakes(run: Run, blocks: Sequence[Block], *, explained: bool = Fa
     ]
     lenses = same_lenses(run.rig, seen) if given.fits.mean() < LEAST_FITTING else ()
     labelled = (given.fits[:, None] & (given.labelled > 0)).mean(axis=0)
-    left = [n for n, share in zip(run.rig.cameras, labelled, strict=True) if share < LEAST_LABELLED]
+    left = [n for n, share in zip(run.rig.cameras, labelled, strict=True) if share < LEAST_LABELLED and n in seen]
     return (*found, *lenses, *_parts_of_pictures(run.rig, left, blocks))
 
 

@@ -472,6 +472,12 @@ def test_cameras_whose_points_have_labels_are_not_cropped(tmp_path):
     assert "cropped" not in checked(run)[0]
 
 
+def test_the_one_spot_of_a_camera_that_stays_in_a_corner_is_not_cropped(tmp_path):
+    run = write_run_folder(random_scene(95215), tmp_path / "run")
+    (run / "truth").rename(tmp_path / "truth")
+    assert "cropped" not in checked(run)[0]
+
+
 @pytest.mark.parametrize("name", ["mirrored left-right", "camera_from_world inverted, one"])
 def test_a_mistake_is_named_at_rest_without_a_false_point(tmp_path, name):
     save_rig(calibrated(unequal_fan(), 1), tmp_path / "rig.yaml")
@@ -481,6 +487,21 @@ def test_a_mistake_is_named_at_rest_without_a_false_point(tmp_path, name):
     (run / "truth").rename(tmp_path / "truth")
     outcome = process_run(with_mistake(name, run, tmp_path / "wrong"), tmp_path / "out")
     assert re.search(CASE[name].words, outcome.verdict.texts[0])
+
+
+@pytest.mark.parametrize("name", ["turned by 90 deg", "prior in radians"])
+def test_four_spots_of_a_vehicle_at_rest_are_enough_evidence(tmp_path, name):
+    """All frames are alike: 17.5 nats."""
+    run = write_run_folder(random_scene(8116, 40), tmp_path / "run")
+    assert re.search(CASE[name].words, checked(with_mistake(name, run, tmp_path / "wrong"))[0])
+
+
+@pytest.mark.parametrize("seed", [95245, 95277])
+def test_spots_that_are_hidden_in_one_of_two_pictures_are_no_wrong_numbers(tmp_path, seed):
+    """Of a vehicle that moves by less than two pixels per frame the next picture shows them, and fits as well."""
+    run = write_run_folder(random_scene(seed), tmp_path / "run")
+    (run / "truth").rename(tmp_path / "truth")
+    assert "BP-M06" not in checked(run)[0]
 
 
 def test_at_rest_only_the_first_and_last_number_show_a_camera_that_is_numbered_from_one(tmp_path):
