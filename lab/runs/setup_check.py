@@ -52,6 +52,8 @@ class SampledFrames:
         """Add the next frame; pictures that are not points have no motion."""
         here = FrameSet(number, {name: found for name, found in points.items() if isinstance(found, Detections)})
         px = _moved_px(points_in(here), points_in(self._last[-1][1])) if self._last else 0.0
+        if not self._last:  # the first frame, to which the prior refers, has a block of its own
+            self.even.add(FrameSet(number - 1, {}))
         self.even.add(here)
         self._last = [*self._last[1 - BLOCK :], (px, here)]
         if len(self._last) == BLOCK and (most := max(step for step, _ in self._last[1:])) > 0:

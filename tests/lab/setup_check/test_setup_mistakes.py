@@ -496,6 +496,13 @@ def test_four_spots_of_a_vehicle_at_rest_are_enough_evidence(tmp_path, name):
     assert re.search(CASE[name].words, checked(with_mistake(name, run, tmp_path / "wrong"))[0])
 
 
+def test_a_prior_refers_to_the_first_frame_and_not_to_the_second(tmp_path):
+    """The vehicle leaves the prior within a frame: 9 cm at 6.6 Hz."""
+    run = write_run_folder(random_scene(96047), tmp_path / "run")
+    (run / "truth").rename(tmp_path / "truth")
+    assert "BP-M06" not in checked(run)[0]
+
+
 @pytest.mark.parametrize("seed", [95245, 95277])
 def test_spots_that_are_hidden_in_one_of_two_pictures_are_no_wrong_numbers(tmp_path, seed):
     """Of a vehicle that moves by less than two pixels per frame the next picture shows them, and fits as well."""
