@@ -128,6 +128,20 @@ def fitted(samples: list[Sample], weight: Array, weights: Path) -> tuple[Array, 
     return logistic(np.array(inputs), np.array(right), (0, 0, 0), np.array(of)), float(np.median(growth))
 
 
+def own_pictures(frames: int, seed: int, unseen: bool, empty: bool | None) -> list[Sample]:
+    """Pictures of the renderer of the training."""
+    rng = np.random.default_rng([seed, 77])
+    return [draw_sample(rng, SIZE_PX, DIAMETERS_PX, unseen=unseen, empty=empty) for _ in range(frames)]
+
+
+def of_calibration(frames: int, seed: int) -> tuple[list[Sample], Array]:
+    """The pictures that `fitted` gets for the constants of the detector, and their weights."""
+    samples = own_pictures(frames, seed, unseen=False, empty=None)
+    kinds = third_renderer.BACKGROUNDS
+    samples += [drawn(third_renderer, kinds[k % len(kinds)], _THIRD_SEED, k // len(kinds)) for k in range(_THIRD)]
+    return samples, np.where(np.arange(len(samples)) < frames, 1.0, _THIRD_WEIGHT)
+
+
 def reliability(confidence: Array, right: Bools) -> list[tuple[float, float, int]]:
     """Mean confidence, share of right candidates and number, by bins of confidence."""
     edges = np.linspace(0, 1, BINS + 1)
@@ -148,17 +162,12 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, default=WEIGHTS, help="a file weights.onnx of the training script")
     a = parser.parse_args()
     cv2.setNumThreads(1)
-    rng = np.random.default_rng([a.seed, 77])
-    samples = [
-        draw_sample(rng, SIZE_PX, DIAMETERS_PX, unseen=not a.calibrate, empty=None if a.calibrate else False)
-        for _ in range(a.frames)
-    ]
     if a.calibrate:
-        kinds = third_renderer.BACKGROUNDS
-        samples += [drawn(third_renderer, kinds[k % len(kinds)], _THIRD_SEED, k // len(kinds)) for k in range(_THIRD)]
-        weight = np.where(np.arange(len(samples)) < a.frames, 1.0, _THIRD_WEIGHT)
+        samples, weight = of_calibration(a.frames, a.seed)
         curve, growth = fitted(samples, weight, a.weights)
         print(f"CALIBRATION = {np.round(curve, 2).tolist()}, GROWTH = {growth:.2f}")
+    else:
+        samples = own_pictures(a.frames, a.seed, unseen=True, empty=False)
     start = time.process_time()
     found = [find_drogues(s.image, DIAMETERS_PX[0], DIAMETERS_PX[1], LEAST_CONFIDENCE, a.weights) for s in samples]
     learned_s = time.process_time() - start

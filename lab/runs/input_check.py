@@ -53,7 +53,7 @@ from lab.runs.setup_check import (
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters
 from tracking.setup_mistakes.evidence import ENOUGH, NAMES, Invisible, invisible_mistakes
-from tracking.setup_mistakes.possible import SHOWN_BY, Block, possible_mistakes
+from tracking.setup_mistakes.possible import HERE, SHOWN_BY, Block, possible_mistakes
 
 
 @dataclass(slots=True)
@@ -227,7 +227,7 @@ def _blocks(run: Run, sampler: SampledFrames) -> list[Block]:
     filmed = [name for name, source in run.cameras.items() if not isinstance(source, DetectionsTable)]
     if filmed and blocks:
         blocks = [blocks[i] for i in evenly_spaced(np.arange(len(blocks)), ENOUGH)]
-    numbers = [frame.frame for block in blocks for frame in block]
+    numbers = [frame.frame for block in blocks for frame in block if frame.frame >= blocks[0][HERE].frame]
     found = _detected(run, filmed, numbers) if filmed else {}
     return [[points_in(frame) | found.get(frame.frame, {}) for frame in block] for block in blocks]
 

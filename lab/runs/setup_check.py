@@ -52,6 +52,8 @@ class SampledFrames:
         """Add the next frame; pictures that are not points have no motion."""
         here = FrameSet(number, {name: found for name, found in points.items() if isinstance(found, Detections)})
         px = _moved_px(points_in(here), points_in(self._last[-1][1])) if self._last else 0.0
+        if not self._last:  # the first frame, to which the prior refers, has a block of its own
+            self.even.add(FrameSet(number - 1, {}))
         self.even.add(here)
         self._last = [*self._last[1 - BLOCK :], (px, here)]
         if len(self._last) == BLOCK and (most := max(step for step, _ in self._last[1:])) > 0:
@@ -124,7 +126,7 @@ def recorded_mistakes(run: Run, blocks: Sequence[Block], *, explained: bool = Fa
     ]
     lenses = same_lenses(run.rig, seen) if given.fits.mean() < LEAST_FITTING else ()
     labelled = (given.fits[:, None] & (given.labelled > 0)).mean(axis=0)
-    left = [n for n, share in zip(run.rig.cameras, labelled, strict=True) if share < LEAST_LABELLED]
+    left = [n for n, share in zip(run.rig.cameras, labelled, strict=True) if share < LEAST_LABELLED and n in seen]
     return (*found, *lenses, *_parts_of_pictures(run.rig, left, blocks))
 
 
@@ -170,6 +172,8 @@ def mistakes_of_run(
         return of_files
     tested = not passes or unused or has_doubtful_pictures(statistics)
     found = recorded_mistakes(run, pictures.blocks, explained=explained) if tested else ()
+    # Where the poses put no spot into a camera's pictures, its points are false ones.
+    unused = [n for n in unused if cameras[n].expected or not statistics.measured]
     if passes and not unused and verdict(found) is not Level.FAIL:
         return (*hidden_by_symmetry(run, statistics), *of_files)
     # Of a run, all pictures show whether a camera is used, not only the sampled ones; without any pose none is.
@@ -285,8 +289,9 @@ def findings_of(compared: Comparison, rig: Rig) -> tuple[Finding, ...]:
         return (finding("BP-M06", Level.FAIL, what, why=why, remedy=sentence("; or ".join(remedies))),)
     if given.good:
         return ()
-    names, points = list(rig.cameras), given.points.sum(axis=0)
-    return tuple(unused_finding(names[c], int(points[c]), len(given.fits)) for c in given.with_few_labels())
+    names, points, expected = list(rig.cameras), given.points.sum(axis=0), given.expected.sum(axis=0)
+    few = [c for c in given.with_few_labels() if expected[c] or not given.fits.any()]
+    return tuple(unused_finding(names[c], int(points[c]), len(given.fits)) for c in few)
 
 
 def unused_finding(camera: str, points: int, pictures: int) -> Finding:

@@ -278,8 +278,10 @@ def _second(scores: Floats, x: int, y: int, apart: float) -> float:
 # detection has an error of some percent of the diameter, but does not drift. So the offset between the two is a state
 # of its own: detections correct the drift, and their errors average out in part. Their size depends on the drogue, its
 # tilt and its background (.6 to 3 % of the diameter, in 48 sequences of two renderers): the variance is estimated from
-# the innovations. An error that all detections of one drogue have in common shows in no innovation; in these sequences
-# it grows with the others, so its variance is stated as _COMMON times theirs. Source: ours.
+# the innovations. An error that all detections of one drogue have in common shows in no innovation. A part of it grows
+# with the others, a part is the same for all drogues: its variance is _COMMON times (the usual one + theirs). Where the
+# rim has little contrast both are larger, so that the contrast itself says nothing more (.001 of the log likelihood per
+# coordinate in 60 approaches of three renderers, this sum .037). Source: ours.
 
 _MATCH_SIGMA_PX = 0.03  # of a match, beside its own covariance
 _MATCH_SIZE_SIGMA = 0.01  # of the log diameter of a match, beside its own covariance
@@ -288,7 +290,7 @@ _START_SPEED = 0.3, 5.0  # 1 sigma of the speed at the start: diameters and px p
 # to the initial value: as in tracking/single_target/point_tracker.py.
 _LEARNING_RATE, _MOST_NIS = 0.1, 6.0
 _SIGMA_A_RANGE = 0.1, 10.0
-_COMMON = 2.0  # variance of the error that all detections have in common, over that of each
+_COMMON = 0.5  # variance of the error that all detections have in common, over the sum of the usual one and of each
 _NOISE_RATE, _NOISE_RANGE = 0.3, (0.2, 10.0)  # the same of the noise of detections, which are few
 WHOLE = 0.9  # visible share of a pattern of which nothing is hidden
 _HUBER_SIGMAS = 2.5  # a detection farther away than this has a smaller weight
@@ -324,7 +326,7 @@ class PatternState:
             noise,
             p.sigma_a_diameters * diameter_px + p.sigma_a_px,
             np.ones(3),
-            _COMMON * noise,
+            2 * _COMMON * noise,
         )
 
     def predicted(self, dt: float, misses: int, p: LightParameters) -> PatternState:
@@ -374,7 +376,7 @@ class PatternState:
         gain = variance / (variance + noise)
         return replace(
             self, offset=self.offset + gain * innovation, offset_variance=(1 - gain) * variance, noise_scale=scale,
-            common_variance=_COMMON * scale * usual,
+            common_variance=_COMMON * (1 + scale) * usual,
         )  # fmt: skip
 
     def moved(self, match: Match, p: LightParameters) -> PatternState:

@@ -66,11 +66,14 @@ class Mistake:
         frames = zip(_points_of(self.rig, poses), _points_of(given, poses), strict=True)
         return not all(np.array_equal(a, b) for a, b in frames)
 
-    @property
-    def opposite(self) -> Mistake:
-        """Numbers that are wrong in the other direction."""
-        changes = {n: replace(c, later=-c.later) for n, c in self.pictures.items()}
-        return replace(self, pictures=changes)
+    def counterparts(self, given: Rig) -> tuple[Mistake, Mistake]:
+        """Of wrong numbers of one camera, the two frames with the same pictures of it: as given, with that which this
+        frame has without the mistake, and without the mistake, with that which this frame has as given.
+        """
+        later = next(iter(self.pictures.values())).later
+        every = {n: PictureChange(n, later=later) for n in given.cameras}
+        others = {n: PictureChange(n, later=-later) for n in given.cameras if n not in self.pictures}
+        return replace(self, pictures=every), replace(self, pictures=others)
 
     @property
     def elsewhere(self) -> Mistake:

@@ -91,11 +91,12 @@ def select_model(
     Raises:
         AdjustmentError: no model can be used.
     """
-    fitted: list[ModelCandidate] = []
+    judged: list[_Judged] = []
     below: LensFit | None = None
     for model in LENS_MODELS if only is None else (only,):
-        if model.coefficients >= RATIONAL.coefficients and any(_is_enough(table, c) for c in fitted):
-            fitted.append(ModelCandidate(model, None, refused="a smaller model leaves no correlated residuals"))
+        futile = _futile(table, model, judged)
+        if futile:
+            judged.append(_Judged(ModelCandidate(model, None, refused=futile)))
             continue
         same = [f for f in rich if f.model.fisheye == model.fisheye]
         starts = [f for f in same if f.model.coefficients <= model.coefficients] or same
@@ -108,17 +109,24 @@ def select_model(
             candidate = _best_start(table, used, model, [{**smaller.values, **shape}], board)
         if candidate.fit is not None and not model.fisheye:
             below = candidate.fit
-        fitted.append(candidate)
-    return choose(table, fitted)
+        judged.append(_judged(table, candidate))
+    return _choose(judged)
 
 
-def _is_enough(table: CornerTable, candidate: ModelCandidate) -> bool:
-    """Whether the residuals of a candidate are noise over the picture, so that more coefficients have nothing to fit.
+def _futile(table: CornerTable, model: LensModel, smaller: Sequence[_Judged]) -> str:
+    """Why a model of 8 or 12 coefficients need not be tried; empty if it must be.
 
-    They would take most of the time: what the photographs do not determine converges slowly.
+    It would take most of the time: what the photographs do not determine converges slowly.
     """
-    found = candidate.fit
-    return found is not None and beyond_noise(*cell_means(table, found), found.sigma_px)[0] >= PLAUSIBLE_NOISE
+    if model.coefficients < RATIONAL.coefficients:
+        return ""
+    fits = [j.candidate.fit for j in smaller if j.candidate.fit is not None]
+    if any(beyond_noise(*cell_means(table, f), f.sigma_px)[0] >= PLAUSIBLE_NOISE for f in fits):
+        return "a smaller model leaves no correlated residuals"
+    unknown = (j.unknown_px * max(1.0, j.scatter) for j in smaller if j.map and j.candidate.model == RATIONAL)
+    if any(px > UNKNOWN_PX for px in unknown):
+        return f"{RATIONAL.coefficients} coefficients leave directions unknown already"
+    return ""
 
 
 def _best_start(
@@ -129,7 +137,7 @@ def _best_start(
     return min(candidates, key=lambda r: np.inf if r.fit is None else r.fit.sigma_px)
 
 
-def choose(table: CornerTable, candidates: Sequence[ModelCandidate]) -> ModelSelection:
+def _choose(judged: Sequence[_Judged]) -> ModelSelection:
     """The candidate with about the smallest expected error that leaves no directions unknown.
 
     Of several with about the same error: of the more probable kind of lens, perspective or fisheye, the first. If all
@@ -138,7 +146,6 @@ def choose(table: CornerTable, candidates: Sequence[ModelCandidate]) -> ModelSel
     Raises:
         AdjustmentError: no candidate can be used.
     """
-    judged = [_judged(table, c) for c in candidates]
     solved = [j for j in judged if j.map is not None]
     if not solved:
         reasons = "; ".join(f"{j.candidate.model.title}: {j.candidate.refused}" for j in judged)
@@ -160,7 +167,7 @@ def choose(table: CornerTable, candidates: Sequence[ModelCandidate]) -> ModelSel
             probability=weight,
             model_error_px=float(np.sqrt(excess)),
         )
-    out = [done.get(c.candidate.model, c.candidate) for c in judged]
+    out = [done.get(j.candidate.model, j.candidate) for j in judged]
     usable = [c for c in out if c.fit is not None and not c.refused]
     if usable:
         least = min(usable, key=lambda c: c.error_px)
@@ -174,7 +181,7 @@ def choose(table: CornerTable, candidates: Sequence[ModelCandidate]) -> ModelSel
         folding = {j.candidate.model for j in solved if j.folds}
         chosen = min(done.values(), key=lambda c: (c.model in folding, c.error_px > UNKNOWN_PX, c.error_px))
         why = "every model folds or leaves directions unknown; this one has the smallest error where corners were seen"
-    return ModelSelection(out, chosen, "as requested" if len(candidates) == 1 else why)
+    return ModelSelection(out, chosen, "as requested" if len(judged) == 1 else why)
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,7 +303,8 @@ def inliers_of_rich_models(
         beyond_noise(*cell_means(table, f), f.sigma_px)[0] < SIGNIFICANT or f.used.mean() < FEWEST_INLIERS for f in fits
     ]
     wanted = only is not None and only.coefficients >= RATIONAL.coefficients
-    if wanted or (only is None and all(leaves)):
+    tried = any(model == RATIONAL for model, _ in starts)
+    if not tried and (wanted or (only is None and all(leaves))):
         for values in [as_rational(table, f) for f in fits]:
             fits += _rich_fit(table, RATIONAL, values, reasons)
     if not fits:

@@ -23,6 +23,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Beam, Rig
+from geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from lab.calibrate.camera.photos import _frames
 from lab.files.project.project import Cloud
 from lab.files.rig.rig_file import save_rig
@@ -332,6 +333,31 @@ def test_a_camera_whose_points_are_never_labelled_is_reported(tmp_path, recordin
     assert any("camera `third`: none of its" in text for text in outcome.verdict.texts)
 
 
+@pytest.mark.parametrize("aside_deg", [0.0, 180.0])
+def test_false_points_of_a_camera_are_reported_only_where_the_poses_put_spots_into_its_pictures(
+    tmp_path, recording, aside_deg
+):
+    """A third camera beside the left one, or with its back to it, that sees four false points per picture."""
+    files = read(recording)
+    left = files.rig["cameras"]["left"]
+    third = yaml.safe_load(yaml.safe_dump(left))
+    pose = Pose(matrix_from_quaternion(np.array(left["camera_from_world"]["quaternion_wxyz"])), np.zeros(3))
+    turned = Pose.from_ypr(np.radians([0.0, aside_deg, 0.0]), np.zeros(3)) @ pose
+    third["camera_from_world"]["quaternion_wxyz"] = quaternion_from_matrix(turned.rotation).tolist()
+    files.rig["cameras"]["third"] = third
+    files.run["cameras"]["third"] = {"detections": "detections.csv"}
+    rng, first = np.random.default_rng(3), files.rows[0]
+    uv = rng.uniform(20, 400, (FRAMES, 4, 2)).tolist()
+    files.rows += [
+        {**first, "camera": "third", "frame": k, "u_px": u, "v_px": v} for k, four in enumerate(uv) for u, v in four
+    ]
+    run = write(files, tmp_path / "run")
+    outcome = process_run(run, tmp_path / "out")
+    said = "camera `third`: none of its"
+    assert any(said in text for text in outcome.verdict.texts) == (aside_deg == 0)
+    assert (said in checked(run)[0]) == (aside_deg == 0)
+
+
 def video(path: Path, size: tuple[int, int] = (64, 48), rate: float = 25.0, fourcc: str = "FFV1") -> Path:
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*fourcc), rate, size, False)
     ramp = np.tile(np.linspace(0, 250, size[0]).astype(np.uint8), (size[1], 1))
@@ -446,6 +472,12 @@ def test_cameras_whose_points_have_labels_are_not_cropped(tmp_path):
     assert "cropped" not in checked(run)[0]
 
 
+def test_the_one_spot_of_a_camera_that_stays_in_a_corner_is_not_cropped(tmp_path):
+    run = write_run_folder(random_scene(95215), tmp_path / "run")
+    (run / "truth").rename(tmp_path / "truth")
+    assert "cropped" not in checked(run)[0]
+
+
 @pytest.mark.parametrize("name", ["mirrored left-right", "camera_from_world inverted, one"])
 def test_a_mistake_is_named_at_rest_without_a_false_point(tmp_path, name):
     save_rig(calibrated(unequal_fan(), 1), tmp_path / "rig.yaml")
@@ -455,6 +487,28 @@ def test_a_mistake_is_named_at_rest_without_a_false_point(tmp_path, name):
     (run / "truth").rename(tmp_path / "truth")
     outcome = process_run(with_mistake(name, run, tmp_path / "wrong"), tmp_path / "out")
     assert re.search(CASE[name].words, outcome.verdict.texts[0])
+
+
+@pytest.mark.parametrize("name", ["turned by 90 deg", "prior in radians"])
+def test_four_spots_of_a_vehicle_at_rest_are_enough_evidence(tmp_path, name):
+    """All frames are alike: 17.5 nats."""
+    run = write_run_folder(random_scene(8116, 40), tmp_path / "run")
+    assert re.search(CASE[name].words, checked(with_mistake(name, run, tmp_path / "wrong"))[0])
+
+
+def test_a_prior_refers_to_the_first_frame_and_not_to_the_second(tmp_path):
+    """The vehicle leaves the prior within a frame: 9 cm at 6.6 Hz."""
+    run = write_run_folder(random_scene(96047), tmp_path / "run")
+    (run / "truth").rename(tmp_path / "truth")
+    assert "BP-M06" not in checked(run)[0]
+
+
+@pytest.mark.parametrize("seed", [95245, 95277])
+def test_spots_that_are_hidden_in_one_of_two_pictures_are_no_wrong_numbers(tmp_path, seed):
+    """Of a vehicle that moves by less than two pixels per frame the next picture shows them, and fits as well."""
+    run = write_run_folder(random_scene(seed), tmp_path / "run")
+    (run / "truth").rename(tmp_path / "truth")
+    assert "BP-M06" not in checked(run)[0]
 
 
 def test_at_rest_only_the_first_and_last_number_show_a_camera_that_is_numbered_from_one(tmp_path):

@@ -82,6 +82,40 @@ def test_a_right_calibration_is_not_suspected_and_what_it_would_not_show_is_stat
         assert not shown or "focal length of both cameras" in {s.name for s in found.suspects}
 
 
+def common_focal_sigma(pair, model, poses):
+    """Bound of Cramer and Rao, %: of a common error of both focal lengths with all poses unknown, by differences."""
+
+    def pixels(pose, share=0.0):
+        off = dict.fromkeys(("fx", "fy"), share * LEFT.matrix[0, 0])
+        changed = StereoPair(tuple(perturbed_camera(camera, off) for camera in pair.cameras))
+        return project_markers(changed, model, pose)[0].ravel() / NOISE_PX
+
+    information = 0.0
+    for pose in poses:
+        J = np.stack([(pixels(pose.plus(h)) - pixels(pose.plus(-h))) / 2e-5 for h in 1e-5 * np.eye(6)], axis=1)
+        of_share = (pixels(pose, 1e-5) - pixels(pose, -1e-5)) / 2e-5
+        left = of_share - J @ np.linalg.lstsq(J, of_share, rcond=None)[0]
+        information += left @ left
+    return 100 / np.sqrt(information)
+
+
+def test_what_a_recording_does_not_show_of_both_focal_lengths_no_estimate_could():
+    """The stated limit is the bound of the information: from depth within the target, and from cameras that are turned
+    towards each other. Of a flat target that faces cameras side by side nothing shows.
+    """
+    frames = approach()
+    poses = [frame.pose for frame in frames]
+    check = check_calibration(PAIR, MODEL, frames)
+    bound = common_focal_sigma(PAIR, MODEL, poses)
+    assert check.hidden_focal_percent == pytest.approx(np.sqrt(20 * max(check.left, 1)) * bound, rel=0.05)
+    R, eye = LEFT.camera_from_world.rotation, RIGHT.camera_from_world.inverse().translation
+    beside = StereoPair((LEFT, replace(RIGHT, camera_from_world=Pose(R, -R @ eye))))
+    flat = replace(MODEL, positions=MODEL.positions * [1, 1, 0])
+    facing = [Pose(np.eye(3), pose.translation) for pose in poses]
+    assert common_focal_sigma(beside, flat, facing) > 50 * bound
+    assert common_focal_sigma(beside, MODEL, poses) > 1.5 * bound
+
+
 def test_an_error_that_the_covariance_states_is_not_suspected():
     wrong = wrong_pair("right", rot_y_rad=np.deg2rad(0.05))
     stated = RigCovariance(("cameras.right.rot_y_rad",), np.array([[np.deg2rad(0.05) ** 2]]))

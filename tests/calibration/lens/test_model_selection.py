@@ -1,0 +1,44 @@
+"""Models of many coefficients are tried only where they can be of use, and derived once."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibration.lens.fit import model_selection
+from calibration.lens.fit.lens_models import LensModel
+from calibration.lens.fit.lens_start import start
+from calibration.lens.fit.model_selection import RATIONAL, ModelCandidate, _futile, _Judged, inliers_of_rich_models
+from calibration.lens.fit.projection_map import projection_map
+from tests.calibration.lens.lens_scenes import Scene, photographs
+
+
+@pytest.fixture(scope="module")
+def bent():
+    """Six photographs with errors of their own, up to a pixel, which no lens describes."""
+    table = photographs(Scene(views=6, distance_m=(0.6, 0.9)), 3)
+    rng = np.random.default_rng(3)
+    wave, phase = rng.uniform(0.006, 0.012, (6, 2, 2)), rng.uniform(0, 6, (6, 2))
+    away = np.sin(np.einsum("nij,nj->ni", wave[table.view], table.pixels) + phase[table.view])
+    return replace(table, pixels=table.pixels + away)
+
+
+@pytest.mark.parametrize(("unknown_px", "scatter", "tried"), [(2.9, 0.7, True), (3.1, 0.7, False), (2.9, 1.2, False)])
+def test_twelve_coefficients_are_not_tried_where_eight_leave_directions_unknown(bent, unknown_px, scatter, tried):
+    fit = next(f for f in inliers_of_rich_models(bent, [start(bent, False)])[1] if f.model == RATIONAL)
+    off = replace(fit, sigma_px=fit.sigma_px / 10)  # its residuals are not noise: more coefficients may help
+    at = projection_map(fit.model, fit.lens, bent.image_size_px, 1.0)
+    eight = _Judged(ModelCandidate(RATIONAL, off), at, scatter=scatter, unknown_px=unknown_px)
+    assert (_futile(bent, LensModel(12), [eight]) == "") is tried
+    assert _futile(bent, LensModel(5), [eight]) == ""
+    assert "no correlated residuals" in _futile(
+        bent, LensModel(12), [replace(eight, candidate=ModelCandidate(RATIONAL, replace(fit, sigma_px=10.0)))]
+    )
+
+
+def test_a_rational_lens_that_is_a_start_is_not_derived_again(bent, monkeypatch):
+    fits = inliers_of_rich_models(bent, [start(bent, False)])[1]
+    assert any(f.model == RATIONAL for f in fits)
+    monkeypatch.setattr(model_selection, "as_rational", lambda *_: pytest.fail("derived again"))
+    again = inliers_of_rich_models(bent, [(f.model, f.values) for f in fits])[1]
+    assert sorted(f.model.coefficients for f in again) == sorted(f.model.coefficients for f in fits)
