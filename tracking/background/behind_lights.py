@@ -136,8 +136,8 @@ def _shown_by(background: NDArray[np.float32], count: Ints, light: Detections, s
     if not part.size or not count[box].any():
         return 0.0
     level = max(float(np.mean(part)), 1.0)
-    dark, lit = seen.noise.variance(level + seen.black_dn + np.array([0.0, light.peak[0]]))
-    own = float(dark) / float(np.mean(count[box]))
+    unlit, lit = seen.noise.variance(level + seen.black_dn + np.array([0.0, light.peak[0]]))
+    own = float(unlit) / float(np.mean(count[box]))
     clear = float(light.peak[0]) * np.sqrt(part.size / float(lit))
     return float(np.sqrt(max(float(np.var(part)) - 2 * own, 0.0))) / level * clear
 

@@ -34,6 +34,7 @@ _MOSTLY = 0.7  # share of the pictures with lights that move, above which those 
 # Contrast up to which the structure is that of the screen's surface, and modulates the spots' light in full. Of what is
 # more, prints or objects, the spots show a part: 0.25 to 0.57 where photographs modulate their light by up to 60 %.
 _OF_SURFACE, _OF_OBJECTS = 0.1, 0.4
+_AS_BRIGHT = 0.8  # share of the flux of a spot that a picture shows of it at least; less is a part, or an edge in its light
 _CLEARLY_BETTER = 0.5  # ratio of the variances of two measurements of a spot
 _SETTLED = 0.01  # sigmas of a pixel: the background behind a light that changes by less is the last one
 # Of the modulation, what is not undone: by edges, since the surface is seen blurred and in other light, at least; by
@@ -223,7 +224,7 @@ def _better_in(background: StaticBackground, picture: Picture, shift: TextureShi
     """How many spots the difference of a picture shows that the picture does not, or clearly more precisely."""
     found = shift.added_to(find_spots(picture, background.parameters, background.noise), background.noise)
     spots = background.spots_in(picture, background.parameters, shift)
-    same = near_each(spots, found, AROUND_SPOT)
+    same = near_each(spots, found, AROUND_SPOT) & (found.flux > _AS_BRIGHT * spots.flux[:, None])
     better = spots.variance_px2[:, None] < _CLEARLY_BETTER * found.variance_px2
     return int(np.count_nonzero(~np.any(same & ~better, axis=1)))
 

@@ -289,3 +289,15 @@ def test_a_spot_that_only_the_difference_shows_is_found_where_the_pictures_are_s
         found = searched.found_in(picture, USUAL, estimate.texture_shift)
         assert found is not None
         assert np.hypot(*(found.uv_px - at[0]).T).min() < 0.3
+
+
+@pytest.mark.parametrize("sigma_px", [3.0, 4.5])
+def test_a_wide_spot_that_single_pictures_show_in_part_is_measured_in_the_difference(sigma_px):
+    """It rests on black between edges, then on an edge; its fit in one picture takes a part of its light."""
+    first, last = np.array([101.0, 62.0]), np.array([123.0, 57.0])
+    share = np.clip((np.arange(45.0) - 22) / 8, 0, 1)[:, None, None]
+    paths = first + share * (last - first) + np.zeros((45, 1, 2))
+    gap, sigma = errors(found_in_all(board_pictures(paths, sigma_px, 0.6, 14)), paths)
+    assert gap.max() < 0.5
+    assert sigma.max() < 0.5
+    assert np.sqrt(np.mean((gap / sigma) ** 2) / 2) < 1.25
