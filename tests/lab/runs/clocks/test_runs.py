@@ -160,9 +160,9 @@ def rounded(r: Recording, frames: float) -> Recording:
     return replace(r, pose_at=pose_at)
 
 
-@pytest.mark.parametrize("frames", [1.0, 3.0])
-def test_turns_that_take_some_frames_are_not_taken_for_corners(frames, tmp_path):
-    own = figures(rounded(random_recording(4000, frames=80), frames), tmp_path)
+@pytest.mark.parametrize(("seed", "frames"), [(4000, 1.0), (4000, 3.0), (8204, 3.0)])
+def test_turns_that_take_some_frames_are_not_taken_for_corners(seed, frames, tmp_path):
+    own = figures(rounded(random_recording(seed, frames=80), frames), tmp_path)
     assert np.nanmean(own.nees) < 1.5
     assert np.nanmax(own.nees) < 8
 
@@ -219,6 +219,19 @@ def test_a_swing_after_a_long_rest_is_no_succession_of_jumps(seed, frames, tmp_p
     assert swings.sum() > 15
     assert rms(own.attitude_deg[swings]) < 1.3 * rms(one.attitude_deg[swings])
     assert np.nanmean(own.nees) < 1.6
+
+
+@pytest.mark.parametrize(("seed", "jumps"), [(9210, 0), (4000, 3)])
+def test_jumps_are_those_of_the_motion(seed, jumps, tmp_path, monkeypatch):
+    """Smooth motion of .4 px per frame has none; at corners they stay."""
+    smoothers = list[_Smoother]()
+    monkeypatch.setattr(_Smoother, "result", lambda s, *a, f=_Smoother.result: smoothers.append(s) or f(s, *a))
+    r = random_recording(seed, frames=120)
+    figures(r, tmp_path)
+    assert np.count_nonzero((r.corners > 3) & (r.corners < 117)) >= jumps
+    found = np.flatnonzero(smoothers[0].motion.jumped)
+    assert len(found) >= jumps
+    assert all(np.abs(r.corners - k).min(initial=np.inf) < 3 for k in found)
 
 
 @pytest.mark.parametrize("gap", [slice(12, 26), slice(8, 22)])
