@@ -83,6 +83,7 @@ FIRST_SLACK_NATS = 3.0  # by which a jump at one moment may at first be less lik
 JUMP_NATS = 3.0  # by which each jump must make a run more likely than motion without it
 NEGLIGIBLE_JUMP = 1e-3  # of the variance of the fastest motion
 LEAST_SIGMA = 0.05  # of a step: of one moment, since no real corner is in one instant; of pairs it is estimated
+SEEN = 0.9  # of the frames beside open jumps: in an occlusion the few spots within are all that shows the motion
 NO_LIMIT = 1e4  # of a jump's variance: spots that are open by it have no weight
 
 
@@ -219,8 +220,7 @@ class _Estimator:
     def _jumps_withdrawn(self, ranges: list[slice], stronger: bool) -> bool:
         """Withdraw the jumps of these steps where the spots are better explained without them; whether any are.
 
-        stronger: a stronger jerk may replace them (a swing that begins after rest has many jumps at first). If not, the
-        spots outside of these steps decide: those within are vague beside a jump, and less likely for that alone.
+        stronger: a stronger jerk may replace them. If not, the spots outside decide: those within are vague by a jump.
         """
         if self.run.delays is None or self.steps is None:
             return False
@@ -311,8 +311,8 @@ class _Estimator:
         earlier = [group.known(self.moment, self.dt) for group in groups]
         pairs = {i: known for i, known in enumerate(earlier) if len(known) == 2}
         found = {i: known[0] for i, known in enumerate(earlier) if len(known) == 1}
-        largest, before = largest_jumps(self.ref, self.measured, self.dt), self.moment.copy()
         none = set(pairs)  # groups that have not one moment, as the spots near it have shown
+        largest, before = largest_jumps(self.ref, self.measured, self.dt), self.moment.copy()
         for number in range(MOMENT_ROUNDS):
             info = self._information_without(groups, largest, found)
             for i, group in enumerate(groups):
@@ -322,8 +322,8 @@ class _Estimator:
                 slack = FIRST_SLACK_NATS if number < MOMENT_ROUNDS - 1 else 0.0
                 moment = find_moment(self.ref, info, density, steps, size, slack, found.get(i))
                 if moment is not None:
-                    least_s = LEAST_SIGMA * self.dt[moment.step]
-                    found[i] = replace(moment, sigma_s=max(moment.sigma_s, least_s)).after(found.get(i))
+                    least = LEAST_SIGMA * self.dt[moment.step]
+                    found[i] = replace(moment, sigma_s=max(moment.sigma_s, least)).after(found.get(i))
                 elif i in found and found.pop(i).rounds > 0:
                     none.add(i)
         real = [self.jump_scale[group.jumps].max() > NEGLIGIBLE_JUMP for group in groups]
@@ -336,8 +336,8 @@ class _Estimator:
         for i in range(len(groups)):
             if i not in found and real[i]:
                 self._find_pair(groups, i, largest, pairs.get(i))
-        withdrawn = self._jumps_withdrawn(still_open(groups, self.moment), stronger=False)
-        return withdrawn or not np.array_equal(before, self.moment)
+        seen = [s for s in still_open(groups, self.moment) if self.measured[s.start - 1 : s.stop].mean() > SEEN]
+        return self._jumps_withdrawn(seen, stronger=False) or not np.array_equal(before, self.moment)
 
     def _size(self, group: JumpGroup, largest: Array) -> Array:
         """Variances (2,) of the jump of a group."""

@@ -160,9 +160,9 @@ def rounded(r: Recording, frames: float) -> Recording:
     return replace(r, pose_at=pose_at)
 
 
-@pytest.mark.parametrize(("seed", "frames"), [(4000, 1.0), (4000, 3.0), (8204, 3.0)])
-def test_turns_that_take_some_frames_are_not_taken_for_corners(seed, frames, tmp_path):
-    own = figures(rounded(random_recording(seed, frames=80), frames), tmp_path)
+@pytest.mark.parametrize("frames", [1.0, 3.0])
+def test_turns_that_take_some_frames_are_not_taken_for_corners(frames, tmp_path):
+    own = figures(rounded(random_recording(4000, frames=80), frames), tmp_path)
     assert np.nanmean(own.nees) < 1.5
     assert np.nanmax(own.nees) < 8
 
