@@ -173,8 +173,7 @@ class _Estimator:
                 break
         assert out is not None
         if self.run.clocks is not None and self.steps is not None:
-            info, _ = self._information(self.ref)
-            at = self.ref, self.steps, self.core.start
+            info, at = self._information(self.ref)[0], (self.ref, self.steps, self.core.start)
             self.clocks = solve_clocks(self.run, self.assigned, self.weight[self.core], at, info, density)
         return self._extrapolated(out)
 
@@ -227,8 +226,8 @@ class _Estimator:
         found, largest = False, largest_jumps(self.ref, self.measured, self.dt)
         for inside in ranges:
             stretch = self._stretch(inside) if stronger else self._stretch(inside).outside()
-            jumps, kept, steps = self.jumped[inside].copy(), self.moment[inside].copy(), stretch.steps
-            nats = stretch.nats(steps.jerk, steps.velocity_jump, steps.moment)
+            jumps, kept, at = self.jumped[inside].copy(), self.moment[inside].copy(), stretch.steps
+            nats = stretch.nats(at.jerk, at.velocity_jump, at.moment)
             self.jumped[inside], self.moment[inside] = False, (-1.0, 0.0)
             others = np.ascontiguousarray(self._jump_variances(self.ref)[stretch.part])
             sizes = (largest * self.jump_scale)[inside][jumps].max(axis=0) if stronger else np.zeros(2)
@@ -322,8 +321,8 @@ class _Estimator:
                 slack = FIRST_SLACK_NATS if number < MOMENT_ROUNDS - 1 else 0.0
                 moment = find_moment(self.ref, info, density, steps, size, slack, found.get(i))
                 if moment is not None:
-                    least = LEAST_SIGMA * self.dt[moment.step]
-                    found[i] = replace(moment, sigma_s=max(moment.sigma_s, least)).after(found.get(i))
+                    sigma_s = max(moment.sigma_s, LEAST_SIGMA * self.dt[moment.step])
+                    found[i] = replace(moment, sigma_s=sigma_s).after(found.get(i))
                 elif i in found and found.pop(i).rounds > 0:
                     none.add(i)
         real = [self.jump_scale[group.jumps].max() > NEGLIGIBLE_JUMP for group in groups]
