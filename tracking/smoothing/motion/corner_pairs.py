@@ -9,7 +9,7 @@ searched on a grid and then by steps that become shorter. Source: ours; the patt
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -24,8 +24,8 @@ _GRID = 0.5  # of a step: distance of the moments that are tried first ...
 _GRID_SPREAD = 0.25  # ... and their sigma
 _SHORTEST = 0.01  # of a step: length of the last steps of the search ...
 _SPREAD = 0.02  # ... and sigma of the moments
-# Of a step: spreads of the moments, weighted by likelihood: a turn may be smooth.
-_ROUNDED = (0.05, 0.1, 0.2, 0.4)
+# Of a step: spreads of the moments, of which the most likely is kept: a turn may be smooth.
+_ROUNDED = (0.02, 0.1, 0.2, 0.4)
 _ROUND_NATS = 10.0  # by which corners must be more likely than a turn with a stronger jerk, which they resemble
 _LONGEST_DIFFERENCE = 0.25  # of a step: for the curvature
 _CLOSE, _LEAST_JUMPS = 6, 5  # steps between two jumps, and jumps, of a close succession
@@ -52,12 +52,6 @@ class Stretch:
     def ends_s(self) -> Array:
         """(F,): when each step ends."""
         return np.cumsum(self.steps.dt)
-
-    def outside(self) -> Stretch:
-        """The same without the spots of the frames on both sides of each of the steps inside."""
-        weight = self.weight.copy()
-        weight[self.inside.start - 1 : self.inside.stop] = 0.0
-        return replace(self, weight=weight)
 
     def nats(self, jerk: Array, jump: Array, moment: Array) -> float:
         """Log-likelihood for jerk densities (F, 6), variances (F, 2) of jumps and their moments (F, 2)."""
@@ -86,31 +80,31 @@ class Stretch:
         return self.nats(jerk, jump, moment)
 
     def without_jumps(self, jump: Array, sizes: Array) -> tuple[float, Array]:
-        """The mean jerk densities (F, 6) without the jumps inside; before them the log-likelihood of the most likely.
+        """The most likely jerk densities (F, 6) without the jumps inside, and before them their log-likelihood.
 
-        jump (F, 2): the variances of the other jumps; sizes (6,): of these, 0: the jerk is not stronger without them.
+        jump (F, 2): the variances of the other jumps; sizes (6,): of these.
         """
+        best, nats = self.steps.jerk, -np.inf
         moment, inside = self.steps.moment.copy(), self.inside
         moment[inside] = -1.0, 0.0
         dt = float(np.median(self.steps.dt[inside]))
-        shares = _JERKS if sizes.any() else np.zeros(1)
-        jerks = np.repeat(self.steps.jerk[None], len(shares), axis=0)
-        # A velocity changes by q dt^3 / 3.
-        jerks[:, inside] = np.maximum(jerks[:, inside], shares[:, None, None] * 3 * sizes / dt**3)
-        nats = np.array([self.nats(jerk, jump, moment) for jerk in jerks])
-        weight = np.exp(nats - nats.max())
-        return float(nats.max()), np.tensordot(weight / weight.sum(), jerks, axes=1)
+        for share in _JERKS:
+            jerk = self.steps.jerk.copy()
+            jerk[inside] = np.maximum(jerk[inside], share * 3 * sizes / dt**3)  # a velocity changes by q dt^3 / 3
+            if (value := self.nats(jerk, jump, moment)) > nats:
+                best, nats = jerk, value
+        return nats, best
 
 
-def successions(jumped: Bools) -> list[slice]:
-    """The steps about jumps (T,) in close succession."""
+def successions(jumped: Bools) -> list[tuple[int, int]]:
+    """The steps, first and end, about jumps (T,) in close succession."""
     out = list[list[int]]()
     for k in np.flatnonzero(jumped).tolist():
         if out and k - out[-1][-1] <= _CLOSE:
             out[-1].append(k)
         else:
             out.append([k])
-    return [slice(max(one[0] - 1, 1), min(one[-1] + 2, len(jumped))) for one in out if len(one) >= _LEAST_JUMPS]
+    return [(max(one[0] - 1, 1), min(one[-1] + 2, len(jumped))) for one in out if len(one) >= _LEAST_JUMPS]
 
 
 def find_pair(stretch: Stretch, before: tuple[JumpMoment, JumpMoment] | None = None) -> tuple[JumpMoment, ...]:
@@ -137,10 +131,10 @@ def find_pair(stretch: Stretch, before: tuple[JumpMoment, JumpMoment] | None = N
     turn_nats, _ = stretch.without_jumps(others, np.repeat(stretch.size, 3))
     open_nats = stretch.nats(usual, stretch.steps.velocity_jump, stretch.steps.moment)
     wider = [np.maximum(sigma, share * dt / MOMENT_SIGMAS) for share in _ROUNDED]
-    nats = np.array([stretch.nats_of_pair(jerk, at, MOMENT_SIGMAS * one) for one in wider])
-    if not nats.max() > max(open_nats, turn_nats + _ROUND_NATS):
+    nats = [stretch.nats_of_pair(jerk, at, MOMENT_SIGMAS * one) for one in wider]
+    if not max(nats) > max(open_nats, turn_nats + _ROUND_NATS):
         return ()
-    sigma = np.sqrt(np.average(np.square(wider), axis=0, weights=np.exp(nats - nats.max())))
+    sigma = wider[int(np.argmax(nats))]
     rows = np.searchsorted(stretch.ends_s, at)
     return tuple(
         JumpMoment(int(row), float(stretch.ends_s[row] - one), float(s), stretch.part, jerk, stretch.size)

@@ -134,15 +134,6 @@ def jump_groups(jumped: Bools, moment: Array, vague: Bools, scale: Array) -> lis
     return out
 
 
-def still_open(groups: list[JumpGroup], moment: Array) -> list[slice]:
-    """The steps of the groups without any moment (T, 2). Groups side by side explain each other: they are one."""
-    out = list[slice]()
-    for inside in (group.inside for group in groups if not (moment[group.inside, 0] >= 0).any()):
-        beside = bool(out) and inside.start <= out[-1].stop
-        out = [*out[:-1], slice(out[-1].start, inside.stop)] if beside else [*out, inside]
-    return out
-
-
 def uncertain_groups(groups: list[JumpGroup], found: dict[int, JumpMoment], dt: Array, real: list[np.bool]) -> set[int]:
     """Which of the groups have no certain moment.
 

@@ -31,7 +31,6 @@ from tracking.smoothing.motion.jump_moments import (
     JumpMoment,
     find_moment,
     jump_groups,
-    still_open,
     uncertain_groups,
 )
 from tracking.smoothing.motion.process_noise import (
@@ -80,10 +79,9 @@ NO_JUMP_NATS = 5.0  # by which a motion without a jump is more likely, from whic
 MOMENT_ROUNDS = 4  # in which the moment of a jump is found, each with the spots that were too near to it before
 EITHER_SIDE_SIGMAS = 3.0  # of such a moment: as near to it, a spot may be on either side
 FIRST_SLACK_NATS = 3.0  # by which a jump at one moment may at first be less likely than at an open one
-JUMP_NATS = 3.0  # by which each jump must make a run more likely than motion without it
+JUMP_NATS = 3.0  # by which each jump in close succession must make a run more likely than a stronger jerk does
 NEGLIGIBLE_JUMP = 1e-3  # of the variance of the fastest motion
-LEAST_SIGMA = 0.05  # of a step: of one moment, since no real corner is in one instant; of pairs it is estimated
-SEEN = 0.9  # of the frames beside open jumps: in an occlusion the few spots within are all that shows the motion
+LEAST_SPREAD = 0.1  # of a step: no real corner is in one instant
 NO_LIMIT = 1e4  # of a jump's variance: spots that are open by it have no weight
 
 
@@ -128,7 +126,7 @@ class _Estimator:
         self.jump_scale = motion.jump_scale[core].copy()  # (T, 2) ... this ...
         self.moment = motion.moment[core].copy()  # (T, 2) ... and this
         self.settled = np.zeros(len(self.dt), dtype=bool)  # (T,) jumps whose moments these passes have found
-        self.continuous = np.zeros(len(self.dt), dtype=bool)  # (T,) steps from which jumps were withdrawn
+        self.turning = np.zeros(len(self.dt), dtype=bool)  # (T,) steps whose jumps a stronger jerk has replaced
         self.no_pair = set[tuple[int, int]]()  # steps, first and end, in which two jumps were searched
         self.kept: tuple[Reference, tuple[Array, Array, Array]] | None = None  # of the last `_without_corners`
         self.fresh = motion.log_density is None
@@ -160,20 +158,20 @@ class _Estimator:
             converged = bool(np.all(np.abs(moved[:, :6]) < CONVERGED_SIGMAS * sd))
             new = np.zeros_like(self.jumped)
             if (adapting or not self.run.adapt_jerk) and number >= NO_JUMPS_BEFORE:
-                new = new_jumps(out.shock, self.jumped) & ~self.continuous
+                new = new_jumps(out.shock, self.jumped) & ~self.turning
                 self.jumped |= new
             if adapting:
                 adapting = not self._adapt(out, number, number - first + 1, bool(new.any()))
                 if not adapting and (
-                    self._jumps_withdrawn(successions(self.jumped), stronger=True)
-                    or (self._hidden_jumps_excluded() | self._find_moments(density))
+                    self._turns_found() or (self._hidden_jumps_excluded() | self._find_moments(density))
                 ):
                     adapting, first = True, number + 1  # the jerk has to explain what the jumps did
             elif converged and not new.any():
                 break
         assert out is not None
         if self.run.clocks is not None and self.steps is not None:
-            info, at = self._information(self.ref)[0], (self.ref, self.steps, self.core.start)
+            info, _ = self._information(self.ref)
+            at = self.ref, self.steps, self.core.start
             self.clocks = solve_clocks(self.run, self.assigned, self.weight[self.core], at, info, density)
         return self._extrapolated(out)
 
@@ -216,33 +214,33 @@ class _Estimator:
                 self.interior = self.smoother.copy()
         return last
 
-    def _jumps_withdrawn(self, ranges: list[slice], stronger: bool) -> bool:
-        """Withdraw the jumps of these steps where the spots are better explained without them; whether any are.
+    def _turns_found(self) -> bool:
+        """Replace jumps in close succession by a stronger jerk where that explains the spots; whether any are.
 
-        stronger: a stronger jerk may replace them. If not, the spots outside decide: those within are vague by a jump.
+        A vehicle that rests and then swings has the strength of the rest at first, and a jump in every second step.
         """
         if self.run.delays is None or self.steps is None:
             return False
         found, largest = False, largest_jumps(self.ref, self.measured, self.dt)
-        for inside in ranges:
-            stretch = self._stretch(inside) if stronger else self._stretch(inside).outside()
-            jumps, kept, at = self.jumped[inside].copy(), self.moment[inside].copy(), stretch.steps
-            nats = stretch.nats(at.jerk, at.velocity_jump, at.moment)
-            self.jumped[inside], self.moment[inside] = False, (-1.0, 0.0)
+        for first, end in successions(self.jumped):
+            stretch, jumps = self._stretch(first, end), self.jumped[first:end].copy()
+            nats = stretch.nats(stretch.steps.jerk, stretch.steps.velocity_jump, stretch.steps.moment)
+            kept, self.jumped[first:end] = self.moment[first:end].copy(), False
+            self.moment[first:end] = -1.0, 0.0
             others = np.ascontiguousarray(self._jump_variances(self.ref)[stretch.part])
-            sizes = (largest * self.jump_scale)[inside][jumps].max(axis=0) if stronger else np.zeros(2)
-            without_nats, jerk = stretch.without_jumps(others, np.repeat(sizes, 3))
-            if without_nats > nats - JUMP_NATS * np.count_nonzero(jumps):
-                self.log_density[stretch.part], self.jump_scale[inside] = np.log(jerk), 1.0
-                self.continuous[inside], found = True, True
-            else:
-                self.jumped[inside], self.moment[inside] = jumps, kept
+            sizes = np.repeat((largest * self.jump_scale)[first:end][jumps].max(axis=0), 3)
+            turn_nats, jerk = stretch.without_jumps(others, sizes)
+            if not turn_nats > nats - JUMP_NATS * np.count_nonzero(jumps):
+                self.jumped[first:end], self.moment[first:end] = jumps, kept
+                continue
+            self.log_density[stretch.part], self.jump_scale[first:end] = np.log(jerk), 1.0
+            self.turning[first:end], found = True, True
         return found
 
-    def _stretch(self, inside: slice, size: Array | None = None) -> Stretch:
+    def _stretch(self, first: int, end: int, size: Array | None = None) -> Stretch:
         """The frames about some steps. size (2,): variances of the jumps that are searched for there."""
         assert self.steps is not None
-        part = slice(max(inside.start - AROUND, 0), min(inside.stop + AROUND, len(self.dt)))
+        part = slice(max(first - AROUND, 0), min(end + AROUND, len(self.dt)))
         weight = np.where(self.used[self.core], np.where(self.measured, 1.0, PARTIAL_WEIGHT), 0.0)
         ref = Reference(*(np.ascontiguousarray(a[part]) for a in self.ref))
         steps = Steps(*(np.ascontiguousarray(a[part]) for a in self.steps))
@@ -252,8 +250,8 @@ class _Estimator:
         )  # fmt: skip
         return Stretch(
             self.run, self.assigned, self.core.start + part.start, part, ref, steps, weight[part],
-            first_variance(self.ref, self.dt, bool(self.measured[0])),
-            slice(inside.start - part.start, inside.stop - part.start), np.zeros(2) if size is None else size,
+            first_variance(self.ref, self.dt, bool(self.measured[0])), slice(first - part.start, end - part.start),
+            np.zeros(2) if size is None else size,
         )  # fmt: skip
 
     def _hidden_jumps_excluded(self) -> bool:
@@ -297,21 +295,22 @@ class _Estimator:
         return nats[1] - nats[0]
 
     def _find_moments(self, density: Array) -> bool:
-        """Find when the velocities jump, where several steps may, or that they do not; whether any changed.
+        """Find when the velocities jump, where several steps may; whether any changed. density (T, 6): of the jerk.
 
         Where it stays open, the poses beside it are vague in runs whose pictures are of different instants. Jumps whose
-        steps overlap may be one, or two. density (T, 6): of the jerk.
+        steps overlap may be one, or two.
         """
         if self.run.delays is None or self.steps is None:
             return False
         groups = jump_groups(self.jumped & ~self.settled, self.moment, ~self.measured | self.weak, self.jump_scale)
         if not groups:
             return False
-        earlier = [group.known(self.moment, self.dt) for group in groups]
-        pairs = {i: known for i, known in enumerate(earlier) if len(known) == 2}
-        found = {i: known[0] for i, known in enumerate(earlier) if len(known) == 1}
-        none = set(pairs)  # groups that have not one moment, as the spots near it have shown
+        pairs = {i: known for i, group in enumerate(groups) if len(known := group.known(self.moment, self.dt)) == 2}
+        found = {
+            i: known[0] for i, group in enumerate(groups) if len(known := group.known(self.moment, self.dt)) == 1
+        }  # fmt: skip
         largest, before = largest_jumps(self.ref, self.measured, self.dt), self.moment.copy()
+        none = set(pairs)  # groups that have not one moment, as the spots near it have shown
         for number in range(MOMENT_ROUNDS):
             info = self._information_without(groups, largest, found)
             for i, group in enumerate(groups):
@@ -321,8 +320,7 @@ class _Estimator:
                 slack = FIRST_SLACK_NATS if number < MOMENT_ROUNDS - 1 else 0.0
                 moment = find_moment(self.ref, info, density, steps, size, slack, found.get(i))
                 if moment is not None:
-                    sigma_s = max(moment.sigma_s, LEAST_SIGMA * self.dt[moment.step])
-                    found[i] = replace(moment, sigma_s=sigma_s).after(found.get(i))
+                    found[i] = moment.after(found.get(i))
                 elif i in found and found.pop(i).rounds > 0:
                     none.add(i)
         real = [self.jump_scale[group.jumps].max() > NEGLIGIBLE_JUMP for group in groups]
@@ -335,8 +333,7 @@ class _Estimator:
         for i in range(len(groups)):
             if i not in found and real[i]:
                 self._find_pair(groups, i, largest, pairs.get(i))
-        seen = [s for s in still_open(groups, self.moment) if self.measured[s.start - 1 : s.stop].mean() > SEEN]
-        return self._jumps_withdrawn(seen, stronger=False) or not np.array_equal(before, self.moment)
+        return not np.array_equal(before, self.moment)
 
     def _size(self, group: JumpGroup, largest: Array) -> Array:
         """Variances (2,) of the jump of a group."""
@@ -349,7 +346,7 @@ class _Estimator:
         for moment in moments:
             k = moment.step
             self.jumped[k] = self.settled[k] = True
-            self.moment[k] = moment.later_s, MOMENT_SIGMAS * moment.sigma_s
+            self.moment[k] = moment.later_s, max(MOMENT_SIGMAS * moment.sigma_s, LEAST_SPREAD * self.dt[k])
             self.jump_scale[k] = np.minimum(moment.size / np.maximum(largest[k], 1e-300), 1.0)
             self.log_density[moment.part] = np.log(moment.density)
 
@@ -367,7 +364,7 @@ class _Estimator:
         if end - first < 2 or not every or (first, end) in self.no_pair:
             return
         self.no_pair.add((first, end))
-        stretch = self._stretch(slice(first, end), self._size(group, largest))
+        stretch = self._stretch(first, end, self._size(group, largest))
         part = stretch.part
         start = None if known is None else [replace(m, step=m.step - part.start) for m in known]
         found = find_pair(stretch, None if start is None else (start[0], start[1]))

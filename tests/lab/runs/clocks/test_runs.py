@@ -230,19 +230,6 @@ def test_a_swing_after_a_long_rest_is_no_succession_of_jumps(seed, frames, tmp_p
     assert np.nanmean(own.nees) < 1.6
 
 
-@pytest.mark.parametrize(("seed", "jumps"), [(9210, 0), (4000, 3)])
-def test_jumps_are_those_of_the_motion(seed, jumps, tmp_path, monkeypatch):
-    """Smooth motion of .4 px per frame has none; at corners they stay."""
-    smoothers = list[_Smoother]()
-    monkeypatch.setattr(_Smoother, "result", lambda s, *a, f=_Smoother.result: smoothers.append(s) or f(s, *a))
-    r = random_recording(seed, frames=120)
-    figures(r, tmp_path)
-    assert np.count_nonzero((r.corners > 3) & (r.corners < 117)) >= jumps
-    found = np.flatnonzero(smoothers[0].motion.jumped)
-    assert len(found) >= jumps
-    assert all(np.abs(r.corners - k).min(initial=np.inf) < 3 for k in found)
-
-
 @pytest.mark.usefixtures("no_search")
 @pytest.mark.parametrize("gap", [slice(12, 26), slice(8, 22)])
 def test_a_turn_in_a_gap_in_which_nothing_is_seen_is_covered(gap, tmp_path):
