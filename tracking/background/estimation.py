@@ -34,7 +34,7 @@ _MOSTLY = 0.7  # share of the pictures with lights that move, above which those 
 # Contrast up to which the structure is that of the screen's surface, and modulates the spots' light in full. Of what is
 # more, prints or objects, the spots show a part: 0.25 to 0.57 where photographs modulate their light by up to 60 %.
 _OF_SURFACE, _OF_OBJECTS = 0.1, 0.4
-_AS_BRIGHT = 0.8  # share of the flux of a spot that a picture shows of it at least; less is a part, or an edge in its light
+_AS_BRIGHT = 0.8  # share of the flux of a spot that a picture shows of it: less is a part, or an edge in its light
 _CLEARLY_BETTER = 0.5  # ratio of the variances of two measurements of a spot
 _SETTLED = 0.01  # sigmas of a pixel: the background behind a light that changes by less is the last one
 # Of the modulation, what is not undone: by edges, since the surface is seen blurred and in other light, at least; by
