@@ -95,10 +95,8 @@ def passing_lights(
 
     found: the lights of each picture; background (h, w), DN, the mean of `count` (h, w) pictures without a light.
     """
-    every = [
-        (_shown_by(background - seen.black_dn, count, d[i : i + 1], seen), k, i)
-        for k, d in enumerate(found) for i in range(len(d))
-    ]  # fmt: skip
+    ground = background - np.float32(seen.black_dn)
+    every = [(_shown_by(ground, count, d[i : i + 1], seen), k, i) for k, d in enumerate(found) for i in range(len(d))]
     fits: list[JointFit] = []
     used = Detections.none()  # two lights in one place have the same errors
     for _, k, i in sorted((x for x in every if x[0] > 1 / UNLIKE), reverse=True):
@@ -113,7 +111,7 @@ def passing_lights(
         box = np.array([*light.uv_px[0], width])
         values, variance, uv = seen.around([k], box, _AROUND * width, _step(width))
         column, row = uv.T.astype(np.int64)
-        empty = background[row, column].astype(float) - seen.black_dn, count[row, column] / variance[0]
+        empty = ground[row, column].astype(float), count[row, column] / variance[0]
         fit = fitted(
             uv, values, variance, light.uv_px, width, float(light.peak[0]), empty, strength=seen.strength[k, None, None]
         )
