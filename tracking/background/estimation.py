@@ -143,9 +143,9 @@ def _with_shifts(
     widths = np.concatenate([np.sqrt(d.major_px * d.minor_px) for d in found])
     width = float(np.median(widths if len(widths) else still_px)) if len(widths) + len(still) else 0.0  # spots may rest
     changed, passed = np.array([background.lights.in_picture(p)[1:] for p in pictures]).swapaxes(0, 1)
-    # Where another light is in nearly all pictures, what rests is what the places of a light have in common that moves
+    # What is alone and unchanged in hardly any picture is what the places of a light have in common that moves
     # by less than its width: that place is searched in the pictures. A wider one is an object, a square of a board.
-    always = (passed.mean(axis=0) > _ALWAYS) & (still_px < _WIDER * width)
+    always = ((passed | changed).mean(axis=0) > _ALWAYS) & (still_px < _WIDER * width)
     common = np.column_stack([still.uv_px, background.lights.half_px])[always]
     unknown = np.concatenate([background.unknown, common])
     better = replace(background, unknown=unknown, fixed=np.asarray(~changed.any(axis=0) & moved))

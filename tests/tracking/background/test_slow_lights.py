@@ -301,3 +301,17 @@ def test_a_wide_spot_that_single_pictures_show_in_part_is_measured_in_the_differ
     assert gap.max() < 0.5
     assert sigma.max() < 0.5
     assert np.sqrt(np.mean((gap / sigma) ** 2) / 2) < 1.25
+
+
+@pytest.mark.parametrize(("start", "length_px"), [(10, 1.0), (15, 1.0), (25, 1.4)])
+def test_a_narrow_spot_that_moves_by_its_width_is_one_point(start, length_px):
+    """The places that it has in the recording overlap: that part of its light looks like a light at rest."""
+    share = np.clip((np.arange(45.0) - start) / 15, 0, 1)[:, None, None] * length_px
+    first = np.array([[62.3, 60.4], [141.6, 102.2], [180.8, 140.7], [220.1, 180.6], [300.5, 100.3]])
+    paths = first + share * np.array([-0.6, 0.8])
+    found = found_in_all(board_pictures(paths, 0.5, 0.3, 15))
+    gap, _ = errors(found, paths)
+    assert gap.max() < 0.2
+    for d, at in zip(found, paths, strict=True):
+        bright = [d.flux[np.hypot(*(d.uv_px - place).T) < 2.0] for place in at]
+        assert [np.count_nonzero(flux > 0.2 * flux.max()) for flux in bright] == [1] * len(at)
