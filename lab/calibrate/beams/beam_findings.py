@@ -23,6 +23,7 @@ from lab.calibrate.beams.recordings import Recordings, stand_of
 from lab.errors import InputError
 from lab.files.project.project import Project
 from lab.findings.finding import ENTRIES, Finding, Level, finding, passed
+from lab.number_format import format_count
 
 
 def diagnose_failed_fit(
@@ -127,7 +128,7 @@ def _determined(c: BeamCalibration, positions: Sequence[str]) -> list[Finding]:
         names = first_names([positions[i] for i in c.dropped])
         out.append(finding("BP-B01", Level.WARN, f"{len(c.dropped)} positions excluded: {names}"))
     if count < FEWEST_POSITIONS:
-        what = f"only {count} position{'' if count == 1 else 's'}, expected {FEWEST_POSITIONS} or more"
+        what = f"only {format_count(count, 'position')}, expected {FEWEST_POSITIONS} or more"
         out.append(finding("BP-B02", Level.FAIL, what))
     known = c.world_from_stand is not None
     if c.undetermined:

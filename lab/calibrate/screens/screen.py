@@ -23,6 +23,7 @@ from lab.files.rig.rig_file import TARGET, RigFile, covariance_blocks, save_rig,
 from lab.files.text.csv_text import write_table
 from lab.findings.finding import Finding, Level, finding, verdict
 from lab.findings.outcome import Outcome
+from lab.number_format import format_count
 from lab.progress import Progress
 
 RESIDUALS, DOTS = "residuals.csv", "dots.csv"
@@ -130,7 +131,7 @@ def _figures(result: FittedScreens) -> str:
     surface = 1e3 * max(float(np.max(spot_sigmas(result, k))) for k in range(len(rig.screens)))
     place = 1e3 * max(pointing_sigmas_m(result).values())
     counted = ", ".join(
-        f"{n} {what}{'' if n == 1 else 's'}" for n, what in ((len(rig.cameras), "camera"), (len(rig.screens), "screen"))
+        format_count(n, what) for n, what in ((len(rig.cameras), "camera"), (len(rig.screens), "screen"))
     )
     return f"{counted}, surfaces to {surface:.2g} mm, cameras to {place:.2g} mm on them"
 

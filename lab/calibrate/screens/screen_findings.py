@@ -14,6 +14,7 @@ from calibration.screens.screens import ApproximatePosition, FittedScreens, poin
 from geometry.arrays import Array
 from lab.files.project.project import Project
 from lab.findings.finding import Finding, Level, finding, level_above, passed
+from lab.number_format import format_count
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,7 +210,7 @@ def _coverage(project: Project, result: FittedScreens) -> list[Finding]:
         beyond = np.flatnonzero((reach > half + 0.01).any(axis=1))
         if beyond.size:
             point = result.network.control_points.names[screen.control_points[int(beyond[0])]]
-            count = "1 point" if len(beyond) == 1 else f"{len(beyond)} points"
+            count = format_count(len(beyond), "point")
             what = f"screen {name!r}: control point {point!r} is outside of size_m ({count} in all)"
             out.append(finding("BP-S13", Level.WARN, what))
         share = np.ptp(screen.xyz[screen.used, :2], axis=0) / np.array(entry.size_m)

@@ -12,6 +12,7 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 
+from lab.number_format import format_count
 from lab.pictures.picture_file import GreyPicture
 from lab.report.frames.canvas import (
     DESK,
@@ -277,7 +278,7 @@ def _camera_block(camera: CameraFrame, wide: int, layout: Layout, cuts: bool, li
     grey = grey_picture(camera, limits)
     measured = sum(m.status is not None and m.status.measured for m in camera.marks)
     n = len(camera.detections)
-    words = f"{camera.camera}: {measured} of {len(camera.marks)} spots measured, {n} detection{'' if n == 1 else 's'}"
+    words = f"{camera.camera}: {measured} of {len(camera.marks)} spots measured, {format_count(n, 'detection')}"
     caption: Pixels = np.full((round(1.5 * line), wide, 3), PAPER, np.uint8)
     write(caption, (4, 1.05 * line), words, line)
     parts = [caption, panel(camera, grey, wide, unit, line)]

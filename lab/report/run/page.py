@@ -18,6 +18,7 @@ from lab.errors import InputError
 from lab.files.run.results import PoseTrack
 from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_text
+from lab.number_format import format_count
 from lab.report.calibration.calibration_scene import LAB_VIEWS, scene_views
 from lab.report.html import as_script, environment
 from lab.report.page import Failure, files_beside, write_failure_report
@@ -194,7 +195,7 @@ def _run_line(m: ReportData) -> str:
     if m.run is not None:
         parts.append(f"{m.run.frame_rate_hz:g} Hz")
     cameras = m.spots.cameras
-    parts.append(f"{len(cameras)} camera{'s' if len(cameras) != 1 else ''} ({', '.join(cameras)})" if cameras else "")
+    parts.append(f"{format_count(len(cameras), 'camera')} ({', '.join(cameras)})" if cameras else "")
     parts.append(f"{len(dict.fromkeys(s for _, s in m.spots.views))} spots")
     if m.summary.stated_method:
         parts.append(f"tracker: {m.summary.stated_method}")

@@ -19,6 +19,7 @@ from lab.files.text.csv_text import csv_word
 from lab.files.text.dataclass_fields import with_overrides
 from lab.files.text.json_text import write_json
 from lab.findings.outcome import Done
+from lab.number_format import format_count
 from lab.packages import versions
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import PictureSource, Video, open_inputs, pictures, pictures_of_frames
@@ -176,4 +177,4 @@ def _summary(series: PictureSeries, options: DetectOptions, wall_s: float) -> di
 
 
 def _counted(pictures: int) -> str:
-    return f"{pictures} picture{'' if pictures == 1 else 's'}"
+    return format_count(pictures, "picture")

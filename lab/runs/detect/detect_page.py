@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from geometry.arrays import Array, Bools
-from lab.number_format import format_number
+from lab.number_format import format_count, format_number
 from lab.pictures.picture_file import GreyPicture
 from lab.report.frames.canvas import PAPER, SOFT, Canvas, Pixels, ground, png, text_size, write
 from lab.report.page import Page, PageDrawing, PageTable, Section, made_with, write_page
@@ -94,7 +94,7 @@ class ContactSheet:
 def _tile(one: _Kept, width: int, height: int) -> Pixels:
     """One picture with its caption above it, and rings around its spots; those most like a laser's have a number."""
     out: Pixels = np.full((_STRIP + height, width, 3), PAPER, np.uint8)
-    spots = f"{len(one.found)} spot{'' if len(one.found) == 1 else 's'}"
+    spots = format_count(len(one.found), "spot")
     write(out, (2, 15), f"frame {one.frame}", _TEXT)
     write(out, (width - text_size(spots, _TEXT)[0] - 3, 15), spots, _TEXT, SOFT)
     h, w = one.picture.shape

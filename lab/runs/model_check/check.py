@@ -31,7 +31,7 @@ from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.files.text.json_text import plain_value
 from lab.findings.finding import ENTRIES, Finding, Level, finding, verdict, worst_first
-from lab.number_format import format_number, format_with_sigma
+from lab.number_format import format_count, format_number, format_with_sigma
 from lab.runs.model_check.frame_sampler import FrameSampler
 from tracking.smoothing.error_scale import LARGEST_WIDTH_SHARE
 from tracking.smoothing.place_errors import correlation, place_errors
@@ -336,7 +336,7 @@ def _delay(name: str, late_s: float, sigma_s: float, model: SpotModel, frame_int
     text = f"camera `{name}` is about {size} {word} against {others}"
     count = round(abs(late_s) / frame_interval_s) if frame_interval_s > 0 else 0
     if count and abs(abs(late_s) / frame_interval_s - count) < _WHOLE_FRAME:
-        text += f" (that is {count} frame{'s' if count != 1 else ''}: its pictures may be numbered wrongly)"
+        text += f" (that is {format_count(count, 'frame')}: its pictures may be numbered wrongly)"
     return text
 
 
