@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,9 +48,7 @@ class Exposures:
         columns = np.arange(max(int(box[0] - half), 0), min(int(box[0] + half) + 1, width), step)
         v, u = (x.ravel() for x in np.meshgrid(rows, columns, indexing="ij"))
         values = np.array([self.pictures[k][v, u] for k in which], dtype=float).reshape(-1, len(u))
-        # In black places the model leaves more than their noise: also there that of the background counts.
-        variance = replace(self.noise, shadow_dn2=0.0).variance(values)
-        return values - self.black_dn, variance, np.column_stack([u, v]).astype(float)
+        return values - self.black_dn, self.noise.variance(values), np.column_stack([u, v]).astype(float)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,10 +74,12 @@ class BehindLights:
         modulation = _modulation([*(part.fit for part in parts), *passing], seen)
         if modulation is not None:
             parts = _behind_each(seen, found, boxes, modulation)
-        columns = zip(*(part[:-1] for part in parts), strict=True) if parts else [[np.zeros(0)]] * 5
+        if not parts:
+            nowhere, none = np.zeros(0, np.int64), np.zeros(0)
+            return BehindLights(nowhere, nowhere, none, none, none, modulation)
+        columns = zip(*(part[:-1] for part in parts), strict=True)
         row, column, level, share, response = (np.concatenate(values) for values in columns)
-        at = row.astype(np.int64), column.astype(np.int64)
-        return BehindLights(*at, level, share, response, modulation)
+        return BehindLights(row, column, level, share, response, modulation)
 
     def covers(self, shape: tuple[int, ...]) -> Bools:
         """(h, w): its pixels."""

@@ -105,8 +105,11 @@ def _without_slow_lights(
     known = slow[slow.known]
     count = np.full(mean.shape, len(pictures))
     count[slow.row, slow.column] = slow.count * slow.known
-    light_dn = better.usual_dn() / shift.over_light
-    seen = Exposures(equal, strength, background.noise, light_dn, better.usual_dn() - light_dn)
+    usual_dn = better.usual_dn()
+    light_dn = usual_dn / shift.over_light
+    # In black places the model leaves more than their noise: also there that of the background counts.
+    noise = replace(background.noise, shadow_dn2=0.0)
+    seen = Exposures(equal, strength, noise, light_dn, usual_dn - light_dn)
     behind = BehindLights.of(seen, here, boxes, passing_lights(seen, found, mean, count))
     mean[behind.row, behind.column] = behind.level_dn
     slow = slow[~slow.known & ~behind.covers(mean.shape)[slow.row, slow.column]]

@@ -85,6 +85,10 @@ class Explained:
         """Of the first frame only."""
         return Explained(*(getattr(self, name)[:1] for name in Explained.__slots__))
 
+    def lead(self, given: Explained) -> float:
+        """The nats by which these frames are explained better than by the set-up as given."""
+        return float(self.nats.sum() - given.nats.sum())
+
     def with_few_labels(self, share: float = 0.0) -> tuple[int, ...]:
         """Cameras with points whose labels are at most this share of the spots that they should see."""
         enough = np.median(self.points, axis=0) >= LEAST_POINTS
@@ -154,11 +158,10 @@ def compare(
         found = [one for one in found if _better(*one, rig, given)]
         # A spot that was hidden in one of two pictures of a camera is found with the other one, whichever way they are
         # numbered: only the same pictures of the camera are evidence.
-        leads = [float(e.nats.sum() - given.nats.sum()) for _, e in found]
         found = [
             (m, e)
-            for (m, e), lead in zip(found, leads, strict=True)
-            if m.kind != "numbers" or _paired_lead(m, lead, rig, frames, parameters, covariance) >= LEAD_NATS
+            for m, e in found
+            if m.kind != "numbers" or e.lead(given) + _lead_beside(m, rig, frames, parameters, covariance) >= LEAD_NATS
         ]
     # Beams whose ends are exchanged hardly ever meet a screen: such a rig explains what one without these beams does.
     found = [(m.elsewhere if m.beams and not e.changed.any() else m, e) for m, e in found]
@@ -170,12 +173,12 @@ def compare(
     )
 
 
-def _paired_lead(
-    mistake: Mistake, nats: float, rig: Rig, frames: Frames, parameters: LabelParameters, known: RigCovariance | None
+def _lead_beside(
+    mistake: Mistake, rig: Rig, frames: Frames, parameters: LabelParameters, known: RigCovariance | None
 ) -> float:
-    """By which wrong numbers of a camera explain frames and their counterparts better; nats: by which these frames."""
-    beside = [explained(m, frames, parameters, known).nats.sum() for m in mistake.counterparts(rig)]
-    return nats + float(beside[1] - beside[0])
+    """The nats by which wrong numbers of a camera explain the counterparts of the frames better."""
+    given, without = (explained(m, frames, parameters, known) for m in mistake.counterparts(rig))
+    return without.lead(given)
 
 
 def _first_is_in_prior(given: Explained, frames: Frames) -> bool:
@@ -241,7 +244,7 @@ def _better(mistake: Mistake, one: Explained, rig: Rig, given: Explained) -> boo
     more = one.labelled[one.fits].sum() - before.sum() >= MORE_LABELS * len(one.fits)
     seen = one.labelled.sum() >= LEAST_SEEN * one.expected.sum()
     several = one.labelled.sum() - given.labelled.sum() >= SEVERAL
-    leads = float(one.nats.sum() - given.nats.sum()) >= (LEAST_NATS if several else LEAD_NATS)
+    leads = one.lead(given) >= (LEAST_NATS if several else LEAD_NATS)
     return fitting and bool(more) and bool(seen) and not lost and not unused and leads
 
 

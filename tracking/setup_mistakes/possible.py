@@ -67,8 +67,10 @@ class Mistake:
         return not all(np.array_equal(a, b) for a, b in frames)
 
     def counterparts(self, given: Rig) -> tuple[Mistake, Mistake]:
-        """Of wrong numbers of one camera, the two frames with the same pictures of it: as given, with that which this
-        frame has without the mistake, and without the mistake, with that which this frame has as given.
+        """Of wrong numbers of one camera: frames as given and without the mistake, with its pictures exchanged.
+
+        The picture that a frame has without the mistake with the pictures of the others that belong to it as given, and
+        the reverse.
         """
         later = next(iter(self.pictures.values())).later
         every = {n: PictureChange(n, later=later) for n in given.cameras}
