@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools, Ints
 from tracking.background.joint_fit import UNLIKE, JointFit, Modulation, fitted, mean_of
-from tracking.background.places import AROUND_LIGHT, SAME_LIGHT, inside, near_each
+from tracking.background.places import AROUND_LIGHT, AROUND_SPOT, ON_LIGHT, SAME_LIGHT, inside, near_each
 from tracking.detections import Detections
 from tracking.noise import NoiseModel
 
@@ -25,6 +25,7 @@ _LARGEST_SIGMA = 0.1  # of the modulated share: of a light that passes, and of a
 _LACKS = 0.5  # of the height, by which a picture without the light is darker
 _MOST_PASSING = 10  # lights on uneven ground that are fitted: those that show the modulation best
 _ALSO_BRIGHT, _SELDOM = 0.3, 0.2  # of the brightest's flux: a second light in the box; share of the pictures with it
+_OFTEN = 0.1  # share of the pictures in which a light has left a place that it passes
 _LIT = 1e-3  # of the peak: there the background comes from the fit
 
 
@@ -60,6 +61,7 @@ class BehindLights:
     level_dn: Array  # (m,): the background
     share: Array  # (m,): variance of its errors over that of a picture's noise
     response: Array  # (m,): the light over that on usual ground, as the fits of the lights show it
+    lights: Sequence[tuple[Array, JointFit]]  # the box (3,) around each such light, and its fit
     modulation: Modulation | None  # of the lights by the surface; None: they do not show it
 
     @staticmethod
@@ -76,10 +78,19 @@ class BehindLights:
             parts = _behind_each(seen, found, boxes, modulation)
         if not parts:
             nowhere, none = np.zeros(0, np.int64), np.zeros(0)
-            return BehindLights(nowhere, nowhere, none, none, none, modulation)
-        columns = zip(*(part[:-1] for part in parts), strict=True)
+            return BehindLights(nowhere, nowhere, none, none, none, [], modulation)
+        columns = zip(*(part[:-2] for part in parts), strict=True)
         row, column, level, share, response = (np.concatenate(values) for values in columns)
-        return BehindLights(row, column, level, share, response, modulation)
+        return BehindLights(row, column, level, share, response, [part[-2:] for part in parts], modulation)
+
+    def leave(self, points: Detections) -> Bools:
+        """Which points (n,) near such a light it leaves in some pictures: they are no part of it."""
+        out = np.zeros(len(points), dtype=bool)
+        for box, fit in self.lights:
+            gap = np.linalg.norm(fit.light.places[:, None] - points.uv_px, axis=-1)
+            away = gap > ON_LIGHT[0] * float(fit.light.widths_px[0]) + ON_LIGHT[1]
+            out |= inside(box[None], points) & (away.mean(axis=0) > _OFTEN)
+        return out
 
     def covers(self, shape: tuple[int, ...]) -> Bools:
         """(h, w): its pixels."""
@@ -168,6 +179,7 @@ class _Part(NamedTuple):
     level_dn: Array
     share: Array
     response: Array
+    box: Array  # (3,)
     fit: JointFit
 
 
@@ -193,9 +205,14 @@ def _behind_one(
         return None
     brightest = [here[k][here[k].flux == here[k].flux.max()][:1] for k in shown]
     width = float(np.median([np.sqrt(d.major_px[0] * d.minor_px[0]) for d in brightest]))
+    places = np.concatenate([d.uv_px for d in brightest])
+    # The box is that of all that moves here, a shadow beside the light, too.
+    least, most = places.min(axis=0), places.max(axis=0)
+    own = 0.5 * float(np.max(most - least)) + ON_LIGHT[0] * width + ON_LIGHT[1] + AROUND_SPOT[1]
+    if own < box[2]:
+        box = np.array([*0.5 * (least + most), own])
     if box[2] > _LARGEST_PATH * width:
         return None
-    places = np.concatenate([d.uv_px for d in brightest])
     height, middle = float(np.median([d.peak[0] for d in brightest])), np.median(places, axis=0)
     lacks = _lacking(seen, shown, middle, width) > _LACKS * height
     # What is found in the middle although the light has left is an edge.
@@ -230,4 +247,4 @@ def _whole(seen: Exposures, there: Ints, empty: Ints, box: Array, width: float, 
     column, row = uv[lit].astype(np.int64).T
     share = fit.share + 1 / np.maximum(information[lit], 1e-3)
     own = Modulation(fit.modulated_share(seen.usual_dn)[0], seen.usual_dn)
-    return _Part(row, column, level[lit] + seen.black_dn, share, own.response(level[lit]), fit)
+    return _Part(row, column, level[lit] + seen.black_dn, share, own.response(level[lit]), box, fit)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array
 from tracking.background.behind_lights import LARGEST_PATH_PX, BehindLights, Exposures, passing_lights
-from tracking.background.joint_fit import Modulation
 from tracking.background.mean_pictures import MOST_BYTES, means_of, smooth_part, usable
 from tracking.background.places import AROUND_LIGHT, AROUND_SPOT, ON_LIGHT, SAME_LIGHT, near_each, places_of
 from tracking.background.shown_light import Shown
@@ -123,17 +122,18 @@ def _without_slow_lights(
     better = better.with_light(pictures)
     if behind.modulation is not None:
         better = better.with_modulation(behind.modulation, (behind.row, behind.column), behind.response)
-    return _with_shifts(better, mean, pictures, moved, shift, behind.modulation)
+    return _with_shifts(better, mean, pictures, moved, shift, behind)
 
 
 def _with_shifts(
     background: StaticBackground, mean: NDArray[np.float32], pictures: Sequence[Picture], moved: bool,
-    shift: TextureShift, modulation: Modulation | None,
+    shift: TextureShift, behind: BehindLights,
 ) -> StaticBackground:  # fmt: skip
     """The background with the errors of lights by its texture, and with those of its lights that stay at rest.
 
-    mean (h, w), DN: it is made from. modulation: of the lights by its surface, if known.
+    mean (h, w), DN: it is made from; behind: of it, what is known from fits of lights.
     """
+    modulation = behind.modulation
     found = [background.spots_in(p, background.parameters, shift) for p in pictures[::TRIED]]
     # Of a light at rest that trembles something is left in the difference: that stays in its place.
     alone = [d[np.asarray(~near_each(d, background.lights.found, ON_LIGHT).any(axis=1))] for d in found]
@@ -145,13 +145,17 @@ def _with_shifts(
     still_px = np.sqrt(still.major_px * still.minor_px)
     widths = np.concatenate([np.sqrt(d.major_px * d.minor_px) for d in found])
     width = float(np.median(widths if len(widths) else still_px)) if len(widths) + len(still) else 0.0  # spots may rest
-    changed, passed = np.array([background.lights.in_picture(p)[1:] for p in pictures]).swapaxes(0, 1)
+    shown, changes, passes = zip(*(background.lights.in_picture(p) for p in pictures), strict=True)
+    changed, passed = np.array(changes), np.array(passes)
+    moving = background.lights.which_move(np.array([d.uv_px for d in shown]), ~changed & ~passed)
     # What is alone and unchanged in hardly any picture is what the places of a light have in common that moves
-    # by less than its width: that place is searched in the pictures. A wider one is an object, a square of a board.
-    always = ((passed | changed).mean(axis=0) > _ALWAYS) & (still_px < _WIDER * width)
+    # by less than its width: that place is searched in the pictures. A wider one is an object, a square of a board, and
+    # so is what a light leaves that has been fitted.
+    always = ((passed | changed).mean(axis=0) > _ALWAYS) & (still_px < _WIDER * width) & ~behind.leave(still)
     common = np.column_stack([still.uv_px, background.lights.half_px])[always]
     unknown = np.concatenate([background.unknown, common])
-    better = replace(background, unknown=unknown, fixed=np.asarray(~changed.any(axis=0) & moved))
+    lights, fixed = replace(background.lights, moving=moving), ~changed.any(axis=0) & ~moving & moved
+    better = replace(background, unknown=unknown, lights=lights, fixed=np.asarray(fixed))
     if not width:
         return better
     mean = background.plain()

@@ -8,7 +8,7 @@ there, the place is searched.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ _SAMPLES = 13  # largest number of pixels from the centre of a window to its sid
 _LARGEST_STEP = 0.25  # widths: a longer step of the centre is not linear
 _LARGEST_CHANGE = 0.3  # of the flux, as a share
 _MISFIT, _MISFIT_SIGMAS = 1.4, 5.0  # chi-square per degree of freedom of an unchanged light: factor, and its sigmas
+_LEAST_MOVE = 0.03  # widths, rms: lights that move by less, apart from what all do, stay where they are
 _PARAMETERS = 9  # of a light: centre, flux, three of its shape, and the plane below it
 _BY_CHANCE = _MISFIT * (_PARAMETERS + _MISFIT_SIGMAS * (2.0 * _PARAMETERS) ** 0.5)  # decrease of chi-square by a step
 
@@ -48,6 +49,7 @@ class RestingLights:
     centre_of: Array  # (n, 2, 2), px: centre by the factors of x and y
     flux_of: Array  # (n, 9): relative flux by the parameters
     clips_dn: float  # of the sensor
+    moving: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))  # (n,), `which_move`
 
     @staticmethod
     def of(mean: NDArray[Any], found: Detections, noise: NoiseModel, saturation_dn: float) -> RestingLights:
@@ -92,7 +94,7 @@ class RestingLights:
         Those that have changed are not measured correctly. Where there is more light than in the mean and nowhere less,
         something else passes over an unchanged light: that is in the difference from the mean, and the light stays
         where the mean shows it. So does a faint light of which a single picture shows no more than that it has not
-        changed.
+        changed, unless the pictures together show that it moves.
         """
         sums = np.zeros((len(self.found), _PARAMETERS + 3))
         centre = self.found.uv_px
@@ -107,11 +109,28 @@ class RestingLights:
         passed = misfit & (darkness < _largest_chi2(np.maximum(darker, 1.0)))
         far = np.linalg.norm(moved, axis=1) > _LARGEST_STEP * self.found.minor_px
         far |= np.abs(more) > _LARGEST_CHANGE
-        changed = misfit | (far & (gain > _BY_CHANCE) & ~same)
+        clear = gain > _BY_CHANCE
+        if len(self.moving):
+            clear |= self.moving
+        changed = misfit | (far & clear & ~same)
         stays = passed | same | (far & ~changed)
         moved, more = np.where(stays[:, None], 0.0, moved), np.where(stays, 0.0, more)
         found = replace(self.found, uv_px=centre + moved, flux=self.found.flux * (1.0 + more))
         return found, np.asarray(changed & ~passed), np.asarray(passed)
+
+    def which_move(self, places: Array, counted: Bools) -> Bools:
+        """Which lights (n,) are not in the same place in some pictures.
+
+        places (k, n, 2), px: as `in_picture` measures them; counted (k, n): where it does. What the camera's vibration
+        does to most lights is no move of one.
+        """
+        apart = places - self.found.uv_px
+        apart = np.where(counted[..., None], apart - np.median(apart, axis=1, keepdims=True), 0.0)
+        count = np.maximum(np.count_nonzero(counted, axis=0), 1)
+        apart -= np.where(counted[..., None], apart.sum(axis=0) / count[:, None], 0.0)
+        chi2 = np.einsum("kni,nij,knj->n", apart, np.linalg.inv(self.found.cov_px2), apart)
+        rms = np.sqrt(np.sum(apart**2, axis=(0, 2)) / count)
+        return np.asarray((chi2 > _largest_chi2(2.0 * count)) & (rms > _LEAST_MOVE * self.found.minor_px))
 
 
 def _largest_chi2(free: Array) -> Array:

@@ -11,12 +11,14 @@ from scipy.stats import multivariate_normal
 
 from geometry.arrays import Array
 from tests.tracking.rendering import round_lights
+from tracking.background.behind_lights import BehindLights, Exposures
 from tracking.background.estimation import PICTURES, static_background
 from tracking.background.lights_on_edges import with_lights_on_edges
 from tracking.background.slow_lights import light_at
 from tracking.background.static_background import StaticBackground
+from tracking.detection.detect import find_spots
 from tracking.detections import Detections
-from tracking.noise import Picture
+from tracking.noise import NoiseModel, Picture
 from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
 from tracking.parameters import DetectParameters
 
@@ -315,3 +317,44 @@ def test_a_narrow_spot_that_moves_by_its_width_is_one_point(start, length_px):
     for d, at in zip(found, paths, strict=True):
         bright = [d.flux[np.hypot(*(d.uv_px - place).T) < 2.0] for place in at]
         assert [np.count_nonzero(flux > 0.2 * flux.max()) for flux in bright] == [1] * len(at)
+
+
+# Even paper with printed dots.
+DOTTED = 30.0 + round_lights(SIZE, [[40.0 * k, 30.0] for k in range(1, 9)], 60.0, 2.0)
+
+
+def test_a_wide_spot_that_swings_over_a_printed_mark_is_measured_in_front_of_it():
+    """Such a mark is no part of the spot: a fit of the spot shows the background with it."""
+    t = np.concatenate([np.zeros(12), np.linspace(0, 4 * np.pi, 33)])
+    paths = np.array([200.0, 150.0]) + 26.0 * np.sin(t)[:, None, None] * np.array([0.5, -0.85])
+    board = DOTTED.copy()
+    board[140:160, 176:206] += 55.0
+    board[144:156, 186:196] -= 50.0
+    gap, _ = errors(found_in_all(board_pictures(paths, 6.0, 0.5, 21, cv2.GaussianBlur(board, (0, 0), 0.7))), paths)
+    assert gap.max() < 0.1
+
+
+@pytest.mark.parametrize(("length_px", "peak"), [(0.4, 22.0), (0.4, 40.0), (0.5, 40.0), (0.6, 40.0)])
+def test_a_spot_that_creeps_while_others_move_fast_is_not_taken_for_a_lamp(length_px, peak):
+    along = np.linspace(-0.5, 0.5, 45)[:, None]
+    paths, fast = [200.3, 100.4] + length_px * along * [0.4, 0.9], [200.0, 220.0] + 250.0 * along * [1.0, 0.0]
+    rng = np.random.default_rng(23)
+    pictures = []
+    for a, b in zip(paths, fast, strict=True):
+        light = DOTTED + round_lights(SIZE, [a], peak, 1.1) + round_lights(SIZE, [b], 90.0, 1.1)
+        pictures.append(np.rint(light + NOISE * rng.standard_normal(SIZE)).astype(np.uint8))
+    gap, sigma = errors(found_in_all(pictures), paths[:, None])
+    assert (gap / sigma).max() < 4.5
+
+
+@pytest.mark.parametrize("more_px", [0.0, 20.0])
+def test_a_light_that_moves_by_its_width_is_fitted_also_where_more_moves_beside_it(more_px):
+    """The box around all that moves, a faint shadow beside the light, too, may be as wide as it likes."""
+    paths = np.where(np.arange(15) < 7, 0.0, 2.0)[:, None, None] * [0.6, 0.8] + [200.0, 100.0]
+    pictures = board_pictures(paths, 1.5, 0.5, 24, DOTTED)
+    noise = NoiseModel(NOISE**2, 0.0, 0.0)
+    found = [find_spots(p, USUAL, noise, np.array([[200.0, 100.0, 9.0]])) for p in pictures]
+    seen = Exposures(pictures, np.ones(15), noise, 30.0, 0.0)
+    behind = BehindLights.of(seen, found, np.array([[200.0 + more_px, 100.0, 9.0 + more_px]]))
+    assert len(behind.lights) == 1
+    assert np.abs(behind.level_dn - 30.0).max() < 5.0
