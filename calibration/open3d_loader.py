@@ -31,11 +31,7 @@ class MissingOpen3DError(RuntimeError):
 
 
 def open3d() -> Any:
-    """The module.
-
-    Raises:
-        MissingOpen3DError: it cannot be loaded.
-    """
+    """The module. Raises MissingOpen3DError: it cannot be loaded."""
     _load_libusb()
     try:
         import open3d as module

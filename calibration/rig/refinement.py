@@ -125,9 +125,7 @@ def refine(
     result, of other labels of the same recordings; only then are parts that have moved searched for. stacks: those that
     are changed; the others keep their values and their uncertainty. for_labels: the rig is only used to label the
     recordings again; errors of second order, which spots do not show beside the tracker's own limits, are left out.
-
-    Raises:
-        AdjustmentError: the recordings have too few frames, or the adjustment does not converge.
+    Raises AdjustmentError: the recordings have too few frames, or the adjustment does not converge.
     """
     prior, free = prior_of(rig, covariance)
     if prior is None:

@@ -37,10 +37,8 @@ def register(names: Sequence[str], cloud: Array, world: Array, covariances: Arra
     """The rigid transform from targets (n, 3), m, of a scan to the survey's (n, 3).
 
     covariances (n, 3, 3), m^2, of the survey; sigma_m: of each coordinate of a target in the scan. Kabsch's rotation,
-    then least squares.
-
-    Raises:
-        ValueError: too few targets, collinear targets, another size (a wrong unit), a mirror image, or an outlier.
+    then least squares. Raises ValueError: too few targets, collinear targets, another size (a wrong unit), a mirror
+    image, or an outlier.
     """
     if len(names) < 3:
         raise ValueError(f"{len(names)} targets are in both the scan and the survey, expected 3 or more")
@@ -137,8 +135,7 @@ class Alignment:
 def on_surfaces(points: Array) -> Bools:
     """Which points (n, 3) have neighbours as near as most points: not dust, mixed pixels at edges, or reflections.
 
-    Raises:
-        MissingOpen3DError: Open3D cannot be loaded.
+    Raises MissingOpen3DError: Open3D cannot be loaded.
     """
     o3d = open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.ascontiguousarray(points)))
@@ -151,11 +148,9 @@ def on_surfaces(points: Array) -> Bools:
 def align(moving: Array, fixed: Array) -> Alignment:
     """The rigid transform of a scan (n, 3), m, to another (k, 3) of the same place, by point-to-plane ICP.
 
-    The scans must agree to about a twentieth of their extent before, as scanner programs align them.
-
-    Raises:
-        ValueError: the scans do not overlap, or what they share does not determine all of the transform (one plane).
-        MissingOpen3DError: Open3D cannot be loaded.
+    The scans must agree to about a twentieth of their extent before, as scanner programs align them. Raises ValueError:
+    the scans do not overlap, or what they share does not determine all of the transform (one plane);
+    MissingOpen3DError: Open3D cannot be loaded.
     """
     o3d = open3d()
     centre = fixed.mean(axis=0)
@@ -240,11 +235,8 @@ def scan_of(
 
     size_m selects the plane of the screen if the cloud has several; without it the largest one is used. point_sigma_m:
     of one point along the normal; None: from the scatter within patches. seen_from (3,), world: the side to which z
-    points. world_from_cloud (None: the cloud is in world) has an error with the covariance registration (6, 6).
-
-    Raises:
-        ValueError: there is no such plane.
-        MissingOpen3DError: Open3D cannot be loaded.
+    points. world_from_cloud (None: the cloud is in world) has an error with the covariance registration (6, 6). Raises
+    ValueError: there is no such plane; MissingOpen3DError: Open3D cannot be loaded.
     """
     if len(points) < FEWEST:
         raise ValueError(f"{len(points)} points, expected {FEWEST} or more")

@@ -71,10 +71,8 @@ def _said(solved: Solved[R], level: Level) -> str:
 def run_step(step: Step, out: Path, solve: Callable[[], Solved[R]]) -> Outcome[R]:
     """Solve a step and write its files, summary.json and report.html into the folder `out`, all or none.
 
-    A FAIL never replaces an earlier usable result: it goes to `OUT-failed`.
-
-    Raises:
-        BeamposeError: as `solve` does, or the folder cannot be written. Nothing is written then.
+    A FAIL never replaces an earlier usable result: it goes to `OUT-failed`. Raises BeamposeError: as `solve` does, or
+    the folder cannot be written. Nothing is written then.
     """
     own = earlier_results(*step.own)
     check_output_folder(out, own)
@@ -147,8 +145,7 @@ def state_of(
 def calibration_date(project: Project, today: datetime.date | None) -> datetime.date:
     """Date written into the result: `today` if given, else the date of the measurements, else the current date.
 
-    Raises:
-        InputError: if the measurements are dated in the future.
+    Raises InputError: if the measurements are dated in the future.
     """
     now = today or datetime.date.today()
     if project.date is not None and project.date > now:

@@ -51,8 +51,7 @@ SECTIONS: Mapping[str, Mapping[str, Entry]] = {
 def explain(code: str) -> str:
     """The explanation of a code, as lines; `V03`, `v3` and `bp-v03` are read as BP-V03.
 
-    Raises:
-        InputError: there is no such code.
+    Raises InputError: there is no such code.
     """
     name = code.strip().upper()
     name = name if name.startswith("BP-") else f"BP-{name}"

@@ -23,10 +23,8 @@ def write_overlay_video(folder: Path, images: Iterable[NDArray[np.uint8]], fps: 
     """Write pictures (h, w, 3), BGR, of one size with even sides; the file is complete or as it was before.
 
     fps: frames per second of the video. Returns its path, and notes on codecs that this OpenCV lacks. A video that an
-    earlier call wrote with another codec is removed.
-
-    Raises:
-        RunError: OpenCV cannot write a video here, or the disk is full.
+    earlier call wrote with another codec is removed. Raises RunError: OpenCV cannot write a video here, or the disk is
+    full.
     """
     pictures = iter(images)
     one = next(pictures)

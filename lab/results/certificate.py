@@ -87,8 +87,7 @@ def certificate(
 ) -> Certificate:
     """The budgets of the frames `at`; without any, of the measured frame with the median uncertainty of attitude.
 
-    Raises:
-        InputError: a table or the run folder cannot be read, or a frame is not measured.
+    Raises InputError: a table or the run folder cannot be read, or a frame is not measured.
     """
     folder = ResultFolder(results, run_folder)
     run, poses, spots = folder.run(), folder.poses, folder.spots

@@ -291,8 +291,7 @@ def compare_and_write(
 ) -> Done[Comparison]:
     """Compare, and write tables and report where `out` is given. The options: `lab.results.compare.compare`.
 
-    Raises:
-        InputError: the input cannot be compared, or `out` cannot be written.
+    Raises InputError: the input cannot be compared, or `out` cannot be written.
     """
     own = earlier_results(SUMMARY)
     if out is not None:

@@ -53,11 +53,8 @@ def show_frame(
     """The annotated picture of a frame of results, or of a run folder.
 
     path: a results folder, or a run folder: its frames up to this one are then processed, without smoothing. camera:
-    one camera; None: all side by side. run_folder: of the results, if it has moved.
-
-    Raises:
-        InputError: the path is neither, or has no such frame or camera.
-        BeamposeError: the run cannot be processed.
+    one camera; None: all side by side. run_folder: of the results, if it has moved. Raises InputError: the path is
+    neither, or has no such frame or camera; BeamposeError: the run cannot be processed.
     """
     path = Path(path)
     if (path / "spots.csv").is_file() and (path / "attitude.csv").is_file():
@@ -164,11 +161,8 @@ def write_video(
     """Write overlay.mp4 (or .avi) into a results folder; it is complete or as it was before.
 
     first, last: frame numbers. every: show each so many frames. fps: frames per second of the video. The memory of
-    pictures does not grow with their number.
-
-    Raises:
-        InputError: the results cannot be read, or have no such frames.
-        RunError: OpenCV cannot write a video here.
+    pictures does not grow with their number. Raises InputError: the results cannot be read, or have no such frames;
+    RunError: OpenCV cannot write a video here.
     """
     data = read_result_data(results, run_folder)
     indices = _selected(data, first, last, every)

@@ -70,8 +70,7 @@ class InputsNow:
 def read_recorded(results: Path) -> Recorded:
     """How the result in a folder was made.
 
-    Raises:
-        InputError: the folder holds no results of a run, or summary.json lacks what is needed.
+    Raises InputError: the folder holds no results of a run, or summary.json lacks what is needed.
     """
     content, path = ResultFolder.of_run(results).summary, Path(results) / "summary.json"
     try:
@@ -244,10 +243,7 @@ def verify(results: Path, run_folder: Path | None = None, progress: Progress | N
     """Compute the tables of a result folder again, from its recorded run folder, settings and parameters.
 
     run_folder: where the run is now, if it has moved. The expiry of the calibration plays no part, since the result was
-    made while it was valid.
-
-    Raises:
-        InputError: the results or their inputs cannot be read.
+    made while it was valid. Raises InputError: the results or their inputs cannot be read.
     """
     results = Path(results)
     recorded = read_recorded(results)

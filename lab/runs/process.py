@@ -52,13 +52,10 @@ def process_run(
     """Process one run folder into the folder `out`: the tables, summary.json and report.html.
 
     overrides: tracker parameters that replace those of run.yaml. causal: the tables hold the causal estimates and
-    nothing is smoothed; otherwise they hold the smoothed estimates, and attitude_causal.csv the causal ones.
-    more: additional content of summary.json; called with the run before its processing. rig_path: a rig.yaml in place
-    of the run's. full_hash: the fingerprints of the inputs cover every byte of large files, too.
-
-    Raises:
-        BeamposeError: the run cannot be processed (CalibrationError: its rig's calibration must not be used); `out` is
-            then unchanged.
+    nothing is smoothed; otherwise they hold the smoothed estimates, and attitude_causal.csv the causal ones. more:
+    additional content of summary.json; called with the run before its processing. rig_path: a rig.yaml in place of the
+    run's. full_hash: the fingerprints of the inputs cover every byte of large files, too. Raises BeamposeError: the run
+    cannot be processed (CalibrationError: its rig's calibration must not be used); `out` is then unchanged.
     """
     started = time.perf_counter()
     run = ready_run(run_folder, overrides, rig_path)
@@ -78,9 +75,8 @@ def ready_run(
 ) -> Run:
     """A run that may be processed, with some tracker parameters replaced. rig_path, recording: as of `load_run`.
 
-    Raises:
-        InputError: the run folder or an override is invalid.
-        CalibrationError: its rig's calibration must not be used.
+    Raises InputError: the run folder or an override is invalid; CalibrationError: its rig's calibration must not be
+    used.
     """
     run = load_run(run_folder, rig_path, recording)
     if overrides:

@@ -81,10 +81,8 @@ def write_processed(
 ) -> Outcome[R]:
     """Process a recording into the folder `out`; earlier results with the same schema are replaced.
 
-    process: writes the tables into a folder. more: additional content of summary.json.
-
-    Raises:
-        BeamposeError: as `process` does, or the folder cannot be written; `out` is then unchanged.
+    process: writes the tables into a folder. more: additional content of summary.json. Raises BeamposeError: as
+    `process` does, or the folder cannot be written; `out` is then unchanged.
     """
     started = time.perf_counter()
     with atomic_folder(out, earlier_results(schema)) as work:

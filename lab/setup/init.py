@@ -55,11 +55,7 @@ class Layout:
 
 
 def rig_of(layout: Layout) -> Rig:
-    """The rig of a layout.
-
-    Raises:
-        InputError: it cannot measure a pose.
-    """
+    """The rig of a layout. Raises InputError: it cannot measure a pose."""
     _check(layout)
     used = _SCREENS[: layout.screens] if layout.screens > 1 else _SCREENS[1:2]
     d = layout.distance_m
@@ -180,10 +176,8 @@ _OPTIONAL_RUN = (
 def start(folder: Path, layout: Layout | RigFile, frame_rate_hz: float) -> Done[Path]:
     """Write rig.yaml, rig.html with its drawing, run.yaml and simulated points into a new or empty folder.
 
-    layout: of a typical rig, or a rig of one's own.
-
-    Raises:
-        InputError: the folder holds files, or the rig cannot measure a pose.
+    layout: of a typical rig, or a rig of one's own. Raises InputError: the folder holds files, or the rig cannot
+    measure a pose.
     """
     folder = Path(folder)
     if folder.is_dir() and any(folder.iterdir()):

@@ -50,10 +50,7 @@ def rig_of_parts(screens: Parts, cameras: Parts, beams: Parts, image_size_px: tu
 
     A camera has `field_of_view_deg` (of the picture's width) or `focal_px` in place of `camera_matrix`, and may have
     `look_at` beside its screen. A beam names the screens that its ends meet: `plus`, beyond the second of two points,
-    and `minus`.
-
-    Raises:
-        InputError: a part is wrong or missing; the message names its place in rig.yaml.
+    and `minus`. Raises InputError: a part is wrong or missing; the message names its place in rig.yaml.
     """
     if not (screens and cameras and beams):
         raise InputError("expected at least one --screen, --camera and --beam each, to describe a rig")

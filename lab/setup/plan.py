@@ -30,10 +30,8 @@ def plan_rig(rig_path: Path, out: Path, options: PlanOptions | None = None) -> O
     """Plan a rig; write plan.csv, effects.csv and report.html into the folder `out`.
 
     Calibration errors come from the rig file's covariance, or from the options where the file states none. A rig that
-    does not suit the range of poses has the exit status of a run that fails its quality gate.
-
-    Raises:
-        InputError: for a rig that cannot be read, invalid options, or a folder with other files in it.
+    does not suit the range of poses has the exit status of a run that fails its quality gate. Raises InputError: for a
+    rig that cannot be read, invalid options, or a folder with other files in it.
     """
     return run_step(_STEP, out, lambda: _solve(Path(rig_path), PlanOptions() if options is None else options))
 

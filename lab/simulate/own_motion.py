@@ -31,10 +31,7 @@ def placed(scenario: Scenario, rig: Rig, start: Pose | None = None) -> Scenario:
     """The scenario with its motion where a rig sees the vehicle, as large as keeps half of the spots in view.
 
     A rig whose spots allow the scenario as it is keeps it. start: the middle of the motion; default: that of the rig's
-    view.
-
-    Raises:
-        InputError: too few spots are in view there.
+    view. Raises InputError: too few spots are in view there.
     """
     model = SpotModel.of(rig)
     if start is None and has_motion(scenario, model, _DRAWS):
@@ -96,10 +93,7 @@ def along(scenario: Scenario, path: Path, rig: Rig, frame_rate_hz: float | None 
     """The scenario along the poses of a table with the columns of truth/pose.csv; and which spots leave the view when.
 
     The first pose is at the time 0 of the recording, which is as long as the table and has its rate, unless another one
-    is stated.
-
-    Raises:
-        InputError: the table is no trajectory, or no spot of the rig is ever in view.
+    is stated. Raises InputError: the table is no trajectory, or no spot of the rig is ever in view.
     """
     table = read_true_poses(path)
     if len(table.frame) < 2:

@@ -65,11 +65,7 @@ class Scene:
 
 
 def scenario_named(scenario: str | Scenario) -> Scenario:
-    """The scenario of this name.
-
-    Raises:
-        InputError: no scenario has this name.
-    """
+    """The scenario of this name. Raises InputError: no scenario has this name."""
     if isinstance(scenario, Scenario):
         return scenario
     if scenario not in SCENARIOS:
@@ -86,10 +82,8 @@ def compose(
 ) -> Scene:
     """One recording of a scenario.
 
-    frames: default: those of the scenario. rig: default: that of the scenario.
-
-    Raises:
-        InputError: an unknown scenario, no frames, or a motion that does not meet the conditions of the scenario.
+    frames: default: those of the scenario. rig: default: that of the scenario. Raises InputError: an unknown scenario,
+    no frames, or a motion that does not meet the conditions of the scenario.
     """
     scenario = scenario_named(scenario)
     count = scenario.frames if frames is None else frames
@@ -150,8 +144,7 @@ def spots_in_view(model: SpotModel, pose: Pose) -> list[str]:
 def draw_motion(scenario: Scenario, model: SpotModel, seed: int) -> AnyMotion:
     """The first draw of phases that meets all conditions of the scenario.
 
-    Raises:
-        InputError: no draw of many meets them.
+    Raises InputError: no draw of many meets them.
     """
     rng = np.random.default_rng([seed, MOTION])
     for _ in range(_MAX_DRAWS):
@@ -263,8 +256,7 @@ def scenario_with(
 ) -> Scenario:
     """The scenario with another clutter probability per spot, rate or exposure.
 
-    Raises:
-        InputError: an unknown scenario, a probability outside 0 to 1, or an exposure longer than a frame.
+    Raises InputError: an unknown scenario, a probability outside 0 to 1, or an exposure longer than a frame.
     """
     scenario = scenario_named(scenario)
     if frame_rate_hz is not None:

@@ -70,18 +70,15 @@ def simulate(
 
     scenario: a name of SCENARIOS, or a value. frames: default: those of the scenario. video: one lossless video per
     camera instead of PNG files. detections_only: no pictures, but a detections.csv with `noise_px` (1 sigma per axis).
-    light: a name of LIGHTS instead of the light of the scenario. clutter: as in simulate_points.
-    picture_scale: 0.5 gives pictures of half the width and height. noisy: False: no shot and read noise, only rounding.
-    threads: number of threads that render and write pictures. progress: called after each picture. rig: a rig.yaml
-    instead of the rig of the scenario: the motion is moved to where that rig sees the vehicle, and as large as keeps
-    half of its spots in view. known_rig: the rig.yaml written to the run folder, such as a calibration of that rig;
-    default: the true one. start: the middle of the motion, instead of that of the rig's view. trajectory: a table of
-    poses (columns of truth/pose.csv) instead of the scenario's motion, with its rate and length. frame_rate_hz,
-    exposure_s: instead of those of the scenario or the trajectory. note: called with a line for each spot that leaves
-    the view of a trajectory.
-
-    Raises:
-        InputError: an argument is not valid, or the folder exists.
+    light: a name of LIGHTS instead of the light of the scenario. clutter: as in simulate_points. picture_scale: 0.5
+    gives pictures of half the width and height. noisy: False: no shot and read noise, only rounding. threads: number of
+    threads that render and write pictures. progress: called after each picture. rig: a rig.yaml instead of the rig of
+    the scenario: the motion is moved to where that rig sees the vehicle, and as large as keeps half of its spots in
+    view. known_rig: the rig.yaml written to the run folder, such as a calibration of that rig; default: the true one.
+    start: the middle of the motion, instead of that of the rig's view. trajectory: a table of poses (columns of
+    truth/pose.csv) instead of the scenario's motion, with its rate and length. frame_rate_hz, exposure_s: instead of
+    those of the scenario or the trajectory. note: called with a line for each spot that leaves the view of a
+    trajectory. Raises InputError: an argument is not valid, or the folder exists.
     """
     if picture_scale != 1.0 and (rig is not None or known_rig is not None):
         raise InputError("the pictures of a rig file keep its size: omit the scale or the rig")

@@ -223,10 +223,8 @@ CONTRADICTION_CHI2, CONTRADICTION_NEXT_TO_JUMP_CHI2 = 60.0, 5.0
 def smooth(recording: TrackedRecording) -> Smoothed:
     """Labels and motion of a run, given all of its frames.
 
-    With `method: spots` the labels stay as that tracker gave them. Without any measured pose nothing is known.
-
-    Raises:
-        FloatingPointError: The first estimate of the motion is not finite.
+    With `method: spots` the labels stay as that tracker gave them. Without any measured pose nothing is known. Raises
+    FloatingPointError: The first estimate of the motion is not finite.
     """
     rec, parameters = recording, recording.parameters
     smoother = _Smoother(rec)

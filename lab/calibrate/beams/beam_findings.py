@@ -32,10 +32,7 @@ def diagnose_failed_fit(
     """Look for a common mistake in poses or labels that explains why the calibration failed.
 
     rig: calibrated cameras and screens with nominal beams; lab_covariance: of cameras and screens. The stand positions
-    must be known.
-
-    Raises:
-        InputError: if a single known mistake explains the failure.
+    must be known. Raises InputError: if a single known mistake explains the failure.
     """
     found = diagnose_error(rig, recordings.spots, stand_of(project, recordings), lab_covariance)
     if found is None:
@@ -49,8 +46,7 @@ def diagnose_failed_fit(
 def check_no_duplicates(project: Project) -> None:
     """Refuse a recording that is listed twice: its spots would count twice and all sigmas would be too small.
 
-    Raises:
-        InputError: names both entries.
+    Raises InputError: names both entries.
     """
     seen: dict[Path, int] = {}
     for k, recording in enumerate(project.recordings):

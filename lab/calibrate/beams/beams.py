@@ -44,12 +44,8 @@ def calibrate_beams(
     """Calibrate the beams of a project; write three tables, report.html and, unless the verdict is FAIL, rig.yaml.
 
     rig: the rig.yaml or screens.yaml with the calibrated cameras and screens and their covariances (None: `rig.yaml`
-    beside the project). The project need not repeat cameras, screens and target; if it has a target, this replaces
-    the rig's.
-
-    Raises:
-        InputError: for errors in the files.
-        CalibrationError: if the spots do not determine a calibration.
+    beside the project). The project need not repeat cameras, screens and target; if it has a target, this replaces the
+    rig's. Raises InputError: for errors in the files; CalibrationError: if the spots do not determine a calibration.
     """
     return run_step(_STEP, out, lambda: _solve(Path(project_path), rig, today))
 

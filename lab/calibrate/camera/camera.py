@@ -89,11 +89,8 @@ def calibrate_camera(
     photos may also be one table of corners, see `corner_tables`, with the size of its pictures in the options.
 
     Writes camera.yaml, corners.csv and report.html. If the verdict is FAIL, the camera file is called
-    camera.failed.yaml so that no program reads it by mistake.
-
-    Raises:
-        InputError: for pictures or a board that cannot be used.
-        CalibrationError: if the photographs do not determine the camera.
+    camera.failed.yaml so that no program reads it by mistake. Raises InputError: for pictures or a board that cannot be
+    used; CalibrationError: if the photographs do not determine the camera.
     """
     return run_step(_STEP, out, lambda: _solve(list(photos), board, options or CameraOptions(), today, progress))
 

@@ -155,11 +155,8 @@ def calibrate_pair_folder(
     """Calibrate a pair from photographs of a board by both cameras; equal numbers in file names are one instant.
 
     left, right: a folder or a pattern. Writes pair.yaml, pairs.csv and report.html into the folder `out`. If the
-    verdict is FAIL, the file is called pair.failed.yaml.
-
-    Raises:
-        InputError: for pictures or a board that cannot be used.
-        CalibrationError: if the photographs do not determine a camera or the pair.
+    verdict is FAIL, the file is called pair.failed.yaml. Raises InputError: for pictures or a board that cannot be
+    used; CalibrationError: if the photographs do not determine a camera or the pair.
     """
     return run_step(_STEP, out, lambda: _solve((left, right), board, options, progress))
 

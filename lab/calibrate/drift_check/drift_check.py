@@ -89,10 +89,7 @@ def check_drift(
 ) -> Outcome[DriftResult]:
     """Compare known points or a vehicle at rest with the stored calibration; write report.html and drift.csv to `out`.
 
-    history: a CSV to which the rows of this check are appended.
-
-    Raises:
-        InputError: for errors in the files.
+    history: a CSV to which the rows of this check are appended. Raises InputError: for errors in the files.
     """
     day = today or datetime.date.today()
     earlier = read_history(history) if history is not None else []

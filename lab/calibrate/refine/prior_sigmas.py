@@ -48,10 +48,8 @@ def stated_covariance(rig: Rig, stated: RigCovariance | None, sigmas: Mapping[st
     sigmas: by `cameras.position_m` (of all cameras), `cameras.left.rotation_deg` (of one), and so on; per axis, of a
     camera or screen about its own place, of a beam across its direction; `cameras.time_offset_s` and
     `cameras.row_time_s`. A part with sigmas has no correlation with others. Where the offset of every camera has one,
-    that of the first is known: recordings show offsets from each other only.
-
-    Raises:
-        InputError: for a name or value that is none, or if nothing is stated at all.
+    that of the first is known: recordings show offsets from each other only. Raises InputError: for a name or value
+    that is none, or if nothing is stated at all.
     """
     chosen = _chosen(rig, sigmas)
     names: list[str] = []

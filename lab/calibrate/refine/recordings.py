@@ -195,10 +195,8 @@ def labelled(run: Run, most: int | None = None, enough: int = 0, *, search: bool
     """Track and smooth a run with its rig. most: number of frames after which it ends, or after `enough` with poses.
 
     search: whether mistakes of the set-up are searched for where few frames have a pose or a camera has few labels.
-
-    Raises:
-        CalibrationError: the recording shows a mistake in the set-up, such as exchanged cameras, which no refinement
-            may absorb, or a camera without a spot where its stated errors allow it, or there is no frame at all.
+    Raises CalibrationError: the recording shows a mistake in the set-up, such as exchanged cameras, which no refinement
+    may absorb, or a camera without a spot where its stated errors allow it, or there is no frame at all.
     """
     camera_of = SpotModel.of(run.rig).camera_of
     sampler, pictures = FrameSampler(with_predicted=most is not None), SampledFrames()

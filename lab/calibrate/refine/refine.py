@@ -71,12 +71,9 @@ def refine_rig(
 
     The runs are tracked and smoothed with the given rig, and a second time with the first solution, which corrects
     labels. If the verdict is FAIL, there is no rig.yaml. free: groups of parameters that are changed (GROUPS); empty:
-    all of which a covariance is known. sigmas: see `stated_covariance`.
-
-    Raises:
-        InputError: for errors in the files or options.
-        CalibrationError: the given rig must not be used, a recording shows a mistake in the set-up, or the recordings
-            determine no result.
+    all of which a covariance is known. sigmas: see `stated_covariance`. Raises InputError: for errors in the files or
+    options; CalibrationError: the given rig must not be used, a recording shows a mistake in the set-up, or the
+    recordings determine no result.
     """
     day = today or datetime.date.today()
     return run_step(_STEP, out, lambda: _solve(list(runs), Path(rig_path), list(free), sigmas or {}, day, progress))

@@ -136,11 +136,8 @@ def calibrate_rig(
 
     rig.yaml holds the verdict and the joint covariance of all parameters (in the target's block; cameras and screens
     hold their own parts of it). If the verdict is FAIL, the file is called rig.failed.yaml. progress: of the search for
-    a mistake in a survey.
-
-    Raises:
-        InputError: for errors in the files.
-        CalibrationError: if the measurements do not determine a calibration.
+    a mistake in a survey. Raises InputError: for errors in the files; CalibrationError: if the measurements do not
+    determine a calibration.
     """
     return run_step(_STEP, out, lambda: _solve(Path(project_path), today, progress))
 

@@ -86,11 +86,8 @@ def calibrate_screen(
 
     Writes into `out`: screens.yaml; rig.yaml with the nominal beams, if the project has a target; residuals.csv,
     dots.csv and report.html. If the verdict is FAIL, no YAML file is written. progress: of the search for a mistake in
-    a survey that does not fit.
-
-    Raises:
-        InputError: for errors in the files.
-        CalibrationError: if the measurements do not determine a calibration.
+    a survey that does not fit. Raises InputError: for errors in the files; CalibrationError: if the measurements do not
+    determine a calibration.
     """
     return run_step(_STEP, out, lambda: _solve(Path(project_path), today, progress))
 

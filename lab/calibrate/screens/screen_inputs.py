@@ -79,10 +79,8 @@ _Found = list[tuple[_Placement, dict[str, BoardView]]]  # placements with the vi
 def board_views(project: Project, rig: Rig) -> BoardViews:
     """Detect the boards of a project in their photographs.
 
-    A photograph of a portable board without the board is noted and excluded.
-
-    Raises:
-        CalibrationError: if a board that is fixed to a screen is not found in its photograph.
+    A photograph of a portable board without the board is noted and excluded. Raises CalibrationError: if a board that
+    is fixed to a screen is not found in its photograph.
     """
     placements = _placements(project)
     notes: list[str] = []
@@ -217,9 +215,7 @@ class ScreenInputs:
 def screen_inputs(project: Project) -> ScreenInputs:
     """Read all measurements of a project's screens.
 
-    Raises:
-        InputError: for errors in the files.
-        CalibrationError: if a board that is fixed to a screen is not found.
+    Raises InputError: for errors in the files; CalibrationError: if a board that is fixed to a screen is not found.
     """
     survey = read_survey(project.survey, project.screens)
     observations = read_observations(
@@ -416,9 +412,8 @@ def _in_metres(targets: Array, survey: Array, cloud: Cloud) -> tuple[Array, list
 def _points(cloud: Cloud) -> tuple[Array, list[str]]:
     """The points (n, 3), m, of all scans of a cloud that lie on surfaces, in the frame of the first; and notes.
 
-    Raises:
-        InputError: a scan cannot be read, or a further one cannot be aligned with the first.
-        MissingOpen3DError: Open3D cannot be loaded.
+    Raises InputError: a scan cannot be read, or a further one cannot be aligned with the first; MissingOpen3DError:
+    Open3D cannot be loaded.
     """
     scans: list[Array] = []
     words: list[str] = []
@@ -458,11 +453,9 @@ _ACCEPTED_MISFIT = 2.0  # misfit below which a change to the survey is accepted 
 def adjusted_screens(project: Project, inputs: ScreenInputs, progress: Progress | None = None) -> FittedScreens:
     """Adjust cameras and screens to the survey; if they do not fit, find the mistake in the survey.
 
-    progress: called with the number of changes to the survey that have been tried, and of all.
-
-    Raises:
-        InputError: for a survey that fits with other axes, signs or units, or parts without common measurements.
-        CalibrationError: if the measurements do not determine a calibration.
+    progress: called with the number of changes to the survey that have been tried, and of all. Raises InputError: for a
+    survey that fits with other axes, signs or units, or parts without common measurements; CalibrationError: if the
+    measurements do not determine a calibration.
     """
     where = ", ".join(str(p) for p in project.survey) or str(project.path)
     problem: Exception | None = None

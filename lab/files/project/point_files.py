@@ -39,8 +39,7 @@ AS_TEXT = (".xyz", ".txt", ".csv", ".asc")
 def read_point_cloud(path: Path, unit_m: float) -> tuple[Array, tuple[str, ...]]:
     """The points (n, 3), m, of a scan, and notes of what was left out. unit_m: metres in one unit of the file.
 
-    Raises:
-        InputError: an unknown kind of file, an empty or damaged one, or no finite point.
+    Raises InputError: an unknown kind of file, an empty or damaged one, or no finite point.
     """
     path = Path(path)
     kind = path.suffix.lower()

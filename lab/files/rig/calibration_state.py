@@ -85,8 +85,7 @@ def require_valid_calibration(
 ) -> None:
     """Checks that a calibration may be used for a recording of that day, or of today; None (state unknown) may.
 
-    Raises:
-        CalibrationError: the verdict is FAIL, or the calibration is out of date (exit status 3).
+    Raises CalibrationError: the verdict is FAIL, or the calibration is out of date (exit status 3).
     """
     if state is None:
         return

@@ -62,8 +62,7 @@ def load_camera(path: Path) -> CameraFile:
 def save_camera(file: CameraFile, path: Path) -> None:
     """Write a camera.yaml, atomically; it reads back to the last bit.
 
-    Raises:
-        InputError: the camera could not be loaded again, or the file cannot be written; an old file stays as it was.
+    Raises InputError: the camera could not be loaded again, or the file cannot be written; an old file stays as it was.
     """
     content = as_mapping(file)
     fields.validated(_CameraFileBlock, content, path)

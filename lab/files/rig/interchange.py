@@ -48,12 +48,10 @@ def convert(
     """Write the cameras of one file into another.
 
     Formats: beampose (camera.yaml), opencv, kalibr, ros, colmap, mrcal, and as a source beampose-rig (rig.yaml). By
-    default the content determines the format of the source, and the name that of the destination. camera: the camera
-    to convert; by default all, if the format of the destination allows several. What the destination cannot hold is
-    an error (a lens), or a note (a pose, a covariance).
-
-    Raises:
-        InputError: a file cannot be read, converted or written; the destination stays as it was.
+    default the content determines the format of the source, and the name that of the destination. camera: the camera to
+    convert; by default all, if the format of the destination allows several. What the destination cannot hold is an
+    error (a lens), or a note (a pose, a covariance). Raises InputError: a file cannot be read, converted or written;
+    the destination stays as it was.
     """
     source, destination = Path(source), Path(destination)
     text = read_text(source)

@@ -51,8 +51,7 @@ class _PairBlock(Block):
 def load_pair_file(path: Path) -> PairFile:
     """The cameras of a pair.yaml, a rig.yaml or a foreign file (Kalibr, OpenCV, mrcal ...) with poses.
 
-    Raises:
-        InputError: with file and field; a file without poses or with one camera is not a calibrated pair.
+    Raises InputError: with file and field; a file without poses or with one camera is not a calibrated pair.
     """
     path = Path(path)
     if not path.is_file():

@@ -70,9 +70,7 @@ def read_detections(path: Path, named: str | None = None) -> DetectionsFile:
     """The points of a detections.csv. named: the camera of all rows, for a file that may lack the column.
 
     Rows may be in any order. Unusable rows are left out and counted in `notes`, each reason with its first example.
-
-    Raises:
-        InputError: the file is not a table, lacks a column of REQUIRED, or has no usable row.
+    Raises InputError: the file is not a table, lacks a column of REQUIRED, or has no usable row.
     """
     optional = ("sigma_u_px", "sigma_v_px", "cov_uv_px2", *SHAPE)
     required = tuple(name for name in REQUIRED if name != "camera" or named is None)

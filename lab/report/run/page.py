@@ -102,11 +102,9 @@ def write_report(
 ) -> Path:
     """Write report.html into a results folder, from its tables alone; returns its path.
 
-    Where the run folder can be read (the one given, or the one that summary.json names), pictures, residuals and
-    errors against truth are added. run, result_tables: those of the folders, where they are known already.
-
-    Raises:
-        InputError: the tables cannot be read; report.html then says so.
+    Where the run folder can be read (the one given, or the one that summary.json names), pictures, residuals and errors
+    against truth are added. run, result_tables: those of the folders, where they are known already. Raises InputError:
+    the tables cannot be read; report.html then says so.
     """
     path = results / FILE_NAME
     try:

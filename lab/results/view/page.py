@@ -38,10 +38,8 @@ def show(
     """Write the scene of a rig.yaml, a run folder or results; without `out`, also open its page in the browser.
 
     frame: of the beams and spots; None: the middle one. sigma_scale: of the ellipsoids; None: a round number that makes
-    them visible. rig: a rig.yaml in place of the run's.
-
-    Raises:
-        InputError: an input is not as it should be, or a file cannot be written.
+    them visible. rig: a rig.yaml in place of the run's. Raises InputError: an input is not as it should be, or a file
+    cannot be written.
     """
     content = read_content(path, rig)
     index = content.at_frame(frame)

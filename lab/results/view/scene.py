@@ -59,8 +59,7 @@ class RigAndPoses:
     def at_frame(self, frame: int | None) -> int | None:
         """Index of a frame; None: the middle one of the known poses, or None without any.
 
-        Raises:
-            InputError: there is no such frame, or it has no pose.
+        Raises InputError: there is no such frame, or it has no pose.
         """
         known = np.flatnonzero(self.known)
         if frame is None:
@@ -76,10 +75,8 @@ class RigAndPoses:
 def read_content(path: Path, rig_path: Path | None) -> RigAndPoses:
     """A rig.yaml, a run folder (with the poses of its truth) or a results folder.
 
-    rig_path: a rig.yaml in place of the one that the run names.
-
-    Raises:
-        InputError: the path is none of these, or a file is not as it should be.
+    rig_path: a rig.yaml in place of the one that the run names. Raises InputError: the path is none of these, or a file
+    is not as it should be.
     """
     path = Path(path)
     if not path.exists():

@@ -48,11 +48,7 @@ FILE_NAME, LOCK_NAME = "batch.csv", ".batch.lock"
 
 @contextlib.contextmanager
 def locked(out: Path) -> Iterator[None]:
-    """Only one process at a time is in this block for a batch's folder.
-
-    Raises:
-        InputError: the lock cannot be had.
-    """
+    """Only one process at a time is in this block for a batch's folder. Raises InputError: the lock cannot be had."""
     lock = filelock.FileLock(out / LOCK_NAME, timeout=LOCK_SECONDS)
     try:
         lock.acquire()
@@ -87,8 +83,7 @@ class BatchTable:
     def write(self, index: bool = False) -> None:
         """Merge the rows added since into batch.csv, and with `index` write index.html.
 
-        Raises:
-            InputError: a file cannot be written. The rows are kept for the next attempt.
+        Raises InputError: a file cannot be written. The rows are kept for the next attempt.
         """
         with locked(self._out):
             there = read_rows(self.path)
@@ -127,8 +122,7 @@ def merged(
 def read_rows(path: Path) -> list[dict[str, str]]:
     """The rows of batch.csv; none where there is no such file. Rows of older versions get their `folder`.
 
-    Raises:
-        InputError: the file is not a table of a batch.
+    Raises InputError: the file is not a table of a batch.
     """
     try:
         text = text_of_file(path)
@@ -159,9 +153,7 @@ def update_data_sets(rows: Iterable[Mapping[str, Any]], out: Path) -> Path:
 
     rows: of batch.csv. A file that was made from the same results stays; that of a run without results is removed.
     `frame` is an integer, names and statuses are text, all other columns are numbers, null where the table is empty.
-
-    Raises:
-        InputError: pyarrow is not installed, a table of the results is damaged, or a file cannot be written.
+    Raises InputError: pyarrow is not installed, a table of the results is damaged, or a file cannot be written.
     """
     needed("parquet", "--parquet")
     root = Path(out) / FOLDER
@@ -275,11 +267,9 @@ def process_batch(
 
     runs, lists: as for `listed_runs`. report: called with one line per run. complain: in its place for runs that ended
     with an error. log: called with the lines of each run's log when it ends. progress: called with the numbers of runs
-    that are done, that were processed (not skipped), and of all. With `jobs`, a script must call this under
-    `if __name__ == "__main__"`, since the processes import it.
-
-    Raises:
-        InputError: the command as a whole cannot be carried out.
+    that are done, that were processed (not skipped), and of all. With `jobs`, a script must call this under `if
+    __name__ == "__main__"`, since the processes import it. Raises InputError: the command as a whole cannot be carried
+    out.
     """
     options, out = options or BatchOptions(), Path(out)
     # A misspelt parameter is the command's mistake, not each run's.

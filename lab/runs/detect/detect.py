@@ -46,11 +46,7 @@ class DetectOptions:
     overrides: Mapping[str, Any] = field(default_factory=dict)  # of TrackerParameters, such as detect.threshold_sigma
 
     def parameters(self) -> DetectParameters:
-        """The parameters of the detection.
-
-        Raises:
-            InputError: an override is not a parameter of the detection.
-        """
+        """The parameters of the detection. Raises InputError: an override is not a parameter of the detection."""
         others = [name for name in self.overrides if not name.startswith("detect.")]
         if others:
             raise InputError(
@@ -65,10 +61,8 @@ def detect_pictures(
 ) -> Done[PictureSeries]:
     """Search pictures for spots, and write detections.csv, a contact sheet, report.html and summary.json into `out`.
 
-    Positions are centroids of the light: without a rig they cannot be corrected to the beams' axes.
-
-    Raises:
-        InputError: the pictures or an option cannot be used, or no picture can be read; `out` is then unchanged.
+    Positions are centroids of the light: without a rig they cannot be corrected to the beams' axes. Raises InputError:
+    the pictures or an option cannot be used, or no picture can be read; `out` is then unchanged.
     """
     started = time.perf_counter()
     parameters = options.parameters()

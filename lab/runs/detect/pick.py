@@ -46,10 +46,8 @@ def write_pick_page(
 ) -> Done[Path]:
     """Write the page of some photographs. given: paths, each with the camera's name before it: `left=photo.png`.
 
-    Without a name the camera is called as the folder of several pictures, or as the file of one.
-
-    Raises:
-        InputError: a picture, a table or an option cannot be used.
+    Without a name the camera is called as the folder of several pictures, or as the file of one. Raises InputError: a
+    picture, a table or an option cannot be used.
     """
     names, table = _names(options.names), _table(options.table)
     shown, unreadable = _shown(given, options, progress)

@@ -214,8 +214,7 @@ def _count_pictures(video: Video) -> int:
 def open_frames(run: Run) -> FrameReader:
     """The reader of a run's pictures. Single damaged pictures are no error: they are Missing.
 
-    Raises:
-        InputError: a folder is empty or has two pictures of one number, a video or table cannot be read, or a frame has
-            no timestamp.
+    Raises InputError: a folder is empty or has two pictures of one number, a video or table cannot be read, or a frame
+    has no timestamp.
     """
     return ClockedFrames(run) if run.clocks else FrameReader(run)

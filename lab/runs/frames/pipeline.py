@@ -122,11 +122,7 @@ class Pipeline:
 
     @staticmethod
     def of(run: Run) -> Pipeline:
-        """Open a run.
-
-        Raises:
-            InputError: its pictures cannot be found.
-        """
+        """Open a run. Raises InputError: its pictures cannot be found."""
         reader = open_frames(run)
         noise: dict[str, CameraNoise] = {}
         if not all(isinstance(source, DetectionsTable) for source in run.cameras.values()):

@@ -203,8 +203,7 @@ class DeviceCamera:
 def open_device(name: str, device: int | str, size_px: tuple[int, int], inbox: Inbox, rate_hz: float) -> DeviceCamera:
     """Open a device, and request grey pictures of this (width, height) at this rate.
 
-    Raises:
-        InputError: the device cannot be opened.
+    Raises InputError: the device cannot be opened.
     """
     try:
         source = open_live(device, size_px, rate_hz)

@@ -96,8 +96,7 @@ class FolderPoll:
     def new(self) -> list[tuple[int, str]]:
         """Numbers and names of the pictures that are new since the last call, by number.
 
-        Raises:
-            OSError: the folder cannot be read.
+        Raises OSError: the folder cannot be read.
         """
         now = time.perf_counter()
         found = self._expected()

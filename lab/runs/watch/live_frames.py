@@ -132,10 +132,7 @@ class LiveFrames:
     def begin(self) -> Mapping[str, list[GreyPicture]]:
         """Wait for the first pictures of every camera; up to FIRST of each, in the order of their numbers.
 
-        Empty if the recording ended without any.
-
-        Raises:
-            InputError: the file names contain no frame numbers.
+        Empty if the recording ended without any. Raises InputError: the file names contain no frame numbers.
         """
         self.inbox.wanted.set()
         self._wait_for_pictures(FIRST, max(_START_S, 8 / self.run.frame_rate_hz, self.options.timeout_s))

@@ -86,11 +86,7 @@ class TimesFollower:
     _rows: list[tuple[int, float]] = field(default_factory=list)  # at most the last two
 
     def new(self) -> list[tuple[int, float]]:
-        """Numbers and times, s, that are new since the last call.
-
-        Raises:
-            InputError: the table has a mistake.
-        """
+        """Numbers and times, s, that are new since the last call. Raises InputError: the table has a mistake."""
         try:
             if os.stat(self.path).st_size <= self._read:
                 return []

@@ -246,10 +246,8 @@ def record(
 
     cameras: sources by name, as `open_live` takes them. stop: ends the recording when set. line: called with a line of
     status every second. run.yaml is written with the first picture of each camera, so that the folder is a valid run
-    whenever the process ends. Exit status 1: a camera failed, or the disk is full; what was recorded is a run.
-
-    Raises:
-        InputError: a camera cannot be opened, the folder has files in it, or no picture came.
+    whenever the process ends. Exit status 1: a camera failed, or the disk is full; what was recorded is a run. Raises
+    InputError: a camera cannot be opened, the folder has files in it, or no picture came.
     """
     stop, out = stop or threading.Event(), Path(out)
     if out.is_dir() and any(out.iterdir()):

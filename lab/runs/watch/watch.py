@@ -76,10 +76,7 @@ def watch_run(
     pictures that the noise and the static background are estimated from (here each camera's first ones; of the
     background, those before each picture) and by pictures that came too late. reprocess: computes the results from the
     finished folders instead, as `beampose run` does, which takes longer. provenance: added to summary.json, such as the
-    command.
-
-    Raises:
-        BeamposeError: the run cannot be watched, or no picture came.
+    command. Raises BeamposeError: the run cannot be watched, or no picture came.
     """
     started = time.perf_counter()
     run = ready_run(run_folder, overrides, recording=True)

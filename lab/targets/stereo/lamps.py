@@ -64,9 +64,8 @@ class LampsOptions(TrackOptions):
     def lens(self) -> CameraFile:
         """The camera.
 
-        Raises:
-            InputError: the file cannot be used, or there is no such detector.
-            CalibrationError: its calibration failed, or is out of date.
+        Raises InputError: the file cannot be used, or there is no such detector; CalibrationError: its calibration
+        failed, or is out of date.
         """
         if self.detector not in DETECTORS:
             raise InputError(f"--detector: expected one of {', '.join(DETECTORS)}, got {self.detector!r}")
