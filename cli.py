@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from lab.commands import batch, calibrate, maintenance, plan_and_simulate, results, run, track
+from lab.commands import calibrate, maintenance, plan_and_simulate, results, run, track
 from lab.commands.common import Commands
 from studies.command import study
 
@@ -21,7 +21,7 @@ def main() -> None:
 
 for command in (
     run.run,
-    batch.batch,
+    run.batch,
     run.detect,
     run.pick,
     run.watch,

@@ -152,7 +152,7 @@ def init(
     from lab.setup.init import Layout, start
 
     if own_screens or own_cameras or own_beams:
-        from lab.setup.own_rig import parts_of, rig_of_parts
+        from lab.setup.init import parts_of, rig_of_parts
 
         screens, cameras = parts_of(own_screens, "--screen"), parts_of(own_cameras, "--camera")
         rig = rig_of_parts(screens, cameras, parts_of(own_beams, "--beam"), picture)
@@ -161,7 +161,7 @@ def init(
         raise click.UsageError("--own asks questions, which need a terminal; state --screen, --camera and --beam")
     values = _asked(given)
     if own:
-        from lab.setup.own_rig import ask_parts, rig_of_parts
+        from lab.setup.init import ask_parts, rig_of_parts
 
         def ask(question: str, default: str) -> str:
             return str(click.prompt(question, default=default or None, show_default=bool(default)))

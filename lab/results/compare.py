@@ -14,8 +14,7 @@ from geometry import rotations
 from geometry.arrays import Array, Bools, Ints
 from lab.errors import InputError
 from lab.files.run.results import ResultFolder
-from lab.files.text.csv_table import Table
-from lab.files.text.csv_text import read_table
+from lab.files.text.csv_text import Table, read_table
 from lab.files.text.error_text import name_of_path
 from lab.findings.finding import Finding, Level, clause, finding, passed
 from lab.number_format import format_number, format_percent, format_with_sigma

@@ -99,7 +99,7 @@ def _shown(data: ResultData, frame: int, camera: str | None) -> Shown:
 
 def _of_run(folder: Path, frame: int, camera: str | None, progress: Progress | None) -> Shown:
     """The frame of a run folder, processed up to it by the causal pass."""
-    from lab.runs.frames.clocked_frames import open_frames
+    from lab.runs.frames.frames import open_frames
     from lab.runs.frames.pipeline import Pipeline
     from lab.runs.process import ready_run
     from lab.runs.tables import TableWriter

@@ -41,8 +41,7 @@ from lab.number_format import format_number
 from lab.pictures.picture_file import DROPPED, UNREADABLE, MissingPicture
 from lab.pictures.source import PictureFiles
 from lab.progress import Progress
-from lab.runs.frames.clocked_frames import open_frames
-from lab.runs.frames.frames import FrameReader, pictures_at
+from lab.runs.frames.frames import FrameReader, open_frames, pictures_at
 from lab.runs.setup_check import (
     SampledFrames,
     mistakes_by_themselves,

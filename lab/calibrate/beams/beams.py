@@ -13,15 +13,17 @@ from calibration.beams.beams import BeamCalibration, self_calibrate
 from calibration.beams.beams import calibrate_beams as solve_beams
 from calibration.least_squares.adjustment import AdjustmentError
 from geometry.uncertainty.rig_uncertainty import RigCovariance
-from lab.calibrate.beams.beam_findings import (
+from lab.calibrate.beams.beams_page import (
     ARCSEC,
+    BEAMS,
     BeamGoals,
     beam_findings,
     check_no_duplicates,
     diagnose_failed_fit,
+    page_of,
     stand_findings,
+    write_tables,
 )
-from lab.calibrate.beams.beams_page import BEAMS, page_of, write_tables
 from lab.calibrate.beams.recordings import read_recordings, stand_of
 from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expiry_findings, run_step, state_of
 from lab.errors import CalibrationError, InputError

@@ -22,8 +22,7 @@ from lab.files.project.point_files import StandPoses, read_poses
 from lab.files.project.project import Project, ProjectRecording
 from lab.files.run.clocks import ESTIMATE
 from lab.files.run.run_file import Run, load_run
-from lab.files.text.csv_table import Table
-from lab.files.text.csv_text import SIGMA_RANGE_PX, check_pixels, check_sigmas, read_table
+from lab.files.text.csv_text import SIGMA_RANGE_PX, Table, check_pixels, check_sigmas, read_table
 from lab.files.text.error_text import printable_line, suggest_name
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from tracking.detections import Detections

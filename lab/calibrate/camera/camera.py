@@ -22,8 +22,7 @@ from calibration.lens.intrinsics import (
 from calibration.lens.intrinsics_result import Intrinsics
 from geometry.camera import FISHEYE, PERSPECTIVE
 from geometry.uncertainty.rig_uncertainty import RigCovariance
-from lab.calibrate.camera.camera_findings import findings_of, next_photographs
-from lab.calibrate.camera.camera_page import page_of
+from lab.calibrate.camera.camera_page import findings_of, next_photographs, page_of
 from lab.calibrate.camera.photos import TABLE_SUFFIXES, PhotoSet, find_in_photos, origins_of, read_corner_table
 from lab.calibrate.step import Solved, Step, run_step
 from lab.errors import CalibrationError, InputError

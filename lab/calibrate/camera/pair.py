@@ -16,7 +16,7 @@ from calibration.lens.intrinsics_result import Intrinsics
 from calibration.pair import CalibratedPair, PairError, calibrate_pair
 from geometry.arrays import Array
 from lab.calibrate.camera.camera import LENSES, corner_table
-from lab.calibrate.camera.camera_findings import findings_of as lens_findings
+from lab.calibrate.camera.camera_page import findings_of as lens_findings
 from lab.calibrate.camera.photos import PhotoSet, find_in_photos
 from lab.calibrate.step import Solved, Step, run_step
 from lab.errors import CalibrationError, InputError

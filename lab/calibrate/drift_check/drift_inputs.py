@@ -14,8 +14,7 @@ from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.run.results import read_poses, read_spots
 from lab.files.run.truth import read_true_poses
-from lab.files.text.csv_table import Table
-from lab.files.text.csv_text import SIGMA_RANGE_PX, check_pixels, check_sigmas, read_table
+from lab.files.text.csv_text import SIGMA_RANGE_PX, Table, check_pixels, check_sigmas, read_table
 from lab.files.text.error_text import suggest_name
 
 PIXELS = ("camera", "point", "u_px", "v_px")

@@ -24,8 +24,7 @@ from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.calibrate.refine import prior_sigmas
 from lab.calibrate.refine.prior_sigmas import GROUPS, free_group, stated_covariance
 from lab.calibrate.refine.recordings import LabelledRun, labelled, tolerant, with_rig
-from lab.calibrate.refine.refine_findings import RefinedRig, refine_findings
-from lab.calibrate.refine.refine_page import changes_of_numbers, page_of, pixel_residuals
+from lab.calibrate.refine.refine_page import RefinedRig, changes_of_numbers, page_of, pixel_residuals, refine_findings
 from lab.calibrate.step import Solved, Step, run_step, state_of
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.calibration_state import require_valid_calibration

@@ -29,7 +29,7 @@ from calibration.terms.corners import CornerTerm
 from calibration.terms.surveyed import RecordTerm, array_of
 from geometry.arrays import Array
 from geometry.rig import Rig
-from lab.calibrate.beams.beam_findings import (
+from lab.calibrate.beams.beams_page import (
     BeamGoals,
     beam_findings,
     check_no_duplicates,
@@ -37,10 +37,9 @@ from lab.calibrate.beams.beam_findings import (
     stand_findings,
 )
 from lab.calibrate.beams.recordings import Recordings, read_recordings, stand_of
-from lab.calibrate.rig.rig_findings import CalibratedRig, joint_findings
-from lab.calibrate.rig.rig_page import page_of
-from lab.calibrate.screens.screen_findings import ScreenLimits, near_findings, network_findings, survey_findings
+from lab.calibrate.rig.rig_page import CalibratedRig, joint_findings, page_of
 from lab.calibrate.screens.screen_inputs import adjusted_screens, screen_inputs
+from lab.calibrate.screens.screen_page import ScreenLimits, near_findings, network_findings, survey_findings
 from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expiry_findings, run_step, state_of
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project, load_project

@@ -14,9 +14,8 @@ import numpy as np
 
 from calibration.screens.screens import FittedScreens, pointing_sigmas_m, spot_sigmas
 from geometry.rig import Rig
-from lab.calibrate.screens.screen_findings import near_findings, network_findings, survey_findings
 from lab.calibrate.screens.screen_inputs import adjusted_screens, screen_inputs
-from lab.calibrate.screens.screen_page import page_of
+from lab.calibrate.screens.screen_page import near_findings, network_findings, page_of, survey_findings
 from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expiry_findings, run_step, state_of
 from lab.files.project.project import Project, load_project
 from lab.files.rig.rig_file import TARGET, RigFile, covariance_blocks, save_rig, save_screens

@@ -18,12 +18,12 @@ from geometry.pose import Pose
 from lab.errors import InputError
 from lab.files.run.truth import check_unit_quaternions
 from lab.files.text import columns
-from lab.files.text.csv_table import Table
 from lab.files.text.csv_text import (
     MAX_COORDINATE_M,
     SIGMA_RANGE_DEG,
     SIGMA_RANGE_M,
     SIGMA_RANGE_PX,
+    Table,
     check_coordinates,
     check_pixels,
     check_sigmas,

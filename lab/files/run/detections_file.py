@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 
 from geometry.arrays import Array, Bools, Ints
 from lab.errors import InputError
-from lab.files.text.csv_table import Table, is_whole
-from lab.files.text.csv_text import read_table
+from lab.files.text.csv_text import Table, is_whole, read_table
 from tracking.detections import Detections
 from tracking.input_validation import DUPLICATE_PX, LARGEST_PX, LEAST_SIGMA_PX, duplicates
 

@@ -16,8 +16,7 @@ from lab.errors import InputError
 from lab.files.run.run_file import Run, load_run
 from lab.files.text import columns
 from lab.files.text.columns import CAUSAL
-from lab.files.text.csv_table import Categorical, Table
-from lab.files.text.csv_text import MAX_TIME_S, read_table
+from lab.files.text.csv_text import MAX_TIME_S, Categorical, Table, read_table
 from lab.files.text.error_text import name_of_path
 from lab.files.text.json_text import has_schema, read_json
 from tracking.statuses import PoseStatus, SpotStatus

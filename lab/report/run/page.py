@@ -27,11 +27,10 @@ from lab.report.run import figures, tables, trust
 from lab.report.run.events import ShownEvent, events, pictures, selected
 from lab.report.run.figures import timeline_figure, tracks_figure, zoom_data
 from lab.report.run.methods import methods
-from lab.report.run.model_fit import HEADS as MODEL_FIT_HEADS
-from lab.report.run.model_fit import model_fit
 from lab.report.run.report_data import ReportData, read_report_data
-from lab.results.view.page import scene_data
-from lab.results.view.scene import content_of_poses, view_of
+from lab.report.run.trust import HEADS as MODEL_FIT_HEADS
+from lab.report.run.trust import model_fit
+from lab.results.view.page import content_of_poses, scene_data, view_of
 from lab.runs.verdict.score import ResultTables
 from tracking.statuses import PoseStatus, SpotStatus
 

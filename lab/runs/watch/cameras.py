@@ -16,8 +16,7 @@ from lab.errors import InputError
 from lab.pictures.live_source import LiveSource, open_live
 from lab.pictures.picture_file import UNREADABLE, MissingPicture, read_picture
 from lab.runs.watch.frame_clock import FolderPoll, FrameClock
-from lab.runs.watch.inbox import Inbox
-from lab.runs.watch.picture_times import TimesFollower
+from lab.runs.watch.inbox import Inbox, TimesFollower
 
 POLL_S = 0.002  # between two polls of a folder ...
 _POLL_IDLE_S = 0.01  # ... and after _IDLE_S without a new picture

@@ -15,13 +15,12 @@ from lab.errors import BeamposeError, InputError
 from lab.files.run.detections_file import LONGEST_GAP
 from lab.files.run.run_file import FramesFolder, LiveDevice, Run
 from lab.pictures.picture_file import DROPPED, GreyPicture, MissingPicture
-from lab.runs.clock_estimate import ClockEstimate
 from lab.runs.frames.frames import FrameSet, Recorded
 from lab.runs.frames.moments import Moment, MomentPlanner, TimedPicture
+from lab.runs.smoothing_pass import ClockEstimate
 from lab.runs.watch.cameras import DeviceCamera, FolderCamera, LiveCamera, in_thread, open_device
 from lab.runs.watch.frame_clock import FolderPoll
-from lab.runs.watch.inbox import CameraQueue, Inbox, is_complete
-from lab.runs.watch.picture_times import complete_times, times_of
+from lab.runs.watch.inbox import CameraQueue, Inbox, complete_times, is_complete, times_of
 
 FIRST = 6  # pictures of each camera for the estimate of the noise
 _ARRIVALS = 200  # frames whose arrivals are compared between cameras

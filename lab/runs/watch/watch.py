@@ -35,8 +35,7 @@ from lab.runs.verdict.frame_checks import FrameChecks
 from lab.runs.verdict.run_statistics import RunStatistics
 from lab.runs.watch.background import FunctionProcess, LiveBackground
 from lab.runs.watch.live_frames import LiveFrames, WatchOptions
-from lab.runs.watch.live_output import LiveOutput, is_live_table
-from lab.runs.watch.streams import opened
+from lab.runs.watch.live_output import LiveOutput, is_live_table, opened
 from tracking.background.estimation import PICTURES, static_background
 from tracking.detections import Detections
 from tracking.parameters import DetectParameters
@@ -114,8 +113,7 @@ def _served(
     run: Run, frames: LiveFrames, page: str, stack: contextlib.ExitStack, line: Callable[[str], None] | None
 ) -> Board:
     """The content of the live page, and its server. Raises InputError: the address cannot be used."""
-    from lab.runs.watch.board import Board, page_html
-    from lab.runs.watch.page_server import PageServer
+    from lab.runs.watch.board import Board, PageServer, page_html
 
     # A process of its own: that of the backgrounds may be busy for seconds.
     board = Board(run, frames, stack.enter_context(FunctionProcess()).call)

@@ -18,8 +18,8 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names
-from lab.calibrate.beams.beam_findings import bad_positions
 from lab.calibrate.beams.beams import calibrate_beams
+from lab.calibrate.beams.beams_page import bad_positions
 from lab.calibrate.beams.recordings import (
     SpotRows,
     average,
