@@ -9,8 +9,8 @@ from markupsafe import Markup
 
 from lab.files.text.atomic_write import atomic_folder, atomic_write_text, earlier_results
 from lab.files.text.csv_text import write_table
-from lab.findings.outcome import Done
-from lab.report.html import environment
+from lab.findings.finding import Done
+from lab.report.page import environment
 
 
 @dataclass(frozen=True, slots=True)

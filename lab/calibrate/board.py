@@ -24,7 +24,7 @@ from lab.errors import InputError
 from lab.files.rig.board_file import load_board, load_board_or_text, save_board
 from lab.files.text.atomic_write import atomic_folder, atomic_write_bytes
 from lab.files.text.error_text import suggest_name
-from lab.findings.outcome import Done
+from lab.findings.finding import Done
 
 PAGES_MM = {"A4": (210.0, 297.0), "A3": (297.0, 420.0)}  # width, height in portrait; landscape is used as well
 FIT = "fit"  # a page of the size that the board needs

@@ -14,12 +14,22 @@ from typing import Any, Generic, TypeVar
 
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project
-from lab.files.rig.calibration_state import CalibrationState
+from lab.files.rig.camera_file import CalibrationState
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.text.atomic_write import atomic_folder, check_output_folder, earlier_results, keep_good_results
 from lab.files.text.json_text import write_json
-from lab.findings.finding import Finding, Level, counted, finding, first_sentence, reasons, verdict, worst_first
-from lab.findings.outcome import Outcome, Verdict
+from lab.findings.finding import (
+    Finding,
+    Level,
+    Outcome,
+    Verdict,
+    counted,
+    finding,
+    first_sentence,
+    reasons,
+    verdict,
+    worst_first,
+)
 from lab.packages import versions
 from lab.report.page import KeyFigure, Page, Section, made_with, write_page
 

@@ -32,7 +32,7 @@ from lab.commands.common import (
     verbose_option,
 )
 from lab.errors import BeamposeError
-from lab.findings.outcome import Outcome
+from lab.findings.finding import Outcome
 
 causal_option = click.option(
     "--causal", is_flag=True, help="No smoothing pass: attitude.csv has the poses as known at each instant."

@@ -23,7 +23,7 @@ from lab.files.run.results import POSE_STATUSES, PoseTrack, ResultFolder, read_r
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder, atomic_write_bytes
 from lab.files.text.json_text import plain_value
-from lab.findings.outcome import Done
+from lab.findings.finding import Done
 from lab.packages import needed, versions
 from tracking.statuses import PoseStatus
 

@@ -18,7 +18,7 @@ from lab.errors import InputError
 from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_bytes
 from lab.files.text.error_text import suggest_name
-from lab.findings.outcome import Done
+from lab.findings.finding import Done
 from lab.pictures.overlay_video import write_overlay_video
 from lab.progress import Progress
 from lab.report.frames.canvas import Pixels, png
@@ -103,7 +103,7 @@ def _of_run(folder: Path, frame: int, camera: str | None, progress: Progress | N
     from lab.runs.frames.pipeline import Pipeline
     from lab.runs.process import ready_run
     from lab.runs.tables import TableWriter
-    from lab.runs.verdict.frame_checks import FrameChecks
+    from lab.runs.verdict.run_statistics import FrameChecks
 
     run = ready_run(folder)
     reader = open_frames(run)

@@ -18,7 +18,7 @@ from lab.files.run.fingerprints import fingerprints
 from lab.files.run.results import ResultFolder
 from lab.files.run.run_file import LiveDevice, Run
 from lab.files.text.dataclass_fields import dataclass_from_yaml
-from lab.findings.outcome import Done
+from lab.findings.finding import Done
 from lab.packages import versions
 from lab.progress import Progress
 from lab.runs.frames.pipeline import Pipeline

@@ -14,16 +14,15 @@ import numpy as np
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rotations import log
-from lab.files.rig.calibration_state import require_valid_calibration
+from lab.files.rig.camera_file import require_valid_calibration
 from lab.files.run.fingerprints import fingerprints
 from lab.files.run.results import SUMMARY_SCHEMA, ResultFolder, are_results
 from lab.files.run.run_file import Run, load_run
 from lab.files.run.truth import load_run_truth
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.dataclass_fields import with_overrides
-from lab.findings.finding import Level, worst_first
+from lab.findings.finding import Level, Outcome, Verdict, worst_first
 from lab.findings.finding import verdict as verdict_of
-from lab.findings.outcome import Outcome, Verdict
 from lab.packages import versions
 from lab.progress import Progress
 from lab.runs.frames.pipeline import FrameRecord, Pair, Pipeline, row_records
@@ -34,8 +33,7 @@ from lab.runs.setup_check import SampledFrames, mistakes_of_run
 from lab.runs.smoothing_pass import SmoothingSummary, TrackingAndSmoothing, clock_findings
 from lab.runs.tables import TableWriter
 from lab.runs.verdict import quality
-from lab.runs.verdict.frame_checks import FrameChecks
-from lab.runs.verdict.run_statistics import MOST_EVENTS, CameraStatistics, RunStatistics
+from lab.runs.verdict.run_statistics import MOST_EVENTS, CameraStatistics, FrameChecks, RunStatistics
 
 if TYPE_CHECKING:
     from lab.runs.model_check.check import ModelCheck

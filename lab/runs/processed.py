@@ -16,7 +16,7 @@ import numpy as np
 from geometry.arrays import Array
 from lab.files.text.atomic_write import atomic_folder, earlier_results
 from lab.files.text.json_text import write_json
-from lab.findings.outcome import Outcome, Verdict
+from lab.findings.finding import Outcome, Verdict
 from lab.packages import versions
 
 R = TypeVar("R")

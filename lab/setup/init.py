@@ -24,7 +24,7 @@ from lab.files.run.run_file import load_run, save_run
 from lab.files.text.atomic_write import atomic_folder, atomic_write_text
 from lab.files.text.error_text import suggest_name
 from lab.files.text.yaml_text import parse_value, with_comments, write_mapping
-from lab.findings.outcome import Done
+from lab.findings.finding import Done
 from lab.results.view.page import read_content, view_of, write_page
 from lab.simulate.scenarios import SCENARIOS
 from lab.simulate.write import simulate

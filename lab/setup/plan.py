@@ -18,7 +18,7 @@ from lab.calibrate.step import Solved, Step, run_step
 from lab.errors import QUALITY_GATE_FAILED
 from lab.files.rig.rig_file import TARGET, joint_covariance, load_rig_file
 from lab.files.text.csv_text import write_table
-from lab.findings.outcome import Outcome
+from lab.findings.finding import Outcome
 from lab.number_format import format_angle, format_length, format_percent
 from lab.report.calibration.calibration_scene import rig_things, scene_views
 from lab.report.page import KeyFigure, PageDrawing, PageTable, Section

@@ -28,8 +28,7 @@ from lab.errors import InputError
 from lab.files.project.point_files import POINTS, POSE_SIGMAS, SURVEY, SURVEY_SIGMAS
 from lab.files.project.project import SCHEMA
 from lab.files.rig.board_file import save_board
-from lab.files.rig.calibration_state import CameraCalibration
-from lab.files.rig.camera_file import CameraFile, save_camera
+from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
 from lab.files.rig.pose_block import pose_mapping
 from lab.files.rig.rig_file import RigFile, as_mapping, load_rig, save_rig
 from lab.files.text import columns
@@ -38,7 +37,7 @@ from lab.files.text.csv_text import write_table
 from lab.files.text.error_text import suggest_name
 from lab.files.text.yaml_text import write_mapping
 from lab.simulate.board_photo import PhotoSettings, photograph
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 
 # A simulated calibration campaign: the true rig, and the measurements of it that a laboratory makes.
 

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from geometry.arrays import Array
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.text.csv_text import write_table
-from lab.findings.finding import ENTRIES, Finding, Level, finding, worst_first
-from lab.findings.outcome import Outcome, Verdict
+from lab.findings.finding import ENTRIES, Finding, Level, Outcome, Verdict, finding, worst_first
 from lab.pictures.overlay_video import write_overlay_video
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import open_inputs

@@ -10,7 +10,7 @@
 5. Add labels by continuity where the pose is uncertain (labels/continuity.py), and those of a camera that was knocked
    (labels/neighbouring_frames.py).
 
-lab/runs/verdict/frame_checks.py tests the result once more, against the spots and the causal pose. Source: ours.
+lab/runs/verdict/run_statistics.py tests the result once more, against the spots and the causal pose. Source: ours.
 """
 
 from __future__ import annotations

@@ -28,11 +28,10 @@ from lab.calibrate.beams.recordings import read_recordings, stand_of
 from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expiry_findings, run_step, state_of
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project, load_project
-from lab.files.rig.calibration_state import CalibrationState
+from lab.files.rig.camera_file import CalibrationState
 from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance, load_lab_file, save_rig
 from lab.files.text.error_text import suggest_name
-from lab.findings.finding import Finding, Level, finding, passed, verdict
-from lab.findings.outcome import Outcome
+from lab.findings.finding import Finding, Level, Outcome, finding, passed, verdict
 
 RIG = "rig.yaml"
 

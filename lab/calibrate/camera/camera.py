@@ -27,12 +27,10 @@ from lab.calibrate.camera.photos import TABLE_SUFFIXES, PhotoSet, find_in_photos
 from lab.calibrate.step import Solved, Step, run_step
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.board_file import load_board_or_text
-from lab.files.rig.calibration_state import CameraCalibration
-from lab.files.rig.camera_file import CameraFile, save_camera
+from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
 from lab.files.text.csv_text import write_table
 from lab.files.text.error_text import suggest_name
-from lab.findings.finding import Finding, Level, verdict
-from lab.findings.outcome import Outcome
+from lab.findings.finding import Finding, Level, Outcome, verdict
 from lab.number_format import format_number
 from lab.progress import Progress
 

@@ -21,12 +21,11 @@ from lab.calibrate.camera.photos import PhotoSet, find_in_photos
 from lab.calibrate.step import Solved, Step, run_step
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.board_file import load_board_or_text
-from lab.files.rig.calibration_state import CalibrationState
+from lab.files.rig.camera_file import CalibrationState
 from lab.files.rig.pair_file import PairFile, save_pair_file
 from lab.files.text.csv_text import write_table
 from lab.files.text.error_text import suggest_name
-from lab.findings.finding import Finding, Level, finding, level_above, verdict
-from lab.findings.outcome import Outcome
+from lab.findings.finding import Finding, Level, Outcome, finding, level_above, verdict
 from lab.number_format import format_length, format_number
 from lab.pictures.source import number_of
 from lab.progress import Progress

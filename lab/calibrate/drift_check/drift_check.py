@@ -48,11 +48,10 @@ from lab.calibrate.drift_check.drift_comparison import (
 )
 from lab.calibrate.drift_check.drift_inputs import DriftInputs, read_points, read_still_pose, read_still_spots
 from lab.calibrate.step import Solved, Step, run_step
-from lab.files.rig.calibration_state import CalibrationState
+from lab.files.rig.camera_file import CalibrationState
 from lab.files.rig.rig_file import RigFile, joint_covariance, load_rig_file
 from lab.files.text.csv_text import write_table
-from lab.findings.finding import Finding, Level, finding, passed
-from lab.findings.outcome import Outcome
+from lab.findings.finding import Finding, Level, Outcome, finding, passed
 from lab.number_format import format_count, format_number
 from lab.report.calibration.calibration_drawings import DriftLine, corners_overlay, drift_chart
 from lab.report.calibration.calibration_scene import Marker, rig_things, scene_views

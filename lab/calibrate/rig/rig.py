@@ -46,8 +46,7 @@ from lab.files.project.project import Project, load_project
 from lab.files.rig.rig_file import RigFile, covariance_blocks, save_rig
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.csv_text import csv_word
-from lab.findings.finding import Finding, Level, finding, passed, verdict
-from lab.findings.outcome import Outcome
+from lab.findings.finding import Finding, Level, Outcome, finding, passed, verdict
 from lab.progress import Progress
 
 RESIDUALS = "residuals.csv"

@@ -20,8 +20,7 @@ from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expi
 from lab.files.project.project import Project, load_project
 from lab.files.rig.rig_file import TARGET, RigFile, covariance_blocks, save_rig, save_screens
 from lab.files.text.csv_text import write_table
-from lab.findings.finding import Finding, Level, finding, verdict
-from lab.findings.outcome import Outcome
+from lab.findings.finding import Finding, Level, Outcome, finding, verdict
 from lab.number_format import format_count
 from lab.progress import Progress
 

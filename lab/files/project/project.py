@@ -20,8 +20,7 @@ from calibration.boards.board_types import Board
 from geometry.rig import Beam, Spot
 from lab.errors import InputError
 from lab.files.rig.board_file import load_board
-from lab.files.rig.calibration_state import Day
-from lab.files.rig.camera_file import CameraFile, load_camera
+from lab.files.rig.camera_file import CameraFile, Day, load_camera
 from lab.files.rig.interchange import read_cameras
 from lab.files.rig.pose_block import PoseBlock
 from lab.files.rig.rig_file import TargetBlock, unknown_name

@@ -20,7 +20,7 @@ from lab.files.rig.rig_file import RigFile, load_rig_file
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.error_text import suggest_name
 from lab.files.text.yaml_text import parse_mapping, read_text
-from lab.findings.outcome import Done
+from lab.findings.finding import Done
 
 BEAMPOSE, RIG = "beampose", "beampose-rig"
 _FOREIGN: Mapping[str, ModuleType] = {m.NAME: m for m in (opencv_yaml, kalibr, ros, colmap, mrcal)}

@@ -15,8 +15,8 @@ from geometry.camera import Camera, SensorNoise
 from geometry.rig import Beam, Rig, Screen, Spot
 from geometry.uncertainty.rig_uncertainty import CLOCK, RigCovariance, is_known, split_name
 from lab.errors import InputError
-from lab.files.rig.calibration_state import CalibrationState
 from lab.files.rig.camera_file import (
+    CalibrationState,
     CovarianceBlock,
     LensBlock,
     covariance_error,

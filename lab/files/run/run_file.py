@@ -17,7 +17,7 @@ from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
-from lab.files.rig.calibration_state import CalibrationState, OptionalDay
+from lab.files.rig.camera_file import CalibrationState, OptionalDay
 from lab.files.rig.rig_file import joint_covariance, load_rig_file
 from lab.files.run.clocks import ESTIMATE, CameraClock, Times, clocks_in, load_clock, load_times
 from lab.files.text import fields

@@ -20,8 +20,7 @@ from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_text
 from lab.number_format import format_count
 from lab.report.calibration.calibration_scene import LAB_VIEWS, scene_views
-from lab.report.html import as_script, environment
-from lab.report.page import Failure, files_beside, write_failure_report
+from lab.report.page import Failure, as_script, environment, files_beside, write_failure_report
 from lab.report.plot.svg import POSE_COLOURS, SPOT_COLOURS
 from lab.report.run import figures, tables, trust
 from lab.report.run.events import ShownEvent, events, pictures, selected

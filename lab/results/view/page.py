@@ -30,7 +30,7 @@ from lab.files.run.results import PoseTrack, ResultFolder
 from lab.files.run.run_file import load_run
 from lab.files.run.truth import load_run_truth
 from lab.files.text.atomic_write import atomic_write_bytes, atomic_write_text, made_folder
-from lab.findings.outcome import Done
+from lab.findings.finding import Done
 from lab.report.calibration.calibration_scene import (
     Frustum,
     Marker,
@@ -43,7 +43,7 @@ from lab.report.calibration.calibration_scene import (
     rig_things,
     scene_views,
 )
-from lab.report.html import as_script, environment
+from lab.report.page import as_script, environment
 from lab.report.plot.svg import GREY, ORANGE, PURPLE, round_size
 from tracking.statuses import PoseStatus
 

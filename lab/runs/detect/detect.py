@@ -18,7 +18,7 @@ from lab.files.text.atomic_write import atomic_folder, earlier_results
 from lab.files.text.csv_text import csv_word
 from lab.files.text.dataclass_fields import with_overrides
 from lab.files.text.json_text import write_json
-from lab.findings.outcome import Done
+from lab.findings.finding import Done
 from lab.number_format import format_count
 from lab.packages import versions
 from lab.pictures.picture_file import MissingPicture

@@ -17,11 +17,11 @@ from lab.files.rig.rig_file import load_rig
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.csv_text import read_table
 from lab.files.text.error_text import printable_line
-from lab.findings.outcome import Done
+from lab.findings.finding import Done
 from lab.pictures.picture_file import GreyPicture, MissingPicture
 from lab.pictures.source import open_inputs, pictures
 from lab.progress import Progress
-from lab.report.html import as_script, environment
+from lab.report.page import as_script, environment
 from lab.report.plot.svg import grey_limits, image_uri
 from lab.runs.detect.detect import DetectOptions
 from lab.runs.detect.picture_series import PictureSeries

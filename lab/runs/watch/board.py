@@ -32,7 +32,7 @@ from lab.findings.finding import Level, first_sentence, verdict
 from lab.pictures.opencv import load_cv2
 from lab.pictures.picture_file import GreyPicture
 from lab.report.frames.canvas import ground
-from lab.report.html import environment
+from lab.report.page import environment
 from lab.report.plot.svg import grey_limits, stretched
 from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.model_check.check import check_sampled_frames

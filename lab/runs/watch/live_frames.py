@@ -18,8 +18,7 @@ from lab.pictures.picture_file import DROPPED, GreyPicture, MissingPicture
 from lab.runs.frames.frames import FrameSet, Recorded
 from lab.runs.frames.moments import Moment, MomentPlanner, TimedPicture
 from lab.runs.smoothing_pass import ClockEstimate
-from lab.runs.watch.cameras import DeviceCamera, FolderCamera, LiveCamera, in_thread, open_device
-from lab.runs.watch.frame_clock import FolderPoll
+from lab.runs.watch.cameras import DeviceCamera, FolderCamera, FolderPoll, LiveCamera, in_thread, open_device
 from lab.runs.watch.inbox import CameraQueue, Inbox, complete_times, is_complete, times_of
 
 FIRST = 6  # pictures of each camera for the estimate of the noise

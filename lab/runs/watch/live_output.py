@@ -26,7 +26,7 @@ from lab.files.text.json_text import plain_value
 from lab.packages import needed
 from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.tables import attitude_rows, pose_numbers
-from lab.runs.verdict.frame_checks import FrameChecks
+from lab.runs.verdict.run_statistics import FrameChecks
 from lab.runs.watch.live_frames import LiveFrames
 from tracking.statuses import PoseStatus
 

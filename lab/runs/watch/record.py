@@ -22,11 +22,11 @@ from lab.files.run.run_file import save_run
 from lab.files.text import columns
 from lab.files.text.atomic_write import made_folder
 from lab.files.text.error_text import suggest_name
-from lab.findings.outcome import Done
+from lab.findings.finding import Done
 from lab.pictures.live_source import LiveSource, open_live
 from lab.pictures.picture_file import GreyPicture, MissingPicture
 from lab.pictures.png import encoded
-from lab.runs.watch.frame_clock import FrameClock
+from lab.runs.watch.cameras import FrameClock
 
 _WAITING = 64  # pictures per camera in memory that are not written yet
 _FAILURES = 5  # consecutive failures after which a camera counts as disconnected

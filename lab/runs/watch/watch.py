@@ -24,15 +24,14 @@ from lab.errors import InputError, RunError
 from lab.files.run.results import are_results
 from lab.files.run.run_file import LiveDevice, Run
 from lab.files.text.atomic_write import atomic_folder
-from lab.findings.outcome import Outcome
+from lab.findings.finding import Outcome
 from lab.pictures.picture_file import GreyPicture
 from lab.progress import Progress
 from lab.runs.frames.pipeline import Pipeline, tracker_of
 from lab.runs.frames.sensor_noise import VIDEO_FRAMES, CameraNoise
 from lab.runs.process import ready_run, write_results
 from lab.runs.smoothing_pass import TRACKING
-from lab.runs.verdict.frame_checks import FrameChecks
-from lab.runs.verdict.run_statistics import RunStatistics
+from lab.runs.verdict.run_statistics import FrameChecks, RunStatistics
 from lab.runs.watch.background import FunctionProcess, LiveBackground
 from lab.runs.watch.live_frames import LiveFrames, WatchOptions
 from lab.runs.watch.live_output import LiveOutput, is_live_table, opened

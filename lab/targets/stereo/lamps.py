@@ -12,8 +12,7 @@ import numpy as np
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
 from lab.files.project.project import load_lens
-from lab.files.rig.calibration_state import require_valid_calibration
-from lab.files.rig.camera_file import CameraFile
+from lab.files.rig.camera_file import CameraFile, require_valid_calibration
 from lab.files.text import columns
 from lab.findings.finding import Finding, Level, finding, level_above
 from lab.number_format import format_length, format_number

@@ -16,11 +16,10 @@ import numpy as np
 from geometry.arrays import evenly_spread
 from geometry.pose import Pose
 from lab.errors import InputError
-from lab.files.rig.calibration_state import require_valid_calibration
+from lab.files.rig.camera_file import require_valid_calibration
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.run.truth import TruePoses, read_true_poses
-from lab.findings.finding import Finding, Level, finding, level_above, passed, worst_first
-from lab.findings.outcome import Outcome, Verdict
+from lab.findings.finding import Finding, Level, Outcome, Verdict, finding, level_above, passed, worst_first
 from lab.number_format import format_length, format_number
 from lab.pictures.picture_file import MissingPicture
 from lab.progress import Progress
