@@ -24,7 +24,7 @@ from lab.progress import Progress
 from lab.report.frames.canvas import Pixels, png
 from lab.report.frames.content import DrawnFrame, ResultData, frame_content, pictures_of, pose_words, read_result_data
 from lab.report.frames.sheet import Layout, Limits, limits_of, sheet
-from lab.runs.frames.frames import Recorded, pictures_at
+from lab.runs.frames.frames import Recorded, open_frames, pictures_at
 
 if TYPE_CHECKING:
     from lab.runs.frames.pipeline import FrameRecord, Pipeline
@@ -99,7 +99,6 @@ def _shown(data: ResultData, frame: int, camera: str | None) -> Shown:
 
 def _of_run(folder: Path, frame: int, camera: str | None, progress: Progress | None) -> Shown:
     """The frame of a run folder, processed up to it by the causal pass."""
-    from lab.runs.frames.frames import open_frames
     from lab.runs.frames.pipeline import Pipeline
     from lab.runs.process import ready_run
     from lab.runs.tables import TableWriter

@@ -24,7 +24,7 @@ from lab.packages import versions
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import PictureSource, Video, open_inputs, pictures, pictures_of_frames
 from lab.progress import Progress
-from lab.runs.detect.detect_page import ContactSheet
+from lab.runs.detect.detect_page import ContactSheet, write_detect_page
 from lab.runs.detect.picture_series import PictureSeries
 from lab.runs.frames.sensor_noise import noise_frames
 from lab.runs.processed import quantiles
@@ -76,8 +76,6 @@ def detect_pictures(
         _search_all(inputs, series, sheet, folder / "detections.csv", options, progress)
         _add_notes(series)
         sheet.write(folder / SHEET)
-        from lab.runs.detect.detect_page import write_detect_page  # imports the template engine, needed only here
-
         write_json(_summary(series, options, time.perf_counter() - started), folder / "summary.json")
         write_detect_page(series, sheet, folder)
     bad = sum(map(len, series.unreadable.values()))

@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
@@ -34,11 +34,12 @@ from lab.pictures.picture_file import GreyPicture
 from lab.report.frames.canvas import ground
 from lab.report.page import environment
 from lab.report.plot.svg import grey_limits, stretched
-from lab.runs.frames.pipeline import FrameRecord
+from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.model_check.check import check_sampled_frames
 from lab.runs.model_check.frame_sampler import FrameSampler
 from lab.runs.tables import pose_numbers
 from lab.runs.watch.background import ENDED
+from lab.runs.watch.live_frames import LiveFrames
 from tracking.detections import CLIPPED, Detections
 from tracking.statuses import PoseStatus
 
@@ -175,10 +176,6 @@ def _handler_of(page: PageServer) -> type[BaseHTTPRequestHandler]:
 
     return Handler
 
-
-if TYPE_CHECKING:
-    from lab.runs.frames.pipeline import Pipeline
-    from lab.runs.watch.live_frames import LiveFrames
 
 _EVERY_S = 0.05  # between two poses of the curves
 _WINDOW_S = 20.0  # of the curves
