@@ -9,7 +9,10 @@ from lab.commands.common import Commands
 from studies.command import study
 
 
-@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group(
+    cls=Commands,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100, "show_default": True},
+)
 @click.version_option(package_name="beampose")
 def main() -> None:
     """Attitude and position of a vehicle model from pictures of its laser spots.

@@ -322,15 +322,9 @@ set_option = click.option(
 
 
 valid_days_option = click.option(
-    "--valid-days",
-    default=365,
-    show_default=True,
-    type=click.IntRange(min=1),
-    help="Validity of the calibration, days.",
+    "--valid-days", default=365, type=click.IntRange(min=1), help="Validity of the calibration, days."
 )
-seed_option = click.option(
-    "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="The same seed gives the same bytes."
-)
+seed_option = click.option("--seed", default=0, type=click.IntRange(min=0), help="The same seed gives the same bytes.")
 
 
 @contextlib.contextmanager

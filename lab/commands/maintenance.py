@@ -96,13 +96,10 @@ def _asked(given: dict[str, float | None]) -> dict[str, float]:
 )
 @click.option("--beams", type=click.IntRange(1, 12), help="Number of laser beams; default 3, of one or two spots each.")
 @click.option("--rate", type=NumberRange(0.1, 1e6), help="Pictures per second; default 100.")
-@click.option(
-    "--distance", default=2.5, show_default=True, type=NumberRange(0.2, 100), help="From vehicle to screens, m."
-)
+@click.option("--distance", default=2.5, type=NumberRange(0.2, 100), help="From vehicle to screens, m.")
 @click.option(
     "--picture",
     default="1280x1024",
-    show_default=True,
     type=ImageSize(10),
     metavar="WxH",
     help="Picture size, width and height in pixels.",

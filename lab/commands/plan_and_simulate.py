@@ -43,16 +43,10 @@ def _six_numbers(ctx: click.Context, parameter: click.Parameter, text: str | Non
 @click.option("--frames", type=click.IntRange(min=1), help="Number of frames; default: that of the scenario.")
 @click.option("--video", is_flag=True, help="One lossless video per camera instead of PNG files.")
 @click.option("--points", is_flag=True, help="No pictures: a detections.csv with noise of --noise-px.")
-@click.option(
-    "--noise-px",
-    default=0.1,
-    show_default=True,
-    type=NumberRange(0, 1000),
-    help="With --points: noise of a spot, 1 sigma.",
-)
+@click.option("--noise-px", default=0.1, type=NumberRange(0, 1000), help="With --points: noise of a spot, 1 sigma.")
 @click.option("--clutter", type=NumberRange(0, 1), help="Probability of a false spot near each spot.")
 @click.option("--light", help="A preset of light and sensor instead of the scenario's.")
-@click.option("--scale", default=1.0, show_default=True, type=NumberRange(0.1, 1), help="0.5: pictures half as wide.")
+@click.option("--scale", default=1.0, type=NumberRange(0.1, 1), help="0.5: pictures half as wide.")
 @click.option(
     "--rig", type=ANY_PATH, help="A rig.yaml with the true rig; the motion goes to where it sees the vehicle."
 )

@@ -94,7 +94,7 @@ def run(
 @click.argument("pictures", metavar="IMAGES_OR_VIDEO...", nargs=-1, required=True, type=ANY_PATH)
 @click.option("--out", required=True, type=FOLDER, help="Gets detections.csv, contact-sheet.png and report.html.")
 @click.option("--camera", help="The camera's name in the table; default: that of the folder or file.")
-@click.option("--every", default=1, show_default=True, type=click.IntRange(min=1), help="Use every N-th picture only.")
+@click.option("--every", default=1, type=click.IntRange(min=1), help="Use every N-th picture only.")
 @click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
 @set_option
 def detect(pictures: tuple[Path, ...], out: Path, **options: Any) -> None:
@@ -118,7 +118,6 @@ def detect(pictures: tuple[Path, ...], out: Path, **options: Any) -> None:
 @click.option(
     "--out",
     default=Path("pick.html"),
-    show_default=True,
     type=click.Path(dir_okay=False, path_type=Path),
     help="The page to write; open it in a browser.",
 )
@@ -166,14 +165,12 @@ def pick(photos: tuple[str, ...], out: Path, **options: Any) -> None:
 @click.option(
     "--idle",
     default=10.0,
-    show_default=True,
     type=NumberRange(min=0.1),
     help="Seconds without a new picture after which the recording has ended.",
 )
 @click.option(
     "--timeout",
     default=0.25,
-    show_default=True,
     type=NumberRange(min=0.001),
     help="Seconds for which a frame waits for a camera whose picture is missing.",
 )
@@ -282,7 +279,7 @@ def _shard(ctx: click.Context, parameter: click.Parameter, value: str | None) ->
 @click.argument("runs", metavar="RUN...", nargs=-1, type=ANY_PATH)
 @click.option("--list", "lists", multiple=True, type=ANY_PATH, help="A text file with a run per line; - is stdin.")
 @click.option("--out", required=True, type=FOLDER, help="Gets one folder per run, batch.csv and index.html.")
-@click.option("--jobs", default=1, show_default=True, type=click.IntRange(1, 1024), help="Processes at the same time.")
+@click.option("--jobs", default=1, type=click.IntRange(1, 1024), help="Processes at the same time.")
 @click.option("--force", is_flag=True, help="Process all runs again, also those that are done.")
 @click.option("--shard", metavar="I/N", callback=_shard, help="Only the I-th of N parts of the runs, for array jobs.")
 @click.option("--full-hash", is_flag=True, help="Compare all bytes of pictures and videos with --out, not samples.")
