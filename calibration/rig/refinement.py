@@ -45,8 +45,7 @@ from calibration.model_check.linearised_frames import (
     correlation_time,
     linearise,
 )
-from calibration.rig.knowledge import Knowledge, normal_equations
-from calibration.rig.recordings import STACKS, RecordingTerm, Reduced
+from calibration.rig.recordings import STACKS, Knowledge, RecordingTerm, Reduced, normal_equations
 from calibration.terms.rig_blocks import (
     BEAMS,
     CAMERAS,

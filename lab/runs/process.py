@@ -166,10 +166,6 @@ def _clock_numbers(run: Run) -> dict[str, Any]:
     return out
 
 
-if TYPE_CHECKING:
-    from lab.runs.model_check.check import ModelCheck
-
-
 def process_run(
     run_folder: Path,
     out: Path,

@@ -30,20 +30,10 @@ from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import write_table
 from lab.pictures.picture_file import GreyPicture
 from lab.progress import Progress
+from lab.simulate.picture import LaserPowers, Sensor, laser_powers, make_sensor, render
 from lab.simulate.points import points_of
 from lab.simulate.scenarios import LIGHTS, RIGS, Motion, PriorRegion, Scenario
-from lab.simulate.scene import (
-    LaserPowers,
-    Scene,
-    Sensor,
-    compose,
-    has_motion,
-    laser_powers,
-    make_sensor,
-    render,
-    scenario_with,
-    spots_in_view,
-)
+from lab.simulate.scene import Scene, compose, has_motion, scenario_with, spots_in_view
 
 _SMALLER = 0.8  # each further size of a motion, until it keeps the spots in view
 _SIZES = 15  # the last one has a twentieth of the amplitude

@@ -15,8 +15,7 @@ from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Board
 from calibration.boards.board_view import BoardView, NotFound
 from calibration.least_squares.adjustment import AdjustmentError, Prior
-from calibration.open3d_loader import MissingOpen3DError
-from calibration.screens.clouds import FEWEST, align, on_surfaces, register, scan_of
+from calibration.screens.clouds import FEWEST, MissingOpen3DError, align, on_surfaces, register, scan_of
 from calibration.screens.network import ControlPoints, Network, PointObservations
 from calibration.screens.network_start import NotConnectedError
 from calibration.screens.screens import (

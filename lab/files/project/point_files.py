@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.open3d_loader import MissingOpen3DError, open3d
+from calibration.screens.clouds import MissingOpen3DError, open3d
 from geometry.arrays import Array, Ints
 from geometry.pose import Pose
 from lab.errors import InputError

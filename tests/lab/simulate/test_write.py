@@ -14,9 +14,10 @@ from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig, save_rig
 from lab.files.run.detections_file import read_detections
 from lab.runs.input_check import check
+from lab.simulate.picture import expected_light, laser_powers, make_sensor, render
 from lab.simulate.points import simulate_points
 from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter, Light, Occlusion
-from lab.simulate.scene import compose, expected_light, laser_powers, make_sensor, render
+from lab.simulate.scene import compose
 from lab.simulate.write import simulate
 
 SMALL = {"picture_scale": 0.25}

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from calibration.open3d_loader import open3d
+from calibration.screens.clouds import open3d
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from lab.errors import InputError
