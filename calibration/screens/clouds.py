@@ -84,9 +84,8 @@ class Registration:
     """world_from_cloud and its uncertainty."""
 
     world_from_cloud: Pose
-    covariance: Array  # (6, 6) of its error
+    covariance: Array  # (6, 6) of its error; widened where the residuals are larger than their sigmas
     residuals_m: Array  # (n, 3), world: transformed targets of the scan minus surveyed targets
-    factor: float  # residuals over their sigmas, at least 1; the covariance is multiplied by its square
 
 
 def register(names: Sequence[str], cloud: Array, world: Array, covariances: Array, sigma_m: float) -> Registration:
@@ -125,7 +124,7 @@ def register(names: Sequence[str], cloud: Array, world: Array, covariances: Arra
     dof = 3 * len(names) - 6
     _check_outliers(names, cloud, world, C)
     factor = max(1.0, float(np.sqrt(chi2 / dof)))
-    return Registration(pose, np.linalg.inv(N) * factor**2, residuals, factor)
+    return Registration(pose, np.linalg.inv(N) * factor**2, residuals)
 
 
 def _check_outliers(names: Sequence[str], cloud: Array, world: Array, C: Array) -> None:

@@ -89,7 +89,7 @@ class ClockEstimate:
         """The estimate after a pass whose clocks were the present ones, and the corrections (p,), s, that it found."""
         mean, sigma = self.prior_s - self.value_s, self.prior_sigma_s
         if recording is None:
-            fit = ClockFit(mean, np.diag(sigma**2), 0)
+            fit = ClockFit(mean, np.diag(sigma**2))
         else:
             fit = fit_clocks(run.rig, recording, run.covariance, self.numbers, (mean, sigma))
         return replace(self, value_s=self.value_s + fit.correction_s, covariance=fit.covariance), fit.correction_s

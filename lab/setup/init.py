@@ -25,6 +25,7 @@ from lab.files.text.atomic_write import atomic_folder, atomic_write_text
 from lab.files.text.error_text import suggest_name
 from lab.files.text.yaml_text import parse_value, with_comments, write_mapping
 from lab.findings.finding import Done
+from lab.number_format import format_count
 from lab.results.view.page import read_content, view_of, write_page
 from lab.simulate.scenarios import SCENARIOS
 from lab.simulate.write import simulate
@@ -177,7 +178,7 @@ def _numbers(ask: Ask, question: str, count: int) -> list[float]:
             values = []
         if len(values) == count and np.isfinite(values).all():
             return values
-        shown = f"expected {count} number{'s' if count > 1 else ''}, got {answer!r}; {question}"
+        shown = f"expected {format_count(count, 'number')}, got {answer!r}; {question}"
 
 
 def understood(rig: Rig) -> list[str]:
@@ -260,7 +261,7 @@ def _check(layout: Layout) -> None:
     least = 3 if layout.screens == 1 else 4 if layout.screens > 2 else 2
     if layout.beams < least:
         raise InputError(
-            f"beams: expected at least {least} for {layout.screens} screen{'s' if layout.screens > 1 else ''}, got"
+            f"beams: expected at least {least} for {format_count(layout.screens, 'screen')}, got"
             f" {layout.beams}; fewer do not determine a pose"
         )
 

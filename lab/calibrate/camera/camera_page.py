@@ -15,7 +15,7 @@ from calibration.lens.intrinsics_result import Intrinsics
 from geometry.arrays import Array
 from lab.calibrate.camera.photos import VIDEO_SUFFIXES, PhotoSet, as_8_bit
 from lab.findings.finding import Finding, Level, finding, level_above, passed
-from lab.number_format import format_number
+from lab.number_format import format_count, format_number
 from lab.pictures.opencv import opened
 from lab.pictures.picture_file import MissingPicture, read_picture
 from lab.report.calibration.calibration_drawings import (
@@ -156,7 +156,7 @@ def _rejected(c: Intrinsics, limits: FindingLimits) -> Finding:
     share, dropped = lost / len(c.table), len(c.fit.dropped)
     what = f"{lost} of {len(c.table)} corners excluded ({share:.1%})"
     if dropped:
-        what += f", among them {dropped} whole view{'s' if dropped > 1 else ''}"
+        what += f", among them {format_count(dropped, 'whole view')}"
     return finding("BP-L12", level_above(share, *limits.rejected), what + ".")
 
 

@@ -77,7 +77,6 @@ class LabelledRun:
 
     run: Run
     recording: ModelCheckRecording  # of the run's own cameras; long recordings are thinned
-    frames: int  # of the run
     unlabelled: tuple[str, ...] = ()  # cameras whose points may be spots, and of which none has a label
     searched: bool = False  # whether mistakes of the set-up have been searched for, and none was found
 
@@ -253,7 +252,7 @@ def labelled(run: Run, most: int | None = None, enough: int = 0, *, search: bool
         clock_s = _clocks_of(run.rig) + (_clocks_in_use(estimated) - _clocks_in_use(run))
         velocity = np.nan_to_num(pixel_velocities(model, recording, np.arange(len(recording.seen))))
         recording = replace(recording, velocity_px_s=velocity, clock_s=clock_s[model.camera_of])
-    return LabelledRun(run, recording, statistics.frames, tuple(unused), searched)
+    return LabelledRun(run, recording, tuple(unused), searched)
 
 
 def _searched(run: Run, pictures: SampledFrames) -> tuple[tuple[Finding, ...], bool]:

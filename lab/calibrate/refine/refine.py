@@ -48,7 +48,7 @@ from lab.files.run.run_file import Run, load_run
 from lab.files.text.csv_text import csv_word, write_table
 from lab.files.text.error_text import suggest_name
 from lab.findings.finding import Finding, Level, Outcome, clause, finding, passed, verdict
-from lab.number_format import format_number, format_with_sigma
+from lab.number_format import format_count, format_number, format_with_sigma
 from lab.progress import Progress
 from lab.report.calibration.calibration_drawings import correlation_matrix, residual_field
 from lab.report.calibration.calibration_scene import SceneObject, Trail, frustum_length, rig_things, scene_views
@@ -212,7 +212,7 @@ def _figures(r: Refinement) -> str:
     frames = sum(len(x.seen) for x in r.recordings)
     determined = int(np.sum(r.gain > 1))
     return (
-        f"{frames} frames of {len(r.recordings)} recording{'s' if len(r.recordings) > 1 else ''} determine {determined}"
+        f"{frames} frames of {format_count(len(r.recordings), 'recording')} determine {determined}"
         f" of {len(r.gain)} directions"
     )
 

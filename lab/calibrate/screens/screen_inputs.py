@@ -6,7 +6,7 @@ Corners of the boards of a calibration project, both portable boards and boards 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -56,7 +56,6 @@ class BoardViews:
     corners: CornerTerm | None  # None: no board
     placements: tuple[str, ...]  # names of the board placements, indexed by `corners.placement`
     fixed: BoardOnScreenTerm | None
-    photo_of: Mapping[tuple[int, int], Path]  # (camera, placement) -> photograph
     notes: tuple[str, ...]  # excluded photographs, each with the reason
 
 
@@ -91,16 +90,8 @@ def board_views(project: Project, rig: Rig) -> BoardViews:
         elif views:
             found.append((placement, views))
     if not found:
-        return BoardViews(None, (), None, {}, tuple(notes))
-    cameras = list(rig.cameras)
-    photo_of = {(cameras.index(c), i): p.photos[c] for i, (p, views) in enumerate(found) for c in views}
-    return BoardViews(
-        _corners(found, rig),
-        tuple(p.name for p, _ in found),
-        _fixed_boards(found),
-        photo_of,
-        tuple(notes),
-    )
+        return BoardViews(None, (), None, tuple(notes))
+    return BoardViews(_corners(found, rig), tuple(p.name for p, _ in found), _fixed_boards(found), tuple(notes))
 
 
 def _placements(project: Project) -> list[_Placement]:
@@ -208,7 +199,6 @@ class ScreenInputs:
     held_screen: int | None  # screen whose frame defines the world frame if there is no survey
     notes: tuple[str, ...]  # assumptions and exclusions, shown as warnings
     remarks: tuple[str, ...] = ()  # properties of the scans
-    photo_of: Mapping[tuple[int, int], Path] = field(default_factory=dict)  # (camera, placement) -> photograph
 
 
 def screen_inputs(project: Project) -> ScreenInputs:
@@ -258,7 +248,7 @@ def screen_inputs(project: Project) -> ScreenInputs:
     }
     scan_notes = [note for _, ns in scans.values() for note in ns]
     noted = (*survey.notes, *observations.notes, *boards.notes)
-    return ScreenInputs(network, setups, near, held, noted, tuple(scan_notes), boards.photo_of)
+    return ScreenInputs(network, setups, near, held, noted, tuple(scan_notes))
 
 
 def _screens_of_points(project: Project, survey: Survey, observations: Observations) -> Ints:

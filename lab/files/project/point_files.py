@@ -128,7 +128,6 @@ class Observations:
     point: tuple[str, ...]  # n
     pixels: Array  # (n, 2)
     sigma_px: Array  # (n,), of each coordinate
-    source: tuple[str, ...]  # n
     notes: tuple[str, ...] = ()
 
 
@@ -177,7 +176,6 @@ def read_survey(paths: Sequence[Path], screens: Collection[str], farthest_m: flo
         np.concatenate(xyz) if xyz else np.empty((0, 3)),
         np.concatenate(covariance) if xyz else np.empty((0, 3, 3)),
         tuple(screen),
-        tuple(source),
         tuple(notes),
     )
 
@@ -192,7 +190,7 @@ def read_observations(
     camera: list[str] = []
     point: list[str] = []
     seen: set[tuple[str, str]] = set()
-    pixels, sigmas, source, notes = [], [], [], []
+    pixels, sigmas, notes = [], [], []
     for path in paths:
         table = read_table(path, POINTS, ("sigma_px",))
         table.require_rows(POINTS)
@@ -219,13 +217,11 @@ def read_observations(
             notes.append(f"{path}: no column sigma_px: {DEFAULT_POINT_SIGMA_PX} px is assumed")
             sigma = np.full(len(table), DEFAULT_POINT_SIGMA_PX)
         sigmas.append(sigma)
-        source += [str(path)] * len(table)
     return Observations(
         tuple(camera),
         tuple(point),
         np.concatenate(pixels) if pixels else np.empty((0, 2)),
         np.concatenate(sigmas) if sigmas else np.empty(0),
-        tuple(source),
         tuple(notes),
     )
 

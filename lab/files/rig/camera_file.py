@@ -24,6 +24,7 @@ from lab.files.text.error_text import suggest_name
 from lab.files.text.fields import Block, Integer, Lines, NonNegative, Number, Positive, Text, one_of, unexpected_value
 from lab.files.text.yaml_text import read_mapping, write_mapping
 from lab.findings.finding import Level
+from lab.number_format import format_count
 
 VERDICTS = tuple(level.name for level in Level)
 
@@ -111,7 +112,7 @@ def require_valid_calibration(
     left = state.days_left(on)
     if left is not None and left < 0:
         raise CalibrationError(
-            f"{path}: calibration.valid_until: {state.valid_until} was {-left} day{'s' if left < -1 else ''}"
+            f"{path}: calibration.valid_until: {state.valid_until} was {format_count(-left, 'day')}"
             f" before {on.isoformat()} ({what}): the calibration is out of date; calibrate again, or confirm it with"
             " `beampose calibrate check` and set a new date"
         )

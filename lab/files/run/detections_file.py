@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from geometry.arrays import Array, Bools, Ints
 from lab.errors import InputError
 from lab.files.text.csv_text import Table, is_whole, read_table
+from lab.number_format import format_count
 from tracking.detections import Detections
 from tracking.input_validation import DUPLICATE_PX, LARGEST_PX, LEAST_SIGMA_PX, duplicates
 
@@ -97,7 +98,7 @@ def read_detections(path: Path, named: str | None = None) -> DetectionsFile:
     if table.long_lines:
         count = len(table.long_lines)
         why = "more fields than the header has (a comma too many, or a decimal comma)"
-        rows.notes.append(f"{path}: {count} line{'s' if count > 1 else ''} left out: {why}")
+        rows.notes.append(f"{path}: {format_count(count, 'line')} left out: {why}")
     if not rows.good.any():
         because = "".join(f"; {note.removeprefix(f'{path}: ')}" for note in rows.notes[len(missing) > 0 :])
         raise InputError(f"{path}: expected rows with {', '.join(required)}, got none that can be used{because}")

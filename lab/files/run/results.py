@@ -79,7 +79,6 @@ class SpotGrid:
     uv_px: Array  # (F, V, 2), distorted pixels; nan where nothing is known
     sigma_px: Array  # (F, V, 2)
     predicted_px: Array  # (F, V, 2), predicted before the detection
-    gain: Array  # (F, V)
     label_probability: Array  # (F, V) probability that the label is right; nan without a label, or where not stated
     status: Ints  # (F, V) index into SPOT_STATUSES, or ABSENT
     cov_uv_px2: Array  # (F, V)
@@ -174,7 +173,6 @@ def read_spots(results: Path) -> SpotGrid:
         uv_px=grid("u_px", "v_px"),
         sigma_px=grid("sigma_u_px", "sigma_v_px"),
         predicted_px=grid("predicted_u_px", "predicted_v_px"),
-        gain=grid("gain")[..., 0],
         label_probability=grid("label_probability")[..., 0],
         status=status,
         cov_uv_px2=grid("cov_uv_px2")[..., 0],

@@ -18,6 +18,7 @@ from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.csv_text import read_table
 from lab.files.text.error_text import printable_line
 from lab.findings.finding import Done
+from lab.number_format import format_count
 from lab.pictures.picture_file import GreyPicture, MissingPicture
 from lab.pictures.source import open_inputs, pictures
 from lab.progress import Progress
@@ -60,7 +61,7 @@ def write_pick_page(
     page = environment().get_template("pick.html.j2")
     atomic_write_text(page.render(title=title, pictures=len(shown), data=as_script(data)), out)
     points = sum(len(p["points"]) for p in shown)
-    line = f"{points} points in {len(shown)} picture{'s' if len(shown) > 1 else ''} -> {out}"
+    line = f"{points} points in {format_count(len(shown), 'picture')} -> {out}"
     return Done(out, (f"{line}; open it in a browser",), tuple(unreadable))
 
 

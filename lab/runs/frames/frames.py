@@ -23,6 +23,7 @@ from lab.files.run.clocks import CameraClock, picture_numbers
 from lab.files.run.detections_file import CameraPoints, DetectionsFile, is_too_sparse, read_detections, stray_frames
 from lab.files.run.run_file import FramesFolder, LiveDevice, Run, VideoFile
 from lab.files.text.error_text import suggest_name
+from lab.number_format import format_count
 from lab.pictures.picture_file import DROPPED, UNREADABLE, GreyPicture, MissingPicture
 from lab.pictures.source import PictureFiles, PictureSource, Video, list_folder, pictures, video_at
 from lab.runs.frames.moments import Moment, plan_moments
@@ -123,7 +124,7 @@ class FrameReader:
             for (of, reason), missing in self._missing.items():
                 if of == camera:
                     some = ", ".join(map(str, missing.first)) + (", ..." if missing.count > NAMED else "")
-                    out.append(f"{camera}: {missing.count} frame{'s' if missing.count > 1 else ''} {reason} ({some})")
+                    out.append(f"{camera}: {format_count(missing.count, 'frame')} {reason} ({some})")
         return out
 
     def __iter__(self) -> Iterator[FrameSet]:

@@ -19,6 +19,7 @@ from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty
+from lab.number_format import format_count
 from lab.runs.frames.pipeline import FrameRecord, Pair
 from tracking.consistency import (
     SpotAgreement,
@@ -56,7 +57,7 @@ class FrameRanges:
         """`12 to 30, 41`; with more than `most` ranges, the first ones and the number of the others."""
         named = [str(a) if a == b else f"{a} to {b}" for a, b in self.ranges[:most]]
         more = len(self.ranges) - most
-        return ", ".join(named) + (f" and {more} more range{'s' if more > 1 else ''}" if more > 0 else "")
+        return ", ".join(named) + (f" and {format_count(more, 'more range')}" if more > 0 else "")
 
 
 NOT_A_COVARIANCE, CONTRADICTION = "not_a_covariance", "contradiction"  # kinds of events
