@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from lab.commands import calibrate, maintenance, plan_and_simulate, results, run, track
+from lab.commands import calibrate, results, run, setup, track
 from lab.commands.common import Commands
 from studies.command import study
 
@@ -29,7 +29,7 @@ for command in (
     run.pick,
     run.watch,
     run.record,
-    plan_and_simulate.simulate,
+    setup.simulate,
     results.check,
     results.report,
     study,
@@ -41,12 +41,12 @@ for command in (
     results.show,
     calibrate.calibrate,
     calibrate.refine,
-    plan_and_simulate.plan,
-    maintenance.init,
-    maintenance.schema,
-    maintenance.verify,
-    maintenance.doctor,
-    maintenance.explain,
+    setup.plan,
+    setup.init,
+    setup.schema,
+    setup.verify,
+    setup.doctor,
+    setup.explain,
 ):
     main.add_command(command)
 calibrate.calibrate.add_command(track.pair)

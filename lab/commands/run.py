@@ -137,7 +137,7 @@ def pick(photos: tuple[str, ...], out: Path, **options: Any) -> None:
     Example:
         beampose pick left=sample_runs/huo2015/frames/left/000000.png --names sample_runs/huo2015/rig.yaml
     """
-    from lab.runs.detect.pick import PickOptions, write_pick_page
+    from lab.runs.detect.detect import PickOptions, write_pick_page
 
     with progress_bar("pictures") as progress:
         done = write_pick_page(photos, out, PickOptions(**options), progress)

@@ -19,9 +19,8 @@ from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_bytes
 from lab.files.text.error_text import suggest_name
 from lab.findings.finding import Done
-from lab.pictures.overlay_video import write_overlay_video
 from lab.progress import Progress
-from lab.report.frames.canvas import Pixels, png
+from lab.report.frames.canvas import Pixels, png, write_overlay_video
 from lab.report.frames.content import DrawnFrame, ResultData, frame_content, pictures_of, pose_words, read_result_data
 from lab.report.frames.sheet import Layout, Limits, limits_of, sheet
 from lab.runs.frames.frames import Recorded, open_frames, pictures_at

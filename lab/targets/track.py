@@ -20,11 +20,10 @@ from geometry.arrays import Array
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.text.csv_text import write_table
 from lab.findings.finding import ENTRIES, Finding, Level, Outcome, Verdict, finding, worst_first
-from lab.pictures.overlay_video import write_overlay_video
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import open_inputs
 from lab.progress import Progress
-from lab.report.frames.canvas import Canvas, Pixels
+from lab.report.frames.canvas import Canvas, Pixels, write_overlay_video
 from lab.report.plot.svg import grey_limits, stretched
 from lab.runs.processed import Processed, write_processed
 from lab.targets.page import write_target_page
