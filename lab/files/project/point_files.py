@@ -176,6 +176,7 @@ def read_survey(paths: Sequence[Path], screens: Collection[str], farthest_m: flo
         np.concatenate(xyz) if xyz else np.empty((0, 3)),
         np.concatenate(covariance) if xyz else np.empty((0, 3, 3)),
         tuple(screen),
+        tuple(source),
         tuple(notes),
     )
 

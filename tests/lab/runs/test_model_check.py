@@ -17,7 +17,7 @@ from lab.runs.model_check import check
 from lab.runs.model_check.check import check_model, check_sampled_frames
 from lab.runs.model_check.frame_sampler import FrameSampler, SampledFrame, stated_covariances
 from lab.runs.verdict import quality
-from lab.simulate.scene import simulate_points
+from lab.simulate.points import simulate_points
 from tests.calibration.model_check.model_scenes import NOISE_PX, changed, recorded, turned
 from tests.calibration.model_check.test_check import suspects, with_slow_errors
 from tracking.curve_switching.spot_tracker import SpotTracker
