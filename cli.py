@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import click
 
-from lab.commands import batch, calibrate, maintenance, plan_and_simulate, results, run, track
+from lab.commands import calibrate, results, run, setup, track
 from lab.commands.common import Commands
 from studies.command import study
 
 
-@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group(
+    cls=Commands,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100, "show_default": True},
+)
 @click.version_option(package_name="beampose")
 def main() -> None:
     """Attitude and position of a vehicle model from pictures of its laser spots.
@@ -21,12 +24,12 @@ def main() -> None:
 
 for command in (
     run.run,
-    batch.batch,
+    run.batch,
     run.detect,
     run.pick,
     run.watch,
     run.record,
-    plan_and_simulate.simulate,
+    setup.simulate,
     results.check,
     results.report,
     study,
@@ -38,12 +41,12 @@ for command in (
     results.show,
     calibrate.calibrate,
     calibrate.refine,
-    plan_and_simulate.plan,
-    maintenance.init,
-    maintenance.schema,
-    maintenance.verify,
-    maintenance.doctor,
-    maintenance.explain,
+    setup.plan,
+    setup.init,
+    setup.schema,
+    setup.verify,
+    setup.doctor,
+    setup.explain,
 ):
     main.add_command(command)
 calibrate.calibrate.add_command(track.pair)

@@ -23,9 +23,9 @@ from calibration.lens.fit.lens_fit import robust_fit
 from calibration.lens.fit.lens_parameters import AS_STATED
 from calibration.lens.fit.lens_start import start
 from calibration.lens.intrinsics import IntrinsicsError, calibrate_intrinsics
-from lab.calibrate.camera.camera_findings import findings_of
+from lab.calibrate.camera.camera_page import findings_of
 from lab.findings.finding import Level, verdict
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tests.calibration.beams.bench import ARCSEC, exact, unknown_place
 from tests.calibration.beams.test_beams import bench_case, tally
 from tests.calibration.lens.lens_scenes import TRUTH, Scene, photographs

@@ -22,7 +22,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose, look_at
 from geometry.pose_prior import PosePrior
 from geometry.rig import Beam, Rig, Screen, Spot
-from lab.simulate.rigs import DISTORTION, RIGS
+from lab.simulate.scenarios import DISTORTION, RIGS
 from tracking.detections import Detections
 from tracking.labelling.first_labels import NO_POINT, FirstLabels, find_labels
 

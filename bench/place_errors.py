@@ -26,8 +26,7 @@ from geometry.rig import Beam, Rig, Screen, Spot
 from lab.files.rig.rig_file import save_rig
 from lab.files.run.results import read_summary
 from lab.runs.process import process_run
-from lab.simulate.rigs import RIGS, lab_camera, scaled
-from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter, Light, Motion
+from lab.simulate.scenarios import LIGHTS, RIGS, SCENARIOS, Clutter, Light, Motion, lab_camera, scaled
 from lab.simulate.scene import draw_motion
 from lab.simulate.write import simulate
 

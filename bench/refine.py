@@ -40,8 +40,7 @@ from geometry.pose import Pose
 from geometry.rig import Beam, Rig
 from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import RigCovariance
-from lab.calibrate.refine.refine import refine_rig
-from lab.calibrate.refine.refine_findings import RefinedRig, refine_findings
+from lab.calibrate.refine.refine import RefinedRig, refine_findings, refine_rig
 from lab.errors import BeamposeError
 from lab.files.rig.rig_file import load_rig
 from lab.files.run.results import read_poses

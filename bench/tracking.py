@@ -22,7 +22,7 @@ from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import fit_pose
 from lab.simulate.points import PointRun, simulate_points
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import Detections

@@ -76,8 +76,7 @@ class ExcessResidual:
     def of(residual: Array, covariance: Array, nuisance: Array | None = None) -> ExcessResidual:
         """From a residual (m,), measured minus predicted, px, its covariance (m, m) and nuisance columns (m, k).
 
-        Raises:
-            ValueError: the covariance is not positive definite.
+        Raises ValueError: the covariance is not positive definite.
         """
         from scipy.linalg import cholesky
 

@@ -65,8 +65,7 @@ def calibrate_pair(
 ) -> CalibratedPair:
     """The pair of two calibrated cameras. numbers: of each camera's views; equal numbers are one instant.
 
-    Raises:
-        PairError: too few photographs show the board in both cameras, or the adjustment does not converge.
+    Raises PairError: too few photographs show the board in both cameras, or the adjustment does not converge.
     """
     shared = sorted(set(numbers[0]) & set(numbers[1]))
     if len(shared) < FEWEST_PAIRS:

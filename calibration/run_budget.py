@@ -44,8 +44,7 @@ class CalibrationShare:
     """How errors of a rig's p parameters change one pose measured with it."""
 
     covariance: RigCovariance  # of the parameters
-    gain: Array  # (6, 2m) derivative of the pose [dt (m, world), dtheta (rad, body)] by the pixels of its m spots
-    sensitivity: Array  # (6, p) derivative of the pose by the parameters
+    sensitivity: Array  # (6, p) derivative of the pose [dt (m, world), dtheta (rad, body)] by the parameters
     rows: Ints  # (m,) views of the spots
     weights: Array  # (m, 2, 2), 1/px^2, of the spots
     adjusted: Array  # (6, 6) factor that the run's own weights add to those of these spots: near the identity
@@ -104,7 +103,7 @@ def calibration_share(
         weights = np.asarray(np.linalg.inv(spots_px2 + left_over), dtype=np.float64)
     K = gain @ S
     adjusted = _transport(K @ covariance.matrix @ K.T, stated)
-    return CalibrationShare(covariance, gain, adjusted @ K, rows, used, adjusted)
+    return CalibrationShare(covariance, adjusted @ K, rows, used, adjusted)
 
 
 def _transport(of: Array, to: Array) -> Array:

@@ -28,8 +28,7 @@ class SensorNoise:
 class Camera:
     """A calibrated camera, fixed in the lab.
 
-    Raises:
-        ValueError: unknown lens model, or a number of distortion coefficients that it does not have.
+    Raises ValueError: unknown lens model, or a number of distortion coefficients that it does not have.
     """
 
     name: str

@@ -24,11 +24,7 @@ class Screen:
 
 @dataclass(frozen=True, slots=True)
 class Beam:
-    """The line of a laser beam, fixed in the vehicle.
-
-    Raises:
-        ValueError: the direction has no length.
-    """
+    """The line of a laser beam, fixed in the vehicle. Raises ValueError: the direction has no length."""
 
     name: str
     direction: Array  # (3,), unit, in body
@@ -55,8 +51,7 @@ class Spot:
 class Rig:
     """Everything that is calibrated. Keys are names, in the order of the file.
 
-    Raises:
-        ValueError: a camera or spot refers to a screen or beam that the rig does not have.
+    Raises ValueError: a camera or spot refers to a screen or beam that the rig does not have.
     """
 
     screens: Mapping[str, Screen]

@@ -1,9 +1,9 @@
-from lab.api.processing import process as process
-from lab.api.processing import scenarios as scenarios
-from lab.api.processing import simulate_run as simulate_run
 from lab.api.results import AnnotatedPicture as AnnotatedPicture
 from lab.api.results import Results as Results
 from lab.api.results import load as load
+from lab.api.results import process as process
+from lab.api.results import scenarios as scenarios
+from lab.api.results import simulate_run as simulate_run
 from lab.api.tracking import Tracker as Tracker
 from lab.api.tracking import find_spots as find_spots
 from lab.api.tracking import track as track

@@ -56,7 +56,7 @@ STUDIES: dict[str, Callable[[int], Comparison]] = {  # name: seed -> table and f
 @click.command()
 @click.argument("name", type=click.Choice(list(STUDIES)))
 @click.option("--out", required=True, type=FOLDER, help="Gets report.html and figures.csv.")
-@click.option("--seed", default=1, show_default=True, type=click.IntRange(min=0))
+@click.option("--seed", default=1, type=click.IntRange(min=0))
 def study(name: str, out: Path, seed: int) -> None:
     """Repeat a published experiment and compare with its printed figures.
 

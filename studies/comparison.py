@@ -9,8 +9,8 @@ from markupsafe import Markup
 
 from lab.files.text.atomic_write import atomic_folder, atomic_write_text, earlier_results
 from lab.files.text.csv_text import write_table
-from lab.findings.outcome import Done
-from lab.report.html import environment
+from lab.findings.finding import Done
+from lab.report.page import environment
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +52,7 @@ class Comparison:
     def value(self, quantity: str, method: str) -> float | None:
         """The number of one method for one quantity.
 
-        Raises:
-            StopIteration: the study has no such quantity.
-            ValueError: the study has no such method.
+        Raises StopIteration: the study has no such quantity; ValueError: the study has no such method.
         """
         column = self.methods.index(method)
         return next(row.values[column] for row in self.rows if row.quantity == quantity)
@@ -67,11 +65,7 @@ def columns(comparison: Comparison) -> tuple[str, ...]:
 
 
 def write_comparison(comparison: Comparison, out: Path) -> Done[Path]:
-    """Write figures.csv and report.html into the folder `out`.
-
-    Raises:
-        InputError: `out` contains other files.
-    """
+    """Write figures.csv and report.html into the folder `out`. Raises InputError: `out` contains other files."""
     with atomic_folder(out, earlier_results("figures.csv")) as work:
         cells = [[row.quantity, row.unit, row.paper, *row.values, row.note] for row in comparison.rows]
         rows = [["" if v is None else f"{v:.6g}" if isinstance(v, float) else v for v in row] for row in cells]

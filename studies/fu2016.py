@@ -76,8 +76,7 @@ class Recording:
 def simulate(seed: int, number: int, disturbance: str) -> Recording:
     """Recording `number` of a seed; the disturbances of one number have the same motion and the same noise.
 
-    Raises:
-        ValueError: no such disturbance.
+    Raises ValueError: no such disturbance.
     """
     if disturbance not in DISTURBANCES:
         raise ValueError(f"disturbance: expected one of {', '.join(DISTURBANCES)}, got {disturbance!r}")

@@ -18,7 +18,7 @@ for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
-from calibration.open3d_loader import MissingOpen3DError, open3d  # noqa: E402
+from calibration.screens.clouds import MissingOpen3DError, open3d  # noqa: E402
 
 # Waiting for the disk shows only after a power cut, and takes longer than the writing: a run waits for ten files. Tests
 # of when it happens replace this function.

@@ -8,8 +8,7 @@ from click.testing import CliRunner
 
 from cli import main
 from lab.findings.finding import ENTRIES
-from lab.simulate.rigs import RIGS
-from lab.simulate.scenarios import SCENARIOS
+from lab.simulate.scenarios import RIGS, SCENARIOS
 from tests.paths import ROOT
 
 DOCUMENT = ROOT / "docs" / "shell_completion.md"

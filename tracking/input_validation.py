@@ -107,11 +107,7 @@ class UsablePoints:
 
     @staticmethod
     def of(found: Sequence[Detections | None]) -> UsablePoints:
-        """Drop invalid and duplicate detections of every camera.
-
-        Raises:
-            ValueError: if an array has a wrong shape.
-        """
+        """Drop invalid and duplicate detections of every camera. Raises ValueError: if an array has a wrong shape."""
         kept: list[Detections | None] = []
         rows: list[Ints | None] = []
         for points in found:
@@ -138,10 +134,8 @@ class UsablePoints:
 def check_step(dt_s: float, found: Sequence[Detections | None], cameras: Sequence[str], first: bool) -> None:
     """Check that a frame is later than the previous one and has one entry per camera.
 
-    first: this is the first frame, for which dt_s may be 0.
-
-    Raises:
-        ValueError: if dt_s or the number of entries is wrong.
+    first: this is the first frame, for which dt_s may be 0. Raises ValueError: if dt_s or the number of entries is
+    wrong.
     """
     if not np.isfinite(dt_s) or dt_s < 0 or (dt_s == 0 and not first):
         raise ValueError(

@@ -44,8 +44,7 @@ class SpotStatus(Word):
     def meaning_for(self, method: str) -> str:
         """One sentence for the user, as the tracker `method` (`rigid` or `spots`) assigns this status.
 
-        Raises:
-            ValueError: for any other method.
+        Raises ValueError: for any other method.
         """
         if method not in _MEANINGS_BY_METHOD:
             raise ValueError(f"tracker method: expected one of {', '.join(_MEANINGS_BY_METHOD)}, got {method!r}")

@@ -24,11 +24,8 @@ class Spread:
     """How far the sigma points lie from the mean, and the weight of the central point in the covariance.
 
     The points of a vector of n numbers lie at sqrt(alpha^2 (n + kappa)) sigmas. Defaults (ours): no negative weight for
-    any n. Fu (2016) uses alpha 0.55, beta 2, kappa -5.
-
-    Raises:
-        ValueError: alpha is not above 0, or beta is below alpha^2: the covariance would not always be positive
-            semidefinite.
+    any n. Fu (2016) uses alpha 0.55, beta 2, kappa -5. Raises ValueError: alpha is not above 0, or beta is below
+    alpha^2: the covariance would not always be positive semidefinite.
     """
 
     alpha: float = 1.0
@@ -42,11 +39,7 @@ class Spread:
             raise ValueError(f"beta: expected alpha^2 = {self.alpha**2:g} or more, got {self.beta}")
 
     def scale(self, n: int) -> float:
-        """n + lambda of eq. (9) of Fu (2016), for a vector of n numbers.
-
-        Raises:
-            ValueError: kappa is -n or less.
-        """
+        """n + lambda of eq. (9) of Fu (2016), for a vector of n numbers. Raises ValueError: kappa is -n or less."""
         if not n + self.kappa > 0:
             raise ValueError(f"kappa: expected more than -{n} for {n} numbers, got {self.kappa}")
         return self.alpha**2 * (n + self.kappa)
@@ -71,10 +64,8 @@ USUAL = Spread()
 def square_root(P: Array) -> Array:
     """A matrix L (n, n) with L L^T = P, for a positive semidefinite P (n, n).
 
-    Eigenvalues that rounding has made negative count as zero.
-
-    Raises:
-        ValueError: P is clearly indefinite, or not finite.
+    Eigenvalues that rounding has made negative count as zero. Raises ValueError: P is clearly indefinite, or not
+    finite.
     """
     try:
         return np.asarray(np.linalg.cholesky(P), dtype=float)
@@ -184,8 +175,7 @@ class Updated:
 def predict(x: Array, P: Array, process: Function, Q: Array, spread: Spread = USUAL) -> tuple[Array, Array]:
     """State x (n,) and covariance P (n, n) one step later; Q (n, n) is added.
 
-    Raises:
-        ValueError: P has a negative eigenvalue.
+    Raises ValueError: P has a negative eigenvalue.
     """
     mean, D = deviations(process(sigma_points(x, P, spread)), len(P), spread)
     return mean, D.T @ D + 0.5 * (Q + Q.T)
@@ -199,10 +189,7 @@ def update(
     With the weighted deviations dx (2n + 1, n) of the state and dz (2n + 1, m) of the predicted measurement, the QR
     decomposition of [[dz, dx], [R^(1/2)^T, 0]] has the triangular factor [[S^(1/2)^T, G^T], [0, P^(1/2)^T]], with the
     gain K = G S^(-1/2) and the new covariance P^(1/2) P^(1/2)^T, for which nothing is subtracted. Weight 0 leaves the
-    state as it was.
-
-    Raises:
-        ValueError: P or R has a negative eigenvalue, or the innovation covariance is singular.
+    state as it was. Raises ValueError: P or R has a negative eigenvalue, or the innovation covariance is singular.
     """
     n, m = len(P), len(z)
     points = sigma_points(x, P, spread)

@@ -22,7 +22,7 @@ from calibration.lens.intrinsics_result import Intrinsics
 from calibration.pair import PairError, calibrate_pair
 from geometry.arrays import Array, Ints
 from lab.calibrate.camera.camera import corner_table
-from lab.calibrate.camera.camera_findings import findings_of
+from lab.calibrate.camera.camera_page import findings_of
 from lab.calibrate.camera.pair import baseline_sigma
 from lab.calibrate.camera.pair import findings_of as pair_findings
 from lab.calibrate.camera.photos import find_in_photos

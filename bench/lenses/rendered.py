@@ -25,7 +25,7 @@ from geometry.arrays import Array
 from geometry.camera import FISHEYE, PERSPECTIVE, Camera
 from geometry.pose import Pose
 from geometry.rotations import exp
-from lab.calibrate.camera.camera_findings import findings_of
+from lab.calibrate.camera.camera_page import findings_of
 from lab.findings.finding import Level, verdict
 from lab.simulate.board_photo import PhotoSettings, photograph
 from tests.calibration.lens.random_lenses import TrueLens, lens_error

@@ -28,7 +28,7 @@ from bench.random_scenes.__main__ import seed_range
 from bench.random_scenes.scene import random_scene
 from bench.random_scenes.write_folder import write_run_folder
 from lab.errors import BeamposeError
-from lab.findings.outcome import Outcome
+from lab.findings.finding import Outcome
 from lab.runs.input_check import check
 from lab.runs.process import process_run
 from lab.runs.verdict.run_statistics import RunStatistics

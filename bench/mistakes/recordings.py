@@ -11,7 +11,7 @@ from bench.random_scenes.scene import random_scene
 from bench.random_scenes.write_folder import write_run_folder
 from geometry.rig import Rig
 from lab.files.rig.rig_file import save_rig
-from lab.simulate.rigs import fan, four_skew_beams, unequal_fan
+from lab.simulate.scenarios import fan, four_skew_beams, unequal_fan
 from lab.simulate.write import simulate
 
 FRAMES, RANDOM_FRAMES = 60, 40

@@ -17,7 +17,7 @@ from bench.random_scenes.scene import Scene, draw_amplitudes, draw_prior, fitted
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from geometry.rig import Screen
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 
 SCREENS_M = 2.5  # of the rigs for a family
 

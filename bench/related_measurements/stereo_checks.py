@@ -40,7 +40,7 @@ from bench.related_measurements.stereo_generator import (
 from geometry.camera import Camera
 from geometry.pose import Pose
 from lab.files.run.truth import read_true_poses
-from lab.findings.outcome import Verdict
+from lab.findings.finding import Verdict
 from lab.targets.stereo.process import add_truth, findings_of, measure
 from lab.targets.stereo.run import StereoResults, load_stereo_run
 from tracking.binocular.marker_model import MarkerImages, MarkerModel, MatchParameters, StereoPair

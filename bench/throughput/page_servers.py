@@ -20,7 +20,7 @@ STATE, PICTURE = '{"filler": "' + "x" * 40_000 + '"}', bytes(120_000)
 def standard(port: int, out: Connection) -> None:
     """The product's own server."""
     begun = time.process_time()
-    from lab.runs.watch.page_server import PageServer
+    from lab.runs.watch.board import PageServer
 
     out.send(time.process_time() - begun)
     with PageServer(str(port), "", lambda over: STATE, lambda name: (PICTURE, {})):

@@ -109,7 +109,7 @@ def _report(out: Path) -> Counter[str]:
 def _read(folder: Path) -> Counter[str]:
     """Read the pictures only, ahead in threads as in a run."""
     from lab.files.run.run_file import load_run
-    from lab.runs.frames.clocked_frames import open_frames
+    from lab.runs.frames.frames import open_frames
 
     reader = open_frames(load_run(folder))
     begun = time.process_time()

@@ -183,10 +183,8 @@ def calibrate_beams(
     """Beams from spots at recorded positions of a stand.
 
     rig: cameras and screens as calibrated, beams as drawn (nominal; if False, their values are not used and the start
-    is from the spots alone). knowledge: joint errors of cameras and screens; None: exact.
-
-    Raises:
-        AdjustmentError: the spots are inconsistent, or no start is found.
+    is from the spots alone). knowledge: joint errors of cameras and screens; None: exact. Raises AdjustmentError: the
+    spots are inconsistent, or no start is found.
     """
     start = _start(rig, spots, stand, nominal)
     values = {
@@ -216,10 +214,7 @@ def self_calibrate(
 
     rig: its beams are the start. The body frame is chosen so that the estimated beams are, together, nearest to these
     (see BodyGauge; points are compared at the points nearest to the origin): a definition, not a measurement. Positions
-    whose pose the spots do not determine are excluded.
-
-    Raises:
-        AdjustmentError: fewer than two positions remain.
+    whose pose the spots do not determine are excluded. Raises AdjustmentError: fewer than two positions remain.
     """
     fits = body_poses(rig, spots, positions)
     usable = [k for k, f in enumerate(fits) if f is not None]

@@ -179,10 +179,8 @@ def fit_spots(rig: Rig, spots: SpotPixels, values: Values, others: Sequence[Term
     """The adjustment to the spots and the other terms.
 
     If the inliers scatter significantly more than their sigmas, these are scaled up. They are never scaled down: larger
-    ones are a safety margin of the user.
-
-    Raises:
-        AdjustmentError: fewer than half of the spots agree, or the adjustment does not converge.
+    ones are a safety margin of the user. Raises AdjustmentError: fewer than half of the spots agree, or the adjustment
+    does not converge.
     """
     every = SpotTerm(rig, spots)
     robust = solve(values, [SpotTerm(rig, spots, Cauchy()), *others], free, _ROUGHLY)

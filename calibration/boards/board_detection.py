@@ -23,11 +23,8 @@ def find_board(image: GreyImage, board: Board, thorough: bool = True) -> BoardVi
     """The board in a grey picture (h, w) of 8 bits.
 
     thorough: if False, only the fast methods are used, and the reason for a failure is not determined
-    (QUICK_SEARCH_FAILED).
-    For 1280x1024 pixels without a board, a thorough search takes 2 to 5 s, a quick one 0.02 to 0.3 s.
-
-    Raises:
-        ValueError: the picture has another type.
+    (QUICK_SEARCH_FAILED). For 1280x1024 pixels without a board, a thorough search takes 2 to 5 s, a quick one 0.02 to
+    0.3 s. Raises ValueError: the picture has another type.
     """
     if image.ndim != 2 or image.dtype != np.uint8:
         raise ValueError(f"expected a grey picture (h, w) of 8 bits, got {image.shape} of {image.dtype}")

@@ -16,11 +16,7 @@ from geometry.arrays import Array, Ints
 
 
 def read_count(text: str) -> tuple[int, int]:
-    """Columns and rows from a text such as 9x6.
-
-    Raises:
-        ValueError: the text is not valid.
-    """
+    """Columns and rows from a text such as 9x6. Raises ValueError: the text is not valid."""
     found = re.fullmatch(r"(\d{1,4})\s*[xX×]\s*(\d{1,4})", text)
     if found is None:
         raise ValueError(f"expected columns x rows such as 9x6, got {text!r}")
@@ -28,11 +24,7 @@ def read_count(text: str) -> tuple[int, int]:
 
 
 def read_length(text: str) -> float:
-    """A length in m from a text with a unit, such as 25mm.
-
-    Raises:
-        ValueError: the text is not valid.
-    """
+    """A length in m from a text with a unit, such as 25mm. Raises ValueError: the text is not valid."""
     found = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*(mm|cm|m)", text, flags=re.IGNORECASE)
     if found is None:
         raise ValueError(f"expected a length with its unit such as 25mm, got {text!r}")
@@ -66,8 +58,7 @@ DICTIONARIES = _dictionaries()  # name -> OpenCV's number, in OpenCV's order
 def dictionary_name(text: str) -> str:
     """OpenCV's name of a dictionary of ArUco markers, from a name in any case.
 
-    Raises:
-        ValueError: there is no such dictionary; the message gives similar names.
+    Raises ValueError: there is no such dictionary; the message gives similar names.
     """
     by_lower = {name.lower(): name for name in DICTIONARIES}
     if text.lower() in by_lower:
@@ -308,11 +299,8 @@ def parse(text: str) -> Board:
     """The board described by a text.
 
     chessboard:9x6:25mm, circles:10x10:12mm[:DIAMETER], acircles:4x11:20mm[:DIAMETER],
-    charuco:5x7:40mm:20mm:DICT_4X4_50[:inverted][:legacy];
-    lengths in mm, cm or m.
-
-    Raises:
-        ValueError: the text is not valid; the message is one line with an example.
+    charuco:5x7:40mm:20mm:DICT_4X4_50[:inverted][:legacy]; lengths in mm, cm or m. Raises ValueError: the text is not
+    valid; the message is one line with an example.
     """
     kind, *parts = [part.strip() for part in text.strip().split(":")]
     kind = kind.lower()

@@ -314,8 +314,7 @@ def _beside(A: Array, centre: Array, band: float, reach: float) -> Array:
 def homography(from_xy: Array, to_xy: Array) -> Array:
     """H (3, 3) with to = H from, least squares over points (n, 2).
 
-    Raises:
-        ValueError: the points do not determine a homography.
+    Raises ValueError: the points do not determine a homography.
     """
     scale = 1.0 / max(float(np.ptp(from_xy)), 1e-12)
     H, _ = cv2.findHomography(from_xy * scale, to_xy, 0)

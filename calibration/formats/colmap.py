@@ -41,11 +41,7 @@ def looks_like(text: str) -> bool:
 
 
 def read(text: str, name: str) -> Read:
-    """The cameras of a file, named by their numbers; `name` is not used.
-
-    Raises:
-        FormatError: the file is not valid.
-    """
+    """The cameras of a file, named by their numbers; `name` is not used. Raises FormatError: the file is not valid."""
     cameras: list[CameraModel] = []
     for i, line in enumerate(text.splitlines(), start=1):
         words = line.split()
@@ -92,8 +88,7 @@ def _camera(words: list[str], where: str) -> CameraModel:
 def write(cameras: Sequence[CameraModel]) -> Written:
     """The file of several cameras, numbered from 1 in their order.
 
-    Raises:
-        FormatError: the format cannot hold a lens.
+    Raises FormatError: the format cannot hold a lens.
     """
     lines = [
         "# Camera list with one line of data per camera:",

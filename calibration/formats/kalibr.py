@@ -46,9 +46,7 @@ def read(content: Mapping[str, Any], name: str) -> Read:
     """The cameras of a parsed camchain, in the order of the chain.
 
     A camera is named by its rostopic (`/left/image_raw` gives left), otherwise cam0, cam1, ...; `name` is not used.
-
-    Raises:
-        FormatError: the file is not valid.
+    Raises FormatError: the file is not valid.
     """
     keys = sorted((k for k in content if re.fullmatch(r"cam\d+", k)), key=lambda k: int(k[3:]))
     if not keys:
@@ -108,8 +106,7 @@ def _pose(value: object, where: str) -> Pose:
 def write(cameras: Sequence[CameraModel]) -> Written:
     """The camchain of several cameras, in their order.
 
-    Raises:
-        FormatError: the format cannot hold a lens, or a camera of several has no pose.
+    Raises FormatError: the format cannot hold a lens, or a camera of several has no pose.
     """
     placed = [c.camera_from_reference is not None for c in cameras]
     if len(cameras) > 1 and not all(placed):

@@ -85,10 +85,8 @@ class Written:
 def fitted(camera: CameraModel, format_name: str) -> tuple[float, ...]:
     """A camera's distortion, with as many coefficients as it has or as the format can hold without loss.
 
-    Zeros are added or removed at the end, which does not change the lens.
-
-    Raises:
-        FormatError: the format cannot hold this lens; the message lists the formats that can.
+    Zeros are added or removed at the end, which does not change the lens. Raises FormatError: the format cannot hold
+    this lens; the message lists the formats that can.
     """
     needed, room = len(significant(camera.distortion)), ROOM[format_name][camera.lens]
     if len(camera.distortion) in room:
@@ -123,8 +121,7 @@ def lost_poses(cameras: Sequence[CameraModel], format_name: str) -> tuple[str, .
 def number(value: object, where: str) -> float:
     """A finite number.
 
-    Raises:
-        FormatError: it is not one; the message starts with the field. The same holds for the functions below.
+    Raises FormatError: it is not one; the message starts with the field. The same holds for the functions below.
     """
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise FormatError(f"{where}: expected a finite number, got {shown(value)}")

@@ -45,8 +45,7 @@ def looks_like(text: str) -> bool:
 def read(text: str, name: str) -> Read:
     """The camera of a file, which gets this name because the file contains none.
 
-    Raises:
-        FormatError: the file is not valid.
+    Raises FormatError: the file is not valid.
     """
     content = _dictionary(text)
     model = next((content[k] for k in _LENS_KEYS if k in content), None)
@@ -94,10 +93,7 @@ def write(cameras: Sequence[CameraModel]) -> Written:
     """The file of one camera.
 
     The pose is written under both keys, because releases before 2.5 read the older one. A missing pose is written as
-    the identity.
-
-    Raises:
-        FormatError: the format cannot hold the lens.
+    the identity. Raises FormatError: the format cannot hold the lens.
     """
     (camera,) = cameras
     distortion = fitted(camera, NAME)

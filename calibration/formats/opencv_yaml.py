@@ -40,8 +40,7 @@ _HEIGHT = ("image_height", "image_Height", "height")
 def read(content: Mapping[str, Any], name: str) -> Read:
     """The camera of a parsed file; `name` is used if the file contains none.
 
-    Raises:
-        FormatError: the file is not valid.
+    Raises FormatError: the file is not valid.
     """
     K = matrix(_first(content, _MATRIX), _MATRIX[0])
     distortion = tuple(matrix(_first(content, _DISTORTION), _DISTORTION[0]).ravel().tolist())
@@ -75,11 +74,7 @@ def _first(content: Mapping[str, Any], keys: Sequence[str]) -> Any:
 
 
 def write(cameras: Sequence[CameraModel]) -> Written:
-    """The file of one camera.
-
-    Raises:
-        FormatError: the format cannot hold the lens.
-    """
+    """The file of one camera. Raises FormatError: the format cannot hold the lens."""
     (camera,) = cameras
     fx, fy, cx, cy = camera.pinhole
     distortion = fitted(camera, NAME)

@@ -44,8 +44,7 @@ _KEYS = {
 def read(content: Mapping[str, Any], name: str) -> Read:
     """The camera of a parsed file; `name` is used if the file contains none.
 
-    Raises:
-        FormatError: the file is not valid.
+    Raises FormatError: the file is not valid.
     """
     found = {ours: next((content[k] for k in keys if k in content), None) for ours, keys in _KEYS.items()}
     for key in ("image_width", "image_height", "camera_matrix", "distortion_coefficients"):
@@ -76,11 +75,7 @@ def read(content: Mapping[str, Any], name: str) -> Read:
 
 
 def write(cameras: Sequence[CameraModel]) -> Written:
-    """The file of one camera.
-
-    Raises:
-        FormatError: the format cannot hold the lens.
-    """
+    """The file of one camera. Raises FormatError: the format cannot hold the lens."""
     (camera,) = cameras
     fx, fy, cx, cy = camera.pinhole
     distortion = fitted(camera, NAME)

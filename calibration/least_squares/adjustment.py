@@ -275,10 +275,8 @@ class Adjusted:
     def covariance(self, at: Sequence[At]) -> Array:
         """Joint covariance (p, p) of the errors of some unknowns, in this order; 0 for fixed numbers.
 
-        It is marginal: all other free unknowns are taken into account.
-
-        Raises:
-            AdjustmentError: the data do not determine some direction of the unknowns.
+        It is marginal: all other free unknowns are taken into account. Raises AdjustmentError: the data do not
+        determine some direction of the unknowns.
         """
         columns = np.concatenate([self._columns.of(*a) for a in at])
         free = columns >= 0
@@ -302,11 +300,8 @@ class Adjusted:
     def reduced_normal(self, keep: Sequence[At]) -> Array:
         """Information matrix (p, p) of some unknowns after elimination of all other free ones (Schur complement).
 
-        Rows of fixed numbers are 0.
-
-        Raises:
-            ValueError: a stack was solved in another basis.
-            AdjustmentError: the other unknowns are not determined even with the kept ones known.
+        Rows of fixed numbers are 0. Raises ValueError: a stack was solved in another basis; AdjustmentError: the other
+        unknowns are not determined even with the kept ones known.
         """
         if any(stack in self._columns.basis for stack, _ in keep):
             raise ValueError("expected stacks solved in their own numbers, got one with another basis")
@@ -348,11 +343,8 @@ def solve(
     """The values that minimise the cost of the terms.
 
     The start values must lie within the convergence region of Newton's method. Directions that nothing determines keep
-    their start values.
-
-    Raises:
-        AdjustmentError: a residual is not finite at the start, or the steps do not converge.
-        KeyError: `free` names a stack that `values` does not have.
+    their start values. Raises AdjustmentError: a residual is not finite at the start, or the steps do not converge;
+    KeyError: `free` names a stack that `values` does not have.
     """
     columns = _Columns.of_free(values, free, basis or {})
     lines = [t.linearise(values) for t in terms]
@@ -513,10 +505,7 @@ class Prior:
     """Prior values of any unknowns of any stacks, with the joint covariance of their errors.
 
     Numbers with an infinite variance (on the diagonal) are not known and give no residual; neither do directions of
-    zero variance, which the caller holds fixed.
-
-    Raises:
-        ValueError: the covariance does not have the size of the values.
+    zero variance, which the caller holds fixed. Raises ValueError: the covariance does not have the size of the values.
     """
 
     at: tuple[At, ...]

@@ -106,10 +106,8 @@ class BoardShapeOptions:
 def board_test(table: CornerTable, found: LensFit, options: BoardShapeOptions = BoardShapeOptions()) -> BoardTest:
     """Test each kind of deviation, and solve for those that are accepted.
 
-    found: a fit of a lens model that is rich enough not to attribute its own error to the board.
-
-    Raises:
-        AdjustmentError: not even the bend can be determined.
+    found: a fit of a lens model that is rich enough not to attribute its own error to the board. Raises
+    AdjustmentError: not even the bend can be determined.
     """
     flat = fit(table, found.used, found.model, {**found.values, **_stated_board(table, found)}, AS_STATED, limits=BRIEF)
     bent = fit(table, flat.used, flat.model, flat.values, BoardFreedom(warp=True), limits=BRIEF)

@@ -48,11 +48,7 @@ class IntrinsicsOptions:
 
 
 def calibrate_intrinsics(table: CornerTable, options: IntrinsicsOptions | None = None) -> Intrinsics:
-    """The complete calibration of one camera.
-
-    Raises:
-        IntrinsicsError: the photographs do not allow a calibration.
-    """
+    """The complete calibration of one camera. Raises IntrinsicsError: the photographs do not allow a calibration."""
     options = IntrinsicsOptions() if options is None else options
     _check_enough(table)
     try:

@@ -265,11 +265,8 @@ def evaluate_model(
     """Test whether a recording fits the rig, and identify the likely fault where it does not.
 
     calibration: covariance of the rig's parameters; deviations that it allows are no faults. Run time and memory are
-    bounded whatever the length of the recording: its frames are thinned evenly.
-
-    Raises:
-        ValueError: the recording has other views than the rig.
-        KeyError: `calibration` names a parameter that the rig does not have.
+    bounded whatever the length of the recording: its frames are thinned evenly. Raises ValueError: the recording has
+    other views than the rig; KeyError: `calibration` names a parameter that the rig does not have.
     """
     model, beams = SpotModel.of(rig), tuple(rig.beams)
     if recording.seen.shape[1] != len(model):

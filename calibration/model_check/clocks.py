@@ -51,7 +51,6 @@ class ClockFit:
 
     correction_s: Array  # (p,)
     covariance: Array  # (p, p)
-    frames: int  # used
 
 
 def fit_clocks(
@@ -67,7 +66,7 @@ def fit_clocks(
     fault_identification.py.
     """
     mean, sigma = prior
-    nothing = ClockFit(mean.copy(), np.diag(sigma**2), 0)
+    nothing = ClockFit(mean.copy(), np.diag(sigma**2))
     model = SpotModel.of(rig)
     testable = np.flatnonzero(recording.usable.sum(axis=1) >= FEWEST_SPOTS)
     if not len(testable) or not len(numbers):
@@ -108,7 +107,7 @@ def fit_clocks(
             break
         keep = steady
     p = len(mean)
-    return ClockFit(theta[:p], covariance[:p, :p], int(keep.sum()))
+    return ClockFit(theta[:p], covariance[:p, :p])
 
 
 def _derivatives(

@@ -62,7 +62,6 @@ class FaultDiagnosis:
     suspected_faults: tuple[SuspectedFault, ...]
     p_before: float  # p-value of the residuals under "no fault"
     p_after: float  # p-value of what the suspected faults leave
-    tests: int  # number of candidates
     residual_scale: float  # root of the reduced chi-square of all residuals: 1 if rig and sigmas are correct
     noise_scale: float  # the same of what no constant fault explains: errors over stated sigmas
     correlation_frames: float  # number of the used frames that count as one independent frame
@@ -117,7 +116,6 @@ def diagnose(
         suspected_faults=suspected,
         p_before=start.p_value,
         p_after=after.p_value,
-        tests=len(faults),
         residual_scale=float(np.sqrt(chi2 / dof)) if dof > 0 else float("nan"),
         noise_scale=float(np.sqrt(noise_variance)),
         correlation_frames=correlation_frames,

@@ -55,8 +55,7 @@ class FaultParameters:
     def of(rig: Rig, model: SpotModel, calibration: RigCovariance | None) -> FaultParameters:
         """All parameters of the possible faults and of the calibration's covariance.
 
-        Raises:
-            KeyError: the covariance names a parameter that the rig does not have.
+        Raises KeyError: the covariance names a parameter that the rig does not have.
         """
         names = [f"cameras.{c}.{p}" for c in rig.cameras for p in ("fx", "fy", "cx", "cy", *POSE)]
         names += [f"screens.{s}.{p}" for s in rig.screens for p in POSE]

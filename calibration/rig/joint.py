@@ -220,10 +220,8 @@ def calibrate_jointly(measured: Measured, *, without: Bools | None = None, start
     """The joint adjustment.
 
     without (spots): spots that are excluded, for a hold-out. start: an earlier result of the same measurements, whose
-    outliers and sigmas are then kept.
-
-    Raises:
-        AdjustmentError: the adjustment does not converge or leaves something undetermined.
+    outliers and sigmas are then kept. Raises AdjustmentError: the adjustment does not converge or leaves something
+    undetermined.
     """
     values: Values = {**measured.screens.values, **measured.beams} if start is None else start.values
     free = free_parameters(measured)

@@ -125,10 +125,8 @@ def hold_out(measured: Measured, joint: Joint) -> HoldOut | None:
     """Five-fold cross-validation of the positions: calibrate without a fifth of their spots and predict them.
 
     None if there are too few positions. The held-out spots are compared with their prediction from rig, stand and
-    record; the expected error includes the uncertainties of all three.
-
-    Raises:
-        AdjustmentError: a fold is not determined by the others.
+    record; the expected error includes the uncertainties of all three. Raises AdjustmentError: a fold is not determined
+    by the others.
     """
     count = len(measured.stand.stand_from_body.translation)
     if count < FEWEST_POSITIONS:
@@ -182,11 +180,8 @@ class RigCalibration:
 def calibrate_in_steps(screens: FittedScreens, spots: SpotPixels, stand: StandModel) -> RigCalibration:
     """Calibrate screens, then beams, then all together.
 
-    screens: of screens/screens.py, the first step; its network's rig holds nominal beams and the spots too.
-
-    Raises:
-        AdjustmentError: the spots are inconsistent, or a parameter is undetermined.
-        ValueError: as raised by the steps.
+    screens: of screens/screens.py, the first step; its network's rig holds nominal beams and the spots too. Raises
+    AdjustmentError: the spots are inconsistent, or a parameter is undetermined; ValueError: as raised by the steps.
     """
     try:
         beams = calibrate_beams(screens.fit.rig, spots, stand, screens.fit.covariance)

@@ -7,18 +7,74 @@ number of its points. The surface is therefore fitted to patches, not to points.
 
 from __future__ import annotations
 
+import ctypes
+import re
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from calibration.open3d_loader import open3d
 from calibration.screens.flatness import assess_flatness, frame_of_extent
 from calibration.screens.screens import Scan, moved_to_surface, pose_covariance, wrong_unit
 from geometry.arrays import Array, Bools, skew
 from geometry.pose import Pose
+
+INSTALL = (
+    "this needs Open3D, which is not installed: `pip install open3d-cpu libusb-package` on Linux with x86-64,"
+    " `pip install open3d` elsewhere"
+)
+_PACKAGES_OF_DEBIAN = {
+    "libEGL.so": "libegl1",
+    "libGL.so": "libgl1",
+    "libX11.so": "libx11-6",
+    "libgomp.so": "libgomp1",
+    "libidn2.so": "libidn2-0",
+    "libudev.so": "libudev1",
+    "libusb-1.0.so": "libusb-1.0-0",
+}
+
+
+class MissingOpen3DError(RuntimeError):
+    """Open3D is not installed, or a system library that it needs is missing. The message says what to install."""
+
+
+def open3d() -> Any:
+    """The module. Raises MissingOpen3DError: it cannot be loaded."""
+    _load_libusb()
+    try:
+        import open3d as module
+    except (ImportError, OSError) as error:  # OSError: a system library that it needs is missing
+        raise MissingOpen3DError(_explained(error)) from None
+    return module
+
+
+def _load_libusb() -> None:
+    """Load the packaged libusb for all that is loaded later; without the package, the system's is used, if any."""
+    if not sys.platform.startswith("linux") or "open3d" in sys.modules:
+        return
+    try:
+        import libusb_package
+
+        path = libusb_package.get_library_path()
+        if path is not None:
+            ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
+    except (ImportError, OSError):
+        return  # `import open3d` then says whether anything is missing
+
+
+def _explained(error: Exception) -> str:
+    """What to install, for an error of `import open3d`."""
+    library = re.match(r"(lib[\w.+-]+?\.so)[.\d]*: cannot open shared object file", str(error))
+    if library is None:
+        return f"{INSTALL} ({error})"
+    package = _PACKAGES_OF_DEBIAN.get(library[1])
+    hint = f"`apt-get install {package}`" if package else "the system package that has it"
+    return f"this needs Open3D, whose system library {library[1]} is missing; on Debian or Ubuntu install {hint}"
+
 
 OUTLIER_SIGMAS = 6.0  # of a target against the others: with three coordinates and many targets, 5 is exceeded at times
 
@@ -28,19 +84,16 @@ class Registration:
     """world_from_cloud and its uncertainty."""
 
     world_from_cloud: Pose
-    covariance: Array  # (6, 6) of its error
+    covariance: Array  # (6, 6) of its error; widened where the residuals are larger than their sigmas
     residuals_m: Array  # (n, 3), world: transformed targets of the scan minus surveyed targets
-    factor: float  # residuals over their sigmas, at least 1; the covariance is multiplied by its square
 
 
 def register(names: Sequence[str], cloud: Array, world: Array, covariances: Array, sigma_m: float) -> Registration:
     """The rigid transform from targets (n, 3), m, of a scan to the survey's (n, 3).
 
     covariances (n, 3, 3), m^2, of the survey; sigma_m: of each coordinate of a target in the scan. Kabsch's rotation,
-    then least squares.
-
-    Raises:
-        ValueError: too few targets, collinear targets, another size (a wrong unit), a mirror image, or an outlier.
+    then least squares. Raises ValueError: too few targets, collinear targets, another size (a wrong unit), a mirror
+    image, or an outlier.
     """
     if len(names) < 3:
         raise ValueError(f"{len(names)} targets are in both the scan and the survey, expected 3 or more")
@@ -71,7 +124,7 @@ def register(names: Sequence[str], cloud: Array, world: Array, covariances: Arra
     dof = 3 * len(names) - 6
     _check_outliers(names, cloud, world, C)
     factor = max(1.0, float(np.sqrt(chi2 / dof)))
-    return Registration(pose, np.linalg.inv(N) * factor**2, residuals, factor)
+    return Registration(pose, np.linalg.inv(N) * factor**2, residuals)
 
 
 def _check_outliers(names: Sequence[str], cloud: Array, world: Array, C: Array) -> None:
@@ -137,8 +190,7 @@ class Alignment:
 def on_surfaces(points: Array) -> Bools:
     """Which points (n, 3) have neighbours as near as most points: not dust, mixed pixels at edges, or reflections.
 
-    Raises:
-        MissingOpen3DError: Open3D cannot be loaded.
+    Raises MissingOpen3DError: Open3D cannot be loaded.
     """
     o3d = open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.ascontiguousarray(points)))
@@ -151,11 +203,9 @@ def on_surfaces(points: Array) -> Bools:
 def align(moving: Array, fixed: Array) -> Alignment:
     """The rigid transform of a scan (n, 3), m, to another (k, 3) of the same place, by point-to-plane ICP.
 
-    The scans must agree to about a twentieth of their extent before, as scanner programs align them.
-
-    Raises:
-        ValueError: the scans do not overlap, or what they share does not determine all of the transform (one plane).
-        MissingOpen3DError: Open3D cannot be loaded.
+    The scans must agree to about a twentieth of their extent before, as scanner programs align them. Raises ValueError:
+    the scans do not overlap, or what they share does not determine all of the transform (one plane);
+    MissingOpen3DError: Open3D cannot be loaded.
     """
     o3d = open3d()
     centre = fixed.mean(axis=0)
@@ -240,11 +290,8 @@ def scan_of(
 
     size_m selects the plane of the screen if the cloud has several; without it the largest one is used. point_sigma_m:
     of one point along the normal; None: from the scatter within patches. seen_from (3,), world: the side to which z
-    points. world_from_cloud (None: the cloud is in world) has an error with the covariance registration (6, 6).
-
-    Raises:
-        ValueError: there is no such plane.
-        MissingOpen3DError: Open3D cannot be loaded.
+    points. world_from_cloud (None: the cloud is in world) has an error with the covariance registration (6, 6). Raises
+    ValueError: there is no such plane; MissingOpen3DError: Open3D cannot be loaded.
     """
     if len(points) < FEWEST:
         raise ValueError(f"{len(points)} points, expected {FEWEST} or more")

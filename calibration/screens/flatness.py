@@ -48,10 +48,8 @@ def frame_of_extent(points: Array, seen_from: Array | None = None) -> Pose:
 def frame_of_dots(points: Array, origin: Array, along_x: Array, on_y_side: Array, origin_at: Array) -> Pose:
     """world_from_screen from three named dots (3,) each, m: `origin` has the coordinates `origin_at` (2,), m.
 
-    x points from it towards `along_x`; y is positive on the side of `on_y_side`.
-
-    Raises:
-        ValueError: the three dots are collinear.
+    x points from it towards `along_x`; y is positive on the side of `on_y_side`. Raises ValueError: the three dots are
+    collinear.
     """
     _, normal, _ = plane_through(points)
     x = along_x - origin
@@ -135,8 +133,7 @@ def fit_surface(
 ) -> Surface:
     """Weighted least squares. scatter_m None: estimated, 0 if the points' sigmas explain the residuals.
 
-    Raises:
-        ValueError: the used points do not determine the surface.
+    Raises ValueError: the used points do not determine the surface.
     """
     use = np.ones(len(xyz), dtype=bool) if used is None else used
     A = _polynomial(xyz[:, :2], bent)

@@ -130,10 +130,7 @@ def adjust(network: Network, start: Start) -> NetworkFit:
     """The adjustment of all measurements.
 
     Observations and corners more than 5 sigmas from the prediction are excluded; corners are weighted by the scatter of
-    their residuals.
-
-    Raises:
-        AdjustmentError: the start is too far from the solution, or a parameter is not determined.
+    their residuals. Raises AdjustmentError: the start is too far from the solution, or a parameter is not determined.
     """
     values, free, at = _unknowns(network, start)
     corners = None if network.corners is None else _weighted_corners(network, start, values, free)

@@ -40,10 +40,8 @@ def resect(camera: Camera, points: Array, pixels: Array, within_px: float) -> li
     """Poses of a camera from points (n, 3), m, in world and their pixels (n, 2), the best first; at most two.
 
     within_px: largest reprojection error of an inlier. A second pose is returned if it has as many inliers, as with few
-    coplanar points that appear small in the picture. Empty if no pose is found.
-
-    Raises:
-        ValueError: fewer than four points, or all on one line.
+    coplanar points that appear small in the picture. Empty if no pose is found. Raises ValueError: fewer than four
+    points, or all on one line.
     """
     if len(points) < FEWEST:
         raise ValueError(f"{len(points)} points, expected {FEWEST} or more")
@@ -237,10 +235,8 @@ def chain(
     """Propagate poses from the world to every camera and board.
 
     on_dots: camera -> camera_from_world by surveyed dots; boards: (camera, placement) -> camera_from_board. Without a
-    survey the world is the frame of held_screen. problems: camera -> why its dots give no pose.
-
-    Raises:
-        NotConnectedError: some cameras are not connected with the others.
+    survey the world is the frame of held_screen. problems: camera -> why its dots give no pose. Raises
+    NotConnectedError: some cameras are not connected with the others.
     """
     cameras: dict[int, Pose] = dict(poses_by_camera)
     placed: dict[int, Pose] = {}
@@ -287,10 +283,8 @@ def start_of(
 ) -> Start:
     """The start values of an adjustment. frames: screen -> world_from_screen from its dots or its scan.
 
-    held_board: board whose pose is fixed if there is no survey.
-
-    Raises:
-        NotConnectedError: a screen or a board has no pose.
+    held_board: board whose pose is fixed if there is no survey. Raises NotConnectedError: a screen or a board has no
+    pose.
     """
     screens = {**chained.world_from_screen, **frames}
     names = list(network.rig.screens)

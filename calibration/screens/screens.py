@@ -91,12 +91,9 @@ def calibrate(
     """Poses of all cameras and screens, their bows where significant, and the joint covariance.
 
     setups: one per screen. near: camera -> approximate position, which decides between two poses. Without a survey, the
-    world is the frame that held_screen gets from the board fixed to it.
-
-    Raises:
-        NotConnectedError: some cameras or screens are not connected with the others.
-        AdjustmentError: the adjustment fails.
-        ValueError: the dots do not determine a screen's plane.
+    world is the frame that held_screen gets from the board fixed to it. Raises NotConnectedError: some cameras or
+    screens are not connected with the others; AdjustmentError: the adjustment fails; ValueError: the dots do not
+    determine a screen's plane.
     """
     near = {} if near is None else near
     poses_by_camera = {c: camera_on_dots(network, c, WITHIN_PX) for c in range(len(network.rig.cameras))}
@@ -177,8 +174,7 @@ def screen_of_dots(
 ) -> tuple[Pose, Flatness]:
     """A screen's frame and flatness from its surveyed dots alone.
 
-    Raises:
-        ValueError: the dots do not determine its plane.
+    Raises ValueError: the dots do not determine its plane.
     """
     xyz, C = network.control_points.xyz[control_points], network.control_points.covariance[control_points]
     count = len(control_points)

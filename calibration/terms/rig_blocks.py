@@ -85,8 +85,7 @@ def lines_in(values: Values) -> Lines:
 def names_at(rig: Rig, at: At) -> tuple[str, ...]:
     """The names, as in rig.yaml's covariance blocks, of the numbers of one unknown of a stack.
 
-    Raises:
-        KeyError: the stack does not belong to the rig.
+    Raises KeyError: the stack does not belong to the rig.
     """
     stack, i = at
     if stack in (INTRINSICS, CAMERAS, *_CLOCKS):
@@ -120,9 +119,7 @@ def prior_of(rig: Rig, covariance: RigCovariance) -> tuple[Prior | None, dict[st
     """A covariance of rig parameters as a prior on the rig's stacks, and the numbers (k, dof) that are then free.
 
     Numbers that are not named, or have a variance of 0, are known and stay fixed. The prior is None if none is free.
-
-    Raises:
-        KeyError: the rig has no parameter of this name.
+    Raises KeyError: the rig has no parameter of this name.
     """
     values = stacks_of(rig)
     every = [(s, i) for s, stack in values.items() for i in range(len(stack))]

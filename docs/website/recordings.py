@@ -20,8 +20,7 @@ from geometry.rotations import exp
 from lab.files.rig.rig_file import load_rig, save_rig
 from lab.simulate.board_photo import PhotoSettings, photograph
 from lab.simulate.campaign import board_poses
-from lab.simulate.rigs import RIGS, scaled, unequal_fan
-from lab.simulate.scenarios import SCENARIOS, Clutter, PictureTiming
+from lab.simulate.scenarios import RIGS, SCENARIOS, Clutter, PictureTiming, scaled, unequal_fan
 from lab.simulate.write import simulate
 
 BOARD = "chessboard:12x8:30mm"

@@ -30,10 +30,8 @@ def gamma_quantile(p_above: float, shape: float) -> float:
     """The value that a gamma variable of this shape and of scale 1 exceeds with probability p_above (0 to 1).
 
     Newton's method on the logarithm of the tail, within a bracket; relative accuracy about 1e-12 for shapes below 1e4,
-    1e-9 below 1e7. Start: Wilson and Hilferty (1931).
-
-    Raises:
-        ValueError: the shape is not positive, or p_above is no probability.
+    1e-9 below 1e7. Start: Wilson and Hilferty (1931). Raises ValueError: the shape is not positive, or p_above is no
+    probability.
     """
     if not shape > 0 or not 0 <= p_above <= 1:
         raise ValueError(f"expected a shape above 0 and a probability, got {shape} and {p_above}")

@@ -95,8 +95,7 @@ def perturbed_camera(camera: Camera, change: Mapping[str, float]) -> Camera:
 def perturbed_rig(rig: Rig, names: Sequence[str], delta: Array) -> Rig:
     """The rig with each named parameter changed by delta (p,), in the parameters' units.
 
-    Raises:
-        KeyError: the rig has no parameter of this name.
+    Raises KeyError: the rig has no parameter of this name.
     """
     changes: dict[tuple[str, str], dict[str, float]] = {}
     for name, value in zip(names, delta, strict=True):
@@ -143,8 +142,7 @@ class Sensitivity:
     def __init__(self, rig: Rig, model: SpotModel, names: Sequence[str]) -> None:
         """model: of this rig, possibly of a subset of its views.
 
-        Raises:
-            KeyError: the rig has no parameter of this name.
+        Raises KeyError: the rig has no parameter of this name.
         """
         self.names = tuple(names)
         cameras, screens, beams = list(rig.cameras), list(rig.screens), list(rig.beams)
@@ -208,11 +206,7 @@ class RigUncertainty:
     """The joint covariance of the pixels of all views that the covariance of a rig's calibration implies."""
 
     def __init__(self, rig: Rig, model: SpotModel, covariance: RigCovariance) -> None:
-        """model: of this rig.
-
-        Raises:
-            KeyError: the covariance names a number that the rig does not have.
-        """
+        """model: of this rig. Raises KeyError: the covariance names a number that the rig does not have."""
         self._model = model
         self._sensitivity = Sensitivity(rig, model, covariance.names)
         self._root = covariance_root(covariance.matrix)

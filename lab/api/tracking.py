@@ -19,7 +19,7 @@ from lab.errors import InputError
 from lab.files.rig.rig_file import RigFile, joint_covariance, load_rig_file
 from lab.files.run.run_file import prior_from
 from lab.files.text import columns
-from lab.files.text.csv_table import is_whole
+from lab.files.text.csv_text import is_whole
 from lab.files.text.dataclass_fields import with_overrides
 from lab.files.text.error_text import suggest_name
 from lab.runs.tables import pose_numbers

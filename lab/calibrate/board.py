@@ -24,7 +24,7 @@ from lab.errors import InputError
 from lab.files.rig.board_file import load_board, load_board_or_text, save_board
 from lab.files.text.atomic_write import atomic_folder, atomic_write_bytes
 from lab.files.text.error_text import suggest_name
-from lab.findings.outcome import Done
+from lab.findings.finding import Done
 
 PAGES_MM = {"A4": (210.0, 297.0), "A3": (297.0, 420.0)}  # width, height in portrait; landscape is used as well
 FIT = "fit"  # a page of the size that the board needs
@@ -70,8 +70,7 @@ class Page:
 def lay_out(board: Board, page: str = "A4") -> Page:
     """Centre a board on a page.
 
-    Raises:
-        InputError: for an unknown page format or a board that does not fit on the page.
+    Raises InputError: for an unknown page format or a board that does not fit on the page.
     """
     drawing = draw(board)
     wide, high = (1000.0 * side for side in drawing.size_m)
@@ -178,8 +177,7 @@ def as_svg(page: Page) -> str:
 def as_png(page: Page, dpi: float = 300.0) -> bytes:
     """The page as a grey PNG with its resolution, which programs print at true size; edges are antialiased.
 
-    Raises:
-        InputError: for a resolution outside 50 to 2400 dpi or a picture of more than 400 megapixels.
+    Raises InputError: for a resolution outside 50 to 2400 dpi or a picture of more than 400 megapixels.
     """
     if not 50 <= dpi <= 2400:
         raise InputError(f"dpi: expected 50 to 2400, got {dpi:g}")
@@ -261,10 +259,8 @@ def write_board(
     """Write board.pdf, board.svg, board.png and board.yaml into the folder `out`.
 
     If `out` names a file with one of these suffixes, only that format and its description are written. All files are
-    written or none. board: a value, its text, or the path of a board.yaml.
-
-    Raises:
-        InputError: for an unknown format, a board that does not fit on the page, or files that cannot be written.
+    written or none. board: a value, its text, or the path of a board.yaml. Raises InputError: for an unknown format, a
+    board that does not fit on the page, or files that cannot be written.
     """
     if isinstance(board, str | Path):
         board = load_board_or_text(board)

@@ -14,12 +14,22 @@ from typing import Any, Generic, TypeVar
 
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project
-from lab.files.rig.calibration_state import CalibrationState
+from lab.files.rig.camera_file import CalibrationState
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.text.atomic_write import atomic_folder, check_output_folder, earlier_results, keep_good_results
 from lab.files.text.json_text import write_json
-from lab.findings.finding import Finding, Level, counted, finding, first_sentence, reasons, verdict, worst_first
-from lab.findings.outcome import Outcome, Verdict
+from lab.findings.finding import (
+    Finding,
+    Level,
+    Outcome,
+    Verdict,
+    counted,
+    finding,
+    first_sentence,
+    reasons,
+    verdict,
+    worst_first,
+)
 from lab.packages import versions
 from lab.report.page import KeyFigure, Page, Section, made_with, write_page
 
@@ -71,10 +81,8 @@ def _said(solved: Solved[R], level: Level) -> str:
 def run_step(step: Step, out: Path, solve: Callable[[], Solved[R]]) -> Outcome[R]:
     """Solve a step and write its files, summary.json and report.html into the folder `out`, all or none.
 
-    A FAIL never replaces an earlier usable result: it goes to `OUT-failed`.
-
-    Raises:
-        BeamposeError: as `solve` does, or the folder cannot be written. Nothing is written then.
+    A FAIL never replaces an earlier usable result: it goes to `OUT-failed`. Raises BeamposeError: as `solve` does, or
+    the folder cannot be written. Nothing is written then.
     """
     own = earlier_results(*step.own)
     check_output_folder(out, own)
@@ -147,8 +155,7 @@ def state_of(
 def calibration_date(project: Project, today: datetime.date | None) -> datetime.date:
     """Date written into the result: `today` if given, else the date of the measurements, else the current date.
 
-    Raises:
-        InputError: if the measurements are dated in the future.
+    Raises InputError: if the measurements are dated in the future.
     """
     now = today or datetime.date.today()
     if project.date is not None and project.date > now:

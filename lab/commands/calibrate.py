@@ -39,8 +39,8 @@ def calibrate() -> None:
 @calibrate.command()
 @click.argument("board")
 @click.option("--out", required=True, type=ANY_PATH, help="A folder, or one file ending in .pdf, .svg or .png.")
-@click.option("--page", default="A4", show_default=True, help="A4, A3 ..., or fit: the size of the board.")
-@click.option("--dpi", default=300.0, show_default=True, type=NumberRange(50, 2400), help="Resolution of the PNG.")
+@click.option("--page", default="A4", help="A4, A3 ..., or fit: the size of the board.")
+@click.option("--dpi", default=300.0, type=NumberRange(50, 2400), help="Resolution of the PNG.")
 def board(board: str, out: Path, page: str, dpi: float) -> None:
     """Write a printable board to exact scale, and board.yaml.
 
@@ -62,17 +62,10 @@ def board(board: str, out: Path, page: str, dpi: float) -> None:
 @click.option("--out", required=True, type=FOLDER, help="Gets camera.yaml, corners.csv and report.html.")
 @click.option("--name", help="The camera's name; default: that of the folder --out.")
 @click.option("--distance-m", type=NumberRange(min=0, min_open=True), help="Distance to the screen, for figures in mm.")
+@click.option("--lens", default="auto", help="0, 4, 5, 8, 12 or fisheye; auto: by the error of directions.")
+@click.option("--warp", default="auto", help="auto, on, off: whether the bending of the board is solved for.")
 @click.option(
-    "--lens", default="auto", show_default=True, help="0, 4, 5, 8, 12 or fisheye; auto: by the error of directions."
-)
-@click.option(
-    "--warp", default="auto", show_default=True, help="auto, on, off: whether the bending of the board is solved for."
-)
-@click.option(
-    "--stretch",
-    default="auto",
-    show_default=True,
-    help="auto, on, off: whether the ratio of the board's x and y scales is solved for.",
+    "--stretch", default="auto", help="auto, on, off: whether the ratio of the board's x and y scales is solved for."
 )
 @click.option(
     "--image-size", "image_size_px", type=ImageSize(), metavar="WxH", help="Of the pictures of a table of corners, px."
@@ -232,14 +225,11 @@ def convert(source: Path, destination: Path, origin: str | None, target: str | N
 @click.option(
     "--rig",
     default="fan",
-    show_default=True,
     shell_complete=complete_rigs,
     help="A rig.yaml as designed, or fan, unequal-fan, two-cameras-per-screen, four-skew-beams.",
 )
 @seed_option
-@click.option(
-    "--positions", default=40, show_default=True, type=click.IntRange(min=3), help="Number of stand positions."
-)
+@click.option("--positions", default=40, type=click.IntRange(min=3), help="Number of stand positions.")
 @click.option("--photos", is_flag=True, help="Also board photographs for `calibrate camera`.")
 def simulate_campaign(out: Path, rig: str, seed: int, positions: int, photos: bool) -> None:
     """Write a simulated calibration campaign with its truth, to try the commands with.

@@ -120,7 +120,7 @@ def stopped_by_ctrl_c(
 
 
 if TYPE_CHECKING:
-    from lab.findings.outcome import Done, Outcome
+    from lab.findings.finding import Done, Outcome
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
 ANY_PATH = click.Path(path_type=Path)
@@ -322,15 +322,9 @@ set_option = click.option(
 
 
 valid_days_option = click.option(
-    "--valid-days",
-    default=365,
-    show_default=True,
-    type=click.IntRange(min=1),
-    help="Validity of the calibration, days.",
+    "--valid-days", default=365, type=click.IntRange(min=1), help="Validity of the calibration, days."
 )
-seed_option = click.option(
-    "--seed", default=0, show_default=True, type=click.IntRange(min=0), help="The same seed gives the same bytes."
-)
+seed_option = click.option("--seed", default=0, type=click.IntRange(min=0), help="The same seed gives the same bytes.")
 
 
 @contextlib.contextmanager
@@ -480,7 +474,7 @@ def complete_scenarios(ctx: click.Context, parameter: click.Parameter, begun: st
 
 def complete_rigs(ctx: click.Context, parameter: click.Parameter, begun: str) -> list[str]:
     """Rigs of `calibrate simulate` that begin with `begun`."""
-    from lab.simulate.rigs import RIGS
+    from lab.simulate.scenarios import RIGS
 
     return [name for name in RIGS if name.startswith(begun)]
 

@@ -57,12 +57,7 @@ def _track(ctx: click.Context, target: Target[Any], given: Path, out: Path) -> N
     "--near", "near_px", type=(_PIXEL, _PIXEL), metavar="U V", help="Centre of the first circle, px, within 20 px."
 )
 @click.option(
-    "--min-radius",
-    "min_radius_px",
-    default=7.0,
-    show_default=True,
-    type=NumberRange(4, 10_000),
-    help="Smallest radius to look for, px.",
+    "--min-radius", "min_radius_px", default=7.0, type=NumberRange(4, 10_000), help="Smallest radius to look for, px."
 )
 @click.option(
     "--max-radius", "max_radius_px", type=NumberRange(4, 10_000), help="Largest one; default: half of the smaller side."
@@ -70,7 +65,6 @@ def _track(ctx: click.Context, target: Target[Any], given: Path, out: Path) -> N
 @click.option(
     "--edge",
     default="supported",
-    show_default=True,
     type=click.Choice(["supported", "outer", "inner", "opening"]),
     help="Which edge, where a target has several: of the rim, of a thin rim's inner side, of the opening inside it.",
 )
@@ -78,14 +72,12 @@ def _track(ctx: click.Context, target: Target[Any], given: Path, out: Path) -> N
 @click.option(
     "--form",
     default="sound",
-    show_default=True,
     type=click.Choice(["sound", "printed"]),
     help="Equations: corrected with a fit of the rim, or as printed in Zhou (2014).",
 )
 @click.option(
     "--detector",
     default="classical",
-    show_default=True,
     type=click.Choice(["classical", "learned"]),
     help="What proposes circles: votes of gradients, or a network that was trained on rendered drogues.",
 )
@@ -119,20 +111,10 @@ def circle(ctx: click.Context, /, pictures: Path, out: Path, **options: Any) -> 
     "--near", "near_px", type=(_PIXEL, _PIXEL), metavar="U V", help="Centre of the first drogue, px, within 20 px."
 )
 @click.option(
-    "--every",
-    "check_every",
-    default=5,
-    show_default=True,
-    type=click.IntRange(1, 1000),
-    help="Frames between two checks by the detector.",
+    "--every", "check_every", default=5, type=click.IntRange(1, 1000), help="Frames between two checks by the detector."
 )
 @click.option(
-    "--min-diameter",
-    "smallest_px",
-    default=8.0,
-    show_default=True,
-    type=NumberRange(8, 10_000),
-    help="Smallest diameter to look for, px.",
+    "--min-diameter", "smallest_px", default=8.0, type=NumberRange(8, 10_000), help="Smallest diameter to look for, px."
 )
 @click.option(
     "--max-diameter",
@@ -184,7 +166,6 @@ def _place(ctx: click.Context, parameter: click.Parameter, value: str | None) ->
 @click.option(
     "--detector",
     default="spots",
-    show_default=True,
     type=click.Choice(["spots", "darker", "brighter", "colour"]),
     help="Points of light, or larger targets: darker or brighter than what is around them, or of a colour. Not used for"
     " a table.",
@@ -209,7 +190,6 @@ def _place(ctx: click.Context, parameter: click.Parameter, value: str | None) ->
 @click.option(
     "--min-measured",
     default=0.5,
-    show_default=True,
     type=NumberRange(min=0, max=1),
     help="Least share of measured frames; with less the exit status is 4.",
 )
@@ -255,7 +235,6 @@ def point(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> Non
 @click.option(
     "--detector",
     default="spots",
-    show_default=True,
     type=click.Choice(["spots", "harris"]),
     help="What finds lights: as for laser spots, or the corners of Fu (2016).",
 )
@@ -307,8 +286,8 @@ def stereo(run_folder: Path, out: Path) -> None:
 @click.argument("right", type=ANY_PATH)
 @click.option("--board", required=True, help="The board in the photos: as for `calibrate board`, or a board.yaml.")
 @click.option("--out", required=True, type=FOLDER, help="Gets pair.yaml, pairs.csv and report.html.")
-@click.option("--names", default="left,right", show_default=True, help="Names of the two cameras.")
-@click.option("--lens", default="auto", show_default=True, help="0, 4, 5, 8, 12 or fisheye; auto: by views held out.")
+@click.option("--names", default="left,right", help="Names of the two cameras.")
+@click.option("--lens", default="auto", help="0, 4, 5, 8, 12 or fisheye; auto: by views held out.")
 @valid_days_option
 def pair(left: Path, right: Path, board: str, out: Path, names: str, lens: str, valid_days: int) -> None:
     """Calibrate two cameras and their relative pose from photos of a board, for `beampose stereo`.

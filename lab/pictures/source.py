@@ -113,8 +113,7 @@ def number_of(name: str) -> int | None:
 def list_folder(folder: Path, camera: str = "") -> PictureFiles:
     """The pictures in a folder, with the frame number from their names (see `number_of`).
 
-    Raises:
-        InputError: two pictures have the same number, or the folder has none or cannot be read.
+    Raises InputError: two pictures have the same number, or the folder has none or cannot be read.
     """
     files: dict[int, Path] = {}
     ignored = []
@@ -160,10 +159,8 @@ def video_at(path: Path, camera: str = "") -> Video:
 def open_inputs(given: Sequence[Path], camera: str | None = None) -> PictureSource:
     """Open the paths of the command line: a folder, picture files or a video.
 
-    camera: a name instead of the folder's or file's own.
-
-    Raises:
-        InputError: a path does not exist, a folder has no pictures, or pictures and videos are mixed.
+    camera: a name instead of the folder's or file's own. Raises InputError: a path does not exist, a folder has no
+    pictures, or pictures and videos are mixed.
     """
     if camera is not None and (not camera.isprintable() or is_formula(camera)):
         raise InputError(
@@ -235,8 +232,7 @@ def _numbered(files: Sequence[Path], camera: str) -> PictureFiles:
 def open_video(path: Path, colour: bool = False) -> cv2.VideoCapture:
     """Open a video. colour: its pictures come as BGR; else grey videos stay as they are, and most others come as grey.
 
-    Raises:
-        InputError: OpenCV cannot read it.
+    Raises InputError: OpenCV cannot read it.
     """
     require_regular_file(path)
     cv2 = load_cv2()

@@ -239,11 +239,6 @@ class Tiff:
         if self.compression in (DEFLATE, OLD_DEFLATE):
             unpacked = decompress(piece, size)
             return None if unpacked is None else np.frombuffer(unpacked, np.uint8)
-        from lab.pictures.tiff import (  # compiled code: imported only where needed
-            decompress_lzw,
-            decompress_pack_bits,
-        )
-
         if self.compression == LZW:
             return decompress_lzw(piece, size)
         out = np.empty(size, np.uint8)

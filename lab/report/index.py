@@ -29,7 +29,7 @@ from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.yaml_text import read_mapping
 from lab.findings.finding import Level
 from lab.number_format import format_number
-from lab.report.html import environment
+from lab.report.page import environment
 from lab.report.plot import svg
 from lab.report.summary import VERDICTS, day_of, valid
 from tracking.statuses import PoseStatus

@@ -27,7 +27,7 @@ from lab.files.run.results import PoseTrack, ResultFolder, SpotGrid, read_result
 from lab.files.run.run_file import Run
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_write_text
-from lab.findings.outcome import Done
+from lab.findings.finding import Done
 from lab.number_format import format_number
 from lab.report.page import Page, PageTable, Section, html_of, made_with
 from tracking.statuses import PoseStatus
@@ -87,8 +87,7 @@ def certificate(
 ) -> Certificate:
     """The budgets of the frames `at`; without any, of the measured frame with the median uncertainty of attitude.
 
-    Raises:
-        InputError: a table or the run folder cannot be read, or a frame is not measured.
+    Raises InputError: a table or the run folder cannot be read, or a frame is not measured.
     """
     folder = ResultFolder(results, run_folder)
     run, poses, spots = folder.run(), folder.poses, folder.spots

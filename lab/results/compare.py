@@ -14,8 +14,7 @@ from geometry import rotations
 from geometry.arrays import Array, Bools, Ints
 from lab.errors import InputError
 from lab.files.run.results import ResultFolder
-from lab.files.text.csv_table import Table
-from lab.files.text.csv_text import read_table
+from lab.files.text.csv_text import Table, read_table
 from lab.files.text.error_text import name_of_path
 from lab.findings.finding import Finding, Level, clause, finding, passed
 from lab.number_format import format_number, format_percent, format_with_sigma
@@ -57,8 +56,7 @@ class ReferenceMotion:
 def read_reference(path: Path, sigma_m: float = 0.0, sigma_deg: float = 0.0) -> ReferenceMotion:
     """The motion of a file. sigma_m, sigma_deg: standard deviations where the file states none.
 
-    Raises:
-        InputError: no such file, neither format, a field that is not a number, or times that do not rise.
+    Raises InputError: no such file, neither format, a field that is not a number, or times that do not rise.
     """
     path = Path(path)
     numbers = _tum_lines(path)
@@ -410,10 +408,8 @@ def compare(
     """Compare a result folder with another one, or with a reference file.
 
     align: what is estimated, of ALIGN; None: everything for a reference, nothing for two results. offset_s: reference
-    time minus result time, approximately. sigma_m, sigma_deg: the reference's sigmas where its file states none.
-
-    Raises:
-        InputError: not results, not a reference, or nothing in common.
+    time minus result time, approximately. sigma_m, sigma_deg: the reference's sigmas where its file states none. Raises
+    InputError: not results, not a reference, or nothing in common.
     """
     if (other is None) == (reference is None):
         raise InputError("expected a second result folder or --reference FILE, and not both")

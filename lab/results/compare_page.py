@@ -10,7 +10,7 @@ import numpy as np
 from lab.files.text.atomic_write import atomic_folder, check_output_folder, earlier_results
 from lab.files.text.csv_text import write_table
 from lab.files.text.json_text import write_json
-from lab.findings.outcome import Done, Verdict
+from lab.findings.finding import Done, Verdict
 from lab.number_format import format_number, format_percent, format_with_sigma
 from lab.packages import versions
 from lab.report.page import Page, PageDrawing, PageTable, Section, made_with
@@ -291,8 +291,7 @@ def compare_and_write(
 ) -> Done[Comparison]:
     """Compare, and write tables and report where `out` is given. The options: `lab.results.compare.compare`.
 
-    Raises:
-        InputError: the input cannot be compared, or `out` cannot be written.
+    Raises InputError: the input cannot be compared, or `out` cannot be written.
     """
     own = earlier_results(SUMMARY)
     if out is not None:

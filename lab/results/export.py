@@ -23,7 +23,7 @@ from lab.files.run.results import POSE_STATUSES, PoseTrack, ResultFolder, read_r
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder, atomic_write_bytes
 from lab.files.text.json_text import plain_value
-from lab.findings.outcome import Done
+from lab.findings.finding import Done
 from lab.packages import needed, versions
 from tracking.statuses import PoseStatus
 
@@ -83,11 +83,8 @@ def export(results: Path | str, to: str, out: Path | str | None = None, *, causa
     out: the file, or the folder of a rosbag2; default: the name of the results in the working folder. causal: the poses
     as known at each instant, in place of the smoothed ones.
 
-    >>> lab.export(results, "tum", results / "motion.tum").result.name
-    'motion.tum'
-
-    Raises:
-        InputError: no results, an unknown format, a package that is not installed, or a motion that it cannot hold.
+    >>> lab.export(results, "tum", results / "motion.tum").result.name 'motion.tum' Raises InputError: no results, an
+    unknown format, a package that is not installed, or a motion that it cannot hold.
     """
     results = Path(results)
     if to not in FORMATS:

@@ -18,13 +18,12 @@ from lab.errors import InputError
 from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_bytes
 from lab.files.text.error_text import suggest_name
-from lab.findings.outcome import Done
-from lab.pictures.overlay_video import write_overlay_video
+from lab.findings.finding import Done
 from lab.progress import Progress
-from lab.report.frames.canvas import Pixels, png
+from lab.report.frames.canvas import Pixels, png, write_overlay_video
 from lab.report.frames.content import DrawnFrame, ResultData, frame_content, pictures_of, pose_words, read_result_data
 from lab.report.frames.sheet import Layout, Limits, limits_of, sheet
-from lab.runs.frames.frames import Recorded, pictures_at
+from lab.runs.frames.frames import Recorded, open_frames, pictures_at
 
 if TYPE_CHECKING:
     from lab.runs.frames.pipeline import FrameRecord, Pipeline
@@ -53,11 +52,8 @@ def show_frame(
     """The annotated picture of a frame of results, or of a run folder.
 
     path: a results folder, or a run folder: its frames up to this one are then processed, without smoothing. camera:
-    one camera; None: all side by side. run_folder: of the results, if it has moved.
-
-    Raises:
-        InputError: the path is neither, or has no such frame or camera.
-        BeamposeError: the run cannot be processed.
+    one camera; None: all side by side. run_folder: of the results, if it has moved. Raises InputError: the path is
+    neither, or has no such frame or camera; BeamposeError: the run cannot be processed.
     """
     path = Path(path)
     if (path / "spots.csv").is_file() and (path / "attitude.csv").is_file():
@@ -102,11 +98,10 @@ def _shown(data: ResultData, frame: int, camera: str | None) -> Shown:
 
 def _of_run(folder: Path, frame: int, camera: str | None, progress: Progress | None) -> Shown:
     """The frame of a run folder, processed up to it by the causal pass."""
-    from lab.runs.frames.clocked_frames import open_frames
     from lab.runs.frames.pipeline import Pipeline
     from lab.runs.process import ready_run
     from lab.runs.tables import TableWriter
-    from lab.runs.verdict.frame_checks import FrameChecks
+    from lab.runs.verdict.run_statistics import FrameChecks
 
     run = ready_run(folder)
     reader = open_frames(run)
@@ -164,11 +159,8 @@ def write_video(
     """Write overlay.mp4 (or .avi) into a results folder; it is complete or as it was before.
 
     first, last: frame numbers. every: show each so many frames. fps: frames per second of the video. The memory of
-    pictures does not grow with their number.
-
-    Raises:
-        InputError: the results cannot be read, or have no such frames.
-        RunError: OpenCV cannot write a video here.
+    pictures does not grow with their number. Raises InputError: the results cannot be read, or have no such frames;
+    RunError: OpenCV cannot write a video here.
     """
     data = read_result_data(results, run_folder)
     indices = _selected(data, first, last, every)

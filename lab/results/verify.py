@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import filecmp
 import itertools
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -18,7 +19,7 @@ from lab.files.run.fingerprints import fingerprints
 from lab.files.run.results import ResultFolder
 from lab.files.run.run_file import LiveDevice, Run
 from lab.files.text.dataclass_fields import dataclass_from_yaml
-from lab.findings.outcome import Done
+from lab.findings.finding import Done
 from lab.packages import versions
 from lab.progress import Progress
 from lab.runs.frames.pipeline import Pipeline
@@ -70,8 +71,7 @@ class InputsNow:
 def read_recorded(results: Path) -> Recorded:
     """How the result in a folder was made.
 
-    Raises:
-        InputError: the folder holds no results of a run, or summary.json lacks what is needed.
+    Raises InputError: the folder holds no results of a run, or summary.json lacks what is needed.
     """
     content, path = ResultFolder.of_run(results).summary, Path(results) / "summary.json"
     try:
@@ -135,24 +135,13 @@ def _by_name(entries: Sequence[dict[str, Any]]) -> dict[tuple[str, int], dict[st
 MOST_SHOWN = 60  # characters of a field in a message
 
 
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """The difference of one table."""
-
-    file: str
-    text: str
-
-    def __str__(self) -> str:
-        return f"{self.file}: {self.text}"
-
-
-def difference_of(recorded: Path, computed: Path) -> Difference | None:
-    """The first difference of two tables with the number of rows that differ; None for the same bytes."""
+def difference_of(recorded: Path, computed: Path) -> str | None:
+    """The table and its first difference, with the number of rows that differ; None for the same bytes."""
     name = recorded.name
     if not recorded.is_file() or not computed.is_file():
         which = "is missing in the results" if computed.is_file() else "is in the results, but is not computed any more"
-        return Difference(name, which)
-    if _same_bytes(recorded, computed):
+        return f"{name}: {which}"
+    if filecmp.cmp(recorded, computed, shallow=False):
         return None
     first, rows, old_rows, new_rows = "", 0, 0, 0
     header: list[str] = []
@@ -166,17 +155,7 @@ def difference_of(recorded: Path, computed: Path) -> Difference | None:
                 first = first or _row_text(number, header, old, new)
     counted = f"{rows} of {max(old_rows, new_rows)} lines differ"
     length = f"; {old_rows} lines recorded, {new_rows} computed" if old_rows != new_rows else ""
-    return Difference(name, f"{first} ({counted}{length})")
-
-
-def _same_bytes(first: Path, second: Path) -> bool:
-    if first.stat().st_size != second.stat().st_size:
-        return False
-    with first.open("rb") as a, second.open("rb") as b:
-        while block := a.read(2**20):
-            if block != b.read(2**20):
-                return False
-    return True
+    return f"{name}: {first} ({counted}{length})"
 
 
 def _fields(line: bytes) -> list[str]:
@@ -218,7 +197,7 @@ class Verification:
     inputs: InputsNow
     versions: tuple[str, ...]  # those that differ
     tables: tuple[str, ...]  # compared
-    differences: tuple[Difference, ...]
+    differences: tuple[str, ...]
 
     @property
     def identical(self) -> bool:
@@ -244,10 +223,7 @@ def verify(results: Path, run_folder: Path | None = None, progress: Progress | N
     """Compute the tables of a result folder again, from its recorded run folder, settings and parameters.
 
     run_folder: where the run is now, if it has moved. The expiry of the calibration plays no part, since the result was
-    made while it was valid.
-
-    Raises:
-        InputError: the results or their inputs cannot be read.
+    made while it was valid. Raises InputError: the results or their inputs cannot be read.
     """
     results = Path(results)
     recorded = read_recorded(results)

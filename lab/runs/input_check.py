@@ -30,19 +30,17 @@ from geometry.pose_solver.visibility import symmetries
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import CalibrationError, InputError
-from lab.files.rig.calibration_state import CalibrationState, require_valid_calibration
+from lab.files.rig.camera_file import CalibrationState, require_valid_calibration
 from lab.files.rig.rig_file import joint_covariance, load_rig_file
 from lab.files.run.run_file import DetectionsTable, Run, load_run
 from lab.files.run.truth import largest_disagreement_px, load_run_truth
 from lab.files.text.error_text import FileError
-from lab.findings.finding import Level, sentence
-from lab.findings.outcome import Done
+from lab.findings.finding import Done, Level, sentence
 from lab.number_format import format_number
 from lab.pictures.picture_file import DROPPED, UNREADABLE, MissingPicture
 from lab.pictures.source import PictureFiles
 from lab.progress import Progress
-from lab.runs.frames.clocked_frames import open_frames
-from lab.runs.frames.frames import FrameReader, pictures_at
+from lab.runs.frames.frames import FrameReader, open_frames, pictures_at
 from lab.runs.setup_check import (
     SampledFrames,
     mistakes_by_themselves,

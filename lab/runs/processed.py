@@ -16,7 +16,7 @@ import numpy as np
 from geometry.arrays import Array
 from lab.files.text.atomic_write import atomic_folder, earlier_results
 from lab.files.text.json_text import write_json
-from lab.findings.outcome import Outcome, Verdict
+from lab.findings.finding import Outcome, Verdict
 from lab.packages import versions
 
 R = TypeVar("R")
@@ -81,10 +81,8 @@ def write_processed(
 ) -> Outcome[R]:
     """Process a recording into the folder `out`; earlier results with the same schema are replaced.
 
-    process: writes the tables into a folder. more: additional content of summary.json.
-
-    Raises:
-        BeamposeError: as `process` does, or the folder cannot be written; `out` is then unchanged.
+    process: writes the tables into a folder. more: additional content of summary.json. Raises BeamposeError: as
+    `process` does, or the folder cannot be written; `out` is then unchanged.
     """
     started = time.perf_counter()
     with atomic_folder(out, earlier_results(schema)) as work:

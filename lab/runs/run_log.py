@@ -11,7 +11,7 @@ from typing import Any
 
 from lab.files.run.run_file import Run
 from lab.files.text.error_text import printable
-from lab.findings.outcome import Verdict
+from lab.findings.finding import Verdict
 from lab.progress import Progress
 
 FILE = "run.log"

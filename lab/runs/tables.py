@@ -87,10 +87,8 @@ class TableWriter:
     def write(self, record: FrameRecord, causal: FrameRecord | None = None) -> None:
         """Add the rows of one frame. causal: the same frame of the causal pass, where its tables are written.
 
-        The rows reach the files in blocks of frames, or when the context ends.
-
-        Raises:
-            ValueError: the tables are closed.
+        The rows reach the files in blocks of frames, or when the context ends. Raises ValueError: the tables are
+        closed.
         """
         if self._open["spots.csv"].closed:
             raise ValueError("the tables are a closed file")
@@ -250,9 +248,7 @@ def _numbers_of_motions(records: Sequence[FrameRecord]) -> list[list[float]]:
 def _sigmas(variances: Array, frames: Sequence[int]) -> Array:
     """Square roots of variances (..., k) of these frames, or of one; nan for nan.
 
-    Raises:
-        RunError: a variance is negative. This is an error of the program, since lab.runs.verdict.frame_checks comes
-            first.
+    Raises RunError: a variance is negative. This is an error of the program, since every frame is checked before.
     """
     if np.any(variances < 0):
         bad = np.any(variances < 0, axis=tuple(range(1, variances.ndim))) if len(frames) > 1 else np.array([True])

@@ -14,8 +14,7 @@ import numpy as np
 import geometry
 from geometry.compilation.compile_cache import cache_folder, is_empty
 from lab.errors import InputError
-from lab.files.rig.calibration_state import CalibrationState
-from lab.files.rig.camera_file import load_camera
+from lab.files.rig.camera_file import CalibrationState, load_camera
 from lab.files.rig.rig_file import load_lab_file
 from lab.files.run.run_file import load_run
 from lab.files.text.yaml_text import read_mapping

@@ -156,8 +156,7 @@ def options_of(
 ) -> PlanOptions:
     """Options from the values of the command line: ranges (first, last, count) by name; None keeps a default.
 
-    Raises:
-        InputError: for an unknown name or an invalid number.
+    Raises InputError: for an unknown name or an invalid number.
     """
     default = PlanOptions()
     for name in ranges:

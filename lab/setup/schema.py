@@ -190,8 +190,7 @@ def _plain(value: Any) -> Any:
 def write(names: list[str], out: Path) -> list[Path]:
     """Write NAME.schema.json for each name into a folder, which is made if needed.
 
-    Raises:
-        InputError: the folder cannot be made, or a file cannot be written.
+    Raises InputError: the folder cannot be made, or a file cannot be written.
     """
     made_folder(out)
     paths = [out / f"{name}.schema.json" for name in names]

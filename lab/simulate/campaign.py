@@ -28,8 +28,7 @@ from lab.errors import InputError
 from lab.files.project.point_files import POINTS, POSE_SIGMAS, SURVEY, SURVEY_SIGMAS
 from lab.files.project.project import SCHEMA
 from lab.files.rig.board_file import save_board
-from lab.files.rig.calibration_state import CameraCalibration
-from lab.files.rig.camera_file import CameraFile, save_camera
+from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
 from lab.files.rig.pose_block import pose_mapping
 from lab.files.rig.rig_file import RigFile, as_mapping, load_rig, save_rig
 from lab.files.text import columns
@@ -38,7 +37,7 @@ from lab.files.text.csv_text import write_table
 from lab.files.text.error_text import suggest_name
 from lab.files.text.yaml_text import write_mapping
 from lab.simulate.board_photo import PhotoSettings, photograph
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 
 # A simulated calibration campaign: the true rig, and the measurements of it that a laboratory makes.
 
@@ -113,10 +112,7 @@ class Campaign:
 def draw_campaign(seed: int, rig: str | Rig = "fan", quality: CampaignQuality | None = None) -> Campaign:
     """The truth and the measurements of one campaign, from a seed.
 
-    rig: a name of RIGS, or a rig.
-
-    Raises:
-        InputError: no rig has this name.
+    rig: a name of RIGS, or a rig. Raises InputError: no rig has this name.
     """
     q = CampaignQuality() if quality is None else quality
     if isinstance(rig, str) and rig not in RIGS:
@@ -319,10 +315,8 @@ def simulate_calibration(
 
     rig: a name of RIGS, or the path of a rig.yaml with the designed rig. positions: of the stand. wrong: share of
     outliers among the pixels of control points and spots. photos: also board photographs of each camera, for `beampose
-    calibrate camera`. quality: sigmas of mounting and measurement.
-
-    Raises:
-        InputError: an argument is not valid, the rig file cannot be read, or the folder exists.
+    calibrate camera`. quality: sigmas of mounting and measurement. Raises InputError: an argument is not valid, the rig
+    file cannot be read, or the folder exists.
     """
     if not 0 <= wrong < 0.3:
         raise InputError(f"wrong: expected a share from 0 up to 0.3, got {wrong:g}")
@@ -340,8 +334,7 @@ def simulate_calibration(
 def _designed(rig: str) -> Rig:
     """The rig of a rig.yaml; a word that names no file and no rig is taken for a misspelt name.
 
-    Raises:
-        InputError: there is no such rig or file, or the file is wrong.
+    Raises InputError: there is no such rig or file, or the file is wrong.
     """
     if not Path(rig).exists():
         raise InputError(f"rig: expected a rig.yaml or a rig's name, got {rig!r}{suggest_name(rig, RIGS)}")

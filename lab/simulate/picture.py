@@ -41,8 +41,7 @@ class Sensor:
 def make_sensor(scene: Scene, camera: int) -> Sensor:
     """Reflectivity, gradient, reflections and hot pixels of one camera, drawn from the seed of the scene.
 
-    Raises:
-        ValueError: the camera has no sensor noise.
+    Raises ValueError: the camera has no sensor noise.
     """
     light = scene.scenario.light
     name = scene.model.camera_names[camera]

@@ -187,10 +187,8 @@ def simulate_points(
 
     noise_px: 1 sigma per axis, also of clutter. clutter: probability of a false point near each spot in the picture
     (default: that of the scenario). The motion depends on scenario and seed only; the clutter of a lower probability is
-    a subset of that of a higher one. picture_scale, rig: as in `compose`.
-
-    Raises:
-        InputError: an unknown scenario, or an argument out of range.
+    a subset of that of a higher one. picture_scale, rig: as in `compose`. Raises InputError: an unknown scenario, or an
+    argument out of range.
     """
     return points_of(compose(scenario_with(scenario, clutter=clutter), seed, frames, picture_scale, rig), noise_px)
 

@@ -17,8 +17,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from lab.errors import InputError
-from lab.simulate.rigs import RIGS, scaled, with_noise
-from lab.simulate.scenarios import SCENARIOS, AnyMotion, Scenario
+from lab.simulate.scenarios import RIGS, SCENARIOS, AnyMotion, Scenario, scaled, with_noise
 
 # Every random number comes from a generator seeded by (seed, purpose, frame, ...): frame 7 is the same in a recording
 # of ten frames and of a thousand, and the clutter does not depend on the noise.
@@ -65,11 +64,7 @@ class Scene:
 
 
 def scenario_named(scenario: str | Scenario) -> Scenario:
-    """The scenario of this name.
-
-    Raises:
-        InputError: no scenario has this name.
-    """
+    """The scenario of this name. Raises InputError: no scenario has this name."""
     if isinstance(scenario, Scenario):
         return scenario
     if scenario not in SCENARIOS:
@@ -86,10 +81,8 @@ def compose(
 ) -> Scene:
     """One recording of a scenario.
 
-    frames: default: those of the scenario. rig: default: that of the scenario.
-
-    Raises:
-        InputError: an unknown scenario, no frames, or a motion that does not meet the conditions of the scenario.
+    frames: default: those of the scenario. rig: default: that of the scenario. Raises InputError: an unknown scenario,
+    no frames, or a motion that does not meet the conditions of the scenario.
     """
     scenario = scenario_named(scenario)
     count = scenario.frames if frames is None else frames
@@ -150,8 +143,7 @@ def spots_in_view(model: SpotModel, pose: Pose) -> list[str]:
 def draw_motion(scenario: Scenario, model: SpotModel, seed: int) -> AnyMotion:
     """The first draw of phases that meets all conditions of the scenario.
 
-    Raises:
-        InputError: no draw of many meets them.
+    Raises InputError: no draw of many meets them.
     """
     rng = np.random.default_rng([seed, MOTION])
     for _ in range(_MAX_DRAWS):
@@ -263,8 +255,7 @@ def scenario_with(
 ) -> Scenario:
     """The scenario with another clutter probability per spot, rate or exposure.
 
-    Raises:
-        InputError: an unknown scenario, a probability outside 0 to 1, or an exposure longer than a frame.
+    Raises InputError: an unknown scenario, a probability outside 0 to 1, or an exposure longer than a frame.
     """
     scenario = scenario_named(scenario)
     if frame_rate_hz is not None:

@@ -51,8 +51,7 @@ class CircleOptions(TrackOptions):
     def parameters(self) -> CircleParameters:
         """The parameters of the tracker.
 
-        Raises:
-            InputError: the radii do not make a range, or there is no such form or detector.
+        Raises InputError: the radii do not make a range, or there is no such form or detector.
         """
         if self.max_radius_px is not None and self.max_radius_px <= self.min_radius_px:
             raise InputError(

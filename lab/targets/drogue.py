@@ -40,11 +40,7 @@ class DrogueOptions(TrackOptions):
     largest_px: float | None = None  # None: the picture's smaller side
 
     def parameters(self) -> LightParameters:
-        """The parameters of the tracker.
-
-        Raises:
-            InputError: the diameters do not make a range.
-        """
+        """The parameters of the tracker. Raises InputError: the diameters do not make a range."""
         if self.largest_px is not None and self.largest_px <= self.smallest_px:
             raise InputError(
                 f"--max-diameter: expected more than --min-diameter ({self.smallest_px:g} px), got {self.largest_px:g}"

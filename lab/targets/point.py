@@ -81,11 +81,7 @@ class PointOptions(TrackOptions):
 
 
 def hue_named(name: str | None) -> float:
-    """Hue, degrees, of a name or of #rrggbb.
-
-    Raises:
-        InputError: there is no such colour, or it is a grey.
-    """
+    """Hue, degrees, of a name or of #rrggbb. Raises InputError: there is no such colour, or it is a grey."""
     known = f"{', '.join(HUES)}, or #rrggbb such as #d02030"
     if name is None:
         raise InputError(f"--detector {COLOUR}: expected --colour with {known}, got none")

@@ -59,10 +59,7 @@ def every_frame(source: PictureSource, limit: int | None = None, *, colour: bool
     """All frame numbers from the first to the last with their pictures; a gap in the numbers is dropped frames.
 
     limit: of the pictures. colour: as for `pictures`. Pictures of another size than the first are missing: their pixels
-    would not be comparable.
-
-    Raises:
-        InputError: the numbers in the names of the pictures are not those of frames.
+    would not be comparable. Raises InputError: the numbers in the names of the pictures are not those of frames.
     """
     _require_frame_numbers(source, limit)
     return _without_gaps(islice(pictures(source, colour=colour), limit))
@@ -108,11 +105,8 @@ def read_pictures(
 ) -> tuple[Recording, list[Looked], float]:
     """Look at every frame of a recording; with what was seen in each, and the process time of that, s.
 
-    frames: of `every_frame`. look: gets the picture, or None where there is no usable one.
-    smallest_px: least side of the pictures.
-
-    Raises:
-        InputError: no picture could be read, or they are too small.
+    frames: of `every_frame`. look: gets the picture, or None where there is no usable one. smallest_px: least side of
+    the pictures. Raises InputError: no picture could be read, or they are too small.
     """
     numbers: list[int] = []
     looked: list[Looked] = []
@@ -151,10 +145,8 @@ def read_pictures(
 def read_points(path: Path, rate_hz: float | None, camera: str | None) -> tuple[Recording, list[Detections | None]]:
     """The points of one camera in a CSV file with frame,u_px,v_px; None where no row of a frame can be used.
 
-    rate_hz: None: that of the column t_s, where there is one. camera: of a table with several.
-
-    Raises:
-        InputError: the table cannot be used, or has other cameras.
+    rate_hz: None: that of the column t_s, where there is one. camera: of a table with several. Raises InputError: the
+    table cannot be used, or has other cameras.
     """
     file = read_detections(path, named="target")
     names = list(file.cameras)
@@ -181,8 +173,7 @@ def read_points(path: Path, rate_hz: float | None, camera: str | None) -> tuple[
 def _times(path: Path, frames: Ints, rate_hz: float | None) -> tuple[float | None, Array | None]:
     """Frame rate and times (n,) of a table: those of its column t_s, where it has one and no rate is given.
 
-    Raises:
-        InputError: t_s does not rise with the frame.
+    Raises InputError: t_s does not rise with the frame.
     """
     if rate_hz is not None:
         return rate_hz, (frames - frames[0]) / rate_hz

@@ -174,10 +174,8 @@ def track_pictures(
 ) -> Track[F]:
     """The track of a tracker through the pictures of a folder or a video.
 
-    step: the next frame, from its picture or from None where there is no usable one.
-
-    Raises:
-        InputError: no picture could be read, or they are too small.
+    step: the next frame, from its picture or from None where there is no usable one. Raises InputError: no picture
+    could be read, or they are too small.
     """
     inputs = open_inputs([path])
     rate = options.rate_hz or header_rate(inputs)

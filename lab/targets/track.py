@@ -19,13 +19,11 @@ from numpy.typing import NDArray
 from geometry.arrays import Array
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.text.csv_text import write_table
-from lab.findings.finding import ENTRIES, Finding, Level, finding, worst_first
-from lab.findings.outcome import Outcome, Verdict
-from lab.pictures.overlay_video import write_overlay_video
+from lab.findings.finding import ENTRIES, Finding, Level, Outcome, Verdict, finding, worst_first
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import open_inputs
 from lab.progress import Progress
-from lab.report.frames.canvas import Canvas, Pixels
+from lab.report.frames.canvas import Canvas, Pixels, write_overlay_video
 from lab.report.plot.svg import grey_limits, stretched
 from lab.runs.processed import Processed, write_processed
 from lab.targets.page import write_target_page
@@ -42,8 +40,7 @@ _COLOURS = {PoseStatus.MEASURED: (60, 220, 60), PoseStatus.PREDICTED: (30, 160, 
 def write_overlay(target: Target[F], track: Track[F], folder: Path) -> None:
     """Write the video, a picture per frame number; black where there is none.
 
-    Raises:
-        RunError: OpenCV cannot write it.
+    Raises RunError: OpenCV cannot write it.
     """
     rate = float(np.clip(track.recording.rate_hz or DEFAULT_RATE_HZ, *_RATE_RANGE_HZ))
     write_overlay_video(folder, _images(target, track), rate)
@@ -169,11 +166,8 @@ def track_target(
 ) -> Outcome[Track[F]]:
     """Track one target, and write the results into the folder `out`.
 
-    more: additional content of summary.json.
-
-    Raises:
-        InputError: the input or an option cannot be used, or no picture can be read; `out` is then unchanged.
-        RunError: OpenCV cannot write the video.
+    more: additional content of summary.json. Raises InputError: the input or an option cannot be used, or no picture
+    can be read; `out` is then unchanged. Raises RunError: OpenCV cannot write the video.
     """
     return write_processed(out, target.schema, lambda folder: _tracked(target, given, folder, progress), more)
 

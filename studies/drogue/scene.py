@@ -80,8 +80,7 @@ LIGHTS = {"front": FRONT_LIGHT, "side": SIDE_LIGHT, "overcast": OVERCAST}
 class DrogueBackground:
     """What is behind the drogue, from its seed; `offset_px` (du, dv) moves it between the frames of a sequence.
 
-    Raises:
-        ValueError: unknown kind, or no picture with the kind "picture".
+    Raises ValueError: unknown kind, or no picture with the kind "picture".
     """
 
     kind: str = CLOUDS
@@ -119,10 +118,7 @@ class DrogueScene:
     """All that determines a picture, apart from the noise.
 
     The pose is in the world of the camera; a camera with the identity as `camera_from_world` has poses in its own
-    frame.
-
-    Raises:
-        ValueError: a radius that is not positive, markers of another shape, or a camera behind the rim.
+    frame. Raises ValueError: a radius that is not positive, markers of another shape, or a camera behind the rim.
     """
 
     camera: Camera
@@ -196,10 +192,8 @@ def rim_points_px(scene: DrogueScene) -> Array:
 def ellipse_through(points_px: Array) -> Ellipse:
     """The ellipse through points (n, 2): least squares of the conic's equation, scaled about their mean.
 
-    Exact for the image of a circle by a camera without distortion.
-
-    Raises:
-        ValueError: fewer than five points, or the conic is no ellipse.
+    Exact for the image of a circle by a camera without distortion. Raises ValueError: fewer than five points, or the
+    conic is no ellipse.
     """
     points = np.asarray(points_px, dtype=float)
     points = points[np.isfinite(points).all(axis=1)]

@@ -30,9 +30,7 @@ NETWORKS = (SMALL, PAPER)
 def make_network(name: str) -> Any:
     """A torch.nn.Module: grey pictures (n, 1, h, w) of 0 to 1 -> (n, 4, h / STRIDE, w / STRIDE).
 
-    Raises:
-        ImportError: torch is not installed.
-        ValueError: there is no network of that name.
+    Raises ImportError: torch is not installed; ValueError: there is no network of that name.
     """
     if name == SMALL:
         return _small()

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from calibration.open3d_loader import MissingOpen3DError, _explained, open3d
+from calibration.screens.clouds import MissingOpen3DError, _explained, open3d
 from tests.open3d_marker import needs_open3d
 from tests.paths import ROOT
 
@@ -15,7 +15,7 @@ from tests.paths import ROOT
 @needs_open3d
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Open3D for Linux needs libusb")
 def test_the_packaged_libusb_is_loaded_and_not_the_systems():
-    code = "from calibration.open3d_loader import open3d; open3d(); print(open('/proc/self/maps').read())"
+    code = "from calibration.screens.clouds import open3d; open3d(); print(open('/proc/self/maps').read())"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
     loaded = {line.split()[-1] for line in out.splitlines() if "libusb" in line}
     assert len(loaded) == 1

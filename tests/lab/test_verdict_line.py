@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lab.findings.finding import Finding, Level, first_sentence
-from lab.findings.outcome import Verdict
+from lab.findings.finding import Finding, Level, Verdict, first_sentence
 
 LONG = "Spot 3 was found in 12.5 % of the frames. It stood beside an edge, e.g. of a frame. `beampose show` draws it"
 

@@ -31,7 +31,7 @@ from bench.random_scenes.__main__ import main
 from bench.random_scenes.write_folder import write_run_folder
 from lab.files.run.run_file import load_run
 from lab.pictures.picture_file import MissingPicture
-from lab.runs.frames.clocked_frames import open_frames
+from lab.runs.frames.frames import open_frames
 from lab.runs.process import process_run
 from tracking.noise import NoiseModel
 

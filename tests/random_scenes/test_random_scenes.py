@@ -27,7 +27,7 @@ from geometry.pose_solver.gauss_newton import fit_pose
 from lab.files.run.run_file import load_run
 from lab.files.run.truth import load_run_truth
 from lab.pictures.picture_file import MissingPicture
-from lab.runs.frames.clocked_frames import open_frames
+from lab.runs.frames.frames import open_frames
 from tracking.detections import Detections
 
 FRAMES = 40

@@ -17,11 +17,7 @@ from geometry.uncertainty.rig_uncertainty import DISTORTION, PINHOLE, POSE, RigC
 
 @dataclass(frozen=True, slots=True)
 class SegmentationParameters:
-    """From a picture to marker candidates: Zhou (2020), section 2.
-
-    Raises:
-        ValueError: a value is out of its range.
-    """
+    """From a picture to marker candidates: Zhou (2020), section 2. Raises ValueError: a value is out of its range."""
 
     gamma: float = 0.8  # of the left picture; the paper's value, below 1: brightens low levels
     specify_histogram: bool = True  # right picture to the histogram of the left one
@@ -54,8 +50,7 @@ class SegmentationParameters:
 class MatchParameters:
     """From candidates in two pictures to labelled markers and a pose. Source: ours.
 
-    Raises:
-        ValueError: a value is out of its range.
+    Raises ValueError: a value is out of its range.
     """
 
     epipolar_sigmas: float = 5.0  # largest epipolar distance of two images of one marker
@@ -171,10 +166,8 @@ class CameraNumbers:
 class StereoPair:
     """Two calibrated cameras; the pictures of the first are the reference of the histogram specification.
 
-    covariance: of the errors of the calibration, names as in geometry/uncertainty/rig_uncertainty.py.
-
-    Raises:
-        ValueError: the cameras are at the same place, or a covariance names another camera.
+    covariance: of the errors of the calibration, names as in geometry/uncertainty/rig_uncertainty.py. Raises
+    ValueError: the cameras are at the same place, or a covariance names another camera.
     """
 
     cameras: tuple[Camera, Camera]

@@ -34,11 +34,7 @@ _CONTOUR_SIGMA = 0.29  # of the place of an edge that is rounded to whole pixels
 
 @dataclass(frozen=True, slots=True)
 class ColourRange:
-    """A colour in HSV.
-
-    Raises:
-        ValueError: a range is empty or beyond its scale.
-    """
+    """A colour in HSV. Raises ValueError: a range is empty or beyond its scale."""
 
     name: str
     hue_deg: tuple[float, float]  # 0 to 360; from the first to the second, through 0 if the first is larger

@@ -192,10 +192,8 @@ def allan_deviation(readings: Array, step_s: float) -> AllanDeviation:
 
     sigma^2(tau) = < (next average - average)^2 > / 2. Limits: chi-square with the degrees of freedom of the noise that
     the local slope indicates. Source: Riley, Handbook of Frequency Stability Analysis, NIST SP 1065 (2008), section 5.2
-    and table 5 (readings take the place of the frequency data).
-
-    Raises:
-        ValueError: fewer than LEAST_READINGS readings, or one that is not finite.
+    and table 5 (readings take the place of the frequency data). Raises ValueError: fewer than LEAST_READINGS readings,
+    or one that is not finite.
     """
     readings = np.asarray(readings, dtype=float)
     n = len(readings)

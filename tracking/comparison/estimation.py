@@ -256,10 +256,8 @@ def estimate_alignment(
     """The alignment of a reference to a result.
 
     free: what may be estimated (default: everything that both motions have). offset_s: the approximate time offset;
-    None: candidates from the correlation of the speeds, and zero.
-
-    Raises:
-        NotComparableError: fewer than LEAST_FRAMES common times.
+    None: candidates from the correlation of the speeds, and zero. Raises NotComparableError: fewer than LEAST_FRAMES
+    common times.
     """
     free = free or Free()
     mask = free.mask(result, reference)

@@ -81,10 +81,8 @@ class SpotTracker:
         """Process one frame.
 
         dt_s: time since the previous frame (0 for the first); found: detections per camera, None without a picture.
-
-        Raises:
-            ValueError: if dt_s is not positive and finite (0 is allowed for the first frame), or if `found` does not
-                have one entry per camera.
+        Raises ValueError: if dt_s is not positive and finite (0 is allowed for the first frame), or if `found` does not
+        have one entry per camera.
         """
         check_step(dt_s, found, self.model.camera_names, not self._started)
         self._started = True

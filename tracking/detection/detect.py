@@ -43,12 +43,10 @@ def find_spots(
     Without a noise model the noise of the background is estimated from the picture (0.3 ms more). For a run it is
     better to estimate it once from several pictures (noise_estimation.photon_transfer.estimate_noise).
 
-    regions (n, 3), px: boxes u, v, half size; only spots in one of them are searched and returned. The light of
-    others is subtracted as in the whole picture if they are nearer to the box than its half size, or than 16 px; that
-    of others farther away is not. Boxes with nan or a negative size are empty.
-
-    Raises:
-        ValueError: if the picture or the regions have another shape or type.
+    regions (n, 3), px: boxes u, v, half size; only spots in one of them are searched and returned. The light of others
+    is subtracted as in the whole picture if they are nearer to the box than its half size, or than 16 px; that of
+    others farther away is not. Boxes with nan or a negative size are empty. Raises ValueError: if the picture or the
+    regions have another shape or type.
     """
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"picture: expected grey (h, w) of uint8 or uint16, got shape {image.shape} of {image.dtype}")

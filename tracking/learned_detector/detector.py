@@ -117,11 +117,9 @@ def find_drogues(
     """Drogues of a picture (h, w), the most confident first.
 
     smallest_px, largest_px: range of the diameters; None: up to the picture's smaller side. 16-bit pictures are scaled
-    by their largest value. weights: of another network of studies/learned_detector/train.py, whose confidence
-    is an order and no probability; None: those of the package.
-
-    Raises:
-        ValueError: the picture is not grey, or the file of the weights is damaged.
+    by their largest value. weights: of another network of studies/learned_detector/train.py, whose confidence is an
+    order and no probability; None: those of the package. Raises ValueError: the picture is not grey, or the file of the
+    weights is damaged.
     """
     weights = weights or WEIGHTS
     rows, levels = first_candidates(picture, smallest_px, largest_px, weights)

@@ -151,10 +151,8 @@ class RigidTracker:
     def step(self, dt_s: float, found: Sequence[Detections | None]) -> TrackedFrame:
         """Track one frame. dt_s: time since the frame before (0 for the first); found: per camera, None: no picture.
 
-        Invalid detections (tracking/input_validation.py) are dropped.
-
-        Raises:
-            ValueError: The step is not forward in time, or cameras or array shapes do not fit.
+        Invalid detections (tracking/input_validation.py) are dropped. Raises ValueError: The step is not forward in
+        time, or cameras or array shapes do not fit.
         """
         check_step(dt_s, found, self.model.camera_names, not self._begun)
         usable = UsablePoints.of(found)

@@ -204,8 +204,7 @@ def share_of_hue(picture: NDArray[np.uint8], hue_deg: float) -> NDArray[np.float
 def find_coloured(picture: NDArray[np.uint8], hue_deg: float, parameters: BlobParameters) -> Detections:
     """The blobs of a hue in a picture (h, w, 3), BGR, strongest first; flux and peak are chroma, DN.
 
-    Raises:
-        ValueError: the picture has no three channels of 8 bits.
+    Raises ValueError: the picture has no three channels of 8 bits.
     """
     if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
         raise ValueError(f"picture: expected (h, w, 3) of 8 bits, got {picture.shape} of {picture.dtype}")

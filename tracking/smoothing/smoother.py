@@ -10,7 +10,7 @@
 5. Add labels by continuity where the pose is uncertain (labels/continuity.py), and those of a camera that was knocked
    (labels/neighbouring_frames.py).
 
-lab/runs/verdict/frame_checks.py tests the result once more, against the spots and the causal pose. Source: ours.
+lab/runs/verdict/run_statistics.py tests the result once more, against the spots and the causal pose. Source: ours.
 """
 
 from __future__ import annotations
@@ -223,10 +223,8 @@ CONTRADICTION_CHI2, CONTRADICTION_NEXT_TO_JUMP_CHI2 = 60.0, 5.0
 def smooth(recording: TrackedRecording) -> Smoothed:
     """Labels and motion of a run, given all of its frames.
 
-    With `method: spots` the labels stay as that tracker gave them. Without any measured pose nothing is known.
-
-    Raises:
-        FloatingPointError: The first estimate of the motion is not finite.
+    With `method: spots` the labels stay as that tracker gave them. Without any measured pose nothing is known. Raises
+    FloatingPointError: The first estimate of the motion is not finite.
     """
     rec, parameters = recording, recording.parameters
     smoother = _Smoother(rec)

@@ -131,10 +131,7 @@ def adjust(
 
     lens_free (18,): which lens parameters are free; None: those of the model. Coefficients that the model does not have
     are set to 0; fixed shape parameters keep their values. The radius of circles is free together with the lens, with a
-    prior from their areas.
-
-    Raises:
-        AdjustmentError: the adjustment is singular or does not converge.
+    prior from their areas. Raises AdjustmentError: the adjustment is singular or does not converge.
     """
     values = {**values, "intrinsics": Vectors(model.cut(lens_of(values))[None])}
     in_use = table.counts(used) > 0

@@ -98,10 +98,8 @@ def fit(
     """Plain least squares over the used corners (N,).
 
     The sigma of a corner is estimated from the start values. It only sets the size of the last step: a model that
-    misses by pixels need not converge to a thousandth of a pixel.
-
-    Raises:
-        AdjustmentError: the adjustment is singular or does not converge.
+    misses by pixels need not converge to a thousandth of a pixel. Raises AdjustmentError: the adjustment is singular or
+    does not converge.
     """
     values, _ = with_circle_radius(table, used, model, values)
     scale = _spread((_residuals(table, used, model, values) / table.noise[:, None])[used])
@@ -118,10 +116,8 @@ def robust_fit(
 ) -> LensFit:
     """The fit without outliers: these are detected under a Cauchy loss and then excluded.
 
-    values must hold a pose for each view; a view whose pose is nan is excluded.
-
-    Raises:
-        AdjustmentError: too few corners remain, or they do not determine the parameters.
+    values must hold a pose for each view; a view whose pose is nan is excluded. Raises AdjustmentError: too few corners
+    remain, or they do not determine the parameters.
     """
     dropped = _without_pose(table, values)
     candidates = ~np.isin(table.view, list(dropped))

@@ -71,11 +71,7 @@ LENS_MODELS = (
 
 
 def named(title: str) -> LensModel:
-    """The model with this title.
-
-    Raises:
-        ValueError: no model has it; the message lists the titles.
-    """
+    """The model with this title. Raises ValueError: no model has it; the message lists the titles."""
     for model in LENS_MODELS:
         if model.title == title:
             return model

@@ -35,8 +35,7 @@ class StartError(ValueError):
 def start(table: CornerTable, fisheye: bool) -> tuple[LensModel, Values]:
     """The best start of a kind of lens, with a pose for every view (nan where none explains its corners).
 
-    Raises:
-        StartError: no start can be found, or the board is mirrored.
+    Raises StartError: no start can be found, or the board is mirrored.
     """
     model = LensModel(4, FISHEYE) if fisheye else LensModel(5)
     trial = table.only_views(_spread_out(table))

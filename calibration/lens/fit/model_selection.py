@@ -86,10 +86,7 @@ def select_model(
     """Fit every model (or `only` one) to the same corners (N,), and choose.
 
     rich: fits of rich models, from which the others start; shape: start values of the board's shape. Each candidate
-    also starts from the next smaller one of its kind.
-
-    Raises:
-        AdjustmentError: no model can be used.
+    also starts from the next smaller one of its kind. Raises AdjustmentError: no model can be used.
     """
     judged: list[_Judged] = []
     below: LensFit | None = None
@@ -142,9 +139,7 @@ def _choose(judged: Sequence[_Judged]) -> ModelSelection:
 
     Of several with about the same error: of the more probable kind of lens, perspective or fisheye, the first. If all
     leave directions unknown, the one with the smallest error where corners were seen is chosen: findings report it.
-
-    Raises:
-        AdjustmentError: no candidate can be used.
+    Raises AdjustmentError: no candidate can be used.
     """
     solved = [j for j in judged if j.map is not None]
     if not solved:
@@ -290,10 +285,8 @@ def inliers_of_rich_models(
     """Corners (N,) that are inliers of any rich model, and the robust fits of these models, best first.
 
     A model too small for the lens would reject the corners at the edge of the picture, which distinguish the models.
-    The rational model is therefore fitted as well, if the plain ones leave systematic residuals.
-
-    Raises:
-        AdjustmentError: no model can be fitted.
+    The rational model is therefore fitted as well, if the plain ones leave systematic residuals. Raises
+    AdjustmentError: no model can be fitted.
     """
     fits: list[LensFit] = []
     reasons: list[str] = []

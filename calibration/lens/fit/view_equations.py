@@ -59,8 +59,7 @@ class ViewEquations:
     def of(table: CornerTable, found: LensFit, board: BoardFreedom | None = None) -> ViewEquations:
         """At a solution; board: shape parameters among the unknowns, None: those that were free.
 
-        Raises:
-            AdjustmentError: the views do not determine the unknowns.
+        Raises AdjustmentError: the views do not determine the unknowns.
         """
         board = found.board if board is None else board
         model, views = found.model, used_views(found, table)
@@ -79,10 +78,8 @@ class ViewEquations:
     ) -> ViewEquations:
         """From derivatives by the shared unknowns (N, 2, q) and by the pose of each view's board (N, 2, 6).
 
-        residuals (N, 2), in sigmas; view (N,): of each corner; known (n, q): rows of priors; lens: p.
-
-        Raises:
-            AdjustmentError: the views do not determine the unknowns.
+        residuals (N, 2), in sigmas; view (N,): of each corner; known (n, q): rows of priors; lens: p. Raises
+        AdjustmentError: the views do not determine the unknowns.
         """
         rows, misses = [], []
         for v in views:
@@ -113,10 +110,8 @@ class ViewEquations:
     def solution(self, which: Bools | None = None) -> tuple[Array, Array]:
         """Change (q,) of the unknowns against all views, and covariance (q, q), from some of the views (V,); None: all.
 
-        The prior, which is weak, counts for each set in full.
-
-        Raises:
-            AdjustmentError: they do not determine the unknowns.
+        The prior, which is weak, counts for each set in full. Raises AdjustmentError: they do not determine the
+        unknowns.
         """
         every = np.eye(len(self.basis))
         left = np.ones(len(self.views), dtype=bool) if which is None else which

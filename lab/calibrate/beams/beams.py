@@ -13,24 +13,25 @@ from calibration.beams.beams import BeamCalibration, self_calibrate
 from calibration.beams.beams import calibrate_beams as solve_beams
 from calibration.least_squares.adjustment import AdjustmentError
 from geometry.uncertainty.rig_uncertainty import RigCovariance
-from lab.calibrate.beams.beam_findings import (
+from lab.calibrate.beams.beams_page import (
     ARCSEC,
+    BEAMS,
     BeamGoals,
     beam_findings,
     check_no_duplicates,
     diagnose_failed_fit,
+    page_of,
     stand_findings,
+    write_tables,
 )
-from lab.calibrate.beams.beams_page import BEAMS, page_of, write_tables
 from lab.calibrate.beams.recordings import read_recordings, stand_of
 from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expiry_findings, run_step, state_of
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project, load_project
-from lab.files.rig.calibration_state import CalibrationState
+from lab.files.rig.camera_file import CalibrationState
 from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance, load_lab_file, save_rig
 from lab.files.text.error_text import suggest_name
-from lab.findings.finding import Finding, Level, finding, passed, verdict
-from lab.findings.outcome import Outcome
+from lab.findings.finding import Finding, Level, Outcome, finding, passed, verdict
 
 RIG = "rig.yaml"
 
@@ -44,12 +45,8 @@ def calibrate_beams(
     """Calibrate the beams of a project; write three tables, report.html and, unless the verdict is FAIL, rig.yaml.
 
     rig: the rig.yaml or screens.yaml with the calibrated cameras and screens and their covariances (None: `rig.yaml`
-    beside the project). The project need not repeat cameras, screens and target; if it has a target, this replaces
-    the rig's.
-
-    Raises:
-        InputError: for errors in the files.
-        CalibrationError: if the spots do not determine a calibration.
+    beside the project). The project need not repeat cameras, screens and target; if it has a target, this replaces the
+    rig's. Raises InputError: for errors in the files; CalibrationError: if the spots do not determine a calibration.
     """
     return run_step(_STEP, out, lambda: _solve(Path(project_path), rig, today))
 

@@ -22,8 +22,7 @@ from lab.files.project.point_files import StandPoses, read_poses
 from lab.files.project.project import Project, ProjectRecording
 from lab.files.run.clocks import ESTIMATE
 from lab.files.run.run_file import Run, load_run
-from lab.files.text.csv_table import Table
-from lab.files.text.csv_text import SIGMA_RANGE_PX, check_pixels, check_sigmas, read_table
+from lab.files.text.csv_text import SIGMA_RANGE_PX, Table, check_pixels, check_sigmas, read_table
 from lab.files.text.error_text import printable_line, suggest_name
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from tracking.detections import Detections
@@ -110,11 +109,9 @@ def spots_of_run(folder: Path, rig: Rig, known: StandPoses | None, world_from_st
     """Labelled spots of all frames of a run.
 
     rig: calibrated cameras and screens with nominal beams, used in place of the rig in run.yaml. If the stand's place
-    and its poses are known, each detection gets the label of the nearest spot predicted by the nominal beams.
-    Otherwise the tracker labels the detections, starting from the run's own prior. Frames without a pose are skipped.
-
-    Raises:
-        InputError: if the run cannot be read or has a camera that is not in `rig`.
+    and its poses are known, each detection gets the label of the nearest spot predicted by the nominal beams. Otherwise
+    the tracker labels the detections, starting from the run's own prior. Frames without a pose are skipped. Raises
+    InputError: if the run cannot be read or has a camera that is not in `rig`.
     """
     run = load_run(folder)
     missing = [c for c in run.cameras if c not in rig.cameras]
@@ -235,8 +232,7 @@ def stand_of(project: Project, recordings: Recordings) -> StandModel:
 def read_recordings(project: Project, rig: Rig) -> Recordings:
     """Read all recordings of a project. rig: calibrated cameras and screens with nominal beams and spots.
 
-    Raises:
-        InputError: with file, line, the expected and the found content.
+    Raises InputError: with file, line, the expected and the found content.
     """
     if not project.recordings:
         raise InputError(
@@ -317,10 +313,8 @@ def _rows(
 def read_spot_table(path: Path, rig: Rig, notes: list[str]) -> SpotRows:
     """Read spots from a table `position,camera,spot,u_px,v_px[,sigma_px]` or from a run's spots.csv.
 
-    Of a spots.csv (column `frame`) only matched spots are used. Assumptions are appended to `notes`.
-
-    Raises:
-        InputError: with file, line, the expected and the found content.
+    Of a spots.csv (column `frame`) only matched spots are used. Assumptions are appended to `notes`. Raises InputError:
+    with file, line, the expected and the found content.
     """
     optional = ("position", "frame", "sigma_px", "sigma_u_px", "sigma_v_px", "cov_uv_px2", "status")
     table = read_table(path, SPOTS, optional)

@@ -22,18 +22,15 @@ from calibration.lens.intrinsics import (
 from calibration.lens.intrinsics_result import Intrinsics
 from geometry.camera import FISHEYE, PERSPECTIVE
 from geometry.uncertainty.rig_uncertainty import RigCovariance
-from lab.calibrate.camera.camera_findings import findings_of, next_photographs
-from lab.calibrate.camera.camera_page import page_of
+from lab.calibrate.camera.camera_page import findings_of, next_photographs, page_of
 from lab.calibrate.camera.photos import TABLE_SUFFIXES, PhotoSet, find_in_photos, origins_of, read_corner_table
 from lab.calibrate.step import Solved, Step, run_step
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.board_file import load_board_or_text
-from lab.files.rig.calibration_state import CameraCalibration
-from lab.files.rig.camera_file import CameraFile, save_camera
+from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
 from lab.files.text.csv_text import write_table
 from lab.files.text.error_text import suggest_name
-from lab.findings.finding import Finding, Level, verdict
-from lab.findings.outcome import Outcome
+from lab.findings.finding import Finding, Level, Outcome, verdict
 from lab.number_format import format_number
 from lab.progress import Progress
 
@@ -89,11 +86,8 @@ def calibrate_camera(
     photos may also be one table of corners, see `corner_tables`, with the size of its pictures in the options.
 
     Writes camera.yaml, corners.csv and report.html. If the verdict is FAIL, the camera file is called
-    camera.failed.yaml so that no program reads it by mistake.
-
-    Raises:
-        InputError: for pictures or a board that cannot be used.
-        CalibrationError: if the photographs do not determine the camera.
+    camera.failed.yaml so that no program reads it by mistake. Raises InputError: for pictures or a board that cannot be
+    used; CalibrationError: if the photographs do not determine the camera.
     """
     return run_step(_STEP, out, lambda: _solve(list(photos), board, options or CameraOptions(), today, progress))
 

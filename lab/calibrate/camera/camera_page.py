@@ -1,21 +1,32 @@
-"""Report of a camera calibration."""
+"""Findings of a camera's calibration, each test with its figures, and its report."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.lens.fit.lens_models import LensModel
+from calibration.lens.fit.lens_models import folds_in_picture
+from calibration.lens.fit.model_selection import OVERFIT, UNKNOWN_PX
+from calibration.lens.fit.projection_map import Difference
 from calibration.lens.intrinsics_result import Intrinsics
 from geometry.arrays import Array
-from lab.calibrate.camera.camera_findings import board_and_model_texts
 from lab.calibrate.camera.photos import VIDEO_SUFFIXES, PhotoSet, as_8_bit
-from lab.number_format import format_number
+from lab.findings.finding import Finding, Level, finding, level_above, passed
+from lab.number_format import format_count, format_number
 from lab.pictures.opencv import opened
 from lab.pictures.picture_file import MissingPicture, read_picture
-from lab.report.calibration.calibration_charts import correlation_matrix, lens_model_chart, residual_histogram
-from lab.report.calibration.calibration_drawings import corners_overlay, coverage_map, residual_field, tilt_polar
+from lab.report.calibration.calibration_drawings import (
+    corners_overlay,
+    correlation_matrix,
+    coverage_map,
+    lens_model_chart,
+    residual_field,
+    residual_histogram,
+    tilt_polar,
+)
 from lab.report.page import (
     KeyFigure,
     PageDrawing,
@@ -23,6 +34,325 @@ from lab.report.page import (
     Section,
 )
 from lab.report.plot.maps import heat_map
+
+_ENOUGH_VIEWS, _FEWEST_MORE = 15, 5  # photographs in all, and at least to add
+_SLIGHT_MODEL_ERROR = 1.02  # factor on the sigmas from rival models below which it is not worth a remark
+_UNDETERMINED = 0.002  # relative, of the difference in scale and of fx / fy: above it the two cannot be distinguished
+
+
+@dataclass(frozen=True, slots=True)
+class FindingLimits:
+    """Thresholds of the findings; pairs are (warning, failure)."""
+
+    noise_px: tuple[float, float] = (0.35, 1.0)  # of a corner; sharp photographs of flat boards give 0.03 to 0.25
+    rejected: tuple[float, float] = (0.05, 0.3)  # share of the corners
+    spread_deg: tuple[float, float] = (25.0, 8.0)  # largest angle between two boards
+    filled: tuple[float, float] = (0.6, 0.25)  # share of the picture within some board
+    aspect: tuple[float, float] = (0.005, 0.03)  # |fx/fy - 1|: pixels of today's sensors are square to 0.1 %
+    off_centre: tuple[float, float] = (0.08, 0.2)  # principal point from the middle, share of the width or height
+    focal: tuple[float, float] = (0.003, 0.02)  # relative sigma of the focal length
+    overfit: tuple[float, float] = (1.5, OVERFIT)  # hold-out error over the noise
+    views: int = 8
+    p_value: float = 0.01  # of the halves' difference
+    scatter_p_value: float = 0.05  # of the scatter between photographs
+    origins_p_value: float = 0.02  # of the difference between photographs that the user names differently
+    halves_px: float = 1.0  # a significant difference larger than this fails
+    map_px: tuple[float, float] = (0.5, UNKNOWN_PX)  # projection uncertainty, 90 % quantile over the picture
+    warp_m: float = 0.002  # a larger bend is not described by a quadratic surface
+    model_factor: float = 2.0  # factor on the sigmas from rival models and correlated residuals
+    board_px: float = 0.1  # change of directions by an unsolved deviation of the board
+    stretch: float = 0.001  # relative scale difference of rows and columns: printers reach .1 %
+    circle: float = 0.03  # relative difference from the stated diameter
+
+
+LIMITS = FindingLimits()
+
+
+def findings_of(c: Intrinsics, limits: FindingLimits = LIMITS) -> tuple[Finding, ...]:
+    """All tests, in the order of the report."""
+    found = [
+        _lens(c),
+        _noise(c, limits),
+        _rejected(c, limits),
+        _views_finding(c, limits),
+        _tilts(c, limits),
+        _coverage_finding(c, limits),
+        _focal(c, limits),
+        _aspect(c, limits),
+        _principal_point(c, limits),
+        _overfit(c, limits),
+        _halves(c, limits),
+        _origins(c, limits),
+        _scatter(c, limits),
+        _map(c, limits),
+        _model_uncertainty(c, limits),
+        _warp(c, limits),
+        _stretch(c, limits),
+        _points(c),
+        _circles(c, limits),
+    ]
+    return tuple(f for f in found if f is not None)
+
+
+def board_and_model_texts(c: Intrinsics) -> list[str]:
+    """What the findings say about the board and about the choice of lens model."""
+    found = (_stretch(c, LIMITS), _points(c), _circles(c, LIMITS), _model_uncertainty(c, LIMITS))
+    return [f.what for f in found if f is not None]
+
+
+def next_photographs(c: Intrinsics) -> str:
+    """What to photograph next, in one sentence, from what the photographs lack."""
+    count = int(np.sum(c.table.counts(c.fit.used) > 0))
+    wanted = max(_ENOUGH_VIEWS - count, _FEWEST_MORE)
+    places = _listed(c.coverage.gaps)
+    where = f"near the {places} of the picture" if places else "in every part of the picture up to its corners"
+    tilt = "tilted by 20 to 45 deg to all sides"
+    if c.coverage.spread_deg < LIMITS.spread_deg[0]:
+        tilt += f" (so far {c.coverage.spread_deg:.0f} deg between any two)"
+    turned = (
+        ", half of them turned by 90 deg in its plane"
+        if level_above(abs(c.fit.lens[0] / c.fit.lens[1] - 1), *LIMITS.aspect)
+        else ""
+    )
+    sharp = ", sharp, on a stiff flat plate" if level_above(c.fit.sigma_px, *LIMITS.noise_px) else ""
+    return f"Photograph next: {wanted} more, the board {where}, {tilt}{turned}{sharp}."
+
+
+def _level_below(value: float, limits: tuple[float, float]) -> Level:
+    """The level of a value that should be large."""
+    return level_above(-value, -limits[0], -limits[1])
+
+
+def _two(value: float) -> str:
+    """Two significant digits without an exponent: 0.29, 3.9, 240."""
+    if not np.isfinite(value) or value == 0:
+        return f"{value:g}"
+    digits = 1 - int(np.floor(np.log10(abs(value))))
+    return f"{round(value, digits):.{max(digits, 0)}f}"
+
+
+def _mm(c: Intrinsics, px: float) -> str:
+    """A length in px, and in mm on the screen."""
+    return f"{px:.3g} px ({_two(px * c.map.usual_mm_per_px())} mm at {c.distance_m:.3g} m)"
+
+
+def _listed(words: tuple[str, ...]) -> str:
+    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
+
+
+def _lens(c: Intrinsics) -> Finding:
+    if folds_in_picture(c.fit.lens, c.model.fisheye, c.table.image_size_px):
+        return finding("BP-L10", Level.FAIL, f"{c.model.words}: the mapping folds inside the picture")
+    return passed(f"Lens: {c.model.words}: {c.selection.why}.")
+
+
+def _noise(c: Intrinsics, limits: FindingLimits) -> Finding:
+    what = f"Corner residuals: {_mm(c, c.fit.sigma_px)} per coordinate (1 sigma; RMS {c.rms_px:.3g} px)."
+    return finding("BP-L11", level_above(c.fit.sigma_px, *limits.noise_px), what)
+
+
+def _rejected(c: Intrinsics, limits: FindingLimits) -> Finding:
+    lost = int(np.sum(~c.fit.used))
+    share, dropped = lost / len(c.table), len(c.fit.dropped)
+    what = f"{lost} of {len(c.table)} corners excluded ({share:.1%})"
+    if dropped:
+        what += f", among them {format_count(dropped, 'whole view')}"
+    return finding("BP-L12", level_above(share, *limits.rejected), what + ".")
+
+
+def _views_finding(c: Intrinsics, limits: FindingLimits) -> Finding:
+    count = int(np.sum(c.table.counts(c.fit.used) > 0))
+    level = Level.WARN if count < limits.views else Level.PASS
+    return finding("BP-L13", level, f"{count} photographs used, {int(c.fit.used.sum())} corners.")
+
+
+def _tilts(c: Intrinsics, limits: FindingLimits) -> Finding:
+    what = f"The orientations of the boards differ by up to {c.coverage.spread_deg:.0f} deg."
+    return finding("BP-L14", _level_below(c.coverage.spread_deg, limits.spread_deg), what)
+
+
+def _coverage_finding(c: Intrinsics, limits: FindingLimits) -> Finding:
+    gaps = c.coverage.gaps
+    level = max(_level_below(c.coverage.filled, limits.filled), Level.WARN if gaps else Level.PASS)
+    where = f"; none came near its {_listed(gaps)}" if gaps else ""
+    return finding("BP-L15", level, f"Boards covered {c.coverage.filled:.0%} of the picture{where}.")
+
+
+def _focal(c: Intrinsics, limits: FindingLimits) -> Finding:
+    share = float(c.sigmas[0] / c.fit.lens[0])
+    return finding(
+        "BP-L16",
+        level_above(share, *limits.focal),
+        f"Focal length {c.fit.lens[0]:.2f} ± {_two(c.sigmas[0])} px ({share:.2%}).",
+        why="A pose's distance is uncertain by that share:"
+        f" {_two(1000 * share * c.distance_m)} mm at {c.distance_m:.3g} m.",
+    )
+
+
+def _aspect(c: Intrinsics, limits: FindingLimits) -> Finding:
+    fx, fy = c.fit.lens[:2]
+    away = fx / fy - 1
+    C = c.covariance[:2, :2] / np.outer([fx, fy], [fx, fy])
+    sigma = float(np.sqrt(C[0, 0] + C[1, 1] - 2 * C[0, 1]))
+    level = level_above(abs(away), *limits.aspect)
+    if level is not Level.FAIL and abs(away) < 2 * sigma:
+        level = Level.PASS
+    return finding("BP-L17", level, f"fx / fy = {fx / fy:.4f} ± {sigma:.1g}.")
+
+
+def _principal_point(c: Intrinsics, limits: FindingLimits) -> Finding:
+    size = np.array(c.table.image_size_px)
+    away = c.fit.lens[2:4] - (size - 1) / 2
+    share = float(np.max(np.abs(away) / size))
+    level = level_above(share, *limits.off_centre)
+    what = (
+        f"Principal point {away[0]:+.1f}, {away[1]:+.1f} px from the centre"
+        f" (± {_two(c.sigmas[2])}, {_two(c.sigmas[3])})."
+    )
+    sure = bool(np.any(np.abs(away) > 2 * c.sigmas[2:4] + limits.off_centre[0] * size))
+    return finding("BP-L18", level, what, variant="" if sure else "uncertain")
+
+
+def _overfit(c: Intrinsics, limits: FindingLimits) -> Finding:
+    ratio = c.held_out_rms_px / c.fit.sigma_px
+    what = f"Hold-out error: {_mm(c, c.held_out_rms_px)}, {ratio:.2f} times the corners' own noise."
+    return finding("BP-L19", level_above(ratio, *limits.overfit), what)
+
+
+def _halves(c: Intrinsics, limits: FindingLimits) -> Finding:
+    d = c.halves
+    if d is None:
+        what = "Half of the photographs do not determine the lens, so that two halves cannot be compared."
+        return finding("BP-L20", Level.WARN, what)
+    return finding(
+        "BP-L21",
+        _disagreement(d, limits, limits.p_value),
+        f"Two halves of the photographs differ by {d.rms_px:.3g} px ({_two(d.rms_mm)} mm at {c.distance_m:.3g} m), RMS"
+        f" over the picture; {d.expected_rms_px:.3g} px are expected from their sigmas (p = {d.p_value:.2g}).",
+    )
+
+
+def _disagreement(d: Difference, limits: FindingLimits, p_value: float) -> Level:
+    if d.p_value >= p_value:
+        return Level.PASS
+    return Level.FAIL if d.rms_px > limits.halves_px else Level.WARN
+
+
+def _origins(c: Intrinsics, limits: FindingLimits) -> Finding | None:
+    if c.origins is None:
+        return None
+    d, (first, second) = c.origins.difference, c.origins.names
+    return finding(
+        "BP-L22",
+        _disagreement(d, limits, limits.origins_p_value),
+        f"The photographs {first!r} and {second!r} give lenses that differ by {d.rms_px:.3g} px, RMS over the picture;"
+        f" {d.expected_rms_px:.3g} px are expected from their sigmas (p = {d.p_value:.2g}).",
+    )
+
+
+def _scatter(c: Intrinsics, limits: FindingLimits) -> Finding:
+    what = (
+        f"The lens parameters scatter from photograph to photograph by {c.scatter.factor:.2f} times what the corners'"
+        " noise explains"
+    )
+    if c.correlated_noise == 1:
+        return passed(f"{what} (p = {c.scatter.p_value:.2g}).")
+    what += f" (p = {c.scatter.p_value:.1g}); the sigmas include it."
+    if c.scatter.p_value >= limits.scatter_p_value:
+        return passed(what)
+    return finding("BP-L23", Level.WARN, what)
+
+
+def _map(c: Intrinsics, limits: FindingLimits) -> Finding:
+    px, mm = c.map.sigma_px(c.covariance), c.map.sigma_mm(c.covariance)
+    (half, most, worst), (half_mm, most_mm, worst_mm) = (np.nanquantile(m, [0.5, 0.9, 1.0]) for m in (px, mm))
+    return finding(
+        "BP-L24",
+        level_above(float(most), *limits.map_px),
+        f"The direction of a pixel is known to {_two(half)} px ({_two(half_mm)} mm at {c.distance_m:.3g} m) or better"
+        f" in half of the picture, to {_two(most)} px ({_two(most_mm)} mm) in 90 %, and to {_two(worst)} px"
+        f" ({_two(worst_mm)} mm) at the worst place (1 sigma).",
+    )
+
+
+def _model_uncertainty(c: Intrinsics, limits: FindingLimits) -> Finding | None:
+    """Model error beyond the covariance of the parameters; None if there is no evidence of it."""
+    d = c.model_uncertainty
+    if d.factor < _SLIGHT_MODEL_ERROR:
+        return None
+    parts = []
+    if d.left_px > 0:
+        parts.append(f"correlated residuals over the picture of {d.left_px:.2g} px (p = {d.p_value:.1g})")
+    if d.between_px > 0:
+        parts.append(f"{d.between_px:.2g} px to the other models, by their probabilities")
+    what = f"Uncertainty of the lens model: {' and '.join(parts)}; all sigmas have been multiplied by {d.factor:.2f}."
+    return finding("BP-L01", Level.WARN if d.factor > limits.model_factor or d.left_px > 0 else Level.PASS, what)
+
+
+def _warp(c: Intrinsics, limits: FindingLimits) -> Finding | None:
+    w = c.warp
+    if w is None:
+        return None
+    what = f"The board is bent by {1000 * w.rise_m:.2f} mm (p = {w.p_value:.1g} for a flat board): {w.why}"
+    if not w.corrected:
+        change = f" Solving for it would change directions by {_two(w.change_px)} px RMS." if w.change_px else ""
+        return passed(f"{what}; taken as flat.{change}")
+    return finding("BP-L25", Level.WARN if w.rise_m > limits.warp_m else Level.PASS, f"{what}; corrected.")
+
+
+def _stretch(c: Intrinsics, limits: FindingLimits) -> Finding | None:
+    """Whether the board's rows and columns are to scale; None if the photographs do not determine it."""
+    s = None if c.board is None else c.board.stretch
+    if s is None:
+        return None
+    what = (
+        f"The board's rows are {100 * s.stretch:+.3f} ± {100 * s.sigma[0]:.1g} % longer than stated, if its columns"
+        f" are right, and deviate from the right angle by"
+        f" {np.degrees(s.lean_rad):+.3f} ± {np.degrees(s.sigma[1]):.1g} deg"
+        f" (p = {s.p_value:.1g}): {s.why}"
+    )
+    if s.corrected:
+        off = max(abs(s.stretch), abs(s.lean_rad))
+        return finding("BP-L03", Level.WARN if off > limits.stretch else Level.PASS, f"{what}; corrected.")
+    aspect = c.fit.lens[0] / c.fit.lens[1]
+    is_open = s.sigma[0] > _UNDETERMINED and abs(aspect - 1) > _UNDETERMINED
+    if s.change_px > 0 and not is_open:
+        level = Level.WARN if s.change_px > limits.board_px else Level.PASS
+        what += f"; taken as stated. Solving for it would change directions by {s.change_px:.2g} px RMS."
+        return finding("BP-L03", level, what, variant="not solved for")
+    return finding("BP-L02", Level.WARN if is_open else Level.PASS, f"{what}; taken as stated.")
+
+
+def _points(c: Intrinsics) -> Finding | None:
+    """Whether single points of the board are displaced; None if not."""
+    p = None if c.board is None else c.board.points
+    if p is None or not (p.corrected or np.any(p.off_m)):
+        return None
+    worst = int(np.argmax(np.linalg.norm(p.off_m[:, :2], axis=1)))
+    off = 1000 * float(np.linalg.norm(p.off_m[worst, :2]))
+    where = 1000 * c.table.board_points[worst, :2]
+    what = (
+        f"Points of the board are displaced by {1000 * p.rms_m:.2g} mm RMS, the worst, at {where[0]:.0f},"
+        f" {where[1]:.0f} mm, by {off:.2g} mm (p = {p.p_value:.1g} for a correct board): {p.why}"
+    )
+    if p.corrected:
+        return finding("BP-L04", Level.WARN, f"{what}; each was solved for.")
+    return passed(f"{what}; taken as stated. Solving for them would change directions by {p.change_px:.2g} px RMS.")
+
+
+def _circles(c: Intrinsics, limits: FindingLimits) -> Finding | None:
+    """Size of the board's circles; None for other boards."""
+    if c.table.circles is None:
+        return None
+    what = f"The circles have a diameter of {2000 * c.fit.radius_m:.3f} ± {2000 * c.fit.radius_sigma_m:.2g} mm"
+    stated = c.table.circles.diameter_m
+    if stated is None:
+        alone = ", from the shift of their centroids alone" if c.table.circles.areas_px2 is None else ""
+        return passed(f"{what}{alone}.")
+    share = 2 * c.fit.radius_m / stated - 1
+    what += f", {100 * share:+.1f} % against the {1000 * stated:.4g} mm stated."
+    return finding("BP-L05", Level.WARN if abs(share) > limits.circle else Level.PASS, what)
+
 
 _WORST_VIEWS = 3  # views with the largest residuals that are shown as pictures, besides the median and the best
 
@@ -90,7 +420,8 @@ def _model(r: Intrinsics) -> Section:
     error = np.array([x.error_px for x in candidates])
     noise = np.array([x.sigma_px for x in candidates])
     chosen = next(k for k, x in enumerate(candidates) if x.model == r.selection.chosen.model)
-    chart = lens_model_chart([_label(x.model) for x in candidates], error, chosen, noise_px=noise)
+    titles = [x.model.title + ("" if x.model.fisheye else " coefficients") for x in candidates]
+    chart = lens_model_chart(titles, error, chosen, noise_px=noise)
     rows = [
         (
             x.model.words,
@@ -120,10 +451,6 @@ def _model(r: Intrinsics) -> Section:
     heads = ("model", "residuals (px)", "noise (px)", "other models (px)", "expected error (px)", "result")
     table = PageTable(heads, rows)
     return Section("Selection of the lens model", words, [PageDrawing(chart, caption)], table)
-
-
-def _label(model: LensModel) -> str:
-    return model.title if model.fisheye else f"{model.title} coefficients"
 
 
 def _extent(r: Intrinsics) -> tuple[float, float, float, float]:

@@ -16,17 +16,16 @@ from calibration.lens.intrinsics_result import Intrinsics
 from calibration.pair import CalibratedPair, PairError, calibrate_pair
 from geometry.arrays import Array
 from lab.calibrate.camera.camera import LENSES, corner_table
-from lab.calibrate.camera.camera_findings import findings_of as lens_findings
+from lab.calibrate.camera.camera_page import findings_of as lens_findings
 from lab.calibrate.camera.photos import PhotoSet, find_in_photos
 from lab.calibrate.step import Solved, Step, run_step
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.board_file import load_board_or_text
-from lab.files.rig.calibration_state import CalibrationState
+from lab.files.rig.camera_file import CalibrationState
 from lab.files.rig.pair_file import PairFile, save_pair_file
 from lab.files.text.csv_text import write_table
 from lab.files.text.error_text import suggest_name
-from lab.findings.finding import Finding, Level, finding, level_above, verdict
-from lab.findings.outcome import Outcome
+from lab.findings.finding import Finding, Level, Outcome, finding, level_above, verdict
 from lab.number_format import format_length, format_number
 from lab.pictures.source import number_of
 from lab.progress import Progress
@@ -155,11 +154,8 @@ def calibrate_pair_folder(
     """Calibrate a pair from photographs of a board by both cameras; equal numbers in file names are one instant.
 
     left, right: a folder or a pattern. Writes pair.yaml, pairs.csv and report.html into the folder `out`. If the
-    verdict is FAIL, the file is called pair.failed.yaml.
-
-    Raises:
-        InputError: for pictures or a board that cannot be used.
-        CalibrationError: if the photographs do not determine a camera or the pair.
+    verdict is FAIL, the file is called pair.failed.yaml. Raises InputError: for pictures or a board that cannot be
+    used; CalibrationError: if the photographs do not determine a camera or the pair.
     """
     return run_step(_STEP, out, lambda: _solve((left, right), board, options, progress))
 

@@ -62,8 +62,7 @@ class PhotoSet:
 def load_photos(paths: Iterable[Path | str]) -> tuple[Path, ...]:
     """Picture and video files named by files, folders and patterns (`shots/*.png`), each once, in natural order.
 
-    Raises:
-        InputError: if a path matches no file, or no path is given.
+    Raises InputError: if a path matches no file, or no path is given.
     """
     found: list[Path] = []
     for given in paths:
@@ -108,9 +107,8 @@ def find_in_photos(
 ) -> PhotoSet:
     """Detect a board in every photograph; a few are searched at a time.
 
-    Raises:
-        InputError: if no picture can be read, no size is that of most pictures, or fewer than `fewest` pictures of
-            that size show the board.
+    Raises InputError: if no picture can be read, no size is that of most pictures, or fewer than `fewest` pictures of
+    that size show the board.
     """
     files = load_photos(paths)
     names = _names(files)
@@ -337,9 +335,7 @@ def read_corner_table(path: Path, board: Board, image_size_px: tuple[int, int]) 
     vnl: `filename x y [weight]`, one row per point of the board in the order of the rows, `-` where it was not found;
     rows with a weight of 0 or less are left out, other weights are not used. CSV: columns view, id, u_px, v_px, with
     the numbers of the points from 0 row by row, as in corners.csv. Pixels refer to the centre of the first pixel.
-
-    Raises:
-        InputError: the table cannot be read, or is not of this board or picture size.
+    Raises InputError: the table cannot be read, or is not of this board or picture size.
     """
     views = _read_vnl(path, board) if path.suffix.lower() == ".vnl" else _read_csv(path)
     size = np.array(image_size_px)

@@ -159,8 +159,7 @@ class HistoryRow:
 def read_history(path: Path) -> list[HistoryRow]:
     """Rows of earlier checks; none if the file does not exist.
 
-    Raises:
-        InputError: for a file that is not a drift history.
+    Raises InputError: for a file that is not a drift history.
     """
     path = Path(path)
     if not path.exists():
@@ -217,8 +216,7 @@ class PixelComparison:
 def compare_points(rig: Rig, known: KnownPoints, covariance: RigCovariance | None, path: Path) -> list[PixelComparison]:
     """Compare the points of each camera with the rig: one comparison per camera, in the rig's order.
 
-    Raises:
-        InputError: if the pixels cannot be those of these points.
+    Raises InputError: if the pixels cannot be those of these points.
     """
     world, predicted = np.zeros((len(known.point), 3)), np.full((len(known.point), 2), np.nan)
     for i in range(len(known.point)):
@@ -338,10 +336,8 @@ def compare_still(
     """Compare the mean spots of a vehicle at rest with the rig.
 
     pose: its pose with covariance (6, 6); None: unknown. floor_px: error of a mean spot that averaging over frames does
-    not reduce. An unknown pose is fitted, and a change that has the same effect as another pose is not detected.
-
-    Raises:
-        InputError: if the spots do not determine an unknown pose, or a spot is not visible at the pose.
+    not reduce. An unknown pose is fitted, and a change that has the same effect as another pose is not detected. Raises
+    InputError: if the spots do not determine an unknown pose, or a spot is not visible at the pose.
     """
     model = SpotModel.of(rig)
     rows = np.array([model.views.index(v) for v in still.views], dtype=np.int64)

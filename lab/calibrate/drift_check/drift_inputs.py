@@ -14,8 +14,7 @@ from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.run.results import read_poses, read_spots
 from lab.files.run.truth import read_true_poses
-from lab.files.text.csv_table import Table
-from lab.files.text.csv_text import SIGMA_RANGE_PX, check_pixels, check_sigmas, read_table
+from lab.files.text.csv_text import SIGMA_RANGE_PX, Table, check_pixels, check_sigmas, read_table
 from lab.files.text.error_text import suggest_name
 
 PIXELS = ("camera", "point", "u_px", "v_px")
@@ -80,10 +79,8 @@ def read_points(path: Path, survey: Path | None, rig: Rig, default_sigma_px: flo
     """Read pixels from a CSV camera,point,u_px,v_px[,sigma_px] and the coordinates of their points.
 
     The coordinates come from `survey` (point,x_m,y_m,z_m[,sigma_x_m,sigma_y_m,sigma_z_m], or point,screen,x_m,y_m for
-    coordinates on a screen), or from the same columns of the pixel file itself.
-
-    Raises:
-        InputError: with file, line, the expected and the found content.
+    coordinates on a screen), or from the same columns of the pixel file itself. Raises InputError: with file, line, the
+    expected and the found content.
     """
     table = read_table(path, PIXELS, ("sigma_px", *PLACES, "screen"))
     table.require_rows(PIXELS)
@@ -194,9 +191,8 @@ def _coordinates(table: Table, rig: Rig) -> dict[str, tuple[list[float], list[fl
 def read_still_spots(run: Path, rig: Rig) -> StillSpots:
     """Mean spots of a vehicle at rest, from a folder of results, its spots.csv, or a run folder (processed first).
 
-    Raises:
-        InputError: for errors in the files, or fewer than two frames of every spot.
-        BeamposeError: whatever processing the run raises.
+    Raises InputError: for errors in the files, or fewer than two frames of every spot; BeamposeError: whatever
+    processing the run raises.
     """
     if not run.exists():
         raise InputError(f"{run}: expected a run folder, a folder of results or a spots.csv, found nothing")
@@ -255,8 +251,7 @@ def _still(results: Path, rig: Rig, named: Path) -> StillSpots:
 def read_still_pose(path: Path) -> Pose:
     """Pose of a vehicle at rest from a pose.csv (columns of truth/pose.csv).
 
-    Raises:
-        InputError: if the file has no row or the pose is not constant.
+    Raises InputError: if the file has no row or the pose is not constant.
     """
     true = read_true_poses(path)
     if not len(true.frame):

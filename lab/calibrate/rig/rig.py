@@ -29,7 +29,7 @@ from calibration.terms.corners import CornerTerm
 from calibration.terms.surveyed import RecordTerm, array_of
 from geometry.arrays import Array
 from geometry.rig import Rig
-from lab.calibrate.beams.beam_findings import (
+from lab.calibrate.beams.beams_page import (
     BeamGoals,
     beam_findings,
     check_no_duplicates,
@@ -37,18 +37,16 @@ from lab.calibrate.beams.beam_findings import (
     stand_findings,
 )
 from lab.calibrate.beams.recordings import Recordings, read_recordings, stand_of
-from lab.calibrate.rig.rig_findings import CalibratedRig, joint_findings
-from lab.calibrate.rig.rig_page import page_of
-from lab.calibrate.screens.screen_findings import ScreenLimits, near_findings, network_findings, survey_findings
+from lab.calibrate.rig.rig_page import CalibratedRig, joint_findings, page_of
 from lab.calibrate.screens.screen_inputs import adjusted_screens, screen_inputs
+from lab.calibrate.screens.screen_page import ScreenLimits, near_findings, network_findings, survey_findings
 from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expiry_findings, run_step, state_of
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import Project, load_project
 from lab.files.rig.rig_file import RigFile, covariance_blocks, save_rig
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.csv_text import csv_word
-from lab.findings.finding import Finding, Level, finding, passed, verdict
-from lab.findings.outcome import Outcome
+from lab.findings.finding import Finding, Level, Outcome, finding, passed, verdict
 from lab.progress import Progress
 
 RESIDUALS = "residuals.csv"
@@ -136,11 +134,8 @@ def calibrate_rig(
 
     rig.yaml holds the verdict and the joint covariance of all parameters (in the target's block; cameras and screens
     hold their own parts of it). If the verdict is FAIL, the file is called rig.failed.yaml. progress: of the search for
-    a mistake in a survey.
-
-    Raises:
-        InputError: for errors in the files.
-        CalibrationError: if the measurements do not determine a calibration.
+    a mistake in a survey. Raises InputError: for errors in the files; CalibrationError: if the measurements do not
+    determine a calibration.
     """
     return run_step(_STEP, out, lambda: _solve(Path(project_path), today, progress))
 

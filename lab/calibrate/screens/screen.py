@@ -14,15 +14,13 @@ import numpy as np
 
 from calibration.screens.screens import FittedScreens, pointing_sigmas_m, spot_sigmas
 from geometry.rig import Rig
-from lab.calibrate.screens.screen_findings import near_findings, network_findings, survey_findings
 from lab.calibrate.screens.screen_inputs import adjusted_screens, screen_inputs
-from lab.calibrate.screens.screen_page import page_of
+from lab.calibrate.screens.screen_page import near_findings, network_findings, page_of, survey_findings
 from lab.calibrate.step import Solved, Step, calibration_date, expiry_date, expiry_findings, run_step, state_of
 from lab.files.project.project import Project, load_project
 from lab.files.rig.rig_file import TARGET, RigFile, covariance_blocks, save_rig, save_screens
 from lab.files.text.csv_text import write_table
-from lab.findings.finding import Finding, Level, finding, verdict
-from lab.findings.outcome import Outcome
+from lab.findings.finding import Finding, Level, Outcome, finding, verdict
 from lab.number_format import format_count
 from lab.progress import Progress
 
@@ -86,11 +84,8 @@ def calibrate_screen(
 
     Writes into `out`: screens.yaml; rig.yaml with the nominal beams, if the project has a target; residuals.csv,
     dots.csv and report.html. If the verdict is FAIL, no YAML file is written. progress: of the search for a mistake in
-    a survey that does not fit.
-
-    Raises:
-        InputError: for errors in the files.
-        CalibrationError: if the measurements do not determine a calibration.
+    a survey that does not fit. Raises InputError: for errors in the files; CalibrationError: if the measurements do not
+    determine a calibration.
     """
     return run_step(_STEP, out, lambda: _solve(Path(project_path), today, progress))
 

@@ -6,7 +6,7 @@ Corners of the boards of a calibration project, both portable boards and boards 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +15,7 @@ from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Board
 from calibration.boards.board_view import BoardView, NotFound
 from calibration.least_squares.adjustment import AdjustmentError, Prior
-from calibration.open3d_loader import MissingOpen3DError
-from calibration.screens.clouds import FEWEST, align, on_surfaces, register, scan_of
+from calibration.screens.clouds import FEWEST, MissingOpen3DError, align, on_surfaces, register, scan_of
 from calibration.screens.network import ControlPoints, Network, PointObservations
 from calibration.screens.network_start import NotConnectedError
 from calibration.screens.screens import (
@@ -57,7 +56,6 @@ class BoardViews:
     corners: CornerTerm | None  # None: no board
     placements: tuple[str, ...]  # names of the board placements, indexed by `corners.placement`
     fixed: BoardOnScreenTerm | None
-    photo_of: Mapping[tuple[int, int], Path]  # (camera, placement) -> photograph
     notes: tuple[str, ...]  # excluded photographs, each with the reason
 
 
@@ -79,10 +77,8 @@ _Found = list[tuple[_Placement, dict[str, BoardView]]]  # placements with the vi
 def board_views(project: Project, rig: Rig) -> BoardViews:
     """Detect the boards of a project in their photographs.
 
-    A photograph of a portable board without the board is noted and excluded.
-
-    Raises:
-        CalibrationError: if a board that is fixed to a screen is not found in its photograph.
+    A photograph of a portable board without the board is noted and excluded. Raises CalibrationError: if a board that
+    is fixed to a screen is not found in its photograph.
     """
     placements = _placements(project)
     notes: list[str] = []
@@ -94,16 +90,8 @@ def board_views(project: Project, rig: Rig) -> BoardViews:
         elif views:
             found.append((placement, views))
     if not found:
-        return BoardViews(None, (), None, {}, tuple(notes))
-    cameras = list(rig.cameras)
-    photo_of = {(cameras.index(c), i): p.photos[c] for i, (p, views) in enumerate(found) for c in views}
-    return BoardViews(
-        _corners(found, rig),
-        tuple(p.name for p, _ in found),
-        _fixed_boards(found),
-        photo_of,
-        tuple(notes),
-    )
+        return BoardViews(None, (), None, tuple(notes))
+    return BoardViews(_corners(found, rig), tuple(p.name for p, _ in found), _fixed_boards(found), tuple(notes))
 
 
 def _placements(project: Project) -> list[_Placement]:
@@ -211,15 +199,12 @@ class ScreenInputs:
     held_screen: int | None  # screen whose frame defines the world frame if there is no survey
     notes: tuple[str, ...]  # assumptions and exclusions, shown as warnings
     remarks: tuple[str, ...] = ()  # properties of the scans
-    photo_of: Mapping[tuple[int, int], Path] = field(default_factory=dict)  # (camera, placement) -> photograph
 
 
 def screen_inputs(project: Project) -> ScreenInputs:
     """Read all measurements of a project's screens.
 
-    Raises:
-        InputError: for errors in the files.
-        CalibrationError: if a board that is fixed to a screen is not found.
+    Raises InputError: for errors in the files; CalibrationError: if a board that is fixed to a screen is not found.
     """
     survey = read_survey(project.survey, project.screens)
     observations = read_observations(
@@ -263,7 +248,7 @@ def screen_inputs(project: Project) -> ScreenInputs:
     }
     scan_notes = [note for _, ns in scans.values() for note in ns]
     noted = (*survey.notes, *observations.notes, *boards.notes)
-    return ScreenInputs(network, setups, near, held, noted, tuple(scan_notes), boards.photo_of)
+    return ScreenInputs(network, setups, near, held, noted, tuple(scan_notes))
 
 
 def _screens_of_points(project: Project, survey: Survey, observations: Observations) -> Ints:
@@ -416,9 +401,8 @@ def _in_metres(targets: Array, survey: Array, cloud: Cloud) -> tuple[Array, list
 def _points(cloud: Cloud) -> tuple[Array, list[str]]:
     """The points (n, 3), m, of all scans of a cloud that lie on surfaces, in the frame of the first; and notes.
 
-    Raises:
-        InputError: a scan cannot be read, or a further one cannot be aligned with the first.
-        MissingOpen3DError: Open3D cannot be loaded.
+    Raises InputError: a scan cannot be read, or a further one cannot be aligned with the first; MissingOpen3DError:
+    Open3D cannot be loaded.
     """
     scans: list[Array] = []
     words: list[str] = []
@@ -458,11 +442,9 @@ _ACCEPTED_MISFIT = 2.0  # misfit below which a change to the survey is accepted 
 def adjusted_screens(project: Project, inputs: ScreenInputs, progress: Progress | None = None) -> FittedScreens:
     """Adjust cameras and screens to the survey; if they do not fit, find the mistake in the survey.
 
-    progress: called with the number of changes to the survey that have been tried, and of all.
-
-    Raises:
-        InputError: for a survey that fits with other axes, signs or units, or parts without common measurements.
-        CalibrationError: if the measurements do not determine a calibration.
+    progress: called with the number of changes to the survey that have been tried, and of all. Raises InputError: for a
+    survey that fits with other axes, signs or units, or parts without common measurements; CalibrationError: if the
+    measurements do not determine a calibration.
     """
     where = ", ".join(str(p) for p in project.survey) or str(project.path)
     problem: Exception | None = None

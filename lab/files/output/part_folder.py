@@ -170,11 +170,8 @@ def folder_lock(target: Path, name: str) -> Iterator[bool]:
     """Holds the lock of the output folder `target`, an absolute path, during the block.
 
     name: the folder as the user wrote it. Its parent must exist. Yields whether the lock is held: False where the file
-    system has no locks.
-
-    Raises:
-        InputError: another process writes to this folder.
-        OSError: the file of the lock cannot be made.
+    system has no locks. Raises InputError: another process writes to this folder; OSError: the file of the lock cannot
+    be made.
     """
     path = target.parent / f".{target.name}.beampose-lock"
     try:

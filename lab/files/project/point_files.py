@@ -12,18 +12,18 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.open3d_loader import MissingOpen3DError, open3d
+from calibration.screens.clouds import MissingOpen3DError, open3d
 from geometry.arrays import Array, Ints
 from geometry.pose import Pose
 from lab.errors import InputError
 from lab.files.run.truth import check_unit_quaternions
 from lab.files.text import columns
-from lab.files.text.csv_table import Table
 from lab.files.text.csv_text import (
     MAX_COORDINATE_M,
     SIGMA_RANGE_DEG,
     SIGMA_RANGE_M,
     SIGMA_RANGE_PX,
+    Table,
     check_coordinates,
     check_pixels,
     check_sigmas,
@@ -39,8 +39,7 @@ AS_TEXT = (".xyz", ".txt", ".csv", ".asc")
 def read_point_cloud(path: Path, unit_m: float) -> tuple[Array, tuple[str, ...]]:
     """The points (n, 3), m, of a scan, and notes of what was left out. unit_m: metres in one unit of the file.
 
-    Raises:
-        InputError: an unknown kind of file, an empty or damaged one, or no finite point.
+    Raises InputError: an unknown kind of file, an empty or damaged one, or no finite point.
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -129,7 +128,6 @@ class Observations:
     point: tuple[str, ...]  # n
     pixels: Array  # (n, 2)
     sigma_px: Array  # (n,), of each coordinate
-    source: tuple[str, ...]  # n
     notes: tuple[str, ...] = ()
 
 
@@ -193,7 +191,7 @@ def read_observations(
     camera: list[str] = []
     point: list[str] = []
     seen: set[tuple[str, str]] = set()
-    pixels, sigmas, source, notes = [], [], [], []
+    pixels, sigmas, notes = [], [], []
     for path in paths:
         table = read_table(path, POINTS, ("sigma_px",))
         table.require_rows(POINTS)
@@ -220,13 +218,11 @@ def read_observations(
             notes.append(f"{path}: no column sigma_px: {DEFAULT_POINT_SIGMA_PX} px is assumed")
             sigma = np.full(len(table), DEFAULT_POINT_SIGMA_PX)
         sigmas.append(sigma)
-        source += [str(path)] * len(table)
     return Observations(
         tuple(camera),
         tuple(point),
         np.concatenate(pixels) if pixels else np.empty((0, 2)),
         np.concatenate(sigmas) if sigmas else np.empty(0),
-        tuple(source),
         tuple(notes),
     )
 

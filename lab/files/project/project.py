@@ -20,8 +20,7 @@ from calibration.boards.board_types import Board
 from geometry.rig import Beam, Spot
 from lab.errors import InputError
 from lab.files.rig.board_file import load_board
-from lab.files.rig.calibration_state import Day
-from lab.files.rig.camera_file import CameraFile, load_camera
+from lab.files.rig.camera_file import CameraFile, Day, load_camera
 from lab.files.rig.interchange import read_cameras
 from lab.files.rig.pose_block import PoseBlock
 from lab.files.rig.rig_file import TargetBlock, unknown_name
@@ -38,10 +37,8 @@ CLOUD_UNITS: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.02
 def load_project(path: Path, lab_known: bool = False) -> Project:
     """Read and check a calibration.yaml and the lenses that it names; tables and photographs are not opened.
 
-    path: the file or its folder. lab_known: cameras and screens come from a rig.yaml and may be left out.
-
-    Raises:
-        InputError: with file, field, what was expected and what was found; FileError for several mistakes.
+    path: the file or its folder. lab_known: cameras and screens come from a rig.yaml and may be left out. Raises
+    InputError: with file, field, what was expected and what was found; FileError for several mistakes.
     """
     path = Path(path)
     if path.is_dir():

@@ -20,7 +20,7 @@ from lab.files.rig.rig_file import RigFile, load_rig_file
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.error_text import suggest_name
 from lab.files.text.yaml_text import parse_mapping, read_text
-from lab.findings.outcome import Done
+from lab.findings.finding import Done
 
 BEAMPOSE, RIG = "beampose", "beampose-rig"
 _FOREIGN: Mapping[str, ModuleType] = {m.NAME: m for m in (opencv_yaml, kalibr, ros, colmap, mrcal)}
@@ -48,12 +48,10 @@ def convert(
     """Write the cameras of one file into another.
 
     Formats: beampose (camera.yaml), opencv, kalibr, ros, colmap, mrcal, and as a source beampose-rig (rig.yaml). By
-    default the content determines the format of the source, and the name that of the destination. camera: the camera
-    to convert; by default all, if the format of the destination allows several. What the destination cannot hold is
-    an error (a lens), or a note (a pose, a covariance).
-
-    Raises:
-        InputError: a file cannot be read, converted or written; the destination stays as it was.
+    default the content determines the format of the source, and the name that of the destination. camera: the camera to
+    convert; by default all, if the format of the destination allows several. What the destination cannot hold is an
+    error (a lens), or a note (a pose, a covariance). Raises InputError: a file cannot be read, converted or written;
+    the destination stays as it was.
     """
     source, destination = Path(source), Path(destination)
     text = read_text(source)

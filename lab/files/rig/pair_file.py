@@ -15,8 +15,14 @@ from geometry.camera import Camera
 from geometry.pose import Pose
 from geometry.uncertainty.rig_uncertainty import RigCovariance, camera_names
 from lab.errors import InputError
-from lab.files.rig.calibration_state import CalibrationState
-from lab.files.rig.camera_block import CovarianceBlock, LensBlock, covariance_error, covariance_mapping, lens_mapping
+from lab.files.rig.camera_file import (
+    CalibrationState,
+    CovarianceBlock,
+    LensBlock,
+    covariance_error,
+    covariance_mapping,
+    lens_mapping,
+)
 from lab.files.rig.interchange import BEAMPOSE, RIG, read_cameras, recognised_format
 from lab.files.rig.pose_block import CameraPoseBlock, pose_mapping
 from lab.files.rig.rig_file import joint_covariance, load_rig_file
@@ -51,8 +57,7 @@ class _PairBlock(Block):
 def load_pair_file(path: Path) -> PairFile:
     """The cameras of a pair.yaml, a rig.yaml or a foreign file (Kalibr, OpenCV, mrcal ...) with poses.
 
-    Raises:
-        InputError: with file and field; a file without poses or with one camera is not a calibrated pair.
+    Raises InputError: with file and field; a file without poses or with one camera is not a calibrated pair.
     """
     path = Path(path)
     if not path.is_file():

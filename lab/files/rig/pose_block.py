@@ -16,7 +16,7 @@ import yaml
 from geometry.arrays import Array, cross, normalised
 from geometry.pose import Pose, look_at
 from geometry.rotations import matrix_from_ypr, nearest_rotation, quaternion_from_matrix
-from lab.files.rig.camera_block import plain_floats
+from lab.files.rig.camera_file import plain_floats
 from lab.files.text.error_text import describe_value
 from lab.files.text.fields import Block, Vector3, field_error, numbers, unexpected_value, vector3
 

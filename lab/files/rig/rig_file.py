@@ -15,8 +15,8 @@ from geometry.camera import Camera, SensorNoise
 from geometry.rig import Beam, Rig, Screen, Spot
 from geometry.uncertainty.rig_uncertainty import CLOCK, RigCovariance, is_known, split_name
 from lab.errors import InputError
-from lab.files.rig.calibration_state import CalibrationState
-from lab.files.rig.camera_block import (
+from lab.files.rig.camera_file import (
+    CalibrationState,
     CovarianceBlock,
     LensBlock,
     covariance_error,
@@ -39,10 +39,7 @@ def joint_covariance(rig: Rig, blocks: Mapping[str, RigCovariance], path: Path |
 
     blocks: by `cameras.NAME`, `screens.NAME`, `target`. The target's block may also name parameters of cameras and
     screens (as a joint solve writes it): then it is complete, and the other blocks, excerpts of it, are not used.
-    Unknown names are ignored, as the contract of the files defines.
-
-    Raises:
-        InputError: a matrix is not a covariance.
+    Unknown names are ignored, as the contract of the files defines. Raises InputError: a matrix is not a covariance.
     """
     target = blocks.get(TARGET)
     if target is not None and any(n.startswith(("cameras.", "screens.")) for n in target.names):
@@ -152,10 +149,8 @@ def save_screens(name: str, file: RigFile, path: Path) -> None:
 def save_rig(rig: Rig | RigFile, path: Path) -> None:
     """Write a rig.yaml, complete or not at all.
 
-    It reads back to the same numbers, directions and rotation matrices to 4e-16 (quaternions have 17 digits).
-
-    Raises:
-        InputError: the rig could not be loaded again, or the file cannot be written; an old file stays as it was.
+    It reads back to the same numbers, directions and rotation matrices to 4e-16 (quaternions have 17 digits). Raises
+    InputError: the rig could not be loaded again, or the file cannot be written; an old file stays as it was.
     """
     file = rig if isinstance(rig, RigFile) else RigFile(rig)
     content = as_mapping(file)

@@ -13,8 +13,7 @@ from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import ROW_TIME, TIME_OFFSET, RigCovariance
 from lab.errors import InputError
 from lab.files.text import columns
-from lab.files.text.csv_table import Table
-from lab.files.text.csv_text import read_table
+from lab.files.text.csv_text import Table, read_table
 
 UNIT_FACTOR = 50.0  # between the steps of the timestamps and of the frame rate, from which one of them is a mistake
 

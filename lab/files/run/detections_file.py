@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from geometry.arrays import Array, Bools, Ints
 from lab.errors import InputError
-from lab.files.text.csv_table import Table, is_whole
-from lab.files.text.csv_text import read_table
+from lab.files.text.csv_text import Table, is_whole, read_table
+from lab.number_format import format_count
 from tracking.detections import Detections
 from tracking.input_validation import DUPLICATE_PX, LARGEST_PX, LEAST_SIGMA_PX, duplicates
 
@@ -70,9 +70,7 @@ def read_detections(path: Path, named: str | None = None) -> DetectionsFile:
     """The points of a detections.csv. named: the camera of all rows, for a file that may lack the column.
 
     Rows may be in any order. Unusable rows are left out and counted in `notes`, each reason with its first example.
-
-    Raises:
-        InputError: the file is not a table, lacks a column of REQUIRED, or has no usable row.
+    Raises InputError: the file is not a table, lacks a column of REQUIRED, or has no usable row.
     """
     optional = ("sigma_u_px", "sigma_v_px", "cov_uv_px2", *SHAPE)
     required = tuple(name for name in REQUIRED if name != "camera" or named is None)
@@ -100,7 +98,7 @@ def read_detections(path: Path, named: str | None = None) -> DetectionsFile:
     if table.long_lines:
         count = len(table.long_lines)
         why = "more fields than the header has (a comma too many, or a decimal comma)"
-        rows.notes.append(f"{path}: {count} line{'s' if count > 1 else ''} left out: {why}")
+        rows.notes.append(f"{path}: {format_count(count, 'line')} left out: {why}")
     if not rows.good.any():
         because = "".join(f"; {note.removeprefix(f'{path}: ')}" for note in rows.notes[len(missing) > 0 :])
         raise InputError(f"{path}: expected rows with {', '.join(required)}, got none that can be used{because}")

@@ -20,10 +20,7 @@ def fingerprints(run: Run, full: bool = False) -> list[dict[str, Any]]:
 
     A folder of pictures has one entry, with a digest of the names, sizes and contents of its files. Reading gigabytes a
     second time takes too long, therefore large files are sampled unless `full`. `covers` describes what each digest
-    covers.
-
-    Raises:
-        OSError: a file cannot be read.
+    covers. Raises OSError: a file cannot be read.
     """
     files = [run.path, run.rig_path, *run.times_paths]
     files += [p for p in (run.folder / "truth" / name for name in ("pose.csv", "spots.csv")) if p.is_file()]
@@ -34,8 +31,7 @@ def fingerprints(run: Run, full: bool = False) -> list[dict[str, Any]]:
 def fingerprints_of(files: Iterable[Path], sources: Iterable[Path], full: bool = False) -> list[dict[str, Any]]:
     """Path, SHA-256 and size of files and of sources, each a file or a folder of pictures; each path once.
 
-    Raises:
-        OSError: a file cannot be read.
+    Raises OSError: a file cannot be read.
     """
     paths = dict.fromkeys((*files, *sources))
     return [_of_folder(p, full) if p.is_dir() else _of_file(p, full) for p in paths]

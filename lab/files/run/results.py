@@ -16,8 +16,7 @@ from lab.errors import InputError
 from lab.files.run.run_file import Run, load_run
 from lab.files.text import columns
 from lab.files.text.columns import CAUSAL
-from lab.files.text.csv_table import Categorical, Table
-from lab.files.text.csv_text import MAX_TIME_S, read_table
+from lab.files.text.csv_text import MAX_TIME_S, Categorical, Table, read_table
 from lab.files.text.error_text import name_of_path
 from lab.files.text.json_text import has_schema, read_json
 from tracking.statuses import PoseStatus, SpotStatus
@@ -80,7 +79,6 @@ class SpotGrid:
     uv_px: Array  # (F, V, 2), distorted pixels; nan where nothing is known
     sigma_px: Array  # (F, V, 2)
     predicted_px: Array  # (F, V, 2), predicted before the detection
-    gain: Array  # (F, V)
     label_probability: Array  # (F, V) probability that the label is right; nan without a label, or where not stated
     status: Ints  # (F, V) index into SPOT_STATUSES, or ABSENT
     cov_uv_px2: Array  # (F, V)
@@ -175,7 +173,6 @@ def read_spots(results: Path) -> SpotGrid:
         uv_px=grid("u_px", "v_px"),
         sigma_px=grid("sigma_u_px", "sigma_v_px"),
         predicted_px=grid("predicted_u_px", "predicted_v_px"),
-        gain=grid("gain")[..., 0],
         label_probability=grid("label_probability")[..., 0],
         status=status,
         cov_uv_px2=grid("cov_uv_px2")[..., 0],

@@ -17,7 +17,7 @@ from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
-from lab.files.rig.calibration_state import CalibrationState, OptionalDay
+from lab.files.rig.camera_file import CalibrationState, OptionalDay
 from lab.files.rig.rig_file import joint_covariance, load_rig_file
 from lab.files.run.clocks import ESTIMATE, CameraClock, Times, clocks_in, load_clock, load_times
 from lab.files.text import fields
@@ -129,10 +129,8 @@ def load_run(run_folder: Path, rig_path: Path | None = None, recording: bool = F
     """Read and check run.yaml of a run folder, its rig and its timestamps; pictures are not opened.
 
     rig_path: a rig.yaml in place of the one that run.yaml names. recording: the cameras' timestamps are still being
-    written, and are not read.
-
-    Raises:
-        InputError: with file, field, what was expected and what was found; FileError for several mistakes.
+    written, and are not read. Raises InputError: with file, field, what was expected and what was found; FileError for
+    several mistakes.
     """
     folder = folder_of_run(run_folder)
     path = folder / "run.yaml"
@@ -220,8 +218,7 @@ _MOST_NAMES = 3
 def no_run_error(folder: Path) -> InputError:
     """The error for a folder without a run.yaml: what was found in it, and what to name instead.
 
-    Raises:
-        InputError: a summary.json in it is a named pipe, a socket or a device.
+    Raises InputError: a summary.json in it is a named pipe, a socket or a device.
     """
     start = f"{folder}: expected a run folder, with a run.yaml,"
     if (folder / "summary.json").is_file() and (run := _run_of_results(folder)):

@@ -18,8 +18,7 @@ from geometry.rig import Rig
 from lab.files.rig.pose_block import QUATERNION_TOLERANCE
 from lab.files.run.run_file import Run
 from lab.files.text import columns
-from lab.files.text.csv_table import Categorical, Table
-from lab.files.text.csv_text import read_table
+from lab.files.text.csv_text import Categorical, Table, read_table
 from lab.files.text.error_text import suggest_name
 
 FARTHEST = 1e9  # px, m or s: a number beyond it is a mistake, and its square may not be finite

@@ -133,11 +133,8 @@ def atomic_folder(target: Path, may_replace: Callable[[Path], bool]) -> Iterator
     """Yields an empty folder beside `target`. It replaces `target` when the block succeeds and is deleted otherwise.
 
     An existing target is replaced only if it is empty or `may_replace(target)` is true. Until the block ends, nothing
-    else can write to `target`. What killed processes left there is put back or removed.
-
-    Raises:
-        InputError: the folder cannot be made, another process writes to it, or `target` holds something that must not
-            be deleted.
+    else can write to `target`. What killed processes left there is put back or removed. Raises InputError: the folder
+    cannot be made, another process writes to it, or `target` holds something that must not be deleted.
     """
     check_output_folder(target, may_replace)
     place = _place_of(target)

@@ -23,10 +23,7 @@ def dataclass_from_yaml(cls: type[T], mapping: Any, path: Path | str, inside: st
     """A frozen parameter dataclass from a block of a file; fields that the block does not have keep their default.
 
     The dataclass's fields are floats, ints, bools, strings, Literals, tuples of floats, other such dataclasses, or
-    optional ones of these.
-
-    Raises:
-        FileError: unknown keys, wrong types, and values that the dataclass itself refuses.
+    optional ones of these. Raises FileError: unknown keys, wrong types, and values that the dataclass itself refuses.
     """
     model = block_of(typing.cast(Any, cls))
     return _value_of(

@@ -227,8 +227,7 @@ def _plain_value(value: Any) -> Any:
 def validated(model: type[M], content: Mapping[str, Any], path: Path | str, inside: str = "") -> M:
     """The content of a file, validated. inside: the block of the file that `content` is, for the messages.
 
-    Raises:
-        FileError: a line for each mistake, in the order of the file.
+    Raises FileError: a line for each mistake, in the order of the file.
     """
     value, mistakes = mistakes_in(model, content, path, inside)
     if value is None:

@@ -41,22 +41,15 @@ def require_regular_file(path: Path) -> None:
 def text_of_file(path: Path) -> str:
     """The text of a file.
 
-    Raises:
-        InputError: it is a named pipe, a socket or a device.
-        OSError: it cannot be read.
-        ValueError: it has another encoding.
+    Raises InputError: it is a named pipe, a socket or a device; OSError: it cannot be read; ValueError: it has another
+    encoding.
     """
     require_regular_file(path)
     return path.read_text("utf-8")
 
 
 def bytes_of_file(path: Path) -> bytes:
-    """The bytes of a file.
-
-    Raises:
-        InputError: it is a named pipe, a socket or a device.
-        OSError: it cannot be read.
-    """
+    """The bytes of a file. Raises InputError: it is a named pipe, a socket or a device; OSError: it cannot be read."""
     require_regular_file(path)
     return path.read_bytes()
 
@@ -70,10 +63,8 @@ def write_json(content: Any, path: Path) -> None:
 def read_json(path: Path) -> Any:
     """The content of a JSON file.
 
-    Raises:
-        InputError: it is a named pipe, a socket or a device.
-        OSError: it cannot be read.
-        ValueError: it is not JSON in UTF-8.
+    Raises InputError: it is a named pipe, a socket or a device; OSError: it cannot be read; ValueError: it is not JSON
+    in UTF-8.
     """
     return json.loads(text_of_file(path))
 
@@ -81,8 +72,7 @@ def read_json(path: Path) -> Any:
 def has_schema(folder: Path, schema: str) -> bool:
     """Whether a folder holds results with this schema in their summary.json.
 
-    Raises:
-        InputError: summary.json is a named pipe, a socket or a device.
+    Raises InputError: summary.json is a named pipe, a socket or a device.
     """
     try:
         return bool(read_json(folder / "summary.json").get("schema") == schema)

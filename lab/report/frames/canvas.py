@@ -1,9 +1,15 @@
-"""A picture that marks and names are drawn on. Every mark has a black edge, so that it is visible on any grey value."""
+"""A picture that marks and names are drawn on, and the video of such pictures, `overlay.mp4`.
+
+Every mark has a black edge, so that it is visible on any grey value. `report --video` and `track --video` write videos.
+"""
 
 from __future__ import annotations
 
+import secrets
 import unicodedata
+from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TypeAlias
 
 import cv2
@@ -11,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools
+from lab.errors import RunError
+from lab.files.output.part_folder import removed_at_the_end
 from lab.report.plot.svg import Box, free_box, true_ranges
 
 Pixels: TypeAlias = NDArray[np.uint8]  # (h, w, 3), BGR
@@ -188,3 +196,48 @@ def ground(grey: Pixels | None, size: tuple[int, int], scale: float) -> Pixels:
 def png(image: Pixels) -> bytes:
     """The picture as a PNG file."""
     return bytes(cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 6])[1].tobytes())
+
+
+# The video of annotated pictures, `overlay.mp4`: written by `report --video` and `track --video`.
+
+
+NAME = "overlay"
+# MPEG-4 files are less than half as large as Motion JPEG (38 against 98 kB for a picture of two cameras), which is in
+# every OpenCV and serves where one was built without the first.
+CODECS = (("mp4v", ".mp4"), ("MJPG", ".avi"))
+
+
+def write_overlay_video(folder: Path, images: Iterable[NDArray[np.uint8]], fps: float) -> tuple[Path, tuple[str, ...]]:
+    """Write pictures (h, w, 3), BGR, of one size with even sides; the file is complete or as it was before.
+
+    fps: frames per second of the video. Returns its path, and notes on codecs that this OpenCV lacks. A video that an
+    earlier call wrote with another codec is removed. Raises RunError: OpenCV cannot write a video here, or the disk is
+    full.
+    """
+    pictures = iter(images)
+    one = next(pictures)
+    notes: list[str] = []
+    for codec, suffix in CODECS:
+        path, part = folder / f"{NAME}{suffix}", folder / f".{NAME}.{secrets.token_hex(8)}{suffix}"
+        with removed_at_the_end(part):
+            writer = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*codec), fps, (one.shape[1], one.shape[0]))
+            if not writer.isOpened():
+                notes.append(f"this OpenCV cannot write {codec} videos ({suffix})")
+                continue
+            try:
+                writer.write(one)
+                for image in pictures:
+                    writer.write(image)
+            finally:
+                writer.release()
+            if not part.is_file() or not part.stat().st_size:
+                raise RunError(f"{path}: the video could not be written; is the disk full?")
+            part.replace(path)
+        for _, other in CODECS:
+            if other != suffix:
+                (folder / f"{NAME}{other}").unlink(missing_ok=True)
+        return path, tuple(notes)
+    raise RunError(
+        f"{folder}: no video could be written: {'; '.join(notes)}; install opencv-python-headless from PyPI, or leave"
+        " the video out"
+    )

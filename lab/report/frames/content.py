@@ -77,8 +77,7 @@ class ResultData:
 def read_result_data(results: Path, run_folder: Path | None = None) -> ResultData:
     """Read a results folder and what is there of its run folder (the one given, or the one that summary.json names).
 
-    Raises:
-        InputError: the results cannot be read, or the given run folder is not theirs.
+    Raises InputError: the results cannot be read, or the given run folder is not theirs.
     """
     folder = ResultFolder(results, run_folder)
     spots, poses = folder.spots, folder.poses

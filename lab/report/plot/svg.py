@@ -506,8 +506,7 @@ def stretched(picture: GreyValues, low: float, high: float) -> Bytes:
 def image_uri(picture: Bytes, kind: str) -> str:
     """Pixels (h, w), (h, w, 3) BGR or (h, w, 4) BGRA as a data URI; kind: png or jpeg.
 
-    Raises:
-        ValueError: OpenCV cannot encode pixels of this shape.
+    Raises ValueError: OpenCV cannot encode pixels of this shape.
     """
     cv2 = load_cv2()
     options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if kind == "jpeg" else [cv2.IMWRITE_PNG_COMPRESSION, 9]

@@ -10,8 +10,8 @@ import numpy as np
 from geometry.arrays import Array
 from lab.findings.finding import first_sentence
 from lab.number_format import format_angle, format_length, format_number, format_percent
-from lab.report.run.model_fit import ModelFit
 from lab.report.run.report_data import ReportData
+from lab.report.run.trust import ModelFit
 from tracking.statuses import PoseStatus
 
 HUO = (

@@ -20,18 +20,16 @@ from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_text
 from lab.number_format import format_count
 from lab.report.calibration.calibration_scene import LAB_VIEWS, scene_views
-from lab.report.html import as_script, environment
-from lab.report.page import Failure, files_beside, write_failure_report
+from lab.report.page import Failure, as_script, environment, files_beside, write_failure_report
 from lab.report.plot.svg import POSE_COLOURS, SPOT_COLOURS
 from lab.report.run import figures, tables, trust
 from lab.report.run.events import ShownEvent, events, pictures, selected
 from lab.report.run.figures import timeline_figure, tracks_figure, zoom_data
 from lab.report.run.methods import methods
-from lab.report.run.model_fit import HEADS as MODEL_FIT_HEADS
-from lab.report.run.model_fit import model_fit
 from lab.report.run.report_data import ReportData, read_report_data
-from lab.results.view.page import scene_data
-from lab.results.view.scene import content_of_poses, view_of
+from lab.report.run.trust import HEADS as MODEL_FIT_HEADS
+from lab.report.run.trust import model_fit
+from lab.results.view.page import content_of_poses, scene_data, view_of
 from lab.runs.verdict.score import ResultTables
 from tracking.statuses import PoseStatus, SpotStatus
 
@@ -102,11 +100,9 @@ def write_report(
 ) -> Path:
     """Write report.html into a results folder, from its tables alone; returns its path.
 
-    Where the run folder can be read (the one given, or the one that summary.json names), pictures, residuals and
-    errors against truth are added. run, result_tables: those of the folders, where they are known already.
-
-    Raises:
-        InputError: the tables cannot be read; report.html then says so.
+    Where the run folder can be read (the one given, or the one that summary.json names), pictures, residuals and errors
+    against truth are added. run, result_tables: those of the folders, where they are known already. Raises InputError:
+    the tables cannot be read; report.html then says so.
     """
     path = results / FILE_NAME
     try:

@@ -69,10 +69,8 @@ def read_report_data(
     """Read a results folder, and what is there of its run folder.
 
     run_folder: None: the folder that summary.json names. If it is missing or damaged, only the data from it are left
-    out. run, tables (with truth): those of the folders, where they are known already.
-
-    Raises:
-        InputError: the results cannot be read.
+    out. run, tables (with truth): those of the folders, where they are known already. Raises InputError: the results
+    cannot be read.
     """
     of = ResultFolder(results, run_folder)
     summary, folder = summary_of(of.summary), of.run_folder

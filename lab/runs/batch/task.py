@@ -37,11 +37,9 @@ def listed_runs(given: Sequence[str | os.PathLike[str]], lists: Sequence[str | o
     """Run folders of the command line, in order.
 
     given: folders, patterns such as `data/*/run-*` (`**`: folders at any depth), or `@FILE`. lists: files of runs; `-`
-    is standard input. A file names a folder or pattern per line; blank lines and lines with # at the start are
-    ignored; paths start at the current folder. A folder that several patterns or lists find is processed once.
-
-    Raises:
-        InputError: a folder is given more than once by name, a pattern finds no run, a list cannot be read.
+    is standard input. A file names a folder or pattern per line; blank lines and lines with # at the start are ignored;
+    paths start at the current folder. A folder that several patterns or lists find is processed once. Raises
+    InputError: a folder is given more than once by name, a pattern finds no run, a list cannot be read.
     """
     out: dict[str, Path] = {}
     named: set[str] = set()
@@ -115,10 +113,8 @@ def allotted(out: Path, folders: Sequence[Path], resumable: Mapping[str, str]) -
 
     It is the name of the run folder, with that of its parent where two runs of the batch have one name, and with a
     digest of its place where another run has that name already. A run that has a result folder keeps it. resumable:
-    result folders by run folder, of runs that have been moved: the run takes over the results.
-
-    Raises:
-        InputError: the record is damaged or cannot be written.
+    result folders by run folder, of runs that have been moved: the run takes over the results. Raises InputError: the
+    record is damaged or cannot be written.
     """
     record = _read(out / FILE_NAME)
     owners = {name.casefold(): place for place, name in record.items()}

@@ -386,8 +386,7 @@ class ModelCheck:
 def check_model(rig: Rig, recording: ModelCheckRecording, calibration: RigCovariance | None = None) -> ModelCheck:
     """Test whether a recording fits the rig. calibration: covariance of the rig's parameters.
 
-    Raises:
-        ValueError: the recording has other views than the rig.
+    Raises ValueError: the recording has other views than the rig.
     """
     model = SpotModel.of(rig)
     if recording.seen.shape[1] == len(model):

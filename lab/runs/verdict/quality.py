@@ -12,11 +12,9 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
-from lab.findings.finding import Finding, Level, finding, level_above, sentence, verdict, worst_first
-from lab.findings.outcome import Verdict
+from lab.findings.finding import Finding, Level, Verdict, finding, level_above, sentence, verdict, worst_first
 from lab.number_format import format_count
-from lab.runs.verdict.frame_checks import FrameRanges
-from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, FrameCause, RunStatistics
+from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, FrameCause, FrameRanges, RunStatistics
 
 # Share of the frames with enough visible spots: where the tracker missed more than half of them, it may not have
 # followed the vehicle in the others either. Frames with too few spots do not count.

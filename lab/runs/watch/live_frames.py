@@ -15,13 +15,11 @@ from lab.errors import BeamposeError, InputError
 from lab.files.run.detections_file import LONGEST_GAP
 from lab.files.run.run_file import FramesFolder, LiveDevice, Run
 from lab.pictures.picture_file import DROPPED, GreyPicture, MissingPicture
-from lab.runs.clock_estimate import ClockEstimate
 from lab.runs.frames.frames import FrameSet, Recorded
 from lab.runs.frames.moments import Moment, MomentPlanner, TimedPicture
-from lab.runs.watch.cameras import DeviceCamera, FolderCamera, LiveCamera, in_thread, open_device
-from lab.runs.watch.frame_clock import FolderPoll
-from lab.runs.watch.inbox import CameraQueue, Inbox, is_complete
-from lab.runs.watch.picture_times import complete_times, times_of
+from lab.runs.smoothing_pass import ClockEstimate
+from lab.runs.watch.cameras import DeviceCamera, FolderCamera, FolderPoll, LiveCamera, in_thread, open_device
+from lab.runs.watch.inbox import CameraQueue, Inbox, complete_times, is_complete, times_of
 
 FIRST = 6  # pictures of each camera for the estimate of the noise
 _ARRIVALS = 200  # frames whose arrivals are compared between cameras
@@ -132,10 +130,7 @@ class LiveFrames:
     def begin(self) -> Mapping[str, list[GreyPicture]]:
         """Wait for the first pictures of every camera; up to FIRST of each, in the order of their numbers.
 
-        Empty if the recording ended without any.
-
-        Raises:
-            InputError: the file names contain no frame numbers.
+        Empty if the recording ended without any. Raises InputError: the file names contain no frame numbers.
         """
         self.inbox.wanted.set()
         self._wait_for_pictures(FIRST, max(_START_S, 8 / self.run.frame_rate_hz, self.options.timeout_s))

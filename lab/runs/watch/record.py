@@ -22,11 +22,11 @@ from lab.files.run.run_file import save_run
 from lab.files.text import columns
 from lab.files.text.atomic_write import made_folder
 from lab.files.text.error_text import suggest_name
-from lab.findings.outcome import Done
+from lab.findings.finding import Done
 from lab.pictures.live_source import LiveSource, open_live
 from lab.pictures.picture_file import GreyPicture, MissingPicture
 from lab.pictures.png import encoded
-from lab.runs.watch.frame_clock import FrameClock
+from lab.runs.watch.cameras import FrameClock
 
 _WAITING = 64  # pictures per camera in memory that are not written yet
 _FAILURES = 5  # consecutive failures after which a camera counts as disconnected
@@ -246,10 +246,8 @@ def record(
 
     cameras: sources by name, as `open_live` takes them. stop: ends the recording when set. line: called with a line of
     status every second. run.yaml is written with the first picture of each camera, so that the folder is a valid run
-    whenever the process ends. Exit status 1: a camera failed, or the disk is full; what was recorded is a run.
-
-    Raises:
-        InputError: a camera cannot be opened, the folder has files in it, or no picture came.
+    whenever the process ends. Exit status 1: a camera failed, or the disk is full; what was recorded is a run. Raises
+    InputError: a camera cannot be opened, the folder has files in it, or no picture came.
     """
     stop, out = stop or threading.Event(), Path(out)
     if out.is_dir() and any(out.iterdir()):

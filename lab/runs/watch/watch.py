@@ -24,19 +24,17 @@ from lab.errors import InputError, RunError
 from lab.files.run.results import are_results
 from lab.files.run.run_file import LiveDevice, Run
 from lab.files.text.atomic_write import atomic_folder
-from lab.findings.outcome import Outcome
+from lab.findings.finding import Outcome
 from lab.pictures.picture_file import GreyPicture
 from lab.progress import Progress
 from lab.runs.frames.pipeline import Pipeline, tracker_of
 from lab.runs.frames.sensor_noise import VIDEO_FRAMES, CameraNoise
 from lab.runs.process import ready_run, write_results
 from lab.runs.smoothing_pass import TRACKING
-from lab.runs.verdict.frame_checks import FrameChecks
-from lab.runs.verdict.run_statistics import RunStatistics
+from lab.runs.verdict.run_statistics import FrameChecks, RunStatistics
 from lab.runs.watch.background import FunctionProcess, LiveBackground
 from lab.runs.watch.live_frames import LiveFrames, WatchOptions
-from lab.runs.watch.live_output import LiveOutput, is_live_table
-from lab.runs.watch.streams import opened
+from lab.runs.watch.live_output import LiveOutput, is_live_table, opened
 from tracking.background.estimation import PICTURES, static_background
 from tracking.detections import Detections
 from tracking.parameters import DetectParameters
@@ -76,10 +74,7 @@ def watch_run(
     pictures that the noise and the static background are estimated from (here each camera's first ones; of the
     background, those before each picture) and by pictures that came too late. reprocess: computes the results from the
     finished folders instead, as `beampose run` does, which takes longer. provenance: added to summary.json, such as the
-    command.
-
-    Raises:
-        BeamposeError: the run cannot be watched, or no picture came.
+    command. Raises BeamposeError: the run cannot be watched, or no picture came.
     """
     started = time.perf_counter()
     run = ready_run(run_folder, overrides, recording=True)
@@ -117,8 +112,7 @@ def _served(
     run: Run, frames: LiveFrames, page: str, stack: contextlib.ExitStack, line: Callable[[str], None] | None
 ) -> Board:
     """The content of the live page, and its server. Raises InputError: the address cannot be used."""
-    from lab.runs.watch.board import Board, page_html
-    from lab.runs.watch.page_server import PageServer
+    from lab.runs.watch.board import Board, PageServer, page_html
 
     # A process of its own: that of the backgrounds may be busy for seconds.
     board = Board(run, frames, stack.enter_context(FunctionProcess()).call)

@@ -145,10 +145,8 @@ def _contents(
 def stereo_frames(run: StereoRun, wanted: Collection[int] | None = None) -> Iterator[StereoFrame]:
     """All frames, from the first to the last of any camera.
 
-    wanted: the others need not be read, and may be missing.
-
-    Raises:
-        InputError: a folder is empty, or a video or table cannot be read.
+    wanted: the others need not be read, and may be missing. Raises InputError: a folder is empty, or a video or table
+    cannot be read.
     """
     sides = [
         _contents(source, name, camera.image_size_px, wanted)

@@ -12,8 +12,7 @@ import numpy as np
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
 from lab.files.project.project import load_lens
-from lab.files.rig.calibration_state import require_valid_calibration
-from lab.files.rig.camera_file import CameraFile
+from lab.files.rig.camera_file import CameraFile, require_valid_calibration
 from lab.files.text import columns
 from lab.findings.finding import Finding, Level, finding, level_above
 from lab.number_format import format_length, format_number
@@ -64,9 +63,8 @@ class LampsOptions(TrackOptions):
     def lens(self) -> CameraFile:
         """The camera.
 
-        Raises:
-            InputError: the file cannot be used, or there is no such detector.
-            CalibrationError: its calibration failed, or is out of date.
+        Raises InputError: the file cannot be used, or there is no such detector; CalibrationError: its calibration
+        failed, or is out of date.
         """
         if self.detector not in DETECTORS:
             raise InputError(f"--detector: expected one of {', '.join(DETECTORS)}, got {self.detector!r}")

@@ -16,11 +16,10 @@ import numpy as np
 from geometry.arrays import evenly_spread
 from geometry.pose import Pose
 from lab.errors import InputError
-from lab.files.rig.calibration_state import require_valid_calibration
+from lab.files.rig.camera_file import require_valid_calibration
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.run.truth import TruePoses, read_true_poses
-from lab.findings.finding import Finding, Level, finding, level_above, passed, worst_first
-from lab.findings.outcome import Outcome, Verdict
+from lab.findings.finding import Finding, Level, Outcome, Verdict, finding, level_above, passed, worst_first
 from lab.number_format import format_length, format_number
 from lab.pictures.picture_file import MissingPicture
 from lab.progress import Progress
@@ -223,9 +222,8 @@ _GREY_CHECKED = 5  # pictures in which a target of saturated colours must have s
 def process_stereo_run(run_folder: Path, out: Path, progress: Progress | None = None) -> Outcome[StereoResults]:
     """Process one stereo run folder into the folder `out`: tables, summary.json, pictures and report.html.
 
-    Raises:
-        BeamposeError: the run cannot be processed (CalibrationError: its pair's calibration must not be used); `out` is
-            then unchanged.
+    Raises BeamposeError: the run cannot be processed (CalibrationError: its pair's calibration must not be used); `out`
+    is then unchanged.
     """
     return write_processed(out, SUMMARY_SCHEMA, lambda work: _processed(run_folder, work, progress))
 
@@ -273,8 +271,7 @@ def _processed(run_folder: Path, work: Path, progress: Progress | None) -> Proce
 def measure(run: StereoRun, progress: Progress | None = None) -> StereoResults:
     """The records of all frames, and the offset between the cameras' clocks.
 
-    Raises:
-        InputError: the pictures cannot be read, or are grey while the markers are coloured.
+    Raises InputError: the pictures cannot be read, or are grey while the markers are coloured.
     """
     results = StereoResults(run)
     tracker = BinocularTracker(run.pair, run.target.model, run.parameters.match)

@@ -35,7 +35,7 @@ from geometry.camera import Camera
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import PoseFit
 from lab.errors import InputError
-from lab.files.rig.calibration_state import CalibrationState, OptionalDay
+from lab.files.rig.camera_file import CalibrationState, OptionalDay
 from lab.files.rig.pair_file import REMEDY, load_pair_file, of_two_cameras
 from lab.files.run.clocks import Times, load_times
 from lab.files.run.run_file import (

@@ -136,8 +136,7 @@ def write_stereo_recording(
     """Write the recording into a new folder: run.yaml, pair.yaml, pictures or detections, truth. The same seed gives
     the same bytes.
 
-    Raises:
-        InputError: the folder exists.
+    Raises InputError: the folder exists.
     """
     size = (round(960 * scale), round(720 * scale))
     view = replace(scene(seed, frames or FRAMES, size, 1100.0 * scale), right_delay_s=right_delay_s)

@@ -13,7 +13,7 @@ from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Spot
 
 WORLD_FROM_STAND = Pose.from_ypr(np.deg2rad([3.0, -2.0, 1.0]), np.array([0.02, 0.03, -0.05]))
-# 0.2 mm on the screen for the cameras of lab/simulate/rigs.py, 4.4 m away with a focal length of 1180 px.
+# 0.2 mm on the screen for the cameras of lab/simulate/scenarios.py, 4.4 m away with a focal length of 1180 px.
 SIGMA_PX = 0.2e-3 * 1180 / 4.4
 ARCSEC = np.deg2rad(1 / 3600)
 

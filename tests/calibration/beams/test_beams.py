@@ -15,9 +15,9 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed_rig
-from lab.calibrate.beams.beam_findings import beam_findings
+from lab.calibrate.beams.beams_page import beam_findings
 from lab.findings.finding import Level
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tests.calibration.beams.bench import (
     ARCSEC,
     SIGMA_PX,

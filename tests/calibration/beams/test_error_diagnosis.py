@@ -9,7 +9,7 @@ import pytest
 
 from calibration.beams.error_diagnosis import diagnose_error, swap_views
 from geometry.pose import Pose
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tests.calibration.beams.bench import drawn, positions, recorded, unknown_place
 
 RIG = RIGS["unequal-fan"]()

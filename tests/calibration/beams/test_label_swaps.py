@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.beams.beams import calibrate_beams
-from lab.calibrate.beams.beam_findings import beam_findings
+from lab.calibrate.beams.beams_page import beam_findings
 from lab.findings.finding import Level
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tests.calibration.beams.bench import drawn, exact, positions, recorded
 
 RIG = RIGS["unequal-fan"]()

@@ -15,7 +15,7 @@ from calibration.terms.rig_blocks import lines_in, stacks_of
 from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tests.calibration.beams.bench import ARCSEC, drawn, errors, exact, opposed, positions, recorded
 
 

@@ -11,7 +11,7 @@ from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
 from lab.calibrate.camera.camera import figures_of
-from lab.calibrate.camera.camera_findings import findings_of
+from lab.calibrate.camera.camera_page import findings_of
 from lab.findings.finding import Level, verdict
 from tests.calibration.lens.lens_scenes import TRUTH, Scene, photographs
 

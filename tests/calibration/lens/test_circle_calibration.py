@@ -14,7 +14,7 @@ from calibration.lens.fit.corner_table import CircleAreas, CornerTable
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
 from calibration.lens.intrinsics_result import Intrinsics
-from lab.calibrate.camera.camera_findings import findings_of
+from lab.calibrate.camera.camera_page import findings_of
 from lab.findings.finding import Level
 from tests.calibration.lens.rendered_circles import LENS, CircleScene, outlines, projected, shots, table_of
 

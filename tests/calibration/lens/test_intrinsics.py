@@ -14,7 +14,7 @@ from calibration.lens.fit.lens_models import LENS_MODELS, LensModel, named
 from calibration.lens.intrinsics import IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
 from calibration.lens.intrinsics_result import Intrinsics
 from geometry.camera import FISHEYE
-from lab.calibrate.camera.camera_findings import findings_of
+from lab.calibrate.camera.camera_page import findings_of
 from lab.findings.finding import Level, verdict
 from tests.calibration.lens.lens_scenes import SIZE, TRUTH, WIDE, Scene, board_points, photographs
 

@@ -7,7 +7,7 @@ import pytest
 
 from calibration.lens.fit.lens_models import LensModel, rational_of_fisheye, undistorted
 from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
-from lab.calibrate.camera.camera_findings import findings_of
+from lab.calibrate.camera.camera_page import findings_of
 from lab.findings.finding import Level, verdict
 from tests.calibration.lens.random_lenses import corners_of, lens_error, random_lens
 

@@ -15,7 +15,7 @@ from calibration.rig.rig_figures import calibrate_in_steps, central_pose, expect
 from calibration.screens.screens import calibrate
 from calibration.terms.corners import CornerTerm
 from geometry.pose import Pose
-from lab.calibrate.rig.rig_findings import joint_findings
+from lab.calibrate.rig.rig_page import joint_findings
 from lab.findings.finding import Level
 from lab.simulate.campaign import Campaign, CampaignQuality, draw_campaign, spots_at
 

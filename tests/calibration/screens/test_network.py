@@ -21,7 +21,7 @@ from calibration.screens.screens import (
 )
 from geometry.pose import Pose
 from geometry.rig import Rig
-from lab.calibrate.screens.screen_findings import near_findings, network_findings
+from lab.calibrate.screens.screen_page import near_findings, network_findings
 from lab.findings.finding import Level
 from tests.calibration.screens.networks import (
     corners_of,

@@ -9,7 +9,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.pose_solver.visibility import alternative_poses, symmetries
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tests.geometry.scenes import random_pose
 
 

@@ -18,7 +18,7 @@ from lab.files.run.run_file import load_run
 from lab.files.text import columns
 from tests.paths import ROOT
 
-MODULES = ("lab.api.results", "lab.api.processing", "lab.api.tracking")
+MODULES = ("lab.api.results", "lab.api.results", "lab.api.tracking")
 
 
 @pytest.fixture(scope="module")

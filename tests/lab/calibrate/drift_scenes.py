@@ -13,7 +13,7 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.rotations import exp
 from geometry.uncertainty.rig_uncertainty import RigCovariance, camera_names, perturbed_rig
-from lab.files.rig.calibration_state import CalibrationState
+from lab.files.rig.camera_file import CalibrationState
 from lab.files.rig.rig_file import RigFile, save_rig
 from tests.geometry.scenes import LENSES, paper_rig
 

@@ -10,7 +10,7 @@ import numpy as np
 from geometry.rig import Rig
 from lab.files.rig.camera_file import CameraFile, save_camera
 from lab.files.text.yaml_text import write_mapping
-from lab.simulate.rigs import fan
+from lab.simulate.scenarios import fan
 
 SURVEY_SIGMA_M, PIXEL_SIGMA_PX = 3e-4, 0.1
 SIZE_M = (2.4, 2.0)

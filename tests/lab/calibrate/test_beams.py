@@ -18,8 +18,8 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names
-from lab.calibrate.beams.beam_findings import bad_positions
 from lab.calibrate.beams.beams import calibrate_beams
+from lab.calibrate.beams.beams_page import bad_positions
 from lab.calibrate.beams.recordings import (
     SpotRows,
     average,
@@ -30,8 +30,7 @@ from lab.calibrate.beams.recordings import (
 )
 from lab.errors import CalibrationError, InputError
 from lab.files.project.project import load_project
-from lab.files.rig.calibration_state import CalibrationState
-from lab.files.rig.camera_file import CameraFile, save_camera
+from lab.files.rig.camera_file import CalibrationState, CameraFile, save_camera
 from lab.files.rig.rig_file import (
     RigFile,
     as_mapping,
@@ -44,7 +43,7 @@ from lab.files.rig.rig_file import (
 from lab.files.run.run_file import save_run
 from lab.files.text.yaml_text import write_mapping
 from lab.findings.finding import Level
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tests.calibration.beams.bench import ARCSEC, WORLD_FROM_STAND, drawn, errors, positions, recorded
 
 STAND = {

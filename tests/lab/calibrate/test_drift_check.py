@@ -21,7 +21,7 @@ from lab.calibrate.drift_check.drift_check import COLUMNS, DriftLimits, check_dr
 from lab.calibrate.drift_check.drift_comparison import compare_points, read_history
 from lab.calibrate.drift_check.drift_inputs import DriftInputs, read_points
 from lab.errors import InputError
-from lab.files.rig.calibration_state import CalibrationState
+from lab.files.rig.camera_file import CalibrationState
 from lab.files.rig.rig_file import joint_covariance
 from lab.findings.finding import Level
 from tests.lab.calibrate import drift_scenes as scenes

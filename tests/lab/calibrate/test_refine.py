@@ -22,10 +22,8 @@ from cli import main
 from geometry.rig import Rig
 from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import covariance_root, perturbed_rig
-from lab.calibrate.refine.prior_sigmas import stated_covariance
-from lab.calibrate.refine.recordings import labelled, tolerant, with_rig
-from lab.calibrate.refine.refine import refine_rig
-from lab.calibrate.refine.refine_findings import refine_findings
+from lab.calibrate.refine.recordings import labelled, stated_covariance, tolerant, with_rig
+from lab.calibrate.refine.refine import refine_findings, refine_rig
 from lab.errors import CalibrationError
 from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance, load_rig_file, save_rig
 from lab.files.run.run_file import load_run

@@ -15,7 +15,7 @@ import pytest
 from calibration.rig.rig_figures import ExpectedPose
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from lab.calibrate.rig import rig_findings
+from lab.calibrate.rig import rig_page
 from lab.calibrate.rig.rig import COLUMNS, calibrate_rig
 from lab.calibrate.step import calibration_date, expiry_date, expiry_findings
 from lab.errors import CalibrationError, InputError
@@ -322,7 +322,7 @@ def test_the_expected_accuracy_is_judged_by_the_worse_of_attitude_and_position(t
     total = np.diag(np.repeat([(moved * 1e-3) ** 2, np.deg2rad(turned * 0.02) ** 2], 3))
     shares = {"cameras": 0.2 * total, "beams": 0.6 * total}
     poses = [ExpectedPose(Pose.identity(), 6, total, part * total, (1 - part) * total, shares) for part in (0.2, 0.8)]
-    found = [rig_findings._expected(pose) for pose in poses]
+    found = [rig_page._expected_finding(pose) for pose in poses]
     assert [f.level for f in found] == [level, level]
     if level > Level.PASS:
         assert [f.why.rsplit("from ", 1)[1] for f in found] == ["beams", "the spots' noise"]
@@ -339,8 +339,8 @@ def test_steps_that_are_consistent_alone_and_not_together_contradict_each_other(
         beams=SimpleNamespace(fit=SimpleNamespace(scale=beams)),
         joint=SimpleNamespace(scales={"dots": 1.0, "spots": together}),
     )
-    assert [f.code for f in rig_findings._contradiction(steps)] == codes
+    assert [f.code for f in rig_page._contradiction(steps)] == codes
 
 
 def test_a_centre_without_a_pose_fails():
-    assert rig_findings._expected(None).level == Level.FAIL
+    assert rig_page._expected_finding(None).level == Level.FAIL

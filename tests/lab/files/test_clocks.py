@@ -11,8 +11,7 @@ import pytest
 from lab.errors import BeamposeError
 from lab.files.run.run_file import load_run
 from lab.report.frames.content import pictures_of
-from lab.runs.frames.clocked_frames import open_frames
-from lab.runs.frames.frames import pictures_at
+from lab.runs.frames.frames import open_frames, pictures_at
 from tests.lab.run_folders import RIG
 
 FRAMES = 20

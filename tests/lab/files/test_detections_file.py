@@ -15,7 +15,7 @@ from lab.files.run.detections_file import read_detections
 from lab.files.run.run_file import load_run
 from lab.files.text import columns
 from lab.pictures.picture_file import MissingPicture
-from lab.runs.frames.clocked_frames import open_frames
+from lab.runs.frames.frames import open_frames
 from lab.runs.input_check import check
 from tests.lab.run_folders import edit, write_run
 from tracking.detections import Detections

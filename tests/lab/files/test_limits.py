@@ -137,7 +137,7 @@ def test_files_of_users_are_read_through_the_helpers_that_refuse_pipes():
         "results/certificate.py",
         "results/compare.py",
         "results/export.py",
-        "runs/detect/pick.py",
+        "runs/detect/detect.py",
         "setup/doctor.py",
         "files/project/point_files.py",
         "setup/init.py",

@@ -12,8 +12,7 @@ import pytest
 
 from lab.report.index import write_index
 from lab.report.run.page import write_report
-from lab.results.view.page import write_page
-from lab.results.view.scene import View, read_content, view_of
+from lab.results.view.page import View, read_content, view_of, write_page
 from tests.lab.report.test_report import make
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

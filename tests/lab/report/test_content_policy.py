@@ -8,7 +8,7 @@ import re
 
 import pytest
 
-from lab.report.html import content_policy, environment, scripts
+from lab.report.page import content_policy, environment, scripts
 
 TEMPLATES = sorted(n for n in environment().list_templates() if n.endswith(".html.j2") and n != "sections.html.j2")
 

@@ -10,8 +10,8 @@ import pytest
 
 from lab.findings.finding import Level
 from lab.report.run import trust
-from lab.report.run.model_fit import HEADS, model_fit
 from lab.report.run.page import write_report
+from lab.report.run.trust import HEADS, model_fit
 from lab.report.summary import summary_of
 from lab.runs.model_check.check import check_model
 from tests.calibration.model_check.model_scenes import changed, recorded

@@ -16,7 +16,6 @@ from lab.calibrate.camera.camera_page import representative_views
 from lab.calibrate.step import fingerprints_of_inputs, made_of
 from lab.errors import InputError
 from lab.findings.finding import Finding, Level, counted
-from lab.report.calibration import calibration_charts as charts
 from lab.report.calibration import calibration_drawings as draw
 from lab.report.calibration import calibration_scene as scene
 from lab.report.page import LARGEST_BYTES, Page, PageDrawing, PageTable, Section, cell, html_of, write_page
@@ -59,22 +58,22 @@ def all_drawings() -> dict[str, str]:
         "map": heat_map(holed, (0, 640, 0, 480), "uncertainty <px>", "px"),
         "map that rises upwards": heat_map(MAP - 1, (-1, 1, -1, 1), "t", "mm", y_down=False),
         "map of nothing": heat_map(np.full((3, 4), np.nan), (0, 1, 0, 1), "t", "px"),
-        "histogram": charts.residual_histogram(RESIDUALS, sigma=0.2),
-        "histogram of none": charts.residual_histogram(RESIDUALS[:0]),
-        "ladder": charts.lens_model_chart(
+        "histogram": draw.residual_histogram(RESIDUALS, sigma=0.2),
+        "histogram of none": draw.residual_histogram(RESIDUALS[:0]),
+        "ladder": draw.lens_model_chart(
             ["4 <&>", "5", "fisheye"], np.array([0.3, 0.2, np.nan]), 1, noise_px=np.array([0.3, 0.1, np.nan])
         ),
-        "flatness": charts.flatness_map(
+        "flatness": draw.flatness_map(
             RNG.normal(size=(40, 2)), RNG.normal(0, 1e-3, 40), size_m=(4, 3), bow=(1e-3, 0, 0)
         ),
-        "correlations": charts.correlation_matrix(["fx", "<k1>", "fixed", "a", "b", "c"], covariance),
-        "drift": charts.drift_chart(
-            {"left": charts.DriftLine(days, np.array([0.1, np.nan, 0.2, 0.1, 0.3]), np.full(5, 0.1))},
+        "correlations": draw.correlation_matrix(["fx", "<k1>", "fixed", "a", "b", "c"], covariance),
+        "drift": draw.drift_chart(
+            {"left": draw.DriftLine(days, np.array([0.1, np.nan, 0.2, 0.1, 0.3]), np.full(5, 0.1))},
             warn=0.2,
             fail=0.5,
             expires=datetime.date(2026, 2, 1),
         ),
-        "one check": charts.drift_chart({"l & r": charts.DriftLine(days[:1], np.array([0.1]))}),
+        "one check": draw.drift_chart({"l & r": draw.DriftLine(days[:1], np.array([0.1]))}),
         **{f"scene {i}": s for i, s in enumerate(scene.scene_views(things))},
         "boards": scene.scene_view(
             [
@@ -230,7 +229,7 @@ def test_a_cell_shows_numbers_to_four_digits(value, shown):
 
 def test_correlations_of_many_parameters_are_those_of_the_first_sixty():
     for count in (60, 61):
-        drawn = charts.correlation_matrix([f"p{i:02d}" for i in range(count)], np.eye(count))
+        drawn = draw.correlation_matrix([f"p{i:02d}" for i in range(count)], np.eye(count))
         assert [f">p{i:02d}<" in drawn for i in range(count)] == [True] * 60 + [False] * (count - 60)
         assert ("(the first 60)" in drawn) == (count > 60)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import jinja2
 import pytest
 
-from lab.report import html
+from lab.report import page
 
 NAME = "failure.html.j2"
 
@@ -15,7 +15,7 @@ NAME = "failure.html.j2"
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
     """Where templates are kept in this test."""
-    monkeypatch.setattr(html, "private_folder", lambda sources: tmp_path)
+    monkeypatch.setattr(page, "private_folder", lambda sources: tmp_path)
     return tmp_path
 
 
@@ -29,7 +29,7 @@ def loaded() -> list[str]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(jinja2.Environment, "compile", counted)
-        html.environment.__wrapped__().get_template(NAME)
+        page.environment.__wrapped__().get_template(NAME)
     return compiled
 
 
@@ -57,12 +57,12 @@ def test_a_full_disk_is_no_error(folder, monkeypatch):
 
 
 def test_without_a_safe_folder_templates_are_compiled_in_every_process(monkeypatch):
-    monkeypatch.setattr(html, "private_folder", lambda sources: None)
+    monkeypatch.setattr(page, "private_folder", lambda sources: None)
     assert loaded() == loaded() == [NAME]
 
 
 def test_an_edited_template_or_another_setting_of_the_engine_means_another_folder(monkeypatch):
     given = []
-    monkeypatch.setattr(html, "private_folder", given.append)
-    html.environment.__wrapped__()
-    assert {Path(str(html.__file__)), *html.TEMPLATES.iterdir()} <= set(given[0])
+    monkeypatch.setattr(page, "private_folder", given.append)
+    page.environment.__wrapped__()
+    assert {Path(str(page.__file__)), *page.TEMPLATES.iterdir()} <= set(given[0])

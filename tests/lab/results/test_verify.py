@@ -172,4 +172,4 @@ def test_each_kind_of_difference_has_its_words(tmp_path, recorded, computed, tex
         (tmp_path / name / "t.csv").write_bytes(content.encode())
     found = difference_of(tmp_path / "old" / "t.csv", tmp_path / "new" / "t.csv")
     assert found is not None
-    assert found.text.startswith(text)
+    assert found.startswith(f"t.csv: {text}")

@@ -11,7 +11,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.runs.frames.pipeline import FrameRecord
-from lab.runs.verdict.frame_checks import CONTRADICTION, NOT_A_COVARIANCE, FrameChecks
+from lab.runs.verdict.run_statistics import CONTRADICTION, NOT_A_COVARIANCE, FrameChecks
 from tests.geometry.scenes import paper_rig
 from tracking.detections import Detections
 from tracking.statuses import MotionEstimate, PoseStatus, SpotStatus, TrackedFrame

@@ -22,8 +22,7 @@ from lab.pictures import picture_file
 from lab.pictures.picture_file import MissingPicture, read_picture
 from lab.pictures.source import AHEAD, list_folder, pictures, video_at
 from lab.runs.frames import frames
-from lab.runs.frames.clocked_frames import open_frames
-from lab.runs.frames.frames import FrameSet, pictures_at
+from lab.runs.frames.frames import FrameSet, open_frames, pictures_at
 from lab.runs.frames.pipeline import Pipeline
 from tests.lab.run_folders import edit, picture_of, write_run
 
@@ -329,7 +328,7 @@ MEASURE = """
 import resource, sys
 from pathlib import Path
 from lab.files.run.run_file import load_run
-from lab.runs.frames.clocked_frames import open_frames
+from lab.runs.frames.frames import open_frames
 count = sum(1 for _ in open_frames(load_run(Path(sys.argv[1]))))
 print(count, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """

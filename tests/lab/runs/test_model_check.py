@@ -75,7 +75,7 @@ def test_a_finding_states_that_a_recording_does_not_distinguish_faults():
 
 def test_indistinguishable_faults_fail_only_if_each_would_and_pass_only_if_each_would():
     small, middle, large = (Effect(0, 0, 0.0, 0.0, 0.1, 0.1, sigmas) for sigmas in (0.1, 2.0, 9.0))
-    diagnosis = FaultDiagnosis((), 0.0, 1.0, 30, 1.0, 1.0, 1.0, False, np.ones(6))
+    diagnosis = FaultDiagnosis((), 0.0, 1.0, 1.0, 1.0, 1.0, False, np.ones(6))
     assert check.level_of(diagnosis, [small, small]) == Level.PASS
     assert check.level_of(diagnosis, [small, middle]) == Level.WARN
     assert check.level_of(diagnosis, [middle, large]) == Level.WARN
@@ -86,7 +86,7 @@ def test_indistinguishable_faults_fail_only_if_each_would_and_pass_only_if_each_
 def test_noise_alone_does_not_make_a_small_fault_a_failure():
     small = [Effect(0, 0, 0.0, 0.2, 0.1, 0.1, 0.1)]
     for noise, level in ((1.0, Level.FAIL), (8.0, Level.PASS)):
-        diagnosis = FaultDiagnosis((), 0.0, 1.0, 30, 8.0, noise, 1.0, False, np.ones(6))
+        diagnosis = FaultDiagnosis((), 0.0, 1.0, 8.0, noise, 1.0, False, np.ones(6))
         assert check.level_of(diagnosis, small) == level
 
 

@@ -13,7 +13,7 @@ import yaml
 
 from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names
 from lab.errors import CalibrationError
-from lab.files.rig.calibration_state import CalibrationState
+from lab.files.rig.camera_file import CalibrationState
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from lab.files.run.results import read_poses
 from lab.runs.batch.batch import process_batch

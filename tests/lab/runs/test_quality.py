@@ -6,9 +6,7 @@ from collections import Counter
 
 import pytest
 
-from lab.findings.finding import ENTRIES, Finding, Level, finding
-from lab.findings.outcome import Verdict
-from lab.runs.verdict.frame_checks import FrameRanges
+from lab.findings.finding import ENTRIES, Finding, Level, Verdict, finding
 from lab.runs.verdict.quality import (
     GOOD_MEASURED,
     LEAST_DISPLACED,
@@ -16,7 +14,7 @@ from lab.runs.verdict.quality import (
     LEAST_MEASURED_OF_SHOWN,
     judge,
 )
-from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, FrameCause, RunStatistics
+from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, FrameCause, FrameRanges, RunStatistics
 
 FRAMES = 1000
 

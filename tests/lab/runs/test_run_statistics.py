@@ -9,8 +9,7 @@ import pytest
 
 from geometry.pose import Pose
 from lab.runs.frames.pipeline import FrameRecord
-from lab.runs.verdict.frame_checks import CONTRADICTION, FrameRanges
-from lab.runs.verdict.run_statistics import CameraStatistics, FrameCause, RunStatistics
+from lab.runs.verdict.run_statistics import CONTRADICTION, CameraStatistics, FrameCause, FrameRanges, RunStatistics
 from tracking.detections import Detections
 from tracking.statuses import Event, PoseStatus, SpotStatus, TrackedFrame
 

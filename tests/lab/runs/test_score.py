@@ -148,7 +148,7 @@ def test_spots_that_cross_closer_than_the_noise_do_not_count_as_swapped():
     true_uv = np.array([[[100.0, 100.0], [100.3, 100.0]]])
     measured = SpotGrid(
         frames=np.array([0]), t_s=np.zeros(1), views=(("a", "1"), ("a", "2")), uv_px=true_uv[:, ::-1].copy(),
-        sigma_px=np.full((1, 2, 2), 0.1), predicted_px=true_uv, gain=np.ones((1, 2)), status=np.zeros((1, 2), np.int64),
+        sigma_px=np.full((1, 2, 2), 0.1), predicted_px=true_uv, status=np.zeros((1, 2), np.int64),
         label_probability=np.ones((1, 2)), cov_uv_px2=np.zeros((1, 2)),
     )  # fmt: skip
     assert right_spot(measured, true_uv).all()

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from cli import main
-from lab.commands import maintenance
+from lab.commands import setup
 from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig
 from lab.runs.input_check import check
@@ -91,9 +91,9 @@ NOTHING = {"screens": None, "cameras": None, "beams": None, "rate": None}
 
 
 def test_without_a_terminal_nothing_is_asked_and_the_defaults_fit_each_other():
-    assert maintenance._asked(NOTHING) == {"screens": 2, "cameras": 2, "beams": 3, "rate": 100.0}
+    assert setup._asked(NOTHING) == {"screens": 2, "cameras": 2, "beams": 3, "rate": 100.0}
     for screens in (1, 2, 3, 4):
-        values = maintenance._asked({**NOTHING, "screens": screens})
+        values = setup._asked({**NOTHING, "screens": screens})
         rig_of(Layout(int(values["cameras"]), screens, int(values["beams"])))
 
 
@@ -104,9 +104,9 @@ def test_on_a_terminal_only_what_is_not_given_is_asked(monkeypatch):
         asked.append(question)
         return type(7)
 
-    monkeypatch.setattr(maintenance, "_on_a_terminal", lambda: True)
+    monkeypatch.setattr(setup, "_on_a_terminal", lambda: True)
     monkeypatch.setattr(click, "prompt", answer)
-    assert maintenance._asked({**NOTHING, "screens": 2, "rate": 25.0}) == {
+    assert setup._asked({**NOTHING, "screens": 2, "rate": 25.0}) == {
         "screens": 2, "cameras": 7, "beams": 7, "rate": 25.0,
     }  # fmt: skip
     assert len(asked) == 2
@@ -161,7 +161,7 @@ def test_a_rig_of_ones_own_is_what_was_measured_and_says_and_draws_it(tmp_path):
 
 
 def test_questions_in_plain_words_give_the_same_rig_as_options(monkeypatch, tmp_path):
-    monkeypatch.setattr(maintenance, "_on_a_terminal", lambda: True)
+    monkeypatch.setattr(setup, "_on_a_terminal", lambda: True)
     answers = [
         "2", "2", "2", "100",
         "wall", "-2 2.5 0", "2, 2.5, 0", "-2 2.5 x", "-2 2.5 3",  # one is no number: asked again

@@ -16,7 +16,7 @@ from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from lab.findings.finding import Level
-from lab.setup.plan import plan_of, plan_rig
+from lab.setup.plan import cell_map, effect_columns, fine_map, plan_columns, plan_of, plan_rig, share_bars
 from lab.setup.plan_findings import (
     CORRELATION,
     TOTAL_CALIBRATION,
@@ -28,7 +28,6 @@ from lab.setup.plan_findings import (
     findings,
     worst_first,
 )
-from lab.setup.plan_page import cell_map, effect_columns, fine_map, plan_columns, share_bars
 from tests.geometry.scenes import LENSES, paper_rig
 
 SMALL = PlanOptions(

@@ -31,7 +31,7 @@ from lab.pictures.source import pictures, video_at
 from lab.runs.input_check import check
 from lab.runs.process import process_run
 from lab.runs.setup_check import SampledFrames, frames_of
-from lab.simulate.rigs import fan, unequal_fan
+from lab.simulate.scenarios import fan, unequal_fan
 from lab.simulate.write import simulate
 from tests.lab.run_folders import edit, write_run
 from tracking.detections import Detections

@@ -15,7 +15,7 @@ from lab.files.rig.rig_file import load_rig
 from lab.files.text.csv_text import read_table
 from lab.setup.init import Layout, start
 from lab.simulate.campaign import CampaignQuality, draw_campaign, lens_covariance, simulate_calibration
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from lab.simulate.write import simulate
 
 

@@ -16,8 +16,7 @@ from geometry.pose import Pose, look_at
 from geometry.rig import Rig
 from lab.simulate.picture import expected_light, laser_powers, make_sensor
 from lab.simulate.points import exposure_instants, on_screen_covariance, spot_images, spot_patch
-from lab.simulate.rigs import fan
-from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter
+from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter, fan
 from lab.simulate.scene import compose
 
 RIG = fan()

@@ -18,7 +18,7 @@ from lab.files.rig.rig_file import load_rig, save_rig
 from lab.files.run.run_file import load_run
 from lab.files.run.truth import load_truth
 from lab.setup.init import Layout, rig_of
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from lab.simulate.write import simulate
 from tests.lab.simulate.test_write import files_of
 

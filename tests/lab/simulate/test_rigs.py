@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.simulate.rigs import IMAGE_SIZE_PX, RIGS, lab_camera, scaled
+from lab.simulate.scenarios import IMAGE_SIZE_PX, RIGS, lab_camera, scaled
 
 AIM = np.array([1.2, -0.4, 0.3])
 

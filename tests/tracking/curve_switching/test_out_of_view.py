@@ -9,7 +9,7 @@ import pytest
 
 from geometry.forward_model import SpotModel
 from geometry.rig import Beam
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tests.geometry.scenes import random_pose
 from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
 

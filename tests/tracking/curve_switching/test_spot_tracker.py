@@ -11,8 +11,7 @@ import pytest
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from lab.simulate.points import PointRun, simulate_points
-from lab.simulate.rigs import RIGS
-from lab.simulate.scenarios import SCENARIOS, Clutter, Occlusion
+from lab.simulate.scenarios import RIGS, SCENARIOS, Clutter, Occlusion
 from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import UNMATCHED, Detections

@@ -12,7 +12,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Beam, Rig
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tracking.detections import Detections
 from tracking.labelling.first_labels import NO_POINT, FirstLabels, find_labels
 from tracking.parameters import LabelParameters

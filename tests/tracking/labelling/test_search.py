@@ -14,7 +14,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tests.geometry.scenes import random_pose, random_rig
 from tests.tracking.labelling.test_first_labels import (
     NOISE_PX,

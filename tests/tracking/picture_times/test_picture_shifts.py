@@ -8,7 +8,7 @@ import pytest
 from geometry.compiled_linalg import pose_plus
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tracking.detections import PictureClock
 from tracking.rigid_body.models.information import add_clock_errors, exposed_after, picture_shifts, timed_spot
 from tracking.rigid_body.models.motion import state_after

@@ -12,7 +12,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose, look_at
 from geometry.pose_prior import PosePrior
 from geometry.rig import Beam, Rig, Spot
-from lab.simulate.rigs import RIGS, fan
+from lab.simulate.scenarios import RIGS, fan
 from tests.tracking.rigid_runs import RIGID, assess, recording_of, smoothed_frames, tracked, with_occlusions
 from tracking.detections import Detections
 from tracking.rigid_body.acquisition import Acquisition

@@ -12,7 +12,7 @@ import pytest
 from geometry.arrays import Array, Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tracking.rigid_body.association.frame_detections import (
     BLENDED,
     CLUTTER_RADIUS_PX,

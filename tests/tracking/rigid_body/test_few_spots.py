@@ -8,8 +8,7 @@ import pytest
 from geometry.pose import Pose
 from geometry.pose_solver.visibility import alternative_poses
 from lab.simulate.points import PointRun, simulate_points
-from lab.simulate.rigs import RIGS, scaled
-from lab.simulate.scenarios import PriorRegion
+from lab.simulate.scenarios import RIGS, PriorRegion, scaled
 from tests.tracking.rigid_runs import RIGID, assess, dt_of, found_in, prior_of, recording_of, tracked, with_occlusions
 from tracking.detections import UNMATCHED
 from tracking.rigid_body.hypotheses.hypothesis_set import (

@@ -8,7 +8,7 @@ import pytest
 from geometry.arrays import Array, Bools, numeric_jacobian
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tracking.rigid_body.frame_summary import inverse
 from tracking.rigid_body.models.information import frame_information, single_frame_pose, well_controlled
 from tracking.rigid_body.models.motion import STATE, updated

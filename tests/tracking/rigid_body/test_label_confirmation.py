@@ -6,7 +6,7 @@ import numpy as np
 
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tracking.rigid_body.association.frame_detections import FrameDetections
 from tracking.rigid_body.label_confirmation import MIN_EVIDENCE_NATS, FirstEvidence, decisive
 

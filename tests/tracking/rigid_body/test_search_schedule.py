@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.forward_model import SpotModel
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tracking.detections import Detections
 from tracking.rigid_body.acquisition import ASTRAY, LONG_UNMEASURED, SEARCH_AT, SearchSchedule
 from tracking.rigid_body.models.occlusion import MISSED

@@ -9,7 +9,7 @@ from geometry.arrays import Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from lab.simulate.points import PointRun
-from lab.simulate.rigs import fan
+from lab.simulate.scenarios import fan
 from tests.tracking.rigid_runs import RIGID, assess, found_in, prior_of, recording_of, smoothed_frames, tracked
 from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.rigid_body.association.joint_search import complete

@@ -9,7 +9,7 @@ import pytest
 
 from geometry.arrays import Array
 from geometry.forward_model import SpotModel
-from lab.simulate.rigs import fan
+from lab.simulate.scenarios import fan
 from tracking.detections import Detections
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.frame_summary import FrameSummary

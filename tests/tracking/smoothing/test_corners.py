@@ -10,8 +10,7 @@ import pytest
 from geometry.arrays import Array, Bools
 from geometry.pose import Pose
 from lab.simulate.points import PointRun
-from lab.simulate.rigs import RIGS
-from lab.simulate.scenarios import PriorRegion
+from lab.simulate.scenarios import RIGS, PriorRegion
 from tests.tracking.rigid_runs import (
     RIGID,
     Assessment,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geometry.pose import Pose
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tests.tracking.rigid_runs import RIGID, dt_of, found_in, recording_of, tracked
 from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.smoothing.error_scale import ErrorScale, scattered_width_share, well_known, widened

@@ -7,8 +7,7 @@ import pytest
 
 from geometry.pose import Pose
 from lab.simulate.points import CLUTTER, PointRun, simulate_points
-from lab.simulate.rigs import RIGS
-from lab.simulate.scenarios import PriorRegion
+from lab.simulate.scenarios import RIGS, PriorRegion
 from tests.tracking.rigid_runs import assess, recording_of, smoothed_frames, tracked, zig_zag
 from tracking.detections import Detections
 from tracking.smoothing.place_errors import correlation, more_of_means, place_errors

@@ -7,7 +7,7 @@ import pytest
 
 from geometry.arrays import Array, Bools
 from geometry.pose import Pose
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tests.tracking.rigid_runs import RIGID, dt_of, found_in, recording_of, tracked
 from tracking.smoothing.motion import whole_run
 from tracking.smoothing.motion.fixed_interval import Interval

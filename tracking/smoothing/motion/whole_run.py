@@ -91,10 +91,8 @@ def estimate(
     """The motion given labels (T, n). measured (T,): frames whose own spots determine the pose.
 
     Spots of frames that are not trusted (T,), or farther than max_distance (frames) from any measured frame, are not
-    used; 0: only measured frames are. Frames before the first used one and after the last are extrapolated.
-
-    Raises:
-        FloatingPointError: The first Gauss-Newton step is not finite.
+    used; 0: only measured frames are. Frames before the first used one and after the last are extrapolated. Raises
+    FloatingPointError: The first Gauss-Newton step is not finite.
     """
     measured = measured & trusted
     far = ~largest_near(measured, max_distance)

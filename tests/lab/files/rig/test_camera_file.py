@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
-from lab.files.rig.calibration_state import CameraCalibration
-from lab.files.rig.camera_file import CameraFile, load_camera, save_camera
+from lab.files.rig.camera_file import CameraCalibration, CameraFile, load_camera, save_camera
 from lab.files.rig.rig_file import load_rig, save_rig
 from tests.lab.run_folders import RIG
 

@@ -12,7 +12,7 @@ from geometry.pose import Pose, look_at
 from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.rig.rig_file import RigFile, as_mapping, load_rig, load_rig_file, save_rig
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 
 EXACT = 1e-12  # m, and of an entry of a rotation matrix: some roundings of numbers of up to 100 m
 SIZE_M = (1.7, 1.1)

@@ -9,9 +9,9 @@ import pytest
 
 from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names
 from lab.errors import CalibrationError, InputError
-from lab.files.rig.calibration_state import CalibrationState, require_valid_calibration
+from lab.files.rig.camera_file import CalibrationState, require_valid_calibration
 from lab.files.rig.rig_file import RigFile, joint_covariance, load_rig_file, save_rig
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 
 RIG = RIGS["fan"]()
 

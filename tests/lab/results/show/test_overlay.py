@@ -14,7 +14,6 @@ from click.testing import CliRunner
 from cli import main
 from lab.errors import InputError, RunError
 from lab.files.run.results import read_poses
-from lab.pictures import overlay_video
 from lab.report.frames import canvas
 from lab.report.frames.canvas import bgr
 from lab.report.frames.content import frame_content, pose_words, read_result_data
@@ -201,7 +200,7 @@ def test_a_tail_is_the_way_of_the_spot_until_now(data):
 
 
 def test_where_a_codec_is_missing_the_next_one_is_used_and_named(fake, monkeypatch):
-    monkeypatch.setattr(overlay_video, "CODECS", (("????", ".avi"), ("MJPG", ".avi")))
+    monkeypatch.setattr(canvas, "CODECS", (("????", ".avi"), ("MJPG", ".avi")))
     written = write_video(fake.results, fake.run_folder, last=2)
     assert "cannot write ???? videos" in written.notes[-1]
     assert len(played(written.result)) == 3
@@ -209,7 +208,7 @@ def test_where_a_codec_is_missing_the_next_one_is_used_and_named(fake, monkeypat
 
 def test_where_no_codec_works_nothing_is_left(fake, monkeypatch):
     before = sorted(p.name for p in fake.results.iterdir())
-    monkeypatch.setattr(overlay_video, "CODECS", (("????", ".avi"),))
+    monkeypatch.setattr(canvas, "CODECS", (("????", ".avi"),))
     with pytest.raises(RunError, match="no video could be written"):
         write_video(fake.results, fake.run_folder, last=2)
     assert sorted(p.name for p in fake.results.iterdir()) == before

@@ -9,15 +9,14 @@ import sys
 import numpy as np
 import pytest
 
-from calibration.open3d_loader import open3d
+from calibration.screens.clouds import open3d
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from lab.errors import InputError
 from lab.files.rig.rig_file import save_rig
+from lab.results.view import page as solids
 from lab.results.view import page as view_module
-from lab.results.view import scene as solids
-from lab.results.view.page import scene_data, show, write_page
-from lab.results.view.scene import read_content, view_of, write_glb
+from lab.results.view.page import read_content, scene_data, show, view_of, write_glb, write_page
 from tests.lab.fake_results import make
 from tests.lab.simulate.test_own_motion import elsewhere
 from tests.open3d_marker import needs_open3d

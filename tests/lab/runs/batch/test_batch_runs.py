@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from lab.commands.batch import pace
+from lab.commands.run import pace
 from lab.errors import InputError
 from lab.runs.batch.batch import BatchOptions, process_batch
 from lab.runs.batch.task import listed_runs, shard_of

@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from lab.runs.batch.workers import THREAD_VARIABLES, performed, threads_per_process
+from lab.runs.batch.batch import THREAD_VARIABLES, performed, threads_per_process
 
 
 def square_or_die(number: int) -> int:

@@ -16,7 +16,7 @@ from cli import main
 from lab.files.run.results import read_poses
 from lab.pictures.picture_file import DROPPED, MissingPicture
 from lab.results.certificate import CLOCKS, certificate
-from lab.runs.frames.clocked_frames import FoundPoints
+from lab.runs.frames.frames import FoundPoints
 from lab.simulate.write import simulate
 from tracking.detections import Detections
 

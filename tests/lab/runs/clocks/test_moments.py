@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lab.runs.frames.moments import plan_moments
-from lab.runs.frames.row_records import _sources
+from lab.runs.frames.pipeline import _sources
 
 ROWS = np.arange(10)
 ROWS_S = ROWS / 100

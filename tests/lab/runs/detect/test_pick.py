@@ -14,7 +14,7 @@ from lab.calibrate.beams.recordings import read_spot_table
 from lab.errors import InputError
 from lab.files.project.point_files import read_observations
 from lab.files.rig.rig_file import load_rig
-from lab.runs.detect.pick import MOST_PICTURES, PickOptions, write_pick_page
+from lab.runs.detect.detect import MOST_PICTURES, PickOptions, write_pick_page
 from tests.lab.chromium import Browser, needs_chromium
 from tests.paths import ROOT
 

@@ -14,10 +14,9 @@ import yaml
 from lab.errors import InputError
 from lab.files.run.clocks import CameraClock, Times
 from lab.files.text import columns
-from lab.runs.watch.inbox import Inbox, is_complete
+from lab.runs.watch.inbox import Inbox, PictureTimes, TimesFollower, is_complete
 from lab.runs.watch.live_frames import WatchOptions
 from lab.runs.watch.live_output import LIVE_TABLE
-from lab.runs.watch.picture_times import PictureTimes, TimesFollower
 from lab.runs.watch.watch import watch_run
 from lab.simulate.write import simulate
 from tests.lab.runs.watch.test_watch import run_of_first_pictures

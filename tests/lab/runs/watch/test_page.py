@@ -17,9 +17,8 @@ import yaml
 
 from lab.errors import InputError
 from lab.findings.finding import Level
-from lab.runs.watch.board import exposure_advice
+from lab.runs.watch.board import PageServer, exposure_advice
 from lab.runs.watch.live_frames import WatchOptions
-from lab.runs.watch.page_server import PageServer
 from lab.runs.watch.watch import watch_run
 from lab.simulate.write import simulate
 from tests.lab.chromium import Browser, needs_chromium

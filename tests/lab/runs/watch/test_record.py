@@ -28,9 +28,9 @@ from lab.pictures import live_source
 from lab.pictures.live_source import GenicamSource, OpenCvSource, ReplaySource, open_live
 from lab.pictures.picture_file import MissingPicture, decode, read_picture
 from lab.pictures.png import encoded
-from lab.runs.frames.clocked_frames import open_frames
+from lab.runs.frames.frames import open_frames
 from lab.runs.watch import record as recording
-from lab.runs.watch.frame_clock import FrameClock
+from lab.runs.watch.cameras import FrameClock
 from lab.runs.watch.record import RecordOptions, record
 from tests.paths import ROOT
 

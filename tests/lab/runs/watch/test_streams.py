@@ -12,7 +12,7 @@ import pytest
 
 from lab.errors import InputError
 from lab.packages import PACKAGES
-from lab.runs.watch.streams import opened
+from lab.runs.watch.live_output import opened
 from tracking.statuses import PoseStatus
 
 POSE = {

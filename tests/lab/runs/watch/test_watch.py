@@ -19,15 +19,14 @@ import yaml
 from lab.errors import InputError, RunError
 from lab.files.run.run_file import LiveDevice, load_run
 from lab.files.text import columns
-from lab.findings.outcome import Outcome
+from lab.findings.finding import Outcome
 from lab.pictures.live_source import OpenCvSource
 from lab.pictures.picture_file import MissingPicture, read_picture
 from lab.runs.frames import sensor_noise
 from lab.runs.process import process_run
 from lab.runs.verdict.run_statistics import RunStatistics
 from lab.runs.watch import watch
-from lab.runs.watch.cameras import DeviceCamera, FolderCamera
-from lab.runs.watch.frame_clock import FolderPoll, FrameClock
+from lab.runs.watch.cameras import DeviceCamera, FolderCamera, FolderPoll, FrameClock
 from lab.runs.watch.inbox import MOST_WAITING, Inbox, is_complete
 from lab.runs.watch.live_frames import FIRST, WatchOptions
 from lab.runs.watch.live_output import LIVE_TABLE, Latency

@@ -15,7 +15,7 @@ from bench.related_measurements.stereo_generator import approach, write_recordin
 from cli import main
 from lab.errors import InputError
 from lab.files.text import columns
-from lab.findings.outcome import Verdict
+from lab.findings.finding import Verdict
 from lab.targets.stereo.process import findings_of, process_stereo_run
 from lab.targets.stereo.simulated_recording import write_stereo_recording
 

@@ -8,7 +8,7 @@ import pytest
 from geometry.arrays import Array
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
-from lab.simulate.rigs import RIGS
+from lab.simulate.scenarios import RIGS
 from tests.tracking.smoothing.labels.path_recordings import FRAMES, GAP, context, filmed, without
 from tracking.smoothing.labels.continuity import pair_labels, transfers_between_cameras
 
