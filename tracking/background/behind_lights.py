@@ -19,6 +19,7 @@ LARGEST_PATH_PX = 250.0  # half side of the box around the places of such a ligh
 _LARGEST_PATH = 12.0  # half side, in widths of the light
 _LEAST_PICTURES, _LEAST_SHARE = 6, 2 / 3  # of the pictures that show the light
 _AROUND = 1.5  # widths beyond the box that are fitted
+_LEAST_CLEAR = 0.5  # share of these pixels that other lights do not reach
 _SAMPLES, _MOST_SAMPLES = 3.0, 2500  # pixels that are fitted: per width of the light, and in all
 _USUAL_FITS = 2.0  # as many fits as the usual scatter counts
 _LARGEST_SIGMA = 0.1  # of the modulated share: of a light that passes, and of a camera
@@ -221,11 +222,43 @@ def _behind_one(
     empty = np.flatnonzero(lacks & ~np.isin(np.arange(len(found)), shown))
     side = 2 * (box[2] + _AROUND * width)
     step = max(_step(width), int(np.ceil(side / np.sqrt(_MOST_SAMPLES))))
-    values, variance, uv = seen.around(there, box, _AROUND * width, step)
-    without = mean_of(seen.around(empty, box, _AROUND * width, step)[0], variance)
+    which = _Which(
+        seen, there, empty, box, np.concatenate([_reach(found[k][~inside(box[None], found[k])]) for k in there])
+    )
+    uv, values, variance, without = which.around(_AROUND * width, step)
+    if len(uv) < _LEAST_CLEAR * (side / step) ** 2:
+        return None
     strength = seen.strength[there, None]
     fit = fitted(uv, values, variance, places, width, height, without, modulation, strength)
-    return None if fit is None else _whole(seen, there, empty, box, width, fit)
+    return None if fit is None else _whole(which, width, fit)
+
+
+def _reach(lights: Detections) -> Array:
+    """(n, 3): places and sizes of lights, px."""
+    return np.column_stack([lights.uv_px, ON_LIGHT[0] * lights.major_px + ON_LIGHT[1]])
+
+
+@dataclass(frozen=True, slots=True)
+class _Which:
+    """The pictures of a light, and where they show it."""
+
+    seen: Exposures
+    there: Ints  # pictures with the light
+    empty: Ints  # those without it
+    box: Array  # (3,)
+    others: Array  # (k, 3): of other lights in the pictures with it
+
+    def around(self, more: float, step: int) -> tuple[Array, Array, Array, tuple[Array, Array]]:
+        """Pixels (m, 2) that no other light reaches, light and variances of the pictures there, mean of those without.
+
+        more, step: as in Exposures.around.
+        """
+        values, variance, uv = self.seen.around(self.there, self.box, more, step)
+        without = self.seen.around(self.empty, self.box, more, step)[0]
+        near = np.linalg.norm(self.others[:, None, :2] - uv, axis=-1) < self.others[:, None, 2]
+        clear = ~near.any(axis=0)
+        variance = variance[:, clear]
+        return uv[clear], values[:, clear], variance, mean_of(without[:, clear], variance)
 
 
 def _lacking(seen: Exposures, shown: Sequence[int], place: Array, width: float) -> Array:
@@ -238,13 +271,12 @@ def _lacking(seen: Exposures, shown: Sequence[int], place: Array, width: float) 
     return np.asarray((np.median(values[shown], axis=0) - values) @ light / np.sum(light**2))
 
 
-def _whole(seen: Exposures, there: Ints, empty: Ints, box: Array, width: float, fit: JointFit) -> _Part:
-    """All pixels that the light of a fit to some pictures reaches. empty: pictures without it."""
-    values, variance, uv = seen.around(there, box, 2 * _AROUND * width, 1)
-    without = mean_of(seen.around(empty, box, 2 * _AROUND * width, 1)[0], variance)
+def _whole(which: _Which, width: float, fit: JointFit) -> _Part:
+    """All pixels that the light of a fit to some pictures reaches."""
+    uv, values, variance, without = which.around(2 * _AROUND * width, 1)
     level, information, light = fit.behind(uv, values, variance, without)
-    lit = light > _LIT
+    lit, seen = light > _LIT, which.seen
     column, row = uv[lit].astype(np.int64).T
     share = fit.share + 1 / np.maximum(information[lit], 1e-3)
     own = Modulation(fit.modulated_share(seen.usual_dn)[0], seen.usual_dn)
-    return _Part(row, column, level[lit] + seen.black_dn, share, own.response(level[lit]), box, fit)
+    return _Part(row, column, level[lit] + seen.black_dn, share, own.response(level[lit]), which.box, fit)

@@ -358,3 +358,13 @@ def test_a_light_that_moves_by_its_width_is_fitted_also_where_more_moves_beside_
     behind = BehindLights.of(seen, found, np.array([[200.0 + more_px, 100.0, 9.0 + more_px]]))
     assert len(behind.lights) == 1
     assert np.abs(behind.level_dn - 30.0).max() < 5.0
+
+
+@pytest.mark.parametrize("apart_px", [13.0, 15.0, 17.0])
+def test_a_light_that_moves_by_its_width_is_measured_also_beside_another_one(apart_px):
+    """The other one is in some of the pixels around it."""
+    moved = np.repeat([0.0, 1.6, 3.6], 15)[:, None, None] * np.array([-0.4, 0.9])
+    paths = np.array([[200.0, 150.0], [200.0 - 0.4 * apart_px, 150.0 - 0.9 * apart_px]]) + moved
+    gap, sigma = errors(found_in_all(board_pictures(paths, 1.9, 0.4, 25, DOTTED)), paths)
+    assert gap.max() < 0.15
+    assert (gap / sigma).max() < 4.5
