@@ -114,7 +114,7 @@ def _points_of(rig: Rig, poses: Pose, outside: bool) -> list[Array]:
     """The pixels at poses (k,) by camera and pose, sorted and rounded: which spots they are plays no part."""
     model = SpotModel.of(rig)
     pixels = np.round(model.project(poses)[0], 6)
-    there = np.isfinite(pixels).all(axis=-1) if outside else model.in_picture(pixels)
+    there = np.asarray(np.isfinite(pixels).all(axis=-1)) if outside else model.in_picture(pixels)
     pixels = np.where(there[..., None], pixels, np.inf)
     keys = np.stack([np.broadcast_to(model.camera_of, pixels.shape[:2]), pixels[..., 0], pixels[..., 1]], axis=-1)
     return [frame[np.lexsort(frame.T)] for frame in keys]
