@@ -16,7 +16,7 @@ from calibration.least_squares.adjustment import Adjusted, AdjustmentError, Limi
 from calibration.lens.board_shape import HALF_SIGNIFICANT
 from calibration.lens.fit.lens_adjustment import coefficient_prior
 from calibration.lens.fit.lens_parameters import Values
-from calibration.lens.fit.view_equations import BEND_PROBABLE, SCATTER_SIGNIFICANT, ViewEquations
+from calibration.lens.fit.view_equations import BEND_PROBABLE, ViewEquations
 from calibration.lens.intrinsics_result import Intrinsics
 from calibration.terms.corners import CornerTerm
 from geometry.arrays import Array, Bools, Ints
@@ -283,7 +283,7 @@ def _covariance(names: tuple[str, str], problem: _Problem, adjusted: Adjusted, m
     equations = problem.equations(adjusted, scale, problem.bent)
     factor = max(s.correlated_noise for s in single)
     spread = equations.scatter()
-    if spread.p_value < SCATTER_SIGNIFICANT:
+    if spread.is_significant:
         factor = max(factor, spread.factor)
     whole = equations.scattered_covariance(factor) if factor > 1 else equations.basis @ equations.basis.T
     whole = whole[: equations.lens, : equations.lens]

@@ -13,10 +13,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from calibration.boards.board_types import parse
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LensModel
+from calibration.lens.fit.view_equations import ViewEquations
 from calibration.lens.intrinsics import IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
 from calibration.lens.intrinsics_result import Intrinsics
 from calibration.pair import PairError, calibrate_pair
@@ -111,15 +113,41 @@ def distinct_subsets(rng: np.random.Generator, views: int, most: int, count: int
     return [np.array(rows) for rows in dict.fromkeys(tuple(np.sort(one).tolist()) for one in drawn)]
 
 
-def spread(values: list[float], sigmas: list[float], shares: list[float], whole: float) -> str:
+def by_number(shares: list[float]) -> Array:
+    """(n,): variance of subsets about the whole set over their own variance, if all photographs are alike."""
+    return 1 - np.array(shares)
+
+
+def by_information(equations: ViewEquations, subsets: list[Ints]) -> tuple[Array, Array]:
+    """The same (n,) of fx from what each photograph determines, and the correlation (n, n) of these differences.
+
+    A subset's fx is a sum over its photographs' gradients, which are independent; subsets share photographs.
+    """
+    by_fx, own, weights = equations.basis[0], [], []
+    for rows in subsets:
+        mine = np.isin(equations.views, rows)
+        a = np.linalg.solve(np.sum(equations.information[mine], axis=0), by_fx)
+        own.append(by_fx @ a)
+        weights.append(mine[:, None] * a - by_fx)
+    C = np.einsum("nvq,vqr,mvr->nm", weights, equations.information, weights)
+    sizes = np.sqrt(np.diagonal(C))
+    return np.diagonal(C) / np.array(own), C / np.outer(sizes, sizes)
+
+
+def spread(off: Array, sigmas: Array, ratios: Array, correlation: Array | None = None) -> str:
     """RMS and robust spread of subsets about the whole set, in sigmas.
 
-    A subset with the share s of the photographs differs from the whole set by its sigma times sqrt(1 - s).
+    ratios: `by_number` or `by_information`; with the correlation, the chance of such an RMS if the sigmas are right.
     """
-    z = (np.array(values) - whole) / (np.array(sigmas) * np.sqrt(1 - np.array(shares)))
-    if not len(z):
+    if not len(off):
         return "no smaller subset"
-    return f"RMS {np.sqrt(np.mean(z**2)):.2f}, by the median {np.median(np.abs(z)) / 0.6745:.2f} of {len(z)}"
+    z = off / (sigmas * np.sqrt(ratios))
+    square = float(np.mean(z**2))
+    words = f"RMS {np.sqrt(square):.2f}, by the median {np.median(np.abs(z)) / 0.6745:.2f}"
+    if correlation is not None:
+        dof = len(z) ** 2 / float(np.sum(correlation**2))  # Satterthwaite's, of a sum of dependent squares
+        words += f" (chance {chi2.sf(square * dof, dof):.2f}, {dof:.1f} degrees of freedom)"
+    return f"{words} of {len(z)}"
 
 
 def bench_set(name: str, count: int, seed: int) -> None:
@@ -137,7 +165,7 @@ def bench_set(name: str, count: int, seed: int) -> None:
     rng = np.random.default_rng([seed, list(SETS).index(name)])
     values: list[float] = []
     sigmas: list[float] = []
-    shares: list[float] = []
+    subsets: list[Ints] = []
     failed = lost = 0
     drawn = distinct_subsets(rng, table.views, min(13, table.views), count)
     for rows in drawn:
@@ -152,11 +180,14 @@ def bench_set(name: str, count: int, seed: int) -> None:
         if not isinstance(found, str) and size < table.views:
             values.append(float(found.fit.lens[0]))
             sigmas.append(float(found.sigmas[0]))
-            shares.append(size / table.views)
+            subsets.append(rows)
     if count and not isinstance(whole, str):
-        around = spread(values, sigmas, shares, float(whole.fit.lens[0]))
+        off = np.array(values) - float(whole.fit.lens[0])
+        ratios, correlation = by_information(ViewEquations.of(whole.table, whole.fit), subsets)
         print(
-            f"  {len(drawn)} subsets: FAIL {failed}, of these where 4 or 5 do not {lost}; fx in sigmas {around}",
+            f"  {len(drawn)} subsets: FAIL {failed}, of these where 4 or 5 do not {lost}; fx in sigmas by the number of"
+            f" photographs {spread(off, np.array(sigmas), by_number([len(s) / table.views for s in subsets]))}; by"
+            f" their information {spread(off, np.array(sigmas), ratios, correlation)}",
             flush=True,
         )
 
@@ -201,7 +232,7 @@ def bench_pair(name: str, count: int, seed: int) -> None:
         sigmas.append(found[1])
         shares.append(size / views)
     if count and not isinstance(whole, str):
-        around = spread(values, sigmas, shares, whole[0])
+        around = spread(np.array(values) - whole[0], np.array(sigmas), by_number(shares))
         print(
             f"  {len(drawn)} subsets: FAIL {failed}, of these where 4 or 5 do not {lost}; baseline in sigmas {around}"
         )

@@ -7,11 +7,12 @@ Drawings have their own frame: origin at the top left corner of the printed area
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
 
-from calibration.boards.board_types import DICTIONARIES, Board, Charuco, CircleGrid
+from calibration.boards.board_types import DICTIONARIES, Board, Charuco, Chessboard, CircleGrid
 from geometry.arrays import Array, Bools, Ints
 
 
@@ -79,17 +80,31 @@ def ink_at(board: Board, xy: Array) -> Array:
     """Ink density of a board at points (..., 2), m, of its frame: 1 ink, 0 paper; 0 outside the printed area."""
     if isinstance(board, CircleGrid):
         return _circle_ink(board, xy)
-    s, (columns, rows) = board.square_m, squares(board)
-    place = xy / s + 1.0
-    square = np.floor(np.where(np.isfinite(place), place, -1.0)).astype(np.int64)
-    j, i = square[..., 0], square[..., 1]
-    on_board = (j >= 0) & (i >= 0) & (j < columns) & (i < rows)
-    ink = is_black_square(board, j, i) & on_board
+    ink, x_edges, y_edges = _ink_of_cells(board)
+    return ink[np.searchsorted(y_edges, xy[..., 1], side="right"), np.searchsorted(x_edges, xy[..., 0], side="right")]
+
+
+@lru_cache(maxsize=8)
+def _ink_of_cells(board: Chessboard | Charuco) -> tuple[Array, Array, Array]:
+    """Ink of the cells that the edges of squares and of the modules of markers form, and these edges in x and y, m.
+
+    With a row and a column without ink before the first edge and behind the last, where nan is sorted to as well.
+    """
+    columns, rows = squares(board)
+    j, i = np.meshgrid(np.arange(columns), np.arange(rows))
+    ink, steps = is_black_square(board, j, i), np.zeros(1)
     if isinstance(board, Charuco):
-        ink |= _marker_ink(board, place, j, i, on_board & ~ink)
-        if board.inverted:
-            ink = on_board & ~ink
-    return ink.astype(float)
+        bits = [marker_bits(board.dictionary, number) for number in range(board.markers)]
+        share, modules = board.marker_m / board.square_m, len(bits[0])
+        steps = np.append(0.0, (1 - share) / 2 + share * np.arange(modules + 1) / modules)
+        places = np.argwhere(~ink) * len(steps) + 1
+        ink = ink.repeat(len(steps), axis=0).repeat(len(steps), axis=1)
+        for marker, (row, column) in zip(bits, places.tolist(), strict=True):
+            ink[row : row + modules, column : column + modules] = marker
+        ink ^= board.inverted
+    edges = (board.square_m * (np.arange(n)[:, None] + steps - 1).ravel() for n in (columns, rows))
+    x, y = (np.append(e, board.square_m * (n - 1)) for e, n in zip(edges, (columns, rows), strict=True))
+    return np.pad(ink.astype(float), 1), x, y
 
 
 def _circle_ink(board: CircleGrid, xy: Array) -> Array:
@@ -103,23 +118,6 @@ def _circle_ink(board: CircleGrid, xy: Array) -> Array:
         j = np.clip(np.round((x - shift) / pitch), 0, board.columns - 1)
         ink |= np.hypot(x - j * pitch - shift, y - i * board.spacing_m) < board.diameter_m / 2
     return ink.astype(float)
-
-
-def _marker_ink(board: Charuco, place: Array, j: Ints, i: Ints, light: Bools) -> Bools:
-    numbers = np.full((board.rows, board.columns), -1)
-    jj, ii = np.meshgrid(np.arange(board.columns), np.arange(board.rows))
-    numbers[~is_black_square(board, jj, ii)] = np.arange(board.markers)
-    bits = np.stack([marker_bits(board.dictionary, k) for k in range(board.markers)])
-    cells = bits.shape[-1]
-    share = board.marker_m / board.square_m
-    out = np.zeros(j.shape, dtype=bool)
-    within = (place[light] - np.stack([j[light], i[light]], axis=-1) - (1 - share) / 2) / share * cells
-    cell = np.floor(within).astype(np.int64)
-    inside = np.all((cell >= 0) & (cell < cells), axis=-1)
-    cell = np.clip(cell, 0, cells - 1)
-    number = numbers[i[light], j[light]]
-    out[light] = inside & bits[number, cell[..., 1], cell[..., 0]]
-    return out
 
 
 def _cells(j: Ints, i: Ints, step: float, start: Array) -> Array:

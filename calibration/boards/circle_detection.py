@@ -7,6 +7,7 @@ areas. Ellipses from tangents are the start of a fit of the blurred outline to t
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -29,6 +30,7 @@ from calibration.boards.board_view import (
     too_blurred,
 )
 from calibration.boards.chessboard_detection import upright
+from calibration.boards.grid_shape import misfit, straightened
 from geometry.arrays import Array, Ints
 
 _BIG_DOT = 1.35  # relative area of a corner circle, above which it marks the origin
@@ -37,7 +39,7 @@ _LATTICE = 0.25  # share of blobs arranged as in a lattice: boards among twice a
 _INK = 0.5  # diameter over distance of neighbours where no blob gives it
 _AT_ONCE, _STEPS, _SMALL_PX = 32, 8, 2e-3  # outlines fitted together, and their iteration
 _MOST_MOVED = 0.1  # by the fit of an outline, in radii; more means that something else is beside it
-_FIT_PX = 0.08  # of the spacing: residual of a grid against a homography (strong lenses cause less than that)
+_FIT_PX = 0.08  # of the spacing: residual of a grid against a plane's picture by a lens with one coefficient
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,18 +61,22 @@ def find_circles(image: GreyImage, board: CircleGrid, thorough: bool = True) -> 
 
     thorough: if False, the reason is not determined.
     """
-    blobs = np.empty((0, 3))
+    blobs, reason = np.empty((0, 3)), None
     for scale in scales(image):
         small = scaled(image, scale)
         for light in (False, True):
             seen = _blobs(255 - small if light else small)
-            found = _grid(seen, board)
-            if found is not None:
-                at_full = np.column_stack([at_full_size(seen[:, :2], scale), seen[:, 2] / scale])
-                return _measured(255 - image if light else image, at_full_size(found, scale), at_full, board, light)
+            for grid in _grids(seen, board, (small.shape[1], small.shape[0])):
+                ordered = _ordered(grid, board, (small.shape[1], small.shape[0]))
+                if not isinstance(ordered, NotFound):
+                    at_full = np.column_stack([at_full_size(seen[:, :2], scale), seen[:, 2] / scale])
+                    return _measured(
+                        255 - image if light else image, at_full_size(ordered, scale), at_full, board, light
+                    )
+                reason = reason or ordered
             if scale == 1.0 and not light:
                 blobs = seen
-    return _why_not(image, board, blobs) if thorough else QUICK_SEARCH_FAILED
+    return reason or (_why_not(image, board, blobs) if thorough else QUICK_SEARCH_FAILED)
 
 
 def _detector(image: GreyImage) -> cv2.SimpleBlobDetector:
@@ -92,44 +98,43 @@ def _blobs(image: GreyImage) -> Array:
     return np.array([[*k.pt, k.size] for k in _detector(image).detect(image)]).reshape(-1, 3)
 
 
-def _grid(blobs: Array, board: CircleGrid, size: tuple[int, int] | None = None) -> Array | None:
-    """Approximate centres (rows, columns, 2), px, of blobs (n, 3) in OpenCV's order, or None."""
+def _grids(
+    blobs: Array, board: CircleGrid, image_size_px: tuple[int, int], size: tuple[int, int] | None = None
+) -> Iterator[Array]:
+    """Possible approximate centres (rows, columns, 2), px, of blobs (n, 3) in OpenCV's order."""
     columns, rows = size or (board.columns, board.rows)
-    if not columns * rows <= len(blobs) <= 3 * columns * rows + _STRAY or _lattice_share(blobs) < _LATTICE:
-        return None
+    if not columns * rows <= len(blobs) <= 3 * columns * rows + _STRAY:
+        return
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
-    for how in (0, cv2.CALIB_CB_CLUSTERING):
-        points = blobs[:, :2].astype(np.float32).reshape(-1, 1, 2)
-        # Without a blob detector, the points are the candidates; the stubs do not know this.
-        found, centres = cv2.findCirclesGrid(
-            points,
-            (columns, rows),
-            kind | how,
-            None,
-            cv2.CirclesGridFinderParameters(),  # type: ignore[call-overload]
-        )
-        if found and centres is not None and centres.size == 2 * columns * rows:
-            return np.asarray(centres, dtype=float).reshape(rows, columns, 2)
-    return None
+    for plane in straightened(blobs[:, :2], image_size_px):
+        points = plane.astype(np.float32).reshape(-1, 1, 2)
+        for how in (0, cv2.CALIB_CB_CLUSTERING) if _lattice_share(plane) >= _LATTICE else ():
+            # Without a blob detector, the points are the candidates; the stubs do not know this.
+            found, centres = cv2.findCirclesGrid(
+                points,
+                (columns, rows),
+                kind | how,
+                None,
+                cv2.CirclesGridFinderParameters(),  # type: ignore[call-overload]
+            )
+            if found and centres is not None and centres.size == 2 * columns * rows:
+                yield blobs[cKDTree(plane).query(centres.reshape(rows, columns, 2))[1], :2]
 
 
-def _lattice_share(blobs: Array) -> float:
-    """Share of blobs (n, 3) that have another one opposite to their nearest neighbour, like the points of a lattice.
+def _lattice_share(points: Array) -> float:
+    """Share of points (n, 2) that have another one opposite to their nearest neighbour, like the points of a lattice.
 
     About 0.1 for random blobs, for which OpenCV's search for a grid does not end; 0.7 and more for boards alone.
     """
-    if len(blobs) < 3:
+    if len(points) < 3:
         return 0.0
-    tree = cKDTree(blobs[:, :2])
-    distance, index = (np.asarray(found)[:, 1] for found in tree.query(blobs[:, :2], k=2))
-    opposite = 2 * blobs[:, :2] - blobs[index.astype(int), :2]
+    tree = cKDTree(points)
+    distance, index = (np.asarray(found)[:, 1] for found in tree.query(points, k=2))
+    opposite = 2 * points - points[index.astype(int)]
     return float(np.mean(np.asarray(tree.query(opposite)[0]) < 0.25 * distance))
 
 
-def _measured(image: GreyImage, grid: Array, blobs: Array, board: CircleGrid, light: bool) -> BoardView | NotFound:
-    ordered = _ordered(grid, board)
-    if isinstance(ordered, NotFound):
-        return ordered
+def _measured(image: GreyImage, ordered: Array, blobs: Array, board: CircleGrid, light: bool) -> BoardView | NotFound:
     more = _goes_on(ordered, board, blobs)
     if more:
         return NotFound(
@@ -336,7 +341,7 @@ def _jacobian_determinants(H: Array, xy: Array) -> Array:
     return np.linalg.det(H) / w**3
 
 
-def _ordered(grid: Array, board: CircleGrid) -> Array | NotFound:
+def _ordered(grid: Array, board: CircleGrid, image_size_px: tuple[int, int]) -> Array | NotFound:
     """The grid numbered as on the board and not mirrored; of several such numberings the upright one."""
     ways = [grid, grid[::-1], grid[:, ::-1], grid[::-1, ::-1]]
     if board.asymmetric and board.rows % 2 == 0:
@@ -349,11 +354,9 @@ def _ordered(grid: Array, board: CircleGrid) -> Array | NotFound:
     mirrored: list[Array] = []
     limit = _FIT_PX * corner_refinement.spacing(grid) + 1.0
     for way in ways:
-        H = homography(board.points[:, :2], way.reshape(-1, 2))
-        residual = mapped(H, board.points[:, :2]) - way.reshape(-1, 2)
-        if np.sqrt(np.mean(np.sum(residual**2, axis=1))) < limit:
-            turns = _jacobian_determinants(H, board.middle[None, :2])[0]
-            (fitting if turns > 0 else mirrored).append(way)
+        away, is_mirrored = misfit(way.reshape(-1, 2), board.points[:, :2] / board.spacing_m, image_size_px)
+        if away < limit:
+            (mirrored if is_mirrored else fitting).append(way)
     if fitting:
         return upright(fitting)
     if mirrored:
@@ -412,21 +415,22 @@ def _why_not(image: GreyImage, board: CircleGrid, blobs: Array) -> NotFound:
     pale = low_contrast(image)
     if pale is not None:
         return pale
-    wanted = board.columns * board.rows
-    if len(blobs) > 3 * wanted + _STRAY or (len(blobs) >= wanted and _lattice_share(blobs) < _LATTICE):
+    wanted, shape = board.columns * board.rows, (image.shape[1], image.shape[0])
+    regular = max(map(_lattice_share, straightened(blobs[:, :2], shape)), default=0.0)
+    if len(blobs) > 3 * wanted + _STRAY or (len(blobs) >= wanted and regular < _LATTICE):
         return NotFound(
             f"no grid of circles: {len(blobs)} round black blobs without a regular arrangement; the board must lie"
             " wholly in the picture, before a plain background"
         )
     other = CircleGrid(board.columns, board.rows, board.spacing_m, not board.asymmetric)
-    if _grid(blobs, other) is not None:
+    if any(True for _ in _grids(blobs, other, shape)):
         return NotFound(
             f"the circles are {'in shifted rows' if other.asymmetric else 'in straight columns'}: write {other.kind}"
             f" instead of {board.kind}"
         )
     for count in range(len(blobs), max(len(blobs) - 3, 8), -1):
         for columns in range(3, count // 3 + 1):
-            if count % columns == 0 and _grid(blobs, board, (columns, count // columns)) is not None:
+            if count % columns == 0 and any(True for _ in _grids(blobs, board, shape, (columns, count // columns))):
                 wide, high = sorted((columns, count // columns), reverse=board.columns >= board.rows)
                 return NotFound(
                     f"a grid of {wide}x{high} circles, not {board.columns}x{board.rows}: part of the"

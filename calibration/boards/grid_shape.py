@@ -12,6 +12,7 @@ lens; the quartic is ours.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 
@@ -64,6 +65,36 @@ def local_shape(grid: Array, known: Bools, image_size_px: tuple[int, int]) -> Ar
     return out
 
 
+def straightened(seen: Array, image_size_px: tuple[int, int]) -> Iterator[Array]:
+    """Pixels (n, 2) as a pinhole would see them, if a lens from a pinhole to a fisheye of 180 deg took the picture."""
+    middle, unit = (np.array(image_size_px) - 1) / 2, float(np.hypot(*image_size_px)) / 2
+    for m in _STARTS:
+        plane = _straightened((seen - middle) / unit, m)
+        if plane is not None:
+            yield middle + unit * plane
+
+
+def _straightened(seen: Array, m: float) -> Array | None:
+    """x (n, 2) of v (n, 2) for a lens without pincushion; None where one of them is too far off the axis."""
+    angle = np.sqrt(m) * np.linalg.norm(seen, axis=1, keepdims=True)
+    if np.max(angle, initial=0.0) >= _WIDEST:
+        return None
+    return seen * np.where(angle > 0, np.tan(angle) / np.where(angle > 0, angle, 1.0), 1.0)
+
+
+def misfit(seen: Array, xy: Array, image_size_px: tuple[int, int]) -> tuple[float, bool]:
+    """RMS distance, px, of pixels (n, 2) from the picture of a plane's points (n, 2), and whether it is mirrored.
+
+    inf where they are no picture of a plane.
+    """
+    middle, unit = (np.array(image_size_px) - 1) / 2, float(np.hypot(*image_size_px)) / 2
+    picture = _Picture.of((seen - middle) / unit, xy)
+    if picture is None:
+        return np.inf, False
+    off = unit * np.linalg.norm(picture.at(xy) - (seen - middle) / unit, axis=1)
+    return float(np.nan_to_num(np.sqrt(np.mean(off**2)), nan=np.inf)), bool(np.linalg.det(picture.H) < 0)
+
+
 @dataclass(frozen=True, slots=True)
 class _Picture:
     """The picture of a board: H and the lens; lengths in halves of the picture's diagonal, about its middle."""
@@ -76,12 +107,10 @@ class _Picture:
         """The best one of corners (n, 2) of cells (n, 2); None if four corners do not span a plane."""
         if len(cells) < 4 or min(len(np.unique(cells[:, k])) for k in (0, 1)) < 2:
             return None
-        away = np.linalg.norm(seen, axis=1)
         best, least = None, np.inf
         for m in _STARTS if len(cells) >= _BENDS else _STARTS[:1]:
-            angle = np.sqrt(m) * away
-            if np.max(angle) < _WIDEST:
-                plane = seen * (np.tan(angle) / np.where(angle > 0, angle, 1.0) if m else np.ones(len(seen)))[:, None]
+            plane = _straightened(seen, m)
+            if plane is not None:
                 H = cv2.findHomography(cells, plane, 0)[0]
                 if H is not None and H[2, 2] != 0:
                     start = cls(H / H[2, 2], m)

@@ -18,7 +18,7 @@ from calibration.lens.fit.lens_parameters import AS_STATED, BOARD_BLOCKS, BoardF
 from calibration.lens.fit.lens_start import StartError, start
 from calibration.lens.fit.model_selection import ModelCandidate, inliers_of_rich_models, select_model
 from calibration.lens.fit.projection_map import Difference, ProjectionMap, difference, projection_map
-from calibration.lens.fit.view_equations import BEND_PROBABLE, SCATTER_SIGNIFICANT, ViewEquations, scattered
+from calibration.lens.fit.view_equations import BEND_PROBABLE, ViewEquations, scattered
 from calibration.lens.intrinsics_result import Intrinsics, Origins
 from calibration.lens.model_uncertainty import estimate_model_uncertainty
 from geometry.arrays import Array, Bools
@@ -79,7 +79,7 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     selection = select_model(table, used, rich, board, replace(free, points=False), options.lens)
     found, equations = _final(table, selection.chosen, free)
     spread = equations.scatter()
-    noise = max(1.0, spread.factor) if spread.p_value < SCATTER_SIGNIFICANT else 1.0
+    noise = spread.factor if spread.is_significant else 1.0
     distance = options.distance_m or _typical_depth(table, found)
     pixel_map = projection_map(found.model, found.lens, table.image_size_px, distance)
     covariance = scattered(found, equations, noise) if noise > 1 else found.covariance

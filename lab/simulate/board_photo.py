@@ -134,13 +134,14 @@ def _light(board: Board, corners: Array, look: PhotoSettings) -> Array:
     row, column = np.nonzero((high > low)[:-1, :-1])
     a, b = corners[row, column], corners[row, column + 1]
     c, d = corners[row + 1, column], corners[row + 1, column + 1]
-    bend = [np.nan_to_num(np.gradient(np.gradient(corners, axis=k), axis=k)[row, column]) / 2 for k in (1, 0)]
+    i, j = (np.clip(k, 1, n - 2) for k, n in zip((row, column), corners.shape, strict=False))
+    bend_x = np.nan_to_num(corners[row, j + 1] - 2 * corners[row, j] + corners[row, j - 1]) / 2
+    bend_y = np.nan_to_num(corners[i + 1, column] - 2 * corners[i, column] + corners[i - 1, column]) / 2
+    along, down, twist = b - a - bend_x, c - a - bend_y, a - b - c + d
     total = np.zeros(len(row))
     lattice = _lattice(max(look.samples // 4, 1))
     for x, y in lattice:
-        xy = (1 - y) * ((1 - x) * a + x * b) + y * ((1 - x) * c + x * d)
-        xy -= x * (1 - x) * bend[0] + y * (1 - y) * bend[1]
-        total += _shade(board, xy, look)
+        total += _shade(board, a + x * (along + x * bend_x + y * twist) + y * (down + y * bend_y), look)
     out[row, column] = total / len(lattice)
     return out
 
@@ -159,7 +160,8 @@ def _on_paper(board: Board, xy: Array) -> Bools:
     low = board.points[:, :2].min(axis=0) - (1 + _MARGIN) * board.spacing_m
     high = board.points[:, :2].max(axis=0) + (1 + _MARGIN) * board.spacing_m
     with np.errstate(invalid="ignore"):
-        return np.all((xy > low) & (xy < high), axis=-1)
+        x, y = xy[..., 0], xy[..., 1]
+        return (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
 
 
 def _piece_with_paper(board: Board, corners: Array) -> tuple[slice, slice] | None:
@@ -175,7 +177,5 @@ def _piece_with_paper(board: Board, corners: Array) -> tuple[slice, slice] | Non
 
 
 def _shade(board: Board, xy: Array, look: PhotoSettings) -> Array:
-    paper = _on_paper(board, xy)
-    shade = np.where(paper, look.paper_dn, look.background_dn)
-    shade[paper] -= (look.paper_dn - look.ink_dn) * ink_at(board, xy[paper])
-    return shade
+    paper = look.paper_dn - (look.paper_dn - look.ink_dn) * ink_at(board, xy)
+    return np.where(_on_paper(board, xy), paper, look.background_dn)

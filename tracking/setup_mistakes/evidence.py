@@ -122,10 +122,13 @@ def compare(
     certain = given.is_certain
     if certain and _first_is_in_prior(given, frames):
         return Comparison(given, ())
+    # Of a rig that few poses of the prior let see enough spots, the same says nothing about a mistake.
+    few = parameters.min_spots
+    often = _may_see(rig, frames.prior, few)
     left: list[tuple[Mistake, Explained | None]] = [
         (m, None)
         for m in possible_mistakes(rig, frames.prior)
-        if (m.rig is rig or (m.has_effect(rig) and _may_see(m.rig, frames.prior, parameters.min_spots)))
+        if (m.rig is rig or (m.has_effect(rig, not often) and (not often or _may_see(m.rig, frames.prior, few))))
         and (m.prior is not None or not certain)
     ]
     whole: list[tuple[Mistake, Explained]] = []

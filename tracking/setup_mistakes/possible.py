@@ -58,12 +58,15 @@ class Mistake:
     by_itself: bool = False  # numbers of the files show it, without a recording
     beams: tuple[str, ...] = ()  # whose spots it changes
 
-    def has_effect(self, given: Rig) -> bool:
-        """Whether the mistake changes more than names: the pictures, the prior, or the points of some pose."""
+    def has_effect(self, given: Rig, outside: bool = False) -> bool:
+        """Whether the mistake changes more than names: the pictures, the prior, or the points of some pose.
+
+        outside: also points outside the pictures, of a rig that few poses let see its spots.
+        """
         if self.pictures or self.prior is not None or self.by_itself:
             return True
         poses = poses_within(assumed_range(given), FEW_POSES)
-        frames = zip(_points_of(self.rig, poses), _points_of(given, poses), strict=True)
+        frames = zip(_points_of(self.rig, poses, outside), _points_of(given, poses, outside), strict=True)
         return not all(np.array_equal(a, b) for a, b in frames)
 
     def counterparts(self, given: Rig) -> tuple[Mistake, Mistake]:
@@ -107,11 +110,12 @@ class Mistake:
         return out
 
 
-def _points_of(rig: Rig, poses: Pose) -> list[Array]:
+def _points_of(rig: Rig, poses: Pose, outside: bool) -> list[Array]:
     """The pixels at poses (k,) by camera and pose, sorted and rounded: which spots they are plays no part."""
     model = SpotModel.of(rig)
     pixels = np.round(model.project(poses)[0], 6)
-    pixels = np.where(model.in_picture(pixels)[..., None], pixels, np.inf)
+    there = np.asarray(np.isfinite(pixels).all(axis=-1)) if outside else model.in_picture(pixels)
+    pixels = np.where(there[..., None], pixels, np.inf)
     keys = np.stack([np.broadcast_to(model.camera_of, pixels.shape[:2]), pixels[..., 0], pixels[..., 1]], axis=-1)
     return [frame[np.lexsort(frame.T)] for frame in keys]
 

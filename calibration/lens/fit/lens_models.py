@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from calibration.terms.corners import INTRINSICS_COUNT
 from geometry import lens
@@ -81,7 +82,8 @@ def named(title: str) -> LensModel:
 def rational_of_fisheye(numbers: Array, widest_rad: float) -> Array:
     """The perspective lens (18,) with k1 ... k6 closest to a fisheye lens (18,) up to an angle off the optical axis.
 
-    Linear least squares over the radius: of d = r N / D, the equation N - (d / r) D = 0.
+    Linear least squares over the radius: of d = r N / D, the equation N - (d / r) D = 0. k4, k5, k6 of D are not
+    negative: otherwise N and D may share a root inside the picture, from which a fit finds no way to a lens without.
     """
     angle = np.linspace(0, min(widest_rad, np.deg2rad(80)), 200)[1:]
     r2 = np.tan(angle) ** 2
@@ -91,7 +93,8 @@ def rational_of_fisheye(numbers: Array, widest_rad: float) -> Array:
     weight = (1 / (1 + r2**3))[:, None]
     A = np.concatenate([powers, -scale[:, None] * powers], axis=1) * weight
     norm = np.linalg.norm(A, axis=0)
-    k = np.linalg.lstsq(A / norm, (scale - 1) * weight[:, 0], rcond=1e-10)[0] / norm
+    lowest = np.array([-np.inf, -np.inf, -np.inf, 0, 0, 0])
+    k = lsq_linear(A / norm, (scale - 1) * weight[:, 0], (lowest, np.inf), method="bvls").x / norm
     out = np.zeros(INTRINSICS_COUNT)
     out[:4] = numbers[:4]
     out[[4, 5, 8]], out[9:12] = k[:3], k[3:]

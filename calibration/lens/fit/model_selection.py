@@ -32,7 +32,7 @@ from calibration.lens.fit.lens_models import (
 )
 from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, Values
 from calibration.lens.fit.projection_map import ProjectionMap, projection_map
-from calibration.lens.fit.view_equations import ViewEquations
+from calibration.lens.fit.view_equations import ViewEquations, scattered
 from geometry.arrays import Array, Bools
 from geometry.camera import project_points_full
 
@@ -190,6 +190,7 @@ class _Judged:
     held_out_px2: float = np.inf  # sum of squared errors of all photographs, each predicted without it
     sigma_px: float = np.nan  # of directions where corners were seen
     unknown_px: float = np.inf  # of directions in 90 % of the picture
+    stated_px: float = np.inf  # the same with the scatter between photographs, as it will be stated
     folds: bool = False
     overfit: float = 1.0  # RMS error in held-out photographs over the noise of the corners
 
@@ -197,7 +198,7 @@ class _Judged:
         """Reason why the model cannot be chosen; empty if it can. raised: factor on the sigmas."""
         if self.folds:
             return "it folds inside the picture: two directions would map to the same pixel"
-        unknown = float(np.hypot(self.unknown_px * raised, model_error_px))
+        unknown = float(np.hypot(max(self.unknown_px * raised, self.stated_px), model_error_px))
         if unknown > UNKNOWN_PX:
             return f"the photographs leave its directions unknown: {unknown:.2g} px or more in a tenth of the picture"
         if self.overfit > OVERFIT:
@@ -219,14 +220,17 @@ def _judged(table: CornerTable, candidate: ModelCandidate) -> _Judged:
     at = projection_map(found.model, found.lens, table.image_size_px, 1.0)
     inside = seen_at(table, found.used, at.pixels) & np.isfinite(at.by_parameter).all(axis=(2, 3))
     variance = np.trace(at.covariance_px2(C)[inside], axis1=-2, axis2=-1)
+    spread = equations.scatter()
+    stated = scattered(found, equations, spread.factor) if spread.is_significant else C
     return _Judged(
         candidate,
         map=at,
         inside=inside,
-        scatter=equations.scatter().factor,
+        scatter=spread.factor,
         held_out_px2=float(np.sum(equations.held_out_px2() * equations.count)) * found.sigma_px**2,
         sigma_px=float(np.sqrt(_common_mean(variance))) if inside.any() else np.inf,
         unknown_px=float(np.nanquantile(at.sigma_px(C), 0.9)),
+        stated_px=float(np.nanquantile(at.sigma_px(stated), 0.9)),
         folds=folds_in_picture(found.lens, found.model.fisheye, table.image_size_px),
         overfit=float(np.sqrt(np.mean(equations.held_out_px2()))),
     )

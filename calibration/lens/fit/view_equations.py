@@ -39,6 +39,11 @@ class Scatter:
     factor: float  # on the sigmas that explains it; about 1 for a good model
     p_value: float  # of at least as much scatter, if model and noise are right
 
+    @property
+    def is_significant(self) -> bool:
+        """Whether it widens the sigmas."""
+        return self.factor > 1 and self.p_value < SCATTER_SIGNIFICANT
+
 
 @dataclass(frozen=True, slots=True)
 class ViewEquations:

@@ -144,6 +144,21 @@ def test_centroids_and_areas_of_circles_are_correct(text, turn):
     assert 2 * term.radii_by_areas(values) == pytest.approx([board.diameter_m], rel=0.01)
 
 
+@pytest.mark.parametrize("text", ["circles:9x7:30mm", "acircles:4x11:24mm"])
+@pytest.mark.parametrize("at", [(0.0, 0.0), (-0.6, 0.3)])
+@pytest.mark.parametrize("turn", [(0.1, 0.2, 0.3), (-0.2, 0.3, 2.0)])
+def test_circles_of_a_board_close_to_a_wide_lens_are_found(text, at, turn):
+    """Their rows are curved by more than the distance of neighbours: OpenCV's search for a grid needs straight ones."""
+    board, R = parse(text), rotations.exp(np.array(turn))
+    wide = replace(camera(FISHEYE), matrix=np.array([[165.0, 0, 239.5], [0, 165, 179.5], [0, 0, 1]]))
+    middle = np.array([*at, 1.0]) * 0.75 * max(board.size_m)
+    picture = photograph(board, wide, Pose(R, middle - R @ board.middle), look=CLEAN)
+    view = view_of(picture.image, board)
+    away = np.linalg.norm(picture.pixels - view.pixels[:, None], axis=2).min(axis=1)
+    assert len(view.pixels) == len(board.points)
+    assert np.max(away) < 1.5 * px  # of centroids from the pictures of centres
+
+
 @pytest.mark.parametrize("blur", [0.6, 1.0, 1.8])
 def test_blur_is_measured(blur):
     board, photo = shot(CHESS, look=PhotoSettings(blur_px=blur, noise_dn=2, samples=9))
