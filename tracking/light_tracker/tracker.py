@@ -255,12 +255,10 @@ class DrogueTracker:
     def _confidence(self, track: Track, match: Match | None) -> float:
         if match is None:
             return 0.0
-        inputs = features(track.support, track.confirmed, track.unconfirmed)
+        inputs = features(track.support, track.confirmed, track.unconfirmed, track.motion.rim_diameter_px)
         if self.trace is not None:
             self.trace.append((inputs, track.motion.centre_px))
-        # A match says that the object is the one detected, not what it is: one detection is as sure as it was.
-        most = 1.0 if track.confirmed > 1 else 1 / (1 + np.exp(-track.support))
-        return min(probability(inputs), float(most))
+        return probability(inputs)
 
     def _acquired(self, picture: Picture) -> DrogueFrame:
         """Search the whole picture."""
