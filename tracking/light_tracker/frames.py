@@ -128,7 +128,7 @@ def nothing_known(cause: Cause, event: str = "", searched: str = "", found: int 
 RIGHT_SHARE = 0.25  # of the diameter
 FEATURES = ("1", "support", "confirmed", "unconfirmed", "size", "size x support")
 SIGNS = (0, 1, 1, -1, -1, 1)  # of the coefficients: more of a good sign never lowers the confidence
-COEFFICIENTS = (3.78, 0.81, 0.48, -0.3, -6.9, 3.26)  # of the features
+COEFFICIENTS = (4.06, 0.6, 0.6, -1.08, -6.6, 2.0)  # of the features
 ABSENT_LOGIT = -2.0  # of a check without a detection, in the running mean of the checks
 _CAP = 0.995  # of correlations: above it, noise decides
 _MOST_CONFIRMED = 10  # checks in a row that count: further ones say nothing new
