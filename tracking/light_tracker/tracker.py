@@ -334,7 +334,8 @@ class DrogueTracker:
         sure = track.confirmed >= TRUSTED and track.unconfirmed < p.most_unconfirmed
         limit = p.size_ratio if sure else np.inf
         # The tracked object may be another one that the detector takes for a drogue, with less confidence.
-        lead = max(logit(p.sure_confidence), track.support + p.sure_logit)
+        least = p.sure_confidence if track.trusted >= p.hand_back_confidence else p.elsewhere_confidence
+        lead = max(logit(least), track.support + p.sure_logit)
         alike = [
             c for c in found if 1 / limit < 2 * c.radius_px / motion.rim_diameter_px < limit or logit(c.score) > lead
         ]
