@@ -164,7 +164,7 @@ class DrogueTracker:
         track.misses, track.blind, track.gap, track.trusted = 0, 0, max(track.gap - 1, 0), confidence
         self._learn(track, picture, match)
         return self._frame(
-            track, PoseStatus.MEASURED, Cause.NONE, source, confidence, match.correlation, searched, found, event
+            track, PoseStatus.MEASURED, Cause.NONE, source, confidence, searched, found, event, match.correlation
         )
 
     def _matched(self, track: Track, picture: Picture) -> Match | None:
@@ -276,17 +276,8 @@ class DrogueTracker:
     def _start(self, seen: CircleCandidate, pattern: Pattern, searched: str, found: int, event: str) -> DrogueFrame:
         motion = PatternState.started(seen.u_px, seen.v_px, 2 * seen.radius_px, self.parameters)
         self._track = track = Track(motion, pattern, logit(seen.score), trusted=seen.score)
-        return self._frame(
-            track,
-            PoseStatus.MEASURED,
-            Cause.NONE,
-            MeasuredBy.DETECTOR,
-            seen.score,
-            float("nan"),
-            searched,
-            found,
-            event,
-        )
+        by = MeasuredBy.DETECTOR
+        return self._frame(track, PoseStatus.MEASURED, Cause.NONE, by, seen.score, searched, found, event)
 
     def _in_picture(self, picture: Picture) -> list[CircleCandidate]:
         return [c for c in self.detector(picture, None) if c.score >= self.parameters.confirm_confidence]
@@ -371,7 +362,7 @@ class DrogueTracker:
             return nothing_known(cause, event)
         sigma = float(np.sqrt(np.trace(motion.covariance) / 2))
         confidence = share * track.trusted * within(sigma, motion.rim_diameter_px)
-        return self._frame(track, PoseStatus.PREDICTED, cause, MeasuredBy.NONE, confidence, float("nan"), "", 0)
+        return self._frame(track, PoseStatus.PREDICTED, cause, MeasuredBy.NONE, confidence)
 
     @staticmethod
     def _frame(
@@ -380,10 +371,10 @@ class DrogueTracker:
         cause: Cause,
         source: MeasuredBy,
         confidence: float,
-        correlation: float,
-        searched: str,
-        found: int,
+        searched: str = "",
+        found: int = 0,
         event: str = "",
+        correlation: float = float("nan"),
     ) -> DrogueFrame:
         m = track.motion
         return DrogueFrame(
