@@ -23,6 +23,7 @@ from bench.related_measurements.renderers import third_renderer
 from geometry.arrays import Array, Bools
 from studies.learned_detector.samples import Sample, draw_sample
 from tracking.learned_detector.detector import (
+    CALIBRATION,
     WEIGHTS,
     DrogueCandidate,
     features,
@@ -111,7 +112,7 @@ def logistic(x: Array, y: Bools, signs: tuple[int, ...], weight: Array | float =
 
 
 def fitted(samples: list[Sample], weight: Array, weights: Path) -> tuple[Array, float]:
-    """CALIBRATION (3,) and GROWTH of the detector, from weighted pictures."""
+    """CALIBRATION and GROWTH of the detector, from weighted pictures."""
     inputs, right, of, growth = [], [], [], []
     for sample, share in zip(samples, weight.tolist(), strict=True):
         rows, levels = first_candidates(sample.image, *DIAMETERS_PX, weights)
@@ -125,7 +126,7 @@ def fitted(samples: list[Sample], weight: Array, weights: Path) -> tuple[Array, 
             of.append(share)
             enlarged = seen[:, 4] > _ENLARGED
             growth += (sizes[enlarged] / seen[enlarged, 4]).tolist() if ok else []
-    return logistic(np.array(inputs), np.array(right), (0, 0, 0), np.array(of)), float(np.median(growth))
+    return logistic(np.array(inputs), np.array(right), (0,) * len(CALIBRATION), np.array(of)), float(np.median(growth))
 
 
 def own_pictures(frames: int, seed: int, unseen: bool, empty: bool | None) -> list[Sample]:

@@ -21,7 +21,7 @@ class LightParameters:
     largest_px: float | None = None  # px; None: the picture's smaller side
     acquire_confidence: float = 0.5  # of a detection that starts a track by itself
     elsewhere_confidence: float = 0.8  # of a detection that replaces a track elsewhere in the picture
-    sure_confidence: float = 0.995  # of a detection that competes with a track that the detector confirms, too ...
+    sure_confidence: float = 0.995  # of a detection that competes with a track that is not handed back ...
     sure_logit: float = 1.5  # ... if its log odds are this much above the mean of the track's checks
     picture_every: int = 2  # checks, of which the last one is of the whole picture
     confirm_confidence: float = 0.15  # of a detection where the tracker is: two independent ones agree
@@ -126,12 +126,15 @@ def nothing_known(cause: Cause, event: str = "", searched: str = "", found: int 
 
 
 RIGHT_SHARE = 0.25  # of the diameter
-FEATURES = ("1", "support", "confirmed", "unconfirmed")
-SIGNS = (0, 1, 1, -1)  # of the coefficients: more of a good sign never lowers the confidence
-COEFFICIENTS = (1.24, 1.46, 1.02, -0.12)  # of the features
+FEATURES = ("1", "support", "confirmed", "unconfirmed", "size", "size x support")
+SIGNS = (0, 1, 1, -1, -1, 1)  # of the coefficients: more of a good sign never lowers the confidence
+COEFFICIENTS = (4.06, 0.6, 0.6, -1.08, -6.6, 2.0)  # of the features
 ABSENT_LOGIT = -2.0  # of a check without a detection, in the running mean of the checks
 _CAP = 0.995  # of correlations: above it, noise decides
 _MOST_CONFIRMED = 10  # checks in a row that count: further ones say nothing new
+# The detector is sure of a drogue of many pixels, but not of one of few: what is large, and doubtful in check after
+# check, is another object. It sees every drogue at 40 px or less, so that a larger one says no more.
+_SIZES_PX = 9.0, 40.0
 
 
 def fisher(correlation: float) -> float:
@@ -139,18 +142,23 @@ def fisher(correlation: float) -> float:
     return float(np.arctanh(np.clip(correlation, 0.0, _CAP)))
 
 
-def features(support: float, confirmed: int, unconfirmed: int) -> Array:
-    """The inputs (4,) of the curve.
+def features(support: float, confirmed: int, unconfirmed: int, diameter_px: float) -> Array:
+    """The inputs (6,) of the curve.
 
     support: running mean of the log odds of the checks. confirmed: detections of this track; unconfirmed: checks in a
     row without one.
     """
-    return np.array([1.0, support, np.log(min(max(confirmed, 1), _MOST_CONFIRMED)), np.log1p(unconfirmed)])
+    size = np.log(np.clip(diameter_px, *_SIZES_PX) / _SIZES_PX[0])
+    known = np.log(min(max(confirmed, 1), _MOST_CONFIRMED))
+    return np.array([1.0, support, known, np.log1p(unconfirmed), size, size * support])
 
 
 def probability(inputs: Array) -> float:
-    """The probability that a match is right."""
-    return float(1 / (1 + np.exp(-float(np.dot(COEFFICIENTS, inputs)))))
+    """The probability that a match is right. A match says that the object is the one detected, not what it is: what was
+    detected once is never surer than that detection.
+    """
+    log_odds = float(np.dot(COEFFICIENTS, inputs))
+    return float(1 / (1 + np.exp(-(min(log_odds, inputs[1]) if inputs[2] == 0 else log_odds))))
 
 
 def within(sigma_px: float, diameter_px: float) -> float:

@@ -164,7 +164,7 @@ class DrogueTracker:
         track.misses, track.blind, track.gap, track.trusted = 0, 0, max(track.gap - 1, 0), confidence
         self._learn(track, picture, match)
         return self._frame(
-            track, PoseStatus.MEASURED, Cause.NONE, source, confidence, match.correlation, searched, found, event
+            track, PoseStatus.MEASURED, Cause.NONE, source, confidence, searched, found, event, match.correlation
         )
 
     def _matched(self, track: Track, picture: Picture) -> Match | None:
@@ -255,12 +255,10 @@ class DrogueTracker:
     def _confidence(self, track: Track, match: Match | None) -> float:
         if match is None:
             return 0.0
-        inputs = features(track.support, track.confirmed, track.unconfirmed)
+        inputs = features(track.support, track.confirmed, track.unconfirmed, track.motion.rim_diameter_px)
         if self.trace is not None:
             self.trace.append((inputs, track.motion.centre_px))
-        # A match says that the object is the one detected, not what it is: one detection is as sure as it was.
-        most = 1.0 if track.confirmed > 1 else 1 / (1 + np.exp(-track.support))
-        return min(probability(inputs), float(most))
+        return probability(inputs)
 
     def _acquired(self, picture: Picture) -> DrogueFrame:
         """Search the whole picture."""
@@ -278,17 +276,8 @@ class DrogueTracker:
     def _start(self, seen: CircleCandidate, pattern: Pattern, searched: str, found: int, event: str) -> DrogueFrame:
         motion = PatternState.started(seen.u_px, seen.v_px, 2 * seen.radius_px, self.parameters)
         self._track = track = Track(motion, pattern, logit(seen.score), trusted=seen.score)
-        return self._frame(
-            track,
-            PoseStatus.MEASURED,
-            Cause.NONE,
-            MeasuredBy.DETECTOR,
-            seen.score,
-            float("nan"),
-            searched,
-            found,
-            event,
-        )
+        by = MeasuredBy.DETECTOR
+        return self._frame(track, PoseStatus.MEASURED, Cause.NONE, by, seen.score, searched, found, event)
 
     def _in_picture(self, picture: Picture) -> list[CircleCandidate]:
         return [c for c in self.detector(picture, None) if c.score >= self.parameters.confirm_confidence]
@@ -336,7 +325,8 @@ class DrogueTracker:
         sure = track.confirmed >= TRUSTED and track.unconfirmed < p.most_unconfirmed
         limit = p.size_ratio if sure else np.inf
         # The tracked object may be another one that the detector takes for a drogue, with less confidence.
-        lead = max(logit(p.sure_confidence), track.support + p.sure_logit)
+        least = p.sure_confidence if track.trusted >= p.hand_back_confidence else p.elsewhere_confidence
+        lead = max(logit(least), track.support + p.sure_logit)
         alike = [
             c for c in found if 1 / limit < 2 * c.radius_px / motion.rim_diameter_px < limit or logit(c.score) > lead
         ]
@@ -372,7 +362,7 @@ class DrogueTracker:
             return nothing_known(cause, event)
         sigma = float(np.sqrt(np.trace(motion.covariance) / 2))
         confidence = share * track.trusted * within(sigma, motion.rim_diameter_px)
-        return self._frame(track, PoseStatus.PREDICTED, cause, MeasuredBy.NONE, confidence, float("nan"), "", 0)
+        return self._frame(track, PoseStatus.PREDICTED, cause, MeasuredBy.NONE, confidence)
 
     @staticmethod
     def _frame(
@@ -381,10 +371,10 @@ class DrogueTracker:
         cause: Cause,
         source: MeasuredBy,
         confidence: float,
-        correlation: float,
-        searched: str,
-        found: int,
+        searched: str = "",
+        found: int = 0,
         event: str = "",
+        correlation: float = float("nan"),
     ) -> DrogueFrame:
         m = track.motion
         return DrogueFrame(

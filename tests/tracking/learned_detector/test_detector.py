@@ -115,6 +115,19 @@ def test_a_second_look_corrects_a_candidate_and_rejects_one_beside_the_drogue(sa
     assert right >= 0.75 * len(samples)
 
 
+@pytest.mark.parametrize("change", [[0, 0, 6.0, 0, 0], [0, 0, 0, 0.4, 0]])
+def test_looks_that_disagree_in_place_or_size_lower_the_confidence(monkeypatch, change):
+    def seen_again(seen):
+        monkeypatch.setattr(detector, "looked_at", lambda row, levels, weights: seen)
+        return detector._seen_again(np.array([0.5, 100.0, 80.0, 20.0]), [], detector.WEIGHTS)
+
+    look = np.array([0.2, 100.0, 80.0, np.log(20.0), 0.0])
+    same, apart = seen_again(np.array([look, look])), seen_again(np.array([look + change, look]))
+    assert same[0] > 0.8
+    assert apart[0] < 0.5
+    assert same[1:].tolist() == pytest.approx([100, 80, 20])
+
+
 def test_the_figures_of_the_bench_follow_from_the_candidates(samples):
     score, right = np.array([0.9, 0.8, 0.7, 0.6]), np.array([True, False, True, False])
     recall, threshold = recall_at(samples[:4], score, right, 0.25)

@@ -7,7 +7,7 @@ import pytest
 
 from tracking.light_tracker.frames import COEFFICIENTS, FEATURES, SIGNS, features, logit, probability, within
 
-GOOD = {"support": 2.0, "confirmed": 5, "unconfirmed": 0}
+GOOD = {"support": 2.0, "confirmed": 5, "unconfirmed": 0, "diameter_px": 9.0}
 
 
 def confidence(**changed: float) -> float:
@@ -28,6 +28,19 @@ def test_a_worse_input_lowers_the_confidence(worse):
 
 def test_a_track_that_checks_do_not_confirm_is_not_believed():
     assert confidence(confirmed=1, unconfirmed=8, support=-1.9) < 0.5
+
+
+@pytest.mark.parametrize("diameter_px", [35.0, 150.0])
+def test_a_large_object_of_which_the_detector_is_never_sure_is_not_believed_however_often_it_is_found(diameter_px):
+    """It is sure of a drogue of that size; of one of 9 px it is not."""
+    assert confidence(support=0.0, confirmed=10, diameter_px=diameter_px) < 0.5
+    assert confidence(support=0.0, confirmed=10) > 0.9
+    assert confidence(support=4.0, diameter_px=diameter_px) > 0.99
+
+
+def test_what_was_detected_once_is_as_sure_as_that_detection():
+    assert confidence(support=0.5, confirmed=1) == pytest.approx(1 / (1 + np.exp(-0.5)))
+    assert confidence(support=0.5, confirmed=2) > 0.9
 
 
 def test_the_coefficients_have_the_signs_of_their_meaning():
