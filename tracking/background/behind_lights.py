@@ -73,10 +73,11 @@ class BehindLights:
 
         The modulation that most lights of a camera show, and those that pass (`passing_lights`), helps with the others.
         """
-        parts = _behind_each(seen, found, boxes, _modulation(passing, seen))
+        lights = [light for box in boxes for light in _lights_of(seen, found, box)]
+        parts = _behind_each(lights, _modulation(passing, seen))
         modulation = _modulation([*(part.fit for part in parts), *passing], seen)
         if modulation is not None:
-            parts = _behind_each(seen, found, boxes, modulation)
+            parts = _behind_each(lights, modulation)
         if not parts:
             nowhere, none = np.zeros(0, np.int64), np.zeros(0)
             return BehindLights(nowhere, nowhere, none, none, none, [], modulation)
@@ -184,71 +185,39 @@ class _Part(NamedTuple):
     fit: JointFit
 
 
-def _behind_each(
-    seen: Exposures, found: Sequence[Detections], boxes: Array, modulation: Modulation | None
-) -> list[_Part]:
-    parts = [_behind_one(seen, found, box, modulation) for box in boxes]
-    return [part for part in parts if part is not None]
-
-
-def _behind_one(
-    seen: Exposures, found: Sequence[Detections], box: Array, modulation: Modulation | None
-) -> _Part | None:
-    """The pixels behind the brightest light in a box; None: no fit."""
-    if box[2] > LARGEST_PATH_PX:
-        return None
-    here = [d[inside(box[None], d)] for d in found]
-    shown = [k for k, d in enumerate(here) if len(d)]
-    if len(shown) < max(_LEAST_PICTURES, _LEAST_SHARE * len(found)):
-        return None
-    together = [np.count_nonzero(here[k].flux > _ALSO_BRIGHT * here[k].flux.max()) > 1 for k in shown]
-    if np.mean(together) > _SELDOM:
-        return None
-    brightest = [here[k][here[k].flux == here[k].flux.max()][:1] for k in shown]
-    width = float(np.median([np.sqrt(d.major_px[0] * d.minor_px[0]) for d in brightest]))
-    places = np.concatenate([d.uv_px for d in brightest])
-    # The box is that of all that moves here, a shadow beside the light, too.
-    least, most = places.min(axis=0), places.max(axis=0)
-    own = 0.5 * float(np.max(most - least)) + ON_LIGHT[0] * width + ON_LIGHT[1] + AROUND_SPOT[1]
-    if own < box[2]:
-        box = np.array([*0.5 * (least + most), own])
-    if box[2] > _LARGEST_PATH * width:
-        return None
-    height, middle = float(np.median([d.peak[0] for d in brightest])), np.median(places, axis=0)
-    lacks = _lacking(seen, shown, middle, width) > _LACKS * height
-    # What is found in the middle although the light has left is an edge.
-    true = ~(lacks[shown] & (np.linalg.norm(places - middle, axis=1) < width))
-    there, places = np.array(shown)[true], places[true]
-    empty = np.flatnonzero(lacks & ~np.isin(np.arange(len(found)), shown))
-    side = 2 * (box[2] + _AROUND * width)
-    step = max(_step(width), int(np.ceil(side / np.sqrt(_MOST_SAMPLES))))
-    which = _Which(
-        seen, there, empty, box, np.concatenate([_reach(found[k][~inside(box[None], found[k])]) for k in there])
-    )
-    uv, values, variance, without = which.around(_AROUND * width, step)
-    if len(uv) < _LEAST_CLEAR * (side / step) ** 2:
-        return None
-    strength = seen.strength[there, None]
-    fit = fitted(uv, values, variance, places, width, height, without, modulation, strength)
-    return None if fit is None else _whole(which, width, fit)
-
-
-def _reach(lights: Detections) -> Array:
-    """(n, 3): places and sizes of lights, px."""
-    return np.column_stack([lights.uv_px, ON_LIGHT[0] * lights.major_px + ON_LIGHT[1]])
-
-
 @dataclass(frozen=True, slots=True)
-class _Which:
-    """The pictures of a light, and where they show it."""
+class _Light:
+    """A light that moves by a few of its widths, and the pictures that show it."""
 
     seen: Exposures
     there: Ints  # pictures with the light
-    empty: Ints  # those without it
+    places: Array  # (n, 2) px: in these
+    width_px: float
+    height_dn: float
+    empty: Ints  # pictures without it
     box: Array  # (3,)
-    others: Array  # (k, 3): of other lights in the pictures with it
+    others: Array  # (k, 3): places and sizes of other lights in the pictures with it
 
-    def around(self, more: float, step: int) -> tuple[Array, Array, Array, tuple[Array, Array]]:
+    def behind(self, modulation: Modulation | None) -> _Part | None:
+        """All pixels that the light reaches; None: no fit."""
+        side = 2 * (self.box[2] + _AROUND * self.width_px)
+        step = max(_step(self.width_px), int(np.ceil(side / np.sqrt(_MOST_SAMPLES))))
+        uv, values, variance, without = self._around(_AROUND * self.width_px, step)
+        if len(uv) < _LEAST_CLEAR * (side / step) ** 2:
+            return None
+        seen, strength = self.seen, self.seen.strength[self.there, None]
+        fit = fitted(uv, values, variance, self.places, self.width_px, self.height_dn, without, modulation, strength)
+        if fit is None:
+            return None
+        uv, values, variance, without = self._around(2 * _AROUND * self.width_px, 1)
+        level, information, light = fit.behind(uv, values, variance, without)
+        lit = light > _LIT
+        column, row = uv[lit].astype(np.int64).T
+        share = fit.share + 1 / np.maximum(information[lit], 1e-3)
+        own = Modulation(fit.modulated_share(seen.usual_dn)[0], seen.usual_dn)
+        return _Part(row, column, level[lit] + seen.black_dn, share, own.response(level[lit]), self.box, fit)
+
+    def _around(self, more: float, step: int) -> tuple[Array, Array, Array, tuple[Array, Array]]:
         """Pixels (m, 2) that no other light reaches, light and variances of the pictures there, mean of those without.
 
         more, step: as in Exposures.around.
@@ -261,6 +230,61 @@ class _Which:
         return uv[clear], values[:, clear], variance, mean_of(without[:, clear], variance)
 
 
+def _behind_each(lights: Sequence[_Light], modulation: Modulation | None) -> list[_Part]:
+    parts = [light.behind(modulation) for light in lights]
+    return [part for part in parts if part is not None]
+
+
+def _lights_of(seen: Exposures, found: Sequence[Detections], box: Array) -> list[_Light]:
+    """The brightest light in a box, or the lights of which most pictures show one each."""
+    if box[2] > LARGEST_PATH_PX:
+        return []
+    rows = [np.flatnonzero(inside(box[None], d)) for d in found]
+    bright = [r[found[k].flux[r] > _ALSO_BRIGHT * found[k].flux[r].max()] if len(r) else r for k, r in enumerate(rows)]
+    several = [k for k, r in enumerate(bright) if len(r) > 1]
+    if len(several) <= _SELDOM * sum(len(r) > 0 for r in rows):
+        first = [r[[int(found[k].flux[r].argmax())]] if len(r) else r for k, r in enumerate(rows)]
+        every = [first]
+    else:
+        # Each is nearest to where it was in one of the pictures: they are further apart than they move.
+        number = int(np.median([len(bright[k]) for k in several]))
+        start = next(k for k in several if len(bright[k]) == number)
+        at = found[start].uv_px[bright[start]]
+        gap = [np.linalg.norm(found[k].uv_px[r, None] - at, axis=-1) for k, r in enumerate(bright)]
+        every = [[r[g.argmin(axis=1) == i] for r, g in zip(bright, gap, strict=True)] for i in range(number)]
+        every = [rows for rows in every if all(len(r) < 2 for r in rows)]
+    lights = [_light_at(seen, found, rows, box) for rows in every]
+    return [light for light in lights if light is not None]
+
+
+def _light_at(seen: Exposures, found: Sequence[Detections], rows: Sequence[Ints], box: Array) -> _Light | None:
+    """A light in a box: one point, or none, of each picture. None: it is in too few pictures, or moves too far."""
+    shown = [k for k, r in enumerate(rows) if len(r)]
+    if len(shown) < max(_LEAST_PICTURES, _LEAST_SHARE * len(found)):
+        return None
+    points = [found[k][rows[k]] for k in shown]
+    width = float(np.median([np.sqrt(d.major_px[0] * d.minor_px[0]) for d in points]))
+    places = np.concatenate([d.uv_px for d in points])
+    # The box is that of all that moves here, a shadow beside the light, too.
+    least, most = places.min(axis=0), places.max(axis=0)
+    own = 0.5 * float(np.max(most - least)) + ON_LIGHT[0] * width + ON_LIGHT[1] + AROUND_SPOT[1]
+    if own < box[2]:
+        box = np.array([*0.5 * (least + most), own])
+    if box[2] > _LARGEST_PATH * width:
+        return None
+    height, middle = float(np.median([d.peak[0] for d in points])), np.median(places, axis=0)
+    lacks = _lacking(seen, shown, middle, width) > _LACKS * height
+    # What is found in the middle although the light has left is an edge.
+    true = ~(lacks[shown] & (np.linalg.norm(places - middle, axis=1) < width))
+    there = np.array(shown)[true]
+    if len(there) < _LEAST_PICTURES:
+        return None
+    empty = np.flatnonzero(lacks & ~np.isin(np.arange(len(found)), shown))
+    others = [found[k][~inside(box[None], found[k])] for k in there]
+    reach = [np.column_stack([d.uv_px, ON_LIGHT[0] * d.major_px + ON_LIGHT[1]]) for d in others]
+    return _Light(seen, there, places[true], width, height, empty, box, np.concatenate([np.zeros((0, 3)), *reach]))
+
+
 def _lacking(seen: Exposures, shown: Sequence[int], place: Array, width: float) -> Array:
     """(n,), DN: by how much less light of this width each picture has at a place than most of those shown.
 
@@ -269,14 +293,3 @@ def _lacking(seen: Exposures, shown: Sequence[int], place: Array, width: float) 
     values, _, uv = seen.around(range(len(seen.pictures)), np.array([*place, width]), width, 1)
     light = np.exp(-0.5 * np.sum((uv - place) ** 2, axis=1) / width**2)
     return np.asarray((np.median(values[shown], axis=0) - values) @ light / np.sum(light**2))
-
-
-def _whole(which: _Which, width: float, fit: JointFit) -> _Part:
-    """All pixels that the light of a fit to some pictures reaches."""
-    uv, values, variance, without = which.around(2 * _AROUND * width, 1)
-    level, information, light = fit.behind(uv, values, variance, without)
-    lit, seen = light > _LIT, which.seen
-    column, row = uv[lit].astype(np.int64).T
-    share = fit.share + 1 / np.maximum(information[lit], 1e-3)
-    own = Modulation(fit.modulated_share(seen.usual_dn)[0], seen.usual_dn)
-    return _Part(row, column, level[lit] + seen.black_dn, share, own.response(level[lit]), which.box, fit)

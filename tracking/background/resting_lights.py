@@ -124,6 +124,8 @@ class RestingLights:
         places (k, n, 2), px: as `in_picture` measures them; counted (k, n): where it does. What the camera's vibration
         does to most lights is no move of one.
         """
+        if not len(self.found):
+            return np.zeros(0, dtype=bool)
         apart = places - self.found.uv_px
         apart = np.where(counted[..., None], apart - np.median(apart, axis=1, keepdims=True), 0.0)
         count = np.maximum(np.count_nonzero(counted, axis=0), 1)

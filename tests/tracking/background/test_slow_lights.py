@@ -360,11 +360,12 @@ def test_a_light_that_moves_by_its_width_is_fitted_also_where_more_moves_beside_
     assert np.abs(behind.level_dn - 30.0).max() < 5.0
 
 
-@pytest.mark.parametrize("apart_px", [13.0, 15.0, 17.0])
-def test_a_light_that_moves_by_its_width_is_measured_also_beside_another_one(apart_px):
-    """The other one is in some of the pixels around it."""
+@pytest.mark.parametrize("at", [(180.0, 121.0), (300.0, 201.0), (199.0, 250.0), (161.0, 140.0)])
+@pytest.mark.parametrize("apart_px", [12.0, 16.0])
+def test_two_lights_that_move_by_their_width_beside_each_other_are_measured_on_edges(at, apart_px):
+    """Each of them is in some of the pixels around the other one."""
     moved = np.repeat([0.0, 1.6, 3.6], 15)[:, None, None] * np.array([-0.4, 0.9])
-    paths = np.array([[200.0, 150.0], [200.0 - 0.4 * apart_px, 150.0 - 0.9 * apart_px]]) + moved
-    gap, sigma = errors(found_in_all(board_pictures(paths, 1.9, 0.4, 25, DOTTED)), paths)
+    paths = np.array([at, np.subtract(at, np.multiply(apart_px, (0.4, 0.9)))]) + moved
+    gap, sigma = errors(found_in_all(board_pictures(paths, 1.9, 0.4, 25)), paths)
     assert gap.max() < 0.15
     assert (gap / sigma).max() < 4.5
