@@ -360,8 +360,11 @@ def test_a_light_that_moves_by_its_width_is_fitted_also_where_more_moves_beside_
     assert np.abs(behind.level_dn - 30.0).max() < 5.0
 
 
-@pytest.mark.parametrize("at", [(180.0, 121.0), (300.0, 201.0), (199.0, 250.0), (161.0, 140.0)])
-@pytest.mark.parametrize("apart_px", [12.0, 16.0])
+@pytest.mark.parametrize(
+    ("at", "apart_px"),
+    [((180.0, 121.0), 12.0), ((300.0, 201.0), 12.0), ((199.0, 250.0), 12.0), ((180.0, 121.0), 16.0),
+     ((300.0, 201.0), 16.0), ((199.0, 250.0), 16.0), ((161.0, 140.0), 16.0)],
+)  # fmt: skip
 def test_two_lights_that_move_by_their_width_beside_each_other_are_measured_on_edges(at, apart_px):
     """Each of them is in some of the pixels around the other one."""
     moved = np.repeat([0.0, 1.6, 3.6], 15)[:, None, None] * np.array([-0.4, 0.9])
