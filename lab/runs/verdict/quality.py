@@ -167,7 +167,7 @@ def _why_never(statistics: RunStatistics) -> list[Finding]:
     if unexplained > FEW_SHOWN * statistics.frames:
         what = (
             f"{unexplained} of {statistics.frames} frames show enough points of light ({per_frame}), but no pose within"
-            " the prior explains them"
+            " the prior explains them better than false points do by chance"
         )
         return [finding("BP-V10", Level.FAIL, what, numbers=numbers)]
     if few or unexplained:
