@@ -35,17 +35,17 @@ from tracking.smoothing.labels.continuity import continued, transfers_between_ca
 from tracking.smoothing.labels.neighbouring_frames import connected, displaced, isolated, next_to
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated, run_log_clutter, run_log_static
 from tracking.smoothing.labels.view_path import PathContext
-from tracking.smoothing.motion.process_noise import corner_offsets, corner_times, jump_sigmas, jump_variances
+from tracking.smoothing.motion.process_noise import corner_offsets, jump_sigmas
 from tracking.smoothing.motion.run_detections import (
     Reference,
     RunDetections,
     SmoothedMotion,
-    Steps,
     WholeRun,
     controlled_labels,
     moved_detections,
     straight_between,
 )
+from tracking.smoothing.motion.timed_run import estimate_timed
 from tracking.smoothing.motion.whole_run import MAX_DISTANCE, estimate
 from tracking.smoothing.place_errors import place_errors, scaled_shares, with_places
 from tracking.smoothing.recording import FoundClocks, TrackedRecording, merged, track_backward
@@ -317,25 +317,16 @@ class _Smoother:
         rec = self.rec
         run = WholeRun(self.views, seen, self.calibration_cov, rec.dt_s, rec.exposure_s, True, self.delays)
         begin = SmoothedMotion.begin(ref, rec.jumped.copy(), None)
-        motion = estimate(run, self.assigned, self.measured, begin, 0, self.measured)
+        motion = estimate_timed(run, self.assigned, self.measured, begin, 0, self.measured)
         turns = motion.jumped | np.append(motion.jumped[1:], False)
         steady = self.measured & ~turns
         return self._at_frames(seen, motion), motion.ref, steady if steady.any() else self.measured
 
     def _at_frames(self, seen: RunDetections, motion: SmoothedMotion) -> RunDetections:
         """The detections where they would have been at the instants of their frames, given the estimated motion."""
-        if self.delays is None or motion.log_density is None:
+        if self.delays is None or motion.between is None:
             return seen
-        nowhere = np.zeros(len(self.rec), dtype=bool)
-        jump = jump_variances(
-            motion.ref, nowhere, self.measured, motion.jumped, self.rec.dt_s, motion.excluded, motion.jump_scale,
-            motion.moment,
-        )  # fmt: skip
-        corners = corner_times(motion.ref, motion.jumped, self.rec.dt_s)
-        steps = Steps(self.rec.dt_s, np.exp(motion.log_density), np.ascontiguousarray(jump), corners, motion.moment)
-        uv, cov = moved_detections(
-            self.views, self.view_table.camera, seen, self.delays, self.assigned, motion.ref, motion.motion_P, steps
-        )
+        uv, cov = moved_detections(self.views, self.view_table.camera, seen, self.delays, self.assigned, motion.between)
         return seen._replace(uv=uv, cov=cov)
 
     def estimate(self, max_distance: int) -> None:
@@ -347,7 +338,8 @@ class _Smoother:
             self.views, self.seen, self.calibration_cov, rec.dt_s, rec.exposure_s, self.parameters.learn_jerk,
             self.delays, rec.unknown_clocks(self.correction_s),
         )  # fmt: skip
-        self.motion = estimate(run, self.assigned, self.measured, self.motion, max_distance, self.trusted)
+        estimated = estimate if self.delays is None else estimate_timed
+        self.motion = estimated(run, self.assigned, self.measured, self.motion, max_distance, self.trusted)
         for _ in range(MAX_CLOCK_STEPS):
             found = self.motion.clocks
             if found is None or self.rec.clocks is None:
@@ -359,7 +351,7 @@ class _Smoother:
             self.correction_s = self.correction_s + np.clip(found.correction_s, -most, most)
             self.delays = self.rec.delays(self.correction_s)
             run = replace(run, delays=self.delays, clocks=rec.unknown_clocks(self.correction_s))
-            self.motion = estimate(
+            self.motion = estimated(
                 run, self.assigned, self.measured, self.motion.without_covariances(), max_distance, self.trusted
             )
         self.detections = self._at_frames(self.seen, self.motion)
@@ -453,9 +445,9 @@ class _Smoother:
         """Assume velocity jumps where the pose contradicts the frame's own spots, and estimate the motion again."""
         # A jump that was detected one step too late leaves the frame before it with the covariance of a smooth path.
         beside = next_to(self.motion.jumped) | self.motion.jumped
-        for _ in range(MAX_REPAIRS):
+        for _ in range(MAX_REPAIRS if self.delays is None else 0):
             limit = np.where(beside, CONTRADICTION_NEXT_TO_JUMP_CHI2, CONTRADICTION_CHI2)
-            wrong = self.own.measured & self.trusted & (self.own.excess > limit) & ~self.timed
+            wrong = self.own.measured & self.trusted & (self.own.excess > limit)
             if not wrong.any():
                 return
             jumped = self.motion.jumped.copy()
