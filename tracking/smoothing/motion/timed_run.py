@@ -43,10 +43,11 @@ from tracking.smoothing.motion.whole_run import (
     _Estimator,
 )
 
-FIRST_PASSES, LATER_PASSES = 14, 7  # with one strength of the jerk first, and after turns have changed
+FIRST_PASSES, LATER_PASSES = 14, 6  # with one strength of the jerk first, and after turns have changed
 LAST_PASSES = 3  # of these, in which the strength of the jerk stays
 ROUNDS = 4  # of passes and improved turns
 APART = 1.5  # frames: of shocks as close as this only the largest is a turn ...
+STRONGEST = 1.0  # m^2 or rad^2: the jerk, times the fifth power of a frame (variance of the pose after it: a 20th)
 FIRST_LENGTH = 1.0  # frames: ... of this length at first
 
 
@@ -129,11 +130,8 @@ class _TimedEstimator(_Estimator):
     def run_passes(self) -> SmoothedMotion:
         """Passes and searches for turns until nothing changes."""
         out = self._passes(FIRST_PASSES if self.fresh else LATER_PASSES, GLOBAL_PASSES if self.fresh else 0)
-        for _ in range(ROUNDS):
-            withdrawn = self._turns_withdrawn()
-            if withdrawn:
-                out = self._passes(LATER_PASSES)
-            if not (self._turns_improved() or withdrawn):
+        for number in range(ROUNDS):
+            if not (self._turns_withdrawn() | self._turns_improved(every=number == 0)):
                 break
             out = self._passes(LATER_PASSES)
         if self.run.clocks is not None:
@@ -151,7 +149,6 @@ class _TimedEstimator(_Estimator):
             if not (np.isfinite(out.x).all() and np.isfinite(out.pose_P).all()):
                 if self.last is None:
                     raise FloatingPointError("the smoothing pass has no finite first step")
-                # Spots that contradict each other make the jerk as strong as rounding allows.
                 (_, self.log_density), self.ref = self.last, before
                 break
             self.last = out, self.log_density
@@ -162,7 +159,9 @@ class _TimedEstimator(_Estimator):
                 if self.run.adapt_jerk:
                     steady = ~jumping
                     steady[0] = False
-                    self.log_density = next_log_density(self.log_density, out, steady, local=number >= common)
+                    density = next_log_density(self.log_density, out, steady, local=number >= common)
+                    # Spots that contradict each other would make it as strong as rounding allows.
+                    self.log_density = np.minimum(density, np.log(STRONGEST / self.frame_s**5))
                 if number >= NO_JUMPS_BEFORE:
                     self._add_turns(np.where(jumping | self.continuous, 0.0, out.shock))
             else:
@@ -197,27 +196,26 @@ class _TimedEstimator(_Estimator):
 
         A vehicle that rests and then swings has the strength of the rest at first, and many turns.
         """
-        found = False
+        found, search = False, self._search()
         for some in successions(self.turns, self.frame_s):
-            search = self._search()
             density = search.without(some, self.turns)
             if density is None:
                 continue
             self.turns = [t for t in self.turns if not any(t is one for one in some)]
             if self.run.adapt_jerk:
-                self.log_density = np.log(density)
+                self.log_density = np.maximum(self.log_density, np.log(density))
             begin, end = some[0].begin_s - self.frame_s, max(t.end_s for t in some) + self.frame_s
             self.continuous |= (self.t_s > begin) & (self.t_s - self.dt < end)
             found = True
         return found
 
-    def _turns_improved(self) -> bool:
-        """Find when the turns are, one after the other; whether any has changed."""
+    def _turns_improved(self, every: bool) -> bool:
+        """Find when the turns are, one after the other; whether any has changed. every: also those that are settled."""
         search, any_changed = self._search(), False
         for some in successions(self.turns, self.frame_s):
             # Of turns side by side one that moves moves the others.
             settled = all(turn.settled for turn in some)
-            for turn in some:
+            for turn in some if every or not settled else ():
                 others = [one for one in self.turns if one is not turn]
                 new = search.improved(turn._replace(settled=settled), others)
                 any_changed |= new is None or not new.settled

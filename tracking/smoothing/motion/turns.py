@@ -18,7 +18,7 @@ from tracking.rigid_body.online_estimates import MANOEUVRE_S
 from tracking.smoothing.motion.fixed_interval import RunInformation, log_likelihood
 from tracking.smoothing.motion.run_detections import Reference, Turn, unknown_moments
 
-AROUND = 12  # frames on both sides of a turn that show it
+AROUND = 8  # frames on both sides of a turn that show it
 LEAST_LENGTH = 0.1  # of a frame: no real corner is in one instant
 _LONGEST = 6.0  # frames: a longer change of the velocities is jerk
 _LENGTHS = (0.1, 1.0, 2.0, 4.0)  # frames: from which the search begins ...
@@ -30,6 +30,7 @@ _GAINED = 1e-3  # nats: less is rounding
 _AMBIGUOUS_NATS = 2.0  # by which a longer turn may be less likely: a turn is as long as the spots allow
 _WIDER = 1.25  # times, in the search for that
 _SIGMAS = 2.0  # of the middle, as a sigma: the same spots show it and then the motion
+_WITH_IT = (-1.0, -0.5, 0.0, 0.5, 1.0)  # of the way of the middle: how far the turn beside it moves, too
 _CURVATURE_NATS = 0.5  # drop of the likelihood from which the sigma of the middle is computed
 _CHANGED = 0.02, 0.1  # of a frame, and relative: less does not change a turn
 TURN_NATS = 3.0  # by which each turn must make a run more likely
@@ -133,7 +134,20 @@ class TurnSearch:
         allowed = length
         while allowed < _LONGEST * frame and nats(middle, _WIDER * allowed) > most - _AMBIGUOUS_NATS:
             allowed *= _WIDER
-        sigma = _SIGMAS * self._sigma(nats, middle, allowed)
+        beside = [
+            one for one in others if len(successions(sorted([turn, one], key=lambda one: one.middle_s), frame)) == 1
+        ]
+        nearest = min(beside, key=lambda one: abs(one.middle_s - middle), default=None)
+
+        def profile(at: float, length: float) -> float:
+            # What moves one of two turns moves the other.
+            if nearest is None:
+                return nats(at, length)
+            rest, here = [one for one in others if one is not nearest], Turn(at, length, length, turn.size)
+            ways = (nearest._replace(middle_s=nearest.middle_s + share * (at - middle)) for share in _WITH_IT)
+            return max(self.nats([*rest, one, here], part) for one in ways)
+
+        sigma = _SIGMAS * self._sigma(profile, middle, allowed)
         spread = min(float(np.hypot(allowed, np.sqrt(12) * sigma)), _LONGEST * frame)
         moved = abs(middle - turn.middle_s) > _CHANGED[0] * frame
         settled = not moved and abs(spread - turn.length_s) < _CHANGED[1] * turn.length_s
