@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -21,7 +23,8 @@ def search_in(run: Run) -> TurnSearch:
     """The likelihood of turns in a run of poses, a frame every DT."""
     frames = len(run.info.dt)
     density = np.ascontiguousarray(run.jerk)
-    return TurnSearch(run.ref, run.info, density, np.zeros((frames, 2)), np.cumsum(run.info.dt), DT)
+    every = np.ones(frames, dtype=bool)
+    return TurnSearch(run.ref, run.info, density, np.zeros((frames, 2)), np.cumsum(run.info.dt), every, DT)
 
 
 def found_in(seed: int, share: float) -> tuple[Turn | None, float]:
@@ -41,6 +44,19 @@ def test_the_error_of_a_turn_is_as_stated_and_a_part_of_a_frame():
     assert 0.1 < np.sqrt(np.mean(over**2)) < 1.0
     assert np.abs(errors).max() < 0.2 * DT
     assert all(turn.length_s < DT for turn, _ in known)
+
+
+def test_two_corners_are_wider_where_a_camera_has_no_picture_between_them():
+    """There they resemble one smooth turn."""
+    search = search_in(drawn(8, FRAMES, jump_at=STEP, moment=0.5))
+    middle = float(search.t_s[STEP] - 0.5 * DT)
+    turn, beside = Turn(middle, DT, DT, SIZE), Turn(middle + 2 * DT, DT, DT, 1e-4 * SIZE)
+    sharp = search.improved(turn, [beside])
+    vague = replace(search, complete=np.arange(FRAMES) != STEP + 1).improved(turn, [beside])
+    assert sharp is not None
+    assert vague is not None
+    assert sharp.middle_s == vague.middle_s
+    assert vague.length_s > 1.2 * sharp.length_s
 
 
 def test_a_settled_turn_stays_where_it_is():
@@ -69,7 +85,7 @@ def test_a_stronger_jerk_replaces_turns_of_a_swing_but_not_a_corner():
     strong = np.tile(JERK, (FRAMES, 1))
     strong[STEP - 6 : STEP + 6] *= 1e4
     swing = search_in(drawn(6, FRAMES, jerk=strong))
-    calm = TurnSearch(swing.ref, swing.info, np.tile(JERK, (FRAMES, 1)), swing.hidden, swing.t_s, DT)
+    calm = replace(swing, density=np.tile(JERK, (FRAMES, 1)))
     turns = [Turn(float(calm.t_s[k] - 0.5 * DT), DT, DT, 0.1 * SIZE) for k in range(STEP - 5, STEP + 6, 2)]
     assert len(successions(turns, DT)) == 1
     density = calm.without(turns, turns)

@@ -97,14 +97,10 @@ MOST_FRAMES_AT_ONCE, CHUNK = 8192, 1024
 
 
 class RunInformation(NamedTuple):
-    """Information of T frames' spots about the motion at a reference, and the process noise of the steps.
+    """Information of T frames' spots about the poses at a reference, and the process noise of the steps."""
 
-    It is about the poses, s = 6, or, where pictures were taken before or after the instants of their frames, about the
-    whole states, s = 18.
-    """
-
-    information: Array  # (T, s, s) normal matrices J^T C^-1 J; 0 without spots
-    vector: Array  # (T, s) J^T C^-1 (measured - expected)
+    information: Array  # (T, 6, 6) normal matrices J^T C^-1 J; 0 without spots
+    vector: Array  # (T, 6) J^T C^-1 (measured - expected)
     dt: Array  # (T,) s since the frame before
     velocity_jump: Array  # (T, 2) variances of the velocities' jump in that step, (m/s)^2 and (rad/s)^2
     acceleration_jump: Array  # (T, 2) variances of the accelerations' jump
@@ -257,9 +253,9 @@ def smoothed(ref: Reference, info: RunInformation, jerk: Array, tested: bool = T
             P = _combine(out, k, xs[k - begin], Ps[k - begin], Y, y)
             if k == 0:
                 break
-            for a in range(info.vector.shape[1]):
+            for a in range(6):
                 y[a] += info.vector[k, a]
-                for b in range(info.vector.shape[1]):
+                for b in range(6):
                     Y[a, b] += info.information[k, a, b]
             if tested:
                 _test_process_noise(info, jerk, k, Y, y, P, out)

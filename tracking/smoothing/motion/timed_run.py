@@ -119,6 +119,8 @@ class _TimedEstimator(_Estimator):
         """known: instants (F,) of frames that are measured, and of those near such frames."""
         self.frame_s, self.turns = frame_s, list(motion.turns)
         self.t_s = np.ascontiguousarray(instants.t_s[core])
+        every_camera: Bools = instants.run.detections.has_image.all(axis=1)
+        self.complete = every_camera[instants.frame[core]]
         self.continuous = np.zeros(len(self.t_s), dtype=bool)  # (F,) steps in which a jerk has replaced turns
         self.clocks: ClockSolution | None = None
         self.last: tuple[Interval, Array] | None = None  # the last finite pass, and its strength of the jerk
@@ -189,7 +191,8 @@ class _TimedEstimator(_Estimator):
 
     def _search(self) -> TurnSearch:
         info, _ = self._information(self.ref)
-        return TurnSearch(self.ref, info, np.exp(self.log_density), self._hidden(), self.t_s, self.frame_s)
+        density = np.exp(self.log_density)
+        return TurnSearch(self.ref, info, density, self._hidden(), self.t_s, self.complete, self.frame_s)
 
     def _turns_withdrawn(self) -> bool:
         """Replace turns by a stronger jerk where that explains the spots; whether any are.
