@@ -47,7 +47,6 @@ FIRST_PASSES, LATER_PASSES = 14, 6  # with one strength of the jerk first, and a
 LAST_PASSES = 3  # of these, in which the strength of the jerk stays
 ROUNDS = 4  # of passes and improved turns
 APART = 1.5  # frames: of shocks as close as this only the largest is a turn ...
-STRONGEST = 1.0  # m^2 or rad^2: the jerk, times the fifth power of a frame (variance of the pose after it: a 20th)
 FIRST_LENGTH = 1.0  # frames: ... of this length at first
 
 
@@ -119,21 +118,27 @@ class _TimedEstimator(_Estimator):
         """known: instants (F,) of frames that are measured, and of those near such frames."""
         self.frame_s, self.turns = frame_s, list(motion.turns)
         self.t_s = np.ascontiguousarray(instants.t_s[core])
-        every_camera: Bools = instants.run.detections.has_image.all(axis=1)
-        self.complete = every_camera[instants.frame[core]]
+        self.complete = np.asarray(np.all(instants.run.detections.has_image, axis=1))[instants.frame[core]]
         self.continuous = np.zeros(len(self.t_s), dtype=bool)  # (F,) steps in which a jerk has replaced turns
         self.clocks: ClockSolution | None = None
         self.last: tuple[Interval, Array] | None = None  # the last finite pass, and its strength of the jerk
         dt = np.ascontiguousarray(instants.run.dt[core])
         # (F, 2) of the first reference: what a jump leaves open would raise the speeds, and these the jumps.
         self.largest = largest_jumps(Reference(*(a[core] for a in motion.ref)), known[0][core], dt)
+        # (6,) A jerk that turns the fastest motion round within a frame, by q dt^3 / 3. Spots that contradict
+        # each other would make it as strong as rounding allows.
+        fastest = np.maximum(self.largest.max(axis=0), np.finfo(float).tiny)
+        self.strongest = np.log(np.repeat(3 * fastest / frame_s**3, 3))
         super().__init__(instants.run, instants.assigned, known[1], used, core, motion)
 
     def run_passes(self) -> SmoothedMotion:
         """Passes and searches for turns until nothing changes."""
         out = self._passes(FIRST_PASSES if self.fresh else LATER_PASSES, GLOBAL_PASSES if self.fresh else 0)
         for number in range(ROUNDS):
-            if not (self._turns_withdrawn() | self._turns_improved(every=number == 0)):
+            withdrawn = self._turns_withdrawn()
+            if withdrawn:  # the stronger jerk would hide the other turns
+                out = self._passes(LATER_PASSES)
+            if not (self._turns_improved(every=number == 0) or withdrawn):
                 break
             out = self._passes(LATER_PASSES)
         if self.run.clocks is not None:
@@ -162,8 +167,7 @@ class _TimedEstimator(_Estimator):
                     steady = ~jumping
                     steady[0] = False
                     density = next_log_density(self.log_density, out, steady, local=number >= common)
-                    # Spots that contradict each other would make it as strong as rounding allows.
-                    self.log_density = np.minimum(density, np.log(STRONGEST / self.frame_s**5))
+                    self.log_density = np.minimum(density, self.strongest)
                 if number >= NO_JUMPS_BEFORE:
                     self._add_turns(np.where(jumping | self.continuous, 0.0, out.shock))
             else:
@@ -206,7 +210,8 @@ class _TimedEstimator(_Estimator):
                 continue
             self.turns = [t for t in self.turns if not any(t is one for one in some)]
             if self.run.adapt_jerk:
-                self.log_density = np.maximum(self.log_density, np.log(density))
+                most = np.maximum(self.log_density, self.strongest)
+                self.log_density = np.clip(np.log(density), self.log_density, most)
             begin, end = some[0].begin_s - self.frame_s, max(t.end_s for t in some) + self.frame_s
             self.continuous |= (self.t_s > begin) & (self.t_s - self.dt < end)
             found = True
