@@ -254,6 +254,9 @@ def _weighted_spot(
     return True, speed, w0, w1, w2
 
 
+OUTLIER_SIGMAS = 6.0  # of a residual, above which a spot pulls no more (Huber 1964): one with a wrong label
+
+
 @compiled
 def delayed_information(
     views: Views,
@@ -282,7 +285,11 @@ def delayed_information(
                 views, i, noise[i], calibration_cov[i], delays.after_s[d], delays.row_time_s[d], ref, k, at, J
             )
             if projected:
-                chi2[k] += add_spot(L[k], g[k], J, w0, w1, w2, uv[i, 0] - at[0], uv[i, 1] - at[1])
+                u, v = uv[i, 0] - at[0], uv[i, 1] - at[1]
+                far = np.sqrt(w0 * u * u + 2 * w1 * u * v + w2 * v * v)
+                share = min(1.0, OUTLIER_SIGMAS / max(far, 1e-300))
+                add_spot(L[k], g[k], J, share * w0, share * w1, share * w2, u, v)
+                chi2[k] += share * far**2 * (2.0 - share)
     return L, g, chi2
 
 

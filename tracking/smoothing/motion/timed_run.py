@@ -205,7 +205,9 @@ class _TimedEstimator(_Estimator):
         """
         found, search = False, self._search()
         for some in successions(self.turns, self.frame_s):
-            density = search.without(some, self.turns)
+            first, end = np.searchsorted(self.t_s, [some[0].begin_s, max(t.end_s for t in some)])
+            # Where few spots are left a strong jerk explains whatever contradicts itself.
+            density = search.without(some, self.turns) if self.measured[max(first - 1, 0) : end + 1].all() else None
             if density is None:
                 continue
             self.turns = [t for t in self.turns if not any(t is one for one in some)]
