@@ -18,8 +18,10 @@ from tracking.rigid_body.models.motion import state_after
 from tracking.smoothing.motion.run_detections import Delays, Reference, WholeRun
 
 # Of the usual step between two frames: spots as close as this share an instant. Each is projected at its own time,
-# with the velocities of that instant.
-TOGETHER = 0.05
+# with the velocities of the instant at the last reference. Where these are open, as in a turn between two cameras'
+# pictures, they follow from the poses at instants as far apart as that, and farther apart each step would make the
+# error of the last one larger.
+TOGETHER = 0.01
 
 
 @dataclass(frozen=True, slots=True)
