@@ -15,7 +15,13 @@ import numpy as np
 
 from geometry.arrays import Array, Bools
 from tracking.rigid_body.online_estimates import MANOEUVRE_S
-from tracking.smoothing.motion.fixed_interval import RunInformation, log_likelihood
+from tracking.smoothing.motion.fixed_interval import (
+    Filtered,
+    RunInformation,
+    filtered,
+    log_likelihood,
+    log_likelihood_with,
+)
 from tracking.smoothing.motion.run_detections import Reference, Turn, unknown_moments
 
 AROUND = 8  # frames on both sides of a turn that show it
@@ -88,18 +94,25 @@ class TurnSearch:
         t_s = self.t_s[part]
         return [t for t in turns if t.end_s > t_s[0] and t.begin_s < t_s[-1]]
 
-    def nats(self, turns: Sequence[Turn], part: slice, density: Array | None = None) -> float:
-        """Log-likelihood of a part of the run, up to a constant."""
+    def _of_part(self, turns: Sequence[Turn], part: slice) -> tuple[Reference, RunInformation]:
+        """A part of the run with some turns."""
         jump, moment = velocity_jumps(turns, self.t_s[part])
         jump = np.where(jump > 0, jump, self.hidden[part])
         some = self.info._replace(
             **{name: getattr(self.info, name)[part] for name in ("information", "vector", "dt")},
             velocity_jump=jump, acceleration_jump=jump / MANOEUVRE_S**2, moment=moment,
         )  # fmt: skip
-        ref = Reference(*(np.ascontiguousarray(a[part]) for a in self.ref))
-        return float(
-            log_likelihood(ref, some, np.ascontiguousarray((self.density if density is None else density)[part]))
-        )
+        return Reference(*(np.ascontiguousarray(a[part]) for a in self.ref)), some
+
+    def nats(self, turns: Sequence[Turn], part: slice, density: Array) -> float:
+        """Log-likelihood of a part of the run with this jerk (F, 6), up to a constant."""
+        return float(log_likelihood(*self._of_part(turns, part), np.ascontiguousarray(density[part])))
+
+    def with_turns(self, turns: Sequence[Turn], part: slice) -> _WithTurns:
+        """A part of the run with turns to which others are added."""
+        (ref, some), density = self._of_part(turns, part), np.ascontiguousarray(self.density[part])
+        both = filtered(ref, some, density)
+        return _WithTurns(tuple(turns), ref, some, density, self.hidden[part], self.t_s[part], both)
 
     def without(self, some: Sequence[Turn], all_turns: Sequence[Turn]) -> Array | None:
         """Densities (F, 6) of a jerk that explains the spots without some of all turns; None: these are needed."""
@@ -116,15 +129,16 @@ class TurnSearch:
             if (nats := self.nats(others, part, density)) > most:
                 best, most = density, nats
         needed = max(TURN_NATS * len(some), SUCCESSION_NATS if len(some) > 1 else 0.0)
-        return best if most > self.nats(every, part) - needed else None
+        return best if most > self.nats(every, part, self.density) - needed else None
 
     def improved(self, turn: Turn, others: Sequence[Turn]) -> Turn | None:
         """The most likely turn in place of one; None: the run is as likely without it."""
         part, frame = self.part(turn.middle_s, turn.middle_s), self.frame_s
         others = [one._replace(length_s=one.likely_s) for one in self.near(others, part)]
+        run = self.with_turns(others, part)
 
         def nats(middle: float, length: float) -> float:
-            return self.nats([*others, Turn(middle, length, length, turn.size)], part)
+            return run.nats([Turn(middle, length, length, turn.size)])
 
         middle, length = turn.middle_s, turn.likely_s
         most = nats(middle, length)
@@ -132,20 +146,21 @@ class TurnSearch:
             found = self._climbed(nats, turn.middle_s, begin * frame, 0.0 if turn.settled else _FARTHEST)
             if found[0] > most:
                 most, middle, length = found
-        if self.nats(others, part) > most - TURN_NATS:
+        if run.nats([]) > most - TURN_NATS:
             return None
         beside = [
             one for one in others if len(successions(sorted([turn, one], key=lambda one: one.middle_s), frame)) == 1
         ]
         nearest = min(beside, key=lambda one: abs(one.middle_s - middle), default=None)
+        rest = run if nearest is None else self.with_turns([one for one in others if one is not nearest], part)
 
         def profile(at: float, length: float) -> float:
             # What moves one of two turns moves the other.
             if nearest is None:
                 return nats(at, length)
-            rest, here = [one for one in others if one is not nearest], Turn(at, length, length, turn.size)
+            here = Turn(at, length, length, turn.size)
             ways = (nearest._replace(middle_s=nearest.middle_s + share * (at - middle)) for share in _WITH_IT)
-            return max(self.nats([*rest, one, here], part) for one in ways)
+            return max(rest.nats([one, here]) for one in ways)
 
         resembles = nearest is not None and not self._complete_between(nearest.middle_s, middle)
         allowed, ambiguous = length, _AMBIGUOUS_NATS[int(resembles)]
@@ -191,6 +206,35 @@ class TurnSearch:
                 break
             apart *= 2
         return float(apart / np.sqrt(2 * drop)) if drop > 0 else _LONGEST * self.frame_s
+
+
+@dataclass(frozen=True, slots=True)
+class _WithTurns:
+    """F instants with some turns, filtered from both ends: what other turns add is a matter of their steps alone."""
+
+    turns: tuple[Turn, ...]
+    ref: Reference
+    info: RunInformation
+    density: Array  # (F, 6)
+    hidden: Array  # (F, 2)
+    t_s: Array  # (F,)
+    filtered: Filtered
+
+    def nats(self, more: Sequence[Turn]) -> float:
+        """Log-likelihood with more turns, up to a constant."""
+        if not more:
+            return float(self.filtered.nats[-1])
+        ends = [min(t.begin_s for t in more), max(t.end_s for t in more)]
+        before, after = np.searchsorted(self.t_s, ends).tolist()
+        first, end = max(before, 1), min(after + 1, len(self.t_s))
+        t_s = self.t_s[first - 1 : end]
+        others = [t for t in self.turns if t.end_s > t_s[0] and t.begin_s < t_s[-1]]
+        jumps, moments = velocity_jumps([*others, *more], t_s)
+        jump, moment = self.info.velocity_jump.copy(), self.info.moment.copy()
+        jump[first:end] = np.where(jumps > 0, jumps, self.hidden[first - 1 : end])[1:]
+        moment[first:end] = moments[1:]
+        info = self.info._replace(velocity_jump=jump, acceleration_jump=jump / MANOEUVRE_S**2, moment=moment)
+        return float(log_likelihood_with(self.ref, info, self.density, self.filtered, first, end))
 
 
 def successions(turns: Sequence[Turn], frame_s: float) -> list[list[Turn]]:
