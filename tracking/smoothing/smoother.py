@@ -277,9 +277,10 @@ class _Smoother:
         self.calibration_cov, self.systematic, self.noise_share = calibration_errors(rec, seen, self.assigned, ref)
         place_px2 = rec.place_px2()
         every, steady, labels = seen, self.measured, self.assigned
+        first = SmoothedMotion.begin(ref, rec.jumped.copy(), None)
         if self.delays is not None:
-            every, ref, steady = self._first_motion(seen, ref)
-            labels = well_known(every, seen, labels)
+            every, first, steady = self._first_motion(seen, first)
+            ref, labels = first.ref, well_known(every, seen, labels)
         self.errors = ErrorScale.of(
             model,
             seen._replace(uv=every.uv),
@@ -294,7 +295,7 @@ class _Smoother:
         self.seen = self.detections = seen._replace(
             cov=self.errors.of_run(seen, place_px2) + parameters.sigma_model_px**2 * np.eye(2)
         )
-        log_density: Array | None = None
+        log_density = first.log_density
         if not parameters.learn_jerk:
             by_hand = 2 * np.log(np.repeat([parameters.jerk_m_s3, parameters.jerk_rad_s3], 3))
             log_density = np.tile(by_hand, (len(rec), 1))
@@ -303,11 +304,13 @@ class _Smoother:
         # (T,) measured by a tracker with enough spots: it has left open what nothing checked.
         self.sure = self.measured & (distinct_spots(self.assigned >= 0, model.spot_of) >= MIN_REDUNDANT_SPOTS)
         self.trusted = connected(self.measured, self.sure | self._controlled(ref)[0])  # (T,) labels that may be used
-        self.motion = SmoothedMotion.begin(ref, rec.jumped.copy(), log_density)
+        self.motion = replace(first.without_covariances(), log_density=log_density)
         self.conflicting = np.zeros(len(rec), dtype=bool)  # (T,) forward and backward poses differ
         self.own = SingleFramePoses.unknown(0)  # at the last estimate
 
-    def _first_motion(self, seen: RunDetections, ref: Reference) -> tuple[RunDetections, Reference, Bools]:
+    def _first_motion(
+        self, seen: RunDetections, begin: SmoothedMotion
+    ) -> tuple[RunDetections, SmoothedMotion, Bools]:
         """The detections at the instants of their frames, by the motion with the stated sigmas; that motion; steady
         frames.
 
@@ -316,11 +319,10 @@ class _Smoother:
         """
         rec = self.rec
         run = WholeRun(self.views, seen, self.calibration_cov, rec.dt_s, rec.exposure_s, True, self.delays)
-        begin = SmoothedMotion.begin(ref, rec.jumped.copy(), None)
         motion = estimate_timed(run, self.assigned, self.measured, begin, 0, self.measured)
         turns = motion.jumped | np.append(motion.jumped[1:], False)
         steady = self.measured & ~turns
-        return self._at_frames(seen, motion), motion.ref, steady if steady.any() else self.measured
+        return self._at_frames(seen, motion), motion, steady if steady.any() else self.measured
 
     def _at_frames(self, seen: RunDetections, motion: SmoothedMotion) -> RunDetections:
         """The detections where they would have been at the instants of their frames, given the estimated motion."""
