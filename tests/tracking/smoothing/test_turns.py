@@ -96,6 +96,20 @@ def test_a_stronger_jerk_replaces_turns_of_a_swing_but_not_a_corner():
     assert corner.without([turn], [turn]) is None
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_the_likelihood_of_more_turns_is_that_of_the_whole_part(seed):
+    """Only their steps are filtered again."""
+    search = search_in(drawn(seed, FRAMES, jump_at=STEP, moment=0.4))
+    at, part = float(search.t_s[STEP] - 0.4 * DT), slice(3, FRAMES - 2)
+    known = [Turn(at - 3 * DT, 2 * DT, 2 * DT, 0.3 * SIZE)]
+    run = search.with_turns(known, part)
+    own, beside = Turn(at, 0.2 * DT, 0.2 * DT, SIZE), Turn(at + 2 * DT, DT, DT, SIZE)
+    overlapping, beyond = (Turn(at + apart * DT, 2 * DT, 2 * DT, SIZE) for apart in (-2, 17))
+    for more in ([], [own], [own, beside], [overlapping], [beyond]):
+        whole = search.nats([*known, *more], part, search.density)
+        assert run.nats(more) == pytest.approx(whole, abs=1e-3), more
+
+
 def covariance_after(jump: Array, moment: Array, dt: Array) -> Array:
     """Covariance (2, 2) of position and velocity of an axis after steps with these jumps."""
     P = np.zeros((2, 2))
