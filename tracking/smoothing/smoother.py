@@ -308,9 +308,7 @@ class _Smoother:
         self.conflicting = np.zeros(len(rec), dtype=bool)  # (T,) forward and backward poses differ
         self.own = SingleFramePoses.unknown(0)  # at the last estimate
 
-    def _first_motion(
-        self, seen: RunDetections, begin: SmoothedMotion
-    ) -> tuple[RunDetections, SmoothedMotion, Bools]:
+    def _first_motion(self, seen: RunDetections, begin: SmoothedMotion) -> tuple[RunDetections, SmoothedMotion, Bools]:
         """The detections at the instants of their frames, by the motion with the stated sigmas; that motion; steady
         frames.
 

@@ -36,6 +36,7 @@ from tracking.smoothing.motion.run_detections import (
 )
 from tracking.smoothing.motion.turns import TurnSearch, successions, velocity_jumps
 from tracking.smoothing.motion.whole_run import (
+    CONVERGED_LOG_DENSITY,
     CONVERGED_SIGMAS,
     GLOBAL_PASSES,
     NO_JUMPS_BEFORE,
@@ -43,7 +44,7 @@ from tracking.smoothing.motion.whole_run import (
     _Estimator,
 )
 
-FIRST_PASSES, LATER_PASSES = 14, 6  # with one strength of the jerk first, and after turns have changed
+FIRST_PASSES, LATER_PASSES = 14, 4  # with one strength of the jerk first, and after turns have changed
 LAST_PASSES = 3  # of these, in which the strength of the jerk stays
 ROUNDS = 4  # of passes and improved turns
 APART = 1.5  # frames: of shocks as close as this only the largest is a turn ...
@@ -140,7 +141,7 @@ class _TimedEstimator(_Estimator):
                 out = self._passes(LATER_PASSES)
             if not (self._turns_improved(every=number == 0) or withdrawn):
                 break
-            out = self._passes(LATER_PASSES)
+            out = self._passes(LATER_PASSES, adapting=False)
         if self.run.clocks is not None:
             info, _ = self._information(self.ref)
             at = self.ref, self.core.start
@@ -148,8 +149,9 @@ class _TimedEstimator(_Estimator):
             self.clocks = solve_clocks(self.run, self.assigned, weight, at, info, np.exp(self.log_density))
         return replace(self._extrapolated(out), clocks=self.clocks, turns=tuple(self.turns))
 
-    def _passes(self, count: int, common: int = 0) -> Interval:
-        """Passes, of which the first `common` have one strength of the jerk."""
+    def _passes(self, count: int, common: int = 0, adapting: bool = True) -> Interval:
+        """Passes, of which the first `common` have one strength of the jerk. adapting: estimate it."""
+        searching = True
         for number in range(count):
             before = self.ref
             out, moved = self._step(np.exp(self.log_density), True)
@@ -162,20 +164,28 @@ class _TimedEstimator(_Estimator):
             jumping = self._jumps()[0].max(axis=1) > 0
             if number > 0:
                 self.turns = [self._sized(turn, out) for turn in self.turns]
-            if number < count - LAST_PASSES:
-                if self.run.adapt_jerk:
-                    steady = ~jumping
-                    steady[0] = False
-                    density = next_log_density(self.log_density, out, steady, local=number >= common)
-                    self.log_density = np.minimum(density, self.strongest)
+            searching &= number < count - LAST_PASSES
+            if searching:
+                settled = not adapting or self._adapted(out, jumping, local=number >= common)
                 if number >= NO_JUMPS_BEFORE:
-                    self._add_turns(np.where(jumping | self.continuous, 0.0, out.shock))
+                    new = self._add_turns(np.where(jumping | self.continuous, 0.0, out.shock))
+                    searching = new or not settled or number < common
             else:
                 sd = np.sqrt(np.maximum(np.diagonal(out.pose_P, axis1=1, axis2=2), 1e-30))
                 if np.all(np.abs(moved[:, :6]) < CONVERGED_SIGMAS * sd):
                     break
         assert self.last is not None
         return self.last[0]
+
+    def _adapted(self, out: Interval, jumping: Bools, local: bool) -> bool:
+        """Update the strength of the jerk after a pass; whether it has hardly changed. jumping (F,): steps in turns."""
+        if not self.run.adapt_jerk:
+            return True
+        before, steady = self.log_density, ~jumping
+        steady[0] = False
+        self.log_density = np.minimum(next_log_density(before, out, steady, local), self.strongest)
+        change = np.abs(self.log_density - before) * np.sqrt(np.minimum(out.gamma, 1.0))
+        return bool(change.max(initial=0.0) < CONVERGED_LOG_DENSITY)
 
     def _sized(self, turn: Turn, out: Interval) -> Turn:
         """One step of the fixed point of `next_log_density` for the variances of a turn."""
@@ -184,14 +194,15 @@ class _TimedEstimator(_Estimator):
         size = turn.size * (energy + PSEUDO_COUNT) / (np.maximum(gamma, 0.0) + PSEUDO_COUNT)
         return turn._replace(size=np.minimum(size, self.largest[steps].max(axis=0, initial=0.0)))
 
-    def _add_turns(self, shock: Array) -> None:
-        """Add turns at the local maxima of the shock (F,)."""
-        middle_s = self.t_s - 0.5 * self.dt
+    def _add_turns(self, shock: Array) -> bool:
+        """Add turns at the local maxima of the shock (F,); whether there are any."""
+        middle_s, before = self.t_s - 0.5 * self.dt, len(self.turns)
         for k in np.flatnonzero(shock > SHOCK_CHI2).tolist():
             if shock[k] >= shock[np.abs(middle_s - middle_s[k]) < APART * self.frame_s].max():
                 length = FIRST_LENGTH * self.frame_s
                 self.turns.append(Turn(float(middle_s[k]), length, length, self.largest[k]))
         self.turns.sort(key=lambda turn: turn.middle_s)
+        return len(self.turns) > before
 
     def _search(self) -> TurnSearch:
         info, _ = self._information(self.ref)
