@@ -44,7 +44,7 @@ from tracking.smoothing.motion.whole_run import (
     _Estimator,
 )
 
-FIRST_PASSES, LATER_PASSES = 14, 4  # with one strength of the jerk first, and after turns have changed
+FIRST_PASSES, LATER_PASSES = 14, 5  # with one strength of the jerk first, and after turns have changed
 LAST_PASSES = 3  # of these, in which the strength of the jerk stays
 ROUNDS = 4  # of passes and improved turns
 APART = 1.5  # frames: of shocks as close as this only the largest is a turn ...
@@ -150,7 +150,7 @@ class _TimedEstimator(_Estimator):
         return replace(self._extrapolated(out), clocks=self.clocks, turns=tuple(self.turns))
 
     def _passes(self, count: int, common: int = 0, adapting: bool = True) -> Interval:
-        """Passes, of which the first `common` have one strength of the jerk. adapting: estimate it."""
+        """Passes, of which the first `common` have one strength of the jerk. adapting: estimate it, once if it was before."""
         searching = True
         for number in range(count):
             before = self.ref
@@ -166,8 +166,9 @@ class _TimedEstimator(_Estimator):
                 self.turns = [self._sized(turn, out) for turn in self.turns]
             searching &= number < count - LAST_PASSES
             if searching:
+                adapting &= number == 0 or common > 0
                 settled = not adapting or self._adapted(out, jumping, local=number >= common)
-                if number >= NO_JUMPS_BEFORE:
+                if number >= (NO_JUMPS_BEFORE if common > 0 else 1):
                     new = self._add_turns(np.where(jumping | self.continuous, 0.0, out.shock))
                     searching = new or not settled or number < common
             else:
