@@ -150,7 +150,7 @@ class _TimedEstimator(_Estimator):
         return replace(self._extrapolated(out), clocks=self.clocks, turns=tuple(self.turns))
 
     def _passes(self, count: int, common: int = 0, adapting: bool = True) -> Interval:
-        """Passes, of which the first `common` have one strength of the jerk. adapting: estimate it, once if it was before."""
+        """Passes, of which the first `common` have one strength of the jerk; adapting: they estimate it."""
         searching = True
         for number in range(count):
             before = self.ref

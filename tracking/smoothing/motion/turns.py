@@ -25,9 +25,9 @@ from tracking.smoothing.motion.fixed_interval import (
 from tracking.smoothing.motion.run_detections import Reference, Turn, unknown_moments
 
 AROUND = 8  # frames on both sides of a turn that show it
-LEAST_LENGTH = 0.1  # of a frame: no real corner is in one instant
+LEAST_LENGTH = 0.02  # of a frame, twice _LAST_STEP: a longer one would round corners by more than the spots show
 _LONGEST = 6.0  # frames: a longer change of the velocities is jerk
-_LENGTHS = (0.1, 1.0, 2.0, 4.0)  # frames: from which the search begins ...
+_LENGTHS = (LEAST_LENGTH, 1.0, 2.0, 4.0)  # frames: from which the search begins ...
 _FARTHEST, _SHORT = 1.5, 0.5  # frames: ... at middles as far as this; of shorter turns the likelihood is narrow ...
 _GRID = (0.25, 0.5)  # frames: ... and of shorter, and of longer turns the distance of these
 _FIRST_STEP, _LAST_STEP = 0.125, 0.01  # frames, of the search for the middle
