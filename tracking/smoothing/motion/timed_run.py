@@ -47,6 +47,7 @@ from tracking.smoothing.motion.whole_run import (
 FIRST_PASSES, LATER_PASSES = 14, 5  # with one strength of the jerk first, and after turns have changed
 LAST_PASSES = 3  # of these, in which the strength of the jerk stays
 ROUNDS = 4  # of passes and improved turns
+EXCLUDED_NATS = 5.0  # by which a motion without a jump in a gap must be more likely
 APART = 1.5  # frames: of shocks as close as this only the largest is a turn ...
 FIRST_LENGTH = 1.0  # frames: ... of this length at first
 
@@ -121,6 +122,7 @@ class _TimedEstimator(_Estimator):
         self.t_s = np.ascontiguousarray(instants.t_s[core])
         self.complete = np.asarray(np.all(instants.run.detections.has_image, axis=1))[instants.frame[core]]
         self.continuous = np.zeros(len(self.t_s), dtype=bool)  # (F,) steps in which a jerk has replaced turns
+        self.steady = np.zeros(len(self.t_s), dtype=bool)  # (F,) unobserved steps that exclude a jump
         self.clocks: ClockSolution | None = None
         self.last: tuple[Interval, Array] | None = None  # the last finite pass, and its strength of the jerk
         dt = np.ascontiguousarray(instants.run.dt[core])
@@ -136,7 +138,7 @@ class _TimedEstimator(_Estimator):
         """Passes and searches for turns until nothing changes."""
         out = self._passes(FIRST_PASSES if self.fresh else LATER_PASSES, GLOBAL_PASSES if self.fresh else 0)
         for number in range(ROUNDS):
-            withdrawn = self._turns_withdrawn()
+            withdrawn = self._hidden_excluded() | self._turns_withdrawn()
             if withdrawn:  # the stronger jerk would hide the other turns
                 out = self._passes(LATER_PASSES)
             if not (self._turns_improved(every=number == 0) or withdrawn):
@@ -247,7 +249,21 @@ class _TimedEstimator(_Estimator):
     def _hidden(self) -> Array:
         """(F, 2): variances of the jumps in the steps that nothing observes."""
         share = P_JUMP_OCCLUDED * np.minimum(self.dt / self.frame_s, 1.0)
-        return np.where(unobserved_steps(self.measured)[:, None], share[:, None] * self.largest, 0.0)
+        hidden = unobserved_steps(self.measured) & ~self.steady
+        return np.where(hidden[:, None], share[:, None] * self.largest, 0.0)
+
+    def _hidden_excluded(self) -> bool:
+        """Exclude jumps from gaps where the motion around is more likely without; whether from any more."""
+        search, before = self._search(), int(self.steady.sum())
+        ends = np.flatnonzero(np.diff(np.r_[False, search.hidden.any(axis=1), False]))
+        for first, end in zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True):
+            part = search.part(self.t_s[first], self.t_s[end - 1])
+            near, hidden = search.near(self.turns, part), search.hidden.copy()
+            hidden[first:end] = 0.0
+            without = replace(search, hidden=hidden).nats(near, part, search.density)
+            if without > search.nats(near, part, search.density) + EXCLUDED_NATS:
+                self.steady[first:end] = True
+        return int(self.steady.sum()) > before
 
     def _jumps(self) -> tuple[Array, Array]:
         """Variances (F, 2) of the velocities' jumps by turns, and their moments (F, 2)."""
