@@ -53,7 +53,8 @@ class Ellipses:
     @property
     def areas(self) -> Array:
         """(n,), px^2."""
-        return np.asarray(np.pi * np.sqrt(np.linalg.det(self.shapes)))
+        with np.errstate(invalid="ignore"):  # nan where there is no ellipse
+            return np.asarray(np.pi * np.sqrt(np.linalg.det(self.shapes)))
 
 
 def find_circles(image: GreyImage, board: CircleGrid, thorough: bool = True) -> BoardView | NotFound:

@@ -13,7 +13,7 @@ import pytest
 
 from bench.lenses import rendered
 from bench.lenses.rendered import BOARDS
-from calibration.boards import charuco_detection, chessboard_detection, corner_refinement
+from calibration.boards import charuco_detection, chessboard_detection, circle_detection, corner_refinement
 from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Board, CircleGrid, parse
 from calibration.boards.board_view import QUICK_SEARCH_FAILED, BoardView, NotFound
@@ -187,6 +187,14 @@ def test_corners_in_any_order_are_renumbered_correctly():
     true = photo.pixels.reshape(6, 9, 2)
     for given in (true, true[::-1], true[:, ::-1], true[::-1, ::-1]):
         np.testing.assert_array_equal(chessboard_detection.oriented(photo.image, given), true)
+
+
+@pytest.mark.filterwarnings("error")
+def test_circles_beside_one_without_an_ellipse_have_their_areas_without_a_warning():
+    shapes = np.stack([4 * np.eye(2), np.full((2, 2), np.nan)])
+    areas = circle_detection.Ellipses(np.zeros((2, 2)), shapes, np.ones(2)).areas
+    assert areas[0] == pytest.approx(4 * np.pi)
+    assert np.isnan(areas[1])
 
 
 def test_a_larger_circle_in_a_corner_becomes_the_first_point():
