@@ -156,28 +156,33 @@ class _Pixels:
         size = 5 + 2 * n + 3 + n
         height = (light.plain + light.modulated * seen.behind) * seen.root
         weighted = height * seen.light_of
-        slopes = np.zeros((size, n + 2, m))
-        slopes[0, :n], slopes[1, :n] = seen.light_of * seen.root, seen.light_of * seen.behind * seen.root
-        slopes[2, :n] = -weighted * seen.along * seen.du
-        slopes[3, :n] = -weighted * seen.along * seen.dv
-        slopes[4, :n] = -weighted * seen.across * seen.dv
-        each = np.arange(n)
-        slopes[5 + 2 * each, each], slopes[6 + 2 * each, each] = seen.place_slopes(light)
-        about = self.uv - light.origin
-        slopes[5 + 2 * n : -n, n] = -np.stack([np.ones(m), *about.T]) / light.texture_dn
-        slopes[size - n + each, each] = height * seen.form
-        by_background = np.concatenate([
-            seen.slope * seen.root, np.full((1, m), 1 / light.texture_dn), np.sqrt(self.empty_information)[None],
-        ])  # fmt: skip
+        # Of each picture (n, 8, m): by p and q, shape, its place and its strength; where these parameters are (n, 8).
+        slopes = np.stack([
+            seen.light_of * seen.root, seen.light_of * seen.behind * seen.root, -weighted * seen.along * seen.du,
+            -weighted * seen.along * seen.dv, -weighted * seen.across * seen.dv, *seen.place_slopes(light),
+            height * seen.form,
+        ], axis=1)  # fmt: skip
+        each, plane = np.arange(n), slice(5 + 2 * n, size - n)
+        own = np.column_stack([np.tile(np.arange(5), (n, 1)), 5 + 2 * each, 6 + 2 * each, size - n + each])
+        by_plane = -np.stack([np.ones(m), *(self.uv - light.origin).T]) / light.texture_dn
+        # The residuals have no part along the background's slopes: it is the best one for this light.
+        by_background = np.concatenate([seen.slope * seen.root, np.full((1, m), 1 / light.texture_dn)])
         by_background /= np.sqrt(seen.information)
-        slopes -= (slopes * by_background).sum(axis=1)[:, None] * by_background
-        flat = slopes.reshape(size, -1)
+        along = slopes * by_background[:n, None]
+        eliminated = np.zeros((size, m))
+        eliminated[:5], eliminated[own[:, 5:]] = along[:, :5].sum(axis=0), along[:, 5:]
+        eliminated[plane] = by_plane * by_background[n]
         usual = np.zeros((2 + n, size))
         share, sigma = self.modulated
         usual[0, :2] = np.array([-share, (1 - share) * self.usual]) / (sigma * self.height)
         usual[1, :2] = np.array([1, self.usual]) / (2 * self.height)
         usual[2 + each, size - n + each] = 1 / (_FLICKER * self.strength.ravel())
-        return flat @ flat.T + usual.T @ usual, flat @ seen.residual.ravel() - usual.T @ seen.usual
+        normal, right = usual.T @ usual - eliminated @ eliminated.T, -usual.T @ seen.usual
+        np.add.at(normal, (own[:, :, None], own[:, None]), slopes @ slopes.transpose(0, 2, 1))
+        np.add.at(right, own, (slopes @ seen.residual[:n, :, None])[..., 0])
+        normal[plane, plane] += by_plane @ by_plane.T
+        right[plane] += by_plane @ seen.residual[n]
+        return normal, right
 
 
 @dataclass(frozen=True, slots=True)
