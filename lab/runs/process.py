@@ -319,13 +319,14 @@ def write_tables(
     diagnosis = model_check.result.diagnosis
     noise_scale = None if diagnosis is not None else pipeline.tracker.noise_scale
     mosaics = {name: noise.mosaic for name, noise in pipeline.noise.items() if noise.mosaic}
-    verdict = quality.judge(statistics, model_check.findings, noise_scale, mosaics)
+    too_wide = {name: noise.too_wide_px for name, noise in pipeline.noise.items() if noise.too_wide_px}
+    verdict = quality.judge(statistics, model_check.findings, noise_scale, mosaics, too_wide)
     explained = diagnosis is not None and diagnosis.is_random
     mistakes = mistakes_of_run(run, statistics, pictures, passes=verdict.status == "pass", explained=explained)
     if mistakes:
         # The deviations of a rig with such a mistake are its consequences.
         others = () if verdict_of(mistakes) is Level.FAIL else model_check.findings
-        verdict = quality.judge(statistics, (*mistakes, *others), noise_scale, mosaics)
+        verdict = quality.judge(statistics, (*mistakes, *others), noise_scale, mosaics, too_wide)
     return statistics, model_check, verdict
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -259,7 +259,8 @@ def _lights_of(seen: Exposures, found: Sequence[Detections], box: Array) -> list
 
 def _light_at(seen: Exposures, found: Sequence[Detections], rows: Sequence[Ints], box: Array) -> _Light | None:
     """A light in a box: one point, or none, of each picture. None: it is in too few pictures, or moves too far."""
-    shown = [k for k, r in enumerate(rows) if len(r)]
+    every = range(len(found))
+    shown = np.array([k for k in every if len(rows[k])], np.int64)
     if len(shown) < max(_LEAST_PICTURES, _LEAST_SHARE * len(found)):
         return None
     points = [found[k][rows[k]] for k in shown]
@@ -273,19 +274,32 @@ def _light_at(seen: Exposures, found: Sequence[Detections], rows: Sequence[Ints]
     if box[2] > _LARGEST_PATH * width:
         return None
     height, middle = float(np.median([d.peak[0] for d in points])), np.median(places, axis=0)
+    others = [d[~inside(box[None], d)] for d in found]
+    reach = [np.column_stack([d.uv_px, ON_LIGHT[0] * d.major_px + ON_LIGHT[1]]) for d in others]
+    beside = np.concatenate([np.zeros((0, 3)), *reach])
+    light = _Light(seen, np.array(every), np.tile(middle, (len(found), 1)), width, height, shown[:0], box, beside)
+    uv, values, _, _ = light._around(_AROUND * width, 1)
+    if not len(uv):
+        return None
+    flux = 2 * np.pi * width**2 * height
+    gone = (values - np.median(values[shown], axis=0)).sum(axis=1) < -_LACKS * flux
     lacks = _lacking(seen, shown, middle, width) > _LACKS * height
     # What is found in the middle although the light has left is an edge.
     true = ~(lacks[shown] & (np.linalg.norm(places - middle, axis=1) < width))
-    there = np.array(shown)[true]
-    if len(there) < _LEAST_PICTURES:
+    there = ~gone
+    there[shown] = true
+    if np.count_nonzero(there) < _LEAST_PICTURES:
         return None
-    empty = np.flatnonzero(lacks & ~np.isin(np.arange(len(found)), shown))
-    others = [found[k][~inside(box[None], found[k])] for k in there]
-    reach = [np.column_stack([d.uv_px, ON_LIGHT[0] * d.major_px + ON_LIGHT[1]]) for d in others]
-    return _Light(seen, there, places[true], width, height, empty, box, np.concatenate([np.zeros((0, 3)), *reach]))
+    # Of one that is there and not found: the first moment of what the picture shows more than the mean.
+    area = float(np.prod(np.ptp(uv, axis=0) + 1)) / len(uv)
+    light.places[:] += area * (values - values.mean(axis=0)) @ (uv - middle) / flux
+    light.places[shown[true]] = places[true]
+    empty = lacks & gone
+    empty[shown] = False
+    return replace(light, there=np.flatnonzero(there), places=light.places[there], empty=np.flatnonzero(empty))
 
 
-def _lacking(seen: Exposures, shown: Sequence[int], place: Array, width: float) -> Array:
+def _lacking(seen: Exposures, shown: Sequence[int] | Ints, place: Array, width: float) -> Array:
     """(n,), DN: by how much less light of this width each picture has at a place than most of those shown.
 
     Where a vehicle rests for a part of the recording, the other pictures show the background behind its lights.

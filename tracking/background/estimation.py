@@ -29,7 +29,7 @@ _MANY_LIGHTS = 4  # at rest, from which the subtraction is used in any case: it 
 _LEAST_FOUND = 0.2  # further or better spots per picture from which the subtraction is used
 _ALWAYS = 0.9  # share of the pictures in which another light passes over one at rest, above which that is part of it
 _WIDER = 2.0  # widths of the lights that move, at most, of what the places of one of them have in common
-_MOSTLY = 0.7  # share of the pictures with lights that move, above which those at rest in all of them are no spots
+MOSTLY = 0.7  # share of the pictures with lights that move, above which those at rest in all of them are no spots
 # Contrast up to which the structure is that of the screen's surface, and modulates the spots' light in full. Of what is
 # more, prints or objects, the spots show a part: 0.25 to 0.57 where photographs modulate their light by up to 60 %.
 _OF_SURFACE, _OF_OBJECTS = 0.1, 0.4
@@ -45,13 +45,15 @@ _NO_GAUSSIAN = 0.02  # share of a light at rest that a Gaussian leaves in a pixe
 
 
 def static_background(
-    pictures: Sequence[Picture], model: NoiseModel, shift: TextureShift, parameters: DetectParameters
-) -> StaticBackground | None:
+    pictures: Sequence[Picture], model: NoiseModel, shift: TextureShift, parameters: DetectParameters,
+    others_move: bool = False, in_any_case: bool = False,
+) -> StaticBackground | None:  # fmt: skip
     """The background of pictures spread over a recording.
 
-    None: too few, or of different sizes or types, or with few lights at rest, while the differences from it show
-    the spots in them no better. model: of the camera's noise and texture; shift: errors of its spots by the
-    texture; parameters: with the grey value at which the sensor clips.
+    None: too few, or of different sizes or types, or, unless it is wanted in any case, with few lights at rest, while
+    the differences from it show the spots in them no better. model: of the camera's noise and texture; shift: errors of
+    its spots by the texture; parameters: with the grey value at which the sensor clips; others_move: lights that the
+    parameters exclude.
     """
     some = usable(pictures)
     if len(some) < _LEAST_PICTURES:
@@ -71,16 +73,16 @@ def static_background(
         lower, mean = means_of(equal)
         background = StaticBackground.of_mean(lower, some, model, parameters).with_light(some)
     tried = some[::TRIED]
-    few = len(background.lights.found) < _MANY_LIGHTS
+    few = len(background.lights.found) < _MANY_LIGHTS and not in_any_case
     moving = few and any(len(background.spots_in(p, parameters, shift)) for p in tried)
     if moving and sum(_better_in(background, p, shift) for p in tried) < max(_LEAST_FOUND * len(tried), 2):
         return None
-    return _without_slow_lights(background, mean, some, equal, 1 / np.array(lights), shift)
+    return _without_slow_lights(background, mean, some, equal, 1 / np.array(lights), shift, others_move)
 
 
 def _without_slow_lights(
     background: StaticBackground, mean: NDArray[np.float32], pictures: Sequence[Picture],
-    equal: Sequence[NDArray[Any]], strength: Array, shift: TextureShift,
+    equal: Sequence[NDArray[Any]], strength: Array, shift: TextureShift, others_move: bool,
 ) -> StaticBackground:  # fmt: skip
     """The background from the mean (h, w) of these pictures (in equal light), given the one from the lower half.
 
@@ -122,12 +124,12 @@ def _without_slow_lights(
     better = better.with_light(pictures)
     if behind.modulation is not None:
         better = better.with_modulation(behind.modulation, (behind.row, behind.column), behind.response)
-    return _with_shifts(better, mean, pictures, moved, shift, behind)
+    return _with_shifts(better, mean, pictures, moved, others_move, shift, behind)
 
 
 def _with_shifts(
     background: StaticBackground, mean: NDArray[np.float32], pictures: Sequence[Picture], moved: bool,
-    shift: TextureShift, behind: BehindLights,
+    others_move: bool, shift: TextureShift, behind: BehindLights,
 ) -> StaticBackground:  # fmt: skip
     """The background with the errors of lights by its texture, and with those of its lights that stay at rest.
 
@@ -138,7 +140,7 @@ def _with_shifts(
     # Of a light at rest that trembles something is left in the difference: that stays in its place.
     alone = [d[np.asarray(~near_each(d, background.lights.found, ON_LIGHT).any(axis=1))] for d in found]
     gone = [bool((~near_each(d, later, SAME_LIGHT).any(axis=1)).any()) for d, later in pairwise(alone)]
-    moved = moved and float(np.mean(gone)) > _MOSTLY
+    moved = others_move or (moved and float(np.mean(gone)) > MOSTLY)
     if not moved:
         background = background.with_lights_on_edges(mean, modulation)
     still = background.lights.found

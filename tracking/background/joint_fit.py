@@ -35,7 +35,7 @@ MODULATED = 0.5, 0.4  # usual share of the light that the brightness of the surf
 UNLIKE = 0.1  # usual sigma of the modulated share of different places
 _DARKEST = 0.1  # of the usual light: what is left of it on black ground, at least
 _ROUNDS = 2  # of the texture's size and the fit
-_LEAST_TEXTURE, _FIRST_TEXTURE = 2.0, 20.0  # DN
+_LEAST_TEXTURE, _FIRST_TEXTURE = 2.0, 20.0  # sigmas of the noise
 _ALIKE = 2.0  # texture is alike over some pixels: fewer of them are independent
 _LARGEST_CHI2 = 2.0  # per degree of freedom
 _LARGEST_SIGMA = 0.1  # of the mean place, in widths of the light
@@ -260,17 +260,17 @@ def fitted(
     expected = MODULATED if modulation is None else modulation.at(max(usual, 1.0))
     strength = np.broadcast_to(strength, (len(values), 1)).astype(float)
     pixels = _Pixels(uv, values, variance, max(usual, 1.0), height_dn, expected, *empty, strength)
-    origin, inverse = uv.mean(axis=0), 1 / width_px
+    origin, inverse, noise_dn = uv.mean(axis=0), 1 / width_px, float(np.sqrt(np.median(variance)))
     light = JointLight(
         places, np.array([inverse, 0.0, inverse]), (1 - expected[0]) * height_dn,
-        expected[0] * height_dn / pixels.usual, np.array([usual, 0.0, 0.0]), origin, _ALIKE * _FIRST_TEXTURE,
+        expected[0] * height_dn / pixels.usual, np.array([usual, 0.0, 0.0]), origin, _ALIKE * _FIRST_TEXTURE * noise_dn,
         strength,
     )  # fmt: skip
     for _ in range(_ROUNDS):
         light = _descended(pixels, light)
         seen = pixels.seen(light)
         about = seen.behind - light.plane[0] - (uv - origin) @ light.plane[1:]
-        light = replace(light, texture_dn=_ALIKE * max(float(np.std(about)), _LEAST_TEXTURE))
+        light = replace(light, texture_dn=_ALIKE * max(float(np.std(about)), _LEAST_TEXTURE * noise_dn))
     light = _descended(pixels, light)
     return _checked(pixels, light, width_px)
 

@@ -15,7 +15,7 @@ from tracking.background.places import AROUND_SPOT
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
 
-SAMPLE = (10, 11)  # rows and columns: every such pixel shows how much of the structure is in a picture
+_SAMPLE, _LEAST_SAMPLES = 10, 24  # every such row of a picture is in the sample; rows of that, in small pictures
 _SMOOTH = (9, 9)  # of these pixels: what varies over them is not structure
 _AROUND = (11, 11)  # of these pixels: 100 px: a part of the picture that shows the structure or does not
 _CLEAR_SIGMAS = 4.0  # of the measured light
@@ -56,7 +56,7 @@ class ShownLight:
 
         Each of the pictures is one of `count` in the mean, whose noise it shows with a weight of one over their number.
         """
-        rows, columns = SAMPLE
+        rows, columns = sample_of(structure.shape)
         plain = (~near_lights[::rows, ::columns]).astype(np.float32)
         own = structure[::rows, ::columns]
         about = own - cv2.blur(own * plain, _SMOOTH) / np.maximum(cv2.blur(plain, _SMOOTH), np.float32(1e-3))
@@ -101,7 +101,7 @@ class ShownLight:
         """The light, not yet relative to the reference; and, on the sample: what is above the smooth part, and the
         structure, DN, about the means around them; whether the place is clear of lights; variances, DN^2.
         """
-        rows, columns = SAMPLE
+        rows, columns = sample_of(self.size)
         above = picture[::rows, ::columns].astype(np.float32) - self.smooth
         more = _median(above[_SOME])
         slope, black = np.float32(self.noise.slope_dn), np.float32(self.noise.black_dn - more)
@@ -117,18 +117,24 @@ class ShownLight:
         return _median(share), above, structure, clear, variance
 
 
-def fits_around(clear: Bools, left: _Values, spots: Detections) -> Bools:
+def sample_of(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Every such row and column of a picture (h, w) shows how much of the structure is in it."""
+    rows = min(max(min(shape) // _LEAST_SAMPLES, 1), _SAMPLE)
+    return rows, rows + 1
+
+
+def fits_around(clear: Bools, left: _Values, spots: Detections, sample: tuple[int, int]) -> Bools:
     """(n,): whether what a picture leaves around spots, sigmas, is noise about its mean: before a person it is more.
 
     clear: the pixels of the sample that count; those of the spots do not: they explain them. The light of wide spots
-    is in what `left` has been reduced by.
+    is in what `left` has been reduced by. sample: `sample_of` the picture.
     """
     clear = clear.copy()
     widths, more = AROUND_SPOT
-    for at, reach in zip(spots.uv_px[:, ::-1] / SAMPLE, widths * spots.major_px + more, strict=True):
-        most = np.ceil(reach / np.array(SAMPLE)).astype(int)
+    for at, reach in zip(spots.uv_px[:, ::-1] / sample, widths * spots.major_px + more, strict=True):
+        most = np.ceil(reach / np.array(sample)).astype(int)
         rows, columns = (np.arange(max(int(x) - m, 0), int(x) + m + 2) for x, m in zip(at, most, strict=True))
-        away2 = ((rows - at[0]) * SAMPLE[0])[:, None] ** 2 + ((columns - at[1]) * SAMPLE[1]) ** 2
+        away2 = ((rows - at[0]) * sample[0])[:, None] ** 2 + ((columns - at[1]) * sample[1]) ** 2
         part = clear[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         part &= away2[: part.shape[0], : part.shape[1]] > reach**2
     counted = clear.astype(np.float32)
@@ -136,7 +142,7 @@ def fits_around(clear: Bools, left: _Values, spots: Detections) -> Bools:
     count, left2 = _sums(counted), np.square(left - means)
     least = _LARGEST_MISFIT**2 * count + _BY_CHANCE * np.sqrt(2 * count)
     fits = _sums(np.asarray(counted * np.minimum(left2, _MOST_LEFT**2), np.float32)) <= least
-    row, column = (np.clip(spots.uv_px[:, 1 - i] // SAMPLE[i], 0, n - 1).astype(int) for i, n in enumerate(fits.shape))
+    row, column = (np.clip(spots.uv_px[:, 1 - i] // sample[i], 0, n - 1).astype(int) for i, n in enumerate(fits.shape))
     return np.asarray(fits[row, column])
 
 

@@ -35,7 +35,7 @@ from tracking.background.places import (
     places_of,
 )
 from tracking.background.resting_lights import RestingLights
-from tracking.background.shown_light import LEAST_CHANGE, SAMPLE, Shown, ShownLight, fits_around
+from tracking.background.shown_light import LEAST_CHANGE, Shown, ShownLight, fits_around, sample_of
 from tracking.detection.detect import find_spots, saturation_of
 from tracking.detection.pixels import TEXTURE_SHARE
 from tracking.detections import Detections
@@ -61,7 +61,7 @@ class StaticBackground:
 
     pictures: int  # from which it is made
     structure: NDArray[np.float32]  # (h, w), DN: the fixed picture without its smooth part
-    smooth: NDArray[np.float32]  # DN, on the pixels of shown_light.SAMPLE
+    smooth: NDArray[np.float32]  # DN, on the pixels of shown_light.sample_of
     near_lights: Bools  # (h, w): near lights that do not move
     blind: Bools  # (h, w): the difference does not show what is there
     shares: NDArray[np.float32]  # (h, w): variance of the fixed picture's own errors over that of a picture's noise
@@ -142,7 +142,8 @@ class StaticBackground:
 
     def usual_dn(self) -> float:
         """The usual brightness of the surface, DN."""
-        return max(float(np.median(self.structure[:: SAMPLE[0], :: SAMPLE[1]] + self.smooth)), 1.0)
+        rows, columns = sample_of(self.structure.shape)
+        return max(float(np.median(self.structure[::rows, ::columns] + self.smooth)), 1.0)
 
     @staticmethod
     def of_mean(
@@ -176,7 +177,7 @@ class StaticBackground:
             texture=0.0,
             local_texture=uneven,
         )
-        rows, columns = SAMPLE
+        rows, columns = sample_of(mean.shape)
         blind = cv2.dilate(mean - np.minimum(plain, level), np.ones((3, 3))) > 1 / steps
         near_lights = places_of(at_rest, mean.shape, AROUND_LIGHT) | blind
         return StaticBackground(
@@ -297,8 +298,9 @@ class StaticBackground:
             )
         spots = find_spots(difference, replace(parameters, saturation_dn=float(top)), model, regions)
         row, column = (nearest(spots.uv_px[:, i], picture.shape[1 - i]) for i in (1, 0))
-        sampled = np.minimum(row // SAMPLE[0], len(clear) - 1), np.minimum(column // SAMPLE[1], clear.shape[1] - 1)
-        kept = ~self.blind[row, column] & fits_around(clear, left, spots)
+        sample = sample_of(picture.shape)
+        sampled = np.minimum(row // sample[0], len(clear) - 1), np.minimum(column // sample[1], clear.shape[1] - 1)
+        kept = ~self.blind[row, column] & fits_around(clear, left, spots, sample)
         spots, row, column, sampled = spots[kept], row[kept], column[kept], (sampled[0][kept], sampled[1][kept])
         if not len(spots):
             return spots

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from geometry.arrays import Array, Ints
 from geometry.camera import SensorNoise
@@ -67,44 +68,72 @@ def saturation_of(parameters: DetectParameters, picture: Picture) -> float:
     return float(np.iinfo(picture.dtype).max) if clips is None else float(clips)
 
 
-def find_all_sizes(picture: Picture, parameters: DetectParameters, noise: NoiseModel | None) -> Detections:
-    """`find_spots`; lights wider than WIDE_PX, if max_sigma_px admits them, are found in sums of 8x8 pixels."""
-    if parameters.max_sigma_px <= WIDE_PX:
-        return find_spots(picture, parameters, noise)
-    wide = find_wide_lights(picture, parameters, noise)
-    others = find_spots(picture, replace(parameters, max_sigma_px=WIDE_PX), noise)
-    return others[~_parts(others, wide)].joined(wide, parameters.max_detections)
+def without_wide(parameters: DetectParameters) -> DetectParameters:
+    """The same for lights that are not found in sums of pixels."""
+    return replace(parameters, max_sigma_px=min(parameters.max_sigma_px, WIDE_PX))
+
+
+def of_all_sizes(narrow: Detections, wide: Detections, parameters: DetectParameters) -> Detections:
+    """Points of a picture and its wide lights together, without the points that are parts of these."""
+    apart = np.linalg.norm(narrow.uv_px[:, None] - wide.uv_px[None], axis=2)
+    parts = (apart < _INSIDE * wide.major_px) & (narrow.major_px[:, None] > _PART * wide.minor_px)
+    return narrow[~parts.any(axis=1)].joined(wide, parameters.max_detections)
 
 
 def find_wide_lights(picture: Picture, parameters: DetectParameters, noise: NoiseModel | None) -> Detections:
-    """Lights (n) with a sigma of WIDE_PX to max_sigma_px in a grey picture (h, w); their flux is in DN of its pixels.
-
-    The noise of a sum of pixels is that of its pixels. A sum of 16 bit pixels is reduced to a mean.
-    """
-    model = noise or guess_noise(picture)
-    height, width = (n // _SIDE for n in picture.shape)
-    if min(height, width) < 2 * _SIDE:
+    """Lights (n) with a sigma of WIDE_PX to max_sigma_px in a grey picture (h, w); flux in DN of its pixels."""
+    squares = squares_of(picture)
+    if min(squares.shape) < 2 * _SIDE:
         return Detections.none()
-    cells = picture[: _SIDE * height, : _SIDE * width].reshape(height, _SIDE, width, _SIDE)
-    means = cells.mean(axis=(1, 3), dtype=np.float32)
-    pixels = float(_SIDE**2)
-    gain = pixels if picture.dtype == np.uint8 else 1.0
-    small = np.rint(gain * means).astype(np.uint16)
-    finer = replace(
+    of_sums = noise_of_squares(noise or guess_noise(picture), picture)
+    return of_squares(find_spots(squares, for_squares(parameters, picture), of_sums), picture)
+
+
+def squares_of(picture: Picture) -> NDArray[np.uint16]:
+    """(h / 8, w / 8): sums of 8x8 pixels of a grey picture (h, w); means of 16 bit ones, whose sums have no room."""
+    height, width = (n // _SIDE for n in picture.shape)
+    rows = picture[: _SIDE * height, : _SIDE * width].reshape(height, _SIDE, -1).sum(axis=1, dtype=np.uint32)
+    sums = rows.reshape(height, width, _SIDE).sum(axis=2, dtype=np.uint32)
+    return np.rint(sums * (_gain_of_squares(picture) / _SIDE**2)).astype(np.uint16)
+
+
+def _gain_of_squares(picture: Picture) -> float:
+    """Grey value in `squares_of` a picture over that in the picture."""
+    return float(_SIDE**2) if picture.dtype == np.uint8 else 1.0
+
+
+def noise_of_squares(noise: NoiseModel, picture: Picture) -> NoiseModel:
+    """That of `squares_of` a picture: the noise of a sum of pixels is that of its pixels."""
+    model, pixels, gain = noise.of_means, float(_SIDE**2), _gain_of_squares(picture)
+    return NoiseModel(
+        gain**2 * model.floor_dn2 / pixels + 1 / 12, gain * model.slope_dn / pixels, gain * model.black_dn,
+        model.texture, gain * model.banding_dn,
+    )  # fmt: skip
+
+
+def for_squares(parameters: DetectParameters, picture: Picture) -> DetectParameters:
+    """The same in `squares_of` a picture."""
+    return replace(
         parameters, min_sigma_px=0.5 * WIDE_PX / _SIDE, max_sigma_px=parameters.max_sigma_px / _SIDE,
-        saturation_dn=gain * saturation_of(parameters, picture),
+        saturation_dn=_gain_of_squares(picture) * saturation_of(parameters, picture),
     )  # fmt: skip
-    of_sums = NoiseModel(
-        gain**2 * model.of_means.floor_dn2 / pixels + 1 / 12, gain * model.of_means.slope_dn / pixels,
-        gain * model.black_dn, model.texture, gain * model.banding_dn,
-    )  # fmt: skip
-    found = find_spots(small, finer, of_sums)
+
+
+def of_squares(found: Detections, picture: Picture) -> Detections:
+    """Of the points found in `squares_of` a picture those wider than WIDE_PX, in its pixels and grey values."""
+    pixels, gain = float(_SIDE**2), _gain_of_squares(picture)
     found = found[_SIDE * found.major_px > WIDE_PX]
     return replace(
         found, uv_px=_SIDE * found.uv_px + 0.5 * (_SIDE - 1), cov_px2=pixels * found.cov_px2,
         flux=pixels / gain * found.flux, peak=found.peak / gain,
         major_px=_SIDE * found.major_px, minor_px=_SIDE * found.minor_px,
+        place_px2=None if found.place_px2 is None else pixels * found.place_px2,
     )  # fmt: skip
+
+
+def limit_that_admits(sigma_px: float) -> int:
+    """A max_sigma_px for lights of this width, which vary."""
+    return 10 * math.ceil(1.3 * sigma_px / 10)
 
 
 def overlooked_lights(
@@ -117,13 +146,6 @@ def overlooked_lights(
     apart = np.linalg.norm(lights.uv_px[:, None] - found.uv_px[None], axis=2) / lights.major_px[:, None]
     as_wide = found.major_px[None] > 0.5 * lights.major_px[:, None]
     return lights[~((apart < 1.0) & as_wide).any(axis=1)]
-
-
-def _parts(found: Detections, wide: Detections) -> np.ndarray:
-    """Which of the points (n,) are parts of a wide light."""
-    apart = np.linalg.norm(found.uv_px[:, None] - wide.uv_px[None], axis=2)
-    inside = (apart < _INSIDE * wide.major_px) & (found.major_px[:, None] > _PART * wide.minor_px)
-    return np.asarray(inside.any(axis=1))
 
 
 class SpotFinder:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -39,6 +38,7 @@ from lab.runs.detect.picture_series import PictureSeries
 from lab.runs.frames.sensor_noise import noise_frames
 from lab.runs.processed import quantiles
 from lab.runs.tables import detection_rows
+from tracking.detection.detect import limit_that_admits
 from tracking.parameters import DetectParameters, TrackerParameters
 
 SCHEMA = "beampose/detect/1"
@@ -140,12 +140,11 @@ def _add_notes(series: PictureSeries) -> None:
         series.notes.append(f"pictures of different sizes or depths, each kind with its own noise model: {kinds}{more}")
     if series.overlooked:
         widest = max(series.overlooked, key=lambda light: light.sigma_px)
-        value = 10 * math.ceil(1.3 * widest.sigma_px / 10)
         series.notes.append(
             f"{_counted(len(series.overlooked))} with a bright light wider than detect.max_sigma_px ="
             f" {series.parameters.max_sigma_px:g}, which is not reported: the widest has a sigma of"
             f" {widest.sigma_px:.0f} px, in frame {widest.frame} at ({widest.uv_px[0]:.0f}, {widest.uv_px[1]:.0f}) px;"
-            f" --set detect.max_sigma_px={value} reports it"
+            f" --set detect.max_sigma_px={limit_that_admits(widest.sigma_px)} reports it"
         )
     series.notes += list(dict.fromkeys(note for g in series.groups.values() for note in g.noise.notes))
 

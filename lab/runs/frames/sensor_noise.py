@@ -18,7 +18,16 @@ from lab.pictures.source import PictureFiles, PictureSource, pictures_of_frames
 from lab.runs.frames.frames import FrameReader
 from tracking.background.estimation import PICTURES, static_background
 from tracking.background.static_background import StaticBackground
-from tracking.detection.detect import WIDE_PX, find_all_sizes, saturation_of
+from tracking.background.wide_lights import WideLights
+from tracking.detection.detect import (
+    WIDE_PX,
+    find_spots,
+    find_wide_lights,
+    of_all_sizes,
+    overlooked_lights,
+    saturation_of,
+    without_wide,
+)
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.noise_estimation.grey_values import mosaic_contrast
@@ -46,6 +55,8 @@ class CameraNoise:
         default=None, init=False
     )  # in use; None before the first estimate if none is stated
     background: StaticBackground | None = field(default=None, init=False)  # for faint spots; None: not used
+    wide: WideLights | None = field(default=None, init=False)  # None: sums of pixels have no background
+    too_wide_px: float = field(default=0.0, init=False)  # sigma of a light that max_sigma_px excludes; 0: none
     unfit: int = field(default=0, init=False)  # consecutive pictures that do not fit the background
     _overruled: bool = field(default=False, init=False)  # the stated noise misses visible spots
     _blank: int = field(default=0, init=False)  # consecutive pictures without any point
@@ -91,13 +102,31 @@ class CameraNoise:
         """Make the static background of pictures spread over the recording, if that shows more or spares fits."""
         if pictures and self.model is not None and self.estimate is not None:
             usual = self._with_saturation(parameters, pictures[0])
-            self.background = make(pictures, self.model, self.estimate.texture_shift, usual)
+            self.wide = WideLights.of(pictures, self.model, usual, make)
+            self.too_wide_px = 0.0 if self.wide is None else self.wide.excluded_px
+            shift, others_move = self.estimate.texture_shift, self.too_wide_px > 0
+            self.background = make(pictures, self.model, shift, without_wide(usual), others_move)
+
+    def look_for_wide(self, pictures: Sequence[Picture], parameters: DetectParameters) -> None:
+        """Find out whether most of these pictures, without a background, show a light that max_sigma_px excludes."""
+        found = [overlooked_lights(p, parameters, self.model, self.detect(p, parameters)) for p in pictures]
+        widest = [float(lights.major_px.max(initial=0.0)) for lights in found]
+        self.too_wide_px = float(np.median(widest)) if widest else 0.0
 
     def detect(self, picture: Picture, parameters: DetectParameters) -> Detections:
         """The points of one picture. After pictures without any point the noise is estimated again."""
         if self.model is None:
             self.estimate_from([picture])
-        if self.background is not None and self.estimate is not None and parameters.max_sigma_px <= WIDE_PX:
+        if parameters.max_sigma_px <= WIDE_PX:
+            return self._spots_in(picture, parameters)
+        usual = self._with_saturation(parameters, picture)
+        wide = None if self.wide is None else self.wide.in_picture(picture, usual)
+        if wide is None:
+            wide = self._with_texture(find_wide_lights(picture, usual, self.model))
+        return of_all_sizes(self._spots_in(picture, without_wide(parameters)), wide, usual)
+
+    def _spots_in(self, picture: Picture, parameters: DetectParameters) -> Detections:
+        if self.background is not None and self.estimate is not None:
             usual = self._with_saturation(parameters, picture)
             seen = self.background.found_in(picture, usual, self.estimate.texture_shift)
             self.unfit = 0 if seen is not None else self.unfit + 1
@@ -140,7 +169,7 @@ class CameraNoise:
         return None if self.stated is None or self.stated.black_dn <= 0 else self.stated.black_dn
 
     def _search(self, picture: Picture, parameters: DetectParameters, model: NoiseModel | None) -> Detections:
-        return find_all_sizes(picture, self._with_saturation(parameters, picture), model)
+        return find_spots(picture, self._with_saturation(parameters, picture), model)
 
     def _with_saturation(self, parameters: DetectParameters, picture: Picture) -> DetectParameters:
         return replace(parameters, saturation_dn=self.saturation_dn(picture, parameters))
@@ -203,7 +232,8 @@ def _prepare(noise: CameraNoise, run: Run, source: PictureSource) -> None:
     """Estimate a camera's noise, and make its static background where that may show more."""
     size_px = run.rig.cameras[noise.camera].image_size_px
     shown = pictures_of_frames(source, noise_frames(source), size_px)
-    noise.estimate_from([p for p in shown.values() if isinstance(p, np.ndarray)])
+    pictures = [p for p in shown.values() if isinstance(p, np.ndarray)]
+    noise.estimate_from(pictures)
     if noise.shows_structure:
         if isinstance(source, PictureFiles):
             wanted = evenly_spread(source.numbers, PICTURES).tolist()
@@ -212,6 +242,8 @@ def _prepare(noise: CameraNoise, run: Run, source: PictureSource) -> None:
         shown |= pictures_of_frames(source, [k for k in wanted if k not in shown], size_px)
         spread = [shown[k] for k in wanted]
         noise.make_background([p for p in spread if isinstance(p, np.ndarray)], run.tracker.detect)
+    if noise.wide is None:
+        noise.look_for_wide(pictures[::2], run.tracker.detect)
     if isinstance(source, PictureFiles):
         source.keep(shown)
 

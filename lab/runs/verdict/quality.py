@@ -15,6 +15,8 @@ from typing import Any
 from lab.findings.finding import Finding, Level, Verdict, finding, level_above, sentence, verdict, worst_first
 from lab.number_format import format_count
 from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, FrameCause, FrameRanges, RunStatistics
+from tracking.detection.detect import limit_that_admits
+from tracking.statuses import SpotStatus
 
 # Share of the frames with enough visible spots: where the tracker missed more than half of them, it may not have
 # followed the vehicle in the others either. Frames with too few spots do not count.
@@ -44,12 +46,13 @@ def judge(
     findings: Sequence[Finding] = (),
     noise_scale: float | None = None,
     mosaics: Mapping[str, float] = MappingProxyType({}),
+    too_wide: Mapping[str, float] = MappingProxyType({}),
 ) -> Verdict:
     """The verdict on a run.
 
     findings: of the model check (lab.runs.model_check.check.check_model). noise_scale: ratio of the residuals to the
     detections' sigmas; None where the model check has tested that. mosaics: contrast of the colour mosaic by camera, of
-    cameras whose pictures show one.
+    cameras whose pictures show one. too_wide: sigma, px, of a light that detect.max_sigma_px excludes, by camera.
     """
     if statistics.frames == 0:
         return _of([finding("BP-V01", Level.FAIL, "there is no frame at all")])
@@ -57,9 +60,10 @@ def judge(
         replace(f, what=f"{f.what}. {sentence(f.why).rstrip('.')}", why="") for f in findings if f.level > Level.PASS
     ]
     # A mistake of the set-up explains why nothing was found, or why the prior does not fit, and a colour mosaic why the
-    # residuals do not fit the rig: they come first.
+    # residuals do not fit the rig, and a light that is too wide why a spot is not found: they come first.
     found = [f for f in given if f.code == _SET_UP]
     found += _mosaics(mosaics, verdict(given))
+    found += _too_wide(too_wide, statistics)
     found += _measured(statistics)
     if statistics.measured:
         found += _cameras(statistics)
@@ -105,6 +109,24 @@ def _mosaics(mosaics: Mapping[str, float], fit: Level) -> list[Finding]:
         " camera move a spot's centroid by up to some tenths of a pixel"
     )
     return [finding("BP-V18", max(Level.WARN, fit), what, numbers=mosaics)]
+
+
+def _too_wide(sigma_px: Mapping[str, float], statistics: RunStatistics) -> list[Finding]:
+    """Cameras with a light that is wider than spots may be, and a spot that is found in no picture."""
+    out = []
+    for name, sigma in sigma_px.items():
+        status = {spot: counts for (camera, spot), counts in statistics.spot_status.items() if camera == name}
+        never = [spot for spot, counts in status.items() if not any(counts[s.value] for s in SpotStatus if s.measured)]
+        if never:
+            spots = f"spot {never[0]} is" if len(never) == 1 else f"spots {', '.join(never)} are"
+            what = (
+                f"camera {name} shows a light with a sigma of {sigma:.0f} px, which is wider than detect.max_sigma_px"
+                f" admits and is not used, and {spots} found in none of its pictures;"
+                f" --set detect.max_sigma_px={limit_that_admits(sigma)} admits it"
+            )
+            level = Level.WARN if statistics.measured else Level.FAIL
+            out.append(finding("BP-V21", level, what, numbers={"camera": name, "sigma_px": sigma}))
+    return out
 
 
 def _measured(statistics: RunStatistics) -> list[Finding]:

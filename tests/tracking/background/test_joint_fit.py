@@ -62,6 +62,22 @@ def test_a_light_that_moves_by_half_its_width_is_separated_from_an_edge_under_it
     assert abs(share - modulated) < max(3 * np.sqrt(variance), 0.1)
 
 
+@pytest.mark.parametrize("times", [64.0, 257.0])
+def test_a_fit_is_the_same_in_any_unit_of_the_grey_values(times):
+    """Sums of 8x8 pixels, and pictures of 16 bits, have larger numbers for the same light."""
+    at = places(3.0)
+    seen = pictures(at, EDGE, 0.6).reshape(len(at), -1)
+    variance = np.full(seen.shape, NOISE**2)
+    once, scaled = (
+        fitted(UV, f * seen, f**2 * variance, at + OFF, 3.0, f * 0.7 * HEIGHT, mean_of(NONE, variance))
+        for f in (1.0, times)
+    )
+    assert once is not None
+    assert scaled is not None
+    assert scaled.light.places == pytest.approx(once.light.places, abs=1e-3)
+    assert scaled.light.plain == pytest.approx(times * once.light.plain, rel=1e-3)
+
+
 def test_a_light_at_rest_on_an_edge_is_not_separated_unless_some_pictures_show_the_edge_without_it():
     at = places(0.0)
     seen = pictures(at, EDGE, 0.6)
