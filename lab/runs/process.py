@@ -322,7 +322,10 @@ def write_tables(
     too_wide = {name: noise.too_wide_px for name, noise in pipeline.noise.items() if noise.too_wide_px}
     verdict = quality.judge(statistics, model_check.findings, noise_scale, mosaics, too_wide)
     explained = diagnosis is not None and diagnosis.is_random
-    mistakes = mistakes_of_run(run, statistics, pictures, passes=verdict.status == "pass", explained=explained)
+    # Where a light is too wide a spot is missing, and no mistake explains that better.
+    named = any(f.code == quality.TOO_WIDE for f in verdict.findings)
+    passes_all = verdict.status == "pass"
+    mistakes = () if named else mistakes_of_run(run, statistics, pictures, passes=passes_all, explained=explained)
     if mistakes:
         # The deviations of a rig with such a mistake are its consequences.
         others = () if verdict_of(mistakes) is Level.FAIL else model_check.findings

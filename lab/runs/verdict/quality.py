@@ -37,6 +37,7 @@ LONG_EMPTY = (
 )
 MOST_WRONG = 0.005  # share of the measured poses beyond 10 sigmas from the truth, up to which the run does not fail
 LEAST_DISPLACED = 5  # frames in which none of a camera's spots fits the others' pose, from which on it is reported
+TOO_WIDE = "BP-V21"  # a light that max_sigma_px excludes, and a spot that is never found
 _SET_UP = "BP-M06"  # a mistake in the files that describe the set-up
 _FEW_FOUND = 0.2  # measured share of the expected spots, below which a mostly empty camera is reported
 
@@ -125,7 +126,7 @@ def _too_wide(sigma_px: Mapping[str, float], statistics: RunStatistics) -> list[
                 f" --set detect.max_sigma_px={limit_that_admits(sigma)} admits it"
             )
             level = Level.WARN if statistics.measured else Level.FAIL
-            out.append(finding("BP-V21", level, what, numbers={"camera": name, "sigma_px": sigma}))
+            out.append(finding(TOO_WIDE, level, what, numbers={"camera": name, "sigma_px": sigma}))
     return out
 
 
