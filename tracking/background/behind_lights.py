@@ -17,7 +17,7 @@ from tracking.noise import NoiseModel
 
 LARGEST_PATH_PX = 250.0  # half side of the box around the places of such a light
 _LARGEST_PATH = 12.0  # half side, in widths of the light
-_LEAST_PICTURES, _LEAST_SHARE = 6, 2 / 3  # of the pictures that show the light
+_LEAST_PICTURES, _LEAST_SHARE = 6, 2 / 3  # pictures in which the light is found; share of those with it
 _AROUND = 1.5  # widths beyond the box that are fitted
 _LEAST_CLEAR = 0.5  # share of these pixels that other lights do not reach
 _SAMPLES, _MOST_SAMPLES = 3.0, 2500  # pixels that are fitted: per width of the light, and in all
@@ -261,7 +261,7 @@ def _light_at(seen: Exposures, found: Sequence[Detections], rows: Sequence[Ints]
     """A light in a box: one point, or none, of each picture. None: it is in too few pictures, or moves too far."""
     every = range(len(found))
     shown = np.array([k for k in every if len(rows[k])], np.int64)
-    if len(shown) < max(_LEAST_PICTURES, _LEAST_SHARE * len(found)):
+    if len(shown) < _LEAST_PICTURES:
         return None
     points = [found[k][rows[k]] for k in shown]
     width = float(np.median([np.sqrt(d.major_px[0] * d.minor_px[0]) for d in points]))
@@ -288,11 +288,13 @@ def _light_at(seen: Exposures, found: Sequence[Detections], rows: Sequence[Ints]
     true = ~(lacks[shown] & (np.linalg.norm(places - middle, axis=1) < width))
     there = ~gone
     there[shown] = true
-    if np.count_nonzero(there) < _LEAST_PICTURES:
+    if np.count_nonzero(there) < max(_LEAST_PICTURES, _LEAST_SHARE * len(found)):
         return None
-    # Of one that is there and not found: the first moment of what the picture shows more than the mean.
-    area = float(np.prod(np.ptp(uv, axis=0) + 1)) / len(uv)
-    light.places[:] += area * (values - values.mean(axis=0)) @ (uv - middle) / flux
+    # Of one that is there and not found: the first moment of what the picture shows more than the mean, in the unit of
+    # the places found. What is found of a light that the mean contains is fainter than the light.
+    moment = (values - values.mean(axis=0)) @ (uv - middle)
+    known, found_at = moment[shown[true]], places[true] - middle
+    light.places[:] += moment * np.sum(known * found_at) / max(np.sum(known**2), 1e-9)
     light.places[shown[true]] = places[true]
     empty = lacks & gone
     empty[shown] = False

@@ -31,15 +31,9 @@ ROOM = (
 )
 
 
-def on_screen(camera: Camera, screen: Screen, at: np.ndarray, sigma_px: float) -> np.ndarray:
-    """The light (h, w), of peak 1, of round spots on a screen with their beams' axes at these pixels (n, 2)."""
-    every, centres = (
-        intersect_plane(*camera.rays(np.asarray(uv, float)), screen.world_from_screen)
-        for uv in (np.stack([X, Y], axis=-1), at)
-    )
-    px_m = np.linalg.norm(every[1:, :-1] - every[:-1, :-1], axis=-1).mean()
-    away = np.linalg.norm(every[:, :, None] - centres, axis=-1)
-    return np.asarray(np.exp(-0.5 * (away / (sigma_px * px_m)) ** 2).sum(axis=-1))
+def on_screen(camera: Camera, screen: Screen, uv: np.ndarray) -> np.ndarray:
+    """Places (..., 2) on a screen, m, that pixels (..., 2) show."""
+    return np.asarray(intersect_plane(*camera.rays(np.asarray(uv, float)), screen.world_from_screen))
 
 
 def recording(folder: Path, ground: np.ndarray) -> Path:
@@ -64,9 +58,13 @@ def recording(folder: Path, ground: np.ndarray) -> Path:
     rng, response = np.random.default_rng(1), 0.5 + 0.5 * ground / ground.mean()
     for camera, sigma in (("left", WIDE_PX), ("right", 1.6)):
         (folder / "frames" / camera).mkdir(parents=True)
+        view = rig.cameras[camera], rig.screens[camera]
+        every = on_screen(*view, np.stack([X, Y], axis=-1))
+        sigma_m = sigma * np.hypot(*(every[1:, :-1] - every[:-1, :-1]).mean(axis=(0, 1)))
         for frame in range(FRAMES):
             at = truth[(truth.camera == camera) & (truth.frame == frame)][["u_px", "v_px"]].to_numpy()
-            light = on_screen(rig.cameras[camera], rig.screens[camera], at, sigma)
+            spots = on_screen(*view, at)
+            light = sum(np.exp(-0.5 * np.sum((every - spot) ** 2, axis=-1) / sigma_m**2) for spot in spots)
             seen = ground + response * 90.0 * light + rng.normal(0.0, 1.0, SIZE)
             picture = np.clip(np.rint(seen), 0, 255).astype(np.uint8)
             cv2.imwrite(str(folder / "frames" / camera / f"{frame:06d}.png"), picture)
