@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from tracking.background.estimation import MOSTLY
@@ -23,6 +24,7 @@ _WIDEST_PX = 8 * WIDE_PX  # as wide as the widest spot, in sums of pixels
 # Variance over that of sums of independent pixels. In sums there is so little noise that what a light's tails leave far
 # from it would be as large, and no picture would fit the background.
 _UNMODELLED = 64.0
+_OVER, _CHANGES = (7, 7), 3.0  # sums: 56 px; sigmas: light is found from 6 on, in its middle
 _LEAST_MOVE = 0.5  # widths, along u or v: a lamp that flickers stays in its place
 _NO_TEXTURE = TextureShift.none()  # but for what the background shows itself
 
@@ -39,10 +41,15 @@ class WideLights:
         pictures: Sequence[Picture], model: NoiseModel, parameters: DetectParameters,
         make: Callable[..., StaticBackground | None],
     ) -> WideLights | None:  # fmt: skip
-        """From pictures spread over a recording; make: `static_background`. None: it makes no background of them."""
+        """From pictures spread over a recording; make: `static_background`.
+
+        None: it makes no background of them, or nothing wide changes and max_sigma_px admits nothing wide.
+        """
         every = replace(parameters, max_sigma_px=_WIDEST_PX)
         of_sums = noise_of_squares(replace(model, correlation=_UNMODELLED * model.correlation), pictures[0])
         squares = [squares_of(p) for p in pictures]
+        if parameters.max_sigma_px <= WIDE_PX and not _changes_widely(squares, of_sums):
+            return None
         background = make(squares, of_sums, _NO_TEXTURE, for_squares(every, pictures[0]), False, True)
         if background is None:
             return None
@@ -63,3 +70,10 @@ class WideLights:
         """
         found = self.background.found_in(squares_of(picture), for_squares(parameters, picture), _NO_TEXTURE)
         return None if found is None else of_squares(found, picture)
+
+
+def _changes_widely(squares: Sequence[Picture], noise: NoiseModel) -> bool:
+    """Whether some of these sums change by more than their noise over the width of a wide light."""
+    every = np.stack(squares)
+    change = cv2.blur(np.asarray(np.ptp(every, axis=0), np.float32), _OVER)
+    return bool((change > _CHANGES * np.sqrt(noise.variance(every[0]))).any())

@@ -242,7 +242,7 @@ def _prepare(noise: CameraNoise, run: Run, source: PictureSource) -> None:
         shown |= pictures_of_frames(source, [k for k in wanted if k not in shown], size_px)
         spread = [shown[k] for k in wanted]
         noise.make_background([p for p in spread if isinstance(p, np.ndarray)], run.tracker.detect)
-    if noise.wide is None:
+    else:
         noise.look_for_wide(pictures[::2], run.tracker.detect)
     if isinstance(source, PictureFiles):
         source.keep(shown)
