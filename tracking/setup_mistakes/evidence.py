@@ -20,6 +20,7 @@ from tracking.detections import Detections
 from tracking.labelling.points import NO_POINT
 from tracking.labelling.search import Labelling, candidate_labellings
 from tracking.parameters import LabelParameters
+from tracking.resting_points import NOWHERE, at_places, resting_places
 from tracking.setup_mistakes.possible import FEW_POSES, HERE, Block, Mistake, possible_mistakes
 
 # How well a rig explains sampled frames of a recording, and which mistake explains them better.
@@ -43,7 +44,7 @@ SURE_SPOTS = 5  # labels of a frame: false points often agree with the pose of f
 P_FIT = 1e-6  # probability that correct labels do not fit their sigmas
 LEAST_POINTS = 2  # points per picture, median, from which a camera without any label is reported
 LEAST_LABELLED = 0.5  # share of the spots that the poses put into a camera's pictures which have a label
-SAME_PX, MOST_CHANGED = 2.0, 1  # a point at the same place; false points that come or go between frames that are alike
+MOST_CHANGED = 1  # false points that come or go between frames that are alike
 MODEL_PX = 0.03  # px: model error that is allowed beside the sigmas of the points (calibrations are no better)
 # A frame is searched with at most this effort: 60 mistakes are compared.
 MOST_POINTS, MOST_TRIPLES = 12, 3000
@@ -111,7 +112,8 @@ def compare(
 
     covariance: of the rig's calibration, if known.
     """
-    unlimited, frames = parameters, replace(frames, blocks=_distinct(frames.blocks))
+    blocks = _without_resting(_distinct(frames.blocks), parameters.min_spots)
+    unlimited, frames = parameters, replace(frames, blocks=blocks)
     parameters = replace(
         parameters,
         max_points=min(parameters.max_points, MOST_POINTS),
@@ -202,13 +204,29 @@ def _distinct(blocks: Sequence[Block]) -> list[Block]:
     return out
 
 
+def _without_resting(blocks: Sequence[Block], min_spots: int) -> Sequence[Block]:
+    """The blocks without the points that stay in their places, if the others are enough for a pose.
+
+    A room's lamps and edges are brighter than spots, and more of them: a limited search then finds no pose of the
+    spots, or one of theirs.
+    """
+    names = {name for block in blocks for name in block[HERE]}
+    seen = {name: [block[HERE][name].uv_px for block in blocks if name in block[HERE]] for name in names}
+    places = resting_places(seen, min_spots)
+    return [[_elsewhere(frame, places) for frame in block] for block in blocks]
+
+
+def _elsewhere(frame: Mapping[str, Detections], places: Mapping[str, Array]) -> dict[str, Detections]:
+    """The points of a frame that are at none of these places of their camera."""
+    return {name: found[~at_places(found.uv_px, places.get(name, NOWHERE))] for name, found in frame.items()}
+
+
 def _moved(one: Mapping[str, Detections], other: Mapping[str, Detections]) -> int:
     """The number of points of a frame that another frame does not have at the same place."""
     count = 0
     for name, found in one.items():
         there = other.get(name, Detections.none()).uv_px
-        gap = np.linalg.norm(found.uv_px[:, None] - there, axis=-1).min(axis=1, initial=np.inf)
-        count += int(np.count_nonzero(gap > SAME_PX))
+        count += int(np.count_nonzero(~at_places(found.uv_px, there)))
     return count
 
 

@@ -17,7 +17,7 @@ from typing import IO, Any, TypeAlias
 
 import numpy as np
 
-from geometry.arrays import Bools, Ints
+from geometry.arrays import Bools, Ints, evenly_spread
 from lab.errors import InputError
 from lab.files.run.clocks import CameraClock, picture_numbers
 from lab.files.run.detections_file import CameraPoints, DetectionsFile, is_too_sparse, read_detections, stray_frames
@@ -28,8 +28,10 @@ from lab.pictures.picture_file import DROPPED, UNREADABLE, GreyPicture, MissingP
 from lab.pictures.source import PictureFiles, PictureSource, Video, list_folder, pictures, video_at
 from lab.runs.frames.moments import Moment, plan_moments
 from tracking.detections import Detections
+from tracking.resting_points import at_places, resting_places
 
 # What a camera recorded for a frame.
+_SAMPLED = 15  # frames of a table, from which points at rest are known; in shorter recordings none are
 Recorded: TypeAlias = GreyPicture | Detections | MissingPicture
 
 BEYOND_PX = 32.0  # a fit may put the centre of a spot at the edge outside the picture, but never farther than this
@@ -80,6 +82,7 @@ class FrameReader:
                     opened[source.path] = read_detections(source.path)
                     self._note_table(source.path, opened[source.path])
                 self._note_camera(name, source.path, opened[source.path])
+        self._mark_resting()
         self.first, self.last = self._span()
         self._check_density()
         self._check_times()
@@ -234,6 +237,22 @@ class FrameReader:
             )
         self._tables[name] = table
         self._notes.append(f"{path}: no rows of camera {name!r}; all its pictures count as empty")
+
+    def _mark_resting(self) -> None:
+        """Mark the points of tables that are at rest in the whole recording while others move."""
+        known = {name: table.cameras[name] for name, table in self._tables.items() if name in table.cameras}
+        some = {
+            name: [own.at(int(k)).uv_px for k in evenly_spread(own.frames, _SAMPLED)] for name, own in known.items()
+        }
+        if any(len(frames) < _SAMPLED for frames in some.values()):
+            return
+        places = resting_places(some, self._run.tracker.labels.min_spots)
+        for name, own in known.items():
+            if len(places[name]):
+                at_rest = at_places(own.points.uv_px, places[name]).astype(float)
+                points = replace(own, points=replace(own.points, at_rest=at_rest))
+                table = self._tables[name]
+                self._tables[name] = replace(table, cameras={**table.cameras, name: points})
 
     def _in_picture(self, name: str, path: Path, points: CameraPoints) -> CameraPoints:
         """A camera's points without those far outside its picture. Raises InputError if most of them are."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -546,3 +547,25 @@ def test_a_beam_that_has_moved_is_not_one_whose_ends_are_exchanged(monkeypatch, 
     blocks = [[dict(zip(rig.cameras, scene.detections[k + i], strict=True)) for i in (-1, 0, 1)] for k in rows]
     found = compare(rig, Frames(blocks, None, at_start=False), LabelParameters(), stated).found
     assert [m.what for m, _ in found] == [words]
+
+
+@pytest.mark.parametrize(("seed", "lamps"), [(0, (39, 20)), (4, (34, 28)), (7, (42, 20)), (10, (36, 28))])
+def test_a_spot_that_no_picture_shows_among_lamps_leaves_right_poses_and_no_mistake(tmp_path, seed, lamps):
+    """The only spot of a camera is off, and lamps brighter than the spots stay where they are in both cameras."""
+    run = simulate("four-skew-beams", tmp_path / "run", seed=seed, frames=30, detections_only=True)
+    rig = run / "rig.yaml"
+    rig.write_text("".join(s for s in rig.read_text().splitlines(keepends=True) if not re.match(r"\s+'[13]':", s)))
+    table = pd.read_csv(run / "detections.csv")
+    spots = table[table.camera == "right"].assign(flux=800.0, peak=60.0)
+    rng = np.random.default_rng(seed)
+    room = pd.DataFrame({"camera": lamps[0] * ["left"] + lamps[1] * ["right"], "flux": 4000.0, "peak": 200.0})
+    room[["u_px", "v_px"]] = rng.uniform([0, 0], [1280, 1024], (len(room), 2))
+    rows = [room.assign(frame=frame, sigma_u_px=0.1, sigma_v_px=0.1) for frame in range(30)]
+    every = pd.concat([spots, *rows]).sort_values(["frame", "camera"], kind="stable")
+    every[["u_px", "v_px"]] += rng.normal(0.0, 0.02, (len(every), 2))
+    every[table.columns].to_csv(run / "detections.csv", index=False)
+    (run / "truth" / "spots.csv").unlink()
+    process_run(run, tmp_path / "out")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["counts"]["pose_status"] == {"measured": 30}
+    assert not {"BP-M01", "BP-M06", "BP-V20"} & {finding["code"] for finding in summary["verdict"]["evidence"]}
