@@ -116,6 +116,8 @@ def test_every_direction_inside_the_fold_of_a_fisheye_lens_is_found_again_and_no
     bent, _ = lens.distort(xy, lens.padded(numbers), True)
     back = lens.undistort(bent, lens.padded(numbers), fold, True)
     np.testing.assert_allclose(np.arctan(np.linalg.norm(back, axis=1)), angle, atol=1e-11)
-    np.testing.assert_allclose(back / np.linalg.norm(back, axis=1, keepdims=True), xy / np.tan(angle)[:, None], atol=1e-9)
+    np.testing.assert_allclose(
+        back / np.linalg.norm(back, axis=1, keepdims=True), xy / np.tan(angle)[:, None], atol=1e-9
+    )
     largest = lens.distort(np.array([[np.tan(0.999999 * limit), 0.0]]), lens.padded(numbers), True)[0]
     assert np.isnan(lens.undistort(1.01 * largest, lens.padded(numbers), fold, True)).all()
