@@ -346,10 +346,8 @@ def test_false_points_of_a_camera_are_reported_only_where_the_poses_put_spots_in
     third["camera_from_world"]["quaternion_wxyz"] = quaternion_from_matrix(turned.rotation).tolist()
     files.rig["cameras"]["third"] = third
     files.run["cameras"]["third"] = {"detections": "detections.csv"}
-    frames = 20
-    files.rows = [row for row in files.rows if int(row["frame"]) < frames]
     rng, first = np.random.default_rng(3), files.rows[0]
-    uv = rng.uniform(20, 400, (frames, 4, 2)).tolist()
+    uv = rng.uniform(20, 400, (FRAMES, 4, 2)).tolist()
     files.rows += [
         {**first, "camera": "third", "frame": k, "u_px": u, "v_px": v} for k, four in enumerate(uv) for u, v in four
     ]
