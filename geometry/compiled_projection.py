@@ -389,7 +389,7 @@ def distort_all(xy: Array, k: Array, fisheye: Bools) -> tuple[Array, Array]:
 
 @compiled
 def undistort_all(v: Views, target: Array) -> Array:
-    """Normalised points (n, 2) whose distortion by the polynomial lens of v[0] is `target` (n, 2); nan without one.
+    """Normalised points (n, 2) whose distortion by the lens of v[0] is `target` (n, 2); nan without one.
 
     Newton's method from the target itself. Each step is shortened until the point stays inside the fold and the
     residual does not grow.

@@ -219,34 +219,7 @@ def undistort(target: Array, coefficients: Array, fold_r2: float, fisheye: bool 
     """Normalised points (n, 2) whose distortion is `target` (n, 2); nan where there is none inside the fold."""
     target = np.array(target, dtype=np.float64, order="C")
     coefficients = np.asarray(coefficients, dtype=float)
-    if fisheye:
-        return _undistort_fisheye(target, coefficients, fold_r2)
     lens = np.zeros(1, VIEW)
     lens["distortion"], lens["tilt"], lens["fold_r2"] = coefficients, tilt_matrix(*coefficients[-2:]), fold_r2
-    lens["lens"] = lens_codes(coefficients, np.asarray(False))
+    lens["lens"] = lens_codes(coefficients, np.asarray(fisheye))
     return undistort_all(lens, target)
-
-
-def _undistort_fisheye(target: Array, coefficients: Array, fold_r2: float) -> Array:
-    """`undistort` for the fisheye model: one angle per point, by Newton's method bounded by the fold."""
-
-    k1, k2, k3, k4 = coefficients[:4]
-    limit = np.arctan(np.sqrt(fold_r2)) * (1 - 1e-9)
-    td = np.linalg.norm(target, axis=-1)
-    t = np.minimum(td, limit)
-    left, below, above = np.arange(len(t)), np.zeros_like(td), np.full_like(td, limit)  # of points that still move
-    for _ in range(60):
-        x, t2 = t[left], t[left] ** 2
-        value = x * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) - td[left]
-        slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-        below, above = np.where(value < 0, x, below), np.where(value > 0, x, above)
-        step = x - value / np.where(slope > 1e-12, slope, 1e-12)
-        t[left] = np.where((step >= below) & (step <= above), step, (below + above) / 2)
-        moved = t[left] != x
-        left, below, above = left[moved], below[moved], above[moved]
-        if not len(left):
-            break
-    t2 = t * t
-    good = np.abs(t * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) - td) < 1e-9
-    scale = np.where(td > 1e-12, np.tan(t) / np.where(td > 1e-12, td, 1.0), 1.0)
-    return np.where(good[..., None], scale[..., None] * target, np.nan)

@@ -73,17 +73,16 @@ def quaternion_from_matrix(rotation: Array) -> Array:
     m00, m01, m02 = R[..., 0, 0], R[..., 0, 1], R[..., 0, 2]
     m10, m11, m12 = R[..., 1, 0], R[..., 1, 1], R[..., 1, 2]
     m20, m21, m22 = R[..., 2, 0], R[..., 2, 1], R[..., 2, 2]
-    forms = np.stack(
-        [
-            np.stack([1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01], -1),
-            np.stack([m21 - m12, 1 + m00 - m11 - m22, m01 + m10, m02 + m20], -1),
-            np.stack([m02 - m20, m01 + m10, 1 - m00 + m11 - m22, m12 + m21], -1),
-            np.stack([m10 - m01, m02 + m20, m12 + m21, 1 - m00 - m11 + m22], -1),
-        ],
-        -2,
-    )
-    best = np.argmax(np.diagonal(forms, axis1=-2, axis2=-1), axis=-1)
-    q = np.take_along_axis(forms, best[..., None, None], axis=-2)[..., 0, :]
+    forms = np.empty((*R.shape[:-2], 4, 4))  # symmetric; entry by entry, since np.stack takes as long as all the rest
+    for i, diagonal in enumerate((1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22)):
+        forms[..., i, i] = diagonal
+    for (i, j), entry in (
+        ((0, 1), m21 - m12), ((0, 2), m02 - m20), ((0, 3), m10 - m01),
+        ((1, 2), m01 + m10), ((1, 3), m02 + m20), ((2, 3), m12 + m21),
+    ):  # fmt: skip
+        forms[..., i, j] = forms[..., j, i] = entry
+    best = np.argmax(np.diagonal(forms, axis1=-2, axis2=-1), axis=-1).ravel()
+    q = forms.reshape(-1, 4, 4)[np.arange(len(best)), best].reshape(*R.shape[:-2], 4)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.where(q[..., :1] < 0, -q, q)
 

@@ -19,6 +19,9 @@ import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 from calibration.screens.clouds import MissingOpen3DError, open3d  # noqa: E402
+from lab.cycle_search import search_rarely  # noqa: E402
+
+search_rarely()  # as the program does: with Python's own setting the searches take 4 % of the tests of calibrations
 
 # Waiting for the disk shows only after a power cut, and takes longer than the writing: a run waits for ten files. Tests
 # of when it happens replace this function.

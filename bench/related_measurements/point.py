@@ -88,7 +88,7 @@ def video(path: Path, published: Path, limit: int | None) -> None:
         first = positions.iloc[0]
         options = PointOptions(
             detector="darker",
-            start_px=(float(first.pos_x), float(first.pos_y)),
+            near_px=(float(first.pos_x), float(first.pos_y)),
             limit=limit,
             overrides={"track.sigma_model_px": 1.0},
         )

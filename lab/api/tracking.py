@@ -199,11 +199,11 @@ def _detections(points: Points, camera: str, sigma_px: float) -> Detections | No
     if not (np.isfinite(sigma_px) and sigma_px > 0):
         raise InputError(f"sigma_px: expected an error above 0 px, got {sigma_px}")
     if not isinstance(points, pd.DataFrame):
-        uv = np.asarray(points, dtype=float)
+        uv = _own(points)
         if uv.ndim != 2 or uv.shape[1] != 2 or not np.isfinite(uv).all():
             raise InputError(f"points of {camera}: expected finite places (n, 2), px, got an array of shape {uv.shape}")
         return Detections.at(uv, np.tile(np.eye(2) * sigma_px**2, (len(uv), 1, 1)))
-    uv = points[["u_px", "v_px"]].to_numpy(dtype=float)
+    uv = _own(points[["u_px", "v_px"]])
     if not np.isfinite(uv).all():
         raise InputError(f"points of {camera}: u_px, v_px: expected finite numbers; leave rows without a place out")
     sigma = np.stack([_column(points, name, sigma_px) for name in ("sigma_u_px", "sigma_v_px")], axis=-1)
@@ -212,6 +212,11 @@ def _detections(points: Points, camera: str, sigma_px: float) -> Detections | No
     shape = (_column(points, name, np.nan) for name in _SHAPE)
     found = Detections(uv, cov, *shape)
     return found[np.argsort(-np.nan_to_num(found.flux, nan=np.inf), kind="stable")]
+
+
+def _own(values: ArrayLike) -> Array:
+    """A copy row by row: compiled functions are compiled again for arrays in another order, or that are read-only."""
+    return np.array(values, dtype=float, order="C")
 
 
 def _column(points: pd.DataFrame, name: str, default: float) -> Array:

@@ -25,8 +25,14 @@ if TYPE_CHECKING:
 # `beampose track`: one target through a video or a folder of pictures.
 
 _PIXEL = NumberRange(-1e6, 1e6)
+_near_option = click.option(
+    "--near", "near_px", type=(_PIXEL, _PIXEL), metavar="U V", help="The target's centre at the start, within 20 px."
+)
 _rate_option = click.option(
-    "--rate", "rate_hz", type=NumberRange(0.01, 1e6), help="Frames per second; default: the video's, or 25."
+    "--rate", "rate_hz", type=NumberRange(0.01, 1e6), help="Frames per second; default: the video's or table's, or 25."
+)
+_video_option = click.option(
+    "--video", "overlay", is_flag=True, help="Also write overlay.mp4: the pictures with the target drawn into them."
 )
 _limit_option = click.option("--limit", type=click.IntRange(min=1), help="Use at most this many pictures.")
 
@@ -53,9 +59,7 @@ def _track(ctx: click.Context, target: Target[Any], given: Path, out: Path) -> N
 @track.command()
 @click.argument("pictures", metavar="VIDEO_OR_FOLDER", type=ANY_PATH)
 @click.option("--out", required=True, type=FOLDER, help="Gets circle.csv, summary.json and report.html.")
-@click.option(
-    "--near", "near_px", type=(_PIXEL, _PIXEL), metavar="U V", help="Centre of the first circle, px, within 20 px."
-)
+@_near_option
 @click.option(
     "--min-radius", "min_radius_px", default=7.0, type=NumberRange(4, 10_000), help="Smallest radius to look for, px."
 )
@@ -82,9 +86,7 @@ def _track(ctx: click.Context, target: Target[Any], given: Path, out: Path) -> N
     help="What proposes circles: votes of gradients, or a network that was trained on rendered drogues.",
 )
 @_limit_option
-@click.option(
-    "--video", "overlay", is_flag=True, help="Also write overlay.mp4: the pictures with the circle drawn into them."
-)
+@_video_option
 @click.pass_context
 def circle(ctx: click.Context, /, pictures: Path, out: Path, **options: Any) -> None:
     """Track a circle (the rim of a drogue, a ring, a disc): centre, radius, rates, sigmas and occlusion.
@@ -107,9 +109,7 @@ def circle(ctx: click.Context, /, pictures: Path, out: Path, **options: Any) -> 
 @click.command()
 @click.argument("pictures", metavar="VIDEO_OR_FOLDER", type=ANY_PATH)
 @click.option("--out", required=True, type=FOLDER, help="Gets drogue.csv, summary.json and report.html.")
-@click.option(
-    "--near", "near_px", type=(_PIXEL, _PIXEL), metavar="U V", help="Centre of the first drogue, px, within 20 px."
-)
+@_near_option
 @click.option(
     "--every", "check_every", default=5, type=click.IntRange(1, 1000), help="Frames between two checks by the detector."
 )
@@ -124,9 +124,7 @@ def circle(ctx: click.Context, /, pictures: Path, out: Path, **options: Any) -> 
 )
 @_rate_option
 @_limit_option
-@click.option(
-    "--video", "overlay", is_flag=True, help="Also write overlay.mp4: the pictures with the drogue drawn into them."
-)
+@_video_option
 @click.pass_context
 def drogue(ctx: click.Context, /, pictures: Path, out: Path, **options: Any) -> None:
     """Track a refuelling drogue: centre, diameter, sigmas and confidence.
@@ -147,19 +145,6 @@ def drogue(ctx: click.Context, /, pictures: Path, out: Path, **options: Any) -> 
 # `beampose track point`: the centre of one target.
 
 
-def _place(ctx: click.Context, parameter: click.Parameter, value: str | None) -> tuple[float, float] | None:
-    """U,V as two numbers."""
-    if value is None:
-        return None
-    try:
-        u, v = (float(part) for part in value.split(","))
-    except ValueError:
-        raise click.BadParameter(f"expected U,V in pixels such as 640,512, got {value!r}", ctx, parameter) from None
-    if not abs(u) + abs(v) < 1e6:
-        raise click.BadParameter(f"expected U,V in pixels such as 640,512, got {value!r}", ctx, parameter)
-    return u, v
-
-
 @click.command()
 @click.argument("source", metavar="VIDEO_OR_FOLDER_OR_CSV", type=ANY_PATH)
 @click.option("--out", required=True, type=FOLDER, help="Gets track.csv, summary.json and report.html.")
@@ -172,19 +157,8 @@ def _place(ctx: click.Context, parameter: click.Parameter, value: str | None) ->
 )
 @click.option("--colour", metavar="NAME", help="Of a coloured target: red, orange, yellow, green, cyan, blue, magenta,"
               " or #rrggbb.")  # fmt: skip
-@click.option(
-    "--start",
-    "start_px",
-    metavar="U,V",
-    callback=_place,
-    help="Where the target is at the start, px; default: the brightest one.",
-)
-@click.option(
-    "--frame-rate",
-    "rate_hz",
-    type=NumberRange(min=1e-6, max=1e6),
-    help="Pictures per second; default: that of the video or t_s.",
-)
+@_near_option
+@_rate_option
 @click.option("--camera", help="The camera, for a table with several.")
 @_limit_option
 @click.option(
@@ -193,7 +167,7 @@ def _place(ctx: click.Context, parameter: click.Parameter, value: str | None) ->
     type=NumberRange(min=0, max=1),
     help="Least share of measured frames; with less the exit status is 4.",
 )
-@click.option("--overlay", is_flag=True, help="Also write overlay.mp4: the pictures with the track.")
+@_video_option
 @click.option(
     "--set",
     "overrides",
@@ -207,7 +181,8 @@ def point(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> Non
     """Track the centre of one target: position, velocity and covariance in every frame.
 
     A video, a folder of pictures, or a CSV table with frame,u_px,v_px (such as detections.csv). A constant-velocity
-    Kalman filter predicts the position where the target is hidden, and finds it again.
+    Kalman filter predicts the position where the target is hidden, and finds it again. Without --near the target is the
+    brightest one.
 
     \b
     Example:
@@ -240,7 +215,7 @@ def point(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> Non
 )
 @_rate_option
 @_limit_option
-@click.option("--video", "overlay", is_flag=True, help="Also write overlay.mp4: the pictures with the target's centre.")
+@_video_option
 @click.pass_context
 def lamps(ctx: click.Context, /, pictures: Path, out: Path, **options: Any) -> None:
     """Pose of a target with lamps at known places, from the pictures of one calibrated camera.

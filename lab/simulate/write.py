@@ -24,7 +24,7 @@ from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from lab.files.run.run_file import save_run
-from lab.files.run.truth import read_true_poses
+from lab.files.run.truth import read_true_poses, write_true_poses
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import write_table
@@ -316,15 +316,7 @@ def _clock(scenario: Scenario, camera: str) -> dict[str, float]:
 def write_truth(scene: Scene, folder: Path) -> None:
     """Write truth/pose.csv and truth/spots.csv with every frame, also those without pictures."""
     folder.mkdir(parents=True)
-    quaternions = scene.poses.quaternion_wxyz
-    write_table(
-        folder / "pose.csv",
-        columns.TRUTH_POSE,
-        (
-            (k, f"{t:.9g}", *(f"{x:.12g}" for x in (*p, *q)))
-            for k, t, p, q in zip(scene.frame, scene.t_s, scene.poses.translation, quaternions, strict=True)
-        ),
-    )
+    write_true_poses(folder / "pose.csv", scene.frame, scene.t_s, scene.poses)
     write_table(
         folder / "spots.csv",
         columns.TRUTH_SPOTS,

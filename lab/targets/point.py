@@ -64,7 +64,7 @@ class PointOptions(TrackOptions):
     """Which target to track, and how."""
 
     detector: str = "spots"  # one of DETECTORS; not used for a table
-    start_px: tuple[float, float] | None = None  # where the target is at the start
+    near_px: tuple[float, float] | None = None  # where the target is at the start
     camera: str | None = None  # of a table with several
     min_measured: float = 0.5  # the gate: least share of measured frames
     overrides: Mapping[str, Any] = field(default_factory=dict)  # of PointSettings
@@ -75,7 +75,7 @@ class PointOptions(TrackOptions):
         if self.detector not in DETECTORS:
             raise InputError(f"--detector: expected one of {', '.join(DETECTORS)}, got {self.detector!r}")
         made = with_overrides(PointSettings(), self.overrides)
-        track = made.track if self.start_px is None else replace(made.track, start_px=self.start_px)
+        track = made.track if self.near_px is None else replace(made.track, start_px=self.near_px)
         polarity: Any = self.detector if self.detector in ("darker", "brighter") else made.blobs.polarity
         return replace(made, track=track, blobs=replace(made.blobs, polarity=polarity))
 
@@ -159,7 +159,7 @@ class PointTarget(Target[PointFrame]):
         options = self.options
         if path.suffix.lower() == ".csv":
             if options.overlay:
-                raise InputError(f"{path}: expected pictures or a video for --overlay, got a table")
+                raise InputError(f"{path}: expected pictures or a video for --video, got a table")
             self.detector = TABLE
             (recording, found), detection_s = read_points(path, options.rate_hz, options.camera), 0.0
         else:

@@ -102,3 +102,22 @@ def test_one_call_projects_perspective_and_fisheye_points():
             lambda q, i=i: project_points(points[i], pinhole[i], q, folds[i], fisheye[i])[0], distortion[i]
         )
         np.testing.assert_allclose(both.d_distortion[i][:, :12], by_lens[:, :12], atol=1e-5)
+
+
+@settings(max_examples=50)
+@given(seed=seeds, scale=st.sampled_from([0.1, 1.0, 3.0]))
+def test_every_direction_inside_the_fold_of_a_fisheye_lens_is_found_again_and_no_pixel_beyond_it(seed, scale):
+    rng = np.random.default_rng(seed)
+    numbers = tuple((rng.normal(size=4) * scale * [0.1, 0.05, 0.02, 0.01]).tolist())
+    fold = lens.fisheye_fold_limit(numbers)
+    limit = np.arctan(np.sqrt(fold))
+    angle, turn = rng.uniform(0.0, 0.9999 * limit, 50), rng.uniform(0.0, 2 * np.pi, 50)
+    xy = np.tan(angle)[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+    bent, _ = lens.distort(xy, lens.padded(numbers), True)
+    back = lens.undistort(bent, lens.padded(numbers), fold, True)
+    np.testing.assert_allclose(np.arctan(np.linalg.norm(back, axis=1)), angle, atol=1e-11)
+    np.testing.assert_allclose(
+        back / np.linalg.norm(back, axis=1, keepdims=True), xy / np.tan(angle)[:, None], atol=1e-9
+    )
+    largest = lens.distort(np.array([[np.tan(0.999999 * limit), 0.0]]), lens.padded(numbers), True)[0]
+    assert np.isnan(lens.undistort(1.01 * largest, lens.padded(numbers), fold, True)).all()

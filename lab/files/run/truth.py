@@ -18,7 +18,7 @@ from geometry.rig import Rig
 from lab.files.rig.pose_block import QUATERNION_TOLERANCE
 from lab.files.run.run_file import Run
 from lab.files.text import columns
-from lab.files.text.csv_text import Categorical, Table, read_table
+from lab.files.text.csv_text import Categorical, Table, read_table, write_table
 from lab.files.text.error_text import suggest_name
 
 FARTHEST = 1e9  # px, m or s: a number beyond it is a mistake, and its square may not be finite
@@ -92,6 +92,12 @@ def read_true_poses(path: Path) -> TruePoses:
             raise table.error(i, f"{name}: expected a number within {FARTHEST:g}, got {table.found(name, i)}")
     check_unit_quaternions(table)
     return TruePoses(frame, numbers["t_s"], table.stack("x_m", "y_m", "z_m"), table.stack("qw", "qx", "qy", "qz"))
+
+
+def write_true_poses(path: Path, frames: Ints, t_s: Array, poses: Pose) -> None:
+    """Write a table of poses, columns TRUTH_POSE."""
+    rows = zip(frames, t_s, poses.translation, poses.quaternion_wxyz, strict=True)
+    write_table(path, columns.TRUTH_POSE, ((k, f"{t:.9g}", *(f"{x:.12g}" for x in (*p, *q))) for k, t, p, q in rows))
 
 
 def check_unit_quaternions(table: Table) -> None:

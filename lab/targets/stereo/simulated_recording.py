@@ -20,6 +20,7 @@ from geometry.pose import Pose
 from geometry.uncertainty.rig_uncertainty import PINHOLE, POSE, RigCovariance, perturbed_camera
 from lab.errors import InputError
 from lab.files.rig.pair_file import PairFile, save_pair_file
+from lab.files.run.truth import write_true_poses
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import write_table
@@ -226,12 +227,7 @@ def _later(view: StereoScene, frame: int) -> Pose:
 
 def _write_truth(view: StereoScene, folder: Path) -> None:
     folder.mkdir()
-    q, p = view.poses.quaternion_wxyz, view.poses.translation
-    write_table(
-        folder / "pose.csv",
-        columns.TRUTH_POSE,
-        [[i, f"{t:.9g}", *(f"{v:.12g}" for v in (*p[i], *q[i]))] for i, t in enumerate(view.t_s.tolist())],
-    )
+    write_true_poses(folder / "pose.csv", np.arange(len(view.t_s)), view.t_s, view.poses)
     pixels, hidden, rows = true_pixels(view), occluded(view), []
     for i in range(len(view.t_s)):
         for c, camera in enumerate(view.pair.cameras):

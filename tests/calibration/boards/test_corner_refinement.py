@@ -80,8 +80,9 @@ def _mean_of_wave(x: Array) -> Array:
     nodes, weights = np.polynomial.legendre.leggauss(3)
     total = np.zeros(middle.shape)
     for node, weight in zip(nodes, weights, strict=True):
-        ends = [np.mod(middle + node * other / 2 + side * longer / 2, 2.0) for side in (-1, 1)]
-        area = [np.where(end < 1, end, 2 - end) for end in ends]
+        half = (middle + node * other / 2) / 2
+        ends = [half + side * longer / 4 for side in (-1, 1)]
+        area = [1 - np.abs(2 * (end - np.floor(end)) - 1) for end in ends]
         total += weight / 2 * (area[1] - area[0]) / longer
     return total
 

@@ -122,18 +122,24 @@ def _ink(scene: CircleScene, R: Array, t: Array, centre: Array, first: Array, la
     rays = np.column_stack([flat, np.ones(len(flat))]) @ R  # in the board's frame
     eye = -R.T @ t
     xy = (eye[:2] - eye[2] / rays[:, 2:] * rays[:, :2]).reshape(*u.shape, 2) - centre
-    covered = np.zeros((u.shape[0] - 1, u.shape[1] - 1))
-    # Samples on the edge count partially: binary samples would shift blobs by 4e-3 px.
     along, down = xy[:-1, 1:] - xy[:-1, :-1], xy[1:, :-1] - xy[:-1, :-1]
+    side = np.linalg.norm(along, axis=-1) + np.linalg.norm(down, axis=-1)
+    from_edge = np.linalg.norm(xy[:-1, :-1], axis=-1) - _radius(scene)
+    covered = np.where(from_edge < 0, float(_SAMPLES**2), 0.0)
+    edge = np.abs(from_edge) < 2 * side  # other pixels lie wholly inside or outside
+    # Samples on the edge count partially: binary samples would shift blobs by 4e-3 px.
+    along, down, total = along[edge], down[edge], np.zeros(np.count_nonzero(edge))
+    corners = [part[edge] for part in (xy[:-1, :-1], xy[:-1, 1:], xy[1:, :-1], xy[1:, 1:])]
     steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
     for a in steps:
-        across = (1 - a) * xy[:, :-1] + a * xy[:, 1:]
+        above, below = ((1 - a) * corners[k] + a * corners[k + 1] for k in (0, 2))
         for b in steps:
-            place = (1 - b) * across[:-1] + b * across[1:]
+            place = (1 - b) * above + b * below
             away = np.linalg.norm(place, axis=-1)
             unit = place / np.maximum(away, 1e-12)[..., None]
             wide = np.abs(np.sum(unit * along, axis=-1)) + np.abs(np.sum(unit * down, axis=-1))
-            covered += np.clip(0.5 + (_radius(scene) - away) * _SAMPLES / wide, 0, 1)
+            total += np.clip(0.5 + (_radius(scene) - away) * _SAMPLES / wide, 0, 1)
+    covered[edge] = total
     return covered / _SAMPLES**2
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import re
@@ -9,7 +10,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -281,6 +282,42 @@ def test_the_undocumented_interfaces_of_numba_are_used_in_one_module():
     private = re.compile(r"numba\.core\.(?!event\b|types\b)|JITCodeLibrary|_load_overload|get_call_template|c_helpers")
     users = {name for name, path in modules(ROOT).items() if private.search(path.read_text("utf-8"))}
     assert users == {"geometry.compilation.numba_internals"}
+
+
+def is_compiled(node: ast.AST) -> bool:
+    return isinstance(node, ast.FunctionDef) and any("compiled" in ast.unparse(d) for d in node.decorator_list)
+
+
+def python_calls(tree: ast.AST) -> Iterator[ast.Call]:
+    """The calls of functions by their names, outside of compiled functions."""
+    for node in ast.iter_child_nodes(tree):
+        if is_compiled(node):
+            continue
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            yield node
+        yield from python_calls(node)
+
+
+def test_python_code_leaves_no_argument_of_a_compiled_function_to_its_default():
+    """numba compiles the function once more for such a call, up to three seconds."""
+    program = {module: path.read_text("utf-8") for module, path in modules(ROOT).items()}
+    compiled = {
+        f"{module}.{node.name}": len(node.args.args)
+        for module, text in program.items()
+        if re.search(r"@compiled\w*\ndef \w+\([^)]*=", text)
+        for node in ast.parse(text).body
+        if is_compiled(node) and node.args.defaults
+    }
+    assert len(compiled) >= 3
+    called = re.compile(rf"\b({'|'.join(name.rsplit('.', 1)[1] for name in compiled)})\(")
+    others = [path for folder in ("tests", "bench") for path in (ROOT / folder).rglob("*.py")]
+    for text in filter(called.search, [*program.values(), *(path.read_text("utf-8") for path in others)]):
+        tree = ast.parse(text)
+        lines = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+        known = {a.asname or a.name: compiled.get(f"{line.module}.{a.name}") for line in lines for a in line.names}
+        for call in python_calls(tree):
+            if known.get(call.func.id) and not any(isinstance(a, ast.Starred) for a in call.args):
+                assert len(call.args) + len(call.keywords) == known[call.func.id], ast.unparse(call)
 
 
 def test_a_truncated_cache_file_is_discarded_and_compiled_again(program, first_two, tmp_path):

@@ -75,9 +75,10 @@ def lengths_by_descent(points: Array, rays: Array, world: Array, rng: np.random.
     """All positive lengths that Gauss-Newton finds from many starts: a slow independent solution."""
     pairs = ((0, 1), (0, 2), (1, 2))
     aim = np.array([np.sum((world[i] - world[j]) ** 2) for i, j in pairs])
-    lengths = rng.uniform(0, 8, (400, 3))
+    lengths, misfit = rng.uniform(0, 8, (400, 3)), np.full(400, np.inf)
+    moving = np.arange(400)
     for _ in range(80):
-        q = points + lengths[..., None] * rays
+        q = points + lengths[moving, :, None] * rays
         F, J = np.empty((len(q), 3)), np.zeros((len(q), 3, 3))
         for row, (i, j) in enumerate(pairs):
             gap = q[:, i] - q[:, j]
@@ -86,8 +87,12 @@ def lengths_by_descent(points: Array, rays: Array, world: Array, rng: np.random.
         H = np.swapaxes(J, -1, -2) @ J + 1e-12 * np.eye(3)
         step = np.linalg.solve(H, np.swapaxes(J, -1, -2) @ F[..., None])[..., 0]
         size = np.linalg.norm(step, axis=-1, keepdims=True)
-        lengths = lengths - step * np.minimum(1.0, 1.0 / np.maximum(size, 1e-12))
-    good = (np.abs(F).max(axis=-1) < 1e-10) & (lengths > 1e-6).all(axis=-1)
+        lengths[moving] -= step * np.minimum(1.0, 1.0 / np.maximum(size, 1e-12))
+        misfit[moving] = np.abs(F).max(axis=-1)
+        moving = moving[size[:, 0] > 1e-13]  # the others have arrived
+        if not len(moving):
+            break
+    good = (misfit < 1e-10) & (lengths > 1e-6).all(axis=-1)
     found: list[Array] = []
     for one in lengths[good]:
         if all(np.abs(one - other).max() > 1e-4 for other in found):

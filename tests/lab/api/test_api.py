@@ -14,11 +14,12 @@ import pandas as pd
 import pytest
 
 import lab
+from lab.api.tracking import _detections
 from lab.files.run.run_file import load_run
 from lab.files.text import columns
 from tests.paths import ROOT
 
-MODULES = ("lab.api.results", "lab.api.results", "lab.api.tracking")
+MODULES = ("lab.api.results", "lab.api.tracking")
 
 
 @pytest.fixture(scope="module")
@@ -142,6 +143,20 @@ def test_places_with_a_sigma_of_their_own_are_the_rows_of_a_table_with_it(proces
     np.testing.assert_allclose(poses[1], poses[0], rtol=1e-9)
     np.testing.assert_allclose(poses[3], poses[2], rtol=1e-9)
     assert np.all(poses[3] > 1.5 * poses[1])
+
+
+@pytest.mark.parametrize("frame", [True, False])
+def test_points_in_another_order_or_read_only_need_no_second_compilation(frame):
+    """Compiled functions are compiled once more for arrays that are stored in another way."""
+    points = pd.DataFrame({"u_px": [3.0, 5.0, 9.0], "v_px": [1.0, 2.0, 4.0], "flux": [1.0, 3.0, 2.0]})
+    places = points[["u_px", "v_px"]].to_numpy()
+    places.flags.writeable = False
+    assert not places.flags.c_contiguous
+    found = _detections(points if frame else places, "left", 0.1)
+    for array in (found.uv_px, found.cov_px2):
+        assert array.flags.c_contiguous
+        assert array.flags.writeable
+    np.testing.assert_array_equal(found.uv_px, places[[1, 2, 0]] if frame else places)
 
 
 def test_a_temporary_result_lasts_as_long_as_its_object(run_folder):

@@ -8,7 +8,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from geometry.arrays import Array
 from tracking.detection.candidates import _mark_significant, _read_block, _sum_squares, block_workspace
+from tracking.detection.narrow_light import PolynomialFrame
 from tracking.detection.pixels import CLIPPED, OUTSIDE, VALID, Pixels, Window, read_window
+from tracking.detection.quality import _AWAY, _correlation_within
 from tracking.noise import BLOCK
 
 WIDTH, HEIGHT = 90, 70
@@ -63,3 +65,18 @@ def test_a_block_is_significant_where_the_sum_of_a_square_about_one_of_its_pixel
             possible = _mark_significant(flat, *least)
             assert possible or not expected
             assert marks.any() == expected
+
+
+@pytest.mark.parametrize("S", [(1600.0, 0.0, 1600.0), (1600.0, 0.0, 400.0), (1600.0, 500.0, 700.0)])
+def test_the_correlation_of_residuals_is_that_of_cells_a_third_of_a_width_apart_in_each_direction(S):
+    """Waves along one axis: the correlation over a distance is the mean cosine over its directions."""
+    window = Window(0, 0, 241, 241, 1)
+    frame = PolynomialFrame(-120.0, -120.0, S[0] ** 0.5, S[2] ** 0.5, S, False)
+    v, u = np.mgrid[0:241, 0:241]
+    root = np.linalg.cholesky([[S[0], S[1]], [S[1], S[2]]])
+    for along in (0, 1):
+        wave = np.linalg.solve(root, np.stack([u.ravel(), v.ravel()]))[along] * 2 * np.pi  # a period is one width
+        rho, away2 = _correlation_within(window, frame, np.sqrt(2) * np.cos(wave), np.ones(u.size))
+        steps = 2 * np.pi * _AWAY * np.cos(np.arange(4) * np.pi / 4)
+        assert away2 == pytest.approx(_AWAY**2, rel=0.06)  # rounded to cells
+        assert rho == pytest.approx(np.mean(np.cos(steps)), abs=0.06)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations, pairwise, permutations, product
 
 import numpy as np
@@ -90,14 +91,24 @@ def injections(views: Ints, points: range) -> Iterator[tuple[int, ...]]:
                 yield tuple(out)
 
 
-def log_likelihood(frame: FrameDetections, views: Ints, assigned: tuple[int, ...], P: Array) -> tuple[float, float]:
+@cache
+def together(rows: tuple[int, ...]) -> tuple[Array, Array, float]:
+    """Of the Gaussian of some views' pixels: inverse covariance, its blocks, and the log of the normalisation."""
+    H = JACOBIAN[list(rows)].reshape(-1, 6)
+    S = H @ P_NEAR @ H.T + SIGMA_PX**2 * np.eye(len(H))
+    inverse = np.linalg.inv(S)
+    blocks = inverse.reshape(len(rows), 2, len(rows), 2)[np.arange(len(rows)), :, np.arange(len(rows))]
+    return inverse, blocks, float(np.linalg.slogdet(2 * np.pi * S)[1])
+
+
+def log_likelihood(frame: FrameDetections, views: Ints, assigned: tuple[int, ...]) -> tuple[float, float]:
     """Log-likelihood with one Gaussian of all pixels together, against false points.
 
     Also the largest squared Mahalanobis distance of a spot from its prediction by the prior and all other spots of the
     assignment, which is what the search's last gate sees.
     """
     score, rows, at = 0.0, [], []
-    for v, d in zip(views, assigned, strict=True):
+    for v, d in zip(views.tolist(), assigned, strict=True):
         p = DETECTION_MODEL.p_detect * P_UNOCCLUDED[v]
         score += np.log(1 - p) if d == MISSED else np.log(p) - LOG_CLUTTER
         if d != MISSED:
@@ -105,15 +116,12 @@ def log_likelihood(frame: FrameDetections, views: Ints, assigned: tuple[int, ...
             at.append(d)
     if not rows:
         return score, 0.0
-    H = JACOBIAN[rows].reshape(-1, 6)
-    S = H @ P @ H.T + SIGMA_PX**2 * np.eye(len(H))
+    inverse, blocks, log_det = together(tuple(rows))
     y = (frame.uv[at] - EXPECTED[rows]).ravel()
     # Each spot given the others: from its block of the inverse.
-    inverse = np.linalg.inv(S)
     z = (inverse @ y).reshape(-1, 2)
-    distances2 = [z[i] @ np.linalg.solve(inverse[2 * i : 2 * i + 2, 2 * i : 2 * i + 2], z[i]) for i in range(len(rows))]
-    gaussian = -0.5 * float(y @ z.ravel() + np.linalg.slogdet(2 * np.pi * S)[1])
-    return score + gaussian, max(distances2)
+    distances2 = np.sum(z * np.linalg.solve(blocks, z[..., None])[..., 0], axis=-1)
+    return score - 0.5 * float(y @ z.ravel() + log_det), float(distances2.max())
 
 
 def scattered(rng: np.random.Generator, cameras: tuple[bool, bool], most: int) -> FrameDetections:
@@ -154,7 +162,7 @@ def test_the_search_finds_the_best_of_all_assignments(cameras, most, seeds):
         scores = {}
         for parts in product(*(some for _, some in by_camera)):
             assigned = sum(parts, ())
-            score, distance2 = log_likelihood(frame, views, assigned, P_NEAR)
+            score, distance2 = log_likelihood(frame, views, assigned)
             if distance2 < 0.9 * GATE_CHI2:  # the search's earlier gates, with fewer spots, are at least as wide
                 scores[assigned] = score
         found = search(frame)

@@ -16,7 +16,7 @@ from tracking.rigid_body.hypotheses.hypothesis_set import (
     MIN_REDUNDANT_SPOTS,
     largest_spot_sigma,
 )
-from tracking.rigid_body.models.motion import predicted
+from tracking.rigid_body.models.motion import ANY_MOMENT, predicted
 from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.statuses import PoseStatus
 
@@ -47,7 +47,9 @@ def test_fewer_than_four_spots_are_not_labelled_if_the_prediction_is_vague():
             # Predicted without a velocity jump, which would make them wider.
             sigmas = []
             for h in range(len(before.t)):
-                R, t, _, P, _ = predicted(before.R[h], before.t[h], before.m[h], before.P[h], dt, noise, NONE, NONE)
+                R, t, _, P, _ = predicted(
+                    before.R[h], before.t[h], before.m[h], before.P[h], dt, noise, NONE, NONE, *ANY_MOMENT
+                )
                 assigned = np.where(frame.point == UNMATCHED, -1, frame.point)
                 sigmas.append(largest_spot_sigma(tracker.model.numbers, R, t, P, assigned))
             assert min(sigmas) <= MAX_TRACKING_SIGMA_PX

@@ -31,7 +31,7 @@ from tracking.rigid_body.hypotheses.hypothesis_set import (
     iterated_update,
     prune_and_merge,
 )
-from tracking.rigid_body.models.motion import STATE, predicted
+from tracking.rigid_body.models.motion import ANY_MOMENT, STATE, predicted
 from tracking.rigid_body.models.occlusion import MISSED
 
 RIG = RIGS["fan"]()
@@ -238,7 +238,7 @@ def branched(jump: Array, seen: Ints = ALL_SEEN) -> tuple[Children, int, Pose]:
     m = np.repeat([0.3, 0.5, 0.0, 0.0], 3)
     R, t, _, _, _ = predicted(
         rotation_of(pose), pose.translation, m + np.append(jump, np.zeros(6)), P_START, DT, np.zeros(6), np.zeros(2),
-        np.zeros(2),
+        np.zeros(2), *ANY_MOMENT,
     )  # fmt: skip
     uv = MODEL.project(Pose(R, t))[0] + SIGMA_PX * rng.normal(size=(N, 2))
     old = one_hypothesis(pose, m, P_START)
@@ -272,7 +272,7 @@ def test_the_covariance_of_an_occluded_vehicle_covers_a_manoeuvre():
     staying, places, _, _ = prune_and_merge(children, count)
     assert np.all(children.assigned[places[0]] <= MISSED)
     old = one_hypothesis(HERE, np.zeros(12), P_START)
-    P = predicted(old.R[0], old.t[0], old.m[0], P_START, DT, DYNAMICS.jerk, np.zeros(2), np.zeros(2))[3]
+    P = predicted(old.R[0], old.t[0], old.m[0], P_START, DT, DYNAMICS.jerk, np.zeros(2), np.zeros(2), *ANY_MOMENT)[3]
     grew = np.diagonal(staying.P[0])[6:12] - np.diagonal(P)[6:12]
     assert np.all(grew > 0.04 * np.repeat(DYNAMICS.velocity_jump, 3))
 

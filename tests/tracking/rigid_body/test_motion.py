@@ -8,7 +8,7 @@ from scipy.linalg import expm
 
 from geometry.arrays import Array, numeric_jacobian
 from geometry.pose import Pose
-from tracking.rigid_body.models.motion import STATE, predicted, process_noise, updated
+from tracking.rigid_body.models.motion import ANY_MOMENT, STATE, predicted, process_noise, updated
 
 JERK = np.repeat([20.0, 60.0], 3) ** 2
 NONE = np.zeros(2)
@@ -32,7 +32,7 @@ def a_covariance(seed: int) -> Array:
 def stepped(state: State, P: Array, dt: float, steps: int = 1, jerk: Array = JERK) -> tuple[State, Array]:
     R, t, m = state[0].rotation, state[0].translation, state[1]
     for _ in range(steps):
-        R, t, m, P, _ = predicted(R, t, m, P, dt / steps, jerk, NONE, NONE)
+        R, t, m, P, _ = predicted(R, t, m, P, dt / steps, jerk, NONE, NONE, *ANY_MOMENT)
     return (Pose(R, t), m), P
 
 
@@ -52,7 +52,7 @@ def test_the_transition_is_the_derivative_of_the_motion(rate, dt):
         (p, m_p), _ = stepped((pose.plus(delta[:6]), m + delta[6:]), np.eye(STATE), dt)
         return np.concatenate([p.minus(there), m_p - m_there])
 
-    F = predicted(pose.rotation, pose.translation, m, np.eye(STATE), dt, JERK, NONE, NONE)[4]
+    F = predicted(pose.rotation, pose.translation, m, np.eye(STATE), dt, JERK, NONE, NONE, *ANY_MOMENT)[4]
     # Central differences with a step of 1e-6: rounding of 1e-16 / 1e-6 and curvature of 1e-12.
     np.testing.assert_allclose(F, numeric_jacobian(moved, np.zeros(STATE)), atol=1e-8)
 
@@ -112,7 +112,7 @@ def test_a_covariance_stays_symmetric_and_positive_over_a_thousand_frames():
     J = np.random.default_rng(5).normal(size=(12, 6)) * [500, 500, 500, 3000, 3000, 3000]
     R, t = pose.rotation, pose.translation
     for k in range(1000):
-        R, t, m, P, _ = predicted(R, t, m, P, 0.01, JERK, NONE, NONE)
+        R, t, m, P, _ = predicted(R, t, m, P, 0.01, JERK, NONE, NONE, *ANY_MOMENT)
         if k % 50 < 40:  # ten frames without spots in fifty
             R, t, m, P, _, _ = updated(R, t, m, P, J.T @ J / 0.01, np.zeros(6))
         assert np.array_equal(P, P.T)
@@ -132,7 +132,7 @@ def test_a_jump_at_an_unknown_moment_of_a_step_has_the_covariance_of_random_mome
     size = np.sqrt(acceleration_jump) * rng.normal(size=draws)
     of_steps = np.stack([size * left**2 / 2, size * left, size])
     for values, args in ((of_jumps, (0.0, velocity_jump, 0.0)), (of_steps, (0.0, 0.0, acceleration_jump))):
-        pp, pv, pa, vv, va, aa = process_noise(dt, *args)
+        pp, pv, pa, vv, va, aa = process_noise(dt, *args, *ANY_MOMENT)
         Q = np.array([[pp, pv, pa], [pv, vv, va], [pa, va, aa]])
         scale = np.sqrt(np.maximum(np.diagonal(Q), 1e-30))
         # The mean of 2e5 squares is good to 0.5 % at worst (fourth moments of a Gaussian times a uniform factor).
@@ -143,17 +143,18 @@ def test_the_kinds_of_process_noise_add_up_axis_by_axis():
     dt, velocity_jump, acceleration_jump = 0.02, np.array([4.0, 9.0]), np.array([100.0, 400.0])
     jerk = np.array([1.0, 4.0, 9.0, 16.0, 25.0, 36.0])
     P = predicted(
-        np.eye(3), np.zeros(3), np.zeros(12), np.zeros((STATE, STATE)), dt, jerk, velocity_jump, acceleration_jump
-    )[3]
+        np.eye(3), np.zeros(3), np.zeros(12), np.zeros((STATE, STATE)), dt, jerk, velocity_jump, acceleration_jump,
+        *ANY_MOMENT,
+    )[3]  # fmt: skip
     for i in range(6):
         rows = [i, i + 6, i + 12]
         parts = [(jerk[i], 0.0, 0.0), (0.0, velocity_jump[i // 3], 0.0), (0.0, 0.0, acceleration_jump[i // 3])]
-        pp, pv, pa, vv, va, aa = np.sum([process_noise(dt, *part) for part in parts], axis=0)
+        pp, pv, pa, vv, va, aa = np.sum([process_noise(dt, *part, *ANY_MOMENT) for part in parts], axis=0)
         np.testing.assert_allclose(P[np.ix_(rows, rows)], [[pp, pv, pa], [pv, vv, va], [pa, va, aa]], rtol=1e-12)
         assert np.all(P[np.ix_(rows, np.setdiff1d(np.arange(STATE), rows))] == 0)
 
 
 def test_a_step_of_zero_length_changes_nothing():
     P0 = a_covariance(7)
-    P = predicted(np.eye(3), np.zeros(3), np.ones(12), P0, 0.0, JERK, np.ones(2), np.ones(2))[3]
+    P = predicted(np.eye(3), np.zeros(3), np.ones(12), P0, 0.0, JERK, np.ones(2), np.ones(2), *ANY_MOMENT)[3]
     np.testing.assert_array_equal(P, P0)

@@ -9,7 +9,7 @@ import pytest
 
 from geometry.arrays import Array
 from geometry.pose import Pose
-from tracking.rigid_body.models.motion import STATE, predicted, updated
+from tracking.rigid_body.models.motion import ANY_MOMENT, STATE, predicted, updated
 from tracking.smoothing.motion import fixed_interval
 from tracking.smoothing.motion.fixed_interval import (
     RunInformation,
@@ -37,7 +37,7 @@ class Run:
 def transition(ref: Reference, info: RunInformation, jerk: Array, k: int) -> tuple[Array, Array, Array]:
     """F, the covariance that step k adds, and the deviation of the predicted reference from the reference itself."""
     args = ref.R[k - 1], ref.t[k - 1], ref.m[k - 1], np.zeros((STATE, STATE)), info.dt[k]
-    R, t, m, Q, F = predicted(*args, jerk[k], info.velocity_jump[k], info.acceleration_jump[k])
+    R, t, m, Q, F = predicted(*args, jerk[k], info.velocity_jump[k], info.acceleration_jump[k], *ANY_MOMENT)
     away = Pose(R, t).minus(Pose(ref.R[k], ref.t[k]))
     return F, Q, np.concatenate([away, m - ref.m[k]])
 
@@ -135,7 +135,7 @@ def log_evidence(run: Run, jerk: Array) -> float:
 
 
 def leave_one_out(run: Run, factor: float) -> float:
-    out = smoothed(run.ref, run.info, factor * run.jerk)
+    out = smoothed(run.ref, run.info, factor * run.jerk, True)
     return float(leave_one_out_log_likelihood(out.x, out.pose_P, run.info))
 
 
@@ -152,7 +152,7 @@ RUNS = {
 def test_means_and_covariances_are_those_of_one_dense_gaussian(kind):
     run = RUNS[kind]()
     frames = len(run.info.dt)
-    x, pose_P, motion_P, *_ = smoothed(run.ref, run.info, run.jerk)
+    x, pose_P, motion_P, *_ = smoothed(run.ref, run.info, run.jerk, True)
     mean, P = dense(run)
     blocks = np.stack([P[STATE * k : STATE * (k + 1), STATE * k : STATE * (k + 1)] for k in range(frames)])
     sigma = np.sqrt(np.diagonal(blocks, axis1=1, axis2=2))
@@ -175,7 +175,7 @@ def test_energy_and_gamma_of_the_process_noise_agree_with_the_dense_gaussian(kin
         velocity_jump=np.zeros_like(run.info.velocity_jump), acceleration_jump=np.zeros_like(run.info.velocity_jump)
     )
     frames = len(run.info.dt)
-    out = smoothed(run.ref, run.info, run.jerk)
+    out = smoothed(run.ref, run.info, run.jerk, True)
     mean, P = dense(run)
     assert np.all(out.energy[0] == 0)  # there is no step before the first frame
     assert np.all(out.gamma[0] == 0)
@@ -204,7 +204,7 @@ def test_the_mean_energy_of_the_process_noise_is_the_number_of_determined_compon
     ratio = []
     for seed in range(6):
         run = drawn(300 + seed, 150, jumps=0.01)
-        out = smoothed(run.ref, run.info, run.jerk)
+        out = smoothed(run.ref, run.info, run.jerk, True)
         ratio.append(out.energy.sum(axis=0) / out.gamma.sum(axis=0))
     # 6 x 150 steps, each of which determines about one component of every axis' noise: sqrt(2 / 900) = 0.05.
     np.testing.assert_allclose(np.mean(ratio, axis=0), 1.0, atol=0.2)
@@ -213,7 +213,7 @@ def test_the_mean_energy_of_the_process_noise_is_the_number_of_determined_compon
 @pytest.mark.parametrize("kind", RUNS)
 def test_the_covariances_of_the_ends_are_those_of_the_dense_gaussian(kind):
     run = RUNS[kind]()
-    ends = smoothed(run.ref, run.info, run.jerk).ends_P
+    ends = smoothed(run.ref, run.info, run.jerk, True).ends_P
     _, P = dense(run)
     for end, block in zip(ends, (P[:STATE, :STATE], P[-STATE:, -STATE:]), strict=True):
         sigma = np.sqrt(np.diagonal(block))
@@ -222,7 +222,7 @@ def test_the_covariances_of_the_ends_are_those_of_the_dense_gaussian(kind):
 
 def test_the_last_frame_agrees_with_the_filter():
     run = drawn(6, 200)
-    x, pose_P, motion_P, *_ = smoothed(run.ref, run.info, run.jerk)
+    x, pose_P, motion_P, *_ = smoothed(run.ref, run.info, run.jerk, True)
     d, P = np.zeros(STATE), np.diag(run.info.first_variance)
     for k in range(len(run.info.dt)):
         if k > 0:
@@ -241,7 +241,7 @@ def test_the_last_frame_agrees_with_the_filter():
 @pytest.mark.parametrize("chunk", [1, 7, 12, 24, 25])
 def test_the_size_of_the_chunks_does_not_change_the_result(chunk, monkeypatch):
     run = drawn(7, 24, without_spots=slice(5, 8))
-    compiled = smoothed(run.ref, run.info, run.jerk)  # all in one chunk
+    compiled = smoothed(run.ref, run.info, run.jerk, True)  # all in one chunk
     monkeypatch.setattr(fixed_interval, "MOST_FRAMES_AT_ONCE", 12)
     monkeypatch.setattr(fixed_interval, "CHUNK", chunk)
     parts = ("_empty_interval", "_filter_checkpoints", "_filter_chunk", "_combine", "_test_process_noise")
@@ -256,13 +256,13 @@ def test_a_run_of_several_chunks_has_no_error_where_they_meet():
     ref = Reference(*(np.concatenate([a] * times) for a in one.ref))
     info = RunInformation(*(np.concatenate([a] * times) for a in one.info[:6]), one.info.first_variance)
     run = Run(ref, info, np.tile(one.jerk, (times, 1)), np.tile(one.true, (times, 1)))
-    x, pose_P, *_ = smoothed(run.ref, run.info, run.jerk)
+    x, pose_P, *_ = smoothed(run.ref, run.info, run.jerk, True)
     meet = 8 * fixed_interval.CHUNK
     assert len(x) >= max(meet + 40, fixed_interval.MOST_FRAMES_AT_ONCE + 1)
     # The frames near the seam by themselves: frames 20 frames away change less than a thousandth of a sigma.
     part = slice(meet - 100, meet + 40)
     info = RunInformation(*(a[part] for a in run.info[:6]), run.info.first_variance)
-    alone_x, alone_P, *_ = smoothed(Reference(*(a[part] for a in run.ref)), info, run.jerk[part])
+    alone_x, alone_P, *_ = smoothed(Reference(*(a[part] for a in run.ref)), info, run.jerk[part], True)
     sigma = np.sqrt(np.diagonal(pose_P, axis1=1, axis2=2))[part]
     seam = slice(70, 120)
     np.testing.assert_allclose((alone_x[:, :6] - x[part, :6])[seam] / sigma[seam], 0, atol=1e-3)
@@ -315,7 +315,7 @@ def test_the_covariances_of_smoothed_states_are_right():
     chi2, motion = [], []
     for seed in range(6):
         run = drawn(100 + seed, 150, without_spots=slice(70, 80))
-        x, pose_P, motion_P, *_ = smoothed(run.ref, run.info, run.jerk)
+        x, pose_P, motion_P, *_ = smoothed(run.ref, run.info, run.jerk, True)
         d = x - run.true
         chi2 += [d[k, :6] @ np.linalg.solve(pose_P[k], d[k, :6]) / 6 for k in range(0, 150, 10)]
         motion += [d[k, 6:12] @ np.linalg.solve(motion_P[k], d[k, 6:12]) / 6 for k in range(0, 150, 10)]
@@ -328,16 +328,16 @@ def test_a_velocity_jump_is_found_at_its_step_and_none_in_steady_motion():
     shocks = []
     for seed in range(8):
         run = drawn(200 + seed, 120)
-        steady = smoothed(run.ref, run.info, run.jerk)[3]
+        steady = smoothed(run.ref, run.info, run.jerk, True)[3]
         assert steady[0] == 0.0  # there is no step before the first frame
         shocks.append(steady[1:-5])
         run = drawn(200 + seed, 120, jump_at=61)
-        jumped = smoothed(run.ref, run.info, run.jerk)[3]
+        jumped = smoothed(run.ref, run.info, run.jerk, True)[3]
         assert int(np.argmax(jumped)) == 61
         assert jumped[61] > 200
         for moment in (0.05, 0.95):  # near an end of its step it may be found in the next one
             run = drawn(200 + seed, 120, jump_at=61, moment=moment)
-            jumped = smoothed(run.ref, run.info, run.jerk)[3]
+            jumped = smoothed(run.ref, run.info, run.jerk, True)[3]
             assert abs(int(np.argmax(jumped)) - 61) <= SHOCK_SEPARATION
             assert np.max(jumped) > 200
     alarms = np.concatenate(shocks)
@@ -348,9 +348,9 @@ def test_a_velocity_jump_is_found_at_its_step_and_none_in_steady_motion():
 
 def test_a_jump_that_the_model_allows_for_is_not_a_shock():
     run = drawn(12, 80, jump_at=41)
-    assert smoothed(run.ref, run.info, run.jerk)[3][41] > 200
+    assert smoothed(run.ref, run.info, run.jerk, True)[3][41] > 200
     run.info.velocity_jump[41], run.info.acceleration_jump[41] = 16.0, 100.0
-    shock = smoothed(run.ref, run.info, run.jerk)[3]
+    shock = smoothed(run.ref, run.info, run.jerk, True)[3]
     assert shock[41] < 20
     assert np.max(shock) < 45
 

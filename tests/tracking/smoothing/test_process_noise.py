@@ -24,7 +24,7 @@ def estimated(run: Run, passes: int = 14, whole_run_first: int = GLOBAL_PASSES) 
     usable = np.arange(len(START)) > 0
     for number in range(passes):
         before = log_density
-        out = smoothed(run.ref, run.info, np.exp(before))
+        out = smoothed(run.ref, run.info, np.exp(before), True)
         assert np.isfinite(out.x).all()
         log_density = next_log_density(before, out, usable, local=number >= whole_run_first)
         change = float(np.abs(log_density - before).max())
@@ -67,7 +67,7 @@ def test_in_uniform_motion_the_jerk_falls_until_the_data_no_longer_determine_it(
     log_density, _ = estimated(run)
     assert np.all(log_density > LOG_RANGE[0])
     assert np.all(log_density < START)
-    out = smoothed(run.ref, run.info, np.exp(log_density))
+    out = smoothed(run.ref, run.info, np.exp(log_density), True)
     d = out.x - run.true
     chi2 = [d[k, :6] @ np.linalg.solve(out.pose_P[k], d[k, :6]) / 6 for k in range(0, FRAMES, 10)]
     # In uniform motion all frames share some 18 errors.
@@ -93,7 +93,7 @@ def test_a_run_without_spots_keeps_its_jerk():
 
 def test_steps_with_a_velocity_jump_are_left_out():
     run = drawn(7, FRAMES, jump_at=150)
-    out = smoothed(run.ref, run.info, np.exp(START))
+    out = smoothed(run.ref, run.info, np.exp(START), True)
     usable = np.arange(FRAMES) > 0
     with_jump = next_log_density(START, out, usable, local=True)
     usable[140:160] = False
@@ -113,7 +113,7 @@ def test_covariances_are_right_where_one_axis_moves_less_than_the_noise(amplitud
         sine = amplitude * sigma * np.sin(2 * np.pi * (2 + 2 * (seed % 3)) * np.cumsum(run.info.dt))
         run = replace(run, info=run.info._replace(vector=run.info.vector + L[:, :, 3] * sine[:, None]))
         log_density, _ = estimated(run)
-        out = smoothed(run.ref, run.info, np.exp(log_density))
+        out = smoothed(run.ref, run.info, np.exp(log_density), True)
         squares.append((run.true[:, 3] + sine - out.x[:, 3]) ** 2 / out.pose_P[:, 3, 3])
     assert 0.6 < np.mean(squares) < largest
 

@@ -120,8 +120,9 @@ def _error_sigmas(uv: Array, degree: int, points: int, ahead: int) -> Array | No
     if len(squared) < MIN_HISTORY:
         return None
     # The squared distance of a two-dimensional Gaussian is exponentially distributed; the tail's sigma is its quantile.
-    core = [np.quantile(squared, q) / (-2 * np.log(1 - q)) for _, q in COMPONENTS[:-1]]
-    return np.asarray(np.sqrt([*core, np.quantile(squared, COMPONENTS[-1][1]) / 2]))
+    shares = np.array([share for _, share in COMPONENTS])
+    per_axis = np.append(-2 * np.log(1 - shares[:-1]), 2.0)
+    return np.asarray(np.sqrt(np.quantile(squared, shares) / per_axis))
 
 
 # Continuation of a spot's path across a corner: a straight row of points that meets the path.

@@ -188,7 +188,7 @@ def test_a_watch_that_has_not_kept_up_says_what_became_of_the_pictures(latency, 
 def test_pictures_that_come_faster_than_they_are_searched_wait_for_the_first_background(tmp_path):
     """On a rough screen spots are found in front of a background only: here from the first picture on."""
     rough = replace(SCENARIOS["smooth"], light=Light(texture=0.12, peak_dn=20.0, background_dn=40.0))
-    run = simulate(rough, tmp_path / "run", seed=3, frames=70, picture_scale=0.25)
+    run = simulate(rough, tmp_path / "run", seed=3, frames=50, picture_scale=0.25)
     shown = {}
     for rate_hz in (10.0, 10_000.0):
         text = yaml.safe_load((run / "run.yaml").read_text("utf-8"))

@@ -162,7 +162,7 @@ def test_two_similar_targets_are_reported_and_one_can_be_chosen(tmp_path):
     table = tmp_path / "two.csv"
     table.write_text("frame,u_px,v_px\n" + "\n".join(lines) + "\n")
     assert "BP-N05" in [f.code for f in track_target(PointTarget(), table, tmp_path / "out").findings]
-    chosen = track_target(PointTarget(PointOptions(start_px=(345.0, 60.0))), table, tmp_path / "other")
+    chosen = track_target(PointTarget(PointOptions(near_px=(345.0, 60.0))), table, tmp_path / "other")
     assert verdict(chosen.findings) is Level.PASS
     assert chosen.result.frames[-1].place[0] == pytest.approx(path_of(19)[0] + 300, abs=0.1)
 
@@ -193,7 +193,8 @@ def test_a_table_that_cannot_be_used_is_one_plain_line(tmp_path, text, words):
     ("arguments", "words"),
     [
         (["--camera", "left"], "expected a table with a column camera"),
-        (["--start", "5"], "expected U,V in pixels such as 640,512, got '5'"),
+        (["--near", "5"], "requires 2 arguments"),
+        (["--near", "nan", "5"], "finite"),
         (["--set", "track.sigma_a=1"], "unknown key"),
         (["--set", "track.p_gate=2"], "expected a number between 0 and 1"),
     ],
