@@ -10,7 +10,7 @@ from geometry.arrays import Array, Bools
 
 SAME_PX = 2.0  # points nearer to each other are at the same place
 _RESTING = 0.75  # share of a camera's frames in which a point is at the same place
-_FEWEST_FRAMES = 2
+_FEWEST_FRAMES = 2  # in one frame all points are where they are
 NOWHERE = np.zeros((0, 2))
 
 
