@@ -88,6 +88,7 @@ _NEAR_PX = 20.0  # distance of the first drogue from the place that the user sta
 _SUPPORT_RATE = 0.25  # of the running mean of the log odds of the checks
 _USUAL_RATE = 0.1  # of the running mean of the correlation
 _OFF_CENTRE, _OFF_SIZE = 0.12, 0.2  # offset of the pattern, in diameters and as a logarithm, that cuts it out again
+_SIZE_SIGMAS = 3.0  # of the logarithm of the diameter, within which a detection elsewhere has the size of the drogue
 _MORE_PX = 2.0  # radius of a window beyond 3 sigma
 
 
@@ -321,20 +322,20 @@ class DrogueTracker:
         """
         motion, p = track.motion, self.parameters
         found = self._in_picture(picture)
-        # A track that few detections confirmed, or the last checks did not, may have a wrong size, and be none.
-        sure = track.confirmed >= TRUSTED and track.unconfirmed < p.most_unconfirmed
-        limit = p.size_ratio if sure else np.inf
+        # A track that few detections confirmed may have a wrong size, and be none.
+        own = np.hypot(motion.sigma_diameter_px / motion.rim_diameter_px, p.detection_size_sigma)
+        limit = _SIZE_SIGMAS * own if track.confirmed >= TRUSTED else np.inf
         # The tracked object may be another one that the detector takes for a drogue, with less confidence.
         least = p.sure_confidence if track.trusted >= p.hand_back_confidence else p.elsewhere_confidence
         lead = max(logit(least), track.support + p.sure_logit)
         alike = [
-            c for c in found if 1 / limit < 2 * c.radius_px / motion.rim_diameter_px < limit or logit(c.score) > lead
-        ]
+            c for c in found
+            if abs(np.log(2 * c.radius_px / motion.rim_diameter_px)) < limit or logit(c.score) > lead
+        ]  # fmt: skip
         if rivals:
             alike = [c for c in alike if logit(c.score) > lead]
         best, _ = self._chosen(alike)
-        doubtful = track.lost and (track.confirmed < TRUSTED or track.misses > LONGEST_GAP)
-        if best is None or (best.score < p.elsewhere_confidence and not doubtful):
+        if best is None or (best.score < p.elsewhere_confidence and not track.lost):
             return None
         u, v = motion.centre_px.tolist()
         if (rivals or track.misses == 0) and np.hypot(best.u_px - u, best.v_px - v) < motion.rim_diameter_px / 2:
