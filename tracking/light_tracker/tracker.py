@@ -29,7 +29,6 @@ from tracking.statuses import Cause, PoseStatus
 # What is known of a drogue while it is followed.
 
 TRUSTED = 4  # detections that confirmed a track
-LONGEST_GAP = 20  # frames
 _MOSTLY = 0.6  # visible share from which the agreement of this share counts
 
 
@@ -50,7 +49,7 @@ class Track:
     trusted: float = 1.0  # confidence of the last measured frame
     misses: int = 0  # frames in a row without a measurement
     blind: int = 0  # frames in a row without a match that resembles the pattern
-    gap: int = 0  # the same, and falling by one with each match afterwards: how far the drogue can have moved away
+    gap: int = 0  # the same since the last confirmation: what matches afterwards may be another object
     before: Known | None = None  # the appearance before the pattern was cut out again
 
     @property
@@ -67,7 +66,7 @@ class Track:
 
     def count_blind(self) -> None:
         """One more frame without a match."""
-        self.blind, self.gap = self.blind + 1, min(self.gap + 1, LONGEST_GAP)
+        self.blind, self.gap = self.blind + 1, self.gap + 1
 
     def resembles(self, match: Match) -> bool:
         """Whether a match is about as good as the ones before; of a new pattern (nan), whether it is good."""
@@ -150,7 +149,7 @@ class DrogueTracker:
         if match is None or confidence < p.measured_confidence:
             cause = Cause.NO_MATCH if match is None else Cause.UNCERTAIN
             if match is not None and track.resembles(match):
-                track.blind, track.gap = 0, max(track.gap - 1, 0)  # it may be the drogue: later frames decide
+                track.blind = 0  # it may be the drogue: later frames decide
             else:
                 track.count_blind()
                 track.motion = predicted.with_offset_of(track.motion)
@@ -162,7 +161,7 @@ class DrogueTracker:
                 return again
             searched = "both"
         event, track.lost = "reacquired" if track.lost else "", False
-        track.misses, track.blind, track.gap, track.trusted = 0, 0, max(track.gap - 1, 0), confidence
+        track.misses, track.blind, track.trusted = 0, 0, confidence
         self._learn(track, picture, match)
         return self._frame(
             track, PoseStatus.MEASURED, Cause.NONE, source, confidence, searched, found, event, match.correlation
@@ -256,7 +255,8 @@ class DrogueTracker:
     def _confidence(self, track: Track, match: Match | None) -> float:
         if match is None:
             return 0.0
-        inputs = features(track.support, track.confirmed, track.unconfirmed, track.motion.rim_diameter_px)
+        size = track.motion.rim_diameter_px
+        inputs = features(track.support, track.confirmed, track.unconfirmed, size, track.gap)
         if self.trace is not None:
             self.trace.append((inputs, track.motion.centre_px))
         return probability(inputs)
@@ -326,7 +326,8 @@ class DrogueTracker:
         own = np.hypot(motion.sigma_diameter_px / motion.rim_diameter_px, p.detection_size_sigma)
         limit = _SIZE_SIGMAS * own if track.confirmed >= TRUSTED else np.inf
         # The tracked object may be another one that the detector takes for a drogue, with less confidence.
-        least = p.sure_confidence if track.trusted >= p.hand_back_confidence else p.elsewhere_confidence
+        usual = probability(features(track.support, track.confirmed, 0, motion.rim_diameter_px))
+        least = p.sure_confidence if usual >= p.hand_back_confidence else p.elsewhere_confidence
         lead = max(logit(least), track.support + p.sure_logit)
         alike = [
             c for c in found
