@@ -29,6 +29,7 @@ from tracking.statuses import Cause, PoseStatus
 # What is known of a drogue while it is followed.
 
 TRUSTED = 4  # detections that confirmed a track
+_SIZE_SIGMAS = 3.0  # of the logarithm of the diameter, within which a detection without a match can be the drogue
 _MOSTLY = 0.6  # visible share from which the agreement of this share counts
 
 
@@ -68,6 +69,12 @@ class Track:
         """One more frame without a match."""
         self.blind, self.gap = self.blind + 1, self.gap + 1
 
+    def has_size_of(self, seen: CircleCandidate, p: LightParameters) -> bool:
+        """Whether a detection has the size of the drogue, if that is known from enough detections."""
+        away = abs(np.log(2 * seen.radius_px / self.motion.rim_diameter_px))
+        sigma = np.hypot(self.motion.sigma_diameter_px / self.motion.rim_diameter_px, p.detection_size_sigma)
+        return self.confirmed < TRUSTED or bool(away < _SIZE_SIGMAS * sigma)
+
     def resembles(self, match: Match) -> bool:
         """Whether a match is about as good as the ones before; of a new pattern (nan), whether it is good."""
         return is_similar(self.usual, fisher(match.agreement if match.visible > _MOSTLY else match.correlation))
@@ -87,7 +94,6 @@ _NEAR_PX = 20.0  # distance of the first drogue from the place that the user sta
 _SUPPORT_RATE = 0.25  # of the running mean of the log odds of the checks
 _USUAL_RATE = 0.1  # of the running mean of the correlation
 _OFF_CENTRE, _OFF_SIZE = 0.12, 0.2  # offset of the pattern, in diameters and as a logarithm, that cuts it out again
-_SIZE_SIGMAS = 3.0  # of the logarithm of the diameter, within which a detection elsewhere has the size of the drogue
 _MORE_PX = 2.0  # radius of a window beyond 3 sigma
 
 
@@ -202,7 +208,7 @@ class DrogueTracker:
         u, v = motion.centre_px.tolist()
         own = [c for c in seen if np.hypot(c.u_px - u, c.v_px - v) <= near]
         if match is None:
-            own = [c for c in own if c.score >= p.acquire_confidence]
+            own = [c for c in own if c.score >= p.acquire_confidence and track.has_size_of(c, p)]
         return max(own, key=lambda c: c.score, default=None)
 
     def _confirm(self, track: Track, picture: Picture, seen: CircleCandidate, match: Match | None) -> Match | None:
@@ -234,7 +240,7 @@ class DrogueTracker:
         track.before = track.known
         track.motion = PatternState.started(seen.u_px, seen.v_px, diameter, self.parameters)
         track.pattern, track.usual, track.confirmed = pattern, float("nan"), 1
-        track.unconfirmed, track.age = 0, 0.0
+        track.unconfirmed, track.age, track.gap = 0, 0.0, 0
         return match
 
     def _learn(self, track: Track, picture: Picture, match: Match) -> None:
@@ -322,17 +328,11 @@ class DrogueTracker:
         """
         motion, p = track.motion, self.parameters
         found = self._in_picture(picture)
-        # A track that few detections confirmed may have a wrong size, and be none.
-        own = np.hypot(motion.sigma_diameter_px / motion.rim_diameter_px, p.detection_size_sigma)
-        limit = _SIZE_SIGMAS * own if track.confirmed >= TRUSTED else np.inf
         # The tracked object may be another one that the detector takes for a drogue, with less confidence.
         usual = probability(features(track.support, track.confirmed, 0, motion.rim_diameter_px))
         least = p.sure_confidence if usual >= p.hand_back_confidence else p.elsewhere_confidence
         lead = max(logit(least), track.support + p.sure_logit)
-        alike = [
-            c for c in found
-            if abs(np.log(2 * c.radius_px / motion.rim_diameter_px)) < limit or logit(c.score) > lead
-        ]  # fmt: skip
+        alike = [c for c in found if track.has_size_of(c, p) or logit(c.score) > lead]
         if rivals:
             alike = [c for c in alike if logit(c.score) > lead]
         best, _ = self._chosen(alike)

@@ -252,6 +252,38 @@ def test_a_target_found_elsewhere_replaces_one_that_is_gone():
     assert np.hypot(*(frames[-1].centre_px - (150.0, 130.0))) < 2.0
 
 
+@pytest.mark.parametrize(
+    ("diameter", "score", "followed_there"), [(23.0, 0.9, False), (14.0, 0.9, True), (14.0, 0.6, True)]
+)
+def test_a_hidden_target_is_found_elsewhere_if_the_detection_has_its_size(diameter, score, followed_there):
+    """Once it is lost a detection that would start a track will do; a larger object is another one."""
+    here, there = (60.0, 60.0, 14.0), (160.0, 130.0, diameter)
+    detector = Detector()
+    tracker = DrogueTracker(detector)
+    for k in range(45):
+        detector.circles = [here if k < 20 else there]
+        detector.confidence = 0.9 if k < 20 else score
+        frame = tracker.step(picture(detector.circles, seed=k))
+    assert (np.hypot(*(frame.centre_px - there[:2])) < 2) == followed_there
+
+
+def test_a_match_after_a_gap_is_less_sure_until_the_detector_confirms_it():
+    """What was in front of the target may be what matches; several matches say no more than one."""
+    detector = Detector()
+    tracker, confidence = DrogueTracker(detector), {}
+    for k in range(40):
+        u, v, d = path(k)
+        gone = 20 <= k < 26
+        detector.circles = [] if 19 < k < 32 else [path(k)]
+        frame = tracker.step(picture([path(k)], seed=k, hidden=(u, v, 2 * d) if gone else None))
+        confidence[k] = frame.confidence
+        assert gone == (frame.status is not PoseStatus.MEASURED), k
+    unconfirmed = [confidence[k] for k in range(26, 32)]
+    assert max(unconfirmed) < confidence[19] - 0.005
+    assert unconfirmed == sorted(unconfirmed, reverse=True)
+    assert confidence[32] > max(unconfirmed)
+
+
 def test_a_target_that_leaves_the_picture_is_out_of_view_then_lost():
     detector = Detector()
     tracker = DrogueTracker(detector)
