@@ -126,15 +126,17 @@ def nothing_known(cause: Cause, event: str = "", searched: str = "", found: int 
 
 
 RIGHT_SHARE = 0.25  # of the diameter
-FEATURES = ("1", "support", "confirmed", "unconfirmed", "size", "size x support", "gap")
-SIGNS = (0, 1, 1, -1, -1, 1, -1)  # of the coefficients: more of a good sign never lowers the confidence
-COEFFICIENTS = (4.06, 0.6, 0.6, -1.08, -6.6, 2.0, -1.0)  # of the features
+FEATURES = ("1", "support", "confirmed", "size", "size x support", "gap")
+SIGNS = (0, 1, 1, -1, 1, -1)  # of the coefficients: more of a good sign never lowers the confidence
+COEFFICIENTS = (1.46, 1.43, 0.34, -5.67, 0.39, -0.44)  # of the features
 ABSENT_LOGIT = -2.0  # of a check without a detection, in the running mean of the checks
 _CAP = 0.995  # of correlations: above it, noise decides
 _MOST_CONFIRMED = 10  # checks in a row that count: further ones say nothing new
 # The detector is sure of a drogue of many pixels, but not of one of few: what is large, and doubtful in check after
-# check, is another object. It sees every drogue at 40 px or less, so that a larger one says no more.
-_SIZES_PX = 9.0, 40.0
+# check, is another object. From 16 px on the size says no more (minus the log likelihood of 7,900 matches: 1659; up to
+# 12, 14, 20, 40 px: 1700, 1695, 1704, 1769). The number of checks in a row without a detection was an input, too; its
+# coefficient was zero, since these checks lower the support.
+_SIZES_PX = 9.0, 16.0
 
 
 def fisher(correlation: float) -> float:
@@ -142,15 +144,15 @@ def fisher(correlation: float) -> float:
     return float(np.arctanh(np.clip(correlation, 0.0, _CAP)))
 
 
-def features(support: float, confirmed: int, unconfirmed: int, diameter_px: float, gap: int = 0) -> Array:
-    """The inputs (7,) of the curve.
+def features(support: float, confirmed: int, diameter_px: float, gap: int = 0) -> Array:
+    """The inputs (6,) of the curve.
 
-    support: running mean of the log odds of the checks. confirmed: detections of this track; unconfirmed: checks in a
-    row without one. gap: frames without a match since the last detection.
+    support: running mean of the log odds of the checks. confirmed: detections of this track. gap: frames without a
+    match since the last one.
     """
     size = np.log(np.clip(diameter_px, *_SIZES_PX) / _SIZES_PX[0])
     known = np.log(min(max(confirmed, 1), _MOST_CONFIRMED))
-    return np.array([1.0, support, known, np.log1p(unconfirmed), size, size * support, np.log1p(gap)])
+    return np.array([1.0, support, known, size, size * support, np.log1p(gap)])
 
 
 def probability(inputs: Array) -> float:

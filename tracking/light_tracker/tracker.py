@@ -262,7 +262,7 @@ class DrogueTracker:
         if match is None:
             return 0.0
         size = track.motion.rim_diameter_px
-        inputs = features(track.support, track.confirmed, track.unconfirmed, size, track.gap)
+        inputs = features(track.support, track.confirmed, size, track.gap)
         if self.trace is not None:
             self.trace.append((inputs, track.motion.centre_px))
         return probability(inputs)
@@ -329,7 +329,7 @@ class DrogueTracker:
         motion, p = track.motion, self.parameters
         found = self._in_picture(picture)
         # The tracked object may be another one that the detector takes for a drogue, with less confidence.
-        usual = probability(features(track.support, track.confirmed, 0, motion.rim_diameter_px))
+        usual = probability(features(track.support, track.confirmed, motion.rim_diameter_px))
         least = p.sure_confidence if usual >= p.hand_back_confidence else p.elsewhere_confidence
         lead = max(logit(least), track.support + p.sure_logit)
         alike = [c for c in found if track.has_size_of(c, p) or logit(c.score) > lead]
