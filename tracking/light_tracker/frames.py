@@ -21,8 +21,7 @@ class LightParameters:
     largest_px: float | None = None  # px; None: the picture's smaller side
     acquire_confidence: float = 0.5  # of a detection that starts a track by itself
     elsewhere_confidence: float = 0.8  # of a detection that replaces a track elsewhere in the picture
-    sure_confidence: float = 0.995  # of a detection that competes with a track that is not handed back ...
-    sure_logit: float = 1.5  # ... if its log odds are this much above the mean of the track's checks
+    sure_logit: float = 1.5  # of a detection that competes with a track: its log odds over those of the track's checks
     picture_every: int = 2  # checks, of which the last one is of the whole picture
     confirm_confidence: float = 0.15  # of a detection where the tracker is: two independent ones agree
     ambiguous_logit: float = 2.5  # a second detection whose log odds are less than this below the best: ambiguous

@@ -58,16 +58,21 @@ class Track:
         """The appearance that detections confirmed last."""
         if self.confirmed < TRUSTED or np.isnan(self.usual):
             return self.before
-        return Known(self.pattern, self.usual, self.confirmed, self.motion)
+        return Known(self.pattern, self.usual, self.confirmed, self.support, self.motion)
 
     def take_back(self, known: Known, found: Match, p: LightParameters) -> None:
         """Continue with the appearance from before, found again at a place."""
         self.motion = known.motion.moved(found, p)
-        self.pattern, self.usual, self.confirmed, self.before = known.pattern, known.usual, known.confirmed, None
+        self.pattern, self.usual, self.before = known.pattern, known.usual, None
+        self.confirmed, self.support = known.confirmed, known.support
 
     def count_blind(self) -> None:
         """One more frame without a match."""
         self.blind, self.gap = self.blind + 1, self.gap + 1
+
+    def checked(self, gap: int = 0) -> Array:
+        """The inputs of the confidence."""
+        return features(self.support, self.confirmed, self.motion.rim_diameter_px, gap)
 
     def has_size_of(self, seen: CircleCandidate, p: LightParameters) -> bool:
         """Whether a detection has the size of the drogue, if that is known from enough detections."""
@@ -205,8 +210,7 @@ class DrogueTracker:
         """The detection of the tracked drogue: at the match, or, without one, where the drogue can be."""
         motion, p = track.motion, self.parameters
         near = p.agree_diameters * motion.rim_diameter_px + (3 * motion.sigma_px if match is None else 1.0)
-        u, v = motion.centre_px.tolist()
-        own = [c for c in seen if np.hypot(c.u_px - u, c.v_px - v) <= near]
+        own = [c for c in seen if _distance(c, motion) <= near]
         if match is None:
             own = [c for c in own if c.score >= p.acquire_confidence and track.has_size_of(c, p)]
         return max(own, key=lambda c: c.score, default=None)
@@ -261,8 +265,7 @@ class DrogueTracker:
     def _confidence(self, track: Track, match: Match | None) -> float:
         if match is None:
             return 0.0
-        size = track.motion.rim_diameter_px
-        inputs = features(track.support, track.confirmed, size, track.gap)
+        inputs = track.checked(track.gap)
         if self.trace is not None:
             self.trace.append((inputs, track.motion.centre_px))
         return probability(inputs)
@@ -313,7 +316,7 @@ class DrogueTracker:
     ) -> DrogueFrame:
         """No measurement: at times the detector searches the whole picture; else the frame is predicted or lost."""
         if (track.misses + 1) % self.parameters.search_after == 0:
-            again = self._found_elsewhere(track, picture)
+            again = self._found_elsewhere(track, picture, rivals=match is not None)
             if again is not None:
                 return again
             searched = "both" if searched else "picture"
@@ -329,17 +332,15 @@ class DrogueTracker:
         motion, p = track.motion, self.parameters
         found = self._in_picture(picture)
         # The tracked object may be another one that the detector takes for a drogue, with less confidence.
-        usual = probability(features(track.support, track.confirmed, motion.rim_diameter_px))
-        least = p.sure_confidence if usual >= p.hand_back_confidence else p.elsewhere_confidence
-        lead = max(logit(least), track.support + p.sure_logit)
+        lead = logit(probability(track.checked())) + p.sure_logit
         alike = [c for c in found if track.has_size_of(c, p) or logit(c.score) > lead]
+        apart = motion.rim_diameter_px / 2
         if rivals:
-            alike = [c for c in alike if logit(c.score) > lead]
+            alike = [c for c in alike if logit(c.score) > lead and _distance(c, motion) >= apart]
         best, _ = self._chosen(alike)
         if best is None or (best.score < p.elsewhere_confidence and not track.lost):
             return None
-        u, v = motion.centre_px.tolist()
-        if (rivals or track.misses == 0) and np.hypot(best.u_px - u, best.v_px - v) < motion.rim_diameter_px / 2:
+        if track.misses == 0 and _distance(best, motion) < apart:
             return None
         pattern = Pattern.started(picture, best.u_px, best.v_px, 2 * best.radius_px)
         if pattern is None:
@@ -383,3 +384,8 @@ class DrogueTracker:
             status, cause, source, m.centre_px, m.x[2:].copy(), m.rim_diameter_px, m.covariance, m.sigma_diameter_px,
             confidence, correlation, searched, found, event,
         )  # fmt: skip
+
+
+def _distance(seen: CircleCandidate, motion: PatternState) -> float:
+    """Of a detection from the tracked centre, px."""
+    return float(np.hypot(*(motion.centre_px - (seen.u_px, seen.v_px))))
