@@ -127,13 +127,13 @@ def nothing_known(cause: Cause, event: str = "", searched: str = "", found: int 
 RIGHT_SHARE = 0.25  # of the diameter
 FEATURES = ("1", "support", "confirmed", "size", "size x support", "gap")
 SIGNS = (0, 1, 1, -1, 1, -1)  # of the coefficients: more of a good sign never lowers the confidence
-COEFFICIENTS = (1.46, 1.43, 0.34, -5.67, 0.39, -0.44)  # of the features
+COEFFICIENTS = (1.3, 1.5, 0.42, -5.57, 0.17, -0.66)  # of the features
 ABSENT_LOGIT = -2.0  # of a check without a detection, in the running mean of the checks
 _CAP = 0.995  # of correlations: above it, noise decides
 _MOST_CONFIRMED = 10  # checks in a row that count: further ones say nothing new
 # The detector is sure of a drogue of many pixels, but not of one of few: what is large, and doubtful in check after
-# check, is another object. From 16 px on the size says no more (minus the log likelihood of 7,900 matches: 1659; up to
-# 12, 14, 20, 40 px: 1700, 1695, 1704, 1769). The number of checks in a row without a detection was an input, too; its
+# check, is another object. From 16 px on the size says no more (minus the log likelihood of 11,000 matches: 2200; up to
+# 12, 14, 20, 40 px: 2322, 2278, 2260, 2344). The number of checks in a row without a detection was an input, too; its
 # coefficient was zero, since these checks lower the support.
 _SIZES_PX = 9.0, 16.0
 
