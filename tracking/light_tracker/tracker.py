@@ -47,7 +47,7 @@ class Track:
     since_check: int = 0  # frames since the detector searched
     checks: int = 0
     lost: bool = False  # reported as lost
-    trusted: float = 1.0  # confidence of the last measured frame
+    trusted: float = 1.0  # confidence of the last match
     misses: int = 0  # frames in a row without a measurement
     blind: int = 0  # frames in a row without a match that resembles the pattern
     gap: int = 0  # the same since the last confirmation: what matches afterwards may be another object
@@ -159,12 +159,13 @@ class DrogueTracker:
             confidence = self._confidence(track, match)
         if match is None or confidence < p.measured_confidence:
             cause = Cause.NO_MATCH if match is None else Cause.UNCERTAIN
+            track.trusted = track.trusted if match is None else confidence
             if match is not None and track.resembles(match):
                 track.blind = 0  # it may be the drogue: later frames decide
             else:
                 track.count_blind()
                 track.motion = predicted.with_offset_of(track.motion)
-            return self._missed(track, picture, cause, match, searched, found, confidence)
+            return self._missed(track, picture, cause, match, searched, found)
         doubted = track.unconfirmed > 0 and track.unconfirmed % p.most_unconfirmed == 0
         if track.since_check == 0 and (doubted or track.checks % p.picture_every == 0):
             again = self._found_elsewhere(track, picture, rivals=not doubted)
@@ -312,7 +313,6 @@ class DrogueTracker:
         match: Match | None = None,
         searched: str = "",
         found: int = 0,
-        confidence: float = 1.0,
     ) -> DrogueFrame:
         """No measurement: at times the detector searches the whole picture; else the frame is predicted or lost."""
         if (track.misses + 1) % self.parameters.search_after == 0:
@@ -320,7 +320,7 @@ class DrogueTracker:
             if again is not None:
                 return again
             searched = "both" if searched else "picture"
-        out = self._unmeasured(track, cause, 1.0 if match is None else confidence)
+        out = self._unmeasured(track, cause)
         correlation = float("nan") if match is None else match.correlation
         return replace(out, correlation=correlation, searched=searched, found=found)
 
@@ -351,7 +351,7 @@ class DrogueTracker:
         self._track.before = known
         return out
 
-    def _unmeasured(self, track: Track, cause: Cause, share: float = 1.0) -> DrogueFrame:
+    def _unmeasured(self, track: Track, cause: Cause) -> DrogueFrame:
         """A frame without a measurement: predicted, or lost."""
         track.misses += 1
         motion, p = track.motion, self.parameters
@@ -364,7 +364,7 @@ class DrogueTracker:
             track.lost = True
             return nothing_known(cause, event)
         sigma = float(np.sqrt(np.trace(motion.covariance) / 2))
-        confidence = share * track.trusted * within(sigma, motion.rim_diameter_px)
+        confidence = track.trusted * within(sigma, motion.rim_diameter_px)
         return self._frame(track, PoseStatus.PREDICTED, cause, MeasuredBy.NONE, confidence)
 
     @staticmethod

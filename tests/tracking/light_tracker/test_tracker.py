@@ -283,6 +283,19 @@ def test_a_match_after_a_gap_is_less_sure_than_one_without_until_a_detection():
     assert confidence[True][33] > max(confidence[True][26:30])
 
 
+def test_a_prediction_is_no_surer_than_the_doubtful_match_before_it():
+    detector = Detector()
+    tracker, confidence = DrogueTracker(detector), []
+    for k in range(26):
+        u, v, d = path(0)
+        detector.circles = [path(0)] if k < 12 else []
+        hidden = (u, v, 2 * d) if k >= 22 else None
+        frame = tracker.step(picture([path(0)], seed=k, hidden=hidden))
+        confidence.append(frame.confidence)
+        assert k < 20 or frame.status is PoseStatus.PREDICTED
+    assert confidence[20:] == sorted(confidence[20:], reverse=True)
+
+
 def test_a_target_that_leaves_the_picture_is_out_of_view_then_lost():
     detector = Detector()
     tracker = DrogueTracker(detector)
