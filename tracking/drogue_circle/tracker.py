@@ -430,8 +430,7 @@ class CircleTracker:
             track.misses += 1
             return self._unmeasured(track, Cause.NO_IMAGE, predicted, np.nan)
         fit, gamma = track.measure(picture, self.detector, self.parameters)
-        sure = fit is not None and (track.measured >= _CONFIRMED or is_certain(fit))
-        if fit is not None and sure and gamma < self.parameters.occluded:
+        if fit is not None and gamma < self.parameters.occluded and (track.measured >= _CONFIRMED or is_certain(fit)):
             track.update(fit, gamma, self.parameters)
             if is_clear(gamma) and track.measured > _CONFIRMED:
                 self._trusted = fit

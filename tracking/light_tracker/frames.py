@@ -131,10 +131,8 @@ COEFFICIENTS = (1.3, 1.5, 0.42, -5.57, 0.17, -0.66)  # of the features
 ABSENT_LOGIT = -2.0  # of a check without a detection, in the running mean of the checks
 _CAP = 0.995  # of correlations: above it, noise decides
 _MOST_CONFIRMED = 10  # checks in a row that count: further ones say nothing new
-# The detector is sure of a drogue of many pixels, but not of one of few: what is large, and doubtful in check after
-# check, is another object. From 16 px on the size says no more (minus the log likelihood of 11,000 matches: 2200; up to
-# 12, 14, 20, 40 px: 2322, 2278, 2260, 2344). The number of checks in a row without a detection was an input, too; its
-# coefficient was zero, since these checks lower the support.
+# The detector is sure of a drogue of many pixels, but not of one of few: what is larger, and doubtful in check after
+# check, is another object. From 16 px on the size says no more (minus log likelihood 2200; 14, 20 px: 2278, 2260).
 _SIZES_PX = 9.0, 16.0
 
 

@@ -159,16 +159,15 @@ class DrogueTracker:
             confidence = self._confidence(track, match)
         if match is None or confidence < p.measured_confidence:
             cause = Cause.NO_MATCH if match is None else Cause.UNCERTAIN
-            track.trusted = track.trusted if match is None else confidence
             if match is not None and track.resembles(match):
-                track.blind = 0  # it may be the drogue: later frames decide
+                track.blind, track.trusted = 0, confidence  # it may be the drogue: later frames decide
             else:
                 track.count_blind()
                 track.motion = predicted.with_offset_of(track.motion)
             return self._missed(track, picture, cause, match, searched, found)
         doubted = track.unconfirmed > 0 and track.unconfirmed % p.most_unconfirmed == 0
         if track.since_check == 0 and (doubted or track.checks % p.picture_every == 0):
-            again = self._found_elsewhere(track, picture, rivals=not doubted)
+            again = self._found_elsewhere(track, picture, matched=True)
             if again is not None:
                 return again
             searched = "both"
@@ -211,7 +210,8 @@ class DrogueTracker:
         """The detection of the tracked drogue: at the match, or, without one, where the drogue can be."""
         motion, p = track.motion, self.parameters
         near = p.agree_diameters * motion.rim_diameter_px + (3 * motion.sigma_px if match is None else 1.0)
-        own = [c for c in seen if _distance(c, motion) <= near]
+        u, v = motion.centre_px.tolist()
+        own = [c for c in seen if np.hypot(c.u_px - u, c.v_px - v) <= near]
         if match is None:
             own = [c for c in own if c.score >= p.acquire_confidence and track.has_size_of(c, p)]
         return max(own, key=lambda c: c.score, default=None)
@@ -316,7 +316,7 @@ class DrogueTracker:
     ) -> DrogueFrame:
         """No measurement: at times the detector searches the whole picture; else the frame is predicted or lost."""
         if (track.misses + 1) % self.parameters.search_after == 0:
-            again = self._found_elsewhere(track, picture, rivals=match is not None)
+            again = self._found_elsewhere(track, picture, match is not None)
             if again is not None:
                 return again
             searched = "both" if searched else "picture"
@@ -324,23 +324,20 @@ class DrogueTracker:
         correlation = float("nan") if match is None else match.correlation
         return replace(out, correlation=correlation, searched=searched, found=found)
 
-    def _found_elsewhere(self, track: Track, picture: Picture, rivals: bool = False) -> DrogueFrame | None:
-        """One drogue in the whole picture, of about the same size, away from where the track is.
+    def _found_elsewhere(self, track: Track, picture: Picture, matched: bool) -> DrogueFrame | None:
+        """A drogue of the tracked size in the whole picture, or one that the detector is surer of than of the track.
 
-        rivals: only one that the detector is surer of than of what is tracked, of any size.
+        matched: the track has a match; only a drogue of the second kind, away from it, replaces it.
         """
         motion, p = track.motion, self.parameters
         found = self._in_picture(picture)
-        # The tracked object may be another one that the detector takes for a drogue, with less confidence.
         lead = logit(probability(track.checked())) + p.sure_logit
-        alike = [c for c in found if track.has_size_of(c, p) or logit(c.score) > lead]
-        apart = motion.rim_diameter_px / 2
-        if rivals:
-            alike = [c for c in alike if logit(c.score) > lead and _distance(c, motion) >= apart]
+        alike = [c for c in found if logit(c.score) > lead or (not matched and track.has_size_of(c, p))]
+        if matched:
+            u, v = motion.centre_px.tolist()
+            alike = [c for c in alike if np.hypot(c.u_px - u, c.v_px - v) >= motion.rim_diameter_px / 2]
         best, _ = self._chosen(alike)
         if best is None or (best.score < p.elsewhere_confidence and not track.lost):
-            return None
-        if track.misses == 0 and _distance(best, motion) < apart:
             return None
         pattern = Pattern.started(picture, best.u_px, best.v_px, 2 * best.radius_px)
         if pattern is None:
@@ -384,8 +381,3 @@ class DrogueTracker:
             status, cause, source, m.centre_px, m.x[2:].copy(), m.rim_diameter_px, m.covariance, m.sigma_diameter_px,
             confidence, correlation, searched, found, event,
         )  # fmt: skip
-
-
-def _distance(seen: CircleCandidate, motion: PatternState) -> float:
-    """Of a detection from the tracked centre, px."""
-    return float(np.hypot(*(motion.centre_px - (seen.u_px, seen.v_px))))
