@@ -32,7 +32,9 @@ from tracking.statuses import PoseStatus
 SMALL_PX, ALL_PX = (9.0, 9.0), (9.0, 150.0)
 HELD_SHARE = 0.5
 RIVALS = ("CSRT", "KCF", "MIL")
-_EMPTY_EVERY = 6  # of the sequences for the calibration, one of these has no drogue
+# Of the sequences for the calibration: ranges of the diameters, in turn, and one of so many has no drogue. Without the
+# second range hardly a drogue of 12 to 20 px is doubtful, and false ones of this size are believed.
+_CALIBRATED_PX, _EMPTY_EVERY = (SMALL_PX, (9.0, 20.0), ALL_PX), 5
 
 Step = Callable[[SequenceFrame], tuple[Array, float, bool]]  # centre (2,) px, confidence, whether it is measured
 
@@ -165,7 +167,7 @@ def calibrated(seed: int, count: int, frames: int) -> None:
     for i in range(count):
         empty = i % _EMPTY_EVERY == 0
         tracker = DrogueTracker(learned_detector(4.0), trace=[])
-        for frame in moving_drogue(1000 * seed + i, frames, SMALL_PX if i % 2 else ALL_PX, empty=empty):
+        for frame in moving_drogue(1000 * seed + i, frames, _CALIBRATED_PX[i % 3], empty=empty):
             assert tracker.trace is not None
             tracker.trace.clear()
             tracker.step(frame.picture)

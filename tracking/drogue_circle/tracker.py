@@ -401,7 +401,7 @@ def nothing_known(cause: Cause, event: str = "") -> CircleFrame:
 # Tracks one circle through pictures: Zhou (2014), figure 2, with a rim fit, a sound noise model and acquisition.
 
 
-_CONFIRMED = 3  # measurements after which an acquisition is confirmed
+_CONFIRMED = 3  # measurements after which an acquisition is confirmed: till then each is as certain as the first one
 _CHANGED = 4  # searches of the whole picture after which a circle of another appearance is accepted
 _FORGOTTEN = 50  # searches for a circle like the lost one, after which any circle is accepted
 _NEAR_PX = 20.0  # distance of the first circle from the place that the user states
@@ -430,7 +430,7 @@ class CircleTracker:
             track.misses += 1
             return self._unmeasured(track, Cause.NO_IMAGE, predicted, np.nan)
         fit, gamma = track.measure(picture, self.detector, self.parameters)
-        if fit is not None and gamma < self.parameters.occluded:
+        if fit is not None and gamma < self.parameters.occluded and (track.measured >= _CONFIRMED or is_certain(fit)):
             track.update(fit, gamma, self.parameters)
             if is_clear(gamma) and track.measured > _CONFIRMED:
                 self._trusted = fit

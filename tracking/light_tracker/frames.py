@@ -21,8 +21,7 @@ class LightParameters:
     largest_px: float | None = None  # px; None: the picture's smaller side
     acquire_confidence: float = 0.5  # of a detection that starts a track by itself
     elsewhere_confidence: float = 0.8  # of a detection that replaces a track elsewhere in the picture
-    sure_confidence: float = 0.995  # of a detection that competes with a track that is not handed back ...
-    sure_logit: float = 1.5  # ... if its log odds are this much above the mean of the track's checks
+    sure_logit: float = 1.5  # of a detection that competes with a track: its log odds over those of the track's checks
     picture_every: int = 2  # checks, of which the last one is of the whole picture
     confirm_confidence: float = 0.15  # of a detection where the tracker is: two independent ones agree
     ambiguous_logit: float = 2.5  # a second detection whose log odds are less than this below the best: ambiguous
@@ -126,15 +125,15 @@ def nothing_known(cause: Cause, event: str = "", searched: str = "", found: int 
 
 
 RIGHT_SHARE = 0.25  # of the diameter
-FEATURES = ("1", "support", "confirmed", "unconfirmed", "size", "size x support")
-SIGNS = (0, 1, 1, -1, -1, 1)  # of the coefficients: more of a good sign never lowers the confidence
-COEFFICIENTS = (4.06, 0.6, 0.6, -1.08, -6.6, 2.0)  # of the features
+FEATURES = ("1", "support", "confirmed", "size", "size x support", "gap")
+SIGNS = (0, 1, 1, -1, 1, -1)  # of the coefficients: more of a good sign never lowers the confidence
+COEFFICIENTS = (1.3, 1.5, 0.42, -5.57, 0.17, -0.66)  # of the features
 ABSENT_LOGIT = -2.0  # of a check without a detection, in the running mean of the checks
 _CAP = 0.995  # of correlations: above it, noise decides
 _MOST_CONFIRMED = 10  # checks in a row that count: further ones say nothing new
-# The detector is sure of a drogue of many pixels, but not of one of few: what is large, and doubtful in check after
-# check, is another object. It sees every drogue at 40 px or less, so that a larger one says no more.
-_SIZES_PX = 9.0, 40.0
+# The detector is sure of a drogue of many pixels, but not of one of few: what is larger, and doubtful in check after
+# check, is another object. From 16 px on the size says no more (minus log likelihood 2200; 14, 20 px: 2278, 2260).
+_SIZES_PX = 9.0, 16.0
 
 
 def fisher(correlation: float) -> float:
@@ -142,15 +141,15 @@ def fisher(correlation: float) -> float:
     return float(np.arctanh(np.clip(correlation, 0.0, _CAP)))
 
 
-def features(support: float, confirmed: int, unconfirmed: int, diameter_px: float) -> Array:
+def features(support: float, confirmed: int, diameter_px: float, gap: int = 0) -> Array:
     """The inputs (6,) of the curve.
 
-    support: running mean of the log odds of the checks. confirmed: detections of this track; unconfirmed: checks in a
-    row without one.
+    support: running mean of the log odds of the checks. confirmed: detections of this track. gap: frames without a
+    match since the last one.
     """
     size = np.log(np.clip(diameter_px, *_SIZES_PX) / _SIZES_PX[0])
     known = np.log(min(max(confirmed, 1), _MOST_CONFIRMED))
-    return np.array([1.0, support, known, np.log1p(unconfirmed), size, size * support])
+    return np.array([1.0, support, known, size, size * support, np.log1p(gap)])
 
 
 def probability(inputs: Array) -> float:

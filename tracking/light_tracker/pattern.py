@@ -462,6 +462,7 @@ class Known:
     pattern: Pattern
     usual: float  # running mean of Fisher's z of its matches
     confirmed: int  # detections
+    support: float  # running mean of the log odds of the checks
     motion: PatternState  # of its last frame: size, offset of the rim
 
     def found(self, picture: Picture, u_px: float, v_px: float, reach_px: float) -> Match | None:

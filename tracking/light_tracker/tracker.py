@@ -29,7 +29,7 @@ from tracking.statuses import Cause, PoseStatus
 # What is known of a drogue while it is followed.
 
 TRUSTED = 4  # detections that confirmed a track
-LONGEST_GAP = 20  # frames
+_SIZE_SIGMAS = 3.0  # of the logarithm of the diameter, within which a detection without a match can be the drogue
 _MOSTLY = 0.6  # visible share from which the agreement of this share counts
 
 
@@ -47,10 +47,10 @@ class Track:
     since_check: int = 0  # frames since the detector searched
     checks: int = 0
     lost: bool = False  # reported as lost
-    trusted: float = 1.0  # confidence of the last measured frame
+    trusted: float = 1.0  # confidence of the last match
     misses: int = 0  # frames in a row without a measurement
     blind: int = 0  # frames in a row without a match that resembles the pattern
-    gap: int = 0  # the same, and falling by one with each match afterwards: how far the drogue can have moved away
+    gap: int = 0  # the same since the last confirmation: what matches afterwards may be another object
     before: Known | None = None  # the appearance before the pattern was cut out again
 
     @property
@@ -58,16 +58,27 @@ class Track:
         """The appearance that detections confirmed last."""
         if self.confirmed < TRUSTED or np.isnan(self.usual):
             return self.before
-        return Known(self.pattern, self.usual, self.confirmed, self.motion)
+        return Known(self.pattern, self.usual, self.confirmed, self.support, self.motion)
 
     def take_back(self, known: Known, found: Match, p: LightParameters) -> None:
         """Continue with the appearance from before, found again at a place."""
         self.motion = known.motion.moved(found, p)
-        self.pattern, self.usual, self.confirmed, self.before = known.pattern, known.usual, known.confirmed, None
+        self.pattern, self.usual, self.before = known.pattern, known.usual, None
+        self.confirmed, self.support = known.confirmed, known.support
 
     def count_blind(self) -> None:
         """One more frame without a match."""
-        self.blind, self.gap = self.blind + 1, min(self.gap + 1, LONGEST_GAP)
+        self.blind, self.gap = self.blind + 1, self.gap + 1
+
+    def checked(self, gap: int = 0) -> Array:
+        """The inputs of the confidence."""
+        return features(self.support, self.confirmed, self.motion.rim_diameter_px, gap)
+
+    def has_size_of(self, seen: CircleCandidate, p: LightParameters) -> bool:
+        """Whether a detection has the size of the drogue, if that is known from enough detections."""
+        away = abs(np.log(2 * seen.radius_px / self.motion.rim_diameter_px))
+        sigma = np.hypot(self.motion.sigma_diameter_px / self.motion.rim_diameter_px, p.detection_size_sigma)
+        return self.confirmed < TRUSTED or bool(away < _SIZE_SIGMAS * sigma)
 
     def resembles(self, match: Match) -> bool:
         """Whether a match is about as good as the ones before; of a new pattern (nan), whether it is good."""
@@ -149,19 +160,19 @@ class DrogueTracker:
         if match is None or confidence < p.measured_confidence:
             cause = Cause.NO_MATCH if match is None else Cause.UNCERTAIN
             if match is not None and track.resembles(match):
-                track.blind, track.gap = 0, max(track.gap - 1, 0)  # it may be the drogue: later frames decide
+                track.blind, track.trusted = 0, confidence  # it may be the drogue: later frames decide
             else:
                 track.count_blind()
                 track.motion = predicted.with_offset_of(track.motion)
-            return self._missed(track, picture, cause, match, searched, found, confidence)
+            return self._missed(track, picture, cause, match, searched, found)
         doubted = track.unconfirmed > 0 and track.unconfirmed % p.most_unconfirmed == 0
         if track.since_check == 0 and (doubted or track.checks % p.picture_every == 0):
-            again = self._found_elsewhere(track, picture, rivals=not doubted)
+            again = self._found_elsewhere(track, picture, matched=True)
             if again is not None:
                 return again
             searched = "both"
         event, track.lost = "reacquired" if track.lost else "", False
-        track.misses, track.blind, track.gap, track.trusted = 0, 0, max(track.gap - 1, 0), confidence
+        track.misses, track.blind, track.trusted = 0, 0, confidence
         self._learn(track, picture, match)
         return self._frame(
             track, PoseStatus.MEASURED, Cause.NONE, source, confidence, searched, found, event, match.correlation
@@ -202,7 +213,7 @@ class DrogueTracker:
         u, v = motion.centre_px.tolist()
         own = [c for c in seen if np.hypot(c.u_px - u, c.v_px - v) <= near]
         if match is None:
-            own = [c for c in own if c.score >= p.acquire_confidence]
+            own = [c for c in own if c.score >= p.acquire_confidence and track.has_size_of(c, p)]
         return max(own, key=lambda c: c.score, default=None)
 
     def _confirm(self, track: Track, picture: Picture, seen: CircleCandidate, match: Match | None) -> Match | None:
@@ -234,7 +245,7 @@ class DrogueTracker:
         track.before = track.known
         track.motion = PatternState.started(seen.u_px, seen.v_px, diameter, self.parameters)
         track.pattern, track.usual, track.confirmed = pattern, float("nan"), 1
-        track.unconfirmed, track.age = 0, 0.0
+        track.unconfirmed, track.age, track.gap = 0, 0.0, 0
         return match
 
     def _learn(self, track: Track, picture: Picture, match: Match) -> None:
@@ -255,7 +266,7 @@ class DrogueTracker:
     def _confidence(self, track: Track, match: Match | None) -> float:
         if match is None:
             return 0.0
-        inputs = features(track.support, track.confirmed, track.unconfirmed, track.motion.rim_diameter_px)
+        inputs = track.checked(track.gap)
         if self.trace is not None:
             self.trace.append((inputs, track.motion.centre_px))
         return probability(inputs)
@@ -302,42 +313,31 @@ class DrogueTracker:
         match: Match | None = None,
         searched: str = "",
         found: int = 0,
-        confidence: float = 1.0,
     ) -> DrogueFrame:
         """No measurement: at times the detector searches the whole picture; else the frame is predicted or lost."""
         if (track.misses + 1) % self.parameters.search_after == 0:
-            again = self._found_elsewhere(track, picture)
+            again = self._found_elsewhere(track, picture, match is not None)
             if again is not None:
                 return again
             searched = "both" if searched else "picture"
-        out = self._unmeasured(track, cause, 1.0 if match is None else confidence)
+        out = self._unmeasured(track, cause)
         correlation = float("nan") if match is None else match.correlation
         return replace(out, correlation=correlation, searched=searched, found=found)
 
-    def _found_elsewhere(self, track: Track, picture: Picture, rivals: bool = False) -> DrogueFrame | None:
-        """One drogue in the whole picture, of about the same size, away from where the track is.
+    def _found_elsewhere(self, track: Track, picture: Picture, matched: bool) -> DrogueFrame | None:
+        """A drogue of the tracked size in the whole picture, or one that the detector is surer of than of the track.
 
-        rivals: only one that the detector is surer of than of what is tracked, of any size.
+        matched: the track has a match; only a drogue of the second kind, away from it, replaces it.
         """
         motion, p = track.motion, self.parameters
         found = self._in_picture(picture)
-        # A track that few detections confirmed, or the last checks did not, may have a wrong size, and be none.
-        sure = track.confirmed >= TRUSTED and track.unconfirmed < p.most_unconfirmed
-        limit = p.size_ratio if sure else np.inf
-        # The tracked object may be another one that the detector takes for a drogue, with less confidence.
-        least = p.sure_confidence if track.trusted >= p.hand_back_confidence else p.elsewhere_confidence
-        lead = max(logit(least), track.support + p.sure_logit)
-        alike = [
-            c for c in found if 1 / limit < 2 * c.radius_px / motion.rim_diameter_px < limit or logit(c.score) > lead
-        ]
-        if rivals:
-            alike = [c for c in alike if logit(c.score) > lead]
+        lead = logit(probability(track.checked())) + p.sure_logit
+        alike = [c for c in found if logit(c.score) > lead or (not matched and track.has_size_of(c, p))]
+        if matched:
+            u, v = motion.centre_px.tolist()
+            alike = [c for c in alike if np.hypot(c.u_px - u, c.v_px - v) >= motion.rim_diameter_px / 2]
         best, _ = self._chosen(alike)
-        doubtful = track.lost and (track.confirmed < TRUSTED or track.misses > LONGEST_GAP)
-        if best is None or (best.score < p.elsewhere_confidence and not doubtful):
-            return None
-        u, v = motion.centre_px.tolist()
-        if (rivals or track.misses == 0) and np.hypot(best.u_px - u, best.v_px - v) < motion.rim_diameter_px / 2:
+        if best is None or (best.score < p.elsewhere_confidence and not track.lost):
             return None
         pattern = Pattern.started(picture, best.u_px, best.v_px, 2 * best.radius_px)
         if pattern is None:
@@ -348,7 +348,7 @@ class DrogueTracker:
         self._track.before = known
         return out
 
-    def _unmeasured(self, track: Track, cause: Cause, share: float = 1.0) -> DrogueFrame:
+    def _unmeasured(self, track: Track, cause: Cause) -> DrogueFrame:
         """A frame without a measurement: predicted, or lost."""
         track.misses += 1
         motion, p = track.motion, self.parameters
@@ -361,7 +361,7 @@ class DrogueTracker:
             track.lost = True
             return nothing_known(cause, event)
         sigma = float(np.sqrt(np.trace(motion.covariance) / 2))
-        confidence = share * track.trusted * within(sigma, motion.rim_diameter_px)
+        confidence = track.trusted * within(sigma, motion.rim_diameter_px)
         return self._frame(track, PoseStatus.PREDICTED, cause, MeasuredBy.NONE, confidence)
 
     @staticmethod

@@ -7,7 +7,7 @@ import pytest
 
 from tracking.light_tracker.frames import COEFFICIENTS, FEATURES, SIGNS, features, logit, probability, within
 
-GOOD = {"support": 2.0, "confirmed": 5, "unconfirmed": 0, "diameter_px": 9.0}
+GOOD = {"support": 2.0, "confirmed": 5, "diameter_px": 9.0, "gap": 0}
 
 
 def confidence(**changed: float) -> float:
@@ -20,14 +20,14 @@ def test_a_good_match_that_the_detector_confirmed_is_almost_sure():
 
 @pytest.mark.parametrize(
     "worse",
-    [{"support": -1.5}, {"confirmed": 1}, {"unconfirmed": 4}],
+    [{"support": -1.5}, {"confirmed": 1}, {"diameter_px": 14.0}, {"gap": 4}],
 )
 def test_a_worse_input_lowers_the_confidence(worse):
     assert confidence(**worse) < confidence()
 
 
 def test_a_track_that_checks_do_not_confirm_is_not_believed():
-    assert confidence(confirmed=1, unconfirmed=8, support=-1.9) < 0.5
+    assert confidence(confirmed=1, support=-1.9) < 0.5
 
 
 @pytest.mark.parametrize("diameter_px", [35.0, 150.0])

@@ -252,6 +252,50 @@ def test_a_target_found_elsewhere_replaces_one_that_is_gone():
     assert np.hypot(*(frames[-1].centre_px - (150.0, 130.0))) < 2.0
 
 
+@pytest.mark.parametrize(
+    ("diameter", "score", "followed_there"), [(23.0, 0.9, False), (14.0, 0.9, True), (14.0, 0.6, True)]
+)
+def test_a_hidden_target_is_found_elsewhere_if_the_detection_has_its_size(diameter, score, followed_there):
+    """Once it is lost a detection that would start a track will do; a larger object is another one."""
+    here, there = (60.0, 60.0, 14.0), (160.0, 130.0, diameter)
+    detector = Detector()
+    tracker = DrogueTracker(detector)
+    for k in range(38):
+        detector.circles = [here if k < 20 else there]
+        detector.confidence = 0.9 if k < 20 else score
+        frame = tracker.step(picture(detector.circles, seed=k))
+    assert (np.hypot(*(frame.centre_px - there[:2])) < 2) == followed_there
+
+
+def test_a_match_after_a_gap_is_less_sure_than_one_without_until_a_detection():
+    """What was in front of the target may be what matches; that it matches in more frames does not change it."""
+    confidence: dict[bool, list[float]] = {}
+    for hides in (True, False):
+        detector = Detector()
+        tracker, own = DrogueTracker(detector), []
+        for k in range(34):
+            u, v, d = path(k)
+            gone = hides and 20 <= k < 26
+            detector.circles = [] if gone or 26 <= k < 30 else [path(k)]
+            own.append(tracker.step(picture([path(k)], seed=k, hidden=(u, v, 2 * d) if gone else None)).confidence)
+        confidence[hides] = own
+    assert all(confidence[True][k] < confidence[False][k] - 0.02 for k in range(26, 30))
+    assert confidence[True][33] > max(confidence[True][26:30])
+
+
+def test_a_prediction_is_no_surer_than_the_doubtful_match_before_it():
+    detector = Detector()
+    tracker, confidence = DrogueTracker(detector), []
+    for k in range(26):
+        u, v, d = path(0)
+        detector.circles = [path(0)] if k < 12 else []
+        hidden = (u, v, 2 * d) if k >= 22 else None
+        frame = tracker.step(picture([path(0)], seed=k, hidden=hidden))
+        confidence.append(frame.confidence)
+        assert k < 20 or frame.status is PoseStatus.PREDICTED
+    assert confidence[20:] == sorted(confidence[20:], reverse=True)
+
+
 def test_a_target_that_leaves_the_picture_is_out_of_view_then_lost():
     detector = Detector()
     tracker = DrogueTracker(detector)
