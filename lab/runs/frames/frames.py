@@ -30,8 +30,9 @@ from lab.runs.frames.moments import Moment, plan_moments
 from tracking.detections import Detections
 from tracking.resting_points import at_places, resting_places
 
+_SAMPLED, _FEWEST = 15, 5  # frames of a table, from which points at rest are known; in shorter recordings none are
+
 # What a camera recorded for a frame.
-_SAMPLED = 15  # frames of a table, from which points at rest are known; in shorter recordings none are
 Recorded: TypeAlias = GreyPicture | Detections | MissingPicture
 
 BEYOND_PX = 32.0  # a fit may put the centre of a spot at the edge outside the picture, but never farther than this
@@ -244,7 +245,7 @@ class FrameReader:
         some = {
             name: [own.at(int(k)).uv_px for k in evenly_spread(own.frames, _SAMPLED)] for name, own in known.items()
         }
-        if any(len(frames) < _SAMPLED for frames in some.values()):
+        if any(len(frames) < _FEWEST for frames in some.values()):
             return
         places = resting_places(some, self._run.tracker.labels.min_spots)
         for name, own in known.items():
