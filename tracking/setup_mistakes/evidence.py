@@ -44,6 +44,7 @@ SURE_SPOTS = 5  # labels of a frame: false points often agree with the pose of f
 P_FIT = 1e-6  # probability that correct labels do not fit their sigmas
 LEAST_POINTS = 2  # points per picture, median, from which a camera without any label is reported
 LEAST_LABELLED = 0.5  # share of the spots that the poses put into a camera's pictures which have a label
+RESTING = 0.75  # share of the frames in which a lamp is found; some of them are neighbours
 MOST_CHANGED = 1  # false points that come or go between frames that are alike
 MODEL_PX = 0.03  # px: model error that is allowed beside the sigmas of the points (calibrations are no better)
 # A frame is searched with at most this effort: 60 mistakes are compared.
@@ -212,7 +213,7 @@ def _without_resting(blocks: Sequence[Block], min_spots: int) -> Sequence[Block]
     """
     names = {name for block in blocks for name in block[HERE]}
     seen = {name: [block[HERE][name].uv_px for block in blocks if name in block[HERE]] for name in names}
-    places = resting_places(seen, min_spots)
+    places = resting_places(seen, min_spots, RESTING)
     return [[_elsewhere(frame, places) for frame in block] for block in blocks]
 
 

@@ -31,6 +31,7 @@ from tracking.detections import Detections
 from tracking.resting_points import at_places, resting_places
 
 _SAMPLED, _FEWEST = 15, 5  # frames of a table, from which points at rest are known; in shorter recordings none are
+_RESTING = 0.55  # share of these frames in which a lamp is found: it may flicker
 
 # What a camera recorded for a frame.
 Recorded: TypeAlias = GreyPicture | Detections | MissingPicture
@@ -247,7 +248,7 @@ class FrameReader:
         }
         if any(len(frames) < _FEWEST for frames in some.values()):
             return
-        places = resting_places(some, self._run.tracker.labels.min_spots)
+        places = resting_places(some, self._run.tracker.labels.min_spots, _RESTING)
         for name, own in known.items():
             if len(places[name]):
                 at_rest = at_places(own.points.uv_px, places[name]).astype(float)
