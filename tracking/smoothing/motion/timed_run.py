@@ -17,12 +17,12 @@ from tracking.smoothing.motion.fixed_interval import Interval, RunInformation
 from tracking.smoothing.motion.instants import Instants, motion_at, usual_step
 from tracking.smoothing.motion.process_noise import (
     P_JUMP_OCCLUDED,
+    P_JUMP_SHARED,
     PSEUDO_COUNT,
     SHOCK_CHI2,
     largest_jumps,
     largest_near,
     next_log_density,
-    unobserved_steps,
 )
 from tracking.smoothing.motion.run_detections import (
     Between,
@@ -110,6 +110,20 @@ def _longest_step(detections: RunDetections) -> int:
     return max((int(np.ceil(np.median(one))) for one in steps if len(one)), default=1)
 
 
+def _near_unobserved(measured: Bools, t_s: Array, frame_s: float) -> Bools:
+    """(F,): steps before instants t_s (F,) in which a jump would not show, as `unobserved_steps`.
+
+    measured (F,): instants of frames whose spots determine the pose. The instants on either side of a gap, up to a
+    frame from it, show a jump but not when it happened.
+    """
+    gap = t_s[~measured]
+    if not len(gap):
+        return np.zeros(len(t_s), dtype=bool)
+    begin = np.append(t_s[:1], t_s[:-1])
+    after = np.clip(np.searchsorted(gap, begin - 1.5 * frame_s), 0, len(gap) - 1)
+    return np.asarray((gap[after] >= begin - 1.5 * frame_s) & (gap[after] <= t_s + 0.5 * frame_s))
+
+
 class _TimedEstimator(_Estimator):
     """Passes over the instants of a run, from the first with a spot to the last."""
 
@@ -122,7 +136,9 @@ class _TimedEstimator(_Estimator):
         self.t_s = np.ascontiguousarray(instants.t_s[core])
         self.complete = np.asarray(np.all(instants.run.detections.has_image, axis=1))[instants.frame[core]]
         self.continuous = np.zeros(len(self.t_s), dtype=bool)  # (F,) steps in which a jerk has replaced turns
-        self.steady = np.zeros(len(self.t_s), dtype=bool)  # (F,) unobserved steps that exclude a jump
+        self.unobserved = _near_unobserved(known[1][core], self.t_s, frame_s)  # (F,) steps, of which ...
+        self.steady = np.zeros(len(self.t_s), dtype=bool)  # (F,) ... these exclude a jump, ...
+        self.open = np.zeros(len(self.t_s))  # (F,) ... and these have one, with this probability in a frame
         self.clocks: ClockSolution | None = None
         self.last: tuple[Interval, Array] | None = None  # the last finite pass, and its strength of the jerk
         dt = np.ascontiguousarray(instants.run.dt[core])
@@ -133,6 +149,7 @@ class _TimedEstimator(_Estimator):
         fastest = np.maximum(self.largest.max(axis=0), np.finfo(float).tiny)
         self.strongest = np.log(np.repeat(3 * fastest / frame_s**3, 3))
         super().__init__(instants.run, instants.assigned, known[1], used, core, motion)
+        self._gaps_opened()
 
     def run_passes(self) -> SmoothedMotion:
         """Passes and searches for turns until nothing changes."""
@@ -163,7 +180,7 @@ class _TimedEstimator(_Estimator):
                 (_, self.log_density), self.ref = self.last, before
                 break
             self.last = out, self.log_density
-            jumping = self._jumps()[0].max(axis=1) > 0
+            jumping = (self._jumps()[0].max(axis=1) > 0) | (self.open > 0)
             if number > 0:
                 self.turns = [self._sized(turn, out) for turn in self.turns]
             searching &= number < count - LAST_PASSES
@@ -205,7 +222,24 @@ class _TimedEstimator(_Estimator):
                 length = FIRST_LENGTH * self.frame_s
                 self.turns.append(Turn(float(middle_s[k]), length, length, self.largest[k]))
         self.turns.sort(key=lambda turn: turn.middle_s)
-        return len(self.turns) > before
+        found = len(self.turns) > before
+        self._gaps_opened()
+        return found
+
+    def _gaps_opened(self) -> None:
+        """Replace turns in and beside gaps: nothing shows in which of the unobserved steps the velocities jump."""
+        ends = np.flatnonzero(np.diff(np.r_[False, self.unobserved, False]))
+        for turn in list(self.turns):
+            inside = (self.t_s > turn.begin_s) & (self.t_s - self.dt < turn.end_s)
+            if not (inside & self.unobserved).any():
+                continue
+            self.turns.remove(turn)
+            for first, end in zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True):
+                if inside[first:end].any():
+                    inside[first:end] = True
+            frames = self.dt[inside].sum() / self.frame_s
+            self.open[inside] = np.maximum(self.open[inside], max(P_JUMP_SHARED, 1.0 / max(frames, 1.0)))
+            self.steady &= ~inside
 
     def _search(self) -> TurnSearch:
         info, _ = self._information(self.ref)
@@ -244,19 +278,21 @@ class _TimedEstimator(_Estimator):
                 new = search.improved(turn._replace(settled=settled), others)
                 any_changed |= new is None or not new.settled
                 self.turns = sorted([*others, *([] if new is None else [new])], key=lambda one: one.middle_s)
+        self._gaps_opened()
         return any_changed
 
     def _hidden(self) -> Array:
         """(F, 2): variances of the jumps in the steps that nothing observes."""
-        share = P_JUMP_OCCLUDED * np.minimum(self.dt / self.frame_s, 1.0)
-        hidden = unobserved_steps(self.measured) & ~self.steady
-        return np.where(hidden[:, None], share[:, None] * self.largest, 0.0)
+        probability = np.where(self.unobserved & ~self.steady, np.maximum(self.open, P_JUMP_OCCLUDED), self.open)
+        return (probability * np.minimum(self.dt / self.frame_s, 1.0))[:, None] * self.largest
 
     def _hidden_excluded(self) -> bool:
         """Exclude jumps from gaps where the motion around is more likely without; whether from any more."""
         search, before = self._search(), int(self.steady.sum())
         ends = np.flatnonzero(np.diff(np.r_[False, search.hidden.any(axis=1), False]))
         for first, end in zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True):
+            if self.open[first:end].any():
+                continue
             part = search.part(self.t_s[first], self.t_s[end - 1])
             near, hidden = search.near(self.turns, part), search.hidden.copy()
             hidden[first:end] = 0.0
