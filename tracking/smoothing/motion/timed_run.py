@@ -13,7 +13,7 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from tracking.rigid_body.online_estimates import MANOEUVRE_S
 from tracking.smoothing.motion.clocks import solve_clocks
-from tracking.smoothing.motion.fixed_interval import Interval, RunInformation
+from tracking.smoothing.motion.fixed_interval import Interval, RunInformation, smoothed
 from tracking.smoothing.motion.instants import Instants, motion_at, usual_step
 from tracking.smoothing.motion.process_noise import (
     P_JUMP_OCCLUDED,
@@ -34,7 +34,7 @@ from tracking.smoothing.motion.run_detections import (
     WholeRun,
     first_variance,
 )
-from tracking.smoothing.motion.turns import TurnSearch, successions, velocity_jumps
+from tracking.smoothing.motion.turns import TurnSearch, successions, unresolved, velocity_jumps
 from tracking.smoothing.motion.whole_run import (
     CONVERGED_LOG_DENSITY,
     CONVERGED_SIGMAS,
@@ -166,7 +166,28 @@ class _TimedEstimator(_Estimator):
             at = self.ref, self.core.start
             weight = self.weight[self.core]
             self.clocks = solve_clocks(self.run, self.assigned, weight, at, info, np.exp(self.log_density))
+        out = self._with_unresolved(out)
         return replace(self._extrapolated(out), clocks=self.clocks, turns=tuple(self.turns))
+
+    def _with_unresolved(self, out: Interval) -> Interval:
+        """The covariances, where several turns resemble a smooth one, of that the motion has either, about the former."""
+        search, turns = self._search(), list(self.turns)
+        for some in unresolved(self.turns, self.frame_s):
+            one = search.one_for(some, turns)
+            if one is not None:
+                turns = sorted(
+                    [*(t for t in turns if not any(t is each for each in some)), one], key=lambda t: t.middle_s
+                )
+        if len(turns) == len(self.turns):
+            return out
+        jump, moment = velocity_jumps(turns, self.t_s)
+        jump = np.where(jump > 0, jump, search.hidden)
+        info = search.info._replace(velocity_jump=jump, acceleration_jump=jump / MANOEUVRE_S**2, moment=moment)
+        other = smoothed(self.ref, info, search.density, tested=False)
+        pose, motion = (x[:, :, None] * x[:, None] for x in (other.x[:, :6], other.x[:, 6:12]))
+        return out._replace(
+            pose_P=0.5 * (out.pose_P + other.pose_P + pose), motion_P=0.5 * (out.motion_P + other.motion_P + motion)
+        )
 
     def _passes(self, count: int, common: int = 0, adapting: bool = True) -> Interval:
         """Passes, of which the first `common` have one strength of the jerk; adapting: they estimate it."""

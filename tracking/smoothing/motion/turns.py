@@ -43,6 +43,12 @@ _CURVATURE_NATS = 0.5  # drop of the likelihood from which the sigma of the midd
 _CHANGED = 0.02, 0.1  # of a frame, and relative: less does not change a turn
 TURN_NATS = 3.0  # by which each turn must make a run more likely
 SUCCESSION_NATS = 10.0  # by which several must; a stronger jerk resembles them
+RESOLVED_NATS = 20.0  # by which turns must be more likely than one smooth turn in their place
+_UNRESOLVED = 4.0  # frames: turns farther apart do not resemble one
+_WIDTHS, _SIZES = (
+    np.array([1.0, 1.3, 1.7]),
+    (0.3, 1.0, 3.0, 10.0),
+)  # of their distance and variances: one in their place
 _CLOSE = 3.0  # frames between two turns in close succession
 _JERKS = 10.0 ** np.arange(-4, 2)  # of the jerk that changes the velocities as much within a frame
 
@@ -130,6 +136,21 @@ class TurnSearch:
                 best, most = density, nats
         needed = max(TURN_NATS * len(some), SUCCESSION_NATS if len(some) > 1 else 0.0)
         return best if most > self.nats(every, part, self.density) - needed else None
+
+    def one_for(self, some: Sequence[Turn], all_turns: Sequence[Turn]) -> Turn | None:
+        """One turn in place of some of all turns; None: the spots exclude it."""
+        begin, end = min(t.likely_begin_s for t in some), max(t.likely_end_s for t in some)
+        part = self.part(begin, end)
+        run = self.with_turns([t for t in self.near(all_turns, part) if not any(t is one for one in some)], part)
+        size = np.sum([t.size for t in some], axis=0)
+        tried = [
+            Turn(0.5 * (begin + end), length, length, factor * size)
+            for length in _WIDTHS * (end - begin)
+            for factor in _SIZES
+        ]
+        nats = [run.nats([one]) for one in tried]
+        most = run.nats([t._replace(length_s=t.likely_s) for t in some])
+        return tried[int(np.argmax(nats))] if max(nats) > most - RESOLVED_NATS else None
 
     def improved(self, turn: Turn, others: Sequence[Turn]) -> Turn | None:
         """The most likely turn in place of one; None: the run is as likely without it."""
@@ -235,6 +256,17 @@ class _WithTurns:
         moment[first:end] = moments[1:]
         info = self.info._replace(velocity_jump=jump, acceleration_jump=jump / MANOEUVRE_S**2, moment=moment)
         return float(log_likelihood_with(self.ref, info, self.density, self.filtered, first, end))
+
+
+def unresolved(turns: Sequence[Turn], frame_s: float) -> list[list[Turn]]:
+    """Groups of turns, by time, that may be one smooth turn."""
+    out = list[list[Turn]]()
+    for turn in turns:
+        if out and turn.middle_s - out[-1][0].middle_s < _UNRESOLVED * frame_s:
+            out[-1].append(turn)
+        else:
+            out.append([turn])
+    return [some for some in out if len(some) > 1]
 
 
 def successions(turns: Sequence[Turn], frame_s: float) -> list[list[Turn]]:
