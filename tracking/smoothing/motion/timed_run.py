@@ -170,7 +170,7 @@ class _TimedEstimator(_Estimator):
         return replace(self._extrapolated(out), clocks=self.clocks, turns=tuple(self.turns))
 
     def _with_unresolved(self, out: Interval) -> Interval:
-        """The covariances, where several turns resemble a smooth one, of that the motion has either, about the former."""
+        """The covariances, where several turns resemble a smooth one, of both, about the former."""
         search, turns = self._search(), list(self.turns)
         for some in unresolved(self.turns, self.frame_s):
             one = search.one_for(some, turns)
@@ -231,8 +231,8 @@ class _TimedEstimator(_Estimator):
     def _sized(self, turn: Turn, out: Interval) -> Turn:
         """One step of the fixed point of `next_log_density` for the variances of a turn."""
         steps = (self.t_s > turn.begin_s) & np.append(True, self.t_s[:-1] < turn.end_s)
-        energy, gamma = out.jump_energy[steps].sum(axis=0), out.jump_gamma[steps].sum(axis=0)
-        size = turn.size * (energy + PSEUDO_COUNT) / (np.maximum(gamma, 0.0) + PSEUDO_COUNT)
+        energy, gamma = out.jump_energy[steps].sum(), out.jump_gamma[steps].sum()
+        size = turn.size * (energy + PSEUDO_COUNT) / (max(gamma, 0.0) + PSEUDO_COUNT)
         return turn._replace(size=np.minimum(size, self.largest[steps].max(axis=0, initial=0.0)))
 
     def _add_turns(self, shock: Array) -> bool:
