@@ -48,6 +48,7 @@ FIRST_PASSES, LATER_PASSES = 14, 5  # with one strength of the jerk first, and a
 LAST_PASSES = 3  # of these, in which the strength of the jerk stays
 ROUNDS = 4  # of passes and improved turns
 EXCLUDED_NATS = 5.0  # by which a motion without a jump in a gap must be more likely
+FEWEST = 3  # turns in succession that a jerk may replace: two are the ends of one motion
 APART = 1.5  # frames: of shocks as close as this only the largest is a turn ...
 FIRST_LENGTH = 1.0  # frames: ... of this length at first
 
@@ -274,6 +275,8 @@ class _TimedEstimator(_Estimator):
         """
         found, search = False, self._search()
         for some in successions(self.turns, self.frame_s):
+            if len(some) < FEWEST:
+                continue
             first, end = np.searchsorted(self.t_s, [some[0].begin_s, max(t.end_s for t in some)])
             # Where few spots are left a strong jerk explains whatever contradicts itself.
             density = search.without(some, self.turns) if self.measured[max(first - 1, 0) : end + 1].all() else None
