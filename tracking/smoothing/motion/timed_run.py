@@ -315,14 +315,12 @@ class _TimedEstimator(_Estimator):
         search, before = self._search(), int(self.steady.sum())
         ends = np.flatnonzero(np.diff(np.r_[False, search.hidden.any(axis=1), False]))
         for first, end in zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True):
-            if self.open[first:end].any():
-                continue
             part = search.part(self.t_s[first], self.t_s[end - 1])
             near, hidden = search.near(self.turns, part), search.hidden.copy()
             hidden[first:end] = 0.0
             without = replace(search, hidden=hidden).nats(near, part, search.density)
             if without > search.nats(near, part, search.density) + EXCLUDED_NATS:
-                self.steady[first:end] = True
+                self.steady[first:end], self.open[first:end] = True, 0.0
         return int(self.steady.sum()) > before
 
     def _jumps(self) -> tuple[Array, Array]:
