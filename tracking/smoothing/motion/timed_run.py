@@ -162,6 +162,9 @@ class _TimedEstimator(_Estimator):
             if not (self._turns_improved(every=number == 0) or withdrawn):
                 break
             out = self._passes(LATER_PASSES, adapting=False)
+        else:  # no turn is left that has not been improved
+            self._turns_improved(every=False)
+            out = self._passes(LATER_PASSES, adapting=False, searching=False)
         if self.run.clocks is not None:
             info, _ = self._information(self.ref)
             at = self.ref, self.core.start
@@ -190,9 +193,11 @@ class _TimedEstimator(_Estimator):
             pose_P=0.5 * (out.pose_P + other.pose_P + pose), motion_P=0.5 * (out.motion_P + other.motion_P + motion)
         )
 
-    def _passes(self, count: int, common: int = 0, adapting: bool = True) -> Interval:
-        """Passes, of which the first `common` have one strength of the jerk; adapting: they estimate it."""
-        searching = True
+    def _passes(self, count: int, common: int = 0, adapting: bool = True, searching: bool = True) -> Interval:
+        """Passes, of which the first `common` have one strength of the jerk.
+
+        adapting: they estimate it; searching: they add turns.
+        """
         for number in range(count):
             before = self.ref
             out, moved = self._step(np.exp(self.log_density), True)

@@ -24,7 +24,7 @@ from tracking.smoothing.motion.fixed_interval import (
 )
 from tracking.smoothing.motion.run_detections import Reference, Turn, unknown_moments
 
-AROUND = 8  # frames on both sides of a turn that show it
+AROUND = 24  # frames on both sides of a turn that show it: 8 showed none of corners of slow motion
 LEAST_LENGTH = 0.02  # of a frame, twice _LAST_STEP: a longer one would round corners by more than the spots show
 _LONGEST = 6.0  # frames: a longer change of the velocities is jerk
 _LENGTHS = (LEAST_LENGTH, 1.0, 2.0, 4.0)  # frames: from which the search begins ...
