@@ -13,7 +13,7 @@ from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.rigid_body.models.motion import process_noise
 from tracking.smoothing.motion.instants import TOGETHER, Instants
 from tracking.smoothing.motion.run_detections import Delays, RunDetections, Turn, WholeRun
-from tracking.smoothing.motion.turns import TurnSearch, successions, velocity_jumps
+from tracking.smoothing.motion.turns import TurnSearch, successions, unresolved, velocity_jumps
 
 FRAMES, STEP = 40, 20  # that has the jump
 SIZE = np.array([0.45, 4.7])  # variances of the jump that `drawn` makes
@@ -23,8 +23,7 @@ def search_in(run: Run) -> TurnSearch:
     """The likelihood of turns in a run of poses, a frame every DT."""
     frames = len(run.info.dt)
     density = np.ascontiguousarray(run.jerk)
-    every = np.ones(frames, dtype=bool)
-    return TurnSearch(run.ref, run.info, density, np.zeros((frames, 2)), np.cumsum(run.info.dt), every, DT)
+    return TurnSearch(run.ref, run.info, density, np.zeros((frames, 2)), np.cumsum(run.info.dt), DT)
 
 
 def found_in(seed: int, share: float) -> tuple[Turn | None, float]:
@@ -46,17 +45,25 @@ def test_the_error_of_a_turn_is_as_stated_and_a_part_of_a_frame():
     assert all(turn.length_s < DT for turn, _ in known)
 
 
-def test_two_corners_are_wider_where_a_camera_has_no_picture_between_them():
-    """There they resemble one smooth turn."""
+def test_two_turns_may_be_one_smooth_turn_only_where_the_spots_do_not_exclude_it():
     search = search_in(drawn(8, FRAMES, jump_at=STEP, moment=0.5))
     middle = float(search.t_s[STEP] - 0.5 * DT)
-    turn, beside = Turn(middle, DT, DT, SIZE), Turn(middle + 2 * DT, DT, DT, 1e-4 * SIZE)
-    sharp = search.improved(turn, [beside])
-    vague = replace(search, complete=np.arange(FRAMES) != STEP + 1).improved(turn, [beside])
-    assert sharp is not None
-    assert vague is not None
-    assert sharp.middle_s == vague.middle_s
-    assert vague.length_s > 1.2 * sharp.length_s
+    turns = [Turn(middle, 0.1 * DT, 0.1 * DT, SIZE), Turn(middle + 2 * DT, 0.1 * DT, 0.1 * DT, 1e-4 * SIZE)]
+    assert unresolved(turns, DT) == [turns]
+    assert search.one_for(turns, turns) is None
+    information = search.info.information.copy()
+    information[STEP : STEP + 2] = 0.0
+    vector = np.where(information.any(axis=2), search.info.vector, 0.0)
+    less = replace(search, info=search.info._replace(information=information, vector=vector))
+    one = less.one_for(turns, turns)
+    assert one is not None
+    assert one.begin_s <= middle
+    assert one.end_s >= middle + 2 * DT
+
+
+def test_turns_far_apart_do_not_resemble_a_smooth_one():
+    turns = [Turn(k * DT, DT, DT, SIZE) for k in (5, 10, 12, 15.5, 20)]
+    assert unresolved(turns, DT) == [turns[1:3]]
 
 
 def test_a_settled_turn_stays_where_it_is():

@@ -135,7 +135,6 @@ class _TimedEstimator(_Estimator):
         """known: instants (F,) of frames that are measured, and of those near such frames."""
         self.frame_s, self.turns = frame_s, list(motion.turns)
         self.t_s = np.ascontiguousarray(instants.t_s[core])
-        self.complete = np.asarray(np.all(instants.run.detections.has_image, axis=1))[instants.frame[core]]
         self.continuous = np.zeros(len(self.t_s), dtype=bool)  # (F,) steps in which a jerk has replaced turns
         self.unobserved = _near_unobserved(known[1][core], self.t_s, frame_s)  # (F,) steps, of which ...
         self.steady = np.zeros(len(self.t_s), dtype=bool)  # (F,) ... these exclude a jump, ...
@@ -271,7 +270,7 @@ class _TimedEstimator(_Estimator):
     def _search(self) -> TurnSearch:
         info, _ = self._information(self.ref)
         density = np.exp(self.log_density)
-        return TurnSearch(self.ref, info, density, self._hidden(), self.t_s, self.complete, self.frame_s)
+        return TurnSearch(self.ref, info, density, self._hidden(), self.t_s, self.frame_s)
 
     def _turns_withdrawn(self) -> bool:
         """Replace turns by a stronger jerk where that explains the spots; whether any are.

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array
 from tracking.rigid_body.online_estimates import MANOEUVRE_S
 from tracking.smoothing.motion.fixed_interval import (
     Filtered,
@@ -33,9 +33,7 @@ _GRID = (0.25, 0.5)  # frames: ... and of shorter, and of longer turns the dista
 _FIRST_STEP, _LAST_STEP = 0.125, 0.01  # frames, of the search for the middle
 _LONGER = 1.5  # times, of that for the length
 _GAINED = 1e-3  # nats: less is rounding
-# By which a longer turn may be less likely: a turn is as long as the spots allow. Two corners resemble a smooth turn
-# where the spots in between are not those of all cameras.
-_AMBIGUOUS_NATS = (2.0, 8.0)
+_AMBIGUOUS_NATS = 2.0  # by which a longer turn may be less likely: a turn is as long as the spots allow
 _WIDER = 1.25  # times, in the search for that
 _SIGMAS = 2.0  # of the middle, as a sigma: the same spots show it and then the motion
 _WITH_IT = (-1.0, -0.5, 0.0, 0.5, 1.0)  # of the way of the middle: how far the turn beside it moves, too
@@ -43,7 +41,7 @@ _CURVATURE_NATS = 0.5  # drop of the likelihood from which the sigma of the midd
 _CHANGED = 0.02, 0.1  # of a frame, and relative: less does not change a turn
 TURN_NATS = 3.0  # by which each turn must make a run more likely
 SUCCESSION_NATS = 10.0  # by which several must; a stronger jerk resembles them
-RESOLVED_NATS = 20.0  # by which turns must be more likely than one smooth turn in their place
+RESOLVED_NATS = 40.0  # by which turns must be more likely than one smooth turn in their place
 _UNRESOLVED = 4.0  # frames: turns farther apart do not resemble one
 _WIDTHS, _SIZES = (
     np.array([1.0, 1.3, 1.7]),
@@ -86,7 +84,6 @@ class TurnSearch:
     density: Array  # (F, 6) of the jerk
     hidden: Array  # (F, 2) variances of jumps in steps that nothing observes
     t_s: Array  # (F,)
-    complete: Bools  # (F,) instants of frames with a picture of every camera
     frame_s: float
 
     def part(self, first_s: float, last_s: float) -> slice:
@@ -183,20 +180,14 @@ class TurnSearch:
             ways = (nearest._replace(middle_s=nearest.middle_s + share * (at - middle)) for share in _WITH_IT)
             return max(rest.nats([one, here]) for one in ways)
 
-        resembles = nearest is not None and not self._complete_between(nearest.middle_s, middle)
-        allowed, ambiguous = length, _AMBIGUOUS_NATS[int(resembles)]
-        while allowed < _LONGEST * frame and nats(middle, _WIDER * allowed) > most - ambiguous:
+        allowed = length
+        while allowed < _LONGEST * frame and nats(middle, _WIDER * allowed) > most - _AMBIGUOUS_NATS:
             allowed *= _WIDER
         sigma = _SIGMAS * self._sigma(profile, middle, allowed)
         spread = min(float(np.hypot(allowed, np.sqrt(12) * sigma)), _LONGEST * frame)
         moved = abs(middle - turn.middle_s) > _CHANGED[0] * frame
         settled = not moved and abs(spread - turn.length_s) < _CHANGED[1] * turn.length_s
         return Turn(middle, length, spread, turn.size, settled)
-
-    def _complete_between(self, one_s: float, other_s: float) -> bool:
-        """Whether every camera has pictures in all frames between two times, and beside them."""
-        first, end = np.searchsorted(self.t_s, [min(one_s, other_s) - self.frame_s, max(one_s, other_s) + self.frame_s])
-        return bool(self.complete[first:end].all())
 
     def _climbed(
         self, nats: Callable[[float, float], float], middle: float, length: float, farthest: float
