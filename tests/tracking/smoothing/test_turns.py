@@ -13,6 +13,7 @@ from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.rigid_body.models.motion import process_noise
 from tracking.smoothing.motion.instants import TOGETHER, Instants
 from tracking.smoothing.motion.run_detections import Delays, RunDetections, Turn, WholeRun
+from tracking.smoothing.motion.timed_run import _near_unobserved
 from tracking.smoothing.motion.turns import TurnSearch, successions, unresolved, velocity_jumps
 
 FRAMES, STEP = 40, 20  # that has the jump
@@ -191,3 +192,15 @@ def test_each_labelled_spot_is_at_its_own_instant_among_those_of_the_frames():
     assert found.keys() == expected.keys()
     for key, (at_s, blended) in expected.items():
         assert found[key] == (pytest.approx(at_s, abs=1e-12), blended)
+
+
+def test_a_jump_beside_a_gap_may_be_in_the_gap():
+    """Half-frame steps; the instants of frames 5 and 6 have no pose. The steps within a frame of these are open, too."""
+    t_s = 0.5 * DT * np.arange(24)
+    measured = (t_s < 4.9 * DT) | (t_s > 6.1 * DT)
+    steps = _near_unobserved(measured, t_s, DT)
+    begin = np.append(t_s[:1], t_s[:-1])
+    assert not steps[t_s < 4.4 * DT].any()
+    assert steps[(t_s > 4.9 * DT) & (begin < 7.4 * DT)].all()
+    assert not steps[begin > 7.6 * DT].any()
+    assert not _near_unobserved(np.ones(24, dtype=bool), t_s, DT).any()

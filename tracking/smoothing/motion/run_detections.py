@@ -474,16 +474,6 @@ class Turn(NamedTuple):
         """When it ends."""
         return self.middle_s + 0.5 * self.length_s
 
-    @property
-    def likely_begin_s(self) -> float:
-        """When it most likely begins."""
-        return self.middle_s - 0.5 * self.likely_s
-
-    @property
-    def likely_end_s(self) -> float:
-        """When it most likely ends."""
-        return self.middle_s + 0.5 * self.likely_s
-
 
 @dataclass(frozen=True, slots=True)
 class SmoothedMotion:

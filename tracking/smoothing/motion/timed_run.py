@@ -178,15 +178,10 @@ class _TimedEstimator(_Estimator):
         for some in unresolved(self.turns, self.frame_s):
             one = search.one_for(some, turns)
             if one is not None:
-                turns = sorted(
-                    [*(t for t in turns if not any(t is each for each in some)), one], key=lambda t: t.middle_s
-                )
+                turns = [*(t for t in turns if not any(t is each for each in some)), one]
         if len(turns) == len(self.turns):
             return out
-        jump, moment = velocity_jumps(turns, self.t_s)
-        jump = np.where(jump > 0, jump, search.hidden)
-        info = search.info._replace(velocity_jump=jump, acceleration_jump=jump / MANOEUVRE_S**2, moment=moment)
-        other = smoothed(self.ref, info, search.density, tested=False)
+        other = smoothed(*search.of_part(turns, slice(None)), search.density, tested=False)
         pose, motion = (x[:, :, None] * x[:, None] for x in (other.x[:, :6], other.x[:, 6:12]))
         return out._replace(
             pose_P=0.5 * (out.pose_P + other.pose_P + pose), motion_P=0.5 * (out.motion_P + other.motion_P + motion)

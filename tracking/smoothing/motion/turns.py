@@ -97,7 +97,7 @@ class TurnSearch:
         t_s = self.t_s[part]
         return [t for t in turns if t.end_s > t_s[0] and t.begin_s < t_s[-1]]
 
-    def _of_part(self, turns: Sequence[Turn], part: slice) -> tuple[Reference, RunInformation]:
+    def of_part(self, turns: Sequence[Turn], part: slice) -> tuple[Reference, RunInformation]:
         """A part of the run with some turns."""
         jump, moment = velocity_jumps(turns, self.t_s[part])
         jump = np.where(jump > 0, jump, self.hidden[part])
@@ -109,11 +109,11 @@ class TurnSearch:
 
     def nats(self, turns: Sequence[Turn], part: slice, density: Array) -> float:
         """Log-likelihood of a part of the run with this jerk (F, 6), up to a constant."""
-        return float(log_likelihood(*self._of_part(turns, part), np.ascontiguousarray(density[part])))
+        return float(log_likelihood(*self.of_part(turns, part), np.ascontiguousarray(density[part])))
 
     def with_turns(self, turns: Sequence[Turn], part: slice) -> _WithTurns:
         """A part of the run with turns to which others are added."""
-        (ref, some), density = self._of_part(turns, part), np.ascontiguousarray(self.density[part])
+        (ref, some), density = self.of_part(turns, part), np.ascontiguousarray(self.density[part])
         both = filtered(ref, some, density)
         return _WithTurns(tuple(turns), ref, some, density, self.hidden[part], self.t_s[part], both)
 
@@ -136,18 +136,14 @@ class TurnSearch:
 
     def one_for(self, some: Sequence[Turn], all_turns: Sequence[Turn]) -> Turn | None:
         """One turn in place of some of all turns; None: the spots exclude it."""
-        begin, end = min(t.likely_begin_s for t in some), max(t.likely_end_s for t in some)
-        part = self.part(begin, end)
+        short = [t._replace(length_s=t.likely_s) for t in some]
+        begin, end = min(t.begin_s for t in short), max(t.end_s for t in short)
+        part, size = self.part(begin, end), np.sum([t.size for t in some], axis=0)
         run = self.with_turns([t for t in self.near(all_turns, part) if not any(t is one for one in some)], part)
-        size = np.sum([t.size for t in some], axis=0)
-        tried = [
-            Turn(0.5 * (begin + end), length, length, factor * size)
-            for length in _WIDTHS * (end - begin)
-            for factor in _SIZES
-        ]
+        lengths = _WIDTHS * (end - begin)
+        tried = [Turn(0.5 * (begin + end), length, length, k * size) for length in lengths for k in _SIZES]
         nats = [run.nats([one]) for one in tried]
-        most = run.nats([t._replace(length_s=t.likely_s) for t in some])
-        return tried[int(np.argmax(nats))] if max(nats) > most - RESOLVED_NATS else None
+        return tried[int(np.argmax(nats))] if max(nats) > run.nats(short) - RESOLVED_NATS else None
 
     def improved(self, turn: Turn, others: Sequence[Turn]) -> Turn | None:
         """The most likely turn in place of one; None: the run is as likely without it."""
