@@ -195,7 +195,7 @@ def test_each_labelled_spot_is_at_its_own_instant_among_those_of_the_frames():
 
 
 def test_a_jump_beside_a_gap_may_be_in_the_gap():
-    """Half-frame steps; the instants of frames 5 and 6 have no pose. The steps within a frame of these are open, too."""
+    """Half-frame steps; frames 5 and 6 have no pose. The steps within a frame of these are open, too."""
     t_s = 0.5 * DT * np.arange(24)
     measured = (t_s < 4.9 * DT) | (t_s > 6.1 * DT)
     steps = _near_unobserved(measured, t_s, DT)
