@@ -173,14 +173,15 @@ class _TimedEstimator(_Estimator):
         return replace(self._extrapolated(out), clocks=self.clocks, turns=tuple(self.turns))
 
     def _with_unresolved(self, out: Interval) -> Interval:
-        """The covariances, where several turns resemble a smooth one, of both, about the former."""
+        """The covariances, where turns resemble others, of both motions about that with the former."""
+        if not self.turns:
+            return out
         search, turns = self._search(), list(self.turns)
         for some in unresolved(self.turns, self.frame_s):
             one = search.one_for(some, turns)
             if one is not None:
                 turns = [*(t for t in turns if not any(t is each for each in some)), one]
-        if len(turns) == len(self.turns):
-            return out
+        turns = [search.to_next_spots(turn) for turn in turns]
         other = smoothed(*search.of_part(turns, slice(None)), search.density, tested=False)
         pose, motion = (x[:, :, None] * x[:, None] for x in (other.x[:, :6], other.x[:, 6:12]))
         return out._replace(

@@ -145,6 +145,15 @@ class TurnSearch:
         nats = [run.nats([one]) for one in tried]
         return tried[int(np.argmax(nats))] if max(nats) > run.nats(short) - RESOLVED_NATS else None
 
+    def to_next_spots(self, turn: Turn) -> Turn:
+        """A turn that takes some frames, from the last spots before it to the first after it: its ends are smooth."""
+        if turn.likely_s < _SHORT * self.frame_s:
+            return turn
+        seen_s = self.t_s[np.any(self.info.vector, axis=1)]
+        first, end = np.searchsorted(seen_s, [turn.begin_s, turn.end_s]).tolist()
+        begin_s, end_s = seen_s[max(first - 1, 0)], seen_s[min(end, len(seen_s) - 1)]
+        return turn._replace(middle_s=0.5 * (begin_s + end_s), length_s=end_s - begin_s)
+
     def improved(self, turn: Turn, others: Sequence[Turn]) -> Turn | None:
         """The most likely turn in place of one; None: the run is as likely without it."""
         part, frame = self.part(turn.middle_s, turn.middle_s), self.frame_s
