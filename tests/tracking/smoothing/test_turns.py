@@ -67,6 +67,19 @@ def test_turns_far_apart_do_not_resemble_a_smooth_one():
     assert unresolved(turns, DT) == [turns[1:3]]
 
 
+def test_a_turn_that_takes_some_frames_may_begin_and_end_between_spots():
+    search = search_in(drawn(8, FRAMES))
+    vector = search.info.vector.copy()
+    vector[[STEP - 3, STEP + 3]] = 0.0
+    search = replace(search, info=search.info._replace(vector=vector))
+    turn = Turn(float(search.t_s[STEP]), 5.0 * DT, 5.0 * DT, SIZE)
+    wider = search.to_next_spots(turn)
+    assert (wider.begin_s, wider.end_s) == pytest.approx((search.t_s[STEP - 4], search.t_s[STEP + 4]))
+    assert search.to_next_spots(turn._replace(likely_s=0.1 * DT)).length_s == turn.length_s
+    beyond = turn._replace(middle_s=float(search.t_s[-1]) + 5 * DT)
+    assert search.to_next_spots(beyond).length_s >= beyond.length_s
+
+
 def test_a_settled_turn_stays_where_it_is():
     run = drawn(3, FRAMES, jump_at=STEP, moment=0.3)
     search = search_in(run)

@@ -151,7 +151,8 @@ class TurnSearch:
             return turn
         seen_s = self.t_s[np.any(self.info.vector, axis=1)]
         first, end = np.searchsorted(seen_s, [turn.begin_s, turn.end_s]).tolist()
-        begin_s, end_s = seen_s[max(first - 1, 0)], seen_s[min(end, len(seen_s) - 1)]
+        begin_s = min(float(seen_s[max(first - 1, 0)]), turn.begin_s)
+        end_s = max(float(seen_s[min(end, len(seen_s) - 1)]), turn.end_s)
         return turn._replace(middle_s=0.5 * (begin_s + end_s), length_s=end_s - begin_s)
 
     def improved(self, turn: Turn, others: Sequence[Turn]) -> Turn | None:
