@@ -258,6 +258,13 @@ OUTLIER_SIGMAS = 6.0  # of a residual, above which a spot pulls no more (Huber 1
 
 
 @compiled
+def _pull(w0: float, w1: float, w2: float, u: float, v: float) -> tuple[float, float]:
+    """How many sigmas a residual u, v, px, of this weight is, and the share of the weight that it has."""
+    far = np.sqrt(w0 * u * u + 2 * w1 * u * v + w2 * v * v)
+    return far, min(1.0, OUTLIER_SIGMAS / max(far, 1e-300))
+
+
+@compiled
 def delayed_information(
     views: Views,
     detections: RunDetections,
@@ -286,8 +293,7 @@ def delayed_information(
             )
             if projected:
                 u, v = uv[i, 0] - at[0], uv[i, 1] - at[1]
-                far = np.sqrt(w0 * u * u + 2 * w1 * u * v + w2 * v * v)
-                share = min(1.0, OUTLIER_SIGMAS / max(far, 1e-300))
+                far, share = _pull(w0, w1, w2, u, v)
                 add_spot(L[k], g[k], J, share * w0, share * w1, share * w2, u, v)
                 chi2[k] += share * far**2 * (2.0 - share)
     return L, g, chi2
@@ -323,12 +329,13 @@ def timed_rows(
             )
             if not projected:
                 continue
-            W[k, i, 0, 0], W[k, i, 0, 1], W[k, i, 1, 0], W[k, i, 1, 1] = w0, w1, w1, w2
             row[k, i] = uv[i, 1]
             for a in range(2):
                 e[k, i, a], speed[k, i, a] = uv[i, a] - at[a], moving[a]
                 for j in range(6):
                     H[k, i, a, j] = J[a, j]
+            _, share = _pull(w0, w1, w2, e[k, i, 0], e[k, i, 1])
+            W[k, i, 0, 0], W[k, i, 0, 1], W[k, i, 1, 0], W[k, i, 1, 1] = share * w0, share * w1, share * w1, share * w2
     return e, W, H, speed, row
 
 
