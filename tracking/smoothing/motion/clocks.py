@@ -21,6 +21,7 @@ from tracking.smoothing.motion.run_detections import (
 )
 
 DETERMINED = 0.3  # of the prior's sigma: a number whose sigma is larger keeps its prior
+_ROUNDING = 30.0  # times the error of the smallest eigenvalue: less is rounding
 _CHUNK = 512  # frames whose rows are in memory at once
 
 
@@ -41,6 +42,20 @@ def _with_priors(S: Array, right: Array, kept: Bools, clocks: UnknownClocks) -> 
     covariance[np.ix_(found, kept)] = -gain @ prior
     covariance[np.ix_(kept, found)] = -prior @ gain.T
     return correction, 0.5 * (covariance + covariance.T)
+
+
+def _beyond_rounding(S: Array, right: Array, clocks: UnknownClocks) -> tuple[Array, Array]:
+    """The equations S (p, p), right (p,), where what the run adds to the prior is rounding only the prior's.
+
+    S is a small difference of large numbers where the motion is free to follow the spots. Without rounding no
+    eigenvalue is below that of the prior: how far the smallest one is shows how large it is.
+    """
+    size = clocks.sigma_s
+    values, vectors = np.linalg.eigh(size[:, None] * 0.5 * (S + S.T) * size)
+    known = values > 1.0 + _ROUNDING * max(1.0 - float(values[0]), 0.0)
+    along = vectors.T @ np.column_stack([size * right, clocks.mean_s / size])
+    S = (vectors * np.where(known, values, 1.0)) @ vectors.T / size[:, None] / size
+    return 0.5 * (S + S.T), vectors @ np.where(known, along[:, 0], along[:, 1]) / size
 
 
 def solve_clocks(
@@ -80,7 +95,8 @@ def solve_clocks(
     precision = np.diag(1 / clocks.sigma_s**2)
     S = C - np.einsum("kis,kit->st", B, G[:, :6]) + precision
     right = b - np.einsum("kis,ki->s", B, x[:, :6]) + precision @ clocks.mean_s
-    noise = np.linalg.inv(0.5 * (S + S.T))
+    S, right = _beyond_rounding(S, right, clocks)
+    noise = np.linalg.inv(S)
     kept = np.sqrt(np.diagonal(noise)) >= DETERMINED * clocks.sigma_s
     correction, noise = _with_priors(S, right, kept, clocks)
     systematic = np.zeros((p, p))

@@ -165,9 +165,16 @@ class _TimedEstimator(_Estimator):
             self._turns_improved(every=False)
             out = self._passes(LATER_PASSES, adapting=False, searching=False)
         if self.run.clocks is not None:
+            # The moments of turns were found with the present clocks: their spots would confirm these.
+            outside = np.ones(len(self.t_s))
+            for turn in self.turns:
+                begin, end = turn.begin_s - self.frame_s, turn.end_s + self.frame_s
+                outside[(self.t_s > begin) & (self.t_s < end)] = 0.0
             info, _ = self._information(self.ref)
+            L, g = info.information * outside[:, None, None], info.vector * outside[:, None]
+            info = info._replace(information=L, vector=g)
             at = self.ref, self.core.start
-            weight = self.weight[self.core]
+            weight = self.weight[self.core] * outside
             self.clocks = solve_clocks(self.run, self.assigned, weight, at, info, np.exp(self.log_density))
         out = self._with_unresolved(out)
         return replace(self._extrapolated(out), clocks=self.clocks, turns=tuple(self.turns))
