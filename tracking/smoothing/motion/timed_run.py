@@ -168,8 +168,7 @@ class _TimedEstimator(_Estimator):
             # The moments of turns were found with the present clocks: their spots would confirm these.
             outside = np.ones(len(self.t_s))
             for turn in self.turns:
-                begin, end = turn.begin_s - self.frame_s, turn.end_s + self.frame_s
-                outside[(self.t_s > begin) & (self.t_s < end)] = 0.0
+                outside[(self.t_s > turn.begin_s) & (self.t_s < turn.end_s)] = 0.0
             info, _ = self._information(self.ref)
             L, g = info.information * outside[:, None, None], info.vector * outside[:, None]
             info = info._replace(information=L, vector=g)
