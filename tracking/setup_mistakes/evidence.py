@@ -20,7 +20,7 @@ from tracking.detections import Detections
 from tracking.labelling.points import NO_POINT
 from tracking.labelling.search import Labelling, candidate_labellings
 from tracking.parameters import LabelParameters
-from tracking.resting_points import NOWHERE, at_places, resting_places
+from tracking.resting_points import NOWHERE, Three, at_places, resting_places
 from tracking.setup_mistakes.possible import FEW_POSES, HERE, Block, Mistake, possible_mistakes
 
 # How well a rig explains sampled frames of a recording, and which mistake explains them better.
@@ -212,9 +212,15 @@ def _without_resting(blocks: Sequence[Block], min_spots: int) -> Sequence[Block]
     spots, or one of theirs.
     """
     names = {name for block in blocks for name in block[HERE]}
-    seen = {name: [block[HERE][name].uv_px for block in blocks if name in block[HERE]] for name in names}
+    seen = {name: [_with_neighbours(block, name) for block in blocks if name in block[HERE]] for name in names}
     places = resting_places(seen, min_spots, RESTING)
     return [[_elsewhere(frame, places) for frame in block] for block in blocks]
+
+
+def _with_neighbours(block: Block, name: str) -> Three:
+    """A camera's points in a frame, and in those before and after it."""
+    before, here, after = (block[k].get(name, Detections.none()).uv_px for k in (0, HERE, -1))
+    return before, here, after
 
 
 def _elsewhere(frame: Mapping[str, Detections], places: Mapping[str, Array]) -> dict[str, Detections]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, evenly_spread
 from lab.errors import InputError
 from lab.files.text.csv_text import Table, is_whole, read_table
 from lab.number_format import format_count
@@ -43,6 +43,12 @@ class CameraPoints:
         if i == len(self.frames) or self.frames[i] != frame:
             return Detections.none()
         return self.points[slice(int(self.starts[i]), int(self.starts[i + 1]))]
+
+    def spread(self, most: int) -> list[tuple[Array, Array, Array]]:
+        """The points (n, 2), px, of so many frames spread over the recording, each with those before and after it."""
+        rows = evenly_spread(np.arange(1, len(self.frames) - 1), most)
+        uv = np.split(self.points.uv_px, self.starts[1:-1])
+        return [(uv[i - 1], uv[i], uv[i + 1]) for i in rows]
 
     def has_only_unusable_rows(self, frame: int) -> bool:
         """Whether a frame has rows, none of them usable."""

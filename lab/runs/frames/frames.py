@@ -17,7 +17,7 @@ from typing import IO, Any, TypeAlias
 
 import numpy as np
 
-from geometry.arrays import Bools, Ints, evenly_spread
+from geometry.arrays import Bools, Ints
 from lab.errors import InputError
 from lab.files.run.clocks import CameraClock, picture_numbers
 from lab.files.run.detections_file import CameraPoints, DetectionsFile, is_too_sparse, read_detections, stray_frames
@@ -243,9 +243,7 @@ class FrameReader:
     def _mark_resting(self) -> None:
         """Mark the points of tables that are at rest in the whole recording while others move."""
         known = {name: table.cameras[name] for name, table in self._tables.items() if name in table.cameras}
-        some = {
-            name: [own.at(int(k)).uv_px for k in evenly_spread(own.frames, _SAMPLED)] for name, own in known.items()
-        }
+        some = {name: own.spread(_SAMPLED) for name, own in known.items()}
         if any(len(frames) < _FEWEST for frames in some.values()):
             return
         places = resting_places(some, self._run.tracker.labels.min_spots, _RESTING)
