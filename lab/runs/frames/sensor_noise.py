@@ -109,7 +109,8 @@ class CameraNoise:
 
     def look_for_wide(self, pictures: Sequence[Picture], parameters: DetectParameters) -> None:
         """Find out whether most of these pictures, without a background, show a light that max_sigma_px excludes."""
-        found = [overlooked_lights(p, parameters, self.model, self.detect(p, parameters)) for p in pictures]
+        narrow = without_wide(parameters)
+        found = [overlooked_lights(p, parameters, self.model, self._search(p, narrow, self.model)) for p in pictures]
         widest = [float(lights.major_px.max(initial=0.0)) for lights in found]
         self.too_wide_px = float(np.median(widest)) if widest else 0.0
 
