@@ -277,7 +277,8 @@ def _light_at(seen: Exposures, found: Sequence[Detections], rows: Sequence[Ints]
     others = [d[~inside(box[None], d)] for d in found]
     reach = [np.column_stack([d.uv_px, ON_LIGHT[0] * d.major_px + ON_LIGHT[1]]) for d in others]
     beside = np.concatenate([np.zeros((0, 3)), *reach])
-    light = _Light(seen, np.array(every), np.tile(middle, (len(found), 1)), width, height, shown[:0], box, beside)
+    at = np.tile(middle, (len(found), 1))
+    light = _Light(seen, np.array(every), at, width, height, shown[:0], box, beside)
     uv, values, _, _ = light._around(_AROUND * width, 1)
     if not len(uv):
         return None
@@ -294,11 +295,11 @@ def _light_at(seen: Exposures, found: Sequence[Detections], rows: Sequence[Ints]
     # the places found. What is found of a light that the mean contains is fainter than the light.
     moment = (values - values.mean(axis=0)) @ (uv - middle)
     known, found_at = moment[shown[true]], places[true] - middle
-    light.places[:] += moment * np.sum(known * found_at) / max(np.sum(known**2), 1e-9)
-    light.places[shown[true]] = places[true]
+    at = middle + moment * np.sum(known * found_at) / max(np.sum(known**2), 1e-9)
+    at[shown[true]] = places[true]
     empty = lacks & gone
     empty[shown] = False
-    return replace(light, there=np.flatnonzero(there), places=light.places[there], empty=np.flatnonzero(empty))
+    return replace(light, there=np.flatnonzero(there), places=at[there], empty=np.flatnonzero(empty))
 
 
 def _lacking(seen: Exposures, shown: Sequence[int] | Ints, place: Array, width: float) -> Array:

@@ -45,17 +45,17 @@ class WideLights:
 
         None: it makes no background of them, or nothing wide changes and max_sigma_px admits nothing wide.
         """
-        every = replace(parameters, max_sigma_px=_WIDEST_PX)
+        every = for_squares(replace(parameters, max_sigma_px=_WIDEST_PX), pictures[0])
         of_sums = noise_of_squares(replace(model, correlation=_UNMODELLED * model.correlation), pictures[0])
         squares = [squares_of(p) for p in pictures]
         if parameters.max_sigma_px <= WIDE_PX and not _changes_widely(squares, of_sums):
             return None
-        background = make(squares, of_sums, _NO_TEXTURE, for_squares(every, pictures[0]), False, True)
+        background = make(squares, of_sums, _NO_TEXTURE, every, False, True)
         if background is None:
             return None
         excluded = Detections.none()
         for picture, sums in zip(pictures, squares, strict=True):
-            parts = background.parts(sums, for_squares(every, picture), _NO_TEXTURE)
+            parts = background.parts(sums, every, _NO_TEXTURE)
             moving = Detections.none() if parts is None else of_squares(parts[0], picture)
             excluded = excluded.joined(moving[moving.major_px > parameters.max_sigma_px][:1], len(pictures))
         often = len(excluded) > MOSTLY * len(pictures)

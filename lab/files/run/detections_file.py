@@ -46,9 +46,12 @@ class CameraPoints:
 
     def spread(self, most: int) -> list[tuple[Array, Array, Array]]:
         """The points (n, 2), px, of so many frames spread over the recording, each with those before and after it."""
-        rows = evenly_spread(np.arange(1, len(self.frames) - 1), most)
-        uv = np.split(self.points.uv_px, self.starts[1:-1])
-        return [(uv[i - 1], uv[i], uv[i + 1]) for i in rows]
+        uv, starts = self.points.uv_px, self.starts
+        out = []
+        for i in evenly_spread(np.arange(1, len(self.frames) - 1), most):
+            first, here, after, end = starts[i - 1 : i + 3]
+            out.append((uv[first:here], uv[here:after], uv[after:end]))
+        return out
 
     def has_only_unusable_rows(self, frame: int) -> bool:
         """Whether a frame has rows, none of them usable."""
