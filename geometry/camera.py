@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from geometry import lens
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array, Bools, skew
 from geometry.pose import Pose
 
 PERSPECTIVE, FISHEYE = "perspective", "fisheye"
@@ -74,15 +74,28 @@ class Camera:
     def rays(self, pixels: Array) -> tuple[Array, Array]:
         """Origins (3,), m, and unit directions (..., 3), both in world, of distorted pixels (..., 2)."""
         pixels = np.asarray(pixels, dtype=float)
+        world = self._towards(pixels) @ self.camera_from_world.rotation  # rows times R = R^T x
+        world /= np.linalg.norm(world, axis=1, keepdims=True)
+        return self.camera_from_world.inverse().translation, world.reshape(*pixels.shape[:-1], 3)
+
+    def _towards(self, pixels: Array) -> Array:
+        """(n, 3): points in the camera frame, at z = 1, of distorted pixels (..., 2)."""
         fx, fy, cx, cy = pinhole_numbers(self)
         distorted = (pixels - [cx, cy]) / [fx, fy]
         flat = lens.undistort(
             distorted.reshape(-1, 2), lens.padded(self.distortion), self.fold_r2, self.lens == FISHEYE
         )
-        xyz = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
-        world = xyz @ self.camera_from_world.rotation  # rows times R = R^T x
-        world /= np.linalg.norm(world, axis=1, keepdims=True)
-        return self.camera_from_world.inverse().translation, world.reshape(*pixels.shape[:-1], 3)
+        return np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+
+    def by_turns(self, pixels: Array) -> Array:
+        """(n, 2, 3), px/rad: d(pixel)/d(rotation vector) of what distorted pixels (n, 2) show, in the camera frame.
+
+        The rotation is that of the scene about the camera: that of the camera has the opposite sign. nan beyond the
+        fold.
+        """
+        points = self._towards(np.asarray(pixels, dtype=float))
+        J = project_points(points, *self.lens_numbers)[1]
+        return np.asarray(-J @ skew(points))
 
     def sees(self, pixels: Array, margin_px: float = 0.0) -> Bools:
         """Whether pixels (..., 2) lie in the picture, or at most `margin_px` outside it; False for nan."""

@@ -38,6 +38,15 @@ class RigCovariance:
     matrix: Array  # (p, p), in the parameters' units; may be singular
 
 
+def with_variances(covariance: RigCovariance | None, variances: Mapping[str, float]) -> RigCovariance:
+    """A covariance of a rig, or of an exact one, with more variance of some parameters, in their units squared."""
+    names, matrix = ((), np.zeros((0, 0))) if covariance is None else (covariance.names, covariance.matrix)
+    new = tuple(name for name in variances if name not in names)
+    every = (*names, *new)
+    wider = np.pad(matrix, (0, len(new))) + np.diag([variances.get(name, 0.0) for name in every])
+    return RigCovariance(every, wider)
+
+
 def distortion_names(camera: Camera) -> tuple[str, ...]:
     """The names of a camera's distortion coefficients, in order."""
     names = FISHEYE_DISTORTION if camera.lens == FISHEYE else DISTORTION

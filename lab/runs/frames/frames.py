@@ -24,7 +24,7 @@ from lab.files.run.detections_file import CameraPoints, DetectionsFile, is_too_s
 from lab.files.run.run_file import FramesFolder, LiveDevice, Run, VideoFile
 from lab.files.text.error_text import suggest_name
 from lab.number_format import format_count
-from lab.pictures.picture_file import DROPPED, UNREADABLE, GreyPicture, MissingPicture
+from lab.pictures.picture_file import DROPPED, REPEATED, UNREADABLE, GreyPicture, MissingPicture
 from lab.pictures.source import PictureFiles, PictureSource, Video, list_folder, pictures, video_at
 from lab.runs.frames.moments import Moment, plan_moments
 from tracking.detections import Detections
@@ -55,6 +55,10 @@ class _MissingFrames:
 
     count: int = 0
     first: list[int] = field(default_factory=list)  # the first NAMED of them
+
+
+_COMPARED = 4  # every such row of two pictures is compared
+_CHANGED = 0.01  # share of the pixels that change from picture to picture by noise: by spots that move fewer do
 
 
 class FrameReader:
@@ -155,7 +159,7 @@ class FrameReader:
         numbers = count(self.first) if last is None else range(self.first, last + 1)
         if name in self._sources:
             size_px = self._run.rig.cameras[name].image_size_px
-            return pictures(self._sources[name], size_px, wanted=numbers)
+            return without_repeats(pictures(self._sources[name], size_px, wanted=numbers))
         table = self._tables[name]
         return ((frame, points_at(table, name, frame, table.first, table.last)) for frame in numbers)
 
@@ -295,6 +299,28 @@ class FrameReader:
                 missing.count += 1
                 if len(missing.first) < NAMED:
                     missing.first.append(frame)
+
+
+def without_repeats(stream: Generator[tuple[int, Any], None, None]) -> Generator[tuple[int, Any], None, None]:
+    """Numbered pictures; those that repeat the one before are missing.
+
+    A grabber or a converter of videos that has no new picture often gives the last one again, with the spots of an
+    earlier instant. Pictures of a sensor differ by its noise everywhere. Those without noise, of a simulation or a
+    compressed video, may be equal while all is at rest: of such a camera no picture counts as a repeat.
+    """
+    before, noisy = np.zeros(0), False
+    with closing(stream):
+        for number, picture in stream:
+            if isinstance(picture, MissingPicture):
+                yield number, picture
+                continue
+            some = picture[::_COMPARED].copy()
+            changed = 0.0 if some.shape != before.shape else float(np.mean(some != before))
+            if noisy and changed == 0.0 and some.shape == before.shape:
+                yield number, MissingPicture(REPEATED)
+                continue
+            noisy, before = changed > _CHANGED, some
+            yield number, picture
 
 
 def recorded_pictures(camera: str, source: FramesFolder | VideoFile) -> PictureSource:
@@ -440,7 +466,8 @@ class ClockedFrames(FrameReader):
         if name in self._sources and self._found is not None:
             return self._found.of(name)
         if name in self._sources:
-            return pictures(self._sources[name], self._run.rig.cameras[name].image_size_px, wanted=numbers)
+            size_px = self._run.rig.cameras[name].image_size_px
+            return without_repeats(pictures(self._sources[name], size_px, wanted=numbers))
         table = self._tables[name]
         own = self._own_times(name)
         first, last = (table.first, table.last) if own is None else (int(own[0]), int(own[-1]))

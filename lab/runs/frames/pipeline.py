@@ -13,6 +13,7 @@ from geometry.arrays import Array, Ints
 from geometry.forward_model import SpotModel
 from geometry.light_centroid import CentroidOffsets
 from geometry.pose_prior import PosePrior
+from geometry.uncertainty.rig_uncertainty import with_variances
 from lab.files.run.run_file import DetectionsTable, Run
 from lab.pictures.picture_file import GreyPicture, MissingPicture
 from lab.runs.frames.frames import FoundPoints, FrameSet, open_frames
@@ -129,6 +130,10 @@ class Pipeline:
             from lab.runs.frames.sensor_noise import camera_noises  # with the detection and OpenCV, 50 ms
 
             noise = camera_noises(run, reader)
+            moving = {name: own.motion.mean_variance_px2 for name, own in noise.items() if own.motion is not None}
+            if moving:  # the rig is that of cameras in their mean attitudes
+                more = {f"cameras.{name}.{at}": variance for name, variance in moving.items() for at in ("cx", "cy")}
+                run = replace(run, covariance=with_variances(run.covariance, more))
         return Pipeline(run, reader, tracker_of(run), noise)
 
     @property

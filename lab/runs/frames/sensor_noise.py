@@ -6,16 +6,18 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from geometry.arrays import evenly_spread
-from geometry.camera import SensorNoise
+from geometry.camera import Camera, SensorNoise
 from lab.files.run.run_file import Run
 from lab.pictures import source as picture_source
 from lab.pictures.source import PictureFiles, PictureSource, pictures_of_frames
 from lab.runs.frames.frames import FrameReader
+from tracking.background.camera_motion import CameraMotion
 from tracking.background.estimation import PICTURES, static_background
 from tracking.background.static_background import StaticBackground
 from tracking.background.wide_lights import WideLights
@@ -36,10 +38,15 @@ from tracking.noise_estimation.texture import is_limited_by_texture
 from tracking.parameters import DetectParameters
 
 VIDEO_PICTURES = (0, 1, 8, 9, 16, 17)  # used for the estimate: the end of a video cannot be read without all of it
+MOTION_PICTURES = 100  # whose mean attitude a camera that moves is taken to have been calibrated in
 VIDEO_FRAMES = 60  # at the start of a video from which its static background is made
 _BLANK = 3  # consecutive pictures without any point after which the noise model is checked
 _BLANK_AGAIN = 50  # it is checked again after this many more
 _CONTRADICTION = 2.0  # ratio of the stated to the estimated background variance from which a note is made
+
+
+def _called(function: Callable[..., Any], *given: Any) -> Any:
+    return function(*given)
 
 
 @dataclass(slots=True)
@@ -49,11 +56,13 @@ class CameraNoise:
     camera: str
     stated: SensorNoise | None = None
     notes: list[str] = field(default_factory=list)
+    optics: Camera | None = None  # calibrated: its rotations from picture to picture are measured
     estimate: NoiseEstimate | None = field(default=None, init=False)
     mosaic: float = field(default=0.0, init=False)  # contrast of a colour mosaic in the pictures; 0: there is none
     model: NoiseModel | None = field(
         default=None, init=False
     )  # in use; None before the first estimate if none is stated
+    motion: CameraMotion | None = field(default=None, init=False)  # None: the camera does not move, or none is seen
     background: StaticBackground | None = field(default=None, init=False)  # for faint spots; None: not used
     wide: WideLights | None = field(default=None, init=False)  # None: sums of pixels have no background
     too_wide_px: float = field(default=0.0, init=False)  # sigma of a light that max_sigma_px excludes; 0: none
@@ -96,16 +105,34 @@ class CameraNoise:
         return self.model is not None and is_limited_by_texture(self.model)
 
     def make_background(
-        self, pictures: Sequence[Picture], parameters: DetectParameters,
-        make: Callable[..., StaticBackground | None] = static_background,
-    ) -> None:  # fmt: skip
-        """Make the static background of pictures spread over the recording, if that shows more or spares fits."""
+        self, pictures: Sequence[Picture], parameters: DetectParameters, call: Callable[..., Any] = _called
+    ) -> None:
+        """Make the static background of pictures spread over the recording, if that shows more or spares fits.
+
+        call: calls a function with arguments, maybe in another process.
+        """
         if pictures and self.model is not None and self.estimate is not None:
             usual = self._with_saturation(parameters, pictures[0])
-            self.wide = WideLights.of(pictures, self.model, usual, make)
-            self.too_wide_px = 0.0 if self.wide is None else self.wide.excluded_px
+            motion = None
+            if self.optics is not None:
+                motion = call(CameraMotion.of, pictures, self.optics, self.model, without_wide(usual))
+            if motion is not None:
+                clips = saturation_of(usual, pictures[0])
+                pictures = [still for p in pictures if (still := motion.stilled(p, clips)[0]) is not None]
+            wide = WideLights.of(pictures, self.model, usual, partial(call, static_background))
+            self.too_wide_px = 0.0 if wide is None else wide.excluded_px
             shift, others_move = self.estimate.texture_shift, self.too_wide_px > 0
-            self.background = make(pictures, self.model, shift, without_wide(usual), others_move)
+            background = call(static_background, pictures, self.model, shift, without_wide(usual), others_move)
+            self.motion, self.wide, self.background = motion, wide, background
+
+    def follow_motion(self, pictures: Sequence[Picture], parameters: DetectParameters) -> None:
+        """Find the mean attitude of a camera that moves in these pictures, and note that it does."""
+        if self.motion is not None and pictures:
+            self.motion = self.motion.with_mean_of(pictures, self.saturation_dn(pictures[0], parameters))
+            self.notes.append(
+                f"{self.camera}: the camera moves by {self.motion.rms_px:.2g} px (rms) from picture to picture; its"
+                " spots are corrected by what stands still in its pictures. Check its mount and the floor"
+            )
 
     def look_for_wide(self, pictures: Sequence[Picture], parameters: DetectParameters) -> None:
         """Find out whether most of these pictures, without a background, show a light that max_sigma_px excludes."""
@@ -118,6 +145,13 @@ class CameraNoise:
         """The points of one picture. After pictures without any point the noise is estimated again."""
         if self.model is None:
             self.estimate_from([picture])
+        if self.motion is None:
+            return self._points_in(picture, parameters)
+        still, turn = self.motion.stilled(picture, self.saturation_dn(picture, parameters))
+        return self.motion.corrected(self._points_in(picture if still is None else still, parameters), turn)
+
+    def _points_in(self, picture: Picture, parameters: DetectParameters) -> Detections:
+        """Those of a picture in which the camera stands still."""
         if parameters.max_sigma_px <= WIDE_PX:
             return self._spots_in(picture, parameters)
         usual = self._with_saturation(parameters, picture)
@@ -151,6 +185,7 @@ class CameraNoise:
             out = _scalars(self.model)
             out["source"] = "pictures" if self.stated is None or self._overruled else "rig"
             out["background_pictures"] = 0 if self.background is None else self.background.pictures
+            out["camera_motion_px"] = 0.0 if self.motion is None else self.motion.rms_px
         if self.estimate is not None:
             seen = asdict(replace(self.estimate, model=replace(self.estimate.model, local_texture=None)))
             del seen["model"]
@@ -222,7 +257,8 @@ def _scalars(model: NoiseModel) -> dict[str, Any]:
 
 def camera_noises(run: Run, reader: FrameReader) -> dict[str, CameraNoise]:
     """Each camera's noise at the start of a run; cameras with tables of points have no entry."""
-    out = {name: CameraNoise(name, own.noise) for name, own in run.rig.cameras.items() if name in reader.sources}
+    cameras = {name: own for name, own in run.rig.cameras.items() if name in reader.sources}
+    out = {name: CameraNoise(name, own.noise, optics=own) for name, own in cameras.items()}
     with ThreadPoolExecutor(picture_source.THREADS) as pool:  # each camera takes up to 40 pictures of memory
         list(pool.map(lambda own: _prepare(own, run, reader.sources[own.camera]), out.values()))
     share_texture(list(out.values()))
@@ -243,6 +279,10 @@ def _prepare(noise: CameraNoise, run: Run, source: PictureSource) -> None:
         shown |= pictures_of_frames(source, [k for k in wanted if k not in shown], size_px)
         spread = [shown[k] for k in wanted]
         noise.make_background([p for p in spread if isinstance(p, np.ndarray)], run.tracker.detect)
+        if noise.motion is not None:
+            numbers = source.numbers if isinstance(source, PictureFiles) else np.arange(VIDEO_FRAMES)
+            every = pictures_of_frames(source, evenly_spread(numbers, MOTION_PICTURES).tolist(), size_px).values()
+            noise.follow_motion([p for p in every if isinstance(p, np.ndarray)], run.tracker.detect)
     else:
         noise.look_for_wide(pictures[::2], run.tracker.detect)
     if isinstance(source, PictureFiles):

@@ -23,7 +23,6 @@ from lab.cycle_search import search_rarely
 from lab.pictures.picture_file import GreyPicture
 from lab.runs.frames.sensor_noise import VIDEO_FRAMES, CameraNoise
 from tracking.background.estimation import PICTURES
-from tracking.background.static_background import StaticBackground
 from tracking.parameters import DetectParameters
 
 _SPACING = VIDEO_FRAMES // PICTURES  # pictures from one that is kept to the next, at first
@@ -111,7 +110,7 @@ class LiveBackground:
 
     noise: CameraNoise
     parameters: DetectParameters
-    make: Callable[..., StaticBackground | None]  # from the arguments of `static_background`
+    call: Callable[..., Any]  # of a function with arguments, in another process
     has_time: Callable[[], bool] = lambda: True  # whether a better one may be made: not while pictures wait
     at_once: bool = False  # without a background pictures come faster than they are searched
     _kept: list[GreyPicture] = field(default_factory=list)
@@ -154,7 +153,7 @@ class LiveBackground:
 
     def _make(self, pictures: list[GreyPicture]) -> None:
         with suppress(*ENDED):  # the earlier background stays
-            self.noise.make_background(pictures, self.parameters, self.make)
+            self.noise.make_background(pictures, self.parameters, self.call)
 
     def finish(self) -> None:
         """Wait until the background that is being made is complete."""

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,7 +34,7 @@ from lab.runs.verdict.run_statistics import FrameChecks, RunStatistics
 from lab.runs.watch.background import FunctionProcess, LiveBackground
 from lab.runs.watch.live_frames import LiveFrames, WatchOptions
 from lab.runs.watch.live_output import LiveOutput, is_live_table, opened
-from tracking.background.estimation import PICTURES, static_background
+from tracking.background.estimation import PICTURES
 from tracking.detections import Detections
 from tracking.parameters import DetectParameters
 
@@ -131,9 +130,11 @@ def _started(
     first = frames.begin()
     if not first:
         raise RunError(f"{run.path}: expected pictures while the run was watched, got none")
-    noise = {name: CameraNoise(name, camera.noise) for name, camera in run.rig.cameras.items()}
-    detect, make = run.tracker.detect, partial(process.call, static_background)
-    backgrounds = {name: LiveBackground(own, detect, make, lambda: frames.caught_up) for name, own in noise.items()}
+    noise = {name: CameraNoise(name, camera.noise, optics=camera) for name, camera in run.rig.cameras.items()}
+    detect = run.tracker.detect
+    backgrounds = {
+        name: LiveBackground(own, detect, process.call, lambda: frames.caught_up) for name, own in noise.items()
+    }
     longest_s = _BUSY / run.frame_rate_hz * min((os.cpu_count() or 1) / len(noise), 1.0)
     with ThreadPoolExecutor(max(len(first), 1)) as pool:  # in parallel, since pictures queue up meanwhile
         list(pool.map(lambda name: noise[name].estimate_from(first[name]), first))

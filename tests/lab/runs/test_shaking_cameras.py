@@ -1,0 +1,152 @@
+"""Runs on recordings whose cameras turn a little from picture to picture, and on such that repeat pictures."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from cli import main
+from geometry.camera import Camera
+from geometry.pose import Pose
+from lab.files.rig.rig_file import load_rig
+from lab.runs.frames.frames import without_repeats
+from tracking.background.camera_motion import CameraMotion
+from tracking.noise import NoiseModel
+from tracking.parameters import DetectParameters
+
+SIZE, FRAMES, MARGIN = (512, 640), 24, 8
+Y, X = np.mgrid[-MARGIN : SIZE[0] + MARGIN, -MARGIN : SIZE[1] + MARGIN]
+# A room with shelves and boxes, as a camera sees it that does not turn.
+ROOM = cv2.GaussianBlur(
+    24.0
+    + 30.0 * (np.sin(X / 21.0 + 1.0) * np.sin(Y / 17.0) > 0.0)
+    + 25.0 * (np.sin(X / 9.0 - Y / 31.0) > 0.8)
+    + np.random.default_rng(4).normal(0.0, 8.0, X.shape),
+    (0, 0),
+    0.9,
+)
+SPLINE = ndimage.spline_filter(ROOM, order=3)
+
+
+def turned(camera: Camera, by_rad: np.ndarray) -> Camera:
+    """The camera after a small rotation about its own axes."""
+    pose = camera.camera_from_world
+    R = Rotation.from_rotvec(by_rad).as_matrix()
+    return replace(camera, camera_from_world=Pose(R @ pose.rotation, R @ pose.translation))
+
+
+def recording(folder: Path, shake_px: float) -> tuple[Path, Path]:
+    """A run folder with pictures of cameras that turn by this root mean square, and its truth beside it."""
+    made = CliRunner().invoke(
+        main,
+        ["simulate", "four-skew-beams", "--frames", str(FRAMES), "--scale", "0.5", "--points", "--out", str(folder)],
+    )
+    assert made.exit_code == 0, made.output
+    run = folder / "run.yaml"
+    run.write_text(re.sub(r"(left|right):\n +detections: detections.csv", r"\1: {frames: frames/\1}", run.read_text()))
+    (folder / "detections.csv").unlink()
+    truth = shutil.move(folder / "truth", folder.with_name("truth"))
+    spots, rig, rng = pd.read_csv(truth / "spots.csv"), load_rig(folder / "rig.yaml"), np.random.default_rng(2)
+    ends = np.stack(np.meshgrid(np.arange(SIZE[1]), np.arange(SIZE[0])), axis=-1).astype(float)
+    for name, camera in rig.cameras.items():
+        (folder / "frames" / name).mkdir(parents=True)
+        turns = rng.normal(0.0, shake_px / camera.matrix[0, 0], (FRAMES, 3))
+        for frame, turn in enumerate(turns - turns.mean(axis=0)):
+            now = turned(camera, turn)
+            origin, rays = now.rays(ends)
+            seen = camera.project(origin + 3.0 * rays)[..., ::-1] + MARGIN
+            picture = ndimage.map_coordinates(SPLINE, np.moveaxis(seen, -1, 0), order=3, prefilter=False)
+            at = spots[(spots.camera == name) & (spots.frame == frame)][["u_px", "v_px"]].dropna().to_numpy()
+            start, towards = camera.rays(at)
+            for u, v in now.project(start + 3.0 * towards):
+                picture += 90.0 * np.exp(-0.5 * ((ends[..., 0] - u) ** 2 + (ends[..., 1] - v) ** 2) / 1.6**2)
+            picture = np.clip(np.rint(picture + rng.normal(0.0, 1.0, SIZE)), 0, 255).astype(np.uint8)
+            cv2.imwrite(str(folder / "frames" / name / f"{frame:06d}.png"), picture)
+    return folder, truth
+
+
+def nees(out: Path, truth: Path) -> np.ndarray:
+    """Of the measured poses, over 6."""
+    rows = pd.read_csv(out / "attitude.csv").merge(pd.read_csv(out / "covariance.csv"), on="frame")
+    rows = rows.merge(pd.read_csv(truth / "pose.csv"), on="frame", suffixes=("", "_true"))
+    found = []
+    for _, row in rows[rows.status == "measured"].iterrows():
+        q, q_true = (Rotation.from_quat(row[[f"q{k}{s}" for k in "xyzw"]].to_numpy(float)) for s in ("", "_true"))
+        away = [row[f"{k}_m_true"] - row[f"{k}_m"] for k in "xyz"]
+        P = np.zeros((6, 6))
+        P[np.triu_indices(6)] = row[[f"c{i}{j}" for i in range(6) for j in range(i, 6)]].to_numpy(float)
+        off = np.append(away, (q.inv() * q_true).as_rotvec())
+        found.append(off @ np.linalg.solve(P + P.T - np.diag(np.diag(P)), off) / 6)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("shake_px", [0.15, 1.0])
+def test_a_camera_that_shakes_is_named_and_its_poses_are_as_good_as_their_sigmas(tmp_path, shake_px):
+    folder, truth = recording(tmp_path / "run", shake_px)
+    done = CliRunner().invoke(main, ["run", str(folder), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 0, done.output
+    found = nees(tmp_path / "out", truth)
+    assert len(found) >= FRAMES - 1
+    assert found.mean() < 2.0
+    assert found.max() < 6.0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    for camera, noise in summary["parameters"]["noise"].items():
+        assert noise["camera_motion_px"] == pytest.approx(shake_px, rel=0.35)
+        assert any(note.startswith(f"{camera}: the camera moves by") for note in summary["notes"])
+
+
+def test_pictures_that_repeat_the_one_before_have_no_spots(tmp_path):
+    """A grabber that has no new picture gives the last one again: its spots are those of another instant.
+
+    The cameras stand still, and are not corrected.
+    """
+    folder, truth = recording(tmp_path / "run", 0.0)
+    again = [9, 14, 15, 20]
+    for camera in ("left", "right"):
+        for frame in again:
+            files = folder / "frames" / camera
+            shutil.copy(files / f"{frame - 1:06d}.png", files / f"{frame:06d}.png")
+    done = CliRunner().invoke(main, ["run", str(folder), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 0, done.output
+    rows = pd.read_csv(tmp_path / "out" / "attitude.csv").set_index("frame")
+    assert (rows.status[again] != "measured").all()
+    assert (rows.status.drop(again) == "measured").all()
+    assert nees(tmp_path / "out", truth).mean() < 2.0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert "left: 4 frames repeated" in " ".join(summary["notes"])
+    assert [noise["camera_motion_px"] for noise in summary["parameters"]["noise"].values()] == [0.0, 0.0]
+    assert "camera moves" not in " ".join(summary["notes"])
+
+
+def test_pictures_without_noise_may_be_equal_while_all_is_at_rest():
+    bright = np.zeros((400, 600), np.uint8)
+    bright[180:192, 300:312] = 200
+    moved = np.roll(bright, 9, axis=1)
+    stream = ((k, p) for k, p in enumerate([bright, bright, moved, moved, moved]))
+    assert [k for k, p in without_repeats(stream) if isinstance(p, np.ndarray)] == [0, 1, 2, 3, 4]
+
+
+def test_lights_of_a_dark_room_do_not_show_how_a_camera_moves():
+    """They may be those of the vehicle, which would be taken for at rest."""
+    rng = np.random.default_rng(3)
+    places = rng.uniform(40, 400, (14, 2))
+    v, u = np.mgrid[:480, :640]
+    pictures = []
+    for _ in range(15):
+        light = sum(120.0 * np.exp(-0.5 * ((u - x) ** 2 + (v - y) ** 2) / 2.0**2) for x, y in places)
+        places += rng.normal(0.0, 0.3, 2)
+        pictures.append(np.clip(np.rint(light + rng.normal(8.0, 1.0, light.shape)), 0, 255).astype(np.uint8))
+    matrix = np.array([[700.0, 0, 320], [0, 700.0, 240], [0, 0, 1]])
+    camera = Camera("left", "wall", (640, 480), matrix, (), Pose.identity())
+    assert CameraMotion.of(pictures, camera, NoiseModel(1.0, 0.0, 8.0), DetectParameters()) is None
