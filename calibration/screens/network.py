@@ -115,7 +115,6 @@ class NetworkFit:
     values: Values
     covariance: RigCovariance  # multiplied by the variance factor
     variance_factor: float  # 1 if the residuals are consistent with the sigmas
-    p_fits: float  # p-value of chi-square, if all sigmas are right
     dof: int
     observation_residuals_px: Array  # (n, 2): measured minus predicted
     normalised_residuals: Array  # (n,): their length in sigmas
@@ -314,7 +313,6 @@ def _fit(
         values=found.values,
         covariance=RigCovariance(names, (covariance + covariance.T) / 2),
         variance_factor=factor,
-        p_fits=p_fits,
         dof=dof,
         observation_residuals_px=observation_residuals(network, found.values),
         normalised_residuals=normalised_residuals(network, found.values)
