@@ -247,21 +247,21 @@ def spot_rows(m: ReportData) -> tuple[list[str], list[list[str]]]:
     return heads, rows
 
 
-def label_words(m: ReportData) -> str:
-    """How many labels were doubtful or changed, in one sentence; empty where there were none."""
+def label_counts(m: ReportData) -> list[str]:
+    """How many labels were doubtful or changed, in words; without those that no label was."""
     left_open = int((np.isfinite(m.spots.label_probability) & ~m.spots.measured).sum())
     kinds, again = m.summary.event_counts, m.summary.found_again
     if again is None:  # older results; here the searches of the causal pass count as well
         again = kinds.get("reacquired", 0)
     counts = [
         (left_open, "left open: no label was likely enough"),
+        (kinds.get("undecided", 0), "intervals in which a label was undecided"),
         (kinds.get("changed", 0), "changed by the smoothing pass, which also uses later frames"),
         (kinds.get("tie", 0), "ties, in which two labellings were equally likely"),
         (kinds.get("relabelled", 0), "times all spots were labelled again during the run"),
         (again, "times the vehicle was found again after it was lost"),
     ]
-    parts = [f"{count} {words}" for count, words in counts if count]
-    return f"Labels: {'; '.join(parts)}." if parts else ""
+    return [f"{count} {words}" for count, words in counts if count]
 
 
 def no_image_ranges(m: ReportData) -> list[tuple[str, str]]:
