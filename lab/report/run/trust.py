@@ -111,10 +111,6 @@ def _numbers(g: Mapping[str, Any]) -> tuple[str, ...]:
     )
 
 
-def _signed(value: float) -> str:
-    return "–" if not np.isfinite(value) else ("+" if value > 0 else "") + format_number(value, 2)
-
-
 def _drawing(index: int, camera: str, size: Any, views: list[Mapping[str, Any]]) -> str:
     """Mean residuals as arrows over the image, with circles of 3 sigma of chance and calibration together."""
     own = [v for v in views if str(v.get("name")).rpartition("/")[0] == camera]
@@ -142,7 +138,7 @@ def _drawing(index: int, camera: str, size: Any, views: list[Mapping[str, Any]])
         start, end = plane.at(at[None]), plane.at((at + factor * r)[None])
         colour = svg.VERMILLION if np.linalg.norm(r) > radius else svg.BLUE
         spot = str(v.get("name")).rpartition("/")[2]
-        words = escape(f"spot {spot}: {_signed(r[0])}, {_signed(r[1])} px")
+        words = escape(f"spot {spot}: {format_number(r[0], 2, True)}, {format_number(r[1], 2, True)} px")
         parts.append(
             f'<g><title>{words}</title><circle cx="{start[0, 0]:.1f}" cy="{start[0, 1]:.1f}"'
             f' r="{min(radius * factor * scale, 2000.0):.1f}" fill="none" stroke="var(--soft)" stroke-dasharray="3 3"/>'

@@ -20,7 +20,7 @@ from lab.files.rig.camera_file import require_valid_calibration
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.run.truth import TruePoses, read_true_poses
 from lab.findings.finding import Finding, Level, Outcome, Verdict, finding, level_above, passed, worst_first
-from lab.number_format import format_length, format_number
+from lab.number_format import decimals_of, format_length, format_number
 from lab.pictures.picture_file import MissingPicture
 from lab.progress import Progress
 from lab.runs.processed import Processed, write_processed
@@ -160,7 +160,7 @@ def _calibration(results: StereoResults) -> Iterator[Finding]:
         yield finding("BP-W11", Level.WARN, what)
     if check is not None and check.significant and not _is_clock(results):
         several = " or ".join(
-            f"{s.name} by {s.value:+.{_decimals(s.sigma)}f} ± {s.sigma:.{_decimals(s.sigma)}f} {s.unit}"
+            f"{s.name} by {s.value:+.{decimals_of(s.sigma)}f} ± {s.sigma:.{decimals_of(s.sigma)}f} {s.unit}"
             for s in check.suspects[:_MOST_NAMED]
         )
         apart = "; this recording does not separate them" if len(check.suspects) > 1 else ""
@@ -194,11 +194,6 @@ def _is_clock(results: StereoResults) -> bool:
     if clock is None or not clock.significant:
         return False
     return check is None or not check.certain or check.left > GOOD_NOISE_SCALE**2
-
-
-def _decimals(sigma: float) -> int:
-    """Decimals that show two digits of a sigma."""
-    return int(np.clip(1 - np.floor(np.log10(max(sigma, 1e-9))), 0, 6))
 
 
 def _noise(results: StereoResults) -> Iterator[Finding]:

@@ -376,12 +376,6 @@ def test_bad_runs_poses_and_histories_are_refused(tmp_path):
     assert history.read_text().endswith("yesterday,left,1,1,1,PASS\n")
 
 
-@pytest.mark.parametrize("bad", [{"p_false_alarm": 0.0}, {"fail_mm": 0.1, "warn_mm": 0.2}, {"point_sigma_px": -1.0}])
-def test_invalid_limits_are_refused(bad):
-    with pytest.raises(ValueError, match="expected"):
-        DriftLimits(**bad)
-
-
 def test_the_wrong_point_among_five_is_identified(tmp_path):
     pixels, survey = scenes.write_points(tmp_path, TRUE, np.random.default_rng(0), wrong={"R3": (-3.0, 0.0)})
     covariance = joint_covariance(RIG, {"target": COVARIANCE}, "rig.yaml")
