@@ -353,6 +353,20 @@ def pose_errors(poses: PoseTrack, truth: Pose) -> Array:
     return np.where(np.isfinite(delta[:, :3]).all(axis=-1, keepdims=True), delta, np.nan)
 
 
+def measured_errors(results: Path, folder: Path) -> tuple[Array, Array]:
+    """Errors (n, 6), as of `pose_errors`, and covariances (n, 6, 6) of the measured poses of a results folder.
+
+    folder: a run folder with the true poses.
+    """
+    tables = read_tables(ResultFolder(results))
+    truth = read_truth(folder, tables.spots, tables.poses)
+    if truth is None or truth.world_from_body is None:
+        raise ValueError(f"{folder}: expected true poses, found none")
+    delta = pose_errors(tables.poses, truth.world_from_body)
+    use = np.isfinite(delta).all(axis=1) & tables.poses.has(PoseStatus.MEASURED)
+    return delta[use], tables.poses.covariance[use]
+
+
 def normalised_squares(delta: Array, covariance: Array) -> Array:
     """NEES (n,): delta^T C^-1 delta of errors (n, 6) and covariances (n, 6, 6); nan where C is singular.
 

@@ -21,8 +21,8 @@ from lab.runs.verdict.score import (
     _returns,
     against_truth,
     differenced,
+    measured_errors,
     normalised_squares,
-    pose_errors,
     read_tables,
     read_truth,
     right_spot,
@@ -82,11 +82,7 @@ def test_poses_with_correct_covariances_have_a_mean_nees_of_six(quiet):
 
 
 def test_the_errors_of_measured_poses_are_those_that_the_score_counts(eventful):
-    poses = read_poses(eventful.results)
-    truth = read_truth(eventful.run_folder, read_spots(eventful.results), poses)
-    delta = pose_errors(poses, truth.world_from_body)
-    use = np.isfinite(delta).all(axis=1) & poses.has(PoseStatus.MEASURED)
-    delta, covariance = delta[use], poses.covariance[use]
+    delta, covariance = measured_errors(eventful.results, eventful.run_folder)
     measured = score(eventful.results, eventful.run_folder)["pose"]["measured"]
     assert len(delta) == len(covariance) == measured["rows"]
     assert np.mean(normalised_squares(delta, covariance)) == pytest.approx(measured["nees_mean"])

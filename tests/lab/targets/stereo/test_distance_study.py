@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.related_measurements.stereo import simulated_calibration
+from bench.related_measurements.stereo import DISTANCES_M, simulated_calibration
 from lab.targets.stereo.simulated_recording import simulated_pair
 from studies.comparison import write_comparison
 from studies.zhou2020 import (
@@ -25,7 +25,7 @@ def test_the_error_of_single_points_is_the_formula_for_parallel_cameras():
 @pytest.mark.slow
 def test_the_study_shows_smaller_errors_than_the_paper_at_every_distance(tmp_path):
     study = compare_zhou2020(seed=2, trials=25)
-    for distance in (5.0, 10.0, 15.0, 20.0, 25.0, 30.0):
+    for distance in DISTANCES_M:
         row = next(r for r in study.rows if r.quantity == f"distance error at {distance:g} m, RMS")
         assert row.values[2] < row.paper
     assert study.value("centroid of a marker, RMS", "joint fit") < 0.05
