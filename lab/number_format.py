@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 
@@ -44,6 +46,16 @@ def median(values: np.ndarray) -> float | None:
     """The median of the finite values; None without any."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else None
+
+
+def format_cell(value: float) -> str:
+    """Six digits, for a table whose figures are less precise; empty if not finite."""
+    return f"{value:.6g}" if np.isfinite(value) else ""
+
+
+def format_some(numbers: Sequence[int]) -> str:
+    """The first five numbers."""
+    return ", ".join(map(str, numbers[:5])) + (", ..." if len(numbers) > 5 else "")
 
 
 def format_count(count: int, thing: str) -> str:

@@ -216,10 +216,11 @@ def flat_boards(corners: CornerTerm, sigma_m: float = WARP_SIGMA_M) -> Sequence[
 def _point_term(network: Network, used: Bools, loss: Cauchy | None = None) -> PointTerm:
     s = network.point_observations
     whiten = np.eye(2) / s.sigma_px[used, None, None]
-    return PointTerm(s.camera_of[used], s.point_of[used], s.pixels[used], whiten, _fisheye(network.rig), loss)
+    return PointTerm(s.camera_of[used], s.point_of[used], s.pixels[used], whiten, fisheye(network.rig), loss)
 
 
-def _fisheye(rig: Rig) -> Bools:
+def fisheye(rig: Rig) -> Bools:
+    """Which cameras have a fisheye lens."""
     return np.array([c.lens == FISHEYE for c in rig.cameras.values()], dtype=bool)
 
 

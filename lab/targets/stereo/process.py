@@ -24,6 +24,7 @@ from lab.number_format import decimals_of, format_length, format_number
 from lab.pictures.picture_file import MissingPicture
 from lab.progress import Progress
 from lab.runs.processed import Processed, write_processed
+from lab.runs.verdict.quality import GOOD_MEASURED, GOOD_PICTURES, LEAST_MEASURED
 from lab.targets.stereo.frames import StereoFrame, stereo_frames
 from lab.targets.stereo.page import write_stereo_page
 from lab.targets.stereo.run import (
@@ -51,8 +52,6 @@ from tracking.binocular.marker_model import MarkerImages
 from tracking.binocular.pose_tracker import AMBIGUOUS, BinocularTracker
 from tracking.binocular.segmentation import is_grey, marker_candidates, prepared
 
-LEAST_MEASURED, GOOD_MEASURED = 0.1, 0.95  # shares of the frames, as for runs of laser spots
-GOOD_PICTURES = 0.95  # share of frames with a usable picture, per camera
 _ENOUGH, _FEWEST_SEEN = 4, 2  # markers of a picture that determine a pose, and frames with as many in both
 LARGEST_NEES = 20.0  # per number, of poses with an error of the calibration: above, the sigmas are of no use
 _MOST_NAMED = 4  # errors of the calibration in a message
