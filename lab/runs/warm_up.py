@@ -40,11 +40,12 @@ def warm_up() -> float:
             algebra.result()
             detecting.result()
         process_run(pictures, folder / "out")
+        _linear_algebra()  # loads it here: Python calls some of it in runs whose rig states errors of its calibration
     return time.perf_counter() - begun
 
 
 def _linear_algebra() -> None:
-    """What the tracker needs only later; pose_minus is called by Python too, where a rig states its errors."""
+    """What the tracker needs only later."""
     R, t = np.eye(3), np.zeros(3)
     pose_minus(R, t, R, t)
     pose_plus(R, t, np.zeros(6))
