@@ -12,10 +12,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.least_squares.adjustment import Adjusted, AdjustmentError, Limits, Part, Poses, Term, Vectors, solve
+from calibration.least_squares.adjustment import (
+    Adjusted,
+    AdjustmentError,
+    Limits,
+    Part,
+    Poses,
+    Term,
+    Values,
+    Vectors,
+    solve,
+)
 from calibration.lens.board_shape import HALF_SIGNIFICANT
 from calibration.lens.fit.lens_adjustment import coefficient_prior
-from calibration.lens.fit.lens_parameters import Values
 from calibration.lens.fit.view_equations import BEND_PROBABLE, ViewEquations
 from calibration.lens.intrinsics_result import Intrinsics
 from calibration.terms.corners import CornerTerm

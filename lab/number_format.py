@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 
-def format_number(value: float | None, digits: int = 3) -> str:
-    """A number with `digits` significant digits, without exponent from 1e-4 to 1e6; a dash for None, nan and inf."""
+def format_number(value: float | None, digits: int = 3, signed: bool = False) -> str:
+    """A number with `digits` significant digits, without exponent from 1e-4 to 1e6; a dash for None, nan and inf.
+
+    signed: with a plus in front of a positive one.
+    """
+    if signed and value is not None and np.isfinite(value) and value > 0:
+        return f"+{format_number(value, digits)}"
     if value is None or not np.isfinite(value):
         return "\u2013"
     if value == 0:
@@ -23,11 +30,32 @@ def format_with_sigma(value: float, sigma: float, signed: bool = False) -> str:
     if not np.isfinite(value):
         return "\u2013"
     if not (np.isfinite(sigma) and sigma > 0):
-        return ("+" if signed and value > 0 else "") + format_number(value, 2)
+        return format_number(value, 2, signed)
     power = int(np.floor(np.log10(sigma)))
     decimals = max(0, -power + (1 if sigma / 10.0**power < 2 else 0))
     text = f"{value:{'+' if signed else ''}.{decimals}f} ± {sigma:.{decimals}f}"
     return text.replace("-", "\u2212")
+
+
+def decimals_of(sigma: float) -> int:
+    """Decimals that show two digits of a sigma, at most six."""
+    return int(np.clip(1 - np.floor(np.log10(max(sigma, 1e-9))), 0, 6))
+
+
+def median(values: np.ndarray) -> float | None:
+    """The median of the finite values; None without any."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else None
+
+
+def format_cell(value: float) -> str:
+    """Six digits, for a table whose figures are less precise; empty if not finite."""
+    return f"{value:.6g}" if np.isfinite(value) else ""
+
+
+def format_some(numbers: Sequence[int]) -> str:
+    """The first five numbers."""
+    return ", ".join(map(str, numbers[:5])) + (", ..." if len(numbers) > 5 else "")
 
 
 def format_count(count: int, thing: str) -> str:

@@ -262,7 +262,6 @@ class PictureRun:
     single: Array  # (T, 5) error of the pose of a single picture: x, y, z, m; yaw, pitch, rad; nan without one
     gust: Bools  # (T,)
     wrong: Bools  # (T,) a lamp has a wrong label
-    sigma: Array  # (T, 8) the filter's
 
 
 def run_pictures(seed: int, robust: bool, steps: int | None = None) -> PictureRun:
@@ -271,7 +270,7 @@ def run_pictures(seed: int, robust: bool, steps: int | None = None) -> PictureRu
     rng, tracker = np.random.default_rng([seed, 71]), lamp_tracker()
     T = len(recording.t_s) if steps is None else steps
     x, P = X0, np.diag(START_SIGMA**2)
-    error, single, sigma = np.full((T, 8), np.nan), np.full((T, 5), np.nan), np.full((T, 8), np.nan)
+    error, single = np.full((T, 8), np.nan), np.full((T, 5), np.nan)
     wrong = np.zeros(T, dtype=bool)
     for k in range(T):
         state = recording.states[k]
@@ -286,8 +285,8 @@ def run_pictures(seed: int, robust: bool, steps: int | None = None) -> PictureRu
             x, P = step.x, step.P
             single[k] = z - state[POSED]
             wrong[k] = _is_wrong(frame, pose_of(state))
-        error[k], sigma[k] = x - state, np.sqrt(np.diagonal(P))
-    return PictureRun(recording.t_s[:T], error, single, recording.disturbed[:T], wrong, sigma)
+        error[k] = x - state
+    return PictureRun(recording.t_s[:T], error, single, recording.disturbed[:T], wrong)
 
 
 def _measured(frame: LampFrame) -> tuple[Array, Array]:

@@ -33,7 +33,6 @@ from tracking.learned_detector.detector import find_drogues
 # printed and cannot be computed from what is; 0.5 m is ours.
 
 FOCAL_PX, SIZE_PX, BASELINE_M = 939.0, (1920, 1080), 0.5
-DISTANCES_M = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
 METHODS = ("paper's method", "single points", "joint fit")  # equations (7) to (9); most likely points; all markers
 
 

@@ -24,7 +24,6 @@ _LEAST_EIGENVALUE = 1e-14  # of a covariance scaled to unit diagonal: smaller on
 class SpotAgreement:
     """Agreement of reported poses with their own spots."""
 
-    squares: Array  # (T, n) squared Mahalanobis distance of each spot from its place in the pose; nan if unused
     chi2: Array  # (T,) their joint chi-square; 0 without spots
     dof: Ints  # (T,) 2 per spot used: degrees of freedom of the limit. A pose fitted to the spots has a lower mean chi2
     rms_px: Array  # (T,) root mean square residual per axis; nan without spots
@@ -70,24 +69,15 @@ def against_own_spots(
     residual = np.where(use[..., None], uv_px - projected, 0.0)
     R = np.where(use[..., None, None], cov_px2, np.eye(2))
     gate = limits(2 * use.sum(axis=1), p)
-    squares = _squares(residual, R)
     # R alone gives the larger chi-square: only frames that fail with it need the pose's covariance as well.
-    rows = np.flatnonzero(squares.sum(axis=1) > gate)
-    chi2 = squares.sum(axis=1)
+    chi2 = _squares(residual, R).sum(axis=1)
+    rows = np.flatnonzero(chi2 > gate)
     if len(rows):
-        spread = J[rows] @ covariance[rows][:, None] @ np.swapaxes(J[rows], -1, -2)
-        squares[rows] = _squares(residual[rows], R[rows] + np.where(use[rows][..., None, None], spread, 0.0))
         chi2[rows] = _joint(residual[rows], R[rows], J[rows] * use[rows][..., None, None], covariance[rows])
     count = use.sum(axis=1)
     with np.errstate(invalid="ignore"):
         rms = np.sqrt(np.sum(residual**2, axis=(1, 2)) / np.where(count > 0, 2 * count, np.nan))
-    return SpotAgreement(
-        squares=np.where(use, squares, np.nan),
-        chi2=chi2,
-        dof=(2 * count).astype(np.int64),
-        rms_px=rms,
-        contradicts=np.asarray(chi2 > gate),
-    )
+    return SpotAgreement(chi2, (2 * count).astype(np.int64), rms, np.asarray(chi2 > gate))
 
 
 def against_causal(

@@ -44,19 +44,6 @@ class Spread:
             raise ValueError(f"kappa: expected more than -{n} for {n} numbers, got {self.kappa}")
         return self.alpha**2 * (n + self.kappa)
 
-    def weights(self, n: int) -> tuple[Array, Array]:
-        """Weights (2n + 1,) of the mean and of the covariance, the central point first.
-
-        Source: eq. (9) of Fu (2016); printed "1/2(n + lambda)" means 1 / (2 (n + lambda)). For his values, n = 8:
-        -7.815, -5.118 and 0.55096.
-        """
-        scale = self.scale(n)
-        mean = np.full(2 * n + 1, 1 / (2 * scale))
-        mean[0] = 1 - n / scale
-        covariance = mean.copy()
-        covariance[0] += 1 - self.alpha**2 + self.beta
-        return mean, covariance
-
 
 USUAL = Spread()
 

@@ -25,9 +25,12 @@ from bench.related_measurements.drogue_sequences import SequenceFrame, moving_dr
 from bench.related_measurements.learned_detector import logistic, reliability
 from geometry.arrays import Array
 from tracking.learned_detector.detector import find_drogues, learned_detector
-from tracking.light_tracker.frames import FEATURES, RIGHT_SHARE, SIGNS, LightParameters
+from tracking.light_tracker.frames import RIGHT_SHARE, LightParameters
 from tracking.light_tracker.tracker import DrogueTracker
 from tracking.statuses import PoseStatus
+
+FEATURES = ("1", "support", "confirmed", "size", "size x support", "gap")
+SIGNS = (0, 1, 1, -1, 1, -1)  # of the coefficients, as they must be
 
 SMALL_PX, ALL_PX = (9.0, 9.0), (9.0, 150.0)
 HELD_SHARE = 0.5

@@ -24,7 +24,6 @@ from geometry.pose import Pose
 from lab.targets.stereo.simulated_recording import drogue_markers, simulated_pair
 from studies.zhou2020 import (
     BASELINE_M,
-    DISTANCES_M,
     FOCAL_PX,
     METHODS,
     SIZE_PX,
@@ -33,6 +32,8 @@ from studies.zhou2020 import (
 )
 from tracking.binocular.joint_fit import MarkerObservations, fit_pose
 from tracking.binocular.marker_model import StereoPair, project, project_markers
+
+DISTANCES_M = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
 
 
 def main() -> None:

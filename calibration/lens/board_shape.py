@@ -18,12 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc
 
-from calibration.least_squares.adjustment import AdjustmentError
+from calibration.least_squares.adjustment import AdjustmentError, Values
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import seen_at
 from calibration.lens.fit.lens_adjustment import BRIEF, term_of
 from calibration.lens.fit.lens_fit import LensFit, fit
-from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, Values, board_as_stated
+from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, board_as_stated
 from calibration.lens.fit.model_selection import EQUAL, difference_px
 from calibration.lens.fit.projection_map import projection_map
 from calibration.lens.fit.view_equations import Scatter, ViewEquations, scattered

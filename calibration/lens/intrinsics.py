@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.least_squares.adjustment import AdjustmentError, Poses
+from calibration.least_squares.adjustment import AdjustmentError, Poses, Values
 from calibration.lens.board_shape import BoardShapeOptions, BoardTest, board_test
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import coverage_of, spread_deg
 from calibration.lens.fit.lens_fit import FEWEST_CORNERS, LensFit, robust_fit, used_views, with_view_noise
 from calibration.lens.fit.lens_models import LensModel, folds_in_picture
-from calibration.lens.fit.lens_parameters import AS_STATED, BOARD_BLOCKS, BoardFreedom, Values, board_as_stated
+from calibration.lens.fit.lens_parameters import AS_STATED, BOARD_BLOCKS, BoardFreedom, board_as_stated
 from calibration.lens.fit.lens_start import StartError, start
 from calibration.lens.fit.model_selection import ModelCandidate, inliers_of_rich_models, select_model
 from calibration.lens.fit.projection_map import Difference, ProjectionMap, difference, projection_map

@@ -115,7 +115,6 @@ class NetworkFit:
     values: Values
     covariance: RigCovariance  # multiplied by the variance factor
     variance_factor: float  # 1 if the residuals are consistent with the sigmas
-    p_fits: float  # p-value of chi-square, if all sigmas are right
     dof: int
     observation_residuals_px: Array  # (n, 2): measured minus predicted
     normalised_residuals: Array  # (n,): their length in sigmas
@@ -217,10 +216,11 @@ def flat_boards(corners: CornerTerm, sigma_m: float = WARP_SIGMA_M) -> Sequence[
 def _point_term(network: Network, used: Bools, loss: Cauchy | None = None) -> PointTerm:
     s = network.point_observations
     whiten = np.eye(2) / s.sigma_px[used, None, None]
-    return PointTerm(s.camera_of[used], s.point_of[used], s.pixels[used], whiten, _fisheye(network.rig), loss)
+    return PointTerm(s.camera_of[used], s.point_of[used], s.pixels[used], whiten, fisheye(network.rig), loss)
 
 
-def _fisheye(rig: Rig) -> Bools:
+def fisheye(rig: Rig) -> Bools:
+    """Which cameras have a fisheye lens."""
     return np.array([c.lens == FISHEYE for c in rig.cameras.values()], dtype=bool)
 
 
@@ -314,7 +314,6 @@ def _fit(
         values=found.values,
         covariance=RigCovariance(names, (covariance + covariance.T) / 2),
         variance_factor=factor,
-        p_fits=p_fits,
         dof=dof,
         observation_residuals_px=observation_residuals(network, found.values),
         normalised_residuals=normalised_residuals(network, found.values)

@@ -188,9 +188,6 @@ def _are_distinct(a: ResectedPose, b: ResectedPose, points: Array) -> bool:
     return bool(np.linalg.norm(centres[0] - centres[1]) > 0.01 * distance or turned < 0.999)
 
 
-WORLD = "the survey"
-
-
 @dataclass(frozen=True, slots=True)
 class CameraOnDots:
     """Poses of one camera from its surveyed dots."""

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.least_squares.adjustment import Linearised, Loss, Part, Values
-from calibration.terms.surveyed import array_of, pose_of
+from calibration.terms.surveyed import array_of, bow_shape, pose_of
 from geometry.arrays import Array, Bools, Ints, cross
 from geometry.camera import Projected, project_points_full
 
@@ -181,7 +181,7 @@ class CornerTerm:
             "cameras": lambda: np.concatenate(
                 [projected.d_point, cross(placed.in_world[:, :, None], by_world_point)], axis=-1
             ),
-            "warp": lambda: by_board_point[..., 2:] * _bend(placed.from_middle)[:, :, None],
+            "warp": lambda: by_board_point[..., 2:] * bow_shape(placed.from_middle)[:, :, None],
             "stretch": lambda: by_board_point[..., :1] * placed.from_middle[:, :, None],
             "print": lambda: by_board_point,
             "radius": lambda: (by_board_point @ placed.by_radius[..., None])[..., :1],
@@ -241,7 +241,7 @@ class _Placed:
         stretch = array_of(values, "stretch")[board, None] if "stretch" in values else np.zeros((1, 1, 2))
         warp = array_of(values, "warp")[board, :, None]
         on_board[..., 0] += stretch[..., 0] * from_middle[..., 0] + stretch[..., 1] * from_middle[..., 1]
-        on_board[..., 2] += (_bend(from_middle) @ warp)[..., 0]
+        on_board[..., 2] += (bow_shape(from_middle) @ warp)[..., 0]
         by_radius = np.zeros(on_board.shape)
         if radii is not None:
             by_radius[..., :2] = step
@@ -292,13 +292,7 @@ def single_camera(
     )
 
 
-def _bend(from_middle: Array) -> Array:
-    """Derivatives (..., 3), m^2, of the height of points (..., 2), m, by a, b and c of the warp."""
-    x, y = from_middle[..., 0], from_middle[..., 1]
-    return np.stack([x * x, x * y, y * y], axis=-1)
-
-
 def _bend_slope(from_middle: Array, step: Array) -> Array:
-    """Derivatives (n, k, 3), m, of `_bend` at points (n, k, 2) along directions `step` (k, 2)."""
+    """Derivatives (n, k, 3), m, of `bow_shape` at points (n, k, 2) along directions `step` (k, 2)."""
     x, y, p, q = from_middle[..., 0], from_middle[..., 1], step[:, 0], step[:, 1]
     return np.stack([2 * x * p, x * q + y * p, 2 * y * q], axis=-1)

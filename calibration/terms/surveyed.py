@@ -213,7 +213,7 @@ class FrameTerm:
 
 
 def bow_shape(on_screen: Array) -> Array:
-    """x^2, x y, y^2 (..., 3), m^2, of points (..., 3), m, in the screen's frame."""
+    """x^2, x y, y^2 (..., 3), m^2, of points (..., 2 or 3), m: derivatives of the height of a bent screen or board."""
     x, y = on_screen[..., 0], on_screen[..., 1]
     return np.stack([x * x, x * y, y * y], axis=-1)
 

@@ -28,7 +28,7 @@ from lab.files.run.results import read_result_table, read_summary
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.yaml_text import read_mapping
 from lab.findings.finding import Level
-from lab.number_format import format_number
+from lab.number_format import format_number, median
 from lab.report.page import environment
 from lab.report.plot import svg
 from lab.report.summary import VERDICTS, day_of, valid
@@ -162,16 +162,11 @@ def _poses(folder: Path | None) -> tuple[Array, Array, tuple[float | None, float
     measured = table.words["status"].recoded((PoseStatus.MEASURED,)) == 0
     sigmas = table.stack(*_SIGMAS)[measured]
     medians = (
-        _median(table.numbers["rms_px"][measured]),
-        _median(sigmas[:, :3].max(axis=1)),
-        _median(sigmas[:, 3:].max(axis=1)),
+        median(table.numbers["rms_px"][measured]),
+        median(sigmas[:, :3].max(axis=1)),
+        median(sigmas[:, 3:].max(axis=1)),
     )
     return _without_jumps(table.stack(*_ANGLES)), table.stack(*_POSITION), medians
-
-
-def _median(values: Array) -> float | None:
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if finite.size else None
 
 
 def _without_jumps(angles_deg: Array) -> Array:

@@ -11,6 +11,7 @@ from typing import Any, TypeVar, cast
 from pydantic import TypeAdapter, ValidationError
 
 from lab.files.run.results import REFINED
+from lab.findings.finding import Finding, Level
 
 T = TypeVar("T")
 DETAILS = ("parameters", "smoother", "rates", "timings", "versions")  # blocks that the report shows as they are
@@ -29,23 +30,13 @@ _NO_VERDICT = ("NO VERDICT", "The results hold no verdict: summary.json is missi
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
-    """One reason of a verdict, with a remedy."""
-
-    what: str
-    remedy: str = ""
-    fails: bool = False  # True: a failed quality gate
-    code: str = ""  # `beampose explain CODE`; empty in older results
-
-
-@dataclass(frozen=True, slots=True)
 class VerdictText:
     """The verdict of a run in words. It is decided where the run is processed."""
 
     status: str  # pass, check, fail or unknown
     word: str
     sentence: str
-    points: tuple[Point, ...]  # the reasons with their remedies; without a remedy in older results
+    points: tuple[Finding, ...]  # the reasons with their remedies; without a remedy in older results
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,18 +114,28 @@ def verdict_of(tree: Mapping[str, Any]) -> VerdictText:
     block = _mapping(tree.get("verdict"))
     status = str(block.get("status", "unknown")).lower()
     word, sentence = VERDICTS.get(status, _NO_VERDICT)
-    evidence = block.get("evidence")
-    found = [e for e in evidence if isinstance(e, dict)] if isinstance(evidence, list) else []
-    points = [
-        Point(str(e.get("what")), str(e.get("remedy") or ""), e.get("level") == "fail", str(e.get("code") or ""))
-        for e in found
-    ]
+    points = findings_in(block.get("evidence"))
     return VerdictText(
         status=status if status in VERDICTS else "unknown",
         word=word,
         sentence=sentence,
-        points=tuple(points or [Point(str(r)) for r in _list(block.get("reasons"))]),
+        points=points or tuple(Finding(Level.WARN, str(r)) for r in _list(block.get("reasons"))),
     )
+
+
+def findings_in(value: object) -> tuple[Finding, ...]:
+    """The findings of a block of summary.json, as far as they are there."""
+    levels = {**Level.__members__, **{level.word: level for level in Level}}
+    texts = ("what", "why", "remedy", "code")
+    return tuple(
+        Finding(levels.get(str(f.get("level")), Level.WARN), **{name: str(f.get(name) or "") for name in texts})  # type: ignore[arg-type]
+        for f in mappings(value)
+    )
+
+
+def mappings(value: object) -> list[Mapping[str, Any]]:
+    """The mappings in a list; empty where it is no list."""
+    return [v for v in value if isinstance(v, Mapping)] if isinstance(value, list) else []
 
 
 def valid(kind: type[T], value: object) -> T | None:

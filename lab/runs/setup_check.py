@@ -15,7 +15,7 @@ from lab.files.run.run_file import Run, VideoFile
 from lab.findings.finding import Finding, Level, finding, sentence, verdict
 from lab.number_format import format_number
 from lab.pictures.source import video_at
-from lab.runs.frames.frames import FrameSet
+from lab.runs.frames.frames import WRITTEN_BY_DEFAULT, FrameSet
 from lab.runs.model_check.frame_sampler import BLOCK, EvenSampler
 from lab.runs.verdict.run_statistics import RunStatistics
 from tracking.detections import Detections
@@ -36,7 +36,6 @@ FRAMES = 2 * ENOUGH  # of a recording, with which mistakes are tested at most
 MOST_KEPT = 90  # frames from which they are chosen
 FEWEST, PART = 10, 0.6  # points, and the share of width and height that they do not exceed in part of a picture
 SAME_RATE = 0.02  # relative difference of frame rates, above which they are not the same
-WRITTEN_BY_DEFAULT = (25.0, 30.0)  # Hz, in the header of a video
 DOUBTFUL = 2  # pictures of a camera without any of its spots, from which on a run that passes is tested, too
 
 

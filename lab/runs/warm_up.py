@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geometry.compiled_linalg import pose_minus
+from geometry.compiled_linalg import pose_minus, pose_plus, posterior, solve
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
 
@@ -30,17 +30,27 @@ def warm_up() -> float:
     begun = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="beampose-") as name:
         folder = Path(name)
-        pictures = simulate(SCENARIO, folder / "pictures", frames=PICTURES, picture_scale=0.5)
         with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as other:
+            algebra = other.submit(_linear_algebra)
+            pictures = simulate(SCENARIO, folder / "pictures", frames=PICTURES, picture_scale=0.5)
             # The spots' own tracker: it shares only detection and smoothing with the one that this process compiles.
             detecting = other.submit(process_run, pictures, folder / "out-of-other", overrides={"method": "spots"})
             points = simulate(SCENARIO, folder / "points", frames=FRAMES, detections_only=True)
             process_run(points, folder / "out")
+            algebra.result()
             detecting.result()
         process_run(pictures, folder / "out")
-    # Compiled for its compiled callers so far. Python calls it too, in runs whose rig states errors of its calibration.
-    pose_minus(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
+        _linear_algebra()  # loads it here: Python calls some of it in runs whose rig states errors of its calibration
     return time.perf_counter() - begun
+
+
+def _linear_algebra() -> None:
+    """What the tracker needs only later."""
+    R, t = np.eye(3), np.zeros(3)
+    pose_minus(R, t, R, t)
+    pose_plus(R, t, np.zeros(6))
+    posterior(np.eye(6), np.eye(6))
+    solve(np.eye(6), np.zeros((6, 7)))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from lab.errors import QUALITY_GATE_FAILED
 from lab.files.rig.rig_file import TARGET, joint_covariance, load_rig_file
 from lab.files.text.csv_text import write_table
 from lab.findings.finding import Outcome
-from lab.number_format import format_angle, format_length, format_percent
+from lab.number_format import format_angle, format_cell, format_length, format_percent
 from lab.report.calibration.calibration_scene import rig_things, scene_views
 from lab.report.page import KeyFigure, PageDrawing, PageTable, Section
 from lab.report.plot.maps import colours, heat_map, hex_colour
@@ -175,20 +175,21 @@ def _plan_rows(plan: Plan) -> Iterator[list[str]]:
     results = np.concatenate(columns, axis=1).tolist()
     spots = plan.seen.sum(axis=1).tolist()
     for i, (coordinates, numbers) in enumerate(zip(plan.coordinates.tolist(), results, strict=True)):
-        yield [str(i), *map(_shown, coordinates), STATUS[plan.status[i]], str(spots[i]), *map(_shown, numbers)]
+        texts = map(format_cell, numbers)
+        yield [str(i), *map(format_cell, coordinates), STATUS[plan.status[i]], str(spots[i]), *texts]
 
 
 def _effect_rows(plan: Plan) -> Iterator[list[str]]:
     for (thing, group, _), median, largest in zip(
         plan.errors.things, plan.thing_median, plan.thing_largest, strict=True
     ):
-        yield [thing, group, "", "", *map(_shown, [*median.tolist(), *largest.tolist()])]
+        yield [thing, group, "", "", *map(format_cell, [*median.tolist(), *largest.tolist()])]
     for name, sigma, median, largest in zip(
         plan.errors.move_names, plan.errors.move_sigmas, plan.effect_median, plan.effect_largest, strict=True
     ):
         if sigma > 0:
             numbers = [*median.tolist(), *largest.tolist()]
-            yield [name, group_of(name), _shown(float(sigma)), unit_of(name), *map(_shown, numbers)]
+            yield [name, group_of(name), format_cell(float(sigma)), unit_of(name), *map(format_cell, numbers)]
 
 
 def unit_of(name: str) -> str:
@@ -199,11 +200,6 @@ def unit_of(name: str) -> str:
     if parameter.endswith(("_m", "_rad")):
         return parameter.rsplit("_", 1)[1]
     return "px" if parameter in ("fx", "fy", "cx", "cy") else "rad" if parameter.startswith("tau") else "1"
-
-
-def _shown(value: float) -> str:
-    """A number with six digits, which exceeds the precision of a planned sigma; empty if not finite."""
-    return f"{value:.6g}" if np.isfinite(value) else ""
 
 
 # Report of a plan: visibility, expected sigmas over the range of poses, and the error budget.

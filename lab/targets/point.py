@@ -17,7 +17,7 @@ from lab.errors import InputError
 from lab.files.text.csv_text import number_fields
 from lab.files.text.dataclass_fields import with_overrides
 from lab.findings.finding import Finding, Level, finding
-from lab.number_format import format_number, format_percent
+from lab.number_format import format_number, format_percent, format_some
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import PictureSource, open_inputs, pictures_of_frames
 from lab.progress import Progress
@@ -28,7 +28,6 @@ from lab.runs.frames.sensor_noise import CameraNoise, noise_frames
 from lab.targets.page import TimeAxis
 from lab.targets.recording import every_frame, read_pictures, read_points
 from lab.targets.target import Codes, Target, Track, TrackOptions, header_rate
-from lab.targets.track import some_frames
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import DetectParameters
 from tracking.single_target.blobs import HUES, BlobParameters, find_blobs, find_coloured, has_colour, hue_of
@@ -213,7 +212,7 @@ class PointTarget(Target[PointFrame]):
         out = []
         lost = [number for number, f in track.events() if f.event == "lost"]
         if lost:
-            out.append(finding("BP-N03", Level.WARN, f"lost at frame {some_frames(lost)}"))
+            out.append(finding("BP-N03", Level.WARN, f"lost at frame {format_some(lost)}"))
         if (nis := _nis_mean(track)) > LARGEST_NIS:
             out.append(
                 finding("BP-N04", Level.WARN, f"the innovations are {np.sqrt(nis):.1f} times as large as their sigmas")

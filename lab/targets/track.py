@@ -8,7 +8,7 @@ The findings that all kinds of tracked targets share.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,14 @@ from geometry.arrays import Array
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.text.csv_text import write_table
 from lab.findings.finding import ENTRIES, Finding, Level, Outcome, Verdict, finding, worst_first
+from lab.number_format import format_some
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import open_inputs
 from lab.progress import Progress
 from lab.report.frames.canvas import Canvas, Pixels, write_overlay_video
 from lab.report.plot.svg import grey_limits, stretched
 from lab.runs.processed import Processed, write_processed
+from lab.runs.verdict.quality import GOOD_MEASURED
 from lab.targets.page import write_target_page
 from lab.targets.recording import DEFAULT_RATE_HZ, every_frame
 from lab.targets.target import F, Target, Track
@@ -85,9 +87,6 @@ def drawn(grey: NDArray[np.uint8], target: Target[F], track: Track[F], k: int, s
     return canvas.image
 
 
-GOOD_MEASURED = 0.95  # a smaller share is reported with its causes
-
-
 def findings_of(target: Target[F], track: Track[F]) -> tuple[Finding, ...]:
     """All findings, failures first."""
     found = [
@@ -139,7 +138,7 @@ def _far_away(target: Target[F], track: Track[F]) -> list[Finding]:
         return []
     what = (
         f"{len(far)} reacquisition{' lies' if len(far) == 1 else 's lie'} more than {target.far_words} from the last"
-        f" known place (frame {some_frames(far)})"
+        f" known place (frame {format_some(far)})"
     )
     return [finding(target.codes.far, Level.WARN, what)]
 
@@ -151,11 +150,6 @@ def _missing(target: Target[F], track: Track[F]) -> list[Finding]:
     reason = max(missing, key=lambda r: missing[r])
     what = f"{sum(missing.values())} of {n} frames have no usable picture (most frequent: {reason})"
     return [finding(target.codes.missing, Level.WARN, what)]
-
-
-def some_frames(frames: Sequence[int]) -> str:
-    """The first five numbers."""
-    return ", ".join(map(str, frames[:5])) + (", ..." if len(frames) > 5 else "")
 
 
 MOST_EVENTS = 500  # listed in summary.json; of the others the number is reported

@@ -21,13 +21,12 @@ from studies.drogue.scene import PICTURE, DrogueBackground, DrogueLight, DrogueL
 # They teach the network that patterns of all kinds are no drogue. None of them is of the kinds of the test (stripes,
 # checks, blobs, walls of polygons; samples.py).
 
-KINDS = ("roads", "arcs", "letters", "ridges", "plots", "crowns", "boxes", "swell")
 _FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_TRIPLEX, cv2.FONT_HERSHEY_SCRIPT_SIMPLEX)
 _LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789&%#?"
 
 
 def structured_picture(rng: np.random.Generator, size_px: tuple[int, int]) -> NDArray[np.uint8]:
-    """A random picture (h, w, 3) of one or two of KINDS under an uneven light; size_px: width, height."""
+    """A random picture (h, w, 3) of one or two kinds under an uneven light; size_px: width, height."""
     draw = (_roads, _arcs, _letters, _ridges, _plots, _crowns, _boxes, _swell)
     field = draw[int(rng.integers(len(draw)))](rng, size_px)
     if rng.random() < 0.35:

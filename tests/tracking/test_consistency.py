@@ -139,7 +139,7 @@ def test_smoothed_and_causal_poses_of_the_same_measurements_agree_and_a_shifted_
 
 
 def agreement_of(contradicts: bool, spots: int) -> SpotAgreement:
-    return SpotAgreement(np.zeros((1, N)), np.zeros(1), np.array([2 * spots]), np.zeros(1), np.array([contradicts]))
+    return SpotAgreement(np.zeros(1), np.array([2 * spots]), np.zeros(1), np.array([contradicts]))
 
 
 @pytest.mark.parametrize(

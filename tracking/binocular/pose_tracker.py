@@ -63,7 +63,6 @@ class BinocularFrame:
     observed: MarkerObservations | None  # the images of that fit
     index: Ints  # (2, K) candidates of the markers, -1: none
     predicted_px: Array  # (2, K, 2), before the pictures were used; nan without a prediction
-    predicted_cov_px2: Array  # (2, K, 2, 2)
 
     @property
     def markers(self) -> int:
@@ -217,12 +216,11 @@ class BinocularTracker:
         ahead: RigidMotion | None,
     ) -> BinocularFrame:
         count = len(self._model)
-        pixels, cov = np.full((2, count, 2), np.nan), np.full((2, count, 2, 2), np.nan)
+        pixels = np.full((2, count, 2), np.nan)
         if ahead is not None:
-            pixels, J = project_markers(self._pair, self._model, ahead.world_from_body)
-            cov = J @ ahead.covariance @ np.swapaxes(J, -1, -2)
+            pixels, _ = project_markers(self._pair, self._model, ahead.world_from_body)
         used = found is not None and (status is PoseStatus.MEASURED or reason == AMBIGUOUS)
         index = found.index if found is not None and used else np.full((2, count), -1, dtype=np.int64)
         fit = None if found is None else found.fit
         observed = None if found is None else observations(self._images, found.index)
-        return BinocularFrame(status, reason, pose, covariance, fit, observed, index, pixels, cov)
+        return BinocularFrame(status, reason, pose, covariance, fit, observed, index, pixels)

@@ -176,15 +176,6 @@ class Alignment:
             self.translation_m + delta[TRANSLATION],
         )
 
-    def minus(self, other: Alignment) -> Array:
-        """The delta (14,) for which other.plus(delta) = self."""
-        clocks = [self.offset_s - other.offset_s, self.rate - other.rate]
-        world = rotations.log(self.world @ other.world.T)
-        body = rotations.log(other.body.T @ self.body)
-        return np.concatenate(
-            [clocks, world, body, self.lever_m - other.lever_m, self.translation_m - other.translation_m]
-        )
-
     def applied(self, result: PoseSeries) -> PoseSeries:
         """The result in the reference's frames, at the result's times."""
         rotation = None if result.rotation is None else self.world @ result.rotation @ self.body

@@ -54,7 +54,6 @@ class RimPoints:
     radius_px: Array  # (n,) distance from the centre; nan where no edge is found
     slope: Array  # (n,) DN/px along the ray, positive in the direction of the polarity; nan there, too
     any_radius_px: Array  # (n,) as radius_px, but also in hidden sectors
-    inside: Bools  # (n,) the ray lies inside the picture
     spacing_px: float  # between neighbouring rays at the rim
     blur_px: float = 0.0  # sigma of the blurred edge
     common_px: float = 0.0  # shift of all edges by a slope inside the target, whose size is not known; 0: none
@@ -104,7 +103,7 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
     none = np.full(n, np.nan)
     height, width = crop.values.shape
     if not height:
-        return RimPoints(theta, none, none, none, np.zeros(n, dtype=bool), spacing)
+        return RimPoints(theta, none, none, none, spacing)
     offset = np.arange(-half_px - _STEP_PX, half_px + 1.5 * _STEP_PX, _STEP_PX)
     base = rim.radius_at(theta)
     distance = base[:, None] + offset
@@ -145,10 +144,10 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
         common = abs(sigma**2 * inner / median(height[good]))
         common = common if common > _LEAST_COMMON_PX else 0.0
     if hidden is None:
-        return RimPoints(theta, radius, strength, radius, inside, spacing, sigma, common)
+        return RimPoints(theta, radius, strength, radius, spacing, sigma, common)
     own = ~hidden[(rows * len(hidden)) // n]
     seen = np.where(own, radius, np.nan)
-    return RimPoints(theta, seen, np.where(own, strength, np.nan), radius, inside, spacing, sigma, common)
+    return RimPoints(theta, seen, np.where(own, strength, np.nan), radius, spacing, sigma, common)
 
 
 def _beside(
@@ -225,7 +224,6 @@ class RimFit:
     coverage: float  # share of the whole rim with edge points that fit
     rms_px: float  # of these points
     beside_gaps: float  # share of the whole rim with such points that the fit leaves out, since they are next to gaps
-    slope_dn: float  # median slope of the rim, DN/px
     polarity: int
     score: float  # coverage, reduced by residuals
     sectors: Array  # (SECTORS,) share of the rays of a sector whose edge lies on the rim, hidden ones too
@@ -439,12 +437,11 @@ def _described(
     covariance = symmetric(covariance[:3, :3]) + _MODEL_SIGMA_PX**2 * np.eye(3)
     covariance[2, 2] += (_BLUR_SIGMA * points.blur_px**2 / (2 * max(rim.radius_px, 1.0))) ** 2 + points.common_px**2
     rms = float(np.sqrt(_sum_of_squares(rim, replace(points, radius_px=points.any_radius_px), fits)))
-    slope = median(points.slope[good])
     on_rim = np.abs(points.any_radius_px - rim.radius_at(points.theta)) < max(3 * rms, _ON_RIM_PX)
     sector = np.arange(len(on_rim)) * SECTORS // len(on_rim)
     sectors = np.bincount(sector, on_rim, SECTORS) / np.maximum(np.bincount(sector, minlength=SECTORS), 1)
     beside = coverage - float(np.mean(good))
-    return RimFit(rim, covariance, coverage, rms, beside, slope, coarse.polarity, coverage / (1 + rms), sectors)
+    return RimFit(rim, covariance, coverage, rms, beside, coarse.polarity, coverage / (1 + rms), sectors)
 
 
 def _correlation_length(away: Array, good: Bools, spacing_px: float) -> float:

@@ -100,11 +100,6 @@ class DrogueFrame:
         """Standard deviations (3,) of `place`."""
         return np.array([*np.sqrt(np.diag(self.covariance)), self.sigma_diameter_px])
 
-    @property
-    def known(self) -> bool:
-        """Whether there is a place."""
-        return self.status is not PoseStatus.LOST
-
 
 def nothing_known(cause: Cause, event: str = "", searched: str = "", found: int = 0) -> DrogueFrame:
     """A lost frame."""
@@ -125,9 +120,8 @@ def nothing_known(cause: Cause, event: str = "", searched: str = "", found: int 
 
 
 RIGHT_SHARE = 0.25  # of the diameter
-FEATURES = ("1", "support", "confirmed", "size", "size x support", "gap")
-SIGNS = (0, 1, 1, -1, 1, -1)  # of the coefficients: more of a good sign never lowers the confidence
-COEFFICIENTS = (1.3, 1.5, 0.42, -5.57, 0.17, -0.66)  # of the features
+# Of 1, support, confirmed, size, size times support, gap: more of a good sign never lowers the confidence.
+COEFFICIENTS = (1.3, 1.5, 0.42, -5.57, 0.17, -0.66)
 ABSENT_LOGIT = -2.0  # of a check without a detection, in the running mean of the checks
 _CAP = 0.995  # of correlations: above it, noise decides
 _MOST_CONFIRMED = 10  # checks in a row that count: further ones say nothing new

@@ -15,14 +15,16 @@ from calibration.least_squares.adjustment import (
     Loss,
     Poses,
     Term,
+    Values,
     Vectors,
     independent,
     solve,
 )
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LensModel
-from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, Values, array_of, lens_of
+from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, lens_of
 from calibration.terms.corners import INTRINSICS_COUNT, CornerTerm, single_camera
+from calibration.terms.surveyed import array_of
 from geometry.arrays import Array, Bools
 
 CONVERGED = Limits()

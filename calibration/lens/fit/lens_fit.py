@@ -8,11 +8,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import chdtrc
 
-from calibration.least_squares.adjustment import Adjusted, Cauchy, Limits, Poses, Vectors
+from calibration.least_squares.adjustment import Adjusted, Cauchy, Limits, Poses, Values, Vectors
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_adjustment import BRIEF, CONVERGED, FitSettings, adjust, term_of, with_circle_radius
 from calibration.lens.fit.lens_models import LensModel
-from calibration.lens.fit.lens_parameters import BoardFreedom, Values, array_of, lens_of
+from calibration.lens.fit.lens_parameters import BoardFreedom, lens_of
+from calibration.terms.surveyed import array_of
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 

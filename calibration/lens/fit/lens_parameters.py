@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.least_squares.adjustment import Poses, Stack, Vectors
+from calibration.least_squares.adjustment import Poses, Values, Vectors
+from calibration.terms.surveyed import array_of
 from geometry.arrays import Array
 from geometry.pose import Pose
 
-Values = Mapping[str, Stack]
 BOARD_BLOCKS = ("warp", "stretch", "print", "radius")
 
 
@@ -56,9 +55,3 @@ def board_as_stated(points: int) -> Values:
 def lens_of(values: Values) -> Array:
     """(18,): the parameters of the lens."""
     return array_of(values, "intrinsics")[0]
-
-
-def array_of(values: Values, name: str) -> Array:
-    stack = values[name]
-    assert isinstance(stack, Vectors)
-    return stack.array

@@ -11,12 +11,12 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from calibration.least_squares.adjustment import AdjustmentError, Cauchy
+from calibration.least_squares.adjustment import AdjustmentError, Cauchy, Values
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_adjustment import BRIEF, FitSettings, adjust, term_of
 from calibration.lens.fit.lens_fit import FEWEST_CORNERS
 from calibration.lens.fit.lens_models import LensModel, folds_in_picture, undistorted
-from calibration.lens.fit.lens_parameters import AS_STATED, Values, lens_of, values_of
+from calibration.lens.fit.lens_parameters import AS_STATED, lens_of, values_of
 from calibration.terms.corners import INTRINSICS_COUNT
 from geometry.arrays import Array, Bools, Ints, evenly_spaced
 from geometry.camera import FISHEYE

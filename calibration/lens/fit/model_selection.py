@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtrc
 
-from calibration.least_squares.adjustment import AdjustmentError, Vectors
+from calibration.least_squares.adjustment import AdjustmentError, Values, Vectors
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import seen_at
 from calibration.lens.fit.lens_adjustment import BRIEF
@@ -30,7 +30,7 @@ from calibration.lens.fit.lens_models import (
     folds_in_picture,
     rational_of_fisheye,
 )
-from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, Values
+from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom
 from calibration.lens.fit.projection_map import ProjectionMap, projection_map
 from calibration.lens.fit.view_equations import ViewEquations, scattered
 from geometry.arrays import Array, Bools

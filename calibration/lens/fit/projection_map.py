@@ -89,11 +89,6 @@ class Difference:
     rms_mm: float
     p_value: float  # of a difference at least as large, if model and noise are right
 
-    @property
-    def ratio(self) -> float:
-        """Actual over expected difference."""
-        return self.rms_px / self.expected_rms_px
-
 
 def difference(at: ProjectionMap, delta: Array, C: Array) -> Difference:
     """Difference of two lenses, to first order about that of the map: delta (p,) of the parameters, covariance C."""

@@ -26,7 +26,7 @@ from lab.files.project.project import Project
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.csv_text import csv_text
 from lab.findings.finding import ENTRIES, Finding, Level, finding, passed
-from lab.number_format import format_count, format_number
+from lab.number_format import format_cell, format_count, format_number
 from lab.report.calibration.calibration_drawings import coverage_map, residual_field, residual_histogram
 from lab.report.calibration.calibration_scene import rig_things, scene_views
 from lab.report.page import (
@@ -284,12 +284,12 @@ def _beam_table(c: BeamCalibration, nominal: Rig) -> str:
         figures = [c.direction_sigmas[i] / ARCSEC, 1e3 * c.offset_sigmas[i], off[i, 0] / ARCSEC, 1e3 * off[i, 1]]
         if c.undetermined:
             figures[:2] = [np.nan, np.nan]
-        rows.append([name, *(f"{v:.12g}" for v in numbers), *(_short(v) for v in figures)])
+        rows.append([name, *(f"{v:.12g}" for v in numbers), *(format_cell(v) for v in figures)])
     return csv_text(BEAM_COLUMNS, rows)
 
 
 def _angle_table(c: BeamCalibration) -> str:
-    rows = [[a.first, a.second, f"{np.rad2deg(a.angle):.9g}", _short(a.sigma / ARCSEC)] for a in c.angles]
+    rows = [[a.first, a.second, f"{np.rad2deg(a.angle):.9g}", format_cell(a.sigma / ARCSEC)] for a in c.angles]
     return csv_text(ANGLE_COLUMNS, rows)
 
 
@@ -302,7 +302,7 @@ def _residual_table(c: BeamCalibration, positions: Sequence[str]) -> str:
         camera, spot = views[c.spots.view[i]]
         numbers = [*c.spots.pixels[i], *c.fit.residuals_px[i], mm[i], c.fit.sigmas[i]]
         words = [names[c.spots.position[i]], camera, spot]
-        rows.append([*words, *(_short(v) for v in numbers), "yes" if c.fit.kept[i] else "no"])
+        rows.append([*words, *(format_cell(v) for v in numbers), "yes" if c.fit.kept[i] else "no"])
     return csv_text(RESIDUAL_COLUMNS, rows)
 
 
@@ -325,10 +325,6 @@ def difference_from_nominal(c: BeamCalibration, nominal: Rig) -> Array:
         gap = np.cross(c.lines.points[i] - b.point, b.direction)
         out.append((np.arctan2(np.linalg.norm(np.cross(d, b.direction)), d @ b.direction), np.linalg.norm(gap)))
     return np.array(out)
-
-
-def _short(value: float) -> str:
-    return f"{value:.6g}" if np.isfinite(value) else ""
 
 
 def page_of(c: BeamCalibration, nominal: Rig, positions: Sequence[str]) -> tuple[list[KeyFigure], list[Section]]:

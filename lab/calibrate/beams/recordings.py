@@ -23,7 +23,7 @@ from lab.files.project.project import Project, ProjectRecording
 from lab.files.run.clocks import ESTIMATE
 from lab.files.run.run_file import Run, load_run
 from lab.files.text.csv_text import SIGMA_RANGE_PX, Table, check_pixels, check_sigmas, read_table
-from lab.files.text.error_text import printable_line, suggest_name
+from lab.files.text.error_text import printable_line
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from tracking.detections import Detections
 from tracking.statuses import SpotStatus
@@ -333,11 +333,9 @@ def read_spot_table(path: Path, rig: Rig, notes: list[str]) -> SpotRows:
     view = np.empty(len(table), dtype=np.int64)
     whole = table.whole(key)
     cameras, spots = table.words["camera"].tolist(), table.words["spot"].tolist()
-    wanted = {"camera": "a calibrated camera", "spot": "a spot of the target"}
+    table.refuse_unknown("camera", rig.cameras, "a calibrated camera")
+    table.refuse_unknown("spot", rig.spots, "a spot of the target")
     for i, (camera, spot) in enumerate(zip(cameras, spots, strict=True)):
-        for kind, name, names in (("camera", camera, rig.cameras), ("spot", spot, rig.spots)):
-            if name not in names:
-                raise table.error(i, f"{kind}: expected {wanted[kind]}, got {name!r}{suggest_name(name, names)}"[:200])
         if (camera, spot) not in views:
             raise table.error(
                 i,
@@ -345,7 +343,7 @@ def read_spot_table(path: Path, rig: Rig, notes: list[str]) -> SpotRows:
                 f" {rig.spots[spot].screen!r}; one of the two names is wrong",
             )
         view[i] = views[camera, spot]
-    pixels = np.stack([table.finite(name) for name in ("u_px", "v_px")], axis=1)
+    pixels = table.finite_stack("u_px", "v_px")
     sizes = {name: c.image_size_px for name, c in rig.cameras.items()}
     check_pixels(table, sizes)
     pairs = np.stack([whole, view], axis=1)

@@ -68,35 +68,35 @@ class FindingLimits:
 LIMITS = FindingLimits()
 
 
-def findings_of(c: Intrinsics, limits: FindingLimits = LIMITS) -> tuple[Finding, ...]:
+def findings_of(c: Intrinsics) -> tuple[Finding, ...]:
     """All tests, in the order of the report."""
     found = [
         _lens(c),
-        _noise(c, limits),
-        _rejected(c, limits),
-        _views_finding(c, limits),
-        _tilts(c, limits),
-        _coverage_finding(c, limits),
-        _focal(c, limits),
-        _aspect(c, limits),
-        _principal_point(c, limits),
-        _overfit(c, limits),
-        _halves(c, limits),
-        _origins(c, limits),
-        _scatter(c, limits),
-        _map(c, limits),
-        _model_uncertainty(c, limits),
-        _warp(c, limits),
-        _stretch(c, limits),
+        _noise(c),
+        _rejected(c),
+        _views_finding(c),
+        _tilts(c),
+        _coverage_finding(c),
+        _focal(c),
+        _aspect(c),
+        _principal_point(c),
+        _overfit(c),
+        _halves(c),
+        _origins(c),
+        _scatter(c),
+        _map(c),
+        _model_uncertainty(c),
+        _warp(c),
+        _stretch(c),
         _points(c),
-        _circles(c, limits),
+        _circles(c),
     ]
     return tuple(f for f in found if f is not None)
 
 
 def board_and_model_texts(c: Intrinsics) -> list[str]:
     """What the findings say about the board and about the choice of lens model."""
-    found = (_stretch(c, LIMITS), _points(c), _circles(c, LIMITS), _model_uncertainty(c, LIMITS))
+    found = (_stretch(c), _points(c), _circles(c), _model_uncertainty(c))
     return [f.what for f in found if f is not None]
 
 
@@ -146,111 +146,111 @@ def _lens(c: Intrinsics) -> Finding:
     return passed(f"Lens: {c.model.words}: {c.selection.why}.")
 
 
-def _noise(c: Intrinsics, limits: FindingLimits) -> Finding:
+def _noise(c: Intrinsics) -> Finding:
     what = f"Corner residuals: {_mm(c, c.fit.sigma_px)} per coordinate (1 sigma; RMS {c.rms_px:.3g} px)."
-    return finding("BP-L11", level_above(c.fit.sigma_px, *limits.noise_px), what)
+    return finding("BP-L11", level_above(c.fit.sigma_px, *LIMITS.noise_px), what)
 
 
-def _rejected(c: Intrinsics, limits: FindingLimits) -> Finding:
+def _rejected(c: Intrinsics) -> Finding:
     lost = int(np.sum(~c.fit.used))
     share, dropped = lost / len(c.table), len(c.fit.dropped)
     what = f"{lost} of {len(c.table)} corners excluded ({share:.1%})"
     if dropped:
         what += f", among them {format_count(dropped, 'whole view')}"
-    return finding("BP-L12", level_above(share, *limits.rejected), what + ".")
+    return finding("BP-L12", level_above(share, *LIMITS.rejected), what + ".")
 
 
-def _views_finding(c: Intrinsics, limits: FindingLimits) -> Finding:
+def _views_finding(c: Intrinsics) -> Finding:
     count = int(np.sum(c.table.counts(c.fit.used) > 0))
-    level = Level.WARN if count < limits.views else Level.PASS
+    level = Level.WARN if count < LIMITS.views else Level.PASS
     return finding("BP-L13", level, f"{count} photographs used, {int(c.fit.used.sum())} corners.")
 
 
-def _tilts(c: Intrinsics, limits: FindingLimits) -> Finding:
+def _tilts(c: Intrinsics) -> Finding:
     what = f"The orientations of the boards differ by up to {c.coverage.spread_deg:.0f} deg."
-    return finding("BP-L14", _level_below(c.coverage.spread_deg, limits.spread_deg), what)
+    return finding("BP-L14", _level_below(c.coverage.spread_deg, LIMITS.spread_deg), what)
 
 
-def _coverage_finding(c: Intrinsics, limits: FindingLimits) -> Finding:
+def _coverage_finding(c: Intrinsics) -> Finding:
     gaps = c.coverage.gaps
-    level = max(_level_below(c.coverage.filled, limits.filled), Level.WARN if gaps else Level.PASS)
+    level = max(_level_below(c.coverage.filled, LIMITS.filled), Level.WARN if gaps else Level.PASS)
     where = f"; none came near its {_listed(gaps)}" if gaps else ""
     return finding("BP-L15", level, f"Boards covered {c.coverage.filled:.0%} of the picture{where}.")
 
 
-def _focal(c: Intrinsics, limits: FindingLimits) -> Finding:
+def _focal(c: Intrinsics) -> Finding:
     share = float(c.sigmas[0] / c.fit.lens[0])
     return finding(
         "BP-L16",
-        level_above(share, *limits.focal),
+        level_above(share, *LIMITS.focal),
         f"Focal length {c.fit.lens[0]:.2f} ± {_two(c.sigmas[0])} px ({share:.2%}).",
         why="A pose's distance is uncertain by that share:"
         f" {_two(1000 * share * c.distance_m)} mm at {c.distance_m:.3g} m.",
     )
 
 
-def _aspect(c: Intrinsics, limits: FindingLimits) -> Finding:
+def _aspect(c: Intrinsics) -> Finding:
     fx, fy = c.fit.lens[:2]
     away = fx / fy - 1
     C = c.covariance[:2, :2] / np.outer([fx, fy], [fx, fy])
     sigma = float(np.sqrt(C[0, 0] + C[1, 1] - 2 * C[0, 1]))
-    level = level_above(abs(away), *limits.aspect)
+    level = level_above(abs(away), *LIMITS.aspect)
     if level is not Level.FAIL and abs(away) < 2 * sigma:
         level = Level.PASS
     return finding("BP-L17", level, f"fx / fy = {fx / fy:.4f} ± {sigma:.1g}.")
 
 
-def _principal_point(c: Intrinsics, limits: FindingLimits) -> Finding:
+def _principal_point(c: Intrinsics) -> Finding:
     size = np.array(c.table.image_size_px)
     away = c.fit.lens[2:4] - (size - 1) / 2
     share = float(np.max(np.abs(away) / size))
-    level = level_above(share, *limits.off_centre)
+    level = level_above(share, *LIMITS.off_centre)
     what = (
         f"Principal point {away[0]:+.1f}, {away[1]:+.1f} px from the centre"
         f" (± {_two(c.sigmas[2])}, {_two(c.sigmas[3])})."
     )
-    sure = bool(np.any(np.abs(away) > 2 * c.sigmas[2:4] + limits.off_centre[0] * size))
+    sure = bool(np.any(np.abs(away) > 2 * c.sigmas[2:4] + LIMITS.off_centre[0] * size))
     return finding("BP-L18", level, what, variant="" if sure else "uncertain")
 
 
-def _overfit(c: Intrinsics, limits: FindingLimits) -> Finding:
+def _overfit(c: Intrinsics) -> Finding:
     ratio = c.held_out_rms_px / c.fit.sigma_px
     what = f"Hold-out error: {_mm(c, c.held_out_rms_px)}, {ratio:.2f} times the corners' own noise."
-    return finding("BP-L19", level_above(ratio, *limits.overfit), what)
+    return finding("BP-L19", level_above(ratio, *LIMITS.overfit), what)
 
 
-def _halves(c: Intrinsics, limits: FindingLimits) -> Finding:
+def _halves(c: Intrinsics) -> Finding:
     d = c.halves
     if d is None:
         what = "Half of the photographs do not determine the lens, so that two halves cannot be compared."
         return finding("BP-L20", Level.WARN, what)
     return finding(
         "BP-L21",
-        _disagreement(d, limits, limits.p_value),
+        _disagreement(d, LIMITS.p_value),
         f"Two halves of the photographs differ by {d.rms_px:.3g} px ({_two(d.rms_mm)} mm at {c.distance_m:.3g} m), RMS"
         f" over the picture; {d.expected_rms_px:.3g} px are expected from their sigmas (p = {d.p_value:.2g}).",
     )
 
 
-def _disagreement(d: Difference, limits: FindingLimits, p_value: float) -> Level:
+def _disagreement(d: Difference, p_value: float) -> Level:
     if d.p_value >= p_value:
         return Level.PASS
-    return Level.FAIL if d.rms_px > limits.halves_px else Level.WARN
+    return Level.FAIL if d.rms_px > LIMITS.halves_px else Level.WARN
 
 
-def _origins(c: Intrinsics, limits: FindingLimits) -> Finding | None:
+def _origins(c: Intrinsics) -> Finding | None:
     if c.origins is None:
         return None
     d, (first, second) = c.origins.difference, c.origins.names
     return finding(
         "BP-L22",
-        _disagreement(d, limits, limits.origins_p_value),
+        _disagreement(d, LIMITS.origins_p_value),
         f"The photographs {first!r} and {second!r} give lenses that differ by {d.rms_px:.3g} px, RMS over the picture;"
         f" {d.expected_rms_px:.3g} px are expected from their sigmas (p = {d.p_value:.2g}).",
     )
 
 
-def _scatter(c: Intrinsics, limits: FindingLimits) -> Finding:
+def _scatter(c: Intrinsics) -> Finding:
     what = (
         f"The lens parameters scatter from photograph to photograph by {c.scatter.factor:.2f} times what the corners'"
         " noise explains"
@@ -258,24 +258,24 @@ def _scatter(c: Intrinsics, limits: FindingLimits) -> Finding:
     if c.correlated_noise == 1:
         return passed(f"{what} (p = {c.scatter.p_value:.2g}).")
     what += f" (p = {c.scatter.p_value:.1g}); the sigmas include it."
-    if c.scatter.p_value >= limits.scatter_p_value:
+    if c.scatter.p_value >= LIMITS.scatter_p_value:
         return passed(what)
     return finding("BP-L23", Level.WARN, what)
 
 
-def _map(c: Intrinsics, limits: FindingLimits) -> Finding:
+def _map(c: Intrinsics) -> Finding:
     px, mm = c.map.sigma_px(c.covariance), c.map.sigma_mm(c.covariance)
     (half, most, worst), (half_mm, most_mm, worst_mm) = (np.nanquantile(m, [0.5, 0.9, 1.0]) for m in (px, mm))
     return finding(
         "BP-L24",
-        level_above(float(most), *limits.map_px),
+        level_above(float(most), *LIMITS.map_px),
         f"The direction of a pixel is known to {_two(half)} px ({_two(half_mm)} mm at {c.distance_m:.3g} m) or better"
         f" in half of the picture, to {_two(most)} px ({_two(most_mm)} mm) in 90 %, and to {_two(worst)} px"
         f" ({_two(worst_mm)} mm) at the worst place (1 sigma).",
     )
 
 
-def _model_uncertainty(c: Intrinsics, limits: FindingLimits) -> Finding | None:
+def _model_uncertainty(c: Intrinsics) -> Finding | None:
     """Model error beyond the covariance of the parameters; None if there is no evidence of it."""
     d = c.model_uncertainty
     if d.factor < _SLIGHT_MODEL_ERROR:
@@ -286,10 +286,10 @@ def _model_uncertainty(c: Intrinsics, limits: FindingLimits) -> Finding | None:
     if d.between_px > 0:
         parts.append(f"{d.between_px:.2g} px to the other models, by their probabilities")
     what = f"Uncertainty of the lens model: {' and '.join(parts)}; all sigmas have been multiplied by {d.factor:.2f}."
-    return finding("BP-L01", Level.WARN if d.factor > limits.model_factor or d.left_px > 0 else Level.PASS, what)
+    return finding("BP-L01", Level.WARN if d.factor > LIMITS.model_factor or d.left_px > 0 else Level.PASS, what)
 
 
-def _warp(c: Intrinsics, limits: FindingLimits) -> Finding | None:
+def _warp(c: Intrinsics) -> Finding | None:
     w = c.warp
     if w is None:
         return None
@@ -297,10 +297,10 @@ def _warp(c: Intrinsics, limits: FindingLimits) -> Finding | None:
     if not w.corrected:
         change = f" Solving for it would change directions by {_two(w.change_px)} px RMS." if w.change_px else ""
         return passed(f"{what}; taken as flat.{change}")
-    return finding("BP-L25", Level.WARN if w.rise_m > limits.warp_m else Level.PASS, f"{what}; corrected.")
+    return finding("BP-L25", Level.WARN if w.rise_m > LIMITS.warp_m else Level.PASS, f"{what}; corrected.")
 
 
-def _stretch(c: Intrinsics, limits: FindingLimits) -> Finding | None:
+def _stretch(c: Intrinsics) -> Finding | None:
     """Whether the board's rows and columns are to scale; None if the photographs do not determine it."""
     s = None if c.board is None else c.board.stretch
     if s is None:
@@ -313,11 +313,11 @@ def _stretch(c: Intrinsics, limits: FindingLimits) -> Finding | None:
     )
     if s.corrected:
         off = max(abs(s.stretch), abs(s.lean_rad))
-        return finding("BP-L03", Level.WARN if off > limits.stretch else Level.PASS, f"{what}; corrected.")
+        return finding("BP-L03", Level.WARN if off > LIMITS.stretch else Level.PASS, f"{what}; corrected.")
     aspect = c.fit.lens[0] / c.fit.lens[1]
     is_open = s.sigma[0] > _UNDETERMINED and abs(aspect - 1) > _UNDETERMINED
     if s.change_px > 0 and not is_open:
-        level = Level.WARN if s.change_px > limits.board_px else Level.PASS
+        level = Level.WARN if s.change_px > LIMITS.board_px else Level.PASS
         what += f"; taken as stated. Solving for it would change directions by {s.change_px:.2g} px RMS."
         return finding("BP-L03", level, what, variant="not solved for")
     return finding("BP-L02", Level.WARN if is_open else Level.PASS, f"{what}; taken as stated.")
@@ -340,7 +340,7 @@ def _points(c: Intrinsics) -> Finding | None:
     return passed(f"{what}; taken as stated. Solving for them would change directions by {p.change_px:.2g} px RMS.")
 
 
-def _circles(c: Intrinsics, limits: FindingLimits) -> Finding | None:
+def _circles(c: Intrinsics) -> Finding | None:
     """Size of the board's circles; None for other boards."""
     if c.table.circles is None:
         return None
@@ -351,7 +351,7 @@ def _circles(c: Intrinsics, limits: FindingLimits) -> Finding | None:
         return passed(f"{what}{alone}.")
     share = 2 * c.fit.radius_m / stated - 1
     what += f", {100 * share:+.1f} % against the {1000 * stated:.4g} mm stated."
-    return finding("BP-L05", Level.WARN if abs(share) > limits.circle else Level.PASS, what)
+    return finding("BP-L05", Level.WARN if abs(share) > LIMITS.circle else Level.PASS, what)
 
 
 _WORST_VIEWS = 3  # views with the largest residuals that are shown as pictures, besides the median and the best

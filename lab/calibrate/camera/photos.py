@@ -393,6 +393,6 @@ def _read_csv(path: Path) -> dict[str, tuple[Ints, Array]]:
     table = read_table(path, CSV_COLUMNS)
     table.require_rows(CSV_COLUMNS)
     ids = table.finite("id", "the number of a point of the board")
-    pixels = np.stack([table.finite("u_px"), table.finite("v_px")], axis=1)
+    pixels = table.finite_stack("u_px", "v_px")
     view = table.words["view"]
     return {name: (ids[view.codes == k].astype(np.int64), pixels[view.codes == k]) for k, name in enumerate(view.words)}

@@ -52,7 +52,7 @@ from lab.files.rig.camera_file import CalibrationState
 from lab.files.rig.rig_file import RigFile, joint_covariance, load_rig_file
 from lab.files.text.csv_text import write_table
 from lab.findings.finding import Finding, Level, Outcome, finding, passed
-from lab.number_format import format_count, format_number
+from lab.number_format import decimals_of, format_count, format_number
 from lab.report.calibration.calibration_drawings import DriftLine, corners_overlay, drift_chart
 from lab.report.calibration.calibration_scene import Marker, rig_things, scene_views
 from lab.report.page import KeyFigure, PageDrawing, PageTable, Section
@@ -137,7 +137,7 @@ def describe_change(c: CameraDrift) -> str:
     assert c.change is not None
     kind = c.change.kind
     if kind == ZOOMED:
-        scale = f"{_signed(c.scale_ppm)} ± {format_number(c.sigma_scale_ppm)} ppm"
+        scale = f"{format_number(c.scale_ppm, signed=True)} ± {format_number(c.sigma_scale_ppm)} ppm"
         return f"has another focal length ({scale}): focus or zoom changed"
     if kind in (TURNED, TURNED_ZOOMED):
         turn = c.change.delta[:3]
@@ -171,10 +171,6 @@ def other_findings(others: Sequence[OtherChange], limits: DriftLimits) -> list[F
 
 def _p(p: float) -> str:
     return "below 1e-12" if p < 1e-12 else f"{p:.1g}"
-
-
-def _signed(value: float) -> str:
-    return ("+" if value > 0 else "") + format_number(value)
 
 
 def page_of(
@@ -260,7 +256,7 @@ def _drift_section(
 def _plus_minus(values: Array, sigmas: Array) -> str:
     """Values rounded to the precision of their largest sigma, and that sigma."""
     sigma = float(np.max(sigmas))
-    decimals = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 6)) if sigma > 0 else 3
+    decimals = decimals_of(sigma) if sigma > 0 else 3
     words = ", ".join(f"{v:.{decimals}f}" for v in values.tolist())
     return f"{words} ± {format_number(sigma, 2)}".replace("-", "−")
 

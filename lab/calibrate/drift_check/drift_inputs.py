@@ -12,12 +12,12 @@ from geometry.arrays import Array
 from geometry.pose import Pose
 from geometry.rig import Rig
 from lab.errors import InputError
+from lab.files.project.point_files import POINTS, pixels_in
 from lab.files.run.results import read_poses, read_spots
 from lab.files.run.truth import read_true_poses
-from lab.files.text.csv_text import SIGMA_RANGE_PX, Table, check_pixels, check_sigmas, read_table
+from lab.files.text.csv_text import Table, read_table
 from lab.files.text.error_text import suggest_name
 
-PIXELS = ("camera", "point", "u_px", "v_px")
 PLACES = ("x_m", "y_m", "z_m", "sigma_x_m", "sigma_y_m", "sigma_z_m")
 _MAX_COORDINATE_M = 500.0  # larger coordinates are taken for millimetres: no lab is that large
 _MAX_RESIDUAL_PX = 200.0  # a median residual above this means other points or another rig
@@ -82,8 +82,8 @@ def read_points(path: Path, survey: Path | None, rig: Rig, default_sigma_px: flo
     coordinates on a screen), or from the same columns of the pixel file itself. Raises InputError: with file, line, the
     expected and the found content.
     """
-    table = read_table(path, PIXELS, ("sigma_px", *PLACES, "screen"))
-    table.require_rows(PIXELS)
+    table = read_table(path, POINTS, ("sigma_px", *PLACES, "screen"))
+    table.require_rows(POINTS)
     if survey is not None:
         coordinates = _coordinates(_survey_table(survey), rig)
     elif "x_m" in table:
@@ -93,29 +93,14 @@ def read_points(path: Path, survey: Path | None, rig: Rig, default_sigma_px: flo
             f"{path}: expected the coordinates of its points: columns x_m,y_m,z_m (or screen,x_m,y_m) in this file, or"
             " a survey file (--survey); got neither"
         )
-    cameras, points = table.names("camera"), table.names("point")
-    pixels = np.stack([table.finite(c) for c in ("u_px", "v_px")], axis=1)
-    seen: dict[tuple[str, str], int] = {}
-    for i, (camera, point) in enumerate(zip(cameras, points, strict=True)):
-        if camera not in rig.cameras:
-            raise table.error(
-                i, f"camera: expected a camera of the rig, got {camera!r}{suggest_name(camera, rig.cameras)}"
-            )
+    table.refuse_unknown("camera", rig.cameras, "a camera of the rig")
+    cameras, points, pixels, sigma = pixels_in(table, {n: c.image_size_px for n, c in rig.cameras.items()}, {})
+    for i, point in enumerate(points):
         if point not in coordinates:
             raise InputError(
                 f"{survey or path}: expected the coordinates of point {point!r} ({path.name}, line {table.lines[i]}),"
                 " got none" + suggest_name(point, coordinates)
             )
-        if (camera, point) in seen:
-            raise table.error(
-                i,
-                f"expected each point once per camera, got {point!r} of {camera!r} again (first in line"
-                f" {seen[camera, point]}); give the mean of repeated measurements",
-            )
-        seen[camera, point] = int(table.lines[i])
-    sigma = table.optional("sigma_px")
-    check_sigmas(table, "sigma_px", SIGMA_RANGE_PX, "px")
-    check_pixels(table, {name: c.image_size_px for name, c in rig.cameras.items()})
     found = [coordinates[point] for point in points]
     return KnownPoints(
         tuple(cameras), tuple(points), pixels, np.where(np.isnan(sigma), default_sigma_px, sigma),
@@ -158,9 +143,12 @@ def _coordinates(table: Table, rig: Rig) -> dict[str, tuple[list[float], list[fl
             f"{table.path}: expected a column 'z_m' (world) or 'screen' (x_m,y_m on a screen), got neither"
         )
     names = ("x_m", "y_m") if on_screens else ("x_m", "y_m", "z_m")
-    places = np.stack([table.finite(c) for c in names], axis=1)
+    places = table.finite_stack(*names)
     sigmas = np.nan_to_num(np.stack([table.optional(f"sigma_{name}") for name in names], axis=1))
-    screens = table.names("screen", may_be_empty=True) if on_screens else [""] * len(table)
+    screens = [""] * len(table)
+    if on_screens:
+        table.refuse_unknown("screen", rig.screens, "a screen of the rig")
+        screens = table.names("screen")
     fill = [0.0] * (3 - len(names))
     out: dict[str, tuple[list[float], list[float], str]] = {}
     for i, point in enumerate(table.names("point")):
@@ -176,11 +164,6 @@ def _coordinates(table: Table, rig: Rig) -> dict[str, tuple[list[float], list[fl
                 i,
                 f"expected sigmas in metres, 0 to {_MAX_COORDINATE_M:g}, got"
                 f" {min(sigma) if min(sigma) < 0 else max(sigma):g}; correct it, or leave the field empty",
-            )
-        if on_screens and screens[i] not in rig.screens:
-            raise table.error(
-                i,
-                f"screen: expected a screen of the rig, got {screens[i]!r}{suggest_name(screens[i], rig.screens)}",
             )
         entry = (place + fill, sigma + fill, screens[i])
         if out.setdefault(point, entry) != entry:

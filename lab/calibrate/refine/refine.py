@@ -25,7 +25,7 @@ from geometry.arrays import Array, finite
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import CLOCK, POSE, ROW_TIME, RigCovariance, split_name
-from lab.calibrate.camera.camera_page import FindingLimits
+from lab.calibrate.camera.camera_page import LIMITS
 from lab.calibrate.refine.recordings import (
     CLOCKS,
     GROUPS,
@@ -376,7 +376,7 @@ def _held(rig: Rig, prior: RigCovariance) -> list[Finding]:
 
 def _lenses(r: Refinement) -> list[Finding]:
     """Cameras whose focal length is neither stated with a sigma nor shown by the recordings."""
-    most = FindingLimits().focal[0]
+    most = LIMITS.focal[0]
     unknown = [f"cameras.{name}" for name, sigma in r.lens_sigmas.items() if sigma > most]
     if not unknown or r.moved:
         return []

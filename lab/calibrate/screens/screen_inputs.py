@@ -16,7 +16,7 @@ from calibration.boards.board_types import Board
 from calibration.boards.board_view import BoardView, NotFound
 from calibration.least_squares.adjustment import AdjustmentError, Prior
 from calibration.screens.clouds import FEWEST, MissingOpen3DError, align, on_surfaces, register, scan_of
-from calibration.screens.network import ControlPoints, Network, PointObservations
+from calibration.screens.network import ControlPoints, Network, PointObservations, fisheye
 from calibration.screens.network_start import NotConnectedError
 from calibration.screens.screens import (
     ApproximatePosition,
@@ -33,7 +33,6 @@ from calibration.terms.corners import CornerTerm
 from calibration.terms.rig_blocks import prior_of
 from calibration.terms.surveyed import BoardOnScreenTerm
 from geometry.arrays import Array, Bools, Ints
-from geometry.camera import FISHEYE
 from geometry.pose import Pose
 from geometry.rig import Rig, Screen
 from geometry.uncertainty.rig_uncertainty import RigCovariance
@@ -148,7 +147,7 @@ def _corners(found: _Found, rig: Rig) -> CornerTerm:
         placement=np.concatenate(placement_of),
         board=np.concatenate(board_of),
         sigma_px=np.full(sum(map(len, pixels)), START_CORNER_SIGMA_PX),
-        fisheye=_fisheye(rig),
+        fisheye=fisheye(rig),
         areas_px2=np.concatenate(areas) if circles else None,
     )
 
@@ -166,10 +165,6 @@ def _fixed_boards(found: _Found) -> BoardOnScreenTerm | None:
         sigma_m=np.array([b.sigma_m for _, _, b in fixed]),
         tilt_sigma_rad=np.array([b.tilt_sigma_rad for _, _, b in fixed]),
     )
-
-
-def _fisheye(rig: Rig) -> Bools:
-    return np.array([c.lens == FISHEYE for c in rig.cameras.values()], dtype=bool)
 
 
 def _view(path: Path, board: Board, size_px: tuple[int, int]) -> BoardView | str:

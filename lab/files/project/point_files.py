@@ -158,7 +158,7 @@ def read_survey(paths: Sequence[Path], screens: Collection[str], farthest_m: flo
             if name in where:
                 raise table.error(i, f"point: expected each point once, got {name!r} again (first in {where[name]})")
             where[name] = f"{path.name}, line {table.lines[i]}"
-        coordinates = _finite(table, SURVEY[1:])
+        coordinates = table.finite_stack(*SURVEY[1:])
         check_coordinates(table, SURVEY[1:], farthest_m)
         sigmas, note = _survey_sigmas(table)
         notes += note
@@ -190,34 +190,25 @@ def read_observations(
     """
     camera: list[str] = []
     point: list[str] = []
-    seen: set[tuple[str, str]] = set()
+    seen: dict[tuple[str, str], str] = {}
     pixels, sigmas, notes = [], [], []
     for path in paths:
         table = read_table(path, POINTS, ("sigma_px",))
         table.require_rows(POINTS)
-        of_camera, of_point = table.names("camera"), table.names("point")
-        _refuse_unknown(table, "camera", of_camera, cameras)
-        _refuse_unknown(table, "point", of_point, points)
-        for i, pair in enumerate(zip(of_camera, of_point, strict=True)):
-            if pair in seen:
-                raise table.error(
-                    i,
-                    f"expected each point once per camera, got point {pair[1]!r} of camera {pair[0]!r} a second time",
-                )
-            seen.add(pair)
+        for kind, known, whose, key in (
+            ("camera", cameras, "project", "`cameras`"), ("point", points, "survey", "`survey` with its points"),
+        ):  # fmt: skip
+            if not known:
+                missing = f"which has none, got {table.names(kind)[0]!r}; add {key} to the project"
+                raise table.error(0, f"{kind}: expected a {kind} of the {whose}, {missing}")
+            table.refuse_unknown(kind, known, f"a {kind} of the {whose}")
+        of_camera, of_point, uv, sigma = pixels_in(table, cameras, seen)
         camera += of_camera
         point += of_point
-        uv = _finite(table, POINTS[2:])
-        check_pixels(table, cameras)
         pixels.append(uv)
-        if "sigma_px" in table:
-            given = table.finite("sigma_px", "a number above 0", may_be_empty=True)
-            check_sigmas(table, "sigma_px", SIGMA_RANGE_PX, "px")
-            sigma = np.where(np.isnan(given), DEFAULT_POINT_SIGMA_PX, given)
-        else:
+        if "sigma_px" not in table:
             notes.append(f"{path}: no column sigma_px: {DEFAULT_POINT_SIGMA_PX} px is assumed")
-            sigma = np.full(len(table), DEFAULT_POINT_SIGMA_PX)
-        sigmas.append(sigma)
+        sigmas.append(np.where(np.isnan(sigma), DEFAULT_POINT_SIGMA_PX, sigma))
     return Observations(
         tuple(camera),
         tuple(point),
@@ -227,6 +218,29 @@ def read_observations(
     )
 
 
+def pixels_in(
+    table: Table, sizes: Mapping[str, tuple[int, int]], seen: dict[tuple[str, str], str]
+) -> tuple[list[str], list[str], Array, Array]:
+    """Cameras, points, pixels (n, 2) and sigmas (n,), px, of the rows of a table; nan where it states no sigma.
+
+    sizes: of the pictures by camera. seen: camera and point of rows that were read before; gets these. Raises
+    InputError.
+    """
+    cameras, points = table.names("camera"), table.names("point")
+    for i, pair in enumerate(zip(cameras, points, strict=True)):
+        where = f"{table.path.name}, line {table.lines[i]}"
+        if seen.setdefault(pair, where) != where:
+            raise table.error(
+                i,
+                f"expected each point once per camera, got {pair[1]!r} of {pair[0]!r} again (first in {seen[pair]});"
+                " give the mean of repeated measurements",
+            )
+    pixels, sigma = table.finite_stack(*POINTS[2:]), table.finite("sigma_px", "a number above 0", may_be_empty=True)
+    check_pixels(table, sizes)
+    check_sigmas(table, "sigma_px", SIGMA_RANGE_PX, "px")
+    return cameras, points, pixels, sigma
+
+
 def read_poses(path: Path) -> StandPoses:
     """Poses of the stand: the columns of truth/pose.csv, and optionally POSE_SIGMAS.
 
@@ -234,17 +248,11 @@ def read_poses(path: Path) -> StandPoses:
     """
     table = read_table(path, columns.TRUTH_POSE, POSE_SIGMAS)
     table.require_rows(columns.TRUTH_POSE)
-    frames = table.whole("frame")
-    for i in np.flatnonzero(np.diff(frames) <= 0)[:1] + 1:
-        raise table.error(
-            i,
-            f"frame: expected rising numbers, got {frames[i]} after {frames[i - 1]}; sort the rows, and give each frame"
-            " once",
-        )
+    frames = table.rising("frame")
     table.finite("t_s", "seconds", may_be_empty=True)
-    xyz = _finite(table, ("x_m", "y_m", "z_m"))
+    xyz = table.finite_stack("x_m", "y_m", "z_m")
     check_coordinates(table, ("x_m", "y_m", "z_m"))
-    q = _finite(table, ("qw", "qx", "qy", "qz"))
+    q = table.finite_stack("qw", "qx", "qy", "qz")
     check_unit_quaternions(table)
     sigmas = np.full((len(table), 6), np.nan)
     for k, name in enumerate(POSE_SIGMAS):
@@ -254,25 +262,6 @@ def read_poses(path: Path) -> StandPoses:
             check_sigmas(table, name, allowed, unit)
             sigmas[:, k] = value if k < 3 else np.radians(value)
     return StandPoses(frames, Pose.from_quaternion(q, xyz), sigmas)
-
-
-def _refuse_unknown(table: Table, kind: str, names: Sequence[str], known: Collection[str]) -> None:
-    """Raises InputError at the first name of the column `kind` that is not known."""
-    for i, name in enumerate(names):
-        if name in known:
-            continue
-        whose = "the project" if kind == "camera" else "the survey"
-        if not known:
-            missing = "`survey` with its points" if kind == "point" else "`cameras`"
-            raise table.error(
-                i,
-                f"{kind}: expected a {kind} of {whose}, which has none, got {name!r}; add {missing} to the project",
-            )
-        raise table.error(i, f"{kind}: expected a {kind} of {whose}, got {name!r}{suggest_name(name, known)}"[:200])
-
-
-def _finite(table: Table, names: Sequence[str]) -> Array:
-    return np.stack([table.finite(name) for name in names], axis=1)
 
 
 def _survey_sigmas(table: Table) -> tuple[Array, list[str]]:

@@ -6,6 +6,7 @@ The state of a calibration: its date, validity and verdict, and whether it may b
 from __future__ import annotations
 
 import datetime
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -164,6 +165,19 @@ class CovarianceBlock(fields.Block):
                 f"expected a matrix row for each of {len(self.parameters)} parameters, got {len(self.matrix)}"
             )
         return self
+
+    def check(self, known: Collection[str]) -> None:
+        """Raises for a name that is not known or there twice, and for a matrix that is not a covariance."""
+        for i, name in enumerate(self.parameters):
+            if name not in known:
+                raise fields.field_error(
+                    f"covariance.parameters: unknown parameter {name!r}{suggest_name(name, known)}"
+                )
+            if name in self.parameters[:i]:
+                raise fields.field_error(f"covariance.parameters: expected each name once, got {name!r} a second time")
+        mistake = covariance_error(self.value())
+        if mistake:
+            raise fields.field_error(f"covariance.matrix: {mistake}")
 
     def value(self) -> RigCovariance:
         """The block as a value."""
@@ -337,17 +351,5 @@ class _CameraFileBlock(LensBlock):
         if self.covariance is None:
             return self
         camera = CameraFile(self.name, self.size(), self.matrix(), tuple(self.distortion), self.lens)
-        known = camera.parameter_names
-        seen: set[str] = set()
-        for name in self.covariance.parameters:
-            if name not in known:
-                raise fields.field_error(
-                    f"covariance.parameters: unknown parameter {name!r}{suggest_name(name, known)}"
-                )
-            if name in seen:
-                raise fields.field_error(f"covariance.parameters: expected each name once, got {name!r} a second time")
-            seen.add(name)
-        mistake = covariance_error(self.covariance.value())
-        if mistake:
-            raise fields.field_error(f"covariance.matrix: {mistake}")
+        self.covariance.check(camera.parameter_names)
         return self

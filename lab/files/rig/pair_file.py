@@ -19,14 +19,12 @@ from lab.files.rig.camera_file import (
     CalibrationState,
     CovarianceBlock,
     LensBlock,
-    covariance_error,
     covariance_mapping,
     lens_mapping,
 )
 from lab.files.rig.interchange import BEAMPOSE, RIG, read_cameras, recognised_format
 from lab.files.rig.pose_block import CameraPoseBlock, pose_mapping
 from lab.files.rig.rig_file import joint_covariance, load_rig_file
-from lab.files.text.error_text import suggest_name
 from lab.files.text.fields import Block, Name, one_of, validated
 from lab.files.text.yaml_text import parse_mapping, read_text, write_mapping
 
@@ -52,6 +50,19 @@ class _PairBlock(Block):
     cameras: dict[Name, _CameraBlock]
     covariance: CovarianceBlock | None = None
     calibration: CalibrationState | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _covariance_of_these_cameras(self) -> _PairBlock:
+        if self.covariance is not None:
+            self.covariance.check([f"cameras.{n}.{p}" for n, c in self.values().items() for p in camera_names(c)])
+        return self
+
+    def values(self) -> dict[str, Camera]:
+        """The cameras by name."""
+        return {
+            name: Camera(name, "", b.size(), b.matrix(), tuple(b.distortion), b.camera_from_world.pose(), lens=b.lens)
+            for name, b in self.cameras.items()
+        }
 
 
 def load_pair_file(path: Path) -> PairFile:
@@ -89,26 +100,12 @@ def load_pair_file(path: Path) -> PairFile:
 
 
 def _own(content: _PairBlock, path: Path) -> PairFile:
-    cameras = {
-        name: Camera(name, "", b.size(), b.matrix(), tuple(b.distortion), b.camera_from_world.pose(), lens=b.lens)
-        for name, b in content.cameras.items()
-    }
-    if len(cameras) < 2:
-        raise InputError(f"{path}: cameras: expected two, got {len(cameras)}; {REMEDY}")
-    covariance = None
-    if content.covariance is not None:
-        block = content.covariance.value()
-        known = [f"cameras.{name}.{p}" for name, camera in cameras.items() for p in camera_names(camera)]
-        for name in block.names:
-            if name not in known:
-                raise InputError(
-                    f"{path}: covariance.parameters: unknown parameter {name!r}{suggest_name(name, known)}"
-                )
-        mistake = covariance_error(block)
-        if mistake:
-            raise InputError(f"{path}: covariance.matrix: {mistake}")
-        covariance = RigCovariance(block.names, symmetric(block.matrix))
-    return PairFile(cameras, covariance, content.calibration)
+    if len(content.cameras) < 2:
+        raise InputError(f"{path}: cameras: expected two, got {len(content.cameras)}; {REMEDY}")
+    covariance = None if content.covariance is None else content.covariance.value()
+    if covariance is not None:
+        covariance = RigCovariance(covariance.names, symmetric(covariance.matrix))
+    return PairFile(content.values(), covariance, content.calibration)
 
 
 def save_pair_file(file: PairFile, path: Path) -> None:

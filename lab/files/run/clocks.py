@@ -59,10 +59,7 @@ def load_times(path: Path, frame_rate_hz: float) -> Times:
     table.refuse_long_lines()
     if not len(table):
         raise InputError(f"{path}: expected a row per frame, got none")
-    frames = table.whole("frame")
-    times_s = table.finite("t_s", "seconds")
-    for i in np.flatnonzero(np.diff(frames) <= 0)[:1] + 1:
-        raise table.error(i, f"frame: expected increasing numbers, got {frames[i]} after {frames[i - 1]}")
+    frames, times_s = table.rising("frame"), table.finite("t_s", "seconds")
     for i in np.flatnonzero(np.diff(times_s) <= 0)[:1] + 1:
         raise table.error(
             i,

@@ -19,7 +19,6 @@ from lab.files.rig.pose_block import QUATERNION_TOLERANCE
 from lab.files.run.run_file import Run
 from lab.files.text import columns
 from lab.files.text.csv_text import Categorical, Table, read_table, write_table
-from lab.files.text.error_text import suggest_name
 
 FARTHEST = 1e9  # px, m or s: a number beyond it is a mistake, and its square may not be finite
 MAX_COMPARED_FRAMES = 500  # by `largest_disagreement_px`, evenly spread: enough to show a wrong rig
@@ -83,9 +82,7 @@ def read_true_poses(path: Path) -> TruePoses:
     """A table of poses, columns TRUTH_POSE. Raises InputError in one line."""
     table = read_table(path, columns.TRUTH_POSE)
     table.refuse_long_lines()
-    frame = table.whole("frame")
-    for i in np.flatnonzero(np.diff(frame) <= 0)[:1] + 1:
-        raise table.error(i, f"frame: expected rising numbers, got {frame[i]} after {frame[i - 1]}")
+    frame = table.rising("frame")
     numbers = {name: table.finite(name) for name in columns.TRUTH_POSE[1:]}
     for name in ("t_s", "x_m", "y_m", "z_m"):
         for i in np.flatnonzero(np.abs(numbers[name]) > FARTHEST)[:1]:
@@ -126,13 +123,8 @@ def _read_true_spots(path: Path, known: dict[str, Collection[str] | None]) -> Tr
         for i in np.flatnonzero(np.abs(table.numbers[name]) > FARTHEST)[:1]:
             raise table.error(i, f"{name}: expected a pixel within {FARTHEST:g}, got {table.found(name, i)}")
     for column, names in known.items():
-        words = table.words[column]
-        for code, word in enumerate(words.words):
-            if names is not None and word not in names:
-                i = int(np.argmax(words.codes == code))
-                raise table.error(
-                    i, f"{column}: expected a {column} of the rig, got {word!r}{suggest_name(word, names)}"
-                )
+        if names is not None:
+            table.refuse_unknown(column, names, f"a {column} of the rig")
     spots = TrueSpots(
         frame, table.words["camera"], table.words["spot"], table.stack("u_px", "v_px"), in_view.astype(np.int64)
     )

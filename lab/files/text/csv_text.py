@@ -12,7 +12,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -22,7 +22,7 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
-from lab.files.text.error_text import describe_value, is_formula, near_name, printable_line
+from lab.files.text.error_text import describe_value, is_formula, near_name, printable_line, suggest_name
 
 MAX_COORDINATE_M = (
     10_000.0  # m from the origin: coordinates of a national grid must be transformed to a local frame first
@@ -423,6 +423,10 @@ class Table:
                 raise self.error(i, f"{column}: expected {expected}, got {found}{remedy}")
         return values
 
+    def finite_stack(self, *columns: str) -> Array:
+        """(n, k): columns of finite numbers side by side. Raises InputError."""
+        return np.stack([self.finite(column) for column in columns], axis=1)
+
     def optional(self, column: str) -> Array:
         """A column (n,) of finite numbers; nan for empty fields, and where the file does not have the column."""
         return self.finite(column, may_be_empty=True)
@@ -434,6 +438,21 @@ class Table:
         if bad.size:
             raise self.error(bad[0], f"{column}: expected a whole number, got {self.found(column, bad[0])}")
         return values.astype(np.int64)
+
+    def rising(self, column: str) -> Ints:
+        """A column (n,) of whole numbers, each larger than the one before. Raises InputError, with the line."""
+        values = self.whole(column)
+        for i in np.flatnonzero(np.diff(values) <= 0)[:1] + 1:
+            remedy = f"sort the rows, and give each {column} once"
+            raise self.error(i, f"{column}: expected rising numbers, got {values[i]} after {values[i - 1]}; {remedy}")
+        return values
+
+    def refuse_unknown(self, column: str, known: Collection[str], expected: str) -> None:
+        """Raises InputError at the first name of a column that is not known. expected: `a camera of the rig`."""
+        for code, word in enumerate(self.words[column].words):
+            for i in np.flatnonzero(self.words[column].codes == code)[: word not in known]:
+                near = suggest_name(word, known)
+                raise self.error(i, f"{column}: expected {expected}, got {word!r}{near}"[:240])
 
     def names(self, column: str, may_be_empty: bool = False) -> list[str]:
         """A column of names. Raises InputError at the first empty field, unless `may_be_empty`."""

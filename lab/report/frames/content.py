@@ -25,6 +25,7 @@ from lab.files.run.results import (
     read_result_table,
 )
 from lab.files.run.run_file import FramesFolder, Run, VideoFile
+from lab.number_format import decimals_of
 from lab.pictures.picture_file import GreyPicture, MissingPicture
 from lab.runs.frames.frames import Recorded, pictures_of_rows
 from tracking.detections import Detections
@@ -258,7 +259,7 @@ def pose_words(poses: PoseTrack, index: int) -> str:
 def _with_sigma(value: float, sigma: float) -> str:
     if not (np.isfinite(sigma) and sigma > 0):
         return f"{value:.4g}"
-    decimals = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 6))
+    decimals = decimals_of(sigma)
     return f"{value:.{decimals}f} +- {sigma:.{decimals}f}"
 
 

@@ -166,7 +166,7 @@ def page(m: ReportData, results: Path) -> str:
         "spot_rows": rows,
         "pictures": [Markup(p) for p in pictures(m, results, selected(m, found))],
         "events": listed[:_MOST_EVENTS],
-        "label_words": tables.label_words(m),
+        "label_words": f"Labels: {'; '.join(labels)}." if (labels := tables.label_counts(m)) else "",
         "more_events": max(len(listed) - _MOST_EVENTS, 0),
         "no_image": tables.no_image_ranges(m),
         "notes": m.summary.notes,

@@ -10,7 +10,7 @@ import numpy as np
 
 from geometry.arrays import Array
 from geometry.rotations import ypr_jacobian
-from lab.number_format import format_angle, format_length, format_number, format_percent
+from lab.number_format import format_angle, format_length, format_number, format_percent, median
 from lab.report.plot.svg import true_ranges
 from lab.report.run.report_data import ReportData
 from tracking.statuses import PoseStatus, SpotStatus
@@ -167,11 +167,6 @@ def pixels(value: float | None) -> str:
     return "\u2013" if value is None or not np.isfinite(value) else f"{format_number(value)} px"
 
 
-def _median(values: Array) -> float | None:
-    values = values[np.isfinite(values)]
-    return float(np.median(values)) if values.size else None
-
-
 def _rms(values: Array) -> float | None:
     values = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(values**2))) if values.size else None
@@ -190,12 +185,12 @@ def key_figures(m: ReportData) -> list[KeyFigure]:
     span = float(m.t_s[-1] - m.t_s[0]) if n else 0.0
     expected = m.spots.has(SpotStatus.MATCHED, SpotStatus.TURNED, SpotStatus.OCCLUDED)
     found = float(m.spots.measured.sum() / expected.sum()) if expected.any() else None
-    sigma_m = _median(np.linalg.norm(p.sigma_position_m[measured], axis=1))
+    sigma_m = median(np.linalg.norm(p.sigma_position_m[measured], axis=1))
     yaw_note, position_note = "median of measured poses", "median of √(σx²+σy²+σz²)"
     if m.causal is not None:
         causal = m.causal.has(PoseStatus.MEASURED)
-        yaw_note = f"median, smoothed; causal {format_angle(_median(m.causal.sigma_ypr_deg[causal, 0]))}"
-        causal_m = _median(np.linalg.norm(m.causal.sigma_position_m[causal], axis=1))
+        yaw_note = f"median, smoothed; causal {format_angle(median(m.causal.sigma_ypr_deg[causal, 0]))}"
+        causal_m = median(np.linalg.norm(m.causal.sigma_position_m[causal], axis=1))
         position_note = f"median, smoothed; causal {format_length(causal_m)}"
     return [
         KeyFigure(
@@ -203,9 +198,9 @@ def key_figures(m: ReportData) -> list[KeyFigure]:
         ),
         KeyFigure("pose measured", format_percent(float(measured.mean()) if len(measured) else None), "of all frames"),
         KeyFigure("spots found", format_percent(found), "of the spots expected in view"),
-        KeyFigure("σ of yaw", format_angle(_median(p.sigma_ypr_deg[measured, 0])), yaw_note),
+        KeyFigure("σ of yaw", format_angle(median(p.sigma_ypr_deg[measured, 0])), yaw_note),
         KeyFigure("σ of position", format_length(sigma_m), position_note),
-        KeyFigure("residual", pixels(_median(p.rms_px[measured])), "median RMS of the pose"),
+        KeyFigure("residual", pixels(median(p.rms_px[measured])), "median RMS of the pose"),
     ]
 
 
@@ -228,7 +223,7 @@ def spot_rows(m: ReportData) -> tuple[list[str], list[list[str]]]:
         counts = [int(m.spots.has(s)[:, j].sum()) for s in SpotStatus]
         sigma = np.where(m.spots.measured[:, j], m.spots.sigma_px[:, j].max(axis=1), np.nan)
         row = [camera, spot, *(str(c) if c else "·" for c in counts)]
-        row += [format_number(_median(sigma)), format_number(_rms(np.linalg.norm(innovation[:, j], axis=1)))]
+        row += [format_number(median(sigma)), format_number(_rms(np.linalg.norm(innovation[:, j], axis=1)))]
         if m.residual_px is not None:
             r = m.residual_px[:, j]
             r = r[np.isfinite(r).all(axis=1)]
@@ -247,21 +242,21 @@ def spot_rows(m: ReportData) -> tuple[list[str], list[list[str]]]:
     return heads, rows
 
 
-def label_words(m: ReportData) -> str:
-    """How many labels were doubtful or changed, in one sentence; empty where there were none."""
+def label_counts(m: ReportData) -> list[str]:
+    """How many labels were doubtful or changed, in words; without those that no label was."""
     left_open = int((np.isfinite(m.spots.label_probability) & ~m.spots.measured).sum())
     kinds, again = m.summary.event_counts, m.summary.found_again
     if again is None:  # older results; here the searches of the causal pass count as well
         again = kinds.get("reacquired", 0)
     counts = [
         (left_open, "left open: no label was likely enough"),
+        (kinds.get("undecided", 0), "intervals in which a label was undecided"),
         (kinds.get("changed", 0), "changed by the smoothing pass, which also uses later frames"),
         (kinds.get("tie", 0), "ties, in which two labellings were equally likely"),
         (kinds.get("relabelled", 0), "times all spots were labelled again during the run"),
         (again, "times the vehicle was found again after it was lost"),
     ]
-    parts = [f"{count} {words}" for count, words in counts if count]
-    return f"Labels: {'; '.join(parts)}." if parts else ""
+    return [f"{count} {words}" for count, words in counts if count]
 
 
 def no_image_ranges(m: ReportData) -> list[tuple[str, str]]:

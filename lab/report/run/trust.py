@@ -15,7 +15,8 @@ from lab.number_format import format_count, format_number, format_percent, forma
 from lab.report.plot import svg
 from lab.report.plot.svg import true_ranges
 from lab.report.run.report_data import ReportData
-from lab.report.summary import day_of
+from lab.report.run.tables import label_counts
+from lab.report.summary import day_of, findings_in, mappings
 from tracking.statuses import PoseStatus
 
 HEADS = (
@@ -25,7 +26,6 @@ HEADS = (
 CLOCKS = "BP-M09"
 _LONGEST = 0.1  # length of the longest arrow, as a share of the image width
 _SIGNIFICANT = 3.0  # sigmas of chance and calibration: radius of the circles
-_TEXTS = ("what", "why", "remedy", "code")
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,16 +44,10 @@ def model_fit(block: Mapping[str, Any] | None) -> ModelFit | None:
     """The section from the block `model_check` of summary.json; None without one."""
     if block is None:
         return None
-    findings = tuple(
-        Finding(
-            Level.__members__.get(str(f.get("level")), Level.WARN),
-            **{name: str(f.get(name) or "") for name in _TEXTS},  # type: ignore[arg-type]
-        )
-        for f in _mappings(block.get("findings"))
-    )
+    findings = findings_in(block.get("findings"))
     rows = []
     for kind, prefix in (("views", ""), ("cameras", "all of camera "), ("beams", "all of beam ")):
-        for g in _mappings(block.get(kind)):
+        for g in mappings(block.get(kind)):
             name = str(g.get("name"))
             camera, spot = name.rsplit("/", 1) if kind == "views" and "/" in name else ("", f"{prefix}{name}")
             rows.append((spot, camera, *_numbers(g)))
@@ -61,7 +55,7 @@ def model_fit(block: Mapping[str, Any] | None) -> ModelFit | None:
     drawings = [
         drawn
         for i, (camera, size) in enumerate(sizes.items() if isinstance(sizes, Mapping) else ())
-        if (drawn := _drawing(i, str(camera), size, _mappings(block.get("views"))))
+        if (drawn := _drawing(i, str(camera), size, mappings(block.get("views"))))
     ]
     used = block.get("frames_for_diagnosis")
     return ModelFit(
@@ -84,10 +78,6 @@ def _sentence(block: Mapping[str, Any], findings: tuple[Finding, ...]) -> str:
     if verdict(findings) is Level.PASS:
         return f"Nearly: the deviations found are within the stated uncertainty ({used})."
     return f"Probably not ({used}):"
-
-
-def _mappings(value: Any) -> list[Mapping[str, Any]]:
-    return [v for v in value if isinstance(v, Mapping)] if isinstance(value, list) else []
 
 
 def _float(value: Any) -> float:
@@ -121,10 +111,6 @@ def _numbers(g: Mapping[str, Any]) -> tuple[str, ...]:
     )
 
 
-def _signed(value: float) -> str:
-    return "–" if not np.isfinite(value) else ("+" if value > 0 else "") + format_number(value, 2)
-
-
 def _drawing(index: int, camera: str, size: Any, views: list[Mapping[str, Any]]) -> str:
     """Mean residuals as arrows over the image, with circles of 3 sigma of chance and calibration together."""
     own = [v for v in views if str(v.get("name")).rpartition("/")[0] == camera]
@@ -152,7 +138,7 @@ def _drawing(index: int, camera: str, size: Any, views: list[Mapping[str, Any]])
         start, end = plane.at(at[None]), plane.at((at + factor * r)[None])
         colour = svg.VERMILLION if np.linalg.norm(r) > radius else svg.BLUE
         spot = str(v.get("name")).rpartition("/")[2]
-        words = escape(f"spot {spot}: {_signed(r[0])}, {_signed(r[1])} px")
+        words = escape(f"spot {spot}: {format_number(r[0], 2, True)}, {format_number(r[1], 2, True)} px")
         parts.append(
             f'<g><title>{words}</title><circle cx="{start[0, 0]:.1f}" cy="{start[0, 1]:.1f}"'
             f' r="{min(radius * factor * scale, 2000.0):.1f}" fill="none" stroke="var(--soft)" stroke-dasharray="3 3"/>'
@@ -169,12 +155,6 @@ def _drawing(index: int, camera: str, size: Any, views: list[Mapping[str, Any]])
 _MODEL = "Fit of rig and recording"
 _LARGE = 1.5  # residuals over their stated sigma from which a camera or beam is pointed out
 _SURE, _MOST, _DOUBTFUL = 0.99, 0.95, 0.9  # probability of a label: sure; share of sure labels; doubtful below
-_AMBIGUOUS = (
-    ("tie", "ties of two labellings"),
-    ("undecided", "intervals with an undecided label"),
-    ("changed", "labels changed by the smoothing pass"),
-    ("relabelled", "times all spots were labelled again"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,17 +295,13 @@ def _labels(m: ReportData) -> Evidence:
 
 
 def _ambiguous(m: ReportData) -> Evidence:
-    left_open = np.isfinite(m.spots.label_probability) & ~m.spots.measured
-    counts = [(int(left_open.sum()), "detections left without a label")]
-    counts += [(m.summary.event_counts.get(kind, 0), words) for kind, words in _AMBIGUOUS]
-    counts.append((m.summary.found_again or 0, "times the vehicle was lost and found again"))
-    parts = [f"{count} {words}" for count, words in counts if count]
+    parts = label_counts(m)
     if not parts:
         return Evidence(Level.PASS, "Ambiguous", "nothing")
+    left_open = np.isfinite(m.spots.label_probability) & ~m.spots.measured
     frames = np.flatnonzero(left_open.any(axis=1))
-    if len(frames):
-        k = int(frames[0])
-        return Evidence(
-            Level.WARN, "Ambiguous", "; ".join(parts), time_link(m, k, k), f"first: frame {m.spots.frames[k]}"
-        )
-    return Evidence(Level.WARN, "Ambiguous", "; ".join(parts))
+    if not len(frames):
+        return Evidence(Level.WARN, "Ambiguous", "; ".join(parts))
+    k = int(frames[0])
+    where = f"first: frame {m.spots.frames[k]}"
+    return Evidence(Level.WARN, "Ambiguous", "; ".join(parts), time_link(m, k, k), where)

@@ -171,11 +171,16 @@ class FrameReader:
             firsts.append(0)
         return min(firsts), max(lasts) if lasts else None
 
+    @property
+    def _numbers_known(self) -> list[Ints]:
+        """The frame numbers of folders, and of cameras in tables."""
+        in_tables = [c.frames for t in self._tables.values() for c in t.cameras.values()]
+        return [v.numbers for v in self._folders] + in_tables
+
     def _check_density(self) -> None:
         if self.last is None:
             return
-        pictures = sum(v.count for v in self._folders)
-        pictures += sum(len(c.frames) for t in self._tables.values() for c in t.cameras.values())
+        pictures = sum(map(len, self._numbers_known))
         if is_too_sparse(self.last - self.first + 1, pictures):
             stray = "file" if self._folders else "row"
             holders = "names" if self._folders else "frame numbers"
@@ -188,9 +193,7 @@ class FrameReader:
 
     def _check_strays(self) -> None:
         """Raises InputError for a few pictures with numbers far from all others. (Tables omit such rows.)"""
-        everything: list[Ints] = [v.numbers for v in self._folders]
-        everything += [c.frames for t in self._tables.values() for c in t.cameras.values()]
-        numbers = np.unique(np.concatenate(everything)) if everything else np.empty(0, np.int64)
+        numbers = np.unique(np.concatenate([*self._numbers_known, np.empty(0, np.int64)]))
         strays = stray_frames(numbers)
         for folder in self._folders:
             for number in numbers[strays].tolist():
@@ -202,11 +205,8 @@ class FrameReader:
                     )
 
     def _check_times(self) -> None:
-        with_picture: list[Ints] = [v.numbers for v in self._folders]
-        with_picture += [c.frames for t in self._tables.values() for c in t.cameras.values()]
-        if not with_picture:
-            return
-        untimed = self._run.times.without_time(np.unique(np.concatenate(with_picture)))
+        with_picture = np.concatenate([*self._numbers_known, np.empty(0, np.int64)])
+        untimed = self._run.times.without_time(np.unique(with_picture))
         if untimed.size:
             raise InputError(
                 f"{self._run.path}: timestamps: expected a time for every frame with a picture, got none for"

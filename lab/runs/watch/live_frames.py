@@ -14,6 +14,7 @@ import numpy as np
 from lab.errors import BeamposeError, InputError
 from lab.files.run.detections_file import LONGEST_GAP
 from lab.files.run.run_file import FramesFolder, LiveDevice, Run
+from lab.number_format import format_some
 from lab.pictures.picture_file import DROPPED, GreyPicture, MissingPicture
 from lab.runs.frames.frames import FrameSet, Recorded
 from lab.runs.frames.moments import Moment, MomentPlanner, TimedPicture
@@ -124,7 +125,8 @@ class LiveFrames:
                     f" {self.options.timeout_s:g} s"
                 )
             if queue.strays:
-                out.append(f"{name}: pictures with numbers far beyond all others were left out: {_some(queue.strays)}")
+                strays = format_some(queue.strays)
+                out.append(f"{name}: pictures with numbers far beyond all others were left out: {strays}")
         return out
 
     def begin(self) -> Mapping[str, list[GreyPicture]]:
@@ -295,7 +297,3 @@ class LiveFrames:
                 f" {source.path}, which is read when it is complete: use `beampose run`"
             )
         return FolderCamera(name, FolderPoll(source.path), size_px, self.inbox, self.options.timeout_s, follower)
-
-
-def _some(numbers: list[int]) -> str:
-    return ", ".join(map(str, numbers[:5])) + (", ..." if len(numbers) > 5 else "")

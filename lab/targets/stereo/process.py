@@ -20,10 +20,11 @@ from lab.files.rig.camera_file import require_valid_calibration
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.run.truth import TruePoses, read_true_poses
 from lab.findings.finding import Finding, Level, Outcome, Verdict, finding, level_above, passed, worst_first
-from lab.number_format import format_length, format_number
+from lab.number_format import decimals_of, format_length, format_number
 from lab.pictures.picture_file import MissingPicture
 from lab.progress import Progress
 from lab.runs.processed import Processed, write_processed
+from lab.runs.verdict.quality import GOOD_MEASURED, GOOD_PICTURES, LEAST_MEASURED
 from lab.targets.stereo.frames import StereoFrame, stereo_frames
 from lab.targets.stereo.page import write_stereo_page
 from lab.targets.stereo.run import (
@@ -51,8 +52,6 @@ from tracking.binocular.marker_model import MarkerImages
 from tracking.binocular.pose_tracker import AMBIGUOUS, BinocularTracker
 from tracking.binocular.segmentation import is_grey, marker_candidates, prepared
 
-LEAST_MEASURED, GOOD_MEASURED = 0.1, 0.95  # shares of the frames, as for runs of laser spots
-GOOD_PICTURES = 0.95  # share of frames with a usable picture, per camera
 _ENOUGH, _FEWEST_SEEN = 4, 2  # markers of a picture that determine a pose, and frames with as many in both
 LARGEST_NEES = 20.0  # per number, of poses with an error of the calibration: above, the sigmas are of no use
 _MOST_NAMED = 4  # errors of the calibration in a message
@@ -160,7 +159,7 @@ def _calibration(results: StereoResults) -> Iterator[Finding]:
         yield finding("BP-W11", Level.WARN, what)
     if check is not None and check.significant and not _is_clock(results):
         several = " or ".join(
-            f"{s.name} by {s.value:+.{_decimals(s.sigma)}f} ± {s.sigma:.{_decimals(s.sigma)}f} {s.unit}"
+            f"{s.name} by {s.value:+.{decimals_of(s.sigma)}f} ± {s.sigma:.{decimals_of(s.sigma)}f} {s.unit}"
             for s in check.suspects[:_MOST_NAMED]
         )
         apart = "; this recording does not separate them" if len(check.suspects) > 1 else ""
@@ -194,11 +193,6 @@ def _is_clock(results: StereoResults) -> bool:
     if clock is None or not clock.significant:
         return False
     return check is None or not check.certain or check.left > GOOD_NOISE_SCALE**2
-
-
-def _decimals(sigma: float) -> int:
-    """Decimals that show two digits of a sigma."""
-    return int(np.clip(1 - np.floor(np.log10(max(sigma, 1e-9))), 0, 6))
 
 
 def _noise(results: StereoResults) -> Iterator[Finding]:

@@ -10,7 +10,9 @@ import pytest
 
 from calibration.boards.board_types import parse
 from calibration.boards.circle_detection import fit_ellipses
+from calibration.least_squares.adjustment import Vectors
 from calibration.lens.fit.corner_table import CircleAreas, CornerTable
+from calibration.lens.fit.lens_adjustment import with_circle_radius
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
 from calibration.lens.intrinsics_result import Intrinsics
@@ -65,6 +67,15 @@ def test_an_unknown_circle_size_is_estimated():
     assert nees(c) < 2.9
     assert abs(2 * c.fit.radius_m - SCENE.board.diameter_m) < 4 * 2 * c.fit.radius_sigma_m
     assert c.fit.radius_sigma_m > 0.005 * c.fit.radius_m  # less precise than with areas
+
+
+@pytest.mark.parametrize(("before", "after"), [(0.0, None), (0.003, 0.003)])
+def test_an_unknown_circle_size_is_searched_from_the_last_one_or_from_the_spacing(before, after):
+    table = replace(pictures(), circles=CircleAreas(None, None))
+    values = {"radius": Vectors(np.array([[before]]))}
+    found, prior = with_circle_radius(table, np.ones(len(table), dtype=bool), LensModel(5), values)
+    assert found["radius"].array[0, 0] == (after or table.spacing_m / 4)
+    assert not prior
 
 
 @pytest.mark.slow

@@ -105,6 +105,18 @@ def test_the_tables_have_a_row_per_observation_and_per_control_point(good):
         assert tuple(rows[0]) == columns
 
 
+def test_the_table_of_control_points_has_their_heights_above_the_surfaces_and_which_were_used(good):
+    out, outcome = good
+    with (out / "dots.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for screen in outcome.result.screens:
+        mine = [rows[k] for k in screen.control_points]
+        heights = [float(r["height_m"]) for r in mine]
+        np.testing.assert_allclose(heights, screen.flatness.chosen.heights_m, atol=1e-7)
+        assert np.ptp(heights) > 1e-5
+        assert [int(r["used"]) for r in mine] == screen.used.astype(int).tolist()
+
+
 def test_the_report_shows_screens_pixels_and_the_lab(good):
     out, _ = good
     text = (out / "report.html").read_text()

@@ -240,7 +240,7 @@ def test_times_of_dropped_frames_are_interpolated():
         ("frame,t\n0,0\n", "times.csv: expected a column 't_s', got frame,t"),
         ("frame,t_s\n0,0\n1,zero\n", "times.csv: line 3: t_s: expected seconds, got 'zero'"),
         ("frame,t_s\n0,0\n1.5,1\n", "times.csv: line 3: frame: expected a whole number, got 1.5"),
-        ("frame,t_s\n0,0\n0,1\n", "times.csv: line 3: frame: expected increasing numbers, got 0 after 0"),
+        ("frame,t_s\n0,0\n0,1\n", "times.csv: line 3: frame: expected rising numbers, got 0 after 0"),
         (
             "frame,t_s\n0,0\n1,2\n2,1\n",
             "times.csv: line 4: t_s: expected increasing times, got 1 s of frame 2 after 2 s",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
 import shutil
 from dataclasses import replace
@@ -29,6 +30,7 @@ from lab.calibrate.camera.photos import _frames
 from lab.files.project.project import Cloud
 from lab.files.rig.rig_file import save_rig
 from lab.pictures.source import pictures, video_at
+from lab.runs import setup_check
 from lab.runs.input_check import check
 from lab.runs.process import process_run
 from lab.runs.setup_check import SampledFrames, frames_of
@@ -38,7 +40,7 @@ from tests.lab.run_folders import edit, write_run
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters
 from tracking.setup_mistakes import evidence
-from tracking.setup_mistakes.evidence import MOST_POINTS, MOST_TRIPLES, Frames, compare, invisible_mistakes
+from tracking.setup_mistakes.evidence import MOST_POINTS, MOST_TRIPLES, Comparison, Frames, compare, invisible_mistakes
 from tracking.setup_mistakes.possible import possible_mistakes
 
 FRAMES = 45
@@ -60,6 +62,21 @@ def symmetric(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("symmetric")
     save_rig(fan(), folder / "rig.yaml")
     return simulate("huo2015", folder / "run", seed=1, frames=FRAMES, detections_only=True, rig=folder / "rig.yaml")
+
+
+@pytest.fixture
+def compared_once(monkeypatch) -> dict[bytes, Comparison]:
+    """A run and a check of one recording compare the same frames with the same mistakes: once, which takes seconds."""
+    known: dict[bytes, Comparison] = {}
+
+    def once(*inputs) -> Comparison:
+        key = pickle.dumps(inputs)
+        if key not in known:
+            known[key] = compare(*inputs)
+        return known[key]
+
+    monkeypatch.setattr(setup_check, "compare", once)
+    return known
 
 
 def with_mistake(name: str, run: Path, out: Path) -> Path:
@@ -336,7 +353,7 @@ def test_a_camera_whose_points_are_never_labelled_is_reported(tmp_path, recordin
 
 @pytest.mark.parametrize("aside_deg", [0.0, 180.0])
 def test_false_points_of_a_camera_are_reported_only_where_the_poses_put_spots_into_its_pictures(
-    tmp_path, recording, aside_deg
+    tmp_path, recording, compared_once, aside_deg
 ):
     """A third camera beside the left one, or with its back to it, that sees four false points per picture."""
     files = read(recording)
@@ -357,6 +374,7 @@ def test_false_points_of_a_camera_are_reported_only_where_the_poses_put_spots_in
     said = "camera `third`: none of its"
     assert any(said in text for text in outcome.verdict.texts) == (aside_deg == 0)
     assert (said in checked(run)[0]) == (aside_deg == 0)
+    assert len(compared_once) == 1
 
 
 def video(path: Path, size: tuple[int, int] = (64, 48), rate: float = 25.0, fourcc: str = "FFV1") -> Path:

@@ -23,12 +23,23 @@ from tracking.comparison.frame_alignment import (
 )
 
 
+def minus(one: Alignment, other: Alignment) -> np.ndarray:
+    """The delta (14,) for which other.plus(delta) is the one."""
+    return np.concatenate([
+        [one.offset_s - other.offset_s, one.rate - other.rate],
+        rotations.log(one.world @ other.world.T),
+        rotations.log(other.body.T @ one.body),
+        one.lever_m - other.lever_m,
+        one.translation_m - other.translation_m,
+    ])  # fmt: skip
+
+
 def nees(found: list, truth: Alignment = TRUTH) -> float:
     """The mean squared error in units of the covariance, per parameter."""
     each = []
     for e in found:
         used = np.diag(e.covariance) > 0
-        error = truth.minus(e.alignment)[used]
+        error = minus(truth, e.alignment)[used]
         each.append(error @ np.linalg.solve(e.covariance[np.ix_(used, used)], error) / used.sum())
     return float(np.mean(each))
 
@@ -115,7 +126,7 @@ def test_one_outlier_in_twelve_hardly_changes_the_result():
     rotation[bad] = rotation[bad] @ rotations.exp(rng.normal(0, 0.2, (len(bad), 3)))
     position[bad] += rng.normal(0, 0.3, (len(bad), 3))
     e = estimate_alignment(result, PoseSeries(reference.t_s, rotation, position, reference.covariance))
-    error = TRUTH.minus(e.alignment)
+    error = minus(TRUTH, e.alignment)
     assert np.all(np.abs(error) < 5 * e.sigmas)
     assert 0.5 < e.inliers.mean() < 0.95
     assert e.scale < 2.5
@@ -212,5 +223,5 @@ def test_the_jacobian_is_the_derivative_of_the_residuals():
 
 def test_plus_and_minus_are_inverse():
     delta = np.linspace(-0.3, 0.4, 14)
-    np.testing.assert_allclose(TRUTH.plus(delta).minus(TRUTH), delta, atol=1e-12)
+    np.testing.assert_allclose(minus(TRUTH.plus(delta), TRUTH), delta, atol=1e-12)
     assert TRANSLATION.stop == 14

@@ -31,7 +31,7 @@ def place(k):
 )
 def test_edges_next_to_gaps_may_be_off_by_the_corner_there_and_no_more(rms_px, beside_gaps, certain):
     rim = Rim(50.0, 50.0, 10.6)  # .24 px is allowed for the others; circles of trees and clouds have .36 px and more
-    fit = RimFit(rim, np.eye(3), 0.88, rms_px, beside_gaps, 20.0, 1, 0.7, np.ones(SECTORS))
+    fit = RimFit(rim, np.eye(3), 0.88, rms_px, beside_gaps, 1, 0.7, np.ones(SECTORS))
     assert is_certain(fit) is certain
 
 

@@ -397,8 +397,9 @@ def _information(
 @compiled
 def _difference(state: tuple[Array, Array, Array], prior: State, size: int) -> Array:
     """The first numbers (size,) of a state (R, t, m) minus the prior."""
-    out = np.empty(size)
-    out[:6] = pose_minus(state[0], state[1], prior.R, prior.t)
+    out, pose = np.empty(size), pose_minus(state[0], state[1], prior.R, prior.t)
+    for i in range(6):
+        out[i] = pose[i]
     for i in range(6, size):
         out[i] = state[2][i - 6] - prior.m[i - 6]
     return out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -79,6 +80,8 @@ def test_a_folder_of_pictures_gives_all_files(folder, tmp_path):
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert page.rstrip().endswith("</html>")
     assert "BP-T03" in page
+    events = page.partition("circles in the picture")[2]
+    assert re.findall(r"<td[^>]*>([^<]*)</td>", events)[:3:2] == ["0", "1"]
     assert not any(word in page for word in ("http://", "https://", ">nan<"))
     capture = cv2.VideoCapture(str(tmp_path / "out" / "overlay.mp4"))
     assert int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) == 12

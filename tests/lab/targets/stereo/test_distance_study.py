@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from bench.related_measurements.stereo import simulated_calibration
+from bench.related_measurements.stereo import DISTANCES_M, simulated_calibration
 from lab.targets.stereo.simulated_recording import simulated_pair
 from studies.comparison import write_comparison
 from studies.zhou2020 import (
     BASELINE_M,
-    DISTANCES_M,
     FOCAL_PX,
     SIZE_PX,
     compare_zhou2020,

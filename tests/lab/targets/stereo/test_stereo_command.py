@@ -16,7 +16,8 @@ from cli import main
 from lab.errors import InputError
 from lab.files.text import columns
 from lab.findings.finding import Verdict
-from lab.targets.stereo.process import _decimals, findings_of, process_stereo_run
+from lab.number_format import decimals_of
+from lab.targets.stereo.process import findings_of, process_stereo_run
 from lab.targets.stereo.simulated_recording import write_stereo_recording
 
 FRAMES = 12  # of the recording of points
@@ -293,4 +294,4 @@ def test_a_long_recording_shows_an_error_of_both_focal_lengths_that_few_of_its_f
 
 @pytest.mark.parametrize(("sigma", "decimals"), [(230.0, 0), (23.0, 0), (2.3, 1), (0.23, 2), (0.00023, 5), (0.0, 6)])
 def test_a_stated_sigma_has_two_digits(sigma, decimals):
-    assert _decimals(sigma) == decimals
+    assert decimals_of(sigma) == decimals
