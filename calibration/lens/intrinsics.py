@@ -12,7 +12,7 @@ from calibration.least_squares.adjustment import AdjustmentError, Poses
 from calibration.lens.board_shape import BoardShapeOptions, BoardTest, board_test
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import coverage_of, spread_deg
-from calibration.lens.fit.lens_fit import FEWEST_CORNERS, LensFit, robust_fit, used_views, with_view_noise
+from calibration.lens.fit.lens_fit import FEWEST_CORNERS, LensFit, robust_fit, used_views, with_own_noise
 from calibration.lens.fit.lens_models import LensModel, folds_in_picture
 from calibration.lens.fit.lens_parameters import AS_STATED, BOARD_BLOCKS, BoardFreedom, Values, board_as_stated
 from calibration.lens.fit.lens_start import StartError, start
@@ -68,7 +68,7 @@ def calibrate_intrinsics(table: CornerTable, options: IntrinsicsOptions | None =
 def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     starts = _starts(table)
     used, rich = inliers_of_rich_models(table, starts, options.lens)
-    weighted = with_view_noise(table, rich[0])
+    weighted = with_own_noise(table, rich[0])
     if weighted is not table:
         table = weighted
         used, rich = inliers_of_rich_models(table, [(f.model, f.values) for f in rich], options.lens)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 from scipy.special import chdtrc
 
 from calibration.least_squares.adjustment import Adjusted, Cauchy, Limits, Poses, Vectors
@@ -23,7 +24,7 @@ CORNER_GATE = 4.5
 # A view with residuals this many times those of the median view was blurred, or its board moved.
 VIEW_GATE = 3.0
 _NOISE_DIFFERS = 1e-3  # p-value of the same noise in all views below which each has its own ...
-_NOISE_RATIO = 2.0  # ... if the largest is that many times the smallest: weights change little below it
+_NOISE_RATIO = 1.5  # ... if the largest is that many times the smallest: weights change little below it
 _ROUNDS = 6  # of fitting and rejecting; all sets tried so far converge within three
 
 
@@ -202,25 +203,53 @@ def used_views(fit: LensFit, table: CornerTable) -> Ints:
     return np.flatnonzero(table.counts(fit.used) > 0)
 
 
-def with_view_noise(table: CornerTable, found: LensFit) -> CornerTable:
-    """The table with the noise of each view's corners, from their residuals; as it is where all may have the same.
+def with_own_noise(table: CornerTable, found: LensFit) -> CornerTable:
+    """The table with the noise of each corner, from its residual; as it is where all may have the same.
 
-    Near boards are out of focus, far ones sharp: in sets of real photographs the noise differs by up to 3.5 times.
-    Bartlett's test (1937, Proc. R. Soc. A 160). Views that are not used have the noise of all.
+    Corners have the noise of the picture, which is large where squares are small, edges wide or markers near; and that
+    of all other causes, which is the same for all. The shares of both have the maximum likelihood. Then each view has a
+    factor, if by Bartlett's test (1937, Proc. R. Soc. A 160) they differ: near boards are out of focus, far ones sharp,
+    by up to 3.5 times in sets of real photographs. Views that are not used have the noise of all.
     """
+    length2 = np.where(found.used, np.sum(found.residuals**2, axis=1), 0.0)
+    variance = _by_picture(table, found.used, length2)
+    views = np.zeros(table.views) + _by_view(table, found, length2 / variance)
+    if np.all(views == views[0]) and np.all(variance == 1.0):
+        return table
+    noise2 = variance * views[table.view]
+    return replace(table, own_noise=np.sqrt(noise2 / np.median(noise2[found.used])))
+
+
+def _by_picture(table: CornerTable, used: Bools, length2: Array) -> Array:
+    """Variances (N,) of corners, up to a factor, from that of the picture; 1 where the residuals do not show it."""
+    if table.sigmas_px is None:
+        return np.ones(len(table))
+    own2 = (table.sigmas_px / np.median(table.sigmas_px)) ** 2
+
+    def deviance(common: float) -> float:
+        w = (common + (1 - common) * own2)[used]
+        return 2 * float(np.sum(np.log(w)) + len(w) * np.log(np.mean(length2[used] / w)))
+
+    share = float(minimize_scalar(deviance, bounds=(0.0, 1.0), method="bounded").x)
+    if chdtrc(1, max(deviance(1.0) - deviance(share), 0.0)) >= _NOISE_DIFFERS:
+        return np.ones(len(table))
+    return share + (1 - share) * own2
+
+
+def _by_view(table: CornerTable, found: LensFit, length2: Array) -> Array | float:
+    """Variances (V,) of views over that of all, from squared residuals (N,); 1 if they may be the same."""
     numbers = table.counts(found.used) * 2.0 - 6
     mine = numbers > 0
     dof = np.where(mine, numbers * (1 - found.model.free.sum() / max(numbers[mine].sum(), 1)), 0.0)
-    lengths2 = np.where(found.used, np.sum(found.residuals**2, axis=1), 0.0)
-    squares = np.bincount(table.view, weights=lengths2, minlength=table.views)
+    squares = np.bincount(table.view, weights=length2, minlength=table.views)
     if mine.sum() < 2 or np.min(dof[mine]) <= 0 or np.min(squares[mine]) <= 0:
-        return table
+        return 1.0
     common, dof = squares[mine].sum() / dof.sum(), dof[mine]
     variance = squares[mine] / dof
     score = dof.sum() * np.log(common) - np.sum(dof * np.log(variance))
     score /= 1 + (np.sum(1 / dof) - 1 / dof.sum()) / (3 * (len(dof) - 1))
     if chdtrc(len(dof) - 1, score) >= _NOISE_DIFFERS or variance.max() < _NOISE_RATIO**2 * variance.min():
-        return table
-    noise = np.ones(table.views)
-    noise[mine] = np.sqrt(variance / common)
-    return replace(table, view_noise=noise)
+        return 1.0
+    out = np.ones(table.views)
+    out[mine] = variance / common
+    return out
