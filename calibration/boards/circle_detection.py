@@ -241,7 +241,7 @@ def _outlines(image: GreyImage, start: Ellipses) -> Ellipses:
     second-order part of perspective and distortion, the rest moves a circle as a whole or changes it in second order,
     and g leaves the centroid at c. An ellipse fitted to an oblique outline with g is not at its centroid. Ours.
     """
-    centres, shapes, noise = start.centres.copy(), start.shapes.copy(), np.full(start.centres.shape, np.nan)
+    centres, shapes, noise = start.centres.copy(), start.shapes.copy(), np.full((len(start.centres), 3), np.nan)
     good = np.flatnonzero(np.isfinite(shapes).all(axis=(1, 2)) & np.isfinite(start.blurs))
     good = good[np.argsort(start.areas[good])]
     for first in range(0, len(good), _AT_ONCE):
@@ -256,7 +256,7 @@ def _outlines(image: GreyImage, start: Ellipses) -> Ellipses:
 
 
 def _fitted_outlines(image: GreyImage, centres: Array, shapes: Array, blur: Array) -> tuple[Array, Array, Array]:
-    """Centres (n, 2), shapes (n, 2, 2) and noise (n, 2) of `_outlines`, from start values.
+    """Centres (n, 2), shapes (n, 2, 2) and noise (n, 3) of `_outlines`, from start values.
 
     blur (n,), px: sigmas of the edges.
     """

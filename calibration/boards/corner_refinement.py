@@ -65,7 +65,7 @@ def refined(
     half = np.clip(np.nan_to_num(reach * height, nan=2.0).astype(int), 2, _MOST_PX)
     out = np.full(grid.shape, np.nan)
     look = np.full((rows, columns, 4), np.nan)  # directions and sigmas of the edges
-    noise = np.full((rows, columns, 2), np.nan)
+    noise = np.full((rows, columns, 3), np.nan)
     inside = known & np.all((grid >= 0) & (grid <= np.array(image.shape[::-1]) - 1), axis=-1)
     out[inside] = grid[inside]
     within = inside if again is None else inside & (again | moved)
@@ -95,7 +95,7 @@ def refined(
 def _saddles(
     image: GreyImage, start: Array, edges: Array, bend: Array, half: int, small_px: float
 ) -> tuple[Array, Array, Array]:
-    """Corners (n, 2), px, directions and sigmas of the two edges (n, 4), and noise (n, 2), by least squares.
+    """Corners (n, 2), px, directions and sigmas of the two edges (n, 4), and noise (n, 3), by least squares.
 
     start (n, 2), px, and edges (n, 4), rad and px: start values; bend (n, 3, 2): the curvature of `local_shape`. Grey
     values are (b + b' d) + (c + c' d) M at the offset d from the corner, M the mean of the product of the signs of the
@@ -175,8 +175,9 @@ def linear_part(L: Pixelwise, grey: Pixelwise) -> Array:
 def step_of(J: Pixelwise, L: Pixelwise, grey: Pixelwise, linear: Array) -> tuple[Array, Array]:
     """The Gauss-Newton step (n, p) of the other parameters, with derivatives J (n, p, m); the linear ones eliminated.
 
-    Also the noise (n, 2): the sigma of the first two, the mean of both, for grey values with a noise of 1 DN; and the
-    noise, DN, from what the fit leaves. L[:, 0]: the weights of the pixels. Source: Kaufman (1975), "A variable projection method for solving separable nonlinear least squares problems", BIT.
+    Also the noise (n, 3): the mean variance of the first two for grey values with a noise of 1 DN; the square of that
+    noise, DN^2, from what the fit leaves; and its degrees of freedom. L[:, 0]: the weights of the pixels. Source:
+    Kaufman (1975), "A variable projection method for solving separable nonlinear least squares problems", BIT.
     """
     mixed = (L @ np.swapaxes(J, 1, 2)).astype(float)
     N = (J @ np.swapaxes(J, 1, 2)).astype(float) - np.swapaxes(mixed, 1, 2) @ np.linalg.solve(_square(L), mixed)
@@ -184,18 +185,21 @@ def step_of(J: Pixelwise, L: Pixelwise, grey: Pixelwise, linear: Array) -> tuple
     left = grey[:, None] - np.swapaxes(linear, 1, 2).astype(L.dtype) @ L
     C = np.linalg.inv(N)
     dof = np.maximum(L[:, 0].sum(axis=1) - L.shape[1] - J.shape[1], 1)
-    noise2 = np.stack([(C[:, 0, 0] + C[:, 1, 1]) / 2, np.sum(left * left, axis=(1, 2)) / dof], axis=1)
-    return (C @ (J @ np.swapaxes(left, 1, 2)).astype(float))[..., 0], np.sqrt(np.maximum(noise2, 0.0))
+    variance = np.maximum((C[:, 0, 0] + C[:, 1, 1]) / 2, 0.0)
+    noise = np.stack([variance, np.sum(left * left, axis=(1, 2)) / dof, dof], axis=1)
+    return (C @ (J @ np.swapaxes(left, 1, 2)).astype(float))[..., 0], noise
 
 
 def of_noise(noise: Array) -> Array:
-    """Sigmas (...), px, of points of a picture from their noise (..., 2) of `step_of`.
+    """Sigmas (...), px, of the points of a picture, from the noise (..., 3) of `step_of`.
 
-    Noise below that of most points is chance: a window of 5 x 5 pixels knows it to 40 %.
+    Noise below that of most points by less than two of its sigmas is chance; above it, something else is in the window.
     """
-    measured = np.isfinite(noise[..., 1])
-    least = float(np.median(noise[measured, 1])) if measured.any() else np.nan
-    return np.asarray(noise[..., 0] * np.maximum(noise[..., 1], least))
+    variance, noise2, dof = np.moveaxis(noise, -1, 0)
+    measured = np.isfinite(noise2)
+    usual = float(np.median(noise2[measured])) if measured.any() else np.nan
+    chance = (noise2 < usual) & (noise2 > usual * (1 - 2 * np.sqrt(2 / dof)))
+    return np.asarray(np.sqrt(variance * np.where(chance, usual, noise2)))
 
 
 def _square(L: Pixelwise) -> Array:

@@ -26,6 +26,8 @@ from geometry.arrays import Array, Bools
 FEWEST_VIEWS = 4
 # With a smaller angle between the boards' normals, focal length and distance cannot be separated.
 LEAST_TILT_DEG = 5.0
+_NOISE_DIFFERS = 0.2  # relative, of any corner, from which on the fit is repeated: weights of less change it by 1 %
+_NOISE_ROUNDS = 3  # of estimating the noise of corners and fitting: the first fit is that of equal weights
 
 
 class IntrinsicsError(ValueError):
@@ -68,8 +70,10 @@ def calibrate_intrinsics(table: CornerTable, options: IntrinsicsOptions | None =
 def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     starts = _starts(table)
     used, rich = inliers_of_rich_models(table, starts, options.lens)
-    weighted = with_own_noise(table, rich[0])
-    if weighted is not table:
+    for _ in range(_NOISE_ROUNDS):
+        weighted = with_own_noise(table, rich[0])
+        if np.allclose(np.log(weighted.noise), np.log(table.noise), atol=_NOISE_DIFFERS):
+            break
         table = weighted
         used, rich = inliers_of_rich_models(table, [(f.model, f.values) for f in rich], options.lens)
     shape = _shape(table, rich[0], options)

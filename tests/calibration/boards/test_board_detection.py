@@ -192,7 +192,7 @@ def test_corners_in_any_order_are_renumbered_correctly():
 @pytest.mark.filterwarnings("error")
 def test_circles_beside_one_without_an_ellipse_have_their_areas_without_a_warning():
     shapes = np.stack([4 * np.eye(2), np.full((2, 2), np.nan)])
-    areas = circle_detection.Ellipses(np.zeros((2, 2)), shapes, np.ones(2)).areas
+    areas = circle_detection.Ellipses(np.zeros((2, 2)), shapes, np.ones(2), np.ones(2)).areas
     assert areas[0] == pytest.approx(4 * np.pi)
     assert np.isnan(areas[1])
 
@@ -339,6 +339,21 @@ def test_a_corner_that_starts_at_another_corner_is_measured_where_it_is():
     start = true.copy()
     start[2, 0] = true[3, 1]
     np.testing.assert_allclose(corner_refinement.refined(photo.image, start).pixels, true, atol=0.05)
+
+
+@pytest.mark.parametrize("text", [CHESS, CHARUCO, "circles:9x7:30mm"])
+@pytest.mark.parametrize("roll", [0.15, np.pi + 0.15])
+def test_each_point_has_the_noise_of_its_place_in_the_picture(text, roll):
+    """Also where the board is upside down, so that its points are counted in another order than they were found."""
+    board, photo = shot(text, turn=(0.4, -0.3, roll))
+    noise = np.random.default_rng(3).normal(0, 1, photo.image.shape)
+    noise[:, 240:] *= 10
+    view = view_of(np.clip(np.round(photo.image + noise), 0, 255).astype(np.uint8), board)
+    assert view.sigmas_px is not None
+    quiet, noisy = view.pixels[:, 0] < 225, view.pixels[:, 0] > 255
+    assert quiet.sum() > 5
+    assert noisy.sum() > 5
+    assert np.median(view.sigmas_px[noisy]) > 5 * np.median(view.sigmas_px[quiet])
 
 
 def test_a_picture_of_another_type_raises():
