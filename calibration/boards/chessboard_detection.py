@@ -154,7 +154,8 @@ def upright(ways: list[Array]) -> Array:
 def oriented(image: GreyImage, grid: Array) -> Array | None:
     """The grid numbered from the corner whose outer square is black, consistently over all pictures where possible.
 
-    grid (rows, columns, 2 or more): pixels, and what else belongs to corners. None if the squares do not alternate, as on things that resemble a chessboard.
+    grid (rows, columns, 2 or more): pixels, and what else belongs to corners. None if the squares do not alternate, as
+    on things that resemble a chessboard.
     """
     ways = orders(grid)
     shades = [alternation(image, way[..., :2]) for way in ways]

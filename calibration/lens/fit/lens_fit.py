@@ -203,63 +203,57 @@ def used_views(fit: LensFit, table: CornerTable) -> Ints:
     return np.flatnonzero(table.counts(fit.used) > 0)
 
 
-def with_own_noise(table: CornerTable, found: LensFit) -> CornerTable:
-    """The table with the noise of each corner, from its residual; None where all may have the same.
+def with_picture_noise(table: CornerTable, found: LensFit) -> CornerTable:
+    """The table with the noise of each corner by that of the picture; None where the residuals do not show it.
 
     Corners have the noise of the picture, which is large where squares are small, edges wide or markers near; and that
-    of all other causes, which is the same for all. The shares of both have the maximum likelihood. Then each view has a
-    factor, if by Bartlett's test (1937, Proc. R. Soc. A 160) they differ: near boards are out of focus, far ones sharp,
-    by up to 3.5 times in sets of real photographs. Views that are not used have the noise of all.
+    of all other causes, which is the same for all. The shares of both have the maximum likelihood, without the corners
+    that are outliers if they are right: the fit may have rejected others, with the noise of most.
     """
-    length2 = np.nan_to_num(np.sum(found.residuals**2, axis=1), nan=np.inf)
-    variance, used = _by_picture(table, found.used, length2)
-    views = _by_view(table, found, np.where(used, length2 / variance, 0.0), used)
-    noise2 = variance * views[table.view]
-    return replace(table, own_noise=None if np.all(noise2 == 1) else np.sqrt(noise2 / np.median(noise2[used])))
-
-
-def _by_picture(table: CornerTable, used: Bools, length2: Array) -> tuple[Array, Bools]:
-    """Variances (N,) of corners, up to a factor, from that of the picture; 1 where the residuals do not show it.
-
-    Also the corners that are no outliers if these are right.
-    """
-    same = np.ones(len(table))
+    same = replace(table, own_noise=None)
     if table.sigmas_px is None:
-        return same, used
+        return same
+    length2, used = np.nan_to_num(np.sum(found.residuals**2, axis=1), nan=np.inf), found.used
     own2 = (table.sigmas_px / np.median(table.sigmas_px)) ** 2
 
-    def of(common: float) -> Array:
+    def variance(common: float) -> Array:
         return np.asarray(common + (1 - common) * own2)
 
     def deviance(common: float) -> float:
-        w = of(common)[now]
-        return 2 * float(np.sum(np.log(w)) + len(w) * np.log(np.mean(length2[now] / w)))
+        w = variance(common)[used]
+        return 2 * float(np.sum(np.log(w)) + len(w) * np.log(np.mean(length2[used] / w)))
 
-    now = used
     for _ in range(_ROUNDS):
         common = float(minimize_scalar(deviance, bounds=(0.0, 1.0), method="bounded").x)
         if chdtrc(1, max(deviance(1.0) - deviance(common), 0.0)) >= _NOISE_DIFFERS:
-            return same, used
-        limit = CORNER_GATE**2 * np.mean(length2[now] / of(common)[now]) / 2
-        before, now = now, length2 / of(common) < limit
-        if np.array_equal(before, now):
+            return same
+        score = length2 / variance(common)
+        before, used = used, score < CORNER_GATE**2 * np.mean(score[used]) / 2
+        if np.array_equal(before, used):
             break
-    return of(common), now
+    noise = np.sqrt(variance(common))
+    return replace(table, own_noise=noise / np.median(noise[used]))
 
 
-def _by_view(table: CornerTable, found: LensFit, length2: Array, used: Bools) -> Array:
-    """Variances (V,) of views over that of all, from squared residuals (N,); 1 if they may be the same."""
-    numbers, out = table.counts(used) * 2.0 - 6, np.ones(table.views)
+def with_view_noise(table: CornerTable, found: LensFit) -> CornerTable:
+    """The table with a factor on the noise of each view, from its residuals; as it is where all may have the same.
+
+    Near boards are out of focus, far ones sharp: in sets of real photographs the noise differs by up to 3.5 times.
+    Bartlett's test (1937, Proc. R. Soc. A 160). Views that are not used have the noise of all.
+    """
+    numbers = table.counts(found.used) * 2.0 - 6
     mine = numbers > 0
     dof = np.where(mine, numbers * (1 - found.model.free.sum() / max(numbers[mine].sum(), 1)), 0.0)
-    squares = np.bincount(table.view, weights=length2, minlength=table.views)
+    lengths2 = np.where(found.used, np.sum(found.residuals**2, axis=1) / table.noise**2, 0.0)
+    squares = np.bincount(table.view, weights=lengths2, minlength=table.views)
     if mine.sum() < 2 or np.min(dof[mine]) <= 0 or np.min(squares[mine]) <= 0:
-        return out
+        return table
     common, dof = squares[mine].sum() / dof.sum(), dof[mine]
     variance = squares[mine] / dof
     score = dof.sum() * np.log(common) - np.sum(dof * np.log(variance))
     score /= 1 + (np.sum(1 / dof) - 1 / dof.sum()) / (3 * (len(dof) - 1))
     if chdtrc(len(dof) - 1, score) >= _NOISE_DIFFERS or variance.max() < _NOISE_RATIO**2 * variance.min():
-        return out
-    out[mine] = variance / common
-    return out
+        return table
+    noise = np.ones(table.views)
+    noise[mine] = np.sqrt(variance / common)
+    return replace(table, own_noise=table.noise * noise[table.view])
