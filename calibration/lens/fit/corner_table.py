@@ -31,7 +31,8 @@ class CornerTable:
     image_size_px: tuple[int, int]
     circles: CircleAreas | None = None  # None: the points are not circles
     sigmas_px: Array | None = None  # (N,): of a coordinate, from the noise of the picture; None: not measured
-    own_noise: Array | None = None  # (N,): of each corner, in units of that of the set; None: the same for all
+    picture_noise: Array | None = None  # (N,): of each corner, in units of that of the set; None: the same for all
+    view_noise: Array | None = None  # (V,): factor on it of a view's corners; None: the same in all
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.pixels).all():
@@ -73,7 +74,8 @@ class CornerTable:
     @property
     def noise(self) -> Array:
         """(N,): of each corner, in units of that of the set."""
-        return np.ones(len(self)) if self.own_noise is None else self.own_noise
+        by_picture = np.ones(len(self)) if self.picture_noise is None else self.picture_noise
+        return by_picture if self.view_noise is None else by_picture * self.view_noise[self.view]
 
     def counts(self, used: Bools | None = None) -> Ints:
         """(V,): number of corners of each view; of the used ones (N,) only, if given."""
@@ -102,7 +104,8 @@ class CornerTable:
             self.image_size_px,
             self._circles_of(order),
             None if self.sigmas_px is None else self.sigmas_px[order],
-            None if self.own_noise is None else self.own_noise[order],
+            None if self.picture_noise is None else self.picture_noise[order],
+            None if self.view_noise is None else self.view_noise[views],
         )
 
     def _circles_of(self, rows: Ints) -> CircleAreas | None:

@@ -173,12 +173,13 @@ def _bad_views(
     table: CornerTable, residuals: Array, candidates: Bools, sigma: float, dropped: Mapping[int, str]
 ) -> dict[int, str]:
     """Views in which most corners are outliers, or which are much worse than the others, with the reason."""
-    length = np.linalg.norm(residuals, axis=1) / table.noise
+    length = np.linalg.norm(residuals, axis=1)
     typical = np.full(table.views, np.nan)
     for v in set(range(table.views)) - set(dropped):
-        typical[v] = np.median(length[(table.view == v) & candidates])
+        mine = (table.view == v) & candidates
+        typical[v] = np.median(length[mine] / (1.0 if table.picture_noise is None else table.picture_noise[mine]))
     median = float(np.nanmedian(typical))
-    good = table.mean_per_view((length < CORNER_GATE * sigma).astype(float), candidates)
+    good = table.mean_per_view((length < CORNER_GATE * sigma * table.noise).astype(float), candidates)
     out = {}
     for v in np.flatnonzero(np.isfinite(typical)).tolist():
         if typical[v] > VIEW_GATE * median:
@@ -210,7 +211,7 @@ def with_picture_noise(table: CornerTable, found: LensFit) -> CornerTable:
     of all other causes, which is the same for all. The shares of both have the maximum likelihood, without the corners
     that are outliers if they are right: the fit may have rejected others, with the noise of most.
     """
-    same = replace(table, own_noise=None)
+    same = replace(table, picture_noise=None)
     if table.sigmas_px is None:
         return same
     length2, used = np.nan_to_num(np.sum(found.residuals**2, axis=1), nan=np.inf), found.used
@@ -232,7 +233,7 @@ def with_picture_noise(table: CornerTable, found: LensFit) -> CornerTable:
         if np.array_equal(before, used):
             break
     noise = np.sqrt(variance(common))
-    return replace(table, own_noise=noise / np.median(noise[used]))
+    return replace(table, picture_noise=noise / np.median(noise[used]))
 
 
 def with_view_noise(table: CornerTable, found: LensFit) -> CornerTable:
@@ -256,4 +257,4 @@ def with_view_noise(table: CornerTable, found: LensFit) -> CornerTable:
         return table
     noise = np.ones(table.views)
     noise[mine] = np.sqrt(variance / common)
-    return replace(table, own_noise=table.noise * noise[table.view])
+    return replace(table, view_noise=noise)

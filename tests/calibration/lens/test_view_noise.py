@@ -24,9 +24,8 @@ def test_blurred_photographs_count_less_than_sharp_ones(monkeypatch):
         table = of_mixed_noise(seed, noise)
         c = calibrate_intrinsics(table, replace(FIVE, warp=False))
         squares.append((errors(c) / c.sigmas) ** 2)
-        assert c.table.own_noise is not None
-        of_views = c.table.mean_per_view(c.table.own_noise, c.fit.used)
-        np.testing.assert_allclose(of_views[5:] / of_views[:5], 4, rtol=0.5)
+        assert c.table.view_noise is not None
+        np.testing.assert_allclose(c.table.view_noise[5:] / c.table.view_noise[:5], 4, rtol=0.5)
         with monkeypatch.context() as patch:
             patch.setattr(lens_fit, "_NOISE_RATIO", np.inf)
             equal = calibrate_intrinsics(table, replace(FIVE, warp=False))
@@ -38,7 +37,7 @@ def test_blurred_photographs_count_less_than_sharp_ones(monkeypatch):
 
 def test_photographs_of_equal_noise_count_the_same():
     tables = [photographs(Scene(views=8), seed) for seed in range(3)]
-    assert all(calibrate_intrinsics(t, IntrinsicsOptions(lens=FIVE.lens)).table.own_noise is None for t in tables)
+    assert all(calibrate_intrinsics(t, IntrinsicsOptions(lens=FIVE.lens)).table.view_noise is None for t in tables)
 
 
 def of_noise_at_the_rim(seed: int, elsewhere_px: float = 0.0):
@@ -80,4 +79,4 @@ def test_noise_that_is_not_of_the_picture_is_added_to_it():
 def test_noise_of_other_causes_alone_leaves_all_corners_alike():
     table = photographs(Scene(views=10, sigma_px=0.2), 6)
     sigmas = np.random.default_rng(9).uniform(0.001, 0.01, len(table))
-    assert calibrate_intrinsics(replace(table, sigmas_px=sigmas), FIVE).table.own_noise is None
+    assert calibrate_intrinsics(replace(table, sigmas_px=sigmas), FIVE).table.picture_noise is None
