@@ -15,7 +15,7 @@ from bench.lenses import rendered
 from bench.lenses.rendered import BOARDS
 from calibration.boards import charuco_detection, chessboard_detection, circle_detection, corner_refinement
 from calibration.boards.board_detection import find_board
-from calibration.boards.board_types import Board, CircleGrid, parse
+from calibration.boards.board_types import Board, Chessboard, CircleGrid, parse
 from calibration.boards.board_view import QUICK_SEARCH_FAILED, BoardView, NotFound
 from calibration.least_squares.adjustment import Poses, Vectors
 from calibration.terms.corners import single_camera
@@ -354,6 +354,17 @@ def test_each_point_has_the_noise_of_its_place_in_the_picture(text, roll):
     assert quiet.sum() > 5
     assert noisy.sum() > 5
     assert np.median(view.sigmas_px[noisy]) > 4 * np.median(view.sigmas_px[quiet])
+
+
+def test_corners_found_in_another_order_keep_their_noise():
+    board, photo = shot(CHESS)
+    assert isinstance(board, Chessboard)
+    image = np.clip(photo.image + np.random.default_rng(3).normal(0, 3, photo.image.shape), 0, 255).astype(np.uint8)
+    true = photo.pixels.reshape(board.rows, board.columns, 2)
+    views = [chessboard_detection._measured(image, grid, board) for grid in (true, true[::-1, ::-1])]
+    assert all(isinstance(view, BoardView) for view in views)
+    np.testing.assert_allclose(views[1].pixels, views[0].pixels, atol=0.01)  # type: ignore[union-attr]
+    np.testing.assert_allclose(views[1].sigmas_px, views[0].sigmas_px, rtol=0.01)  # type: ignore[union-attr]
 
 
 def test_a_picture_of_another_type_raises():
