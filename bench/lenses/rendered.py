@@ -17,7 +17,7 @@ import numpy as np
 from calibration.boards.board_detection import find_board
 from calibration.boards.board_types import Board, Charuco, CircleGrid, parse
 from calibration.boards.board_view import BoardView
-from calibration.lens.fit.corner_table import CircleAreas, CornerTable
+from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LensModel, folds_in_picture, rational_of_fisheye
 from calibration.lens.intrinsics import IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
 from calibration.lens.intrinsics_result import Intrinsics
@@ -25,7 +25,9 @@ from geometry.arrays import Array
 from geometry.camera import FISHEYE, PERSPECTIVE, Camera
 from geometry.pose import Pose
 from geometry.rotations import exp
+from lab.calibrate.camera.camera import corner_table
 from lab.calibrate.camera.camera_page import findings_of
+from lab.calibrate.camera.photos import PhotoSet
 from lab.findings.finding import Level, verdict
 from lab.simulate.board_photo import PhotoSettings, photograph
 from tests.calibration.lens.random_lenses import TrueLens, lens_error
@@ -110,11 +112,7 @@ def rendered_set(kind: str, text: str, seed: int, views: int | None = None) -> R
         if isinstance(view, BoardView):
             found.append(view)
             truth.append(_nearest(board, picture.pixels, view))
-    areas = None
-    if isinstance(board, CircleGrid):
-        areas = CircleAreas(np.concatenate([v.areas_px2 for v in found if v.areas_px2 is not None]))
-    rows = [(np.searchsorted(board.ids, v.ids), v.pixels) for v in found]
-    table = CornerTable.of(rows, board.points, board.middle, SIZE, areas)
+    table = corner_table(PhotoSet(board, SIZE, tuple(("", v) for v in found), (), {}))
     return RenderedSet(table, np.concatenate(truth), lens, fisheye, clock / searched)
 
 

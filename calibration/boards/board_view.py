@@ -27,6 +27,7 @@ class BoardView:
     blur_px: float  # sigma of the edges, including the width of a pixel; nan where it could not be measured
     notes: tuple[str, ...] = ()  # remarks for the user about this picture
     areas_px2: Array | None = None  # (n,), areas of the blobs of circles; None for other boards
+    sigmas_px: Array | None = None  # (n,): of a coordinate, from the noise of the picture; None: not measured
 
     def __len__(self) -> int:
         return len(self.ids)

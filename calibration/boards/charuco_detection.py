@@ -203,7 +203,8 @@ def _corners(image: GreyImage, board: Charuco, markers: Markers, notes: tuple[st
     apart = corner_refinement.spacing(fine.pixels)
     if fine.blur_px > BLUR_LIMIT * apart:
         return too_blurred(fine.blur_px, apart)
-    return BoardView(board.ids[seen], fine.pixels.reshape(-1, 2)[seen], apart, fine.blur_px, notes)
+    pixels, sigmas = fine.pixels.reshape(-1, 2)[seen], fine.sigmas_px.ravel()[seen]
+    return BoardView(board.ids[seen], pixels, apart, fine.blur_px, notes, sigmas_px=sigmas)
 
 
 def _mirrored(image: GreyImage, board: Charuco, seen: int) -> NotFound | None:

@@ -67,8 +67,10 @@ def _measured(image: GreyImage, grid: Array | Corners, board: Chessboard) -> Boa
     fine = grid if isinstance(grid, Corners) else corner_refinement.refined(image, grid)
     if not np.isfinite(fine.pixels).all() or not _is_sheet(fine.pixels):
         return None
-    ordered = oriented(image, fine.pixels)
-    return None if ordered is None else _checked(image, replace(fine, pixels=ordered), board)
+    ordered = oriented(image, np.dstack([fine.pixels, fine.sigmas_px]))
+    if ordered is None:
+        return None
+    return _checked(image, replace(fine, pixels=ordered[..., :2], sigmas_px=ordered[..., 2]), board)
 
 
 def _grids(image: GreyImage, columns: int, rows: int, parts: list[Array]) -> Iterator[Array | Corners]:
@@ -152,10 +154,11 @@ def upright(ways: list[Array]) -> Array:
 def oriented(image: GreyImage, grid: Array) -> Array | None:
     """The grid numbered from the corner whose outer square is black, consistently over all pictures where possible.
 
-    None if the squares do not alternate, as on things that resemble a chessboard.
+    grid (rows, columns, 2 or more): pixels, and what else belongs to corners. None if the squares do not alternate, as
+    on things that resemble a chessboard.
     """
     ways = orders(grid)
-    shades = [alternation(image, way) for way in ways]
+    shades = [alternation(image, way[..., :2]) for way in ways]
     if max(abs(shade) for shade in shades) < _ALTERNATING:
         return None
     # Both corners white (a board with an even sum, printed with the colours exchanged): any of them, but upright.
@@ -193,7 +196,7 @@ def _checked(image: GreyImage, fine: Corners, board: Chessboard) -> BoardView | 
     apart = corner_refinement.spacing(fine.pixels)
     if fine.blur_px > BLUR_LIMIT * apart:
         return too_blurred(fine.blur_px, apart)
-    return BoardView(board.ids, fine.pixels.reshape(-1, 2), apart, fine.blur_px)
+    return BoardView(board.ids, fine.pixels.reshape(-1, 2), apart, fine.blur_px, sigmas_px=fine.sigmas_px.ravel())
 
 
 def _grown(image: GreyImage, part: Array, rows: int, columns: int) -> Iterator[Corners]:

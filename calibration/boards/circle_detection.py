@@ -49,6 +49,7 @@ class Ellipses:
     centres: Array  # (n, 2), px
     shapes: Array  # (n, 2, 2), px^2: L L^T of the outline c + L (cos a, sin a)
     blurs: Array  # (n,), px: sigma of the edge, including the width of a pixel
+    sigmas_px: Array  # (n,): of a coordinate of the centre, from the noise of the picture; nan where not measured
 
     @property
     def areas(self) -> Array:
@@ -153,7 +154,7 @@ def _measured(image: GreyImage, ordered: Array, blobs: Array, board: CircleGrid,
     if blur > BLUR_LIMIT * apart:
         return too_blurred(blur, apart)
     notes = ("white circles on a black ground",) if light else ()
-    return BoardView(board.ids, centres, apart, blur, notes, ellipses.areas[order])
+    return BoardView(board.ids, centres, apart, blur, notes, ellipses.areas[order], ellipses.sigmas_px[order])
 
 
 def _radii(grid: Array, board: CircleGrid, blobs: Array) -> Array:
@@ -200,7 +201,8 @@ def fit_ellipses(image: GreyImage, centres: Array, radii: Array) -> Ellipses:
         fit = _ellipse(gx[piece], gy[piece], smooth[piece], centre - first, reach)
         if fit is not None and np.linalg.norm(fit[:2] + first - centre) <= 0.7 * radius + 1:
             out[n] = [*(fit[:2] + first), *fit[2:]]
-    return _outlines(image, Ellipses(out[:, :2], out[:, [2, 3, 3, 4]].reshape(-1, 2, 2), out[:, 5]))
+    shapes = out[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+    return _outlines(image, Ellipses(out[:, :2], shapes, out[:, 5], np.full(len(out), np.nan)))
 
 
 def _ellipse(gx: Array, gy: Array, grey: Array, centre: Array, reach: float) -> Array | None:
@@ -239,22 +241,25 @@ def _outlines(image: GreyImage, start: Ellipses) -> Ellipses:
     second-order part of perspective and distortion, the rest moves a circle as a whole or changes it in second order,
     and g leaves the centroid at c. An ellipse fitted to an oblique outline with g is not at its centroid. Ours.
     """
-    centres, shapes = start.centres.copy(), start.shapes.copy()
+    centres, shapes, noise = start.centres.copy(), start.shapes.copy(), np.full((len(start.centres), 3), np.nan)
     good = np.flatnonzero(np.isfinite(shapes).all(axis=(1, 2)) & np.isfinite(start.blurs))
     good = good[np.argsort(start.areas[good])]
     for first in range(0, len(good), _AT_ONCE):
         rows = good[first : first + _AT_ONCE]
-        found, L2 = _fitted_outlines(image, centres[rows], shapes[rows], start.blurs[rows])
+        found, L2, noise[rows] = _fitted_outlines(image, centres[rows], shapes[rows], start.blurs[rows])
         size = np.sqrt(np.linalg.det(shapes[rows]))
         with np.errstate(invalid="ignore"):
             near = np.linalg.norm(found - centres[rows], axis=1) < _MOST_MOVED * np.sqrt(size)
             near &= np.abs(np.sqrt(np.linalg.det(L2)) / size - 1) < _MOST_MOVED
         centres[rows[near]], shapes[rows[near]] = found[near], L2[near]
-    return Ellipses(centres, shapes, start.blurs)
+    return Ellipses(centres, shapes, start.blurs, corner_refinement.of_noise(noise))
 
 
-def _fitted_outlines(image: GreyImage, centres: Array, shapes: Array, blur: Array) -> tuple[Array, Array]:
-    """Centres (n, 2) and shapes (n, 2, 2) of `_outlines`, from start values and sigmas (n,) of the edges, px."""
+def _fitted_outlines(image: GreyImage, centres: Array, shapes: Array, blur: Array) -> tuple[Array, Array, Array]:
+    """Centres (n, 2), shapes (n, 2, 2) and noise (n, 3) of `_outlines`, from start values.
+
+    blur (n,), px: sigmas of the edges.
+    """
     values, vectors = np.linalg.eigh(shapes)
     A = (vectors / np.sqrt(values)[:, None]) @ np.swapaxes(vectors, 1, 2)  # offset in px to the unit circle
     whole = np.round(centres).astype(int)
@@ -298,13 +303,13 @@ def _fitted_outlines(image: GreyImage, centres: Array, shapes: Array, blur: Arra
         J[:, 2], J[:, 3], J[:, 4] = g * p * d[:, 0], g * (p * d[:, 1] + q * d[:, 0]), g * q * d[:, 1]
         J[:, 5:7] = -(g * length)[:, None] * cube
         J[:, 7] = g * n * (curved * sigma / 2 - away / sigma)
-        step = corner_refinement.step_of(J, B, grey, linear)
+        step, noise = corner_refinement.step_of(J, B, grey, linear)
         x = x + np.clip(step, -largest, largest)
         x[:, 7] = np.maximum(x[:, 7], 0.25)
         if np.max(np.abs(step[:, :2])) < _SMALL_PX:
             break
     inverse = np.linalg.inv(x[:, [2, 3, 3, 4]].reshape(-1, 2, 2))
-    return whole + x[:, :2], inverse @ np.swapaxes(inverse, 1, 2)
+    return whole + x[:, :2], inverse @ np.swapaxes(inverse, 1, 2), noise
 
 
 def _beside(A: Array, centre: Array, band: float, reach: float) -> Array:

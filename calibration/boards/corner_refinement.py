@@ -43,6 +43,7 @@ class Corners:
     """Measured corners, with the blur of the edges that meet there."""
 
     pixels: Array  # (rows, columns, 2); nan if not found
+    sigmas_px: Array  # (rows, columns): of a coordinate, from the noise of the picture
     blur_px: float  # median sigma of the edges, including the width of a pixel; nan if no corner was found
 
 
@@ -64,6 +65,7 @@ def refined(
     half = np.clip(np.nan_to_num(reach * height, nan=2.0).astype(int), 2, _MOST_PX)
     out = np.full(grid.shape, np.nan)
     look = np.full((rows, columns, 4), np.nan)  # directions and sigmas of the edges
+    noise = np.full((rows, columns, 3), np.nan)
     inside = known & np.all((grid >= 0) & (grid <= np.array(image.shape[::-1]) - 1), axis=-1)
     out[inside] = grid[inside]
     within = inside if again is None else inside & (again | moved)
@@ -81,21 +83,19 @@ def refined(
                 steps, new = shape[i, j, :2], np.isnan(look[i, j, :1])
                 edges = np.column_stack([np.arctan2(steps[..., 1], steps[..., 0]), np.full((len(i), 2), _BLUR_PX)])
                 edges = np.where(new, edges, look[i, j])
-                found, seen = _saddles(image, out[i, j], edges, shape[i, j, 2:], size, small_px)
+                found, seen, noise[i, j] = _saddles(image, out[i, j], edges, shape[i, j, 2:], size, small_px)
                 good = np.linalg.norm(found - out[i, j], axis=1) <= max(1.0, 0.25 * size)
                 out[i, j], look[i, j] = np.where(good[:, None], found, out[i, j]), seen
     out[np.linalg.norm(out - grid, axis=-1) > np.maximum(1.5, 0.75 * half)] = np.nan
     out[_by_others(out)[1] > _OFF * height] = np.nan
     look = look[np.isfinite(out).all(axis=-1) & within]
-    if not len(look):
-        return Corners(out, np.nan)
-    return Corners(out, float(np.median(look[:, 2:])))
+    return Corners(out, of_noise(noise), float(np.median(look[:, 2:])) if len(look) else np.nan)
 
 
 def _saddles(
     image: GreyImage, start: Array, edges: Array, bend: Array, half: int, small_px: float
-) -> tuple[Array, Array]:
-    """Corners (n, 2), px, with directions and sigmas of the two edges (n, 4), by least squares.
+) -> tuple[Array, Array, Array]:
+    """Corners (n, 2), px, directions and sigmas of the two edges (n, 4), and noise (n, 3), by least squares.
 
     start (n, 2), px, and edges (n, 4), rad and px: start values; bend (n, 3, 2): the curvature of `local_shape`. Grey
     values are (b + b' d) + (c + c' d) M at the offset d from the corner, M the mean of the product of the signs of the
@@ -130,12 +130,12 @@ def _saddles(
         J[:, :2] = -np.swapaxes(across, 1, 2) @ g
         J[:, 2:4] = -g * s
         J[:, 4:] = -g * e
-        step = step_of(J, L, grey, linear)
+        step, noise = step_of(J, L, grey, linear)
         x = x + np.clip(step, -largest, largest)
         x[:, 4:] = np.clip(x[:, 4:], 0.25, half)
         if np.max(np.abs(step[:, :2])) < small_px:
             break
-    return whole + x[:, :2], x[:, 2:]
+    return whole + x[:, :2], x[:, 2:], noise
 
 
 def _crossing(e: Pixelwise, cosine: Pixelwise) -> tuple[Pixelwise, Pixelwise]:
@@ -172,16 +172,34 @@ def linear_part(L: Pixelwise, grey: Pixelwise) -> Array:
     return np.linalg.solve(_square(L), (L @ grey[..., None]).astype(float))
 
 
-def step_of(J: Pixelwise, L: Pixelwise, grey: Pixelwise, linear: Array) -> Array:
+def step_of(J: Pixelwise, L: Pixelwise, grey: Pixelwise, linear: Array) -> tuple[Array, Array]:
     """The Gauss-Newton step (n, p) of the other parameters, with derivatives J (n, p, m); the linear ones eliminated.
 
-    Source: Kaufman (1975), "A variable projection method for solving separable nonlinear least squares problems", BIT.
+    Also the noise (n, 3): the mean variance of the first two for grey values with a noise of 1 DN; the square of that
+    noise, DN^2, from what the fit leaves; and its degrees of freedom. L[:, 0]: the weights of the pixels. Source:
+    Kaufman (1975), "A variable projection method for solving separable nonlinear least squares problems", BIT.
     """
     mixed = (L @ np.swapaxes(J, 1, 2)).astype(float)
     N = (J @ np.swapaxes(J, 1, 2)).astype(float) - np.swapaxes(mixed, 1, 2) @ np.linalg.solve(_square(L), mixed)
     N += (1e-3 * np.einsum("nii->ni", N)[:, None] + 1e-9) * np.eye(J.shape[1])
     left = grey[:, None] - np.swapaxes(linear, 1, 2).astype(L.dtype) @ L
-    return np.asarray(np.linalg.solve(N, (J @ np.swapaxes(left, 1, 2)).astype(float))[..., 0])
+    C = np.linalg.inv(N)
+    dof = np.maximum(L[:, 0].sum(axis=1) - L.shape[1] - J.shape[1], 1)
+    variance = np.maximum((C[:, 0, 0] + C[:, 1, 1]) / 2, 0.0)
+    noise = np.stack([variance, np.sum(left * left, axis=(1, 2)) / dof, dof], axis=1)
+    return (C @ (J @ np.swapaxes(left, 1, 2)).astype(float))[..., 0], noise
+
+
+def of_noise(noise: Array) -> Array:
+    """Sigmas (...), px, of the points of a picture, from the noise (..., 3) of `step_of`.
+
+    Noise below that of most points by less than two of its sigmas is chance; above it, something else is in the window.
+    """
+    variance, noise2, dof = np.moveaxis(noise, -1, 0)
+    measured = np.isfinite(noise2)
+    usual = float(np.median(noise2[measured])) if measured.any() else np.nan
+    chance = (noise2 < usual) & (noise2 > usual * (1 - 2 * np.sqrt(2 / dof)))
+    return np.asarray(np.sqrt(variance * np.where(chance, usual, noise2)))
 
 
 def _square(L: Pixelwise) -> Array:

@@ -12,7 +12,14 @@ from calibration.least_squares.adjustment import AdjustmentError, Poses, Values
 from calibration.lens.board_shape import BoardShapeOptions, BoardTest, board_test
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import coverage_of, spread_deg
-from calibration.lens.fit.lens_fit import FEWEST_CORNERS, LensFit, robust_fit, used_views, with_view_noise
+from calibration.lens.fit.lens_fit import (
+    FEWEST_CORNERS,
+    LensFit,
+    robust_fit,
+    used_views,
+    with_picture_noise,
+    with_view_noise,
+)
 from calibration.lens.fit.lens_models import LensModel, folds_in_picture
 from calibration.lens.fit.lens_parameters import AS_STATED, BOARD_BLOCKS, BoardFreedom, board_as_stated
 from calibration.lens.fit.lens_start import StartError, start
@@ -26,6 +33,7 @@ from geometry.arrays import Array, Bools
 FEWEST_VIEWS = 4
 # With a smaller angle between the boards' normals, focal length and distance cannot be separated.
 LEAST_TILT_DEG = 5.0
+_NOISE_DIFFERS = 0.2  # relative, of any corner, from which on the fit is repeated: less changes sigmas by about 1 %
 
 
 class IntrinsicsError(ValueError):
@@ -68,10 +76,12 @@ def calibrate_intrinsics(table: CornerTable, options: IntrinsicsOptions | None =
 def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     starts = _starts(table)
     used, rich = inliers_of_rich_models(table, starts, options.lens)
-    weighted = with_view_noise(table, rich[0])
-    if weighted is not table:
-        table = weighted
-        used, rich = inliers_of_rich_models(table, [(f.model, f.values) for f in rich], options.lens)
+    # Twice by the picture, since the first fit has equal weights. By views once: what fits a view raises its weight.
+    for with_noise in (with_picture_noise, with_picture_noise, with_view_noise):
+        weighted = with_noise(table, rich[0])
+        if not np.allclose(np.log(weighted.noise), np.log(table.noise), atol=_NOISE_DIFFERS):
+            table = weighted
+            used, rich = inliers_of_rich_models(table, [(f.model, f.values) for f in rich], options.lens)
     shape = _shape(table, rich[0], options)
     free = AS_STATED if shape is None else shape.free
     as_found = (rich[0] if shape is None else shape.fit).values

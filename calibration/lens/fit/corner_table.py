@@ -30,7 +30,9 @@ class CornerTable:
     views: int
     image_size_px: tuple[int, int]
     circles: CircleAreas | None = None  # None: the points are not circles
-    view_noise: Array | None = None  # (V,): of a view's corners, in units of that of the set; None: the same in all
+    sigmas_px: Array | None = None  # (N,): of a coordinate, from the noise of the picture; None: not measured
+    picture_noise: Array | None = None  # (N,): of each corner, in units of that of the set; None: the same for all
+    view_noise: Array | None = None  # (V,): factor on it of a view's corners; None: the same in all
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.pixels).all():
@@ -45,8 +47,9 @@ class CornerTable:
         middle: Array,
         image_size_px: tuple[int, int],
         circles: CircleAreas | None = None,
+        sigmas_px: Array | None = None,
     ) -> CornerTable:
-        """From (ids (n,), pixels (n, 2)) per photograph; the areas of circles are in the order of the views."""
+        """From (ids (n,), pixels (n, 2)) per photograph; areas of circles and sigmas are in the order of the views."""
         sizes = [len(ids) for ids, _ in views]
         return CornerTable(
             view=np.repeat(np.arange(len(views)), sizes),
@@ -57,6 +60,7 @@ class CornerTable:
             views=len(views),
             image_size_px=image_size_px,
             circles=circles,
+            sigmas_px=sigmas_px,
         )
 
     def __len__(self) -> int:
@@ -70,7 +74,8 @@ class CornerTable:
     @property
     def noise(self) -> Array:
         """(N,): of each corner, in units of that of the set."""
-        return np.ones(len(self)) if self.view_noise is None else self.view_noise[self.view]
+        by_picture = np.ones(len(self)) if self.picture_noise is None else self.picture_noise
+        return by_picture if self.view_noise is None else by_picture * self.view_noise[self.view]
 
     def counts(self, used: Bools | None = None) -> Ints:
         """(V,): number of corners of each view; of the used ones (N,) only, if given."""
@@ -98,6 +103,8 @@ class CornerTable:
             len(views),
             self.image_size_px,
             self._circles_of(order),
+            None if self.sigmas_px is None else self.sigmas_px[order],
+            None if self.picture_noise is None else self.picture_noise[order],
             None if self.view_noise is None else self.view_noise[views],
         )
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 from scipy.special import chdtrc
 
 from calibration.least_squares.adjustment import Adjusted, Cauchy, Limits, Poses, Values, Vectors
@@ -24,7 +25,7 @@ CORNER_GATE = 4.5
 # A view with residuals this many times those of the median view was blurred, or its board moved.
 VIEW_GATE = 3.0
 _NOISE_DIFFERS = 1e-3  # p-value of the same noise in all views below which each has its own ...
-_NOISE_RATIO = 2.0  # ... if the largest is that many times the smallest: weights change little below it
+_NOISE_RATIO = 1.5  # ... if the largest is that many times the smallest: weights change little below it
 _ROUNDS = 6  # of fitting and rejecting; all sets tried so far converge within three
 
 
@@ -176,7 +177,8 @@ def _bad_views(
     length = np.linalg.norm(residuals, axis=1)
     typical = np.full(table.views, np.nan)
     for v in set(range(table.views)) - set(dropped):
-        typical[v] = np.median(length[(table.view == v) & candidates])
+        mine = (table.view == v) & candidates
+        typical[v] = np.median(length[mine] / (1.0 if table.picture_noise is None else table.picture_noise[mine]))
     median = float(np.nanmedian(typical))
     good = table.mean_per_view((length < CORNER_GATE * sigma * table.noise).astype(float), candidates)
     out = {}
@@ -203,8 +205,40 @@ def used_views(fit: LensFit, table: CornerTable) -> Ints:
     return np.flatnonzero(table.counts(fit.used) > 0)
 
 
+def with_picture_noise(table: CornerTable, found: LensFit) -> CornerTable:
+    """The table with the noise of each corner by that of the picture; None where the residuals do not show it.
+
+    Corners have the noise of the picture, which is large where squares are small, edges wide or markers near; and that
+    of all other causes, which is the same for all. The shares of both have the maximum likelihood, without the corners
+    that are outliers if they are right: the fit may have rejected others, with the noise of most.
+    """
+    same = replace(table, picture_noise=None)
+    if table.sigmas_px is None:
+        return same
+    length2, used = np.nan_to_num(np.sum(found.residuals**2, axis=1), nan=np.inf), found.used
+    own2 = (table.sigmas_px / np.median(table.sigmas_px)) ** 2
+
+    def variance(common: float) -> Array:
+        return np.asarray(common + (1 - common) * own2)
+
+    def deviance(common: float) -> float:
+        w = variance(common)[used]
+        return 2 * float(np.sum(np.log(w)) + len(w) * np.log(np.mean(length2[used] / w)))
+
+    for _ in range(_ROUNDS):
+        common = float(minimize_scalar(deviance, bounds=(0.0, 1.0), method="bounded").x)
+        if chdtrc(1, max(deviance(1.0) - deviance(common), 0.0)) >= _NOISE_DIFFERS:
+            return same
+        score = length2 / variance(common)
+        before, used = used, score < CORNER_GATE**2 * np.mean(score[used]) / 2
+        if np.array_equal(before, used):
+            break
+    noise = np.sqrt(variance(common))
+    return replace(table, picture_noise=noise / np.median(noise[used]))
+
+
 def with_view_noise(table: CornerTable, found: LensFit) -> CornerTable:
-    """The table with the noise of each view's corners, from their residuals; as it is where all may have the same.
+    """The table with a factor on the noise of each view, from its residuals; as it is where all may have the same.
 
     Near boards are out of focus, far ones sharp: in sets of real photographs the noise differs by up to 3.5 times.
     Bartlett's test (1937, Proc. R. Soc. A 160). Views that are not used have the noise of all.
@@ -212,7 +246,7 @@ def with_view_noise(table: CornerTable, found: LensFit) -> CornerTable:
     numbers = table.counts(found.used) * 2.0 - 6
     mine = numbers > 0
     dof = np.where(mine, numbers * (1 - found.model.free.sum() / max(numbers[mine].sum(), 1)), 0.0)
-    lengths2 = np.where(found.used, np.sum(found.residuals**2, axis=1), 0.0)
+    lengths2 = np.where(found.used, np.sum(found.residuals**2, axis=1) / table.noise**2, 0.0)
     squares = np.bincount(table.view, weights=lengths2, minlength=table.views)
     if mine.sum() < 2 or np.min(dof[mine]) <= 0 or np.min(squares[mine]) <= 0:
         return table

@@ -20,6 +20,7 @@ from calibration.lens.intrinsics import (
     calibrate_intrinsics,
 )
 from calibration.lens.intrinsics_result import Intrinsics
+from geometry.arrays import Array
 from geometry.camera import FISHEYE, PERSPECTIVE
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.calibrate.camera.camera_page import findings_of, next_photographs, page_of
@@ -151,11 +152,16 @@ def corner_table(photos: PhotoSet) -> CornerTable:
     views = [view for _, view in photos.views]
     circles = None
     if isinstance(board, CircleGrid):
-        areas = [view.areas_px2 for view in views if view.areas_px2 is not None]
-        measured = np.concatenate(areas) if len(areas) == len(views) else None
-        circles = CircleAreas(measured, board.stated_diameter_m)
+        circles = CircleAreas(_joined([view.areas_px2 for view in views]), board.stated_diameter_m)
     rows = [(np.searchsorted(board.ids, view.ids), view.pixels) for view in views]
-    return CornerTable.of(rows, board.points, board.middle, photos.image_size_px, circles)
+    sigmas = _joined([view.sigmas_px for view in views])
+    return CornerTable.of(rows, board.points, board.middle, photos.image_size_px, circles, sigmas)
+
+
+def _joined(of_views: Sequence[Array | None]) -> Array | None:
+    """One array of all views; None if one of them has none."""
+    known = [one for one in of_views if one is not None]
+    return np.concatenate(known) if len(known) == len(of_views) else None
 
 
 def camera_file(

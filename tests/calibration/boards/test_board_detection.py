@@ -15,7 +15,7 @@ from bench.lenses import rendered
 from bench.lenses.rendered import BOARDS
 from calibration.boards import charuco_detection, chessboard_detection, circle_detection, corner_refinement
 from calibration.boards.board_detection import find_board
-from calibration.boards.board_types import Board, CircleGrid, parse
+from calibration.boards.board_types import Board, Chessboard, CircleGrid, parse
 from calibration.boards.board_view import QUICK_SEARCH_FAILED, BoardView, NotFound
 from calibration.least_squares.adjustment import Poses, Vectors
 from calibration.terms.corners import single_camera
@@ -192,7 +192,7 @@ def test_corners_in_any_order_are_renumbered_correctly():
 @pytest.mark.filterwarnings("error")
 def test_circles_beside_one_without_an_ellipse_have_their_areas_without_a_warning():
     shapes = np.stack([4 * np.eye(2), np.full((2, 2), np.nan)])
-    areas = circle_detection.Ellipses(np.zeros((2, 2)), shapes, np.ones(2)).areas
+    areas = circle_detection.Ellipses(np.zeros((2, 2)), shapes, np.ones(2), np.ones(2)).areas
     assert areas[0] == pytest.approx(4 * np.pi)
     assert np.isnan(areas[1])
 
@@ -339,6 +339,32 @@ def test_a_corner_that_starts_at_another_corner_is_measured_where_it_is():
     start = true.copy()
     start[2, 0] = true[3, 1]
     np.testing.assert_allclose(corner_refinement.refined(photo.image, start).pixels, true, atol=0.05)
+
+
+@pytest.mark.parametrize("text", [CHESS, CHARUCO, "circles:9x7:30mm"])
+@pytest.mark.parametrize("roll", [0.15, np.pi + 0.15])
+def test_each_point_has_the_noise_of_its_place_in_the_picture(text, roll):
+    """Also where the board is upside down, so that its points are counted in another order than they were found."""
+    board, photo = shot(text, turn=(0.4, -0.3, roll))
+    noise = np.random.default_rng(3).normal(0, 0.5, photo.image.shape)
+    noise[:, 240:] *= 8
+    view = view_of(np.clip(np.round(photo.image + noise), 0, 255).astype(np.uint8), board)
+    assert view.sigmas_px is not None
+    quiet, noisy = view.pixels[:, 0] < 225, view.pixels[:, 0] > 255
+    assert quiet.sum() > 5
+    assert noisy.sum() > 5
+    assert np.median(view.sigmas_px[noisy]) > 4 * np.median(view.sigmas_px[quiet])
+
+
+def test_corners_found_in_another_order_keep_their_noise():
+    board, photo = shot(CHESS)
+    assert isinstance(board, Chessboard)
+    image = np.clip(photo.image + np.random.default_rng(3).normal(0, 3, photo.image.shape), 0, 255).astype(np.uint8)
+    true = photo.pixels.reshape(board.rows, board.columns, 2)
+    views = [chessboard_detection._measured(image, grid, board) for grid in (true, true[::-1, ::-1])]
+    assert all(isinstance(view, BoardView) for view in views)
+    np.testing.assert_allclose(views[1].pixels, views[0].pixels, atol=0.01)  # type: ignore[union-attr]
+    np.testing.assert_allclose(views[1].sigmas_px, views[0].sigmas_px, rtol=0.01)  # type: ignore[union-attr]
 
 
 def test_a_picture_of_another_type_raises():

@@ -155,3 +155,32 @@ def test_the_light_of_two_blurred_edges_is_that_of_the_bivariate_normal_distribu
         moved[:, k] = h
         slope = [_crossing(e + s * moved, np.array([cosine]))[0] for s in (-1, 1)]
         np.testing.assert_allclose(by[0, k], (slope[1] - slope[0])[0] / (2 * h), atol=2e-3)
+
+
+@pytest.mark.parametrize(("lens", "blur_px"), [("pinhole", 2.0), ("fisheye", 0.7)])
+def test_the_scatter_of_each_corner_is_its_stated_sigma(lens, blur_px):
+    """Of wide and narrow squares, sharp and out of focus, and with five times the noise in half of the picture."""
+    board = parse("chessboard:9x6:30mm")
+    assert isinstance(board, Chessboard)
+    near = camera(lens)
+    at = placed(board, near, (0.5, 0.6, -0.4), 330.0)
+    grid = true_grid(board, near, at)
+    light = light_without_noise(board, near, at, blur_px)
+    middle = round(float(np.median(grid[..., 0])))
+    rng = np.random.default_rng(5)
+    off, sigmas = [], []
+    for _ in range(40):
+        noise = rng.normal(0, 1, light.shape)
+        noise[:, middle:] *= 5
+        found = refined((light + noise).astype(np.float32), grid + 0.2)  # type: ignore[arg-type]
+        off.append(found.pixels - grid)
+        sigmas.append(found.sigmas_px)
+    z = np.array(off) / np.array(sigmas)[..., None]
+    typical = np.median(sigmas, axis=0)
+    assert typical.max() > 6 * typical.min()
+    for half in (grid[..., 0] < middle - 12, grid[..., 0] > middle + 12):
+        assert half.sum() > 15
+        # 1200 numbers and more: their RMS is known to 2 %, and the sigmas of narrow squares to some percent
+        assert np.sqrt(np.mean(z[:, half] ** 2)) == pytest.approx(1, abs=0.1)
+    by_corner = np.sqrt(np.mean(z**2, axis=(0, 3)))  # each from 80 numbers, known to 8 %
+    assert np.all((by_corner > 0.65) & (by_corner < 1.4))

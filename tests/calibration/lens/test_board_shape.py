@@ -67,3 +67,13 @@ def test_displaced_points_are_solved_for():
     assert c.board.points.rms_m == pytest.approx(3e-4 * np.sqrt(2), rel=0.25)
     assert np.all(errors_in_sigmas(c) < 3.5)
     assert c.fit.sigma_px == pytest.approx(0.2, rel=0.1)
+
+
+def test_displaced_points_of_a_few_photographs_are_not_solved_for():
+    """They would take up a third of five photographs, and errors that differ between these with it."""
+    table = photographs(Scene(views=5, sigma_px=0.05), 4)
+    off = np.random.default_rng(3).normal(0, 3e-4, table.board_points.shape) * [1, 1, 0]
+    c = calibrate_intrinsics(stated(table, table.board_points + off), IntrinsicsOptions(lens=LensModel(5)))
+    assert c.board is not None
+    assert not c.board.points.corrected
+    assert "too few photographs" in c.board.points.why

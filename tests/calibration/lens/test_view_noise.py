@@ -1,4 +1,4 @@
-"""Photographs whose corners have different noise: near boards out of focus, far ones sharp."""
+"""Corners of different noise: near boards out of focus, far ones sharp, and narrow squares at the rim of a picture."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from calibration.lens.fit import lens_fit
 from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
-from tests.calibration.lens.lens_scenes import Scene, photographs
+from tests.calibration.lens.lens_scenes import SIZE, Scene, photographs
 from tests.calibration.lens.test_intrinsics import FIVE, errors
 
 
@@ -38,3 +38,45 @@ def test_blurred_photographs_count_less_than_sharp_ones(monkeypatch):
 def test_photographs_of_equal_noise_count_the_same():
     tables = [photographs(Scene(views=8), seed) for seed in range(3)]
     assert all(calibrate_intrinsics(t, IntrinsicsOptions(lens=FIVE.lens)).table.view_noise is None for t in tables)
+
+
+def of_noise_at_the_rim(seed: int, elsewhere_px: float = 0.0):
+    """Corners with the noise of their picture, .03 px in the middle and .3 px at its rim, and with other noise."""
+    table = photographs(Scene(views=10, sigma_px=0.0), seed)
+    away = np.linalg.norm(table.pixels / SIZE - 0.5, axis=1)
+    sigmas = np.where(away > 0.35, 0.3, 0.03)
+    rng = np.random.default_rng([seed, 8])
+    drawn = np.hypot(sigmas, elsewhere_px)[:, None] * rng.normal(size=(len(table), 2))
+    return replace(table, pixels=table.pixels + drawn, sigmas_px=sigmas)
+
+
+def test_corners_with_the_noise_of_their_picture_count_by_it():
+    squares, smaller = [], []
+    for seed in range(4):
+        table = of_noise_at_the_rim(seed)
+        c = calibrate_intrinsics(table, replace(FIVE, warp=False))
+        squares.append((errors(c) / c.sigmas) ** 2)
+        assert table.sigmas_px is not None
+        at_rim = table.sigmas_px > 0.1
+        np.testing.assert_allclose(c.table.noise[at_rim].mean() / c.table.noise[~at_rim].mean(), 10, rtol=0.3)
+        assert c.fit.used[at_rim].mean() > 0.95  # not outliers
+        equal = calibrate_intrinsics(replace(table, sigmas_px=None), replace(FIVE, warp=False))
+        smaller.append(c.sigmas[0] / equal.sigmas[0])
+    assert np.mean(smaller) < 0.8
+    # The mean of 36 squared numbers, which are correlated: within .3 to 2.2 with a probability of 99 %.
+    assert 0.3 < np.mean(squares) < 2.2
+
+
+def test_noise_that_is_not_of_the_picture_is_added_to_it():
+    table = of_noise_at_the_rim(5, 0.15)
+    assert table.sigmas_px is not None
+    c = calibrate_intrinsics(table, replace(FIVE, warp=False))
+    at_rim = table.sigmas_px > 0.1
+    expected = np.hypot(0.3, 0.15) / np.hypot(0.03, 0.15)
+    np.testing.assert_allclose(c.table.noise[at_rim].mean() / c.table.noise[~at_rim].mean(), expected, rtol=0.2)
+
+
+def test_noise_of_other_causes_alone_leaves_all_corners_alike():
+    table = photographs(Scene(views=10, sigma_px=0.2), 6)
+    sigmas = np.random.default_rng(9).uniform(0.001, 0.01, len(table))
+    assert calibrate_intrinsics(replace(table, sigmas_px=sigmas), FIVE).table.picture_noise is None
