@@ -44,6 +44,7 @@ class Look:
     motion: str = ""  # of bench.random_scenes.draw.motions; empty: any
     hidden: bool = True  # with occlusions and missing pictures
     plain_rig: bool = False  # the rig of the paper at 1280 x 1024
+    shake_px: float = 0.0  # rotation of each camera in each picture, about each axis, times its focal length; rms
     photograph: float = 0.0  # share of the laser light that the darkest place of a photograph takes; 0: no photograph
 
     @property
@@ -65,6 +66,7 @@ class Look:
             parts += [f"{count} {what}"] if count else []
         parts += ["screen edge"] if self.screen_edge else []
         parts += ["in front of a photograph"] if self.photograph else []
+        parts += [f"shakes by {self.shake_px:.2g} px"] if self.shake_px else []
         parts += [f"{self.clutter} moving clutter"] if self.clutter else []
         parts += [f"exposure {self.exposure_share:.2g} of a frame"]
         return f"{self.sensor.text}; {', '.join(parts)}"
@@ -143,6 +145,14 @@ def _clutter(rng: np.random.Generator, look: Look) -> Look:
                    screen_edge=True, hot_pixels=20)  # fmt: skip
 
 
+def _photographs(rng: np.random.Generator, look: Look) -> Look:
+    return replace(
+        look, photograph=0.6, background=40 / 255, gradient=0.0, vignetting=0.0, texture=0.0, flicker=0.0,
+        sensor=replace(look.sensor, full_well_e=float(rng.uniform(8e3, 15e3)), read_e=4.0),
+        peak_snr=_log(rng, 40, 150), hot_pixels=0,
+    )  # fmt: skip
+
+
 FAMILIES: dict[str, Callable[[np.random.Generator, Look], Look]] = {
     "issue": _issue,
     "faint": lambda r, k: replace(k, peak_snr=_log(r, 4, 9), sigma_px=_log(r, 1.0, 3.0)),
@@ -182,11 +192,8 @@ FAMILIES: dict[str, Callable[[np.random.Generator, Look], Look]] = {
         k, sensor=replace(draw_sensor(r, "8"), full_well_e=float(r.uniform(3e4, 6e4)), read_e=1.0, row_e=0.0),
         background=float(r.uniform(0, 0.03)), texture=0.0, flicker=0.0,
     ),
-    "photographs": lambda r, k: replace(
-        k, photograph=0.6, background=40 / 255, gradient=0.0, vignetting=0.0, texture=0.0, flicker=0.0,
-        sensor=replace(k.sensor, full_well_e=float(r.uniform(8e3, 15e3)), read_e=4.0), peak_snr=_log(r, 40, 150),
-        hot_pixels=0,
-    ),
+    "photographs": _photographs,
+    "shaking": lambda r, k: replace(_photographs(r, k), shake_px=_log(r, 0.03, 1.0)),
     "row-noise": lambda r, k: replace(k, sensor=replace(k.sensor, row_e=float(r.uniform(0.5, 1.0) * k.sensor.read_e))),
 }  # fmt: skip
 

@@ -9,12 +9,12 @@ import numpy as np
 from bench.random_pictures.optics import Patch
 from bench.random_pictures.scene import PictureScene
 from bench.random_pictures.sensors import Light, Picture, compressed, expose
-from bench.random_pictures.surroundings import Surroundings, draw_surroundings, gaussian_patch
+from bench.random_pictures.surroundings import Surroundings, draw_surroundings, gaussian_patch, seen_turned
 from bench.random_scenes.scene import SHINING
 from geometry.arrays import Array
 
 LEAST_SNR = 11.0  # smallest SNR of the median spot at rest in a matched filter; peaks are raised to it
-SURROUNDINGS, AMPLITUDE, CLUTTER, NOISE, FLICKER = range(21, 26)  # streams of random numbers
+SURROUNDINGS, AMPLITUDE, CLUTTER, NOISE, FLICKER, SHAKE = range(21, 27)  # streams of random numbers
 
 
 @dataclass(slots=True)
@@ -163,6 +163,10 @@ class Renderer:
     def raw(self, k: int, camera: int) -> Picture:
         """Frame k as read from the sensor, before lossy compression."""
         light, rng = self.expected(k, camera), self._rng(NOISE, 1 + k, camera)
+        if self.ps.look.shake_px:
+            seen_by = list(self.ps.scene.rig.cameras.values())[camera]
+            turn = self._rng(SHAKE, k, camera).normal(0.0, self.ps.look.shake_px / seen_by.matrix[0, 0], 3)
+            light = seen_turned(light, seen_by, turn)
         for row, column, charge in self.still[camera].blinking:
             if rng.random() < 0.5:
                 light[row, column] += charge

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
 from bench.random_pictures.looks import Look
@@ -15,6 +17,7 @@ from bench.random_pictures.sensors import Light
 from bench.random_pictures.spots import periodic_field
 from geometry.arrays import Array
 from geometry.camera import Camera
+from geometry.pose import Pose
 from geometry.rig import Screen
 
 _NODE_PX = 16  # spacing of the pixels at which the position on the screen is computed; cubic interpolation between them
@@ -86,6 +89,22 @@ def draw_photograph(rng: np.random.Generator, size_px: tuple[int, int]) -> Light
     way = cv2.INTER_AREA if part > 1 else cv2.INTER_CUBIC
     scaled = np.clip(cv2.resize(cut, size_px, interpolation=way).astype(np.float32), 2.0, 255.0)
     return np.asarray(scaled / scaled.mean(), np.float32)
+
+
+def seen_turned(light: Light, camera: Camera, turn_rad: Array) -> Light:
+    """Expected electrons (h, w) as the camera sees them after a small rotation (3,) about its own axes."""
+    height, width = light.shape
+    v, u = np.mgrid[0 : height + 32 : 32, 0 : width + 32 : 32].astype(float)
+    R = camera.camera_from_world.rotation
+    turned = Rotation.from_rotvec(turn_rad).as_matrix() @ R
+    now = replace(camera, camera_from_world=Pose(turned, turned @ R.T @ camera.camera_from_world.translation))
+    origin, rays = now.rays(np.stack([u, v], axis=-1))
+    away = camera.project(origin + rays) - np.stack([u, v], axis=-1)
+    to_v, to_u = np.mgrid[:height, :width]
+    maps = np.asarray(to_u / 32, np.float32), np.asarray(to_v / 32, np.float32)
+    gaps = [cv2.remap(np.asarray(away[..., i], np.float32), *maps, cv2.INTER_LINEAR) for i in (0, 1)]
+    places = np.stack([to_v + gaps[1], to_u + gaps[0]])
+    return np.maximum(ndimage.map_coordinates(light, places, order=3, mode="nearest"), np.float32(0.0))
 
 
 def gaussian_patch(u: float, v: float, sigma: float, size_px: tuple[int, int]) -> Patch | None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import cv2
@@ -26,13 +27,13 @@ from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
 from tracking.parameters import DetectParameters
 
-_LEAST_PICTURES, _SMALLEST_PX = 5, 80
+_LEAST_PICTURES, _SMALLEST_PX = 5, 160  # fewer do not show a scatter; a smaller one has no room for the tiles
 _TILES = 16  # of a picture, along each side: the landmarks are spread over them
 _FEW, _PER_TILE = 3, 8  # landmarks per tile and direction: whether the camera moves; by how much
 _STEEP = 8.0  # sigmas of a pixel's noise per px: least slope of a landmark
 _SINGLE = 4.0  # sigmas of a pixel, and of its slope: a pixel that differs by more from those around it is a hot one
-_LEAST_TILES = 16  # with landmarks: lights of a dark room are in fewer, and may be those of the vehicle
-_MARGIN = 12  # px: no landmarks at the edge
+_LEAST_TILES = 16  # with landmarks: lights of an unlit room are in fewer, and may be those of the vehicle
+_MARGIN, _SPARSE = 12, 2  # px: no landmarks at the edge; every such pixel may be one
 _BLUR_PX, _RADIUS = 1.0, 2  # px: of the pictures at the landmarks, whose slopes would be noise otherwise
 _SHARED = 4 * np.pi * _BLUR_PX**2  # landmarks that share their noise, at most
 _FARTHEST_PX = 8  # largest movement
@@ -44,7 +45,7 @@ _OUTLIER = 3.0  # sigmas: what a landmark leaves counts in full up to this, and 
 _LARGEST_MISFIT = 1.6  # sigma of what the landmarks leave over their noise; above it something else has changed
 _MOSTLY, _STILL_SHARE = 0.85, 0.5  # of the pictures, in which a landmark stands still; least share of those that do
 _LEAST_PX = 0.01  # movements with a smaller root mean square are none: few spots are better than that
-_CLEAR = 3.0  # times its error: a movement is corrected
+_CLEAR = 1.5  # times its error, which is stated for landmarks that share their noise: a movement is corrected
 _BEFORE = 3  # pixels before a place in the filter of 8 pixels that moves a picture
 _CHANGE_PX = 0.01  # for the derivatives of that filter
 _SIDE = 32  # px of a row that are moved by the same
@@ -59,6 +60,13 @@ class Turn(NamedTuple):
     motion: Array  # (5,): rotation of what it sees, in its frame, rad, and shift of its pictures, px
     covariance: Array  # (5, 5)
     movement: Array  # (2, 3), px per (1, u, v): what `stilled` has undone of it
+
+
+class _Fit(NamedTuple):
+    motion: Array  # (5,): small
+    covariance: Array  # (5, 5)
+    left: Array  # (k,), sigmas
+    misfit: float  # sigma of these
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,8 +104,8 @@ class CameraMotion:
         motion = _landmarks(mean, len(moved), lit, camera, noise, _PER_TILE)
         if (turned := motion._turns_in(pictures, clips)) is None:
             return None
-        left = [np.abs(motion._left(moved_by(p, turn.movement, clips))) for p, turn in turned]
-        still = np.mean(np.array(left) < _OUTLIER, axis=0) > _MOSTLY
+        fits = [motion._fitted(moved_by(p, turn.movement, clips), 0.0) for p, turn in turned]
+        still = np.mean([fit.left < _OUTLIER for fit in fits if fit is not None], axis=0) > _MOSTLY
         if still.mean() < _STILL_SHARE:
             return None
         motion = motion._only(still)
@@ -132,10 +140,14 @@ class CameraMotion:
             found = self._fitted(moved, self.moved @ motion - undone)
             if found is None:
                 break
-            left, covariance, misfit = found[0] - self.mean_motion, *found[1:]
+            left = found.motion - self.mean_motion
             motion = motion + left
             if np.abs(self._middle @ left).max() < (_NEAR_PX if k else _ON_PX):
-                return (None, None) if misfit > _LARGEST_MISFIT else (moved, Turn(motion, covariance, movement))
+                return (
+                    (None, None)
+                    if found.misfit > _LARGEST_MISFIT
+                    else (moved, Turn(motion, found.covariance, movement))
+                )
         return None, None
 
     def corrected(self, found: Detections, turn: Turn | None) -> Detections:
@@ -218,16 +230,8 @@ class CameraMotion:
         expected = self.values - np.sum(self.slopes * known_px, axis=1)
         return np.asarray((self._seen(picture, np.zeros(2, int)) - expected) / self.sigma)
 
-    def _left(self, picture: Picture) -> Array:
-        """(k,): what a picture leaves of the landmarks, sigmas, with its motion, light and level."""
-        design, off = self._design(), self._off(picture)
-        return np.asarray(off - design @ np.linalg.lstsq(design, off, rcond=None)[0])
-
-    def _fitted(self, picture: Picture, known_px: Array) -> tuple[Array, Array, float] | None:
-        """By a robust fit the small motion (5,) beside a known movement (k, 2), px, its covariance, and the misfit.
-
-        None: it is not determined.
-        """
+    def _fitted(self, picture: Picture, known_px: Array | float) -> _Fit | None:
+        """By a robust fit what has changed beside a known movement (k, 2), px; None: it is not determined."""
         design, off = self._design(), self._off(picture, known_px)
         scale = np.linalg.norm(design, axis=0)
         if not scale.all():
@@ -246,7 +250,7 @@ class CameraMotion:
             if spread > 0.99 * before:
                 break
         covariance = _SHARED * max(spread, 1.0) ** 2 * inverse / np.outer(scale, scale)
-        return solution[:_FREE] / scale[:_FREE], covariance[:_FREE, :_FREE], spread
+        return _Fit(solution[:_FREE] / scale[:_FREE], covariance[:_FREE, :_FREE], left, spread)
 
 
 def moved_by(picture: Picture, movement: Array, clips: float) -> Picture:
@@ -352,10 +356,13 @@ def _landmarks(
     grey = np.asarray(cv2.GaussianBlur(grey, (2 * _RADIUS + 1,) * 2, _BLUR_PX), np.float32)
     variance *= float(np.sum(_WEIGHTS**2))
     along, across = _filtered(grey, _SLOPE, _VALUE), _filtered(grey, _VALUE, _SLOPE)
-    usable = (along**2 + across**2 > _STEEP**2 * variance) & ~beside
+    some = np.s_[_MARGIN:-_MARGIN:_SPARSE, _MARGIN:-_MARGIN:_SPARSE]
+    along_some, across_some = along[some], across[some]
+    usable = (along_some**2 + across_some**2 > _STEEP**2 * variance[some]) & ~beside[some]
     # As many for each direction: a picture may show the edges of shelves, and little that is upright.
-    steep = [np.where(usable, np.abs(slope), np.float32(0)) for slope in (along, across)]
-    pixels = np.unique(np.concatenate([_spread_over_tiles(slope, per_tile) for slope in steep]), axis=0)
+    steep = [np.abs(slope) * usable for slope in (along_some, across_some)]
+    chosen = np.unique(np.concatenate([_spread_over_tiles(slope, per_tile) for slope in steep]), axis=0)
+    pixels = _SPARSE * chosen + _MARGIN
     moved = _movements(camera, pixels)
     known = np.isfinite(moved).all(axis=(1, 2))
     pixels, moved = pixels[known], moved[known]
@@ -366,13 +373,13 @@ def _landmarks(
 
 
 def _spread_over_tiles(slope: NDArray[np.float32], per_tile: int) -> Ints:
-    """(k, 2): u, v of the largest values of each tile of a picture (h, w)."""
-    inner = slope[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
+    """(k, 2): column, row of the largest positive values of each tile of an array (h, w)."""
+    rows, columns = (np.linspace(0, n, _TILES + 1).astype(int) for n in slope.shape)
     chosen = []
-    for rows in np.array_split(np.arange(inner.shape[0]), _TILES):
-        for columns in np.array_split(np.arange(inner.shape[1]), _TILES):
-            tile = inner[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].ravel()
+    for top, bottom in pairwise(rows):
+        for left, right in pairwise(columns):
+            tile = slope[top:bottom, left:right].ravel()
             best = np.argpartition(tile, -per_tile)[-per_tile:]
-            v, u = np.divmod(best[tile[best] > 0], len(columns))
-            chosen.append(np.column_stack([u + columns[0], v + rows[0]]) + _MARGIN)
+            row, column = np.divmod(best[tile[best] > 0], right - left)
+            chosen.append(np.stack([column + left, row + top], axis=-1))
     return np.concatenate(chosen)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,14 +14,17 @@ import pytest
 from lab.runs.frames.sensor_noise import VIDEO_FRAMES, CameraNoise
 from lab.runs.watch.background import FunctionProcess, LiveBackground
 from tests.tracking.background.test_static_background import USUAL, Recording, path
-from tracking.background.estimation import static_background
 from tracking.noise import Picture
 
 
-def live(recording: Recording, make: Callable = static_background) -> tuple[CameraNoise, LiveBackground]:
+def at_once(function: Callable, *given: Any) -> Any:
+    return function(*given)
+
+
+def live(recording: Recording, call: Callable = at_once) -> tuple[CameraNoise, LiveBackground]:
     noise = CameraNoise("left")
     noise.estimate_from(recording.pictures[:6])
-    return noise, LiveBackground(noise, USUAL, make)
+    return noise, LiveBackground(noise, USUAL, call)
 
 
 def recall(noise: CameraNoise, picture: Picture, centres: np.ndarray) -> float:
@@ -48,7 +51,7 @@ def test_a_process_makes_the_same_background_until_it_is_ended():
     recording = Recording.of(path(90, 6, 2.0, 1), 4.5)
     own, background = live(recording)
     with FunctionProcess() as process:
-        others, made_elsewhere = live(recording, partial(process.call, static_background))
+        others, made_elsewhere = live(recording, process.call)
         for picture in recording.pictures[: VIDEO_FRAMES + 1]:
             background.add(picture)
             made_elsewhere.add(picture)

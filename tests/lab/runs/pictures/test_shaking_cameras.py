@@ -137,7 +137,7 @@ def test_pictures_without_noise_may_be_equal_while_all_is_at_rest():
     assert [k for k, p in without_repeats(stream) if isinstance(p, np.ndarray)] == [0, 1, 2, 3, 4]
 
 
-def test_lights_of_a_dark_room_do_not_show_how_a_camera_moves():
+def test_lights_of_an_unlit_room_do_not_show_how_a_camera_moves():
     """They may be those of the vehicle, which would be taken for at rest."""
     rng = np.random.default_rng(3)
     places = rng.uniform(40, 400, (14, 2))
