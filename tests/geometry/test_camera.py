@@ -112,3 +112,20 @@ def test_one_call_projects_points_of_several_cameras_with_the_jacobian_of_differ
 def test_a_wrong_number_of_distortion_coefficients_is_refused_with_the_name_of_the_camera(n):
     with pytest.raises(ValueError, match=f"camera 'left': {n} distortion numbers, OpenCV's models have 0, 4, 5"):
         camera((0.1,) * n)
+
+
+@given(seed=seeds, n_numbers=st.sampled_from(list(LENSES)))
+def test_what_a_camera_shows_moves_with_its_rotation_as_the_derivative_says(seed, n_numbers):
+    rng = np.random.default_rng(seed)
+    c = camera(LENSES[n_numbers], random_pose(rng))
+    pixels = rng.uniform([300, 250], [1000, 750], (5, 2))
+    origin, rays = c.rays(pixels)
+
+    def seen(turn):
+        pose = c.camera_from_world
+        R = Rotation.from_rotvec(turn).as_matrix()
+        turned = camera(c.distortion, Pose(R @ pose.rotation, R @ pose.translation))
+        return turned.project(origin + 2.0 * rays).ravel()
+
+    expected = numeric_jacobian(seen, np.zeros(3)).reshape(5, 2, 3)
+    np.testing.assert_allclose(c.by_turns(pixels), expected, rtol=1e-5, atol=1e-3)

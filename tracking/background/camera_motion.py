@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -99,7 +100,7 @@ class CameraMotion:
             return None
         # The noise of one picture makes slopes too steep, that of a mean less.
         moved = [moved_by(p, motion._movement(turn.motion - about.mean_motion), clips) for p, turn in turned]
-        mean = np.asarray(sum(p.astype(np.float32) for p in moved) / len(moved))
+        mean = np.asarray(sum(moved) / len(moved))
         lit = places_of(find_spots(middle, parameters, noise), middle.shape, AROUND_LIGHT) | (mean >= clips)
         motion = _landmarks(mean, len(moved), lit, camera, noise, _PER_TILE)
         if (turned := motion._turns_in(pictures, clips)) is None:
@@ -126,16 +127,19 @@ class CameraMotion:
         """
         if picture.shape[::-1] != self.camera.image_size_px:
             return None, None
-        near = self._found(picture, np.zeros(_FREE), clips)
-        return near if near[1] is not None else self._found(picture, self._nearest(picture), clips)
+        for start in (np.zeros(_FREE), None):
+            found = self._found(picture, self._nearest(picture) if start is None else start, clips)
+            if found is not None:
+                return in_whole_dn(found[0], picture), found[1]
+        return None, None
 
-    def _found(self, picture: Picture, motion: Array, clips: float) -> tuple[Picture | None, Turn | None]:
-        """As `stilled`, from a first estimate of the motion."""
+    def _found(self, picture: Picture, motion: Array, clips: float) -> tuple[NDArray[np.float32], Turn] | None:
+        """As `stilled`, not rounded, from a first estimate of the motion."""
         for k in range(_ROUNDS):
             if np.abs(self._middle @ motion).max() > _FARTHEST_PX:
                 break
             movement = self._movement(motion)
-            moved = moved_by(picture, movement, clips) if motion.any() else picture
+            moved = moved_by(picture, movement, clips) if motion.any() else picture.astype(np.float32)
             undone = movement[:, 0] + self.pixels @ movement[:, 1:].T
             found = self._fitted(moved, self.moved @ motion - undone)
             if found is None:
@@ -143,12 +147,8 @@ class CameraMotion:
             left = found.motion - self.mean_motion
             motion = motion + left
             if np.abs(self._middle @ left).max() < (_NEAR_PX if k else _ON_PX):
-                return (
-                    (None, None)
-                    if found.misfit > _LARGEST_MISFIT
-                    else (moved, Turn(motion, found.covariance, movement))
-                )
-        return None, None
+                return None if found.misfit > _LARGEST_MISFIT else (moved, Turn(motion, found.covariance, movement))
+        return None
 
     def corrected(self, found: Detections, turn: Turn | None) -> Detections:
         """The points of a picture that `stilled` has moved where they would be if the camera had not turned.
@@ -214,7 +214,7 @@ class CameraMotion:
         left = [np.mean(np.minimum(np.abs(some._seen(picture, s) - some.values) / some.sigma, _LIKE)) for s in shifts]
         return np.append(np.zeros(3), shifts[int(np.argmin(left))])
 
-    def _seen(self, picture: Picture, shift: Ints) -> Array:
+    def _seen(self, picture: Picture | NDArray[np.float32], shift: Ints) -> Array:
         """(k,), DN: what is in a picture at the landmarks, moved by whole px."""
         width = picture.shape[1]
         first = (self.pixels[:, 1] + shift[1]) * width + self.pixels[:, 0] + shift[0]
@@ -225,12 +225,12 @@ class CameraMotion:
         columns = -np.einsum("ki,kij->kj", self.slopes, self.moved)
         return np.column_stack([columns, self.values, np.ones(len(self.values))]) / self.sigma[:, None]
 
-    def _off(self, picture: Picture, known_px: Array | float = 0.0) -> Array:
+    def _off(self, picture: NDArray[np.float32], known_px: Array | float = 0.0) -> Array:
         """(k,), sigmas: differences of a picture from the landmarks after a known movement (k, 2), px, of each."""
         expected = self.values - np.sum(self.slopes * known_px, axis=1)
         return np.asarray((self._seen(picture, np.zeros(2, int)) - expected) / self.sigma)
 
-    def _fitted(self, picture: Picture, known_px: Array | float) -> _Fit | None:
+    def _fitted(self, picture: NDArray[np.float32], known_px: Array | float) -> _Fit | None:
         """By a robust fit what has changed beside a known movement (k, 2), px; None: it is not determined."""
         design, off = self._design(), self._off(picture, known_px)
         scale = np.linalg.norm(design, axis=0)
@@ -253,7 +253,7 @@ class CameraMotion:
         return _Fit(solution[:_FREE] / scale[:_FREE], covariance[:_FREE, :_FREE], left, spread)
 
 
-def moved_by(picture: Picture, movement: Array, clips: float) -> Picture:
+def moved_by(picture: Picture, movement: Array, clips: float) -> NDArray[np.float32]:
     """A picture (h, w) whose pixel at x shows what was at x + movement @ (1, u, v), px; clipped ones stay so.
 
     movement (2, 3); clips: in DN.
@@ -265,8 +265,22 @@ def moved_by(picture: Picture, movement: Array, clips: float) -> Picture:
         beside = cv2.dilate(clipped.astype(np.uint8), np.ones((3, 3)))  # and by less than a pixel elsewhere
         shift = np.rint(movement @ [1, *(0.5 * np.array(picture.shape[::-1]))]).astype(int)
         moved[np.roll(beside, -shift[::-1], (0, 1)) > 0] = most
-    whole_dn = np.clip(np.rint(moved, out=moved), 0, most)
-    return whole_dn.astype(np.uint8) if picture.dtype == np.uint8 else whole_dn.astype(np.uint16)
+    return moved
+
+
+def in_whole_dn(moved: NDArray[np.float32], picture: Picture) -> Picture:
+    """Grey values (h, w) in the type of a picture.
+
+    With a random part before they are rounded: a small movement changes whole numbers by less than half, and rounding
+    would undo it.
+    """
+    whole = np.clip(np.floor(moved + _dither(moved.shape)), 0, np.iinfo(picture.dtype).max)
+    return whole.astype(np.uint8) if picture.dtype == np.uint8 else whole.astype(np.uint16)
+
+
+@cache
+def _dither(shape: tuple[int, ...]) -> NDArray[np.float32]:
+    return np.random.default_rng(0).random(shape, np.float32)
 
 
 @compiled_for_threads

@@ -18,6 +18,7 @@ from geometry.uncertainty.rig_uncertainty import (
     perturbed_rig,
     rig_names,
     split_name,
+    with_variances,
 )
 from tests.geometry.scenes import LENSES, paper_rig, random_pose, uncommon_rig
 
@@ -139,3 +140,13 @@ def test_views_without_a_projection_have_no_covariance():
     joint = RigUncertainty(rig, model, RigCovariance(names, np.eye(len(names)) * 1e-8)).at(pose)
     assert np.all(np.isfinite(joint))
     assert np.all(np.diagonal(joint).reshape(-1, 2)[gone] == 0)
+
+
+def test_more_variance_of_some_parameters_leaves_the_others_as_they_are():
+    known = RigCovariance(("cameras.left.cx", "cameras.left.cy"), np.array([[0.04, 0.01], [0.01, 0.09]]))
+    more = with_variances(known, {"cameras.left.cx": 0.02, "cameras.right.cy": 0.03})
+    assert more.names == ("cameras.left.cx", "cameras.left.cy", "cameras.right.cy")
+    np.testing.assert_allclose(more.matrix, [[0.06, 0.01, 0], [0.01, 0.09, 0], [0, 0, 0.03]])
+    exact = with_variances(None, {"cameras.left.cx": 0.02})
+    assert exact.names == ("cameras.left.cx",)
+    assert exact.matrix.tolist() == [[0.02]]
