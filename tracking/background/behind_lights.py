@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from statistics import median_low
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -247,7 +248,7 @@ def _lights_of(seen: Exposures, found: Sequence[Detections], box: Array) -> list
         every = [first]
     else:
         # Each is nearest to where it was in one of the pictures: they are further apart than they move.
-        number = int(np.median([len(bright[k]) for k in several]))
+        number = median_low(len(bright[k]) for k in several)
         start = next(k for k in several if len(bright[k]) == number)
         at = found[start].uv_px[bright[start]]
         gap = [np.linalg.norm(found[k].uv_px[r, None] - at, axis=-1) for k, r in enumerate(bright)]

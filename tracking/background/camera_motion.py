@@ -237,18 +237,19 @@ class CameraMotion:
         if not scale.all():
             return None
         design /= scale
-        weights, spread = np.ones(len(off)), np.inf
+        left, before = np.abs(off), np.inf  # at first: where a spot was in one of the pictures, they differ by far
         for _ in range(_ROUNDS):
+            spread = 1.4826 * float(np.median(left))
+            if spread > 0.99 * before:
+                break
+            weights = np.clip(2 - left / (_OUTLIER * max(spread, 1.0)), 0.0, 1.0)
             weighted = design * weights[:, None]
             normal = weighted.T @ design
             if np.linalg.cond(normal) > 1 / np.finfo(np.float32).eps:
                 return None
             inverse = np.linalg.inv(normal)
-            left = np.abs(off - design @ (solution := inverse @ (weighted.T @ off)))
-            before, spread = spread, 1.4826 * float(np.median(left))
-            weights = np.clip(2 - left / (_OUTLIER * max(spread, 1.0)), 0.0, 1.0)
-            if spread > 0.99 * before:
-                break
+            left, before = np.abs(off - design @ (solution := inverse @ (weighted.T @ off))), spread
+        spread = 1.4826 * float(np.median(left))
         covariance = _SHARED * max(spread, 1.0) ** 2 * inverse / np.outer(scale, scale)
         return _Fit(solution[:_FREE] / scale[:_FREE], covariance[:_FREE, :_FREE], left, spread)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array
 from tracking.background.behind_lights import LARGEST_PATH_PX, BehindLights, Exposures, passing_lights
-from tracking.background.mean_pictures import MOST_BYTES, means_of, smooth_part, usable
+from tracking.background.mean_pictures import MOST_BYTES, in_equal_light, means_of, smooth_part, usable
 from tracking.background.places import AROUND_LIGHT, AROUND_SPOT, ON_LIGHT, SAME_LIGHT, near_each, places_of
 from tracking.background.shown_light import Shown
 from tracking.background.slow_lights import ROUNDS, SlowLights, as_pictures_show, light_at
@@ -58,7 +58,7 @@ def static_background(
     some = usable(pictures)
     if len(some) < _LEAST_PICTURES:
         return None
-    lower, mean = means_of(some)
+    lower, mean = means_of(in_equal_light(some))
     background = StaticBackground.of_mean(lower, some, model, parameters).with_light(some)
     shown = [(p, fit[0]) for p in some if (fit := background.shown.in_picture(p)) is not None]
     some, lights = [p for p, _ in shown], [light for _, light in shown]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools
+from tracking.background.mean_pictures import LEAST_CHANGE
 from tracking.background.places import AROUND_SPOT
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
@@ -21,7 +22,6 @@ _AROUND = (11, 11)  # of these pixels: 100 px: a part of the picture that shows 
 _CLEAR_SIGMAS = 4.0  # of the measured light
 _EFFICIENCY = 2.0  # sigma of the median over places, of those that show most structure, over that of one fit
 _MOST_LEFT = 2.5  # sigmas: more counts as much, since somebody in front of the screen is in many pixels
-LEAST_CHANGE = 0.03  # the light has not changed by more than this share: the structure is not scaled
 _LEAST_LIGHT, _MOST_LIGHT = 0.2, 5.0  # changes of the light beyond which a picture is searched without subtraction
 _BY_CHANCE = 4.0  # sigmas of the sum of squares, of few pixels between lights at rest
 _LARGEST_MISFIT = 1.3  # sigma of what is left over that of the noise; above it the camera or the light has moved

@@ -20,6 +20,7 @@ from tracking.background.joint_fit import Modulation
 from tracking.background.lights_on_edges import with_lights_on_edges
 from tracking.background.mean_pictures import (
     GAIN_BITS,
+    LEAST_CHANGE,
     highest_of_blocks,
     in_steps,
     raised_difference,
@@ -35,7 +36,7 @@ from tracking.background.places import (
     places_of,
 )
 from tracking.background.resting_lights import RestingLights
-from tracking.background.shown_light import LEAST_CHANGE, Shown, ShownLight, fits_around, sample_of
+from tracking.background.shown_light import Shown, ShownLight, fits_around, sample_of
 from tracking.detection.detect import find_spots, saturation_of
 from tracking.detection.pixels import TEXTURE_SHARE
 from tracking.detections import Detections

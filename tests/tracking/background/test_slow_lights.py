@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 
 from geometry.arrays import Array
 from tests.tracking.rendering import round_lights
-from tracking.background.behind_lights import BehindLights, Exposures
+from tracking.background.behind_lights import BehindLights, Exposures, _lights_of
 from tracking.background.estimation import PICTURES, static_background
 from tracking.background.lights_on_edges import with_lights_on_edges
 from tracking.background.slow_lights import light_at
@@ -372,3 +372,14 @@ def test_two_lights_that_move_by_their_width_beside_each_other_are_measured_on_e
     gap, sigma = errors(found_in_all(board_pictures(paths, 1.9, 0.4, 25)), paths)
     assert gap.max() < 0.15
     assert (gap / sigma).max() < 4.5
+
+
+def test_pictures_that_show_two_and_four_lights_of_a_box_have_no_picture_of_the_number_between():
+    def points(n: int) -> Detections:
+        return Detections.at(
+            np.column_stack([20.0 + 6 * np.arange(n), np.full(n, 30.0)]), np.tile(np.eye(2), (n, 1, 1))
+        )
+
+    found = [points(n) for n in (2, 4, 2, 4)]
+    lights = _lights_of(None, [replace(d, flux=np.ones(len(d))) for d in found], np.array([30.0, 30.0, 20.0]))
+    assert lights == []

@@ -1,4 +1,4 @@
-"""Runs on recordings whose cameras turn a little from picture to picture, and on such that repeat pictures."""
+"""Runs on recordings whose cameras turn a little or whose light changes, and on such that repeat pictures."""
 
 from __future__ import annotations
 
@@ -46,8 +46,11 @@ def turned(camera: Camera, by_rad: np.ndarray) -> Camera:
     return replace(camera, camera_from_world=Pose(R @ pose.rotation, R @ pose.translation))
 
 
-def recording(folder: Path, shake_px: float) -> tuple[Path, Path]:
-    """A run folder with pictures of cameras that turn by this root mean square, and its truth beside it."""
+def recording(folder: Path, shake_px: float, flicker: float = 0.0) -> tuple[Path, Path]:
+    """A run folder with pictures of cameras that turn by this root mean square, and its truth beside it.
+
+    flicker: of the room's light, share.
+    """
     made = CliRunner().invoke(
         main,
         ["simulate", "four-skew-beams", "--frames", str(FRAMES), "--scale", "0.5", "--points", "--out", str(folder)],
@@ -67,6 +70,7 @@ def recording(folder: Path, shake_px: float) -> tuple[Path, Path]:
             origin, rays = now.rays(ends)
             seen = camera.project(origin + 3.0 * rays)[..., ::-1] + MARGIN
             picture = ndimage.map_coordinates(SPLINE, np.moveaxis(seen, -1, 0), order=3, prefilter=False)
+            picture *= 1 + flicker * np.sin(0.7 * frame + 1.0)
             at = spots[(spots.camera == name) & (spots.frame == frame)][["u_px", "v_px"]].dropna().to_numpy()
             start, towards = camera.rays(at)
             for u, v in now.project(start + 3.0 * towards):
@@ -104,6 +108,19 @@ def test_a_camera_that_shakes_is_named_and_its_poses_are_as_good_as_their_sigmas
     for camera, noise in summary["parameters"]["noise"].items():
         assert noise["camera_motion_px"] == pytest.approx(shake_px, rel=0.35)
         assert any(note.startswith(f"{camera}: the camera moves by") for note in summary["notes"])
+
+
+def test_spots_are_found_in_front_of_a_room_whose_light_flickers(tmp_path):
+    folder, truth = recording(tmp_path / "run", 0.0, flicker=0.12)
+    done = CliRunner().invoke(main, ["run", str(folder), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 0, done.output
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert all(noise["background_pictures"] > 0 for noise in summary["parameters"]["noise"].values())
+    found = nees(tmp_path / "out", truth)
+    assert len(found) == FRAMES
+    assert found.mean() < 2.0
+    spots = pd.read_csv(tmp_path / "out" / "spots.csv")
+    assert (spots.status == "matched").mean() > 0.97
 
 
 def test_pictures_that_repeat_the_one_before_have_no_spots(tmp_path):
