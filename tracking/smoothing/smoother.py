@@ -35,17 +35,17 @@ from tracking.smoothing.labels.continuity import continued, transfers_between_ca
 from tracking.smoothing.labels.neighbouring_frames import connected, displaced, isolated, next_to
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated, run_log_clutter, run_log_static
 from tracking.smoothing.labels.view_path import PathContext
-from tracking.smoothing.motion.process_noise import corner_offsets, corner_times, jump_sigmas, jump_variances
+from tracking.smoothing.motion.process_noise import corner_offsets, jump_sigmas
 from tracking.smoothing.motion.run_detections import (
     Reference,
     RunDetections,
     SmoothedMotion,
-    Steps,
     WholeRun,
     controlled_labels,
     moved_detections,
     straight_between,
 )
+from tracking.smoothing.motion.timed_run import estimate_timed
 from tracking.smoothing.motion.whole_run import MAX_DISTANCE, estimate
 from tracking.smoothing.place_errors import place_errors, scaled_shares, with_places
 from tracking.smoothing.recording import FoundClocks, TrackedRecording, merged, track_backward
@@ -275,9 +275,10 @@ class _Smoother:
         self.calibration_cov, self.systematic, self.noise_share = calibration_errors(rec, seen, self.assigned, ref)
         place_px2 = rec.place_px2()
         every, steady, labels = seen, self.measured, self.assigned
+        first = SmoothedMotion.begin(ref, rec.jumped.copy(), None)
         if self.delays is not None:
-            every, ref, steady = self._first_motion(seen, ref)
-            labels = well_known(every, seen, labels)
+            every, first, steady = self._first_motion(seen, first)
+            ref, labels = first.ref, well_known(every, seen, labels)
         self.errors = ErrorScale.of(
             model,
             seen._replace(uv=every.uv),
@@ -292,7 +293,7 @@ class _Smoother:
         self.seen = self.detections = seen._replace(
             cov=self.errors.of_run(seen, place_px2) + parameters.sigma_model_px**2 * np.eye(2)
         )
-        log_density: Array | None = None
+        log_density = first.log_density
         if not parameters.learn_jerk:
             by_hand = 2 * np.log(np.repeat([parameters.jerk_m_s3, parameters.jerk_rad_s3], 3))
             log_density = np.tile(by_hand, (len(rec), 1))
@@ -301,11 +302,11 @@ class _Smoother:
         # (T,) measured by a tracker with enough spots: it has left open what nothing checked.
         self.sure = self.measured & (distinct_spots(self.assigned >= 0, model.spot_of) >= MIN_REDUNDANT_SPOTS)
         self.trusted = connected(self.measured, self.sure | self._controlled(ref)[0])  # (T,) labels that may be used
-        self.motion = SmoothedMotion.begin(ref, rec.jumped.copy(), log_density)
+        self.motion = replace(first.without_covariances(), log_density=log_density)
         self.conflicting = np.zeros(len(rec), dtype=bool)  # (T,) forward and backward poses differ
         self.own = SingleFramePoses.unknown(0)  # at the last estimate
 
-    def _first_motion(self, seen: RunDetections, ref: Reference) -> tuple[RunDetections, Reference, Bools]:
+    def _first_motion(self, seen: RunDetections, begin: SmoothedMotion) -> tuple[RunDetections, SmoothedMotion, Bools]:
         """The detections at the instants of their frames, by the motion with the stated sigmas; that motion; steady
         frames.
 
@@ -314,26 +315,16 @@ class _Smoother:
         """
         rec = self.rec
         run = WholeRun(self.views, seen, self.calibration_cov, rec.dt_s, rec.exposure_s, True, self.delays)
-        begin = SmoothedMotion.begin(ref, rec.jumped.copy(), None)
-        motion = estimate(run, self.assigned, self.measured, begin, 0, self.measured)
+        motion = estimate_timed(run, self.assigned, self.measured, begin, 0, self.measured)
         turns = motion.jumped | np.append(motion.jumped[1:], False)
         steady = self.measured & ~turns
-        return self._at_frames(seen, motion), motion.ref, steady if steady.any() else self.measured
+        return self._at_frames(seen, motion), motion, steady if steady.any() else self.measured
 
     def _at_frames(self, seen: RunDetections, motion: SmoothedMotion) -> RunDetections:
         """The detections where they would have been at the instants of their frames, given the estimated motion."""
-        if self.delays is None or motion.log_density is None:
+        if self.delays is None or motion.between is None:
             return seen
-        nowhere = np.zeros(len(self.rec), dtype=bool)
-        jump = jump_variances(
-            motion.ref, nowhere, self.measured, motion.jumped, self.rec.dt_s, motion.excluded, motion.jump_scale,
-            motion.moment,
-        )  # fmt: skip
-        corners = corner_times(motion.ref, motion.jumped, self.rec.dt_s)
-        steps = Steps(self.rec.dt_s, np.exp(motion.log_density), np.ascontiguousarray(jump), corners, motion.moment)
-        uv, cov = moved_detections(
-            self.views, self.view_table.camera, seen, self.delays, self.assigned, motion.ref, motion.motion_P, steps
-        )
+        uv, cov = moved_detections(self.views, self.view_table.camera, seen, self.delays, self.assigned, motion.between)
         return seen._replace(uv=uv, cov=cov)
 
     def estimate(self, max_distance: int) -> None:
@@ -345,7 +336,8 @@ class _Smoother:
             self.views, self.seen, self.calibration_cov, rec.dt_s, rec.exposure_s, self.parameters.learn_jerk,
             self.delays, rec.unknown_clocks(self.correction_s),
         )  # fmt: skip
-        self.motion = estimate(run, self.assigned, self.measured, self.motion, max_distance, self.trusted)
+        estimated = estimate if self.delays is None else estimate_timed
+        self.motion = estimated(run, self.assigned, self.measured, self.motion, max_distance, self.trusted)
         for _ in range(MAX_CLOCK_STEPS):
             found = self.motion.clocks
             if found is None or self.rec.clocks is None:
@@ -357,7 +349,7 @@ class _Smoother:
             self.correction_s = self.correction_s + np.clip(found.correction_s, -most, most)
             self.delays = self.rec.delays(self.correction_s)
             run = replace(run, delays=self.delays, clocks=rec.unknown_clocks(self.correction_s))
-            self.motion = estimate(
+            self.motion = estimated(
                 run, self.assigned, self.measured, self.motion.without_covariances(), max_distance, self.trusted
             )
         self.detections = self._at_frames(self.seen, self.motion)
@@ -451,9 +443,9 @@ class _Smoother:
         """Assume velocity jumps where the pose contradicts the frame's own spots, and estimate the motion again."""
         # A jump that was detected one step too late leaves the frame before it with the covariance of a smooth path.
         beside = next_to(self.motion.jumped) | self.motion.jumped
-        for _ in range(MAX_REPAIRS):
+        for _ in range(MAX_REPAIRS if self.delays is None else 0):
             limit = np.where(beside, CONTRADICTION_NEXT_TO_JUMP_CHI2, CONTRADICTION_CHI2)
-            wrong = self.own.measured & self.trusted & (self.own.excess > limit) & ~self.timed
+            wrong = self.own.measured & self.trusted & (self.own.excess > limit)
             if not wrong.any():
                 return
             jumped = self.motion.jumped.copy()

@@ -241,3 +241,21 @@ def test_a_turn_in_a_gap_in_which_nothing_is_seen_is_covered(gap, tmp_path):
     own = figures(replace(r, hidden=hidden), tmp_path)
     assert np.isfinite(own.attitude_deg[gap]).sum() <= 2
     assert np.nanmax(own.nees) < 8
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_search")
+@pytest.mark.parametrize(
+    ("seed", "frames"),
+    [
+        pytest.param(6000, 300, id="gaps with spots of one camera, of which one has two corners"),
+        pytest.param(6007, 300, id="smooth turns of two frames, which resemble two corners"),
+        pytest.param(6015, 300, id="corners side by side that a stronger jerk would explain"),
+        pytest.param(9304, 220, id="slow corners, which few frames do not show"),
+    ],
+)
+def test_no_pose_beside_a_turn_is_wrong_by_more_than_it_states(seed, frames, tmp_path):
+    own = figures(random_recording(seed, frames=frames), tmp_path)
+    assert np.isfinite(own.nees).sum() > 0.25 * frames
+    assert np.nanmean(own.nees) < 1.5
+    assert np.nanmax(own.nees) < 8
