@@ -73,7 +73,7 @@ def subtract_noise(Y: Array, y: Array, axis: int, root: Array) -> None:
             A[c, e] = 0.5 * (A[c, e] + A[e, c])
             A[e, c] = A[c, e]
     # With W W^T = A, subtract Z W^-T (Z W^-T)^T.
-    W = cholesky(A)
+    W = cholesky(A, 1.0)
     for c in range(3):
         for e in range(c):
             w = W[c, e]

@@ -49,6 +49,9 @@ LAST_PASSES = 3  # of these, in which the strength of the jerk stays
 ROUNDS = 4  # of passes and improved turns
 EXCLUDED_NATS = 5.0  # by which a motion without a jump in a gap must be more likely
 FEWEST = 3  # turns in succession that a jerk may replace: two are the ends of one motion
+# m and rad: a sigma of each pose in a gap about the reference. A strong jerk would let the vehicle be kilometres away
+# after some frames, and covariances with both this and the error of a spot exceed the digits of a number.
+NEAR = 10.0
 APART = 1.5  # frames: of shocks as close as this only the largest is a turn ...
 FIRST_LENGTH = 1.0  # frames: ... of this length at first
 
@@ -340,6 +343,11 @@ class _TimedEstimator(_Estimator):
         jump = np.where(jump > 0, jump, self._hidden())
         first = first_variance(ref, self.dt, True)
         return RunInformation(L, g, self.dt, jump, jump / MANOEUVRE_S**2, moment, first), float(chi2.sum())
+
+    def _spot_information(self, ref: Reference) -> tuple[Array, Array, Array]:
+        """As in one clock's runs, and in gaps that each pose is near the reference: see NEAR."""
+        L, g, chi2 = super()._spot_information(ref)
+        return np.where(self.measured[:, None, None], L, L + np.eye(6) / NEAR**2), g, chi2
 
     def _beside(self, ref: Reference) -> Array:
         """As `corner_offsets`: of the instants whose exposures may contain a part of a turn."""
