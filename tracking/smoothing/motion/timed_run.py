@@ -69,6 +69,8 @@ def estimate_timed(
     if not measured.any():
         return replace(motion, known=np.zeros(frames, dtype=bool), weight=np.zeros(frames))
     observed = largest_near(measured, _longest_step(run.detections))
+    # Of frames before the first measured one, and after the last, nothing shows the velocity on the other side.
+    observed &= np.logical_or.accumulate(measured) & np.logical_or.accumulate(measured[::-1])[::-1]
     used = largest_near(measured, max_distance) & trusted & (assigned >= 0).any(axis=1)
     instants = Instants.of(run, assigned, used)
     frames_s = np.cumsum(run.dt)
