@@ -170,18 +170,23 @@ class _TimedEstimator(_Estimator):
             self._turns_improved(every=False)
             out = self._passes(LATER_PASSES, adapting=False, searching=False)
         if self.run.clocks is not None:
-            # The moments of turns were found with the present clocks: their spots would confirm these.
-            outside = np.ones(len(self.t_s))
-            for turn in self.turns:
-                outside[(self.t_s > turn.begin_s) & (self.t_s < turn.end_s)] = 0.0
+            found = self.turns
+            self.turns = [self._with_other_clocks(turn) for turn in found]
             info, _ = self._information(self.ref)
-            L, g = info.information * outside[:, None, None], info.vector * outside[:, None]
-            info = info._replace(information=L, vector=g)
             at = self.ref, self.core.start
-            weight = self.weight[self.core] * outside
-            self.clocks = solve_clocks(self.run, self.assigned, weight, at, info, np.exp(self.log_density))
+            self.clocks = solve_clocks(
+                self.run, self.assigned, self.weight[self.core], at, info, np.exp(self.log_density)
+            )
+            self.turns = found
         out = self._with_unresolved(out)
         return replace(self._extrapolated(out), clocks=self.clocks, turns=tuple(self.turns))
+
+    def _with_other_clocks(self, turn: Turn) -> Turn:
+        """A turn at the moments that it may have with other clocks: those found with the present ones confirm these."""
+        assert self.run.clocks is not None
+        own = self.run.clocks
+        sigma = np.max(own.sigma_s[~own.is_row_time], initial=0.0)
+        return turn._replace(length_s=float(np.hypot(turn.length_s, np.sqrt(12) * sigma)))
 
     def _with_unresolved(self, out: Interval) -> Interval:
         """The covariances, where turns resemble others, of both motions about that with the former."""
