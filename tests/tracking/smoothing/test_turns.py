@@ -11,9 +11,10 @@ from geometry.arrays import Array
 from tests.tracking.smoothing.test_fixed_interval import DT, JERK, Run, drawn
 from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.rigid_body.models.motion import process_noise
+from tracking.smoothing.motion.fixed_interval import smoothed
 from tracking.smoothing.motion.instants import TOGETHER, Instants
 from tracking.smoothing.motion.run_detections import Delays, RunDetections, Turn, WholeRun
-from tracking.smoothing.motion.timed_run import _near_unobserved
+from tracking.smoothing.motion.timed_run import _near_unobserved, _observed
 from tracking.smoothing.motion.turns import TurnSearch, successions, unresolved, velocity_jumps
 
 FRAMES, STEP = 40, 20  # that has the jump
@@ -44,6 +45,29 @@ def test_the_error_of_a_turn_is_as_stated_and_a_part_of_a_frame():
     assert 0.1 < np.sqrt(np.mean(over**2)) < 1.0
     assert np.abs(errors).max() < 0.2 * DT
     assert all(turn.length_s < DT for turn, _ in known)
+
+
+def test_poses_at_a_turn_without_spots_have_the_errors_that_they_state():
+    """As the moment of a jump: the spots of both frames beside its step are missing, as in a gap of two frames."""
+    nees, errors = [], []
+    for seed, share in enumerate(np.random.default_rng(5).uniform(size=60)):
+        run = drawn(seed, FRAMES, jump_at=STEP, moment=share)
+        open_frames = slice(STEP - 1, STEP + 1)
+        run.info.information[open_frames], run.info.vector[open_frames] = 0.0, 0.0
+        search = search_in(run)
+        turn = search.improved(Turn(float(search.t_s[STEP] - 0.5 * DT), DT, DT, SIZE), [])
+        if turn is None:
+            continue
+        at_s = float(search.t_s[STEP - 1] + share * DT)
+        assert turn.begin_s <= at_s <= turn.end_s
+        errors.append(turn.middle_s - at_s)
+        out = smoothed(*search.of_part([turn], slice(None)), search.density)
+        for k in (STEP - 1, STEP):
+            away = out.x[k, :6] - run.true[k, :6]
+            nees.append(away @ np.linalg.solve(out.pose_P[k], away) / 6)
+    assert len(errors) > 50
+    assert np.mean(nees) == pytest.approx(1.0, abs=0.35)
+    assert np.abs(errors).max() < 0.2 * DT
 
 
 def test_two_turns_may_be_one_smooth_turn_only_where_the_spots_do_not_exclude_it():
@@ -217,3 +241,10 @@ def test_a_jump_beside_a_gap_may_be_in_the_gap():
     assert steps[(t_s > 4.9 * DT) & (begin < 7.4 * DT)].all()
     assert not steps[begin > 7.6 * DT].any()
     assert not _near_unobserved(np.ones(24, dtype=bool), t_s, DT).any()
+
+
+def test_before_the_first_measured_frame_and_after_the_last_nothing_shows_a_jump():
+    measured = np.zeros(12, dtype=bool)
+    measured[[3, 5, 8]] = True
+    np.testing.assert_array_equal(np.flatnonzero(_observed(measured, 1)), [3, 4, 5, 6, 7, 8])
+    np.testing.assert_array_equal(np.flatnonzero(_observed(measured, 0)), [3, 5, 8])

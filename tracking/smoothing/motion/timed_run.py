@@ -68,9 +68,7 @@ def estimate_timed(
     frames = len(run.dt)
     if not measured.any():
         return replace(motion, known=np.zeros(frames, dtype=bool), weight=np.zeros(frames))
-    observed = largest_near(measured, _longest_step(run.detections))
-    # Of frames before the first measured one, and after the last, nothing shows the velocity on the other side.
-    observed &= np.logical_or.accumulate(measured) & np.logical_or.accumulate(measured[::-1])[::-1]
+    observed = _observed(measured, _longest_step(run.detections))
     used = largest_near(measured, max_distance) & trusted & (assigned >= 0).any(axis=1)
     instants = Instants.of(run, assigned, used)
     frames_s = np.cumsum(run.dt)
@@ -114,6 +112,15 @@ def _longest_step(detections: RunDetections) -> int:
     """The usual number of frames from one picture of a camera to the next, of the slowest one."""
     steps = (np.diff(np.flatnonzero(there)) for there in detections.has_image.T)
     return max((int(np.ceil(np.median(one))) for one in steps if len(one)), default=1)
+
+
+def _observed(measured: Bools, longest: int) -> Bools:
+    """(T,): frames that would show a jump: near measured ones (T,), by the longest step of a camera, and between them.
+
+    Before the first measured frame, and after the last, nothing shows the velocity on the other side.
+    """
+    between = np.logical_or.accumulate(measured) & np.logical_or.accumulate(measured[::-1])[::-1]
+    return np.asarray(largest_near(measured, longest) & between)
 
 
 def _near_unobserved(measured: Bools, t_s: Array, frame_s: float) -> Bools:

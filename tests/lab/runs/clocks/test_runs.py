@@ -18,6 +18,7 @@ from geometry.pose import Pose
 from lab.files.run.results import read_poses
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
+from tracking.smoothing.motion.clocks import DETERMINED
 from tracking.smoothing.smoother import _Smoother
 
 FRAMES, SEED = 40, 3
@@ -252,6 +253,7 @@ def test_a_turn_in_a_gap_in_which_nothing_is_seen_is_covered(gap, tmp_path):
         pytest.param(6007, 300, id="smooth turns of two frames, which resemble two corners"),
         pytest.param(6015, 300, id="corners side by side that a stronger jerk would explain"),
         pytest.param(9304, 220, id="slow corners, which few frames do not show"),
+        pytest.param(7111, 120, id="a corner before the first frame that has a pose"),
     ],
 )
 def test_no_pose_beside_a_turn_is_wrong_by_more_than_it_states(seed, frames, tmp_path):
@@ -259,3 +261,19 @@ def test_no_pose_beside_a_turn_is_wrong_by_more_than_it_states(seed, frames, tmp
     assert np.isfinite(own.nees).sum() > 0.25 * frames
     assert np.nanmean(own.nees) < 1.5
     assert np.nanmax(own.nees) < 8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seed", "known"),
+    [
+        pytest.param(7111, 0, id="a strong jerk in gaps, and spots of one camera: a motion that is not finite"),
+        pytest.param(7127, 1, id="a turntable, whose turns alone show the clock"),
+    ],
+)
+def test_clocks_are_estimated_with_turns_that_depend_on_them(seed, known, tmp_path):
+    own = figures(random_recording(seed, frames=120), tmp_path, estimate=True)
+    assert own.wrong_poses == 0
+    found = [(error, sigma) for error, sigma, prior in own.clocks if sigma < DETERMINED * prior]
+    assert len(found) >= known
+    assert all(abs(error) < 3 * sigma for error, sigma in found)
