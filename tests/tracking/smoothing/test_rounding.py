@@ -1,4 +1,4 @@
-"""Motions of very short and long steps, weak and strong jerk, precise and missing spots: finite, and as exact as stated."""
+"""Steps of a microsecond to a second, weak and strong jerk, precise and missing spots: motions are finite and exact."""
 
 from __future__ import annotations
 
