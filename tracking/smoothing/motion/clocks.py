@@ -97,7 +97,7 @@ def solve_clocks(
     right = b - np.einsum("kis,ki->s", B, x[:, :6]) + precision @ clocks.mean_s
     S, right = _beyond_rounding(S, right, clocks)
     noise = np.linalg.inv(S)
-    kept = np.sqrt(np.diagonal(noise)) >= DETERMINED * clocks.sigma_s
+    kept = (np.sqrt(np.diagonal(noise)) >= DETERMINED * clocks.sigma_s) | clocks.unsettled
     correction, noise = _with_priors(S, right, kept, clocks)
     systematic = np.zeros((p, p))
     if clocks.calibration is not None:

@@ -442,6 +442,7 @@ class UnknownClocks:
     sigma_s: Array  # (p,)
     camera_of: Ints  # (n,) of the views
     middle_row: Array  # (n,) of the pictures
+    unsettled: bool  # no number is solved for
     calibration: RigUncertainty | None = None
 
     def columns(self, speed: Array, row: Array) -> Array:
