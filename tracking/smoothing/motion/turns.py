@@ -37,6 +37,7 @@ _AMBIGUOUS_NATS = 2.0  # by which a longer turn may be less likely: a turn is as
 _WIDER = 1.25  # times, in the search for that
 _SIGMAS = 2.0  # of the middle, as a sigma: the same spots show it and then the motion
 _WITH_IT = (-1.0, -0.5, 0.0, 0.5, 1.0)  # of the way of the middle: how far the turn beside it moves, too
+_SHARES = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)  # of a turn's variance, of which the most likely one is taken
 _CURVATURE_NATS = 0.5  # drop of the likelihood from which the sigma of the middle is computed
 _CHANGED = 0.02, 0.1  # of a frame, and relative: less does not change a turn
 TURN_NATS = 3.0  # by which each turn must make a run more likely
@@ -132,7 +133,10 @@ class TurnSearch:
             if (nats := self.nats(others, part, density)) > most:
                 best, most = density, nats
         needed = max(TURN_NATS * len(some), SUCCESSION_NATS if len(some) > 1 else 0.0)
-        return best if most > self.nats(every, part, self.density) - needed else None
+        run, likely = self.with_turns(others, part), [t._replace(length_s=t.likely_s) for t in some]
+        for i, turn in enumerate(likely):
+            likely[i] = run.sized(turn, [*likely[:i], *likely[i + 1 :]])
+        return best if most > run.nats(likely) - needed else None
 
     def one_for(self, some: Sequence[Turn], all_turns: Sequence[Turn]) -> Turn | None:
         """One turn in place of some of all turns; None: the spots exclude it."""
@@ -170,6 +174,8 @@ class TurnSearch:
             found = self._climbed(nats, turn.middle_s, begin * frame, 0.0 if turn.settled else _FARTHEST)
             if found[0] > most:
                 most, middle, length = found
+        sized = run.sized(Turn(middle, length, length, turn.size))
+        turn, most = turn._replace(size=sized.size), max(most, run.nats([sized]))
         if run.nats([]) > most - TURN_NATS:
             return None
         beside = [
@@ -253,6 +259,11 @@ class _WithTurns:
         moment[first:end] = moments[1:]
         info = self.info._replace(velocity_jump=jump, acceleration_jump=jump / MANOEUVRE_S**2, moment=moment)
         return float(log_likelihood_with(self.ref, info, self.density, self.filtered, first, end))
+
+    def sized(self, turn: Turn, more: Sequence[Turn] = ()) -> Turn:
+        """A turn with its most likely size: that of a new one, of the fastest motion, makes a slow one unlikely."""
+        tried = [turn._replace(size=share * turn.size) for share in _SHARES]
+        return max(tried, key=lambda one: self.nats([one, *more]))
 
 
 def unresolved(turns: Sequence[Turn], frame_s: float) -> list[list[Turn]]:
