@@ -51,7 +51,13 @@ from tracking.smoothing.motion.whole_run import MAX_DISTANCE, estimate
 from tracking.smoothing.place_errors import place_errors, scaled_shares, with_places
 from tracking.smoothing.recording import FoundClocks, TrackedRecording, merged, track_backward
 from tracking.smoothing.single_frame_poses import SingleFramePoses, rms_residuals, single_frame_poses
-from tracking.smoothing.systematic_errors import calibration_errors, exposure_offsets, exposure_sigmas, pose_shift
+from tracking.smoothing.systematic_errors import (
+    calibration_errors,
+    clock_sigmas,
+    exposure_offsets,
+    exposure_sigmas,
+    pose_shift,
+)
 from tracking.statuses import Event, MotionEstimate, PoseStatus, SpotStatus, TrackedFrame, view_statuses
 
 _BLOCK = 4096  # frames whose measured spots are in memory twice
@@ -515,6 +521,9 @@ class _Smoother:
             spread = motion.clocks.motion @ clock_cov @ np.swapaxes(motion.clocks.motion, 1, 2)
             covariance, motion_P = covariance + spread[:, :6, :6], motion_P + spread[:, 6:, 6:]
             rest[2] = spread[:, *np.triu_indices(6)]
+            offsets_s2 = np.diag(clock_cov)[[not is_row_time for _, is_row_time in self.rec.clocks.numbers]]
+            beyond = clock_sigmas(final, float(np.sqrt(offsets_s2.sum())), self.rec.dt_s)
+            covariance, rest[1] = covariance + beyond[:, :, None] ** 2 * np.eye(6), np.hypot(of_poses, beyond)
         jerk = np.full(2, np.nan)
         if motion.log_density is not None:
             half = 0.5 * np.median(motion.log_density, axis=0)
