@@ -52,6 +52,9 @@ FEWEST = 3  # turns in succession that a jerk may replace: two are the ends of o
 # m and rad: a sigma of each pose in a gap about the reference. A strong jerk would let the vehicle be kilometres away
 # after some frames, and covariances with both this and the error of a spot exceed the digits of a number.
 NEAR = 10.0
+# Frames with poses of their own: three show position, velocity and acceleration, as many more that the jerk is as strong
+# as assumed. Without these any offset follows from that assumption.
+FEWEST_POSES = 6
 APART = 1.5  # frames: of shocks as close as this only the largest is a turn ...
 FIRST_LENGTH = 1.0  # frames: ... of this length at first
 
@@ -68,6 +71,8 @@ def estimate_timed(
     frames = len(run.dt)
     if not measured.any():
         return replace(motion, known=np.zeros(frames, dtype=bool), weight=np.zeros(frames))
+    if run.clocks is not None and np.count_nonzero(measured) < FEWEST_POSES:
+        run = replace(run, clocks=replace(run.clocks, unsettled=True))
     observed = _observed(measured, _longest_step(run.detections))
     used = largest_near(measured, max_distance) & trusted & (assigned >= 0).any(axis=1)
     instants = Instants.of(run, assigned, used)
