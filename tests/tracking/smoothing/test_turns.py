@@ -15,7 +15,7 @@ from tracking.smoothing.motion.fixed_interval import smoothed
 from tracking.smoothing.motion.instants import TOGETHER, Instants
 from tracking.smoothing.motion.run_detections import Delays, RunDetections, Turn, WholeRun
 from tracking.smoothing.motion.timed_run import _near_unobserved, _observed
-from tracking.smoothing.motion.turns import TurnSearch, successions, unresolved, velocity_jumps
+from tracking.smoothing.motion.turns import TURN_NATS, TurnSearch, successions, unresolved, velocity_jumps
 
 FRAMES, STEP = 40, 20  # that has the jump
 SIZE = np.array([0.45, 4.7])  # variances of the jump that `drawn` makes
@@ -124,6 +124,21 @@ def test_a_turn_of_steady_motion_is_dropped():
     density = search.without([turn], [turn])
     assert density is not None
     np.testing.assert_array_equal(density, search.density)
+
+
+@pytest.mark.parametrize("times", [100.0, 1000.0])
+def test_a_corner_smaller_than_the_fastest_motion_is_not_dropped(times):
+    """A new turn has the size of the fastest motion; slow corners were less likely with that than without a turn."""
+    search = search_in(drawn(6, FRAMES, jump_at=STEP))
+    weak = replace(search, info=search.info._replace(information=search.info.information * 1e-4))
+    weak = replace(weak, info=weak.info._replace(vector=search.info.vector * 1e-4))
+    new = Turn(float(search.t_s[STEP] - 0.5 * DT), DT, DT, times * SIZE)
+    every = slice(None)
+    assert weak.nats([new], every, weak.density) < weak.nats([], every, weak.density) + TURN_NATS
+    assert weak.without([new], [new]) is None
+    found = weak.improved(new, [])
+    assert found is not None
+    assert np.all(found.size < 0.1 * new.size)
 
 
 def test_a_stronger_jerk_replaces_turns_of_a_swing_but_not_a_corner():

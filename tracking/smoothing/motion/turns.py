@@ -133,7 +133,7 @@ class TurnSearch:
             if (nats := self.nats(others, part, density)) > most:
                 best, most = density, nats
         needed = max(TURN_NATS * len(some), SUCCESSION_NATS if len(some) > 1 else 0.0)
-        run, likely = self.with_turns(others, part), [t._replace(length_s=t.likely_s) for t in some]
+        run, likely = self.with_turns(others, part), list(some)
         for i, turn in enumerate(likely):
             likely[i] = run.sized(turn, [*likely[:i], *likely[i + 1 :]])
         return best if most > run.nats(likely) - needed else None
@@ -261,8 +261,12 @@ class _WithTurns:
         return float(log_likelihood_with(self.ref, info, self.density, self.filtered, first, end))
 
     def sized(self, turn: Turn, more: Sequence[Turn] = ()) -> Turn:
-        """A turn with its most likely size: that of a new one, of the fastest motion, makes a slow one unlikely."""
-        tried = [turn._replace(size=share * turn.size) for share in _SHARES]
+        """A turn with its most likely size: that of a new one, of the fastest motion, makes a slow one unlikely.
+
+        It is as long as it may be, or as is most likely.
+        """
+        lengths = turn.length_s, turn.likely_s
+        tried = [turn._replace(length_s=length, size=share * turn.size) for length in lengths for share in _SHARES]
         return max(tried, key=lambda one: self.nats([one, *more]))
 
 

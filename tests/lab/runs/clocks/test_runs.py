@@ -270,6 +270,7 @@ def test_no_pose_beside_a_turn_is_wrong_by_more_than_it_states(seed, frames, tmp
     [
         pytest.param(7103, 60, 0, id="a turntable that turns four times: the steps of the clocks do not end"),
         pytest.param(7111, 120, 0, id="a strong jerk in gaps, and spots of one camera: a motion that is not finite"),
+        pytest.param(7141, 120, 0, id="an offset that stays open by a frame, of swings that last for twelve"),
         pytest.param(7127, 120, 1, id="a turntable, whose turns alone show the clock"),
     ],
 )
