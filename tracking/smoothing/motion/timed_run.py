@@ -52,8 +52,8 @@ FEWEST = 3  # turns in succession that a jerk may replace: two are the ends of o
 # m and rad: a sigma of each pose in a gap about the reference. A strong jerk would let the vehicle be kilometres away
 # after some frames, and covariances with both this and the error of a spot exceed the digits of a number.
 NEAR = 10.0
-# Frames with poses of their own: three show position, velocity and acceleration, as many more that the jerk is as strong
-# as assumed. Without these any offset follows from that assumption.
+# Frames with poses of their own: three show position, velocity and acceleration, as many more that the jerk is as
+# strong as assumed. Without these any offset follows from that assumption.
 FEWEST_POSES = 6
 APART = 1.5  # frames: of shocks as close as this only the largest is a turn ...
 FIRST_LENGTH = 1.0  # frames: ... of this length at first
@@ -209,7 +209,7 @@ class _TimedEstimator(_Estimator):
             one = search.one_for(some, turns)
             if one is not None:
                 turns = [*(t for t in turns if not any(t is each for each in some)), one]
-        turns = [search.to_next_spots(turn) for turn in turns]
+        turns = [search.to_next_spots(search.largest(turn, turns)) for turn in turns]
         other = smoothed(*search.of_part(turns, slice(None)), search.density, tested=False)
         pose, motion = (x[:, :, None] * x[:, None] for x in (other.x[:, :6], other.x[:, 6:12]))
         return out._replace(

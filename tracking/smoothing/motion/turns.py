@@ -149,6 +149,17 @@ class TurnSearch:
         nats = [run.nats([one]) for one in tried]
         return tried[int(np.argmax(nats))] if max(nats) > run.nats(short) - RESOLVED_NATS else None
 
+    def largest(self, turn: Turn, all_turns: Sequence[Turn]) -> Turn:
+        """A turn as large as the spots allow: slow motion hardly shows its size."""
+        part = self.part(turn.begin_s, turn.end_s)
+        run = self.with_turns([t for t in self.near(all_turns, part) if t is not turn], part)
+        least = run.nats([turn]) - _AMBIGUOUS_NATS
+        for share in _SHARES:  # the largest first
+            larger = turn._replace(size=turn.size * share / _SHARES[-1])
+            if run.nats([larger]) > least:
+                return larger
+        return turn
+
     def to_next_spots(self, turn: Turn) -> Turn:
         """A turn that takes some frames, from the last spots before it to the first after it: its ends are smooth."""
         if turn.likely_s < _SHORT * self.frame_s:
