@@ -75,6 +75,10 @@ class EstimatedClocks:
     mean_s: Array  # (p,) of the prior
     sigma_s: Array  # (p,)
 
+    def offset_sigma_s(self, covariance: Array) -> float:
+        """Of the sum of all offsets with this covariance (p, p) of the numbers."""
+        return float(np.sqrt(sum(covariance[i, i] for i, (_, row_time) in enumerate(self.numbers) if not row_time)))
+
 
 @dataclass(frozen=True, slots=True)
 class FoundClocks:

@@ -35,7 +35,7 @@ from tracking.smoothing.labels.continuity import continued, transfers_between_ca
 from tracking.smoothing.labels.neighbouring_frames import connected, displaced, isolated, next_to
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated, run_log_clutter, run_log_static
 from tracking.smoothing.labels.view_path import PathContext
-from tracking.smoothing.motion.clocks import DETERMINED
+from tracking.smoothing.motion.clocks import DETERMINED, clock_sigmas
 from tracking.smoothing.motion.process_noise import corner_offsets, jump_sigmas
 from tracking.smoothing.motion.run_detections import (
     Reference,
@@ -51,13 +51,7 @@ from tracking.smoothing.motion.whole_run import MAX_DISTANCE, estimate
 from tracking.smoothing.place_errors import place_errors, scaled_shares, with_places
 from tracking.smoothing.recording import FoundClocks, TrackedRecording, merged, track_backward
 from tracking.smoothing.single_frame_poses import SingleFramePoses, rms_residuals, single_frame_poses
-from tracking.smoothing.systematic_errors import (
-    calibration_errors,
-    clock_sigmas,
-    exposure_offsets,
-    exposure_sigmas,
-    pose_shift,
-)
+from tracking.smoothing.systematic_errors import calibration_errors, exposure_offsets, exposure_sigmas, pose_shift
 from tracking.statuses import Event, MotionEstimate, PoseStatus, SpotStatus, TrackedFrame, view_statuses
 
 _BLOCK = 4096  # frames whose measured spots are in memory twice
@@ -513,7 +507,7 @@ class _Smoother:
         covariance = covariance + of_poses[:, :, None] ** 2 * np.eye(6)
         rest = [1 - (1 - place_share) / place_factor, of_poses, np.zeros((len(covariance), 21))]
         clocks: FoundClocks | None = None
-        if motion.clocks is not None:
+        if motion.clocks is not None and self.rec.clocks is not None:
             # Errors of places do not average out for the clocks either.
             excess = float(np.median(place_factor[motion.known])) if motion.known.any() else 1.0
             clock_cov = motion.clocks.noise * max(excess, 1.0) + motion.clocks.systematic
@@ -521,8 +515,7 @@ class _Smoother:
             spread = motion.clocks.motion @ clock_cov @ np.swapaxes(motion.clocks.motion, 1, 2)
             covariance, motion_P = covariance + spread[:, :6, :6], motion_P + spread[:, 6:, 6:]
             rest[2] = spread[:, *np.triu_indices(6)]
-            offsets_s2 = np.diag(clock_cov)[[not is_row_time for _, is_row_time in self.rec.clocks.numbers]]
-            beyond = clock_sigmas(final, float(np.sqrt(offsets_s2.sum())), self.rec.dt_s)
+            beyond = clock_sigmas(final, self.rec.clocks.offset_sigma_s(clock_cov), self.rec.dt_s)
             covariance, rest[1] = covariance + beyond[:, :, None] ** 2 * np.eye(6), np.hypot(of_poses, beyond)
         jerk = np.full(2, np.nan)
         if motion.log_density is not None:

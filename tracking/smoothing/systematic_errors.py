@@ -13,8 +13,7 @@ from geometry.compiled_projection import Views, project_all
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import coordinates_of, covariance_of
 from geometry.uncertainty.rig_uncertainty import share_without_calibration
-from tracking.smoothing.motion.instants import usual_step
-from tracking.smoothing.motion.process_noise import corner_offsets, largest_near
+from tracking.smoothing.motion.process_noise import corner_offsets
 from tracking.smoothing.motion.run_detections import Reference, RunDetections, labelled_points
 from tracking.smoothing.recording import TrackedRecording
 
@@ -63,19 +62,6 @@ def exposure_sigmas(motion: Reference, jumped: Bools, exposure_s: float, dt: Arr
         other = np.abs(acceleration - motion.m[:, 6:]) * exposure_s**2 / 24
         other[corners > 0] = 0.0
     return np.abs(corners) + other, other
-
-
-def clock_sigmas(motion: Reference, sigma_s: float, dt: Array) -> Array:
-    """Sigmas (T, 6), m and rad, of poses by cameras' unknown offsets (sigma_s) beyond the first order.
-
-    Of a motion that accelerates, the offset d moves the pose of a camera's picture by v d + a d^2 / 2. The mean of the
-    second part's square is 3/4 a^2 sigma^4. a sigma is the largest change of the velocities that far from the frame.
-    Source: ours.
-    """
-    step, v = usual_step(dt), motion.m[:, :6]
-    far = max(int(np.ceil(sigma_s / step)), 1)
-    change = np.maximum(largest_near(v, far) - v, v + largest_near(-v, far)) * min(sigma_s / (far * step), 1.0)
-    return np.asarray(np.sqrt(0.75) * sigma_s * change)
 
 
 def pose_shift(views: Views, motion: Reference, offsets: Array) -> Array:

@@ -6,9 +6,10 @@ import pytest
 from geometry.compiled_projection import project_all
 from geometry.pose import Pose
 from lab.simulate.points import simulate_points
+from tracking.smoothing.motion.clocks import clock_sigmas
 from tracking.smoothing.motion.process_noise import corner_offsets, with_errors_along_axes
 from tracking.smoothing.motion.run_detections import Reference
-from tracking.smoothing.systematic_errors import clock_sigmas, exposure_offsets, exposure_sigmas, pose_shift
+from tracking.smoothing.systematic_errors import exposure_offsets, exposure_sigmas, pose_shift
 
 EXPOSURE_S = 0.02
 
@@ -133,6 +134,8 @@ def test_poses_of_an_unknown_offset_have_the_errors_beyond_the_first_order_that_
     sigmas = clock_sigmas(motion, sigma_frames * dt, np.full(len(k), dt))
     assert not sigmas[:, 1:].any()
     rms = np.sqrt(np.mean(errors**2, axis=1))
-    assert np.all(rms < 1.1 * sigmas[:, 0])
-    assert np.sqrt(np.mean(sigmas[:, 0] ** 2)) < 3 * np.sqrt(np.mean(rms**2))
+    # Where a swing's acceleration is zero the third order is left.
+    assert np.all(rms < 1.5 * sigmas[:, 0])
+    over = np.sqrt(np.mean(rms**2) / np.mean(sigmas[:, 0] ** 2))
+    assert 0.2 < over < 1.0
     assert not clock_sigmas(motion, 0.0, np.full(len(k), dt)).any()

@@ -130,8 +130,8 @@ def test_a_turn_of_steady_motion_is_dropped():
 def test_a_corner_smaller_than_the_fastest_motion_is_not_dropped(times):
     """A new turn has the size of the fastest motion; slow corners were less likely with that than without a turn."""
     search = search_in(drawn(6, FRAMES, jump_at=STEP))
-    weak = replace(search, info=search.info._replace(information=search.info.information * 1e-4))
-    weak = replace(weak, info=weak.info._replace(vector=search.info.vector * 1e-4))
+    weak = replace(search, info=search.info._replace(information=search.info.information * 1e-5))
+    weak = replace(weak, info=weak.info._replace(vector=search.info.vector * 1e-5))
     new = Turn(float(search.t_s[STEP] - 0.5 * DT), DT, DT, times * SIZE)
     every = slice(None)
     assert weak.nats([new], every, weak.density) < weak.nats([], every, weak.density) + TURN_NATS

@@ -12,6 +12,8 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from tracking.rigid_body.models.motion import STATE
 from tracking.smoothing.motion.fixed_interval import RunInformation, smoothed
+from tracking.smoothing.motion.instants import usual_step
+from tracking.smoothing.motion.process_noise import largest_near
 from tracking.smoothing.motion.run_detections import (
     ClockSolution,
     Reference,
@@ -111,3 +113,16 @@ def solve_clocks(
         systematic = noise @ total @ total.T @ noise
         systematic[kept], systematic[:, kept] = 0.0, 0.0
     return ClockSolution(correction, noise, systematic, -G[:, :12])
+
+
+def clock_sigmas(motion: Reference, sigma_s: float, dt: Array) -> Array:
+    """Sigmas (T, 6), m and rad, of poses by cameras' unknown offsets (sigma_s) beyond the first order.
+
+    Of a motion that accelerates, the offset d moves the pose of a camera's picture by v d + a d^2 / 2. The mean of the
+    second part's square is 3/4 a^2 sigma^4. a sigma is the largest change of the velocities that far from the frame.
+    Source: ours.
+    """
+    step, v = usual_step(dt), motion.m[:, :6]
+    far = max(int(np.ceil(sigma_s / step)), 1)
+    change = np.maximum(largest_near(v, far) - v, v + largest_near(-v, far)) * min(sigma_s / (far * step), 1.0)
+    return np.asarray(np.sqrt(0.75) * sigma_s * change)
