@@ -513,10 +513,10 @@ class _Smoother:
             clock_cov = motion.clocks.noise * max(excess, 1.0) + motion.clocks.systematic
             clocks = FoundClocks(self.correction_s, clock_cov)
             spread = motion.clocks.motion @ clock_cov @ np.swapaxes(motion.clocks.motion, 1, 2)
+            beyond = clock_sigmas(final, self.rec.clocks.offset_sigma_s(clock_cov), self.rec.dt_s)
+            spread[:, np.arange(6), np.arange(6)] += beyond**2
             covariance, motion_P = covariance + spread[:, :6, :6], motion_P + spread[:, 6:, 6:]
             rest[2] = spread[:, *np.triu_indices(6)]
-            beyond = clock_sigmas(final, self.rec.clocks.offset_sigma_s(clock_cov), self.rec.dt_s)
-            covariance, rest[1] = covariance + beyond[:, :, None] ** 2 * np.eye(6), np.hypot(of_poses, beyond)
         jerk = np.full(2, np.nan)
         if motion.log_density is not None:
             half = 0.5 * np.median(motion.log_density, axis=0)
