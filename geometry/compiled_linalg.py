@@ -173,21 +173,27 @@ MIN_PIVOT = 1e-15  # smallest pivot of a Cholesky factor relative to the diagona
 
 
 @compiled
-def cholesky(a: Array) -> Array:
-    """The lower triangular L (n, n) with L L^T = a, of a symmetric, positive semidefinite matrix."""
+def cholesky(a: Array, least_pivot: float = 0.0) -> Array:
+    """The lower triangular L (n, n) with L L^T = a, of a symmetric, positive semidefinite matrix.
+
+    least_pivot: that no pivot is below but by rounding; 1 for I + B with a semidefinite B.
+    """
     n = a.shape[0]
     out = np.zeros((n, n))
     for j in range(n):
         s = a[j, j]
         for k in range(j):
             s -= out[j, k] * out[j, k]
-        least = MIN_PIVOT * a[j, j]
-        if not s > least:
+        least = max(MIN_PIVOT * a[j, j], least_pivot)
+        known = s > least
+        if not known:
             s = least
         if not s > 0.0:
             continue  # zero variance: the column stays 0
         root = np.sqrt(s)
         out[j, j] = root
+        if not known:
+            continue  # the rest of the column is rounding, too: over so small a pivot it would grow from row to row
         for i in range(j + 1, n):
             s = a[i, j]
             for k in range(j):
@@ -222,7 +228,7 @@ def posterior(P: Array, information: Array) -> tuple[Array, float]:
         for c in range(i):
             M[c, i] = M[i, c]
         M[i, i] += 1.0
-    W = cholesky(M)
+    W = cholesky(M, 1.0)
     log_det = 0.0
     for i in range(k):
         log_det += 2 * np.log(W[i, i])

@@ -75,6 +75,10 @@ class EstimatedClocks:
     mean_s: Array  # (p,) of the prior
     sigma_s: Array  # (p,)
 
+    def offset_sigma_s(self, covariance: Array) -> float:
+        """Of the sum of all offsets with this covariance (p, p) of the numbers."""
+        return float(np.sqrt(sum(covariance[i, i] for i, (_, row_time) in enumerate(self.numbers) if not row_time)))
+
 
 @dataclass(frozen=True, slots=True)
 class FoundClocks:
@@ -185,15 +189,15 @@ class TrackedRecording:
         """(m,): of the variance of a coordinate of each detection of the run, the part that belongs to its place."""
         return self._place.values
 
-    def unknown_clocks(self, corrections_s: Array) -> UnknownClocks | None:
-        """The clocks that are estimated with the motion, after these corrections (p,)."""
+    def unknown_clocks(self, corrections_s: Array, unsettled: bool) -> UnknownClocks | None:
+        """The clocks that are estimated with the motion, after these corrections (p,). unsettled: all keep priors."""
         clocks, model = self.clocks, self.model
         if clocks is None:
             return None
         camera, is_row_time = zip(*clocks.numbers, strict=True)
         return UnknownClocks(
             np.array(camera, dtype=np.int64), np.array(is_row_time, dtype=bool), clocks.mean_s - corrections_s,
-            clocks.sigma_s, model.camera_of, (model.image_size_px[:, 1] - 1) / 2, self.calibration,
+            clocks.sigma_s, model.camera_of, (model.image_size_px[:, 1] - 1) / 2, unsettled, self.calibration,
         )  # fmt: skip
 
     def delays(self, corrections_s: Array | None = None) -> Delays | None:

@@ -35,17 +35,18 @@ from tracking.smoothing.labels.continuity import continued, transfers_between_ca
 from tracking.smoothing.labels.neighbouring_frames import connected, displaced, isolated, next_to
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated, run_log_clutter, run_log_static
 from tracking.smoothing.labels.view_path import PathContext
-from tracking.smoothing.motion.process_noise import corner_offsets, corner_times, jump_sigmas, jump_variances
+from tracking.smoothing.motion.clocks import DETERMINED, clock_sigmas
+from tracking.smoothing.motion.process_noise import corner_offsets, jump_sigmas
 from tracking.smoothing.motion.run_detections import (
     Reference,
     RunDetections,
     SmoothedMotion,
-    Steps,
     WholeRun,
     controlled_labels,
     moved_detections,
     straight_between,
 )
+from tracking.smoothing.motion.timed_run import estimate_timed
 from tracking.smoothing.motion.whole_run import MAX_DISTANCE, estimate
 from tracking.smoothing.place_errors import place_errors, scaled_shares, with_places
 from tracking.smoothing.recording import FoundClocks, TrackedRecording, merged, track_backward
@@ -212,6 +213,8 @@ MAX_ROUNDS = 4  # of motion and labels
 MAX_CLOCK_STEPS = 4  # of the clocks after each estimate of the motion
 MAX_CLOCK_STEP = 0.5  # of a prior's sigma: a longer step is not linear
 NEGLIGIBLE_STEP = 0.05  # of its sigma: a shorter step of a clock is not taken
+# Of a prior's sigma: the last of these steps of a number whose sigma is below DETERMINED. Then nothing is known of any.
+UNSETTLED_STEP = 0.3
 VAGUE_SIGMA_PX = 1.0  # a spot predicted worse than this may be labelled by its path although the pose is measured
 MAX_REPAIRS = 3  # times that velocity jumps are added where poses contradict their spots
 # Excess chi-square (6 degrees of freedom) of a frame's spots at the smoothed pose over that at their own pose, above
@@ -266,6 +269,7 @@ class _Smoother:
         ref = straight_between(rec.poses, self.measured, np.cumsum(rec.dt_s))
         self.delays = rec.delays()
         self.correction_s = np.zeros(0 if rec.clocks is None else len(rec.clocks.numbers))
+        self.unsettled = False  # the steps of the clocks do not end
         # (T,) frames with pictures of other instants: beside a velocity jump they have no pose of their own.
         self.timed = np.zeros(len(rec), dtype=bool)
         if self.delays is not None:
@@ -275,9 +279,10 @@ class _Smoother:
         self.calibration_cov, self.systematic, self.noise_share = calibration_errors(rec, seen, self.assigned, ref)
         place_px2 = rec.place_px2()
         every, steady, labels = seen, self.measured, self.assigned
+        first = SmoothedMotion.begin(ref, rec.jumped.copy(), None)
         if self.delays is not None:
-            every, ref, steady = self._first_motion(seen, ref)
-            labels = well_known(every, seen, labels)
+            every, first, steady = self._first_motion(seen, first)
+            ref, labels = first.ref, well_known(every, seen, labels)
         self.errors = ErrorScale.of(
             model,
             seen._replace(uv=every.uv),
@@ -292,7 +297,7 @@ class _Smoother:
         self.seen = self.detections = seen._replace(
             cov=self.errors.of_run(seen, place_px2) + parameters.sigma_model_px**2 * np.eye(2)
         )
-        log_density: Array | None = None
+        log_density = first.log_density
         if not parameters.learn_jerk:
             by_hand = 2 * np.log(np.repeat([parameters.jerk_m_s3, parameters.jerk_rad_s3], 3))
             log_density = np.tile(by_hand, (len(rec), 1))
@@ -301,11 +306,11 @@ class _Smoother:
         # (T,) measured by a tracker with enough spots: it has left open what nothing checked.
         self.sure = self.measured & (distinct_spots(self.assigned >= 0, model.spot_of) >= MIN_REDUNDANT_SPOTS)
         self.trusted = connected(self.measured, self.sure | self._controlled(ref)[0])  # (T,) labels that may be used
-        self.motion = SmoothedMotion.begin(ref, rec.jumped.copy(), log_density)
+        self.motion = replace(first.without_covariances(), log_density=log_density)
         self.conflicting = np.zeros(len(rec), dtype=bool)  # (T,) forward and backward poses differ
         self.own = SingleFramePoses.unknown(0)  # at the last estimate
 
-    def _first_motion(self, seen: RunDetections, ref: Reference) -> tuple[RunDetections, Reference, Bools]:
+    def _first_motion(self, seen: RunDetections, begin: SmoothedMotion) -> tuple[RunDetections, SmoothedMotion, Bools]:
         """The detections at the instants of their frames, by the motion with the stated sigmas; that motion; steady
         frames.
 
@@ -314,26 +319,16 @@ class _Smoother:
         """
         rec = self.rec
         run = WholeRun(self.views, seen, self.calibration_cov, rec.dt_s, rec.exposure_s, True, self.delays)
-        begin = SmoothedMotion.begin(ref, rec.jumped.copy(), None)
-        motion = estimate(run, self.assigned, self.measured, begin, 0, self.measured)
+        motion = estimate_timed(run, self.assigned, self.measured, begin, 0, self.measured)
         turns = motion.jumped | np.append(motion.jumped[1:], False)
         steady = self.measured & ~turns
-        return self._at_frames(seen, motion), motion.ref, steady if steady.any() else self.measured
+        return self._at_frames(seen, motion), motion, steady if steady.any() else self.measured
 
     def _at_frames(self, seen: RunDetections, motion: SmoothedMotion) -> RunDetections:
         """The detections where they would have been at the instants of their frames, given the estimated motion."""
-        if self.delays is None or motion.log_density is None:
+        if self.delays is None or motion.between is None:
             return seen
-        nowhere = np.zeros(len(self.rec), dtype=bool)
-        jump = jump_variances(
-            motion.ref, nowhere, self.measured, motion.jumped, self.rec.dt_s, motion.excluded, motion.jump_scale,
-            motion.moment,
-        )  # fmt: skip
-        corners = corner_times(motion.ref, motion.jumped, self.rec.dt_s)
-        steps = Steps(self.rec.dt_s, np.exp(motion.log_density), np.ascontiguousarray(jump), corners, motion.moment)
-        uv, cov = moved_detections(
-            self.views, self.view_table.camera, seen, self.delays, self.assigned, motion.ref, motion.motion_P, steps
-        )
+        uv, cov = moved_detections(self.views, self.view_table.camera, seen, self.delays, self.assigned, motion.between)
         return seen._replace(uv=uv, cov=cov)
 
     def estimate(self, max_distance: int) -> None:
@@ -343,21 +338,31 @@ class _Smoother:
         self.motion, self.own = self.motion.without_covariances(), SingleFramePoses.unknown(0)
         run = WholeRun(
             self.views, self.seen, self.calibration_cov, rec.dt_s, rec.exposure_s, self.parameters.learn_jerk,
-            self.delays, rec.unknown_clocks(self.correction_s),
+            self.delays, rec.unknown_clocks(self.correction_s, self.unsettled),
         )  # fmt: skip
-        self.motion = estimate(run, self.assigned, self.measured, self.motion, max_distance, self.trusted)
-        for _ in range(MAX_CLOCK_STEPS):
+        estimated = estimate if self.delays is None else estimate_timed
+        self.motion = estimated(run, self.assigned, self.measured, self.motion, max_distance, self.trusted)
+        for step in range(MAX_CLOCK_STEPS + 1):
             found = self.motion.clocks
-            if found is None or self.rec.clocks is None:
+            if found is None or rec.clocks is None:
                 break
             sigma = np.sqrt(np.diagonal(found.noise))
             if np.all(np.abs(found.correction_s) < NEGLIGIBLE_STEP * sigma):
                 break
-            most = MAX_CLOCK_STEP * self.rec.clocks.sigma_s
-            self.correction_s = self.correction_s + np.clip(found.correction_s, -most, most)
-            self.delays = self.rec.delays(self.correction_s)
-            run = replace(run, delays=self.delays, clocks=rec.unknown_clocks(self.correction_s))
-            self.motion = estimate(
+            most = MAX_CLOCK_STEP * rec.clocks.sigma_s
+            change = np.clip(found.correction_s, -most, most)
+            if step == MAX_CLOCK_STEPS:
+                solved = sigma < DETERMINED * rec.clocks.sigma_s
+                self.unsettled |= bool(
+                    np.any(np.abs(found.correction_s)[solved] > UNSETTLED_STEP * rec.clocks.sigma_s[solved])
+                )
+                if not self.unsettled:
+                    break
+                change = rec.clocks.mean_s - self.correction_s
+            self.correction_s = self.correction_s + change
+            self.delays = rec.delays(self.correction_s)
+            run = replace(run, delays=self.delays, clocks=rec.unknown_clocks(self.correction_s, self.unsettled))
+            self.motion = estimated(
                 run, self.assigned, self.measured, self.motion.without_covariances(), max_distance, self.trusted
             )
         self.detections = self._at_frames(self.seen, self.motion)
@@ -451,9 +456,9 @@ class _Smoother:
         """Assume velocity jumps where the pose contradicts the frame's own spots, and estimate the motion again."""
         # A jump that was detected one step too late leaves the frame before it with the covariance of a smooth path.
         beside = next_to(self.motion.jumped) | self.motion.jumped
-        for _ in range(MAX_REPAIRS):
+        for _ in range(MAX_REPAIRS if self.delays is None else 0):
             limit = np.where(beside, CONTRADICTION_NEXT_TO_JUMP_CHI2, CONTRADICTION_CHI2)
-            wrong = self.own.measured & self.trusted & (self.own.excess > limit) & ~self.timed
+            wrong = self.own.measured & self.trusted & (self.own.excess > limit)
             if not wrong.any():
                 return
             jumped = self.motion.jumped.copy()
@@ -502,12 +507,14 @@ class _Smoother:
         covariance = covariance + of_poses[:, :, None] ** 2 * np.eye(6)
         rest = [1 - (1 - place_share) / place_factor, of_poses, np.zeros((len(covariance), 21))]
         clocks: FoundClocks | None = None
-        if motion.clocks is not None:
+        if motion.clocks is not None and self.rec.clocks is not None:
             # Errors of places do not average out for the clocks either.
             excess = float(np.median(place_factor[motion.known])) if motion.known.any() else 1.0
             clock_cov = motion.clocks.noise * max(excess, 1.0) + motion.clocks.systematic
             clocks = FoundClocks(self.correction_s, clock_cov)
             spread = motion.clocks.motion @ clock_cov @ np.swapaxes(motion.clocks.motion, 1, 2)
+            beyond = clock_sigmas(final, self.rec.clocks.offset_sigma_s(clock_cov), self.rec.dt_s)
+            spread[:, np.arange(6), np.arange(6)] += beyond**2
             covariance, motion_P = covariance + spread[:, :6, :6], motion_P + spread[:, 6:, 6:]
             rest[2] = spread[:, *np.triu_indices(6)]
         jerk = np.full(2, np.nan)

@@ -12,14 +12,7 @@ from lab.simulate.scenarios import RIGS
 from tracking.detections import PictureClock
 from tracking.rigid_body.models.information import add_clock_errors, exposed_after, picture_shifts, timed_spot
 from tracking.rigid_body.models.motion import state_after
-from tracking.smoothing.motion.run_detections import (
-    Delays,
-    Reference,
-    RunDetections,
-    Steps,
-    moved_detections,
-    unknown_moments,
-)
+from tracking.smoothing.motion.run_detections import Between, Delays, Reference, RunDetections, moved_detections
 
 MODEL = SpotModel.of(RIGS["four-skew-beams"]())
 R, T = np.eye(3), np.zeros(3)
@@ -85,14 +78,18 @@ def test_points_are_moved_to_their_frames_instant_as_their_spots_move():
     first = np.searchsorted(MODEL.camera_of, [[0, 1, 2]])
     seen = RunDetections(uv, cov, np.zeros(n), np.array([0, n]), first, np.ones((1, 2), bool), np.ones(n), np.ones(n))
     delays = Delays(np.full(n, after), np.zeros(n), np.array([[[after, 0.0, 511.5]] * 2]))
-    steps = Steps(
-        np.array([0.01]), np.full((1, 6), jerk), np.zeros((1, 2)), np.full((1, 2), np.nan), unknown_moments(1)
-    )
+    m_then = M + np.concatenate([after * M[6:], np.zeros(6)])
+    ref = Reference(*(np.stack(pair) for pair in ((R, R_then), (T, t_then), (M, m_then))))
+    jump, moment = np.array([[0.0, 0.0], [0.5, 0.5]]), np.array([[-1.0, 0.0], [0.002, 1e-4]])
+    velocity_P = np.tile(np.eye(6) * 0.1**2, (2, 1, 1))
+    between = Between(
+        np.array([0.0, after]), np.array([0]), ref, velocity_P, np.full((2, 6), jerk), jump, moment
+    )  # fmt: skip
     labels = np.where(np.arange(n) % 2, np.arange(n) - first[0, MODEL.camera_of], -1)[None]
-    motion, velocity_P = Reference(R[None], T[None], M[None]), np.eye(6)[None] * 0.1**2
-    moved = moved_detections(MODEL.numbers, MODEL.camera_of, seen, delays, labels, motion, velocity_P, steps)
+    moved = moved_detections(MODEL.numbers, MODEL.camera_of, seen, delays, labels, between)
     np.testing.assert_allclose(moved[0], pixels_after(0.0), atol=1e-9)
-    variance = (0.1 * after) ** 2 + jerk * after**5 / 20  # of the way, in m and rad
+    # Of the way, in m and rad: by the velocities, the jerk, and when the velocities jump.
+    variance = (0.1 * after) ** 2 + jerk * after**5 / 20 + 0.5 * 1e-4**2
     np.testing.assert_allclose(moved[1], cov + variance * J @ np.swapaxes(J, 1, 2), rtol=1e-9)
 
 

@@ -6,6 +6,7 @@ import pytest
 from geometry.compiled_projection import project_all
 from geometry.pose import Pose
 from lab.simulate.points import simulate_points
+from tracking.smoothing.motion.clocks import clock_sigmas
 from tracking.smoothing.motion.process_noise import corner_offsets, with_errors_along_axes
 from tracking.smoothing.motion.run_detections import Reference
 from tracking.smoothing.systematic_errors import exposure_offsets, exposure_sigmas, pose_shift
@@ -117,3 +118,24 @@ def test_a_component_that_accelerates_while_another_one_turns_has_the_offset_of_
     assert both[3, 0] == pytest.approx(turn * exposure_s / 8)
     assert without_jumps[3, 0] == 0.0
     assert both[3, 1] == without_jumps[3, 1] == pytest.approx(acceleration * exposure_s**2 / 24)
+
+
+@pytest.mark.parametrize("sigma_frames", [0.2, 0.5, 1.0, 1.5])
+@pytest.mark.parametrize("period", [12.0, 30.0])
+def test_poses_of_an_unknown_offset_have_the_errors_beyond_the_first_order_that_they_state(sigma_frames, period):
+    """A swing, seen at unknown offsets from the frames: what the velocity times the offset does not contain."""
+    dt, k = 0.025, np.arange(240.0)
+    turn = 2 * np.pi / period
+    places, m = np.zeros((len(k), 3)), np.zeros((len(k), 12))
+    places[:, 0], m[:, 0] = np.sin(turn * k), np.cos(turn * k) * turn / dt
+    motion = Reference(np.tile(np.eye(3), (len(k), 1, 1)), places, m)
+    offset = np.random.default_rng(3).normal(size=4000) * sigma_frames
+    errors = np.sin(turn * (k[:, None] + offset)) - places[:, :1] - m[:, :1] * dt * offset
+    sigmas = clock_sigmas(motion, sigma_frames * dt, np.full(len(k), dt))
+    assert not sigmas[:, 1:].any()
+    rms = np.sqrt(np.mean(errors**2, axis=1))
+    # Where a swing's acceleration is zero the third order is left.
+    assert np.all(rms < 1.5 * sigmas[:, 0])
+    over = np.sqrt(np.mean(rms**2) / np.mean(sigmas[:, 0] ** 2))
+    assert 0.2 < over < 1.0
+    assert not clock_sigmas(motion, 0.0, np.full(len(k), dt)).any()

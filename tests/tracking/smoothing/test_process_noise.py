@@ -10,8 +10,7 @@ import pytest
 from geometry.arrays import Array
 from tests.tracking.smoothing.test_fixed_interval import Run, drawn
 from tracking.smoothing.motion.fixed_interval import smoothed
-from tracking.smoothing.motion.process_noise import LOG_RANGE, corner_times, next_log_density
-from tracking.smoothing.motion.run_detections import Reference
+from tracking.smoothing.motion.process_noise import LOG_RANGE, next_log_density
 from tracking.smoothing.motion.whole_run import GLOBAL_PASSES
 
 FRAMES = 300
@@ -116,20 +115,3 @@ def test_covariances_are_right_where_one_axis_moves_less_than_the_noise(amplitud
         out = smoothed(run.ref, run.info, np.exp(log_density), True)
         squares.append((run.true[:, 3] + sine - out.x[:, 3]) ** 2 / out.pose_P[:, 3, 3])
     assert 0.6 < np.mean(squares) < largest
-
-
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.8])
-def test_a_corner_is_where_the_straight_lines_before_and_after_it_meet(share):
-    dt, at, velocities = 0.01, 3 + share, np.array([[0.8, -0.2, 0.1], [-0.5, 0.4, 0.3]])  # the corner in frames; m/s
-    k = np.arange(8.0)
-    after = k > at
-    t = dt * (np.minimum(k, at)[:, None] * velocities[0] + np.maximum(k - at, 0.0)[:, None] * velocities[1])
-    m = np.zeros((8, 12))
-    m[:, :3] = velocities[after.astype(int)]
-    ref, jumped = Reference(np.tile(np.eye(3), (8, 1, 1)), t, m), k == 4
-    corner = corner_times(ref, jumped, np.full(8, dt))
-    assert corner[4, 0] == pytest.approx(share * dt)
-    assert np.isnan(np.delete(corner, 4, axis=0)).all()
-    # Two jumps in a row, or lines that meet in another step: the corner may be anywhere.
-    assert np.isnan(corner_times(ref, jumped | (k == 5), np.full(8, dt))).all()
-    assert np.isnan(corner_times(ref, k == 6, np.full(8, dt))[:, 0]).all()

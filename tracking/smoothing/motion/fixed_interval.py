@@ -73,7 +73,7 @@ def subtract_noise(Y: Array, y: Array, axis: int, root: Array) -> None:
             A[c, e] = 0.5 * (A[c, e] + A[e, c])
             A[e, c] = A[c, e]
     # With W W^T = A, subtract Z W^-T (Z W^-T)^T.
-    W = cholesky(A)
+    W = cholesky(A, 1.0)
     for c in range(3):
         for e in range(c):
             w = W[c, e]
@@ -97,14 +97,10 @@ MOST_FRAMES_AT_ONCE, CHUNK = 8192, 1024
 
 
 class RunInformation(NamedTuple):
-    """Information of T frames' spots about the motion at a reference, and the process noise of the steps.
+    """Information of T frames' spots about the poses at a reference, and the process noise of the steps."""
 
-    It is about the poses, s = 6, or, where pictures were taken before or after the instants of their frames, about the
-    whole states, s = 18.
-    """
-
-    information: Array  # (T, s, s) normal matrices J^T C^-1 J; 0 without spots
-    vector: Array  # (T, s) J^T C^-1 (measured - expected)
+    information: Array  # (T, 6, 6) normal matrices J^T C^-1 J; 0 without spots
+    vector: Array  # (T, 6) J^T C^-1 (measured - expected)
     dt: Array  # (T,) s since the frame before
     velocity_jump: Array  # (T, 2) variances of the velocities' jump in that step, (m/s)^2 and (rad/s)^2
     acceleration_jump: Array  # (T, 2) variances of the accelerations' jump
@@ -167,9 +163,8 @@ def _predict(ref: Reference, info: RunInformation, jerk: Array, k: int, x: Array
 
 
 @compiled
-def _update(info: RunInformation, k: int, x: Array, P: Array) -> tuple[Array, Array, float]:
-    """Measurement update of frame k: deviation and covariance after it, and its log-likelihood up to a constant."""
-    L, g = info.information[k], info.vector[k]
+def _update(L: Array, g: Array, x: Array, P: Array) -> tuple[Array, Array, float]:
+    """Update with information L (s, s), g (s,): deviation, covariance, and the log-likelihood up to a constant."""
     if L[0, 0] == 0.0 and L[3, 3] == 0.0:
         return x, P, 0.0
     out, log_det = posterior(P, L)
@@ -205,7 +200,7 @@ def log_likelihood(ref: Reference, info: RunInformation, jerk: Array) -> float:
     for k in range(info.dt.shape[0]):
         if k > 0:
             x, P = _predict(ref, info, jerk, k, x, P)
-        x, P, gained = _update(info, k, x, P)
+        x, P, gained = _update(info.information[k], info.vector[k], x, P)
         total += gained
     return total
 
@@ -230,6 +225,68 @@ def _predict_backward(
     out = transposed_multiply(F, half.T.copy())
     symmetrise(out)
     return out, transposed_apply(F, y)
+
+
+class Filtered(NamedTuple):
+    """T frames, filtered from both ends."""
+
+    x: Array  # (T, 18) deviations given the spots up to those of each frame
+    P: Array  # (T, 18, 18)
+    nats: Array  # (T,) log-likelihood of those spots
+    Y: Array  # (T, 18, 18) information of the later frames about each frame
+    y: Array  # (T, 18)
+    later: Array  # (T,) their log-likelihood, less that by Y and y
+
+
+@compiled
+def filtered(ref: Reference, info: RunInformation, jerk: Array) -> Filtered:
+    """What `log_likelihood_with` needs of a run with this jerk (T, 6)."""
+    frames = info.dt.shape[0]
+    out = Filtered(
+        np.empty((frames, STATE)),
+        np.empty((frames, STATE, STATE)),
+        np.empty(frames),
+        np.zeros((frames, STATE, STATE)),
+        np.zeros((frames, STATE)),
+        np.zeros(frames),
+    )
+    x, P = _first_prior(info)
+    total = 0.0
+    for k in range(frames):
+        if k > 0:
+            x, P = _predict(ref, info, jerk, k, x, P)
+        x, P, gained = _update(info.information[k], info.vector[k], x, P)
+        total += gained
+        copy_into(out.x[k], x)
+        copy_matrix_into(out.P[k], P)
+        out.nats[k] = total
+    for k in range(frames - 1, 0, -1):
+        Y, y = out.Y[k].copy(), out.y[k].copy()
+        for a in range(6):
+            y[a] += info.vector[k, a]
+            for b in range(6):
+                Y[a, b] += info.information[k, a, b]
+        Y, y = _predict_backward(ref, info, jerk, k, Y, y)
+        copy_into(out.y[k - 1], y)
+        copy_matrix_into(out.Y[k - 1], Y)
+        _, _, gained = _update(Y, y, out.x[k - 1], out.P[k - 1])
+        out.later[k - 1] = total - out.nats[k - 1] - gained
+    return out
+
+
+@compiled
+def log_likelihood_with(
+    ref: Reference, info: RunInformation, jerk: Array, others: Filtered, first: int, end: int
+) -> float:
+    """`log_likelihood` of a run that is `others` but for the steps from first to before end."""
+    x, P, total = others.x[first - 1], others.P[first - 1], others.nats[first - 1]
+    for k in range(first, end):
+        x, P = _predict(ref, info, jerk, k, x, P)
+        x, P, gained = _update(info.information[k], info.vector[k], x, P)
+        total += gained
+    last = max(first, end) - 1
+    _, _, gained = _update(others.Y[last], others.y[last], x, P)
+    return total + gained + others.later[last]
 
 
 @compiled
@@ -257,9 +314,9 @@ def smoothed(ref: Reference, info: RunInformation, jerk: Array, tested: bool = T
             P = _combine(out, k, xs[k - begin], Ps[k - begin], Y, y)
             if k == 0:
                 break
-            for a in range(info.vector.shape[1]):
+            for a in range(6):
                 y[a] += info.vector[k, a]
-                for b in range(info.vector.shape[1]):
+                for b in range(6):
                     Y[a, b] += info.information[k, a, b]
             if tested:
                 _test_process_noise(info, jerk, k, Y, y, P, out)
@@ -293,7 +350,7 @@ def _filter_chunk(
     for k in range(begin, end):
         if k > begin:
             x, P = _predict(ref, info, jerk, k, x, P)
-        x, P, _ = _update(info, k, x, P)
+        x, P, _ = _update(info.information[k], info.vector[k], x, P)
         copy_into(xs[k - begin], x)
         copy_matrix_into(Ps[k - begin], P)
     return x, P

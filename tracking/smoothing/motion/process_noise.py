@@ -157,22 +157,6 @@ def unobserved_steps(measured: Bools) -> Bools:
     return out
 
 
-def open_steps(k: int, vague: Bools, scale: Array) -> tuple[int, int]:
-    """The first and the last step that may have the known jump of step k.
-
-    vague (T,): frames that do not determine the pose, or much worse than usual; scale (T, 2): as in `jump_variances`.
-    """
-    first, last = k, k
-    while first > 1 and vague[first - 1]:
-        first -= 1
-    while last < len(vague) - 1 and vague[last]:
-        last += 1
-    if first == last and scale[k].min() < 1:
-        # Found by its motion alone, it may in truth be one step farther.
-        first, last = max(k - 1, 1), min(k + 1, len(vague) - 1)
-    return first, last
-
-
 def largest_jumps(ref: Reference, measured: Bools, dt: Array) -> Array:
     """Variances (T, 2) of jumps as large as the fastest motion near each step, (m/s)^2 and (rad/s)^2."""
     usual = float(np.median(dt[dt > 0])) if np.any(dt > 0) else SPEED_WINDOW_S
@@ -180,54 +164,31 @@ def largest_jumps(ref: Reference, measured: Bools, dt: Array) -> Array:
     return jump_variance(largest_near(np.where(measured[:, None], speeds(ref.m), 0.0), window))
 
 
-def jump_variances(
-    ref: Reference, weak: Bools, measured: Bools, jumped: Bools, dt: Array, excluded: Bools, scale: Array, moment: Array
-) -> Array:
+def jump_variances(ref: Reference, weak: Bools, measured: Bools, jumped: Bools, dt: Array) -> Array:
     """Variances (T, 2) of the velocities' jump in each step, (m/s)^2 and (rad/s)^2, weighted with its probability.
 
     measured (T,): frames whose spots determine the pose; weak (T,): those that do so much worse than usual; jumped
-    (T,): steps with a known jump; dt (T,), s; excluded (T,): unobserved steps in which there was none; scale (T, 2): of
-    the variances of known jumps, which are otherwise those of the fastest motion; moment (T, 2): of RunInformation.
+    (T,): steps with a known jump; dt (T,), s.
     """
-    size = largest_jumps(ref, measured, dt)
-    known = largest_near(moment[:, 0] >= 0, 1)
-    probability = np.where(unobserved_steps(measured) & ~excluded & ~known, P_JUMP_OCCLUDED, 0.0)
-    vague, sizes = ~measured | weak, np.zeros_like(size)
-    for k in np.flatnonzero(jumped).tolist():
+    probability = np.where(unobserved_steps(measured), P_JUMP_OCCLUDED, 0.0)
+    vague = ~measured | weak
+    for k in np.flatnonzero(jumped):
         probability[k] = 1.0
-        if moment[k, 0] >= 0:
-            sizes[k] = size[k] * scale[k]
-            continue
-        first, last = open_steps(k, vague, scale)
-        some = slice(first, last + 1)
         # The jump is in one of the steps between the frames that determine the pose well.
+        first, last = k, k
+        while first > 1 and vague[first - 1]:
+            first -= 1
+        while last < len(vague) - 1 and vague[last]:
+            last += 1
         share = 1.0 if first == last else max(1.0 / (last + 1 - first), P_JUMP_SHARED)
-        probability[some] = np.maximum(probability[some], share)
-        if scale[k].min() < 1 and not vague[k - 1] and not vague[k]:
-            sizes[some] = np.maximum(sizes[some], size[k] * scale[k])
-    return np.asarray(probability[:, None] * np.where(sizes > 0, sizes, size))
+        probability[first : last + 1] = np.maximum(probability[first : last + 1], share)
+    return np.asarray(probability[:, None] * largest_jumps(ref, measured, dt))
 
 
 def new_jumps(shock: Array, jumped: Bools) -> Bools:
     """(T,): steps with a velocity jump that is not known yet (jumped (T,)): local maxima of the shock (T,)."""
     peak = shock >= largest_near(np.where(jumped, 0.0, shock), SHOCK_SEPARATION)
     return np.asarray(peak & (shock > SHOCK_CHI2) & ~jumped)
-
-
-def corner_times(ref: Reference, jumped: Bools, dt: Array) -> Array:
-    """When the velocities jump within a step, (T, 2), s after its begin, of translation and rotation; nan: not known.
-
-    Where the straight lines before and after meet, along the jump; jumped (T,): steps with a known jump. Lines that
-    meet outside of the step, and those between two jumps, say that the jump may be in another one.
-    """
-    out, pose = np.full((len(ref.t), 2), np.nan), Pose(ref.R, ref.t)
-    alone = jumped & ~np.r_[False, jumped[:-1]] & ~np.r_[jumped[1:], False]
-    for k in (np.flatnonzero(alone[1:]) + 1).tolist():
-        jump = (ref.m[k, :6] - ref.m[k - 1, :6]).reshape(2, 3)
-        late = (ref.m[k, :6] * dt[k] - pose[k].minus(pose[k - 1])).reshape(2, 3)
-        at = np.sum(late * jump, axis=1) / np.maximum(np.sum(jump**2, axis=1), 1e-300)
-        out[k] = np.where((at > 0) & (at < dt[k]), at, np.nan)
-    return out
 
 
 def corner_offsets(ref: Reference, jumped: Bools, exposure_s: float, dt: Array) -> Array:

@@ -22,10 +22,9 @@ from tracking.rigid_body.models.information import (
     frame_information,
     inverse_2x2,
     single_frame_pose,
-    timed_spot,
     well_controlled,
 )
-from tracking.rigid_body.models.motion import STATE, state_after
+from tracking.rigid_body.models.motion import state_after
 
 
 class Reference(NamedTuple):
@@ -191,12 +190,7 @@ def controlled_labels(
 
 
 # Spots that were not exposed at the instants of their frames: their information about the motion, and where they
-# would have been at those instants; compiled.
-#
-# A spot exposed s seconds after its frame's instant measures the pose at that time, which follows from the frame's
-# state by the motion model: its Jacobian by the state (18 numbers) is that of the pose times the transition over s.
-# What the motion model does not know of that time (the jerk, and a velocity jump in the step) is added to the spot's
-# covariance. Source: ours; the transition as in tracking/rigid_body/models/motion.py.
+# would have been at those instants; compiled. Source: ours; the transition as in tracking/rigid_body/models/motion.py.
 
 
 class Delays(NamedTuple):
@@ -207,75 +201,16 @@ class Delays(NamedTuple):
     clocks: Array  # (T, cameras, 3) of the pictures, as PictureClock.numbers
 
 
-class Steps(NamedTuple):
-    """What the motion model leaves open in the step before each of F frames."""
-
-    dt: Array  # (F,) s
-    jerk: Array  # (F, 6) spectral densities of the white jerk
-    velocity_jump: Array  # (F, 2) variances of the velocities' jump
-    corner_s: Array  # (F, 2) when they jump, s after the step's begin; nan: not known
-    moment: Array  # (F, 2) of RunInformation
-
-
-CORNER_SIGMAS = 2.0  # of a known moment of a jump: as near to it, a spot may be on either side
-CORNER_SHARE = 0.05  # of a step: how much nearer to a frame than the corner a spot must be to belong to the same line
-
-
-@compiled_in_caller
-def _open_variance(steps: Steps, k: int, axis: int, after: float) -> float:
-    """Variance of an axis of the pose `after` seconds from frame k beyond the extrapolated state; m^2 or rad^2."""
-    s = abs(after)
-    out = steps.jerk[k, axis] * s**5 / 20
-    step = k + 1 if after > 0.0 else k
-    if 0 < step < steps.dt.shape[0] and steps.dt[step] > 0.0:
-        corner, dt = steps.corner_s[step, axis // 3], steps.dt[step]
-        later, spread = steps.moment[step]
-        if later >= 0.0:
-            beyond = s - (dt - later if after > 0.0 else later)
-            if beyond > -CORNER_SIGMAS * spread:
-                beyond = max(beyond, 0.0)
-                out += steps.velocity_jump[step, axis // 3] * (beyond * beyond + spread * spread)
-            return out
-        beyond = s - (corner if after > 0.0 else dt - corner)
-        if not beyond < -CORNER_SHARE * dt:
-            out += steps.velocity_jump[step, axis // 3] / dt * s**3 / 3
-    return out
-
-
-@compiled_in_caller
-def _on_its_side(steps: Steps, k: int, after: float) -> tuple[int, float]:
-    """The frame whose state a spot `after` seconds from frame k follows from, and its time after that one, s.
-
-    Frame k, or the next one on the other side of a jump whose moment is known.
-    """
-    if after > 0.0 and k + 1 < steps.dt.shape[0]:
-        later = steps.moment[k + 1, 0]
-        if later >= 0.0 and after > steps.dt[k + 1] - later:
-            return k + 1, after - steps.dt[k + 1]
-    elif after < 0.0 and k > 0:
-        later = steps.moment[k, 0]
-        if later >= 0.0 and -after > later:
-            return k - 1, after + steps.dt[k]
-    return k, after
-
-
 @compiled
-def _covariance(
-    cov: Array, J: Array, m: Array, row_time: float, steps: Steps, k: int, after: float
-) -> tuple[float, float, float]:
-    """Covariance (uu, uv, vv), px^2, of a detection less the pixel expected from frame k's state at its own instant.
+def _covariance(cov: Array, speed: Array, row_time: float) -> tuple[float, float, float]:
+    """Covariance (uu, uv, vv), px^2, of a detection less the pixel expected at its own instant.
 
-    cov (2, 2): of the detection; J (2, 6), m (12,): of its spot; after: s from the frame to that instant. An error of
-    the row changes that instant, and so the expectation; and the motion between the two is not known exactly.
+    cov (2, 2): of the detection; speed (2,), px/s, of its spot: an error of the row changes that instant, and so the
+    expectation.
     """
-    speed = _speed(J, m)
     a, b = -speed[0] * row_time, 1.0 - speed[1] * row_time
     uu = cov[0, 0] + 2 * a * cov[0, 1] + a * a * cov[1, 1]
-    both, vv = b * (cov[0, 1] + a * cov[1, 1]), b * b * cov[1, 1]
-    for i in range(6):
-        more = _open_variance(steps, k, i, after)
-        uu, both, vv = uu + more * J[0, i] ** 2, both + more * J[0, i] * J[1, i], vv + more * J[1, i] ** 2
-    return uu, both, vv
+    return uu, b * (cov[0, 1] + a * cov[1, 1]), b * b * cov[1, 1]
 
 
 @compiled
@@ -297,25 +232,36 @@ def _weighted_spot(
     after: float,
     row_time: float,
     ref: Reference,
-    steps: Steps,
     k: int,
     at: Array,
     J: Array,
-    H: Array,
 ) -> tuple[bool, Array, float, float, float]:
-    """Whether view i is projected `after` seconds from frame k, its motion as of `timed_spot`, and a point's weight.
+    """Whether view i is projected `after` seconds from instant k of ref, its speed (2,), px/s, and a point's weight.
 
-    noise, calibration_cov (2, 2), px^2: of the point, and of the view; row_time: of its picture. k: frame of ref and
-    steps. at, J, H receive what `timed_spot` writes. The weight is the upper triangle of the inverse of the covariance,
-    1/px^2.
+    noise, calibration_cov (2, 2), px^2: of the point, and of the view; row_time: of its picture. at (2,), J (2, 6)
+    receive the pixel, without the views' shift, and its Jacobian. The weight is the upper triangle of the inverse of
+    the covariance, 1/px^2.
     """
-    projected, m = timed_spot(views, i, ref.R[k], ref.t[k], ref.m[k], after, at, J, H)
-    if not projected:
-        return False, m, 0.0, 0.0, 0.0
-    uu, both, vv = _covariance(noise, J, m, row_time, steps, k, after)
+    R, t, m = state_after(ref.R[k], ref.t[k], ref.m[k], after)
+    if not project_view(views, i, R, t, at, J):
+        return False, np.zeros(2), 0.0, 0.0, 0.0
+    for a in range(2):
+        at[a] -= views[i]["shift"][a]
+    speed = _speed(J, m)
+    uu, both, vv = _covariance(noise, speed, row_time)
     uu, both, vv = uu + calibration_cov[0, 0], both + calibration_cov[0, 1], vv + calibration_cov[1, 1]
     w0, w1, w2, _ = inverse_2x2(uu, both, vv)
-    return True, m, w0, w1, w2
+    return True, speed, w0, w1, w2
+
+
+OUTLIER_SIGMAS = 6.0  # of a residual, above which a spot pulls no more (Huber 1964): one with a wrong label
+
+
+@compiled
+def _pull(w0: float, w1: float, w2: float, u: float, v: float) -> tuple[float, float]:
+    """How many sigmas a residual u, v, px, of this weight is, and the share of the weight that it has."""
+    far = np.sqrt(w0 * u * u + 2 * w1 * u * v + w2 * v * v)
+    return far, min(1.0, OUTLIER_SIGMAS / max(far, 1e-300))
 
 
 @compiled
@@ -326,34 +272,31 @@ def delayed_information(
     assigned: Ints,
     calibration_cov: Array,
     ref: Reference,
-    steps: Steps,
     start: int,
-) -> tuple[Array, Array, Array, Array]:
-    """Normal matrices (F, 18, 18), vectors (F, 18) and chi-squares (F,) of the labelled spots at a reference motion.
+) -> tuple[Array, Array, Array]:
+    """`spot_information` of spots that were exposed so soon before or after F instants that the velocities are known.
 
-    Also the sums (F,) of the log determinants of their covariances.
-
-    assigned (T, n); ref, steps: F frames from frame `start` on.
+    assigned (T, n); ref: F instants from instant `start` on.
     """
     frames, n = ref.t.shape[0], assigned.shape[1]
-    L, g, chi2 = np.zeros((frames, STATE, STATE)), np.zeros((frames, STATE)), np.zeros(frames)
-    log_det = np.zeros(frames)
-    at, J, H, no_cov = np.empty(2), np.empty((2, 6)), np.empty((2, STATE)), np.zeros((n, 2, 2))
+    L, g, chi2 = np.zeros((frames, 6, 6)), np.zeros((frames, 6)), np.zeros(frames)
+    at, J, no_cov = np.empty(2), np.empty((2, 6)), np.empty((n, 2, 2))
+    no_cov[:] = 0.0
     for k in range(frames):
         use, uv, noise = labelled_points(detections, start + k, assigned[start + k], no_cov)
         for i in range(n):
             if not use[i]:
                 continue
             d = detections.begin[start + k] + assigned[start + k, i]
-            j, after = _on_its_side(steps, k, delays.after_s[d])
             projected, _, w0, w1, w2 = _weighted_spot(
-                views, i, noise[i], calibration_cov[i], after, delays.row_time_s[d], ref, steps, j, at, J, H
+                views, i, noise[i], calibration_cov[i], delays.after_s[d], delays.row_time_s[d], ref, k, at, J
             )
-            if not projected:
-                continue
-            chi2[j] += add_spot(L[j], g[j], H, w0, w1, w2, uv[i, 0] - at[0], uv[i, 1] - at[1])
-            log_det[j] -= np.log(w0 * w2 - w1 * w1)
-    return L, g, chi2, log_det
+            if projected:
+                u, v = uv[i, 0] - at[0], uv[i, 1] - at[1]
+                far, share = _pull(w0, w1, w2, u, v)
+                add_spot(L[k], g[k], J, share * w0, share * w1, share * w2, u, v)
+                chi2[k] += share * far**2 * (2.0 - share)
+    return L, g, chi2
 
 
 @compiled
@@ -364,77 +307,92 @@ def timed_rows(
     assigned: Ints,
     calibration_cov: Array,
     ref: Reference,
-    steps: Steps,
     start: int,
 ) -> tuple[Array, Array, Array, Array, Array]:
     """What `delayed_information` sums up, spot by spot; 0 for views without a label.
 
-    Returns residuals (F, n, 2), px; their weights (F, n, 2, 2); Jacobians (F, n, 2, 18) by the states; the speeds
+    Returns residuals (F, n, 2), px; their weights (F, n, 2, 2); Jacobians (F, n, 2, 6) by the poses; the speeds
     (F, n, 2), px/s, of the spots; and their rows (F, n), px.
     """
     frames, n = ref.t.shape[0], assigned.shape[1]
-    e, W, H = np.zeros((frames, n, 2)), np.zeros((frames, n, 2, 2)), np.zeros((frames, n, 2, STATE))
+    e, W, H = np.zeros((frames, n, 2)), np.zeros((frames, n, 2, 2)), np.zeros((frames, n, 2, 6))
     speed, row = np.zeros((frames, n, 2)), np.zeros((frames, n))
-    at, J, one, no_cov = np.empty(2), np.empty((2, 6)), np.empty((2, STATE)), np.zeros((n, 2, 2))
+    at, J, no_cov = np.empty(2), np.empty((2, 6)), np.zeros((n, 2, 2))
     for k in range(frames):
         use, uv, noise = labelled_points(detections, start + k, assigned[start + k], no_cov)
         for i in range(n):
             if not use[i]:
                 continue
             d = detections.begin[start + k] + assigned[start + k, i]
-            projected, m, w0, w1, w2 = _weighted_spot(
-                views,
-                i,
-                noise[i],
-                calibration_cov[i],
-                delays.after_s[d],
-                delays.row_time_s[d],
-                ref,
-                steps,
-                k,
-                at,
-                J,
-                one,
+            projected, moving, w0, w1, w2 = _weighted_spot(
+                views, i, noise[i], calibration_cov[i], delays.after_s[d], delays.row_time_s[d], ref, k, at, J
             )
             if not projected:
                 continue
-            W[k, i, 0, 0], W[k, i, 0, 1], W[k, i, 1, 0], W[k, i, 1, 1] = w0, w1, w1, w2
-            moving = _speed(J, m)
             row[k, i] = uv[i, 1]
             for a in range(2):
                 e[k, i, a], speed[k, i, a] = uv[i, a] - at[a], moving[a]
-                for j in range(STATE):
-                    H[k, i, a, j] = one[a, j]
+                for j in range(6):
+                    H[k, i, a, j] = J[a, j]
+            _, share = _pull(w0, w1, w2, e[k, i, 0], e[k, i, 1])
+            W[k, i, 0, 0], W[k, i, 0, 1], W[k, i, 1, 0], W[k, i, 1, 1] = share * w0, share * w1, share * w1, share * w2
     return e, W, H, speed, row
+
+
+class Between(NamedTuple):
+    """The motion at F instants, those of T frames and between them."""
+
+    t_s: Array  # (F,)
+    of_frame: Ints  # (T,) which of them are those of the frames
+    ref: Reference  # F instants
+    motion_P: Array  # (F, 6, 6) of the velocities
+    jerk: Array  # (F, 6) spectral densities of the white jerk
+    jump: Array  # (F, 2) variances of the velocities' jump in the step before, and when it is ...
+    moment: Array  # (F, 2) ... as in RunInformation
+
+
+@compiled_in_caller
+def _open_variance(between: Between, own: int, other: int, after: float, axis: int) -> float:
+    """Variance of an axis of the pose `after` seconds from instant `own`, near instant `other`, relative to that pose.
+
+    By what the steps between them leave open: the jerk, and when the velocities jump.
+    """
+    s = abs(after)
+    out = between.jerk[own, axis] * s**5 / 20
+    for step in range(min(own, other) + 1, max(own, other) + 1):
+        later, spread = between.moment[step]
+        if later < 0.0:
+            spread = between.t_s[step] - between.t_s[step - 1]
+        out += between.jump[step, axis // 3] * spread**2
+    return out
 
 
 @compiled
 def moved_detections(
-    views: Views,
-    camera: Ints,
-    detections: RunDetections,
-    delays: Delays,
-    assigned: Ints,
-    ref: Reference,
-    velocity_P: Array,
-    steps: Steps,
+    views: Views, camera: Ints, detections: RunDetections, delays: Delays, assigned: Ints, between: Between
 ) -> tuple[Array, Array]:
     """The detections where they would have been at the instants of their frames: (m, 2), px, and covariances (m, 2, 2).
 
-    Each moves as its spot does in a reference motion of T frames, one without a label (T, n) as the spot nearest to it.
-    camera (n,): of each view; velocity_P (T, 6, 6): covariances of the velocities; steps: T frames.
+    Each moves as its spot does in a motion, one without a label (T, n) as the spot nearest to it. camera (n,): of each
+    view.
     """
     uv, cov = detections.uv.copy(), detections.cov.copy()
     here, there, J = np.empty(2), np.empty(2), np.empty((2, 6))
     cameras, n = detections.has_image.shape[1], assigned.shape[1]
-    for k in range(ref.t.shape[0]):
+    t_s, ref = between.t_s, between.ref
+    for k in range(len(between.of_frame)):
+        own = between.of_frame[k]
         for c in range(cameras):
             if delays.clocks[k, c, 0] == 0.0 and delays.clocks[k, c, 1] == 0.0:
                 continue
             for row in range(detections.first[k, c], detections.first[k, c + 1]):
                 d = detections.begin[k] + row
-                own, after = _on_its_side(steps, k, delays.after_s[d])
-                R, t, m = state_after(ref.R[own], ref.t[own], ref.m[own], after)
+                after, near = delays.after_s[d], own
+                at_s = t_s[own] + after
+                step = 1 if after > 0.0 else -1
+                while 0 <= near + step < len(t_s) and abs(t_s[near + step] - at_s) < abs(t_s[near] - at_s):
+                    near += step
+                R, t, m = state_after(ref.R[near], ref.t[near], ref.m[near], at_s - t_s[near])
                 view, nearest = -1, np.inf
                 for i in range(n):
                     if camera[i] != c or not project_view(views, i, R, t, there, J):
@@ -444,17 +402,19 @@ def moved_detections(
                         gap = -1.0
                     if gap < nearest:
                         view, nearest = i, gap
-                if view < 0 or not project_view(views, view, ref.R[k], ref.t[k], here, J):
+                if view < 0 or not project_view(views, view, ref.R[own], ref.t[own], here, J):
                     continue
                 project_view(views, view, R, t, there, J)
-                uu, both, vv = _covariance(detections.cov[d], J, m, delays.row_time_s[d], steps, own, after)
+                uu, both, vv = _covariance(detections.cov[d], _speed(J, m), delays.row_time_s[d])
                 cov[d, 0, 0], cov[d, 0, 1], cov[d, 1, 0], cov[d, 1, 1] = uu, both, both, vv
                 for a in range(2):
                     uv[d, a] += here[a] - there[a]
                     for b in range(2):
                         for i in range(6):
+                            cov[d, a, b] += _open_variance(between, own, near, after, i) * J[a, i] * J[b, i]
                             for j in range(6):
-                                cov[d, a, b] += delays.after_s[d] ** 2 * J[a, i] * velocity_P[own, i, j] * J[b, j]
+                                P = 0.5 * (between.motion_P[own, i, j] + between.motion_P[near, i, j])
+                                cov[d, a, b] += after**2 * J[a, i] * P * J[b, j]
     return uv, cov
 
 
@@ -482,6 +442,7 @@ class UnknownClocks:
     sigma_s: Array  # (p,)
     camera_of: Ints  # (n,) of the views
     middle_row: Array  # (n,) of the pictures
+    unsettled: bool  # no number is solved for
     calibration: RigUncertainty | None = None
 
     def columns(self, speed: Array, row: Array) -> Array:
@@ -502,23 +463,41 @@ class ClockSolution:
     motion: Array  # (T, 12, p) change of pose and velocities by the numbers
 
 
+class Turn(NamedTuple):
+    """A change of the velocities (turns.py)."""
+
+    middle_s: float
+    likely_s: float  # the most likely length
+    length_s: float  # that the spots allow
+    size: Array  # (2,) its variances, (m/s)^2 and (rad/s)^2
+    settled: bool = False  # a search has not changed it
+
+    @property
+    def begin_s(self) -> float:
+        """When it begins."""
+        return self.middle_s - 0.5 * self.length_s
+
+    @property
+    def end_s(self) -> float:
+        """When it ends."""
+        return self.middle_s + 0.5 * self.length_s
+
+
 @dataclass(frozen=True, slots=True)
 class SmoothedMotion:
     """The estimate, T frames."""
 
     ref: Reference
     log_density: Array | None  # (T, 6) logarithms of the jerk's spectral densities; None: not estimated yet
-    interpolation_offset: float  # to be added to them for the interpolation between frames ...
-    smoother: Bools  # (T,) ... about these
+    interpolation_offset: float  # to be added to them for the interpolation between frames
     jumped: Bools  # (T,) the velocities jumped in the step before
-    jump_scale: Array  # (T, 2) of the variances of these jumps, as in `jump_variances` ...
-    moment: Array  # (T, 2) ... and when they are, as in RunInformation
-    excluded: Bools  # (T,) the velocities did not jump in the step before, although it was not observed
     pose_P: Array  # (T, 6, 6)
     motion_P: Array  # (T, 6, 6) of the velocities
     known: Bools  # (T,) the pose is not lost
     weight: Array  # (T,) of the information of each frame's spots in the motion; 0: not used
     clocks: ClockSolution | None = None
+    turns: tuple[Turn, ...] = ()  # of a run whose cameras have clocks of their own, ...
+    between: Between | None = None  # ... and its motion at the instants of its spots
 
     @staticmethod
     def begin(ref: Reference, jumped: Bools, log_density: Array | None) -> SmoothedMotion:
@@ -526,10 +505,7 @@ class SmoothedMotion:
         frames = len(ref.t)
         zero = np.zeros((frames, 6, 6))
         known = np.zeros(frames, dtype=bool)
-        scale, moment = np.ones((frames, 2)), unknown_moments(frames)
-        return SmoothedMotion(
-            ref, log_density, 0.0, ~known, jumped, scale, moment, known.copy(), zero, zero, known, np.zeros(frames)
-        )
+        return SmoothedMotion(ref, log_density, 0.0, jumped, zero, zero, known, np.zeros(frames))
 
     def without_covariances(self) -> SmoothedMotion:
         """What the next estimate starts from: less memory."""

@@ -18,6 +18,7 @@ from geometry.pose import Pose
 from lab.files.run.results import read_poses
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
+from tracking.smoothing.motion.clocks import DETERMINED
 from tracking.smoothing.smoother import _Smoother
 
 FRAMES, SEED = 40, 3
@@ -241,3 +242,41 @@ def test_a_turn_in_a_gap_in_which_nothing_is_seen_is_covered(gap, tmp_path):
     own = figures(replace(r, hidden=hidden), tmp_path)
     assert np.isfinite(own.attitude_deg[gap]).sum() <= 2
     assert np.nanmax(own.nees) < 8
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_search")
+@pytest.mark.parametrize(
+    ("seed", "frames"),
+    [
+        pytest.param(6000, 300, id="gaps with spots of one camera, of which one has two corners"),
+        pytest.param(6007, 300, id="smooth turns of two frames, which resemble two corners"),
+        pytest.param(6015, 300, id="corners side by side that a stronger jerk would explain"),
+        pytest.param(6015, 200, id="the same with more noise: corners much smaller than the fastest motion"),
+        pytest.param(9304, 220, id="slow corners, which few frames do not show"),
+        pytest.param(7111, 120, id="a corner before the first frame that has a pose"),
+    ],
+)
+def test_no_pose_beside_a_turn_is_wrong_by_more_than_it_states(seed, frames, tmp_path):
+    own = figures(random_recording(seed, frames=frames), tmp_path)
+    assert np.isfinite(own.nees).sum() > 0.25 * frames
+    assert np.nanmean(own.nees) < 1.5
+    assert np.nanmax(own.nees) < 8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seed", "frames", "known"),
+    [
+        pytest.param(7103, 60, 0, id="a turntable that turns four times: the steps of the clocks do not end"),
+        pytest.param(7111, 120, 0, id="a strong jerk in gaps, and spots of one camera: a motion that is not finite"),
+        pytest.param(7141, 120, 0, id="an offset that stays open by a frame, of swings that last for twelve"),
+        pytest.param(7127, 120, 1, id="a turntable, whose turns alone show the clock"),
+    ],
+)
+def test_clocks_are_estimated_with_turns_that_depend_on_them(seed, frames, known, tmp_path):
+    own = figures(random_recording(seed, frames=frames), tmp_path, estimate=True)
+    assert own.wrong_poses == 0
+    found = [(error, sigma) for error, sigma, prior in own.clocks if sigma < DETERMINED * prior]
+    assert len(found) >= known
+    assert all(abs(error) < 3 * sigma for error, sigma in found)
