@@ -44,9 +44,10 @@ _ROUNDS = 6  # of the fit, whose weights and whose place change
 _NEAR_PX, _ON_PX = 0.03, 0.005  # a movement that is not undone but corrected; one that is no movement
 _OUTLIER = 3.0  # sigmas: what a landmark leaves counts in full up to this, and not at all beyond twice of it
 _LARGEST_MISFIT = 1.6  # sigma of what the landmarks leave over their noise; above it something else has changed
+_UNDETERMINED = 1e12  # condition of the fit: of long focal lengths, where a rotation is nearly a shift, up to 1e9
 _MOSTLY, _STILL_SHARE = 0.85, 0.5  # of the pictures, in which a landmark stands still; least share of those that do
 _LEAST_PX = 0.01  # movements with a smaller root mean square are none: few spots are better than that
-_CLEAR = 1.5  # times its error, which is stated for landmarks that share their noise: a movement is corrected
+_CLEAR = 0.75  # times its error, which is 3.5 times that of landmarks with noise of their own: a movement is corrected
 _BEFORE = 3  # pixels before a place in the filter of 8 pixels that moves a picture
 _CHANGE_PX = 0.01  # for the derivatives of that filter
 _SIDE = 32  # px of a row that are moved by the same
@@ -245,7 +246,7 @@ class CameraMotion:
             weights = np.clip(2 - left / (_OUTLIER * max(spread, 1.0)), 0.0, 1.0)
             weighted = design * weights[:, None]
             normal = weighted.T @ design
-            if np.linalg.cond(normal) > 1 / np.finfo(np.float32).eps:
+            if np.linalg.cond(normal) > _UNDETERMINED:
                 return None
             inverse = np.linalg.inv(normal)
             left, before = np.abs(off - design @ (solution := inverse @ (weighted.T @ off))), spread
