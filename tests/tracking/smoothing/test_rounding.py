@@ -99,7 +99,7 @@ def ratios(P: Array, true: Array) -> Array:
 def test_covariances_are_those_of_extended_precision(seed):
     """Jerks of 1e-3 to 1e9, steps of 1e-6 to 1 s, information of 1e-2 to 1e12."""
     still, info, jerk, rows, _ = extreme(seed, NEAR)
-    out, true = smoothed(still, info, jerk), least_squares(info, jerk, rows)
+    out, true = smoothed(still, info, jerk, True), least_squares(info, jerk, rows)
     for k in range(FRAMES):
         for P, block in ((out.pose_P[k], true[k, :6, :6]), (out.motion_P[k], true[k, 6:12, 6:12])):
             np.testing.assert_allclose(ratios(P, block), 1.0, atol=0.05)
@@ -109,7 +109,7 @@ def test_covariances_are_those_of_extended_precision(seed):
 def test_all_is_finite_symmetric_and_positive_definite(near):
     for seed in range(100):
         still, info, jerk, *_ = extreme(1000 + seed, near)
-        out = smoothed(still, info, jerk)
+        out = smoothed(still, info, jerk, True)
         assert all(np.isfinite(part).all() for part in out)
         assert np.isfinite(log_likelihood(still, info, jerk))
         assert all(np.isfinite(part).all() for part in filtered(still, info, jerk))
@@ -129,4 +129,4 @@ def test_a_precise_spot_of_a_pose_that_is_kilometres_away_leaves_it_finite():
         assert np.isfinite(again).all()
         assert np.isfinite(log_det)
         # No pivot of a root is larger than the row that it belongs to.
-        assert np.all(np.abs(cholesky(P)).max(axis=1) <= 1.01 * np.sqrt(np.diagonal(P)))
+        assert np.all(np.abs(cholesky(P, 0.0)).max(axis=1) <= 1.01 * np.sqrt(np.diagonal(P)))

@@ -196,7 +196,9 @@ def test_a_turn_adds_the_same_however_the_time_is_divided(middle, length):
 def test_a_turn_of_a_whole_step_is_a_jump_at_an_unknown_moment():
     jump, moment = velocity_jumps([Turn(0.015, 0.01, 0.01, SIZE)], np.array([0.0, 0.01, 0.02]))
     assert jump[2] == pytest.approx(SIZE)
-    np.testing.assert_allclose(process_noise(0.01, 0.0, 1.0, 0.0, *moment[2]), process_noise(0.01, 0.0, 1.0, 0.0))
+    np.testing.assert_allclose(
+        process_noise(0.01, 0.0, 1.0, 0.0, *moment[2]), process_noise(0.01, 0.0, 1.0, 0.0, -1.0, 0.0)
+    )
 
 
 def test_the_noise_of_a_jump_at_a_known_moment_is_that_of_drawn_jumps():
