@@ -19,6 +19,7 @@ _CUT = 0.25  # share of the lowest and of the highest grey values of a pixel tha
 _SAMPLE, _ROUNDS, _OUTLIER = 10, 4, 4.0  # every such row; fits of a line, without what is farther than so many medians
 _LEAST_RANGE = 8.0  # DN, of most of the grey values: fewer do not show how the light changes
 LEAST_CHANGE = 0.03  # the light has not changed by more than this share: the structure is not scaled
+LEAST_LIGHT, MOST_LIGHT = 0.2, 5.0  # changes of the light beyond which a picture is searched without subtraction
 GAIN_BITS = 8  # binary places of a factor on the difference
 _SMOOTH_BLOCKS = 6.0  # blocks: sigma of the smooth part of the background, which is no structure
 
@@ -60,10 +61,13 @@ def in_equal_light(pictures: Sequence[Picture]) -> Sequence[NDArray[Any]]:
     usual = np.median(seen, axis=0)
     if float(np.ptp(np.quantile(usual, [0.1, 0.9]))) < _LEAST_RANGE:
         return pictures
-    lines = np.array([_line(usual, values) for values in seen])
-    if np.abs(lines[:, 0] - 1).max() < LEAST_CHANGE:
+    lines = [_line(usual, values) for values in seen]
+    if all(abs(light - 1) < LEAST_CHANGE or not LEAST_LIGHT < light < MOST_LIGHT for light, _ in lines):
         return pictures
-    return [(p - np.float32(level)) / np.float32(light) for p, (light, level) in zip(pictures, lines, strict=True)]
+    return [
+        (p - np.float32(level)) / np.float32(light) if LEAST_LIGHT < light < MOST_LIGHT else p
+        for p, (light, level) in zip(pictures, lines, strict=True)
+    ]
 
 
 def _line(usual: NDArray[np.float32], values: NDArray[np.float32]) -> tuple[float, float]:

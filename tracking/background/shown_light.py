@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools
-from tracking.background.mean_pictures import LEAST_CHANGE
+from tracking.background.mean_pictures import LEAST_CHANGE, LEAST_LIGHT, MOST_LIGHT
 from tracking.background.places import AROUND_SPOT
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
@@ -22,7 +22,6 @@ _AROUND = (11, 11)  # of these pixels: 100 px: a part of the picture that shows 
 _CLEAR_SIGMAS = 4.0  # of the measured light
 _EFFICIENCY = 2.0  # sigma of the median over places, of those that show most structure, over that of one fit
 _MOST_LEFT = 2.5  # sigmas: more counts as much, since somebody in front of the screen is in many pixels
-_LEAST_LIGHT, _MOST_LIGHT = 0.2, 5.0  # changes of the light beyond which a picture is searched without subtraction
 _BY_CHANCE = 4.0  # sigmas of the sum of squares, of few pixels between lights at rest
 _LARGEST_MISFIT = 1.3  # sigma of what is left over that of the noise; above it the camera or the light has moved
 
@@ -72,7 +71,7 @@ class ShownLight:
         of_noise = float(np.mean(noise.variance(smooth[where]))) / count
         in_mean = of_noise / max(float(np.mean(seen[where] ** 2)), 1e-12)
         reference = float(np.median(lights)) - in_mean
-        return replace(first, reference=reference if reference > _LEAST_LIGHT else 0.0, in_mean=in_mean)
+        return replace(first, reference=reference if reference > LEAST_LIGHT else 0.0, in_mean=in_mean)
 
     def in_picture(self, picture: Picture) -> Shown | None:
         """How much of the structure a picture shows, relative to the background, and what it leaves.
@@ -89,7 +88,7 @@ class ShownLight:
         # Whether a picture is one of those in the mean is not known here: both of its lights are usual.
         if not self.reference or -usual < light - 1 < usual + self.in_mean / self.reference:
             light = 1.0
-        if not _LEAST_LIGHT < light < _MOST_LIGHT:
+        if not LEAST_LIGHT < light < MOST_LIGHT:
             return None
         left = above - np.float32(light) * structure
         left /= np.sqrt(variance * np.float32(1 + light**2 * self.noise_share))
