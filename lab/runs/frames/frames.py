@@ -57,7 +57,7 @@ class _MissingFrames:
     first: list[int] = field(default_factory=list)  # the first NAMED of them
 
 
-_COMPARED = 4  # every such row of two pictures is compared
+_COMPARED = 16  # every such row of two pictures is compared
 _CHANGED = 0.01  # share of the pixels that change from picture to picture by noise: by spots that move fewer do
 
 
