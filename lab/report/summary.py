@@ -128,7 +128,7 @@ def findings_in(value: object) -> tuple[Finding, ...]:
     levels = {**Level.__members__, **{level.word: level for level in Level}}
     texts = ("what", "why", "remedy", "code")
     return tuple(
-        Finding(levels.get(str(f.get("level")), Level.WARN), **{name: str(f.get(name) or "") for name in texts})  # type: ignore[arg-type]
+        Finding(levels.get(str(f.get("level")), Level.WARN), **{name: str(f.get(name) or "") for name in texts})  # type: ignore[arg-type]  # the names are those of its texts
         for f in mappings(value)
     )
 

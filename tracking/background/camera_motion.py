@@ -51,9 +51,7 @@ _CLEAR = 0.75  # times its error, which is 3.5 times that of landmarks with nois
 _BEFORE = 3  # pixels before a place in the filter of 8 pixels that moves a picture
 _CHANGE_PX = 0.01  # for the derivatives of that filter
 _SIDE = 32  # px of a row that are moved by the same
-
-
-_FREE = 5  # a rotation and a shift
+_FREE = 5  # unknowns of a motion: a rotation and a shift
 
 
 class Turn(NamedTuple):
@@ -126,23 +124,23 @@ class CameraMotion:
 
         clips, DN: of the sensor. None: the picture does not show how the camera has turned.
         """
-        if picture.shape[::-1] != self.camera.image_size_px:
-            return None, None
-        for start in (np.zeros(_FREE), None):
-            found = self._found(picture, self._nearest(picture) if start is None else start, clips)
-            if found is not None:
-                return in_whole_dn(found[0], picture), found[1]
-        return None, None
+        found = self._turned(picture, clips)
+        return (None, None) if found is None else (in_whole_dn(found[0], picture), found[1])
 
-    def _found(self, picture: Picture, motion: Array, clips: float) -> tuple[NDArray[np.float32], Turn] | None:
-        """As `stilled`, not rounded, from a first estimate of the motion."""
+    def _turned(self, picture: Picture, clips: float) -> tuple[NDArray[Any], Turn] | None:
+        """As `stilled`, not rounded."""
+        if picture.shape[::-1] != self.camera.image_size_px:
+            return None
+        return self._found(picture, np.zeros(_FREE), clips) or self._found(picture, self._nearest(picture), clips)
+
+    def _found(self, picture: Picture, motion: Array, clips: float) -> tuple[NDArray[Any], Turn] | None:
+        """As `_turned`, from a first estimate of the motion."""
         for k in range(_ROUNDS):
             if np.abs(self._middle @ motion).max() > _FARTHEST_PX:
                 break
             movement = self._movement(motion)
-            moved = moved_by(picture, movement, clips) if motion.any() else picture.astype(np.float32)
-            undone = movement[:, 0] + self.pixels @ movement[:, 1:].T
-            found = self._fitted(moved, self.moved @ motion - undone)
+            moved: NDArray[Any] = moved_by(picture, movement, clips) if motion.any() else picture
+            found = self._fitted(moved, self.moved @ motion - _undone(movement, self.pixels))
             if found is None:
                 break
             left = found.motion - self.mean_motion
@@ -159,8 +157,7 @@ class CameraMotion:
         if turn is None:
             return replace(found, cov_px2=found.cov_px2 + self.rms_px**2 * np.eye(2))
         moved = _movements(self.camera, found.uv_px)
-        undone = turn.movement[:, 0] + found.uv_px @ turn.movement[:, 1:].T
-        uv = found.uv_px + undone - moved @ (turn.motion - self.offset)
+        uv = found.uv_px + _undone(turn.movement, found.uv_px) - moved @ (turn.motion - self.offset)
         return replace(found, uv_px=uv, cov_px2=found.cov_px2 + moved @ turn.covariance @ moved.transpose(0, 2, 1))
 
     @property
@@ -194,7 +191,7 @@ class CameraMotion:
         """The pictures that show their turns, and these; None: the landmarks are too few, or most pictures do not."""
         if self._tiles < _LEAST_TILES:
             return None
-        known = [(p, turn) for p in pictures if (turn := self.stilled(p, clips)[1]) is not None]
+        known = [(p, found[1]) for p in pictures if (found := self._turned(p, clips)) is not None]
         return known if len(known) > len(pictures) // 2 else None
 
     def _about_mean(self, turns: Sequence[Turn]) -> CameraMotion | None:
@@ -215,7 +212,7 @@ class CameraMotion:
         left = [np.mean(np.minimum(np.abs(some._seen(picture, s) - some.values) / some.sigma, _LIKE)) for s in shifts]
         return np.append(np.zeros(3), shifts[int(np.argmin(left))])
 
-    def _seen(self, picture: Picture | NDArray[np.float32], shift: Ints) -> Array:
+    def _seen(self, picture: NDArray[Any], shift: Ints) -> Array:
         """(k,), DN: what is in a picture at the landmarks, moved by whole px."""
         width = picture.shape[1]
         first = (self.pixels[:, 1] + shift[1]) * width + self.pixels[:, 0] + shift[0]
@@ -226,12 +223,12 @@ class CameraMotion:
         columns = -np.einsum("ki,kij->kj", self.slopes, self.moved)
         return np.column_stack([columns, self.values, np.ones(len(self.values))]) / self.sigma[:, None]
 
-    def _off(self, picture: NDArray[np.float32], known_px: Array | float = 0.0) -> Array:
+    def _off(self, picture: NDArray[Any], known_px: Array | float = 0.0) -> Array:
         """(k,), sigmas: differences of a picture from the landmarks after a known movement (k, 2), px, of each."""
         expected = self.values - np.sum(self.slopes * known_px, axis=1)
         return np.asarray((self._seen(picture, np.zeros(2, int)) - expected) / self.sigma)
 
-    def _fitted(self, picture: NDArray[np.float32], known_px: Array | float) -> _Fit | None:
+    def _fitted(self, picture: NDArray[Any], known_px: Array | float) -> _Fit | None:
         """By a robust fit what has changed beside a known movement (k, 2), px; None: it is not determined."""
         design, off = self._design(), self._off(picture, known_px)
         scale = np.linalg.norm(design, axis=0)
@@ -270,7 +267,7 @@ def moved_by(picture: Picture, movement: Array, clips: float) -> NDArray[np.floa
     return moved
 
 
-def in_whole_dn(moved: NDArray[np.float32], picture: Picture) -> Picture:
+def in_whole_dn(moved: NDArray[Any], picture: Picture) -> Picture:
     """Grey values (h, w) in the type of a picture.
 
     With a random part before they are rounded: a small movement changes whole numbers by less than half, and rounding
@@ -347,6 +344,11 @@ _WEIGHTS /= _WEIGHTS.sum()
 def _filtered(picture: NDArray[Any], along: Array, across: Array) -> NDArray[np.float32]:
     """A picture (h, w) with weights as `_weights` along u and v."""
     return np.asarray(cv2.sepFilter2D(picture, cv2.CV_32F, along, across, anchor=(_BEFORE, _BEFORE)), np.float32)
+
+
+def _undone(movement: Array, pixels: Array | Ints) -> Array:
+    """(n, 2), px: by how much `moved_by` moves what pixels (n, 2) show."""
+    return np.asarray(movement[:, 0] + pixels @ movement[:, 1:].T)
 
 
 def _movements(camera: Camera, pixels: Array | Ints) -> Array:
