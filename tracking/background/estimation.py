@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Array
+from geometry.arrays import Array, Bools
 from tracking.background.behind_lights import LARGEST_PATH_PX, BehindLights, Exposures, passing_lights
 from tracking.background.mean_pictures import MOST_BYTES, in_equal_light, means_of, smooth_part, usable
 from tracking.background.places import AROUND_LIGHT, AROUND_SPOT, ON_LIGHT, SAME_LIGHT, near_each, places_of
@@ -29,6 +29,7 @@ _MANY_LIGHTS = 4  # at rest, from which the subtraction is used in any case: it 
 _LEAST_FOUND = 0.2  # further or better spots per picture from which the subtraction is used
 _ALWAYS = 0.9  # share of the pictures in which another light passes over one at rest, above which that is part of it
 _WIDER = 2.0  # widths of the lights that move, at most, of what the places of one of them have in common
+_ODD = 0.2  # share of the peak that the fit of an object leaves; lights on strong edges leave up to 0.15
 MOSTLY = 0.7  # share of the pictures with lights that move, above which those at rest in all of them are no spots
 # Contrast up to which the structure is that of the screen's surface, and modulates the spots' light in full. Of what is
 # more, prints or objects, the spots show a part: 0.25 to 0.57 where photographs modulate their light by up to 60 %.
@@ -58,20 +59,28 @@ def static_background(
     some = usable(pictures)
     if len(some) < _LEAST_PICTURES:
         return None
-    lower, mean = means_of(in_equal_light(some))
-    background = StaticBackground.of_mean(lower, some, model, parameters).with_light(some)
-    shown = [(p, fit[0]) for p in some if (fit := background.shown.in_picture(p)) is not None]
+    equal = in_equal_light(some)
+    shown: list[tuple[Picture, float]] = []
+    dark = False
+    for passed in (False, True):
+        means = means_of(equal, passed)
+        first = StaticBackground.of_mean(means[0], some, model, parameters).with_light(equal)
+        fitting = [(p, fit[0]) for p in some if (fit := first.shown.in_picture(p)) is not None]
+        if len(fitting) > len(shown):
+            (lower, mean), background, shown, dark = means, first, fitting, passed
+        if len(shown) == len(some):
+            break
     some, lights = [p for p, _ in shown], [light for _, light in shown]
     if len(some) < _LEAST_PICTURES:
         return None
-    equal: Sequence[NDArray[Any]] = some
+    equal = some
     if set(lights) != {1.0}:
         if 4 * some[0].size * len(some) > MOST_BYTES:
             return None
         smooth = lower - background.structure
         equal = [smooth + (p - smooth_part(p.astype(np.float32))) / light for p, light in shown]
-        lower, mean = means_of(equal)
-        background = StaticBackground.of_mean(lower, some, model, parameters).with_light(some)
+        lower, mean = means_of(equal, dark)
+        background = StaticBackground.of_mean(lower, some, model, parameters).with_light(equal)
     tried = some[::TRIED]
     few = len(background.lights.found) < _MANY_LIGHTS and not in_any_case
     moving = few and any(len(background.spots_in(p, parameters, shift)) for p in tried)
@@ -97,6 +106,7 @@ def _without_slow_lights(
         background.spots_in(p, background.parameters, shift, inverted=True, fit=fit)
         for p, fit in zip(pictures, fits, strict=True)
     ]
+    found, holes = _without_objects(found, holes, float(background.noise.variance(background.usual_dn())))
     slow = SlowLights.of(equal, found, holes)
     mean[slow.row, slow.column] = slow.means()
     better = background.with_mean(slow.row, slow.column, mean[slow.row, slow.column])
@@ -121,10 +131,28 @@ def _without_slow_lights(
         better = StaticBackground.of_mean(mean, pictures, background.noise, background.parameters)
     better.shares[known.row, known.column] = 1 / known.count
     better.shares[behind.row, behind.column] = behind.share
-    better = better.with_light(pictures)
+    better = better.with_light(equal)
     if behind.modulation is not None:
         better = better.with_modulation(behind.modulation, (behind.row, behind.column), behind.response)
     return _with_shifts(better, mean, pictures, moved, others_move, shift, behind)
+
+
+def _without_objects(
+    found: list[Detections], holes: list[Detections], variance: float
+) -> tuple[list[Detections], list[Detections]]:
+    """Points without those that are wider than the lights and no Gaussians: parts of somebody who walks past.
+
+    variance: of a pixel, DN^2.
+    """
+
+    def odd(points: Detections) -> Bools:
+        left2 = np.zeros(len(points)) if points.chi2 is None else points.chi2 * variance
+        return np.asarray(left2 > (_ODD * points.peak) ** 2)
+
+    widths = np.concatenate([d.major_px[~odd(d)] for d in found])
+    widest = _WIDER * float(np.median(widths)) if len(widths) else 0.0
+    both = [[d[np.asarray(~odd(d) | (d.major_px < widest))] for d in points] for points in (found, holes)]
+    return both[0], both[1]
 
 
 def _with_shifts(

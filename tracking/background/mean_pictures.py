@@ -33,10 +33,11 @@ def usable(pictures: Sequence[Picture]) -> list[Picture]:
     return [pictures[i] for i in evenly_spread(np.arange(len(pictures)), MOST_BYTES // pictures[0].nbytes)]
 
 
-def means_of(pictures: Sequence[NDArray[Any]]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def means_of(pictures: Sequence[NDArray[Any]], passed: bool = False) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The means (h, w) of the lower half of each pixel's grey values, without the lowest, and of the middle half.
 
-    The lower half does not contain lights that were elsewhere in half of the pictures; its noise is larger.
+    The lower half does not contain lights that were elsewhere in half of the pictures; its noise is larger. passed:
+    something darker was in front of each pixel in some pictures, a person: as much is left out of the lower half.
     """
     lower, middle = np.empty((2, *pictures[0].shape), np.float32)
     count = len(pictures)
@@ -44,7 +45,7 @@ def means_of(pictures: Sequence[NDArray[Any]]) -> tuple[NDArray[np.float32], NDA
     for top in range(0, len(lower), STRIP):
         part = np.s_[top : top + STRIP]
         values = _in_order([p[part].copy() for p in pictures])
-        lower[part] = _mean(values[1 : count // 2])
+        lower[part] = _mean(values[cut if passed else 1 : count // 2])
         middle[part] = _mean(values[cut : count - cut])
     return lower, middle
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -46,10 +48,20 @@ def turned(camera: Camera, by_rad: np.ndarray) -> Camera:
     return replace(camera, camera_from_world=Pose(R @ pose.rotation, R @ pose.translation))
 
 
-def recording(folder: Path, shake_px: float, flicker: float = 0.0) -> tuple[Path, Path]:
+def person(picture: np.ndarray, frame: int) -> np.ndarray:
+    """Somebody in dark clothes who walks past the camera during the recording, and hides a sixth of it."""
+    v, u = np.mgrid[: SIZE[0], : SIZE[1]]
+    away = (u - SIZE[1] * (1.4 * frame / FRAMES - 0.2)) / 48, (v - 300) / 260
+    hides = cv2.GaussianBlur((np.hypot(*away) < 1).astype(float), (0, 0), 2.0)
+    return picture * (1 - hides) + hides * (12 + 5 * np.sin(u / 17 + v / 23))
+
+
+def recording(
+    folder: Path, shake_px: float = 0.0, light: Callable[[int], Any] = lambda frame: 1.0, walks: bool = False
+) -> tuple[Path, Path]:
     """A run folder with pictures of cameras that turn by this root mean square, and its truth beside it.
 
-    flicker: of the room's light, share.
+    light: of the room in a frame, a number or one for each row (h, 1); walks: a person, through all pictures.
     """
     made = CliRunner().invoke(
         main,
@@ -70,11 +82,12 @@ def recording(folder: Path, shake_px: float, flicker: float = 0.0) -> tuple[Path
             origin, rays = now.rays(ends)
             seen = camera.project(origin + 3.0 * rays)[..., ::-1] + MARGIN
             picture = ndimage.map_coordinates(SPLINE, np.moveaxis(seen, -1, 0), order=3, prefilter=False)
-            picture *= 1 + flicker * np.sin(0.7 * frame + 1.0)
+            picture *= light(frame)
             at = spots[(spots.camera == name) & (spots.frame == frame)][["u_px", "v_px"]].dropna().to_numpy()
             start, towards = camera.rays(at)
             for u, v in now.project(start + 3.0 * towards):
                 picture += 90.0 * np.exp(-0.5 * ((ends[..., 0] - u) ** 2 + (ends[..., 1] - v) ** 2) / 1.6**2)
+            picture = person(picture, frame) if walks else picture
             picture = np.clip(np.rint(picture + rng.normal(0.0, 1.0, SIZE)), 0, 255).astype(np.uint8)
             cv2.imwrite(str(folder / "frames" / name / f"{frame:06d}.png"), picture)
     return folder, truth
@@ -110,8 +123,15 @@ def test_a_camera_that_shakes_is_named_and_its_poses_are_as_good_as_their_sigmas
         assert any(note.startswith(f"{camera}: the camera moves by") for note in summary["notes"])
 
 
-def test_spots_are_found_in_front_of_a_room_whose_light_flickers(tmp_path):
-    folder, truth = recording(tmp_path / "run", 0.0, flicker=0.12)
+@pytest.mark.parametrize(
+    "light",
+    [
+        pytest.param(lambda frame: 1 + 0.12 * np.sin(0.7 * frame + 1.0), id="flickers"),
+        pytest.param(lambda frame: 1 - 0.5 * np.clip(frame / 8 - 1, 0, 1), id="falls"),
+    ],
+)
+def test_spots_are_found_in_front_of_a_room_whose_light_changes(tmp_path, light):
+    folder, truth = recording(tmp_path / "run", light=light)
     done = CliRunner().invoke(main, ["run", str(folder), "--out", str(tmp_path / "out")])
     assert done.exit_code == 0, done.output
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
@@ -123,12 +143,24 @@ def test_spots_are_found_in_front_of_a_room_whose_light_flickers(tmp_path):
     assert (spots.status == "matched").mean() > 0.97
 
 
+def test_somebody_who_walks_past_the_cameras_hides_spots_and_causes_no_wrong_pose(tmp_path):
+    folder, truth = recording(tmp_path / "run", walks=True)
+    done = CliRunner().invoke(main, ["run", str(folder), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 0, done.output
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert all(noise["background_pictures"] > 0 for noise in summary["parameters"]["noise"].values())
+    found = nees(tmp_path / "out", truth)
+    assert len(found) > FRAMES / 2
+    assert found.mean() < 2.0
+    assert found.max() < 6.0
+
+
 def test_pictures_that_repeat_the_one_before_have_no_spots(tmp_path):
     """A grabber that has no new picture gives the last one again: its spots are those of another instant.
 
     The cameras stand still, and are not corrected.
     """
-    folder, truth = recording(tmp_path / "run", 0.0)
+    folder, truth = recording(tmp_path / "run")
     again = [9, 14, 15, 20]
     for camera in ("left", "right"):
         for frame in again:
