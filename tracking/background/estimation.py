@@ -61,13 +61,13 @@ def static_background(
         return None
     equal = in_equal_light(some)
     shown: list[tuple[Picture, float]] = []
-    dark = False
+    hidden = False  # something passes in front of the pixels
     for passed in (False, True):
         means = means_of(equal, passed)
         first = StaticBackground.of_mean(means[0], some, model, parameters).with_light(equal)
         fitting = [(p, fit[0]) for p in some if (fit := first.shown.in_picture(p)) is not None]
         if len(fitting) > len(shown):
-            (lower, mean), background, shown, dark = means, first, fitting, passed
+            (lower, mean), background, shown, hidden = means, first, fitting, passed
         if len(shown) == len(some):
             break
     some, lights = [p for p, _ in shown], [light for _, light in shown]
@@ -79,7 +79,7 @@ def static_background(
             return None
         smooth = lower - background.structure
         equal = [smooth + (p - smooth_part(p.astype(np.float32))) / light for p, light in shown]
-        lower, mean = means_of(equal, dark)
+        lower, mean = means_of(equal, hidden)
         background = StaticBackground.of_mean(lower, some, model, parameters).with_light(equal)
     tried = some[::TRIED]
     few = len(background.lights.found) < _MANY_LIGHTS and not in_any_case

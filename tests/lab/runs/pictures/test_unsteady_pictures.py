@@ -49,7 +49,7 @@ def turned(camera: Camera, by_rad: np.ndarray) -> Camera:
 
 
 def person(picture: np.ndarray, frame: int) -> np.ndarray:
-    """Somebody in dark clothes who walks past the camera during the recording, and hides a sixth of it."""
+    """Somebody in black clothes who walks past the camera during the recording, and hides a sixth of it."""
     v, u = np.mgrid[: SIZE[0], : SIZE[1]]
     away = (u - SIZE[1] * (1.4 * frame / FRAMES - 0.2)) / 48, (v - 300) / 260
     hides = cv2.GaussianBlur((np.hypot(*away) < 1).astype(float), (0, 0), 2.0)
