@@ -60,25 +60,25 @@ def static_background(
     if len(some) < _LEAST_PICTURES:
         return None
     equal = in_equal_light(some)
-    shown: list[tuple[Picture, float]] = []
+    shown: list[tuple[Picture, Shown]] = []
     hidden = False  # something passes in front of the pixels
     for passed in (False, True):
         means = means_of(equal, passed)
         first = StaticBackground.of_mean(means[0], some, model, parameters).with_light(equal)
-        fitting = [(p, fit[0]) for p in some if (fit := first.shown.in_picture(p)) is not None]
+        fitting = [(p, fit) for p in some if (fit := first.shown.in_picture(p)) is not None]
         if len(fitting) > len(shown):
             (lower, mean), background, shown, hidden = means, first, fitting, passed
         if len(shown) == len(some):
             break
-    some, lights = [p for p, _ in shown], [light for _, light in shown]
+    some, lights = [p for p, _ in shown], [fit.light for _, fit in shown]
     if len(some) < _LEAST_PICTURES:
         return None
     equal = some
-    if set(lights) != {1.0}:
+    if set(lights) != {1.0} or any(fit.rows is not None for _, fit in shown):
         if 4 * some[0].size * len(some) > MOST_BYTES:
             return None
         smooth = lower - background.structure
-        equal = [smooth + (p - smooth_part(p.astype(np.float32))) / light for p, light in shown]
+        equal = [_in_light(p, fit, smooth) for p, fit in shown]
         lower, mean = means_of(equal, hidden)
         background = StaticBackground.of_mean(lower, some, model, parameters).with_light(equal)
     tried = some[::TRIED]
@@ -87,6 +87,14 @@ def static_background(
     if moving and sum(_better_in(background, p, shift) for p in tried) < max(_LEAST_FOUND * len(tried), 2):
         return None
     return _without_slow_lights(background, mean, some, equal, 1 / np.array(lights), shift, others_move)
+
+
+def _in_light(picture: Picture, fit: Shown, smooth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The picture (h, w) in the light of the background, DN, of which it shows `fit`; smooth: the smooth part."""
+    if fit.rows is None:
+        return smooth + (picture - smooth_part(picture.astype(np.float32))) / fit.light
+    light, level = np.asarray(fit.rows[..., None], np.float32)
+    return smooth + (picture - smooth - level) / light
 
 
 def _without_slow_lights(

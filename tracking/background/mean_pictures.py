@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import evenly_spread
+from geometry.arrays import Array, evenly_spread
 from geometry.compilation.jit import compiled_for_threads
 from tracking.noise import BLOCK, Picture
 
@@ -135,34 +135,37 @@ def in_steps(values: NDArray[np.float32], steps: int) -> NDArray[np.uint16]:
 
 
 def raised_difference(
-    picture: Picture, steps: int, subtracted: NDArray[np.uint16], structure: NDArray[np.float32], more: float,
-    clips: float, top: int, level: int = 0, gain: NDArray[np.uint16] | None = None,
+    picture: Picture, steps: int, subtracted: NDArray[np.uint16], structure: NDArray[np.float32],
+    rows: tuple[Array, Array], clips: float, top: int, level: int = 0, gain: NDArray[np.uint16] | None = None,
 ) -> NDArray[np.uint16]:  # fmt: skip
-    """A picture (h, w) in steps of a fraction of 1 DN, plus `subtracted` and `more` times the structure (h, w).
+    """A picture (h, w) in steps of a fraction of 1 DN, plus `subtracted`, and more in some rows.
 
-    Pixels of at least `clips`, DN, become `top`. gain (h, w): what is above or below `level` is multiplied by it;
-    256 is 1. In one pass: whole pictures in between take most of the time.
+    rows (h,) each: there so much times the structure (h, w), and so many steps. Pixels of at least `clips`, DN, become
+    `top`. gain (h, w): what is above or below `level` is multiplied by it; 256 is 1. In one pass:
+    whole pictures in between take most of the time.
     """
     out = np.empty_like(subtracted)
     most = int(np.iinfo(picture.dtype).max) + 1
     limit = min(int(np.ceil(min(clips, most))), most)
+    more, raised = rows[0].astype(np.float32), np.rint(rows[1]).astype(np.int32)
     if gain is None:
-        _raise(picture, steps, subtracted, structure, np.float32(more), limit, top, out)
+        _raise(picture, steps, subtracted, structure, more, raised, limit, top, out)
     else:
-        _raise_by(picture, steps, subtracted, structure, np.float32(more), limit, top, level, gain, out)
+        _raise_by(picture, steps, subtracted, structure, more, raised, limit, top, level, gain, out)
     return out
 
 
 @compiled_for_threads
 def _raise(
     picture: NDArray[Any], steps: int, subtracted: NDArray[np.uint16], structure: NDArray[np.float32],
-    more: np.float32, clips: int, top: int, out: NDArray[np.uint16],
+    more: NDArray[np.float32], raised: NDArray[np.int32], clips: int, top: int, out: NDArray[np.uint16],
 ) -> None:  # fmt: skip
     many, limit, high = np.int32(steps), np.int32(clips), np.int32(top)
     lowest, most = np.int32(0), np.int32(65535)
     for i in range(out.shape[0]):
         seen, added, to = picture[i], subtracted[i], out[i]
-        if more == np.float32(0.0):
+        factor_of, lift = more[i], raised[i]
+        if factor_of == np.float32(0.0) and lift == 0:
             for j in range(to.shape[0]):
                 x = np.int32(seen[j])
                 y = x * many + np.int32(added[j])
@@ -172,7 +175,7 @@ def _raise(
         own = structure[i]
         for j in range(to.shape[0]):
             x = np.int32(seen[j])
-            z = np.int32(added[j]) + np.int32(more * own[j])
+            z = np.int32(added[j]) + np.int32(factor_of * own[j]) + lift
             z = z if z > lowest else lowest
             y = x * many + (z if z < most else most)
             y = y if y < most else most
@@ -182,13 +185,15 @@ def _raise(
 @compiled_for_threads
 def _raise_by(
     picture: NDArray[Any], steps: int, subtracted: NDArray[np.uint16], structure: NDArray[np.float32],
-    more: np.float32, clips: int, top: int, level: int, gain: NDArray[np.uint16], out: NDArray[np.uint16],
+    more: NDArray[np.float32], raised: NDArray[np.int32], clips: int, top: int, level: int, gain: NDArray[np.uint16],
+    out: NDArray[np.uint16],
 ) -> None:  # fmt: skip
     many, limit, high, base = np.int32(steps), np.int32(clips), np.int32(top), np.int32(level)
     lowest, most, bits = np.int32(0), np.int32(65535), np.int32(GAIN_BITS)
     for i in range(out.shape[0]):
         seen, added, factor, own, to = picture[i], subtracted[i], gain[i], structure[i], out[i]
-        if more == np.float32(0.0):
+        factor_of, lift = more[i], raised[i]
+        if factor_of == np.float32(0.0) and lift == 0:
             for j in range(to.shape[0]):
                 x = np.int32(seen[j])
                 z = x * many + np.int32(added[j]) - base
@@ -199,7 +204,7 @@ def _raise_by(
             continue
         for j in range(to.shape[0]):
             x = np.int32(seen[j])
-            z = x * many + np.int32(added[j]) + np.int32(more * own[j]) - base
+            z = x * many + np.int32(added[j]) + np.int32(factor_of * own[j]) + lift - base
             y = base + ((z * np.int32(factor[j])) >> bits)
             y = y if y > lowest else lowest
             y = y if y < most else most

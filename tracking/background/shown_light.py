@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -25,10 +25,23 @@ _MOST_LEFT = 2.5  # sigmas: more counts as much, since somebody in front of the 
 _BY_CHANCE = 4.0  # sigmas of the sum of squares, of few pixels between lights at rest
 _LARGEST_MISFIT = 1.3  # sigma of what is left over that of the noise; above it the camera or the light has moved
 
+# Light that differs from row to row: sigma of its smoothing, in rows of the sample; its usual size; residuals beyond so
+# many sigmas count as much; fits.
+_ROWS, _USUAL_BAND, _LARGEST_LEFT, _FITS = 2.0, 0.2, 2.0, 3
+_BAND_SIGMAS = 6.0  # of the light of a row that differs: there are up to 100 of them in a picture
+
 _SOME = (slice(None, None, 2), slice(None, None, 2))  # of the sample, for medians over the whole picture
-_Values = NDArray[np.float32]
-# Light of a picture relative to the background; on the sample: what is clear of lights, and what is left there, sigmas.
-Shown: TypeAlias = tuple[float, Bools, _Values]
+_Values: TypeAlias = NDArray[np.float32]
+
+
+class Shown(NamedTuple):
+    """What a picture (h, w) shows of a background."""
+
+    light: float  # relative to the background
+    clear: Bools  # on the sample: without lights
+    left: _Values  # on the sample: what the background leaves, sigmas
+    # (2, h): light of each row, and its level, DN, where lamps flicker while a sensor reads its rows; None: all alike
+    rows: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +93,7 @@ class ShownLight:
         """
         if picture.shape != self.size:
             return None
-        light, above, structure, clear, variance = self._measured(picture)
+        light, above, structure, clear, variance, level = self._measured(picture)
         light /= self.reference or 1.0
         power = float(np.sum(np.square(clear * structure)))
         sigma = _EFFICIENCY * float(np.sqrt(_median(variance[_SOME]) / max(power, 1e-12))) / (self.reference or 1.0)
@@ -90,18 +103,33 @@ class ShownLight:
             light = 1.0
         if not LEAST_LIGHT < light < MOST_LIGHT:
             return None
-        left = above - np.float32(light) * structure
-        left /= np.sqrt(variance * np.float32(1 + light**2 * self.noise_share))
+        sigmas = np.sqrt(variance * np.float32(1 + light**2 * self.noise_share))
+        shown = structure / sigmas
+        left = above / sigmas - np.float32(light) * shown
+        differs = _differing_rows(left, shown, clear) if self.reference else None
+        rows = None
+        if differs is not None:
+            left -= differs * shown
+            rows = self._of_rows(np.float32(light) + differs, level, clear)
         if 1.4826 * _median(np.abs(left[_SOME][clear[_SOME]])) > _LARGEST_MISFIT:
             return None
-        return light, clear, left
+        return Shown(light, clear, left, rows)
 
-    def _measured(self, picture: Picture) -> tuple[float, _Values, _Values, Bools, _Values]:
+    def _of_rows(self, light: _Values, level: _Values, clear: Bools) -> Array:
+        """(2, h): light and level of each row; light (a, 1); level (a, b), DN, and clear (a, b): on the sample."""
+        counted = clear.astype(np.float32)
+        above = _over_rows(counted * (level - light * self.own))
+        levels = above / np.maximum(_over_rows(counted), np.float32(1e-3))
+        at, known = np.arange(self.size[0]), np.arange(len(light)) * sample_of(self.size)[0]
+        return np.array([np.interp(at, known, x[:, 0]) for x in (light, levels - np.median(levels))])
+
+    def _measured(self, picture: Picture) -> tuple[float, _Values, _Values, Bools, _Values, _Values]:
         """The light, not yet relative to the reference; and, on the sample: what is above the smooth part, and the
-        structure, DN, about the means around them; whether the place is clear of lights; variances, DN^2.
+        structure, DN, about the means around them; whether the place is clear of lights; variances, DN^2; what is
+        above the smooth part, with these means.
         """
         rows, columns = sample_of(self.size)
-        above = picture[::rows, ::columns].astype(np.float32) - self.smooth
+        level = above = picture[::rows, ::columns].astype(np.float32) - self.smooth
         more = _median(above[_SOME])
         slope, black = np.float32(self.noise.slope_dn), np.float32(self.noise.black_dn - more)
         variance = np.float32(self.noise.floor_dn2) + slope * np.maximum(self.level - black, np.float32(0.0))
@@ -113,7 +141,26 @@ class ShownLight:
         clear = (self.plain > 0) & (np.abs(above) < sigmas + 4 * np.abs(structure))
         seen = clear * structure
         share = _sums(seen * above)[self.showing] / np.maximum(_sums(seen * seen)[self.showing], np.float32(1e-12))
-        return _median(share), above, structure, clear, variance
+        return _median(share), above, structure, clear, variance, level
+
+
+def _differing_rows(left: _Values, structure: _Values, clear: Bools) -> _Values | None:
+    """(a, 1): by how much the light of each row of the sample differs; None: not beyond its errors.
+
+    left (a, b): what the background leaves; structure (a, b): of the background; both in sigmas of a pixel.
+    """
+
+    seen = clear * structure
+    power = _over_rows(seen * seen) + np.float32(_USUAL_BAND**-2)
+    differs = np.zeros((len(left), 1), np.float32)
+    for _ in range(_FITS):
+        step = _over_rows(seen * np.clip(left - differs * structure, -_LARGEST_LEFT, _LARGEST_LEFT)) / power
+        if not differs.any():
+            sigma = np.sqrt(1 / (2 * np.sqrt(np.pi) * _ROWS * power))
+            if not (np.abs(step) > np.maximum(LEAST_CHANGE, _BAND_SIGMAS * sigma)).any():
+                return None
+        differs += step
+    return differs
 
 
 def sample_of(shape: tuple[int, ...]) -> tuple[int, int]:
@@ -143,6 +190,11 @@ def fits_around(clear: Bools, left: _Values, spots: Detections, sample: tuple[in
     fits = _sums(np.asarray(counted * np.minimum(left2, _MOST_LEFT**2), np.float32)) <= least
     row, column = (np.clip(spots.uv_px[:, 1 - i] // sample[i], 0, n - 1).astype(int) for i, n in enumerate(fits.shape))
     return np.asarray(fits[row, column])
+
+
+def _over_rows(values: _Values) -> _Values:
+    """(a, 1): sums of the rows of the sample, smoothed over rows."""
+    return np.asarray(cv2.GaussianBlur(values.sum(axis=1, keepdims=True), (1, 0), 0.1, sigmaY=_ROWS), np.float32)
 
 
 def _sums(values: _Values) -> _Values:

@@ -281,17 +281,20 @@ class StaticBackground:
         inverted: bool = False, regions: NDArray[np.float64] | None = None,
     ) -> Detections:  # fmt: skip
         """`spots_in`, with the result of `ShownLight.in_picture`."""
-        light, clear, left = fit
-        model, more = self.model, 0.0
-        if abs(light - 1) > LEAST_CHANGE:
-            own, more = self._noise_share, (1 - light) * self.steps
+        light, clear, left, rows = fit
+        model = self.model
+        more, raised = np.zeros((2, len(picture)))
+        if rows is not None:
+            more, raised = (1 - rows[0]) * self.steps, -rows[1] * self.steps
+        elif abs(light - 1) > LEAST_CHANGE:
+            own, more = self._noise_share, more + (1 - light) * self.steps
             model = replace(model, floor_dn2=model.floor_dn2 * (1 + light**2 * own) / (1 + own))
         clips = saturation_of(parameters, picture)
         top = min(int((clips + self.level_dn) * self.steps), np.iinfo(np.uint16).max)
         clipped = np.inf if inverted else clips
         level = int(self.level_dn * self.steps)
         difference = raised_difference(
-            picture, self.steps, self.subtracted, self.structure, more, clipped, top, level, self.gain
+            picture, self.steps, self.subtracted, self.structure, (more, raised), clipped, top, level, self.gain
         )
         if inverted:
             difference = np.asarray(
