@@ -45,6 +45,7 @@ class Look:
     hidden: bool = True  # with occlusions and missing pictures
     plain_rig: bool = False  # the rig of the paper at 1280 x 1024
     shake_px: float = 0.0  # rotation of each camera in each picture, about each axis, times its focal length; rms
+    bands: float = 0.0  # of the ambient light, share: lamps that flicker while the sensor reads its rows; amplitude
     photograph: float = 0.0  # share of the laser light that the darkest place of a photograph takes; 0: no photograph
 
     @property
@@ -66,6 +67,7 @@ class Look:
             parts += [f"{count} {what}"] if count else []
         parts += ["screen edge"] if self.screen_edge else []
         parts += ["in front of a photograph"] if self.photograph else []
+        parts += [f"bands of {self.bands:.1%}"] if self.bands else []
         parts += [f"shakes by {self.shake_px:.2g} px"] if self.shake_px else []
         parts += [f"{self.clutter} moving clutter"] if self.clutter else []
         parts += [f"exposure {self.exposure_share:.2g} of a frame"]
@@ -193,6 +195,7 @@ FAMILIES: dict[str, Callable[[np.random.Generator, Look], Look]] = {
         background=float(r.uniform(0, 0.03)), texture=0.0, flicker=0.0,
     ),
     "photographs": _photographs,
+    "bands": lambda r, k: replace(_photographs(r, k), bands=_log(r, 0.02, 0.3)),
     "shaking": lambda r, k: replace(_photographs(r, k), shake_px=_log(r, 0.03, 1.0)),
     "row-noise": lambda r, k: replace(k, sensor=replace(k.sensor, row_e=float(r.uniform(0.5, 1.0) * k.sensor.read_e))),
 }  # fmt: skip

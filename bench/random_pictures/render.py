@@ -14,7 +14,7 @@ from bench.random_scenes.scene import SHINING
 from geometry.arrays import Array
 
 LEAST_SNR = 11.0  # smallest SNR of the median spot at rest in a matched filter; peaks are raised to it
-SURROUNDINGS, AMPLITUDE, CLUTTER, NOISE, FLICKER, SHAKE = range(21, 27)  # streams of random numbers
+SURROUNDINGS, AMPLITUDE, CLUTTER, NOISE, FLICKER, SHAKE, BANDS = range(21, 28)  # streams of random numbers
 
 
 @dataclass(slots=True)
@@ -137,7 +137,7 @@ class Renderer:
     def expected(self, k: int, camera: int) -> Light:
         """The expected electrons of the pixels, (h, w); fills `snr` of the views of this frame."""
         still, scene = self.still[camera], self.ps.scene
-        light = still.ambient_e * np.float32(self.ambient[k, camera])
+        light = still.ambient_e * self._ambient(k, camera)
         light += still.steady_e
         for view in np.flatnonzero(scene.camera_of == camera):
             patch = self.patch(k, int(view))
@@ -152,6 +152,13 @@ class Renderer:
             if patch is not None:
                 light[patch.where] += patch.light * np.float32(peak)
         return light
+
+    def _ambient(self, k: int, camera: int) -> Light:
+        """The ambient light of the rows (h, 1), relative to the usual one."""
+        height = len(self.still[camera].ambient_e)
+        periods, of_frame, phase = self._rng(BANDS, camera).uniform([0.0, 0.0, 0.0], [4.0, 1.0, 1.0])
+        waves = periods * np.arange(height)[:, None] / height + of_frame * k + phase
+        return np.asarray(self.ambient[k, camera] + self.ps.look.bands * np.sin(2 * np.pi * waves), np.float32)
 
     def _snr(self, camera: int, patch: Patch) -> float:
         """SNR of a matched filter over noise and texture of the background; light above full scale does not count."""

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array, Bools, evenly_spread
 from tracking.background.behind_lights import LARGEST_PATH_PX, BehindLights, Exposures, passing_lights
-from tracking.background.mean_pictures import MOST_BYTES, in_equal_light, means_of, smooth_part, usable
+from tracking.background.mean_pictures import MOST_BYTES, means_of, smooth_part, usable
 from tracking.background.places import AROUND_LIGHT, AROUND_SPOT, ON_LIGHT, SAME_LIGHT, near_each, places_of
-from tracking.background.shown_light import Shown
+from tracking.background.shown_light import LARGEST_MISFIT, Shown
 from tracking.background.slow_lights import ROUNDS, SlowLights, as_pictures_show, light_at
 from tracking.background.static_background import TRIED, StaticBackground
 from tracking.detection.detect import find_spots
@@ -56,37 +56,58 @@ def static_background(
     its spots by the texture; parameters: with the grey value at which the sensor clips; others_move: lights that the
     parameters exclude.
     """
-    some = usable(pictures)
+    every = usable(pictures)
+    if len(every) < _LEAST_PICTURES:
+        return None
+    light = EqualLight.of(every, model, parameters)
+    if len(light.pictures) < len(every):
+        passed = EqualLight.of(every, model, parameters, passed=True)
+        light = max(light, passed, key=lambda x: len(x.pictures))
+    background, some = light.background, light.pictures
     if len(some) < _LEAST_PICTURES:
         return None
-    equal = in_equal_light(some)
-    shown: list[tuple[Picture, Shown]] = []
-    hidden = False  # something passes in front of the pixels
-    for passed in (False, True):
-        means = means_of(equal, passed)
-        first = StaticBackground.of_mean(means[0], some, model, parameters).with_light(equal)
-        fitting = [(p, fit) for p in some if (fit := first.shown.in_picture(p)) is not None]
-        if len(fitting) > len(shown):
-            (lower, mean), background, shown, hidden = means, first, fitting, passed
-        if len(shown) == len(some):
-            break
-    some, lights = [p for p, _ in shown], [fit.light for _, fit in shown]
-    if len(some) < _LEAST_PICTURES:
-        return None
-    equal = some
-    if set(lights) != {1.0} or any(fit.rows is not None for _, fit in shown):
-        if 4 * some[0].size * len(some) > MOST_BYTES:
-            return None
-        smooth = lower - background.structure
-        equal = [_in_light(p, fit, smooth) for p, fit in shown]
-        lower, mean = means_of(equal, hidden)
-        background = StaticBackground.of_mean(lower, some, model, parameters).with_light(equal)
     tried = some[::TRIED]
     few = len(background.lights.found) < _MANY_LIGHTS and not in_any_case
     moving = few and any(len(background.spots_in(p, parameters, shift)) for p in tried)
     if moving and sum(_better_in(background, p, shift) for p in tried) < max(_LEAST_FOUND * len(tried), 2):
         return None
-    return _without_slow_lights(background, mean, some, equal, 1 / np.array(lights), shift, others_move)
+    return _without_slow_lights(light, shift, others_move)
+
+
+@dataclass(frozen=True, slots=True)
+class EqualLight:
+    """Pictures (h, w) that fit a background, and they in its light."""
+
+    background: StaticBackground  # from the lower half of their grey values
+    mean: NDArray[np.float32]  # (h, w), DN, of the middle half
+    pictures: Sequence[Picture]
+    equal: Sequence[NDArray[Any]]
+    strength: Array  # (n,): of the moving lights in the pictures in equal light
+
+    @staticmethod
+    def of(
+        pictures: Sequence[Picture], model: NoiseModel, parameters: DetectParameters, passed: bool = False
+    ) -> EqualLight:
+        """passed: as in `means_of`. Where the light differs, the first mean is no picture in any light."""
+        equal: Sequence[NDArray[Any]] = pictures
+        strength = np.ones(len(pictures))
+        for largest in (np.inf, LARGEST_MISFIT, 0.0):
+            lower, mean = means_of(equal, passed)
+            background = StaticBackground.of_mean(lower, pictures, model, parameters).with_light(equal)
+            if not largest:
+                break
+            shown = [(p, fit) for p in pictures if (fit := background.shown.in_picture(p, largest)) is not None]
+            fitting = [(p, fit) for p, fit in shown if fit.misfit <= LARGEST_MISFIT]
+            if len(fitting) >= _LEAST_PICTURES and all(fit.is_usual for _, fit in fitting):
+                pictures = equal = [p for p, _ in fitting]
+                strength = np.ones(len(pictures))
+                break
+            shown = [shown[i] for i in evenly_spread(np.arange(len(shown)), MOST_BYTES // (4 * lower.size))]
+            pictures, strength = [p for p, _ in shown], 1 / np.array([fit.light for _, fit in shown])
+            if len(pictures) < _LEAST_PICTURES:
+                break
+            equal = [_in_light(p, fit, lower - background.structure) for p, fit in shown]
+        return EqualLight(background, mean, pictures, equal, strength)
 
 
 def _in_light(picture: Picture, fit: Shown, smooth: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -97,17 +118,13 @@ def _in_light(picture: Picture, fit: Shown, smooth: NDArray[np.float32]) -> NDAr
     return smooth + (picture - smooth - level) / light
 
 
-def _without_slow_lights(
-    background: StaticBackground, mean: NDArray[np.float32], pictures: Sequence[Picture],
-    equal: Sequence[NDArray[Any]], strength: Array, shift: TextureShift, others_move: bool,
-) -> StaticBackground:  # fmt: skip
-    """The background from the mean (h, w) of these pictures (in equal light), given the one from the lower half.
-
-    strength (n,): of the moving lights in the pictures in equal light.
+def _without_slow_lights(light: EqualLight, shift: TextureShift, others_move: bool) -> StaticBackground:
+    """The background from the mean of these pictures, given the one from the lower half.
 
     A light that moves slowly, or rests for a part of the recording, is in the mean of the pictures. Where it is in
     some of them the others count; where its absence leaves a hole, those with the hole.
     """
+    background, mean, pictures, equal = light.background, light.mean, light.pictures, light.equal
     fits = [background.shown.in_picture(p) for p in pictures]
     found = [_searched(background, p, shift, fit) for p, fit in zip(pictures, fits, strict=True)]
     holes = [
@@ -128,7 +145,7 @@ def _without_slow_lights(
     light_dn = usual_dn / shift.over_light
     # In black places the model leaves more than their noise: also there that of the background counts.
     noise = replace(background.noise, shadow_dn2=0.0)
-    seen = Exposures(equal, strength, noise, light_dn, usual_dn - light_dn)
+    seen = Exposures(equal, light.strength, noise, light_dn, usual_dn - light_dn)
     behind = BehindLights.of(seen, here, boxes, passing_lights(seen, found, mean, count))
     mean[behind.row, behind.column] = behind.level_dn
     slow = slow[~slow.known & ~behind.covers(mean.shape)[slow.row, slow.column]]

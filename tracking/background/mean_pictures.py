@@ -16,8 +16,6 @@ from tracking.noise import BLOCK, Picture
 MOST_BYTES = 150_000_000  # of these pictures
 STRIP = 4 * BLOCK  # rows that are computed at once: several arrays of them are in the processor's cache
 _CUT = 0.25  # share of the lowest and of the highest grey values of a pixel that is left out
-_SAMPLE, _ROUNDS, _OUTLIER = 10, 4, 4.0  # every such row; fits of a line, without what is farther than so many medians
-_LEAST_RANGE = 8.0  # DN, of most of the grey values: fewer do not show how the light changes
 LEAST_CHANGE = 0.03  # the light has not changed by more than this share: the structure is not scaled
 LEAST_LIGHT, MOST_LIGHT = 0.2, 5.0  # changes of the light beyond which a picture is searched without subtraction
 GAIN_BITS = 8  # binary places of a factor on the difference
@@ -48,38 +46,6 @@ def means_of(pictures: Sequence[NDArray[Any]], passed: bool = False) -> tuple[ND
         lower[part] = _mean(values[cut if passed else 1 : count // 2])
         middle[part] = _mean(values[cut : count - cut])
     return lower, middle
-
-
-def in_equal_light(pictures: Sequence[Picture]) -> Sequence[NDArray[Any]]:
-    """Pictures whose light differs, DN, each on the line through those of the median picture; others as they are.
-
-    Pixels sorted by their grey values would be those of the pictures with the least light where a pixel is bright, and
-    with the least noise where it is not: the mean of the lower ones would be no picture in any light.
-    """
-    if 4 * pictures[0].size * len(pictures) > MOST_BYTES:
-        return pictures
-    seen = np.stack([p[::_SAMPLE, :: _SAMPLE + 1].ravel() for p in pictures]).astype(np.float32)
-    usual = np.median(seen, axis=0)
-    if float(np.ptp(np.quantile(usual, [0.1, 0.9]))) < _LEAST_RANGE:
-        return pictures
-    lines = [_line(usual, values) for values in seen]
-    if all(abs(light - 1) < LEAST_CHANGE or not LEAST_LIGHT < light < MOST_LIGHT for light, _ in lines):
-        return pictures
-    return [
-        (p - np.float32(level)) / np.float32(light) if LEAST_LIGHT < light < MOST_LIGHT else p
-        for p, (light, level) in zip(pictures, lines, strict=True)
-    ]
-
-
-def _line(usual: NDArray[np.float32], values: NDArray[np.float32]) -> tuple[float, float]:
-    """Slope and level of most of the values (n,) over the usual ones."""
-    kept = np.ones(len(usual), dtype=bool)
-    slope, level = 1.0, 0.0
-    for _ in range(_ROUNDS):
-        slope, level = np.polyfit(usual[kept], values[kept], 1)
-        left = np.abs(values - slope * usual - level)
-        kept = left <= _OUTLIER * max(float(np.median(left)), 0.5)
-    return float(slope), float(level)
 
 
 def _in_order(values: list[NDArray[Any]]) -> list[NDArray[Any]]:

@@ -23,11 +23,11 @@ _CLEAR_SIGMAS = 4.0  # of the measured light
 _EFFICIENCY = 2.0  # sigma of the median over places, of those that show most structure, over that of one fit
 _MOST_LEFT = 2.5  # sigmas: more counts as much, since somebody in front of the screen is in many pixels
 _BY_CHANCE = 4.0  # sigmas of the sum of squares, of few pixels between lights at rest
-_LARGEST_MISFIT = 1.3  # sigma of what is left over that of the noise; above it the camera or the light has moved
+LARGEST_MISFIT = 1.3  # sigma of what is left over that of the noise; above it the camera or the light has moved
 
 # Light that differs from row to row: sigma of its smoothing, in rows of the sample; its usual size; residuals beyond so
-# many sigmas count as much; fits.
-_ROWS, _USUAL_BAND, _LARGEST_LEFT, _FITS = 2.0, 0.2, 2.0, 3
+# many of their sigmas count as much; fits.
+_ROWS, _USUAL_BAND, _LARGEST_LEFT, _FITS = 2.0, 0.2, 2.0, 4
 _BAND_SIGMAS = 6.0  # of the light of a row that differs: there are up to 100 of them in a picture
 
 _SOME = (slice(None, None, 2), slice(None, None, 2))  # of the sample, for medians over the whole picture
@@ -40,8 +40,14 @@ class Shown(NamedTuple):
     light: float  # relative to the background
     clear: Bools  # on the sample: without lights
     left: _Values  # on the sample: what the background leaves, sigmas
+    misfit: float  # its usual size
     # (2, h): light of each row, and its level, DN, where lamps flicker while a sensor reads its rows; None: all alike
     rows: Array | None = None
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether the picture is in the light of the background."""
+        return self.light == 1.0 and self.rows is None
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +83,7 @@ class ShownLight:
         first = ShownLight(
             structure.shape, smooth, smooth + own, own, plain, power >= np.median(power), noise, noise_share,
         )  # fmt: skip
-        lights = [first._measured(p)[0] for p in pictures]
+        lights = [first._measured(p[::rows, ::columns].astype(np.float32) - smooth)[0] for p in pictures]
         if not lights or not plain.any():
             return replace(first, reference=0.0)
         where = plain > 0
@@ -86,14 +92,44 @@ class ShownLight:
         reference = float(np.median(lights)) - in_mean
         return replace(first, reference=reference if reference > LEAST_LIGHT else 0.0, in_mean=in_mean)
 
-    def in_picture(self, picture: Picture) -> Shown | None:
+    def in_picture(self, picture: Picture, largest_misfit: float = LARGEST_MISFIT) -> Shown | None:
         """How much of the structure a picture shows, relative to the background, and what it leaves.
 
         1 if it is the same within the errors of its measurement. None: the picture and the background do not fit.
         """
         if picture.shape != self.size:
             return None
-        light, above, structure, clear, variance, level = self._measured(picture)
+        rows, columns = sample_of(self.size)
+        seen = picture[::rows, ::columns].astype(np.float32) - self.smooth
+        light, clear, left, shown = self._fitted(seen)
+        of_rows = None
+        for k in range(_FITS if self.reference else 0):
+            differs = _light_of_rows(left, shown, clear)
+            if k == 0 and not differs[1].any():
+                break
+            step = np.float32(1) + differs[0] / np.float32(light)
+            counted = clear.astype(np.float32)
+            own = np.float32(light) * step * self.own
+            level = _over_rows(counted * (seen - own)) / np.maximum(_over_rows(counted), np.float32(1e-3))
+            level -= _median(level)
+            seen = (seen - level) / step
+            last = (1.0, 0.0) if of_rows is None else of_rows
+            of_rows = last[0] * step, last[0] * level + last[1]
+            light, clear, left, shown = self._fitted(seen)
+        misfit = 1.4826 * _median(np.abs(left[_SOME][clear[_SOME]]))
+        if misfit > largest_misfit or not LEAST_LIGHT < light < MOST_LIGHT:
+            return None
+        if of_rows is None:
+            return Shown(light, clear, left, misfit)
+        at, known = np.arange(self.size[0]), np.arange(len(seen)) * rows
+        every = [np.interp(at, known, x[:, 0]) for x in (light * of_rows[0], of_rows[1])]
+        return Shown(light, clear, left, misfit, np.array(every))
+
+    def _fitted(self, seen: _Values) -> tuple[float, Bools, _Values, _Values]:
+        """The light relative to the background; and, on the sample: what is clear of lights, what the background
+        leaves, its structure; the last two in sigmas of a pixel. seen (a, b), DN: above the smooth part.
+        """
+        light, above, structure, clear, variance = self._measured(seen)
         light /= self.reference or 1.0
         power = float(np.sum(np.square(clear * structure)))
         sigma = _EFFICIENCY * float(np.sqrt(_median(variance[_SOME]) / max(power, 1e-12))) / (self.reference or 1.0)
@@ -101,66 +137,42 @@ class ShownLight:
         # Whether a picture is one of those in the mean is not known here: both of its lights are usual.
         if not self.reference or -usual < light - 1 < usual + self.in_mean / self.reference:
             light = 1.0
-        if not LEAST_LIGHT < light < MOST_LIGHT:
-            return None
         sigmas = np.sqrt(variance * np.float32(1 + light**2 * self.noise_share))
         shown = structure / sigmas
-        left = above / sigmas - np.float32(light) * shown
-        differs = _differing_rows(left, shown, clear) if self.reference else None
-        rows = None
-        if differs is not None:
-            left -= differs * shown
-            rows = self._of_rows(np.float32(light) + differs, level, clear)
-        if 1.4826 * _median(np.abs(left[_SOME][clear[_SOME]])) > _LARGEST_MISFIT:
-            return None
-        return Shown(light, clear, left, rows)
+        return light, clear, above / sigmas - np.float32(light) * shown, shown
 
-    def _of_rows(self, light: _Values, level: _Values, clear: Bools) -> Array:
-        """(2, h): light and level of each row; light (a, 1); level (a, b), DN, and clear (a, b): on the sample."""
-        counted = clear.astype(np.float32)
-        above = _over_rows(counted * (level - light * self.own))
-        levels = above / np.maximum(_over_rows(counted), np.float32(1e-3))
-        at, known = np.arange(self.size[0]), np.arange(len(light)) * sample_of(self.size)[0]
-        return np.array([np.interp(at, known, x[:, 0]) for x in (light, levels - np.median(levels))])
-
-    def _measured(self, picture: Picture) -> tuple[float, _Values, _Values, Bools, _Values, _Values]:
+    def _measured(self, seen: _Values) -> tuple[float, _Values, _Values, Bools, _Values]:
         """The light, not yet relative to the reference; and, on the sample: what is above the smooth part, and the
-        structure, DN, about the means around them; whether the place is clear of lights; variances, DN^2; what is
-        above the smooth part, with these means.
+        structure, DN, about the means around them; whether the place is clear of lights; variances, DN^2.
+
+        seen (a, b), DN: above the smooth part.
         """
-        rows, columns = sample_of(self.size)
-        level = above = picture[::rows, ::columns].astype(np.float32) - self.smooth
-        more = _median(above[_SOME])
+        more = _median(seen[_SOME])
         slope, black = np.float32(self.noise.slope_dn), np.float32(self.noise.black_dn - more)
         variance = np.float32(self.noise.floor_dn2) + slope * np.maximum(self.level - black, np.float32(0.0))
         sigmas = 6 * np.sqrt(variance)
         # Wide lights are in the means around them.
-        even = self.plain * (np.abs(above - more - self.own) < sigmas + np.abs(self.own))
+        even = self.plain * (np.abs(seen - more - self.own) < sigmas + np.abs(self.own))
         around = np.maximum(cv2.blur(even, _SMOOTH), np.float32(1e-3))
-        above, structure = (x - cv2.blur(x * even, _SMOOTH) / around for x in (above, self.own))
+        above, structure = (x - cv2.blur(x * even, _SMOOTH) / around for x in (seen, self.own))
         clear = (self.plain > 0) & (np.abs(above) < sigmas + 4 * np.abs(structure))
-        seen = clear * structure
-        share = _sums(seen * above)[self.showing] / np.maximum(_sums(seen * seen)[self.showing], np.float32(1e-12))
-        return _median(share), above, structure, clear, variance, level
+        shown = clear * structure
+        share = _sums(shown * above)[self.showing] / np.maximum(_sums(shown * shown)[self.showing], np.float32(1e-12))
+        return _median(share), above, structure, clear, variance
 
 
-def _differing_rows(left: _Values, structure: _Values, clear: Bools) -> _Values | None:
-    """(a, 1): by how much the light of each row of the sample differs; None: not beyond its errors.
+def _light_of_rows(left: _Values, structure: _Values, clear: Bools) -> tuple[_Values, Bools]:
+    """(a, 1) each: by how much the light of each row of the sample differs from their mean; where beyond its errors.
 
     left (a, b): what the background leaves; structure (a, b): of the background; both in sigmas of a pixel.
     """
-
     seen = clear * structure
     power = _over_rows(seen * seen) + np.float32(_USUAL_BAND**-2)
-    differs = np.zeros((len(left), 1), np.float32)
-    for _ in range(_FITS):
-        step = _over_rows(seen * np.clip(left - differs * structure, -_LARGEST_LEFT, _LARGEST_LEFT)) / power
-        if not differs.any():
-            sigma = np.sqrt(1 / (2 * np.sqrt(np.pi) * _ROWS * power))
-            if not (np.abs(step) > np.maximum(LEAST_CHANGE, _BAND_SIGMAS * sigma)).any():
-                return None
-        differs += step
-    return differs
+    most = np.float32(_LARGEST_LEFT * max(1.4826 * _median(np.abs(left[_SOME][clear[_SOME]])), 1.0))
+    differs = _over_rows(seen * np.clip(left, -most, most)) / power
+    differs -= np.sum(power * differs) / np.sum(power)
+    sigma = np.sqrt(1 / (2 * np.sqrt(np.pi) * _ROWS * power))
+    return differs, np.asarray(np.abs(differs) > np.maximum(LEAST_CHANGE, _BAND_SIGMAS * sigma))
 
 
 def sample_of(shape: tuple[int, ...]) -> tuple[int, int]:
@@ -186,7 +198,7 @@ def fits_around(clear: Bools, left: _Values, spots: Detections, sample: tuple[in
     counted = clear.astype(np.float32)
     means = cv2.blur(left * counted, _SMOOTH) / np.maximum(cv2.blur(counted, _SMOOTH), np.float32(1e-3))
     count, left2 = _sums(counted), np.square(left - means)
-    least = _LARGEST_MISFIT**2 * count + _BY_CHANCE * np.sqrt(2 * count)
+    least = LARGEST_MISFIT**2 * count + _BY_CHANCE * np.sqrt(2 * count)
     fits = _sums(np.asarray(counted * np.minimum(left2, _MOST_LEFT**2), np.float32)) <= least
     row, column = (np.clip(spots.uv_px[:, 1 - i] // sample[i], 0, n - 1).astype(int) for i, n in enumerate(fits.shape))
     return np.asarray(fits[row, column])

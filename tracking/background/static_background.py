@@ -281,8 +281,7 @@ class StaticBackground:
         inverted: bool = False, regions: NDArray[np.float64] | None = None,
     ) -> Detections:  # fmt: skip
         """`spots_in`, with the result of `ShownLight.in_picture`."""
-        light, clear, left, rows = fit
-        model = self.model
+        light, rows, model = fit.light, fit.rows, self.model
         more, raised = np.zeros((2, len(picture)))
         if rows is not None:
             more, raised = (1 - rows[0]) * self.steps, -rows[1] * self.steps
@@ -303,8 +302,11 @@ class StaticBackground:
         spots = find_spots(difference, replace(parameters, saturation_dn=float(top)), model, regions)
         row, column = (nearest(spots.uv_px[:, i], picture.shape[1 - i]) for i in (1, 0))
         sample = sample_of(picture.shape)
-        sampled = np.minimum(row // sample[0], len(clear) - 1), np.minimum(column // sample[1], clear.shape[1] - 1)
-        kept = ~self.blind[row, column] & fits_around(clear, left, spots, sample)
+        sampled = (
+            np.minimum(row // sample[0], len(fit.clear) - 1),
+            np.minimum(column // sample[1], fit.clear.shape[1] - 1),
+        )
+        kept = ~self.blind[row, column] & fits_around(fit.clear, fit.left, spots, sample)
         spots, row, column, sampled = spots[kept], row[kept], column[kept], (sampled[0][kept], sampled[1][kept])
         if not len(spots):
             return spots

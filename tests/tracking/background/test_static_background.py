@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -11,8 +12,7 @@ import pytest
 from geometry.arrays import Array
 from tests.tracking.rendering import round_lights
 from tracking.background import mean_pictures
-from tracking.background.estimation import PICTURES, static_background
-from tracking.background.mean_pictures import in_equal_light
+from tracking.background.estimation import PICTURES, EqualLight, static_background
 from tracking.background.static_background import StaticBackground
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
@@ -280,16 +280,33 @@ def test_the_points_stay_sorted_and_limited():
     assert np.all(np.diff(found.flux) <= 0)
 
 
-def test_pictures_in_other_light_are_made_equal_and_black_ones_stay():
+def contrast_of(pictures: Sequence[Picture], room: Array) -> Array:
+    return np.array([(p[room > 50].mean() - p[room < 50].mean()) / 60 for p in pictures])
+
+
+@pytest.mark.parametrize(("periods", "fitting", "largest_dn"), [(0.0, 14, 0.2), (1.7, 12, 0.5), (3.0, 12, 0.5)])
+def test_pictures_in_other_light_are_made_equal_and_black_ones_are_left_out(periods, fitting, largest_dn):
+    """The light differs from picture to picture, and from row to row where lamps flicker while a sensor reads them."""
     rng = np.random.default_rng(5)
-    room = 20.0 + 60.0 * (rng.random((160, 200)) > 0.5)
-    lights = 1 + 0.1 * np.sin(np.arange(9))
-    pictures = [np.rint(light * room + rng.normal(0, 1, room.shape)).astype(np.uint8) for light in lights]
+    room = 20.0 + 60.0 * (cv2.GaussianBlur(rng.random(SIZE), (0, 0), 2) > 0.5)
+    rows = np.arange(SIZE[0])[:, None] / SIZE[0]
+    lights = [1 + 0.12 * np.sin(0.9 * k + 2 * np.pi * periods * rows) for k in range(15)]
+    pictures = [np.rint(light * room + rng.normal(0, 1, SIZE)).astype(np.uint8) for light in lights]
     pictures[4] = np.zeros_like(pictures[4])
-    equal = in_equal_light(pictures)
-    assert equal[4] is pictures[4]
-    others = np.stack([p for k, p in enumerate(equal) if k != 4])
-    assert np.isfinite(others).all()
-    assert np.std(others.mean(axis=(1, 2))) < 0.2  # before: 3 DN
-    still = [np.rint(room + rng.normal(0, 1, room.shape)).astype(np.uint8) for _ in range(9)]
-    assert in_equal_light(still) is still
+    light = EqualLight.of(pictures, NoiseModel(1.0, 0.0, 0.0), USUAL)
+    assert fitting <= len(light.pictures) <= 14
+    contrast = contrast_of(light.equal, room)
+    assert np.std(contrast) < 0.01  # before: .08 without bands
+    assert np.std([p.mean() for p in light.equal]) < largest_dn  # before: 3
+    spread = np.std([p - light.mean for p in light.equal], axis=0)
+    assert np.sqrt(np.mean(spread**2)) < 1.6  # DN; before: 4
+    np.testing.assert_allclose(light.strength * contrast_of(light.pictures, room), contrast, rtol=0.03)
+
+
+def test_pictures_in_one_light_stay_as_they_are():
+    rng = np.random.default_rng(5)
+    room = 20.0 + 60.0 * (rng.random(SIZE) > 0.5)
+    pictures = [np.rint(room + rng.normal(0, 1, SIZE)).astype(np.uint8) for _ in range(9)]
+    light = EqualLight.of(pictures, NoiseModel(1.0, 0.0, 0.0), USUAL)
+    assert all(a is b for a, b in zip(light.equal, pictures, strict=True))
+    assert set(light.strength) == {1.0}

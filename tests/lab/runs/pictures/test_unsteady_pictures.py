@@ -128,6 +128,7 @@ def test_a_camera_that_shakes_is_named_and_its_poses_are_as_good_as_their_sigmas
     [
         pytest.param(lambda frame: 1 + 0.12 * np.sin(0.7 * frame + 1.0), id="flickers"),
         pytest.param(lambda frame: 1 - 0.5 * np.clip(frame / 8 - 1, 0, 1), id="falls"),
+        pytest.param(lambda frame: 1 + 0.1 * np.sin(0.9 * frame + np.arange(SIZE[0])[:, None] / 27), id="in bands"),
     ],
 )
 def test_spots_are_found_in_front_of_a_room_whose_light_changes(tmp_path, light):
