@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools, Ints
 from tracking.background.joint_fit import UNLIKE, JointFit, Modulation, fitted, mean_of
-from tracking.background.places import AROUND_LIGHT, AROUND_SPOT, ON_LIGHT, SAME_LIGHT, inside, near_each
+from tracking.background.places import AROUND_LIGHT, AROUND_SPOT, ON_LIGHT, SAME_LIGHT, inside, near_each, nearest
 from tracking.detections import Detections
 from tracking.noise import NoiseModel
 
@@ -36,10 +36,14 @@ class Exposures:
     """n pictures (h, w) of one camera in equal light of the room."""
 
     pictures: Sequence[NDArray[Any]]
-    strength: Array  # (n,), of the lights
+    strength: Array  # (n, h), of the lights in each row
     noise: NoiseModel
     usual_dn: float  # light of the surface, above black
     black_dn: float  # grey value without light
+
+    def strength_at(self, which: Sequence[int] | Ints, places: Array) -> Array:
+        """(k, 1): of a light that is at these places (k, 2) in some pictures."""
+        return self.strength[which, nearest(places[:, 1], self.strength.shape[1])][:, None]
 
     def around(self, which: Sequence[int] | Ints, box: Array, more: float, step: int) -> tuple[Array, Array, Array]:
         """Light above black, DN, and its variances (k, m) in some pictures, in pixels (m, 2) around a box.
@@ -127,7 +131,14 @@ def passing_lights(
         column, row = uv.T.astype(np.int64)
         empty = ground[row, column].astype(float), count[row, column] / variance[0]
         fit = fitted(
-            uv, values, variance, light.uv_px, width, float(light.peak[0]), empty, strength=seen.strength[k, None, None]
+            uv,
+            values,
+            variance,
+            light.uv_px,
+            width,
+            float(light.peak[0]),
+            empty,
+            strength=seen.strength_at([k], light.uv_px),
         )
         if fit is not None and fit.modulated_share(seen.usual_dn)[1] < _LARGEST_SIGMA**2:
             fits.append(fit)
@@ -206,7 +217,7 @@ class _Light:
         uv, values, variance, without = self._around(_AROUND * self.width_px, step)
         if len(uv) < _LEAST_CLEAR * (side / step) ** 2:
             return None
-        seen, strength = self.seen, self.seen.strength[self.there, None]
+        seen, strength = self.seen, self.seen.strength_at(self.there, self.places)
         fit = fitted(uv, values, variance, self.places, self.width_px, self.height_dn, without, modulation, strength)
         if fit is None:
             return None
@@ -284,7 +295,10 @@ def _light_at(seen: Exposures, found: Sequence[Detections], rows: Sequence[Ints]
     if not len(uv):
         return None
     flux = 2 * np.pi * width**2 * height
-    gone = (values - np.median(values[shown], axis=0)).sum(axis=1) < -_LACKS * flux
+    # A light that moves is in none of the medians, and most of the pixels show the light of the room alone.
+    more = values - np.median(values[shown], axis=0)
+    total = np.sum(more - np.median(more, axis=1, keepdims=True), axis=1)
+    gone = total < np.median(total[shown]) - _LACKS * flux
     lacks = _lacking(seen, shown, middle, width) > _LACKS * height
     # What is found in the middle although the light has left is an edge.
     true = ~(lacks[shown] & (np.linalg.norm(places - middle, axis=1) < width))

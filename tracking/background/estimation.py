@@ -82,7 +82,7 @@ class EqualLight:
     mean: NDArray[np.float32]  # (h, w), DN, of the middle half
     pictures: Sequence[Picture]
     equal: Sequence[NDArray[Any]]
-    strength: Array  # (n,): of the moving lights in the pictures in equal light
+    strength: Array  # (n, h): of the moving lights in each row of the pictures in equal light
 
     @staticmethod
     def of(
@@ -90,7 +90,7 @@ class EqualLight:
     ) -> EqualLight:
         """passed: as in `means_of`. Where the light differs, the first mean is no picture in any light."""
         equal: Sequence[NDArray[Any]] = pictures
-        strength = np.ones(len(pictures))
+        strength = np.ones((len(pictures), len(pictures[0])))
         for largest in (np.inf, LARGEST_MISFIT, 0.0):
             lower, mean = means_of(equal, passed)
             background = StaticBackground.of_mean(lower, pictures, model, parameters).with_light(equal)
@@ -100,12 +100,13 @@ class EqualLight:
             fitting = [(p, fit) for p, fit in shown if fit.misfit <= LARGEST_MISFIT]
             if len(fitting) >= _LEAST_PICTURES and all(fit.is_usual for _, fit in fitting):
                 pictures = equal = [p for p, _ in fitting]
-                strength = np.ones(len(pictures))
+                strength = np.ones((len(pictures), len(lower)))
                 break
             shown = [shown[i] for i in evenly_spread(np.arange(len(shown)), MOST_BYTES // (4 * lower.size))]
-            pictures, strength = [p for p, _ in shown], 1 / np.array([fit.light for _, fit in shown])
+            pictures = [p for p, _ in shown]
             if len(pictures) < _LEAST_PICTURES:
                 break
+            strength = np.array([1 / fit.of_rows(len(lower))[0] for _, fit in shown])
             equal = [_in_light(p, fit, lower - background.structure) for p, fit in shown]
         return EqualLight(background, mean, pictures, equal, strength)
 

@@ -49,6 +49,10 @@ class Shown(NamedTuple):
         """Whether the picture is in the light of the background."""
         return self.light == 1.0 and self.rows is None
 
+    def of_rows(self, height: int) -> Array:
+        """(2, h): the light of each row, and its level, DN."""
+        return np.outer((self.light, 0.0), np.ones(height)) if self.rows is None else self.rows
+
 
 @dataclass(frozen=True, slots=True)
 class ShownLight:
@@ -111,7 +115,6 @@ class ShownLight:
             counted = clear.astype(np.float32)
             own = np.float32(light) * step * self.own
             level = _over_rows(counted * (seen - own)) / np.maximum(_over_rows(counted), np.float32(1e-3))
-            level -= _median(level)
             seen = (seen - level) / step
             last = (1.0, 0.0) if of_rows is None else of_rows
             of_rows = last[0] * step, last[0] * level + last[1]

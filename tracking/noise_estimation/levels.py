@@ -23,6 +23,7 @@ LEVELS = 12  # largest number of levels
 _STRIPE = 64  # rows per stripe of the sample
 _LEAST_WHITE = 0.01  # DN^2: a smaller variance in time comes from single steps of a few pixels
 _GRAIN = 1.25  # ratio of the variance of means to that of white noise up to which the noise counts as white
+_ROWS, _LIGHT_SIGMAS = 17, 8.0  # rows that share the change of their light; its sigmas from which it counts
 _FOURTH_DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # zero for anything cubic; nearly so for a smooth spot
 
 
@@ -84,7 +85,9 @@ def _between(a: Picture, b: Picture, top: float) -> tuple[Floats, Floats, Array]
     coarse = max(np.sqrt(quantile_variance(np.abs(difference[::4, ::4]))), 0.5)
     held = np.clip(difference, -4 * coarse, 4 * coarse)
     difference -= cv2.blur(held, (SIDE, SIDE))
-    level = cv2.blur(0.5 * (x + y), (3, 3))
+    both = 0.5 * (x + y)
+    difference = _in_equal_light(difference, both, 4 * coarse)
+    level = cv2.blur(both, (3, 3))
     chosen = _sample(level) & (cv2.dilate(cv2.max(a, b), np.ones((3, 3), np.uint8)) < top) & (cv2.min(a, b) > 0)
     white = trimmed_variance(difference[::4, ::4].ravel())
     grain = 1.0
@@ -94,6 +97,20 @@ def _between(a: Picture, b: Picture, top: float) -> tuple[Floats, Floats, Array]
         grain = max(grain, share / (1 - cell**2 / SIDE**2))
     factor = 1 / (1 - 1 / SIDE**2)
     return level[chosen], difference[chosen] * np.sqrt(factor), np.array([grain if grain > _GRAIN else 1.0])
+
+
+def _in_equal_light(difference: Floats, level: Floats, largest: float) -> Floats:
+    """A difference (h, w) without what changes of the light make of the structure of its rows; others as they are.
+
+    level (h, w): of the pictures; largest: difference that is noise. Lamps flicker, also while a sensor reads its rows.
+    """
+    structure = level - cv2.blur(level, (SIDE, SIDE))
+    seen = np.where(np.abs(difference) < largest, difference, np.float32(0.0))
+    shared, power = (cv2.blur((structure * x).sum(axis=1, keepdims=True), (1, _ROWS)) for x in (seen, structure))
+    change = shared / np.maximum(power, np.float32(1e-6))
+    by_chance = trimmed_variance(difference[::4, ::4].ravel()) / np.maximum(_ROWS * power, np.float32(1e-6))
+    changed = change**2 > _LIGHT_SIGMAS**2 * by_chance
+    return difference - change * structure if changed.any() else difference
 
 
 def _stripes(picture: Picture) -> Picture:

@@ -138,13 +138,13 @@ def test_the_modulation_that_one_light_shows_helps_with_the_others():
     even = np.rint(pictures(at, np.full(X.shape, 20.0), 0.6)).astype(np.uint8)
     found = [find_spots(p, DetectParameters(), noise) for p in even]
     box = np.array([[MIDDLE, MIDDLE, 9.0]])
-    behind = BehindLights.of(Exposures(list(seen), np.ones(len(seen)), noise, 40.0, 0.0), found, box)
+    behind = BehindLights.of(Exposures(list(seen), np.ones(np.shape(seen)[:2]), noise, 40.0, 0.0), found, box)
     expected = 0.6 * 40 / 60 / (0.4 + 0.6 * 40 / 60)
     assert behind.modulation is not None
     assert behind.modulation.share == pytest.approx(expected, abs=0.1)
     assert np.abs(behind.level_dn - EDGE[behind.row, behind.column]).max() < 3.0
     nowhere = BehindLights.of(
-        Exposures(list(seen), np.ones(len(seen)), noise, 40.0, 0.0), found, np.array([[3.0, 3.0, 2.0]])
+        Exposures(list(seen), np.ones(np.shape(seen)[:2]), noise, 40.0, 0.0), found, np.array([[3.0, 3.0, 2.0]])
     )
     assert nowhere.modulation is None
     assert not nowhere.covers((SIDE, SIDE)).any()
@@ -165,7 +165,7 @@ def test_lights_that_pass_over_edges_show_the_modulation_and_how_unlike_their_pl
         spot = Detections.at(np.array([[u, v]]) + OFF, np.eye(2)[None])
         found.append(replace(spot, major_px=np.array([2.6]), minor_px=np.array([2.3]), peak=np.array([80.0])))
     count = np.full(ground.shape, 11)
-    pictures = Exposures(seen, np.ones(12), NoiseModel(NOISE**2, 0.0, 15.0), 60.0, 0.0)
+    pictures = Exposures(seen, np.ones(np.shape(seen)[:2]), NoiseModel(NOISE**2, 0.0, 15.0), 60.0, 0.0)
     fits = passing_lights(pictures, found, ground, count)
     box = np.array([[3.0, 3.0, 2.0]])
     shown = BehindLights.of(pictures, found, box, fits).modulation
@@ -207,7 +207,9 @@ def test_light_modulates_light_and_the_black_level_is_none():
     found = [replace(d, flux=np.array([1000.0])) for d in found]
     noise, box = NoiseModel(NOISE**2, 0.0, 30.0), np.array([[MIDDLE, MIDDLE, 9.0]])
     shown = [
-        BehindLights.of(Exposures(seen, np.ones(15), noise, 30.0 - black_dn, black_dn), found, box).modulation
+        BehindLights.of(
+            Exposures(seen, np.ones(np.shape(seen)[:2]), noise, 30.0 - black_dn, black_dn), found, box
+        ).modulation
         for black_dn in (0.0, 12.0)
     ]
     more = [m.response(np.array([30.0, 33.6])) for m in shown if m is not None]  # a fifth more light

@@ -354,10 +354,27 @@ def test_a_light_that_moves_by_its_width_is_fitted_also_where_more_moves_beside_
     pictures = board_pictures(paths, 1.5, 0.5, 24, DOTTED)
     noise = NoiseModel(NOISE**2, 0.0, 0.0)
     found = [find_spots(p, USUAL, noise, np.array([[200.0, 100.0, 9.0]])) for p in pictures]
-    seen = Exposures(pictures, np.ones(15), noise, 30.0, 0.0)
+    seen = Exposures(pictures, np.ones((15, SIZE[0])), noise, 30.0, 0.0)
     behind = BehindLights.of(seen, found, np.array([[200.0 + more_px, 100.0, 9.0 + more_px]]))
     assert len(behind.lights) == 1
     assert np.abs(behind.level_dn - 30.0).max() < 5.0
+
+
+@pytest.mark.parametrize("length_px", [10.0, 30.0])
+@pytest.mark.parametrize("level_dn", [0.0, 0.1])
+def test_pictures_that_a_light_has_left_are_not_taken_for_some_that_show_it(length_px, level_dn):
+    """It moves over a path of some of its widths; the room's light is not the same in all pictures."""
+    rng, there = np.random.default_rng(5), np.arange(15) % 3 != 1
+    paths = np.where(there, 0.0, 500.0)[:, None] + [200.0, 100.0] + length_px * rng.uniform(-0.5, 0.5, (15, 2))
+    pictures = [p + level_dn * (k % 4) for k, p in enumerate(board_pictures(paths[:, None], 2.0, 0.5, 24, DOTTED))]
+    noise = NoiseModel(NOISE**2, 0.0, 0.0)
+    box = np.array([[200.0, 100.0, 0.5 * length_px + 8.0]])
+    found = [find_spots(p.astype(np.uint8), USUAL, noise, box) for p in pictures]
+    found = [d if there[k] else d[:0] for k, d in enumerate(found)]
+    seen = Exposures(pictures, np.ones((15, SIZE[0])), noise, 30.0, 0.0)
+    behind = BehindLights.of(seen, found, box)
+    assert [len(fit.light.places) for _, fit in behind.lights] == [10]
+    assert np.abs(behind.level_dn - DOTTED[behind.row, behind.column]).max() < 5.0
 
 
 @pytest.mark.parametrize(

@@ -296,11 +296,11 @@ def test_pictures_in_other_light_are_made_equal_and_black_ones_are_left_out(peri
     light = EqualLight.of(pictures, NoiseModel(1.0, 0.0, 0.0), USUAL)
     assert fitting <= len(light.pictures) <= 14
     contrast = contrast_of(light.equal, room)
-    assert np.std(contrast) < 0.01  # before: .08 without bands
+    assert np.std(contrast) < 0.02  # before: .08 without bands
     assert np.std([p.mean() for p in light.equal]) < largest_dn  # before: 3
     spread = np.std([p - light.mean for p in light.equal], axis=0)
     assert np.sqrt(np.mean(spread**2)) < 1.6  # DN; before: 4
-    np.testing.assert_allclose(light.strength * contrast_of(light.pictures, room), contrast, rtol=0.03)
+    np.testing.assert_allclose(light.strength.mean(axis=1) * contrast_of(light.pictures, room), contrast, rtol=0.03)
 
 
 def test_pictures_in_one_light_stay_as_they_are():
@@ -309,4 +309,4 @@ def test_pictures_in_one_light_stay_as_they_are():
     pictures = [np.rint(room + rng.normal(0, 1, SIZE)).astype(np.uint8) for _ in range(9)]
     light = EqualLight.of(pictures, NoiseModel(1.0, 0.0, 0.0), USUAL)
     assert all(a is b for a, b in zip(light.equal, pictures, strict=True))
-    assert set(light.strength) == {1.0}
+    assert set(light.strength.ravel()) == {1.0}
