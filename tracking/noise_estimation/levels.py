@@ -23,7 +23,8 @@ LEVELS = 12  # largest number of levels
 _STRIPE = 64  # rows per stripe of the sample
 _LEAST_WHITE = 0.01  # DN^2: a smaller variance in time comes from single steps of a few pixels
 _GRAIN = 1.25  # ratio of the variance of means to that of white noise up to which the noise counts as white
-_ROWS, _LIGHT_SIGMAS = 17, 8.0  # rows that share the change of their light; its sigmas from which it counts
+# Rows that share the change of their light; its sigmas from which it counts; structure over noise that shows it.
+_ROWS, _LIGHT_SIGMAS, _STRUCTURE = 17, 8.0, 2.0
 _FOURTH_DIFFERENCE = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # zero for anything cubic; nearly so for a smooth spot
 
 
@@ -108,8 +109,9 @@ def _in_equal_light(difference: Floats, level: Floats, largest: float) -> Floats
     seen = np.where(np.abs(difference) < largest, difference, np.float32(0.0))
     shared, power = (cv2.blur((structure * x).sum(axis=1, keepdims=True), (1, _ROWS)) for x in (seen, structure))
     change = shared / np.maximum(power, np.float32(1e-6))
-    by_chance = trimmed_variance(difference[::4, ::4].ravel()) / np.maximum(_ROWS * power, np.float32(1e-6))
-    changed = change**2 > _LIGHT_SIGMAS**2 * by_chance
+    noise = trimmed_variance(difference[::4, ::4].ravel())
+    changed = change**2 * _ROWS * power > _LIGHT_SIGMAS**2 * noise
+    changed &= power > _STRUCTURE**2 * noise * difference.shape[1]
     return difference - change * structure if changed.any() else difference
 
 
