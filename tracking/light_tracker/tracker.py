@@ -157,7 +157,8 @@ class DrogueTracker:
                 track.unconfirmed += 1
                 track.support += _SUPPORT_RATE * (ABSENT_LOGIT - track.support)
             confidence = self._confidence(track, match)
-        if match is None or confidence < p.measured_confidence:
+        # After a gap, what was in front of the drogue may match.
+        if match is None or confidence < p.measured_confidence or track.gap > 0:
             cause = Cause.NO_MATCH if match is None else Cause.UNCERTAIN
             if match is not None and track.resembles(match):
                 track.blind, track.trusted = 0, confidence  # it may be the drogue: later frames decide
@@ -327,15 +328,19 @@ class DrogueTracker:
     def _found_elsewhere(self, track: Track, picture: Picture, matched: bool) -> DrogueFrame | None:
         """A drogue of the tracked size in the whole picture, or one that the detector is surer of than of the track.
 
-        matched: the track has a match; only a drogue of the second kind, away from it, replaces it.
+        matched: the track has a match; only a drogue of the second kind, away from it, replaces it. Without a match,
+        what has another size and covers the predicted place may be what hides the drogue.
         """
         motion, p = track.motion, self.parameters
         found = self._in_picture(picture)
         lead = logit(probability(track.checked())) + p.sure_logit
-        alike = [c for c in found if logit(c.score) > lead or (not matched and track.has_size_of(c, p))]
-        if matched:
-            u, v = motion.centre_px.tolist()
-            alike = [c for c in alike if np.hypot(c.u_px - u, c.v_px - v) >= motion.rim_diameter_px / 2]
+        u, v = motion.centre_px.tolist()
+        radius = motion.rim_diameter_px / 2
+        alike = [
+            c for c in found
+            if (not matched and track.has_size_of(c, p))
+            or (logit(c.score) > lead and np.hypot(c.u_px - u, c.v_px - v) >= radius + (0 if matched else c.radius_px))
+        ]  # fmt: skip
         best, _ = self._chosen(alike)
         if best is None or (best.score < p.elsewhere_confidence and not track.lost):
             return None

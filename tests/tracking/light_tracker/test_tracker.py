@@ -267,6 +267,32 @@ def test_a_hidden_target_is_found_elsewhere_if_the_detection_has_its_size(diamet
     assert (np.hypot(*(frame.centre_px - there[:2])) < 2) == followed_there
 
 
+@pytest.mark.parametrize("score", [0.85, 0.95, 0.99])
+@pytest.mark.parametrize("aside", [0.0, 7.0])
+def test_what_hides_a_doubtful_target_is_not_taken_for_it_however_sure_the_detector_is(score, aside):
+    """It is larger than the target, and lies where the target was last."""
+    here, cover = (60.0, 60.0, 14.0), (60.0 + aside, 60.0, 30.0)
+    detector = Detector()
+    tracker = DrogueTracker(detector)
+    for k in range(30):
+        detector.circles = [here] if k < 12 else [] if k < 22 else [cover]
+        detector.confidence = 0.9 if k < 12 else score
+        frame = tracker.step(picture([here] if k < 22 else [cover], seed=k))
+        assert k < 22 or frame.status is not PoseStatus.MEASURED, k
+
+
+def test_after_a_gap_nothing_is_measured_before_a_detection():
+    detector = Detector()
+    tracker = DrogueTracker(detector)
+    for k in range(34):
+        u, v, d = path(k)
+        gone, unseen = 20 <= k < 23, 20 <= k < 27
+        detector.circles = [] if unseen else [path(k)]
+        frame = tracker.step(picture([path(k)], seed=k, hidden=(u, v, 2 * d) if gone else None))
+        assert 27 <= k < 30 or (frame.status is PoseStatus.MEASURED) != unseen, k
+        assert not 23 < k < 27 or np.hypot(*(frame.centre_px - (u, v))) < 0.15 * d  # a match is followed all the same
+
+
 def test_a_match_after_a_gap_is_less_sure_than_one_without_until_a_detection():
     """What was in front of the target may be what matches; that it matches in more frames does not change it."""
     confidence: dict[bool, list[float]] = {}
