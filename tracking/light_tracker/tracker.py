@@ -78,7 +78,7 @@ class Track:
         """Whether a detection has the size of the drogue, if that is known from enough detections."""
         away = abs(np.log(2 * seen.radius_px / self.motion.rim_diameter_px))
         sigma = np.hypot(self.motion.sigma_diameter_px / self.motion.rim_diameter_px, p.detection_size_sigma)
-        return self.confirmed < TRUSTED or bool(away < _SIZE_SIGMAS * sigma)
+        return self.confirmed < TRUSTED or bool(away < min(_SIZE_SIGMAS * sigma, np.log(p.size_ratio)))
 
     def resembles(self, match: Match) -> bool:
         """Whether a match is about as good as the ones before; of a new pattern (nan), whether it is good."""
@@ -157,7 +157,8 @@ class DrogueTracker:
                 track.unconfirmed += 1
                 track.support += _SUPPORT_RATE * (ABSENT_LOGIT - track.support)
             confidence = self._confidence(track, match)
-        if match is None or confidence < p.measured_confidence:
+        # After a gap, what was in front of the drogue may match.
+        if match is None or confidence < p.measured_confidence or track.gap > 0:
             cause = Cause.NO_MATCH if match is None else Cause.UNCERTAIN
             if match is not None and track.resembles(match):
                 track.blind, track.trusted = 0, confidence  # it may be the drogue: later frames decide
@@ -327,18 +328,27 @@ class DrogueTracker:
     def _found_elsewhere(self, track: Track, picture: Picture, matched: bool) -> DrogueFrame | None:
         """A drogue of the tracked size in the whole picture, or one that the detector is surer of than of the track.
 
-        matched: the track has a match; only a drogue of the second kind, away from it, replaces it.
+        matched: the track has a match; only a drogue of the second kind, away from it, replaces it. Without a match,
+        what has another size and covers the predicted place may be what hides the drogue.
         """
         motion, p = track.motion, self.parameters
         found = self._in_picture(picture)
-        lead = logit(probability(track.checked())) + p.sure_logit
-        alike = [c for c in found if logit(c.score) > lead or (not matched and track.has_size_of(c, p))]
-        if matched:
-            u, v = motion.centre_px.tolist()
-            alike = [c for c in alike if np.hypot(c.u_px - u, c.v_px - v) >= motion.rim_diameter_px / 2]
-        best, _ = self._chosen(alike)
+        lead = logit(probability(track.checked()))
+        away = {c: np.hypot(*(motion.centre_px - (c.u_px, c.v_px))) - motion.rim_diameter_px / 2 for c in found}
+        again = [c for c in found if not matched and track.has_size_of(c, p)]
+        surer = [
+            c for c in found
+            if logit(c.score) > lead + p.sure_logit and away[c] >= (0 if matched else c.radius_px) and c not in again
+        ]  # fmt: skip
+        best, _ = self._chosen(again + surer)
         if best is None or (best.score < p.elsewhere_confidence and not track.lost):
             return None
+        if best in surer:
+            # One of the two is the drogue, or none: the odds of the track, or those in this picture, count against it.
+            other = max([lead, *(logit(c.score) for c in found if away[c] < 0)])
+            best = replace(best, score=float(1 / (1 + (1 + np.exp(other)) * np.exp(-logit(best.score)))))
+            if best.score < p.acquire_confidence:
+                return None
         pattern = Pattern.started(picture, best.u_px, best.v_px, 2 * best.radius_px)
         if pattern is None:
             return None

@@ -267,6 +267,64 @@ def test_a_hidden_target_is_found_elsewhere_if_the_detection_has_its_size(diamet
     assert (np.hypot(*(frame.centre_px - there[:2])) < 2) == followed_there
 
 
+@pytest.mark.parametrize("score", [0.85, 0.95, 0.99])
+@pytest.mark.parametrize("aside", [0.0, 7.0])
+def test_what_hides_a_doubtful_target_is_not_taken_for_it_however_sure_the_detector_is(score, aside):
+    """It is larger than the target, and lies where the target was last."""
+    here, cover = (60.0, 60.0, 14.0), (60.0 + aside, 60.0, 30.0)
+    detector = Detector()
+    tracker = DrogueTracker(detector)
+    for k in range(30):
+        detector.circles = [here] if k < 12 else [] if k < 22 else [cover]
+        detector.confidence = 0.9 if k < 12 else score
+        frame = tracker.step(picture([here] if k < 22 else [cover], seed=k))
+        assert k < 22 or frame.status is not PoseStatus.MEASURED, k
+
+
+def test_what_hides_a_target_of_uncertain_size_is_not_taken_for_it():
+    """Its sigma would admit twice the diameter."""
+    detector = Detector()
+    tracker = DrogueTracker(detector, LightParameters(check_every=1))
+    for k in range(40):
+        d = 14 * (1.0, 1.35, 0.74)[k % 3]
+        detector.circles = [(60.0, 60.0, d if k < 30 else 28.0)]
+        detector.confidence = 0.9 if k < 30 else 0.97
+        frame = tracker.step(picture([(60.0, 60.0, 14.0 if k < 30 else 28.0)], seed=k))
+        assert k < 30 or frame.status is not PoseStatus.MEASURED, k
+
+
+@pytest.mark.parametrize(("here", "there"), [(0.6, 0.88), (0.8, 0.95), (0.3, 0.9), (0.93, 0.95)])
+def test_what_replaces_a_target_that_is_still_seen_is_as_sure_as_the_two_leave_it(here, there):
+    """There is one drogue: what speaks for one object speaks against the other."""
+
+    def detector(_: Picture, window: Window | None) -> list[CircleCandidate]:
+        found = [CircleCandidate(120.0, 40.0, 10.0, 0.8 if k == 0 else 0.55 if window is not None else here)]
+        if k >= 10:
+            found.append(CircleCandidate(40.0, 90.0, 15.0, there))
+        return [c for c in found if window is None or np.hypot(c.u_px - window.u_px, c.v_px - window.v_px) < 30]
+
+    tracker, frames = DrogueTracker(detector), []
+    for k in range(30):
+        shown = [(120.0, 40.0, 20.0), *([(40.0, 90.0, 30.0)] if k >= 10 else [])]
+        frames.append(tracker.step(picture(shown, seed=k)))
+    replaced = [f for f in frames if f.event == "reacquired" and f.centre_px[0] < 80]
+    odds = there / (1 - there) / (1 + here / (1 - here))
+    assert len(replaced) == (odds > 1)
+    assert all(f.confidence <= odds / (1 + odds) + 1e-9 for f in replaced)
+
+
+def test_after_a_gap_nothing_is_measured_before_a_detection():
+    detector = Detector()
+    tracker = DrogueTracker(detector)
+    for k in range(34):
+        u, v, d = path(k)
+        gone, unseen = 20 <= k < 23, 20 <= k < 27
+        detector.circles = [] if unseen else [path(k)]
+        frame = tracker.step(picture([path(k)], seed=k, hidden=(u, v, 2 * d) if gone else None))
+        assert 27 <= k < 30 or (frame.status is PoseStatus.MEASURED) != unseen, k
+        assert not 23 < k < 27 or np.hypot(*(frame.centre_px - (u, v))) < 0.15 * d  # a match is followed all the same
+
+
 def test_a_match_after_a_gap_is_less_sure_than_one_without_until_a_detection():
     """What was in front of the target may be what matches; that it matches in more frames does not change it."""
     confidence: dict[bool, list[float]] = {}
