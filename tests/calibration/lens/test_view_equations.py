@@ -105,6 +105,6 @@ def test_photographs_that_scatter_have_errors_of_the_stated_size_however_few_the
     squares = []
     for _ in range(400):
         error, equations = drawn_apart(views, rng)
-        squares.append(error**2 / np.diagonal(equations.scattered_covariance(equations.scatter().factor)))
+        squares.append(error**2 / np.diagonal(equations.scattered_covariance(equations.scatter())))
     spread = np.sqrt(np.mean(squares, axis=0))
     assert np.all((spread > 0.7) & (spread < 1.2)), spread  # without degrees of freedom 1.2 to 1.6
