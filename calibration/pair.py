@@ -25,7 +25,7 @@ from calibration.least_squares.adjustment import (
 )
 from calibration.lens.board_shape import HALF_SIGNIFICANT
 from calibration.lens.fit.lens_adjustment import coefficient_prior
-from calibration.lens.fit.view_equations import BOARD_PROBABLE, ViewEquations
+from calibration.lens.fit.view_equations import BEND_PROBABLE, ViewEquations
 from calibration.lens.intrinsics_result import Intrinsics
 from calibration.terms.corners import CornerTerm
 from geometry.arrays import Array, Bools, Ints
@@ -294,7 +294,7 @@ def _covariance(names: tuple[str, str], problem: _Problem, adjusted: Adjusted, m
     spread = max(spreads, key=lambda s: s.factor if s.is_significant else 0.0)
     whole = equations.scattered_covariance(spread)[: equations.lens, : equations.lens]
     shapes = [s.board for s in single if s.board is not None]
-    if not problem.bent and any(b.warp.p_value < BOARD_PROBABLE and not b.points.corrected for b in shapes):
+    if not problem.bent and any(b.warp.p_value < BEND_PROBABLE and not b.points.corrected for b in shapes):
         change = problem.equations(adjusted, scale, True).solution()[0][: equations.lens]
         whole = whole + np.outer(change, change)
     labels = [f"cameras.{n}.{p}" for n, s in zip(names, single, strict=True) for p in s.parameters]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.least_squares.adjustment import AdjustmentError, Poses, Values
-from calibration.lens.board_shape import MOST_POINTS, BoardShapeOptions, BoardTest, board_test
+from calibration.lens.board_shape import MOST_POINTS, SIGNIFICANT, BoardShapeOptions, BoardTest, board_test
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import coverage_of, spread_deg
 from calibration.lens.fit.lens_adjustment import BRIEF
@@ -27,7 +27,7 @@ from calibration.lens.fit.lens_parameters import AS_STATED, BOARD_BLOCKS, BoardF
 from calibration.lens.fit.lens_start import StartError, start
 from calibration.lens.fit.model_selection import ModelCandidate, inliers_of_rich_models, select_model
 from calibration.lens.fit.projection_map import Difference, ProjectionMap, difference, projection_map
-from calibration.lens.fit.view_equations import BOARD_PROBABLE, ViewEquations, scattered
+from calibration.lens.fit.view_equations import BEND_PROBABLE, ViewEquations, scattered
 from calibration.lens.intrinsics_result import Intrinsics, Origins
 from calibration.lens.model_uncertainty import estimate_model_uncertainty
 from geometry.arrays import Array, Bools
@@ -184,27 +184,25 @@ def _final(table: CornerTable, chosen: ModelCandidate, board: BoardFreedom) -> t
 def _by_unsolved_board(
     table: CornerTable, found: LensFit, shape: BoardTest | None, options: IntrinsicsOptions
 ) -> Array:
-    """Covariance (p, p) of the lens by probable errors of the board that are not solved for: their square effect.
+    """Covariance (p, p) of the lens by errors of the board that are not solved for: their square effect.
 
     Few photographs show displaced points or a bend without showing them in each half. 0 if they are solved for, not
-    probable, or excluded by the user.
+    probable or significant, or excluded by the user.
     """
     change = np.zeros(len(found.model.parameters))
-    if shape is not None and not found.board.points:
-        try:
-            if (
-                shape.points.p_value < BOARD_PROBABLE
-                and options.stretch is None
-                and len(table.board_points) <= MOST_POINTS
-            ):
-                board = replace(found.board, points=True)
-                freed = fit(table, found.used, found.model, found.values, board, limits=BRIEF)
-                change = (freed.lens - found.lens)[found.model.free]
-            elif shape.warp.p_value < BOARD_PROBABLE and options.warp is None and not found.board.warp:
-                equations = ViewEquations.of(table, found, replace(found.board, warp=True))
-                change = equations.solution()[0][: equations.lens]
-        except AdjustmentError:
-            pass
+    if shape is None or found.board.points:
+        return np.outer(change, change)
+    few = len(table.board_points) <= MOST_POINTS
+    try:
+        if few and shape.points.p_value < SIGNIFICANT and options.stretch is None:
+            board = replace(found.board, points=True)
+            freed = fit(table, found.used, found.model, found.values, board, limits=BRIEF)
+            change = (freed.lens - found.lens)[found.model.free]
+        elif shape.warp.p_value < BEND_PROBABLE and options.warp is None and not found.board.warp:
+            equations = ViewEquations.of(table, found, replace(found.board, warp=True))
+            change = equations.solution()[0][: equations.lens]
+    except AdjustmentError:
+        pass
     return np.outer(change, change)
 
 
