@@ -179,7 +179,7 @@ class ViewEquations:
         C = np.einsum("uik,ij,vjk->kuv", by_sum, error, by_sum) - np.einsum("uik,vik->kuv", by_own, by_sum)
         C -= np.einsum("uik,vik->kuv", by_sum, by_own)
         np.einsum("kvv->kv", C)[:] += np.einsum("vik,vik->kv", along, by_own)
-        expected = np.trace(C, axis1=1, axis2=2)
+        expected = np.maximum(np.trace(C, axis1=1, axis2=2), _UNDETERMINED)  # less is what priors alone determine
         dof = np.maximum(expected**2 / np.sum(C**2, axis=(1, 2)), _FEWEST_DOF)
         ratio = np.einsum("ik,ij,jk->k", axes, error, axes) / expected
         jackknife = (axes * squares * ratio * dof / (dof - 2)) @ axes.T
