@@ -290,12 +290,9 @@ def _covariance(names: tuple[str, str], problem: _Problem, adjusted: Adjusted, m
     """
     single, scale = problem.single, max(misfit, 1.0)
     equations = problem.equations(adjusted, scale, problem.bent)
-    factor = max(s.correlated_noise for s in single)
-    spread = equations.scatter()
-    if spread.is_significant:
-        factor = max(factor, spread.factor)
-    whole = equations.scattered_covariance(factor) if factor > 1 else equations.basis @ equations.basis.T
-    whole = whole[: equations.lens, : equations.lens]
+    spreads = [equations.scatter(), *(s.scatter for s in single)]
+    spread = max(spreads, key=lambda s: s.factor if s.is_significant else 0.0)
+    whole = equations.scattered_covariance(spread)[: equations.lens, : equations.lens]
     shapes = [s.board for s in single if s.board is not None]
     if not problem.bent and any(b.warp.p_value < BEND_PROBABLE and not b.points.corrected for b in shapes):
         change = problem.equations(adjusted, scale, True).solution()[0][: equations.lens]

@@ -36,7 +36,7 @@ EXPLAINED = 0.01  # p-value of scatter between photographs below which noise doe
 # and with them errors that differ between photographs. With 5 views they take 3 of 10: the rest then looked like noise,
 # and fx of a wavy sheet of paper was 9 of its sigmas off.
 _SEEN_OFTEN = 8.0
-_MOST_POINTS = 2000  # above it the points are not solved for: three unknowns each
+MOST_POINTS = 2000  # above it the points are not solved for: three unknowns each
 _WARP, _STRETCH = slice(0, 3), slice(3, 5)  # of the shape's five parameters
 
 
@@ -250,7 +250,7 @@ def _points(
     if any(_p_of_points(table, found, factor, found.used & half) >= HALF_SIGNIFICANT for half in (odd, ~odd)):
         return PointsTest(nothing, p, False, _NOT_IN_HALVES), found
     seen = np.bincount(table.point[found.used], minlength=len(nothing))
-    if np.median(seen[seen > 0]) < _SEEN_OFTEN or np.sum(seen > 0) > _MOST_POINTS:
+    if np.median(seen[seen > 0]) < _SEEN_OFTEN or np.sum(seen > 0) > MOST_POINTS:
         why = "significant, but there are too few photographs to solve for each point"
         return PointsTest(nothing, p, False, why), found
     board = BoardFreedom(found.board.warp, found.board.stretch, points=True)
@@ -278,7 +278,7 @@ def _direction_sigma_px(table: CornerTable, found: LensFit) -> float:
     """Median sigma of directions where corners were seen, from noise and the scatter between photographs."""
     equations = ViewEquations.of(table, found, AS_STATED)
     at = projection_map(found.model, found.lens, table.image_size_px, 1.0)
-    sigmas = at.sigma_px(scattered(found, equations, max(1.0, equations.scatter().factor)))
+    sigmas = at.sigma_px(scattered(found, equations, equations.scatter()))
     return float(np.nanmedian(sigmas[seen_at(table, found.used, at.pixels)]))
 
 

@@ -9,12 +9,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.least_squares.adjustment import AdjustmentError, Poses, Values
-from calibration.lens.board_shape import BoardShapeOptions, BoardTest, board_test
+from calibration.lens.board_shape import MOST_POINTS, SIGNIFICANT, BoardShapeOptions, BoardTest, board_test
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import coverage_of, spread_deg
+from calibration.lens.fit.lens_adjustment import BRIEF
 from calibration.lens.fit.lens_fit import (
     FEWEST_CORNERS,
     LensFit,
+    fit,
     robust_fit,
     used_views,
     with_picture_noise,
@@ -92,8 +94,7 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     noise = spread.factor if spread.is_significant else 1.0
     distance = options.distance_m or _typical_depth(table, found)
     pixel_map = projection_map(found.model, found.lens, table.image_size_px, distance)
-    covariance = scattered(found, equations, noise) if noise > 1 else found.covariance
-    covariance = covariance + _by_unsolved_bend(table, found, shape, options)
+    covariance = scattered(found, equations, spread) + _by_unsolved_board(table, found, shape, options)
     model_uncertainty = estimate_model_uncertainty(table, found, selection, pixel_map, covariance, noise)
     return Intrinsics(
         table=table,
@@ -180,22 +181,28 @@ def _final(table: CornerTable, chosen: ModelCandidate, board: BoardFreedom) -> t
     return chosen.fit, ViewEquations.of(table, chosen.fit)
 
 
-def _by_unsolved_bend(table: CornerTable, found: LensFit, shape: BoardTest | None, options: IntrinsicsOptions) -> Array:
-    """Covariance (p, p) of the lens by a probable bend of the board that is not solved for: its square effect.
+def _by_unsolved_board(
+    table: CornerTable, found: LensFit, shape: BoardTest | None, options: IntrinsicsOptions
+) -> Array:
+    """Covariance (p, p) of the lens by errors of the board that are not solved for: their square effect.
 
-    Few photographs show a bend without showing it in each half. 0 if the bend is solved for, not probable, or excluded
-    by the user.
+    Few photographs show displaced points or a bend without showing them in each half. 0 if they are solved for, not
+    probable or significant, or excluded by the user.
     """
-    nothing = np.zeros((len(found.model.parameters),) * 2)
-    if shape is None or found.board.warp or found.board.points or options.warp is not None:
-        return nothing
-    if shape.warp.p_value >= BEND_PROBABLE:
-        return nothing
+    change = np.zeros(len(found.model.parameters))
+    if shape is None or found.board.points:
+        return np.outer(change, change)
+    few = len(table.board_points) <= MOST_POINTS
     try:
-        equations = ViewEquations.of(table, found, replace(found.board, warp=True))
+        if few and shape.points.p_value < SIGNIFICANT and options.stretch is None:
+            board = replace(found.board, points=True)
+            freed = fit(table, found.used, found.model, found.values, board, limits=BRIEF)
+            change = (freed.lens - found.lens)[found.model.free]
+        elif shape.warp.p_value < BEND_PROBABLE and options.warp is None and not found.board.warp:
+            equations = ViewEquations.of(table, found, replace(found.board, warp=True))
+            change = equations.solution()[0][: equations.lens]
     except AdjustmentError:
-        return nothing
-    change = equations.solution()[0][: equations.lens]
+        pass
     return np.outer(change, change)
 
 

@@ -117,9 +117,9 @@ def _futile(table: CornerTable, model: LensModel, smaller: Sequence[_Judged]) ->
     """
     if model.coefficients < RATIONAL.coefficients:
         return ""
-    fits = [j.candidate.fit for j in smaller if j.candidate.fit is not None]
+    fits = [j.candidate.fit for j in smaller if j.candidate.fit is not None and not j.scatters]
     if any(beyond_noise(*cell_means(table, f), f.sigma_px)[0] >= PLAUSIBLE_NOISE for f in fits):
-        return "a smaller model leaves no correlated residuals"
+        return "a smaller model leaves no correlated residuals and no scatter between photographs"
     unknown = (j.unknown_px * max(1.0, j.scatter) for j in smaller if j.map and j.candidate.model == RATIONAL)
     if any(px > UNKNOWN_PX for px in unknown):
         return f"{RATIONAL.coefficients} coefficients leave directions unknown already"
@@ -187,6 +187,7 @@ class _Judged:
     map: ProjectionMap | None = None  # None: no fit, or the views do not determine it
     inside: Bools | None = None  # (rows, columns): corners were seen there
     scatter: float = 1.0  # between photographs, factor on the sigmas
+    scatters: bool = False  # whether it is significant
     held_out_px2: float = np.inf  # sum of squared errors of all photographs, each predicted without it
     sigma_px: float = np.nan  # of directions where corners were seen
     unknown_px: float = np.inf  # of directions in 90 % of the picture
@@ -221,12 +222,13 @@ def _judged(table: CornerTable, candidate: ModelCandidate) -> _Judged:
     inside = seen_at(table, found.used, at.pixels) & np.isfinite(at.by_parameter).all(axis=(2, 3))
     variance = np.trace(at.covariance_px2(C)[inside], axis1=-2, axis2=-1)
     spread = equations.scatter()
-    stated = scattered(found, equations, spread.factor) if spread.is_significant else C
+    stated = scattered(found, equations, spread)
     return _Judged(
         candidate,
         map=at,
         inside=inside,
         scatter=spread.factor,
+        scatters=spread.is_significant,
         held_out_px2=float(np.sum(equations.held_out_px2() * equations.count)) * found.sigma_px**2,
         sigma_px=float(np.sqrt(_common_mean(variance))) if inside.any() else np.inf,
         unknown_px=float(np.nanquantile(at.sigma_px(C), 0.9)),

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from calibration.lens.fit.corner_table import CornerTable
+from calibration.lens.fit.lens_fit import fit
 from calibration.lens.fit.lens_models import LensModel
+from calibration.lens.fit.lens_parameters import BoardFreedom
 from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
 from lab.calibrate.camera.camera import figures_of
 from lab.calibrate.camera.camera_page import findings_of
@@ -69,7 +71,7 @@ def test_displaced_points_are_solved_for():
     assert c.fit.sigma_px == pytest.approx(0.2, rel=0.1)
 
 
-def test_displaced_points_of_a_few_photographs_are_not_solved_for():
+def test_displaced_points_of_a_few_photographs_are_not_solved_for_but_are_part_of_the_sigmas():
     """They would take up a third of five photographs, and errors that differ between these with it."""
     table = photographs(Scene(views=5, sigma_px=0.05), 4)
     off = np.random.default_rng(3).normal(0, 3e-4, table.board_points.shape) * [1, 1, 0]
@@ -77,3 +79,19 @@ def test_displaced_points_of_a_few_photographs_are_not_solved_for():
     assert c.board is not None
     assert not c.board.points.corrected
     assert "too few photographs" in c.board.points.why
+    freed = fit(c.table, c.fit.used, c.model, c.fit.values, BoardFreedom(points=True))
+    change = (freed.lens - c.fit.lens)[c.model.free]
+    excluded = calibrate_intrinsics(c.table, IntrinsicsOptions(lens=LensModel(5), stretch=False))
+    assert np.all(c.sigmas > 0.98 * np.hypot(change, excluded.sigmas))
+    assert np.max(c.sigmas / excluded.sigmas) > 1.1
+
+
+@pytest.mark.slow
+def test_lenses_by_few_photographs_of_displaced_points_are_within_their_sigmas():
+    squares = []
+    for seed in range(10):
+        table = photographs(Scene(views=6, sigma_px=0.1), seed)
+        off = np.random.default_rng([3, seed]).normal(0, 3e-4, table.board_points.shape) * [1, 1, 0]
+        c = calibrate_intrinsics(stated(table, table.board_points + off), FIVE)
+        squares.append(errors_in_sigmas(c)[:4] ** 2)
+    assert 0.7 < np.sqrt(np.mean(squares)) < 1.1  # 1.23 with the displacements left out

@@ -31,9 +31,10 @@ def test_twelve_coefficients_are_not_tried_where_eight_leave_directions_unknown(
     eight = _Judged(ModelCandidate(RATIONAL, off), at, scatter=scatter, unknown_px=unknown_px)
     assert (_futile(bent, LensModel(12), [eight]) == "") is tried
     assert _futile(bent, LensModel(5), [eight]) == ""
-    assert "no correlated residuals" in _futile(
-        bent, LensModel(12), [replace(eight, candidate=ModelCandidate(RATIONAL, replace(fit, sigma_px=10.0)))]
-    )
+    noise = replace(eight, candidate=ModelCandidate(RATIONAL, replace(fit, sigma_px=10.0)))
+    assert "no correlated residuals" in _futile(bent, LensModel(12), [noise])
+    # Photographs that scatter show a wrong model, too.
+    assert "no correlated residuals" not in _futile(bent, LensModel(12), [replace(noise, scatters=True)])
 
 
 def test_a_rational_lens_that_is_a_start_is_not_derived_again(bent, monkeypatch):
