@@ -70,6 +70,39 @@ def test_poses_at_a_turn_without_spots_have_the_errors_that_they_state():
     assert np.abs(errors).max() < 0.2 * DT
 
 
+GAP = slice(STEP - 8, STEP + 8)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_corner_in_a_gap_is_expected_where_nearby_motion_is_much_faster(seed):
+    """With jumps of the fastest motion's size in each step a smooth gap was more likely, and its poses far off."""
+    run = drawn(seed, FRAMES, jump_at=STEP, without_spots=GAP, jerk=0.1 * JERK)
+    search, most, every = search_in(run), np.tile(1e4 * SIZE, (FRAMES, 1)), slice(None)
+
+    def in_gap(share: float) -> tuple[float, float]:
+        """Likelihood, and NEES/6 of the poses."""
+        hidden = np.zeros((FRAMES, 2))
+        hidden[GAP] = share * most[GAP]
+        here = replace(search, hidden=hidden)
+        out = smoothed(*here.of_part([], every), search.density)
+        away = (out.x[:, :6] - run.true[:, :6])[GAP]
+        nees = np.sum(away * np.linalg.solve(out.pose_P[GAP], away[..., None])[..., 0], axis=1)
+        return here.nats([], every, search.density), float(np.mean(nees)) / 6
+
+    likely, largest = search.gap_shares(GAP, most, [])
+    assert in_gap(1.0)[0] < in_gap(0.0)[0] - 5
+    assert in_gap(0.0)[1] > 20
+    assert 0.0 < largest < 0.01
+    assert likely <= largest
+    assert in_gap(largest)[1] < 2
+
+
+def test_a_gap_of_steady_motion_has_no_jump():
+    for seed in range(6):
+        search = search_in(drawn(seed, FRAMES, without_spots=GAP, jerk=0.1 * JERK))
+        assert max(search.gap_shares(GAP, np.tile(SIZE, (FRAMES, 1)), [])) < 0.01
+
+
 def test_two_turns_may_be_one_smooth_turn_only_where_the_spots_do_not_exclude_it():
     search = search_in(drawn(8, FRAMES, jump_at=STEP, moment=0.5))
     middle = float(search.t_s[STEP] - 0.5 * DT)
