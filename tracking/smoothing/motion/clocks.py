@@ -27,7 +27,7 @@ MAX_CLOCK_STEPS = 4  # after each estimate of the motion
 _LONGEST_STEP = 0.5  # of a prior's sigma: a longer step is not linear
 _NEGLIGIBLE_STEP = 0.05  # of its sigma: a shorter step of a clock is not taken
 # The third of these steps, or a later one, of a number whose sigma is below DETERMINED: longer than so many of its
-# sigmas, or than this share of its prior's. Steps of a linear problem end after the first. Then nothing is known of any.
+# sigmas, or than this share of its prior's. Then nothing is known of any: a linear problem is solved by the first step.
 _FIRST_SMALL, _UNSETTLED_STEP = 2, (3.0, 0.3)
 _ROUNDING = 30.0  # times the error of the smallest eigenvalue: less is rounding
 _CHUNK = 512  # frames whose rows are in memory at once
@@ -125,7 +125,7 @@ def solve_clocks(
 
 
 def clock_step(found: ClockSolution, prior_sigma_s: Array, step: int) -> Array | None:
-    """The change (p,) of the clocks after an estimate of the motion and so many steps, 0: none; None: they do not end."""
+    """The change (p,) of the clocks after so many steps, each with its estimate of the motion; None: they do not end."""
     sigma, away = np.sqrt(np.diagonal(found.noise)), np.abs(found.correction_s)
     long = away > np.minimum(_UNSETTLED_STEP[0] * sigma, _UNSETTLED_STEP[1] * prior_sigma_s)
     if step >= _FIRST_SMALL and np.any(long & (sigma < DETERMINED * prior_sigma_s)):

@@ -154,9 +154,10 @@ class _TimedEstimator(_Estimator):
         self.continuous = np.zeros(len(self.t_s), dtype=bool)  # (F,) steps in which a jerk has replaced turns
         self.unobserved = _near_unobserved(known[1][core], self.t_s, frame_s)  # (F,) steps, of which ...
         self.open = np.zeros(len(self.t_s))  # (F,) ... these have a jump, with this probability in a frame
-        # (F,) of the fastest motion's variances, in these steps: the most likely share, and the largest that the spots
-        # have allowed. A jerk that has become stronger beside a gap makes all jumps in it less likely.
-        self.share, self.allowed = np.ones(len(self.t_s)), np.zeros(len(self.t_s))
+        self.steady = np.zeros(len(self.t_s), dtype=bool)  # (F,) these exclude a jump, but for one of a variance of ...
+        # (F,) ... this share of the fastest motion's: the largest that the spots have allowed, since a jerk that has
+        # become stronger beside a gap makes all jumps in it less likely.
+        self.allowed = np.zeros(len(self.t_s))
         self.clocks: ClockSolution | None = None
         self.last: tuple[Interval, Array] | None = None  # the last finite pass, and its strength of the jerk
         dt = np.ascontiguousarray(instants.run.dt[core])
@@ -173,7 +174,7 @@ class _TimedEstimator(_Estimator):
         """Passes and searches for turns until nothing changes."""
         out = self._passes(FIRST_PASSES if self.fresh else LATER_PASSES, GLOBAL_PASSES if self.fresh else 0)
         for number in range(ROUNDS):
-            withdrawn = self._hidden_sized() | self._turns_withdrawn()
+            withdrawn = self._hidden_excluded() | self._turns_withdrawn()
             if withdrawn:  # the stronger jerk would hide the other turns
                 out = self._passes(LATER_PASSES)
             if not (self._turns_improved(every=number == 0) or withdrawn):
@@ -202,7 +203,7 @@ class _TimedEstimator(_Estimator):
         return turn._replace(length_s=float(np.hypot(turn.length_s, np.sqrt(12) * sigma)))
 
     def _with_unresolved(self, out: Interval) -> Interval:
-        """The covariances, where turns resemble others, and hidden jumps larger ones, of both motions about the former."""
+        """The covariances, where turns or hidden jumps resemble others, of both motions about that with the former."""
         hidden, search, turns = self._hidden(self.allowed), self._search(), list(self.turns)
         if not turns and not hidden.any():
             return out
@@ -231,7 +232,7 @@ class _TimedEstimator(_Estimator):
                 (_, self.log_density), self.ref = self.last, before
                 break
             self.last = out, self.log_density
-            jumping = np.any((self._jumps()[0] > 0) | (self._hidden(self.share) > 0), axis=1)
+            jumping = (self._jumps()[0].max(axis=1) > 0) | ((self.open > 0) & ~self.steady)
             if number > 0:
                 self.turns = [self._sized(turn, out) for turn in self.turns]
             searching &= number < count - LAST_PASSES
@@ -290,12 +291,13 @@ class _TimedEstimator(_Estimator):
                     inside[first:end] = True
             frames = self.dt[inside].sum() / self.frame_s
             self.open[inside] = np.maximum(self.open[inside], max(P_JUMP_SHARED, 1.0 / max(frames, 1.0)))
-            self.share[inside] = self.allowed[inside] = 1.0
+            self.steady &= ~inside
+            self.allowed[inside] = 1.0
 
     def _search(self) -> TurnSearch:
         info, _ = self._information(self.ref)
         density = np.exp(self.log_density)
-        return TurnSearch(self.ref, info, density, self._hidden(self.share), self.t_s, self.frame_s)
+        return TurnSearch(self.ref, info, density, self._hidden(~self.steady), self.t_s, self.frame_s)
 
     def _turns_withdrawn(self) -> bool:
         """Replace turns by a stronger jerk where that explains the spots; whether any are.
@@ -334,20 +336,20 @@ class _TimedEstimator(_Estimator):
         self._gaps_opened()
         return any_changed
 
-    def _hidden(self, shares: Array) -> Array:
+    def _hidden(self, shares: Array | Bools) -> Array:
         """(F, 2): variances of the jumps in the steps that nothing observes, with these shares (F,)."""
         probability = np.where(self.unobserved, np.maximum(self.open, P_JUMP_OCCLUDED), self.open)
         return (shares * probability * np.minimum(self.dt / self.frame_s, 1.0))[:, None] * self.largest
 
-    def _hidden_sized(self) -> bool:
-        """Find how large the jumps in gaps are, each gap by itself; whether any has changed."""
-        search, before, every = self._search(), self.share.copy(), self._hidden(np.ones(len(self.t_s)))
+    def _hidden_excluded(self) -> bool:
+        """Exclude jumps from gaps where the motion around is more likely without; whether from any more."""
+        search, before, every = self._search(), self.steady.copy(), self._hidden(np.ones(len(self.t_s)))
         ends = np.flatnonzero(np.diff(np.r_[False, every.any(axis=1), False]))
         for first, end in zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True):
-            share, allowed = search.gap_shares(slice(first, end), every, self.turns)
-            self.share[first:end] = share
+            steady, allowed = search.gap_share(slice(first, end), every, self.turns)
+            self.steady[first:end] |= steady
             self.allowed[first:end] = np.maximum(self.allowed[first:end], allowed)
-        return bool(np.any(self.share != before))
+        return bool(np.any(self.steady & ~before))
 
     def _jumps(self) -> tuple[Array, Array]:
         """Variances (F, 2) of the velocities' jumps by turns, and their moments (F, 2)."""
@@ -357,7 +359,7 @@ class _TimedEstimator(_Estimator):
         jump, moment = self._jumps()
         self.beside = self._beside(ref)
         L, g, chi2 = self._spot_information(ref)
-        jump = np.where(jump > 0, jump, self._hidden(self.share))
+        jump = np.where(jump > 0, jump, self._hidden(~self.steady))
         first = first_variance(ref, self.dt, True)
         return RunInformation(L, g, self.dt, jump, jump / MANOEUVRE_S**2, moment, first), float(chi2.sum())
 
