@@ -76,7 +76,7 @@ GAP = slice(STEP - 8, STEP + 8)
 @pytest.mark.parametrize("seed", range(4))
 def test_a_corner_in_a_gap_is_not_excluded_where_nearby_motion_is_much_faster(seed):
     """Jumps of the fastest motion's size in each step are less likely than none, and smaller ones are needed."""
-    run = drawn(seed, FRAMES, jump_at=STEP, without_spots=GAP, jerk=0.05 * JERK)
+    run = drawn(seed, FRAMES, jump_at=STEP, without_spots=GAP, jerk=0.1 * JERK)
     search, most, every = search_in(run), np.tile(1e5 * SIZE, (FRAMES, 1)), slice(None)
 
     def in_gap(share: float) -> tuple[float, float]:

@@ -125,7 +125,7 @@ def solve_clocks(
 
 
 def clock_step(found: ClockSolution, prior_sigma_s: Array, step: int) -> Array | None:
-    """The change (p,) of the clocks after so many steps, each with its estimate of the motion; None: they do not end."""
+    """The change (p,) of the clocks after so many steps, with an estimate of the motion each; None: they do not end."""
     sigma, away = np.sqrt(np.diagonal(found.noise)), np.abs(found.correction_s)
     long = away > np.minimum(_UNSETTLED_STEP[0] * sigma, _UNSETTLED_STEP[1] * prior_sigma_s)
     if step >= _FIRST_SMALL and np.any(long & (sigma < DETERMINED * prior_sigma_s)):
