@@ -497,7 +497,7 @@ class _Smoother:
         if motion.clocks is not None and self.rec.clocks is not None:
             # Errors of places do not average out for the clocks either.
             excess = float(np.median(place_factor[motion.known])) if motion.known.any() else 1.0
-            clock_cov = motion.clocks.noise * max(excess, 1.0) + motion.clocks.systematic
+            clock_cov = motion.clocks.with_excess(excess, self.rec.clocks.sigma_s) + motion.clocks.systematic
             clocks = FoundClocks(self.correction_s, clock_cov)
             spread = motion.clocks.motion @ clock_cov @ np.swapaxes(motion.clocks.motion, 1, 2)
             beyond = clock_sigmas(final, self.rec.clocks.offset_sigma_s(clock_cov), self.rec.dt_s)

@@ -30,3 +30,11 @@ def test_from_the_third_step_on_a_step_longer_than_its_sigma_allows_leaves_nothi
         assert (change is None) == (step >= 2 and not ends)
     of_open_numbers = clock_step(solution(0.9 * PRIOR_S * one, [PRIOR_S[0], SIGMA_S[1]]), PRIOR_S, step)
     assert of_open_numbers is not None
+
+
+def test_errors_of_places_do_not_widen_the_prior_of_a_number_that_keeps_it():
+    """It was 1.7 times as wide, and so were the poses of all its camera's pictures."""
+    found = ClockSolution(np.zeros(2), np.diag([1e-8, PRIOR_S[1] ** 2]), np.zeros((2, 2)), np.zeros((1, 12, 2)))
+    wider = found.with_excess(3.0, PRIOR_S)
+    np.testing.assert_allclose(np.diagonal(wider), [3e-8, PRIOR_S[1] ** 2], rtol=1e-12)
+    np.testing.assert_array_equal(found.with_excess(0.5, PRIOR_S), found.noise)
