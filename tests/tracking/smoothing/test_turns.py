@@ -14,7 +14,7 @@ from tracking.rigid_body.models.motion import process_noise
 from tracking.smoothing.motion.fixed_interval import smoothed
 from tracking.smoothing.motion.instants import TOGETHER, Instants
 from tracking.smoothing.motion.run_detections import Delays, RunDetections, Turn, WholeRun
-from tracking.smoothing.motion.timed_run import _near_unobserved, _observed
+from tracking.smoothing.motion.timed_run import _bounded, _near_unobserved, _observed
 from tracking.smoothing.motion.turns import TURN_NATS, TurnSearch, successions, unresolved, velocity_jumps
 
 FRAMES, STEP = 40, 20  # that has the jump
@@ -301,3 +301,11 @@ def test_before_the_first_measured_frame_and_after_the_last_nothing_shows_a_jump
     measured[[3, 5, 8]] = True
     np.testing.assert_array_equal(np.flatnonzero(_observed(measured, 1)), [3, 4, 5, 6, 7, 8])
     np.testing.assert_array_equal(np.flatnonzero(_observed(measured, 0)), [3, 5, 8])
+
+
+def test_beside_a_gap_frames_without_a_pose_show_no_jump_however_slow_a_camera_is():
+    """A swing began in a gap, and the frames before the slow camera's next picture were taken for steady."""
+    measured = np.zeros(40, dtype=bool)
+    measured[[2, 5, 8, 11, 26, 29, 32, 35]] = True
+    bounded = _bounded(measured, 3)
+    np.testing.assert_array_equal(np.flatnonzero(bounded), [*range(2, 12), *range(26, 36)])

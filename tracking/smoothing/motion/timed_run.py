@@ -72,7 +72,8 @@ def estimate_timed(
         return replace(motion, known=np.zeros(frames, dtype=bool), weight=np.zeros(frames))
     if run.clocks is not None and np.count_nonzero(measured) < FEWEST_POSES:
         run = replace(run, clocks=replace(run.clocks, unsettled=True))
-    observed = _observed(measured, _longest_step(run.detections))
+    longest = _longest_step(run.detections)
+    observed = _observed(measured, longest)
     used = largest_near(measured, max_distance) & trusted & (assigned >= 0).any(axis=1)
     instants = Instants.of(run, assigned, used)
     frames_s = np.cumsum(run.dt)
@@ -85,7 +86,7 @@ def estimate_timed(
     has_spots: Bools = np.any(instants.assigned >= 0, axis=1)
     at = np.flatnonzero(has_spots)
     core = slice(int(at[0]), int(at[-1]) + 1)
-    known = measured[instants.frame], observed[instants.frame]
+    known = tuple(some[instants.frame] for some in (measured, observed, _bounded(measured, longest)))
     estimator = _TimedEstimator(instants, usual_step(run.dt), known, has_spots, core, begin)
     found = estimator.run_passes()
     rows = instants.of_frame
@@ -127,6 +128,12 @@ def _observed(measured: Bools, longest: int) -> Bools:
     return np.asarray(largest_near(measured, longest) & between)
 
 
+def _bounded(measured: Bools, longest: int) -> Bools:
+    """(T,): measured frames (T,), and those between them that are near both: a gap's ends have one on one side only."""
+    near_both = ~largest_near(~largest_near(measured, longest), longest)
+    return np.asarray(_observed(measured, longest) & (measured | near_both))
+
+
 def _near_unobserved(measured: Bools, t_s: Array, frame_s: float) -> Bools:
     """(F,): steps before instants t_s (F,) in which a jump would not show, as `unobserved_steps`.
 
@@ -145,14 +152,14 @@ class _TimedEstimator(_Estimator):
     """Passes over the instants of a run, from the first with a spot to the last."""
 
     def __init__(
-        self, instants: Instants, frame_s: float, known: tuple[Bools, Bools], used: Bools, core: slice,
+        self, instants: Instants, frame_s: float, known: tuple[Bools, ...], used: Bools, core: slice,
         motion: SmoothedMotion,
     ) -> None:  # fmt: skip
-        """known: instants (F,) of frames that are measured, and of those near such frames."""
+        """known: instants (F,) of frames that are measured, of those near such frames, and of those between these."""
         self.frame_s, self.turns = frame_s, list(motion.turns)
         self.t_s = np.ascontiguousarray(instants.t_s[core])
         self.continuous = np.zeros(len(self.t_s), dtype=bool)  # (F,) steps in which a jerk has replaced turns
-        self.unobserved = _near_unobserved(known[1][core], self.t_s, frame_s)  # (F,) steps, of which ...
+        self.unobserved = _near_unobserved(known[2][core], self.t_s, frame_s)  # (F,) steps, of which ...
         self.open = np.zeros(len(self.t_s))  # (F,) ... these have a jump, with this probability in a frame
         self.steady = np.zeros(len(self.t_s), dtype=bool)  # (F,) these exclude a jump, but for one of a variance of ...
         # (F,) ... this share of the fastest motion's: the largest that the spots have allowed, since a jerk that has
