@@ -159,7 +159,8 @@ class _TimedEstimator(_Estimator):
         self.frame_s, self.turns = frame_s, list(motion.turns)
         self.t_s = np.ascontiguousarray(instants.t_s[core])
         self.continuous = np.zeros(len(self.t_s), dtype=bool)  # (F,) steps in which a jerk has replaced turns
-        self.unobserved = _near_unobserved(known[2][core], self.t_s, frame_s)  # (F,) steps, of which ...
+        self.unobserved = _near_unobserved(known[1][core], self.t_s, frame_s)  # (F,) steps, of which ...
+        self.vague = self.unobserved | _near_unobserved(known[2][core], self.t_s, frame_s)  # (F,) with the gaps' ends
         self.open = np.zeros(len(self.t_s))  # (F,) ... these have a jump, with this probability in a frame
         self.steady = np.zeros(len(self.t_s), dtype=bool)  # (F,) these exclude a jump, but for one of a variance of ...
         # (F,) ... this share of the fastest motion's: the largest that the spots have allowed, since a jerk that has
@@ -211,7 +212,7 @@ class _TimedEstimator(_Estimator):
 
     def _with_unresolved(self, out: Interval) -> Interval:
         """The covariances, where turns or hidden jumps resemble others, of both motions about that with the former."""
-        hidden, search, turns = self._hidden(self.allowed), self._search(), list(self.turns)
+        hidden, search, turns = self._hidden(self._allowed_at_ends(), self.vague), self._search(), list(self.turns)
         if not turns and not hidden.any():
             return out
         for some in unresolved(self.turns, self.frame_s):
@@ -343,9 +344,17 @@ class _TimedEstimator(_Estimator):
         self._gaps_opened()
         return any_changed
 
-    def _hidden(self, shares: Array | Bools) -> Array:
-        """(F, 2): variances of the jumps in the steps that nothing observes, with these shares (F,)."""
-        probability = np.where(self.unobserved, np.maximum(self.open, P_JUMP_OCCLUDED), self.open)
+    def _allowed_at_ends(self) -> Array:
+        """(F,): `allowed`, also of the ends of each gap."""
+        out, ends = self.allowed.copy(), np.flatnonzero(np.diff(np.r_[False, self.vague, False]))
+        for first, end in zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True):
+            out[first:end] = out[first:end].max()
+        return out
+
+    def _hidden(self, shares: Array | Bools, unobserved: Bools | None = None) -> Array:
+        """(F, 2): variances of the jumps in unobserved steps (F,), with these shares (F,)."""
+        unobserved = self.unobserved if unobserved is None else unobserved
+        probability = np.where(unobserved, np.maximum(self.open, P_JUMP_OCCLUDED), self.open)
         return (shares * probability * np.minimum(self.dt / self.frame_s, 1.0))[:, None] * self.largest
 
     def _hidden_excluded(self) -> bool:
