@@ -18,14 +18,17 @@ def solution(correction_s, sigma_s=SIGMA_S):
 def test_a_long_first_step_is_shortened_and_negligible_ones_are_not_taken():
     np.testing.assert_allclose(clock_step(solution(-0.8 * PRIOR_S), PRIOR_S, 0), -0.5 * PRIOR_S)
     np.testing.assert_array_equal(clock_step(solution(0.01 * SIGMA_S), PRIOR_S, 1), 0.0)
-    np.testing.assert_array_equal(clock_step(solution(SIGMA_S), PRIOR_S, MAX_CLOCK_STEPS), 0.0)
+    np.testing.assert_array_equal(clock_step(solution(0.9 * SIGMA_S), PRIOR_S, MAX_CLOCK_STEPS), 0.0)
 
 
 @pytest.mark.parametrize("step", range(MAX_CLOCK_STEPS + 1))
 def test_from_the_third_step_on_a_step_longer_than_its_sigma_allows_leaves_nothing_known(step):
     """A turntable's turns and the clocks followed each other for steps of five sigmas each, to 83 sigmas."""
     one = np.array([1.0, 0.0])
-    for times, sigma_s, ends in ((2.9, SIGMA_S, True), (3.1, SIGMA_S, False), (1.1, 0.28 * PRIOR_S, False)):
+    limit = 1.0 if step == MAX_CLOCK_STEPS else 3.0
+    for times, sigma_s, ends in (
+        (limit - 0.1, SIGMA_S, True), (limit + 0.1, SIGMA_S, False), (1.1, 0.28 * PRIOR_S, False),
+    ):  # fmt: skip
         change = clock_step(solution(times * sigma_s * one, sigma_s), PRIOR_S, step)
         assert (change is None) == (step >= 2 and not ends)
     of_open_numbers = clock_step(solution(0.9 * PRIOR_S * one, [PRIOR_S[0], SIGMA_S[1]]), PRIOR_S, step)
