@@ -35,7 +35,7 @@ from tracking.smoothing.labels.continuity import continued, transfers_between_ca
 from tracking.smoothing.labels.neighbouring_frames import connected, displaced, isolated, next_to
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated, run_log_clutter, run_log_static
 from tracking.smoothing.labels.view_path import PathContext
-from tracking.smoothing.motion.clocks import DETERMINED, clock_sigmas
+from tracking.smoothing.motion.clocks import MAX_CLOCK_STEPS, clock_sigmas, clock_step
 from tracking.smoothing.motion.process_noise import corner_offsets, jump_sigmas
 from tracking.smoothing.motion.run_detections import (
     Reference,
@@ -210,11 +210,6 @@ class Smoothed:
 
 
 MAX_ROUNDS = 4  # of motion and labels
-MAX_CLOCK_STEPS = 4  # of the clocks after each estimate of the motion
-MAX_CLOCK_STEP = 0.5  # of a prior's sigma: a longer step is not linear
-NEGLIGIBLE_STEP = 0.05  # of its sigma: a shorter step of a clock is not taken
-# Of a prior's sigma: the last of these steps of a number whose sigma is below DETERMINED. Then nothing is known of any.
-UNSETTLED_STEP = 0.3
 VAGUE_SIGMA_PX = 1.0  # a spot predicted worse than this may be labelled by its path although the pose is measured
 MAX_REPAIRS = 3  # times that velocity jumps are added where poses contradict their spots
 # Excess chi-square (6 degrees of freedom) of a frame's spots at the smoothed pose over that at their own pose, above
@@ -346,19 +341,11 @@ class _Smoother:
             found = self.motion.clocks
             if found is None or rec.clocks is None:
                 break
-            sigma = np.sqrt(np.diagonal(found.noise))
-            if np.all(np.abs(found.correction_s) < NEGLIGIBLE_STEP * sigma):
+            change = clock_step(found, rec.clocks.sigma_s, step)
+            if change is None:
+                self.unsettled, change = True, rec.clocks.mean_s - self.correction_s
+            if not change.any():
                 break
-            most = MAX_CLOCK_STEP * rec.clocks.sigma_s
-            change = np.clip(found.correction_s, -most, most)
-            if step == MAX_CLOCK_STEPS:
-                solved = sigma < DETERMINED * rec.clocks.sigma_s
-                self.unsettled |= bool(
-                    np.any(np.abs(found.correction_s)[solved] > UNSETTLED_STEP * rec.clocks.sigma_s[solved])
-                )
-                if not self.unsettled:
-                    break
-                change = rec.clocks.mean_s - self.correction_s
             self.correction_s = self.correction_s + change
             self.delays = rec.delays(self.correction_s)
             run = replace(run, delays=self.delays, clocks=rec.unknown_clocks(self.correction_s, self.unsettled))
@@ -510,7 +497,7 @@ class _Smoother:
         if motion.clocks is not None and self.rec.clocks is not None:
             # Errors of places do not average out for the clocks either.
             excess = float(np.median(place_factor[motion.known])) if motion.known.any() else 1.0
-            clock_cov = motion.clocks.noise * max(excess, 1.0) + motion.clocks.systematic
+            clock_cov = motion.clocks.with_excess(excess, self.rec.clocks.sigma_s) + motion.clocks.systematic
             clocks = FoundClocks(self.correction_s, clock_cov)
             spread = motion.clocks.motion @ clock_cov @ np.swapaxes(motion.clocks.motion, 1, 2)
             beyond = clock_sigmas(final, self.rec.clocks.offset_sigma_s(clock_cov), self.rec.dt_s)

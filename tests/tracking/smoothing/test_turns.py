@@ -14,7 +14,7 @@ from tracking.rigid_body.models.motion import process_noise
 from tracking.smoothing.motion.fixed_interval import smoothed
 from tracking.smoothing.motion.instants import TOGETHER, Instants
 from tracking.smoothing.motion.run_detections import Delays, RunDetections, Turn, WholeRun
-from tracking.smoothing.motion.timed_run import _near_unobserved, _observed
+from tracking.smoothing.motion.timed_run import _bounded, _near_unobserved, _observed
 from tracking.smoothing.motion.turns import TURN_NATS, TurnSearch, successions, unresolved, velocity_jumps
 
 FRAMES, STEP = 40, 20  # that has the jump
@@ -68,6 +68,42 @@ def test_poses_at_a_turn_without_spots_have_the_errors_that_they_state():
     assert len(errors) > 50
     assert np.mean(nees) == pytest.approx(1.0, abs=0.35)
     assert np.abs(errors).max() < 0.2 * DT
+
+
+GAP = slice(STEP - 8, STEP + 8)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_corner_in_a_gap_is_not_excluded_where_nearby_motion_is_much_faster(seed):
+    """Jumps of the fastest motion's size in each step are less likely than none, and smaller ones are needed."""
+    run = drawn(seed, FRAMES, jump_at=STEP, without_spots=GAP, jerk=0.1 * JERK)
+    search, most, every = search_in(run), np.tile(1e5 * SIZE, (FRAMES, 1)), slice(None)
+
+    def in_gap(share: float) -> tuple[float, float]:
+        """Likelihood, and NEES/6 of the poses."""
+        hidden = np.zeros((FRAMES, 2))
+        hidden[GAP] = share * most[GAP]
+        here = replace(search, hidden=hidden)
+        out = smoothed(*here.of_part([], every), search.density)
+        away = (out.x[:, :6] - run.true[:, :6])[GAP]
+        nees = np.sum(away * np.linalg.solve(out.pose_P[GAP], away[..., None])[..., 0], axis=1)
+        return here.nats([], every, search.density), float(np.mean(nees)) / 6
+
+    assert in_gap(1.0)[0] < in_gap(0.0)[0] - 5
+    assert in_gap(0.0)[1] > 20
+    assert search.gap_share(GAP, most, []) == (False, 1.0)
+    assert in_gap(1.0)[1] < 2
+
+
+def test_a_gap_of_steady_motion_excludes_all_but_small_jumps():
+    found = [
+        search_in(drawn(seed, FRAMES, without_spots=GAP, jerk=0.1 * JERK)).gap_share(
+            GAP, np.tile(1e2 * SIZE, (FRAMES, 1)), []
+        )
+        for seed in range(6)
+    ]
+    assert all(excluded for excluded, _ in found)
+    assert max(share for _, share in found) < 1e-3
 
 
 def test_two_turns_may_be_one_smooth_turn_only_where_the_spots_do_not_exclude_it():
@@ -265,3 +301,11 @@ def test_before_the_first_measured_frame_and_after_the_last_nothing_shows_a_jump
     measured[[3, 5, 8]] = True
     np.testing.assert_array_equal(np.flatnonzero(_observed(measured, 1)), [3, 4, 5, 6, 7, 8])
     np.testing.assert_array_equal(np.flatnonzero(_observed(measured, 0)), [3, 5, 8])
+
+
+def test_beside_a_gap_frames_without_a_pose_show_no_jump_however_slow_a_camera_is():
+    """A swing began in a gap, and the frames before the slow camera's next picture were taken for steady."""
+    measured = np.zeros(40, dtype=bool)
+    measured[[2, 5, 8, 11, 26, 29, 32, 35]] = True
+    bounded = _bounded(measured, 3)
+    np.testing.assert_array_equal(np.flatnonzero(bounded), [*range(2, 12), *range(26, 36)])

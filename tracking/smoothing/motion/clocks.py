@@ -23,6 +23,12 @@ from tracking.smoothing.motion.run_detections import (
 )
 
 DETERMINED = 0.3  # of the prior's sigma: a number whose sigma is larger keeps its prior
+MAX_CLOCK_STEPS = 4  # after each estimate of the motion
+_LONGEST_STEP = 0.5  # of a prior's sigma: a longer step is not linear
+_NEGLIGIBLE_STEP = 0.05  # of its sigma: a shorter step of a clock is not taken
+# The third of these steps or a later one, and the last, of a number whose sigma is below DETERMINED: longer than so
+# many of its sigmas, or than this share of its prior's. Then nothing is known of any: a linear problem takes one step.
+_FIRST_SMALL, _UNSETTLED_SIGMAS, _UNSETTLED_SHARE = 2, (3.0, 1.0), 0.3
 _ROUNDING = 30.0  # times the error of the smallest eigenvalue: less is rounding
 _CHUNK = 512  # frames whose rows are in memory at once
 
@@ -99,7 +105,10 @@ def solve_clocks(
     right = b - np.einsum("kis,ki->s", B, x[:, :6]) + precision @ clocks.mean_s
     S, right = _beyond_rounding(S, right, clocks)
     noise = np.linalg.inv(S)
-    kept = (np.sqrt(np.diagonal(noise)) >= DETERMINED * clocks.sigma_s) | clocks.unsettled
+    kept = np.full(p, clocks.unsettled)
+    while np.any(more := ~kept & (np.sqrt(np.diagonal(noise)) >= DETERMINED * clocks.sigma_s)):
+        kept |= more  # and those that these leave open
+        _, noise = _with_priors(S, right, kept, clocks)
     correction, noise = _with_priors(S, right, kept, clocks)
     systematic = np.zeros((p, p))
     if clocks.calibration is not None:
@@ -113,6 +122,19 @@ def solve_clocks(
         systematic = noise @ total @ total.T @ noise
         systematic[kept], systematic[:, kept] = 0.0, 0.0
     return ClockSolution(correction, noise, systematic, -G[:, :12])
+
+
+def clock_step(found: ClockSolution, prior_sigma_s: Array, step: int) -> Array | None:
+    """The change (p,) of the clocks after so many steps, with an estimate of the motion each; None: they do not end."""
+    sigma, away = np.sqrt(np.diagonal(found.noise)), np.abs(found.correction_s)
+    most = _UNSETTLED_SIGMAS[int(step == MAX_CLOCK_STEPS)] * sigma
+    long = away > np.minimum(most, _UNSETTLED_SHARE * prior_sigma_s)
+    if step >= _FIRST_SMALL and np.any(long & (sigma < DETERMINED * prior_sigma_s)):
+        return None
+    if step == MAX_CLOCK_STEPS or np.all(away < _NEGLIGIBLE_STEP * sigma):
+        return np.zeros(len(sigma))
+    longest = _LONGEST_STEP * prior_sigma_s
+    return np.asarray(np.clip(found.correction_s, -longest, longest))
 
 
 def clock_sigmas(motion: Reference, sigma_s: float, dt: Array) -> Array:

@@ -462,6 +462,11 @@ class ClockSolution:
     systematic: Array  # (p, p) ... and by the calibration's errors
     motion: Array  # (T, 12, p) change of pose and velocities by the numbers
 
+    def with_excess(self, factor: float, prior_sigma_s: Array) -> Array:
+        """`noise` with so many times the spots' part of it, at least once: numbers that keep their priors have none."""
+        own = np.sqrt(np.diagonal(self.noise)) < prior_sigma_s
+        return np.asarray(self.noise * np.where(np.outer(own, own), max(factor, 1.0), 1.0))
+
 
 class Turn(NamedTuple):
     """A change of the velocities (turns.py)."""

@@ -47,7 +47,6 @@ from tracking.smoothing.motion.whole_run import (
 FIRST_PASSES, LATER_PASSES = 14, 5  # with one strength of the jerk first, and after turns have changed
 LAST_PASSES = 3  # of these, in which the strength of the jerk stays
 ROUNDS = 4  # of passes and improved turns
-EXCLUDED_NATS = 5.0  # by which a motion without a jump in a gap must be more likely
 FEWEST = 3  # turns in succession that a jerk may replace: two are the ends of one motion
 # m and rad: a sigma of each pose in a gap about the reference. A strong jerk would let the vehicle be kilometres away
 # after some frames, and covariances with both this and the error of a spot exceed the digits of a number.
@@ -73,7 +72,8 @@ def estimate_timed(
         return replace(motion, known=np.zeros(frames, dtype=bool), weight=np.zeros(frames))
     if run.clocks is not None and np.count_nonzero(measured) < FEWEST_POSES:
         run = replace(run, clocks=replace(run.clocks, unsettled=True))
-    observed = _observed(measured, _longest_step(run.detections))
+    longest = _longest_step(run.detections)
+    observed = _observed(measured, longest)
     used = largest_near(measured, max_distance) & trusted & (assigned >= 0).any(axis=1)
     instants = Instants.of(run, assigned, used)
     frames_s = np.cumsum(run.dt)
@@ -86,7 +86,7 @@ def estimate_timed(
     has_spots: Bools = np.any(instants.assigned >= 0, axis=1)
     at = np.flatnonzero(has_spots)
     core = slice(int(at[0]), int(at[-1]) + 1)
-    known = measured[instants.frame], observed[instants.frame]
+    known = tuple(some[instants.frame] for some in (measured, observed, _bounded(measured, longest)))
     estimator = _TimedEstimator(instants, usual_step(run.dt), known, has_spots, core, begin)
     found = estimator.run_passes()
     rows = instants.of_frame
@@ -128,6 +128,12 @@ def _observed(measured: Bools, longest: int) -> Bools:
     return np.asarray(largest_near(measured, longest) & between)
 
 
+def _bounded(measured: Bools, longest: int) -> Bools:
+    """(T,): measured frames (T,), and those between them that are near both: a gap's ends have one on one side only."""
+    near_both = ~largest_near(~largest_near(measured, longest), longest)
+    return np.asarray(_observed(measured, longest) & (measured | near_both))
+
+
 def _near_unobserved(measured: Bools, t_s: Array, frame_s: float) -> Bools:
     """(F,): steps before instants t_s (F,) in which a jump would not show, as `unobserved_steps`.
 
@@ -146,16 +152,20 @@ class _TimedEstimator(_Estimator):
     """Passes over the instants of a run, from the first with a spot to the last."""
 
     def __init__(
-        self, instants: Instants, frame_s: float, known: tuple[Bools, Bools], used: Bools, core: slice,
+        self, instants: Instants, frame_s: float, known: tuple[Bools, ...], used: Bools, core: slice,
         motion: SmoothedMotion,
     ) -> None:  # fmt: skip
-        """known: instants (F,) of frames that are measured, and of those near such frames."""
+        """known: instants (F,) of frames that are measured, of those near such frames, and of those between these."""
         self.frame_s, self.turns = frame_s, list(motion.turns)
         self.t_s = np.ascontiguousarray(instants.t_s[core])
         self.continuous = np.zeros(len(self.t_s), dtype=bool)  # (F,) steps in which a jerk has replaced turns
         self.unobserved = _near_unobserved(known[1][core], self.t_s, frame_s)  # (F,) steps, of which ...
-        self.steady = np.zeros(len(self.t_s), dtype=bool)  # (F,) ... these exclude a jump, ...
-        self.open = np.zeros(len(self.t_s))  # (F,) ... and these have one, with this probability in a frame
+        self.vague = self.unobserved | _near_unobserved(known[2][core], self.t_s, frame_s)  # (F,) with the gaps' ends
+        self.open = np.zeros(len(self.t_s))  # (F,) ... these have a jump, with this probability in a frame
+        self.steady = np.zeros(len(self.t_s), dtype=bool)  # (F,) these exclude a jump, but for one of a variance of ...
+        # (F,) ... this share of the fastest motion's: the largest that the spots have allowed, since a jerk that has
+        # become stronger beside a gap makes all jumps in it less likely.
+        self.allowed = np.zeros(len(self.t_s))
         self.clocks: ClockSolution | None = None
         self.last: tuple[Interval, Array] | None = None  # the last finite pass, and its strength of the jerk
         dt = np.ascontiguousarray(instants.run.dt[core])
@@ -201,16 +211,16 @@ class _TimedEstimator(_Estimator):
         return turn._replace(length_s=float(np.hypot(turn.length_s, np.sqrt(12) * sigma)))
 
     def _with_unresolved(self, out: Interval) -> Interval:
-        """The covariances, where turns resemble others, of both motions about that with the former."""
-        if not self.turns:
+        """The covariances, where turns or hidden jumps resemble others, of both motions about that with the former."""
+        hidden, search, turns = self._hidden(self._allowed_at_ends(), self.vague), self._search(), list(self.turns)
+        if not turns and not hidden.any():
             return out
-        search, turns = self._search(), list(self.turns)
         for some in unresolved(self.turns, self.frame_s):
             one = search.one_for(some, turns)
             if one is not None:
                 turns = [*(t for t in turns if not any(t is each for each in some)), one]
         turns = [search.to_next_spots(search.largest(turn, turns)) for turn in turns]
-        other = smoothed(*search.of_part(turns, slice(None)), search.density, tested=False)
+        other = smoothed(*replace(search, hidden=hidden).of_part(turns, slice(None)), search.density, tested=False)
         pose, motion = (x[:, :, None] * x[:, None] for x in (other.x[:, :6], other.x[:, 6:12]))
         return out._replace(
             pose_P=0.5 * (out.pose_P + other.pose_P + pose), motion_P=0.5 * (out.motion_P + other.motion_P + motion)
@@ -230,7 +240,7 @@ class _TimedEstimator(_Estimator):
                 (_, self.log_density), self.ref = self.last, before
                 break
             self.last = out, self.log_density
-            jumping = (self._jumps()[0].max(axis=1) > 0) | (self.open > 0)
+            jumping = (self._jumps()[0].max(axis=1) > 0) | ((self.open > 0) & ~self.steady)
             if number > 0:
                 self.turns = [self._sized(turn, out) for turn in self.turns]
             searching &= number < count - LAST_PASSES
@@ -290,11 +300,12 @@ class _TimedEstimator(_Estimator):
             frames = self.dt[inside].sum() / self.frame_s
             self.open[inside] = np.maximum(self.open[inside], max(P_JUMP_SHARED, 1.0 / max(frames, 1.0)))
             self.steady &= ~inside
+            self.allowed[inside] = 1.0
 
     def _search(self) -> TurnSearch:
         info, _ = self._information(self.ref)
         density = np.exp(self.log_density)
-        return TurnSearch(self.ref, info, density, self._hidden(), self.t_s, self.frame_s)
+        return TurnSearch(self.ref, info, density, self._hidden(~self.steady), self.t_s, self.frame_s)
 
     def _turns_withdrawn(self) -> bool:
         """Replace turns by a stronger jerk where that explains the spots; whether any are.
@@ -333,23 +344,28 @@ class _TimedEstimator(_Estimator):
         self._gaps_opened()
         return any_changed
 
-    def _hidden(self) -> Array:
-        """(F, 2): variances of the jumps in the steps that nothing observes."""
-        probability = np.where(self.unobserved & ~self.steady, np.maximum(self.open, P_JUMP_OCCLUDED), self.open)
-        return (probability * np.minimum(self.dt / self.frame_s, 1.0))[:, None] * self.largest
+    def _allowed_at_ends(self) -> Array:
+        """(F,): `allowed`, also of the ends of each gap."""
+        out, ends = self.allowed.copy(), np.flatnonzero(np.diff(np.r_[False, self.vague, False]))
+        for first, end in zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True):
+            out[first:end] = out[first:end].max()
+        return out
+
+    def _hidden(self, shares: Array | Bools, unobserved: Bools | None = None) -> Array:
+        """(F, 2): variances of the jumps in unobserved steps (F,), with these shares (F,)."""
+        unobserved = self.unobserved if unobserved is None else unobserved
+        probability = np.where(unobserved, np.maximum(self.open, P_JUMP_OCCLUDED), self.open)
+        return (shares * probability * np.minimum(self.dt / self.frame_s, 1.0))[:, None] * self.largest
 
     def _hidden_excluded(self) -> bool:
         """Exclude jumps from gaps where the motion around is more likely without; whether from any more."""
-        search, before = self._search(), int(self.steady.sum())
-        ends = np.flatnonzero(np.diff(np.r_[False, search.hidden.any(axis=1), False]))
+        search, before, every = self._search(), self.steady.copy(), self._hidden(np.ones(len(self.t_s)))
+        ends = np.flatnonzero(np.diff(np.r_[False, every.any(axis=1), False]))
         for first, end in zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True):
-            part = search.part(self.t_s[first], self.t_s[end - 1])
-            near, hidden = search.near(self.turns, part), search.hidden.copy()
-            hidden[first:end] = 0.0
-            without = replace(search, hidden=hidden).nats(near, part, search.density)
-            if without > search.nats(near, part, search.density) + EXCLUDED_NATS:
-                self.steady[first:end], self.open[first:end] = True, 0.0
-        return int(self.steady.sum()) > before
+            steady, allowed = search.gap_share(slice(first, end), every, self.turns)
+            self.steady[first:end] |= steady
+            self.allowed[first:end] = np.maximum(self.allowed[first:end], allowed)
+        return bool(np.any(self.steady & ~before))
 
     def _jumps(self) -> tuple[Array, Array]:
         """Variances (F, 2) of the velocities' jumps by turns, and their moments (F, 2)."""
@@ -359,7 +375,7 @@ class _TimedEstimator(_Estimator):
         jump, moment = self._jumps()
         self.beside = self._beside(ref)
         L, g, chi2 = self._spot_information(ref)
-        jump = np.where(jump > 0, jump, self._hidden())
+        jump = np.where(jump > 0, jump, self._hidden(~self.steady))
         first = first_variance(ref, self.dt, True)
         return RunInformation(L, g, self.dt, jump, jump / MANOEUVRE_S**2, moment, first), float(chi2.sum())
 

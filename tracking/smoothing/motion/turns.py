@@ -9,7 +9,7 @@ a change point, e.g. Basseville & Nikiforov (1993), "Detection of Abrupt Changes
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,6 +38,8 @@ _WIDER = 1.25  # times, in the search for that
 _SIGMAS = 2.0  # of the middle, as a sigma: the same spots show it and then the motion
 _WITH_IT = (-1.0, -0.5, 0.0, 0.5, 1.0)  # of the way of the middle: how far the turn beside it moves, too
 _SHARES = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)  # of a turn's variance, of which the most likely one is taken
+_GAP_SHARES = (*10.0 ** np.arange(0.0, -6.5, -0.5), 0.0)  # of that of a gap's jumps: a thousandth of the fastest speed
+_EXCLUDED_NATS = 5.0  # by which these must be less likely than none, or than smaller ones, to exclude them
 _CURVATURE_NATS = 0.5  # drop of the likelihood from which the sigma of the middle is computed
 _CHANGED = 0.02, 0.1  # of a frame, and relative: less does not change a turn
 TURN_NATS = 3.0  # by which each turn must make a run more likely
@@ -159,6 +161,22 @@ class TurnSearch:
             if run.nats([larger]) > least:
                 return larger
         return turn
+
+    def gap_share(self, gap: slice, most: Array, turns: Sequence[Turn]) -> tuple[bool, float]:
+        """Whether the steps of a gap have no jumps, and the share of the variances `most` (F, 2) that these may have.
+
+        `most` belongs to the fastest motion nearby. Around the gap the vehicle may be much slower, where jumps of that
+        size are less likely than none although smaller ones are needed: then they are not excluded.
+        """
+        part, hidden = self.part(self.t_s[gap.start], self.t_s[gap.stop - 1]), self.hidden.copy()
+        near, nats = self.near(turns, part), []
+        for share in _GAP_SHARES:
+            hidden[gap] = share * most[gap]
+            nats.append(replace(self, hidden=hidden).nats(near, part, self.density))
+        if max(nats) > nats[-1] + TURN_NATS or nats[-1] < nats[0] + _EXCLUDED_NATS:
+            return False, 1.0
+        allowed = np.flatnonzero(np.array(nats) > max(nats) - _EXCLUDED_NATS)
+        return True, float(_GAP_SHARES[allowed[0]])
 
     def to_next_spots(self, turn: Turn) -> Turn:
         """A turn that takes some frames, from the last spots before it to the first after it: its ends are smooth."""

@@ -255,6 +255,8 @@ def test_a_turn_in_a_gap_in_which_nothing_is_seen_is_covered(gap, tmp_path):
         pytest.param(6015, 200, id="the same with more noise: corners much smaller than the fastest motion"),
         pytest.param(9304, 220, id="slow corners, which few frames do not show"),
         pytest.param(7111, 120, id="a corner before the first frame that has a pose"),
+        pytest.param(21001, 300, id="a slow corner in a gap beside fast motion"),
+        pytest.param(7331, 120, id="a swing that begins in a gap, with a slow camera"),
     ],
 )
 def test_no_pose_beside_a_turn_is_wrong_by_more_than_it_states(seed, frames, tmp_path):
@@ -272,6 +274,7 @@ def test_no_pose_beside_a_turn_is_wrong_by_more_than_it_states(seed, frames, tmp
         pytest.param(7111, 120, 0, id="a strong jerk in gaps, and spots of one camera: a motion that is not finite"),
         pytest.param(7141, 120, 0, id="an offset that stays open by a frame, of swings that last for twelve"),
         pytest.param(7127, 120, 1, id="a turntable, whose turns alone show the clock"),
+        pytest.param(7303, 120, 0, id="a turntable, whose turns follow the clock for many steps"),
     ],
 )
 def test_clocks_are_estimated_with_turns_that_depend_on_them(seed, frames, known, tmp_path):
