@@ -106,27 +106,31 @@ class ShownLight:
         rows, columns = sample_of(self.size)
         seen = picture[::rows, ::columns].astype(np.float32) - self.smooth
         light, clear, left, shown = self._fitted(seen)
-        of_rows = None
-        for k in range(_FITS if self.reference else 0):
-            differs = _light_of_rows(left, shown, clear)
-            if k == 0 and not differs[1].any():
+        if not LEAST_LIGHT < light < MOST_LIGHT:
+            return None
+        of_rows, levels, differ = np.ones((len(seen), 1), np.float32), np.zeros((len(seen), 1), np.float32), False
+        for _ in range(_FITS if self.reference else 0):
+            differs, beyond = _light_of_rows(left, shown, clear)
+            if not (differ or beyond.any()):
                 break
-            step = np.float32(1) + differs[0] / np.float32(light)
+            differ, step = (
+                True,
+                np.clip(1 + differs / np.float32(light), np.float32(LEAST_LIGHT), np.float32(MOST_LIGHT)),
+            )
             counted = clear.astype(np.float32)
-            own = np.float32(light) * step * self.own
-            level = _over_rows(counted * (seen - own)) / np.maximum(_over_rows(counted), np.float32(1e-3))
+            level = _over_rows(counted * (seen - np.float32(light) * step * self.own))
+            level /= np.maximum(_over_rows(counted), np.float32(1e-3))
             seen = (seen - level) / step
-            last = (1.0, 0.0) if of_rows is None else of_rows
-            of_rows = last[0] * step, last[0] * level + last[1]
+            of_rows, levels = of_rows * step, of_rows * level + levels
             light, clear, left, shown = self._fitted(seen)
         misfit = 1.4826 * _median(np.abs(left[_SOME][clear[_SOME]]))
-        if misfit > largest_misfit or not LEAST_LIGHT < light < MOST_LIGHT:
+        if misfit > largest_misfit:
             return None
-        if of_rows is None:
+        if not differ:
             return Shown(light, clear, left, misfit)
         at, known = np.arange(self.size[0]), np.arange(len(seen)) * rows
-        every = [np.interp(at, known, x[:, 0]) for x in (light * of_rows[0], of_rows[1])]
-        return Shown(light, clear, left, misfit, np.array(every))
+        every = np.array([np.interp(at, known, x[:, 0]) for x in (light * of_rows, levels)])
+        return Shown(light, clear, left, misfit, every)
 
     def _fitted(self, seen: _Values) -> tuple[float, Bools, _Values, _Values]:
         """The light relative to the background; and, on the sample: what is clear of lights, what the background
