@@ -23,6 +23,7 @@ PICTURE_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm", ".jpg", ".jpeg")
 UNREADABLE = "unreadable"
 DROPPED = "dropped"
 REPEATED = "repeated: the picture is that of the frame before"
+TORN = "torn: rows of the picture are those of the frame before"
 _MAX_PADDING_BYTES = 16  # bytes that some cameras add before the end of a JPEG; damage leaves about fifty or more
 _LARGE_BYTES = 1 << 26  # bytes: a larger file is mapped, not read, since its header may show that it is unusable
 
@@ -34,7 +35,7 @@ ColourPicture: TypeAlias = NDArray[np.uint8]  # (h, w, 3), BGR
 class MissingPicture:
     """The reason why there is no usable picture."""
 
-    reason: str  # "dropped", "repeated: ...", "unreadable: ...", "wrong size ..."
+    reason: str  # "dropped", "repeated: ...", "torn: ...", "unreadable: ...", "wrong size ..."
 
 
 def read_picture(path: Path, size_px: tuple[int, int] | None, colour: bool = False) -> Any:

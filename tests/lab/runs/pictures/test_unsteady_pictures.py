@@ -179,6 +179,35 @@ def test_pictures_that_repeat_the_one_before_have_no_spots(tmp_path):
     assert "camera moves" not in " ".join(summary["notes"])
 
 
+def test_torn_pictures_have_no_spots(tmp_path):
+    """The lower half of a picture is that of the frame before; the spots there are those of another instant."""
+    folder, truth = recording(tmp_path / "run")
+    torn = [9, 14, 20]
+    for frame in torn:
+        for camera in ("left", "right"):
+            now, before = (folder / "frames" / camera / f"{frame - k:06d}.png" for k in (0, 1))
+            halves = [cv2.imread(str(p), cv2.IMREAD_UNCHANGED) for p in (now, before)]
+            cv2.imwrite(str(now), np.vstack([halves[0][: SIZE[0] // 2], halves[1][SIZE[0] // 2 :]]))
+    done = CliRunner().invoke(main, ["run", str(folder), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 0, done.output
+    rows = pd.read_csv(tmp_path / "out" / "attitude.csv").set_index("frame")
+    assert (rows.status[torn] != "measured").all()
+    assert (rows.status.drop(torn) == "measured").all()
+    assert nees(tmp_path / "out", truth).mean() < 2.0
+    assert "left: 3 frames torn" in " ".join(json.loads((tmp_path / "out" / "summary.json").read_text())["notes"])
+
+
+def test_rows_without_noise_may_be_equal():
+    """Black rows, and blocks that a video has not coded again."""
+    rng = np.random.default_rng(2)
+    pictures = [rng.integers(0, 20, (400, 600), np.uint8) for _ in range(4)]
+    for k, picture in enumerate(pictures):
+        picture[:40] = 0
+        if k:
+            picture[200:, : 100 * k] = pictures[k - 1][200:, : 100 * k]
+    assert all(isinstance(p, np.ndarray) for _, p in without_repeats((k, p) for k, p in enumerate(pictures)))
+
+
 def test_pictures_without_noise_may_be_equal_while_all_is_at_rest():
     bright = np.zeros((400, 600), np.uint8)
     bright[180:192, 300:312] = 200
