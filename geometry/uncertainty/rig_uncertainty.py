@@ -164,7 +164,7 @@ class Sensitivity:
             if parameter in CLOCK:
                 continue
             if kind == "cameras":
-                field, column = _camera_column(rig.cameras[item], parameter)
+                field, column = camera_column(rig.cameras[item], parameter)
                 views = camera_of == cameras.index(item)
             elif kind == "screens":
                 field, column = ("bow", BOW.index(parameter)) if parameter in BOW else ("screen", POSE.index(parameter))
@@ -190,9 +190,8 @@ class Sensitivity:
         return out
 
 
-def _camera_column(camera: Camera, parameter: str) -> tuple[str, int]:
+def camera_column(camera: Camera, parameter: str) -> tuple[str, int]:
     """Field of SpotDerivatives and column in it of a camera's parameter."""
-
     if parameter in PINHOLE:
         return "pinhole", PINHOLE.index(parameter)
     if parameter in POSE:
