@@ -67,9 +67,9 @@ def find_circles(image: GreyImage, board: CircleGrid, thorough: bool = True) -> 
     for scale in scales(image):
         small = scaled(image, scale)
         for light in (False, True):
-            dark = 255 - small if light else small
+            black = 255 - small if light else small
             # Centres and diameters (n, 3), px.
-            seen = np.array([[*k.pt, k.size] for k in _detector(dark).detect(dark)]).reshape(-1, 3)
+            seen = np.array([[*k.pt, k.size] for k in _detector(black).detect(black)]).reshape(-1, 3)
             for grid in _grids(seen, board, (small.shape[1], small.shape[0])):
                 ordered = _ordered(grid, board, (small.shape[1], small.shape[0]))
                 if not isinstance(ordered, NotFound):
