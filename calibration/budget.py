@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
@@ -240,7 +240,9 @@ def plan_grid(rig: Rig, errors: RigErrors, sources: Mapping[str, str], options: 
     model = SpotModel.of(rig)
     budget = PoseBudget(model, Sensitivity(rig, model, errors.names), errors, options.sigma_px, options.edge_px)
     coordinates = options.coordinates()
-    chunks = [_of_chunk(model, budget.of(poses_of(part)), part) for part in _chunks(coordinates)]
+    starts = range(0, len(coordinates), _POSES_AT_ONCE)
+    parts = [coordinates[start : start + _POSES_AT_ONCE] for start in starts]
+    chunks = [_of_chunk(model, budget.of(poses_of(part)), part) for part in parts]
     columns = {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
     effects, things = columns.pop("effects"), columns.pop("things")
     solved = columns["status"] != STATUS.index(NOT_OBSERVABLE)
@@ -273,11 +275,6 @@ def axes_jacobian(rotation: Array) -> Array:
     return out
 
 
-def _chunks(coordinates: Array) -> Iterator[Array]:
-    for start in range(0, len(coordinates), _POSES_AT_ONCE):
-        yield coordinates[start : start + _POSES_AT_ONCE]
-
-
 def _of_chunk(model: SpotModel, b: Budget, coordinates: Array) -> dict[str, Array]:
     """The columns of a plan for some of its poses, with effects (k, 6, q) and things (k, t, 6) in single precision."""
     to_axes = axes_jacobian(poses_of(coordinates).rotation)
@@ -293,7 +290,7 @@ def _of_chunk(model: SpotModel, b: Budget, coordinates: Array) -> dict[str, Arra
     return {
         "status": np.where(b.observable, np.where(vague, 1, 0), 2),
         "seen": b.seen,
-        "margin_px": _margins(b.pixels, model.image_size_px),
+        "margin_px": np.min(np.minimum(b.pixels + 0.5, model.image_size_px - 0.5 - b.pixels), axis=-1),
         "closest_px": _closest(b.pixels, b.seen, model.camera_of),
         "condition": b.condition,
         "sigma": _root_of_diagonal(axes_of_total),
@@ -317,12 +314,6 @@ def _over_poses(of: Callable[..., Array], values: Array) -> Array:
 
 def _root_of_diagonal(covariances: Array) -> Array:
     return np.sqrt(np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0))
-
-
-def _margins(pixels: Array, sizes_px: Array) -> Array:
-    """Distance (k, n), px, of pixels (k, n, 2) to the nearest edge of their pictures (n, 2), negative outside."""
-    inside = np.minimum(pixels + 0.5, sizes_px - 0.5 - pixels)
-    return np.min(inside, axis=-1)
 
 
 def _closest(pixels: Array, seen: Bools, camera_of: Ints) -> Array:

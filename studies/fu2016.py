@@ -492,7 +492,8 @@ def _observability_rows(observed: dict[str, Observability]) -> list[ComparisonRo
     """The standard filter's column: observability depends on the measurement, not on the filter."""
     out = []
     for name, o in observed.items():
-        note = f"of {len(STATES)}; not observed: {', '.join(_unobserved(o)) or 'none'}"
+        unobserved = [state for state, good in zip(STATES, o.observed(), strict=True) if not good]
+        note = f"of {len(STATES)}; not observed: {', '.join(unobserved) or 'none'}"
         out.append(_standard_only(f"observed directions, {name}", "", float(o.rank), note))
         out.append(
             _standard_only(f"sigma of range x, {name}", "m", float(o.sigma[0]), f"prior {o.sigma_prior[0]:.1f} m")
@@ -502,10 +503,6 @@ def _observability_rows(observed: dict[str, Observability]) -> list[ComparisonRo
 
 def _standard_only(quantity: str, unit: str, value: float, note: str) -> ComparisonRow:
     return ComparisonRow(quantity, unit, None, (value, *[None] * (len(FILTERS) - 1)), note)
-
-
-def _unobserved(o: Observability) -> list[str]:
-    return [name for name, good in zip(STATES, o.observed(), strict=True) if not good]
 
 
 # The figures ------------------------------------------------------------------------------------------------------

@@ -272,8 +272,15 @@ def still_errors(seed: int, count: int) -> StillErrors:
             prior = still.circle + PREDICTION_PX * rng.standard_normal(3) * [1, 1, 1 / 3]
             fit = measured_once(still.picture, prior, parameters)
             away = np.full(3, np.nan) if fit is None else fit.centre_and_radius - still.circle
-            nees = [np.nan, np.nan] if fit is None else [_nees(away, fit.covariance_px2, n) for n in (2, 3)]
-            errors = [_distance(c, still.circle) for c in (strongest(still.picture), _printed(still.picture, prior))]
+            nees = (
+                [np.nan, np.nan]
+                if fit is None
+                else [float(away[:n] @ np.linalg.solve(fit.covariance_px2[:n, :n], away[:n])) for n in (2, 3)]
+            )
+            errors = [
+                _distance(c, still.circle)
+                for c in (strongest(still.picture), printed_measurement(still.picture, prior, parameters))
+            ]
             rows.append([hidden, *errors, float(np.hypot(*away[:2])), *nees])
     return StillErrors(*np.array(rows).T)
 
@@ -300,14 +307,6 @@ def strongest(picture: Picture) -> Array | None:
         if found is not None:
             return np.asarray(found, dtype=float).reshape(-1, 3)[0]
     return None
-
-
-def _nees(away: Array, covariance: Array, n: int) -> float:
-    return float(away[:n] @ np.linalg.solve(covariance[:n, :n], away[:n]))
-
-
-def _printed(picture: Picture, prior: Array) -> Array | None:
-    return printed_measurement(picture, prior, CircleParameters())
 
 
 def _distance(circle: Array | None, truth: Array) -> float:

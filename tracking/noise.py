@@ -115,7 +115,8 @@ def guess_noise(image: Picture) -> NoiseModel:
         sigma = clipped_normal(sample.ravel().astype(float))[1]
         if is_clipped_noise(first, second, sigma):
             floor = max(floor, sigma**2 + ROUNDING_DN2)
-    return NoiseModel(max(floor, ROUNDING_DN2), usual_slope(image.dtype), level)
+    slope = float(np.iinfo(image.dtype).max) / FULL_SCALE_E  # of a sensor with so many electrons at the largest value
+    return NoiseModel(max(floor, ROUNDING_DN2), slope, level)
 
 
 def is_clipped_noise(first: NDArray[np.generic], second: NDArray[np.generic], sigma: float) -> bool:
@@ -145,8 +146,3 @@ def quantile_variance(scatter: NDArray[np.floating]) -> float:
     """Variance of normal deviates from their absolute values, robust to a few per cent of outliers."""
     low, high = np.quantile(scatter, [0.68, 0.95])
     return float(max(low / NORMAL_68, high / NORMAL_95) ** 2)
-
-
-def usual_slope(dtype: np.dtype) -> float:
-    """Slope, DN, of a sensor with FULL_SCALE_E electrons at the largest value of the data type."""
-    return float(np.iinfo(dtype).max) / FULL_SCALE_E

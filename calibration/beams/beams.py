@@ -322,7 +322,7 @@ def _finished(
         undetermined = in_words(motions, list(rig.beams), lines_in(values), world_from_stand)
         at, joint = parameters, _determined_covariance(loose, parameters)
     else:
-        at = parameters + [(s, i) for s in _lab_blocks(free) for i in range(len(values[s]))]
+        at = parameters + [(s, i) for s in free if s not in (BEAMS, STAND, POSES) for i in range(len(values[s]))]
         joint = fit.adjusted.covariance(at)
     for t in gauge:
         slide = slide @ t.projection(lines_in(values))
@@ -353,10 +353,6 @@ def _finished(
         frame_free=len(directions) if gauge else 0,
         dropped=dropped,
     )
-
-
-def _lab_blocks(free: dict[str, bool | Bools]) -> list[str]:
-    return [s for s in free if s not in (BEAMS, STAND, POSES)]
 
 
 def at_feet(lines: Lines) -> tuple[Lines, Array]:

@@ -7,7 +7,7 @@ spots. The best candidates are then used in a calibration: only if most spots ag
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -87,7 +87,7 @@ def _of_records(rig: Rig, spots: SpotPixels, stand: StandModel) -> list[_Candida
         if misfit < _FAR_BETTER * present:
             out.append(_Candidate(of, misfit / present, spots, replace(stand, stand_from_body=poses)))
     sigmas = np.broadcast_to(np.asarray(stand.pose_sigmas, dtype=float), (count, 6))
-    for n in _shifts(count):
+    for n in (k for k in range(-(count // 2), count // 2 + 1) if k):
         both = (usable + n >= 0) & (usable + n < count)
         if np.sum(both) < _FEWEST:
             continue
@@ -124,10 +124,6 @@ def _other_records(poses: Pose) -> Iterator[tuple[RecordingError, Pose]]:
         remedy = "write x_m, y_m, z_m in metres"
         words = f"with their positions times {factor:g} ({unit} were written)"
         yield RecordingError(False, words, remedy), Pose(poses.rotation, factor * t)
-
-
-def _shifts(count: int) -> Sequence[int]:
-    return [n for n in range(-(count // 2), count // 2 + 1) if n]
 
 
 def _shifted(n: int) -> RecordingError:

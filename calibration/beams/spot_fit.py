@@ -127,13 +127,9 @@ def _best(model: SpotModel, spots: SpotPixels, starts: list[Pose]) -> PoseFit | 
     """The fit with the least chi-square."""
     if len(spots) < 3:
         return None
-    fits = [_fit(model, spots.view, spots, s) for s in starts]
+    fits = [fit_pose(model, spots.view, spots.pixels, spots.covariance, s) for s in starts]
     usable = [f for f in fits if f is not None]
     return min(usable, key=lambda f: (not f.observable, f.chi2), default=None)
-
-
-def _fit(model: SpotModel, rows: Ints, spots: SpotPixels, start: Pose) -> PoseFit | None:
-    return fit_pose(model, rows, spots.pixels, spots.covariance, start)
 
 
 def _pose_from_whole_beams(rig: Rig, spots: SpotPixels, points: Array) -> Pose | None:

@@ -67,7 +67,9 @@ def find_circles(image: GreyImage, board: CircleGrid, thorough: bool = True) -> 
     for scale in scales(image):
         small = scaled(image, scale)
         for light in (False, True):
-            seen = _blobs(255 - small if light else small)
+            black = 255 - small if light else small
+            # Centres and diameters (n, 3), px.
+            seen = np.array([[*k.pt, k.size] for k in _detector(black).detect(black)]).reshape(-1, 3)
             for grid in _grids(seen, board, (small.shape[1], small.shape[0])):
                 ordered = _ordered(grid, board, (small.shape[1], small.shape[0]))
                 if not isinstance(ordered, NotFound):
@@ -93,11 +95,6 @@ def _detector(image: GreyImage) -> cv2.SimpleBlobDetector:
     p.minThreshold, p.maxThreshold, p.thresholdStep = 10.0, 245.0, 10.0
     p.minRepeatability = 2
     return cv2.SimpleBlobDetector.create(p)
-
-
-def _blobs(image: GreyImage) -> Array:
-    """Centres and diameters (n, 3), px."""
-    return np.array([[*k.pt, k.size] for k in _detector(image).detect(image)]).reshape(-1, 3)
 
 
 def _grids(

@@ -131,14 +131,11 @@ def write(cameras: Sequence[CameraModel]) -> Written:
         pose = camera.camera_from_reference
         if pose is not None:
             step = pose if before is None else pose @ before.inverse()
-            if before is not None or not _is_identity(step) or len(cameras) == 1:
+            moved = not np.array_equal(step.rotation, np.eye(3)) or step.translation.any()
+            if before is not None or moved or len(cameras) == 1:
                 lines += ["  T_cn_cnm1:", *(f"  - {exact_list(row)}" for row in _rows(step))]
             before = pose
     return Written("\n".join(lines) + "\n")
-
-
-def _is_identity(pose: Pose) -> bool:
-    return bool(np.array_equal(pose.rotation, np.eye(3)) and not pose.translation.any())
 
 
 def _rows(pose: Pose) -> Array:

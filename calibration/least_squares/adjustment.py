@@ -293,7 +293,9 @@ class Adjusted:
             block = (factor.solve(rhs) * scale[:, None])[picked]
             out[np.ix_(free, free)] = (block + block.T) / 2
         if any(stack in self._columns.basis for stack, _ in at):
-            M = block_diag(*[self._columns.basis_of(a[0]) for a in at])
+            # The basis (dof, dof) in which each stack's steps are taken.
+            basis, column = self._columns.basis, self._columns.column
+            M = block_diag(*[basis.get(s, np.eye(column[s].shape[1])) for s, _ in at])
             out = M @ out @ M.T
         return out
 
@@ -409,10 +411,6 @@ class _Columns:
     def of(self, stack: str, element: int) -> Ints:
         """The columns (dof,) of one unknown."""
         return self.column[stack][element]
-
-    def basis_of(self, stack: str) -> Array:
-        """The basis (dof, dof) in which a stack's steps are taken."""
-        return self.basis.get(stack, np.eye(self.column[stack].shape[1]))
 
     def jacobian(self, part: Part) -> Array:
         """Derivatives (N, d, dof) by the coordinates in which steps are taken."""

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc
 
-from calibration.least_squares.adjustment import AdjustmentError, Values
+from calibration.least_squares.adjustment import AdjustmentError
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import seen_at
 from calibration.lens.fit.lens_adjustment import BRIEF, term_of
@@ -112,7 +112,9 @@ def board_test(table: CornerTable, found: LensFit, options: BoardShapeOptions = 
     found: a fit of a lens model that is rich enough not to attribute its own error to the board. Raises
     AdjustmentError: not even the bend can be determined.
     """
-    flat = fit(table, found.used, found.model, {**found.values, **_stated_board(table, found)}, AS_STATED, limits=BRIEF)
+    # The board as stated, its circles as measured.
+    stated = {**board_as_stated(len(table.board_points)), "radius": found.values["radius"]}
+    flat = fit(table, found.used, found.model, {**found.values, **stated}, AS_STATED, limits=BRIEF)
     bent = fit(table, flat.used, flat.model, flat.values, BoardFreedom(warp=True), limits=BRIEF)
     test = _Evidence.of(table, bent)
     warp, why = test.is_bent, test.why_bent
@@ -144,11 +146,6 @@ def board_test(table: CornerTable, found: LensFit, options: BoardShapeOptions = 
         )
     points, kept = _points(table, kept, options, max(1.0, test.scatter.factor))
     return BoardTest(warp_test, stretch_test, points, kept)
-
-
-def _stated_board(table: CornerTable, found: LensFit) -> Values:
-    """The board as stated, its circles as measured."""
-    return {**board_as_stated(len(table.board_points)), "radius": found.values["radius"]}
 
 
 @dataclass(frozen=True, slots=True)

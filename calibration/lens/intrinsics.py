@@ -96,6 +96,7 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     pixel_map = projection_map(found.model, found.lens, table.image_size_px, distance)
     covariance = scattered(found, equations, spread) + _by_unsolved_board(table, found, shape, options)
     model_uncertainty = estimate_model_uncertainty(table, found, selection, pixel_map, covariance, noise)
+    odd = np.arange(len(equations.views)) % 2 == 1
     return Intrinsics(
         table=table,
         model=found.model,
@@ -108,7 +109,7 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
         held_out_rms_px=found.sigma_px * float(np.sqrt(np.mean(equations.held_out_px2()))),
         selection=selection,
         board=shape,
-        halves=_halves(equations, pixel_map, noise),
+        halves=_difference(equations, pixel_map, noise, ~odd, odd),
         origins=_origins(equations, pixel_map, options.origins),
         map=pixel_map,
         distance_m=distance,
@@ -210,12 +211,6 @@ def _typical_depth(table: CornerTable, found: LensFit) -> float:
     """The median distance of the boards along the optical axis, m."""
     depths = found.poses.apply(table.middle)[used_views(found, table), 2]
     return float(np.median(depths))
-
-
-def _halves(equations: ViewEquations, at: ProjectionMap, noise: float) -> Difference | None:
-    """Odd and even views compared. noise: factor on the sigmas."""
-    odd = np.arange(len(equations.views)) % 2 == 1
-    return _difference(equations, at, noise, ~odd, odd)
 
 
 def _origins(equations: ViewEquations, at: ProjectionMap, origins: Sequence[str]) -> Origins | None:

@@ -384,7 +384,8 @@ def refine(
         before, noise = noise, np.maximum(noise * _noise_of_cameras(model, reduced), 1.0)
         if not count and np.all(np.abs(noise / before - 1) < _CONVERGED):
             break
-    frames = _correlation(reduced)
+    left = (np.where(d.lin.used[..., None], d.left, np.nan).reshape(len(d.left), -1) for d in reduced)
+    frames = max(map(correlation_time, left))  # that count as one, the largest number of any recording
     blocks = stated if len(stated) > 1 else _blocks(stated[0])
     wider = frames * noise[model.camera_of][:, None, None] ** 2
     terms = [RecordingTerm(rig, replace(r, cov_px2=r.cov_px2 * wider), free) for r in blocks]
@@ -498,11 +499,6 @@ def _noise_of_cameras(model: SpotModel, data: Sequence[Reduced]) -> Array:
         if total > FEWEST_FRAMES:
             out[c] = np.sqrt(np.sum(squares[model.camera_of == c]) / total)
     return out
-
-
-def _correlation(data: Sequence[Reduced]) -> float:
-    """Largest number of frames, of any recording, that count as one."""
-    return max(correlation_time(np.where(d.lin.used[..., None], d.left, np.nan).reshape(len(d.left), -1)) for d in data)
 
 
 def _with_curvature(

@@ -18,7 +18,7 @@ from geometry.arrays import Array, symmetric
 from geometry.camera import FISHEYE, Camera
 from geometry.forward_model import SpotDerivatives, SpotModel
 from geometry.pose import Pose
-from geometry.rig import Beam, Rig, Screen
+from geometry.rig import Rig, Screen
 
 PINHOLE = ("fx", "fy", "cx", "cy")
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
@@ -119,7 +119,8 @@ def perturbed_rig(rig: Rig, names: Sequence[str], delta: Array) -> Rig:
         elif kind == "screens":
             screens[item] = _perturbed_screen(screens[item], change)
         else:
-            beams[item] = _perturbed_beam(beams[item], change)
+            way, point = _changes_of(change, DIRECTION), _changes_of(change, POINT)
+            beams[item] = replace(beams[item], direction=beams[item].direction + way, point=beams[item].point + point)
     return Rig(screens, cameras, beams, rig.spots)
 
 
@@ -136,10 +137,6 @@ def _perturbed_pose(pose: Pose, change: Mapping[str, float]) -> Pose:
 def _perturbed_screen(screen: Screen, change: Mapping[str, float]) -> Screen:
     a, b, c = (np.array(screen.bow) + _changes_of(change, BOW)).tolist()
     return replace(screen, world_from_screen=_perturbed_pose(screen.world_from_screen, change), bow=(a, b, c))
-
-
-def _perturbed_beam(beam: Beam, change: Mapping[str, float]) -> Beam:
-    return Beam(beam.name, beam.direction + _changes_of(change, DIRECTION), beam.point + _changes_of(change, POINT))
 
 
 class Sensitivity:
@@ -167,7 +164,7 @@ class Sensitivity:
             if parameter in CLOCK:
                 continue
             if kind == "cameras":
-                field, column = _camera_column(rig.cameras[item], parameter)
+                field, column = camera_column(rig.cameras[item], parameter)
                 views = camera_of == cameras.index(item)
             elif kind == "screens":
                 field, column = ("bow", BOW.index(parameter)) if parameter in BOW else ("screen", POSE.index(parameter))
@@ -193,9 +190,8 @@ class Sensitivity:
         return out
 
 
-def _camera_column(camera: Camera, parameter: str) -> tuple[str, int]:
+def camera_column(camera: Camera, parameter: str) -> tuple[str, int]:
     """Field of SpotDerivatives and column in it of a camera's parameter."""
-
     if parameter in PINHOLE:
         return "pinhole", PINHOLE.index(parameter)
     if parameter in POSE:

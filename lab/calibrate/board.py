@@ -292,7 +292,8 @@ def write_board(
         atomic_write_bytes(contents[single], out)
         save_board(board, description)
         return _done(board, (out, description), layout.name)
-    with atomic_folder(out, _holds_boards_only) as work:
+    known = {DESCRIPTION, *(f"board.{name}" for name in FORMATS)}
+    with atomic_folder(out, lambda folder: {path.name for path in folder.iterdir()} <= known) as work:
         for name, data in contents.items():
             (work / f"board.{name}").write_bytes(data)
         save_board(board, work / DESCRIPTION)
@@ -321,8 +322,3 @@ def _check_rim(board: Board) -> None:
             f"{board.describe()}: the white rim around the markers is only {board.rim_modules:.2f} marker modules wide,"
             f" at least {MIN_RIM_MODULES:g} are needed to find the corners; make the markers {largest_mm:g} mm or less"
         )
-
-
-def _holds_boards_only(folder: Path) -> bool:
-    known = {DESCRIPTION, *(f"board.{name}" for name in FORMATS)}
-    return {path.name for path in folder.iterdir()} <= known

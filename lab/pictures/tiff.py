@@ -185,7 +185,7 @@ class Tiff:
             and self.compression in ((PLAIN, DEFLATE, OLD_DEFLATE) if self.bits == 16 else _OWN_COMPRESSIONS)
             and self.predictor in (1, 2)
             and min(self.tile or (1, self.rows_per_strip)) >= 1
-            and len(self.offsets) == len(self.counts) == self._across * self._down
+            and len(self.offsets) == len(self.counts) == self._across * -(-self.height // self._segment[1])
         )
 
     @property
@@ -196,10 +196,6 @@ class Tiff:
     @property
     def _across(self) -> int:
         return -(-self.width // self._segment[0])
-
-    @property
-    def _down(self) -> int:
-        return -(-self.height // self._segment[1])
 
     def content(self, data: NDArray[np.uint8]) -> NDArray[np.uint8] | NDArray[np.uint16] | None:
         """The pixels (height, width) of a file that `is_simple`; None where a strip or tile is incomplete.

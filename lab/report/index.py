@@ -7,9 +7,7 @@ A result folder may be missing or damaged: what cannot be read is left empty.
 
 from __future__ import annotations
 
-import base64
 import datetime
-import hashlib
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -372,24 +370,16 @@ def write_index(rows: Sequence[Mapping[str, Any]], out: Path) -> Path:
     columns = [*_COLUMNS, *(Column(key.replace("_", " ")) for key in added)]
     cells = [[*_cells(run, points), *(_other_cell(run.row.get(key)) for key in added)] for run in runs]
     kept = [i for i in range(len(columns)) if any(row[i].text for row in cells)]  # no column without a value
-    script = environment().get_template("index.js").render().strip()
-    text = (
-        environment()
-        .get_template("index.html.j2")
-        .render(
-            columns=[columns[i] for i in kept],
-            runs=[
-                (run, _path(run, above), _why(run, above), [row[i] for i in kept])
-                for run, row in zip(runs, cells, strict=True)
-            ],
-            above=above,
-            counts=[(status, _word(runs, status), n) for (_, status), n in counts.items()],
-            trends=[Markup(t) for t in trends(runs)],
-            dated=len(dated(runs)),
-            script=Markup(script),
-            script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
-        )
-    )
+    word_of = {run.status: run.word for run in reversed(runs)}  # of the first run of each status
+    text = environment().get_template("index.html.j2").render(
+        columns=[columns[i] for i in kept],
+        runs=[
+            (run, _path(run, above), _why(run, above), [row[i] for i in kept])
+            for run, row in zip(runs, cells, strict=True)
+        ],
+        above=above, counts=[(status, word_of[status], n) for (_, status), n in counts.items()],
+        trends=[Markup(t) for t in trends(runs)], dated=len(dated(runs)),
+    )  # fmt: skip
     path = Path(out) / FILE_NAME
     atomic_write_text(text.encode("utf-8", "replace").decode(), path)  # names of folders need not be valid text
     return path
@@ -414,10 +404,6 @@ def _why(run: IndexedRun, above: str) -> str:
     """The message, without the folder that the page states; that of a PASS says no more than the verdict."""
     text = "" if run.status == "pass" else str(run.row.get("message") or "")
     return text.replace(above + os.path.sep, "") if above else text
-
-
-def _word(runs: Sequence[IndexedRun], status: str) -> str:
-    return next(run.word for run in runs if run.status == status)
 
 
 _COLUMNS = (

@@ -138,18 +138,16 @@ def mappings(value: object) -> list[Mapping[str, Any]]:
     return [v for v in value if isinstance(v, Mapping)] if isinstance(value, list) else []
 
 
+_ADAPTER = cache(TypeAdapter)
+
+
 def valid(kind: type[T], value: object) -> T | None:
     """The value as this type, with nested values as the types of its fields; None where it does not fit."""
     hashable: Any = kind
     try:
-        return cast(T, _adapter(hashable).validate_python(value))
+        return cast(T, _ADAPTER(hashable).validate_python(value))
     except ValidationError:
         return None
-
-
-@cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(kind)
 
 
 def day_of(value: object) -> datetime.date | None:

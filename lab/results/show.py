@@ -15,7 +15,6 @@ import numpy as np
 
 from geometry.arrays import Ints
 from lab.errors import InputError
-from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_bytes
 from lab.files.text.error_text import suggest_name
 from lab.findings.finding import Done
@@ -120,7 +119,7 @@ def _of_run(folder: Path, frame: int, camera: str | None, progress: Progress | N
                 reached = record.frame == frame
         if not reached:
             raise InputError(f"frame {frame}: the recording ends before it")
-        data = _with_run(read_result_data(work, folder), run)
+        data = replace(read_result_data(work, folder), name=run.name, run=run)
     notes = (f"processed up to frame {frame} without smoothing; for more pictures show the results of `beampose run`",)
     shown = _shown(data, frame, camera)
     return replace(shown, notes=(*shown.notes, *notes))
@@ -134,10 +133,6 @@ def _up_to(frame: int, pipeline: Pipeline, progress: Progress | None) -> Iterato
         yield record, None
         if record.frame >= frame:
             return
-
-
-def _with_run(data: ResultData, run: Run) -> ResultData:
-    return replace(data, name=run.name, run=run)
 
 
 TAIL = 25  # frames

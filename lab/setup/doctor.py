@@ -146,12 +146,8 @@ def check_cache() -> Finding:
     ready = sum(not is_empty(f) for f in folders)
     text = f"compiled code: {ready} of {len(folders)} parts are ready in {', '.join(sorted(places))}"
     if ready < len(folders):
-        return finding(
-            "BP-D07",
-            Level.WARN,
-            text,
-            remedy="The next run compiles the rest (a minute), or: `python -m lab.runs.warm_up`",
-        )
+        remedy = "The next run compiles the rest (a minute), or: `python -m lab.runs.warm_up`"
+        return finding("BP-D07", Level.WARN, text, remedy=remedy)
     return finding("BP-D07", Level.PASS, text)
 
 

@@ -76,7 +76,8 @@ def cell_map(
             out.append(f'<rect {box} fill="{fill}" stroke="var(--line)" stroke-width="0.5"/>')
             if columns <= _MAX_LABELLED_COLUMNS:
                 ink = "#fff" if share[j, i] > 0.5 else "#1c2126"
-                out.append(text(*middle, _cell(value), "mid", f"fill:{ink}"))
+                shown = f"{value:.0f}" if value == round(value) else number_format.format_number(value)
+                out.append(text(*middle, shown, "mid", f"fill:{ink}"))
     bottom = _TOP + _HIGH
     out += [
         text(_LEFT + (i + 0.5) * wide, bottom + 14, _plain(x[i]), "mid") for i in range(0, columns, -(-columns // 12))
@@ -103,10 +104,6 @@ def share_bars(parts: Sequence[tuple[str, float]], title: str) -> str:
         out.append(f'<rect x="{left}" y="{y}" width="{size:.1f}" height="14" fill="{BLUE}"{pale}/>')
         out.append(text(left + size + 6, y + 11, format_percent(share)))
     return figure(540, 30 + step * len(parts), title, out)
-
-
-def _cell(value: float) -> str:
-    return f"{value:.0f}" if value == round(value) else number_format.format_number(value)
 
 
 def _plain(value: float) -> str:
@@ -418,17 +415,13 @@ def _effects(plan: Plan) -> Section:
         thing, group, _ = plan.errors.things[i]
         kind, name = thing.split(".", 1)
         rows.append([f"{kind.removesuffix('s')} {name}", group, *(float(v) * 1e3 for v in plan.thing_median[i])])
-    heads = ("part", "errors", *(f"{a.split('_')[0]} ({_milli(a)})" for a in AXES))
+    heads = ("part", "errors", *(f"{a.split('_')[0]} ({'mm' if a.endswith('_m') else 'mdeg'})" for a in AXES))
     words = (
         "Effect of the errors of one camera, screen or beam on the pose, median over the poses, the largest effects on"
         " the attitude first. If a camera's pose comes from a resection, the errors of its lens include their effect on"
         " this pose. effects.csv lists the effect of every parameter."
     )
     return Section("Effects of the calibration errors", words, (), PageTable(heads, rows))
-
-
-def _milli(axis: str) -> str:
-    return "mm" if axis.endswith("_m") else "mdeg"
 
 
 def _scene(plan: Plan) -> Section:

@@ -101,22 +101,12 @@ class DrogueTarget(Target[DrogueFrame]):
         """A low confidence, or checks in which the detector does not find the drogue."""
         out = []
         if track.measured.any() and (mean := float(_confidences(track)[track.measured].mean())) < GOOD_CONFIDENCE:
-            out.append(
-                finding(
-                    "BP-G06",
-                    Level.WARN,
-                    f"the mean confidence of the measured frames is {mean:.2f} (usual: {GOOD_CONFIDENCE} and more)",
-                )
-            )
+            what = f"the mean confidence of the measured frames is {mean:.2f} (usual: {GOOD_CONFIDENCE} and more)"
+            out.append(finding("BP-G06", Level.WARN, what))
         checks, confirmed = _checks(track)
         if checks >= _LEAST_CHECKS and confirmed < LEAST_CONFIRMED * checks:
-            out.append(
-                finding(
-                    "BP-G07",
-                    Level.WARN,
-                    f"the detector finds the drogue in {format_percent(confirmed / checks)} of its {checks} checks",
-                )
-            )
+            what = f"the detector finds the drogue in {format_percent(confirmed / checks)} of its {checks} checks"
+            out.append(finding("BP-G07", Level.WARN, what))
         return out
 
     def figures(self, track: Track[DrogueFrame]) -> dict[str, Any]:

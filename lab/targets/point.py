@@ -219,13 +219,8 @@ class PointTarget(Target[PointFrame]):
             )
         similar = _similar(track)
         if similar > SIMILAR_SHARE and self.settings.track.start_px is None:
-            out.append(
-                finding(
-                    "BP-N05",
-                    Level.WARN,
-                    f"another target of similar brightness is in view in {format_percent(similar)} of the frames",
-                )
-            )
+            what = f"another target of similar brightness is in view in {format_percent(similar)} of the frames"
+            out.append(finding("BP-N05", Level.WARN, what))
         return out
 
     def figures(self, track: Track[PointFrame]) -> dict[str, Any]:

@@ -308,7 +308,8 @@ def _distinct(estimates: list[Estimate]) -> list[Estimate]:
     """One estimate of each group with the same time offset."""
     kept: list[Estimate] = []
     for e in estimates:
-        if all(abs(e.alignment.offset_s - k.alignment.offset_s) > 10 * _offset_sigma(e, k) for k in kept):
+        apart = ((abs(e.alignment.offset_s - k.alignment.offset_s), e.sigmas[0], k.sigmas[0]) for k in kept)
+        if all(gap > 10 * max(one, other, 1e-6) for gap, one, other in apart):
             kept.append(e)
     return kept
 
@@ -317,10 +318,6 @@ def _as_good(best: Estimate) -> float:
     """The largest variance factor that is as good as the best one, for the number of independent residuals."""
     independent = max(float(best.inliers.sum()) * 3 / best.correlation**2, 2.0)
     return best.scale * (1.1 + _SAME_FIT * math.sqrt(2 / independent)) + 1e-12
-
-
-def _offset_sigma(a: Estimate, b: Estimate) -> float:
-    return max(float(a.sigmas[0]), float(b.sigmas[0]), 1e-6)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,6 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.forward_model import SpotModel
-from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import PoseFit, SolveLimits, is_measurement, pixel_covariance
 from geometry.rig import Rig
@@ -111,8 +110,10 @@ class SpotTracker:
             fit, point = self._acquire(found, self.prior, events, "labelled")
             return _Matches(point, np.zeros(n, dtype=bool), np.full(n, np.nan)), fit
         matches = self._match(found)
+        motion = self.vehicle.motion
+        start = self.prior.centre if motion is None else motion.world_from_body
         fit, point, turned = self.rigid_check.pose_of_matches(
-            found, matches.point, matches.turned, self.tracks, self.vehicle, self._start_pose(), events
+            found, matches.point, matches.turned, self.tracks, self.vehicle, start, events
         )
         if fit is None and self._should_search(found):
             kind = "relabelled" if self.vehicle.anchor_age_s <= 1.5 * dt_s else "reacquired"
@@ -141,9 +142,6 @@ class SpotTracker:
             m = match(t.last[rows], t.x[rows, :2], r1[rows], r2[rows], points.uv_px, model.image_size_px[rows[0]], p)
             point[rows], turned[rows], gain[rows] = m.point, m.step == 2, m.gain
         return _Matches(point, turned, gain)
-
-    def _start_pose(self) -> Pose:
-        return self.vehicle.motion.world_from_body if self.vehicle.motion is not None else self.prior.centre
 
     def _should_search(self, found: Sequence[Detections | None]) -> bool:
         """Whether to search the labels again: there are enough points, and the tracks give no pose."""

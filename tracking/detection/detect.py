@@ -16,7 +16,7 @@ from tracking.detection.block_search import TEXTURE, Blocks, bin_pixels, find_hi
 from tracking.detection.candidates import PeakSearch, block_workspace
 from tracking.detection.measuring import DetectionLimits, Wings, measure
 from tracking.detection.pixels import TEXTURE_SHARE, Noise, Pixels
-from tracking.detection.regions import EVERYWHERE, boxes_of, margin_of, write_detections
+from tracking.detection.regions import EVERYWHERE, MARGIN, boxes_of, write_detections
 from tracking.detection.search import BORDER_BLOCKS, MAX_COMPARED, find_peaks_in, find_separate_peaks
 from tracking.detection.table import ALGEBRA, CANDIDATE, CELL_ROWS, MOST_CELLS, PEAK, Peaks
 from tracking.detections import Detections
@@ -216,7 +216,8 @@ class SpotFinder:
             order = order[np.sort(first)]
         places = np.stack([peaks["u"], peaks["v"]], axis=-1)
         away = np.abs(places[:, None] - regions[:, :2]).max(axis=2)
-        wanted = (away <= regions[:, 2] + margin_of(regions)).any(axis=1)
+        # Around them, peaks of their spots are measured, and of others beside those.
+        wanted = (away <= regions[:, 2] + np.maximum(regions[:, 2], MARGIN)).any(axis=1)
         near, threshold = (self._near, self._gaps), task.limits.threshold_sigma
         n = find_separate_peaks(task.pixels, peaks, order, wanted, task.noise, threshold, self._separate, *near)
         chosen = self._separate[: min(n, self.most)].copy()

@@ -20,11 +20,6 @@ MARGIN = 16  # px: largest distance of a peak from its spot's centre
 EVERYWHERE = np.array([[0.0, 0.0, 1e9]])  # a region (u, v, radius), px
 
 
-def margin_of(regions: Array) -> Array:
-    """(n,) px: how far around regions (n, 3) peaks are measured: those of their spots, and of others beside those."""
-    return np.asarray(np.maximum(regions[:, 2], MARGIN))
-
-
 @compiled
 def boxes_of(regions: Array, width: int, height: int, boxes: Ints) -> int:
     """The blocks (n, 4: first row, last, first column, last) of regions (n, 3: u, v, half size, px) and around them.

@@ -42,7 +42,8 @@ class Appearance:
 
     def coefficient(self, cells_dn: Array, inside: Bools) -> float:
         """gamma of the cells (rings, sectors) of a frame, 0 to 1. Cells outside the picture count as not seen."""
-        return float(np.clip(1 - self._filled(cells_dn, inside) / max(self.fill, 0.05), 0.0, 1.0))
+        filled = float(np.mean(self._matching(cells_dn, inside)))  # share of the cells that look as before
+        return float(np.clip(1 - filled / max(self.fill, 0.05), 0.0, 1.0))
 
     def hidden_sectors(self, cells_dn: Array, inside: Bools) -> Bools:
         """Sectors (sectors,) that look different next to the rim: the edges there are those of an occluder."""
@@ -69,10 +70,6 @@ class Appearance:
             float(np.clip(fill, 0.3, 1.0)),
             self.frames + 1,
         )
-
-    def _filled(self, cells_dn: Array, inside: Bools) -> float:
-        """Share of the cells that look as before."""
-        return float(np.mean(self._matching(cells_dn, inside)))
 
     def _matching(self, cells_dn: Array, inside: Bools) -> Bools:
         """Which cells look as before, apart from a change of the light, which is common to all."""

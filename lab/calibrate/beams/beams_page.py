@@ -23,8 +23,7 @@ from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.calibrate.beams.recordings import Recordings, stand_of
 from lab.errors import InputError
 from lab.files.project.project import Project
-from lab.files.text.atomic_write import atomic_write_text
-from lab.files.text.csv_text import csv_text
+from lab.files.text.csv_text import write_table
 from lab.findings.finding import ENTRIES, Finding, Level, finding, passed
 from lab.number_format import format_cell, format_count, format_number
 from lab.report.calibration.calibration_drawings import coverage_map, residual_field, residual_histogram
@@ -271,12 +270,13 @@ RESIDUAL_COLUMNS = (
 
 def write_tables(c: BeamCalibration, nominal: Rig, positions: Sequence[str], folder: Path) -> None:
     """Write the three tables. nominal: the rig with the beams as designed; positions: names of all positions."""
-    atomic_write_text(_beam_table(c, nominal), folder / BEAMS)
-    atomic_write_text(_angle_table(c), folder / ANGLES)
-    atomic_write_text(_residual_table(c, positions), folder / RESIDUALS)
+    write_table(folder / BEAMS, BEAM_COLUMNS, _beam_rows(c, nominal))
+    angles = [[a.first, a.second, f"{np.rad2deg(a.angle):.9g}", format_cell(a.sigma / ARCSEC)] for a in c.angles]
+    write_table(folder / ANGLES, ANGLE_COLUMNS, angles)
+    write_table(folder / RESIDUALS, RESIDUAL_COLUMNS, _residual_rows(c, positions))
 
 
-def _beam_table(c: BeamCalibration, nominal: Rig) -> str:
+def _beam_rows(c: BeamCalibration, nominal: Rig) -> list[list[str]]:
     rows = []
     off = difference_from_nominal(c, nominal)
     for i, name in enumerate(c.rig.beams):
@@ -285,15 +285,10 @@ def _beam_table(c: BeamCalibration, nominal: Rig) -> str:
         if c.undetermined:
             figures[:2] = [np.nan, np.nan]
         rows.append([name, *(f"{v:.12g}" for v in numbers), *(format_cell(v) for v in figures)])
-    return csv_text(BEAM_COLUMNS, rows)
+    return rows
 
 
-def _angle_table(c: BeamCalibration) -> str:
-    rows = [[a.first, a.second, f"{np.rad2deg(a.angle):.9g}", format_cell(a.sigma / ARCSEC)] for a in c.angles]
-    return csv_text(ANGLE_COLUMNS, rows)
-
-
-def _residual_table(c: BeamCalibration, positions: Sequence[str]) -> str:
+def _residual_rows(c: BeamCalibration, positions: Sequence[str]) -> list[list[str]]:
     names = used_positions(c, positions)
     views = c.rig.views()
     mm = residuals_mm(c)
@@ -303,7 +298,7 @@ def _residual_table(c: BeamCalibration, positions: Sequence[str]) -> str:
         numbers = [*c.spots.pixels[i], *c.fit.residuals_px[i], mm[i], c.fit.sigmas[i]]
         words = [names[c.spots.position[i]], camera, spot]
         rows.append([*words, *(format_cell(v) for v in numbers), "yes" if c.fit.kept[i] else "no"])
-    return csv_text(RESIDUAL_COLUMNS, rows)
+    return rows
 
 
 def used_positions(c: BeamCalibration, positions: Sequence[str]) -> list[str]:

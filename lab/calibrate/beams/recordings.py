@@ -21,10 +21,10 @@ from lab.errors import InputError
 from lab.files.project.point_files import StandPoses, read_poses
 from lab.files.project.project import Project, ProjectRecording
 from lab.files.run.clocks import ESTIMATE
-from lab.files.run.run_file import Run, load_run
+from lab.files.run.run_file import load_run
 from lab.files.text.csv_text import SIGMA_RANGE_PX, Table, check_pixels, check_sigmas, read_table
 from lab.files.text.error_text import printable_line
-from lab.runs.frames.pipeline import FrameRecord, Pipeline
+from lab.runs.frames.pipeline import Pipeline
 from tracking.detections import Detections
 from tracking.statuses import SpotStatus
 
@@ -134,7 +134,8 @@ def spots_of_run(folder: Path, rig: Rig, known: StandPoses | None, world_from_st
     if known is not None:
         poses = {int(f): known.stand_from_body[i] for i, f in enumerate(known.frames)}
         if world_from_stand is not None:
-            run = _starting_at(run, world_from_stand @ known.stand_from_body[0])
+            start = PosePrior(world_from_stand @ known.stand_from_body[0], 0.1, float(np.deg2rad(10.0)))
+            run = dataclasses.replace(run, prior=start)
     frame, view, pixels, covariance = [], [], [], []
     for number, found in _labelled(Pipeline.of(run), model, poses, world_from_stand):
         if known is not None and number not in poses:
@@ -189,17 +190,8 @@ def _labelled(
                 yield number, label(model, world_from_stand @ poses[number], detections)
     else:
         for record in pipeline.records():
-            yield record.frame, _tracked(record)
-
-
-def _tracked(record: FrameRecord) -> Labelled:
-    t = record.tracked
-    return [(v, t.uv_px[v], t.cov_px2[v]) for v, s in enumerate(t.status) if s in _MEASURED]
-
-
-def _starting_at(run: Run, world_from_body: Pose) -> Run:
-    """The run with its tracker's prior replaced by a pose (sigma 0.1 m, 10 deg)."""
-    return dataclasses.replace(run, prior=PosePrior(world_from_body, 0.1, float(np.deg2rad(10.0))))
+            t = record.tracked
+            yield record.frame, [(v, t.uv_px[v], t.cov_px2[v]) for v, s in enumerate(t.status) if s in _MEASURED]
 
 
 SPOTS = ("camera", "spot", "u_px", "v_px")
@@ -385,7 +377,7 @@ def _covariances(table: Table, notes: list[str]) -> Array:
 def _pose_sigmas(known: StandPoses, project: Project) -> Array:
     """Sigmas (n, 6), m and rad, of the recorded poses: from the table, else from the stand, else 0."""
     stand = project.stand
-    default = [0.0] * 6 if stand is None else [stand.pose_sigma_m] * 3 + [stand.pose_sigma_rad] * 3
+    default = [0.0] * 6 if stand is None else [stand.pose_sigma_m] * 3 + [np.radians(stand.pose_sigma_deg)] * 3
     return np.where(np.isnan(known.sigmas), np.array(default), known.sigmas)
 
 

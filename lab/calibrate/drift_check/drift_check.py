@@ -395,13 +395,10 @@ def _compare(file: RigFile, rig_path: Path, inputs: DriftInputs, limits: DriftLi
     assert inputs.run is not None
     still = read_still_spots(inputs.run, file.rig)
     check_at_rest(still, limits.still_px, inputs.run)
-    pose = None if inputs.pose is None else (read_still_pose(inputs.pose), _pose_covariance(limits))
+    covariance_of_pose = np.diag([limits.pose_sigma_m**2] * 3 + [np.deg2rad(limits.pose_sigma_deg) ** 2] * 3)
+    pose = None if inputs.pose is None else (read_still_pose(inputs.pose), covariance_of_pose)
     compared = [compare_still(file.rig, still, covariance, pose, limits.floor_px, inputs.run)]
     return CheckData(compared, covariance is not None, sigma_given=True, pose_free=pose is None)
-
-
-def _pose_covariance(limits: DriftLimits) -> Array:
-    return np.diag([limits.pose_sigma_m**2] * 3 + [np.deg2rad(limits.pose_sigma_deg) ** 2] * 3)
 
 
 def judge(
@@ -446,7 +443,7 @@ def _camera_drift(
     sigmas = np.sqrt(np.maximum(np.diagonal(fit.covariance), 0))
     ways = np.zeros((len(one.misfit.white), 2))
     ways[of_rows[::2], 0] = ways[of_rows[1::2], 1] = 1.0
-    tests = limits_share(p_false_alarm, len(one.columns))
+    tests = p_false_alarm / 2 / max(len(one.columns), 1)  # of one camera, as `find_changes` shares the rate
     detectable = misfit.detectable(ways, model, tests, limits.power)
     predicted = one.predicted[rows]
     mm_per_px = mm_at_screen(rig, camera, predicted, np.full_like(predicted, np.sqrt(0.5)))
@@ -485,11 +482,6 @@ def _camera_drift(
         unexplained_mm=left_mm,
         level=level,
     )
-
-
-def limits_share(p_false_alarm: float, n_cameras: int) -> float:
-    """Share of the false-alarm rate that `find_changes` gives to the test of one camera."""
-    return p_false_alarm / 2 / max(n_cameras, 1)
 
 
 def mm_at_screen(rig: Rig, camera: Camera, pixels: Array, displacement_px: Array) -> float:

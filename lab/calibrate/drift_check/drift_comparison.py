@@ -31,11 +31,11 @@ from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import (
     BOW,
-    PINHOLE,
+    CLOCK,
     POSE,
     RigCovariance,
     Sensitivity,
-    distortion_names,
+    camera_column,
     split_name,
 )
 from lab.calibrate.drift_check.drift_inputs import KnownPoints, StillSpots, check_points_match
@@ -291,16 +291,12 @@ def _by_parameters(
         d_world = (lens.d_point @ R_c) * here[:, None, None]
         screens[name] = np.concatenate([d_world @ moves, d_world @ bulge], axis=-1)
     J = np.zeros((n, 2, len(names)))
-    lens_names = distortion_names(camera)
+    by_camera = {"camera": pose, "pinhole": lens.d_pinhole, "distortion": lens.d_distortion}
     for k, full in enumerate(names):
         kind, thing, parameter = split_name(full)
-        if kind == "cameras" and thing == camera.name:
-            if parameter in PINHOLE:
-                J[..., k] = lens.d_pinhole[..., PINHOLE.index(parameter)]
-            elif parameter in POSE:
-                J[..., k] = pose[..., POSE.index(parameter)]
-            else:
-                J[..., k] = lens.d_distortion[..., lens_names.index(parameter)]
+        if kind == "cameras" and thing == camera.name and parameter not in CLOCK:  # the points do not move
+            field, column = camera_column(camera, parameter)
+            J[..., k] = by_camera[field][..., column]
         elif kind == "screens" and thing in screens:
             J[..., k] = screens[thing][..., (*POSE, *BOW).index(parameter)]
     return J.reshape(2 * n, len(names))

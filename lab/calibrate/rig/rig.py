@@ -175,7 +175,9 @@ def _solve(project_path: Path, today: datetime.date | None, progress: Progress |
     failed = verdict(findings) is Level.FAIL
 
     def write(folder: Path) -> None:
-        save_rig(_rig_file(joint, findings, project, day), folder / (FAILED_RIG if failed else RIG))
+        state = state_of(findings, day, expiry_date(project, day), project.notes)
+        file = RigFile(joint.rig, covariance_blocks(joint.covariance), state)
+        save_rig(file, folder / (FAILED_RIG if failed else RIG))
         write_residuals(steps, recordings.names, folder / RESIDUALS)
 
     return Solved(
@@ -248,8 +250,3 @@ def _lens_findings(project: Project, day: datetime.date) -> list[Finding]:
             what = f"camera {name!r}: {file} has no covariance: its lens is assumed exact"
             out.append(finding("BP-K06", Level.WARN, what))
     return out
-
-
-def _rig_file(joint: Joint, findings: Sequence[Finding], project: Project, day: datetime.date) -> RigFile:
-    state = state_of(findings, day, expiry_date(project, day), project.notes)
-    return RigFile(joint.rig, covariance_blocks(joint.covariance), state)

@@ -299,11 +299,6 @@ class Stand(fields.Block):
         """Sigma of its attitude; 0 where none is stated."""
         return float(np.radians(self.attitude_sigma_deg or 0.0))
 
-    @property
-    def pose_sigma_rad(self) -> float:
-        """Sigma of the attitude in a pose of the stand, where the table of poses has none."""
-        return float(np.radians(self.pose_sigma_deg))
-
 
 class ProjectRecording(fields.Block):
     """Spots recorded at poses of the stand, static or moving."""
@@ -437,10 +432,7 @@ def load_lens(path: Path, name: str | None = None) -> CameraFile:
     if name is not None and name not in known:
         raise InputError(f"{path}: expected a camera of this file, got {name!r}{suggest_name(name, known)}")
     model = cameras[0] if name is None else known[name]
-    if len(cameras) == 1 and _is_camera_yaml(path):
+    own = re.search(r"^schema:\s*['\"]?beampose/camera/", text_of_file(path), re.MULTILINE)
+    if len(cameras) == 1 and own is not None:
         return load_camera(path)
     return CameraFile(model.name, model.image_size_px, model.matrix, model.distortion, model.lens)
-
-
-def _is_camera_yaml(path: Path) -> bool:
-    return re.search(r"^schema:\s*['\"]?beampose/camera/", text_of_file(path), re.MULTILINE) is not None

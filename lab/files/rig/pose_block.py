@@ -146,7 +146,8 @@ class CameraPoseBlock(PoseBlock):
             along = np.subtract(self.look_at.target_m, self.look_at.eye_m)
             if np.linalg.norm(along) < MIN_LENGTH_M:
                 raise field_error("look_at: expected two different points, got the same eye_m and target_m")
-            if _sine(along, self.look_at.up) < MIN_SINE:
+            up = self.look_at.up
+            if np.linalg.norm(np.cross(along, up)) / (np.linalg.norm(along) * np.linalg.norm(up)) < MIN_SINE:
                 raise field_error(
                     f"look_at.up: expected a direction that is not the line of sight, got"
                     f" {describe_value(self.look_at.up)}; name the direction that is up in the picture, such as"
@@ -258,8 +259,3 @@ def measured_forms(content: Block, where: str = "") -> Iterator[tuple[str, str]]
                     yield place, f"measured as {words}"
             elif isinstance(entry, Block):
                 yield from measured_forms(entry, place)
-
-
-def _sine(a: Any, b: Any) -> float:
-    """Sine of the angle between two vectors (3,)."""
-    return float(np.linalg.norm(np.cross(a, b)) / (np.linalg.norm(a) * np.linalg.norm(b)))

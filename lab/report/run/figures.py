@@ -38,7 +38,8 @@ def pose_shades(m: ReportData) -> tuple[Shade, ...]:
 
 def _of_poses(m: ReportData, zoom: ZoomData | None) -> partial[str]:
     """A `time_panel` over the times of the poses, with their statuses."""
-    return partial(time_panel, m.pose_times, shades=pose_shades(m), time_name=m.time_name, zoom=zoom, row=0)
+    t = m.poses.t_s if m.time_name != "frame" else m.poses.frames.astype(float)
+    return partial(time_panel, t, shades=pose_shades(m), time_name=m.time_name, zoom=zoom, row=0)
 
 
 def nees_figure(m: ReportData, zoom: ZoomData | None = None) -> str:

@@ -57,11 +57,6 @@ class ReportData:
             return None
         return -pose_errors(self.poses, self.truth.world_from_body)
 
-    @property
-    def pose_times(self) -> Array:
-        """(F',): time of each pose, or the frame number where times are missing."""
-        return self.poses.t_s if self.time_name != "frame" else self.poses.frames.astype(float)
-
 
 def read_report_data(
     results: Path, run_folder: Path | None, run: Run | None = None, tables: ResultTables | None = None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from geometry.arrays import Array
 from geometry.rotations import ypr_jacobian
 from lab.number_format import format_angle, format_length, format_number, format_percent, median
+from lab.report.page import KeyFigure
 from lab.report.plot.svg import true_ranges
 from lab.report.run.report_data import ReportData
 from tracking.statuses import PoseStatus, SpotStatus
@@ -33,10 +33,10 @@ def truth_figures(e: Errors | None) -> list[KeyFigure]:
     if s := part(e, "spots"):
         outside = part(s, "out_of_view_px")
         keys += [
-            KeyFigure("right in view", format_percent(s.get("in_view_identity")), "of visible spots"),
-            KeyFigure("wrong labels", counted(s.get("wrong_labels")), "measured rows"),
-            KeyFigure("prediction error", pixels(part(s, "prediction_px", "smooth").get("rms")), "RMS, straight parts"),
-            KeyFigure(
+            ("right in view", format_percent(s.get("in_view_identity")), "of visible spots"),
+            ("wrong labels", counted(s.get("wrong_labels")), "measured rows"),
+            ("prediction error", pixels(part(s, "prediction_px", "smooth").get("rms")), "RMS, straight parts"),
+            (
                 "out-of-view error",
                 pixels(outside.get("rms")),
                 f"RMS; largest {pixels(outside.get('max'))}" if outside else "no spot was out of view",
@@ -52,9 +52,9 @@ def truth_figures(e: Errors | None) -> list[KeyFigure]:
             )
             notes = [f"RMS, smoothed; causal {value}" for value in shown]
         keys += [
-            KeyFigure("rotation error", format_angle(rotation), notes[0]),
-            KeyFigure("position error", format_length(position), notes[1]),
-            KeyFigure("NEES", format_number(measured.get("nees_mean")), "mean; 6 if σ is correct"),
+            ("rotation error", format_angle(rotation), notes[0]),
+            ("position error", format_length(position), notes[1]),
+            ("NEES", format_number(measured.get("nees_mean")), "mean; 6 if σ is correct"),
         ]
     return keys
 
@@ -153,15 +153,6 @@ def _motion_rows(x: Errors, causal: str) -> list[tuple[str, str, str]]:
 # The tables of a report: key figures, spots, labels, and frames without a picture.
 
 
-@dataclass(frozen=True, slots=True)
-class KeyFigure:
-    """One key figure."""
-
-    name: str
-    value: str
-    note: str = ""
-
-
 def pixels(value: float | None) -> str:
     """A distance in the picture."""
     return "\u2013" if value is None or not np.isfinite(value) else f"{format_number(value)} px"
@@ -193,14 +184,12 @@ def key_figures(m: ReportData) -> list[KeyFigure]:
         causal_m = median(np.linalg.norm(m.causal.sigma_position_m[causal], axis=1))
         position_note = f"median, smoothed; causal {format_length(causal_m)}"
     return [
-        KeyFigure(
-            "frames", f"{n:,}".replace(",", "\u202f"), f"{format_number(span)} s" if m.time_name != "frame" else ""
-        ),
-        KeyFigure("pose measured", format_percent(float(measured.mean()) if len(measured) else None), "of all frames"),
-        KeyFigure("spots found", format_percent(found), "of the spots expected in view"),
-        KeyFigure("σ of yaw", format_angle(median(p.sigma_ypr_deg[measured, 0])), yaw_note),
-        KeyFigure("σ of position", format_length(sigma_m), position_note),
-        KeyFigure("residual", pixels(median(p.rms_px[measured])), "median RMS of the pose"),
+        ("frames", f"{n:,}".replace(",", "\u202f"), f"{format_number(span)} s" if m.time_name != "frame" else ""),
+        ("pose measured", format_percent(float(measured.mean()) if len(measured) else None), "of all frames"),
+        ("spots found", format_percent(found), "of the spots expected in view"),
+        ("σ of yaw", format_angle(median(p.sigma_ypr_deg[measured, 0])), yaw_note),
+        ("σ of position", format_length(sigma_m), position_note),
+        ("residual", pixels(median(p.rms_px[measured])), "median RMS of the pose"),
     ]
 
 

@@ -115,7 +115,7 @@ def content_of_poses(name: str, rig: Rig, track: PoseTrack) -> RigAndPoses:
     without = ~np.isfinite(covariance).all(axis=(1, 2))
     covariance[without] = track.sigma_position_m[without][:, :, None] ** 2 * np.eye(3)
     measured = track.has(PoseStatus.MEASURED)
-    t_s = _times(track.frames, track.t_s)
+    t_s = track.t_s if np.isfinite(track.t_s).all() else track.frames.astype(float)
     return RigAndPoses(name, "attitude.csv", rig, track.frames, t_s, track.world_from_body, covariance, measured)
 
 
@@ -180,10 +180,6 @@ def workspace(rig: Rig, middle: Pose) -> Trail | None:
         for a, b in edges_of
     ]
     return Trail("workspace", np.concatenate(lines)[:-1], GREY)
-
-
-def _times(frames: Ints, t_s: Array) -> Array:
-    return t_s if np.isfinite(t_s).all() else frames.astype(float)
 
 
 # A scene as one coloured triangle mesh: lines as thin tubes, spots as balls, sigmas as ellipsoids.
@@ -357,7 +353,8 @@ def view_of(
     others = content.world_from_body[evenly_spaced(known, _SIZING)] if len(known) > 1 else None
     fixed: list[SceneObject] = [t for t in rig_things(content.rig, pose, others) if not isinstance(t, Ray | Marker)]
     if len(known) > 1:
-        fixed.append(Trail("trajectory", _trajectory(content, most_points), PURPLE))
+        positions = content.world_from_body.translation  # nan where the pose is unknown
+        fixed.append(Trail("trajectory", positions[evenly_spaced(np.arange(len(positions)), most_points)], PURPLE))
     fixed += [] if space is None else [space]
     reach = frustum_length(fixed)
     points = np.concatenate([outline(t, reach) for t in fixed])
@@ -374,11 +371,6 @@ def ellipsoid(content: RigAndPoses, index: int, scale: float) -> Ellipsoid:
     values, vectors = np.linalg.eigh(content.position_covariance[index])
     axes = vectors * np.sqrt(np.maximum(values, 0.0)) * scale
     return Ellipsoid(content.world_from_body.translation[index], axes, PURPLE if content.measured[index] else GREY)
-
-
-def _trajectory(content: RigAndPoses, most: int) -> Array:
-    """Positions (n, 3), at most so many, at even steps of the frames, with nan where the pose is unknown."""
-    return content.world_from_body.translation[evenly_spaced(np.arange(len(content.frames)), most)]
 
 
 def _scale(content: RigAndPoses, indices: Ints, extent_m: float) -> float:

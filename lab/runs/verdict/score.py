@@ -400,13 +400,11 @@ def _pose_spread(delta: Array, covariance: Array) -> dict[str, Any] | None:
         # Central 95 % interval of the mean of n independent rows; rows of a filter are not independent.
         "nees_mean_95": [2 * gamma_quantile(1 - p, 3 * n) / n for p in (0.025, 0.975)] if n else None,
         "nees_rows": n,
-        "beyond_10_sigmas": int(np.count_nonzero(_widened(delta, covariance) > WRONG_SIGMAS**2)),
+        # With the error of a truth: KNOWN_TO in each component.
+        "beyond_10_sigmas": int(
+            np.count_nonzero(normalised_squares(delta, covariance + KNOWN_TO**2 * np.eye(6)) > WRONG_SIGMAS**2)
+        ),
     }
-
-
-def _widened(delta: Array, covariance: Array) -> Array:
-    """NEES (n,) with covariances that include the error of a truth: KNOWN_TO in each component."""
-    return normalised_squares(delta, covariance + KNOWN_TO**2 * np.eye(6))
 
 
 def _spread(error: Array) -> dict[str, Any] | None:

@@ -330,10 +330,6 @@ class Inbox:
         self.next_row = row + 1
         return out, arrived
 
-    def has_later(self, row: int) -> bool:
-        """Whether any camera has a picture of a later row."""
-        return any(queue.later_s(row) is not None for queue in self.queues.values())
-
     def reaches(self, row: int) -> bool:
         """Whether the tables have a row, by the pictures so far: the cameras without times of their own decide."""
         times = [queue.times for queue in self.queues.values()]

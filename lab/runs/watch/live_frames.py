@@ -175,7 +175,8 @@ class LiveFrames:
                     self.arrived_s[row] = max(arrived.values(), default=None)
                     self.arrivals.append(arrived)
                     unread = sum(camera.unread for camera in self._cameras.values())
-                    self.caught_up |= not (unread or self.inbox.has_later(row))
+                    later = (queue.later_s(row) for queue in self.inbox.queues.values())
+                    self.caught_up |= not unread and all(t_s is None for t_s in later)
                     is_row = row >= self._first and (self.moments is None or self.inbox.reaches(row))
                 for name, pictures in given.items():
                     for _, content in pictures:

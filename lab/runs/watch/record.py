@@ -337,16 +337,13 @@ class _Recording:
             more = {} if self.options.exposure_s is None else {"exposure_s": self.options.exposure_s}
             day = datetime.date.today().isoformat()
             content = {"name": self.out.resolve().name, "rig": "rig.yaml", "frame_rate_hz": self.rate_hz, **more}
-            save_run({**content, "recorded": day, "cameras": cameras, "notes": self._notes()}, self.out)
+            notes = f"Recorded by beampose. {self._counts()}."
+            save_run({**content, "recorded": day, "cameras": cameras, "notes": notes}, self.out)
 
     def _counts(self) -> str:
         return "; ".join(
             f"{one.name} {one.written} pictures, {one.lost} lost, {one.unwritten} not written" for one in self.recorders
         )
-
-    def _notes(self) -> str:
-        """What run.yaml says about the recording."""
-        return f"Recorded by beampose. {self._counts()}."
 
     def _concluded(self) -> Done[Path]:
         if not any(one.written for one in self.recorders):

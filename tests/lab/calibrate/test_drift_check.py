@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.stats import binom
 
 from calibration.changes import TURNED, WRONG_POINT, ZOOMED, find_changes
@@ -16,7 +17,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from geometry.rotations import exp
-from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed_rig, rig_names
+from geometry.uncertainty.rig_uncertainty import CLOCK, RigCovariance, perturbed_rig, rig_names
 from lab.calibrate.drift_check.drift_check import COLUMNS, DriftLimits, check_drift
 from lab.calibrate.drift_check.drift_comparison import compare_points, read_history
 from lab.calibrate.drift_check.drift_inputs import DriftInputs, read_points
@@ -382,6 +383,18 @@ def test_the_wrong_point_among_five_is_identified(tmp_path):
     one = compare_points(RIG, read_points(pixels, survey, RIG, 0.1), covariance, pixels)[1]
     changes = find_changes(one.misfit, one.columns, one.others, 0.002).changes
     assert [(c.kind, c.subject) for c in changes] == [(WRONG_POINT, "R3")]
+
+
+def test_clocks_in_the_covariance_do_not_matter_to_points_at_rest(tmp_path):
+    """`beampose refine` states them; an earlier check took each for a number of the lens that it did not know."""
+    pixels, survey = scenes.write_points(tmp_path, TRUE, np.random.default_rng(0))
+    known = read_points(pixels, survey, RIG, 0.1)
+    stated = joint_covariance(RIG, {"target": COVARIANCE}, "rig.yaml")
+    clocks = tuple(f"cameras.{name}.{number}" for name in RIG.cameras for number in CLOCK)
+    with_clocks = RigCovariance((*stated.names, *clocks), block_diag(stated.matrix, 1e-6 * np.eye(len(clocks))))
+    pairs = zip(*(compare_points(RIG, known, C, pixels) for C in (stated, with_clocks)), strict=True)
+    for one, other in pairs:
+        np.testing.assert_allclose(other.calibration_sigma_px, one.calibration_sigma_px, rtol=1e-12)
 
 
 def test_a_run_folder_is_processed_first(tmp_path):

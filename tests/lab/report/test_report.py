@@ -247,7 +247,7 @@ def test_damaged_errors_against_truth_are_dashes(tmp_path):
     html = write_report(fake.results).read_text(encoding="utf-8")
     assert "50.0 %" in html
     assert "6.20" in html
-    assert tables.truth_figures(odd)[4].value == "\u2013"
+    assert tables.truth_figures(odd)[4][1] == "\u2013"
 
 
 @pytest.mark.parametrize(("status", "word"), [("pass", "PASS"), ("check", "CHECK"), ("fail", "FAIL")])

@@ -171,7 +171,7 @@ def after_corner(points_of: PointsOf, k: int, direction: int, line: Line, limits
     if not fitting:
         return {}
     longest = max(fitting, key=len)
-    if any(_disagree(longest, other) for other in fitting):
+    if any(frame in longest and longest[frame][0] != row for one in fitting for frame, (row, _) in one.items()):
         return {}
     return {frame: row for frame, (row, _) in longest.items()}
 
@@ -216,10 +216,6 @@ def _meets(row: _Row, k: int, direction: int, line: Line, limits: Limits) -> boo
     tau = float(np.clip(-(apart @ change) / max(float(change @ change), 1e-12), 0.0, gap))
     miss = float(np.linalg.norm(apart + tau * change))
     return miss <= MEETING_SIGMAS * limits.sigma_px * gap
-
-
-def _disagree(one: _Row, other: _Row) -> bool:
-    return any(frame in one and one[frame][0] != row for frame, (row, _) in other.items())
 
 
 POSE_GATE_CHI2 = 25.0  # squared Mahalanobis distance from the place that the pose predicts
