@@ -77,12 +77,14 @@ def recording(
     for name, camera in rig.cameras.items():
         (folder / "frames" / name).mkdir(parents=True)
         turns = rng.normal(0.0, shake_px / camera.matrix[0, 0], (FRAMES, 3))
+        room = np.zeros(SIZE)
         for frame, turn in enumerate(turns - turns.mean(axis=0)):
             now = turned(camera, turn)
-            origin, rays = now.rays(ends)
-            seen = camera.project(origin + 3.0 * rays)[..., ::-1] + MARGIN
-            picture = ndimage.map_coordinates(SPLINE, np.moveaxis(seen, -1, 0), order=3, prefilter=False)
-            picture *= light(frame)
+            if frame == 0 or shake_px:
+                origin, rays = now.rays(ends)
+                seen = camera.project(origin + 3.0 * rays)[..., ::-1] + MARGIN
+                room = ndimage.map_coordinates(SPLINE, np.moveaxis(seen, -1, 0), order=3, prefilter=False)
+            picture = room * light(frame)
             at = spots[(spots.camera == name) & (spots.frame == frame)][["u_px", "v_px"]].dropna().to_numpy()
             start, towards = camera.rays(at)
             for u, v in now.project(start + 3.0 * towards):
