@@ -16,6 +16,7 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner
 from scipy import ndimage
+from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import Rotation
 
 from cli import main
@@ -27,7 +28,8 @@ from tracking.background.camera_motion import CameraMotion
 from tracking.noise import NoiseModel
 from tracking.parameters import DetectParameters
 
-SIZE, FRAMES, MARGIN = (512, 640), 24, 8
+SIZE, FRAMES, MARGIN, STEP = (512, 640), 24, 8, 16
+EVERY = [np.arange(0, n + STEP, STEP) for n in SIZE]
 Y, X = np.mgrid[-MARGIN : SIZE[0] + MARGIN, -MARGIN : SIZE[1] + MARGIN]
 # A room with shelves and boxes, as a camera sees it that does not turn.
 ROOM = cv2.GaussianBlur(
@@ -73,7 +75,8 @@ def recording(
     (folder / "detections.csv").unlink()
     truth = shutil.move(folder / "truth", folder.with_name("truth"))
     spots, rig, rng = pd.read_csv(truth / "spots.csv"), load_rig(folder / "rig.yaml"), np.random.default_rng(2)
-    ends = np.stack(np.meshgrid(np.arange(SIZE[1]), np.arange(SIZE[0])), axis=-1).astype(float)
+    ends = np.stack(np.meshgrid(np.arange(SIZE[1] + STEP), np.arange(SIZE[0] + STEP)), axis=-1).astype(float)
+    pixels = ends[: SIZE[0], : SIZE[1]]
     for name, camera in rig.cameras.items():
         (folder / "frames" / name).mkdir(parents=True)
         turns = rng.normal(0.0, shake_px / camera.matrix[0, 0], (FRAMES, 3))
@@ -81,14 +84,15 @@ def recording(
         for frame, turn in enumerate(turns - turns.mean(axis=0)):
             now = turned(camera, turn)
             if frame == 0 or shake_px:
-                origin, rays = now.rays(ends)
-                seen = camera.project(origin + 3.0 * rays)[..., ::-1] + MARGIN
-                room = ndimage.map_coordinates(SPLINE, np.moveaxis(seen, -1, 0), order=3, prefilter=False)
+                origin, rays = now.rays(ends[::STEP, ::STEP])  # they vary smoothly
+                seen = np.moveaxis(camera.project(origin + 3.0 * rays)[..., ::-1] + MARGIN, -1, 0)
+                at_all = [RectBivariateSpline(*EVERY, x)(np.arange(SIZE[0]), np.arange(SIZE[1])) for x in seen]
+                room = ndimage.map_coordinates(SPLINE, at_all, order=3, prefilter=False)
             picture = room * light(frame)
             at = spots[(spots.camera == name) & (spots.frame == frame)][["u_px", "v_px"]].dropna().to_numpy()
             start, towards = camera.rays(at)
             for u, v in now.project(start + 3.0 * towards):
-                picture += 90.0 * np.exp(-0.5 * ((ends[..., 0] - u) ** 2 + (ends[..., 1] - v) ** 2) / 1.6**2)
+                picture += 90.0 * np.exp(-0.5 * ((pixels[..., 0] - u) ** 2 + (pixels[..., 1] - v) ** 2) / 1.6**2)
             picture = person(picture, frame) if walks else picture
             picture = np.clip(np.rint(picture + rng.normal(0.0, 1.0, SIZE)), 0, 255).astype(np.uint8)
             cv2.imwrite(str(folder / "frames" / name / f"{frame:06d}.png"), picture)
