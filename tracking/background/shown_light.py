@@ -105,12 +105,12 @@ class ShownLight:
             return None
         rows, columns = sample_of(self.size)
         seen = picture[::rows, ::columns].astype(np.float32) - self.smooth
-        light, clear, left, shown = self._fitted(seen)
+        light, clear, left, shown, misfit = self._fitted(seen)
         if not LEAST_LIGHT < light < MOST_LIGHT:
             return None
         of_rows, levels, differ = np.ones((len(seen), 1), np.float32), np.zeros((len(seen), 1), np.float32), False
         for _ in range(_FITS if self.reference else 0):
-            differs, beyond = _light_of_rows(left, shown, clear)
+            differs, beyond = _light_of_rows(left, shown, clear, misfit)
             if not (differ or beyond.any()):
                 break
             differ, step = (
@@ -122,8 +122,7 @@ class ShownLight:
             level /= np.maximum(_over_rows(counted), np.float32(1e-3))
             seen = (seen - level) / step
             of_rows, levels = of_rows * step, of_rows * level + levels
-            light, clear, left, shown = self._fitted(seen)
-        misfit = 1.4826 * _median(np.abs(left[_SOME][clear[_SOME]]))
+            light, clear, left, shown, misfit = self._fitted(seen)
         if misfit > largest_misfit:
             return None
         if not differ:
@@ -132,9 +131,11 @@ class ShownLight:
         every = np.array([np.interp(at, known, x[:, 0]) for x in (light * of_rows, levels)])
         return Shown(light, clear, left, misfit, every)
 
-    def _fitted(self, seen: _Values) -> tuple[float, Bools, _Values, _Values]:
+    def _fitted(self, seen: _Values) -> tuple[float, Bools, _Values, _Values, float]:
         """The light relative to the background; and, on the sample: what is clear of lights, what the background
-        leaves, its structure; the last two in sigmas of a pixel. seen (a, b), DN: above the smooth part.
+        leaves, its structure, both in sigmas of a pixel; the usual size of what it leaves.
+
+        seen (a, b), DN: above the smooth part.
         """
         light, above, structure, clear, variance = self._measured(seen)
         light /= self.reference or 1.0
@@ -146,7 +147,8 @@ class ShownLight:
             light = 1.0
         sigmas = np.sqrt(variance * np.float32(1 + light**2 * self.noise_share))
         shown = structure / sigmas
-        return light, clear, above / sigmas - np.float32(light) * shown, shown
+        left = above / sigmas - np.float32(light) * shown
+        return light, clear, left, shown, 1.4826 * _median(np.abs(left[_SOME][clear[_SOME]]))
 
     def _measured(self, seen: _Values) -> tuple[float, _Values, _Values, Bools, _Values]:
         """The light, not yet relative to the reference; and, on the sample: what is above the smooth part, and the
@@ -168,14 +170,14 @@ class ShownLight:
         return _median(share), above, structure, clear, variance
 
 
-def _light_of_rows(left: _Values, structure: _Values, clear: Bools) -> tuple[_Values, Bools]:
+def _light_of_rows(left: _Values, structure: _Values, clear: Bools, misfit: float) -> tuple[_Values, Bools]:
     """(a, 1) each: by how much the light of each row of the sample differs from their mean; where beyond its errors.
 
-    left (a, b): what the background leaves; structure (a, b): of the background; both in sigmas of a pixel.
+    left (a, b): what the background leaves, usually misfit; structure (a, b): of it; in sigmas of a pixel.
     """
     seen = clear * structure
     power = _over_rows(seen * seen) + np.float32(_USUAL_BAND**-2)
-    most = np.float32(_LARGEST_LEFT * max(1.4826 * _median(np.abs(left[_SOME][clear[_SOME]])), 1.0))
+    most = np.float32(_LARGEST_LEFT * max(misfit, 1.0))
     differs = _over_rows(seen * np.clip(left, -most, most)) / power
     differs -= np.sum(power * differs) / np.sum(power)
     sigma = np.sqrt(1 / (2 * np.sqrt(np.pi) * _ROWS * power))
