@@ -203,7 +203,7 @@ def _by_unsolved_board(
             equations = ViewEquations.of(table, found, replace(found.board, warp=True))
             change = equations.solution()[0][: equations.lens]
     except AdjustmentError:
-        pass
+        pass  # the photographs do not determine these errors of the board: their effect is not known
     return np.outer(change, change)
 
 

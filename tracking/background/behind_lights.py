@@ -130,16 +130,8 @@ def passing_lights(
         values, variance, uv = seen.around([k], box, _AROUND * width, _step(width))
         column, row = uv.T.astype(np.int64)
         empty = ground[row, column].astype(float), count[row, column] / variance[0]
-        fit = fitted(
-            uv,
-            values,
-            variance,
-            light.uv_px,
-            width,
-            float(light.peak[0]),
-            empty,
-            strength=seen.strength_at([k], light.uv_px),
-        )
+        height, strength = float(light.peak[0]), seen.strength_at([k], light.uv_px)
+        fit = fitted(uv, values, variance, light.uv_px, width, height, empty, strength=strength)
         if fit is not None and fit.modulated_share(seen.usual_dn)[1] < _LARGEST_SIGMA**2:
             fits.append(fit)
     return fits

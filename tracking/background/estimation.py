@@ -90,7 +90,6 @@ class EqualLight:
     ) -> EqualLight:
         """passed: as in `means_of`. Where the light differs, the first mean is no picture in any light."""
         equal: Sequence[NDArray[Any]] = pictures
-        strength = np.ones((len(pictures), len(pictures[0])))
         for largest in (np.inf, LARGEST_MISFIT, 0.0):
             lower, mean = means_of(equal, passed)
             background = StaticBackground.of_mean(lower, pictures, model, parameters).with_light(equal)
@@ -98,15 +97,13 @@ class EqualLight:
                 break
             shown = [(p, fit) for p in pictures if (fit := background.shown.in_picture(p, largest)) is not None]
             fitting = [(p, fit) for p, fit in shown if fit.misfit <= LARGEST_MISFIT]
-            if len(fitting) >= _LEAST_PICTURES and all(fit.is_usual for _, fit in fitting):
-                pictures = equal = [p for p, _ in fitting]
-                strength = np.ones((len(pictures), len(lower)))
-                break
-            shown = [shown[i] for i in evenly_spread(np.arange(len(shown)), MOST_BYTES // (4 * lower.size))]
-            pictures = [p for p, _ in shown]
-            if len(pictures) < _LEAST_PICTURES:
-                break
+            usual = len(fitting) >= _LEAST_PICTURES and all(fit.is_usual for _, fit in fitting)
+            most = MOST_BYTES // (4 * lower.size)
+            shown = fitting if usual else [shown[i] for i in evenly_spread(np.arange(len(shown)), most)]
+            pictures = equal = [p for p, _ in shown]
             strength = np.array([1 / fit.of_rows(len(lower))[0] for _, fit in shown])
+            if usual or len(pictures) < _LEAST_PICTURES:
+                break
             equal = [_in_light(p, fit, lower - background.structure) for p, fit in shown]
         return EqualLight(background, mean, pictures, equal, strength)
 

@@ -87,7 +87,7 @@ class ShownLight:
         first = ShownLight(
             structure.shape, smooth, smooth + own, own, plain, power >= np.median(power), noise, noise_share,
         )  # fmt: skip
-        lights = [first._measured(p[::rows, ::columns].astype(np.float32) - smooth)[0] for p in pictures]
+        lights = [first._measured(first._seen(p))[0] for p in pictures]
         if not lights or not plain.any():
             return replace(first, reference=0.0)
         where = plain > 0
@@ -103,8 +103,7 @@ class ShownLight:
         """
         if picture.shape != self.size:
             return None
-        rows, columns = sample_of(self.size)
-        seen = picture[::rows, ::columns].astype(np.float32) - self.smooth
+        seen = self._seen(picture)
         light, clear, left, shown, misfit = self._fitted(seen)
         if not LEAST_LIGHT < light < MOST_LIGHT:
             return None
@@ -127,9 +126,14 @@ class ShownLight:
             return None
         if not differ:
             return Shown(light, clear, left, misfit)
-        at, known = np.arange(self.size[0]), np.arange(len(seen)) * rows
+        at, known = np.arange(self.size[0]), np.arange(len(seen)) * sample_of(self.size)[0]
         every = np.array([np.interp(at, known, x[:, 0]) for x in (light * of_rows, levels)])
         return Shown(light, clear, left, misfit, every)
+
+    def _seen(self, picture: Picture) -> _Values:
+        """(a, b), DN: what the sample of a picture shows above the smooth part."""
+        rows, columns = sample_of(self.size)
+        return picture[::rows, ::columns].astype(np.float32) - self.smooth
 
     def _fitted(self, seen: _Values) -> tuple[float, Bools, _Values, _Values, float]:
         """The light relative to the background; and, on the sample: what is clear of lights, what the background

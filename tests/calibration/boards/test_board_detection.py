@@ -363,8 +363,8 @@ def test_corners_found_in_another_order_keep_their_noise():
     true = photo.pixels.reshape(board.rows, board.columns, 2)
     views = [chessboard_detection._measured(image, grid, board) for grid in (true, true[::-1, ::-1])]
     assert all(isinstance(view, BoardView) for view in views)
-    np.testing.assert_allclose(views[1].pixels, views[0].pixels, atol=0.01)  # type: ignore[union-attr]
-    np.testing.assert_allclose(views[1].sigmas_px, views[0].sigmas_px, rtol=0.01)  # type: ignore[union-attr]
+    np.testing.assert_allclose(views[1].pixels, views[0].pixels, atol=0.01)
+    np.testing.assert_allclose(views[1].sigmas_px, views[0].sigmas_px, rtol=0.01)
 
 
 def test_a_picture_of_another_type_raises():

@@ -100,7 +100,7 @@ def test_corners_without_noise_are_where_the_board_is(lens, turn, seen_px):
     at = placed(board, near, turn, seen_px)
     grid = true_grid(board, near, at)
     picture = light_without_noise(board, near, at, 0.7)  # not rounded to grey values, which no picture of a file is
-    off = refined(picture, grid + 0.2).pixels - grid  # type: ignore[arg-type]
+    off = refined(picture, grid + 0.2).pixels - grid
     outward = grid - near.matrix[:2, 2]
     outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
     assert np.sqrt(np.mean(off**2)) < 0.0002 * px
@@ -172,7 +172,7 @@ def test_the_scatter_of_each_corner_is_its_stated_sigma(lens, blur_px):
     for _ in range(40):
         noise = rng.normal(0, 1, light.shape)
         noise[:, middle:] *= 5
-        found = refined((light + noise).astype(np.float32), grid + 0.2)  # type: ignore[arg-type]
+        found = refined((light + noise).astype(np.float32), grid + 0.2)
         off.append(found.pixels - grid)
         sigmas.append(found.sigmas_px)
     z = np.array(off) / np.array(sigmas)[..., None]

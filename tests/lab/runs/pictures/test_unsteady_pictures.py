@@ -114,16 +114,21 @@ def nees(out: Path, truth: Path) -> np.ndarray:
     return np.array(found)
 
 
+def processed(folder: Path, out: Path) -> dict[str, Any]:
+    """The summary of a run by the command line."""
+    done = CliRunner().invoke(main, ["run", str(folder), "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    return dict(json.loads((out / "summary.json").read_text()))
+
+
 @pytest.mark.parametrize("shake_px", [0.15, 1.0])
 def test_a_camera_that_shakes_is_named_and_its_poses_are_as_good_as_their_sigmas(tmp_path, shake_px):
     folder, truth = recording(tmp_path / "run", shake_px)
-    done = CliRunner().invoke(main, ["run", str(folder), "--out", str(tmp_path / "out")])
-    assert done.exit_code == 0, done.output
+    summary = processed(folder, tmp_path / "out")
     found = nees(tmp_path / "out", truth)
     assert len(found) >= FRAMES - 1
     assert found.mean() < 2.0
     assert found.max() < 6.0
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     for camera, noise in summary["parameters"]["noise"].items():
         assert noise["camera_motion_px"] == pytest.approx(shake_px, rel=0.35)
         assert any(note.startswith(f"{camera}: the camera moves by") for note in summary["notes"])
@@ -139,9 +144,7 @@ def test_a_camera_that_shakes_is_named_and_its_poses_are_as_good_as_their_sigmas
 )
 def test_spots_are_found_in_front_of_a_room_whose_light_changes(tmp_path, light):
     folder, truth = recording(tmp_path / "run", light=light)
-    done = CliRunner().invoke(main, ["run", str(folder), "--out", str(tmp_path / "out")])
-    assert done.exit_code == 0, done.output
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    summary = processed(folder, tmp_path / "out")
     assert all(noise["background_pictures"] > 0 for noise in summary["parameters"]["noise"].values())
     found = nees(tmp_path / "out", truth)
     assert len(found) == FRAMES
@@ -152,9 +155,7 @@ def test_spots_are_found_in_front_of_a_room_whose_light_changes(tmp_path, light)
 
 def test_somebody_who_walks_past_the_cameras_hides_spots_and_causes_no_wrong_pose(tmp_path):
     folder, truth = recording(tmp_path / "run", walks=True)
-    done = CliRunner().invoke(main, ["run", str(folder), "--out", str(tmp_path / "out")])
-    assert done.exit_code == 0, done.output
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    summary = processed(folder, tmp_path / "out")
     assert all(noise["background_pictures"] > 0 for noise in summary["parameters"]["noise"].values())
     found = nees(tmp_path / "out", truth)
     assert len(found) > FRAMES / 2
@@ -173,13 +174,11 @@ def test_pictures_that_repeat_the_one_before_have_no_spots(tmp_path):
         for frame in again:
             files = folder / "frames" / camera
             shutil.copy(files / f"{frame - 1:06d}.png", files / f"{frame:06d}.png")
-    done = CliRunner().invoke(main, ["run", str(folder), "--out", str(tmp_path / "out")])
-    assert done.exit_code == 0, done.output
+    summary = processed(folder, tmp_path / "out")
     rows = pd.read_csv(tmp_path / "out" / "attitude.csv").set_index("frame")
     assert (rows.status[again] != "measured").all()
     assert (rows.status.drop(again) == "measured").all()
     assert nees(tmp_path / "out", truth).mean() < 2.0
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert "left: 4 frames repeated" in " ".join(summary["notes"])
     assert [noise["camera_motion_px"] for noise in summary["parameters"]["noise"].values()] == [0.0, 0.0]
     assert "camera moves" not in " ".join(summary["notes"])
@@ -194,13 +193,12 @@ def test_torn_pictures_have_no_spots(tmp_path):
             now, before = (folder / "frames" / camera / f"{frame - k:06d}.png" for k in (0, 1))
             halves = [cv2.imread(str(p), cv2.IMREAD_UNCHANGED) for p in (now, before)]
             cv2.imwrite(str(now), np.vstack([halves[0][: SIZE[0] // 2], halves[1][SIZE[0] // 2 :]]))
-    done = CliRunner().invoke(main, ["run", str(folder), "--out", str(tmp_path / "out")])
-    assert done.exit_code == 0, done.output
+    summary = processed(folder, tmp_path / "out")
     rows = pd.read_csv(tmp_path / "out" / "attitude.csv").set_index("frame")
     assert (rows.status[torn] != "measured").all()
     assert (rows.status.drop(torn) == "measured").all()
     assert nees(tmp_path / "out", truth).mean() < 2.0
-    assert "left: 3 frames torn" in " ".join(json.loads((tmp_path / "out" / "summary.json").read_text())["notes"])
+    assert "left: 3 frames torn" in " ".join(summary["notes"])
 
 
 def test_rows_without_noise_may_be_equal():
