@@ -48,6 +48,8 @@ _UNDETERMINED = 1e12  # condition of the fit: of long focal lengths, where a rot
 _MOSTLY, _STILL_SHARE = 0.85, 0.5  # of the pictures, in which a landmark stands still; least share of those that do
 _LEAST_PX = 0.01  # movements with a smaller root mean square are none: few spots are better than that
 _CLEAR = 0.75  # times its error, which is 3.5 times that of landmarks with noise of their own: a movement is corrected
+_PARTS, _STEP = 10, 9.0  # of a recording; square of their mean movement over its variance, above which that is a step
+_SLOW_SHARE = 0.3  # variance of the mean of the movements over theirs, above which they are slow
 _BEFORE = 3  # pixels before a place in the filter of 8 pixels that moves a picture
 _CHANGE_PX = 0.01  # for the derivatives of that filter
 _SIDE = 32  # px of a row that are moved by the same
@@ -82,6 +84,7 @@ class CameraMotion:
     mean_motion: Array  # (5,): of the pictures that `stilled` gives, from the landmarks
     offset: Array  # (5,): mean of the recording, from those pictures
     rms_px: float = 0.0  # of the movements
+    mean_variance_px2: float = 0.0  # of their mean, along each axis: the same in all pictures
     pictures: int = 1  # from which the mean is known
 
     @staticmethod
@@ -114,10 +117,11 @@ class CameraMotion:
 
     def with_mean_of(self, pictures: Sequence[Picture], clips: float) -> CameraMotion:
         """With the mean attitude of more pictures of the recording for that to which spots are corrected."""
-        motions = [turn.motion for _, turn in self._turns_in(pictures, clips) or ()]
+        motions = np.array([turn.motion for _, turn in self._turns_in(pictures, clips) or ()])
         if len(motions) <= self.pictures:
             return self
-        return replace(self, offset=np.mean(motions, axis=0), pictures=len(motions))
+        variance = _variance_of_mean((motions - motions.mean(axis=0)) @ self._middle.T)
+        return replace(self, offset=motions.mean(axis=0), mean_variance_px2=variance, pictures=len(motions))
 
     def stilled(self, picture: Picture, clips: float) -> tuple[Picture | None, Turn | None]:
         """A picture (h, w) moved to where the camera does not turn, and its turn, which `corrected` needs.
@@ -161,9 +165,9 @@ class CameraMotion:
         return replace(found, uv_px=uv, cov_px2=found.cov_px2 + moved @ turn.covariance @ moved.transpose(0, 2, 1))
 
     @property
-    def mean_variance_px2(self) -> float:
-        """Of the mean of the movements, along each axis: the same in all pictures."""
-        return self.rms_px**2 / self.pictures
+    def is_slow(self) -> bool:
+        """Whether the camera moves once, or slowly, so that the mean of its pictures is no attitude of calibration."""
+        return self.mean_variance_px2 > _SLOW_SHARE * self.rms_px**2
 
     @property
     def _middle(self) -> Array:
@@ -202,7 +206,10 @@ class CameraMotion:
         rms = float(np.sqrt(np.mean(moved**2)))
         if rms < max(_LEAST_PX, _CLEAR * float(np.sqrt(error2))):
             return None
-        return replace(self, mean_motion=self.mean_motion + mean, rms_px=rms, pictures=len(turns))
+        return replace(
+            self, mean_motion=self.mean_motion + mean, rms_px=rms, mean_variance_px2=_variance_of_mean(moved),
+            pictures=len(turns),
+        )  # fmt: skip
 
     def _nearest(self, picture: Picture) -> Array:
         """The motion (5,) by whole px that leaves least of some of the landmarks."""
@@ -250,6 +257,19 @@ class CameraMotion:
         spread = 1.4826 * float(np.median(left))
         covariance = _SHARED * max(spread, 1.0) ** 2 * inverse / np.outer(scale, scale)
         return _Fit(solution[:_FREE] / scale[:_FREE], covariance[:_FREE, :_FREE], left, spread)
+
+
+def _variance_of_mean(deviations: Array) -> float:
+    """Of the mean of successive values, per coordinate, from their deviations (n, 2) from it.
+
+    After a step, or with a slow movement, the attitude of the calibration may be any of those in the recording.
+    """
+    n = len(deviations)
+    parts = np.array_split(deviations, min(_PARTS, n // 3))  # of three values and more
+    independent = 0.5 * float(np.mean(np.diff(deviations, axis=0) ** 2))
+    means2 = [float(np.mean(part.mean(axis=0) ** 2)) for part in parts]
+    steps = [x for x, part in zip(means2, parts, strict=True) if x > _STEP * independent / len(part)]
+    return max(steps, default=float(np.mean(deviations**2)) / n)
 
 
 def moved_by(picture: Picture, movement: Array, clips: float) -> NDArray[np.float32]:

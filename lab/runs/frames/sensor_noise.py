@@ -129,9 +129,13 @@ class CameraNoise:
         """Find the mean attitude of a camera that moves in these pictures, and note that it does."""
         if self.motion is not None and pictures:
             self.motion = self.motion.with_mean_of(pictures, self.saturation_dn(pictures[0], parameters))
+            if self.motion.is_slow:
+                how, remedy = "once or slowly", "Find out when it was moved, and calibrate it again"
+            else:
+                how, remedy = "from picture to picture", "Check its mount and the floor"
             self.notes.append(
-                f"{self.camera}: the camera moves by {self.motion.rms_px:.2g} px (rms) from picture to picture; its"
-                " spots are corrected by what stands still in its pictures. Check its mount and the floor"
+                f"{self.camera}: the camera moves by {self.motion.rms_px:.2g} px (rms) {how}; its spots are corrected by"
+                f" what stands still in its pictures. {remedy}"
             )
 
     def look_for_wide(self, pictures: Sequence[Picture], parameters: DetectParameters) -> None:

@@ -59,11 +59,13 @@ def person(picture: np.ndarray, frame: int) -> np.ndarray:
 
 
 def recording(
-    folder: Path, shake_px: float = 0.0, light: Callable[[int], Any] = lambda frame: 1.0, walks: bool = False
-) -> tuple[Path, Path]:
+    folder: Path, shake_px: float = 0.0, light: Callable[[int], Any] = lambda frame: 1.0, walks: bool = False,
+    step_px: float = 0.0, step_at: int = 0,
+) -> tuple[Path, Path]:  # fmt: skip
     """A run folder with pictures of cameras that turn by this root mean square, and its truth beside it.
 
-    light: of the room in a frame, a number or one for each row (h, 1); walks: a person, through all pictures.
+    light: of the room in a frame, a number or one for each row (h, 1); walks: a person, through all pictures; step: by
+    what the cameras are moved in a frame. They were calibrated before.
     """
     made = CliRunner().invoke(
         main,
@@ -81,9 +83,11 @@ def recording(
         (folder / "frames" / name).mkdir(parents=True)
         turns = rng.normal(0.0, shake_px / camera.matrix[0, 0], (FRAMES, 3))
         room = np.zeros(SIZE)
-        for frame, turn in enumerate(turns - turns.mean(axis=0)):
+        turns -= turns.mean(axis=0)
+        turns[step_at:, :2] += step_px / camera.matrix[0, 0]
+        for frame, turn in enumerate(turns):
             now = turned(camera, turn)
-            if frame == 0 or shake_px:
+            if frame == 0 or shake_px or (step_px and frame == step_at):
                 origin, rays = now.rays(ends[::STEP, ::STEP])  # they vary smoothly
                 seen = np.moveaxis(camera.project(origin + 3.0 * rays)[..., ::-1] + MARGIN, -1, 0)
                 at_all = [RectBivariateSpline(*EVERY, x)(np.arange(SIZE[0]), np.arange(SIZE[1])) for x in seen]
@@ -132,6 +136,19 @@ def test_a_camera_that_shakes_is_named_and_its_poses_are_as_good_as_their_sigmas
     for camera, noise in summary["parameters"]["noise"].items():
         assert noise["camera_motion_px"] == pytest.approx(shake_px, rel=0.35)
         assert any(note.startswith(f"{camera}: the camera moves by") for note in summary["notes"])
+
+
+@pytest.mark.parametrize("step_at", [4, FRAMES // 2, FRAMES - 6])
+def test_cameras_that_are_moved_during_a_recording_are_named_and_the_sigmas_contain_the_step(tmp_path, step_at):
+    """Which of the two attitudes is that of the calibration cannot be seen; the truth here is the first."""
+    folder, truth = recording(tmp_path / "run", step_px=1.5, step_at=step_at)
+    summary = processed(folder, tmp_path / "out")
+    found = nees(tmp_path / "out", truth)
+    assert len(found) >= FRAMES - 1
+    assert found.mean() < 3.0
+    assert found.max() < 6.0
+    for camera in summary["parameters"]["noise"]:
+        assert any(note.startswith(f"{camera}: the camera moves by") and "once" in note for note in summary["notes"])
 
 
 @pytest.mark.parametrize(
