@@ -318,9 +318,11 @@ def write_tables(
     # Where the model check has tested the residuals, it has separated noise from faults.
     diagnosis = model_check.result.diagnosis
     noise_scale = None if diagnosis is not None else pipeline.tracker.noise_scale
-    mosaics = {name: noise.mosaic for name, noise in pipeline.noise.items() if noise.mosaic}
-    too_wide = {name: noise.too_wide_px for name, noise in pipeline.noise.items() if noise.too_wide_px}
-    verdict = quality.judge(statistics, model_check.findings, noise_scale, mosaics, too_wide)
+    shown = {
+        kind: {name: value for name, noise in pipeline.noise.items() if (value := getattr(noise, attribute))}
+        for kind, attribute in (("mosaics", "mosaic"), ("too_wide", "too_wide_px"), ("moved", "moved_px"))
+    }
+    verdict = quality.judge(statistics, model_check.findings, noise_scale, **shown)
     explained = diagnosis is not None and diagnosis.is_random
     # Where a light is too wide a spot is missing, and no mistake explains that better.
     named = any(f.code == quality.TOO_WIDE for f in verdict.findings)
@@ -329,7 +331,7 @@ def write_tables(
     if mistakes:
         # The deviations of a rig with such a mistake are its consequences.
         others = () if verdict_of(mistakes) is Level.FAIL else model_check.findings
-        verdict = quality.judge(statistics, (*mistakes, *others), noise_scale, mosaics, too_wide)
+        verdict = quality.judge(statistics, (*mistakes, *others), noise_scale, **shown)
     return statistics, model_check, verdict
 
 

@@ -37,9 +37,9 @@ _LEAST_TILES = 16  # with landmarks: lights of an unlit room are in fewer, and m
 _MARGIN, _SPARSE = 12, 2  # px: no landmarks at the edge; every such pixel may be one
 _BLUR_PX, _RADIUS = 1.0, 2  # px: of the pictures at the landmarks, whose slopes would be noise otherwise
 _SHARED = 4 * np.pi * _BLUR_PX**2  # landmarks that share their noise, at most
-_FARTHEST_PX = 8  # largest movement
-_SOME = 4  # every such landmark is searched
-_LIKE = 20.0  # sigmas: a landmark that differs by more is not there
+FARTHEST_PX = 8  # largest movement that is corrected
+_SOME = 4  # every such landmark shows which movement of a whole picture is nearest
+_LEAST_PEAK = 0.3  # of a correlation of pictures: .3 to .5 in front of a room, .16 of eight lights that move alike
 _ROUNDS = 6  # of the fit, whose weights and whose place change
 _NEAR_PX, _ON_PX = 0.03, 0.005  # a movement that is not undone but corrected; one that is no movement
 _OUTLIER = 3.0  # sigmas: what a landmark leaves counts in full up to this, and not at all beyond twice of it
@@ -76,6 +76,7 @@ class CameraMotion:
     """What stands still in the pictures (h, w) of a camera, and how much the camera turns about its mean attitude."""
 
     camera: Camera
+    usual: NDArray[np.float32]  # (h, w), DN: a picture in which it does not turn
     pixels: Ints  # (k, 2): u, v of landmarks
     values: Array  # (k,), DN: of the landmarks where the camera does not turn
     slopes: Array  # (k, 2), DN/px
@@ -135,12 +136,12 @@ class CameraMotion:
         """As `stilled`, not rounded."""
         if picture.shape[::-1] != self.camera.image_size_px:
             return None
-        return self._found(picture, np.zeros(_FREE), clips) or self._found(picture, self._nearest(picture), clips)
+        return self._found(picture, np.zeros(_FREE), clips) or self._found(picture, np.append(np.zeros(3), shift_between(self.usual, picture)), clips)
 
     def _found(self, picture: Picture, motion: Array, clips: float) -> tuple[NDArray[Any], Turn] | None:
         """As `_turned`, from a first estimate of the motion."""
         for k in range(_ROUNDS):
-            if np.abs(self._middle @ motion).max() > _FARTHEST_PX:
+            if np.abs(self._middle @ motion).max() > FARTHEST_PX:
                 break
             movement = self._movement(motion)
             moved: NDArray[Any] = moved_by(picture, movement, clips) if motion.any() else picture
@@ -211,19 +212,10 @@ class CameraMotion:
             pictures=len(turns),
         )  # fmt: skip
 
-    def _nearest(self, picture: Picture) -> Array:
-        """The motion (5,) by whole px that leaves least of some of the landmarks."""
-        some = self._only(np.arange(len(self.values)) % _SOME == 0)
-        reach = range(-_FARTHEST_PX, _FARTHEST_PX + 1)
-        shifts = np.array([(u, v) for v in reach for u in reach])
-        left = [np.mean(np.minimum(np.abs(some._seen(picture, s) - some.values) / some.sigma, _LIKE)) for s in shifts]
-        return np.append(np.zeros(3), shifts[int(np.argmin(left))])
-
-    def _seen(self, picture: NDArray[Any], shift: Ints) -> Array:
-        """(k,), DN: what is in a picture at the landmarks, moved by whole px."""
-        width = picture.shape[1]
-        first = (self.pixels[:, 1] + shift[1]) * width + self.pixels[:, 0] + shift[0]
-        return np.asarray(picture.ravel()[first[:, None] + _NEAR @ [1, width]] @ _WEIGHTS)
+    def _seen(self, picture: NDArray[Any]) -> Array:
+        """(k,), DN: what is in a picture at the landmarks."""
+        at = self.pixels @ [1, picture.shape[1]]
+        return np.asarray(picture.ravel()[at[:, None] + _NEAR @ [1, picture.shape[1]]] @ _WEIGHTS)
 
     def _design(self) -> Array:
         """(k, 7), sigmas: what a motion, more light and a brighter level change at the landmarks."""
@@ -233,7 +225,7 @@ class CameraMotion:
     def _off(self, picture: NDArray[Any], known_px: Array | float = 0.0) -> Array:
         """(k,), sigmas: differences of a picture from the landmarks after a known movement (k, 2), px, of each."""
         expected = self.values - np.sum(self.slopes * known_px, axis=1)
-        return np.asarray((self._seen(picture, np.zeros(2, int)) - expected) / self.sigma)
+        return np.asarray((self._seen(picture) - expected) / self.sigma)
 
     def _fitted(self, picture: NDArray[Any], known_px: Array | float) -> _Fit | None:
         """By a robust fit what has changed beside a known movement (k, 2), px; None: it is not determined."""
@@ -257,6 +249,19 @@ class CameraMotion:
         spread = 1.4826 * float(np.median(left))
         covariance = _SHARED * max(spread, 1.0) ** 2 * inverse / np.outer(scale, scale)
         return _Fit(solution[:_FREE] / scale[:_FREE], covariance[:_FREE, :_FREE], left, spread)
+
+
+def shift_between(first: Picture | NDArray[np.float32], second: Picture) -> Array:
+    """(2,), px: by what a second picture (h, w) is moved; 0 where they have no structure in common, or differ in size.
+
+    By phase correlation of the signs of their curvature, in which bright lights count no more than what else is there.
+    """
+    if first.shape != second.shape:
+        return np.zeros(2)
+    window = cv2.createHanningWindow(first.shape[::-1], cv2.CV_32F)
+    signs = [np.sign(cv2.Laplacian(cv2.GaussianBlur(x, (0, 0), _BLUR_PX), cv2.CV_32F)) for x in (first, second)]
+    shift, peak = cv2.phaseCorrelate(*signs, window)
+    return np.array(shift) if peak > _LEAST_PEAK else np.zeros(2)
 
 
 def _variance_of_mean(deviations: Array) -> float:
@@ -407,7 +412,7 @@ def _landmarks(
     at = pixels[:, 1], pixels[:, 0]
     slopes = np.column_stack([along[at], across[at]]).astype(float)
     sigma = np.sqrt((1 + pictures) * variance[at]).astype(float)
-    return CameraMotion(camera, pixels, grey[at].astype(float), slopes, sigma, moved, np.zeros(_FREE), np.zeros(_FREE))
+    return CameraMotion(camera, plain, pixels, grey[at].astype(float), slopes, sigma, moved, np.zeros(_FREE), np.zeros(_FREE))
 
 
 def _spread_over_tiles(slope: NDArray[np.float32], per_tile: int) -> Ints:

@@ -17,7 +17,7 @@ from lab.files.run.run_file import Run
 from lab.pictures import source as picture_source
 from lab.pictures.source import PictureFiles, PictureSource, pictures_of_frames
 from lab.runs.frames.frames import FrameReader
-from tracking.background.camera_motion import CameraMotion
+from tracking.background.camera_motion import FARTHEST_PX, CameraMotion, shift_between
 from tracking.background.estimation import PICTURES, static_background
 from tracking.background.static_background import StaticBackground
 from tracking.background.wide_lights import WideLights
@@ -64,6 +64,7 @@ class CameraNoise:
     )  # in use; None before the first estimate if none is stated
     motion: CameraMotion | None = field(default=None, init=False)  # None: the camera does not move, or none is seen
     background: StaticBackground | None = field(default=None, init=False)  # for faint spots; None: not used
+    moved_px: float = field(default=0.0, init=False)  # between the first picture and the last, if too far to correct
     wide: WideLights | None = field(default=None, init=False)  # None: sums of pixels have no background
     too_wide_px: float = field(default=0.0, init=False)  # sigma of a light that max_sigma_px excludes; 0: none
     unfit: int = field(default=0, init=False)  # consecutive pictures that do not fit the background
@@ -113,6 +114,8 @@ class CameraNoise:
         """
         if pictures and self.model is not None and self.estimate is not None:
             usual = self._with_saturation(parameters, pictures[0])
+            moved_px = float(np.linalg.norm(shift_between(pictures[0], pictures[-1])))
+            self.moved_px = moved_px if moved_px > FARTHEST_PX else 0.0
             motion = None
             if self.optics is not None:
                 motion = call(CameraMotion.of, pictures, self.optics, self.model, without_wide(usual))

@@ -48,12 +48,14 @@ def judge(
     noise_scale: float | None = None,
     mosaics: Mapping[str, float] = MappingProxyType({}),
     too_wide: Mapping[str, float] = MappingProxyType({}),
+    moved: Mapping[str, float] = MappingProxyType({}),
 ) -> Verdict:
     """The verdict on a run.
 
     findings: of the model check (lab.runs.model_check.check.check_model). noise_scale: ratio of the residuals to the
     detections' sigmas; None where the model check has tested that. mosaics: contrast of the colour mosaic by camera, of
-    cameras whose pictures show one. too_wide: sigma, px, of a light that detect.max_sigma_px excludes, by camera.
+    cameras whose pictures show one. too_wide: sigma, px, of a light that detect.max_sigma_px excludes, by camera. moved:
+    px, by what the pictures of a camera have moved, by camera.
     """
     if statistics.frames == 0:
         return _of([finding("BP-V01", Level.FAIL, "there is no frame at all")])
@@ -65,6 +67,13 @@ def judge(
     found = [f for f in given if f.code == _SET_UP]
     found += _mosaics(mosaics, verdict(given))
     found += _too_wide(too_wide, statistics)
+    found += [
+        finding(
+            "BP-V19", Level.WARN, f"what stands still in the pictures of camera {name} has moved by {px:.0f} px between"
+            " the start and the end of the recording", variant="pictures", numbers={"camera": name, "moved_px": px},
+        )  # fmt: skip
+        for name, px in moved.items()
+    ]
     found += _measured(statistics)
     if statistics.measured:
         found += _cameras(statistics)

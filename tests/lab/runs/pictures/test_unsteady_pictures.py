@@ -151,6 +151,15 @@ def test_cameras_that_are_moved_during_a_recording_are_named_and_the_sigmas_cont
         assert any(note.startswith(f"{camera}: the camera moves by") and "once" in note for note in summary["notes"])
 
 
+def test_cameras_that_are_moved_by_many_pixels_are_named(tmp_path):
+    """They are not corrected: with all of them moved alike, the later spots fit a wrong pose."""
+    summary = processed(recording(tmp_path / "run", step_px=25.0, step_at=FRAMES // 2)[0], tmp_path / "out")
+    assert summary["verdict"]["status"] == "check"
+    named = [e["numbers"] for e in summary["verdict"]["evidence"] if e["code"] == "BP-V19"]
+    assert [n["camera"] for n in named] == ["left", "right"]
+    assert [n["moved_px"] for n in named] == pytest.approx([25.0 * np.sqrt(2)] * 2, rel=0.1)
+
+
 @pytest.mark.parametrize(
     "light",
     [
