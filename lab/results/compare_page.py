@@ -192,7 +192,7 @@ def _curves(comparison: Comparison) -> Section:
 
 def _curve(comparison: Comparison, axis: AxisStatistic, k: int, shades: tuple[Shade, ...]) -> str:
     used = np.where(comparison.used, axis.values, np.nan)
-    usual = 0.0 if axis.sigmas is None else 2 * float(np.nanmedian(axis.sigmas))
+    usual = np.nan if axis.sigmas is None else 2 * float(np.nanmedian(axis.sigmas))
     low, high = y_range = svg.robust_range(np.append(used, usual))
     bands: tuple[Band, ...] = ()
     if axis.sigmas is not None:
