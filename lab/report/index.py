@@ -1,8 +1,6 @@
 """The index page of a folder of runs, with their curves and trends.
 
-One run of a batch as the index shows it: its row of batch.csv, and what its result folder adds.
-
-A result folder may be missing or damaged: what cannot be read is left empty.
+A run's content is its row of batch.csv, and what its result folder adds: what cannot be read there is left empty.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""Figures of errors and residuals in a run report.
+"""Figures of a run report: errors and residuals, the spots' statuses and their tracks (Huo 2015, Fig. 8), the motion.
 
-Pose, velocity and angular rate over time: value on the left, uncertainty on the right.
-
-Figures of the spots: tracks over the picture (Huo 2015, Fig. 8), statuses over time.
+Pose, velocity and angular rate over time have the value on the left, the uncertainty on the right.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """`beampose view`: view.html, the scene to turn and to play in a browser with still drawings, and scene.glb.
 
-view.html is one file that works offline; it opens in the browser where there is a display. The scene: its content, its
-solids, and the glTF file of them.
+view.html is one file that works offline; it opens in the browser where there is a display.
 """
 
 from __future__ import annotations
