@@ -168,11 +168,7 @@ def lamp_tracker() -> LampTracker:
 
 def projected(points: Array, pose: Pose) -> Array:
     """Pixels (n, 2) of points of the body (n, 3), m; nan behind the camera."""
-    seen = camera()
-    in_camera = seen.camera_from_world.apply(pose.apply(points))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        flat = in_camera[:, :2] / np.where(in_camera[:, 2:] > 0, in_camera[:, 2:], np.nan)
-    return FOCAL_PX * flat + seen.matrix[:2, 2]
+    return camera().project(pose.apply(points))
 
 
 def pose_of(state: Array) -> Pose:
@@ -322,32 +318,35 @@ _SHOWN_PX = (420, 180)  # size of the part of a picture that is shown
 
 def picture_rows(runs: dict[str, PictureRun]) -> list[ComparisonRow]:
     """The rows; runs: one recording of pictures through the filters of these names."""
-
-    def row(quantity: str, unit: str, paper: float | None, of: dict[str, float], note: str = "") -> ComparisonRow:
-        return ComparisonRow(f"pictures: {quantity}", unit, paper, tuple(of.get(n) for n in FILTERS), note)
-
     quiet = {n: ~r.gust & (r.t_s > _SETTLED_S) for n, r in runs.items()}
     seen = {n: np.isfinite(r.single[:, 0]) for n, r in runs.items()}
+    note = "four or five lamps agree with one pose, and no other labels do"
+    clear = {n: 100 * float(seen[n][~r.gust].mean()) for n, r in runs.items()}
     out = [
-        row(
-            "clear ones with a pose", "%", None, {n: 100 * float(seen[n][~r.gust].mean()) for n, r in runs.items()},
-            "four or five lamps agree with one pose, and no other labels do",
-        ),
-        row("wrong labels, all pictures", "", None, {n: float(r.wrong.sum()) for n, r in runs.items()}),
-    ]  # fmt: skip
+        _row("pictures: clear ones with a pose", "%", None, clear, note),
+        _row("pictures: wrong labels, all pictures", "", None, {n: float(r.wrong.sum()) for n, r in runs.items()}),
+    ]
     if any(r.gust.any() for r in runs.values()):
         with_pose = {n: 100 * float(seen[n][r.gust].mean()) for n, r in runs.items()}
-        out.append(row("disturbed ones with a pose", "%", None, with_pose, "blur, 16 false lights, hidden lamps"))
+        out.append(
+            _row("pictures: disturbed ones with a pose", "%", None, with_pose, "blur, 16 false lights, hidden lamps")
+        )
     for quantity, of, unit, scale in (
         ("range x", [0], "m", 1.0),
         ("position y, z", [1, 2], "m", 1.0),
         ("yaw, pitch", [6, 7], "deg", float(np.rad2deg(1.0))),
     ):
         rms = {n: scale * float(np.sqrt(np.mean(r.error[quiet[n]][:, of] ** 2))) for n, r in runs.items()}
-        out.append(row(f"quiet RMS, {quantity}", unit, None, rms, "the pose observes all eight numbers of the state"))
+        out.append(
+            _row(
+                f"pictures: quiet RMS, {quantity}", unit, None, rms, "the pose observes all eight numbers of the state"
+            )
+        )
     if any(r.gust.any() for r in runs.values()):
         largest = {n: float(np.abs(r.error[r.gust][:, :3]).max()) for n, r in runs.items()}
-        out.append(row("largest position error, 6 to 8 s", "m", 0.1, largest, "x, y, z; the paper: within 10 cm"))
+        out.append(
+            _row("pictures: largest position error, 6 to 8 s", "m", 0.1, largest, "x, y, z; the paper: within 10 cm")
+        )
     return out
 
 
@@ -455,7 +454,8 @@ def _errors(seed: int, recordings: int, name: str) -> Errors:
 
 
 def _row(quantity: str, unit: str, paper: float | None, values: dict[str, float], note: str = "") -> ComparisonRow:
-    return ComparisonRow(quantity, unit, paper, tuple(values[name] for name in FILTERS), note)
+    """values: by filter; of observability, which depends on the measurement alone, those of the standard one."""
+    return ComparisonRow(quantity, unit, paper, tuple(values.get(name) for name in FILTERS), note)
 
 
 def _quiet_rows(errors: dict[str, Errors]) -> list[ComparisonRow]:
@@ -467,10 +467,8 @@ def _quiet_rows(errors: dict[str, Errors]) -> list[ComparisonRow]:
         ratio = {n: float(np.max(v / rms["standard"])) for n, v in rms.items()}
         out.append(_row(f"quiet RMS, {quantity}, ratio to standard, worst", "", None, ratio))
     range_rms = {n: float(np.median(e.quiet[:, 3])) for n, e in errors.items()}
-    out.append(
-        _row("quiet RMS, range x", "m", None, range_rms, "not observed by eq. (4): the error of the first state")
-    )
-    return out
+    note = "not observed by eq. (4): the error of the first state"
+    return [*out, _row("quiet RMS, range x", "m", None, range_rms, note)]
 
 
 def _peak_rows(errors: dict[str, Errors]) -> list[ComparisonRow]:
@@ -489,20 +487,14 @@ def _peak_rows(errors: dict[str, Errors]) -> list[ComparisonRow]:
 
 
 def _observability_rows(observed: dict[str, Observability]) -> list[ComparisonRow]:
-    """The standard filter's column: observability depends on the measurement, not on the filter."""
     out = []
     for name, o in observed.items():
         unobserved = [state for state, good in zip(STATES, o.observed(), strict=True) if not good]
         note = f"of {len(STATES)}; not observed: {', '.join(unobserved) or 'none'}"
-        out.append(_standard_only(f"observed directions, {name}", "", float(o.rank), note))
-        out.append(
-            _standard_only(f"sigma of range x, {name}", "m", float(o.sigma[0]), f"prior {o.sigma_prior[0]:.1f} m")
-        )
+        out.append(_row(f"observed directions, {name}", "", None, {"standard": float(o.rank)}, note))
+        prior, sigma = f"prior {o.sigma_prior[0]:.1f} m", {"standard": float(o.sigma[0])}
+        out.append(_row(f"sigma of range x, {name}", "m", None, sigma, prior))
     return out
-
-
-def _standard_only(quantity: str, unit: str, value: float, note: str) -> ComparisonRow:
-    return ComparisonRow(quantity, unit, None, (value, *[None] * (len(FILTERS) - 1)), note)
 
 
 # The figures ------------------------------------------------------------------------------------------------------
@@ -513,12 +505,8 @@ def _curves(seed: int) -> list[Figure]:
     for disturbance in DISTURBANCES[1:]:
         recording = simulate(seed, 0, disturbance)
         states = {name: estimate(recording, name) for name in FILTERS}
-        panels = [
-            _panel(recording, states, 1, "y: estimate − true", "m"),
-            _panel(recording, states, 2, "z: estimate − true", "m"),
-            _panel(recording, states, 4, "velocity y: estimate − true", "m/s"),
-            _panel(recording, states, 6, "yaw: estimate − true", "deg"),
-        ]
+        shown = ((1, "y", "m"), (2, "z", "m"), (4, "velocity y", "m/s"), (6, "yaw", "deg"))
+        panels = [_panel(recording, states, column, f"{name}: estimate − true", unit) for column, name, unit in shown]
         out.append(
             Figure(
                 f"Errors with a {disturbance} (Figs. 4 to 8)",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -245,52 +247,30 @@ def _tracker_rows(run: PointRun, trackers: dict[str, TrackedRun], bends: Bools) 
     visible = run.in_view == 1
     exists = ~np.isnan(run.uv_px[..., 0])
 
-    def row(quantity: str, unit: str, printed: float | None, of: dict[str, float], note: str) -> ComparisonRow:
-        return ComparisonRow(quantity, unit, printed, tuple(of[name] for name in METHOD_NAMES), note)
+    def row(
+        quantity: str, unit: str, printed: float | None, of: Callable[[TrackedRun], float], note: str
+    ) -> ComparisonRow:
+        return ComparisonRow(quantity, unit, printed, tuple(float(of(trackers[n])) for n in METHOD_NAMES), note)
 
     def largest(t: TrackedRun) -> float:
         return float(np.nanmax(np.linalg.norm(t.uv_px - run.uv_px, axis=-1)[START_FRAMES:]))
 
-    prediction = {name: _rms(t.prediction_error_px, use & t.right) for name, t in trackers.items()}
+    def prediction(axis: int, t: TrackedRun) -> float:
+        return _rms(t.prediction_error_px, use & t.right)[axis]
+
     return [
-        row("prediction RMS x, tracking", "px", 0.6762, {n: p[0] for n, p in prediction.items()}, "with clutter"),
-        row("prediction RMS y, tracking", "px", 0.6611, {n: p[1] for n, p in prediction.items()}, "with clutter"),
-        row(
-            "largest tracking error",
-            "px",
-            2.5,
-            {n: largest(t) for n, t in trackers.items()},
-            "any spot, in or out of view; published value is measured",
-        ),
-        row(
-            "recognition rate, eq. (15)",
-            "%",
-            65.97,
-            {n: 100 * float(t.right.sum() / exists.sum()) for n, t in trackers.items()},
-            "every out-of-view estimate counts as wrong, as apparently in the paper; this dominates the two next rows",
-        ),
-        row(
-            "right identity of spots in view",
-            "%",
-            None,
-            {n: 100 * float((t.right & visible).sum() / visible.sum()) for n, t in trackers.items()},
-            "of visible spots in the picture",
-        ),
-        row(
-            "wrong labels",
-            "%",
-            None,
-            {n: 100 * float((t.taken & ~t.right).sum() / max(t.taken.sum(), 1)) for n, t in trackers.items()},
-            "of all labelled detections",
-        ),
-        row(
-            "out-of-view RMS while tracking",
-            "px",
-            None,
-            {n: _outside_rms(run, t) for n, t in trackers.items()},
-            "spots 3 and 6, with the labels of the tracker",
-        ),
-    ]
+        row("prediction RMS x, tracking", "px", 0.6762, partial(prediction, 0), "with clutter"),
+        row("prediction RMS y, tracking", "px", 0.6611, partial(prediction, 1), "with clutter"),
+        row("largest tracking error", "px", 2.5, largest, "any spot, in or out of view; published value is measured"),
+        row("recognition rate, eq. (15)", "%", 65.97, lambda t: 100 * t.right.sum() / exists.sum(), "every out-of-view"
+            " estimate counts as wrong, as apparently in the paper; this dominates the two next rows"),
+        row("right identity of spots in view", "%", None, lambda t: 100 * (t.right & visible).sum() / visible.sum(),
+            "of visible spots in the picture"),
+        row("wrong labels", "%", None, lambda t: 100 * (t.taken & ~t.right).sum() / max(t.taken.sum(), 1),
+            "of all labelled detections"),
+        row("out-of-view RMS while tracking", "px", None, lambda t: _outside_rms(run, t),
+            "spots 3 and 6, with the labels of the tracker"),
+    ]  # fmt: skip
 
 
 def _outside_rms(run: PointRun, t: TrackedRun) -> float:
@@ -321,13 +301,13 @@ def comparison_of(study: Study) -> Comparison:
         explanation="Conventional and curve switching: the paper's tracker alone (no rigid-body check, occluded spots"
         " from their own filter, quadratic equation out of view), without and with eq. (6). Beampose: the default"
         " settings of method “spots”.",
-        figures=tuple(Figure(*figure) for figure in _figures(study)),
+        figures=tuple(_figures(study)),
         source="J. Huo, N. Yang, M. Yang, Optics and Precision Engineering 23(8), 2134 (2015),"
         " doi 10.3788/OPE.20152308.2134.",
     )
 
 
-def _figures(study: Study) -> list[tuple[str, str, str]]:
+def _figures(study: Study) -> list[Figure]:
     t, n = study.run.t_s, study.run.model
     shade = (Shade(study.bends, "predicted", "the trajectory bends"),)
     out = []
@@ -340,7 +320,7 @@ def _figures(study: Study) -> list[tuple[str, str, str]]:
             for kind, e in zip(("conventional", "curve switching"), errors, strict=True)
         ]
         out.append(
-            (
+            Figure(
                 f"Prediction by the conventional and the curve-switching filter, {name} (Figs. 5 and 6)",
                 "Both filters get the same noisy positions. After a bend the conventional filter needs many frames to"
                 " converge if its process noise is small; with a large process noise switching has little effect.",
@@ -359,7 +339,7 @@ def _figures(study: Study) -> list[tuple[str, str, str]]:
             time_panel(t, f"spot {spot}: distance from truth, {study.run.noise_px:g} px noise", "px", lines=lines)
         )
     out.append(
-        (
+        Figure(
             "Spots out of view (Figs. 7 and 12)",
             "Solved from the other spots by the paper's quadratic equation, and from the pose of all visible spots."
             " Without noise both are exact to rounding; the published 0.05 px corresponds to an input noise of about"
@@ -368,7 +348,7 @@ def _figures(study: Study) -> list[tuple[str, str, str]]:
         )
     )
     out.append(
-        (
+        Figure(
             "Trajectories (Fig. 8)",
             "As tracked by beampose. The rectangle is the edge of the picture; positions outside are solved.",
             "".join(_tracks(study, c) for c in range(len(n.camera_names))),
@@ -379,7 +359,9 @@ def _figures(study: Study) -> list[tuple[str, str, str]]:
         e = study.trackers["beampose"].uv_px[:, i] - study.run.uv_px[:, i]
         outside = (Shade(study.run.in_view[:, i] == 0, "outside", "out of view"),)
         panels.append(_panel(t, f"spot {spot} ({camera}): estimate − true", e, outside, svg.robust_range(e, 0.5)))
-    out.append(("Tracking error (Figs. 9 and 13)", "Measured in view, solved out of view (shaded).", "".join(panels)))
+    out.append(
+        Figure("Tracking error (Figs. 9 and 13)", "Measured in view, solved out of view (shaded).", "".join(panels))
+    )
     return out
 
 

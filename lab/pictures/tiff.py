@@ -2,12 +2,8 @@
 
 OpenCV reads the others (colour, palettes, JPEG and other compressions). From damaged 8-bit content it returns zeros,
 with a message on standard error only. It applies the orientation tag even with IMREAD_IGNORE_ORIENTATION (5.0.0), so
-that tag is set to "as stored" before.
-
-LZW and PackBits decompression of TIFF strips; compiled.
-
-For 8 bits only: from a damaged strip OpenCV returns zeros, with a message on standard error only. For 16 bits it
-returns no picture, and is faster (LZW: 6 ms, here 9 ms, for 1280x1024).
+that tag is set to "as stored" before. Strips of LZW and PackBits are decompressed by compiled functions for 8 bits
+only: from damaged ones of 16 bits OpenCV returns no picture, and is faster (LZW: 6 ms, here 9 ms, for 1280x1024).
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """The index page of a folder of runs, with their curves and trends.
 
-One run of a batch as the index shows it: its row of batch.csv, and what its result folder adds.
-
-A result folder may be missing or damaged: what cannot be read is left empty.
+A run's content is its row of batch.csv, and what its result folder adds: what cannot be read there is left empty.
 """
 
 from __future__ import annotations
@@ -454,11 +452,9 @@ def _spread(values: Array) -> str:
     return f"{max(sizes):.3g}" if sizes else ""
 
 
-def _number_cell(value: float | None) -> Cell:
-    return Cell("", "n") if value is None else _shown(value, 3)
-
-
-def _shown(value: float, digits: int) -> Cell:
+def _number_cell(value: float | None, digits: int = 3) -> Cell:
+    if value is None:
+        return Cell("", "n")
     shown = format_number(value, digits)
     plain = shown.replace(".", "", 1).isdigit()
     return Cell(shown, "n", "" if plain else f"{value:.6g}")
@@ -475,4 +471,4 @@ def _other_cell(value: Any, digits: int = 4) -> Cell:
         return Cell(str(value))
     if number.is_integer() and abs(number) < 1e9:
         return Cell(str(int(number)), "n")
-    return _shown(number, digits)
+    return _number_cell(number, digits)

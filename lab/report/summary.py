@@ -20,10 +20,7 @@ _OLDEST_METHOD = "spots"  # the only tracker of results that do not state one
 VERDICTS = {
     "pass": ("PASS", "The run was processed and every quality gate passed."),
     "check": ("CHECK", "The run was processed and its gates passed; read the points below before using it."),
-    "fail": (
-        "FAIL",
-        "The run was processed, but a quality gate failed: read the points below.",
-    ),
+    "fail": ("FAIL", "The run was processed, but a quality gate failed: read the points below."),
     "error": ("ERROR", "The run could not be processed: there are no results to use."),
 }
 _NO_VERDICT = ("NO VERDICT", "The results hold no verdict: summary.json is missing or was written by another program.")

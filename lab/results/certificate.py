@@ -255,10 +255,8 @@ def _frame_sections(f: FrameCertificate) -> list[Section]:
         row: list[object] = [value, u, f"{r.degrees_of_freedom[i]:.0f}", f"{r.factor[i]:.3f}", U]
         if f.simulated is not None:
             of_draws = f.simulated[1][i]
-            row += [
-                _rounded(scale * of_draws, scale * r.expanded[i]),
-                f"{100 * (of_draws / r.expanded[i] - 1):+.1f}".replace("-", "\u2212"),
-            ]
+            difference = f"{100 * (of_draws / r.expanded[i] - 1):+.1f}".replace("-", "\u2212")
+            row += [_rounded(scale * of_draws, scale * r.expanded[i]), difference]
         of_result.append([f"{name} ({unit})", *row])
     probability = f"{100 * COVERAGE:g} %"
     heads = ["", "value", "u", "dof", "k", "U"]
@@ -276,20 +274,9 @@ def _frame_sections(f: FrameCertificate) -> list[Section]:
             f" that probability; chance changes it by {format_number(100 / np.sqrt(f.draws), 1)} %."
         )
     budget: list[list[object]] = []
-    for line, v, dof in zip(f.lines, f.variances, f.degrees_of_freedom.tolist(), strict=True):
-        kind, shape, _ = EVALUATED[line]
-        budget.append(
-            [
-                line,
-                kind,
-                shape,
-                dof,
-                *(format_number(scale * np.sqrt(max(float(v[i]), 0.0))) for _, i, *_, scale in _SHOWN),
-            ]
-        )
-    budget.append(
-        ["combined (u)", "", "", "", *(format_number(scale * float(r.combined[i])) for _, i, *_, scale in _SHOWN)]
-    )
+    for line, v, dof in zip(f.lines, np.sqrt(np.maximum(f.variances, 0.0)), f.degrees_of_freedom.tolist(), strict=True):
+        budget.append([line, *EVALUATED[line][:2], dof, *_shown(v)])
+    budget.append(["combined (u)", "", "", "", *_shown(r.combined)])
     sections = [
         Section(f"Result of {at}", words, (), PageTable(heads, of_result)),
         Section(
@@ -299,7 +286,7 @@ def _frame_sections(f: FrameCertificate) -> list[Section]:
                 " the last row, which is covariance.csv. The place of a camera is calibrated with its lens: the line of"
                 " the lenses contains how the places follow them, and each later line what is independent of the lines"
                 " above it.",
-                *_sources(f.lines),
+                _sources(f.lines),
             ],
             (),
             PageTable(["source", "type", "distribution", "dof", *_HEADS], budget),
@@ -308,14 +295,16 @@ def _frame_sections(f: FrameCertificate) -> list[Section]:
     return sections if f.share is None else [*sections, _sensitivities(f, f.share, at)]
 
 
-def _sources(lines: Sequence[str]) -> list[str]:
+def _shown(u: Array) -> list[str]:
+    """Standard uncertainties (6,) as the tables show them."""
+    return [format_number(scale * float(u[i])) for _, i, *_, scale in _SHOWN]
+
+
+def _sources(lines: Sequence[str]) -> str:
     """Where the figures of a budget's lines come from."""
     places = dict.fromkeys(EVALUATED[line][2] for line in lines)
-    return [
-        "Evaluated from: "
-        + "; ".join(f"{', '.join(x for x in lines if EVALUATED[x][2] == place)}: {place}" for place in places)
-        + "."
-    ]
+    named = (f"{', '.join(x for x in lines if EVALUATED[x][2] == place)}: {place}" for place in places)
+    return f"Evaluated from: {'; '.join(named)}."
 
 
 def _rounded(value: float, uncertainty: float) -> str:
@@ -331,6 +320,8 @@ def _sensitivities(f: FrameCertificate, share: CalibrationShare, at: str) -> Sec
     columns_of = {"centroids, all spots (px)": (f.spot_sigma_px, of_noise)}
     columns_of |= {n: (float(u[p]), T[:, p]) for p, n in enumerate(share.covariance.names) if u[p] > 0}
     change = 100 * float(np.abs(np.linalg.eigvals(share.adjusted) - 1).max())
+    heads = ["input quantity", "u", *(f"{h} per unit" for h in _HEADS)]
+    rows = [[name, of, *(scale * c[i] for _, i, *_, scale in _SHOWN)] for name, (of, c) in columns_of.items()]
     return Section(
         f"Sensitivities of {at}",
         [
@@ -343,33 +334,20 @@ def _sensitivities(f: FrameCertificate, share: CalibrationShare, at: str) -> Sec
             " which is contained.",
         ],
         (),
-        PageTable(
-            ["input quantity", "u", *(f"{h} per unit" for h in _HEADS)],
-            [[name, of, *(scale * c[i] for _, i, *_, scale in _SHOWN)] for name, (of, c) in columns_of.items()],
-        ),
+        PageTable(heads, rows),
     )
 
 
 def _range(c: Certificate) -> Section:
     U = c.over_recording.expanded
-    figures = (np.min(U, axis=0), np.median(U, axis=0), np.quantile(U, 0.95, axis=0), np.max(U, axis=0))
-    return Section(
-        "Range over the recording",
+    figures = zip(_HEADS, *map(_shown, np.quantile(U, [0.0, 0.5, 0.95, 1.0], axis=0)), strict=True)
+    rows = [[*row, c.measured[np.argmax(U[:, i])]] for row, (_, i, *_) in zip(figures, _SHOWN, strict=True)]
+    words = (
         f"Expanded uncertainty U of the {len(c.measured)} measured frames. Other frames have no certificate; their"
-        " covariances are in covariance.csv.",
-        (),
-        PageTable(
-            ["", "least", "median", "95 % of frames within", "largest", "in frame"],
-            [
-                [
-                    f"{name} ({unit})",
-                    *(format_number(scale * float(v[i])) for v in figures),
-                    int(c.measured[np.argmax(U[:, i])]),
-                ]
-                for name, i, _, _, unit, scale in _SHOWN
-            ],
-        ),
+        " covariances are in covariance.csv."
     )
+    heads = ["", "least", "median", "95 % of frames within", "largest", "in frame"]
+    return Section("Range over the recording", words, (), PageTable(heads, rows))
 
 
 def _traceability(c: Certificate, results: Path) -> Section:

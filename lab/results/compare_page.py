@@ -181,7 +181,7 @@ def _curves(comparison: Comparison) -> Section:
     shades = (Shade(outliers, "miss", "excluded as outlier"),) if outliers.any() else ()
     # Two columns: x, y, z of the position on the left, those of the rotation beside them.
     order = sorted(range(len(comparison.axes)), key=lambda k: (k % 3, k) if k < 6 else (k, k))
-    drawings = [PageDrawing(_curve(comparison, comparison.axes[k], k, shades)) for k in order]
+    drawings = [_curve(comparison, comparison.axes[k], k, shades) for k in order]
     words = (
         "Result minus reference, after the alignment. Bands: two stated sigmas of the difference. Rotations are about"
         " the axes of the reference's body; yaw, pitch and roll are differences of the angles. Triangles mark values"
@@ -192,18 +192,14 @@ def _curves(comparison: Comparison) -> Section:
 
 def _curve(comparison: Comparison, axis: AxisStatistic, k: int, shades: tuple[Shade, ...]) -> str:
     used = np.where(comparison.used, axis.values, np.nan)
+    usual = np.nan if axis.sigmas is None else 2 * float(np.nanmedian(axis.sigmas))
+    low, high = y_range = svg.robust_range(np.append(used, usual))
     bands: tuple[Band, ...] = ()
-    limits = used
     if axis.sigmas is not None:
-        bands = (Band(-2 * axis.sigmas, 2 * axis.sigmas, "#8a8f98", "two stated sigmas"),)
-        middle = 2 * float(np.nanmedian(axis.sigmas)) * np.ones(1)
-        limits = np.concatenate([used, middle])
-    low, high = svg.robust_range(limits)
-    bands = tuple(Band(np.clip(b.low, low, high), np.clip(b.high, low, high), b.colour, b.name) for b in bands)
+        below, above = (np.clip(side * axis.sigmas, low, high) for side in (-2, 2))
+        bands = (Band(below, above, svg.GREY, "two stated sigmas"),)
     lines = (Line(axis.values, _COLOURS[k % 3], axis.name),)
-    return time_panel(
-        comparison.t_s, axis.name, axis.unit, lines=lines, bands=bands, shades=shades, y_range=(low, high)
-    )
+    return time_panel(comparison.t_s, axis.name, axis.unit, lines=lines, bands=bands, shades=shades, y_range=y_range)
 
 
 def _table(comparison: Comparison) -> Section:
@@ -269,15 +265,11 @@ def _allan_chart(still: StillStand) -> str:
     for i, (name, a) in enumerate(still.of_result):
         good = a.low > 0
         x = np.log10(a.tau_s[good])
-        places = p.at(np.stack([x, np.log10(1e3 * a.deviation[good])], -1))
-        whiskers = svg.segments(
-            p.at(np.stack([x, np.log10(1e3 * a.low[good])], -1)), p.at(np.stack([x, np.log10(1e3 * a.high[good])], -1))
-        )
+        places, low, high = (p.at(np.stack([x, np.log10(1e3 * y[good])], -1)) for y in (a.deviation, a.low, a.high))
         colour = _COLOURS[i]
         out.append(f'<path class="line" d="{svg.line_path(places[:, 0], places[:, 1])}" stroke="{colour}"/>')
-        out.append(
-            f'<path d="{whiskers}" stroke="{colour}" fill="none"/><path d="{svg.dots(places, 3)}" fill="{colour}"/>'
-        )
+        out.append(f'<path d="{svg.segments(low, high)}" stroke="{colour}" fill="none"/>')
+        out.append(f'<path d="{svg.dots(places, 3)}" fill="{colour}"/>')
         out.append(svg.text(left + wide - 8, top + 16 + 16 * i, name, "end", f"fill:{colour};font-weight:600"))
     out.append(svg.note(p, "bars: 95 % confidence limits"))
     return svg.svg_of(p, title, [*out, svg.frame(p)])

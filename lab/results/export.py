@@ -83,8 +83,10 @@ def export(results: Path | str, to: str, out: Path | str | None = None, *, causa
     out: the file, or the folder of a rosbag2; default: the name of the results in the working folder. causal: the poses
     as known at each instant, in place of the smoothed ones.
 
-    >>> lab.export(results, "tum", results / "motion.tum").result.name 'motion.tum' Raises InputError: no results, an
-    unknown format, a package that is not installed, or a motion that it cannot hold.
+    >>> lab.export(results, "tum", results / "motion.tum").result.name
+    'motion.tum'
+
+    Raises InputError: no results, an unknown format, a package that is not installed, or a motion that it cannot hold.
     """
     results = Path(results)
     if to not in FORMATS:

@@ -21,7 +21,8 @@ from lab.findings.finding import Done
 from lab.progress import Progress
 from lab.report.frames.canvas import Pixels, png, write_overlay_video
 from lab.report.frames.content import DrawnFrame, ResultData, frame_content, pictures_of, pose_words, read_result_data
-from lab.report.frames.sheet import Layout, Limits, limits_of, sheet
+from lab.report.frames.sheet import Layout, Limits, sheet
+from lab.report.plot.svg import grey_limits
 from lab.runs.frames.frames import Recorded, open_frames, pictures_at
 
 if TYPE_CHECKING:
@@ -194,7 +195,7 @@ def _images(data: ResultData, indices: Ints, progress: Progress | None) -> Gener
         for shown in content.cameras:
             age = ages.get(shown.camera, _SAME_LIMITS)
             if shown.picture is not None and age >= _SAME_LIMITS:
-                limits[shown.camera], age = limits_of(shown.picture), 0
+                limits[shown.camera], age = grey_limits(shown.picture), 0
             ages[shown.camera] = age + 1
         image = sheet(content, layout, cuts=False, limits=limits, same_size=longest)
         if size is None:

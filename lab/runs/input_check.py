@@ -1,12 +1,7 @@
-"""`beampose check`: reads a rig file or a run folder as a run does, and reports what it finds.
+"""`beampose check`: reads a rig file or a run folder as a run does, and reports what it finds as plain lines.
 
-The findings of `beampose check` as plain lines.
-
-`beampose check`: what the rig can see over a range of poses.
-
-`beampose check`: mistakes that the files or the recording show, and those that no recording would show.
-
-`beampose check`: the pictures, times and truth of a run.
+Its subjects are the pictures, times and truth of a run, what the rig can see over a range of poses, the mistakes that
+the files or the recording show, and those that no recording would show.
 """
 
 from __future__ import annotations

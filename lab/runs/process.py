@@ -28,7 +28,7 @@ from lab.progress import Progress
 from lab.runs.frames.pipeline import FrameRecord, Pair, Pipeline, row_records
 from lab.runs.model_check.frame_sampler import FrameSampler
 from lab.runs.processed import Processed
-from lab.runs.run_log import RunLog, listening
+from lab.runs.run_log import listening
 from lab.runs.setup_check import SampledFrames, mistakes_of_run
 from lab.runs.smoothing_pass import SmoothingSummary, TrackingAndSmoothing, clock_findings
 from lab.runs.tables import TableWriter
@@ -230,41 +230,27 @@ def write_results(
     started: time.perf_counter() at the start of the command. more: additional content of summary.json, called last.
     full_hash: as of `process_run`.
     """
-    with listening() as log:
-        return _write_results(pipeline, work, out, started, log, causal, progress, more, full_hash)
-
-
-def _write_results(
-    pipeline: Pipeline,
-    work: Path,
-    out: Path,
-    started: float,
-    log: RunLog,
-    causal: bool,
-    progress: Progress | None,
-    more: Callable[[], Mapping[str, Any]],
-    full_hash: bool,
-) -> Outcome[RunStatistics]:
     run = pipeline.run
-    log.start(run, versions())
-    passes = TrackingAndSmoothing.of(pipeline, work, log.progress(progress))
-    pipeline = passes.pipeline
-    statistics, model_check, verdict = write_tables(pipeline, passes, work, causal=causal)
-    from lab.runs.verdict.score import against_truth, read_tables
+    with listening() as log:
+        log.start(run, versions())
+        passes = TrackingAndSmoothing.of(pipeline, work, log.progress(progress))
+        pipeline = passes.pipeline
+        statistics, model_check, verdict = write_tables(pipeline, passes, work, causal=causal)
+        from lab.runs.verdict.score import against_truth, read_tables
 
-    tables, added = against_truth(read_tables(ResultFolder(work)), run.folder), more()
-    verdict = quality.against_truth(verdict, tables.errors)
+        tables, added = against_truth(read_tables(ResultFolder(work)), run.folder), more()
+        errors, verdict = tables.errors, quality.against_truth(verdict, tables.errors)
 
-    def page(folder: Path, content: Mapping[str, Any]) -> None:
-        from lab.report.run.page import write_report  # imports the template engine, which only the report needs
+        def page(folder: Path, content: Mapping[str, Any]) -> None:
+            from lab.report.run.page import write_report  # imports the template engine, which only the report needs
 
-        log.info("stage: report")
-        write_report(folder, run.folder, run, tables)
-        log.conclude(verdict, content, time.perf_counter() - started)
-        log.write(folder)
+            log.info("stage: report")
+            write_report(folder, run.folder, run, tables)
+            log.conclude(verdict, content, time.perf_counter() - started)
+            log.write(folder)
 
-    done = processed_run(pipeline, statistics, model_check, verdict, passes.smoothing, tables.errors, page, full_hash)
-    return done.write(work, out, started, added)
+        done = processed_run(pipeline, statistics, model_check, verdict, passes.smoothing, errors, page, full_hash)
+        return done.write(work, out, started, added)
 
 
 def write_tables(

@@ -21,7 +21,7 @@ from lab.files.text.csv_text import write_table
 from lab.findings.finding import Outcome
 from lab.number_format import format_angle, format_cell, format_length, format_percent
 from lab.report.calibration.calibration_scene import rig_things, scene_views
-from lab.report.page import KeyFigure, PageDrawing, PageTable, Section
+from lab.report.page import KeyFigure, PageTable, Section
 from lab.report.plot.maps import colours, heat_map, hex_colour
 from lab.report.plot.svg import BLUE, figure, number, text, vertical_text
 from lab.setup.plan_findings import (
@@ -233,9 +233,8 @@ def _key_figures(plan: Plan) -> list[KeyFigure]:
         ("Position", format_length(m), f"median of 1 sigma; up to {format_length(top[0])}"),
     ]
     if lines:
-        figures.append(
-            ("Limited by", lines[0].name, f"{format_percent(lines[0].share_deg)} of the attitude's variance")
-        )
+        share = f"{format_percent(lines[0].share_deg)} of the attitude's variance"
+        figures.append(("Limited by", lines[0].name, share))
     return figures
 
 
@@ -270,8 +269,8 @@ def _budget(plan: Plan) -> Section:
             " other, so that shares of single groups have no meaning."
         )
     drawings = [
-        PageDrawing(share_bars([(x.name, x.share_deg) for x in lines], "Attitude: shares of the variance")),
-        PageDrawing(share_bars([(x.name, x.share_m) for x in lines], "Position: shares of the variance")),
+        share_bars([(x.name, x.share_deg) for x in lines], "Attitude: shares of the variance"),
+        share_bars([(x.name, x.share_m) for x in lines], "Position: shares of the variance"),
     ]
     return Section("Error budget", words, drawings if lines else (), PageTable(heads, rows))
 
@@ -296,22 +295,14 @@ def _plane(plan: Plan, across: int, up: int) -> Section:
     x_name, y_name = axis_names[across], axis_names[up]
     fine = fine_map(plan, across, up)
 
-    def smooth(k: int, what: str, unit: str) -> PageDrawing:
-        values = 1e3 * fine[..., k]
-        extent = (a.first, a.last, b.first, b.last)
-        title = f"{what} sigma ({unit}), other coordinates in the middle"
-        return PageDrawing(
-            heat_map(
-                values, extent, title, unit, x_name=x_name, y_name=y_name, y_down=False, equal=False,
-                limits=_limits(values),
-            )
-        )  # fmt: skip
+    def smooth(k: int, what: str, unit: str) -> str:
+        values, extent = 1e3 * fine[..., k], (a.first, a.last, b.first, b.last)
+        title, free = f"{what} sigma ({unit}), other coordinates in the middle", {"y_down": False, "equal": False}
+        return heat_map(values, extent, title, unit, x_name=x_name, y_name=y_name, limits=_limits(values), **free)
 
-    def cells(values: Array, statistic: str, title: str, low_is_bad: bool = False) -> PageDrawing:
+    def cells(values: Array, statistic: str, title: str, low_is_bad: bool = False) -> str:
         grid = _reduced(plan, values, across, up, statistic)
-        return PageDrawing(
-            cell_map(grid, a.values(), b.values(), title, x_name=x_name, y_name=y_name, low_is_bad=low_is_bad)
-        )
+        return cell_map(grid, a.values(), b.values(), title, x_name=x_name, y_name=y_name, low_is_bad=low_is_bad)
 
     spots = plan.seen.sum(axis=1).astype(float)
     drawings = [
@@ -410,11 +401,11 @@ def _three(values: Sequence[float], decimals: int) -> str:
 
 def _effects(plan: Plan) -> Section:
     attitude = np.linalg.norm(plan.thing_median[:, 3:], axis=1)
-    rows: list[list[object]] = []
+    rows = []
     for i in np.argsort(-attitude, kind="stable").tolist()[:_EFFECT_ROWS]:
         thing, group, _ = plan.errors.things[i]
         kind, name = thing.split(".", 1)
-        rows.append([f"{kind.removesuffix('s')} {name}", group, *(float(v) * 1e3 for v in plan.thing_median[i])])
+        rows.append([f"{kind.removesuffix('s')} {name}", group, *(1e3 * plan.thing_median[i])])
     heads = ("part", "errors", *(f"{a.split('_')[0]} ({'mm' if a.endswith('_m') else 'mdeg'})" for a in AXES))
     words = (
         "Effect of the errors of one camera, screen or beam on the pose, median over the poses, the largest effects on"

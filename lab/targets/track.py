@@ -1,8 +1,6 @@
-"""Tracks one target through a recording: its table, summary.json, report.html and overlay video.
+"""Tracks one target through a recording: its table, summary.json, report.html and findings that all targets share.
 
-The overlay video: the pictures with the target's outline, its centre, its path and the status.
-
-The findings that all kinds of tracked targets share.
+The overlay video is the pictures with the target's outline, its centre, its path and the status.
 """
 
 from __future__ import annotations

@@ -136,7 +136,9 @@ class CameraMotion:
         """As `stilled`, not rounded."""
         if picture.shape[::-1] != self.camera.image_size_px:
             return None
-        return self._found(picture, np.zeros(_FREE), clips) or self._found(picture, np.append(np.zeros(3), shift_between(self.usual, picture)), clips)
+        return self._found(picture, np.zeros(_FREE), clips) or self._found(
+            picture, np.append(np.zeros(3), shift_between(self.usual, picture)), clips
+        )
 
     def _found(self, picture: Picture, motion: Array, clips: float) -> tuple[NDArray[Any], Turn] | None:
         """As `_turned`, from a first estimate of the motion."""
@@ -259,9 +261,14 @@ def shift_between(first: Picture | NDArray[np.float32], second: Picture) -> Arra
     if first.shape != second.shape:
         return np.zeros(2)
     window = cv2.createHanningWindow(first.shape[::-1], cv2.CV_32F)
-    signs = [np.sign(cv2.Laplacian(cv2.GaussianBlur(x, (0, 0), _BLUR_PX), cv2.CV_32F)) for x in (first, second)]
-    shift, peak = cv2.phaseCorrelate(*signs, window)
+    shift, peak = cv2.phaseCorrelate(_curvature(first), _curvature(second), np.asarray(window, np.float32))
     return np.array(shift) if peak > _LEAST_PEAK else np.zeros(2)
+
+
+def _curvature(picture: NDArray[Any]) -> NDArray[np.float32]:
+    """(h, w): the sign of the curvature of a picture."""
+    blurred = cv2.GaussianBlur(picture, (0, 0), _BLUR_PX)
+    return np.asarray(np.sign(cv2.Laplacian(blurred, cv2.CV_32F)), np.float32)
 
 
 def _variance_of_mean(deviations: Array) -> float:
@@ -390,7 +397,7 @@ def _landmarks(
 
     lit (h, w): lights.
     """
-    plain = cv2.medianBlur(grey, 3)
+    plain = np.asarray(cv2.medianBlur(grey, 3), np.float32)
     variance = np.asarray(noise.variance(plain) / pictures, np.float32)
     # A hot pixel belongs to the sensor, and turns with it.
     steep2 = np.square(cv2.Sobel(plain, cv2.CV_32F, 1, 0)) + np.square(cv2.Sobel(plain, cv2.CV_32F, 0, 1))
@@ -412,7 +419,9 @@ def _landmarks(
     at = pixels[:, 1], pixels[:, 0]
     slopes = np.column_stack([along[at], across[at]]).astype(float)
     sigma = np.sqrt((1 + pictures) * variance[at]).astype(float)
-    return CameraMotion(camera, plain, pixels, grey[at].astype(float), slopes, sigma, moved, np.zeros(_FREE), np.zeros(_FREE))
+    return CameraMotion(
+        camera, plain, pixels, grey[at].astype(float), slopes, sigma, moved, np.zeros(_FREE), np.zeros(_FREE)
+    )
 
 
 def _spread_over_tiles(slope: NDArray[np.float32], per_tile: int) -> Ints:

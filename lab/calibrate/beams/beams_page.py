@@ -158,7 +158,7 @@ def _wrong_spots(c: BeamCalibration, positions: Sequence[str], goals: BeamGoals)
     if not len(wrong):
         return [passed(f"all {len(c.spots)} spots are consistent")]
     views = c.rig.views()
-    used = [p for i, p in enumerate(positions) if i not in set(c.dropped)]
+    used = used_positions(c, positions)
     size = np.linalg.norm(c.fit.residuals_px, axis=1)
     worst = [
         f"position {used[c.spots.position[i]]}, camera {views[c.spots.view[i]][0]}, spot {views[c.spots.view[i]][1]}:"
@@ -324,7 +324,7 @@ def difference_from_nominal(c: BeamCalibration, nominal: Rig) -> Array:
 
 def page_of(c: BeamCalibration, nominal: Rig, positions: Sequence[str]) -> tuple[list[KeyFigure], list[Section]]:
     """Key figures and sections of the report. nominal: the rig with the beams as designed; positions: names of all."""
-    scene = [PageDrawing(view) for view in scene_views(rig_things(c.rig, c.world_from_body[0]))]
+    scene = scene_views(rig_things(c.rig, c.world_from_body[0]))
     return _key_figures(c), [
         _beams(c, nominal),
         _between(c),
@@ -343,27 +343,20 @@ def _key_figures(c: BeamCalibration) -> list[KeyFigure]:
     out = []
     if not c.undetermined:
         worst = list(c.rig.beams)[int(np.argmax(direction))]
-        rms = float(np.sqrt(np.mean(direction**2))) / ARCSEC
-        note = (
-            f"1 sigma per axis, RMS over beams; worst: {worst} with {format_number(float(direction.max()) / ARCSEC, 3)}"
-        )
+        largest = format_number(float(direction.max()) / ARCSEC)
+        note = f"1 sigma per axis, RMS over beams; worst: {worst} with {largest}"
         note += "; in the frame of the nominal beams" if c.world_from_stand is None else ""
-        out.append(("sigma of directions", f"{format_number(rms, 3)} arcsec", note))
+        rms = float(np.sqrt(np.mean(direction**2))) / ARCSEC
+        out.append(("sigma of directions", f"{format_number(rms)} arcsec", note))
+        note = "per axis, at the point nearest to the body's origin"
         rms = 1e3 * float(np.sqrt(np.mean(offset**2)))
-        out.append(
-            ("sigma of offsets", f"{format_number(rms, 3)} mm", "per axis, at the point nearest to the body's origin")
-        )
+        out.append(("sigma of offsets", f"{format_number(rms)} mm", note))
     if c.angles:
         angles = float(np.sqrt(np.mean([a.sigma**2 for a in c.angles]))) / ARCSEC
         note = "RMS over pairs; independent of the body frame"
-        out.append(("angles between beams", f"± {format_number(angles, 3)} arcsec", note))
-    out.append(
-        (
-            "residuals",
-            f"{format_number(rms_px, 3)} px · {format_number(rms_mm, 3)} mm",
-            "RMS per axis, mm on the screens",
-        )
-    )
+        out.append(("angles between beams", f"± {format_number(angles)} arcsec", note))
+    size = f"{format_number(rms_px)} px · {format_number(rms_mm)} mm"
+    out.append(("residuals", size, "RMS per axis, mm on the screens"))
     out.append(("spots", f"{int(kept.sum())} of {len(kept)}", "used; the others were rejected as outliers"))
     count = len(c.world_from_body.translation)
     out.append(("positions", str(count), "known poses" if c.world_from_stand is not None else "unknown poses"))
@@ -394,18 +387,11 @@ def beam_table(rig: Rig, direction: Array, offset: Array, off_nominal: Array) ->
     ends = {
         b: "".join(sorted({"+" if s.sign > 0 else "−" for s in rig.spots.values() if s.beam == b})) for b in rig.beams
     }
+    angle, distance = off_nominal.T
+    sigmas = np.column_stack([direction / ARCSEC, 1e3 * offset, 60 * np.rad2deg(angle), 1e3 * distance])
     rows = [
-        (
-            name,
-            ends[name],
-            _three(beam.direction, 6),
-            _three(1e3 * beam.point, 2),
-            float(direction[i] / ARCSEC),
-            float(1e3 * offset[i]),
-            float(np.rad2deg(off_nominal[i, 0]) * 60),
-            float(1e3 * off_nominal[i, 1]),
-        )
-        for i, (name, beam) in enumerate(rig.beams.items())
+        (name, ends[name], _three(beam.direction, 6), _three(1e3 * beam.point, 2), *figures)
+        for (name, beam), figures in zip(rig.beams.items(), sigmas, strict=True)
     ]
     heads = (
         "beam", "ends", "direction", "offset (mm)", "sigma direction (arcsec)", "sigma offset (mm)",
@@ -420,10 +406,8 @@ def _three(vector: Array, digits: int) -> str:
 
 def _between(c: BeamCalibration) -> Section:
     rows = [(a.first, a.second, f"{np.rad2deg(a.angle):.5f}", a.sigma / ARCSEC) for a in c.angles]
-    words = ["These angles do not depend on the choice of the body frame."]
-    return Section(
-        "Angles between beams", words, (), PageTable(("first", "second", "angle (deg)", "sigma (arcsec)"), rows)
-    )
+    table = PageTable(("first", "second", "angle (deg)", "sigma (arcsec)"), rows)
+    return Section("Angles between beams", "These angles do not depend on the choice of the body frame.", (), table)
 
 
 def _body_frame(c: BeamCalibration) -> Section:
@@ -439,25 +423,18 @@ def _body_frame(c: BeamCalibration) -> Section:
                 " between beams do not depend on this choice.",
             ],
         )
-    yaw, pitch, roll = np.rad2deg(c.world_from_stand.ypr)
-    sigmas = np.sqrt(np.maximum(np.diagonal(c.stand_covariance), 0))
-    turns = np.rad2deg(ypr_sigmas(c.world_from_stand, c.stand_covariance))
-    place = 1e3 * c.world_from_stand.translation
-    rows = [
-        ("x (mm)", float(place[0]), float(1e3 * sigmas[0])),
-        ("y (mm)", float(place[1]), float(1e3 * sigmas[1])),
-        ("z (mm)", float(place[2]), float(1e3 * sigmas[2])),
-        ("yaw (deg)", float(yaw), float(turns[0])),
-        ("pitch (deg)", float(pitch), float(turns[1])),
-        ("roll (deg)", float(roll), float(turns[2])),
-    ]
+    stand, C = c.world_from_stand, c.stand_covariance
+    values = [*(1e3 * stand.translation), *np.rad2deg(stand.ypr)]
+    sigmas = [*(1e3 * np.sqrt(np.maximum(np.diagonal(C)[:3], 0))), *np.rad2deg(ypr_sigmas(stand, C))]
+    names = ("x (mm)", "y (mm)", "z (mm)", "yaw (deg)", "pitch (deg)", "roll (deg)")
     words = [
         "The body frame is the frame of the stand's carriage, as its poses were recorded. Pose of the stand in the"
         " world:",
     ]
     if c.undetermined:
         words.append(f"Not determined: {'; '.join(c.undetermined)}. {c.motion.remedy().capitalize()}.")
-        rows = [(name, value, float("nan")) for name, value, _ in rows]
+        sigmas = [np.nan] * 6
+    rows = list(zip(names, values, sigmas, strict=True))
     return Section("The stand", words, (), PageTable(("world_from_stand", "value", "sigma"), rows))
 
 
@@ -468,20 +445,15 @@ def _positions(c: BeamCalibration, positions: Sequence[str]) -> Section:
         here = c.spots.position == k
         used = here & c.fit.kept
         rms = float(np.sqrt(np.mean(c.fit.residuals_px[used] ** 2))) if used.any() else float("nan")
-        yaw, pitch, roll = np.rad2deg(c.world_from_body[k].ypr)
-        x, y, z = 1e3 * c.world_from_body[k].translation
-        rows.append(
-            (name, float(yaw), float(pitch), float(roll), float(x), float(y), float(z), int(here.sum()),
-             int(here.sum() - used.sum()), rms)
-        )  # fmt: skip
+        pose = c.world_from_body[k]
+        numbers = (*np.rad2deg(pose.ypr), *(1e3 * pose.translation))
+        rows.append((name, *numbers, here.sum(), here.sum() - used.sum(), rms))
     heads = (
         "position", "yaw (deg)", "pitch (deg)", "roll (deg)", "x (mm)", "y (mm)", "z (mm)", "spots", "excluded",
         "RMS (px)",
     )  # fmt: skip
     coverage = [
-        PageDrawing(
-            coverage_map(c.rig.cameras[n].image_size_px, pixels, f"Camera {n}: coverage by spots", things="spots")
-        )
+        coverage_map(c.rig.cameras[n].image_size_px, pixels, f"Camera {n}: coverage by spots", things="spots")
         for n, pixels in _by_camera(c, c.spots.pixels).items()
     ]
     words = [
@@ -494,22 +466,16 @@ def _positions(c: BeamCalibration, positions: Sequence[str]) -> Section:
 
 def _residuals(c: BeamCalibration) -> Section:
     kept = c.fit.kept
-    drawings = [
-        PageDrawing(
-            residual_field(
-                c.rig.cameras[n].image_size_px,
-                pixels,
-                _by_camera(c, c.fit.residuals_px, kept)[n],
-                f"Camera {n}: measured − predicted",
-                things="spots",
-            ),
-            "Arrows that vary slowly over the picture indicate an error of the lens or the screen; equal arrows at all"
-            " spots of one position indicate an error of the stand."
-            if i == 0
-            else "",
-        )
-        for i, (n, pixels) in enumerate(_by_camera(c, c.spots.pixels, kept).items())
-    ]
+    drawings: list[PageDrawing] = []
+    caption = (
+        "Arrows that vary slowly over the picture indicate an error of the lens or the screen; equal arrows at all"
+        " spots of one position indicate an error of the stand."
+    )
+    residuals = _by_camera(c, c.fit.residuals_px, kept)
+    for n, pixels in _by_camera(c, c.spots.pixels, kept).items():
+        title, size_px = f"Camera {n}: measured − predicted", c.rig.cameras[n].image_size_px
+        field = residual_field(size_px, pixels, residuals[n], title, things="spots")
+        drawings.append(PageDrawing(field, "" if drawings else caption))
     whitened = c.fit.adjusted.residuals[0]
     drawings.append(PageDrawing(residual_histogram(whitened, "Normalised residuals", "sigma", sigma=1.0)))
     views = c.rig.views()
@@ -519,9 +485,9 @@ def _residuals(c: BeamCalibration) -> Section:
         here = (c.spots.view == v) & kept
         if here.any():
             px = float(np.sqrt(np.mean(c.fit.residuals_px[here] ** 2)))
-            on_screen = float(np.sqrt(np.nanmean(mm[here] ** 2) / 2))
-            excluded = int(((c.spots.view == v) & ~kept).sum())
-            rows.append((camera, spot, c.rig.spots[spot].beam, int(here.sum()), excluded, px, on_screen))
+            on_screen = np.sqrt(np.nanmean(mm[here] ** 2) / 2)
+            excluded = ((c.spots.view == v) & ~kept).sum()
+            rows.append((camera, spot, c.rig.spots[spot].beam, here.sum(), excluded, px, on_screen))
     heads = ("camera", "spot", "beam", "spots used", "excluded", "RMS (px)", "RMS on the screen (mm)")
     words = "RMS is per axis. The curve is the normal distribution for the stated sigmas."
     if c.fit.scale > 1:

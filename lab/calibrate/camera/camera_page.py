@@ -367,29 +367,17 @@ def _key_figures(r: Intrinsics, valid_until: str) -> list[KeyFigure]:
     px, mm = r.map.sigma_px(r.covariance), r.map.sigma_mm(r.covariance)
     at = f"at {format_number(r.distance_m)} m"
     held = r.held_out_rms_px * r.map.usual_mm_per_px()
+    fx = f"{r.fit.lens[0]:.2f} ± {format_number(r.sigmas[0], 2)} px"
+    both = (np.nanmedian, np.nanmax)
+    usual, largest = (f"{format_number(of(px), 2)} px · {format_number(of(mm), 2)} mm" for of in both)
+    held_out = f"{r.held_out_rms_px:.3f} px · {format_number(held, 2)} mm"
     return [
-        (
-            "focal length fx",
-            f"{r.fit.lens[0]:.2f} ± {format_number(r.sigmas[0], 2)} px",
-            f"{r.sigmas[0] / r.fit.lens[0]:.2%}",
-        ),
+        ("focal length fx", fx, f"{r.sigmas[0] / r.fit.lens[0]:.2%}"),
         ("lens model", r.model.words, "the smallest expected error of directions"),
-        (
-            "direction of a pixel, median",
-            f"{format_number(np.nanmedian(px), 2)} px · {format_number(np.nanmedian(mm), 2)} mm",
-            f"1 sigma, {at}",
-        ),
-        (
-            "direction, maximum",
-            f"{format_number(np.nanmax(px), 2)} px · {format_number(np.nanmax(mm), 2)} mm",
-            f"1 sigma, {at}",
-        ),
+        ("direction of a pixel, median", usual, f"1 sigma, {at}"),
+        ("direction, maximum", largest, f"1 sigma, {at}"),
         ("RMS of corners", f"{r.rms_px:.3f} px", f"per coordinate; {r.rms_2d_px:.3f} px per corner, as in OpenCV"),
-        (
-            "RMS in held-out photographs",
-            f"{r.held_out_rms_px:.3f} px · {format_number(held, 2)} mm",
-            f"per coordinate, {at}",
-        ),
+        ("RMS in held-out photographs", held_out, f"per coordinate, {at}"),
         ("valid until", valid_until or "no expiry date", ""),
     ]
 
@@ -422,17 +410,11 @@ def _model(r: Intrinsics) -> Section:
     chosen = next(k for k, x in enumerate(candidates) if x.model == r.selection.chosen.model)
     titles = [x.model.title + ("" if x.model.fisheye else " coefficients") for x in candidates]
     chart = lens_model_chart(titles, error, chosen, noise_px=noise)
-    rows = [
-        (
-            x.model.words,
-            np.nan if x.fit is None else x.fit.sigma_px,
-            x.sigma_px,
-            x.model_error_px,
-            x.error_px,
-            "chosen" if x.model == r.selection.chosen.model else x.refused or "larger error",
-        )
-        for x in r.selection.candidates
-    ]
+    rows = []
+    for x in r.selection.candidates:
+        result = "chosen" if x.model == r.selection.chosen.model else x.refused or "larger error"
+        residuals = np.nan if x.fit is None else x.fit.sigma_px
+        rows.append((x.model.words, residuals, x.sigma_px, x.model_error_px, x.error_px, result))
     words = [
         "The expected error of a direction where corners were seen: the part that noise and the scatter between"
         " photographs leave, which grows with the number of coefficients, and the difference to the other models,"
@@ -506,20 +488,11 @@ def _residuals(r: Intrinsics, photos: PhotoSet) -> Section:
     ]
     rms = _rms_per_view(r)
     for v, word in representative_views(rms, worst=_WORST_VIEWS):
-        name, _ = photos.views[v]
-        mine = t.view == v
-        drawings.append(
-            PageDrawing(
-                corners_overlay(
-                    t.image_size_px,
-                    t.pixels[mine],
-                    residuals[mine],
-                    f"{name} ({word}): RMS {rms[v]:.3f} px",
-                    picture=_picture(photos, name),
-                    rejected=~used[mine],
-                )
-            )
-        )
+        (name, _), mine = photos.views[v], t.view == v
+        title, picture = f"{name} ({word}): RMS {rms[v]:.3f} px", _picture(photos, name)
+        of_view = t.pixels[mine], residuals[mine]
+        drawn = corners_overlay(t.image_size_px, *of_view, title, picture=picture, rejected=~used[mine])
+        drawings.append(PageDrawing(drawn))
     words = (
         "Single residuals are noise; a common direction in a part of the picture (red) is an error of the lens model."
         " Corners with residuals beyond 4.5 sigma, and views with residuals three times those of the median view, are"
@@ -592,8 +565,8 @@ def _views(r: Intrinsics, photos: PhotoSet) -> Section:
     for v, (name, view) in enumerate(photos.views):
         reason = r.fit.dropped.get(v, "")
         note = f"excluded: {reason}" if reason else "; ".join(view.notes)
-        distance_tilt = (np.nan, np.nan) if reason else (float(depth[v]), float(r.coverage.tilt_deg[v]))
-        rows.append((name, f"{counts[v]} of {len(view)}", float(rms[v]), *distance_tilt, note))
+        distance_tilt = (np.nan, np.nan) if reason else (depth[v], r.coverage.tilt_deg[v])
+        rows.append((name, f"{counts[v]} of {len(view)}", rms[v], *distance_tilt, note))
     rows += [(name, "none", np.nan, np.nan, np.nan, reason) for name, reason in photos.refused]
     heads = ("photograph", "corners used", "RMS (px)", "distance (m)", "tilt (deg)", "remarks")
     return Section("The photographs", photos.line() + ".", (), PageTable(heads, rows))

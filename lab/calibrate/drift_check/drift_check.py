@@ -227,22 +227,15 @@ def _drift_section(
         )
         for c in cameras
     ]  # fmt: skip
-    drawings = [
-        PageDrawing(
-            corners_overlay(
-                file.rig.cameras[c.camera].image_size_px,
-                c.pixels,
-                c.residual_px,
-                f"Camera {c.camera}: measured − predicted",
-                labels=labels[c.camera],
-            ),
-            "Parallel arrows: the camera turned. Arrows around a centre: it rolled. Arrows away from a centre: focus or"
-            " zoom changed. A single arrow: this point is wrong."
-            if i == 0
-            else "",
-        )
-        for i, c in enumerate(cameras)
-    ]
+    drawings: list[PageDrawing] = []
+    caption = (
+        "Parallel arrows: the camera turned. Arrows around a centre: it rolled. Arrows away from a centre: focus or"
+        " zoom changed. A single arrow: this point is wrong."
+    )
+    for c in cameras:
+        size_px, title = file.rig.cameras[c.camera].image_size_px, f"Camera {c.camera}: measured − predicted"
+        picture = corners_overlay(size_px, c.pixels, c.residual_px, title, labels=labels[c.camera])
+        drawings.append(PageDrawing(picture, "" if drawings else caption))
     words = [
         "Drift: the rotation of the camera and change of its focal length that fit today's pixels, as RMS displacement"
         " over the points. The sigmas include the uncertainties of the pixels, the survey and the calibration.",
@@ -272,10 +265,11 @@ def _history_section(history: Sequence[HistoryRow], limits: DriftLimits, file: R
         return out
 
     until = None if file.calibration is None else file.calibration.valid_until
-    in_mm = drift_chart(
-        lines("mm"), "Drift at the screen", "mm", warn=limits.warn_mm, fail=limits.fail_mm, expires=until
-    )
-    drawings = [PageDrawing(in_mm), PageDrawing(drift_chart(lines("px"), "Drift in the picture", "px", expires=until))]
+    warn, fail = limits.warn_mm, limits.fail_mm
+    drawings = [
+        drift_chart(lines("mm"), "Drift at the screen", "mm", warn=warn, fail=fail, expires=until),
+        drift_chart(lines("px"), "Drift in the picture", "px", expires=until),
+    ]
     words = "All checks so far. A slow increase indicates a creeping mount or a change of temperature, a step a shock."
     return Section("Drift over time", words, drawings)
 
@@ -294,12 +288,8 @@ def _points_section(
             c = by_camera[name]
             for k, i in enumerate(one.rows_of(name)):
                 left = float(np.linalg.norm(c.residual_px[k] - c.explained_px[k]))
-                rows.append(
-                    (
-                        name, one.label[i], *one.pixels[i].tolist(), *c.residual_px[k].tolist(), left,
-                        float(one.measured_sigma_px[i]), float(one.calibration_sigma_px[i]),
-                    )
-                )  # fmt: skip
+                sigmas = one.measured_sigma_px[i], one.calibration_sigma_px[i]
+                rows.append((name, one.label[i], *one.pixels[i], *c.residual_px[k], left, *sigmas))
     words = [f"{o.change.subject}: {o.change.kind}, {size(o.px, o.mm)}." for o in others]
     return Section("Points", words, (), PageTable(heads, rows))
 

@@ -484,14 +484,11 @@ def _directions(result: RefinedRig) -> Section:
 def _held_out(result: RefinedRig) -> Section:
     r = result.refined
     several = len(r.recordings) > 1
-    rows = [
-        (
-            result.runs[i].run.name if several else f"block {i + 1}",
-            *(float(np.sqrt(chi2 / max(h.dof, 1))) for chi2 in h.chi2), h.p,
-            h.log_density[1] - h.log_density[0],
-        )
-        for i, h in enumerate(r.held_out)
-    ]  # fmt: skip
+    rows = []
+    for i, h in enumerate(r.held_out):
+        name = result.runs[i].run.name if several else f"block {i + 1}"
+        in_sigmas = (np.sqrt(chi2 / max(h.dof, 1)) for chi2 in h.chi2)
+        rows.append((name, *in_sigmas, h.p, h.log_density[1] - h.log_density[0]))
     heads = ("held out", "residuals, given (sigmas)", "residuals, refined (sigmas)", "p", "gain of ln p")
     words = (
         f"Each {'recording' if several else 'block of time of the recording'} against the rig refined by the others:"
@@ -515,9 +512,7 @@ def _residuals(r: Refinement) -> Section:
             at = np.concatenate(places)
             if len(at):
                 title = f"Camera {camera}, {words} rig"
-                drawings.append(
-                    PageDrawing(residual_field(c.image_size_px, at, np.concatenate(residuals), title, things="spots"))
-                )
+                drawings.append(residual_field(c.image_size_px, at, np.concatenate(residuals), title, things="spots"))
     words_ = "Mean residuals over each picture, after the pose of each frame was fitted; the scales differ."
     return Section("Residuals", words_, drawings)
 
@@ -535,7 +530,7 @@ def _scene(r: Refinement) -> Section:
     things = rig_things(r.rig, poses[len(poses.translation) // 2])
     arrows, times = _arrows(r, 1.5 * frustum_length(things))
     words = f"Arrows are the changes of cameras and screens, {format_number(times, 2)} times as long." if arrows else ""
-    return Section("The refined rig", words, [PageDrawing(picture) for picture in scene_views([*things, *arrows])])
+    return Section("The refined rig", words, scene_views([*things, *arrows]))
 
 
 def _arrows(r: Refinement, longest_m: float) -> tuple[list[SceneObject], float]:

@@ -11,7 +11,7 @@ from calibration.rig.joint import DOTS, FRAMES, LEAST_REDUNDANCY, LOST, P_MISFIT
 from calibration.rig.rig_figures import ExpectedPose, HoldOut, RigCalibration, in_degrees, in_mm
 from calibration.terms.rig_blocks import POSES, STAND, lines_in, stacks_of
 from calibration.terms.surveyed import pose_of
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, skew
 from geometry.pose import ypr_sigmas
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import split_name
@@ -233,14 +233,9 @@ def _expected(o: CalibratedRig) -> Section | None:
     if e is None:
         return None
     rows = []
-    for name, C in (
-        ("all", e.total),
-        ("noise of the spots in that frame", e.noise),
-        ("calibration", e.systematic),
-    ):
+    for name, C in (("all", e.total), ("noise of the spots in that frame", e.noise), ("calibration", e.systematic)):
         mm = 1e3 * np.sqrt(np.maximum(np.diagonal(C)[:3], 0))
-        ypr = np.rad2deg(ypr_sigmas(e.world_from_body, C))
-        rows.append((name, *(float(v) for v in ypr), *(float(v) for v in mm)))
+        rows.append((name, *np.rad2deg(ypr_sigmas(e.world_from_body, C)), *mm))
     heads = ("part", "yaw (deg)", "pitch (deg)", "roll (deg)", "x (mm)", "y (mm)", "z (mm)")
     words = [
         f"Expected 1 sigma of a pose measured from one frame, in the middle of the stand's positions, with {e.views}"
@@ -292,8 +287,8 @@ def _held_out(o: CalibratedRig, positions: Sequence[str]) -> Section | None:
         "misfit / expected",
     )  # fmt: skip
     drawings = [
-        PageDrawing(residual_histogram(deg, "Attitude error of held-out positions, per axis", "deg")),
-        PageDrawing(residual_histogram(mm, "Position error of held-out positions, per axis", "mm")),
+        residual_histogram(deg, "Attitude error of held-out positions, per axis", "deg"),
+        residual_histogram(mm, "Position error of held-out positions, per axis", "mm"),
     ]
     words = (
         "Cross-validation with five folds: the poses of each fifth of the positions were measured with a calibration"
@@ -313,18 +308,9 @@ def _groups(o: CalibratedRig) -> Section:
         kept = joint.kept.get(name)
         left_out = 0 if kept is None else int(np.sum(~kept))
         tested = g.redundancy > LEAST_REDUNDANCY
-        p = f"{g.p:.2g}" if tested else "–"
-        rows.append(
-            (
-                name,
-                g.numbers,
-                f"{g.redundancy:.0f}",
-                f"{g.scale:.2f}" if tested else "–",
-                p,
-                left_out,
-                f"{joint.scales.get(name, 1.0):.2f}",
-            )
-        )
+        misfit, p = (f"{g.scale:.2f}", f"{g.p:.2g}") if tested else ("–", "–")
+        raised = f"{joint.scales.get(name, 1.0):.2f}"
+        rows.append((name, g.numbers, f"{g.redundancy:.0f}", misfit, p, left_out, raised))
     heads = ("kind", "numbers", "redundant", "misfit / sigma", "p", "excluded", "sigmas multiplied by")
     words = [
         "Deviation of each kind of measurement from the prediction by all others, in units of its sigmas; the expected"
@@ -339,19 +325,14 @@ def _residuals(o: CalibratedRig) -> Section:
     joint, measured = o.steps.joint, o.steps.measured
     cameras = list(joint.rig.cameras)
     views = joint.rig.views()
-    drawings = []
     spots = joint.every[SPOTS].linearise(joint.values).residuals
-    px = -_spot_pixels(o, spots)
     camera_of = np.array([cameras.index(views[v][0]) for v in measured.spots.view], dtype=np.int64)
-    drawings += _fields(o, "spots", measured.spots.pixels, px, camera_of, joint.kept[SPOTS])
+    drawings = _fields(o, "spots", measured.spots.pixels, -_spot_pixels(o, spots), camera_of, joint.kept[SPOTS])
     if DOTS in joint.every:
         s = measured.network.point_observations
         r = joint.every[DOTS].linearise(joint.values).residuals
-        residuals_px = -r * s.sigma_px[:, None]
-        drawings += _fields(o, "control points", s.pixels, residuals_px, s.camera_of, joint.kept[DOTS])
-    drawings.append(
-        PageDrawing(residual_histogram(spots[joint.kept[SPOTS]], "Spots: normalised residuals", "sigma", sigma=1.0))
-    )
+        drawings += _fields(o, "control points", s.pixels, -r * s.sigma_px[:, None], s.camera_of, joint.kept[DOTS])
+    drawings.append(residual_histogram(spots[joint.kept[SPOTS]], "Spots: normalised residuals", "sigma", sigma=1.0))
     words = (
         "Measured minus predicted, without excluded measurements. Arrows that vary slowly over the picture indicate an"
         " error of the lens or the screen; equal arrows at all spots of one position indicate an error of the stand."
@@ -360,17 +341,13 @@ def _residuals(o: CalibratedRig) -> Section:
     return Section("Residuals", words, drawings)
 
 
-def _fields(
-    o: CalibratedRig, what: str, pixels: Array, residuals: Array, camera_of: Ints, kept: Bools
-) -> list[PageDrawing]:
+def _fields(o: CalibratedRig, what: str, pixels: Array, residuals: Array, camera_of: Ints, kept: Bools) -> list[str]:
     out = []
     for c, (name, camera) in enumerate(o.steps.joint.rig.cameras.items()):
         here = (camera_of == c) & kept
         if here.any():
             title = f"Camera {name}: {what}, measured − predicted"
-            out.append(
-                PageDrawing(residual_field(camera.image_size_px, pixels[here], residuals[here], title, things=what))
-            )
+            out.append(residual_field(camera.image_size_px, pixels[here], residuals[here], title, things=what))
     return out
 
 
@@ -392,18 +369,10 @@ def _screens(o: CalibratedRig) -> Section | None:
         if result.flatness is not None and len(result.xyz):
             chosen = result.flatness.chosen
             sigma = float(np.median(chosen.sigma_m[chosen.used]))
-            drawings.append(
-                PageDrawing(
-                    flatness_map(
-                        result.xyz[:, :2],
-                        result.xyz[:, 2],
-                        f"Screen {name}: height of the control points over its plane",
-                        size_m=screen.size_m,
-                        bow=screen.bow if any(screen.bow) else None,
-                        sigma_m=sigma,
-                    )
-                )
-            )
+            title, shape = f"Screen {name}: height of the control points over its plane", screen.bow
+            xy, z = result.xyz[:, :2], result.xyz[:, 2]
+            bent = shape if any(shape) else None
+            drawings.append(flatness_map(xy, z, title, size_m=screen.size_m, bow=bent, sigma_m=sigma))
         normal = screen.world_from_screen.rotation[:, 2]
         along = tilt = 0.0
         if "screens" in joint.unknowns.start:
@@ -412,10 +381,9 @@ def _screens(o: CalibratedRig) -> Section | None:
             along = float(np.sqrt(np.maximum(normal @ C[:3, :3] @ normal, 0.0)))
             tilt = float(np.sqrt(np.maximum(C[3, 3] + C[4, 4], 0.0) / 2))
         bow = float(sigmas.get(f"screens.{name}.bow_xx_per_m", 0.0))
-        rows.append(
-            (name, ", ".join(f"{v:.4f}" for v in screen.world_from_screen.translation), 1e3 * along,
-             float(np.rad2deg(tilt)), "bent" if any(screen.bow) else "flat", float(1e3 * bow) if bow else None)
-        )  # fmt: skip
+        place = ", ".join(f"{v:.4f}" for v in screen.world_from_screen.translation)
+        surface = "bent" if any(screen.bow) else "flat"
+        rows.append((name, place, 1e3 * along, np.rad2deg(tilt), surface, 1e3 * bow or None))
     heads = ("screen", "origin (m)", "sigma along its normal (mm)", "sigma of its tilt (deg)", "surface",
              "sigma of the bow (1/km)")  # fmt: skip
     words = (
@@ -456,22 +424,14 @@ def _cameras(o: CalibratedRig) -> Section:
     for i, (name, camera) in enumerate(joint.rig.cameras.items()):
         at = joint.unknowns.places("cameras", i)
         C = joint.all_covariance[np.ix_(at, at)]
-        # Camera centre in world: -R^T t. Errors of t act through R^T, those of the attitude through d(centre)/d(theta).
-        R, t = camera.camera_from_world.rotation, camera.camera_from_world.translation
-        J = np.concatenate([-R.T, _centre_jacobian(R, t)], axis=1)
-        place = np.sqrt(np.mean(np.maximum(np.diagonal(J @ C @ J.T), 0.0)))
+        # The centre c is -R^T t: errors of t act through R^T, and R Exp(theta) gives c - theta x c.
         centre = camera.camera_from_world.inverse().translation
-        rows.append(
-            (
-                name,
-                ", ".join(f"{v:.4f}" for v in centre),
-                float(1e3 * place),
-                float(np.rad2deg(np.sqrt(np.mean(np.diagonal(C)[3:])))),
-                float(camera.matrix[0, 0]),
-                float(sigmas.get(f"cameras.{name}.fx", 0.0)),
-                float(camera.matrix[0, 0] - before.cameras[name].matrix[0, 0]),
-            )
-        )
+        J = np.concatenate([-camera.camera_from_world.rotation.T, skew(centre)], axis=1)
+        mm = 1e3 * np.sqrt(np.mean(np.maximum(np.diagonal(J @ C @ J.T), 0.0)))
+        deg = np.rad2deg(np.sqrt(np.mean(np.diagonal(C)[3:])))
+        fx, sigma = camera.matrix[0, 0], sigmas.get(f"cameras.{name}.fx", 0.0)
+        place = ", ".join(f"{v:.4f}" for v in centre)
+        rows.append((name, place, mm, deg, fx, sigma, fx - before.cameras[name].matrix[0, 0]))
     heads = ("camera", "position (m)", "sigma of position (mm)", "sigma of attitude (deg)", "fx (px)",
              "sigma of fx (px)", "change of fx since the lens calibration (px)")  # fmt: skip
     words = (
@@ -479,13 +439,6 @@ def _cameras(o: CalibratedRig) -> Section:
         " more distant camera. rig.yaml holds the joint covariance."
     )
     return Section("Cameras", words, (), PageTable(heads, rows))
-
-
-def _centre_jacobian(R: Array, t: Array) -> Array:
-    """d(centre)/d(theta) (3, 3) for camera_from_world R Exp(theta), t: the centre is -(R Exp(theta))^T t."""
-    c = -R.T @ t
-    # Exp(-theta) c = c - theta x c
-    return np.array([[0, -c[2], c[1]], [c[2], 0, -c[0]], [-c[1], c[0], 0]])
 
 
 def _correlations(o: CalibratedRig) -> Section:
@@ -523,7 +476,7 @@ def _lab(o: CalibratedRig) -> Section:
     return Section(
         "The lab",
         "Calibrated cameras, screens and beams, with the vehicle in the middle of the stand's positions.",
-        [PageDrawing(view) for view in scene_views(rig_things(joint.rig, body))],
+        scene_views(rig_things(joint.rig, body)),
     )
 
 

@@ -20,7 +20,6 @@ from calibration.screens.screens import (
 from geometry.arrays import Array
 from geometry.camera import pinhole_numbers
 from lab.files.project.project import Project
-from lab.files.rig.rig_file import covariance_blocks
 from lab.findings.finding import Finding, Level, finding, level_above, passed
 from lab.number_format import format_count, format_number
 from lab.report.calibration.calibration_drawings import corners_overlay, correlation_matrix, flatness_map
@@ -271,18 +270,11 @@ def _key_figures(result: FittedScreens) -> list[KeyFigure]:
         note = f"1 sigma at the centre of its screen; {format_number(px, 2)} px"
         out.append((f"Pose of camera {name}", f"{format_number(1e3 * sigma_m, 2)} mm", note))
     used = fit.observation_residuals_px[fit.used]
-    if len(used):
-        rms = float(np.sqrt(np.mean(used**2)))
-        out.append(
-            (
-                "Control points",
-                f"{format_number(rms, 3)} px",
-                f"RMS per axis of {len(used)} observations, {len(fit.used) - len(used)} excluded",
-            )
-        )
-    if len(fit.corner_errors_px):
-        rms = float(np.sqrt(np.mean(fit.corner_errors_px**2)))
-        out.append(("Corners of boards", f"{format_number(rms, 3)} px", f"RMS per axis of {len(fit.corner_errors_px)}"))
+    points = f"{len(used)} observations, {len(fit.used) - len(used)} excluded"
+    corners = fit.corner_errors_px
+    for what, errors, of in (("Control points", used, points), ("Corners of boards", corners, f"{len(corners)}")):
+        if len(errors):
+            out.append((what, f"{format_number(float(np.sqrt(np.mean(errors**2))))} px", f"RMS per axis of {of}"))
     factor = float(np.sqrt(fit.variance_factor))
     note = (
         "the stated sigmas are correct" if factor == 1 else "times the stated sigmas; all sigmas are multiplied by it"
@@ -352,28 +344,15 @@ def _screen(result: FittedScreens, project: Project, k: int) -> Section:
                 f" improvement on a flat screen is {f.p_flat:.2g}."
             )
         )
-        a, b, c = screen.bow
-        drawings.append(
-            PageDrawing(
-                flatness_map(
-                    about.xyz[on, :2],
-                    f.flat.heights_m[on],
-                    f"Screen {name}: height over the best plane",
-                    size_m=screen.size_m,
-                    bow=(a, b, c) if f.chosen.bent else None,
-                    sigma_m=sigma,
-                ),
-                "Height along the normal. A smooth pattern is a bow; a random pattern is roughness or survey noise.",
-            )
-        )
+        bow, xy, size_m = (screen.bow if f.chosen.bent else None), about.xyz[on, :2], screen.size_m
+        title = f"Screen {name}: height over the best plane"
+        drawing = flatness_map(xy, f.flat.heights_m[on], title, size_m=size_m, bow=bow, sigma_m=sigma)
+        caption = "Height along the normal. A smooth pattern is a bow; a random pattern is roughness or survey noise."
+        drawings.append(PageDrawing(drawing, caption))
         if f.chosen.bent:
-            drawings.append(
-                PageDrawing(
-                    flatness_map(about.xyz[on, :2], f.chosen.heights_m[on], f"Screen {name}: residuals after the bow",
-                                 size_m=screen.size_m, sigma_m=sigma),
-                    "Height above the curved surface: only noise should remain.",
-                )
-            )  # fmt: skip
+            title = f"Screen {name}: residuals after the bow"
+            drawing = flatness_map(xy, f.chosen.heights_m[on], title, size_m=size_m, sigma_m=sigma)
+            drawings.append(PageDrawing(drawing, "Height above the curved surface: only noise should remain."))
     return Section(f"Screen {name}", words, drawings)
 
 
@@ -395,7 +374,7 @@ def _pixels(result: FittedScreens) -> Section:
             rejected = np.concatenate([rejected, np.zeros(int(its.sum()), dtype=bool)])
         if len(pixels):
             title = f"Camera {name}: measured − predicted"
-            drawings.append(PageDrawing(corners_overlay(c.image_size_px, pixels, error, title, rejected=rejected)))
+            drawings.append(corners_overlay(c.image_size_px, pixels, error, title, rejected=rejected))
     words = "Arrows with a common direction in a part of a picture indicate a lens that changed since its calibration."
     return Section("Pixels", words, drawings)
 
@@ -422,7 +401,7 @@ def _observations(result: FittedScreens) -> Section:
     return Section("Observations of control points", words, table=PageTable(heads, rows[:_MAX_ROWS]))
 
 
-def _scene(result: FittedScreens) -> list[PageDrawing]:
+def _scene(result: FittedScreens) -> list[str]:
     fit, network = result.fit, result.network
     things: list[SceneObject] = []
     for k, (name, screen) in enumerate(fit.rig.screens.items()):
@@ -433,21 +412,19 @@ def _scene(result: FittedScreens) -> list[PageDrawing]:
         things.append(Rectangle(f"screen {name}", screen.world_from_screen, size))
     things += [frustum_of(c) for c in fit.rig.cameras.values()]
     things += [Marker("", p) for p in network.control_points.xyz[: 5 * _MAX_ROWS]]
-    return [PageDrawing(view) for view in scene_views(things, "Cameras, screens and control points", LAB_VIEWS)]
+    return scene_views(things, "Cameras, screens and control points", LAB_VIEWS)
 
 
 def _correlations(result: FittedScreens) -> Section:
-    blocks = covariance_blocks(result.fit.covariance)
-    first = next(iter(result.fit.rig.cameras))
-    block = blocks[f"cameras.{first}"]
-    screen = result.fit.rig.cameras[first].screen
+    first, camera = next(iter(result.fit.rig.cameras.items()))
     names = result.fit.covariance.names
-    rows = [i for i, n in enumerate(names) if n.startswith((f"cameras.{first}.", f"screens.{screen}."))]
+    of_camera = [n for n in names if n.startswith(f"cameras.{first}.")]
+    rows = [i for i, n in enumerate(names) if n.startswith((f"cameras.{first}.", f"screens.{camera.screen}."))]
     rows = [i for i in rows if not names[i].endswith(("fx", "fy", "cx", "cy")) and ".k" not in names[i]]
     labels = [names[i].split(".", 1)[1] for i in rows]
-    drawing = correlation_matrix(labels, result.fit.covariance.matrix[np.ix_(rows, rows)])
     words = (
-        f"Parameters of camera {first} ({len(block.names)}) and its screen. Use the joint covariance in"
+        f"Parameters of camera {first} ({len(of_camera)}) and its screen. Use the joint covariance in"
         " screens.yaml, which has these correlations for the whole lab."
     )
-    return Section("Correlations", words, [PageDrawing(drawing)])
+    drawing = correlation_matrix(labels, result.fit.covariance.matrix[np.ix_(rows, rows)])
+    return Section("Correlations", words, [drawing])

@@ -1,10 +1,9 @@
 """Result folders that are complete or absent, and what is removed when the process stops.
 
-One writer per output folder: a locked file beside the folder.
-
-The system releases the lock when its process ends in any way. So the holder knows that every part of results beside the
-folder is left from a process that no longer runs, on this machine or in another container or machine that shares the
-volume, without comparing process ids. `flock` is used directly: the library filelock leaves its file behind.
+A locked file beside the folder admits one writer. The system releases the lock when its process ends in any way. So
+the holder knows that every part of results beside the folder is left from a process that no longer runs, on this
+machine or in another container or machine that shares the volume, without comparing process ids. `flock` is used
+directly: the library filelock leaves its file behind.
 """
 
 from __future__ import annotations

@@ -2,9 +2,8 @@
 
 `read_table` reads the named columns of any CSV file into a `Table`. A regular file (each line as many commas as the
 header, no quotes, no blank line) is split at its commas; the csv module reads all others. All errors name the line of
-the file (`Table.error`). See docs/decisions/csv-layer.md.
-
-Range checks of table columns: a digit too many, a wrong unit, a placeholder.
+the file (`Table.error`). Range checks of columns find a digit too many, a wrong unit, a placeholder. See
+docs/decisions/csv-layer.md.
 """
 
 from __future__ import annotations

@@ -83,9 +83,8 @@ def read_result_data(results: Path, run_folder: Path | None = None) -> ResultDat
     folder = ResultFolder(results, run_folder)
     spots, poses = folder.spots, folder.poses
     if not len(spots.frames) or not spots.views:
-        raise InputError(
-            f"{results / 'spots.csv'}: expected rows of at least one frame, got none; process the run again"
-        )
+        path = results / "spots.csv"
+        raise InputError(f"{path}: expected rows of at least one frame, got none; process the run again")
     if not np.array_equal(spots.frames, poses.frames):
         raise InputError(f"{results}: spots.csv and attitude.csv have different frames; process the run again")
     run, notes = _run_of(folder, run_folder is not None)
@@ -212,20 +211,12 @@ def frame_content(
     marks = _marks(data, index, near, tail)
     shown = []
     for camera in cameras:
-        views = data.views_of(camera)
-        picture = shown_by.get(camera)
+        picture, table = shown_by.get(camera), data.detections.get(camera)
         grey = picture if isinstance(picture, np.ndarray) else None
-        table = data.detections.get(camera)
-        shown.append(
-            CameraFrame(
-                camera,
-                data.sizes_px[camera],
-                grey,
-                "" if grey is not None else _reason(picture),
-                _NONE if table is None else table.at(int(poses.frames[index])),
-                tuple(marks[j] for j in views),
-            )
-        )
+        reason = "" if grey is not None else _reason(picture)
+        detections = _NONE if table is None else table.at(int(poses.frames[index]))
+        own = tuple(marks[j] for j in data.views_of(camera))
+        shown.append(CameraFrame(camera, data.sizes_px[camera], grey, reason, detections, own))
     return DrawnFrame(
         name=data.name,
         frame=int(poses.frames[index]),
@@ -241,14 +232,9 @@ def pose_words(poses: PoseTrack, index: int) -> str:
     """Position and angles of a frame with their sigmas in ASCII, since not every OpenCV draws other characters."""
     if not poses.known[index]:
         return "no pose"
-    position = [
-        _with_sigma(1e3 * float(v), 1e3 * float(s))
-        for v, s in zip(poses.world_from_body.translation[index], poses.sigma_position_m[index], strict=True)
-    ]
-    angles = [
-        _with_sigma(float(v), float(s))
-        for v, s in zip(poses.yaw_pitch_roll_deg[index], poses.sigma_ypr_deg[index], strict=True)
-    ]
+    mm = 1e3 * poses.world_from_body.translation[index], 1e3 * poses.sigma_position_m[index]
+    deg = poses.yaw_pitch_roll_deg[index], poses.sigma_ypr_deg[index]
+    position, angles = (list(map(_with_sigma, values, sigmas)) for values, sigmas in (mm, deg))
     used, rms = poses.spots_used[index], poses.rms_px[index]
     fit = f"   {int(used)} spots" if np.isfinite(used) else ""
     fit += f", rms {rms:.2g} px" if np.isfinite(rms) else ""

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 
 from lab.number_format import format_count
-from lab.pictures.picture_file import GreyPicture
 from lab.report.frames.canvas import (
     DESK,
     INK,
@@ -51,17 +50,11 @@ def status_words(mark: SpotMark) -> str:
     return f"{mark.spot} {words}{doubt}"
 
 
-def limits_of(picture: GreyPicture) -> Limits:
-    """The grey values of a picture that are shown as black and as white."""
-    return grey_limits(picture)
-
-
 def grey_picture(camera: CameraFrame, limits: Limits | None = None) -> Pixels | None:
     """The picture with stretched contrast (h, w), or None without one. limits: None: those of the picture."""
     if camera.picture is None:
         return None
-    low, high = limits_of(camera.picture) if limits is None else limits
-    return stretched(camera.picture, low, high)
+    return stretched(camera.picture, *(limits or grey_limits(camera.picture)))
 
 
 def panel(camera: CameraFrame, grey: Pixels | None, width: int, unit: float, size: float) -> Pixels:

@@ -1,8 +1,6 @@
-"""Figures of errors and residuals in a run report.
+"""Figures of a run report: errors and residuals, the spots' statuses and their tracks (Huo 2015, Fig. 8), the motion.
 
-Pose, velocity and angular rate over time: value on the left, uncertainty on the right.
-
-Figures of the spots: tracks over the picture (Huo 2015, Fig. 8), statuses over time.
+Pose, velocity and angular rate over time have the value on the left, the uncertainty on the right.
 """
 
 from __future__ import annotations
@@ -80,25 +78,16 @@ def error_grid(m: ReportData, columns: tuple[tuple[str, Array], ...], zoom: Zoom
     for j in shown:
         camera, spot = m.spots.views[j]
         last = j == shown[-1]
+        panel = partial(
+            time_panel, m.t_s, shades=view_shades(m, j), height=128 if last else 104, with_time=last,
+            time_name=m.time_name, zoom=zoom, row=1 + j,
+        )  # fmt: skip
         for (name, errors), y_range in zip(columns, ranges, strict=True):
-            out.append(
-                time_panel(
-                    m.t_s,
-                    f"spot {spot} ({camera}): {name}",
-                    "px",
-                    lines=(
-                        Line(errors[:, j, 0], U_COLOUR, f"spot {spot}, u: {name}", 0.9),
-                        Line(errors[:, j, 1], V_COLOUR, f"spot {spot}, v: {name}", 0.9),
-                    ),
-                    shades=view_shades(m, j),
-                    y_range=y_range,
-                    height=128 if last else 104,
-                    with_time=last,
-                    time_name=m.time_name,
-                    zoom=zoom,
-                    row=1 + j,
-                )
+            lines = tuple(
+                Line(errors[:, j, k], colour, f"spot {spot}, {'uv'[k]}: {name}", 0.9)
+                for k, colour in enumerate((U_COLOUR, V_COLOUR))
             )
+            out.append(panel(title=f"spot {spot} ({camera}): {name}", unit="px", lines=lines, y_range=y_range))
     return "".join(out)
 
 
@@ -292,9 +281,7 @@ def tracks_figure(m: ReportData, camera: str, zoom: ZoomData | None = None) -> s
     p, picture = _track_plane(uv, m.spots.measured[:, views], size)
     left, top, wide, high = p.box
     clip = f"clip-{m.spots.cameras.index(camera)}"
-    out = [
-        f'<clipPath id="{clip}"><rect x="{left}" y="{top}" width="{wide:.1f}" height="{high:.1f}"/></clipPath>',
-    ]
+    out = [f'<clipPath id="{clip}"><rect x="{left}" y="{top}" width="{wide:.1f}" height="{high:.1f}"/></clipPath>']
     if size is not None:
         (x0, y0), (x1, y1) = p.at(picture).tolist()
         out.append(

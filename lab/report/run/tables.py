@@ -32,25 +32,19 @@ def truth_figures(e: Errors | None) -> list[KeyFigure]:
     keys = []
     if s := part(e, "spots"):
         outside = part(s, "out_of_view_px")
+        largest = f"RMS; largest {pixels(outside.get('max'))}" if outside else "no spot was out of view"
         keys += [
             ("right in view", format_percent(s.get("in_view_identity")), "of visible spots"),
             ("wrong labels", counted(s.get("wrong_labels")), "measured rows"),
             ("prediction error", pixels(part(s, "prediction_px", "smooth").get("rms")), "RMS, straight parts"),
-            (
-                "out-of-view error",
-                pixels(outside.get("rms")),
-                f"RMS; largest {pixels(outside.get('max'))}" if outside else "no spot was out of view",
-            ),
+            ("out-of-view error", pixels(outside.get("rms")), largest),
         ]
     if measured := part(e, "pose", "measured"):
         rotation, position = (part(measured, name).get("rms") for name in ("rotation_deg", "position_m"))
         notes = ["RMS, measured poses"] * 2
         if causal := part(e, "pose_causal", "measured"):
-            shown = (
-                format_angle(part(causal, "rotation_deg").get("rms")),
-                format_length(part(causal, "position_m").get("rms")),
-            )
-            notes = [f"RMS, smoothed; causal {value}" for value in shown]
+            turn, shift = (part(causal, name).get("rms") for name in ("rotation_deg", "position_m"))
+            notes = [f"RMS, smoothed; causal {value}" for value in (format_angle(turn), format_length(shift))]
         keys += [
             ("rotation error", format_angle(rotation), notes[0]),
             ("position error", format_length(position), notes[1]),
@@ -99,12 +93,9 @@ def _label_rows(s: Errors) -> list[tuple[str, str, str]]:
     if not s:
         return []
     share, wrong = format_percent(s.get("wrong_label_share")), counted(s.get("wrong_labels"))
+    right = format_percent(s.get("in_view_identity"))
     out = [
-        (
-            "right identity in view",
-            format_percent(s.get("in_view_identity")),
-            "of visible spots, found under their own name",
-        ),
+        ("right identity in view", right, "of visible spots, found under their own name"),
         ("wrong labels", f"{wrong} ({share})", "of all measured rows"),
     ]
     for block, name in ((part(s, "re_entries"), "re-entries kept"), (part(s, "after_hiding"), "kept after occlusion")):
@@ -282,16 +273,13 @@ def budget_rows(m: ReportData) -> list[tuple[str, ...]]:
     if not measured.any():
         return []
     R = m.poses.world_from_body.rotation[measured]
-    total = _variances(R, m.poses.covariance[measured])
-    systematic = _variances(R, m.poses.systematic[measured])
+    total, systematic = (_variances(R, C[measured]) for C in (m.poses.covariance, m.poses.systematic))
     noise = np.maximum(total - systematic, 0.0)
     columns = [total, noise, systematic, noise / AVERAGED + systematic, systematic]
-    sigmas = [np.sqrt(np.median(c, axis=0)) for c in columns]
-    rows = []
-    for i, name in enumerate(("x", "y", "z", "yaw", "pitch", "roll")):
-        shown = format_length if i < 3 else format_angle
-        rows.append((name, *(shown(float(s[i])) for s in sigmas)))
-    return rows
+    sigmas = np.sqrt(np.median(columns, axis=1)).T
+    shown = (*[format_length] * 3, *[format_angle] * 3)
+    names = ("x", "y", "z", "yaw", "pitch", "roll")
+    return [(name, *map(text, row.tolist())) for name, text, row in zip(names, shown, sigmas, strict=True)]
 
 
 def _variances(R: Array, covariance: Array) -> Array:

@@ -226,28 +226,19 @@ def _model(fit: ModelFit | None) -> Evidence:
     if not fit.tested:
         return Evidence(None, _MODEL, fit.sentence[:1].lower() + fit.sentence[1:].rstrip("."))
     worst = verdict(fit.findings)
-    words = "the residuals agree with the calibrated rig"
-    if fit.findings:
-        words = (
-            "deviations within the stated uncertainty" if worst is Level.PASS else "the residuals do not fit the rig"
-        )
+    words = "the residuals do not fit the rig" if worst > Level.PASS else "deviations within the stated uncertainty"
+    words = words if fit.findings else "the residuals agree with the calibrated rig"
     words += f" ({format_count(fit.frames, 'frame')} tested)" if fit.frames is not None else ""
-    found = "; ".join(first_sentence(f.what) for f in fit.findings[:2]) + (
-        "; and more" if len(fit.findings) > 2 else ""
-    )
+    found = "; ".join(first_sentence(f.what) for f in fit.findings[:2])
+    found += "; and more" if len(fit.findings) > 2 else ""
     return Evidence(worst, _MODEL, f"{words}: {found}" if found else words)
 
 
 def _residuals(m: ReportData) -> list[Evidence]:
     """The residuals by camera and by beam: median, px, and RMS over the size expected from the stated sigmas."""
     if m.residual_px is None or m.run is None or not m.residual_share:
-        return [
-            Evidence(
-                None,
-                "Residuals",
-                "not known without the run folder's rig or a measured pose, nor for cameras with clocks of their own",
-            )
-        ]
+        why = "not known without the run folder's rig or a measured pose, nor for cameras with clocks of their own"
+        return [Evidence(None, "Residuals", why)]
     beams = {name: spot.beam for name, spot in m.run.rig.spots.items()}
     out = []
     for name, groups in (
@@ -284,14 +275,8 @@ def _labels(m: ReportData) -> Evidence:
     if p[k, j] >= _SURE:
         return Evidence(Level.PASS, "Labels", words)
     words += f"; lowest {format_number(float(p[k, j]), 3)}, spot {m.spots.views[j][1]}"
-    link = time_link(m, int(k), int(k))
-    return Evidence(
-        Level.PASS if sure >= _MOST and p[k, j] >= _DOUBTFUL else Level.WARN,
-        "Labels",
-        words,
-        link,
-        f"frame {m.spots.frames[k]}",
-    )
+    level = Level.PASS if sure >= _MOST and p[k, j] >= _DOUBTFUL else Level.WARN
+    return Evidence(level, "Labels", words, time_link(m, int(k), int(k)), f"frame {m.spots.frames[k]}")
 
 
 def _ambiguous(m: ReportData) -> Evidence:
@@ -299,9 +284,6 @@ def _ambiguous(m: ReportData) -> Evidence:
     if not parts:
         return Evidence(Level.PASS, "Ambiguous", "nothing")
     left_open = np.isfinite(m.spots.label_probability) & ~m.spots.measured
-    frames = np.flatnonzero(left_open.any(axis=1))
-    if not len(frames):
-        return Evidence(Level.WARN, "Ambiguous", "; ".join(parts))
-    k = int(frames[0])
-    where = f"first: frame {m.spots.frames[k]}"
-    return Evidence(Level.WARN, "Ambiguous", "; ".join(parts), time_link(m, k, k), where)
+    frames: list[int] = np.flatnonzero(left_open.any(axis=1)).tolist()
+    place = [(time_link(m, k, k), f"first: frame {m.spots.frames[k]}") for k in frames[:1]]
+    return Evidence(Level.WARN, "Ambiguous", "; ".join(parts), *(place[0] if place else ()))

@@ -1,7 +1,6 @@
 """`beampose view`: view.html, the scene to turn and to play in a browser with still drawings, and scene.glb.
 
-view.html is one file that works offline; it opens in the browser where there is a display. The scene: its content, its
-solids, and the glTF file of them.
+view.html is one file that works offline; it opens in the browser where there is a display.
 """
 
 from __future__ import annotations
@@ -131,22 +130,20 @@ def _of_run(path: Path, rig_path: Path | None) -> RigAndPoses:
         return RigAndPoses(run.name, "truth/pose.csv", rig, t.frame, t.t_s, poses, unknown, np.ones(n, dtype=bool))
     if run.prior is None:
         return _without_poses(run.name, rig)
-    centre = run.prior.centre
-    poses = Pose(centre.rotation[None], centre.translation[None])
     # An even spread within a cube has this variance along each axis.
-    covariance = np.eye(3)[None] * run.prior.within_m**2 / 3
-    one = np.zeros(1, dtype=np.int64)
-    return RigAndPoses(
-        run.name, "the prior of run.yaml", rig, one, np.zeros(1), poses, covariance, np.zeros(1, dtype=bool)
-    )
+    return _of_one(run.name, "the prior of run.yaml", rig, run.prior.centre, run.prior.within_m**2 / 3)
 
 
 def _without_poses(name: str, rig: Rig) -> RigAndPoses:
     """A rig with the vehicle in the middle of what it sees."""
-    centre = assumed_range(rig).centre
-    poses, unknown = Pose(centre.rotation[None], centre.translation[None]), np.full((1, 3, 3), np.nan)
-    one = np.zeros(1, dtype=np.int64)
-    return RigAndPoses(name, "", rig, one, np.zeros(1), poses, unknown, np.zeros(1, dtype=bool))
+    return _of_one(name, "", rig, assumed_range(rig).centre, np.nan)
+
+
+def _of_one(name: str, poses_from: str, rig: Rig, pose: Pose, variance_m2: float) -> RigAndPoses:
+    """One pose that was not measured, with the variance of its position along each axis."""
+    first, not_measured = np.zeros(1, dtype=np.int64), np.zeros(1, dtype=bool)
+    covariance = variance_m2 * np.eye(3)[None]
+    return RigAndPoses(name, poses_from, rig, first, np.zeros(1), Pose.stack([pose]), covariance, not_measured)
 
 
 def workspace(rig: Rig, middle: Pose) -> Trail | None:
@@ -173,13 +170,9 @@ def workspace(rig: Rig, middle: Pose) -> Trail | None:
             first = int(np.argmax(few)) if few.any() else len(few)
             ends[side, axis] = sign * (steps[first - 1] if first else 0.0)
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    edges_of = [(a, b) for a in range(8) for b in range(a) if np.sum(corners[a] != corners[b]) == 1]
-    gap = np.full((1, 3), np.nan)
-    lines = [
-        np.concatenate([np.where(corners[[a, b]] == 0, ends[0], ends[1]) + middle.translation, gap])
-        for a, b in edges_of
-    ]
-    return Trail("workspace", np.concatenate(lines)[:-1], GREY)
+    places = np.append(np.where(corners == 0, ends[0], ends[1]) + middle.translation, np.full((1, 3), np.nan), axis=0)
+    edges_of = [(a, b, -1) for a in range(8) for b in range(a) if np.sum(corners[a] != corners[b]) == 1]
+    return Trail("workspace", places[np.ravel(edges_of)][:-1], GREY)
 
 
 # A scene as one coloured triangle mesh: lines as thin tubes, spots as balls, sigmas as ellipsoids.
@@ -261,8 +254,7 @@ def ball(centre: Array, axes: Array, colour: str) -> Mesh:
 
 def merged(parts: Sequence[Mesh]) -> Mesh:
     """Several meshes as one."""
-    if not parts:
-        return Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3)))
+    parts = [Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3))), *parts]
     first = np.cumsum([0, *(len(p.vertices) for p in parts)])
     return Mesh(
         np.concatenate([p.vertices for p in parts]),
@@ -297,6 +289,8 @@ _SHARE = 0.02  # of the scene's extent: the size at which a typical ellipsoid is
 _FAR_M, _STEPS = 10.0, 401  # how far from the middle the workspace is looked for, and at how many places
 _SIZING = 200  # poses whose spots decide the size of a screen that states none
 _TURN = np.linspace(0, 2 * np.pi, 33)
+_SIGMA = "sigma of the position"
+_WITHOUT_LABEL = ("trajectory", "workspace", _SIGMA)  # on the page
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,10 +304,7 @@ class Ellipsoid:
     def circles(self) -> list[Trail]:
         """Its three principal ellipses."""
         ring = np.stack([np.cos(_TURN), np.sin(_TURN), 0 * _TURN])
-        return [
-            Trail("sigma of the position", self.centre + (self.axes @ np.roll(ring, k, axis=0)).T, self.colour)
-            for k in range(3)
-        ]
+        return [Trail(_SIGMA, self.centre + (self.axes @ np.roll(ring, k, axis=0)).T, self.colour) for k in range(3)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -470,22 +461,13 @@ def write_page(view: View, index: int | None, path: Path) -> None:
     """Write view.html; index: of the pose in the still drawings. Raises InputError."""
     things = [*view.fixed, *view.moving(index), *(c for e in view.ellipsoids for c in e.circles())]
     content = view.content
-    html = (
-        environment()
-        .get_template("view.html.j2")
-        .render(
-            name=content.name,
-            poses=content.poses_from,
-            space=_space(view),
-            frame=None if index is None or not content.poses_from else int(content.frames[index]),
-            moments=int(content.known.sum()),
-            ellipsoids=len(view.ellipsoids),
-            too_large=view.too_large,
-            scale=f"{view.sigma_scale:g}",
-            drawings=[Markup(d) for d in scene_views(things)],
-            data=as_script(scene_data(view, index)),
-        )
-    )
+    html = environment().get_template("view.html.j2").render(
+        name=content.name, poses=content.poses_from, space=_space(view),
+        frame=None if index is None or not content.poses_from else int(content.frames[index]),
+        moments=int(content.known.sum()), ellipsoids=len(view.ellipsoids), too_large=view.too_large,
+        scale=f"{view.sigma_scale:g}", drawings=[Markup(d) for d in scene_views(things)],
+        data=as_script(scene_data(view, index)),
+    )  # fmt: skip
     atomic_write_text(html, path)
 
 
@@ -501,14 +483,11 @@ def _space(view: View) -> str:
 def scene_data(view: View, index: int | None, most_moments: int = MOST_MOMENTS, digits: int = 4) -> dict[str, Any]:
     """The scene for the page's program: lines, labels and moments; coordinates in m, rounded to so many digits."""
     lines = []
-    for thing in view.fixed:
+    for thing in (*view.fixed, *(c for e in view.ellipsoids for c in e.circles())):
         for number, line in enumerate(edges(thing, view.reach_m)):
-            label = thing.name if number == 0 and not thing.name.startswith(("trajectory", "workspace")) else ""
-            lines.append(
-                {"c": thing.colour, "n": label, "f": isinstance(thing, Rectangle), "p": _rounded(line, digits)}
-            )
-    for e in view.ellipsoids:
-        lines += [{"c": e.colour, "n": "", "f": False, "p": _rounded(c.places, digits)} for c in e.circles()]
+            label = "" if number or thing.name in _WITHOUT_LABEL else thing.name
+            filled = isinstance(thing, Rectangle)
+            lines.append({"c": thing.colour, "n": label, "f": filled, "p": _rounded(line, digits)})
     content = view.content
     indices = evenly_spaced(np.flatnonzero(content.known), most_moments)
     first = 0 if index is None else min(int(np.searchsorted(indices, index)), len(indices) - 1)
@@ -531,15 +510,8 @@ def _moments(content: RigAndPoses, indices: Ints, digits: int) -> list[dict[str,
             rays.append(_rounded(np.stack([starts[rig.spots[spot].beam][k], hits[k, j]]), digits))
             spots.append([spot, ORANGE, *hits[k, j].round(digits).tolist()])
         spots.append(["vehicle", PURPLE, *poses.translation[k].round(digits).tolist()])
-        out.append(
-            {
-                "k": int(content.frames[i]),
-                "t": round(float(content.t_s[i]), 4),
-                "m": bool(content.measured[i]),
-                "r": rays,
-                "s": spots,
-            }
-        )
+        t, measured = round(float(content.t_s[i]), 4), bool(content.measured[i])
+        out.append({"k": int(content.frames[i]), "t": t, "m": measured, "r": rays, "s": spots})
     return out
 
 

@@ -1,8 +1,8 @@
 """Processes many runs: a result folder each, batch.csv and index.html. Work that is done already is skipped.
 
-The processes that work on the runs: a worker that dies (killed, out of memory) costs its own run only. batch.csv and
-index.html: the rows of all batches into one folder, merged under a lock. The tables of all runs as Parquet data sets: a
-file per run, with the run's result folder as a column.
+A worker process that dies (killed, out of memory) costs its own run only. batch.csv and index.html have the rows of
+all batches into one folder, merged under a lock. The tables of all runs are Parquet data sets: a file per run, with the
+run's result folder as a column.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""One run of a batch: skipped where its results exist, else processed; its row of batch.csv, whatever happens.
+"""One run of a batch: skipped where results with the fingerprint of its inputs and settings exist, else processed.
 
-The runs of a batch and their result folders.
-
-Which runs of a batch are done: the fingerprint of a run's inputs and settings, and results that have it.
+Whatever happens, it has a row of batch.csv.
 """
 
 from __future__ import annotations

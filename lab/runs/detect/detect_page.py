@@ -193,11 +193,9 @@ def noise_chart(estimate: NoiseEstimate, measured: LevelVariances | None, name: 
     p = svg.plot_area((bottom, top), (0.0, highest), height=280)
     title = f"Variance of a pixel: {name}"
     out = svg.axes(p, title, "grey value (DN)", "variance (DN²)")
-    band = np.concatenate(
-        [np.stack([level, np.minimum(above, highest)], -1), np.stack([level, np.minimum(below, highest)], -1)[::-1]]
-    )
-    out.append(f'<path d="{svg.polyline(p.at(band), closed=True)}" fill="{svg.BLUE}" fill-opacity="0.18"/>')
     x, y = p.at(np.stack([level, line], -1)).T
+    band = svg.area_path(x, *(p.Y(np.minimum(edge, highest)) for edge in (below, above)))
+    out.append(f'<path d="{band}" fill="{svg.BLUE}" fill-opacity="0.18"/>')
     out.append(f'<path class="line" d="{svg.line_path(x, y)}" stroke="{svg.BLUE}" stroke-width="1.5"/>')
     inside: Bools = np.ones(0, dtype=bool)
     if measured is not None and len(measured.level):
@@ -251,31 +249,15 @@ def _key_figures(series: PictureSeries, table: Array, groups: list[SizeGroup]) -
         ("Spots", str(series.spots.total), f"{each} in a picture" if series.pictures > 1 else "in the picture"),
     ]
     if len(table):
-        low, middle, high = np.percentile(table[:, 3], [5, 50, 95])
-        figures.append(
-            (
-                "Size",
-                f"{format_number(middle)} px",
-                f"1 sigma of the major axis; 90 %: {format_number(low)} to {format_number(high)}",
-            )
-        )
-        low, middle, high = np.percentile(table[:, 5], [5, 50, 95])
-        figures.append(
-            (
-                "Signal to noise",
-                format_number(middle),
-                f"matched filter, median; 90 %: {format_number(low)} to {format_number(high)}",
-            )
-        )
+        size, ratio = (list(map(format_number, np.percentile(table[:, k], [5, 50, 95]))) for k in (3, 5))
+        figures += [
+            ("Size", f"{size[1]} px", f"1 sigma of the major axis; 90 %: {size[0]} to {size[2]}"),
+            ("Signal to noise", ratio[1], f"matched filter, median; 90 %: {ratio[0]} to {ratio[2]}"),
+        ]
     model = groups[0].noise.model
     if model is not None:
-        figures.append(
-            (
-                "Noise",
-                f"{format_number(math.sqrt(model.floor_dn2))} DN",
-                f"of a pixel at {format_number(model.black_dn)} DN",
-            )
-        )
+        floor = f"{format_number(math.sqrt(model.floor_dn2))} DN"
+        figures.append(("Noise", floor, f"of a pixel at {format_number(model.black_dn)} DN"))
     return figures
 
 
@@ -295,29 +277,22 @@ def _spots(series: PictureSeries, table: Array) -> Section:
     drawings = []
     if len(series.spots.per_frame) > 1:
         frame, count = np.array(series.spots.per_frame, dtype=float).T
-        drawings.append(
-            PageDrawing(
-                time_panel(
-                    frame, "Spots in each picture", "", lines=(Line(count, svg.BLUE, "spots"),),
-                    y_range=(0.0, max(float(count.max()) * 1.1, 1.0)), width=1100, height=150, time_name="frame",
-                ),
-                wide=True,
-            )
+        counts = time_panel(
+            frame, "Spots in each picture", "", lines=(Line(count, svg.BLUE, "spots"),),
+            y_range=(0.0, max(float(count.max()) * 1.1, 1.0)), width=1100, height=150, time_name="frame",
         )  # fmt: skip
+        drawings.append(PageDrawing(counts, wide=True))
     if len(table):
+        axes, ratio = [("major", table[:, 3]), ("minor", table[:, 4])], [("signal to noise", table[:, 5])]
+        title, threshold = "Signal to noise behind a matched filter", series.parameters.threshold_sigma
+        caption = (
+            "Flux over its noise, with the noise of the background only. Spots below the threshold (dashed line) are"
+            " not detected."
+        )
         drawings += [
-            PageDrawing(
-                counts_chart([("major", table[:, 3]), ("minor", table[:, 4])], "Sizes", "half axis, 1 sigma (px)")
-            ),
-            PageDrawing(
-                counts_chart(
-                    [("signal to noise", table[:, 5])], "Signal to noise behind a matched filter", "ratio",
-                    mark=series.parameters.threshold_sigma,
-                ),
-                "Flux over its noise, with the noise of the background only. Spots below the threshold (dashed line)"
-                " are not detected.",
-            ),
-        ]  # fmt: skip
+            PageDrawing(counts_chart(axes, "Sizes", "half axis, 1 sigma (px)")),
+            PageDrawing(counts_chart(ratio, title, "ratio", mark=threshold), caption),
+        ]
     description = (
         "Positions are centroids of the light."
         if series.spots.total
@@ -340,8 +315,7 @@ def _most_alike(table: Array) -> Section:
 
 
 def _places(table: Array, groups: list[SizeGroup]) -> Section:
-    width = max(g.size_px[0] for g in groups)
-    height = max(g.size_px[1] for g in groups)
+    width, height = (max(g.size_px[k] for g in groups) for k in (0, 1))
     description = (
         "All spots of all pictures. A spot that does not move while others do (a reflection, a hot pixel) appears as"
         " one dense dot."
@@ -350,20 +324,16 @@ def _places(table: Array, groups: list[SizeGroup]) -> Section:
 
 
 def _noise(series: PictureSeries, groups: list[SizeGroup]) -> Section:
-    rows: list[list[object]] = []
-    for g in groups[:_MOST_ROWS]:
-        e = g.noise.estimate
-        if e is None:
-            continue
-        m = e.model
-        rows.append(
-            [
-                g.text(), e.pictures, "in time" if e.temporal else "within pictures", m.black_dn,
-                _with_sigma(math.sqrt(m.floor_dn2), e.floor_sigma / 2), _with_sigma(1 / m.slope_dn, e.slope_sigma),
-                m.correlation, math.sqrt(m.compression_dn2), 100 * m.texture,
-                "not seen" if e.saturation_dn is None else e.saturation_dn, e.step_dn,
-            ]
-        )  # fmt: skip
+    known = [(g.text(), e, e.model) for g in groups[:_MOST_ROWS] if (e := g.noise.estimate) is not None]
+    rows = [
+        (
+            name, e.pictures, "in time" if e.temporal else "within pictures", m.black_dn,
+            _with_sigma(math.sqrt(m.floor_dn2), e.floor_sigma / 2), _with_sigma(1 / m.slope_dn, e.slope_sigma),
+            m.correlation, math.sqrt(m.compression_dn2), 100 * m.texture,
+            "not seen" if e.saturation_dn is None else e.saturation_dn, e.step_dn,
+        )
+        for name, e, m in known
+    ]  # fmt: skip
     heads = (
         "pictures", "estimated from", "differences", "background (DN)", "noise there (DN)", "electrons per DN",
         "correlation of pixels", "by compression (DN)", "texture (%)", "clips at (DN)", "grey step (DN)",

@@ -68,9 +68,12 @@ class FrameReader:
     Pictures are read and decoded ahead in threads (lab/pictures/source.py).
     """
 
+    moments: Sequence[Moment] | None = None  # None: one for each frame
+
     def __init__(self, run: Run) -> None:
         self._run = run
-        self._sources: dict[str, PictureSource] = {}
+        self.cameras = tuple(run.cameras)  # names, in the rig's order
+        self.sources: dict[str, PictureSource] = {}  # the pictures of the cameras that have some
         self._tables: dict[str, DetectionsFile] = {}
         self._notes: list[str] = []
         self._missing: dict[tuple[str, str], _MissingFrames] = {}  # by camera and reason
@@ -78,7 +81,7 @@ class FrameReader:
         opened: dict[Path, DetectionsFile] = {}
         for name, source in run.cameras.items():
             if isinstance(source, FramesFolder | VideoFile):
-                self._sources[name] = recorded_pictures(name, source)
+                self.sources[name] = recorded_pictures(name, source)
             elif isinstance(source, LiveDevice):
                 raise InputError(
                     f"{run.path}: cameras.{name}.device: expected recorded frames or detections, got a live camera; use"
@@ -95,22 +98,12 @@ class FrameReader:
         self._check_times()
 
     @property
-    def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras, in the rig's order."""
-        return tuple(self._run.cameras)
-
-    @property
-    def sources(self) -> Mapping[str, PictureSource]:
-        """The pictures of the cameras that have some."""
-        return self._sources
-
-    @property
     def _folders(self) -> list[PictureFiles]:
-        return [s for s in self._sources.values() if isinstance(s, PictureFiles)]
+        return [s for s in self.sources.values() if isinstance(s, PictureFiles)]
 
     @property
     def _videos(self) -> dict[str, Video]:
-        return {name: s for name, s in self._sources.items() if isinstance(s, Video)}
+        return {name: s for name, s in self.sources.items() if isinstance(s, Video)}
 
     @property
     def expected_frames(self) -> int | None:
@@ -120,11 +113,6 @@ class FrameReader:
             return None
         ends = [n - 1 for n in counts if n is not None] + ([] if self.last is None else [self.last])
         return max(ends) - self.first + 1
-
-    @property
-    def moments(self) -> Sequence[Moment] | None:
-        """None: one for each frame."""
-        return None
 
     @property
     def notes(self) -> list[str]:
@@ -158,9 +146,9 @@ class FrameReader:
         """One camera's pictures or points from the first frame on; they end with a video."""
         last = None if self._videos else self.last
         numbers = count(self.first) if last is None else range(self.first, last + 1)
-        if name in self._sources:
+        if name in self.sources:
             size_px = self._run.rig.cameras[name].image_size_px
-            return without_repeats(pictures(self._sources[name], size_px, wanted=numbers))
+            return without_repeats(pictures(self.sources[name], size_px, wanted=numbers))
         table = self._tables[name]
         return ((frame, points_at(table, name, frame, table.first, table.last)) for frame in numbers)
 
@@ -411,6 +399,8 @@ class FoundPoints:
 class ClockedFrames(FrameReader):
     """As FrameReader; each FrameSet is that of one of `moments`."""
 
+    moments: tuple[Moment, ...]  # by time
+
     def __init__(self, run: Run) -> None:
         super().__init__(run)
         self._found: FoundPoints | None = None
@@ -437,12 +427,7 @@ class ClockedFrames(FrameReader):
                     f" {rows_s[-1]:.6g} s, got times from {t_s[0]:.6g} to {t_s[-1]:.6g} s; are time_offset_s and the"
                     " timestamps in seconds on the run's clock?"
                 )
-        self._moments = tuple(plan_moments(rows, rows_s, own))
-
-    @property
-    def moments(self) -> tuple[Moment, ...]:
-        """By time."""
-        return self._moments
+        self.moments = tuple(plan_moments(rows, rows_s, own))
 
     @property
     def expected_frames(self) -> int | None:
@@ -468,11 +453,11 @@ class ClockedFrames(FrameReader):
 
     def _stream(self, name: str) -> Generator[tuple[int, Any], None, None]:
         numbers = self._numbers[name].tolist()
-        if name in self._sources and self._found is not None:
+        if name in self.sources and self._found is not None:
             return self._found.of(name)
-        if name in self._sources:
+        if name in self.sources:
             size_px = self._run.rig.cameras[name].image_size_px
-            return without_repeats(pictures(self._sources[name], size_px, wanted=numbers))
+            return without_repeats(pictures(self.sources[name], size_px, wanted=numbers))
         table = self._tables[name]
         own = self._own_times(name)
         first, last = (table.first, table.last) if own is None else (int(own[0]), int(own[-1]))
@@ -489,7 +474,7 @@ class ClockedFrames(FrameReader):
 
     def _check_own_times(self, name: str, own: Ints) -> None:
         """Raises InputError where a camera's own times do not fit its pictures."""
-        clock, source = self._clock(name), self._sources.get(name)
+        clock, source = self._clock(name), self.sources.get(name)
         where = f"{clock.times_path}: frame"
         table = self._tables.get(name)
         if isinstance(source, Video):
@@ -535,7 +520,7 @@ class ClockedFrames(FrameReader):
 
     def _span(self) -> tuple[int, int | None]:
         shared = [name for name in self._run.cameras if self._own_times(name) is None]
-        folders = [s for n, s in self._sources.items() if isinstance(s, PictureFiles) and n in shared]
+        folders = [s for n, s in self.sources.items() if isinstance(s, PictureFiles) and n in shared]
         points = [
             self._tables[n].cameras[n].frames for n in shared if n in self._tables and n in self._tables[n].cameras
         ]

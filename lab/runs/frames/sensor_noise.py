@@ -137,8 +137,8 @@ class CameraNoise:
             else:
                 how, remedy = "from picture to picture", "Check its mount and the floor"
             self.notes.append(
-                f"{self.camera}: the camera moves by {self.motion.rms_px:.2g} px (rms) {how}; its spots are corrected by"
-                f" what stands still in its pictures. {remedy}"
+                f"{self.camera}: the camera moves by {self.motion.rms_px:.2g} px (rms) {how}; its spots are corrected"
+                f" by what stands still in its pictures. {remedy}"
             )
 
     def look_for_wide(self, pictures: Sequence[Picture], parameters: DetectParameters) -> None:

@@ -1,10 +1,7 @@
-"""The model check of a run: whether its rig file fits what was recorded, as findings and for summary.json.
+"""The model check of a run: whether its rig file fits what was recorded, as values for summary.json and findings.
 
-Position-dependent errors on the screen, in the model check: over a vehicle at rest they would look like faults.
-
-The model check's result as plain values for summary.json.
-
-Findings of the model check: which component is wrong, by how much, the effect on the pose, and the remedy.
+A finding says which component is wrong, by how much, the effect on the pose, and the remedy. Over a vehicle at rest,
+errors that depend on the place on the screen would look like faults.
 """
 
 from __future__ import annotations

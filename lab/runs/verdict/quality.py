@@ -54,8 +54,8 @@ def judge(
 
     findings: of the model check (lab.runs.model_check.check.check_model). noise_scale: ratio of the residuals to the
     detections' sigmas; None where the model check has tested that. mosaics: contrast of the colour mosaic by camera, of
-    cameras whose pictures show one. too_wide: sigma, px, of a light that detect.max_sigma_px excludes, by camera. moved:
-    px, by what the pictures of a camera have moved, by camera.
+    cameras whose pictures show one. too_wide: sigma, px, of a light that detect.max_sigma_px excludes, by camera.
+    moved: px, by how much what stands still in the pictures of a camera has moved, by camera.
     """
     if statistics.frames == 0:
         return _of([finding("BP-V01", Level.FAIL, "there is no frame at all")])
@@ -67,13 +67,7 @@ def judge(
     found = [f for f in given if f.code == _SET_UP]
     found += _mosaics(mosaics, verdict(given))
     found += _too_wide(too_wide, statistics)
-    found += [
-        finding(
-            "BP-V19", Level.WARN, f"what stands still in the pictures of camera {name} has moved by {px:.0f} px between"
-            " the start and the end of the recording", variant="pictures", numbers={"camera": name, "moved_px": px},
-        )  # fmt: skip
-        for name, px in moved.items()
-    ]
+    found += _moved(moved)
     found += _measured(statistics)
     if statistics.measured:
         found += _cameras(statistics)
@@ -119,6 +113,19 @@ def _mosaics(mosaics: Mapping[str, float], fit: Level) -> list[Finding]:
         " camera move a spot's centroid by up to some tenths of a pixel"
     )
     return [finding("BP-V18", max(Level.WARN, fit), what, numbers=mosaics)]
+
+
+def _moved(moved_px: Mapping[str, float]) -> list[Finding]:
+    """Cameras that were moved, as what stands still in their pictures shows."""
+    out = []
+    for name, px in moved_px.items():
+        what = (
+            f"what stands still in the pictures of camera {name} has moved by {px:.0f} px between the start and the end"
+            " of the recording"
+        )
+        numbers = {"camera": name, "moved_px": px}
+        out.append(finding("BP-V19", Level.WARN, what, variant="pictures", numbers=numbers))
+    return out
 
 
 def _too_wide(sigma_px: Mapping[str, float], statistics: RunStatistics) -> list[Finding]:

@@ -1,10 +1,8 @@
 """Errors of a run's results against its truth, where the run folder has one (a simulation, or a turntable's record).
 
-Errors of velocity and angular rate against finite differences of the true poses, since a truth file has poses only.
-
-A five-point difference has the error h^4/30 times the fifth derivative: 1e-6 m/s on a path of 0.3 m at 1 Hz and 100
-frames per second, where a three-point difference has 1e-3. At a sharp turn neither is a velocity, and such rows are
-excluded.
+A truth file has poses only, so the true velocity and angular rate are their five-point differences. Their error is
+h^4/30 times the fifth derivative: 1e-6 m/s on a path of 0.3 m at 1 Hz and 100 frames per second, where a three-point
+difference has 1e-3. At a sharp turn neither is a velocity, and such rows are excluded.
 """
 
 from __future__ import annotations

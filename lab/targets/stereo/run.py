@@ -14,8 +14,6 @@ target:                          # or the name of a file with this content
 segmentation: {gamma: 0.8}       # optional: SegmentationParameters
 match: {gate_sigmas: 4.5}        # optional: MatchParameters
 ```
-
-The block `target:` of a stereo run.yaml: the markers of the vehicle and their colours.
 """
 
 from __future__ import annotations

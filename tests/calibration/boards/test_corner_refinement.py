@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 
 from calibration.boards.board_types import Chessboard, parse
 from calibration.boards.corner_refinement import _crossing, refined
-from calibration.boards.grid_shape import local_shape
+from calibration.boards.grid_shape import _ratio, local_shape
 from geometry import rotations
 from geometry.arrays import Array
 from geometry.camera import FISHEYE, PERSPECTIVE, Camera
@@ -184,3 +184,11 @@ def test_the_scatter_of_each_corner_is_its_stated_sigma(lens, blur_px):
         assert np.sqrt(np.mean(z[:, half] ** 2)) == pytest.approx(1, abs=0.1)
     by_corner = np.sqrt(np.mean(z**2, axis=(0, 3)))  # each from 80 numbers, known to 8 %
     assert np.all((by_corner > 0.65) & (by_corner < 1.4))
+
+
+def test_the_bend_of_lines_by_a_lens_has_the_derivatives_of_its_series():
+    """On both sides of where a short series takes over."""
+    z = np.array([-0.3, -0.02, -0.0099, -1e-3, 0.0, 1e-3, 0.0099, 0.02, 0.3])
+    atan = np.polynomial.Polynomial((-1.0) ** np.arange(40) / (2 * np.arange(40) + 1))
+    for order, values in enumerate(_ratio(z)):
+        np.testing.assert_allclose(values, atan.deriv(order)(z), atol=1e-9)

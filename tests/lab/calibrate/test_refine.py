@@ -226,12 +226,12 @@ def test_a_recording_of_which_no_frame_has_a_pose_contradicts_the_rig(lab):
     ]
 
 
-def test_a_wrong_focal_length_of_which_nothing_is_stated_is_named_and_not_absorbed(lab, short, tmp_path):
-    _, _, true, _ = lab
+def test_a_wrong_focal_length_of_which_nothing_is_stated_is_named_and_not_absorbed(lab, tmp_path):
+    _, runs, true, _ = lab
     camera = true.cameras["left-b"]
     longer = replace(camera, matrix=camera.matrix * np.array([[1.02, 1.0, 1.0], [1.0, 1.02, 1.0], [1.0, 1.0, 1.0]]))
     write_known(replace(true, cameras={**true.cameras, "left-b": longer}), tmp_path / "rig.yaml")
-    done = typed("refine", short, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "new")
+    done = typed("refine", runs[0], "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "new")
     assert (done.exit_code, "the focal length of camera `left-b` is wrong by −" in done.output) == (3, True), (
         done.output
     )

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geometry.arrays import Array
+from geometry.compilation.jit import compiled
 from tracking.rigid_body.online_estimates import MANOEUVRE_S
 from tracking.smoothing.motion.fixed_interval import (
     Filtered,
@@ -22,7 +23,7 @@ from tracking.smoothing.motion.fixed_interval import (
     log_likelihood,
     log_likelihood_with,
 )
-from tracking.smoothing.motion.run_detections import Reference, Turn, unknown_moments
+from tracking.smoothing.motion.run_detections import Reference, Turn
 
 AROUND = 24  # frames on both sides of a turn that show it: 8 showed none of corners of slow motion
 LEAST_LENGTH = 0.02  # of a frame, twice _LAST_STEP: a longer one would round corners by more than the spots show
@@ -60,21 +61,31 @@ def velocity_jumps(turns: Sequence[Turn], t_s: Array) -> tuple[Array, Array]:
     As in RunInformation: white acceleration in a part of a step adds what a jump in the middle of that part does, whose
     moment has a sigma of the part's length over the square root of 12.
     """
-    jump, moment = np.zeros((len(t_s), 2)), unknown_moments(len(t_s))
-    weight, first, second = (np.zeros(len(t_s)) for _ in range(3))
-    for turn in turns:
-        steps = np.arange(max(int(np.searchsorted(t_s, turn.begin_s)), 1), len(t_s))
-        steps = steps[t_s[steps - 1] < turn.end_s]
-        low, high = np.maximum(turn.begin_s, t_s[steps - 1]), np.minimum(turn.end_s, t_s[steps])
-        share, later = (high - low) / turn.length_s, t_s[steps] - 0.5 * (low + high)
-        jump[steps] += share[:, None] * turn.size
-        own = share * turn.size.max()
-        weight[steps] += own
-        first[steps] += own * later
-        second[steps] += own * (later**2 + (high - low) ** 2 / 12)
-    some = weight > 0
-    moment[some, 0] = first[some] / weight[some]
-    moment[some, 1] = np.sqrt(np.maximum(second[some] / weight[some] - moment[some, 0] ** 2, 0.0))
+    spans = np.array([(turn.begin_s, turn.end_s, turn.length_s) for turn in turns]).reshape(-1, 3)
+    return _velocity_jumps(spans, np.array([turn.size for turn in turns]).reshape(-1, 2), t_s)
+
+
+@compiled
+def _velocity_jumps(spans: Array, sizes: Array, t_s: Array) -> tuple[Array, Array]:
+    """`velocity_jumps` of turns with begins, ends and lengths (n, 3), s, and sizes (n, 2)."""
+    jump, moment = np.zeros((len(t_s), 2)), np.empty((len(t_s), 2))
+    moment[:, 0], moment[:, 1] = -1.0, 0.0  # unknown
+    for k in range(1, len(t_s)):
+        weight = first = second = 0.0
+        for i in range(len(spans)):
+            begin, end, length = spans[i]
+            if t_s[k] < begin or t_s[k - 1] >= end:
+                continue
+            low, high = max(begin, t_s[k - 1]), min(end, t_s[k])
+            share, later = (high - low) / length, t_s[k] - 0.5 * (low + high)
+            jump[k] += share * sizes[i]
+            own = share * sizes[i].max()
+            weight += own
+            first += own * later
+            second += own * (later**2 + (high - low) ** 2 / 12)
+        if weight > 0:
+            moment[k, 0] = first / weight
+            moment[k, 1] = np.sqrt(max(second / weight - moment[k, 0] ** 2, 0.0))
     return jump, moment
 
 

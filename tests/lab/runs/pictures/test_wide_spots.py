@@ -63,8 +63,11 @@ def recording(folder: Path, ground: np.ndarray) -> Path:
         sigma_m = sigma * np.hypot(*(every[1:, :-1] - every[:-1, :-1]).mean(axis=(0, 1)))
         for frame in range(FRAMES):
             at = truth[(truth.camera == camera) & (truth.frame == frame)][["u_px", "v_px"]].to_numpy()
-            spots = on_screen(*view, at)
-            light = sum(np.exp(-0.5 * np.sum((every - spot) ** 2, axis=-1) / sigma_m**2) for spot in spots)
+            light = np.zeros(SIZE)
+            for (u, v), spot in zip(at, on_screen(*view, at), strict=True):
+                near = tuple(slice(max(int(x - 12 * sigma), 0), max(int(x + 12 * sigma), 0)) for x in (v, u))
+                x, y = np.moveaxis(every[near] - spot, -1, 0)
+                light[near] += np.exp(-0.5 * (x**2 + y**2) / sigma_m**2)
             seen = ground + response * 90.0 * light + rng.normal(0.0, 1.0, SIZE)
             picture = np.clip(np.rint(seen), 0, 255).astype(np.uint8)
             cv2.imwrite(str(folder / "frames" / camera / f"{frame:06d}.png"), picture)

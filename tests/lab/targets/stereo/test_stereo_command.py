@@ -84,6 +84,9 @@ def test_the_triangulated_points_are_where_the_pose_puts_the_markers(result):
     record = result.result.records[0]
     points = {r["spot"]: r for r in rows(result.out, "points.csv") if r["frame"] == "0"}
     model = result.result.run.target.model
+    both = (record.tracked.index >= 0).all(axis=0)
+    assert both.sum() > 3
+    assert list(points) == [name for name, seen in zip(model.names, both, strict=True) if seen]
     for name, x in zip(model.names, record.tracked.pose.apply(model.positions), strict=True):
         if name in points:
             at, sigma = (np.array([float(points[name][f"{p}{a}_m"]) for a in "xyz"]) for p in ("", "sigma_"))
