@@ -156,7 +156,7 @@ def probability(inputs: Array) -> float:
 
 def against(p: float, other: float) -> float:
     """The probability of a drogue where another one has these log odds: one of the two is it, or none."""
-    return float(1 / (1 + (1 + np.exp(other)) * np.exp(-logit(p))))
+    return float(p / (p + (1 - p) * (1 + np.exp(other))))
 
 
 def within(sigma_px: float, diameter_px: float) -> float:
