@@ -239,8 +239,8 @@ class PointTracker:
     def _hidden_px2(self, found: Detections, row: int) -> float:
         """Variance of a coordinate, px^2, since a part of the target is hidden, or something else is taken for one.
 
-        An edge that hides a share s of a disc with the radius r moves its centroid by .82 to 1 times s r, except for
-        the smallest shares. The area is flux over peak, which the light does not change.
+        An edge that hides a share s of a disc with the radius r moves its centroid by .85 to 1 times s r. The
+        area is flux over peak, which the light does not change.
         """
         area = float(found.flux[row] / found.peak[row]) if found.peak[row] > 0 else float("nan")
         if not area > 0 or np.isnan(self._log_area):
