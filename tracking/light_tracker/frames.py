@@ -154,6 +154,11 @@ def probability(inputs: Array) -> float:
     return float(1 / (1 + np.exp(-(min(log_odds, inputs[1]) if inputs[2] == 0 else log_odds))))
 
 
+def against(p: float, other: float) -> float:
+    """The probability of a drogue where another one has these log odds: one of the two is it, or none."""
+    return float(p / (p + (1 - p) * (1 + np.exp(other))))
+
+
 def within(sigma_px: float, diameter_px: float) -> float:
     """The probability that a predicted centre is right: that of a normal distribution, the same in both axes."""
     return float(1 - np.exp(-0.5 * (RIGHT_SHARE * diameter_px / max(sigma_px, 1e-9)) ** 2))

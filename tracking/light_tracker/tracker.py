@@ -15,6 +15,7 @@ from tracking.light_tracker.frames import (
     DrogueFrame,
     LightParameters,
     MeasuredBy,
+    against,
     features,
     fisher,
     logit,
@@ -52,6 +53,7 @@ class Track:
     blind: int = 0  # frames in a row without a match that resembles the pattern
     gap: int = 0  # the same since the last confirmation: what matches afterwards may be another object
     before: Known | None = None  # the appearance before the pattern was cut out again
+    against: float = -np.inf  # log odds of the drogue that this one replaced: running mean over the searches
 
     @property
     def known(self) -> Known | None:
@@ -73,6 +75,20 @@ class Track:
     def checked(self, gap: int = 0) -> Array:
         """The inputs of the confidence."""
         return features(self.support, self.confirmed, self.motion.rim_diameter_px, gap)
+
+    def lead(self) -> float:
+        """Log odds of the track, or of the drogue before its pattern was cut out again."""
+        inputs, before = [self.checked()], self.before
+        if before is not None:
+            inputs.append(features(before.support, before.confirmed, before.motion.rim_diameter_px))
+        return max(logit(probability(x)) for x in inputs)
+
+    def see_others(self, found: Sequence[CircleCandidate]) -> None:
+        """The detections of the whole picture: is the drogue that this one replaced still seen?"""
+        if np.isfinite(self.against):
+            u, v = self.motion.centre_px
+            others = [logit(c.score) for c in found if np.hypot(c.u_px - u, c.v_px - v) > self.motion.rim_diameter_px]
+            self.against += _SUPPORT_RATE * (max(others, default=ABSENT_LOGIT) - self.against)
 
     def has_size_of(self, seen: CircleCandidate, p: LightParameters) -> bool:
         """Whether a detection has the size of the drogue, if that is known from enough detections."""
@@ -96,6 +112,7 @@ class Track:
 
 
 _NEAR_PX = 20.0  # distance of the first drogue from the place that the user states
+_MOST_SUPPORT = 3.5  # of one detection that replaces a track: one look of many at an object is the surest
 _SUPPORT_RATE = 0.25  # of the running mean of the log odds of the checks
 _USUAL_RATE = 0.1  # of the running mean of the correlation
 _OFF_CENTRE, _OFF_SIZE = 0.12, 0.2  # offset of the pattern, in diameters and as a logarithm, that cuts it out again
@@ -270,7 +287,7 @@ class DrogueTracker:
         inputs = track.checked(track.gap)
         if self.trace is not None:
             self.trace.append((inputs, track.motion.centre_px))
-        return probability(inputs)
+        return against(probability(inputs), track.against)
 
     def _acquired(self, picture: Picture) -> DrogueFrame:
         """Search the whole picture."""
@@ -333,7 +350,8 @@ class DrogueTracker:
         """
         motion, p = track.motion, self.parameters
         found = self._in_picture(picture)
-        lead = logit(probability(track.checked()))
+        lead = track.lead()
+        track.see_others(found)
         away = {c: np.hypot(*(motion.centre_px - (c.u_px, c.v_px))) - motion.rim_diameter_px / 2 for c in found}
         again = [c for c in found if not matched and track.has_size_of(c, p)]
         surer = [
@@ -346,8 +364,7 @@ class DrogueTracker:
         if best in surer:
             # One of the two is the drogue, or none: the odds of the track, or those in this picture, count against it.
             other = max([lead, *(logit(c.score) for c in found if away[c] < 0)])
-            best = replace(best, score=float(1 / (1 + (1 + np.exp(other)) * np.exp(-logit(best.score)))))
-            if best.score < p.acquire_confidence:
+            if against(best.score, other) < p.acquire_confidence:
                 return None
         pattern = Pattern.started(picture, best.u_px, best.v_px, 2 * best.radius_px)
         if pattern is None:
@@ -356,7 +373,11 @@ class DrogueTracker:
         out = self._start(best, pattern, "both", len(found), "reacquired")
         assert self._track is not None
         self._track.before = known
-        return out
+        if best not in surer:
+            return out
+        self._track.against, self._track.support = other, min(self._track.support, _MOST_SUPPORT)
+        self._track.trusted = against(1 / (1 + np.exp(-self._track.support)), other)
+        return replace(out, confidence=self._track.trusted)
 
     def _unmeasured(self, track: Track, cause: Cause) -> DrogueFrame:
         """A frame without a measurement: predicted, or lost."""

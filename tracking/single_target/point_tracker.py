@@ -153,7 +153,11 @@ NEAR_MISS = 4.0  # times the gate: a detection nearer than this may be the targe
 # turn while it is hidden, and does turn if a detection lies a little outside the gate.
 MISS_GROWTH, NEAR_MISS_GROWTH, MOST_GROWTH = 1.1, 1.5, 10.0
 SPEED_FACTOR = 3.0  # a lost target may move this much faster than ever observed
-_FLUX_RATE = 0.1  # of the running mean of the target's brightness
+_FLUX_RATE = 0.1  # of the running means of the target's brightness and of its area
+# An area that differs by more sigmas than this is that of a part of the target, or of the target and something beside
+# it. What is hidden makes it smaller: a small area changes the mean twenty times as slowly. The first sigma is of the
+# logarithm.
+_UNUSUAL_AREA, _UNUSUAL_RATE, _FIRST_AREA_SIGMA = 2.0, 0.05 * _FLUX_RATE, 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,6 +192,8 @@ class PointTracker:
         self._speed = 0.0  # px/frame, the largest so far
         self._growth = 1.0  # of the acceleration while the target is not seen
         self._flux = float("nan")  # running mean of the target's brightness
+        # Of the area's logarithm: running mean and variance, and how much the next area changes them.
+        self._log_area, self._area_variance, self._area_rate = float("nan"), 0.0, 1.0
         self._last_px: Array | None = None  # where the target was lost
         self._waited = 0.0  # frames since the last picture that CandidateTracks has seen
 
@@ -205,7 +211,7 @@ class PointTracker:
             cov = self._covariances(found)
             row, nis = nearest(self._x, self._P, found.uv_px, cov, self.parameters.p_gate)
             if row is not None:
-                self._update(found, cov, row, nis)
+                nis = self._update(found, cov[row] + self._hidden_px2(found, row) * np.eye(2), row)
                 return self._estimate(PoseStatus.MEASURED, predicted, nis, row)
             near = nis < NEAR_MISS * chi2_limit(self.parameters.p_gate, 2)
             self._learn(nis if near else float("nan"))
@@ -225,20 +231,44 @@ class PointTracker:
             return NOTHING
         last = steps[-1]
         self._x, self._P, self.acquired = last.x, last.P, steps
-        self._unseen, self._growth = 0.0, 1.0
+        self._unseen, self._growth, self._log_area = 0.0, 1.0, float("nan")
         fluxes = [s.flux for s in steps if np.isfinite(s.flux)]
         self._flux = float(np.mean(fluxes)) if fluxes else self._flux
         return self._estimate(PoseStatus.MEASURED, np.full(2, np.nan), float("nan"), last.row)
 
-    def _update(self, found: Detections, cov: Array, row: int, nis: float) -> None:
+    def _hidden_px2(self, found: Detections, row: int) -> float:
+        """Variance of a coordinate, px^2, since a part of the target is hidden, or something else is taken for one.
+
+        An edge that hides a share s of a disc with the radius r moves its centroid by .85 to 1 times s r. The
+        area is flux over peak, which the light does not change.
+        """
+        area = float(found.flux[row] / found.peak[row]) if found.peak[row] > 0 else float("nan")
+        if not area > 0 or np.isnan(self._log_area):
+            self._log_area = float(np.log(area)) if area > 0 else float("nan")
+            self._area_variance, self._area_rate = _FIRST_AREA_SIGMA**2, 0.5
+            return 0.0
+        usual, away = self._log_area, float(np.log(area)) - self._log_area
+        most = _UNUSUAL_AREA * self._area_variance**0.5
+        rate = _UNUSUAL_RATE if abs(away) > most else self._area_rate
+        self._log_area += (_FLUX_RATE if away > most else rate) * max(away, -most)
+        self._area_variance += rate * (min(abs(away), most) ** 2 - self._area_variance)
+        if abs(away) > most:
+            return float(np.exp(usual) / np.pi * (1 - np.exp(away)) ** 2 / 2)
+        self._area_rate = max(self._area_rate / (1 + self._area_rate), _FLUX_RATE)
+        return 0.0
+
+    def _update(self, found: Detections, cov: Array, row: int) -> float:
+        """The state with a detection that has this covariance (2, 2). Returns its normalised innovation squared."""
         assert self._x is not None
-        self._x, self._P = kalman.update(self._x, self._P, found.uv_px[row], cov[row])
+        nis = float(kalman.innovation(self._x, self._P, found.uv_px[row], cov)[2])
+        self._x, self._P = kalman.update(self._x, self._P, found.uv_px[row], cov)
         self._learn(nis)
         flux = float(found.flux[row])
         if np.isfinite(flux):
             self._flux = flux if np.isnan(self._flux) else (1 - _FLUX_RATE) * self._flux + _FLUX_RATE * flux
         self._unseen, self._growth = 0.0, 1.0
         self._speed = max(self._speed, float(np.linalg.norm(self._x[2:])))
+        return nis
 
     def _learn(self, nis: float) -> None:
         """Adapt the acceleration to an innovation, of a detection in the gate or a little outside it.

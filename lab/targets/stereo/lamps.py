@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from geometry.arrays import evenly_spread
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.errors import InputError
 from lab.files.project.project import load_lens
 from lab.files.rig.camera_file import CameraFile, require_valid_calibration
 from lab.files.text import columns
-from lab.findings.finding import Finding, Level, finding, level_above
+from lab.findings.finding import Finding, Level, finding, level_above, passed
 from lab.number_format import format_length, format_number
 from lab.pictures.source import open_inputs
 from lab.progress import Progress
@@ -25,9 +26,11 @@ from lab.runs.processed import quantiles
 from lab.runs.tables import pose_numbers
 from lab.targets.page import TimeAxis
 from lab.targets.recording import DEFAULT_RATE_HZ
+from lab.targets.stereo.process import contradiction
 from lab.targets.stereo.run import GOOD_NOISE_SCALE, LARGEST_NOISE_SCALE, load_lamps, noise_scale
 from lab.targets.stereo.tables import attitude_row, covariance_rows
 from lab.targets.target import Codes, Target, Track, TrackOptions, header_rate, track_pictures
+from tracking.binocular.calibration_check import MOST_FRAMES, CalibrationCheck, LabelledFrame, check_calibration
 from tracking.binocular.lamp_corners import harris_corners
 from tracking.binocular.lamp_tracker import LampFrame, LampTracker
 from tracking.binocular.marker_model import MarkerImages, MatchParameters
@@ -90,11 +93,17 @@ class LampsTarget(Target[LampFrame]):
             else RigCovariance(tuple(f"cameras.{self._lens.name}.{p}" for p in of_lens.names), of_lens.matrix)
         )
 
+        self._check: CalibrationCheck | None = None  # of the lens, with the recording that was read
+
     def read(self, path: Path, progress: Progress | None) -> Track[LampFrame]:
         rate = self.options.rate_hz or header_rate(open_inputs([path])) or DEFAULT_RATE_HZ
         find = DETECTORS[self.options.detector]
         tracker = LampTracker(self._lens.camera(), self._model, find, 1 / rate, self._covariance)
         track = track_pictures(path, tracker.step, self.options, progress)
+        measured = [f.tracked for f in track.frames if f.status is PoseStatus.MEASURED]
+        some = [measured[k] for k in evenly_spread(np.arange(len(measured)), MOST_FRAMES).tolist()]
+        labelled = [LabelledFrame(t.observed, t.pose) for t in some if t.observed is not None and t.pose is not None]
+        self._check = check_calibration(tracker.pair, self._model, labelled)
         if track.recording.size_px != self._lens.image_size_px:
             expected, got = (
                 "{} x {} px".format(*(size or ())) for size in (self._lens.image_size_px, track.recording.size_px)
@@ -113,11 +122,17 @@ class LampsTarget(Target[LampFrame]):
         return {"covariance.csv": (columns.COVARIANCE, rows)}
 
     def findings(self, track: Track[LampFrame]) -> list[Finding]:
-        """Residuals that contradict their sigmas, and a camera that states no covariance."""
+        """Residuals that contradict their sigmas or the lens, and a camera that states no covariance."""
         out, scale = [], _noise_scale(track)
         if np.isfinite(scale):
             what = f"residuals are {format_number(scale)} times as large as the stated sigmas of the lamps"
             out.append(finding("BP-J05", level_above(scale, GOOD_NOISE_SCALE, LARGEST_NOISE_SCALE), what))
+        if (check := self._check) is not None and check.significant:
+            of_lens = tuple(s for s in check.suspects if s.name.endswith(f"of {self._lens.name}"))
+            out.append(contradiction("BP-J07", replace(check, suspects=of_lens), self.options.camera.name))
+        elif check is not None and not check.certain:
+            words = f"an error of the focal length below {check.hidden_focal_percent:.2g} % would not show"
+            out.append(passed(f"the lamps show no error of {self.options.camera.name}; {words}"))
         if self._covariance is None:
             what = f"{self.options.camera.name} states no covariance of the lens"
             out.append(finding("BP-J06", Level.WARN, what))

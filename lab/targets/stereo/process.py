@@ -42,6 +42,7 @@ from tracking.binocular.calibration_check import (
     FEWEST_FRAMES,
     MOST_ALONE,
     MOST_FRAMES,
+    CalibrationCheck,
     FittedFrame,
     LabelledFrame,
     check_calibration,
@@ -158,22 +159,27 @@ def _calibration(results: StereoResults) -> Iterator[Finding]:
         what += f"; needed are {FEWEST_FRAMES} frames with four markers in each picture"
         yield finding("BP-W11", Level.WARN, what)
     if check is not None and check.significant and not _is_clock(results):
-        several = " or ".join(
-            f"{s.name} by {s.value:+.{decimals_of(s.sigma)}f} ± {s.sigma:.{decimals_of(s.sigma)}f} {s.unit}"
-            for s in check.suspects[:_MOST_NAMED]
-        )
-        apart = "; this recording does not separate them" if len(check.suspects) > 1 else ""
-        other = "; it does not explain all: there are more errors, or pictures of different times"
-        other = "" if check.left < GOOD_NOISE_SCALE**2 else other
-        what = (
-            f"the markers contradict {results.run.pair_path.name}: to be corrected: {several}{apart}{other}; poses move"
-            f" by {format_length(check.change_m)} RMS"
-        )
-        yield finding("BP-W06", Level.FAIL if check.change_sigmas**2 > LARGEST_NEES else Level.WARN, what)
+        yield contradiction("BP-W06", check, results.run.pair_path.name)
     if check is not None and not check.certain:
         yield passed(f"the markers show no error of {results.run.pair_path.name}; {_not_shown(results)}")
     if results.run.pair.covariance is None:
         yield finding("BP-W10", Level.WARN, f"{results.run.pair_path.name} states no covariance of the calibration")
+
+
+def contradiction(code: str, check: CalibrationCheck, file_name: str) -> Finding:
+    """The errors of a calibration that explain the residuals of the markers, with their corrections."""
+    several = " or ".join(
+        f"{s.name} by {s.value:+.{decimals_of(s.sigma)}f} ± {s.sigma:.{decimals_of(s.sigma)}f} {s.unit}"
+        for s in check.suspects[:_MOST_NAMED]
+    )
+    apart = "; this recording does not separate them" if len(check.suspects) > 1 else ""
+    other = "; it does not explain all: there are more errors, or pictures of different times"
+    other = "" if check.left < GOOD_NOISE_SCALE**2 else other
+    what = (
+        f"the markers contradict {file_name}: to be corrected: {several}{apart}{other}; poses move by"
+        f" {format_length(check.change_m)} RMS"
+    )
+    return finding(code, Level.FAIL if check.change_sigmas**2 > LARGEST_NEES else Level.WARN, what)
 
 
 def _not_shown(results: StereoResults) -> str:

@@ -313,6 +313,28 @@ def test_what_replaces_a_target_that_is_still_seen_is_as_sure_as_the_two_leave_i
     assert all(f.confidence <= odds / (1 + odds) + 1e-9 for f in replaced)
 
 
+@pytest.mark.parametrize("still_seen", [True, False])
+def test_what_replaced_a_target_is_doubtful_as_long_as_the_target_is_seen(still_seen):
+    """One look at an object that only resembles a drogue can be very sure: it is one of many."""
+    replaced_at = None
+
+    def detector(_: Picture, window: Window | None) -> list[CircleCandidate]:
+        found = [CircleCandidate(40.0, 90.0, 15.0, 0.998 if replaced_at is None else 0.95)] if k >= 20 else []
+        if replaced_at is None or still_seen:
+            found.append(CircleCandidate(120.0, 40.0, 10.0, 0.8))
+        return [c for c in found if window is None or np.hypot(c.u_px - window.u_px, c.v_px - window.v_px) < 30]
+
+    tracker, sure = DrogueTracker(detector), []
+    for k in range(120):
+        frame = tracker.step(picture([(120.0, 40.0, 20.0), *([(40.0, 90.0, 30.0)] if k >= 20 else [])], seed=k))
+        if replaced_at is None and frame.centre_px[0] < 80:
+            replaced_at = k
+        if replaced_at is not None:
+            sure.append(frame.confidence)
+    assert len(sure) > 80
+    assert max(sure) < 0.92 if still_seen else min(sure[-10:]) > 0.93
+
+
 def test_after_a_gap_nothing_is_measured_before_a_detection():
     detector = Detector()
     tracker = DrogueTracker(detector)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tracking.detections import Detections
+from tracking.single_target.blobs import BlobParameters, find_blobs
 from tracking.single_target.point_tracker import PointParameters, PointTracker, track_point
 from tracking.statuses import PoseStatus
 
@@ -157,3 +158,43 @@ def test_without_a_picture_nothing_is_measured():
 def test_a_parameter_without_meaning_is_refused(wrong):
     with pytest.raises(ValueError, match="expected"):
         PointParameters(**wrong)
+
+
+def disc_behind_an_edge(centre, radius, edge, background=150.0):
+    """Picture (120, 160) of a black disc; what is within `edge` px, along u + v, of a bright object is hidden by it."""
+    fine = (np.arange(4 * 160) + 0.5) / 4 - 0.5
+    u, v = np.meshgrid(fine, fine[: 4 * 120])
+    along = (u - centre[0] + v - centre[1]) / np.sqrt(2)
+    black = (np.hypot(u - centre[0], v - centre[1]) < radius) & ~((edge[0] < along) & (along < edge[1]))
+    share = black.reshape(120, 4, 160, 4).mean(axis=(1, 3))
+    return background - 130 * share
+
+
+@pytest.mark.parametrize("radius", [5.0, 9.0])
+@pytest.mark.parametrize("steps_of_the_edge", [6, 25])
+def test_a_centre_is_uncertain_while_an_edge_hides_a_part_of_the_target(radius, steps_of_the_edge):
+    rng, tracker, ratios, sigmas = np.random.default_rng(4), PointTracker(), [], []
+    for k in range(90):
+        centre = np.array([60.0, 50.0]) + k * np.array([0.3, 0.2])
+        begin = radius * (1 - 3 * (k - 30) / steps_of_the_edge)  # far beyond the disc until frame 30
+        picture = disc_behind_an_edge(centre, radius, (begin, begin + 3 * radius))
+        noisy = np.clip(np.round(picture + 2 * rng.standard_normal(picture.shape)), 0, 255).astype(np.uint8)
+        estimate = tracker.step(1.0, find_blobs(noisy, BlobParameters("darker")))
+        if estimate.status is PoseStatus.MEASURED:
+            away = estimate.x[:2] - centre
+            ratios.append(np.sqrt(away @ np.linalg.solve(estimate.P[:2, :2], away)))
+            sigmas.append(np.sqrt(estimate.P[0, 0]))
+    assert len(ratios) > 60
+    # The first and the last frames of an occlusion are off by less than the area shows: a few hundredths of the radius.
+    assert max(ratios) < 20
+    assert np.sqrt(np.mean(np.square(ratios))) < 3
+    assert np.mean(sigmas[:25]) < 0.1
+    assert min(sigmas[-5:]) < 0.1
+
+
+def test_a_target_that_came_nearer_while_it_was_hidden_is_soon_as_certain_as_before():
+    tracker, sigmas = PointTracker(FIXED), []
+    for k in range(120):
+        found = replace(at((100.0 + k, 200.0), flux=100.0 * 200.0 * np.exp(0.006 * k)), peak=np.array([100.0]))
+        sigmas.append(np.sqrt(tracker.step(1.0, at() if 50 <= k < 70 else found).P[0, 0]))
+    assert max(sigmas[95:]) < 1.2 * max(sigmas[40:50])

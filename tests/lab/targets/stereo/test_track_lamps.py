@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 
 import cv2
 import numpy as np
@@ -73,6 +74,28 @@ def test_a_lens_without_covariance_is_at_best_a_check(recording):
     assert done.exit_code == 0
     assert "CHECK" in done.output
     assert "BP-J06" in (folder / "other" / "report.html").read_text("utf-8")
+
+
+@pytest.mark.parametrize("error", [-0.03, 0.02])
+def test_a_wrong_focal_length_is_named_with_its_correction(recording, error):
+    folder, _, _ = recording
+    content = yaml.safe_load((folder / "camera.yaml").read_text())
+    for name in ("fx", "fy"):
+        content["camera_matrix"][name] *= 1 + error
+    (folder / "zoomed.yaml").write_text(yaml.safe_dump(content))
+    done = typed(folder, camera="zoomed.yaml")
+    assert done.exit_code == 4
+    found = re.search(r"focal length of nose by ([-+.\d]+) ± ([.\d]+) %", done.output)
+    correction, sigma = map(float, found.groups())
+    assert abs(correction - 100 * (1 / (1 + error) - 1)) < 4 * sigma
+    assert sigma < 0.6  # %: errors of 3 % and more are then certain (4.5 sigma)
+
+
+def test_a_pass_states_the_error_of_the_focal_length_that_would_not_show(recording):
+    folder, _, _ = recording
+    page = (folder / "out" / "report.html").read_text("utf-8")
+    assert re.search(r"an error of the focal length below [.\d]+ % would not show", page)
+    assert "BP-J07" not in page
 
 
 @pytest.mark.parametrize(
