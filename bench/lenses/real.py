@@ -121,15 +121,18 @@ def by_number(shares: list[float]) -> Array:
 def by_information(equations: ViewEquations, subsets: list[Ints]) -> tuple[Array, Array]:
     """The same (n,) of fx from what each photograph determines, and the correlation (n, n) of these differences.
 
-    A subset's fx is a sum over its photographs' gradients, which are independent; subsets share photographs.
+    A subset's fx is a sum over its photographs' gradients, which are independent; subsets share photographs, and the
+    priors (on the radius of circles, which photographs alone may leave open) count in every one.
     """
     by_fx, own, weights = equations.basis[0], [], []
+    priors = np.eye(len(by_fx)) - np.sum(equations.information, axis=0)
+    information = np.concatenate([equations.information, priors[None]])
     for rows in subsets:
-        mine = np.isin(equations.views, rows)
-        a = np.linalg.solve(np.sum(equations.information[mine], axis=0), by_fx)
+        mine = np.append(np.isin(equations.views, rows), True)
+        a = np.linalg.solve(np.sum(information[mine], axis=0), by_fx)
         own.append(by_fx @ a)
         weights.append(mine[:, None] * a - by_fx)
-    C = np.einsum("nvq,vqr,mvr->nm", weights, equations.information, weights)
+    C = np.einsum("nvq,vqr,mvr->nm", weights, information, weights)
     sizes = np.sqrt(np.diagonal(C))
     return np.diagonal(C) / np.array(own), C / np.outer(sizes, sizes)
 
