@@ -20,7 +20,6 @@ from calibration.boards.board_view import (
     scales,
     too_blurred,
 )
-from calibration.boards.circle_detection import mapped
 from geometry.arrays import Array, Ints
 
 _FEWEST = 6  # corners that do not all lie on one line: fewer do not contribute to the lens
@@ -150,12 +149,12 @@ def _fit(board: Charuco, markers: Markers) -> _Fit:
     if found is None:
         return _Fit(0.0, None)
     H = np.asarray(found, dtype=float)
-    centres = mapped(H, seen.mean(axis=1))
+    centres = _mapped(H, seen.mean(axis=1))
     good = np.linalg.norm(centres - on_board, axis=1) < 0.3
     share = float(good.sum() / max(len(markers.ids), 1))
     if good.sum() < 2:
         return _Fit(0.0, None)
-    shape = mapped(H, seen[good].reshape(-1, 2)).reshape(-1, 4, 2)
+    shape = _mapped(H, seen[good].reshape(-1, 2)).reshape(-1, 4, 2)
     # The corners must be in the board's sense of rotation; a mirrored numbering has another homography.
     way = shape - shape.mean(axis=1, keepdims=True)
     agree = np.sum(way * corners, axis=(1, 2)) / (np.linalg.norm(way, axis=(1, 2)) * np.linalg.norm(corners))
@@ -249,6 +248,13 @@ def _why_no_markers(image: GreyImage, board: Charuco) -> NotFound:
         if len(find_markers(scaled(image, scale), board.dictionary, board.markers).ids) >= 3:
             return NotFound("too blurred for reading markers; focus, hold the board still or use a shorter exposure")
     return NotFound(f"no marker of {board.dictionary} found: no board, or it is too far away, blurred or in glare")
+
+
+def _mapped(H: Array, xy: Array) -> Array:
+    """H applied to points (..., 2)."""
+    p = xy @ H[:, :2].T + H[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):  # a wrong board can have points at infinity
+        return np.asarray(p[..., :2] / p[..., 2:], dtype=float)
 
 
 def _smallest(name: str, number: int) -> str:
