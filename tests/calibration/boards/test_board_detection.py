@@ -189,6 +189,18 @@ def test_corners_in_any_order_are_renumbered_correctly():
         np.testing.assert_array_equal(chessboard_detection.oriented(photo.image, given), true)
 
 
+def test_a_charuco_board_near_a_wide_lens_is_found():
+    """Its markers were not arranged as on the board for a pinhole, whose picture of a plane keeps lines straight."""
+    numbers, matrix = (0.02, -0.004, 0.001, 0.0), np.array([[300.0, 0, 640], [0, 300, 480], [0, 0, 1]])
+    wide = Camera("c", "s", (1280, 960), matrix, numbers, Pose.identity(), lens=FISHEYE)
+    board = parse("charuco:9x7:30mm:22mm:DICT_4X4_50")
+    photo = photograph(board, wide, board_pose(board, (0.3, -0.2, 0.1), 0.3), look=CLEAN)
+    view = view_of(photo.image, board)
+    off = np.linalg.norm(view.pixels - photo.pixels[np.searchsorted(photo.ids, view.ids)], axis=1)
+    assert len(view) > 40
+    assert np.median(off) < 0.01 * px
+
+
 @pytest.mark.parametrize("lens", [PERSPECTIVE, FISHEYE])
 @pytest.mark.parametrize("around", np.linspace(0, np.pi, 5))
 def test_oblique_circles_are_not_confused_with_their_neighbours(lens, around):
