@@ -1,7 +1,8 @@
-"""Lenses from rendered photographs with exact truth: `python -m bench.lenses.rendered [sets] [seed] [KIND ...]`.
+"""Lenses from rendered photographs with exact truth: `python -m bench.lenses.rendered [sets] [seed] [n] [KIND ...]`.
 
 KIND: LENS-BOARD with LENS plain (five coefficients), rational (eight) or fisheye and BOARD chess, circles, acircles or
-charuco; default: all twelve. A set has 6 to 40 photographs of 1280 x 960 px. Ten sets per kind take an hour.
+charuco; default: all twelve. A set has 6 to 40 photographs of 1280 x 960 px, or n. Ten sets per kind
+take an hour. Process times of sets of fewer than 20 are too long: not all of the work grows with the photographs.
 """
 
 from __future__ import annotations
@@ -231,6 +232,7 @@ def main(arguments: list[str]) -> None:
     """Print a line per set and per kind, and one for all."""
     count = int(arguments[0]) if arguments else 10
     first = int(arguments[1]) if len(arguments) > 1 else 1
+    views = int(arguments.pop(2)) if len(arguments) > 2 and arguments[2].isdigit() else None
     kinds = arguments[2:] or [f"{lens}-{board}" for lens in LENSES for board in BOARDS]
     every: list[Row] = []
     cv2.setNumThreads(1)  # as the commands do, which search several photographs at a time
@@ -238,7 +240,7 @@ def main(arguments: list[str]) -> None:
         lens, board = kind.split("-")
         rows = []
         for seed in range(first, first + count):
-            s = rendered_set(lens, BOARDS[board], seed)
+            s = rendered_set(lens, BOARDS[board], seed, views)
             row = judged(kind, s)
             rms, inward, error = corner_error(s)
             print(
