@@ -31,7 +31,7 @@ from calibration.boards.board_view import (
 )
 from calibration.boards.chessboard_detection import upright
 from calibration.boards.corner_refinement import SINGLE, Pixelwise
-from calibration.boards.grid_shape import misfit, straightened
+from calibration.boards.grid_shape import misfit, predicted, straightened
 from geometry.arrays import Array, Bools, Ints
 
 _BIG_DOT = 1.35  # relative area of a corner circle, above which it marks the origin
@@ -146,28 +146,24 @@ def _measured(image: GreyImage, ordered: Array, blobs: Array, board: CircleGrid,
             f"the grid continues {more} beyond {board.columns}x{board.rows} circles; count again (circles in a row,"
             " rows)"
         )
-    by_board = _local_shapes(board, ordered.reshape(-1, 2))
-    radii = _radii(ordered.reshape(-1, 2), by_board, board, blobs)
-    ellipses = fit_ellipses(image, ordered.reshape(-1, 2), radii[:, None, None] * by_board)
+    centres = ordered.reshape(-1, 2)
+    expected, by_board = predicted(centres, board.points[:, :2], (image.shape[1], image.shape[0]))
+    shapes = _radii(centres, by_board, board, blobs)[:, None, None] * by_board
+    ellipses = fit_ellipses(image, centres, shapes)
     lost = np.isnan(ellipses.areas)
+    if lost.any():  # other blobs were taken for them, or several circles that are one at a high threshold
+        ellipses = fit_ellipses(image, np.where(lost[:, None], expected, centres), shapes)
+        lost = np.isnan(ellipses.areas)
     if lost.any():
         return NotFound(f"{lost.sum()} of {len(lost)} circles have no clean outline: hidden, in glare or blurred")
     order = _by_big_dot(ordered.shape[:2], ellipses.areas / np.linalg.det(by_board), board)
-    centres = ellipses.centres[order]
+    pixels = ellipses.centres[order]
     blur = float(np.median(ellipses.blurs))
-    apart = corner_refinement.spacing(centres.reshape(ordered.shape))
+    apart = corner_refinement.spacing(pixels.reshape(ordered.shape))
     if blur > BLUR_LIMIT * apart:
         return too_blurred(blur, apart)
     notes = ("white circles on a black ground",) if light else ()
-    return BoardView(board.ids, centres, apart, blur, notes, ellipses.areas[order], ellipses.sigmas_px[order])
-
-
-def _local_shapes(board: CircleGrid, centres: Array) -> Array:
-    """Derivatives (n, 2, 2), px/m, of the picture by the board at approximate centres (n, 2), from six neighbours."""
-    at = board.points[:, :2]
-    near = np.asarray(cKDTree(at).query(at, k=min(7, len(at)))[1])
-    on_board, seen = (x[near] - x[:, None] for x in (at, centres))
-    return np.swapaxes(np.linalg.pinv(on_board) @ seen, 1, 2)
+    return BoardView(board.ids, pixels, apart, blur, notes, ellipses.areas[order], ellipses.sigmas_px[order])
 
 
 def _radii(centres: Array, by_board: Array, board: CircleGrid, blobs: Array) -> Array:

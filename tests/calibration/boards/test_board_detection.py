@@ -201,6 +201,20 @@ def test_a_charuco_board_near_a_wide_lens_is_found():
     assert np.median(off) < 0.01 * px
 
 
+@pytest.mark.parametrize(("across_px", "seed"), [(5, 1), (8, 3), (12, 0)])
+def test_a_blob_between_circles_is_not_taken_for_one_of_them(across_px, seed):
+    """At a high threshold several small circles are one blob, whose middle was taken for that of a circle."""
+    matrix = np.array([[950.0, 0, 640], [0, 950, 480], [0, 0, 1]])
+    seen = Camera("c", "s", (1280, 960), matrix, (-0.2, 0.05, 0, 0, 0), Pose.identity())
+    rng, board = np.random.default_rng(seed), parse("circles:9x7:30mm")
+    R = rotations.exp(rng.uniform(-0.4, 0.4, 3))
+    at = np.append(rng.uniform(-0.2, 0.2, 2), 1) * 950 * board.diameter_m / across_px
+    look = PhotoSettings(blur_px=0.7, noise_dn=2.0, samples=36)
+    photo = photograph(board, seen, Pose(R, at - R @ board.middle), look=look, seed=seed)
+    off = np.min(np.linalg.norm(view_of(photo.image, board).pixels[:, None] - photo.pixels, axis=2), axis=1)
+    assert off.max() < 0.2 * px
+
+
 @pytest.mark.parametrize("lens", [PERSPECTIVE, FISHEYE])
 @pytest.mark.parametrize("around", np.linspace(0, np.pi, 5))
 def test_oblique_circles_are_not_confused_with_their_neighbours(lens, around):
