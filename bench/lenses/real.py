@@ -2,12 +2,14 @@
 
 PART: a set of SETS (the whole set, OpenCV's plain solve and the published focal length, then random subsets of 5 to 13
 photographs), a pair of PAIRS, or sets (whole sets only); default: all sets and pairs. 100 subsets of each take an hour.
+simulated-SET: the same spread in draws of the errors of a set, whose sigmas then are what the program makes of them.
 """
 
 from __future__ import annotations
 
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -22,7 +24,7 @@ from calibration.lens.fit.view_equations import ViewEquations
 from calibration.lens.intrinsics import IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
 from calibration.lens.intrinsics_result import Intrinsics
 from calibration.pair import PairError, calibrate_pair
-from geometry.arrays import Array, Ints
+from geometry.arrays import Array, Bools, Ints
 from lab.calibrate.camera.camera import corner_table
 from lab.calibrate.camera.camera_page import findings_of
 from lab.calibrate.camera.pair import baseline_sigma
@@ -45,6 +47,7 @@ SETS: dict[str, tuple[str, str, float | None]] = {
     "charuco-0": (f"{_TWO}0.mp4", _CHARUCO, 903.6),
     "charuco-1": (f"{_TWO}1.mp4", _CHARUCO, 760.3),
 }
+SIMULATED = "simulated-"
 PAIRS = {"stereo": ("stereo-left", "stereo-right")}
 
 
@@ -121,15 +124,18 @@ def by_number(shares: list[float]) -> Array:
 def by_information(equations: ViewEquations, subsets: list[Ints]) -> tuple[Array, Array]:
     """The same (n,) of fx from what each photograph determines, and the correlation (n, n) of these differences.
 
-    A subset's fx is a sum over its photographs' gradients, which are independent; subsets share photographs.
+    A subset's fx is a sum over its photographs' gradients, which are independent; subsets share photographs, and the
+    priors (on the radius of circles, which photographs alone may leave open) count in every one.
     """
     by_fx, own, weights = equations.basis[0], [], []
+    priors = np.eye(len(by_fx)) - np.sum(equations.information, axis=0)
+    information = np.concatenate([equations.information, priors[None]])
     for rows in subsets:
-        mine = np.isin(equations.views, rows)
-        a = np.linalg.solve(np.sum(equations.information[mine], axis=0), by_fx)
+        mine = np.append(np.isin(equations.views, rows), True)
+        a = np.linalg.solve(np.sum(information[mine], axis=0), by_fx)
         own.append(by_fx @ a)
         weights.append(mine[:, None] * a - by_fx)
-    C = np.einsum("nvq,vqr,mvr->nm", weights, equations.information, weights)
+    C = np.einsum("nvq,vqr,mvr->nm", weights, information, weights)
     sizes = np.sqrt(np.diagonal(C))
     return np.diagonal(C) / np.array(own), C / np.outer(sizes, sizes)
 
@@ -192,6 +198,72 @@ def bench_set(name: str, count: int, seed: int) -> None:
         )
 
 
+APART = (0.0, 1.0, 2.0, 5.0)  # sizes of the errors of each photograph's own, in sigmas of the whole set's unknowns
+DRAWS = 200
+
+
+def bench_simulated(name: str, count: int, seed: int) -> None:
+    """Draws of the gradients of a set's photographs, linear about its solution: are sigmas right, what is the spread?
+
+    The gradient of a photograph is noise with the covariance of its information, and an error of its own.
+    """
+    table, _ = table_of(name)
+    whole = calibrated(table)
+    assert not isinstance(whole, str)
+    equations = ViewEquations.of(whole.table, whole.fit)
+    priors = np.eye(len(equations.basis)) - np.sum(equations.information, axis=0)
+    roots = [_root(S) for S in (*equations.information, priors)]
+    rng = np.random.default_rng(seed)
+    views = len(equations.views)
+    every = np.ones(views, dtype=bool)
+    subsets = [s for s in distinct_subsets(rng, views, min(13, views), count) if len(s) < views]
+    ratios, _ = by_information(equations, [equations.views[s] for s in subsets])
+    for apart in APART:
+        spreads, errors, significant = [], [], 0
+        for _ in range(DRAWS):
+            noise = [R @ rng.normal(size=len(R)) for R in roots]
+            own = [apart * S @ rng.normal(size=len(S)) for S in equations.information]
+            drawn = replace(equations, gradient=np.array(noise[:-1]) + np.array(own)), noise[-1]
+            fx, sigma, scatters = _solved_part(*drawn, every)
+            errors.append(fx / sigma)
+            significant += scatters
+            parts = [_solved_part(*drawn, np.isin(np.arange(views), s)) for s in subsets]
+            off, sigmas = np.array([p[0] - fx for p in parts]), np.array([p[1] for p in parts])
+            spreads.append(np.sqrt(np.mean((off / sigmas) ** 2 / ratios)))
+        low, high = np.quantile(spreads, [0.05, 0.95])
+        good = np.mean((np.array(spreads) >= 0.8) & (np.array(spreads) <= 1.3))
+        print(
+            f"  simulated {name}, errors {apart:g}: scatter significant in {significant / DRAWS:.0%}; fx in"
+            f" sigmas, RMS {np.sqrt(np.mean(np.square(errors))):.2f}, within one {np.mean(np.abs(errors) < 1):.0%};"
+            f" spread over subsets, RMS {np.sqrt(np.mean(np.square(spreads))):.2f}, of 90 % of the draws {low:.2f} to"
+            f" {high:.2f}, .8 to 1.3 in {good:.0%}",
+            flush=True,
+        )
+
+
+def _root(C: Array) -> Array:
+    values, vectors = np.linalg.eigh(C)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
+
+
+def _solved_part(equations: ViewEquations, prior: Array, which: Bools) -> tuple[float, float, bool]:
+    """fx of some views against the truth, its sigma, and whether they scatter; prior (q,): its gradient."""
+    left = np.eye(len(prior)) - np.sum(equations.information[~which], axis=0)
+    values, vectors = np.linalg.eigh(left)
+    T = vectors / np.sqrt(values)  # to coordinates in which these views have the identity as information
+    y = -T @ (T.T @ (np.sum(equations.gradient[which], axis=0) + prior))
+    part = replace(
+        equations,
+        information=T.T @ equations.information[which] @ T,
+        gradient=(equations.gradient[which] + equations.information[which] @ y) @ T,
+        views=equations.views[which],
+        basis=equations.basis @ T,
+    )
+    spread = part.scatter()
+    sigma = np.sqrt(part.scattered_covariance(spread)[0, 0])
+    return float((equations.basis @ y)[0]), float(sigma), spread.is_significant
+
+
 def bench_pair(name: str, count: int, seed: int) -> None:
     """The baseline of a pair: all photographs, then random subsets."""
     tables = [table_of(side)[0] for side in PAIRS[name]]
@@ -246,7 +318,10 @@ def main(arguments: list[str]) -> None:
     if parts == ["sets"]:
         count, parts = 0, [*SETS]
     for part in parts:
-        (bench_set if part in SETS else bench_pair)(part, count, seed)
+        if part.startswith(SIMULATED):
+            bench_simulated(part.removeprefix(SIMULATED), count, seed)
+        else:
+            (bench_set if part in SETS else bench_pair)(part, count, seed)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from calibration.boards.board_view import (
     scales,
     too_blurred,
 )
-from calibration.boards.circle_detection import mapped
+from calibration.boards.grid_shape import straightened
 from geometry.arrays import Array, Ints
 
 _FEWEST = 6  # corners that do not all lie on one line: fewer do not contribute to the lens
@@ -55,7 +55,7 @@ def find_charuco(image: GreyImage, board: Charuco, thorough: bool = True) -> Boa
     printed, markers = _as_printed(image, board)
     if len(markers.ids) == 0:
         return _why_no_markers(image, board) if thorough else QUICK_SEARCH_FAILED
-    true, share = _fitting(board, markers)
+    true, share = _fitting(board, markers, (image.shape[1], image.shape[0]))
     if isinstance(true, NotFound):
         return _mirrored(image, board, len(markers.ids)) or true
     notes = []
@@ -101,18 +101,20 @@ def find_markers(image: GreyImage, dictionary: str, below: int | None = None) ->
     return Markers(numbers[keep], places[first[keep]])
 
 
-def _fitting(board: Charuco, markers: Markers) -> tuple[Charuco | NotFound, float | None]:
+def _fitting(
+    board: Charuco, markers: Markers, image_size_px: tuple[int, int]
+) -> tuple[Charuco | NotFound, float | None]:
     """The board with the pattern (current or legacy) that the markers fit, and the side of a marker over a square's.
 
     A few markers that do not fit the board are mostly false: bookshelves sometimes resemble 4x4 bits.
     """
     if len(markers.ids) < 2:
         return NotFound(f"only one marker of {board.dictionary} found: the board is mostly hidden, or absent"), None
-    stated = _fit(board, markers)
+    stated = _fit(board, markers, image_size_px)
     if stated.share >= _FITS:
         return board, stated.marker_over_square
     other = replace(board, legacy=not board.legacy)
-    fit = _fit(other, markers)
+    fit = _fit(other, markers, image_size_px)
     if fit.share >= _FITS:
         return other, fit.marker_over_square
     if len(markers.ids) < 4:
@@ -121,7 +123,7 @@ def _fitting(board: Charuco, markers: Markers) -> tuple[Charuco | NotFound, floa
     if board.columns != board.rows:
         for legacy in (False, True):
             turned = replace(board, columns=board.rows, rows=board.columns, legacy=legacy)
-            if _fit(turned, markers).share >= _FITS:
+            if _fit(turned, markers, image_size_px).share >= _FITS:
                 return NotFound(f"{words}: they fit {turned.columns}x{turned.rows} squares; exchange the two"), None
     return NotFound(f"{words}; check the number of columns and rows of squares"), None
 
@@ -132,8 +134,19 @@ class _Fit:
     marker_over_square: float | None
 
 
-def _fit(board: Charuco, markers: Markers) -> _Fit:
-    """How well markers fit a board: RANSAC homography of their centres, with a tolerance of 0.3 squares.
+def _fit(board: Charuco, markers: Markers, image_size_px: tuple[int, int]) -> _Fit:
+    """How well markers fit a board, for the best of lenses from a pinhole to a fisheye of 180 deg."""
+    best = _Fit(0.0, None)
+    for plane in straightened(markers.corners.reshape(-1, 2), image_size_px):
+        fit = _fit_by_pinhole(board, Markers(markers.ids, plane.reshape(-1, 4, 2)))
+        best = fit if fit.share > best.share else best
+        if best.share >= _FITS:
+            break
+    return best
+
+
+def _fit_by_pinhole(board: Charuco, markers: Markers) -> _Fit:
+    """By a RANSAC homography of their centres, with a tolerance of 0.3 squares.
 
     Centres do not depend on the size of the markers.
     """
@@ -150,12 +163,12 @@ def _fit(board: Charuco, markers: Markers) -> _Fit:
     if found is None:
         return _Fit(0.0, None)
     H = np.asarray(found, dtype=float)
-    centres = mapped(H, seen.mean(axis=1))
+    centres = _mapped(H, seen.mean(axis=1))
     good = np.linalg.norm(centres - on_board, axis=1) < 0.3
     share = float(good.sum() / max(len(markers.ids), 1))
     if good.sum() < 2:
         return _Fit(0.0, None)
-    shape = mapped(H, seen[good].reshape(-1, 2)).reshape(-1, 4, 2)
+    shape = _mapped(H, seen[good].reshape(-1, 2)).reshape(-1, 4, 2)
     # The corners must be in the board's sense of rotation; a mirrored numbering has another homography.
     way = shape - shape.mean(axis=1, keepdims=True)
     agree = np.sum(way * corners, axis=(1, 2)) / (np.linalg.norm(way, axis=(1, 2)) * np.linalg.norm(corners))
@@ -249,6 +262,13 @@ def _why_no_markers(image: GreyImage, board: Charuco) -> NotFound:
         if len(find_markers(scaled(image, scale), board.dictionary, board.markers).ids) >= 3:
             return NotFound("too blurred for reading markers; focus, hold the board still or use a shorter exposure")
     return NotFound(f"no marker of {board.dictionary} found: no board, or it is too far away, blurred or in glare")
+
+
+def _mapped(H: Array, xy: Array) -> Array:
+    """H applied to points (..., 2)."""
+    p = xy @ H[:, :2].T + H[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):  # a wrong board can have points at infinity
+        return np.asarray(p[..., :2] / p[..., 2:], dtype=float)
 
 
 def _smallest(name: str, number: int) -> str:

@@ -30,15 +30,21 @@ from calibration.boards.board_view import (
     too_blurred,
 )
 from calibration.boards.chessboard_detection import upright
-from calibration.boards.grid_shape import misfit, straightened
-from geometry.arrays import Array, Ints
+from calibration.boards.corner_refinement import SINGLE, Pixelwise
+from calibration.boards.grid_shape import misfit, predicted, straightened
+from geometry.arrays import Array, Bools, Ints
 
 _BIG_DOT = 1.35  # relative area of a corner circle, above which it marks the origin
+_SEARCHED_PX = 800  # longer side of the copy that is searched first: circles of most boards are large enough in it
 _STRAY = 100  # blobs allowed besides three times the board's: among thousands OpenCV searches for many minutes
 _LATTICE = 0.25  # share of blobs arranged as in a lattice: boards among twice as many other blobs have more
 _INK = 0.5  # diameter over distance of neighbours where no blob gives it
-_AT_ONCE, _STEPS, _SMALL_PX = 32, 8, 2e-3  # outlines fitted together, and their iteration
+_AT_ONCE, _STEPS, _SMALL_PX = 16, 8, 2e-3  # outlines fitted together, and their iteration
 _MOST_MOVED = 0.1  # by the fit of an outline, in radii; more means that something else is beside it
+_REACH, _EDGE_PX, _BESIDE = 1.5, 1.5, 8  # of a patch: radii, px beyond for the edge, px with blur and slope
+_EVERY_PX, _LARGEST_STEP = 6, 4  # minor radius from twice of which on every second pixel will do; and the most
+_MOST_OFF = 0.8  # radii from its approximate centre to that of an ellipse
+_FEWEST = 8  # pixels on the edge of a circle: an ellipse has five unknowns
 _FIT_PX = 0.08  # of the spacing: residual of a grid against a plane's picture by a lens with one coefficient
 
 
@@ -64,7 +70,7 @@ def find_circles(image: GreyImage, board: CircleGrid, thorough: bool = True) -> 
     thorough: if False, the reason is not determined.
     """
     blobs, reason = np.empty((0, 3)), None
-    for scale in scales(image):
+    for scale in sorted(scales(image), key=lambda s: abs(np.log(s * max(image.shape) / _SEARCHED_PX))):
         small = scaled(image, scale)
         for light in (False, True):
             black = 255 - small if light else small
@@ -106,7 +112,7 @@ def _grids(
         return
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
     for plane in straightened(blobs[:, :2], image_size_px):
-        points = plane.astype(np.float32).reshape(-1, 1, 2)
+        points = plane.astype(SINGLE).reshape(-1, 1, 2)
         for how in (0, cv2.CALIB_CB_CLUSTERING) if _lattice_share(plane) >= _LATTICE else ():
             # Without a blob detector, the points are the candidates; the stubs do not know this.
             found, centres = cv2.findCirclesGrid(
@@ -140,94 +146,121 @@ def _measured(image: GreyImage, ordered: Array, blobs: Array, board: CircleGrid,
             f"the grid continues {more} beyond {board.columns}x{board.rows} circles; count again (circles in a row,"
             " rows)"
         )
-    ellipses = fit_ellipses(image, ordered.reshape(-1, 2), _radii(ordered, board, blobs))
+    centres = ordered.reshape(-1, 2)
+    expected, by_board = predicted(centres, board.points[:, :2], (image.shape[1], image.shape[0]))
+    shapes = _radii(centres, by_board, board, blobs)[:, None, None] * by_board
+    ellipses = fit_ellipses(image, centres, shapes)
     lost = np.isnan(ellipses.areas)
+    if lost.any():  # other blobs were taken for them, or several circles that are one at a high threshold
+        ellipses = fit_ellipses(image, np.where(lost[:, None], expected, centres), shapes)
+        lost = np.isnan(ellipses.areas)
     if lost.any():
         return NotFound(f"{lost.sum()} of {len(lost)} circles have no clean outline: hidden, in glare or blurred")
-    order = _by_big_dot(ordered, ellipses.areas, board)
-    centres = ellipses.centres[order]
+    order = _by_big_dot(ordered.shape[:2], ellipses.areas / np.linalg.det(by_board), board)
+    pixels = ellipses.centres[order]
     blur = float(np.median(ellipses.blurs))
-    apart = corner_refinement.spacing(centres.reshape(ordered.shape))
+    apart = corner_refinement.spacing(pixels.reshape(ordered.shape))
     if blur > BLUR_LIMIT * apart:
         return too_blurred(blur, apart)
     notes = ("white circles on a black ground",) if light else ()
-    return BoardView(board.ids, centres, apart, blur, notes, ellipses.areas[order], ellipses.sigmas_px[order])
+    return BoardView(board.ids, pixels, apart, blur, notes, ellipses.areas[order], ellipses.sigmas_px[order])
 
 
-def _radii(grid: Array, board: CircleGrid, blobs: Array) -> Array:
-    """Radii (n,), px, at approximate centres (rows, columns, 2), from the blobs (m, 3) there.
+def _radii(centres: Array, by_board: Array, board: CircleGrid, blobs: Array) -> Array:
+    """Radii (n,), m, at approximate centres (n, 2), from the blobs (m, 3) there and derivatives (n, 2, 2), px/m.
 
     All circles of a board have the same size, so that one radius is used for all; only a markedly larger blob, the dot
     that marks the origin, keeps its own. Single blobs can be much too small where the ink is paler inside.
     """
-    centres = grid.reshape(-1, 2)
-    H = homography(board.points[:, :2], centres)
-    enlarged = np.sqrt(np.abs(_jacobian_determinants(H, board.points[:, :2])))
-    nearest = enlarged * board.neighbours_m
-    radii = nearest * _INK / 2
+    enlarged = np.sqrt(np.abs(np.linalg.det(by_board)))
+    radii = np.full(len(centres), board.neighbours_m * _INK / 2)
     if len(blobs):
-        distance = np.linalg.norm(centres[:, None] - blobs[None, :, :2], axis=-1)
-        best = distance.argmin(axis=1)
-        hit = distance[np.arange(len(centres)), best] < nearest / 3
+        distance, best = cKDTree(blobs[:, :2]).query(centres)
+        hit = distance < enlarged * board.neighbours_m / 3
         if hit.any():
-            own = blobs[best, 2] / 2
-            radii = enlarged * float(np.median(own[hit] / enlarged[hit]))
+            own = blobs[best, 2] / 2 / enlarged
+            radii[:] = np.median(own[hit])
             radii = np.where(hit & (own > 1.3 * radii), own, radii)
-    return np.clip(radii, 1.5, 0.6 * nearest)
+    return np.clip(radii, 1.5 / enlarged, 0.6 * board.neighbours_m)
 
 
-def fit_ellipses(image: GreyImage, centres: Array, radii: Array) -> Ellipses:
-    """The ellipse around each approximate centre (n, 2) of a black circle of about this radius (n,), px.
+def fit_ellipses(image: GreyImage, centres: Array, shapes: Array) -> Ellipses:
+    """The ellipse around each approximate centre (n, 2) of a black circle with about the outline shape (cos a, sin a).
 
-    Every pixel on the outline gives a tangent l = (g_x, g_y, -g . p) by its gradient g; the tangents of an ellipse
-    satisfy l^T D l = 0 with its dual conic D, which is solved for by least squares with the weight |g|^2. An isotropic
-    blur does not move the centre. Source: Ouellet and Hebert (2009), "Precise ellipse estimation without contour point
-    extraction", Machine Vision and Applications 21.
+    shapes (n, 2, 2), px: with them, patches of oblique circles do not contain neighbours. Every pixel on the outline
+    gives a tangent l = (g_x, g_y, -g . p) by its gradient g; the tangents of an ellipse satisfy l^T D l = 0 with its
+    dual conic D, which is solved for by least squares with the weight |g|^2. An isotropic blur does not move the
+    centre. Source: Ouellet and Hebert (2009), "Precise ellipse estimation without contour point extraction", Machine
+    Vision and Applications 21.
     """
-    out = np.full((len(centres), 6), np.nan)
-    smooth = np.asarray(cv2.GaussianBlur(image.astype(np.float64), (0, 0), 0.7), dtype=float)
-    gx, gy = (np.asarray(cv2.Scharr(smooth, cv2.CV_64F, *d) / 32, dtype=float) for d in ((1, 0), (0, 1)))
-    height, width = image.shape
-    for n, (centre, radius) in enumerate(zip(centres, radii, strict=True)):
-        reach = 1.5 * radius + 1.5
-        first = np.maximum(np.floor(centre - reach), 0).astype(int)
-        last = np.minimum(np.ceil(centre + reach), [width - 1, height - 1]).astype(int)
-        if np.any(last - first < radius):
-            continue
-        piece = np.s_[first[1] : last[1] + 1, first[0] : last[0] + 1]
-        fit = _ellipse(gx[piece], gy[piece], smooth[piece], centre - first, reach)
-        if fit is not None and np.linalg.norm(fit[:2] + first - centre) <= 0.7 * radius + 1:
-            out[n] = [*(fit[:2] + first), *fit[2:]]
-    shapes = out[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
-    return _outlines(image, Ellipses(out[:, :2], shapes, out[:, 5], np.full(len(out), np.nan)))
+    reach = _REACH * np.linalg.norm(shapes, axis=2) + _BESIDE
+    # The part of the picture around all circles.
+    first = np.maximum(np.floor(np.min(centres - reach, axis=0)), 0).astype(int)
+    last = np.ceil(np.max(centres + reach, axis=0)).astype(int)
+    part = image[first[1] : last[1] + 1, first[0] : last[0] + 1].astype(SINGLE)
+    smooth = cv2.GaussianBlur(part, (0, 0), 0.7)
+    picture = np.stack([*(cv2.Scharr(smooth, cv2.CV_32F, *d) / 32 for d in ((1, 0), (0, 1))), smooth])
+    out, by_size = np.empty((len(centres), 6)), np.argsort(reach.max(axis=1))
+    for rows in np.split(by_size, range(_AT_ONCE, len(by_size), _AT_ONCE)):
+        out[rows] = _ellipses(picture, centres[rows] - first, shapes[rows])
+    outlines = out[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+    return _outlines(image, Ellipses(out[:, :2] + first, outlines, out[:, 5], np.full(len(out), np.nan)))
 
 
-def _ellipse(gx: Array, gy: Array, grey: Array, centre: Array, reach: float) -> Array | None:
-    """Centre x, y, shape xx, xy, yy, sigma of the edge (6,) in a patch; None if it is not an ellipse."""
-    v, u = np.indices(gx.shape)
-    x, y = u - centre[0], v - centre[1]
-    strength = np.hypot(gx, gy)
+def _ellipses(picture: Pixelwise, centres: Array, shapes: Array) -> Array:
+    """Centre x, y, shape xx, xy, yy, sigma of the edge (n, 6); nan where none is.
+
+    centres (n, 2) and shapes (n, 2, 2): approximate ones. picture (3, h, w): slopes along x and y, and grey values.
+    """
+    minor = np.linalg.svd(shapes, compute_uv=False)[:, 1]
+    reach = _REACH + _EDGE_PX / minor  # in units of the shape, in which all circles have the radius 1
+    whole, half = np.round(centres).astype(int), int(np.max(reach[:, None] * np.linalg.norm(shapes, axis=2))) + 1
+    # The outline of a large circle has more pixels than a start needs.
+    step = int(np.clip(minor.min() // _EVERY_PX, 1, _LARGEST_STEP))
+    place = _square(half // step) * step
+    at, size = whole[:, None] + place, np.array(picture.shape[:0:-1])
+    dx, dy = np.moveaxis((place - (centres - whole)[:, None]).astype(SINGLE), -1, 0)
+    to_circle = np.linalg.inv(shapes).astype(SINGLE)[..., None]
+    x, y = (to_circle[:, k, 0] * dx + to_circle[:, k, 1] * dy for k in (0, 1))
+    away = np.hypot(x, y)
+    near = (away < reach[:, None]) & np.all((at >= 0) & (at < size), axis=-1)
+    at = np.clip(at, 0, size - 1)
+    gx, gy, grey = picture[:, at[..., 1], at[..., 0]]
+    strength = np.hypot(gx, gy) * near
+    strongest = strength.max(axis=1, keepdims=True, initial=1e-6)
+    L = (shapes / strongest[..., None]).astype(SINGLE)[..., None]
+    a, b = (gx * L[:, 0, k] + gy * L[:, 1, k] for k in (0, 1))
     # Only slopes that rise outwards, as on a black circle; those of a neighbour do not.
-    edge = (gx * x + gy * y > 0) & (strength > 0.2 * strength.max())
-    edge &= np.hypot(x, y) < reach
-    if edge.sum() < 8:
-        return None
-    a, b = gx[edge], gy[edge]
-    c = -(a * x[edge] + b * y[edge])
+    edge = (a * x + b * y > 0) & (strength > 0.2 * strongest)
+    a, b = a * edge, b * edge
+    c = -(a * x + b * y)
     # D = [[A, B/2, D/2], [B/2, C, E/2], [D/2, E/2, 1]], |l| = |g| already weighs each row by |g|^2.
-    rows = np.column_stack([a * a, a * b, b * b, a * c, b * c])
-    (A, B, C, D, E), *_ = np.linalg.lstsq(rows, -c * c, rcond=None)
-    place = np.array([D / 2, E / 2])
+    rows = np.stack([a * a, a * b, b * b, a * c, b * c, -c * c], axis=1)
+    N = (rows @ np.swapaxes(rows, 1, 2)).astype(float)
+    A, B, C, D, E = np.linalg.solve(N[:, :5, :5] + 1e-9 * np.eye(5), N[:, :5, 5:])[..., 0].T
+    middle = np.stack([D, E], axis=-1) / 2
     # With the centre subtracted, D's upper block is -1 times the ellipse's shape matrix.
-    shape = np.outer(place, place) - np.array([[A, B / 2], [B / 2, C]])
-    det = np.linalg.det(shape)
-    if not (det > 0 and np.trace(shape) > 0):
-        return None
-    inside = np.hypot(x - place[0], y - place[1]) < 1.2
-    outside = np.hypot(x, y) > 0.85 * reach
-    contrast = float(np.median(grey[outside]) - np.min(grey[inside])) if inside.any() and outside.any() else np.nan
-    blur = contrast / float(np.percentile(strength[edge], 90)) / np.sqrt(2 * np.pi)
-    return np.array([*(place + centre), shape[0, 0], shape[0, 1], shape[1, 1], blur])
+    found = middle[:, :, None] * middle[:, None] - np.stack([A, B / 2, B / 2, C], axis=-1).reshape(-1, 2, 2)
+    inside = near & (np.hypot(x - middle[:, :1], y - middle[:, 1:]) < 1.2 * step / minor[:, None])
+    black = np.min(grey, axis=1, where=inside, initial=np.inf)
+    white = _quantile(grey, near & (away > 0.85 * reach[:, None]), 0.5)
+    with np.errstate(invalid="ignore"):
+        blur = (white - black) / _quantile(strength, edge, 0.9) / np.sqrt(2 * np.pi)
+    good = (np.linalg.det(found) > 0) & (np.trace(found, axis1=1, axis2=2) > 0) & (edge.sum(axis=1) >= _FEWEST)
+    good &= np.isfinite(blur) & (np.linalg.norm(middle, axis=1) < _MOST_OFF)
+    centres = centres + (shapes @ middle[..., None])[..., 0]
+    found = (shapes @ found @ np.swapaxes(shapes, 1, 2)).reshape(-1, 4)[:, [0, 1, 3]]
+    return np.where(good[:, None], np.column_stack([centres, found, blur]), np.nan)
+
+
+def _quantile(values: Pixelwise, which: Bools, q: float) -> Array:
+    """The quantile (n,) of some (n, m) of the values (n, m) of each row, interpolated; nan where there are none."""
+    ordered = np.sort(np.where(which, values, np.inf), axis=1)
+    k = q * np.maximum(np.sum(which, axis=1) - 1, 0)
+    low, row = np.floor(k).astype(int), np.arange(len(k))
+    part = (k - low).astype(values.dtype)
+    with np.errstate(invalid="ignore"):
+        return np.where(part > 0, (1 - part) * ordered[row, low] + part * ordered[row, low + 1], ordered[row, low])
 
 
 def _outlines(image: GreyImage, start: Ellipses) -> Ellipses:
@@ -261,23 +294,21 @@ def _fitted_outlines(image: GreyImage, centres: Array, shapes: Array, blur: Arra
     A = (vectors / np.sqrt(values)[:, None]) @ np.swapaxes(vectors, 1, 2)  # offset in px to the unit circle
     whole = np.round(centres).astype(int)
     band = np.minimum(3 * blur + 1, 0.5 * np.sqrt(values[:, 0]) + 1)
-    near = [_beside(a, c - w, b, np.sqrt(v[1])) for a, c, w, b, v in zip(A, centres, whole, band, values, strict=True)]
-    most = max(len(place) for place in near)
-    place = np.stack([np.pad(p, ((0, most - len(p)), (0, 0))) for p in near])  # (n, m, 2) about `whole`
+    place, weight = _beside(A, centres - whole, band, np.sqrt(values[:, 1]))
+    most = place.shape[1]
     at = whole[:, None] + place
     height, width = image.shape
-    weight = (np.arange(most) < np.array([len(p) for p in near])[:, None]).astype(corner_refinement.SINGLE)
     weight *= np.all((at >= 0) & (at < [width, height]), axis=-1)
     grey = weight * image[np.clip(at[..., 1], 0, height - 1), np.clip(at[..., 0], 0, width - 1)]
     size = np.sqrt(values.prod(axis=1) ** 0.5)  # px
     scale = np.stack([np.ones_like(size)] * 2 + [1 / size] * 3 + [np.ones_like(size)] * 3, axis=1)
     x = np.concatenate([centres - whole, A.reshape(-1, 4)[:, [0, 1, 3]], np.zeros((len(A), 2)), blur[:, None]], axis=1)
     largest = np.array([0.5, 0.5, 0.05, 0.05, 0.05, 0.05, 0.05, 0.3]) * scale
-    J, B = (np.empty((len(grey), k, most), dtype=corner_refinement.SINGLE) for k in (8, 6))
+    J, B = (np.empty((len(grey), k, most), dtype=SINGLE) for k in (8, 6))
     B[:, 0] = weight
-    place = np.swapaxes(place, 1, 2).astype(corner_refinement.SINGLE)  # (n, 2, m)
+    place = np.swapaxes(place, 1, 2).astype(SINGLE)  # (n, 2, m)
     for _ in range(_STEPS):
-        y = x.astype(corner_refinement.SINGLE)
+        y = x.astype(SINGLE)
         d = place - y[:, :2, None]
         to_circle = y[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
         w = to_circle @ d
@@ -292,10 +323,10 @@ def _fitted_outlines(image: GreyImage, centres: Array, shapes: Array, blur: Arra
         sigma = y[:, 7:]
         e = away / sigma + sigma * curved / 2  # blur displaces a curved edge towards its centre of curvature
         B[:, 1:3] = weight[:, None] * d / size[:, None, None]
-        B[:, 3:] = B[:, :3] * erf(e / corner_refinement.SINGLE(2**0.5))[:, None]
+        B[:, 3:] = B[:, :3] * erf(e / SINGLE(2**0.5))[:, None]
         linear = corner_refinement.linear_part(B, grey)
-        slope = np.swapaxes(linear[:, 3:], 1, 2).astype(corner_refinement.SINGLE) @ B[:, :3]
-        g = slope[:, 0] * corner_refinement.SINGLE((2 / np.pi) ** 0.5) * np.exp(-e * e / 2) / (sigma * n)
+        slope = np.swapaxes(linear[:, 3:], 1, 2).astype(SINGLE) @ B[:, :3]
+        g = slope[:, 0] * SINGLE((2 / np.pi) ** 0.5) * np.exp(-e * e / 2) / (sigma * n)
         J[:, :2] = -g[:, None] * normal
         J[:, 2], J[:, 3], J[:, 4] = g * p * d[:, 0], g * (p * d[:, 1] + q * d[:, 0]), g * q * d[:, 1]
         J[:, 5:7] = -(g * length)[:, None] * cube
@@ -309,39 +340,30 @@ def _fitted_outlines(image: GreyImage, centres: Array, shapes: Array, blur: Arra
     return whole + x[:, :2], inverse @ np.swapaxes(inverse, 1, 2), noise
 
 
-def _beside(A: Array, centre: Array, band: float, reach: float) -> Array:
-    """Offsets (m, 2), px, of the pixels within `band` of an ellipse about `centre`; A (2, 2): to the unit circle."""
-    half = int(np.ceil(reach + band)) + 1
-    v, u = np.mgrid[-half : half + 1, -half : half + 1]
-    w = np.stack([u - centre[0], v - centre[1]], axis=-1) @ A
-    length = np.maximum(np.linalg.norm(w, axis=-1), 1e-6)
-    near = np.abs(length - 1) < band * np.linalg.norm(w @ A, axis=-1) / length
-    return np.stack([u[near], v[near]], axis=-1)
+def _beside(A: Array, centres: Array, band: Array, reach: Array) -> tuple[Ints, Pixelwise]:
+    """Offsets (n, m, 2), px, of the pixels within `band` (n,) of ellipses about centres (n, 2), and weights (n, m).
 
-
-def homography(from_xy: Array, to_xy: Array) -> Array:
-    """H (3, 3) with to = H from, least squares over points (n, 2).
-
-    Raises ValueError: the points do not determine a homography.
+    A (n, 2, 2): to the unit circle. Weights are 1; 0 where an ellipse has fewer than m such pixels.
     """
-    scale = 1.0 / max(float(np.ptp(from_xy)), 1e-12)
-    H, _ = cv2.findHomography(from_xy * scale, to_xy, 0)
-    if H is None:
-        raise ValueError("these points do not determine a homography")
-    return np.asarray(H, dtype=float) @ np.diag([scale, scale, 1.0])
+    half = int(np.ceil(np.max(reach + band))) + 1
+    pixels = _square(half)
+    x, y = np.moveaxis((pixels - centres[:, None]).astype(SINGLE), -1, 0)
+    a, b, c = (A.reshape(-1, 4)[:, k, None].astype(SINGLE) for k in (0, 1, 3))
+    p, q = a * x + b * y, b * x + c * y
+    length = np.hypot(p, q)
+    near = np.abs(length - 1) * length < band[:, None] * np.hypot(a * p + b * q, b * p + c * q)
+    ellipse, pixel = np.nonzero(near)
+    counts = np.bincount(ellipse, minlength=len(A))
+    column = np.arange(len(pixel)) - np.repeat(np.cumsum(counts) - counts, counts)
+    place, weight = np.zeros((len(A), counts.max(), 2), dtype=int), np.zeros((len(A), counts.max()), dtype=SINGLE)
+    place[ellipse, column], weight[ellipse, column] = pixels[pixel], 1
+    return place, weight
 
 
-def mapped(H: Array, xy: Array) -> Array:
-    """H applied to points (..., 2)."""
-    p = xy @ H[:, :2].T + H[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):  # a wrong board can have points at infinity
-        return np.asarray(p[..., :2] / p[..., 2:], dtype=float)
-
-
-def _jacobian_determinants(H: Array, xy: Array) -> Array:
-    """Area magnification of H at points (n, 2): det H / w^3."""
-    w = xy @ H[2, :2] + H[2, 2]
-    return np.linalg.det(H) / w**3
+def _square(half: int) -> Ints:
+    """x and y (m, 2) of a square about 0, row by row."""
+    v, u = np.mgrid[-half : half + 1, -half : half + 1]
+    return np.stack([u, v], axis=-1).reshape(-1, 2)
 
 
 def _ordered(grid: Array, board: CircleGrid, image_size_px: tuple[int, int]) -> Array | NotFound:
@@ -391,17 +413,16 @@ def _goes_on(grid: Array, board: CircleGrid, blobs: Array) -> str:
     return " and ".join(names)
 
 
-def _by_big_dot(grid: Array, areas: Array, board: CircleGrid) -> Ints:
+def _by_big_dot(shape: tuple[int, ...], areas: Array, board: CircleGrid) -> Ints:
     """The order (n,) of the circles in which a markedly larger corner circle comes first; as they are without one.
 
-    On boards with unequal sides, a large dot that could come first only by mirroring becomes the last one of the first
-    row.
+    areas (n,): on the board. On boards with unequal sides, a large dot that could come first only by mirroring becomes
+    the last one of the first row.
     """
-    number = np.arange(len(areas)).reshape(grid.shape[:2])
+    number = np.arange(len(areas)).reshape(shape)
     if board.asymmetric:
         return number.ravel()
-    H = homography(board.points[:, :2], grid.reshape(-1, 2))
-    size = (areas / _jacobian_determinants(H, board.points[:, :2])).reshape(grid.shape[:2])
+    size = areas.reshape(shape)
     size = size / np.median(size)
     corners = {(0, 0): size[0, 0], (0, -1): size[0, -1], (-1, 0): size[-1, 0], (-1, -1): size[-1, -1]}
     big = [where for where, share in corners.items() if share > _BIG_DOT]

@@ -95,6 +95,19 @@ def misfit(seen: Array, xy: Array, image_size_px: tuple[int, int]) -> tuple[floa
     return float(np.nan_to_num(np.sqrt(np.mean(off**2)), nan=np.inf)), bool(np.linalg.det(picture.H) < 0)
 
 
+def predicted(seen: Array, xy: Array, image_size_px: tuple[int, int]) -> tuple[Array, Array]:
+    """Points (n, 2), px, of the picture of a plane that pixels (n, 2) fit best, and its derivatives (n, 2, 2).
+
+    Raises ValueError: they are no picture of a plane.
+    """
+    middle, unit = (np.array(image_size_px) - 1) / 2, float(np.hypot(*image_size_px)) / 2
+    picture = _Picture.of((seen - middle) / unit, xy)
+    if picture is None:
+        raise ValueError("these pixels are no picture of a plane")
+    by_plane, _, by_point = picture.derivatives(xy, unit)
+    return middle + unit * picture.at(xy), by_plane @ by_point
+
+
 @dataclass(frozen=True, slots=True)
 class _Picture:
     """The picture of a board: H and the lens; lengths in halves of the picture's diagonal, about its middle."""

@@ -189,6 +189,51 @@ def test_corners_in_any_order_are_renumbered_correctly():
         np.testing.assert_array_equal(chessboard_detection.oriented(photo.image, given), true)
 
 
+def test_a_charuco_board_near_a_wide_lens_is_found():
+    """Its markers were not arranged as on the board for a pinhole, whose picture of a plane keeps lines straight."""
+    numbers, matrix = (0.02, -0.004, 0.001, 0.0), np.array([[190.0, 0, 400], [0, 190, 300], [0, 0, 1]])
+    wide = Camera("c", "s", (800, 600), matrix, numbers, Pose.identity(), lens=FISHEYE)
+    board = parse("charuco:9x7:30mm:22mm:DICT_4X4_50")
+    photo = photograph(board, wide, board_pose(board, (0.3, -0.2, 0.1), 0.3), look=CLEAN)
+    view = view_of(photo.image, board)
+    off = np.linalg.norm(view.pixels - photo.pixels[np.searchsorted(photo.ids, view.ids)], axis=1)
+    assert len(view) > 40
+    assert np.median(off) < 0.03 * px
+
+
+@pytest.mark.parametrize(("across_px", "seed"), [(5, 1), (8, 3), (12, 0)])
+def test_a_blob_between_circles_is_not_taken_for_one_of_them(across_px, seed):
+    """At a high threshold several small circles are one blob, whose middle was taken for that of a circle."""
+    matrix = np.array([[950.0, 0, 640], [0, 950, 480], [0, 0, 1]])
+    seen = Camera("c", "s", (1280, 960), matrix, (-0.2, 0.05, 0, 0, 0), Pose.identity())
+    rng, board = np.random.default_rng(seed), parse("circles:9x7:30mm")
+    R = rotations.exp(rng.uniform(-0.4, 0.4, 3))
+    at = np.append(rng.uniform(-0.2, 0.2, 2), 1) * 950 * board.diameter_m / across_px
+    look = PhotoSettings(blur_px=0.7, noise_dn=2.0, samples=36)
+    photo = photograph(board, seen, Pose(R, at - R @ board.middle), look=look, seed=seed)
+    off = np.min(np.linalg.norm(view_of(photo.image, board).pixels[:, None] - photo.pixels, axis=2), axis=1)
+    assert off.max() < 0.2 * px
+
+
+@pytest.mark.parametrize(("lens", "around"), [(PERSPECTIVE, 0.0), (PERSPECTIVE, 2.356), (FISHEYE, 1.571)])
+def test_oblique_circles_are_not_confused_with_their_neighbours(lens, around):
+    """Which are nearer along the short axis than a circle's long one reaches: outlines were off by up to 2.7 px."""
+    seen, board = replace(camera(lens), image_size_px=(1280, 960)), parse("acircles:4x11:24mm")
+    seen.matrix[:2, 2] += 400, 300
+    R = rotations.exp(np.deg2rad(66) * np.array([np.cos(around), np.sin(around), 0]))
+    pose = Pose(R, np.array([0, 0, 0.25]) - R @ board.middle)
+    photo = photograph(board, seen, pose, look=PhotoSettings(blur_px=0.7, noise_dn=2.0, samples=36), seed=1)
+    points, step_m = pose.apply(board.points), 1e-6
+    by_board = np.stack([seen.project(points + step_m * R[:, k]) - photo.pixels for k in (0, 1)], axis=-1) / step_m
+    shapes = by_board * board.diameter_m / 2
+    large = np.linalg.svd(shapes, compute_uv=False)[:, 1] > 3 * px
+    off = shapes @ np.random.default_rng(1).uniform(-0.2, 0.2, (len(points), 2, 1))
+    found = circle_detection.fit_ellipses(photo.image, (photo.pixels + off[..., 0])[large], shapes[large])
+    share = found.areas / (np.pi * np.abs(np.linalg.det(shapes[large])))
+    assert large.sum() > 15
+    assert np.all(np.abs(share / np.median(share) - 1) < 0.05)
+
+
 @pytest.mark.filterwarnings("error")
 def test_circles_beside_one_without_an_ellipse_have_their_areas_without_a_warning():
     shapes = np.stack([4 * np.eye(2), np.full((2, 2), np.nan)])

@@ -159,7 +159,7 @@ def table_of(scene: CircleScene, seed: int, searched: bool = False) -> CornerTab
             assert view.areas_px2 is not None
             ids, pixels, area = view.ids, view.pixels, view.areas_px2
         else:
-            found = fit_ellipses(shot.image, shot.centres, shot.radii_px)
+            found = fit_ellipses(shot.image, shot.centres, shot.radii_px[:, None, None] * np.eye(2))
             ids = np.flatnonzero(np.isfinite(found.areas))
             pixels, area = found.centres[ids], found.areas[ids]
         views.append((ids, pixels))
