@@ -47,7 +47,8 @@ from tracking.smoothing.motion.whole_run import (
 FIRST_PASSES, LATER_PASSES = 14, 5  # with one strength of the jerk first, and after turns have changed
 LAST_PASSES = 3  # of these, in which the strength of the jerk stays
 ROUNDS = 4  # of passes and improved turns
-FEWEST = 2  # turns in succession that a jerk may replace
+FEWEST = 2  # turns in succession that a jerk may replace ...
+BESIDE_GAP = 3.0  # frames: ... unless a gap is as near, whose jumps a jerk that is stronger there would exclude
 # m and rad: a sigma of each pose in a gap about the reference. A strong jerk would let the vehicle be kilometres away
 # after some frames, and covariances with both this and the error of a spot exceed the digits of a number.
 NEAR = 10.0
@@ -315,9 +316,10 @@ class _TimedEstimator(_Estimator):
         for some in successions(self.turns, self.frame_s):
             if len(some) < FEWEST:
                 continue
-            first, end = np.searchsorted(self.t_s, [some[0].begin_s, max(t.end_s for t in some)])
+            first = np.searchsorted(self.t_s, some[0].begin_s - BESIDE_GAP * self.frame_s)
+            end = np.searchsorted(self.t_s, max(t.end_s for t in some) + BESIDE_GAP * self.frame_s)
             # Where few spots are left a strong jerk explains whatever contradicts itself.
-            density = search.without(some, self.turns) if self.measured[max(first - 1, 0) : end + 1].all() else None
+            density = search.without(some, self.turns) if self.measured[first : end + 1].all() else None
             if density is None:
                 continue
             self.turns = [t for t in self.turns if not any(t is one for one in some)]

@@ -42,6 +42,8 @@ _WITH_IT = (-1.0, -0.5, 0.0, 0.5, 1.0)  # of the way of the middle: how far the 
 _SHARES = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)  # of a turn's variance, of which the most likely one is taken
 _GAP_SHARES = (*10.0 ** np.arange(0.0, -6.5, -0.5), 0.0)  # of that of a gap's jumps: a thousandth of the fastest speed
 _EXCLUDED_NATS = 5.0  # by which these must be less likely than none, or than smaller ones, to exclude them
+# By which the largest jumps that a gap may have must be: they are of all six axes, those of a motion often of one.
+_IMPOSSIBLE_NATS = 6 * _EXCLUDED_NATS / 2
 _CURVATURE_NATS = 0.5  # drop of the likelihood from which the sigma of the middle is computed
 _CHANGED = 0.02, 0.1  # of a frame, and relative: less does not change a turn
 TURN_NATS = 3.0  # by which each turn must make a run more likely
@@ -190,7 +192,7 @@ class TurnSearch:
             nats.append(replace(self, hidden=hidden).nats(near, part, self.density))
         if max(nats) > nats[-1] + TURN_NATS or nats[-1] < nats[0] + _EXCLUDED_NATS:
             return False, 1.0
-        allowed = np.flatnonzero(np.array(nats) > max(nats) - _EXCLUDED_NATS)
+        allowed = np.flatnonzero(np.array(nats) > max(nats) - _IMPOSSIBLE_NATS)
         return True, float(_GAP_SHARES[allowed[0]])
 
     def to_next_spots(self, turn: Turn) -> Turn:
