@@ -53,6 +53,17 @@ class Times:
             return 0.0
         return float(self.sigma_s[min(int(np.searchsorted(self.frames, number)), len(self.sigma_s) - 1)])
 
+    @property
+    def scatter(self) -> str | None:
+        """What is unknown of the times of a free-running camera, in words; None: nothing."""
+        if self.sigma_s is None or self.frames is None:
+            return None
+        usual_s, largest = float(np.median(self.sigma_s)), int(np.argmax(self.sigma_s))
+        number, largest_s = self.frames[largest], float(self.sigma_s[largest])
+        if largest_s > STAMP_OUTLIER * usual_s:
+            return f"t_s of frame {number} is {1e3 * largest_s:.3g} ms from where the other times put it"
+        return f"the times scatter by {1e3 * usual_s:.2g} ms about a constant rate"
+
     def without_time(self, frames: Ints) -> Ints:
         """The frame numbers, of (n,) given, without a timestamp; none where the rate is constant."""
         if self.frames is None:

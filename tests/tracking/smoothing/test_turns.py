@@ -259,7 +259,7 @@ def test_each_labelled_spot_is_at_its_own_instant_among_those_of_the_frames():
     assigned[rng.random(assigned.shape) < 0.2] = -1
     assigned[5, 1] = 2 + BLENDED
     used = np.arange(frames) != 11
-    delays = Delays(after, np.full(frames * n, 1e-6), np.zeros((frames, 1, 3)))
+    delays = Delays(after, np.full(frames * n, 1e-6), np.zeros(frames * n), np.zeros((frames, 1, 3)))
     views = np.zeros(n)
     dt = np.r_[0.0, np.full(frames - 1, DT)]
     instants = Instants.of(WholeRun(views, seen, cov[:n], dt, 0.0, True, delays), assigned, used)

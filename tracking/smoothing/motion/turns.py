@@ -151,11 +151,13 @@ class TurnSearch:
                     break
                 best, most = density, value
             density = best
-        needed = TURN_NATS * (len(some) - AS_MANY)
         run, likely = self.with_turns(others, part), list(some)
         for i, turn in enumerate(likely):
             likely[i] = run.sized(turn, [*likely[:i], *likely[i + 1 :]])
-        return best if most > run.nats(likely) - needed else None
+        least = run.nats(likely) - TURN_NATS * len(some)
+        if nats[0] > least:
+            return self.density
+        return best if most > least + TURN_NATS * AS_MANY else None
 
     def one_for(self, some: Sequence[Turn], all_turns: Sequence[Turn]) -> Turn | None:
         """One turn in place of some of all turns; None: the spots exclude it."""
