@@ -237,7 +237,8 @@ class RigidTracker:
         Each moves as the spot nearest to it. As noise of its own in each picture this error hardly biases the pose:
         along the motion the other cameras decide.
         """
-        errors = [(0.0, 0.0, 0.0) if k is None else (k.delay_sigma_s, k.row_sigma_s, k.middle_row) for k in self._clocks]
+        none = (0.0, 0.0, 0.0)
+        errors = [none if k is None else (k.delay_sigma_s, k.row_sigma_s, k.middle_row) for k in self._clocks]
         cov = self._stated_cov.copy()
         add_clock_errors(
             views, self._view_table.camera, np.array(errors), state.R, state.t, state.m, velocity_P, frame.first,

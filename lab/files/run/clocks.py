@@ -103,6 +103,7 @@ def _check_unit(table: Table, times: Times) -> None:
 FEWEST_STAMPS = 12  # that show whether they are those of a constant rate
 LARGEST_SCATTER, NEGLIGIBLE_SCATTER = 0.15, 1e-3  # of the usual step: pictures at any time; stamps without errors
 STAMP_OUTLIER = 5.0  # sigmas of the scatter
+NORMAL_MEDIAN = 0.6745  # median of |x| of a normal distribution of sigma 1
 
 
 def stamp_sigmas(times: Times) -> Array | None:
@@ -124,9 +125,6 @@ def stamp_sigmas(times: Times) -> Array | None:
     if scatter_s > NEGLIGIBLE_SCATTER * step_s:
         sigma_s = np.maximum(sigma_s, scatter_s)
     return sigma_s if sigma_s.any() else None
-
-
-NORMAL_MEDIAN = 0.6745  # median of |x| of a normal distribution of sigma 1
 
 
 def _from_line(index: Array, t_s: Array) -> Array:

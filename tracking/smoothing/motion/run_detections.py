@@ -241,9 +241,9 @@ def _weighted_spot(
 ) -> tuple[bool, Array, float, float, float]:
     """Whether view i is projected `after` seconds from instant k of ref, its speed (2,), px/s, and a point's weight.
 
-    noise, calibration_cov (2, 2), px^2: of the point, and of the view; row_time, sigma: of its picture. at (2,), J (2, 6)
-    receive the pixel, without the views' shift, and its Jacobian. The weight is the upper triangle of the inverse of
-    the covariance, 1/px^2.
+    noise, calibration_cov (2, 2), px^2: of the point, and of the view; row_time, sigma: of its picture, as of Delays.
+    at (2,), J (2, 6) receive the pixel, without the views' shift, and its Jacobian. The weight is the upper triangle of
+    the inverse of the covariance, 1/px^2.
     """
     R, t, m = state_after(ref.R[k], ref.t[k], ref.m[k], after)
     if not project_view(views, i, R, t, at, J):
@@ -292,8 +292,17 @@ def delayed_information(
                 continue
             d = detections.begin[start + k] + assigned[start + k, i]
             projected, _, w0, w1, w2 = _weighted_spot(
-                views, i, noise[i], calibration_cov[i], delays.after_s[d], delays.row_time_s[d], delays.sigma_s[d], ref,
-                k, at, J,
+                views,
+                i,
+                noise[i],
+                calibration_cov[i],
+                delays.after_s[d],
+                delays.row_time_s[d],
+                delays.sigma_s[d],
+                ref,
+                k,
+                at,
+                J,
             )
             if projected:
                 u, v = uv[i, 0] - at[0], uv[i, 1] - at[1]
@@ -329,8 +338,17 @@ def timed_rows(
                 continue
             d = detections.begin[start + k] + assigned[start + k, i]
             projected, moving, w0, w1, w2 = _weighted_spot(
-                views, i, noise[i], calibration_cov[i], delays.after_s[d], delays.row_time_s[d], delays.sigma_s[d], ref,
-                k, at, J,
+                views,
+                i,
+                noise[i],
+                calibration_cov[i],
+                delays.after_s[d],
+                delays.row_time_s[d],
+                delays.sigma_s[d],
+                ref,
+                k,
+                at,
+                J,
             )
             if not projected:
                 continue
