@@ -47,12 +47,6 @@ class Times:
             return 1 / self.frame_rate_hz
         return float(np.median(np.diff(self.times_s) / np.diff(self.frames)))
 
-    def stamp_sigma_s(self, number: int) -> float:
-        """Of the time of one frame."""
-        if self.sigma_s is None or self.frames is None:
-            return 0.0
-        return float(self.sigma_s[min(int(np.searchsorted(self.frames, number)), len(self.sigma_s) - 1)])
-
     @property
     def scatter(self) -> str | None:
         """What is unknown of the times of a free-running camera, in words; None: nothing."""
@@ -174,6 +168,13 @@ class CameraClock:
         """Times (m,), s, of pictures (m,) at mid-exposure of their middle rows, on the run's clock."""
         times = run_times if self.times is None else self.times
         return np.asarray(times.t_s(numbers) + self.offset_s)
+
+    def stamp_sigma_s(self, number: int) -> float:
+        """Of the time of one picture in the camera's own times."""
+        if self.times is None or self.times.sigma_s is None or self.times.frames is None:
+            return 0.0
+        at = np.searchsorted(self.times.frames, number)
+        return float(self.times.sigma_s[min(int(at), len(self.times.sigma_s) - 1)])
 
     def wide(self, rate_hz: float, height: int) -> bool:
         """Whether the sigma of a prior is wide. rate_hz: of the run; height: of the pictures, px."""

@@ -215,9 +215,9 @@ class Pipeline:
         clock = self.run.clocks.get(camera)
         row_time_s, sigmas = 0.0, (0.0, 0.0, 0.0)
         if clock is not None:
-            times = clock.times or self.run.times
-            views = sum(name == camera for name, _ in self.model.views)
-            stamp_s = float(np.sqrt(views)) * times.stamp_sigma_s(moment.pictures[camera].number)
+            stamp_s = clock.stamp_sigma_s(moment.pictures[camera].number)
+            if stamp_s:
+                stamp_s *= float(np.sqrt(sum(name == camera for name, _ in self.model.views)))
             row_time_s, sigmas = clock.row_time_s, (clock.offset_sigma_s, clock.row_time_sigma_s, stamp_s)
         if abs(delay_s) < NEGLIGIBLE_S and row_time_s == 0.0 and not any(sigmas):
             return points

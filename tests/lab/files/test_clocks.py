@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lab.errors import BeamposeError
-from lab.files.run.clocks import Times, stamp_sigmas
+from lab.files.run.clocks import CameraClock, Times, stamp_sigmas
 from lab.files.run.run_file import load_run
 from lab.report.frames.content import pictures_of
 from lab.runs.frames.frames import open_frames, pictures_at
@@ -154,6 +154,7 @@ def test_a_stamp_far_from_the_others_has_that_distance_as_its_sigma(away_s):
     times = stamped(PICTURES / 97 + away_s * (PICTURES == 40))
     assert np.flatnonzero(times.sigma_s).tolist() == [40]
     # A picture that comes before its time by more than half a step is taken for the one before.
-    assert times.stamp_sigma_s(40) == pytest.approx(min(abs(away_s), 1 / 97 - abs(away_s)), rel=1e-6)
-    assert times.stamp_sigma_s(41) == 0.0
+    clock = CameraClock(times=times)
+    assert clock.stamp_sigma_s(40) == pytest.approx(min(abs(away_s), 1 / 97 - abs(away_s)), rel=1e-6)
+    assert clock.stamp_sigma_s(41) == 0.0
     assert times.scatter.startswith("t_s of frame 40 is 4")
