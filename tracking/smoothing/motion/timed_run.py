@@ -48,7 +48,7 @@ FIRST_PASSES, LATER_PASSES = 14, 5  # with one strength of the jerk first, and a
 LAST_PASSES = 3  # of these, in which the strength of the jerk stays
 ROUNDS = 4  # of passes and improved turns
 FEWEST = 2  # turns in succession that a jerk may replace ...
-BESIDE_GAP = 3.0  # frames: ... unless a gap is as near, whose jumps a jerk that is stronger there would exclude
+BESIDE_GAP = 1.0  # frames: ... unless a gap is as near, whose jumps a jerk that is stronger there would exclude
 # m and rad: a sigma of each pose in a gap about the reference. A strong jerk would let the vehicle be kilometres away
 # after some frames, and covariances with both this and the error of a spot exceed the digits of a number.
 NEAR = 10.0
