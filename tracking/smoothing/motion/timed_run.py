@@ -316,10 +316,10 @@ class _TimedEstimator(_Estimator):
         for some in successions(self.turns, self.frame_s):
             if len(some) < FEWEST:
                 continue
-            first = np.searchsorted(self.t_s, some[0].begin_s - BESIDE_GAP * self.frame_s)
-            end = np.searchsorted(self.t_s, max(t.end_s for t in some) + BESIDE_GAP * self.frame_s)
+            beside, last_s = BESIDE_GAP * self.frame_s, max(t.end_s for t in some)
+            first, after = np.searchsorted(self.t_s, [some[0].begin_s - beside, last_s + beside])
             # Where few spots are left a strong jerk explains whatever contradicts itself.
-            density = search.without(some, self.turns) if self.measured[first : end + 1].all() else None
+            density = search.without(some, self.turns) if self.measured[first : after + 1].all() else None
             if density is None:
                 continue
             self.turns = [t for t in self.turns if not any(t is one for one in some)]

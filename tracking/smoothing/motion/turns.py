@@ -143,7 +143,7 @@ class TurnSearch:
         (ref, info), density, own = self.of_part(others, part), best, inside[part]
         for local in (False, True):
             for _ in range(_JERK_STEPS):
-                out = smoothed(ref, info, np.ascontiguousarray(density[part]))
+                out = smoothed(ref, info, np.ascontiguousarray(density[part]), True)
                 out = out._replace(energy=out.energy[own], gamma=out.gamma[own])
                 density = density.copy()
                 density[inside] = np.exp(next_log_density(np.log(density[inside]), out, own[own], local))
