@@ -178,7 +178,8 @@ class TrackedRecording:
             rows = slice(begin + int(first[c]), begin + int(first[c + 1]))
             points = Detections.at(self._uv.values[rows], self._cov.values[rows])
             size = self._size.values[rows]
-            clock = PictureClock(*self._clock.values[k, c], 0.0, 0.0, float(self._stamp.values[k, c]))
+            delay_s, row_time_s, middle_row = self._clock.values[k, c]
+            clock = PictureClock(delay_s, row_time_s, middle_row, stamp_sigma_s=float(self._stamp.values[k, c]))
             timed = None if clock.numbers == AT_THE_FRAME and not clock.stamp_sigma_s else clock.reversed()
             out.append(replace(points, major_px=size, minor_px=size, clock=timed) if there else None)
         return out
