@@ -20,6 +20,8 @@ class PictureClock:
     middle_row: float  # (height - 1) / 2
     sigma_s: float = 0.0  # of the delay, where it is being estimated
     row_sigma_s: float = 0.0  # of the row time, likewise
+    # Of the picture's own time, for each of its spots: all of them together know it no better than its stamp.
+    stamp_sigma_s: float = 0.0
 
     def after_s(self, v_px: Array) -> Array:
         """(...): when points in these rows (...) were exposed, s after the frame's instant."""
@@ -27,11 +29,16 @@ class PictureClock:
 
     def reversed(self) -> PictureClock:
         """The same for a time that runs backward."""
-        return PictureClock(-self.delay_s, -self.row_time_s, self.middle_row, self.sigma_s, self.row_sigma_s)
+        return replace(self, delay_s=-self.delay_s, row_time_s=-self.row_time_s)
 
     def variance_s2(self, v_px: Array) -> Array:
         """(...): variances of these times, s^2."""
-        return np.asarray(self.sigma_s**2 + ((v_px - self.middle_row) * self.row_sigma_s) ** 2)
+        return np.asarray(self.delay_sigma_s**2 + ((v_px - self.middle_row) * self.row_sigma_s) ** 2)
+
+    @property
+    def delay_sigma_s(self) -> float:
+        """Of the delay, with what is unknown of the picture's own time."""
+        return float(np.hypot(self.sigma_s, self.stamp_sigma_s))
 
     @property
     def numbers(self) -> tuple[float, float, float]:

@@ -227,7 +227,7 @@ class RigidTracker:
         views = self.model.numbers.copy()
         views["shift"] = shift
         frame = obs.frame
-        if any(clock is not None and (clock.sigma_s or clock.row_sigma_s) for clock in self._clocks):
+        if any(clock is not None and (clock.delay_sigma_s or clock.row_sigma_s) for clock in self._clocks):
             frame = frame._replace(cov=self._with_clock_errors(frame, views, state, velocity_P))
         return obs._replace(views=views, calibration_cov=self._calibration_cov + cov, shift_cov=cov, frame=frame)
 
@@ -237,7 +237,8 @@ class RigidTracker:
         Each moves as the spot nearest to it. As noise of its own in each picture this error hardly biases the pose:
         along the motion the other cameras decide.
         """
-        errors = [(0.0, 0.0, 0.0) if k is None else (k.sigma_s, k.row_sigma_s, k.middle_row) for k in self._clocks]
+        none = (0.0, 0.0, 0.0)
+        errors = [none if k is None else (k.delay_sigma_s, k.row_sigma_s, k.middle_row) for k in self._clocks]
         cov = self._stated_cov.copy()
         add_clock_errors(
             views, self._view_table.camera, np.array(errors), state.R, state.t, state.m, velocity_P, frame.first,

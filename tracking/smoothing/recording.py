@@ -111,6 +111,7 @@ class TrackedRecording:
         self._uv, self._cov, self._size, self._place = _Column((2,)), _Column((2, 2)), _Column(), _Column()
         self._first, self._has_image = _Column((cameras + 1,), np.int64), _Column((cameras,), bool)
         self._clock = _Column((cameras, 3))  # of the pictures, as PictureClock.numbers
+        self._stamp = _Column((cameras,))  # and as PictureClock.stamp_sigma_s
         self._begin = _Column(dtype=np.int64)  # (T + 1,) where the detections of each frame begin
         self._begin.append(0)
 
@@ -131,6 +132,7 @@ class TrackedRecording:
         self._first.append(first)
         self._has_image.append([f is not None for f in found])
         self._clock.append([AT_THE_FRAME if f is None or f.clock is None else f.clock.numbers for f in found])
+        self._stamp.append([0.0 if f is None or f.clock is None else f.clock.stamp_sigma_s for f in found])
         self._dt.append(dt_s)
         self._assigned.append(assigned_in_one_list(tracked, first[self.model.camera_of]))
         self._jumped.append(SpotStatus.TURNED in tracked.status)
@@ -176,8 +178,9 @@ class TrackedRecording:
             rows = slice(begin + int(first[c]), begin + int(first[c + 1]))
             points = Detections.at(self._uv.values[rows], self._cov.values[rows])
             size = self._size.values[rows]
-            clock = PictureClock(*self._clock.values[k, c])
-            timed = None if clock.numbers == AT_THE_FRAME else clock.reversed()
+            delay_s, row_time_s, middle_row = self._clock.values[k, c]
+            clock = PictureClock(delay_s, row_time_s, middle_row, stamp_sigma_s=float(self._stamp.values[k, c]))
+            timed = None if clock.numbers == AT_THE_FRAME and not clock.stamp_sigma_s else clock.reversed()
             out.append(replace(points, major_px=size, minor_px=size, clock=timed) if there else None)
         return out
 
@@ -206,7 +209,7 @@ class TrackedRecording:
         corrections_s (p,): of the estimated clocks.
         """
         clocks = self._clock.values
-        if self.clocks is None and not clocks[..., :2].any():
+        if self.clocks is None and not clocks[..., :2].any() and not self._stamp.values.any():
             return None
         if self.clocks is not None and corrections_s is not None:
             more = np.zeros((clocks.shape[1], 2))
@@ -214,9 +217,10 @@ class TrackedRecording:
                 more[camera, int(is_row_time)] = correction
             clocks = clocks.copy()
             clocks[..., :2] += np.where(self._has_image.values[..., None], more, 0.0)
-        per_picture = np.diff(self._first.values, axis=1)  # (T, cameras) detections
-        delay, row_time, middle = (np.repeat(clocks[..., i].ravel(), per_picture.ravel()) for i in range(3))
-        return Delays(delay + (self._uv.values[:, 1] - middle) * row_time, row_time, np.ascontiguousarray(clocks))
+        per_picture = np.diff(self._first.values, axis=1).ravel()  # (T cameras,) detections
+        delay, row_time, middle = (np.repeat(clocks[..., i].ravel(), per_picture) for i in range(3))
+        after_s, sigma_s = delay + (self._uv.values[:, 1] - middle) * row_time, self._stamp.values.ravel()
+        return Delays(after_s, row_time, np.repeat(sigma_s, per_picture), np.ascontiguousarray(clocks))
 
     def run_detections(self) -> RunDetections:
         """All detections of the run; their arrays are the recording's own."""

@@ -25,6 +25,7 @@ class Times:
     frame_rate_hz: float
     frames: Ints | None = None  # (n,) increasing: the frames with a timestamp; None: a constant rate
     times_s: Array | None = None  # (n,) increasing
+    sigma_s: Array | None = None  # (n,) of these, where the stamps of a free-running camera scatter; None: exact
 
     def t_s(self, frames: int | Ints) -> Array:
         """Times (...), s, of frame numbers (...).
@@ -45,6 +46,17 @@ class Times:
         if self.frames is None or self.times_s is None or len(self.frames) < 2:
             return 1 / self.frame_rate_hz
         return float(np.median(np.diff(self.times_s) / np.diff(self.frames)))
+
+    @property
+    def scatter(self) -> str | None:
+        """What is unknown of the times of a free-running camera, in words; None: nothing."""
+        if self.sigma_s is None or self.frames is None:
+            return None
+        usual_s, largest = float(np.median(self.sigma_s)), int(np.argmax(self.sigma_s))
+        number, largest_s = self.frames[largest], float(self.sigma_s[largest])
+        if largest_s > STAMP_OUTLIER * usual_s:
+            return f"t_s of frame {number} is {1e3 * largest_s:.3g} ms from where the other times put it"
+        return f"the times scatter by {1e3 * usual_s:.2g} ms about a constant rate"
 
     def without_time(self, frames: Ints) -> Ints:
         """The frame numbers, of (n,) given, without a timestamp; none where the rate is constant."""
@@ -82,6 +94,51 @@ def _check_unit(table: Table, times: Times) -> None:
         )
 
 
+FEWEST_STAMPS = 12  # that show whether they are those of a constant rate
+LARGEST_SCATTER, NEGLIGIBLE_SCATTER = 0.15, 1e-3  # of the usual step: pictures at any time; stamps without errors
+STAMP_OUTLIER = 5.0  # sigmas of the scatter
+NORMAL_MEDIAN = 0.6745  # median of |x| of a normal distribution of sigma 1
+
+
+def stamp_sigmas(times: Times) -> Array | None:
+    """Sigmas (n,), s, of the stamps of a camera of constant rate; None: they are exact, or its rate is not constant.
+
+    A stamp that is not where the others put it may be an error of the stamp or a picture at that time. Its sigma is its
+    distance from a line over the pictures, at least the scatter of all stamps. The line may change its slope slowly: it
+    is fitted to parts of the recording, as long as their stamps scatter evenly about it.
+    """
+    if times.times_s is None or len(times.times_s) < FEWEST_STAMPS:
+        return None
+    # Dropped pictures may have numbers or not.
+    index = np.cumsum(np.round(np.diff(times.times_s, prepend=times.times_s[0]) / times.usual_step_s))
+    away, step_s = _from_line(index, times.times_s), times.usual_step_s
+    scatter_s = float(np.median(np.abs(away))) / NORMAL_MEDIAN
+    sigma_s = np.where(np.abs(away) > max(STAMP_OUTLIER * scatter_s, NEGLIGIBLE_SCATTER * step_s), np.abs(away), 0.0)
+    if scatter_s > LARGEST_SCATTER * step_s or np.mean(sigma_s > 0) > LARGEST_SCATTER:
+        return None
+    if scatter_s > NEGLIGIBLE_SCATTER * step_s:
+        sigma_s = np.maximum(sigma_s, scatter_s)
+    return sigma_s if sigma_s.any() else None
+
+
+def _from_line(index: Array, t_s: Array) -> Array:
+    """Distances (n,), s, of stamps from lines over the pictures (n,), which most of the stamps determine."""
+    near = np.ones(len(t_s), dtype=bool)
+    away = t_s - t_s[0]
+    for _ in range(3):
+        slope, offset = np.polyfit(index[near] - index[0], t_s[near] - t_s[0], 1)
+        away = t_s - t_s[0] - offset - slope * (index - index[0])
+        scatter_s = float(np.median(np.abs(away))) / NORMAL_MEDIAN
+        near = np.abs(away) <= STAMP_OUTLIER * scatter_s
+    half = len(t_s) // 2
+    if half >= FEWEST_STAMPS:
+        # A change of the slope puts the ends on one side of the line and the middle on the other.
+        means = [float(np.mean(part)) for part in np.array_split(away[near], 4)]
+        if max(means) - min(means) > STAMP_OUTLIER * scatter_s / np.sqrt(np.count_nonzero(near) / 4):
+            return np.concatenate([_from_line(index[:half], t_s[:half]), _from_line(index[half:], t_s[half:])])
+    return away
+
+
 LONGEST_READOUT = 1.05  # of the time between two pictures; above 1 for a rounded row time
 
 
@@ -111,6 +168,13 @@ class CameraClock:
         """Times (m,), s, of pictures (m,) at mid-exposure of their middle rows, on the run's clock."""
         times = run_times if self.times is None else self.times
         return np.asarray(times.t_s(numbers) + self.offset_s)
+
+    def stamp_sigma_s(self, number: int) -> float:
+        """Of the time of one picture in the camera's own times."""
+        if self.times is None or self.times.sigma_s is None or self.times.frames is None:
+            return 0.0
+        at = np.searchsorted(self.times.frames, number)
+        return float(self.times.sigma_s[min(int(at), len(self.times.sigma_s) - 1)])
 
     def wide(self, rate_hz: float, height: int) -> bool:
         """Whether the sigma of a prior is wide. rate_hz: of the run; height: of the pictures, px."""
@@ -179,6 +243,7 @@ def load_clock(
         if not recording and not path.is_file():
             raise InputError(f"{where}.timestamps: expected a table frame,t_s, found none at {path}")
         times = Times(rate_hz) if recording else load_times(path, rate_hz)
+        times.sigma_s = stamp_sigmas(times)
         rate_hz = 1 / times.usual_step_s
     row_time_prior_s = ROW_TIME_SIGMA / rate_hz / height if isinstance(row_time_s, str) else 0.0
     offset_s = 0.0 if isinstance(offset_s, str) else offset_s

@@ -213,9 +213,12 @@ class Pipeline:
         """The points of a camera's picture with the time between the moment and their exposure."""
         delay_s = moment.pictures[camera].t_s - moment.t_s
         clock = self.run.clocks.get(camera)
-        row_time_s, sigmas = 0.0, (0.0, 0.0)
+        row_time_s, sigmas = 0.0, (0.0, 0.0, 0.0)
         if clock is not None:
-            row_time_s, sigmas = clock.row_time_s, (clock.offset_sigma_s, clock.row_time_sigma_s)
+            stamp_s = clock.stamp_sigma_s(moment.pictures[camera].number)
+            if stamp_s:
+                stamp_s *= float(np.sqrt(sum(name == camera for name, _ in self.model.views)))
+            row_time_s, sigmas = clock.row_time_s, (clock.offset_sigma_s, clock.row_time_sigma_s, stamp_s)
         if abs(delay_s) < NEGLIGIBLE_S and row_time_s == 0.0 and not any(sigmas):
             return points
         middle = (self.run.rig.cameras[camera].image_size_px[1] - 1) / 2

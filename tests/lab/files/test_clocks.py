@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from lab.errors import BeamposeError
+from lab.files.run.clocks import CameraClock, Times, stamp_sigmas
 from lab.files.run.run_file import load_run
 from lab.report.frames.content import pictures_of
 from lab.runs.frames.frames import open_frames, pictures_at
@@ -112,3 +113,48 @@ def test_pictures_of_a_camera_with_times_of_its_own_are_those_nearest_to_the_row
     assert sorted(shown) == list(range(6))
     drawn = [found["right"] for found in pictures_of(run, ["right"], range(6))]
     assert {row: int(p[0, 0]) for row, p in enumerate(drawn) if isinstance(p, np.ndarray)} == values
+
+
+PICTURES = np.arange(300)
+
+
+def stamped(times_s: np.ndarray, numbers: np.ndarray = PICTURES) -> Times:
+    times = Times(100.0, numbers, np.asarray(times_s))
+    times.sigma_s = stamp_sigmas(times)
+    return times
+
+
+@pytest.mark.parametrize(
+    "times_s",
+    [
+        pytest.param(PICTURES / 97, id="constant"),
+        pytest.param(np.round(PICTURES / 97, 6), id="written to a microsecond"),
+        pytest.param(np.concatenate([PICTURES[:150] / 97, 0.003 + PICTURES[150:] / 97]), id="a jump that stays"),
+        pytest.param(np.cumsum(np.random.default_rng(1).uniform(0.004, 0.016, 300)), id="at any time"),
+        pytest.param(np.arange(300) / 97 + 2e-4 * np.sin(PICTURES / 300), id="a rate that changes slowly"),
+        pytest.param(PICTURES[:11] / 97 + 1e-3 * (PICTURES[:11] == 5), id="too few"),
+    ],
+)
+def test_stamps_that_do_not_scatter_about_a_constant_rate_are_exact(times_s):
+    assert stamped(times_s, PICTURES[: len(times_s)]).sigma_s is None
+
+
+@pytest.mark.parametrize("dropped", [False, True])
+def test_the_scatter_of_stamps_is_the_sigma_of_each(dropped):
+    t_s = PICTURES / 97 + np.random.default_rng(2).normal(0, 2e-4, 300)
+    if dropped:  # and the camera has numbered those that are left
+        t_s = np.delete(t_s, np.s_[30:60])
+    times = stamped(t_s, np.arange(len(t_s)))
+    np.testing.assert_allclose(times.sigma_s, 2e-4, rtol=0.2)
+    assert "scatter by 0.2" in times.scatter
+
+
+@pytest.mark.parametrize("away_s", [0.004, -0.006])
+def test_a_stamp_far_from_the_others_has_that_distance_as_its_sigma(away_s):
+    times = stamped(PICTURES / 97 + away_s * (PICTURES == 40))
+    assert np.flatnonzero(times.sigma_s).tolist() == [40]
+    # A picture that comes before its time by more than half a step is taken for the one before.
+    clock = CameraClock(times=times)
+    assert clock.stamp_sigma_s(40) == pytest.approx(min(abs(away_s), 1 / 97 - abs(away_s)), rel=1e-6)
+    assert clock.stamp_sigma_s(41) == 0.0
+    assert times.scatter.startswith("t_s of frame 40 is 4")

@@ -77,7 +77,7 @@ def test_points_are_moved_to_their_frames_instant_as_their_spots_move():
     cov = np.tile([[0.02, 0.005], [0.005, 0.03]], (n, 1, 1))
     first = np.searchsorted(MODEL.camera_of, [[0, 1, 2]])
     seen = RunDetections(uv, cov, np.zeros(n), np.array([0, n]), first, np.ones((1, 2), bool), np.ones(n), np.ones(n))
-    delays = Delays(np.full(n, after), np.zeros(n), np.array([[[after, 0.0, 511.5]] * 2]))
+    delays = Delays(np.full(n, after), np.zeros(n), np.zeros(n), np.array([[[after, 0.0, 511.5]] * 2]))
     m_then = M + np.concatenate([after * M[6:], np.zeros(6)])
     ref = Reference(*(np.stack(pair) for pair in ((R, R_then), (T, t_then), (M, m_then))))
     jump, moment = np.array([[0.0, 0.0], [0.5, 0.5]]), np.array([[-1.0, 0.0], [0.002, 1e-4]])

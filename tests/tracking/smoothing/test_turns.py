@@ -192,6 +192,18 @@ def test_a_stronger_jerk_replaces_turns_of_a_swing_but_not_a_corner():
     assert corner.without([turn], [turn]) is None
 
 
+def test_a_jerk_in_place_of_turns_is_that_of_the_axis_that_turns():
+    """A turntable turns about one axis; the same jerk of all six would be less likely than the turns."""
+    axis, strong = 5, np.tile(JERK, (FRAMES, 1))
+    strong[STEP - 6 : STEP + 6, axis] *= 1e6
+    calm = replace(search_in(drawn(6, FRAMES, jerk=strong)), density=np.tile(JERK, (FRAMES, 1)))
+    turns = [Turn(float(calm.t_s[k] - 0.5 * DT), DT, DT, SIZE) for k in range(STEP - 5, STEP + 6, 2)]
+    density = calm.without(turns, turns)
+    assert density is not None
+    others = np.delete(np.arange(6), axis)
+    assert density[STEP, axis] > 100 * density[STEP, others].max()
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_likelihood_of_more_turns_is_that_of_the_whole_part(seed):
     """Only their steps are filtered again."""
@@ -259,7 +271,7 @@ def test_each_labelled_spot_is_at_its_own_instant_among_those_of_the_frames():
     assigned[rng.random(assigned.shape) < 0.2] = -1
     assigned[5, 1] = 2 + BLENDED
     used = np.arange(frames) != 11
-    delays = Delays(after, np.full(frames * n, 1e-6), np.zeros((frames, 1, 3)))
+    delays = Delays(after, np.full(frames * n, 1e-6), np.zeros(frames * n), np.zeros((frames, 1, 3)))
     views = np.zeros(n)
     dt = np.r_[0.0, np.full(frames - 1, DT)]
     instants = Instants.of(WholeRun(views, seen, cov[:n], dt, 0.0, True, delays), assigned, used)

@@ -58,7 +58,7 @@ class Instants:
         detections = seen._replace(
             uv=seen.uv[rows], cov=seen.cov[rows], blend_px=seen.blend_px[rows], size_px=seen.size_px[rows], begin=begin,
         )  # fmt: skip
-        own = Delays(at_s[order] - t_s[of_spot], delays.row_time_s[rows], delays.clocks[:0])
+        own = Delays(at_s[order] - t_s[of_spot], delays.row_time_s[rows], delays.sigma_s[rows], delays.clocks[:0])
         whole = replace(run, detections=detections, delays=own, dt=np.diff(t_s, prepend=t_s[:1]))
         return Instants(t_s, of_frame, _nearest(frames_s, t_s), whole, labels)
 

@@ -198,19 +198,21 @@ class Delays(NamedTuple):
 
     after_s: Array  # (m,) s after the frame's instant
     row_time_s: Array  # (m,) s per row of its picture
+    sigma_s: Array  # (m,) of `after_s`, as PictureClock.stamp_sigma_s
     clocks: Array  # (T, cameras, 3) of the pictures, as PictureClock.numbers
 
 
 @compiled
-def _covariance(cov: Array, speed: Array, row_time: float) -> tuple[float, float, float]:
+def _covariance(cov: Array, speed: Array, row_time: float, sigma: float) -> tuple[float, float, float]:
     """Covariance (uu, uv, vv), px^2, of a detection less the pixel expected at its own instant.
 
     cov (2, 2): of the detection; speed (2,), px/s, of its spot: an error of the row changes that instant, and so the
-    expectation.
+    expectation. sigma: of that instant, s.
     """
-    a, b = -speed[0] * row_time, 1.0 - speed[1] * row_time
-    uu = cov[0, 0] + 2 * a * cov[0, 1] + a * a * cov[1, 1]
-    return uu, b * (cov[0, 1] + a * cov[1, 1]), b * b * cov[1, 1]
+    a, b, c = -speed[0] * row_time, 1.0 - speed[1] * row_time, sigma * sigma
+    uu = cov[0, 0] + 2 * a * cov[0, 1] + a * a * cov[1, 1] + c * speed[0] * speed[0]
+    both = b * (cov[0, 1] + a * cov[1, 1]) + c * speed[0] * speed[1]
+    return uu, both, b * b * cov[1, 1] + c * speed[1] * speed[1]
 
 
 @compiled
@@ -231,6 +233,7 @@ def _weighted_spot(
     calibration_cov: Array,
     after: float,
     row_time: float,
+    sigma: float,
     ref: Reference,
     k: int,
     at: Array,
@@ -238,9 +241,9 @@ def _weighted_spot(
 ) -> tuple[bool, Array, float, float, float]:
     """Whether view i is projected `after` seconds from instant k of ref, its speed (2,), px/s, and a point's weight.
 
-    noise, calibration_cov (2, 2), px^2: of the point, and of the view; row_time: of its picture. at (2,), J (2, 6)
-    receive the pixel, without the views' shift, and its Jacobian. The weight is the upper triangle of the inverse of
-    the covariance, 1/px^2.
+    noise, calibration_cov (2, 2), px^2: of the point, and of the view; row_time, sigma: of its picture, as of Delays.
+    at (2,), J (2, 6) receive the pixel, without the views' shift, and its Jacobian. The weight is the upper triangle of
+    the inverse of the covariance, 1/px^2.
     """
     R, t, m = state_after(ref.R[k], ref.t[k], ref.m[k], after)
     if not project_view(views, i, R, t, at, J):
@@ -248,7 +251,7 @@ def _weighted_spot(
     for a in range(2):
         at[a] -= views[i]["shift"][a]
     speed = _speed(J, m)
-    uu, both, vv = _covariance(noise, speed, row_time)
+    uu, both, vv = _covariance(noise, speed, row_time, sigma)
     uu, both, vv = uu + calibration_cov[0, 0], both + calibration_cov[0, 1], vv + calibration_cov[1, 1]
     w0, w1, w2, _ = inverse_2x2(uu, both, vv)
     return True, speed, w0, w1, w2
@@ -289,7 +292,17 @@ def delayed_information(
                 continue
             d = detections.begin[start + k] + assigned[start + k, i]
             projected, _, w0, w1, w2 = _weighted_spot(
-                views, i, noise[i], calibration_cov[i], delays.after_s[d], delays.row_time_s[d], ref, k, at, J
+                views,
+                i,
+                noise[i],
+                calibration_cov[i],
+                delays.after_s[d],
+                delays.row_time_s[d],
+                delays.sigma_s[d],
+                ref,
+                k,
+                at,
+                J,
             )
             if projected:
                 u, v = uv[i, 0] - at[0], uv[i, 1] - at[1]
@@ -325,7 +338,17 @@ def timed_rows(
                 continue
             d = detections.begin[start + k] + assigned[start + k, i]
             projected, moving, w0, w1, w2 = _weighted_spot(
-                views, i, noise[i], calibration_cov[i], delays.after_s[d], delays.row_time_s[d], ref, k, at, J
+                views,
+                i,
+                noise[i],
+                calibration_cov[i],
+                delays.after_s[d],
+                delays.row_time_s[d],
+                delays.sigma_s[d],
+                ref,
+                k,
+                at,
+                J,
             )
             if not projected:
                 continue
@@ -383,10 +406,11 @@ def moved_detections(
     for k in range(len(between.of_frame)):
         own = between.of_frame[k]
         for c in range(cameras):
-            if delays.clocks[k, c, 0] == 0.0 and delays.clocks[k, c, 1] == 0.0:
-                continue
+            at_frame = delays.clocks[k, c, 0] == 0.0 and delays.clocks[k, c, 1] == 0.0
             for row in range(detections.first[k, c], detections.first[k, c + 1]):
                 d = detections.begin[k] + row
+                if at_frame and delays.sigma_s[d] == 0.0:
+                    break
                 after, near = delays.after_s[d], own
                 at_s = t_s[own] + after
                 step = 1 if after > 0.0 else -1
@@ -405,7 +429,7 @@ def moved_detections(
                 if view < 0 or not project_view(views, view, ref.R[own], ref.t[own], here, J):
                     continue
                 project_view(views, view, R, t, there, J)
-                uu, both, vv = _covariance(detections.cov[d], _speed(J, m), delays.row_time_s[d])
+                uu, both, vv = _covariance(detections.cov[d], _speed(J, m), delays.row_time_s[d], delays.sigma_s[d])
                 cov[d, 0, 0], cov[d, 0, 1], cov[d, 1, 0], cov[d, 1, 1] = uu, both, both, vv
                 for a in range(2):
                     uv[d, a] += here[a] - there[a]

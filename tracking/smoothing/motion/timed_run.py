@@ -47,7 +47,8 @@ from tracking.smoothing.motion.whole_run import (
 FIRST_PASSES, LATER_PASSES = 14, 5  # with one strength of the jerk first, and after turns have changed
 LAST_PASSES = 3  # of these, in which the strength of the jerk stays
 ROUNDS = 4  # of passes and improved turns
-FEWEST = 3  # turns in succession that a jerk may replace: two are the ends of one motion
+FEWEST = 2  # turns in succession that a jerk may replace ...
+BESIDE_GAP = 1.0  # frames: ... unless a gap is as near, whose jumps a jerk that is stronger there would exclude
 # m and rad: a sigma of each pose in a gap about the reference. A strong jerk would let the vehicle be kilometres away
 # after some frames, and covariances with both this and the error of a spot exceed the digits of a number.
 NEAR = 10.0
@@ -182,12 +183,11 @@ class _TimedEstimator(_Estimator):
         """Passes and searches for turns until nothing changes."""
         out = self._passes(FIRST_PASSES if self.fresh else LATER_PASSES, GLOBAL_PASSES if self.fresh else 0)
         for number in range(ROUNDS):
-            withdrawn = self._hidden_excluded() | self._turns_withdrawn()
-            if withdrawn:  # the stronger jerk would hide the other turns
-                out = self._passes(LATER_PASSES)
-            if not (self._turns_improved(every=number == 0) or withdrawn):
+            improved = self._turns_improved(every=number == 0)
+            adapting = self._hidden_excluded() | self._turns_withdrawn()
+            if not (improved or adapting):
                 break
-            out = self._passes(LATER_PASSES, adapting=False)
+            out = self._passes(LATER_PASSES, adapting=adapting)
         else:  # no turn is left that has not been improved
             self._turns_improved(every=False)
             out = self._passes(LATER_PASSES, adapting=False, searching=False)
@@ -316,9 +316,10 @@ class _TimedEstimator(_Estimator):
         for some in successions(self.turns, self.frame_s):
             if len(some) < FEWEST:
                 continue
-            first, end = np.searchsorted(self.t_s, [some[0].begin_s, max(t.end_s for t in some)])
+            beside, last_s = BESIDE_GAP * self.frame_s, max(t.end_s for t in some)
+            first, after = np.searchsorted(self.t_s, [some[0].begin_s - beside, last_s + beside])
             # Where few spots are left a strong jerk explains whatever contradicts itself.
-            density = search.without(some, self.turns) if self.measured[max(first - 1, 0) : end + 1].all() else None
+            density = search.without(some, self.turns) if self.measured[first : after + 1].all() else None
             if density is None:
                 continue
             self.turns = [t for t in self.turns if not any(t is one for one in some)]

@@ -22,7 +22,9 @@ from tracking.smoothing.motion.fixed_interval import (
     filtered,
     log_likelihood,
     log_likelihood_with,
+    smoothed,
 )
+from tracking.smoothing.motion.process_noise import next_log_density
 from tracking.smoothing.motion.run_detections import Reference, Turn
 
 AROUND = 24  # frames on both sides of a turn that show it: 8 showed none of corners of slow motion
@@ -41,10 +43,12 @@ _WITH_IT = (-1.0, -0.5, 0.0, 0.5, 1.0)  # of the way of the middle: how far the 
 _SHARES = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)  # of a turn's variance, of which the most likely one is taken
 _GAP_SHARES = (*10.0 ** np.arange(0.0, -6.5, -0.5), 0.0)  # of that of a gap's jumps: a thousandth of the fastest speed
 _EXCLUDED_NATS = 5.0  # by which these must be less likely than none, or than smaller ones, to exclude them
+# By which the largest jumps that a gap may have must be: they are of all six axes, those of a motion often of one.
+_IMPOSSIBLE_NATS = 6 * _EXCLUDED_NATS / 2
 _CURVATURE_NATS = 0.5  # drop of the likelihood from which the sigma of the middle is computed
 _CHANGED = 0.02, 0.1  # of a frame, and relative: less does not change a turn
 TURN_NATS = 3.0  # by which each turn must make a run more likely
-SUCCESSION_NATS = 10.0  # by which several must; a stronger jerk resembles them
+AS_MANY = 2  # turns have as many numbers as a jerk has axes
 RESOLVED_NATS = 40.0  # by which turns must be more likely than one smooth turn in their place
 _UNRESOLVED = 4.0  # frames: turns farther apart do not resemble one
 _WIDTHS, _SIZES = (
@@ -53,6 +57,7 @@ _WIDTHS, _SIZES = (
 )  # of their distance and variances: one in their place
 _CLOSE = 3.0  # frames between two turns in close succession
 _JERKS = 10.0 ** np.arange(-4, 2)  # of the jerk that changes the velocities as much within a frame
+_JERK_STEPS, _GAINED_BY_STEP = 20, 1.0  # from there, and nats that each must gain
 
 
 def velocity_jumps(turns: Sequence[Turn], t_s: Array) -> tuple[Array, Array]:
@@ -140,16 +145,30 @@ class TurnSearch:
         inside = (self.t_s > begin - self.frame_s) & (self.t_s - self.info.dt < end + self.frame_s)
         # A velocity changes by q dt^3 / 3.
         size = np.repeat(np.max([t.size for t in some], axis=0), 3) * 3 / self.frame_s**3
-        best, most = self.density, -np.inf
-        for share in (0.0, *_JERKS):
-            density = np.where(inside[:, None], np.maximum(self.density, share * size), self.density)
-            if (nats := self.nats(others, part, density)) > most:
-                best, most = density, nats
-        needed = max(TURN_NATS * len(some), SUCCESSION_NATS if len(some) > 1 else 0.0)
+        tried = [
+            np.where(inside[:, None], np.maximum(self.density, share * size), self.density) for share in (0.0, *_JERKS)
+        ]
+        nats = [self.nats(others, part, density) for density in tried]
+        best, most = tried[int(np.argmax(nats))], max(nats)
+        # Each axis has a strength of its own, as a turntable's about which it turns; then each part of the time.
+        (ref, info), density, own = self.of_part(others, part), best, inside[part]
+        for local in (False, True):
+            for _ in range(_JERK_STEPS):
+                out = smoothed(ref, info, np.ascontiguousarray(density[part]), True)
+                out = out._replace(energy=out.energy[own], gamma=out.gamma[own])
+                density = density.copy()
+                density[inside] = np.exp(next_log_density(np.log(density[inside]), out, own[own], local))
+                if (value := self.nats(others, part, density)) < most + _GAINED_BY_STEP:
+                    break
+                best, most = density, value
+            density = best
         run, likely = self.with_turns(others, part), list(some)
         for i, turn in enumerate(likely):
             likely[i] = run.sized(turn, [*likely[:i], *likely[i + 1 :]])
-        return best if most > run.nats(likely) - needed else None
+        least = run.nats(likely) - TURN_NATS * len(some)
+        if nats[0] > least:
+            return self.density
+        return best if most > least + TURN_NATS * AS_MANY else None
 
     def one_for(self, some: Sequence[Turn], all_turns: Sequence[Turn]) -> Turn | None:
         """One turn in place of some of all turns; None: the spots exclude it."""
@@ -186,7 +205,7 @@ class TurnSearch:
             nats.append(replace(self, hidden=hidden).nats(near, part, self.density))
         if max(nats) > nats[-1] + TURN_NATS or nats[-1] < nats[0] + _EXCLUDED_NATS:
             return False, 1.0
-        allowed = np.flatnonzero(np.array(nats) > max(nats) - _EXCLUDED_NATS)
+        allowed = np.flatnonzero(np.array(nats) > max(nats) - _IMPOSSIBLE_NATS)
         return True, float(_GAP_SHARES[allowed[0]])
 
     def to_next_spots(self, turn: Turn) -> Turn:

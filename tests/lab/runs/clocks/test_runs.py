@@ -102,6 +102,33 @@ def test_a_camera_of_another_rate_needs_only_its_times(recording, tmp_path):
 
 
 @pytest.mark.usefixtures("no_search")
+@pytest.mark.parametrize("scatter_s", [0.0, 2e-4])
+def test_the_errors_of_stamps_are_in_the_poses(scatter_s, tmp_path):
+    """Fast motion at 413 Hz: one stamp off by half a step, or all by a twelfth: 4 and .7 px, of spots to .15 px."""
+    r = random_recording(41061, frames=60)
+    write_recording(r, tmp_path / "run")
+    rng = np.random.default_rng(5)
+    for table in sorted((tmp_path / "run").glob("times-*.csv")):
+        rows = list(csv.reader(table.open()))
+        for row in rows[1:]:
+            row[1] = f"{float(row[1]) + rng.normal(0, scatter_s):.12g}"
+        if not scatter_s and table.stem == "times-1":
+            rows[41][1] = f"{float(rows[41][1]) + 0.5 / r.rate_hz:.12g}"
+        with table.open("w", newline="") as file:
+            csv.writer(file).writerows(rows)
+    process_run(tmp_path / "run", tmp_path / "out")
+    poses = read_poses(tmp_path / "out")
+    known = ~poses.has("lost")
+    delta = r.pose_at(r.rows_s)[poses.frames].minus(poses.world_from_body)[known]
+    nees = np.sum(delta * np.linalg.solve(poses.covariance[known], delta[..., None])[..., 0], axis=1) / 6
+    assert poses.has("measured").sum() > 35
+    assert nees.mean() < 1.5
+    assert nees.max() < 6
+    notes = json.loads((tmp_path / "out" / "summary.json").read_text())["notes"]
+    assert any(("scatter by 0.2" if scatter_s else "t_s of frame 40 is") in note for note in notes)
+
+
+@pytest.mark.usefixtures("no_search")
 def test_four_spots_seen_by_free_running_cameras_are_found(tmp_path):
     """If the first search allowed for the fastest motion alone, no pose could be distinguished from false points."""
     write_recording(random_recording(1006, frames=12), tmp_path / "run")
@@ -256,6 +283,7 @@ def test_a_turn_in_a_gap_in_which_nothing_is_seen_is_covered(gap, tmp_path):
         pytest.param(9304, 220, id="slow corners, which few frames do not show"),
         pytest.param(7111, 120, id="a corner before the first frame that has a pose"),
         pytest.param(21001, 300, id="a slow corner in a gap beside fast motion"),
+        pytest.param(7321, 120, id="smooth turns of eight frames about one axis, which resemble six corners"),
         pytest.param(7331, 120, id="a swing that begins in a gap, with a slow camera"),
     ],
 )
