@@ -38,11 +38,11 @@ class MissingPicture:
     reason: str  # "dropped", "repeated: ...", "torn: ...", "unreadable: ...", "wrong size ..."
 
 
-def read_picture(path: Path, size_px: tuple[int, int] | None, colour: bool = False) -> Any:
+def read_picture(path: Path, size_px: tuple[int, int] | None, colour: bool = False, used_bits: int | None = 16) -> Any:
     """The picture in a file as grey (h, w), 8 or 16 bit; Missing where it is damaged or has another (width, height).
 
-    size_px None: any size. colour: (h, w, 3), BGR, 8 bits, instead; a grey picture has three equal channels. The caller
-    owns the array. Thread-safe.
+    size_px None: any size. colour: (h, w, 3), BGR, 8 bits, instead; a grey picture has three equal channels. used_bits:
+    as for `as_colour`; None: colours of 16 bits as stored. The caller owns the array. Thread-safe.
     """
     try:
         data = _content(path)
@@ -52,15 +52,20 @@ def read_picture(path: Path, size_px: tuple[int, int] | None, colour: bool = Fal
     if not colour or isinstance(found, MissingPicture) or found.ndim == 3:
         return found
     cv2 = load_cv2()
-    picture = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    return MissingPicture(f"{UNREADABLE}: damaged, or no picture") if picture is None else picture
+    picture = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    if picture is None:
+        return MissingPicture(f"{UNREADABLE}: damaged, or no picture")
+    return picture if used_bits is None else as_colour(picture, used_bits)
 
 
-def as_colour(picture: NDArray[Any]) -> ColourPicture:
-    """A picture of 8 or 16 bits, grey or BGR, as (h, w, 3), BGR, 8 bits."""
+def as_colour(picture: NDArray[Any], used_bits: int = 16) -> ColourPicture:
+    """A picture of 8 or 16 bits, grey or BGR, as (h, w, 3), BGR, 8 bits.
+
+    used_bits: of pictures of 16 bits, 8 to 16; the upper 8 of them are taken, and values with more bits are clipped.
+    """
     cv2 = load_cv2()
     if picture.dtype == np.uint16:
-        picture = (picture >> 8).astype(np.uint8)
+        picture = np.minimum(picture >> (used_bits - 8), 255).astype(np.uint8)
     if picture.ndim == 2 or picture.shape[2] == 1:
         return cast(ColourPicture, cv2.cvtColor(picture.reshape(picture.shape[:2]), cv2.COLOR_GRAY2BGR))
     return cast(ColourPicture, picture[..., :3])

@@ -7,6 +7,7 @@ YUV videos, all channels of RGB videos. Files are regular files. Live cameras: l
 from __future__ import annotations
 
 import glob
+import math
 import os
 import re
 from collections import deque
@@ -48,6 +49,7 @@ _RATE_RANGE_HZ = (0.01, 1e6)  # a rate outside it in a video's header is not one
 _LAST_NUMBER = re.compile(r"([0-9]+)[^0-9]*$")
 _HINT = f"a picture ({', '.join(s[1:] for s in PICTURE_SUFFIXES)}), a folder of pictures, or a video"
 _SHOWN = 3  # names in a message
+_DEPTH_PICTURES = 9  # whose values show the bits of the sensor
 
 Read: TypeAlias = GreyPicture | ColourPicture | MissingPicture
 
@@ -314,6 +316,7 @@ class _Reader(Protocol):
 class _FileReader:
     def __init__(self, source: PictureFiles, size_px: tuple[int, int] | None, colour: bool) -> None:
         self._source, self._size_px, self._colour = source, size_px, colour
+        self._used_bits = _used_bits(source) if colour else 16
         self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="decode")
 
     def request(self, frame: int) -> Future[Read]:
@@ -323,10 +326,33 @@ class _FileReader:
         if not self._colour and (kept := self._source.kept.pop(frame, None)) is not None:
             return kept
         path = self._source.files.get(frame)
-        return MissingPicture(DROPPED) if path is None else read_picture(path, self._size_px, self._colour)
+        if path is None:
+            return MissingPicture(DROPPED)
+        return read_picture(path, self._size_px, self._colour, self._used_bits)
 
     def close(self) -> None:
         self._pool.shutdown(cancel_futures=True)
+
+
+def _used_bits(source: PictureFiles) -> int:
+    """Bits that the sensor has in colour files of 16 bits, 8 to 16, an even number.
+
+    Pictures from all of the series are looked at: it has one number, so that a colour stays the same.
+    """
+    from tracking.noise_estimation.grey_values import full_scale, grey_step
+
+    paths, wide = list(source.files.values()), []
+    for k in np.unique(np.linspace(0, len(paths) - 1, _DEPTH_PICTURES).astype(int)).tolist():
+        picture = read_picture(paths[k], None, True, None)
+        if isinstance(picture, MissingPicture):
+            continue
+        if picture.dtype == np.uint8:
+            return 16
+        wide.append(picture)
+    if not wide:
+        return 16
+    step = grey_step(wide)
+    return 2 * math.ceil(math.log2(full_scale(wide, step) + step) / 2)
 
 
 class _VideoReader:

@@ -185,7 +185,8 @@ def _density(uv_px: Array, projected_px: Array) -> float:
 # colour in the other picture come first. Source: ours, with the compiled solver geometry/pose_solver/three_spots.py.
 
 _MOST_CANDIDATES = 12  # of a picture, in triples: 1,320 ordered ones
-_FIRST_TRIPLES = 8  # of markers: enough where most of them are seen
+_MORE_CANDIDATES = 24  # ... where those explain no picture, with few triples of markers
+_FIRST_TRIPLES, _LAST_TRIPLES = 8, 4  # of markers: enough where most of them are seen; with _MORE_CANDIDATES
 _MOST_TRIPLES = 60  # of markers: all triples of eight
 _MOST_TRIED = 20_000  # ordered triples of candidates times triples of markers, beyond the first triples
 _REFINED, _REFINED_SHARE = 24, 0.6  # best hypotheses that are fitted: at most so many, of this share of the best score
@@ -231,10 +232,18 @@ def acquire(pair: StereoPair, model: MarkerModel, images: Images, p: MatchParame
     expected = sum(min(len(model), len(candidates)) for candidates in images)
     triples = marker_triples(model)
     # The first triples in both pictures, then the others: any four markers of eight contain four triples.
-    for c, some in [(c, part) for part in (triples[:_FIRST_TRIPLES], triples[_FIRST_TRIPLES:]) for c in (0, 1)]:
+    # Last, candidates that are not among the first: other lights may be brighter than the markers.
+    parts = (
+        (triples[:_FIRST_TRIPLES], _MOST_CANDIDATES),
+        (triples[_FIRST_TRIPLES:], _MOST_CANDIDATES),
+        (triples[:_LAST_TRIPLES], _MORE_CANDIDATES),
+    )
+    for c, (some, most) in [(c, part) for part in parts for c in (0, 1)]:
         if c == 0 and any(explains_a_picture(f, model, images) for f in found):
             break  # a camera that contradicts is not reconciled by other triples
-        poses = _hypotheses(pair, model, images[c], ranked[c], c, some)
+        if most > _MOST_CANDIDATES >= len(ranked[c]):
+            continue  # no further ones
+        poses = _hypotheses(pair, model, images[c], ranked[c][:most], c, some)
         tried += len(poses.translation)
         fits = [
             labelled_pose(pair, model, images, pose, near_pose(pose), p) for pose in _best(pair, model, images, poses)
@@ -309,7 +318,7 @@ def near_pose(pose: Pose) -> Array:
 def _ranked(candidates: MarkerImages, has_partner: Bools) -> Ints:
     """The candidates for triples: those with a partner first, then the larger ones."""
     area = np.nan_to_num(candidates.area_px2, nan=0.0)
-    return np.lexsort((-area, ~has_partner))[:_MOST_CANDIDATES].astype(np.int64)
+    return np.lexsort((-area, ~has_partner))[:_MORE_CANDIDATES].astype(np.int64)
 
 
 def marker_triples(model: MarkerModel) -> list[tuple[int, int, int]]:

@@ -210,11 +210,12 @@ class PointTracker:
         if found is not None:
             cov = self._covariances(found)
             row, nis = nearest(self._x, self._P, found.uv_px, cov, self.parameters.p_gate)
+            near = nis < NEAR_MISS * chi2_limit(self.parameters.p_gate, 2)
+            # Without what an unusual area adds to the sigmas: a target that starts to move may change its area, too.
+            self._learn(nis if near else float("nan"))
             if row is not None:
                 nis = self._update(found, cov[row] + self._hidden_px2(found, row) * np.eye(2), row)
                 return self._estimate(PoseStatus.MEASURED, predicted, nis, row)
-            near = nis < NEAR_MISS * chi2_limit(self.parameters.p_gate, 2)
-            self._learn(nis if near else float("nan"))
         self._growth = min(self._growth * (NEAR_MISS_GROWTH if near else MISS_GROWTH) ** dt, MOST_GROWTH)
         sigma = float(np.sqrt(np.linalg.eigvalsh(self._P[:2, :2])[1]))
         if self._unseen > self.parameters.max_predicted or sigma > self.parameters.lost_sigma_px:
@@ -262,7 +263,6 @@ class PointTracker:
         assert self._x is not None
         nis = float(kalman.innovation(self._x, self._P, found.uv_px[row], cov)[2])
         self._x, self._P = kalman.update(self._x, self._P, found.uv_px[row], cov)
-        self._learn(nis)
         flux = float(found.flux[row])
         if np.isfinite(flux):
             self._flux = flux if np.isnan(self._flux) else (1 - _FLUX_RATE) * self._flux + _FLUX_RATE * flux

@@ -102,6 +102,16 @@ def test_at_the_start_four_lamps_among_many_lights_are_not_enough():
     assert tracker_of([np.concatenate([PLACES[1:], crowd])]).step(BLACK).status is PoseStatus.LOST
 
 
+@pytest.mark.parametrize("others", [12, 18])
+def test_lamps_among_lights_that_are_all_brighter_are_found(others):
+    rng = np.random.default_rng(others)
+    for _ in range(3):
+        brighter = rng.uniform(0, 1, (others, 2)) * camera().image_size_px
+        frame = tracker_of([np.concatenate([brighter, PLACES])]).step(BLACK)
+        assert frame.status is PoseStatus.MEASURED
+        np.testing.assert_array_equal(frame.tracked.index[0], others + np.arange(len(PLACES)))
+
+
 def test_a_missing_picture_is_predicted_and_after_many_the_target_is_lost():
     tracker = tracker_of([PLACES])
     frames = [tracker.step(BLACK), *(tracker.step(None) for _ in range(40))]

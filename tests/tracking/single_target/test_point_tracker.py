@@ -192,6 +192,17 @@ def test_a_centre_is_uncertain_while_an_edge_hides_a_part_of_the_target(radius, 
     assert min(sigmas[-5:]) < 0.1
 
 
+@pytest.mark.parametrize("fastest", [4.0, 15.0])
+def test_a_target_whose_area_changes_as_it_starts_to_move_is_followed(fastest):
+    rng, tracker, u, statuses = np.random.default_rng(3), PointTracker(), 100.0, []
+    for k in range(100):
+        u += min(0.2 * max(k - 60, 0), fastest)
+        area = (230.0 if k > 60 else 200.0) * np.exp(0.02 * rng.standard_normal())
+        found = replace(at((u + 0.006 * rng.standard_normal(), 200.0), flux=100.0 * area), peak=np.array([100.0]))
+        statuses.append(tracker.step(1.0, found).status)
+    assert set(statuses[60:]) == {PoseStatus.MEASURED}
+
+
 def test_a_target_that_came_nearer_while_it_was_hidden_is_soon_as_certain_as_before():
     tracker, sigmas = PointTracker(FIXED), []
     for k in range(120):

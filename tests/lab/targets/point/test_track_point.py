@@ -279,6 +279,22 @@ def test_a_target_of_another_colour_is_lost_and_never_reported(tmp_path):
     assert {r["status"] for r in rows_of(tmp_path / "out")} == {"lost"}
 
 
+@pytest.mark.parametrize(("bits", "shift"), [(8, 0), (10, 0), (12, 0), (12, 4), (14, 0), (16, 0)])
+@pytest.mark.parametrize("suffix", ["png", "tiff"])
+def test_colours_of_a_sensor_with_fewer_bits_than_its_files_are_found_as_in_8_bits(bits, shift, suffix, tmp_path):
+    found = []
+    for name, wide in (("narrow", False), ("wide", True)):
+        (source := tmp_path / name).mkdir()
+        for k in range(8):
+            stored = coloured(k).astype(np.uint16) * 257 >> (16 - bits) << shift
+            stored = stored >> 4 if k == 0 else stored  # unlit: the first picture alone does not show the bits
+            cv2.imwrite(str(source / f"{k:04d}.{suffix}"), stored if wide else coloured(k))
+        options = PointOptions("colour", rate_hz=25.0, colour="red")
+        assert track_target(PointTarget(options), source, tmp_path / f"{name}-out").exit_status == 0
+        found.append([[float(r["u_px"]), float(r["v_px"])] for r in rows_of(tmp_path / f"{name}-out")[3:]])
+    np.testing.assert_allclose(found[1], found[0], atol=0.1)
+
+
 def test_a_video_that_ends_early_is_noted(tmp_path):
     path = tmp_path / "cut.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (160, 120))
