@@ -379,12 +379,8 @@ class _Smoother:
         """Label each frame from the motion that the other frames give; whether any label changed."""
         ref, known = self.motion.ref, self.motion.known
         detection_model = DetectionModel(self.parameters.p_detect, self.parameters.p_blend)
-        noise_px2 = 0.5 * np.trace(self.rec.run_detections().cov, axis1=1, axis2=2) - self.rec.place_px2()
-        static = run_log_static(
-            self.views, self.view_table.camera, self.detections, noise_px2, self.assigned, ref, known
-        )
         run = RunObservation(
-            self.views, self.view_table, detection_model, self.calibration_cov, self.detections, static
+            self.views, self.view_table, detection_model, self.calibration_cov, self.detections, self._log_static(known)
         )
         found, probability, sigma_px = reassociated(
             run, self.assigned, ref, self.motion.pose_P, self.motion.weight, self._log_clutter(known),
@@ -462,16 +458,23 @@ class _Smoother:
             self.parameters.labels.clutter_per_px2,
         )  # fmt: skip
 
+    def _log_static(self, known: Bools) -> Array:
+        noise_px2 = 0.5 * np.trace(self.rec.run_detections().cov, axis1=1, axis2=2) - self.rec.place_px2()
+        return run_log_static(
+            self.views, self.view_table.camera, self.detections, noise_px2, self.assigned, self.motion.ref, known
+        )
+
     def continue_paths(self) -> None:
         """Label spots by the continuity of their paths where the pose is uncertain, and those of a displaced camera."""
         motion = self.motion
         uv, cov = project_with_covariances(self.views, motion.ref.R, motion.ref.t, motion.pose_P)
         cov += self.calibration_cov
-        log_clutter = self._log_clutter(self.own.measured)
+        # In a gap a spot that rests far from its vague place would count as static.
+        log_clutter, log_static = self._log_clutter(self.own.measured), self._log_static(self.own.measured)
         known, sure = motion.known[:, None], (self.own.measured & self.trusted)[:, None]
         vague = np.trace(cov, axis1=2, axis2=3) > VAGUE_SIGMA_PX**2
         uv = np.where(known[..., None], uv, np.nan)
-        context = PathContext(self.view_table.camera, uv, cov, log_clutter, ~known | ~sure | vague)
+        context = PathContext(self.view_table.camera, uv, cov, log_clutter, log_static, ~known | ~sure | vague)
         transfers = transfers_between_cameras(self.rec.rig, self.model.views)
         self.assigned, probability = continued(self.detections, self.assigned, context, transfers)
         visible = self.model.in_picture(uv) & sure & ~vague

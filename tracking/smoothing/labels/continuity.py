@@ -155,7 +155,7 @@ class _Path(ViewPath):
         if not len(rows):
             return None
         likelihood = mean_density(predicted, place, self.covariances(k, rows))
-        odds = likelihood * (1 - P_GONE) / np.exp(self.log_clutter(k))
+        odds = likelihood * (1 - P_GONE) / self.false_density(k, rows)
         best = int(np.argmax(odds))
         p = float(odds[best] / (odds.sum() + P_GONE))
         if p < MIN_PROBABILITY or not self.allowed(k, int(rows[best])):
@@ -339,10 +339,10 @@ class _Pair:
         right = np.nan_to_num(mean_density(of_relative, apart, cov[:, None] + other_cov))
         if self.first.camera == self.second.camera:
             right[rows[:, None] == other_rows] = 0.0  # one point is not two spots
-        false, other_false = np.exp(self.first.log_clutter(k)), np.exp(self.second.log_clutter(k))
+        false, other_false = self.first.false_density(k, rows), self.second.false_density(k, other_rows)
         here = _anywhere(of_first, place, cov, uv[last], self.first.speed_px * abs(k - last))
         there = _anywhere(of_second, other, other_cov, second_uv[last], self.second.speed_px * abs(k - last))
-        both = here[:, None] * right / (false * other_false) * (1 - P_GONE) ** 2
+        both = here[:, None] * right / (false[:, None] * other_false) * (1 - P_GONE) ** 2
         only_one = ((here / false).sum() + (there / other_false).sum()) * P_GONE * (1 - P_GONE)
         i, j = np.unravel_index(int(np.argmax(both)), both.shape)
         p = float(both[i, j] / (both.sum() + only_one + P_GONE))

@@ -228,6 +228,7 @@ class PathContext(NamedTuple):
     expected: Array  # (T, n, 2) px: pixels of the spots at the smoothed poses; nan without a projection
     expected_cov: Array  # (T, n, 2, 2) px^2
     log_clutter: Array  # (T, n) log density of false points, 1/px^2
+    log_static: Array  # (m,) log density of static points at each detection, 1/px^2
     open: Bools  # (T, n) views that may get labels
 
 
@@ -264,9 +265,10 @@ class ViewPath:
         """Covariances (m, 2, 2), px^2, of points of a frame."""
         return np.asarray(self.detections.cov[self.detections.begin[k] + rows])
 
-    def log_clutter(self, k: int) -> float:
-        """Log density, 1/px^2, of false points in a frame."""
-        return float(self.context.log_clutter[k, self.view])
+    def false_density(self, k: int, rows: Ints) -> Array:
+        """Density (m,), 1/px^2, of false points at points of a frame: a static one is no spot that has come to rest."""
+        static = self.context.log_static[self.detections.begin[k] + rows]
+        return np.asarray(np.exp(np.maximum(self.context.log_clutter[k, self.view], static)))
 
     def allowed(self, k: int, row: int) -> bool:
         """Whether the uncertain pose allows the spot at a point. One that does not lead to the screen says nothing."""

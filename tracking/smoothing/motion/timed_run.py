@@ -49,6 +49,7 @@ LAST_PASSES = 3  # of these, in which the strength of the jerk stays
 ROUNDS = 4  # of passes and improved turns
 FEWEST = 2  # turns in succession that a jerk may replace ...
 BESIDE_GAP = 1.0  # frames: ... unless a gap is as near, whose jumps a jerk that is stronger there would exclude
+UNSETTLED_FEWEST = 3  # and where clocks stay at their priors: their errors resemble two turns, which a jerk would hide
 # m and rad: a sigma of each pose in a gap about the reference. A strong jerk would let the vehicle be kilometres away
 # after some frames, and covariances with both this and the error of a spot exceed the digits of a number.
 NEAR = 10.0
@@ -312,9 +313,10 @@ class _TimedEstimator(_Estimator):
 
         A vehicle that rests and then swings has the strength of the rest at first, and many turns.
         """
-        found, search = False, self._search()
+        found, search, clocks = False, self._search(), self.run.clocks
+        fewest = UNSETTLED_FEWEST if clocks is not None and clocks.unsettled else FEWEST
         for some in successions(self.turns, self.frame_s):
-            if len(some) < FEWEST:
+            if len(some) < fewest:
                 continue
             beside, last_s = BESIDE_GAP * self.frame_s, max(t.end_s for t in some)
             first, after = np.searchsorted(self.t_s, [some[0].begin_s - beside, last_s + beside])

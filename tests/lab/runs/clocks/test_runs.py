@@ -303,6 +303,7 @@ def test_no_pose_beside_a_turn_is_wrong_by_more_than_it_states(seed, frames, tmp
         pytest.param(7141, 120, 0, id="an offset that stays open by a frame, of swings that last for twelve"),
         pytest.param(7127, 120, 1, id="a turntable, whose turns alone show the clock"),
         pytest.param(7303, 120, 0, id="a turntable, whose turns follow the clock for many steps"),
+        pytest.param(7327, 120, 0, id="two turns of clocks that stay at their priors, which a jerk would explain too"),
     ],
 )
 def test_clocks_are_estimated_with_turns_that_depend_on_them(seed, frames, known, tmp_path):

@@ -58,7 +58,8 @@ def context(
     density = max(false_points / 120.0**2, 1e-6)
     spread = np.tile(sigma_px**2 * np.eye(2), (*uv.shape[:2], 1, 1))
     camera = np.zeros(uv.shape[1], dtype=np.int64) if cameras is None else np.array(cameras)
-    return PathContext(camera, uv + 50.0, spread, np.full(uv.shape[:2], np.log(density)), open_views)
+    none_static = np.full(2 * uv[..., 0].size, -np.inf)
+    return PathContext(camera, uv + 50.0, spread, np.full(uv.shape[:2], np.log(density)), none_static, open_views)
 
 
 def without(rows: Ints, *frames: slice) -> Ints:

@@ -110,6 +110,23 @@ def test_a_spot_at_rest_keeps_its_labels():
     np.testing.assert_array_equal(out[GAP], rows[GAP])
 
 
+@pytest.mark.parametrize("step_px", [4.0, 8.0, 20.0])
+def test_a_static_point_near_a_hidden_spot_that_moves_in_steps_is_not_labelled(step_px):
+    """A turntable: since the errors of the path's extrapolation are of its steps too, the point could be a spot."""
+    k = np.arange(FRAMES, dtype=float)
+    steps = np.clip((k[:, None] - np.array([10, 25, 40, 62, 80, 100])) / 5, 0, 1).sum(axis=1)
+    spot = np.stack([300 + step_px * steps, np.full(FRAMES, 400.0)], axis=1)
+    reflection = np.tile([300 + 3.5 * step_px, 406.0], (FRAMES, 1))
+    visible = np.ones((FRAMES, 2), dtype=bool)
+    visible[GAP, 0] = False
+    every, rows = filmed(np.stack([spot, reflection], axis=1), visible, 0.0, 1)
+    before, c = without(rows, GAP), context(np.stack([spot, reflection], axis=1))
+    before[:, 1] = -1
+    c.log_static[every.begin[:-1] + rows[:, 1]] = 0.0
+    out, _ = continued(every, before, c, {})
+    np.testing.assert_array_equal(out, before)
+
+
 def test_a_path_is_followed_where_the_uncertain_pose_leads_to_no_point_of_the_screen():
     uv = paths()
     every, rows = filmed(uv, np.ones((FRAMES, 2), dtype=bool), 0.0, 7)
