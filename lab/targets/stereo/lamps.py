@@ -129,7 +129,8 @@ class LampsTarget(Target[LampFrame]):
             out.append(finding("BP-J05", level_above(scale, GOOD_NOISE_SCALE, LARGEST_NOISE_SCALE), what))
         if (check := self._check) is not None and check.significant:
             of_lens = tuple(s for s in check.suspects if s.name.endswith(f"of {self._lens.name}"))
-            out.append(contradiction("BP-J07", replace(check, suspects=of_lens), self.options.camera.name))
+            level, what = contradiction(replace(check, suspects=of_lens), self.options.camera.name)
+            out.append(finding("BP-J07", level, what))
         elif check is not None and not check.certain:
             words = f"an error of the focal length below {check.hidden_focal_percent:.2g} % would not show"
             out.append(passed(f"the lamps show no error of {self.options.camera.name}; {words}"))

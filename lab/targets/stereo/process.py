@@ -159,15 +159,15 @@ def _calibration(results: StereoResults) -> Iterator[Finding]:
         what += f"; needed are {FEWEST_FRAMES} frames with four markers in each picture"
         yield finding("BP-W11", Level.WARN, what)
     if check is not None and check.significant and not _is_clock(results):
-        yield contradiction("BP-W06", check, results.run.pair_path.name)
+        yield finding("BP-W06", *contradiction(check, results.run.pair_path.name))
     if check is not None and not check.certain:
         yield passed(f"the markers show no error of {results.run.pair_path.name}; {_not_shown(results)}")
     if results.run.pair.covariance is None:
         yield finding("BP-W10", Level.WARN, f"{results.run.pair_path.name} states no covariance of the calibration")
 
 
-def contradiction(code: str, check: CalibrationCheck, file_name: str) -> Finding:
-    """The errors of a calibration that explain the residuals of the markers, with their corrections."""
+def contradiction(check: CalibrationCheck, file_name: str) -> tuple[Level, str]:
+    """The errors of a calibration that explain the residuals of the markers, with their corrections, and how bad."""
     several = " or ".join(
         f"{s.name} by {s.value:+.{decimals_of(s.sigma)}f} ± {s.sigma:.{decimals_of(s.sigma)}f} {s.unit}"
         for s in check.suspects[:_MOST_NAMED]
@@ -179,7 +179,7 @@ def contradiction(code: str, check: CalibrationCheck, file_name: str) -> Finding
         f"the markers contradict {file_name}: to be corrected: {several}{apart}{other}; poses move by"
         f" {format_length(check.change_m)} RMS"
     )
-    return finding(code, Level.FAIL if check.change_sigmas**2 > LARGEST_NEES else Level.WARN, what)
+    return Level.FAIL if check.change_sigmas**2 > LARGEST_NEES else Level.WARN, what
 
 
 def _not_shown(results: StereoResults) -> str:
