@@ -400,9 +400,15 @@ class _Smoother:
         dropped = isolated(count)
         # In a long occlusion so few false points fit a pose once by chance; spots would be there in the next frame too.
         measured = self._single_frame_poses(new).measured if left_open.any() else self.measured
-        dropped |= vague & measured & (count <= MIN_REDUNDANT_SPOTS) & ~next_to(measured)
-        new[dropped] = -1
-        self.probability = np.where((found >= 0) & ~dropped[:, None], probability, np.nan)
+        once = vague & measured & ~next_to(measured)
+        dropped |= once & (count <= MIN_REDUNDANT_SPOTS)
+        # And one beside spots that one camera always shows, which do not determine the pose without it.
+        labelled = new >= 0
+        alone = labelled & ~next_to(labelled)
+        alone &= (once & (distinct_spots(alone, self.model.spot_of) <= MIN_REDUNDANT_SPOTS))[:, None]
+        measured &= ~alone.any(axis=1)
+        new[dropped[:, None] | alone] = -1
+        self.probability = np.where((found >= 0) & ~dropped[:, None] & ~alone, probability, np.nan)
         changed = bool(np.any(new != before))
         self.trusted = ~unchecked & ~self.conflicting
         self.measured = measured & ~dropped & ~self.conflicting

@@ -8,6 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 
+from bench.random_scenes.answers import answers_in_memory
+from bench.random_scenes.judge import judge
+from bench.random_scenes.oracle import ask_oracle
+from bench.random_scenes.scene import random_scene
 from geometry.pose import Pose
 from lab.simulate.points import PointRun, simulate_points
 from tests.tracking.rigid_runs import (
@@ -61,6 +65,16 @@ def test_the_smoothing_pass_labels_no_fewer_spots_and_none_wrongly(scenario, hid
     assert again.missed() <= causal.missed() + 1
     assert again.missed() <= 3
     assert again.wrong == 0
+
+
+def test_a_false_point_beside_spots_of_one_camera_gives_no_pose_once_in_an_occlusion():
+    """The spots of one camera do not determine the pose; each spot of the other has a false point near it."""
+    scene = random_scene(31323)
+    answers = answers_in_memory(scene)
+    judgement = judge(scene, ask_oracle(scene), answers)
+    assert judgement.smoothed.wrong == 0
+    assert judgement.smoothed.wrong_measured == 0
+    assert judgement.smoothed.measured == 160
 
 
 def test_the_smoothing_pass_labels_no_false_points_on_an_occluded_screen():
