@@ -304,9 +304,11 @@ def write_tables(
     # Where the model check has tested the residuals, it has separated noise from faults.
     diagnosis = model_check.result.diagnosis
     noise_scale = None if diagnosis is not None else pipeline.tracker.noise_scale
+    cameras = pipeline.noise.items()
     shown = {
-        kind: {name: value for name, noise in pipeline.noise.items() if (value := getattr(noise, attribute))}
-        for kind, attribute in (("mosaics", "mosaic"), ("too_wide", "too_wide_px"), ("moved", "moved_px"))
+        "mosaics": {name: noise.mosaic for name, noise in cameras if noise.mosaic},
+        "too_wide": {name: noise.too_wide_px for name, noise in cameras if noise.too_wide_px},
+        "moved": {name: noise.moved_px for name, noise in cameras if noise.moved_px},
     }
     verdict = quality.judge(statistics, model_check.findings, noise_scale, **shown)
     explained = diagnosis is not None and diagnosis.is_random
