@@ -270,10 +270,10 @@ def test_a_limited_number_of_frames_is_read_ahead(tmp_path, monkeypatch):
     lock, state = threading.Lock(), {"read": 0}
     real = read_picture
 
-    def counted(path, size_px, colour):
+    def counted(path, *how):
         with lock:
             state["read"] += 1
-        return real(path, size_px)
+        return real(path, *how)
 
     monkeypatch.setattr("lab.pictures.source.read_picture", counted)
     for taken, _ in enumerate(open_frames(load_run(write_run(tmp_path / "a", frames=60))), start=1):
@@ -289,9 +289,9 @@ def test_a_limited_number_of_frames_is_read_ahead(tmp_path, monkeypatch):
 def test_pictures_that_the_noise_is_estimated_from_are_not_decoded_again(tmp_path, monkeypatch):
     decoded = []
 
-    def noted(path, size_px, colour):
+    def noted(path, *how):
         decoded.append(path)
-        return read_picture(path, size_px)
+        return read_picture(path, *how)
 
     monkeypatch.setattr("lab.pictures.source.read_picture", noted)
     pipeline = Pipeline.of(load_run(write_run(tmp_path / "a", frames=20)))
@@ -303,7 +303,7 @@ def test_pictures_that_the_noise_is_estimated_from_are_not_decoded_again(tmp_pat
 
 
 def test_an_exception_in_a_thread_reaches_the_reader(tmp_path, monkeypatch):
-    def broken(path, size_px, colour):
+    def broken(path, *_):
         raise RuntimeError(f"boom {path.name}")
 
     monkeypatch.setattr("lab.pictures.source.read_picture", broken)
