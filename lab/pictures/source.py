@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 
-from geometry.arrays import Ints
+from geometry.arrays import Ints, evenly_spread
 from lab.errors import InputError
 from lab.files.text.error_text import is_formula, name_of_path
 from lab.files.text.json_text import require_regular_file
@@ -342,7 +342,7 @@ def _used_bits(source: PictureFiles) -> int:
     from tracking.noise_estimation.grey_values import full_scale, grey_step
 
     paths, wide = list(source.files.values()), []
-    for k in np.unique(np.linspace(0, len(paths) - 1, _DEPTH_PICTURES).astype(int)).tolist():
+    for k in evenly_spread(np.arange(len(paths)), _DEPTH_PICTURES).tolist():
         picture = read_picture(paths[k], None, True, None)
         if isinstance(picture, MissingPicture):
             continue

@@ -112,13 +112,18 @@ def stamp_sigmas(times: Times) -> Array | None:
     # Dropped pictures may have numbers or not.
     index = np.cumsum(np.round(np.diff(times.times_s, prepend=times.times_s[0]) / times.usual_step_s))
     away, step_s = _from_line(index, times.times_s), times.usual_step_s
-    scatter_s = float(np.median(np.abs(away))) / NORMAL_MEDIAN
+    scatter_s = _scatter(away)
     sigma_s = np.where(np.abs(away) > max(STAMP_OUTLIER * scatter_s, NEGLIGIBLE_SCATTER * step_s), np.abs(away), 0.0)
     if scatter_s > LARGEST_SCATTER * step_s or np.mean(sigma_s > 0) > LARGEST_SCATTER:
         return None
     if scatter_s > NEGLIGIBLE_SCATTER * step_s:
         sigma_s = np.maximum(sigma_s, scatter_s)
     return sigma_s if sigma_s.any() else None
+
+
+def _scatter(away: Array) -> float:
+    """A robust sigma of distances (n,) from 0."""
+    return float(np.median(np.abs(away))) / NORMAL_MEDIAN
 
 
 def _from_line(index: Array, t_s: Array) -> Array:
@@ -128,7 +133,7 @@ def _from_line(index: Array, t_s: Array) -> Array:
     for _ in range(3):
         slope, offset = np.polyfit(index[near] - index[0], t_s[near] - t_s[0], 1)
         away = t_s - t_s[0] - offset - slope * (index - index[0])
-        scatter_s = float(np.median(np.abs(away))) / NORMAL_MEDIAN
+        scatter_s = _scatter(away)
         near = np.abs(away) <= STAMP_OUTLIER * scatter_s
     half = len(t_s) // 2
     if half >= FEWEST_STAMPS:

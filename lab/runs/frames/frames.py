@@ -405,8 +405,8 @@ class ClockedFrames(FrameReader):
         super().__init__(run)
         self._found: FoundPoints | None = None
         for clock in run.clocks.values():
-            if clock.times is not None and clock.times_path is not None and clock.times.scatter is not None:
-                self._notes.append(f"{clock.times_path}: {clock.times.scatter}; the poses have that as an error")
+            if clock.times is not None and (scatter := clock.times.scatter) is not None:
+                self._notes.append(f"{clock.times_path}: {scatter}; the poses have that as an error")
         self._numbers = {name: self._numbers_of(name) for name in run.cameras}
         self._plan()
 

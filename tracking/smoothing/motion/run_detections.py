@@ -231,27 +231,26 @@ def _weighted_spot(
     i: int,
     noise: Array,
     calibration_cov: Array,
-    after: float,
-    row_time: float,
-    sigma: float,
+    delays: Delays,
+    d: int,
     ref: Reference,
     k: int,
     at: Array,
     J: Array,
 ) -> tuple[bool, Array, float, float, float]:
-    """Whether view i is projected `after` seconds from instant k of ref, its speed (2,), px/s, and a point's weight.
+    """Whether view i is projected at the instant of point d, its speed (2,), px/s, and the weight of the point.
 
-    noise, calibration_cov (2, 2), px^2: of the point, and of the view; row_time, sigma: of its picture, as of Delays.
+    noise, calibration_cov (2, 2), px^2: of the point, and of the view. That instant is near instant k of ref.
     at (2,), J (2, 6) receive the pixel, without the views' shift, and its Jacobian. The weight is the upper triangle of
     the inverse of the covariance, 1/px^2.
     """
-    R, t, m = state_after(ref.R[k], ref.t[k], ref.m[k], after)
+    R, t, m = state_after(ref.R[k], ref.t[k], ref.m[k], delays.after_s[d])
     if not project_view(views, i, R, t, at, J):
         return False, np.zeros(2), 0.0, 0.0, 0.0
     for a in range(2):
         at[a] -= views[i]["shift"][a]
     speed = _speed(J, m)
-    uu, both, vv = _covariance(noise, speed, row_time, sigma)
+    uu, both, vv = _covariance(noise, speed, delays.row_time_s[d], delays.sigma_s[d])
     uu, both, vv = uu + calibration_cov[0, 0], both + calibration_cov[0, 1], vv + calibration_cov[1, 1]
     w0, w1, w2, _ = inverse_2x2(uu, both, vv)
     return True, speed, w0, w1, w2
@@ -291,19 +290,7 @@ def delayed_information(
             if not use[i]:
                 continue
             d = detections.begin[start + k] + assigned[start + k, i]
-            projected, _, w0, w1, w2 = _weighted_spot(
-                views,
-                i,
-                noise[i],
-                calibration_cov[i],
-                delays.after_s[d],
-                delays.row_time_s[d],
-                delays.sigma_s[d],
-                ref,
-                k,
-                at,
-                J,
-            )
+            projected, _, w0, w1, w2 = _weighted_spot(views, i, noise[i], calibration_cov[i], delays, d, ref, k, at, J)
             if projected:
                 u, v = uv[i, 0] - at[0], uv[i, 1] - at[1]
                 far, share = _pull(w0, w1, w2, u, v)
@@ -338,17 +325,7 @@ def timed_rows(
                 continue
             d = detections.begin[start + k] + assigned[start + k, i]
             projected, moving, w0, w1, w2 = _weighted_spot(
-                views,
-                i,
-                noise[i],
-                calibration_cov[i],
-                delays.after_s[d],
-                delays.row_time_s[d],
-                delays.sigma_s[d],
-                ref,
-                k,
-                at,
-                J,
+                views, i, noise[i], calibration_cov[i], delays, d, ref, k, at, J
             )
             if not projected:
                 continue
