@@ -1,6 +1,7 @@
 """Common parts of all commands: error messages and exit statuses, argument types, --set, the progress bar.
 
-SIGTERM and SIGHUP end a command as Ctrl-C does: unfinished results are removed, no traceback is shown.
+SIGTERM and SIGHUP end a command as Ctrl-C does: unfinished results are removed, no traceback is shown. None of them
+interrupts LLVM.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import shlex
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,6 +31,8 @@ from lab.files.text.error_text import printable
 from lab.progress import Progress
 
 _GRACE_S = 5.0  # for the regular end; Docker kills after 10 s, Slurm after 30 s
+
+_RETRY_S = 0.01  # LLVM loads a function in about that time
 
 _SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # Windows: no SIGHUP
 
@@ -51,11 +55,14 @@ def stopped_by_signals() -> Iterator[None]:
     The exception may be lost (in a callback, in a destructor), and threads may go on. So after some seconds, or at a
     second signal, unfinished results are removed and the process ends at once.
     """
-    ours = []
+    ours = []  # number, handler before, handler in the block
     if threading.current_thread() is threading.main_thread():
-        ours = [number for number in _SIGNALS if signal.getsignal(number) == signal.SIG_DFL]
-        for number in ours:
-            signal.signal(number, _first)
+        ours = [(number, signal.getsignal(number), _first) for number in _SIGNALS]
+        ours = [each for each in ours if each[1] == signal.SIG_DFL]
+        if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
+            ours.append((signal.SIGINT, signal.default_int_handler, _ctrl_c))
+        for number, _, handler in ours:
+            signal.signal(number, handler)
     try:
         yield
     except StoppedBySignal:
@@ -63,9 +70,9 @@ def stopped_by_signals() -> Iterator[None]:
         raise
     finally:
         _received.clear()
-        for number in ours:
-            if signal.getsignal(number) == _first:  # no signal came
-                signal.signal(number, signal.SIG_DFL)
+        for number, before, handler in ours:
+            if signal.getsignal(number) == handler:  # no signal came
+                signal.signal(number, before)
 
 
 @contextmanager
@@ -82,6 +89,26 @@ def stops_are_no_errors() -> Iterator[None]:
         raise
 
 
+def _outside_llvm(handler: Callable[[int, FrameType | None], None]) -> Callable[[int, FrameType | None], None]:
+    """A handler of signals that waits for LLVM: an exception in one of its callbacks crashes the process."""
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        files = (each.f_code.co_filename for each, _ in traceback.walk_stack(frame))
+        if hasattr(signal, "setitimer") and any("llvmlite" in file for file in files):
+            signal.signal(signal.SIGALRM, lambda _, later: handle(number, later))
+            signal.setitimer(signal.ITIMER_REAL, _RETRY_S)
+        else:
+            handler(number, frame)
+
+    return handle
+
+
+@_outside_llvm
+def _ctrl_c(_number: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+@_outside_llvm
 def _first(number: int, _frame: FrameType | None) -> None:
     """Raises StoppedBySignal, and prepares for the case that it does not arrive."""
     _received.append(number)

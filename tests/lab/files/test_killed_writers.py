@@ -204,3 +204,34 @@ assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "still here\n", "")
+
+
+@pytest.mark.parametrize("sent", ["SIGTERM", "SIGHUP", "SIGINT"])
+def test_a_stop_in_a_callback_of_llvm_comes_after_it(sent):
+    """An exception in there is printed and lost, and LLVM then crashes or compiles what was compiled."""
+    program = f"""
+import signal, sys, time
+sys.path.insert(0, {str(ROOT)!r})
+import llvmlite.binding as llvm
+from lab.commands.common import stopped_by_signals
+signal.signal(signal.{sent}, signal.default_int_handler if {sent!r} == "SIGINT" else signal.SIG_DFL)
+llvm.initialize_native_target()
+llvm.initialize_native_asmprinter()
+module = llvm.parse_assembly("define i32 @one() {{ ret i32 1 }}")
+machine = llvm.Target.from_default_triple().create_target_machine(jit=True)
+engine = llvm.create_mcjit_compiler(module, machine)
+asked = []
+def load(module):
+    asked.append(module)
+    signal.raise_signal(signal.{sent})
+engine.set_object_cache(getbuffer_func=load)
+with stopped_by_signals():
+    try:
+        engine.finalize_object()
+        time.sleep(30)
+    except (SystemExit, KeyboardInterrupt) as stop:
+        print(type(stop).__name__, len(asked))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    stop = "KeyboardInterrupt" if sent == "SIGINT" else "StoppedBySignal"
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"{stop} 1\n", "")
