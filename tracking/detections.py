@@ -84,6 +84,15 @@ class Detections:
         """(n,): variance of a coordinate, the mean of both."""
         return np.asarray(0.5 * (self.cov_px2[:, 0, 0] + self.cov_px2[:, 1, 1]))
 
+    @property
+    def profile_px2(self) -> Array:
+        """(n, 2, 2): second moments of the fitted Gaussians."""
+        c, s = np.cos(np.radians(self.angle_deg)), np.sin(np.radians(self.angle_deg))
+        major2, minor2 = self.major_px**2, self.minor_px**2
+        across = (major2 - minor2) * c * s
+        u, v = major2 * c**2 + minor2 * s**2, major2 * s**2 + minor2 * c**2
+        return np.stack([np.stack([u, across], axis=-1), np.stack([across, v], axis=-1)], axis=-2)
+
     def __getitem__(self, rows: Ints | Bools | slice) -> Detections:
         """The points of the given rows, in that order."""
         known: list[Array] = [getattr(self, name)[rows] for name in Detections.__slots__[:7]]
@@ -130,9 +139,7 @@ def on_beam_axes(
     """
     if not len(found) or noise is None:
         return found
-    c, s = np.cos(np.radians(found.angle_deg)), np.sin(np.radians(found.angle_deg))
-    major2, minor2 = found.major_px**2, found.minor_px**2
-    shape = np.stack([major2 * c**2 + minor2 * s**2, (major2 - minor2) * c * s, major2 * s**2 + minor2 * c**2], axis=-1)
+    shape = found.profile_px2[:, [0, 0, 1], [0, 1, 1]]
     clipped = found.peak > CLIPPED * (saturation_dn - noise.black_dn)
     height = np.where(clipped, found.flux / (2 * np.pi * found.major_px * found.minor_px), found.peak)
     brightness = noise.slope_dn * height / noise.floor_dn2

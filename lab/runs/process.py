@@ -304,11 +304,13 @@ def write_tables(
     # Where the model check has tested the residuals, it has separated noise from faults.
     diagnosis = model_check.result.diagnosis
     noise_scale = None if diagnosis is not None else pipeline.tracker.noise_scale
-    cameras = pipeline.noise.items()
-    shown = {
+    cameras, names = pipeline.noise.items(), list(run.rig.cameras)
+    shown: dict[str, Mapping[str, Any]] = {
         "mosaics": {name: noise.mosaic for name, noise in cameras if noise.mosaic},
         "too_wide": {name: noise.too_wide_px for name, noise in cameras if noise.too_wide_px},
         "moved": {name: noise.moved_px for name, noise in cameras if noise.moved_px},
+        "kept": {name: noise.kept for name, noise in cameras},
+        "stretch": {names[camera]: found for camera, found in sampler.stretch_of_cameras(model.camera_of).items()},
     }
     verdict = quality.judge(statistics, model_check.findings, noise_scale, **shown)
     explained = diagnosis is not None and diagnosis.is_random

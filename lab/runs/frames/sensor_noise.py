@@ -32,6 +32,7 @@ from tracking.detection.detect import (
 )
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
+from tracking.noise_estimation.averaging import kept_of_the_last
 from tracking.noise_estimation.grey_values import mosaic_contrast
 from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
 from tracking.noise_estimation.texture import is_limited_by_texture
@@ -65,6 +66,7 @@ class CameraNoise:
     motion: CameraMotion | None = field(default=None, init=False)  # None: the camera does not move, or none is seen
     background: StaticBackground | None = field(default=None, init=False)  # for faint spots; None: not used
     moved_px: float = field(default=0.0, init=False)  # between the first picture and the last, if too far to correct
+    kept: float = field(default=float("nan"), init=False)  # share of a picture from the one before; nan: not known
     wide: WideLights | None = field(default=None, init=False)  # None: sums of pixels have no background
     too_wide_px: float = field(default=0.0, init=False)  # sigma of a light that max_sigma_px excludes; 0: none
     unfit: int = field(default=0, init=False)  # consecutive pictures that do not fit the background
@@ -275,9 +277,13 @@ def camera_noises(run: Run, reader: FrameReader) -> dict[str, CameraNoise]:
 def _prepare(noise: CameraNoise, run: Run, source: PictureSource) -> None:
     """Estimate a camera's noise, and make its static background where that may show more."""
     size_px = run.rig.cameras[noise.camera].image_size_px
-    shown = pictures_of_frames(source, noise_frames(source), size_px)
-    pictures = [p for p in shown.values() if isinstance(p, np.ndarray)]
+    wanted, three = noise_frames(source), successive_frames(source)
+    shown = pictures_of_frames(source, sorted({*wanted, *three}), size_px)
+    pictures = [p for k in wanted if isinstance(p := shown[k], np.ndarray)]
     noise.estimate_from(pictures)
+    successive = [p for k in three if isinstance(p := shown[k], np.ndarray)]
+    if noise.estimate is not None:
+        noise.kept = kept_of_the_last(successive, noise.estimate.step_dn**2 / 12)
     if noise.shows_structure:
         if isinstance(source, PictureFiles):
             wanted = evenly_spread(source.numbers, PICTURES).tolist()
@@ -323,6 +329,14 @@ def noise_frames(source: PictureSource) -> list[int]:
     if isinstance(source, PictureFiles):
         return [int(source.numbers[i]) for i in noise_estimation_frames(source.count)]
     return list(VIDEO_PICTURES)
+
+
+def successive_frames(source: PictureSource) -> list[int]:
+    """Numbers of three successive pictures, of which two serve the estimate of the noise; none in short recordings."""
+    if not isinstance(source, PictureFiles):
+        return [16, 17, 18]
+    middle = (source.count - 1) // 2
+    return source.numbers[middle : middle + 3].tolist() if source.count > 4 else []
 
 
 def noise_estimation_frames(pictures: int) -> list[int]:

@@ -13,6 +13,7 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from lab.runs.frames.pipeline import FrameRecord
 from tracking.detections import UNMATCHED, Detections
+from tracking.noise_estimation.averaging import stretch_by_motion
 from tracking.parameters import TrackerParameters
 from tracking.statuses import PoseStatus, TrackedFrame
 
@@ -74,16 +75,16 @@ def stated_covariances(
     return out
 
 
-def widths(tracked: TrackedFrame, found: Sequence[Detections | None], camera_of: Ints) -> Array:
-    """Widths (n,), px: sigmas of the intensity profiles of the n views' detections; nan without a detection.
+def profiles(tracked: TrackedFrame, found: Sequence[Detections | None], camera_of: Ints) -> Array:
+    """Second moments (n, 2, 2), px^2, of the intensity profiles of the n views' detections; nan without a detection.
 
     camera_of: as in `stated_covariances`.
     """
-    out = np.full(len(camera_of), np.nan)
-    for view in np.flatnonzero(tracked.point != UNMATCHED):
-        points = found[int(camera_of[view])]
-        if points is not None:
-            out[view] = points.major_px[tracked.point[view]]
+    out = np.full((len(camera_of), 2, 2), np.nan)
+    for camera, points in enumerate(found):
+        views = np.flatnonzero((camera_of == camera) & (tracked.point != UNMATCHED))
+        if points is not None and len(views):
+            out[views] = points.profile_px2[tracked.point[views]]
     return out
 
 
@@ -99,7 +100,7 @@ class SampledFrame:
     predicted_px: Array | None = None  # (n, 2)
     predicted_cov_px2: Array | None = None  # (n, 2, 2)
     pose_covariance: Array | None = None  # (6, 6)
-    width_px: Array | None = None  # (n,); nan where not seen or unknown
+    profile_px2: Array | None = None  # (n, 2, 2) second moments; nan where not seen or unknown
 
 
 @dataclass(slots=True)
@@ -123,7 +124,7 @@ class FrameSampler:
         tracked: TrackedFrame,
         predicted_cov_px2: Array | None = None,
         stated_cov_px2: Array | None = None,
-        width_px: Array | None = None,
+        profile_px2: Array | None = None,
     ) -> None:
         """Add the next frame as a tracker or a smoother reports it.
 
@@ -143,7 +144,7 @@ class FrameSampler:
         self.add(
             SampledFrame(
                 t_s, seen, tracked.uv_at_pose_px, cov_px2, pose, predicted_px, predicted_cov_px2,
-                tracked.pose_covariance, width_px,
+                tracked.pose_covariance, profile_px2,
             )
         )  # fmt: skip
 
@@ -151,8 +152,20 @@ class FrameSampler:
         """Add the next frame of a run, with the covariances that its detections state; arguments as there."""
         tracked, found = record.tracked, record.detections
         stated = stated_covariances(tracked, found, camera_of, parameters)
-        width = widths(tracked, found, camera_of)
-        self.add_tracked(record.t_s, tracked, tracked.predicted_cov_px2, stated, width)
+        profile = profiles(tracked, found, camera_of)
+        self.add_tracked(record.t_s, tracked, tracked.predicted_cov_px2, stated, profile)
+
+    def stretch_of_cameras(self, camera_of: Ints) -> dict[int, tuple[float, float]]:
+        """By camera, how much longer its spots are along their motion; see `stretch_by_motion`. camera_of (n,)."""
+        blocks = [b for b in self._sampler.blocks if all(k.profile_px2 is not None for k in b)]
+        if not blocks:
+            return {}
+        uv = np.stack([[np.where(k.seen[:, None], k.uv_px, np.nan) for k in block] for block in blocks])
+        middle = [block[BLOCK // 2] for block in blocks]
+        profile = np.stack([k.profile_px2 for k in middle if k.profile_px2 is not None])
+        variance = np.stack([np.trace(k.cov_px2, axis1=-1, axis2=-2) / 2 for k in middle])
+        cameras = ((camera, camera_of == camera) for camera in np.unique(camera_of).tolist())
+        return {c: stretch_by_motion(uv[:, :, of], profile[:, of], variance[:, of]) for c, of in cameras}
 
     def recording(self) -> ModelCheckRecording | None:
         """The sampled frames; None where no frame was added."""
@@ -182,12 +195,13 @@ def _stacked(values: Sequence[Array | None], shape: tuple[int, ...]) -> Array:
 
 
 def _median_widths(kept: Sequence[SampledFrame]) -> Array | None:
-    """Median over the frames of each view's width (n,); None where all are unknown."""
-    widths = [k.width_px for k in kept if k.width_px is not None]
-    if not widths:
+    """Median over the frames of each view's longest sigma (n,); None where all are unknown."""
+    profiles = [k.profile_px2 for k in kept if k.profile_px2 is not None]
+    if not profiles:
         return None
-    stack = np.stack(widths)
-    known = np.isfinite(stack).any(axis=0)
-    out = np.full(stack.shape[1], np.nan)
-    out[known] = np.nanmedian(stack[:, known], axis=0)
+    u2, uv, v2 = np.stack(profiles)[..., [0, 0, 1], [0, 1, 1]].transpose(2, 0, 1)
+    widths = np.sqrt((u2 + v2) / 2 + np.hypot((u2 - v2) / 2, uv))
+    known = np.isfinite(widths).any(axis=0)
+    out = np.full(widths.shape[1], np.nan)
+    out[known] = np.nanmedian(widths[:, known], axis=0)
     return out

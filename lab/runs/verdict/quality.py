@@ -13,9 +13,10 @@ from types import MappingProxyType
 from typing import Any
 
 from lab.findings.finding import Finding, Level, Verdict, finding, level_above, sentence, verdict, worst_first
-from lab.number_format import format_count
+from lab.number_format import format_count, format_with_sigma
 from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, FrameCause, FrameRanges, RunStatistics
 from tracking.detection.detect import limit_that_admits
+from tracking.noise_estimation.averaging import OPEN_SHUTTER
 from tracking.statuses import SpotStatus
 
 # Share of the frames with enough visible spots: where the tracker missed more than half of them, it may not have
@@ -38,6 +39,9 @@ LONG_EMPTY = (
 MOST_WRONG = 0.005  # share of the measured poses beyond 10 sigmas from the truth, up to which the run does not fail
 LEAST_DISPLACED = 5  # frames in which none of a camera's spots fits the others' pose, from which on it is reported
 TOO_WIDE = "BP-V21"  # a light that max_sigma_px excludes, and a spot that is never found
+LEAST_KEPT = 0.12  # share of the picture before from which a camera averages; without it 0.02 at most is seen
+# Sigmas, and share of the spots' growth that such a filter gives where they are blurred to more than a Gaussian.
+_SURE_SIGMAS, _OF_GROWTH = 4.0, 0.3
 _SET_UP = "BP-M06"  # a mistake in the files that describe the set-up
 _FEW_FOUND = 0.2  # measured share of the expected spots, below which a mostly empty camera is reported
 
@@ -49,13 +53,16 @@ def judge(
     mosaics: Mapping[str, float] = MappingProxyType({}),
     too_wide: Mapping[str, float] = MappingProxyType({}),
     moved: Mapping[str, float] = MappingProxyType({}),
+    kept: Mapping[str, float] = MappingProxyType({}),
+    stretch: Mapping[str, tuple[float, float]] = MappingProxyType({}),
 ) -> Verdict:
     """The verdict on a run.
 
     findings: of the model check (lab.runs.model_check.check.check_model). noise_scale: ratio of the residuals to the
     detections' sigmas; None where the model check has tested that. mosaics: contrast of the colour mosaic by camera, of
     cameras whose pictures show one. too_wide: sigma, px, of a light that detect.max_sigma_px excludes, by camera.
-    moved: px, by how much what stands still in the pictures of a camera has moved, by camera.
+    moved: px, by how much what stands still in the pictures of a camera has moved, by camera. kept, stretch: what the
+    noise and the spots of a camera say about averages of successive pictures (tracking.noise_estimation.averaging).
     """
     if statistics.frames == 0:
         return _of([finding("BP-V01", Level.FAIL, "there is no frame at all")])
@@ -67,7 +74,7 @@ def judge(
     found = [f for f in given if f.code == _SET_UP]
     found += _mosaics(mosaics, verdict(given))
     found += _too_wide(too_wide, statistics)
-    found += _moved(moved)
+    found += _moved(moved) + _averaging(kept, stretch)
     found += _measured(statistics)
     if statistics.measured:
         found += _cameras(statistics)
@@ -125,6 +132,26 @@ def _moved(moved_px: Mapping[str, float]) -> list[Finding]:
         )
         numbers = {"camera": name, "moved_px": px}
         out.append(finding("BP-V19", Level.WARN, what, variant="pictures", numbers=numbers))
+    return out
+
+
+def _averaging(kept: Mapping[str, float], stretch: Mapping[str, tuple[float, float]]) -> list[Finding]:
+    """Cameras whose pictures are averages of successive ones."""
+    out = []
+    for name in dict.fromkeys((*kept, *stretch)):
+        share, (growth, sigma) = kept.get(name, float("nan")), stretch.get(name, (0.0, float("inf")))
+        if growth - OPEN_SHUTTER > _SURE_SIGMAS * sigma:
+            shown = (
+                f"the spots of camera {name} are longer along their motion by {format_with_sigma(growth, sigma)} of its"
+                f" square, where a shutter that is always open gives {OPEN_SHUTTER:.2g}"
+            )
+        elif share > LEAST_KEPT and growth + _SURE_SIGMAS * sigma > _OF_GROWTH * share / (1 - share) ** 2:
+            shown = f"the noise of successive pictures of camera {name} is correlated ({share:.2f})"
+        else:
+            continue
+        what = f"{shown}: the pictures are averages of successive ones, and the spots lag behind the vehicle"
+        numbers = {"camera": name, "correlation": share, "growth": growth, "growth_sigma": sigma}
+        out.append(finding("BP-V22", Level.WARN, what, numbers=numbers))
     return out
 
 

@@ -176,6 +176,22 @@ def test_cameras_that_are_moved_by_many_pixels_are_named(tmp_path):
     assert [n["moved_px"] for n in named] == pytest.approx([25.0 * np.sqrt(2)] * 2, rel=0.1)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_cameras_that_average_their_pictures_over_time_are_named(tmp_path, share):
+    """A filter against noise takes this share of each picture from the one before; all spots then lag by a picture."""
+    folder, _ = recording(tmp_path / "run")
+    for camera in ("left", "right"):
+        shown = 0.0
+        for k, file in enumerate(sorted((folder / "frames" / camera).iterdir())):
+            picture = cv2.imread(str(file), cv2.IMREAD_UNCHANGED).astype(float)
+            shown = picture if k == 0 else (1 - share) * picture + share * shown
+            cv2.imwrite(str(file), np.rint(shown).astype(np.uint8))
+    verdict = processed(folder, tmp_path / "out")["verdict"]
+    named = [e["numbers"]["camera"] for e in verdict["evidence"] if e["code"] == "BP-V22"]
+    assert named == (["left", "right"] if share else [])
+    assert verdict["status"] == ("check" if share else "pass")
+
+
 def flickers(frame: int) -> Any:
     return 1 + 0.12 * np.sin(0.7 * frame + 1.0)
 
