@@ -24,7 +24,7 @@ from lab.calibrate.beams.recordings import Recordings, stand_of
 from lab.errors import InputError
 from lab.files.project.project import Project
 from lab.files.text.csv_text import write_table
-from lab.findings.finding import ENTRIES, Finding, Level, finding, passed
+from lab.findings.finding import Finding, Level, entries, finding, passed
 from lab.number_format import format_cell, format_count, format_number
 from lab.report.calibration.calibration_drawings import coverage_map, residual_field, residual_histogram
 from lab.report.calibration.calibration_scene import rig_things, scene_views
@@ -218,7 +218,7 @@ def _sigmas(c: BeamCalibration, goals: BeamGoals) -> Finding:
         remedy = f"{c.motion.remedy()}, or {remedy}" if c.motion.flat else remedy
         return finding("BP-B09", level, what, why=why, remedy=remedy)
     times = int(np.ceil((rms / goals.direction) ** 2))
-    remedy = f"{ENTRIES['BP-B09'].remedy} {times} times as many positions reach the goal."
+    remedy = f"{entries()['BP-B09'].remedy} {times} times as many positions reach the goal."
     return finding("BP-B09", level, what, remedy=remedy)
 
 

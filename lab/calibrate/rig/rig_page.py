@@ -16,7 +16,7 @@ from geometry.pose import ypr_sigmas
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import split_name
 from lab.calibrate.beams.beams_page import ARCSEC, bad_positions, beam_table, first_names
-from lab.findings.finding import ENTRIES, Finding, Level, finding, level_above, passed
+from lab.findings.finding import Finding, Level, entries, finding, level_above, passed
 from lab.number_format import format_number
 from lab.report.calibration.calibration_drawings import (
     correlation_matrix,
@@ -71,7 +71,7 @@ def joint_findings(
 ) -> list[Finding]:
     """All findings of the joint adjustment. positions: names of the stand's positions."""
     joint = steps.joint
-    out = [_fit_of(joint, name) for name in joint.groups if name in ENTRIES[_MISFIT].variants]
+    out = [_fit_of(joint, name) for name in joint.groups if name in entries()[_MISFIT].variants]
     out += _contradiction(steps)
     out += _outliers(steps, positions)
     if held_out is not None:

@@ -27,7 +27,7 @@ from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.files.text.json_text import plain_value
-from lab.findings.finding import ENTRIES, Finding, Level, finding, verdict, worst_first
+from lab.findings.finding import Finding, Level, entries, finding, verdict, worst_first
 from lab.number_format import format_count, format_number, format_with_sigma
 from lab.runs.model_check.frame_sampler import FrameSampler
 from tracking.smoothing.error_scale import LARGEST_WIDTH_SHARE
@@ -201,7 +201,7 @@ def fault_finding(
     else:
         what += f", p {p_value}"
     components = list(dict.fromkeys(e.fault.component for e in suspected.explanations))
-    remedy = " ".join(ENTRIES["BP-M01"].variant(c).remedy for c in components)
+    remedy = " ".join(entries()["BP-M01"].variant(c).remedy for c in components)
     if suspected.alternatives:
         way = "A new calibration of the beams" if components == [f.BEAM] else "A `calibrate check` with marked points"
         remedy += f" {way} distinguishes the candidates."
