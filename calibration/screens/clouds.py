@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from calibration.screens.flatness import assess_flatness, frame_of_extent
 from calibration.screens.screens import Scan, moved_to_surface, pose_covariance, wrong_unit
-from geometry.arrays import Array, Bools, skew
+from geometry.arrays import Array, Bools, robust_sigma, skew
 from geometry.pose import Pose
 
 INSTALL = (
@@ -241,7 +241,7 @@ def align(moving: Array, fixed: Array) -> Alignment:
     turn = Rotation.from_matrix(transform[:3, :3]).as_rotvec()
     rotation = Rotation.from_rotvec(np.round(turn / _DIGITS) * _DIGITS).as_matrix()
     shift = np.round((transform[:3, 3] + centre - rotation @ centre) / _DIGITS) * _DIGITS
-    return Alignment(Pose(rotation, shift), 1.4826 * float(np.median(np.abs(off))), overlap)
+    return Alignment(Pose(rotation, shift), float(robust_sigma(off)), overlap)
 
 
 def _thinned(points: Array) -> Array:
@@ -365,7 +365,7 @@ def patches(frame: Pose, points: Array, point_sigma_m: float | None) -> tuple[Ar
         mine = flat[order[start : start + n]]
         # Relative to the patch's own slope, so that a tilt does not count as scatter.
         left = mine[:, 2] - _plane_heights(mine)
-        inner.append(1.4826 * float(np.median(np.abs(left - np.median(left)))))
+        inner.append(float(robust_sigma(left - np.median(left))))
         xyz.append([mine[:, 0].mean(), mine[:, 1].mean(), float(np.median(left)) + _plane_heights(mine).mean()])
         used.append(n)
     if len(xyz) < 12:
