@@ -282,16 +282,15 @@ def scan_of(
     size_m: tuple[float, float] | None = None,
     point_sigma_m: float | None = None,
     bow: str = "auto",
-    seen_from: Array | None = None,
     world_from_cloud: Pose | None = None,
     registration: Array | None = None,
 ) -> Scan:
     """The screen in a cloud of points (n, 3), m.
 
     size_m selects the plane of the screen if the cloud has several; without it the largest one is used. point_sigma_m:
-    of one point along the normal; None: from the scatter within patches. seen_from (3,), world: the side to which z
-    points. world_from_cloud (None: the cloud is in world) has an error with the covariance registration (6, 6). Raises
-    ValueError: there is no such plane; MissingOpen3DError: Open3D cannot be loaded.
+    of one point along the normal; None: from the scatter within patches. world_from_cloud (None: the cloud is in
+    world) has an error with the covariance registration (6, 6). Raises ValueError: there is no such plane;
+    MissingOpen3DError: Open3D cannot be loaded.
     """
     if len(points) < FEWEST:
         raise ValueError(f"{len(points)} points, expected {FEWEST} or more")
@@ -301,7 +300,7 @@ def scan_of(
         raise ValueError("no plane was found in the cloud; crop it to the screen and its frame")
     chosen = _plane_of_size(found, size_m)
     on_plane = to_world.apply(chosen.points)
-    frame = frame_of_extent(on_plane, seen_from)
+    frame = frame_of_extent(on_plane)
     xyz, sigma, scatter = patches(frame, on_plane, point_sigma_m)
     flatness = assess_flatness(xyz, sigma, bow)
     frame = moved_to_surface(frame, flatness.chosen)
