@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -53,9 +53,19 @@ def format_cell(value: float) -> str:
     return f"{value:.6g}" if np.isfinite(value) else ""
 
 
-def format_some(numbers: Sequence[int]) -> str:
-    """The first five numbers."""
-    return ", ".join(map(str, numbers[:5])) + (", ..." if len(numbers) > 5 else "")
+def format_some(things: Sequence[object], most: int = 5, separator: str = ", ") -> str:
+    """The first ones of some numbers or names."""
+    return separator.join(map(str, things[:most])) + (f"{separator}..." if len(things) > most else "")
+
+
+def format_vector(vector: Iterable[float], decimals: int) -> str:
+    """`1.00, \u22122.00, 0.00`."""
+    return ", ".join(f"{round(float(v), decimals) + 0.0:.{decimals}f}" for v in vector).replace("-", "\u2212")
+
+
+def format_p(p_value: float) -> str:
+    """`= 0.2`, `= 3e-09`, `below 1e-12`."""
+    return "below 1e-12" if p_value < 1e-12 else f"= {p_value:.1g}"
 
 
 def format_count(count: int, thing: str) -> str:

@@ -7,7 +7,7 @@ from click.shell_completion import ShellComplete
 from click.testing import CliRunner
 
 from cli import main
-from lab.findings.finding import ENTRIES
+from lab.findings.finding import entries
 from lab.simulate.scenarios import RIGS, SCENARIOS
 from tests.paths import ROOT
 
@@ -34,4 +34,4 @@ def test_commands_options_and_allowed_words_are_completed():
     assert completed("schema", "ca") == ["camera", "calibration"]
     assert completed("simulate", "hu") == [name for name in SCENARIOS if name.startswith("hu")] != []
     assert completed("calibrate", "simulate", "--rig", "f") == [name for name in RIGS if name.startswith("f")] != []
-    assert completed("explain", "bp-v") == [code for code in ENTRIES if code.startswith("BP-V")] != []
+    assert completed("explain", "bp-v") == [code for code in entries() if code.startswith("BP-V")] != []

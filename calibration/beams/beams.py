@@ -178,15 +178,14 @@ class BeamCalibration:
 
 
 def calibrate_beams(
-    rig: Rig, spots: SpotPixels, stand: StandModel, knowledge: RigCovariance | None = None, *, nominal: bool = True
+    rig: Rig, spots: SpotPixels, stand: StandModel, knowledge: RigCovariance | None = None
 ) -> BeamCalibration:
     """Beams from spots at recorded positions of a stand.
 
-    rig: cameras and screens as calibrated, beams as drawn (nominal; if False, their values are not used and the start
-    is from the spots alone). knowledge: joint errors of cameras and screens; None: exact. Raises AdjustmentError: the
-    spots are inconsistent, or no start is found.
+    rig: cameras and screens as calibrated, beams as drawn. knowledge: joint errors of cameras and screens; None: exact.
+    Raises AdjustmentError: the spots are inconsistent, or no start is found.
     """
-    start = _start(rig, spots, stand, nominal)
+    start = _start(rig, spots, stand)
     values = {
         **stacks_of(start[0]),
         STAND: Poses.of([start[1]]),
@@ -236,14 +235,10 @@ def self_calibrate(
     return _finished(rig, used, values, others, free, None, dropped)
 
 
-def _start(rig: Rig, spots: SpotPixels, stand: StandModel, nominal: bool) -> tuple[Rig, Pose]:
+def _start(rig: Rig, spots: SpotPixels, stand: StandModel) -> tuple[Rig, Pose]:
     """The rig with start values of the beams, and world_from_stand."""
     world_from_stand = stand.world_from_stand
     if world_from_stand is None:
-        if not nominal:
-            raise AdjustmentError(
-                "neither world_from_stand nor nominal beams are known: give one of the two as a start value"
-            )
         count = len(stand.stand_from_body.translation)
         few = evenly_spaced(np.arange(count), _FOR_THE_STAND)
         place = np.full(count, -1, dtype=np.int64)
@@ -259,14 +254,6 @@ def _start(rig: Rig, spots: SpotPixels, stand: StandModel, nominal: bool) -> tup
         bodies = Poses.of([f.world_from_body for f in fits if f is not None]).pose
         world_from_stand = stand_of(bodies, stand.stand_from_body[np.array(usable)])
     found = beams_through_spots(rig, spots, world_from_stand @ stand.stand_from_body)
-    if not nominal:
-        without = [b for b in rig.beams if b not in found]
-        if without:
-            raise AdjustmentError(
-                f"beam {without[0]}: its spots are all at the same place along it and do not determine its direction;"
-                " add nominal beams, or positions with another distance to the screen"
-            )
-        return replace(rig, beams={b: found[b] for b in rig.beams}), world_from_stand
     from_spots = replace(rig, beams={**rig.beams, **found})
     at = {STAND: Poses.of([world_from_stand]), POSES: Poses(stand.stand_from_body)}
     costs = [_cost_per_beam(r, spots, at) for r in (rig, from_spots)]

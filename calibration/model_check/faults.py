@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.changes import USUAL_SIZES
+from calibration.least_squares.adjustment import Lines
 from calibration.model_check.linearised_frames import LinearisedFrames, ModelCheckRecording
-from geometry.arrays import Array, Bools, Ints, finite, normalised, skew
+from geometry.arrays import Array, Bools, Ints, finite, skew
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import DIRECTION, POINT, POSE, RigCovariance, Sensitivity, is_known
@@ -183,7 +184,7 @@ def _beam_faults(rig: Rig, model: SpotModel, index: dict[str, int]) -> list[Poss
     faults = []
     for i, (name, beam) in enumerate(rig.beams.items()):
         views = model.beam_of == i
-        across = _perpendicular(beam.direction)
+        across = Lines(beam.point[None], beam.direction[None]).basis[0]
         aim = _directions(index, f"beams.{name}", DIRECTION, across)
         sideways = _directions(index, f"beams.{name}", POINT, across)
         aim_size, sideways_size = np.full(2, USUAL_SIZES.laser_rad), np.full(2, USUAL_SIZES.laser_m)
@@ -202,9 +203,3 @@ def _view_faults(model: SpotModel, index: dict[str, int]) -> list[PossibleFault]
         only = np.arange(len(model)) == i
         faults.append(PossibleFault(VIEW, name, PIXEL_OFFSET, directions, np.full(2, USUAL_SIZES.point_px), only))
     return faults
-
-
-def _perpendicular(direction: Array) -> Array:
-    """Two orthonormal vectors, the columns of (3, 2), perpendicular to a direction (3,)."""
-    aside = normalised(np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))]))
-    return np.stack([aside, np.cross(direction, aside)], axis=1)

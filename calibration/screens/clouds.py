@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from calibration.screens.flatness import assess_flatness, frame_of_extent
 from calibration.screens.screens import Scan, moved_to_surface, pose_covariance, wrong_unit
-from geometry.arrays import Array, Bools, skew
+from geometry.arrays import Array, Bools, robust_sigma, skew
 from geometry.pose import Pose
 
 INSTALL = (
@@ -241,7 +241,7 @@ def align(moving: Array, fixed: Array) -> Alignment:
     turn = Rotation.from_matrix(transform[:3, :3]).as_rotvec()
     rotation = Rotation.from_rotvec(np.round(turn / _DIGITS) * _DIGITS).as_matrix()
     shift = np.round((transform[:3, 3] + centre - rotation @ centre) / _DIGITS) * _DIGITS
-    return Alignment(Pose(rotation, shift), 1.4826 * float(np.median(np.abs(off))), overlap)
+    return Alignment(Pose(rotation, shift), float(robust_sigma(off)), overlap)
 
 
 def _thinned(points: Array) -> Array:
@@ -282,16 +282,15 @@ def scan_of(
     size_m: tuple[float, float] | None = None,
     point_sigma_m: float | None = None,
     bow: str = "auto",
-    seen_from: Array | None = None,
     world_from_cloud: Pose | None = None,
     registration: Array | None = None,
 ) -> Scan:
     """The screen in a cloud of points (n, 3), m.
 
     size_m selects the plane of the screen if the cloud has several; without it the largest one is used. point_sigma_m:
-    of one point along the normal; None: from the scatter within patches. seen_from (3,), world: the side to which z
-    points. world_from_cloud (None: the cloud is in world) has an error with the covariance registration (6, 6). Raises
-    ValueError: there is no such plane; MissingOpen3DError: Open3D cannot be loaded.
+    of one point along the normal; None: from the scatter within patches. world_from_cloud (None: the cloud is in
+    world) has an error with the covariance registration (6, 6). Raises ValueError: there is no such plane;
+    MissingOpen3DError: Open3D cannot be loaded.
     """
     if len(points) < FEWEST:
         raise ValueError(f"{len(points)} points, expected {FEWEST} or more")
@@ -301,7 +300,7 @@ def scan_of(
         raise ValueError("no plane was found in the cloud; crop it to the screen and its frame")
     chosen = _plane_of_size(found, size_m)
     on_plane = to_world.apply(chosen.points)
-    frame = frame_of_extent(on_plane, seen_from)
+    frame = frame_of_extent(on_plane)
     xyz, sigma, scatter = patches(frame, on_plane, point_sigma_m)
     flatness = assess_flatness(xyz, sigma, bow)
     frame = moved_to_surface(frame, flatness.chosen)
@@ -365,7 +364,7 @@ def patches(frame: Pose, points: Array, point_sigma_m: float | None) -> tuple[Ar
         mine = flat[order[start : start + n]]
         # Relative to the patch's own slope, so that a tilt does not count as scatter.
         left = mine[:, 2] - _plane_heights(mine)
-        inner.append(1.4826 * float(np.median(np.abs(left - np.median(left)))))
+        inner.append(float(robust_sigma(left - np.median(left))))
         xyz.append([mine[:, 0].mean(), mine[:, 1].mean(), float(np.median(left)) + _plane_heights(mine).mean()])
         used.append(n)
     if len(xyz) < 12:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import chdtrc, fdtrc
 
-from geometry.arrays import Array, Bools, cross, normalised
+from geometry.arrays import NORMAL_MEDIAN, Array, Bools, cross, normalised
 from geometry.pose import Pose
 
 # Definition of a screen's frame: its origin and axes.
@@ -232,8 +232,7 @@ def _robust_inliers(xyz: Array, sigma_m: Array, bent: bool) -> Bools:
     used = np.ones(len(xyz), dtype=bool)
     for _ in range(10):
         surface = fit_surface(xyz, sigma_m, bent, 0.0, used)
-        # The median distance of a Gaussian is 0.6745 sigmas.
-        scatter = float(np.median(np.abs(surface.heights_m))) / 0.6745
+        scatter = float(np.median(np.abs(surface.heights_m))) / NORMAL_MEDIAN
         now = np.abs(surface.heights_m) < OUTLIER_SIGMAS * np.maximum(scatter, sigma_m)
         if np.array_equal(now, used) or np.mean(now) < 0.5:
             break

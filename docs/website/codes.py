@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from docs.website.text import cell
-from lab.findings.finding import SECTIONS
+from lab.findings.finding import sections
 
 _HEAD = """# Codes
 
@@ -17,7 +17,7 @@ This page is generated from `lab/findings/catalogue.toml`.
 def page() -> str:
     """The page as Markdown."""
     lines = [_HEAD]
-    for title, section in SECTIONS.items():
+    for title, section in sections().items():
         lines += [f"## {title}", ""]
         for code, text in section.items():
             lines += [f"### {code}: {cell(text.title)} {{ #{code.lower()} }}", ""]

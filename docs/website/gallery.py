@@ -29,7 +29,7 @@ import numpy as np
 
 from docs.website.recordings import MISTAKES, photograph_board, record
 from docs.website.text import cell, table
-from lab.findings.finding import ENTRIES, sentence
+from lab.findings.finding import entries, sentence
 from lab.runs.verdict.score import measured_errors, normalised_squares
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -193,7 +193,7 @@ def page(
         word = {"check": "CHECK" if sight.board is None else "WARN"}.get(e["level"], "FAIL")
         lines += [
             f"The report, {word}, [{code}](../reference/codes.md#{code.lower()}) "
-            f"{cell(ENTRIES[code].title.lower())}:", "",
+            f"{cell(entries()[code].title.lower())}:", "",
             *(f"> {cell(sentence(e[part]))}\n>" for part in ("what", "why") if e[part]), "",
         ]  # fmt: skip
     if cost:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geometry.arrays import Array, symmetric
+from geometry.arrays import Array, robust_sigma, symmetric
 from geometry.camera import FISHEYE, Camera
 from geometry.forward_model import SpotDerivatives, SpotModel
 from geometry.pose import Pose
@@ -274,7 +274,6 @@ def share_without_calibration(J: Array, noise: Array, calibration: Array) -> flo
 
 
 _OUTLIER2 = 4.5**2  # squared distance, in sigmas, beyond which a difference does not count as scatter
-_MAD = 1.4826  # sigma of a normal distribution over its median absolute deviation
 _FEWEST = 10  # differences from which a scatter is computed
 _NEAREST, _FARTHEST = 0.5, 1.5  # ends of a beam's image, over the lengths to the nearest and to the farthest screen
 
@@ -344,7 +343,7 @@ def scatter(differences: Array) -> Array:
     known = differences[np.isfinite(differences).all(axis=1)]
     if len(known) < _FEWEST:
         return np.full((2, 2), np.nan)
-    sigma = np.maximum(_MAD * np.median(np.abs(known), axis=0), 1e-9)
+    sigma = np.maximum(robust_sigma(known, axis=0), 1e-9)
     near = known[((known / sigma) ** 2 < _OUTLIER2).all(axis=1)]
     if len(near) < _FEWEST:
         return np.full((2, 2), np.nan)

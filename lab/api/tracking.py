@@ -95,7 +95,7 @@ class Tracker:
             known = joint_covariance(self.rig, file.covariances, str(rig))
         start = PosePrior.everywhere(self.rig) if prior is None else prior
         if not isinstance(start, PosePrior):
-            start = prior_from(start, "prior")
+            start = prior_from(start)
         kind = SpotTracker if self.parameters.method == "spots" else RigidTracker
         self._tracker = kind(self.rig, self.parameters, start, known)
 

@@ -508,6 +508,6 @@ def complete_rigs(ctx: click.Context, parameter: click.Parameter, begun: str) ->
 
 def complete_codes(ctx: click.Context, parameter: click.Parameter, begun: str) -> list[str]:
     """Codes of `explain` that begin with `begun`, in any case."""
-    from lab.findings.finding import ENTRIES
+    from lab.findings.finding import entries
 
-    return [code for code in ENTRIES if code.startswith(begun.upper())]
+    return [code for code in entries() if code.startswith(begun.upper())]

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import re
 import textwrap
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from functools import cache
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -40,12 +40,27 @@ def _entry(table: Mapping[str, Any]) -> Entry:
     return Entry(**texts, variants={key: value for key, value in table.items() if key not in texts})
 
 
-_TABLE = tomllib.loads(Path(__file__).with_name("catalogue.toml").read_text("utf-8"))
-ENTRIES: Mapping[str, Entry] = {code: _entry(table) for code, table in _TABLE.items() if code != "sections"}
-SECTIONS: Mapping[str, Mapping[str, Entry]] = {
-    title: {code: entry for code, entry in ENTRIES.items() if code.startswith(f"BP-{letter}")}
-    for letter, title in _TABLE["sections"].items()
-}
+@cache
+def _table() -> dict[str, Any]:
+    """The catalogue. Read when a code is first looked up: that takes a tenth of a start of the program."""
+    import tomllib
+
+    return tomllib.loads(Path(__file__).with_name("catalogue.toml").read_text("utf-8"))
+
+
+@cache
+def entries() -> Mapping[str, Entry]:
+    """The entries of all codes."""
+    return {code: _entry(table) for code, table in _table().items() if code != "sections"}
+
+
+@cache
+def sections() -> Mapping[str, Mapping[str, Entry]]:
+    """The entries by the title of their section."""
+    return {
+        title: {code: entry for code, entry in entries().items() if code.startswith(f"BP-{letter}")}
+        for letter, title in _table()["sections"].items()
+    }
 
 
 def explain(code: str) -> str:
@@ -57,11 +72,11 @@ def explain(code: str) -> str:
     name = name if name.startswith("BP-") else f"BP-{name}"
     if parts := re.fullmatch(r"BP-([A-Z])(\d)", name):
         name = f"BP-{parts[1]}0{parts[2]}"
-    if name not in ENTRIES:
-        near = suggest_name(name, ENTRIES)
+    if name not in entries():
+        near = suggest_name(name, entries())
         hint = near if "did you mean" in near else ""
         raise InputError(f"expected a code such as BP-V03, got {code!r}{hint}; `beampose explain` lists all codes")
-    entry = ENTRIES[name]
+    entry = entries()[name]
     lines = [f"{name}  {entry.title}"]
     for part in (f"What it means: {entry.meaning}", f"What to do: {entry.remedy}"):
         lines += ["", *textwrap.wrap(part, _WIDTH, break_long_words=False, break_on_hyphens=False)]
@@ -71,7 +86,7 @@ def explain(code: str) -> str:
 def listed() -> list[str]:
     """A line for each code, under the title of its section."""
     lines: list[str] = []
-    for title, section in SECTIONS.items():
+    for title, section in sections().items():
         lines += ["", title] if lines else [title]
         lines += [f"  {code}  {entry.title}" for code, entry in section.items()]
     return lines
@@ -104,7 +119,7 @@ class Finding:
     def as_mapping(self) -> dict[str, Any]:
         """For summary.json."""
         return {
-            "kind": ENTRIES[self.code].kind if self.code else "",
+            "kind": entries()[self.code].kind if self.code else "",
             "code": self.code,
             "level": self.level.word,
             "what": self.what,
@@ -133,7 +148,7 @@ def finding(
 
     variant: of the code, with texts of its own. A PASS has no remedy, and a reason only if one is given.
     """
-    entry = ENTRIES[code].variant(variant)
+    entry = entries()[code].variant(variant)
     if level is Level.PASS:
         return Finding(level, what, why, code=code, numbers=numbers or {})
     return Finding(level, what, why or entry.meaning, remedy or entry.remedy, code, numbers or {})

@@ -24,9 +24,10 @@ from lab.files.run.results import read_result_table, read_summary
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.yaml_text import read_mapping
 from lab.findings.finding import Level
-from lab.number_format import format_number, median
+from lab.number_format import format_number, format_percent, median
 from lab.report.page import environment
 from lab.report.plot import svg
+from lab.report.plot.series import unwrapped
 from lab.report.summary import VERDICTS, day_of, valid
 from tracking.statuses import PoseStatus
 
@@ -162,15 +163,7 @@ def _poses(folder: Path | None) -> tuple[Array, Array, tuple[float | None, float
         median(sigmas[:, :3].max(axis=1)),
         median(sigmas[:, 3:].max(axis=1)),
     )
-    return _without_jumps(table.stack(*_ANGLES)), table.stack(*_POSITION), medians
-
-
-def _without_jumps(angles_deg: Array) -> Array:
-    out = np.where(np.isfinite(angles_deg), angles_deg, np.nan)
-    for k in range(out.shape[1]):
-        known = np.isfinite(out[:, k])
-        out[known, k] = np.unwrap(out[known, k], period=360.0)
-    return out
+    return unwrapped(table.stack(*_ANGLES)), table.stack(*_POSITION), medians
 
 
 # Thumbnails: three curves of a run in one small drawing, with a common scale.
@@ -428,7 +421,7 @@ def _cells(run: IndexedRun, points: int) -> list[Cell]:
         Cell(Markup(position), "curve", _spread(run.position_m)),
         Cell("" if run.recorded is None else run.recorded.isoformat(), "day"),
         Cell("" if run.frames is None else str(run.frames), "n"),
-        Cell("" if share is None else _percent(share), "n"),
+        Cell("" if share is None else format_percent(share), "n"),
         _number_cell(run.rms_px),
         _number_cell(run.mean_residual_px),
         _number_cell(run.sigma_attitude_deg),
@@ -436,13 +429,6 @@ def _cells(run: IndexedRun, points: int) -> list[Cell]:
         Cell("" if run.calibration_age is None else str(run.calibration_age), "n"),
         _other_cell(run.row.get("seconds"), 3),
     ]
-
-
-def _percent(share: float) -> str:
-    """With one decimal; 100 % and 0 % mean exactly all and none."""
-    if share in (0.0, 1.0):
-        return f"{100 * share:.0f} %"
-    return f"{min(max(100 * share, 0.1), 99.9):.1f} %"
 
 
 def _spread(values: Array) -> str:

@@ -28,7 +28,7 @@ from geometry.compilation.compile_cache import private_folder
 from lab.errors import RunError
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.error_text import printable
-from lab.findings.finding import ENTRIES, Finding, verdict, worst_first
+from lab.findings.finding import Finding, entries, verdict, worst_first
 from lab.number_format import format_number
 from lab.packages import versions
 
@@ -294,7 +294,7 @@ def files_beside(report: Path) -> list[str]:
 def write_failure_report(path: Path, failure: Failure) -> Path:
     """Write the report of a failure as the HTML file `path`; returns the path. Raises InputError."""
     text = environment().get_template("failure.html.j2").render(
-        f=failure, explanation=ENTRIES[failure.code], log=[printable(line) for line in failure.log]
+        f=failure, explanation=entries()[failure.code], log=[printable(line) for line in failure.log]
     )  # fmt: skip
     atomic_write_text(text, path)
     return path

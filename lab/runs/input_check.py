@@ -31,7 +31,7 @@ from lab.files.run.run_file import DetectionsTable, Run, load_run
 from lab.files.run.truth import largest_disagreement_px, load_run_truth
 from lab.files.text.error_text import FileError
 from lab.findings.finding import Done, Level, sentence
-from lab.number_format import format_number
+from lab.number_format import format_number, format_percent, format_some
 from lab.pictures.picture_file import DROPPED, UNREADABLE, MissingPicture
 from lab.pictures.source import PictureFiles
 from lab.progress import Progress
@@ -116,13 +116,13 @@ def check_visibility(findings: Findings, rig: Rig, prior: PosePrior | None, limi
         + f" roll ({turned})",
     ]
     rows = [
-        (camera, spot, _percent(seen.in_picture[i]), _percent(seen.outside[i]), _percent(seen.off_screen[i]))
+        (camera, spot, *(format_percent(share[i]) for share in (seen.in_picture, seen.outside, seen.off_screen)))
         for i, (camera, spot) in enumerate(seen.views)
     ]
     findings.facts += table(("camera", "spot", "in picture", "outside", "off screen"), rows)
     few = np.percentile(seen.spots_in_view, [0, 50, 100]).astype(int) if seen.views else (0, 0, 0)
     findings.facts.append(f"spots in view of all cameras: {few[0]} to {few[2]}, median {few[1]}")
-    line = f"pose observable from one frame: {_percent(seen.observable)} of the poses"
+    line = f"pose observable from one frame: {format_percent(seen.observable)} of the poses"
     if seen.observable > 0:
         good = (seen.sigma_m <= limits.max_sigma_m) & (seen.sigma_rad <= limits.max_sigma_rad)
         line += (
@@ -144,7 +144,7 @@ def check_visibility(findings: Findings, rig: Rig, prior: PosePrior | None, limi
         severe += never
         severe.append(f"{rig_path}: {_without_mistake(rig, span, limits)}")
     findings.remarks += [
-        f"{rig_path}: cameras.{camera}: sees no spot in {_percent(share)} of the poses"
+        f"{rig_path}: cameras.{camera}: sees no spot in {format_percent(share)} of the poses"
         for camera, share in seen.blind.items()
         if SELDOM < share < 1
     ]
@@ -162,10 +162,6 @@ def _without_mistake(rig: Rig, span: PosePrior, limits: SolveLimits) -> str:
     if not found:
         return "compare camera_from_world, camera_matrix and world_from_screen with the lab"
     return f"it would be otherwise if {', or if '.join(m.what for m in found[:MOST_NAMED])}"
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f} %"
 
 
 def check_rig(
@@ -276,10 +272,8 @@ def check_pictures(findings: Findings, run: Run, reader: FrameReader, progress: 
     findings.remarks += reader.notes
     for name, source in reader.sources.items():
         if isinstance(source, PictureFiles) and source.ignored:
-            some = ", ".join(source.ignored[:3]) + (", ..." if len(source.ignored) > 3 else "")
-            findings.remarks.append(
-                f"{run.cameras[name].path}: {len(source.ignored)} files of {name!r} are no frames: {some}"
-            )
+            what = f"{len(source.ignored)} files of {name!r} are no frames: {format_some(source.ignored, 3)}"
+            findings.remarks.append(f"{run.cameras[name].path}: {what}")
     _compare_cameras(findings, seen)
     frames = np.unique(np.concatenate([np.array(s.frames, dtype=np.int64) for s in seen.values()]))
     _check_times(findings, run, frames)

@@ -19,7 +19,7 @@ from lab.errors import QUALITY_GATE_FAILED
 from lab.files.rig.rig_file import TARGET, joint_covariance, load_rig_file
 from lab.files.text.csv_text import write_table
 from lab.findings.finding import Outcome
-from lab.number_format import format_angle, format_cell, format_length, format_percent
+from lab.number_format import format_angle, format_cell, format_length, format_percent, format_vector
 from lab.report.calibration.calibration_scene import rig_things, scene_views
 from lab.report.page import KeyFigure, PageTable, Section
 from lab.report.plot.maps import colours, heat_map, hex_colour
@@ -380,7 +380,7 @@ def _worst(plan: Plan) -> Section:
         c = plan.coordinates[i].tolist()
         rows.append(
             [
-                _three(c[:3], 3), _three(c[3:], 1),
+                format_vector(c[:3], 3), format_vector(c[3:], 1),
                 STATUS[plan.status[i]], int(spots[i]), margin, format_angle(float(plan.worst[i, 1])),
                 axis_words(plan.worst_axis[i, 1]), format_length(float(plan.worst[i, 0])),
                 axis_words(plan.worst_axis[i, 0]),
@@ -393,10 +393,6 @@ def _worst(plan: Plan) -> Section:
     )  # fmt: skip
     words = "Poses that are not observable first, then by attitude sigma. All poses are in plan.csv."
     return Section("Worst poses", words, (), PageTable(heads, rows))
-
-
-def _three(values: Sequence[float], decimals: int) -> str:
-    return "  ".join(f"{v + 0.0:g}" for v in np.round(values, decimals).tolist()).replace("-", "−")
 
 
 def _effects(plan: Plan) -> Section:

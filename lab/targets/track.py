@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from geometry.arrays import Array
 from lab.files.run.fingerprints import fingerprints_of
 from lab.files.text.csv_text import write_table
-from lab.findings.finding import ENTRIES, Finding, Level, Outcome, Verdict, finding, worst_first
+from lab.findings.finding import Finding, Level, Outcome, Verdict, entries, finding, worst_first
 from lab.number_format import format_some
 from lab.pictures.picture_file import MissingPicture
 from lab.pictures.source import open_inputs
@@ -104,7 +104,7 @@ def _measured(target: Target[F], track: Track[F]) -> Finding:
     of_others = ", ".join(f"{count} {cause}" for cause, count in list(causes.items())[:3])
     if not measured:
         what = f"no {target.subject} was found in {n} frames ({of_others})"
-        remedy = ENTRIES[target.codes.few].variant(cause).remedy
+        remedy = entries()[target.codes.few].variant(cause).remedy
         return finding(target.codes.none, Level.FAIL, what, remedy=remedy)
     what = f"{measured} of {n} frames ({share:.1%}) have a measured {target.subject}"
     level = Level.FAIL if share < least else Level.WARN if share < GOOD_MEASURED else Level.PASS

@@ -10,7 +10,7 @@ import pytest
 
 from lab import errors
 from lab.errors import InputError
-from lab.findings.finding import ENTRIES, SECTIONS, Finding, Level, explain, finding, listed
+from lab.findings.finding import Finding, Level, entries, explain, finding, listed, sections
 from tests.paths import ROOT
 
 CODE = re.compile(r"BP-[A-Z]\d\d")
@@ -65,15 +65,15 @@ def test_a_finding_without_a_code_is_found(call):
 
 
 def test_every_code_in_use_is_explained_and_every_explained_code_is_in_use():
-    assert codes_in_use() - set(ENTRIES) == set()
-    assert set(ENTRIES) - codes_in_use() - set(SECTIONS["Errors"]) == {"BP-V17"}  # of results of older versions
+    assert codes_in_use() - set(entries()) == set()
+    assert set(entries()) - codes_in_use() - set(sections()["Errors"]) == {"BP-V17"}  # of results of older versions
 
 
 def test_every_kind_of_verdict_reason_has_its_own_code():
-    own = [entry.kind for entry in SECTIONS["Verdict of a run"].values()]
+    own = [entry.kind for entry in sections()["Verdict of a run"].values()]
     assert all(own)
     assert len(set(own)) == len(own)
-    assert {entry.kind for entry in SECTIONS["Model check of a run"].values()} == {"model"}
+    assert {entry.kind for entry in sections()["Model check of a run"].values()} == {"model"}
 
 
 def test_the_codes_of_verdict_reasons_never_change():
@@ -81,7 +81,7 @@ def test_the_codes_of_verdict_reasons_never_change():
     first += ["missing_pictures", "nothing_detected", "few_points", "not_acquired", "not_confirmed", "ambiguous"]
     first += ["lost", "contradiction", "internal", "noise_scale", "model"]
     for number, kind in enumerate(first, start=1):
-        assert ENTRIES[f"BP-V{number:02d}"].kind == kind
+        assert entries()[f"BP-V{number:02d}"].kind == kind
 
 
 def test_a_finding_in_a_summary_has_its_code_and_the_kind_of_it():
@@ -95,13 +95,13 @@ def test_every_class_of_error_has_the_code_of_its_exit_status():
     assert len(classes) == 4
     for c in classes:
         assert c.code == f"BP-E0{c.exit_status}"
-        assert f"exit status {c.exit_status}" in ENTRIES[c.code].title
-    assert f"exit status {errors.QUALITY_GATE_FAILED}" in ENTRIES["BP-E04"].title
+        assert f"exit status {c.exit_status}" in entries()[c.code].title
+    assert f"exit status {errors.QUALITY_GATE_FAILED}" in entries()["BP-E04"].title
 
 
 def test_a_code_belongs_to_one_section_and_has_all_texts():
-    assert sum(map(len, SECTIONS.values())) == len(ENTRIES)
-    for code, text in ENTRIES.items():
+    assert sum(map(len, sections().values())) == len(entries())
+    for code, text in entries().items():
         assert CODE.fullmatch(code)
         assert min(map(len, (text.title, text.meaning, text.remedy))) > 3
         assert text.meaning.endswith(".")
@@ -119,11 +119,11 @@ def test_a_code_that_does_not_exist_is_an_input_error():
 
 
 def test_the_list_has_every_code():
-    assert set(CODE.findall("\n".join(listed()))) == set(ENTRIES)
+    assert set(CODE.findall("\n".join(listed()))) == set(entries())
 
 
 def test_a_finding_has_the_texts_of_its_code_or_variant_unless_others_are_given():
-    of_code = ENTRIES["BP-C09"]
+    of_code = entries()["BP-C09"]
     assert finding("BP-C09", Level.WARN, "a") == Finding(Level.WARN, "a", of_code.meaning, of_code.remedy, "BP-C09")
     laser = finding("BP-C09", Level.WARN, "a", variant="laser")
     assert laser.remedy == of_code.variants["laser"]["remedy"] != of_code.remedy

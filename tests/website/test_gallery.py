@@ -9,7 +9,7 @@ import pytest
 
 from docs.website import gallery
 from docs.website.recordings import MISTAKES
-from lab.findings.finding import ENTRIES
+from lab.findings.finding import entries
 from tests.website.test_commands_shown import problem
 
 SIGHTS = {sight.name: sight for sight in gallery.sights()}
@@ -19,7 +19,7 @@ def test_a_sight_names_a_mistake_codes_and_commands_that_exist():
     assert len(SIGHTS) >= 15
     for sight in SIGHTS.values():
         assert sight.mistake in {*MISTAKES, ""}
-        assert set(sight.named) <= set(ENTRIES)
+        assert set(sight.named) <= set(entries())
         assert [wrong for c in sight.commands if (wrong := problem(f"beampose {c}"))] == []
     assert {sight.mistake for sight in SIGHTS.values()} - {""} == set(MISTAKES)
 

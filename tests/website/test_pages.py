@@ -17,7 +17,7 @@ from docs.website.navigation import expanded
 from docs.website.network import network_addresses
 from docs.website.pages import GENERATED
 from docs.website.text import cell
-from lab.findings.finding import ENTRIES
+from lab.findings.finding import entries
 from lab.setup.schema import BLOCKS
 from tests.paths import ROOT
 from tracking.parameters import DetectParameters, LabelParameters, TrackerParameters
@@ -65,14 +65,14 @@ def test_every_command_and_every_option_is_listed():
 
 def test_every_code_has_a_heading_to_which_one_can_link():
     page = codes.page()
-    assert [code for code in ENTRIES if f"{{ #{code.lower()} }}" not in page] == []
+    assert [code for code in entries() if f"{{ #{code.lower()} }}" not in page] == []
 
 
 def test_the_pages_link_to_codes_that_exist():
     texts = [path.read_text(encoding="utf-8") for path in (ROOT / "docs").rglob("*.md")]
     linked = {code.upper() for text in texts for code in re.findall(r"codes\.md#(bp-\w+)", text)}
     assert len(linked) > 20
-    assert sorted(linked - set(ENTRIES)) == []
+    assert sorted(linked - set(entries())) == []
 
 
 def test_every_yaml_file_has_a_table_and_no_remark_is_meant_for_a_linter():

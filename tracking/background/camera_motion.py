@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, robust_sigma
 from geometry.camera import Camera
 from geometry.compilation.jit import compiled_for_threads
 from tracking.background.places import AROUND_LIGHT, places_of
@@ -238,7 +238,7 @@ class CameraMotion:
         design /= scale
         left, before = np.abs(off), np.inf  # at first: where a spot was in one of the pictures, they differ by far
         for _ in range(_ROUNDS):
-            spread = 1.4826 * float(np.median(left))
+            spread = float(robust_sigma(left))
             if spread > 0.99 * before:
                 break
             weights = np.clip(2 - left / (_OUTLIER * max(spread, 1.0)), 0.0, 1.0)
@@ -248,7 +248,7 @@ class CameraMotion:
                 return None
             inverse = np.linalg.inv(normal)
             left, before = np.abs(off - design @ (solution := inverse @ (weighted.T @ off))), spread
-        spread = 1.4826 * float(np.median(left))
+        spread = float(robust_sigma(left))
         covariance = _SHARED * max(spread, 1.0) ** 2 * inverse / np.outer(scale, scale)
         return _Fit(solution[:_FREE] / scale[:_FREE], covariance[:_FREE, :_FREE], left, spread)
 

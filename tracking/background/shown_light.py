@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Array, Bools
+from geometry.arrays import MEDIAN_TO_SIGMA, Array, Bools, upper_median
 from tracking.background.mean_pictures import LEAST_CHANGE, LEAST_LIGHT, MOST_LIGHT
 from tracking.background.places import AROUND_SPOT
 from tracking.detections import Detections
@@ -144,7 +144,9 @@ class ShownLight:
         light, above, structure, clear, variance = self._measured(seen)
         light /= self.reference or 1.0
         power = float(np.sum(np.square(clear * structure)))
-        sigma = _EFFICIENCY * float(np.sqrt(_median(variance[_SOME]) / max(power, 1e-12))) / (self.reference or 1.0)
+        sigma = (
+            _EFFICIENCY * float(np.sqrt(upper_median(variance[_SOME]) / max(power, 1e-12))) / (self.reference or 1.0)
+        )
         usual = max(LEAST_CHANGE, _CLEAR_SIGMAS * sigma)
         # Whether a picture is one of those in the mean is not known here: both of its lights are usual.
         if not self.reference or -usual < light - 1 < usual + self.in_mean / self.reference:
@@ -152,7 +154,7 @@ class ShownLight:
         sigmas = np.sqrt(variance * np.float32(1 + light**2 * self.noise_share))
         shown = structure / sigmas
         left = above / sigmas - np.float32(light) * shown
-        return light, clear, left, shown, 1.4826 * _median(np.abs(left[_SOME][clear[_SOME]]))
+        return light, clear, left, shown, MEDIAN_TO_SIGMA * upper_median(np.abs(left[_SOME][clear[_SOME]]))
 
     def _measured(self, seen: _Values) -> tuple[float, _Values, _Values, Bools, _Values]:
         """The light, not yet relative to the reference; and, on the sample: what is above the smooth part, and the
@@ -160,7 +162,7 @@ class ShownLight:
 
         seen (a, b), DN: above the smooth part.
         """
-        more = _median(seen[_SOME])
+        more = upper_median(seen[_SOME])
         slope, black = np.float32(self.noise.slope_dn), np.float32(self.noise.black_dn - more)
         variance = np.float32(self.noise.floor_dn2) + slope * np.maximum(self.level - black, np.float32(0.0))
         sigmas = 6 * np.sqrt(variance)
@@ -171,7 +173,7 @@ class ShownLight:
         clear = (self.plain > 0) & (np.abs(above) < sigmas + 4 * np.abs(structure))
         shown = clear * structure
         share = _sums(shown * above)[self.showing] / np.maximum(_sums(shown * shown)[self.showing], np.float32(1e-12))
-        return _median(share), above, structure, clear, variance
+        return upper_median(share), above, structure, clear, variance
 
 
 def _light_of_rows(left: _Values, structure: _Values, clear: Bools, misfit: float) -> tuple[_Values, Bools]:
@@ -225,8 +227,3 @@ def _over_rows(values: _Values) -> _Values:
 def _sums(values: _Values) -> _Values:
     """Sums over the surroundings of each pixel of the sample."""
     return np.asarray(cv2.boxFilter(values, -1, _AROUND, normalize=False), np.float32)
-
-
-def _median(values: Array | _Values) -> float:
-    """The upper median; nan without values."""
-    return float(np.partition(values.ravel(), values.size // 2)[values.size // 2]) if values.size else float("nan")

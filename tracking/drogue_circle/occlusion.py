@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from geometry.arrays import Array, Bools
-from tracking.drogue_circle.rim_fit import SECTORS, RimFit, median
+from geometry.arrays import Array, Bools, upper_median
+from tracking.drogue_circle.rim_fit import SECTORS, RimFit
 from tracking.noise import Picture
 
 _RINGS, _SECTORS = 10, SECTORS
@@ -60,7 +60,7 @@ class Appearance:
         rate = max(_RATE, 1 / (self.frames + 1)) if new else _RATE
         away = cells_dn - self.mean_dn
         same = self._matching(cells_dn, inside)
-        away = away - median(away[inside & same] if same.any() else away[inside])
+        away = away - upper_median(away[inside & same] if same.any() else away[inside])
         step = np.where(inside, np.where(same | new, rate, _CHANGED), 0.0)
         filled = float(np.mean(same)) - self.fill
         fill = self.fill if self.frames < 2 else self.fill + (rate if filled > 0 or new else _CHANGED) * filled
@@ -80,8 +80,8 @@ class Appearance:
         away = cells_dn - self.mean_dn
         # The common change is limited: an occluder over the whole target is not a change of the light. Where half of
         # the target is hidden, the median may be that of the occluder: no change is tried, too.
-        most = _LIGHT * max(abs(median(self.mean_dn.ravel())), 1.0)
-        common = float(np.clip(median(away[inside]), -most, most))
+        most = _LIGHT * max(abs(upper_median(self.mean_dn)), 1.0)
+        common = float(np.clip(upper_median(away[inside]), -most, most))
         plain, corrected = (inside & (np.abs(away - change) < tolerance) for change in (0.0, common))
         return np.asarray(corrected if corrected.sum() > plain.sum() else plain)
 

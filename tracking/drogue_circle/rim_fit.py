@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Array, Bools, symmetric
+from geometry.arrays import MEDIAN_TO_SIGMA, NORMAL_MEDIAN, Array, Bools, symmetric, upper_median
 from tracking.drogue_circle.detectors import CircleCandidate, Window, crop_bounds
 from tracking.noise import Picture
 
@@ -71,12 +71,6 @@ class SmoothCrop:
     blur_px: float
 
 
-def median(values: Array | NDArray[np.float32]) -> float:
-    """The upper median of values (n,), n > 0: np.median, at a fifth of its cost on the small arrays of one frame."""
-    half = len(values) // 2
-    return float(np.partition(values, half)[half])
-
-
 def smooth_crop(picture: Picture, window: Window, blur_px: float) -> SmoothCrop:
     """The part of a picture in a window, filtered by a Gaussian."""
     top, bottom, left, right = crop_bounds(picture.shape, window)
@@ -85,7 +79,7 @@ def smooth_crop(picture: Picture, window: Window, blur_px: float) -> SmoothCrop:
         return SmoothCrop(np.zeros((0, 0), np.float32), left, top, 0.0, blur_px)
     # Noise: median of the second difference along rows, which cancels gradients (Immerkaer 1996, one dimension).
     second = np.abs(raw[::2, 2:] - 2 * raw[::2, 1:-1] + raw[::2, :-2])
-    noise = max(median(second.ravel()) / 0.6745 / np.sqrt(6.0), 0.3)
+    noise = max(upper_median(second) / NORMAL_MEDIAN / np.sqrt(6.0), 0.3)
     filtered = noise / (2 * np.sqrt(np.pi) * blur_px)  # white noise behind a Gaussian filter
     smooth = np.asarray(cv2.GaussianBlur(raw, (0, 0), blur_px), np.float32)
     return SmoothCrop(smooth, left, top, float(filtered), blur_px)
@@ -123,7 +117,7 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
     strength = middle[rows, best]
     good = inside & (score[rows, best] > 0)
     if good.any():
-        good &= strength > _LEAST_SHARE * median(strength[good])
+        good &= strength > _LEAST_SHARE * upper_median(strength[good])
     a, b, c = slope[rows, best], strength, slope[rows, best + 2]
     bend = np.where(good, a - 2 * b + c, -1.0)
     vertex = np.clip(0.5 * (a - c) / np.minimum(bend, -1e-12), -0.5, 0.5)  # of a parabola through three slopes
@@ -137,11 +131,11 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
     common = 0.0
     if good.any() and half_px == _PASSES[-1][0]:  # the passes before need no such precision
         height = np.sqrt(2 * np.pi) * sigma * strength
-        tail = 0.5 * median(height[good]) * (1 - erf(float(offset[-1]) / (np.sqrt(2) * sigma)))
+        tail = 0.5 * upper_median(height[good]) * (1 - erf(float(offset[-1]) / (np.sqrt(2) * sigma)))
         ends = polarity * values[:, [0, -1]] + [-tail, tail]  # without what the blurred step still rises there
         away, inner = _beside(crop, rim, theta, polarity, ends, strength)
         radius -= sigma**2 * away / height
-        common = abs(sigma**2 * inner / median(height[good]))
+        common = abs(sigma**2 * inner / upper_median(height[good]))
         common = common if common > _LEAST_COMMON_PX else 0.0
     if hidden is None:
         return RimPoints(theta, radius, strength, radius, spacing, sigma, common)
@@ -161,7 +155,7 @@ def _beside(
     slope: (n,) DN/px, of the edges; nan without one.
     """
     good = np.isfinite(slope)
-    steep = median(slope[good])
+    steep = upper_median(slope[good])
     length = min(_BESIDE_PX, _BESIDE * rim.radius_px)
     distance = rim.radius_at(theta)[:, None] + (_PASSES[-1][0] + _STEP_PX + length) * np.array([-1.0, 1.0])
     x = (rim.u_px - crop.left + distance * np.cos(theta)[:, None]).astype(np.float32)
@@ -190,7 +184,7 @@ def _edge_width(ratios_px: Array, half_px: float, least_px: float) -> float:
 
     The height is A erf(half / (sqrt(2) sigma)) and the slope A / (sqrt(2 pi) sigma); least_px: the filter's own sigma.
     """
-    ratio = median(ratios_px) / np.sqrt(2 * np.pi)
+    ratio = upper_median(ratios_px) / np.sqrt(2 * np.pi)
     sigma = max(ratio, least_px)
     for _ in range(4):
         sigma = float(np.clip(ratio / erf(half_px / (np.sqrt(2) * sigma)), least_px, _MOST_BLUR * half_px))
@@ -333,7 +327,7 @@ def _solve(rim: Rim, points: RimPoints, least_scale_px: float, oblique: bool) ->
     for _ in range(12):
         bend = (x[0] * sine - x[1] * cosine) ** 2 / (2 * max(x[2], 1.0))
         residual = observed - A @ x + bend
-        scale = max(1.4826 * median(np.abs(residual)), least_scale_px / _TUKEY, _LEAST_SIGMA_PX)
+        scale = max(MEDIAN_TO_SIGMA * upper_median(np.abs(residual)), least_scale_px / _TUKEY, _LEAST_SIGMA_PX)
         weight = np.maximum(1 - (residual / (_TUKEY * scale)) ** 2, 0.0) ** 2
         prior = _prior(points, scale, count)
         normal = (A * weight[:, None]).T @ A + prior

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Array
+from geometry.arrays import Array, robust_sigma
 from tracking.detections import Detections
 from tracking.noise import Picture
 
@@ -29,7 +29,6 @@ class BlobParameters:
     max_size_px: float = 250.0  # px: above it is an edge of the scene
 
 
-_MAD_TO_SIGMA = 1.4826  # of a Gaussian
 # A square of this share of background_px as well, for blobs of up to half of that: clouds change less within it.
 _NARROW = 0.67
 _EVERY = 4  # every 4th row and column is enough for the noise
@@ -63,7 +62,7 @@ def _blobs_before(picture: Picture | NDArray[np.float32], parameters: BlobParame
     background = cv2.blur(grey, (side, side), borderType=cv2.BORDER_REFLECT)
     contrast = sign * (grey - background)
     sample = contrast[::_EVERY, ::_EVERY]
-    sigma = max(float(_MAD_TO_SIGMA * np.median(np.abs(sample - np.median(sample)))), 0.3)  # 0.3 DN: rounding
+    sigma = max(float(robust_sigma(sample - np.median(sample))), 0.3)  # 0.3 DN: rounding
     limit = max(parameters.threshold_sigma * sigma, parameters.threshold_share * float(contrast.max()))
     mask = _outlines(contrast, limit)
     if parameters.close_px > 1:

@@ -15,7 +15,7 @@ from calibration.lens.fit.lens_adjustment import BRIEF, CONVERGED, FitSettings, 
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.fit.lens_parameters import BoardFreedom, lens_of
 from calibration.terms.surveyed import array_of
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, robust_sigma
 from geometry.pose import Pose
 
 FEWEST_CORNERS = 6  # of a view: four determine its pose, the others contribute to the lens
@@ -158,7 +158,7 @@ def _residuals(table: CornerTable, candidates: Bools, model: LensModel, values: 
 
 def _spread(residuals: Array) -> float:
     """Robust sigma of a coordinate from the median of residuals (n, 2), with a breakdown point of 50 %; >= 1e-6 px."""
-    return max(1.4826 * float(np.median(np.abs(residuals))), 1e-6)
+    return max(float(robust_sigma(residuals)), 1e-6)
 
 
 def _without_pose(table: CornerTable, values: Values) -> dict[int, str]:

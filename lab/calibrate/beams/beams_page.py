@@ -24,8 +24,8 @@ from lab.calibrate.beams.recordings import Recordings, stand_of
 from lab.errors import InputError
 from lab.files.project.project import Project
 from lab.files.text.csv_text import write_table
-from lab.findings.finding import ENTRIES, Finding, Level, finding, passed
-from lab.number_format import format_cell, format_count, format_number
+from lab.findings.finding import Finding, Level, entries, finding, passed
+from lab.number_format import format_cell, format_count, format_number, format_some, format_vector
 from lab.report.calibration.calibration_drawings import coverage_map, residual_field, residual_histogram
 from lab.report.calibration.calibration_scene import rig_things, scene_views
 from lab.report.page import (
@@ -73,7 +73,7 @@ def check_no_duplicates(project: Project) -> None:
 
 ARCSEC = np.deg2rad(1 / 3600)
 _P_NOT_COLLINEAR = 1e-3  # p-value below which opposed beams are not collinear
-_WORST_NAMED = 6
+WORST_NAMED = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,22 +116,17 @@ def stand_findings(project: Project, recordings: Recordings) -> list[Finding]:
     return out
 
 
-def first_names(names: Sequence[str], separator: str = ", ") -> str:
-    """The first names of a list, and an ellipsis where there are more."""
-    return separator.join(names[:_WORST_NAMED]) + (" …" if len(names) > _WORST_NAMED else "")
-
-
 def bad_positions(position: Ints, wrong: Sequence[int], names: Sequence[str]) -> list[str]:
     """Names of the positions of which most spots were excluded. position: of each spot; wrong: the excluded spots."""
     at, of_all = Counter(position[wrong].tolist()), Counter(position.tolist())
-    return [names[k] for k in sorted(at) if at[k] >= 2 and 2 * at[k] > of_all[k]][:_WORST_NAMED]
+    return [names[k] for k in sorted(at) if at[k] >= 2 and 2 * at[k] > of_all[k]][:WORST_NAMED]
 
 
 def _determined(c: BeamCalibration, positions: Sequence[str]) -> list[Finding]:
     out = []
     count = len(c.world_from_body.translation)
     if c.dropped:
-        names = first_names([positions[i] for i in c.dropped])
+        names = format_some([positions[i] for i in c.dropped], WORST_NAMED)
         out.append(finding("BP-B01", Level.WARN, f"{len(c.dropped)} positions excluded: {names}"))
     if count < FEWEST_POSITIONS:
         what = f"only {format_count(count, 'position')}, expected {FEWEST_POSITIONS} or more"
@@ -165,12 +160,12 @@ def _wrong_spots(c: BeamCalibration, positions: Sequence[str], goals: BeamGoals)
         f" {size[i]:.3g} px"
         for i in wrong[np.argsort(-size[wrong])]
     ]
-    what = f"{len(wrong)} of {len(c.spots)} spots excluded as outliers ({first_names(worst, '; ')})"
+    what = f"{len(wrong)} of {len(c.spots)} spots excluded as outliers ({format_some(worst, WORST_NAMED, '; ')})"
     level = Level.WARN if len(wrong) > goals.wrong_share * len(c.spots) else Level.PASS
     out = [finding("BP-B05", level, what)]
     cameras = list(c.rig.cameras)
     camera_of = np.array([cameras.index(views[v][0]) for v in c.spots.view])
-    for i, j in swapped_pairs(c.spots, c.fit.kept, c.fit.residuals_px, camera_of)[:_WORST_NAMED]:
+    for i, j in swapped_pairs(c.spots, c.fit.kept, c.fit.residuals_px, camera_of)[:WORST_NAMED]:
         (camera, first), (_, second) = views[c.spots.view[i]], views[c.spots.view[j]]
         what = f"position {used[c.spots.position[i]]}: spots {first} and {second} of camera {camera!r} are exchanged"
         out.append(finding("BP-B06", Level.WARN, what))
@@ -218,7 +213,7 @@ def _sigmas(c: BeamCalibration, goals: BeamGoals) -> Finding:
         remedy = f"{c.motion.remedy()}, or {remedy}" if c.motion.flat else remedy
         return finding("BP-B09", level, what, why=why, remedy=remedy)
     times = int(np.ceil((rms / goals.direction) ** 2))
-    remedy = f"{ENTRIES['BP-B09'].remedy} {times} times as many positions reach the goal."
+    remedy = f"{entries()['BP-B09'].remedy} {times} times as many positions reach the goal."
     return finding("BP-B09", level, what, remedy=remedy)
 
 
@@ -390,7 +385,7 @@ def beam_table(rig: Rig, direction: Array, offset: Array, off_nominal: Array) ->
     angle, distance = off_nominal.T
     sigmas = np.column_stack([direction / ARCSEC, 1e3 * offset, 60 * np.rad2deg(angle), 1e3 * distance])
     rows = [
-        (name, ends[name], _three(beam.direction, 6), _three(1e3 * beam.point, 2), *figures)
+        (name, ends[name], format_vector(beam.direction, 6), format_vector(1e3 * beam.point, 2), *figures)
         for (name, beam), figures in zip(rig.beams.items(), sigmas, strict=True)
     ]
     heads = (
@@ -398,10 +393,6 @@ def beam_table(rig: Rig, direction: Array, offset: Array, off_nominal: Array) ->
         "off nominal (arcmin)", "off nominal (mm)",
     )  # fmt: skip
     return PageTable(heads, rows)
-
-
-def _three(vector: Array, digits: int) -> str:
-    return ", ".join(f"{v:.{digits}f}".replace("-", "−") for v in vector)
 
 
 def _between(c: BeamCalibration) -> Section:

@@ -123,17 +123,9 @@ def _level_below(value: float, limits: tuple[float, float]) -> Level:
     return level_above(-value, -limits[0], -limits[1])
 
 
-def _two(value: float) -> str:
-    """Two significant digits without an exponent: 0.29, 3.9, 240."""
-    if not np.isfinite(value) or value == 0:
-        return f"{value:g}"
-    digits = 1 - int(np.floor(np.log10(abs(value))))
-    return f"{round(value, digits):.{max(digits, 0)}f}"
-
-
 def _mm(c: Intrinsics, px: float) -> str:
     """A length in px, and in mm on the screen."""
-    return f"{px:.3g} px ({_two(px * c.map.usual_mm_per_px())} mm at {c.distance_m:.3g} m)"
+    return f"{px:.3g} px ({format_number(px * c.map.usual_mm_per_px(), 2)} mm at {c.distance_m:.3g} m)"
 
 
 def _listed(words: tuple[str, ...]) -> str:
@@ -183,9 +175,9 @@ def _focal(c: Intrinsics) -> Finding:
     return finding(
         "BP-L16",
         level_above(share, *LIMITS.focal),
-        f"Focal length {c.fit.lens[0]:.2f} ± {_two(c.sigmas[0])} px ({share:.2%}).",
+        f"Focal length {c.fit.lens[0]:.2f} ± {format_number(c.sigmas[0], 2)} px ({share:.2%}).",
         why="A pose's distance is uncertain by that share:"
-        f" {_two(1000 * share * c.distance_m)} mm at {c.distance_m:.3g} m.",
+        f" {format_number(1000 * share * c.distance_m, 2)} mm at {c.distance_m:.3g} m.",
     )
 
 
@@ -207,7 +199,7 @@ def _principal_point(c: Intrinsics) -> Finding:
     level = level_above(share, *LIMITS.off_centre)
     what = (
         f"Principal point {away[0]:+.1f}, {away[1]:+.1f} px from the centre"
-        f" (± {_two(c.sigmas[2])}, {_two(c.sigmas[3])})."
+        f" (± {format_number(c.sigmas[2], 2)}, {format_number(c.sigmas[3], 2)})."
     )
     sure = bool(np.any(np.abs(away) > 2 * c.sigmas[2:4] + LIMITS.off_centre[0] * size))
     return finding("BP-L18", level, what, variant="" if sure else "uncertain")
@@ -227,8 +219,9 @@ def _halves(c: Intrinsics) -> Finding:
     return finding(
         "BP-L21",
         _disagreement(d, LIMITS.p_value),
-        f"Two halves of the photographs differ by {d.rms_px:.3g} px ({_two(d.rms_mm)} mm at {c.distance_m:.3g} m), RMS"
-        f" over the picture; {d.expected_rms_px:.3g} px are expected from their sigmas (p = {d.p_value:.2g}).",
+        f"Two halves of the photographs differ by {d.rms_px:.3g} px ({format_number(d.rms_mm, 2)} mm at"
+        f" {c.distance_m:.3g} m), RMS over the picture; {d.expected_rms_px:.3g} px are expected from their sigmas"
+        f" (p = {d.p_value:.2g}).",
     )
 
 
@@ -265,13 +258,13 @@ def _scatter(c: Intrinsics) -> Finding:
 
 def _map(c: Intrinsics) -> Finding:
     px, mm = c.map.sigma_px(c.covariance), c.map.sigma_mm(c.covariance)
-    (half, most, worst), (half_mm, most_mm, worst_mm) = (np.nanquantile(m, [0.5, 0.9, 1.0]) for m in (px, mm))
+    places = np.stack([np.nanquantile(m, [0.5, 0.9, 1.0]) for m in (px, mm)], axis=-1)
+    half, most, worst = (f"{format_number(a, 2)} px ({format_number(b, 2)} mm" for a, b in places.tolist())
     return finding(
         "BP-L24",
-        level_above(float(most), *LIMITS.map_px),
-        f"The direction of a pixel is known to {_two(half)} px ({_two(half_mm)} mm at {c.distance_m:.3g} m) or better"
-        f" in half of the picture, to {_two(most)} px ({_two(most_mm)} mm) in 90 %, and to {_two(worst)} px"
-        f" ({_two(worst_mm)} mm) at the worst place (1 sigma).",
+        level_above(float(places[1, 0]), *LIMITS.map_px),
+        f"The direction of a pixel is known to {half} at {c.distance_m:.3g} m) or better in half of the picture, to"
+        f" {most}) in 90 %, and to {worst}) at the worst place (1 sigma).",
     )
 
 
@@ -295,7 +288,9 @@ def _warp(c: Intrinsics) -> Finding | None:
         return None
     what = f"The board is bent by {1000 * w.rise_m:.2f} mm (p = {w.p_value:.1g} for a flat board): {w.why}"
     if not w.corrected:
-        change = f" Solving for it would change directions by {_two(w.change_px)} px RMS." if w.change_px else ""
+        change = (
+            f" Solving for it would change directions by {format_number(w.change_px, 2)} px RMS." if w.change_px else ""
+        )
         return passed(f"{what}; taken as flat.{change}")
     return finding("BP-L25", Level.WARN if w.rise_m > LIMITS.warp_m else Level.PASS, f"{what}; corrected.")
 

@@ -52,7 +52,7 @@ from lab.files.rig.camera_file import CalibrationState
 from lab.files.rig.rig_file import RigFile, joint_covariance, load_rig_file
 from lab.files.text.csv_text import write_table
 from lab.findings.finding import Finding, Level, Outcome, finding, passed
-from lab.number_format import decimals_of, format_count, format_number
+from lab.number_format import decimals_of, format_count, format_number, format_p
 from lab.report.calibration.calibration_drawings import DriftLine, corners_overlay, drift_chart
 from lab.report.calibration.calibration_scene import Marker, rig_things, scene_views
 from lab.report.page import KeyFigure, PageDrawing, PageTable, Section
@@ -109,7 +109,7 @@ def camera_findings(c: CameraDrift, limits: DriftLimits, pose_free: bool) -> lis
         if pose_free:
             why += ". The fit of the unknown vehicle pose may absorb part of the change."
         change = describe_change(c)
-        what = f"{name} {change}: its picture is off by {size(c.drift_px, c.drift_mm)}, p = {_p(c.change.p_value)}"
+        what = f"{name} {change}: its picture is off by {size(c.drift_px, c.drift_mm)}, p {format_p(c.change.p_value)}"
         out.append(finding("BP-C06", level, what, why=why, variant=c.change.kind))
     if np.isfinite(c.unexplained_px):
         what = (
@@ -165,12 +165,8 @@ def other_findings(others: Sequence[OtherChange], limits: DriftLimits) -> list[F
         else:
             what, variant = f"one point is wrong: {o.change.subject} is off by {off}, the others are not", "point"
             level = min(level, Level.WARN)  # an error of the point, not of the calibration
-        out.append(finding("BP-C09", level, f"{what}, p = {_p(o.change.p_value)}", variant=variant))
+        out.append(finding("BP-C09", level, f"{what}, p {format_p(o.change.p_value)}", variant=variant))
     return out
-
-
-def _p(p: float) -> str:
-    return "below 1e-12" if p < 1e-12 else f"{p:.1g}"
 
 
 def page_of(

@@ -48,12 +48,12 @@ from lab.files.run.run_file import Run, load_run
 from lab.files.text.csv_text import csv_word, write_table
 from lab.files.text.error_text import suggest_name
 from lab.findings.finding import Finding, Level, Outcome, clause, finding, passed, verdict
-from lab.number_format import format_count, format_number, format_with_sigma
+from lab.number_format import format_count, format_number, format_p, format_with_sigma
 from lab.progress import Progress
 from lab.report.calibration.calibration_drawings import correlation_matrix, residual_field
 from lab.report.calibration.calibration_scene import SceneObject, Trail, frustum_length, rig_things, scene_views
 from lab.report.page import KeyFigure, PageDrawing, PageTable, Section, cell
-from lab.runs.model_check.check import ModelCheck, p_text, with_place_errors
+from lab.runs.model_check.check import ModelCheck, with_place_errors
 from lab.runs.process import process_run
 
 RIG, RESIDUALS = "rig.yaml", "residuals.csv"
@@ -291,10 +291,10 @@ NOISY = 1.5  # the limit of the model check
 
 def _changes(r: Refinement) -> list[Finding]:
     if r.p_change >= P_CHANGE and not r.moved:
-        what = f"the changes agree with the stated sigmas, p {p_text(r.p_change)}"
+        what = f"the changes agree with the stated sigmas, p {format_p(r.p_change)}"
         return [passed(what)]
     if not r.moved:
-        what = f"the changes are larger than the stated sigmas allow, p {p_text(r.p_change)}"
+        what = f"the changes are larger than the stated sigmas allow, p {format_p(r.p_change)}"
         return [finding("BP-F06", Level.FAIL, what)]
     return [finding("BP-F03", Level.FAIL, _moved(m)) for m in r.moved]
 
@@ -303,7 +303,7 @@ def _moved(suspected: SuspectedFault) -> str:
     words = "; or ".join(_part(e) for e in suspected.explanations)
     more = f"; or one of {suspected.more_alternatives} more" if suspected.more_alternatives else ""
     undecided = ": these recordings do not distinguish them" if suspected.alternatives else ""
-    return f"{words}{more}{undecided}, p {p_text(suspected.best.change.p_value)}"
+    return f"{words}{more}{undecided}, p {format_p(suspected.best.change.p_value)}"
 
 
 def _part(e: FittedFault) -> str:
@@ -343,10 +343,10 @@ def _held_out_finding(r: Refinement) -> list[Finding]:
     p = min(1.0, len(held) * min(h.p for h in held))
     words = f"held-out residuals {format_number(before)} sigmas with the given rig, {format_number(after)} refined"
     if p < P_HELD_OUT:
-        return [finding("BP-F01", Level.FAIL, f"{words}; they contradict its covariance, p {p_text(p)}")]
+        return [finding("BP-F01", Level.FAIL, f"{words}; they contradict its covariance, p {format_p(p)}")]
     if sum(h.log_density[1] - h.log_density[0] for h in held) <= 0 or after > before:
         return [finding("BP-F02", Level.FAIL, words)]
-    return [passed(f"{words}; they agree with its covariance, p {p_text(p)}")]
+    return [passed(f"{words}; they agree with its covariance, p {format_p(p)}")]
 
 
 def _used(result: RefinedRig) -> list[Finding]:

@@ -15,9 +15,9 @@ from geometry.arrays import Array, Bools, Ints, skew
 from geometry.pose import ypr_sigmas
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import split_name
-from lab.calibrate.beams.beams_page import ARCSEC, bad_positions, beam_table, first_names
-from lab.findings.finding import ENTRIES, Finding, Level, finding, level_above, passed
-from lab.number_format import format_number
+from lab.calibrate.beams.beams_page import ARCSEC, WORST_NAMED, bad_positions, beam_table
+from lab.findings.finding import Finding, Level, entries, finding, level_above, passed
+from lab.number_format import format_number, format_some
 from lab.report.calibration.calibration_drawings import (
     correlation_matrix,
     flatness_map,
@@ -71,7 +71,7 @@ def joint_findings(
 ) -> list[Finding]:
     """All findings of the joint adjustment. positions: names of the stand's positions."""
     joint = steps.joint
-    out = [_fit_of(joint, name) for name in joint.groups if name in ENTRIES[_MISFIT].variants]
+    out = [_fit_of(joint, name) for name in joint.groups if name in entries()[_MISFIT].variants]
     out += _contradiction(steps)
     out += _outliers(steps, positions)
     if held_out is not None:
@@ -127,7 +127,7 @@ def _outliers(steps: RigCalibration, positions: Sequence[str]) -> list[Finding]:
         share = len(wrong) / len(kept)
         level = level_above(share, LIMITS.wrong_warn, LIMITS.wrong_fail)
         if name == RECORDS:
-            where = first_names([positions[i] for i in wrong])
+            where = format_some([positions[i] for i in wrong], WORST_NAMED)
             what = f"{name}: the recorded pose does not fit the spots at {len(wrong)} of {len(kept)} ({where})"
             out.append(finding("BP-R04", max(level, Level.WARN), what))
             continue
@@ -142,7 +142,7 @@ def _outliers(steps: RigCalibration, positions: Sequence[str]) -> list[Finding]:
             s = measured.network.point_observations
             seen = zip(s.point_of[wrong].tolist(), s.camera_of[wrong].tolist(), strict=True)
             which = [f"{names[dot]} in camera {cameras[camera]}" for dot, camera in seen]
-        named = f": {first_names(which, '; ')}" if which else ""
+        named = f": {format_some(which, WORST_NAMED, '; ')}" if which else ""
         out.append(finding("BP-R05", level, f"{name}: {len(wrong)} of {len(kept)} excluded as outliers{named}"))
         if name == SPOTS and (bad := bad_positions(measured.spots.position, wrong, positions)):
             out.append(finding("BP-R06", Level.WARN, f"most spots of position {', '.join(bad)} were excluded"))

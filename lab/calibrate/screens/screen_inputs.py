@@ -369,7 +369,7 @@ def _scan(cloud: Cloud, entry: ProjectScreen, survey: Survey, project: Project) 
             pose, covariance = found.world_from_cloud, found.covariance
             misses = 1e3 * float(np.sqrt(np.mean(np.sum(found.residuals_m**2, axis=1))))
             words.append(f"{cloud.path.name}: {len(both)} targets fit the survey to {misses:.2g} mm RMS")
-        scan = scan_of(points, entry.size_m, cloud.point_sigma_m, entry.bow, None, pose, covariance)
+        scan = scan_of(points, entry.size_m, cloud.point_sigma_m, entry.bow, pose, covariance)
     except MissingOpen3DError as error:
         raise InputError(f"{cloud.path}: {error}") from None
     except ValueError as error:

@@ -21,7 +21,7 @@ from geometry.arrays import Array
 from geometry.camera import pinhole_numbers
 from lab.files.project.project import Project
 from lab.findings.finding import Finding, Level, finding, level_above, passed
-from lab.number_format import format_count, format_number
+from lab.number_format import format_count, format_number, format_vector
 from lab.report.calibration.calibration_drawings import corners_overlay, correlation_matrix, flatness_map
 from lab.report.calibration.calibration_scene import LAB_VIEWS, Marker, Rectangle, SceneObject, frustum_of, scene_views
 from lab.report.page import (
@@ -319,8 +319,8 @@ def _screen(result: FittedScreens, project: Project, k: int) -> Section:
     normal, origin = screen.world_from_screen.rotation[:, 2], screen.world_from_screen.translation
     x_axis = screen.world_from_screen.rotation[:, 0]
     words = [
-        f"Origin at {_vector(origin, 4)} m in the world, normal (z) along {_vector(normal, 5)},"
-        f" x along {_vector(x_axis, 5)}. The axes within the plane are a convention"
+        f"Origin at ({format_vector(origin, 4)}) m in the world, normal (z) along ({format_vector(normal, 5)}),"
+        f" x along ({format_vector(x_axis, 5)}). The axes within the plane are a convention"
         + (", defined by the named points." if project.screens[name].frame else ": the centre of its measurements.")
     ]
     drawings = []
@@ -354,10 +354,6 @@ def _screen(result: FittedScreens, project: Project, k: int) -> Section:
             drawing = flatness_map(xy, f.chosen.heights_m[on], title, size_m=size_m, sigma_m=sigma)
             drawings.append(PageDrawing(drawing, "Height above the curved surface: only noise should remain."))
     return Section(f"Screen {name}", words, drawings)
-
-
-def _vector(v: np.ndarray, digits: int) -> str:
-    return "(" + ", ".join(f"{round(float(x), digits) + 0.0:.{digits}f}" for x in v) + ")"
 
 
 def _pixels(result: FittedScreens) -> Section:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geometry.arrays import Array, Ints
+from geometry.arrays import NORMAL_MEDIAN, Array, Ints
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import ROW_TIME, TIME_OFFSET, RigCovariance
 from lab.errors import InputError
@@ -97,7 +97,6 @@ def _check_unit(table: Table, times: Times) -> None:
 FEWEST_STAMPS = 12  # that show whether they are those of a constant rate
 LARGEST_SCATTER, NEGLIGIBLE_SCATTER = 0.15, 1e-3  # of the usual step: pictures at any time; stamps without errors
 STAMP_OUTLIER = 5.0  # sigmas of the scatter
-NORMAL_MEDIAN = 0.6745  # median of |x| of a normal distribution of sigma 1
 
 
 def stamp_sigmas(times: Times) -> Array | None:

@@ -345,9 +345,9 @@ def _prior_of(block: _PriorBlock) -> PosePrior:
     )
 
 
-def prior_from(content: Mapping[str, Any], place: str) -> PosePrior:
-    """The prior region that the `prior` block of a run.yaml states. place: in messages. Raises InputError."""
-    return _prior_of(fields.validated(_PriorBlock, dict(content), place))
+def prior_from(content: Mapping[str, Any]) -> PosePrior:
+    """The prior region that the `prior` block of a run.yaml states. Raises InputError."""
+    return _prior_of(fields.validated(_PriorBlock, dict(content), "prior"))
 
 
 def source_of(block: SourceBlock, folder: Path, where: str) -> Source:

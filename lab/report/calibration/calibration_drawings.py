@@ -14,7 +14,7 @@ from html import escape
 import cv2
 import numpy as np
 
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array, Bools, robust_sigma
 from lab.report.plot import svg
 from lab.report.plot.maps import BAR_WIDTH, colour_bar, colours, contour_lines, hex_colour, label_place, value_range
 
@@ -360,12 +360,11 @@ def residual_histogram(
 ) -> str:
     """Counts of residuals (any shape; nan are omitted) within 5 sigma, and the normal curve of the same area.
 
-    sigma: of the curve, in the residuals' unit: the assumed noise; None: the robust spread of the residuals (1.4826
-    times their median absolute value).
+    sigma: of the curve, in the residuals' unit: the assumed noise; None: the robust sigma of the residuals.
     """
     values = np.asarray(residuals, dtype=float).ravel()
     values = values[np.isfinite(values)]
-    robust = 1.4826 * float(np.median(np.abs(values))) if values.size else 1.0
+    robust = float(robust_sigma(values)) if values.size else 1.0
     spread = max(sigma if sigma is not None else robust, 1e-12)
     beyond = int((np.abs(values) > 5 * spread).sum())
     rms = svg.number(float(np.sqrt(np.mean(values**2)))) if values.size else "–"

@@ -28,14 +28,12 @@ class Frustum:
 
 @dataclass(frozen=True, slots=True)
 class Rectangle:
-    """A screen or a board."""
+    """A screen; its origin is its centre."""
 
     name: str
     world_from_rectangle: Pose
     size_m: tuple[float, float]
-    centred: bool = True  # whether its origin is its centre, else a corner
     colour: str = svg.GREEN
-    faint: bool = False  # thin and without a name, for one of many boards
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,9 +185,8 @@ def outline(thing: SceneObject, reach: float) -> Array:
         body = np.array([[0, 0, 0], [-a, -b, reach], [a, -b, reach], [a, b, reach], [-a, b, reach]])
         return thing.camera_from_world.inverse().apply(body)
     if isinstance(thing, Rectangle):
-        w, h = thing.size_m
-        corners = np.array([[0.0, 0, 0], [w, 0, 0], [w, h, 0], [0, h, 0]])
-        return thing.world_from_rectangle.apply(corners - (np.array([w / 2, h / 2, 0]) if thing.centred else 0))
+        w, h = np.array(thing.size_m) / 2
+        return thing.world_from_rectangle.apply(np.array([[-w, -h, 0], [w, -h, 0], [w, h, 0], [-w, h, 0]]))
     if isinstance(thing, Ray):
         return np.stack([thing.start, thing.end])
     if isinstance(thing, Trail):
@@ -206,11 +203,10 @@ def _drawn(thing: SceneObject, at: Array) -> tuple[str, tuple[float, float, str]
         shape = f'<path d="{d}" fill="{c}" fill-opacity="0.13" stroke="{c}" stroke-width="1.3">{tip}</path>'
         return shape + f'<path d="{svg.dots(at[:1], 3)}" fill="{c}"/>', (*_pair(at[0]), thing.name)
     if isinstance(thing, Rectangle):
-        width, opacity = (0.6, 0.03) if thing.faint else (1.5, 0.12)
         d = svg.polyline(at, closed=True)
-        shape = f'<path d="{d}" fill="{c}" fill-opacity="{opacity}" stroke="{c}" stroke-width="{width}">{tip}</path>'
+        shape = f'<path d="{d}" fill="{c}" fill-opacity="0.12" stroke="{c}" stroke-width="1.5">{tip}</path>'
         topmost = at[int(np.argmin(at[:, 1]))]
-        return shape, None if thing.faint else (*_pair(topmost), thing.name)
+        return shape, (*_pair(topmost), thing.name)
     if isinstance(thing, Ray):
         d = svg.segments(at[:1], at[1:])
         return f'<path d="{d}" stroke="{c}" stroke-width="1.1" stroke-opacity="0.85">{tip}</path>', None

@@ -259,6 +259,15 @@ def _band_data(zoom: ZoomData | None, band: Band, fine: bool) -> str:
     return "" if None in names else f' data-b="{" ".join(map(str, names))}"'
 
 
+def unwrapped(degrees: Array) -> Array:
+    """Angles (n, k) over time without jumps by 360 degrees; nan where they are not known."""
+    out = np.where(np.isfinite(degrees), degrees, np.nan)
+    for k in range(out.shape[1]):
+        known = np.isfinite(out[:, k])
+        out[known, k] = np.unwrap(out[known, k], period=360.0)
+    return out
+
+
 def time_scale(t: Array, left: float, right: float, margin: float = 0.0) -> svg.Scale:
     """A scale for times (n,) between two drawing coordinates; margin: time added at both ends."""
     lo, hi = float(t[0]), float(t[-1])

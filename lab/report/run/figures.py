@@ -5,7 +5,7 @@ Pose, velocity and angular rate over time have the value on the left, the uncert
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from html import escape
@@ -17,7 +17,7 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from lab.files.run.results import POSE_STATUSES, SPOT_STATUSES, PoseTrack
 from lab.report.plot import svg
-from lab.report.plot.series import Band, Line, Shade, ZoomData, time_data, time_panel, time_scale, time_ticks
+from lab.report.plot.series import Band, Line, Shade, ZoomData, time_data, time_panel, time_scale, time_ticks, unwrapped
 from lab.report.run.report_data import ReportData
 from lab.runs.verdict.score import differenced, normalised_squares
 from tracking.statuses import PoseStatus, SpotStatus
@@ -48,18 +48,21 @@ def nees_figure(m: ReportData, zoom: ZoomData | None = None) -> str:
     nees = normalised_squares(delta, m.poses.covariance)
     if not np.isfinite(nees).any():
         return ""
+    return nees_panel(nees, partial(_of_poses(m, zoom), width=1090, height=140))
+
+
+def nees_panel(nees: Array, panel: Callable[..., str]) -> str:
+    """The normalised estimation errors squared (n,) of poses over time; panel: a `time_panel` with its times."""
     n = np.ones(len(nees))
     usual = nees[np.isfinite(nees)]
     top = max(25.0, min(float(usual.max()) * 1.08, 2.0 * float(np.percentile(usual, 99))))
     # Chi-squared with 6 degrees of freedom lies in 1.237 .. 14.449 with a probability of 95 %.
-    return _of_poses(m, zoom)(
+    return panel(
         "NEES: squared pose error over its covariance; mean 6 if the stated uncertainty is correct, band: 95 %",
         "",
         lines=(Line(nees, svg.BLUE, "NEES", 0.8), Line(6.0 * n, svg.GREEN, "6, the expected mean", 1.4, "6 4")),
         bands=(Band(1.237 * n, 14.449 * n, svg.GREEN, "95 % of the frames if the covariance is correct", 0.15),),
         y_range=(0.0, top),
-        width=1090,
-        height=140,
     )
 
 
@@ -162,8 +165,7 @@ def pose_figure(m: ReportData, zoom: ZoomData | None = None) -> str:
         return ""
     true = None if m.truth is None else m.truth.world_from_body
     errors, causal = _minus(p, true), _causal(m, true)
-    angles = np.degrees(np.unwrap(np.radians(p.yaw_pitch_roll_deg), axis=0)) if p.known.all() else p.yaw_pitch_roll_deg
-    values = np.concatenate([angles, p.world_from_body.translation], axis=1)
+    values = np.concatenate([unwrapped(p.yaw_pitch_roll_deg), p.world_from_body.translation], axis=1)
     sigmas = np.concatenate([p.sigma_ypr_deg, p.sigma_position_m], axis=1)
     names, units = ("yaw", "pitch", "roll", "x", "y", "z"), (("deg", "mdeg", 1.0), ("m", "mm", 0.1))
     return _rows(m, zoom, names, units, values, sigmas, errors, causal)

@@ -26,7 +26,7 @@ from lab.files.text.dataclass_fields import with_overrides
 from lab.files.text.error_text import printable_line
 from lab.files.text.json_text import write_json
 from lab.findings.finding import Done
-from lab.number_format import format_count
+from lab.number_format import format_count, format_some
 from lab.packages import versions
 from lab.pictures.picture_file import GreyPicture, MissingPicture
 from lab.pictures.source import PictureSource, Video, open_inputs, pictures, pictures_of_frames
@@ -43,7 +43,6 @@ from tracking.parameters import DetectParameters, TrackerParameters
 
 SCHEMA = "beampose/detect/1"
 SHEET = "contact-sheet.png"
-_NAMED = 5  # frames that a note names for each kind of problem
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,8 +130,7 @@ def _add_notes(series: PictureSeries) -> None:
         why = f": {most_frequent}" if most_frequent else ""
         raise InputError(f"{series.source}: expected pictures, got none that can be read{why}")
     for reason, frames in series.unreadable.items():
-        some = ", ".join(map(str, frames[:_NAMED])) + (", ..." if len(frames) > _NAMED else "")
-        series.notes.append(f"{_counted(len(frames))} {reason} (frame {some})")
+        series.notes.append(f"{_counted(len(frames))} {reason} (frame {format_some(frames)})")
     if len(series.groups) > 1:
         most = sorted(series.groups.values(), key=lambda g: -g.pictures)
         kinds = "; ".join(f"{_counted(g.pictures)} of {g.text()}" for g in most[:6])

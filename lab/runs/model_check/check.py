@@ -27,8 +27,8 @@ from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.files.text.json_text import plain_value
-from lab.findings.finding import ENTRIES, Finding, Level, finding, verdict, worst_first
-from lab.number_format import format_count, format_number, format_with_sigma
+from lab.findings.finding import Finding, Level, entries, finding, verdict, worst_first
+from lab.number_format import format_count, format_number, format_p, format_with_sigma
 from lab.runs.model_check.frame_sampler import FrameSampler
 from tracking.smoothing.error_scale import LARGEST_WIDTH_SHARE
 from tracking.smoothing.place_errors import correlation, place_errors
@@ -191,7 +191,7 @@ def fault_finding(
         count = suspected.more_alternatives
         more = f"; or one of {count} more" if count > 1 else "; or one more" if count else ""
         what += f". Or {'; or '.join(descriptions[1:])}{more}: this recording does not distinguish them"
-    p_value = p_text(suspected.best.change.p_value)
+    p_value = format_p(suspected.best.change.p_value)
     if effect.axis >= 0:
         camera, spot = model.views[effect.view]
         what += (
@@ -201,7 +201,7 @@ def fault_finding(
     else:
         what += f", p {p_value}"
     components = list(dict.fromkeys(e.fault.component for e in suspected.explanations))
-    remedy = " ".join(ENTRIES["BP-M01"].variant(c).remedy for c in components)
+    remedy = " ".join(entries()["BP-M01"].variant(c).remedy for c in components)
     if suspected.alternatives:
         way = "A new calibration of the beams" if components == [f.BEAM] else "A `calibrate check` with marked points"
         remedy += f" {way} distinguishes the candidates."
@@ -214,7 +214,7 @@ def unexplained_finding(diagnosis: FaultDiagnosis) -> Finding:
     beyond = "" if not diagnosis.suspected_faults else " beyond what is named above"
     what = (
         f"the residuals do not fit the rig file{beyond}, and no single camera, screen, beam or clock explains it,"
-        f" p {p_text(diagnosis.p_after)}"
+        f" p {format_p(diagnosis.p_after)}"
     )
     why = (
         f"the residuals are {format_number(diagnosis.residual_scale, 2)} times as large as the spots' sigmas allow; the"
@@ -335,11 +335,6 @@ def _delay(name: str, late_s: float, sigma_s: float, model: SpotModel, frame_int
     if count and abs(abs(late_s) / frame_interval_s - count) < _WHOLE_FRAME:
         text += f" (that is {format_count(count, 'frame')}: its pictures may be numbered wrongly)"
     return text
-
-
-def p_text(p: float) -> str:
-    """`= 0.2`, `= 3e-09`, `below 1e-12`."""
-    return "below 1e-12" if p < 1e-12 else f"= {p:.1g}"
 
 
 @dataclass(frozen=True, slots=True)

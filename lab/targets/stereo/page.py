@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ from geometry.arrays import Array, Ints
 from lab.findings.finding import Finding, verdict
 from lab.number_format import format_angle, format_length, format_number
 from lab.report.page import Page, PageDrawing, PageTable, Section, made_with, write_page
-from lab.report.plot.series import Band, Line, time_panel
+from lab.report.plot.series import Band, Line, time_panel, unwrapped
 from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION, padded_range
+from lab.report.run.figures import nees_panel
 from lab.runs.tables import pose_numbers
 from lab.targets.page import TimeAxis
 from lab.targets.stereo.frames import annotated_pictures
@@ -102,11 +104,12 @@ def _poses(results: StereoResults) -> Section:
             continue
         numbers = pose_numbers(r.tracked.pose, r.tracked.covariance)
         value[i], sigma[i] = numbers[[0, 1, 2, 7, 8, 9]], numbers[10:]
+    value[:, 3:] = unwrapped(value[:, 3:])
     measured = np.array([r.measured for r in results.records])
     axis, drawings = _axis(results), []
     for k in (0, 3, 1, 4, 2, 5):
         name, unit = (f"{_AXES[k]}", "m") if k < 3 else (("yaw", "pitch", "roll")[k - 3], "deg")
-        shown = value[:, k] if k < 3 else _unwrapped(value[:, k])
+        shown = value[:, k]
         band = Band.about(shown, np.where(measured, sigma[:, k], np.nan), 3.0, BLUE, "3 sigma")
         line, y_range = Line(shown, BLUE, name), padded_range(shown)
         drawings.append(axis.panel(name, unit, line, bands=(band,), y_range=y_range, wide=False, height=118))
@@ -115,13 +118,6 @@ def _poses(results: StereoResults) -> Section:
         " Shaded: not measured."
     )
     return Section("Pose", words, drawings)
-
-
-def _unwrapped(degrees: Array) -> Array:
-    out = degrees.copy()
-    good = np.isfinite(out)
-    out[good] = np.rad2deg(np.unwrap(np.deg2rad(out[good])))
-    return out
 
 
 def _truth(results: StereoResults, e: TruthErrors) -> Section:
@@ -135,13 +131,7 @@ def _truth(results: StereoResults, e: TruthErrors) -> Section:
         )
         for k, axis in enumerate(_AXES)
     ]  # fmt: skip
-    panels.append(
-        time_panel(
-            t, "NEES: squared pose error over its covariance; band: 95 %", "",
-            lines=(Line(e.nees, BLUE, "NEES"), Line(np.full(len(t), 6.0), GREEN, "6, the expected mean", 1.3, "6 4")),
-            bands=(Band(np.full(len(t), 1.237), np.full(len(t), 14.449), GREEN, "95 %", 0.15),),
-        )
-    )  # fmt: skip
+    panels.append(nees_panel(e.nees, partial(time_panel, t)))
     m = e.as_mapping()
     rows = [
         ("position, RMS", format_length(m["position_rms_m"])),

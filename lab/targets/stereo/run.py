@@ -49,6 +49,7 @@ from lab.files.text import fields
 from lab.files.text.dataclass_fields import dataclass_from_yaml
 from lab.files.text.error_text import name_of_path, suggest_name
 from lab.files.text.yaml_text import read_mapping
+from lab.runs.verdict.score import normalised_squares
 from tracking.binocular.calibration_check import CalibrationCheck, ClockOffset
 from tracking.binocular.joint_fit import pose_of_points
 from tracking.binocular.marker_model import (
@@ -384,16 +385,11 @@ def truth_errors(records: Sequence[StereoRecord], run: StereoRun, frames: Array,
     shared = [r for r in records if r.measured and r.frame in place]
     if not shared:
         return None
+    true = poses[np.array([place[r.frame] for r in shared])]
+    found = Pose.stack([r.tracked.pose for r in shared if r.tracked.pose is not None])
+    covariances = np.array([r.tracked.covariance for r in shared])
+    delta = true.minus(found)
     eye = run.pair.cameras[0].camera_from_world.inverse().translation
-    deltas, nees, apart = [], [], []
-    for r in shared:
-        assert r.tracked.pose is not None
-        assert r.tracked.covariance is not None
-        true = poses[place[r.frame]]
-        delta = true.minus(r.tracked.pose)
-        deltas.append(delta)
-        nees.append(float(delta @ np.linalg.solve(r.tracked.covariance, delta)))
-        far = float(np.linalg.norm(true.translation - eye))
-        apart.append(float(np.linalg.norm(r.tracked.pose.translation - eye)) - far)
+    far, true_far = (np.linalg.norm(p.translation - eye, axis=1) for p in (found, true))
     numbers = np.array([r.frame for r in shared])
-    return TruthErrors(numbers, np.array(deltas), np.array(nees), np.array(apart))
+    return TruthErrors(numbers, delta, normalised_squares(delta, covariances), far - true_far)

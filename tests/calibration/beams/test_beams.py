@@ -50,12 +50,12 @@ def test_noise_free_beams_are_exact_to_rounding(name, known):
     assert found.fit.scale == 1.0
 
 
-def test_without_nominal_beams_the_start_is_from_lines_through_the_spots():
+def test_beams_far_from_the_nominal_ones_start_from_lines_through_the_spots():
     rng = np.random.default_rng(2)
     rig = opposed(RIGS["four-skew-beams"](), rng)
     poses = positions(rng)
     nothing = drawn(rig, rng, 100.0, 5.0)
-    found = calibrate_beams(nothing, recorded(rng, rig, poses), exact(poses), nominal=False)
+    found = calibrate_beams(nothing, recorded(rng, rig, poses), exact(poses))
     sigmas = np.sqrt(np.diagonal(found.lines_covariance)).reshape(-1, 4)
     assert np.all(np.abs(errors(rig, found.rig)) < 5 * sigmas)
 

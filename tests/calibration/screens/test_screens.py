@@ -183,7 +183,7 @@ def scan_points(seed=0, bow=0.0, sigma=1e-3, n=12_000):
 @pytest.mark.parametrize("bow", [0.0, 1e-3])
 def test_a_scanned_screen_before_a_larger_wall_is_found_by_its_size(bow):
     pose, points = scan_points(1, bow)
-    scan = clouds.scan_of(points, (4.0, 3.0), seen_from=np.zeros(3))
+    scan = facing(clouds.scan_of(points, (4.0, 3.0)), np.zeros(3))
     found, n = scan.world_from_screen, pose.rotation[:, 2]
     assert np.arccos(np.clip(found.rotation[:, 2] @ n, -1, 1)) < 2e-4
     assert abs((found.translation - pose.translation) @ n) < 3e-4
@@ -212,7 +212,7 @@ def test_a_cloud_of_few_points_raises():
 @needs_open3d
 def test_a_scan_turned_to_face_the_camera_is_the_same_surface():
     pose, points = scan_points(3, 1e-3)
-    scan = clouds.scan_of(points, (4.0, 3.0), seen_from=np.zeros(3))
+    scan = facing(clouds.scan_of(points, (4.0, 3.0)), np.zeros(3))
     other = facing(scan, pose.translation - 3 * pose.rotation[:, 2])
     assert other.world_from_screen.rotation[:, 2] @ pose.rotation[:, 2] < -0.99
     world = [s.world_from_screen.apply(s.xyz) for s in (scan, other)]

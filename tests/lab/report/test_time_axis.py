@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lab.report.plot.series import Band, Line, ZoomData, time_panel
+from lab.report.plot.series import Band, Line, ZoomData, time_panel, unwrapped
 from lab.report.plot.svg import BLUE, area_path, date_ticks, line_path
+from lab.report.run.figures import pose_figure
 from lab.report.run.page import write_report
 from lab.report.run.report_data import read_report_data
 from lab.report.run.trust import evidence, time_link
@@ -265,3 +266,29 @@ def test_ticks_of_dates_are_days_or_first_days_of_months_and_years(first, last, 
     assert found == labels
     days = [datetime.date.fromordinal(int(p)).isoformat() for p in places]
     assert days == [label + "-01-01"[len(label) - 4 :] if len(label) < 10 else label for label in labels]
+
+
+def test_angles_over_time_have_no_jumps_although_poses_are_missing():
+    turning = np.linspace(100.0, 800.0, 141)[:, None] * [1.0, -1.0, 0.01]
+    stated = (turning + 180.0) % 360.0 - 180.0
+    stated[30:33] = stated[100] = np.nan
+    shown = unwrapped(stated)
+    known = np.isfinite(stated)
+    np.testing.assert_array_equal(np.isfinite(shown), known)
+    np.testing.assert_allclose((shown - shown[0])[known], (turning - turning[0])[known], atol=1e-9)
+
+
+def test_the_report_of_a_run_with_a_missing_pose_shows_angles_without_jumps(tmp_path):
+    fake = make(tmp_path, 60)
+    table = fake.results / "attitude.csv"
+    head, *rows = (line.split(",") for line in table.read_text().splitlines())
+    yaw, status = head.index("yaw_deg"), head.index("status")
+    for k, row in enumerate(rows):
+        row[yaw] = f"{(170.0 + k + 180.0) % 360.0 - 180.0}"  # from 170 to 229 deg
+    rows[5] = [v if n in ("frame", "t_s") else "" for n, v in zip(head, rows[5], strict=True)]
+    rows[5][status] = "lost"
+    table.write_text("\n".join(",".join(row) for row in (head, *rows)) + "\n")
+    zoom = ZoomData(np.arange(60.0), np.arange(60))
+    pose_figure(read_report_data(fake.results, None), zoom)
+    _, _, series = read(zoom.encoded())
+    assert any(np.nanmax(y) > 220.0 and np.nanmin(y) > 160.0 for y in series if np.isfinite(y).any())

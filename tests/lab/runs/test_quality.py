@@ -6,7 +6,7 @@ from collections import Counter
 
 import pytest
 
-from lab.findings.finding import ENTRIES, Finding, Level, Verdict, finding
+from lab.findings.finding import Finding, Level, Verdict, entries, finding
 from lab.runs.verdict.quality import (
     GOOD_MEASURED,
     LEAST_DISPLACED,
@@ -51,7 +51,7 @@ def statistics_of(
 
 
 def kinds(verdict: Verdict) -> list[str]:
-    return [ENTRIES[e.code].kind for e in verdict.findings]
+    return [entries()[e.code].kind for e in verdict.findings]
 
 
 def test_a_clean_run_passes_and_gives_the_reason():
@@ -85,7 +85,7 @@ def test_only_missed_frames_fail_a_run_and_frames_with_too_few_spots_do_not(caus
     assert verdict.status == ("fail" if cause in MISSED else "check")
     assert kinds(verdict) == ["few_measured"]
     assert cause.meaning in verdict.texts[0]
-    assert verdict.findings[0].remedy == ENTRIES["BP-V03"].variant(cause.value).remedy
+    assert verdict.findings[0].remedy == entries()["BP-V03"].variant(cause.value).remedy
 
 
 def test_the_share_of_missed_frames_is_relative_to_the_frames_with_enough_spots():
@@ -242,7 +242,7 @@ def test_a_camera_without_detections_at_the_end_is_reported_if_spots_are_expecte
 def test_findings_of_the_model_check_count_by_their_level_and_keep_their_remedy():
     found = [finding("BP-M01", level, "camera `right` may have moved", why="It turns the pose.") for level in Level]
     verdict = judge(statistics_of(), found)
-    remedy = ENTRIES["BP-M01"].remedy
+    remedy = entries()["BP-M01"].remedy
     assert [(e.code, e.level, e.remedy) for e in verdict.findings] == [
         ("BP-M01", Level.FAIL, remedy),
         ("BP-M01", Level.WARN, remedy),
@@ -262,8 +262,8 @@ def test_failures_come_before_points_to_check():
 
 
 def test_every_kind_of_reason_and_every_cause_has_a_remedy():
-    assert set(ENTRIES["BP-V03"].variants) == {cause.value for cause in FrameCause}
-    assert all(entry.remedy for entry in ENTRIES.values())
+    assert set(entries()["BP-V03"].variants) == {cause.value for cause in FrameCause}
+    assert all(entry.remedy for entry in entries().values())
 
 
 def test_a_reason_is_written_as_plain_values():

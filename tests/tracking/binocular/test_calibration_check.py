@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from geometry.pose import Pose
 from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed_camera
 from tests.tracking.binocular.scenes import MODEL, NOISE_PX, PAIR, images
-from tracking.binocular.calibration_check import LabelledFrame, check_calibration, labelled_by_each
+from tracking.binocular.calibration_check import ClockOffset, LabelledFrame, check_calibration, labelled_by_each
 from tracking.binocular.joint_fit import MarkerObservations
 from tracking.binocular.marker_model import MatchParameters, StereoPair, project_markers
 
@@ -144,3 +144,14 @@ def test_markers_are_labelled_in_each_picture_where_the_cameras_contradict_each_
     wrong = wrong_pair("right", rot_x_rad=np.deg2rad(0.5))  # 10 px
     found = labelled_by_each(wrong, MODEL, images(pose, rng), None, MatchParameters())
     np.testing.assert_allclose(found.observed.uv_px, project_markers(PAIR, MODEL, pose)[0], atol=6 * NOISE_PX)
+
+
+@pytest.mark.parametrize(
+    ("sigmas", "jitter_significance", "shift_px", "significant"),
+    [(6.0, 0.0, 0.2, True), (0.0, 9.0, 0.2, True), (4.0, 7.0, 0.2, False), (6.0, 9.0, 0.04, False)],
+)
+def test_an_offset_of_the_clocks_counts_where_it_is_certain_and_moves_the_images(
+    sigmas, jitter_significance, shift_px, significant
+):
+    offset = ClockOffset(-1e-4 * sigmas, 1e-4, np.zeros(3), np.ones(3), 0.0, jitter_significance, shift_px, 50)
+    assert offset.significant == significant

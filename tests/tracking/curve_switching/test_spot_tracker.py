@@ -14,6 +14,7 @@ from lab.simulate.points import PointRun, simulate_points
 from lab.simulate.scenarios import RIGS, SCENARIOS, Clutter, Occlusion
 from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
 from tracking.curve_switching.spot_tracker import SpotTracker
+from tracking.curve_switching.vehicle import Tracks
 from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.statuses import PoseStatus, SpotStatus, TrackedFrame
@@ -476,3 +477,17 @@ def test_the_time_between_frames_may_vary():
     t = Tracked(thinned, track(thinned))
     assert t.identity() >= 0.995
     assert t.prediction_rms().max() < 0.6
+
+
+def test_innovations_of_their_stated_size_leave_the_estimated_accelerations_as_they_are():
+    """Those of twice the size raise them, those of half the size lower them."""
+    n, all_views = 20_000, np.ones(20_000, dtype=bool)
+
+    def change(size: float) -> float:
+        tracks = replace(Tracks.none(n, 100.0), alive=all_views)  # covariance of the predicted place: 1 px^2
+        z = size * np.sqrt(1.25) * np.random.default_rng(1).standard_normal((n, 2))
+        tracks.update(z, np.tile(0.25 * np.eye(2), (n, 1, 1)), all_views, all_views, ~all_views, TrackerParameters())
+        return float(np.mean(np.log(tracks.sigma_a / 100.0)))
+
+    assert abs(change(1.0)) < 0.02 * change(2.0)
+    assert change(0.5) < -0.1 * change(2.0)

@@ -15,7 +15,7 @@ from cli import main
 from lab.commands.common import command_line
 from lab.errors import CalibrationError, InputError, RunError
 from lab.files.text.csv_text import write_table
-from lab.findings.finding import ENTRIES
+from lab.findings.finding import entries
 from lab.runs import process
 from lab.runs.batch import task as module
 from lab.runs.batch.batch import BatchOptions, process_batch, read_rows
@@ -167,7 +167,7 @@ def test_the_report_of_a_failed_run_has_message_status_and_explained_code_and_th
     page = (outcome.table.parent / row["report"]).read_text("utf-8")
     assert html.escape(row["message"]) in page
     assert "BP-E02" in page
-    assert ENTRIES["BP-E02"].meaning in page
+    assert entries()["BP-E02"].meaning in page
     assert "exit status 2" in page
     assert 'href="./errors/nothing.html"' in outcome.index.read_text("utf-8")
 
