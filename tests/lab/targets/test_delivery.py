@@ -21,7 +21,7 @@ def centre(k):
 
 
 def clean(k):
-    """A dark disc before a grey field (h, w) at time k, frames."""
+    """A black disc before a grey field (h, w) at time k, frames."""
     v, u = np.mgrid[: SIZE[1], : SIZE[0]]
     inside = np.clip(8.5 - np.hypot(u - centre(k)[0], v - centre(k)[1]), 0, 1)
     return cv2.GaussianBlur(150 - 100 * inside, (0, 0), 0.8)
