@@ -305,10 +305,11 @@ def write_tables(
     diagnosis = model_check.result.diagnosis
     noise_scale = None if diagnosis is not None else pipeline.tracker.noise_scale
     cameras, names = pipeline.noise.items(), list(run.rig.cameras)
-    shown: dict[str, Mapping[str, Any]] = {
+    shown: dict[str, Any] = {
         "mosaics": {name: noise.mosaic for name, noise in cameras if noise.mosaic},
         "too_wide": {name: noise.too_wide_px for name, noise in cameras if noise.too_wide_px},
         "moved": {name: noise.moved_px for name, noise in cameras if noise.moved_px},
+        "interlaced": [name for name, noise in cameras if noise.interlaced],
         "kept": {name: noise.kept for name, noise in cameras},
         "stretch": {names[camera]: found for camera, found in sampler.stretch_of_cameras(model.camera_of).items()},
     }

@@ -17,6 +17,7 @@ from lab.errors import InputError
 from lab.files.run.detections_file import is_too_sparse, read_detections
 from lab.files.text.csv_text import read_table
 from lab.files.text.error_text import name_of_path
+from lab.pictures.delivery import Delivery, without_repeats
 from lab.pictures.picture_file import DROPPED, MissingPicture
 from lab.pictures.source import PictureFiles, PictureSource, Video, pictures
 from lab.progress import Progress
@@ -41,6 +42,7 @@ class Recording:
     size_px: tuple[int, int] | None  # width, height of the first picture; None: a table
     missing: Mapping[str, int] = field(default_factory=dict)  # frames without a usable picture by reason
     notes: tuple[str, ...] = ()
+    delivery: Delivery = field(default_factory=Delivery)  # of its pictures
 
     @property
     def pictures(self) -> int:
@@ -58,11 +60,12 @@ class Recording:
 def every_frame(source: PictureSource, limit: int | None = None, *, colour: bool = False) -> Iterator[tuple[int, Any]]:
     """All frame numbers from the first to the last with their pictures; a gap in the numbers is dropped frames.
 
-    limit: of the pictures. colour: as for `pictures`. Pictures of another size than the first are missing: their pixels
-    would not be comparable. Raises InputError: the numbers in the names of the pictures are not those of frames.
+    limit: of the pictures. colour: as for `pictures`. Pictures that repeat the one before are missing, and those of
+    another size than the first: their pixels would not be comparable. Raises InputError: the numbers in the names of
+    the pictures are not those of frames.
     """
     _require_frame_numbers(source, limit)
-    return _without_gaps(islice(pictures(source, colour=colour), limit))
+    return _without_gaps(islice(without_repeats(pictures(source, colour=colour)), limit))
 
 
 def _require_frame_numbers(inputs: PictureSource, limit: int | None) -> None:
@@ -113,6 +116,7 @@ def read_pictures(
     missing: Counter[str] = Counter()
     size: tuple[int, int] | None = None
     stated, process_s = inputs.count, 0.0
+    delivery = Delivery()
     total = stated if limit is None or stated is None else min(stated, limit)
     for number, picture in frames:
         usable = None if isinstance(picture, MissingPicture) else picture
@@ -122,6 +126,7 @@ def read_pictures(
             size = picture.shape[1], picture.shape[0]
         begun = time.process_time()
         looked.append(look(usable))
+        delivery.add(usable)
         process_s += time.process_time() - begun
         numbers.append(number)
         if progress is not None:
@@ -138,7 +143,7 @@ def read_pictures(
         notes.append(f"the video ends after {len(numbers)} of the {stated} pictures that its header states")
     of_frames = np.array(numbers)
     t_s = None if rate_hz is None else of_frames / rate_hz
-    recording = Recording(inputs.camera, path, rate_hz, of_frames, t_s, size, missing, tuple(notes))
+    recording = Recording(inputs.camera, path, rate_hz, of_frames, t_s, size, missing, tuple(notes), delivery)
     return recording, looked, process_s
 
 

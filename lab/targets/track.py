@@ -93,6 +93,7 @@ def findings_of(target: Target[F], track: Track[F]) -> tuple[Finding, ...]:
         *_far_away(target, track),
         *target.findings(track),
         *_missing(target, track),
+        *_delivered(track),
     ]
     return worst_first(found)
 
@@ -148,6 +149,19 @@ def _missing(target: Target[F], track: Track[F]) -> list[Finding]:
     reason = max(missing, key=lambda r: missing[r])
     what = f"{sum(missing.values())} of {n} frames have no usable picture (most frequent: {reason})"
     return [finding(target.codes.missing, Level.WARN, what)]
+
+
+def _delivered(track: Track[F]) -> list[Finding]:
+    """Pictures that do not show one instant each."""
+    out, share = [], track.recording.delivery.averaged_share
+    if share:
+        late = f"what moves is shown {share / (1 - share):.2g} frames late or more"
+        what = f"at least {share:.0%} of each picture is the picture before: {late}"
+        out.append(finding("BP-U01", Level.WARN, what))
+    if track.recording.delivery.interlaced:
+        what = "even and odd rows show what moves at two places: the pictures are interlaced"
+        out.append(finding("BP-U02", Level.WARN, what))
+    return out
 
 
 MOST_EVENTS = 500  # listed in summary.json; of the others the number is reported

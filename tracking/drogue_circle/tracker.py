@@ -36,6 +36,7 @@ _APART = 0.99  # radius of another edge, the same
 _SHIFT, _SHIFTS, _GROWTH = 0.12, 6, (0.9, 1.0, 1.1)
 _MOST_SHIFT_PX = 3.0  # of a start: large drogues move by pixels, not by shares of their radius
 _ON_RIM = 0.03, 0.3  # of `_clean_share`: share of the radius, and least distance, px
+_CLEAN = 0.95  # a rim of which this share is clean is none of two: of a mixture each is seen in part
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,6 +177,8 @@ def _best_near(crop: SmoothCrop, fit: RimFit, p: CircleParameters) -> RimFit:
     best, share = fit, _clean_share(fit)
     for du, dv in shifts:
         for growth in _GROWTH:
+            if share > _CLEAN:
+                return best
             start = CircleCandidate(u + du, v + dv, growth * radius, 0.0, fit.polarity)
             other = fit_rim(crop, start, p.acquire_coverage, sure=True)
             if other is not None and _clean_share(other) > share:

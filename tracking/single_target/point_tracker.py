@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -158,6 +159,8 @@ _FLUX_RATE = 0.1  # of the running means of the target's brightness and of its a
 # it. What is hidden makes it smaller: a small area changes the mean twenty times as slowly. The first sigma is of the
 # logarithm.
 _UNUSUAL_AREA, _UNUSUAL_RATE, _FIRST_AREA_SIGMA = 2.0, 0.05 * _FLUX_RATE, 0.05
+_STEADY = 3  # frames after which the area of a target that was lost is that of all of it
+_POSITION = np.diag([1.0, 1.0, 0.0, 0.0])  # the part of the state
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,12 +197,19 @@ class PointTracker:
         self._flux = float("nan")  # running mean of the target's brightness
         # Of the area's logarithm: running mean and variance, and how much the next area changes them.
         self._log_area, self._area_variance, self._area_rate = float("nan"), 0.0, 1.0
+        # The area's logarithm before the target was lost, and frames since then in which its area is steady.
+        self._lost_log_area, self._steady = float("nan"), 0
+        self.in_part = False  # the last picture shows the target in part, or not at all
         self._last_px: Array | None = None  # where the target was lost
         self._waited = 0.0  # frames since the last picture that CandidateTracks has seen
 
-    def step(self, dt: float, found: Detections | None) -> PointEstimate:
-        """The target `dt` frames after the last step; found: the picture's detections, None without a picture."""
-        self.acquired = ()
+    def step(self, dt: float, found: Detections | None, before_hidden: bool = False) -> PointEstimate:
+        """The target `dt` frames after the last step; found: the picture's detections, None without a picture.
+
+        before_hidden: the next picture shows the target in part, or not at all.
+        """
+        self.acquired, beside = (), before_hidden or self.in_part
+        self.in_part = False
         self._waited += dt
         if self._x is None:
             self._unseen += dt
@@ -214,8 +224,9 @@ class PointTracker:
             # Without what an unusual area adds to the sigmas: a target that starts to move may change its area, too.
             self._learn(nis if near else float("nan"))
             if row is not None:
-                nis = self._update(found, cov[row] + self._hidden_px2(found, row) * np.eye(2), row)
+                nis = self._update(found, cov[row] + self._hidden_px2(found, row, beside) * np.eye(2), row)
                 return self._estimate(PoseStatus.MEASURED, predicted, nis, row)
+        self.in_part = found is not None
         self._growth = min(self._growth * (NEAR_MISS_GROWTH if near else MISS_GROWTH) ** dt, MOST_GROWTH)
         sigma = float(np.sqrt(np.linalg.eigvalsh(self._P[:2, :2])[1]))
         if self._unseen > self.parameters.max_predicted or sigma > self.parameters.lost_sigma_px:
@@ -230,33 +241,45 @@ class PointTracker:
         self._waited = 0.0
         if steps is None:
             return NOTHING
+        if np.isfinite(self._log_area):
+            self._lost_log_area = self._log_area
+        if np.isfinite(self._lost_log_area) and np.isfinite(self._flux):  # found again: it may still be hidden in part
+            more = [_shift_px2(self._lost_log_area, min(s.flux / self._flux, 2.0)) for s in steps]
+            steps = tuple(replace(s, P=s.P + m * _POSITION) for s, m in zip(steps, more, strict=True))
         last = steps[-1]
         self._x, self._P, self.acquired = last.x, last.P, steps
-        self._unseen, self._growth, self._log_area = 0.0, 1.0, float("nan")
+        self._unseen, self._growth, self._log_area, self._steady = 0.0, 1.0, float("nan"), 0
         fluxes = [s.flux for s in steps if np.isfinite(s.flux)]
         self._flux = float(np.mean(fluxes)) if fluxes else self._flux
         return self._estimate(PoseStatus.MEASURED, np.full(2, np.nan), float("nan"), last.row)
 
-    def _hidden_px2(self, found: Detections, row: int) -> float:
+    def _hidden_px2(self, found: Detections, row: int, beside: bool) -> float:
         """Variance of a coordinate, px^2, since a part of the target is hidden, or something else is taken for one.
 
-        An edge that hides a share s of a disc with the radius r moves its centroid by .85 to 1 times s r. The
-        area is flux over peak, which the light does not change.
+        beside: the picture before or after this one shows it so: this one may, by less than the area's scatter.
+        An edge that hides a share s of a disc with the radius r moves its centroid by .85 to 1 times s r. The area is
+        flux over peak, which the light does not change.
         """
         area = float(found.flux[row] / found.peak[row]) if found.peak[row] > 0 else float("nan")
         if not area > 0 or np.isnan(self._log_area):
             self._log_area = float(np.log(area)) if area > 0 else float("nan")
             self._area_variance, self._area_rate = _FIRST_AREA_SIGMA**2, 0.5
-            return 0.0
+            known = np.isfinite(self._log_area) and np.isfinite(self._lost_log_area)
+            return _shift_px2(self._lost_log_area, area / np.exp(self._lost_log_area)) if known else 0.0
         usual, away = self._log_area, float(np.log(area)) - self._log_area
         most = _UNUSUAL_AREA * self._area_variance**0.5
         rate = _UNUSUAL_RATE if abs(away) > most else self._area_rate
         self._log_area += (_FLUX_RATE if away > most else rate) * max(away, -most)
         self._area_variance += rate * (min(abs(away), most) ** 2 - self._area_variance)
-        if abs(away) > most:
-            return float(np.exp(usual) / np.pi * (1 - np.exp(away)) ** 2 / 2)
-        self._area_rate = max(self._area_rate / (1 + self._area_rate), _FLUX_RATE)
-        return 0.0
+        self.in_part = abs(away) > most
+        if not self.in_part:
+            self._area_rate = max(self._area_rate / (1 + self._area_rate), _FLUX_RATE)
+        if np.isfinite(self._lost_log_area) and self._steady < _STEADY:
+            self._steady = 0 if self.in_part else self._steady + 1
+            return _shift_px2(self._lost_log_area, area / np.exp(self._lost_log_area))
+        if not (self.in_part or beside):
+            return 0.0
+        return _shift_px2(usual, np.exp(away), 0.0 if self.in_part else self._area_variance)
 
     def _update(self, found: Detections, cov: Array, row: int) -> float:
         """The state with a detection that has this covariance (2, 2). Returns its normalised innovation squared."""
@@ -302,6 +325,11 @@ class PointTracker:
         return PointEstimate(status, self._x.copy(), self._P.copy(), predicted, nis, row, self._sigma_a)
 
 
+def _shift_px2(log_area: float, seen: float, variance: float = 0.0) -> float:
+    """Variance of a coordinate, px^2, of a disc with this area of which a share is seen, with the share's variance."""
+    return float(np.exp(log_area) / np.pi * ((1 - seen) ** 2 + variance) / 2)
+
+
 def track_point(
     dt: Array, found: Sequence[Detections | None], parameters: PointParameters = USUAL
 ) -> list[PointEstimate]:
@@ -312,10 +340,22 @@ def track_point(
     tracker = PointTracker(parameters)
     out: list[PointEstimate] = []
     pictures: list[int] = []  # frames with a picture
-    for k, (step, detections) in enumerate(zip(dt.tolist(), found, strict=True)):
+    steps = dt.tolist()
+    before, whole = copy(tracker), False  # the tracker before the last frame; whether that frame shows the whole target
+    for k, (step, detections) in enumerate(zip(steps, found, strict=True)):
         if detections is not None:
             pictures.append(k)
-        out.append(tracker.step(step, detections))
+        last = copy(tracker)
+        now = tracker.step(step, detections)
+        if tracker.in_part and whole:
+            # The frame before may be hidden in part, too, by less than shows: once more, with sigmas that contain it.
+            tracker = before
+            out[k - 1] = tracker.step(steps[k - 1], found[k - 1], before_hidden=True)
+            last = copy(tracker)
+            now = tracker.step(step, detections)
+        out.append(now)
+        before = last
+        whole = now.status is PoseStatus.MEASURED and not (tracker.in_part or tracker.acquired)
         for at, earlier in zip(pictures[-len(tracker.acquired) : -1], tracker.acquired[:-1], strict=False):
             start = replace(out[k], x=earlier.x, P=earlier.P, row=earlier.row)
             out[at] = start

@@ -24,7 +24,8 @@ from lab.files.run.detections_file import CameraPoints, DetectionsFile, is_too_s
 from lab.files.run.run_file import FramesFolder, LiveDevice, Run, VideoFile
 from lab.files.text.error_text import suggest_name
 from lab.number_format import format_count
-from lab.pictures.picture_file import DROPPED, REPEATED, TORN, UNREADABLE, GreyPicture, MissingPicture
+from lab.pictures.delivery import without_repeats
+from lab.pictures.picture_file import DROPPED, UNREADABLE, GreyPicture, MissingPicture
 from lab.pictures.source import PictureFiles, PictureSource, Video, list_folder, pictures, video_at
 from lab.runs.frames.moments import Moment, plan_moments
 from tracking.detections import Detections
@@ -55,11 +56,6 @@ class _MissingFrames:
 
     count: int = 0
     first: list[int] = field(default_factory=list)  # the first NAMED of them
-
-
-_COMPARED = 16  # every such row of two pictures is compared
-_CHANGED = 0.01  # share of the pixels that change from picture to picture by noise: by spots that move fewer do
-_NOISY = 0.3  # share in each row, of a camera whose noise is not compressed: there an unchanged row is an earlier one
 
 
 class FrameReader:
@@ -288,32 +284,6 @@ class FrameReader:
                 missing.count += 1
                 if len(missing.first) < NAMED:
                     missing.first.append(frame)
-
-
-def without_repeats(stream: Generator[tuple[int, Any], None, None]) -> Generator[tuple[int, Any], None, None]:
-    """Numbered pictures; those that repeat the one before, or rows of it, are missing.
-
-    A grabber or a converter of videos that has no new picture often gives the last one again, or a part of it, with the
-    spots of an earlier instant. Pictures of a sensor differ by its noise everywhere. Those without noise, of a
-    simulation or a compressed video, may be equal while all is at rest: of such a camera no picture counts as a repeat.
-    """
-    before, noisy, in_all_rows = np.zeros(0), False, False
-    with closing(stream):
-        for number, picture in stream:
-            if isinstance(picture, MissingPicture):
-                yield number, picture
-                continue
-            some = picture[::_COMPARED].copy()
-            alike = some.shape == before.shape
-            changed = np.mean(some != before, axis=tuple(range(1, some.ndim))) if alike else np.zeros(len(some))
-            before = some
-            if alike and noisy and not changed.any():
-                yield number, MissingPicture(REPEATED)
-            elif alike and in_all_rows and np.median(changed[changed > 0]) > _NOISY and not changed.all():
-                yield number, MissingPicture(TORN)
-            else:
-                noisy, in_all_rows = float(np.mean(changed)) > _CHANGED, float(np.min(changed)) > _NOISY
-                yield number, picture
 
 
 def recorded_pictures(camera: str, source: FramesFolder | VideoFile) -> PictureSource:

@@ -32,7 +32,7 @@ from tracking.detection.detect import (
 )
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
-from tracking.noise_estimation.averaging import kept_of_the_last
+from tracking.noise_estimation.averaging import RowCounts, kept_of_the_last
 from tracking.noise_estimation.grey_values import mosaic_contrast
 from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
 from tracking.noise_estimation.texture import is_limited_by_texture
@@ -67,6 +67,7 @@ class CameraNoise:
     background: StaticBackground | None = field(default=None, init=False)  # for faint spots; None: not used
     moved_px: float = field(default=0.0, init=False)  # between the first picture and the last, if too far to correct
     kept: float = field(default=float("nan"), init=False)  # share of a picture from the one before; nan: not known
+    interlaced: bool = field(default=False, init=False)  # even and odd rows show two instants
     wide: WideLights | None = field(default=None, init=False)  # None: sums of pixels have no background
     too_wide_px: float = field(default=0.0, init=False)  # sigma of a light that max_sigma_px excludes; 0: none
     unfit: int = field(default=0, init=False)  # consecutive pictures that do not fit the background
@@ -281,6 +282,10 @@ def _prepare(noise: CameraNoise, run: Run, source: PictureSource) -> None:
     shown = pictures_of_frames(source, sorted({*wanted, *three}), size_px)
     pictures = [p for k in wanted if isinstance(p := shown[k], np.ndarray)]
     noise.estimate_from(pictures)
+    rows = RowCounts()
+    for picture in pictures:
+        rows.add(picture)
+    noise.interlaced = rows.interlaced
     successive = [p for k in three if isinstance(p := shown[k], np.ndarray)]
     if noise.estimate is not None:
         noise.kept = kept_of_the_last(successive, noise.estimate.step_dn**2 / 12)

@@ -16,7 +16,7 @@ from lab.findings.finding import Finding, Level, Verdict, finding, level_above, 
 from lab.number_format import format_count, format_with_sigma
 from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, FrameCause, FrameRanges, RunStatistics
 from tracking.detection.detect import limit_that_admits
-from tracking.noise_estimation.averaging import OPEN_SHUTTER
+from tracking.noise_estimation.averaging import LEAST_KEPT, OPEN_SHUTTER
 from tracking.statuses import SpotStatus
 
 # Share of the frames with enough visible spots: where the tracker missed more than half of them, it may not have
@@ -39,7 +39,6 @@ LONG_EMPTY = (
 MOST_WRONG = 0.005  # share of the measured poses beyond 10 sigmas from the truth, up to which the run does not fail
 LEAST_DISPLACED = 5  # frames in which none of a camera's spots fits the others' pose, from which on it is reported
 TOO_WIDE = "BP-V21"  # a light that max_sigma_px excludes, and a spot that is never found
-LEAST_KEPT = 0.12  # share of the picture before from which a camera averages; without it 0.02 at most is seen
 # Sigmas, and share of the spots' growth that such a filter gives where they are blurred to more than a Gaussian.
 _SURE_SIGMAS, _OF_GROWTH = 4.0, 0.3
 _SET_UP = "BP-M06"  # a mistake in the files that describe the set-up
@@ -53,6 +52,7 @@ def judge(
     mosaics: Mapping[str, float] = MappingProxyType({}),
     too_wide: Mapping[str, float] = MappingProxyType({}),
     moved: Mapping[str, float] = MappingProxyType({}),
+    interlaced: Sequence[str] = (),
     kept: Mapping[str, float] = MappingProxyType({}),
     stretch: Mapping[str, tuple[float, float]] = MappingProxyType({}),
 ) -> Verdict:
@@ -61,8 +61,9 @@ def judge(
     findings: of the model check (lab.runs.model_check.check.check_model). noise_scale: ratio of the residuals to the
     detections' sigmas; None where the model check has tested that. mosaics: contrast of the colour mosaic by camera, of
     cameras whose pictures show one. too_wide: sigma, px, of a light that detect.max_sigma_px excludes, by camera.
-    moved: px, by how much what stands still in the pictures of a camera has moved, by camera. kept, stretch: what the
-    noise and the spots of a camera say about averages of successive pictures (tracking.noise_estimation.averaging).
+    moved: px, by how much what stands still in the pictures of a camera has moved, by camera. interlaced: cameras with
+    such pictures. kept, stretch: what the noise and the spots of a camera say about averages of successive pictures
+    (tracking.noise_estimation.averaging).
     """
     if statistics.frames == 0:
         return _of([finding("BP-V01", Level.FAIL, "there is no frame at all")])
@@ -75,6 +76,9 @@ def judge(
     found += _mosaics(mosaics, verdict(given))
     found += _too_wide(too_wide, statistics)
     found += _moved(moved) + _averaging(kept, stretch)
+    for name in interlaced:
+        what = f"even and odd rows of the pictures of camera {name} show the moving spots at two places: interlaced"
+        found.append(finding("BP-V23", Level.WARN, what, numbers={"camera": name}))
     found += _measured(statistics)
     if statistics.measured:
         found += _cameras(statistics)

@@ -192,6 +192,27 @@ def test_a_centre_is_uncertain_while_an_edge_hides_a_part_of_the_target(radius, 
     assert min(sigmas[-5:]) < 0.1
 
 
+@pytest.mark.parametrize("hidden_frames", [0, 60])
+@pytest.mark.parametrize("px_per_frame", [0.8, 4.0])
+def test_no_frame_of_an_occlusion_is_off_by_more_than_its_sigmas_say(px_per_frame, hidden_frames):
+    """Neither the first and the last ones, which hide less than the area shows, nor those of a target found again."""
+    rng, radius, found, centres = np.random.default_rng(6), 7.0, [], []
+    half = (2 * radius + px_per_frame * hidden_frames) / 2
+    for k in range(round(60 + 2 * (half + 2 * radius) / px_per_frame)):
+        centres.append(np.array([70.0 + 18 * np.sin(k / 11), 60.0 + 12 * np.sin(k / 14)]))
+        middle = 2 * radius + half - px_per_frame * (k - 25)
+        picture = disc_behind_an_edge(centres[-1], radius, (middle - half, middle + half))
+        noisy = np.clip(np.round(picture + 2 * rng.standard_normal(picture.shape)), 0, 255).astype(np.uint8)
+        found.append(find_blobs(noisy, BlobParameters("darker")))
+    track, ratios = track_point(steps(len(found)), found), []
+    for estimate, centre in zip(track, centres, strict=True):
+        if estimate.status is PoseStatus.MEASURED:
+            away = estimate.x[:2] - centre
+            ratios.append(np.sqrt(away @ np.linalg.solve(estimate.P[:2, :2], away)))
+    assert len(ratios) > 45
+    assert max(ratios) < 6
+
+
 @pytest.mark.parametrize("fastest", [4.0, 15.0])
 def test_a_target_whose_area_changes_as_it_starts_to_move_is_followed(fastest):
     rng, tracker, u, statuses = np.random.default_rng(3), PointTracker(), 100.0, []

@@ -23,7 +23,7 @@ from cli import main
 from geometry.camera import Camera
 from geometry.pose import Pose
 from lab.files.rig.rig_file import load_rig
-from lab.runs.frames.frames import without_repeats
+from lab.pictures.delivery import without_repeats
 from tracking.background.camera_motion import CameraMotion
 from tracking.noise import NoiseModel
 from tracking.parameters import DetectParameters
