@@ -252,7 +252,10 @@ def _goes_on(image: GreyImage, grid: Array) -> list[str]:
         g = _from_side(grid, side)
         g = np.concatenate([_next_line(g), g[:3]])
         beyond, within = _crossing(image, g, 0), _crossing(image, g, 2)
-        like = beyond * np.sign(within) / np.median(np.abs(within[np.isfinite(within)]))
+        contrast = np.median(np.abs(within[np.isfinite(within)])) if np.isfinite(within).any() else 0.0
+        if contrast == 0:
+            continue  # overexposed, unlit, or a line of points that are no corners
+        like = beyond * np.sign(within) / contrast
         if np.isfinite(like).sum() >= 3 and np.nanmedian(like) > 0.75 and np.nanmin(like) > 0.3:
             names.append(side)
     return names

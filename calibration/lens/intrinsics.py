@@ -25,7 +25,7 @@ from calibration.lens.fit.lens_fit import (
 from calibration.lens.fit.lens_models import LensModel, folds_in_picture
 from calibration.lens.fit.lens_parameters import AS_STATED, BOARD_BLOCKS, BoardFreedom, board_as_stated
 from calibration.lens.fit.lens_start import StartError, start
-from calibration.lens.fit.model_selection import ModelCandidate, inliers_of_rich_models, select_model
+from calibration.lens.fit.model_selection import ModelCandidate, difference_px, inliers_of_rich_models, select_model
 from calibration.lens.fit.projection_map import Difference, ProjectionMap, difference, projection_map
 from calibration.lens.fit.view_equations import BEND_PROBABLE, ViewEquations, scattered
 from calibration.lens.intrinsics_result import Intrinsics, Origins
@@ -35,6 +35,11 @@ from geometry.arrays import Array, Bools
 FEWEST_VIEWS = 4
 # With a smaller angle between the boards' normals, focal length and distance cannot be separated.
 LEAST_TILT_DEG = 5.0
+_SCATTER_OF_TWO_LENSES = 2.0  # least factor on the noise: below it one cannot measure what two lenses leave of it
+_LEFT_BY_TWO_LENSES = 0.1  # most of the variance of the scatter that they leave: 0 to .07 of it in four mixed sets
+_NOISE_OF_SECOND = 2.0  # most noise of the smaller group over that of the other: rejected views have three times it
+_LENSES_DIFFER_PX = 1.0  # of directions, RMS over the picture; the sigmas include what smaller differences do
+_MOST_NAMES = 12  # of photographs in a message
 _NOISE_DIFFERS = 0.2  # relative, of any corner, from which on the fit is repeated: less changes sigmas by about 1 %
 
 
@@ -55,6 +60,7 @@ class IntrinsicsOptions:
     warp: bool | None = None  # whether to correct a bent board; None: where it is significant
     stretch: bool | None = None  # whether to correct rows and columns that are not to scale; None: where significant
     origins: tuple[str, ...] = ()  # of each view; different origins may mean different cameras; empty: unknown
+    names: tuple[str, ...] = ()  # of each view, for messages; empty: their numbers
 
 
 def calibrate_intrinsics(table: CornerTable, options: IntrinsicsOptions | None = None) -> Intrinsics:
@@ -78,12 +84,16 @@ def calibrate_intrinsics(table: CornerTable, options: IntrinsicsOptions | None =
 def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     starts = _starts(table)
     used, rich = inliers_of_rich_models(table, starts, options.lens)
+    _check_one_lens(table, rich[0], options)
     # Twice by the picture, since the first fit has equal weights. By views once: what fits a view raises its weight.
     for with_noise in (with_picture_noise, with_picture_noise, with_view_noise):
         weighted = with_noise(table, rich[0])
         if not np.allclose(np.log(weighted.noise), np.log(table.noise), atol=_NOISE_DIFFERS):
+            try:
+                used, rich = inliers_of_rich_models(weighted, [(f.model, f.values) for f in rich], options.lens)
+            except AdjustmentError:  # weights sharpen a fit; where views contradict each other it may not converge
+                break
             table = weighted
-            used, rich = inliers_of_rich_models(table, [(f.model, f.values) for f in rich], options.lens)
     shape = _shape(table, rich[0], options)
     free = AS_STATED if shape is None else shape.free
     as_found = (rich[0] if shape is None else shape.fit).values
@@ -158,6 +168,54 @@ def _check_tilts(values: Values) -> None:
             " the focal length is not determined: a longer lens farther away gives the same pictures; tilt the board"
             " by 20 to 45 deg to all sides"
         )
+
+
+def _check_one_lens(table: CornerTable, found: LensFit, options: IntrinsicsOptions) -> None:
+    """Raises IntrinsicsError if the photographs are those of two lenses.
+
+    Two lenses, each fitted to its own photographs, then leave almost none of the scatter between photographs. Errors of
+    each photograph's own, such as a lens that refocuses, are left in part: at least a quarter (uniform errors of one
+    unknown, split in the middle). Photographs that the fit rejects as a whole may be those of the second lens.
+    """
+    try:
+        equations = ViewEquations.of(table, found)
+    except AdjustmentError:
+        return
+    spread = equations.scatter()
+    scatters = spread.is_significant and spread.factor >= _SCATTER_OF_TWO_LENSES
+    second = equations.two_groups() if scatters else np.zeros(len(equations.views), dtype=bool)
+    if 2 * second.sum() > len(second):
+        second = ~second
+    rejected = np.setdiff1d(np.flatnonzero(table.counts() >= FEWEST_CORNERS), equations.views)
+    groups = [np.sort(np.append(equations.views[second], rejected)), equations.views[~second]]
+    if min(map(len, groups)) < FEWEST_VIEWS:
+        return
+    left, fits = 0.0, []
+    for views in groups:
+        part = table.only_views(views)
+        try:
+            fits.append(inliers_of_rich_models(part, _starts(part), options.lens)[1][0])
+            share = len(views) / sum(map(len, groups))
+            left += share * (ViewEquations.of(part, fits[-1]).scatter().factor ** 2 - 1)
+        except (AdjustmentError, StartError, IntrinsicsError):
+            return  # the photographs of one group do not determine a lens
+    if left > _LEFT_BY_TWO_LENSES * (max(spread.factor, _SCATTER_OF_TWO_LENSES) ** 2 - 1):
+        return
+    if fits[0].sigma_px > _NOISE_OF_SECOND * fits[1].sigma_px:
+        return  # blurred
+    at = projection_map(fits[0].model, fits[0].lens, table.image_size_px, 1.0)
+    apart = difference_px(at.pixels.reshape(-1, 2), at.rays.reshape(-1, 3), fits[1])
+    if apart < _LENSES_DIFFER_PX:
+        return
+    names = options.names or tuple(f"photograph {v + 1}" for v in range(table.views))
+    few, many = groups
+    listed = ", ".join(names[v] for v in few[:_MOST_NAMES])
+    raise IntrinsicsError(
+        "the photographs are from two cameras, or focus or zoom was changed in between:"
+        f" {listed}{f' and {len(few) - _MOST_NAMES} more' if len(few) > _MOST_NAMES else ''} give a lens with fx"
+        f" {fits[0].lens[0]:.4g} px, {len(many)} others one with fx {fits[1].lens[0]:.4g} px, and directions differ by"
+        f" {apart:.1f} px; calibrate each set separately, and fix focus and zoom before the first photograph"
+    )
 
 
 def _shape(table: CornerTable, rich: LensFit, options: IntrinsicsOptions) -> BoardTest | None:

@@ -30,6 +30,8 @@ _SCATTER_SIGNIFICANT = 0.1
 BEND_PROBABLE = 0.05
 _MOST_BY_ONE = 0.8  # share of the information on a direction that comes from one view, as the jackknife counts it
 _FEWEST_DOF = 3.0  # of a scatter that is widened: with 2 the standard deviation of a t distribution is unlimited
+_SPLITS = 3  # directions from which two groups are searched: mixed sets of two cameras were found from the first
+_ROUNDS = 30  # of assigning views to groups: ten views settle within five
 _UNDETERMINED = 1e-9  # relative size of a pivot below which a direction of the unknowns is not determined
 
 
@@ -125,6 +127,29 @@ class ViewEquations:
         C = half @ half.T
         inverse = (vectors / values) @ vectors.T
         return -self.basis @ (inverse @ np.sum(self.gradient[left], axis=0)), C
+
+    def two_groups(self) -> Bools:
+        """(V,): the split of the views that two sets of unknowns explain best; the sum of chi-squares is a minimum.
+
+        Each view joins the set that explains it better, and each set is solved from its views, in turn (k-means, Lloyd
+        1982), from splits along the directions in which the gradients of the views scatter most.
+        """
+        S, g = self.information, self.gradient
+        best, least = np.zeros(len(S), dtype=bool), np.inf
+        for direction in np.linalg.svd(g, full_matrices=False)[2][:_SPLITS]:
+            score = g @ direction
+            second = score > np.median(score)
+            for _ in range(_ROUNDS):
+                before = second
+                y = [-np.linalg.pinv(np.sum(S[m], axis=0)) @ np.sum(g[m], axis=0) for m in (~second, second)]
+                chi2 = np.array([self.chi2 + 2 * g @ own + (S @ own) @ own for own in y])
+                second = chi2[1] < chi2[0]
+                if np.array_equal(second, before):
+                    break
+            total = float(np.sum(np.min(chi2, axis=0)))
+            if total < least:
+                best, least = second, total
+        return best
 
     def moved(self, change: Array) -> ViewEquations:
         """The equations at other values of the unknowns: changed by (q,)."""

@@ -67,11 +67,12 @@ class CameraOptions:
         if self.valid_days is not None and self.valid_days < 1:
             raise InputError(f"valid days: expected 1 or more, got {self.valid_days}")
 
-    def intrinsics(self, origins: tuple[str, ...] = ()) -> IntrinsicsOptions:
-        """The options of the solver. origins: source of each view, see `origins_of`."""
+    def intrinsics(self, photos: PhotoSet) -> IntrinsicsOptions:
+        """The options of the solver."""
         lens = None if self.lens == "auto" else named(self.lens)
         warp, stretch = WARPS[self.warp], WARPS[self.stretch]
-        return IntrinsicsOptions(self.distance_m, lens, warp, stretch, origins)
+        names = tuple(name for name, _ in photos.views)
+        return IntrinsicsOptions(self.distance_m, lens, warp, stretch, origins_of(photos), names)
 
 
 def calibrate_camera(
@@ -104,7 +105,7 @@ def _solve(
     known = load_board_or_text(board) if isinstance(board, str | Path) else board
     found = _views(photos, known, options, progress)
     try:
-        r = calibrate_intrinsics(corner_table(found), options.intrinsics(origins_of(found)))
+        r = calibrate_intrinsics(corner_table(found), options.intrinsics(found))
     except TooFewViewsError as error:
         raise InputError(f"{options.name} ({found.line()}): {error}") from None
     except IntrinsicsError as error:

@@ -217,7 +217,9 @@ def baseline_sigma(pair: CalibratedPair) -> float:
 def _calibrated(name: str, found: PhotoSet, options: PairOptions) -> Intrinsics:
     lens = None if options.lens == "auto" else named(options.lens)
     try:
-        return calibrate_intrinsics(corner_table(found), IntrinsicsOptions(lens=lens))
+        return calibrate_intrinsics(
+            corner_table(found), IntrinsicsOptions(lens=lens, names=tuple(n for n, _ in found.views))
+        )
     except IntrinsicsError as error:
         raise CalibrationError(f"{name} ({found.line()}): {error}") from None
 

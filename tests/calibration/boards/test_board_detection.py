@@ -273,6 +273,12 @@ def test_the_reason_gives_the_actual_size_of_a_chessboard():
     assert len(view_of(photo.image, parse("chessboard:6x9:25mm"))) == len(board.ids)  # the same board, held upright
 
 
+@pytest.mark.filterwarnings("error")
+def test_corners_without_any_contrast_give_no_warning():
+    grid = np.stack(np.meshgrid(np.arange(8.0), np.arange(5.0)), axis=-1) * 20 + 60
+    assert chessboard_detection._goes_on(np.full((300, 400), 255, np.uint8), grid) == []
+
+
 def test_the_reason_gives_the_actual_size_or_kind_of_a_grid():
     _, photo = shot("circles:9x7:25mm")
     assert "9x7 circles, not 10x8" in reason_of(photo.image, parse("circles:10x8:25mm"))

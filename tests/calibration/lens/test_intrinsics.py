@@ -255,3 +255,43 @@ def test_a_photograph_of_one_row_and_one_corner_more_does_not_stop_the_calibrati
     assert np.count_nonzero(partial.view == 0) == 10
     found = calibrate_intrinsics(partial, FIVE)
     assert found.fit.lens[0] == pytest.approx(typical().fit.lens[0], rel=1e-3)
+
+
+def of_two_lenses(first: tuple[float, ...], second: tuple[float, ...], counts: tuple[int, int]) -> CornerTable:
+    """Photographs of two cameras in one folder, those of the second among the first ones of the other."""
+    tables = [
+        photographs(Scene(views=n, lens=lens, sigma_px=0.05), 8)
+        for lens, n in zip((first, second), counts, strict=True)
+    ]
+    views = [[(t.point[t.view == v], t.pixels[t.view == v]) for v in range(t.views)] for t in tables]
+    mixed = [view for pair in zip(*views, strict=False) for view in pair] + views[0][counts[1] :]
+    return CornerTable.of(mixed, tables[0].board_points, tables[0].middle, SIZE)
+
+
+@pytest.mark.parametrize(
+    ("second", "counts"),
+    [
+        ((1010.0, 1010.0, *TRUTH[2:]), (8, 8)),
+        ((1000.0, 1003.0, 600.0, 545.0, -0.1, 0.03, 0.0, 0.0, 0.0), (10, 5)),
+        ((700.0, 700.0, 640.0, 500.0, -0.05, 0.0, 0.0, 0.0, 0.0), (7, 6)),
+    ],
+)
+def test_photographs_of_two_cameras_are_named_and_give_no_lens(second, counts):
+    names = tuple(f"{n:02d}.png" for n in range(sum(counts)))
+    with pytest.raises(IntrinsicsError, match="calibrate each set separately") as error:
+        calibrate_intrinsics(of_two_lenses(TRUTH, second, counts), IntrinsicsOptions(names=names))
+    assert "from two cameras, or focus or zoom was changed" in str(error.value)
+    fewer = [name for name in names[1 : 2 * counts[1] : 2] if name in str(error.value)]
+    others = [name for name in names if name in str(error.value) and name not in fewer]
+    assert (len(fewer) == counts[1] and not others) or (counts[0] == counts[1] and len(others) == counts[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_a_lens_that_refocuses_is_not_taken_for_two_cameras(seed):
+    rng = np.random.default_rng(seed)
+    scenes = [Scene(views=1, lens=(f, f, *TRUTH[2:]), sigma_px=0.05) for f in 1000 * (1 + rng.uniform(-0.01, 0.01, 14))]
+    tables = [photographs(scene, 100 * seed + k) for k, scene in enumerate(scenes)]
+    views = [(t.point, t.pixels) for t in tables]
+    c = calibrate_intrinsics(CornerTable.of(views, tables[0].board_points, tables[0].middle, SIZE), FIVE)
+    assert finding(c, "parameters scatter") is Level.WARN
