@@ -323,7 +323,8 @@ def _figures(study: Study) -> list[Figure]:
             Figure(
                 f"Prediction by the conventional and the curve-switching filter, {name} (Figs. 5 and 6)",
                 "Blue: x; orange: y. Both filters get the same noisy positions. After a bend the conventional filter"
-                " needs many frames to converge if its process noise is small; with a large process noise switching has little effect.",
+                " needs many frames to converge if its process noise is small; with a large process noise"
+                " switching has little effect.",
                 "".join(panels),
             )
         )
