@@ -322,8 +322,9 @@ def _figures(study: Study) -> list[Figure]:
         out.append(
             Figure(
                 f"Prediction by the conventional and the curve-switching filter, {name} (Figs. 5 and 6)",
-                "Both filters get the same noisy positions. After a bend the conventional filter needs many frames to"
-                " converge if its process noise is small; with a large process noise switching has little effect.",
+                "Blue: x; orange: y. Both filters get the same noisy positions. After a bend the conventional filter"
+                " needs many frames to converge if its process noise is small; with a large process noise"
+                " switching has little effect.",
                 "".join(panels),
             )
         )
@@ -341,9 +342,9 @@ def _figures(study: Study) -> list[Figure]:
     out.append(
         Figure(
             "Spots out of view (Figs. 7 and 12)",
-            "Solved from the other spots by the paper's quadratic equation, and from the pose of all visible spots."
-            " Without noise both are exact to rounding; the published 0.05 px corresponds to an input noise of about"
-            " 0.004 px.",
+            "Solved from the other spots by the paper's quadratic equation (orange), and from the pose of all visible"
+            " spots (blue). Without noise both are exact to rounding; the published 0.05 px corresponds to an input"
+            " noise of about 0.004 px.",
             "".join(panels),
         )
     )
@@ -360,7 +361,11 @@ def _figures(study: Study) -> list[Figure]:
         outside = (Shade(study.run.in_view[:, i] == 0, "outside", "out of view"),)
         panels.append(_panel(t, f"spot {spot} ({camera}): estimate − true", e, outside, svg.robust_range(e, 0.5)))
     out.append(
-        Figure("Tracking error (Figs. 9 and 13)", "Measured in view, solved out of view (shaded).", "".join(panels))
+        Figure(
+            "Tracking error (Figs. 9 and 13)",
+            "Blue: x; orange: y. Measured in view, solved out of view (shaded).",
+            "".join(panels),
+        )
     )
     return out
 

@@ -178,14 +178,14 @@ def _alignment(comparison: Comparison) -> Section:
 
 def _curves(comparison: Comparison) -> Section:
     outliers = comparison.differences.known & ~comparison.used
-    shades = (Shade(outliers, "miss", "excluded as outlier"),) if outliers.any() else ()
+    shades = (Shade(outliers, "predicted", "excluded as outlier"),) if outliers.any() else ()
     # Two columns: x, y, z of the position on the left, those of the rotation beside them.
     order = sorted(range(len(comparison.axes)), key=lambda k: (k % 3, k) if k < 6 else (k, k))
     drawings = [_curve(comparison, comparison.axes[k], k, shades) for k in order]
     words = (
         "Result minus reference, after the alignment. Bands: two stated sigmas of the difference. Rotations are about"
         " the axes of the reference's body; yaw, pitch and roll are differences of the angles. Triangles mark values"
-        " beyond the axis."
+        f" beyond the axis{', yellow columns frames that were excluded as outliers' if shades else ''}."
     )
     return Section("Differences over time", words, drawings)
 

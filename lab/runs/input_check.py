@@ -246,7 +246,7 @@ class _Seen:
     shown: list[int] = field(default_factory=list)  # of these, those that are no empty lists of points
     kinds: set[str] = field(default_factory=set)
     points: int = 0
-    brightest: int = 0  # DN
+    ends: set[int] = field(default_factory=set)  # least and largest value of the first pictures, DN, until these differ
     dropped: int = 0
     unreadable: int = 0
     wrong_size: int = 0
@@ -292,8 +292,10 @@ def _describe_pictures(findings: Findings, run: Run, seen: dict[str, _Seen]) -> 
             findings.problems.append(f"{run.cameras[name].path}: camera {name!r} has no usable picture: {why}")
         if len(s.kinds) > 1:
             findings.remarks.append(f"{run.cameras[name].path}: pictures of different kinds: {', '.join(s.kinds)}")
-        if s.brightest == 0 and s.frames and "points" not in s.kinds:
-            findings.remarks.append(f"{run.cameras[name].path}: all pictures are black; is the lens covered?")
+        if len(s.ends) == 1 and "points" not in s.kinds:
+            bright = f"have the value {max(s.ends)} in every pixel; is the camera overexposed"
+            what = bright if any(s.ends) else "are black; is the lens covered"
+            findings.remarks.append(f"{run.cameras[name].path}: all pictures {what}?")
         if "points" in s.kinds and s.points == 0:
             findings.remarks.append(f"{run.cameras[name].path}: no points of camera {name!r}")
     findings.facts += table(("camera", "usable", "frames", "dropped", "unreadable", "wrong size", "kind"), rows)
@@ -327,8 +329,8 @@ def _count(seen: _Seen, frame: int, picture: object) -> None:
         seen.points += len(picture)
     elif isinstance(picture, np.ndarray):
         seen.kinds.add(f"{8 * picture.dtype.itemsize}-bit")
-        if seen.brightest == 0:  # one bright picture is enough
-            seen.brightest = int(picture.max())
+        if len(seen.ends) < 2:
+            seen.ends |= {int(picture.min()), int(picture.max())}
 
 
 def _compare_cameras(findings: Findings, seen: dict[str, _Seen]) -> None:

@@ -120,9 +120,10 @@ def recorded_mistakes(run: Run, blocks: Sequence[Block], *, explained: bool = Fa
     found, given = findings_of(compared, run.rig), compared.given
     if compared.found or given.good or explained:
         return found
-    seen = [
-        n for n, c in zip(run.rig.cameras, given.points.sum(axis=0), strict=True) if c >= LEAST_POINTS * len(given.fits)
-    ]
+    points = dict(zip(run.rig.cameras, given.points.sum(axis=0), strict=True))
+    if not given.fits.any() and not all(points[name] for name in run.cameras):
+        return ()  # no pose can be expected: a camera shows no point
+    seen = [n for n, count in points.items() if count >= LEAST_POINTS * len(given.fits)]
     lenses = same_lenses(run.rig, seen) if given.fits.mean() < LEAST_FITTING else ()
     labelled = (given.fits[:, None] & (given.labelled > 0)).mean(axis=0)
     left = [n for n, share in zip(run.rig.cameras, labelled, strict=True) if share < LEAST_LABELLED and n in seen]

@@ -102,6 +102,8 @@ def test_commands_output_and_exit_status_are_read_from_a_block():
     assert commands_in(text) == [Shown("beampose a   b", 4, ("out 1",)), Shown("c", 0, ())]
     assert is_shown("drift 0.03 px", ["x", "drift 0.04 px"])
     assert not is_shown("drift 0.03 px", ["drift 0.03 mm"])
+    assert not is_shown("chi-square 1.01 ± 0.05", ["chi-square 0.17 ± 0.05"])
+    assert is_shown("beampose 0.1.0", ["beampose 0.2.0"])
 
 
 @pytest.fixture

@@ -446,6 +446,8 @@ def _unit(name: str) -> tuple[str, float]:
     parameter = split_name(name)[2]
     if parameter in CLOCK:
         return ("us", 1e6) if parameter == ROW_TIME else ("ms", 1e3)
+    if parameter in ("fx", "fy", "cx", "cy"):
+        return "px", 1.0
     is_angle = parameter.endswith("_rad") or parameter.startswith("direction")
     return ("mm", 1e3) if parameter.endswith("_m") else ("mrad", 1e3) if is_angle else ("", 1.0)
 

@@ -6,6 +6,7 @@ What a killed process leaves (a hidden part folder or file) is removed by the ne
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 import secrets
@@ -13,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from lab.errors import InputError
+from lab.errors import InputError, RunError
 from lab.files.output.part_folder import (
     folder_lock,
     is_at,
@@ -25,6 +26,7 @@ from lab.files.output.part_folder import (
 )
 from lab.files.text.json_text import has_schema
 
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 _REMEDIES = {
     IsADirectoryError: "; name a file in it",
     FileNotFoundError: "; make its folder first",
@@ -105,10 +107,9 @@ def check_output_folder(target: Path, may_replace: Callable[[Path], bool]) -> No
         raise InputError(f"{target}: expected a folder for the results, found a broken link; choose another --out")
     if target.exists() and not target.is_dir():
         raise InputError(f"{target}: expected a folder for the results, found a file; choose another --out")
-    if target.is_mount():
-        raise InputError(
-            f"{target}: expected a folder that can be replaced, found a mounted volume; name a folder in it"
-        )
+    kept = "a mounted volume" if os.path.ismount(target) else "the current folder"
+    if os.path.ismount(target) or (target.exists() and target.samefile(Path.cwd())):
+        raise InputError(f"{target}: expected a folder that can be replaced, found {kept}; name a folder in it")
     above = next(p for p in (target, *target.absolute().parents) if p.exists())
     if not above.is_dir():
         raise InputError(f"{target}: the folder cannot be made: {above} is a file; choose another --out")
@@ -134,7 +135,8 @@ def atomic_folder(target: Path, may_replace: Callable[[Path], bool]) -> Iterator
 
     An existing target is replaced only if it is empty or `may_replace(target)` is true. Until the block ends, nothing
     else can write to `target`. What killed processes left there is put back or removed. Raises InputError: the folder
-    cannot be made, another process writes to it, or `target` holds something that must not be deleted.
+    cannot be made, another process writes to it, or `target` holds something that must not be deleted; RunError: the
+    disk is full.
     """
     check_output_folder(target, may_replace)
     place = _place_of(target)
@@ -147,8 +149,14 @@ def atomic_folder(target: Path, may_replace: Callable[[Path], bool]) -> Iterator
             work = stack.enter_context(part_folder(place))
         except OSError as error:
             raise InputError(f"{target}: the folder cannot be made: {error.strerror}; choose another --out") from None
-        yield work
-        replace_folder(work, place)
+        try:
+            yield work
+            replace_folder(work, place)
+        except OSError as error:
+            if error.errno not in _FULL:
+                raise
+            what = f"{target}: expected room for the results, found a full disk; free some, or choose another --out"
+            raise RunError(what) from None
 
 
 @contextmanager

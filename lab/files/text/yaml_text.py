@@ -218,6 +218,25 @@ def read_text(path: Path) -> str:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
 
 
+# What the parser's words mean to the user, by a part of them. Of some, it notices the mistake in a later line.
+_MISTAKES = {
+    "'\\t'": "a tab; indent with spaces",
+    "sequence entries are not allowed": 'a lone minus; quote it: "-"',
+    "mapping values are not allowed": "a colon out of place; write a space after the colons of this line and the one"
+    " above, indent them alike, and quote a text that holds a colon",
+    "could not determine a constructor": "a tag of another program (`!name`, `!!name`); remove the tag",
+    "could not find expected ':'": "text without a colon; write `key: value`",
+    "expected ',' or": "a bracket that is not closed, or a missing comma",
+    "unexpected end of stream": "a quote that is not closed",
+    "expected <block end>": "text that does not continue the lines above; check indents, brackets and quotes",
+    "expected '<document start>'": "text that does not continue the lines above; check indents, brackets and quotes",
+    "expected the node content": "a comma or a bracket in place of a value",
+    "cannot start any token": "a value that begins with {character}; quote it",
+    "unknown escape character": "a backslash in double quotes; use single quotes, or / between folders",
+}
+_SEEN_LATER = {"could not find expected ':'", "expected ',' or", "unexpected end of stream"}
+
+
 def read_mapping(path: Path) -> dict[str, Any]:
     """The mapping in a YAML file; keys are words. Raises InputError, in one line, with the line number."""
     return parse_mapping(read_text(path), path)
@@ -230,19 +249,14 @@ def parse_mapping(text: str, path: Path | str, opencv: bool = False) -> dict[str
     try:
         content = _loaded(text, opencv)
     except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        where = f"line {mark.line + 1}" if mark else "the text"
-        problem = error.problem or "a mistake"
-        if "'\\t'" in problem:
-            problem = "a tab; indent with spaces"
-        elif "sequence entries are not allowed" in problem:
-            problem = 'a lone minus; quote it: "-"'
-        elif "mapping values are not allowed" in problem:
-            problem = "a second colon; quote the text that holds it"
-        if problem.startswith("could not determine a constructor"):
-            problem = "a tag of another program (`!name`, `!!name`); remove the tag"
+        problem, where = error.problem or "a mistake", error.problem_mark or error.context_mark
+        for part, words in _MISTAKES.items():
+            if part in problem:
+                where = (error.context_mark or where) if part in _SEEN_LATER else where
+                problem = words.format(character=problem.split("'")[1] if "'" in problem else "")
+        place = f"line {where.line + 1}" if where else "the text"
         problem = problem.removeprefix("but ").removeprefix("expected a sequence node, but ").removeprefix("found ")
-        raise InputError(f"{path}: {where}: expected YAML, found {problem}") from None
+        raise InputError(f"{path}: {place}: expected YAML, found {problem}") from None
     except yaml.YAMLError as error:
         raise InputError(f"{path}: expected YAML, found {str(error).splitlines()[0]}") from None
     if not isinstance(content, dict):  # its content is not shown: the path may name any file

@@ -417,7 +417,7 @@ def zoom_data(m: ReportData) -> ZoomData | None:
 def timeline_figure(m: ReportData) -> str:
     """A strip of colours for the pose and for each view: its status over time."""
     n = len(m.spots.frames)
-    left, right, row = 128.0, 1000.0, 19.0
+    left, right, row = 128.0, 985.0, 19.0
     n_columns = min(n, int(right - left))
     column = np.arange(n) * n_columns // max(n, 1)
     size = np.bincount(column, minlength=n_columns)

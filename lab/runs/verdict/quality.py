@@ -160,16 +160,21 @@ def _averaging(kept: Mapping[str, float], stretch: Mapping[str, tuple[float, flo
 
 
 def _too_wide(sigma_px: Mapping[str, float], statistics: RunStatistics) -> list[Finding]:
-    """Cameras with a light that is wider than spots may be, and a spot that is found in no picture."""
+    """Cameras with a light that is wider than spots may be, and a spot that is labelled in no picture.
+
+    Without any pose no spot is labelled: where another camera shows nothing, that is the reason.
+    """
     out = []
     for name, sigma in sigma_px.items():
+        if not statistics.measured and any(not c.points for n, c in statistics.cameras.items() if n != name):
+            continue
         status = {spot: counts for (camera, spot), counts in statistics.spot_status.items() if camera == name}
         never = [spot for spot, counts in status.items() if not any(counts[s.value] for s in SpotStatus if s.measured)]
         if never:
             spots = f"spot {never[0]} is" if len(never) == 1 else f"spots {', '.join(never)} are"
             what = (
                 f"camera {name} shows a light with a sigma of {sigma:.0f} px, which is wider than detect.max_sigma_px"
-                f" admits and is not used, and {spots} found in none of its pictures;"
+                f" admits and is not used, and {spots} labelled in none of its pictures;"
                 f" --set detect.max_sigma_px={limit_that_admits(sigma)} admits it"
             )
             level = Level.WARN if statistics.measured else Level.FAIL

@@ -5,13 +5,14 @@ from __future__ import annotations
 import errno
 import importlib
 import os
+import re
 import stat
 import sys
 from pathlib import Path
 
 import pytest
 
-from lab.errors import InputError
+from lab.errors import InputError, RunError
 from lab.files.output import part_folder
 from lab.files.text.atomic_write import atomic_folder, atomic_write_text, check_output_folder, keep_good_results
 
@@ -69,6 +70,27 @@ def test_a_disk_that_fails_at_the_end_leaves_the_old_results(tmp_path, monkeypat
         (work / "a.csv").write_text("new")
     assert (target / "a.csv").read_text() == "old"
     assert names(tmp_path) == ["results"]
+
+
+def test_a_full_disk_is_named_with_the_folder_and_what_to_do(tmp_path):
+    """The system says neither which disk is full nor, after a failed write, which file it was."""
+    message = f"{tmp_path / 'results'}: expected room for the results, found a full disk; free some, or choose another"
+    with pytest.raises(RunError, match=re.escape(message)), atomic_folder(tmp_path / "results", never):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("folder", [".", "", "../here", "{}"])
+def test_the_current_folder_is_not_replaced(tmp_path, monkeypatch, folder):
+    """Under a shell in it, all would be gone."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    with pytest.raises(InputError, match="found the current folder; name a folder in it"):
+        check_output_folder(Path(folder.format(tmp_path / "here")), always)
+    check_output_folder(Path("inner"), always)
+    monkeypatch.chdir("/")
+    with pytest.raises(InputError, match="found a mounted volume; name a folder in it"):
+        check_output_folder(Path("."), always)
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
@@ -314,7 +336,7 @@ def test_old_results_are_restored_when_the_last_rename_fails(tmp_path, monkeypat
             monkeypatch.setattr(part_folder, "exchange", lambda one, other: False)
             monkeypatch.setattr(Path, "rename", broken)
 
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(RunError, match="found a full disk"):
         replace_it()
     assert names(target) == ["old"]
     assert names(tmp_path) == ["results"]

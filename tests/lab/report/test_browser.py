@@ -13,6 +13,7 @@ import pytest
 from lab.report.index import write_index
 from lab.report.run.page import write_report
 from lab.results.view.page import View, read_content, view_of, write_page
+from tests.lab.chromium import Browser
 from tests.lab.report.test_report import make
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -102,6 +103,28 @@ def test_the_index_fits_into_the_window(index, width):
 
 def test_the_report_of_a_run_has_no_console_errors(tmp_path):
     assert browse(write_report(make(tmp_path, 300).results))[1] == []
+
+
+SMALLEST_LETTER = """
+Math.min(...[...document.querySelectorAll("svg text")].filter((t) => t.getBoundingClientRect().width).map((t) => {
+  const svg = t.ownerSVGElement;
+  return parseFloat(getComputedStyle(t).fontSize) * svg.getBoundingClientRect().width / svg.viewBox.baseVal.width;
+}))
+"""
+
+
+@pytest.mark.parametrize("width", [420, 1300])
+def test_the_pages_of_results_fit_into_a_window_and_the_letters_of_their_drawings_can_be_read(tmp_path, width):
+    results = make(tmp_path, 300).results
+    write_page(*_scene(results), tmp_path / "view.html")
+    browser = Browser(tmp_path)
+    try:
+        for page in (write_report(results), tmp_path / "view.html"):
+            browser.open(page.as_uri(), width)
+            assert browser.get("document.documentElement.scrollWidth - document.documentElement.clientWidth") <= 0
+            assert browser.get(SMALLEST_LETTER) > 6
+    finally:
+        browser.close()
 
 
 INK = """

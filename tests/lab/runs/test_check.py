@@ -111,6 +111,15 @@ def test_black_pictures_are_remarks(folder):
     assert "right: all pictures are black" not in checked(folder)[0]
 
 
+def test_overexposed_pictures_are_remarks(folder):
+    for path in (folder / "frames/left").iterdir():
+        cv2.imwrite(str(path), np.full((48, 64), 255, np.uint8))
+    remark = "left: all pictures have the value 255 in every pixel; is the camera overexposed?"
+    assert remark in checked(folder)[0]
+    cv2.imwrite(str(folder / "frames/left/000000.png"), np.eye(48, 64, dtype=np.uint8))
+    assert remark not in checked(folder)[0]
+
+
 def test_the_consequences_of_a_missing_prior_or_camera_are_reported(folder):
     edit(folder / "run.yaml", "  right: {frames: frames/right}\n", "")
     (folder / "run.yaml").write_text((folder / "run.yaml").read_text().split("prior:")[0])

@@ -302,3 +302,15 @@ def test_a_colour_mosaic_comes_before_the_misfit_that_it_explains():
     assert kinds(verdict) == ["colour_mosaic", "model"]
     assert "demosaicing" in verdict.of_frames(FRAMES, FRAMES)
     assert verdict.texts[1] == "camera `left` may have moved. Averaging does not help"
+
+
+def test_a_light_that_is_too_wide_is_no_reason_where_another_camera_shows_nothing():
+    """Without any pose no spot of any camera has a label: that of a spot is then not missing for its width."""
+    cameras = {"left": a_camera(points=0, empty=FRAMES, found=0), "right": a_camera(found=0)}
+    nothing = statistics_of(0, {FrameCause.FEW_POINTS: FRAMES}, cameras)
+    nothing.spot_status = {("left", "1"): Counter(), ("right", "2"): Counter()}
+    found = judge(nothing, too_wide={"right": 32.0})
+    assert "BP-V21" not in {f.code for f in found.findings}
+    assert "BP-V08" in {f.code for f in found.findings}
+    of_itself = judge(nothing, too_wide={"left": 32.0})  # its only light may be the spot
+    assert of_itself.findings[0].code == "BP-V21"

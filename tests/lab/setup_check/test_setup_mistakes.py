@@ -351,6 +351,21 @@ def test_a_camera_whose_points_are_never_labelled_is_reported(tmp_path, recordin
     assert any("camera `third`: none of its" in text for text in outcome.verdict.texts)
 
 
+def test_the_other_cameras_are_not_blamed_for_one_that_shows_nothing(tmp_path, recording):
+    """A covered lens: no pose is found, and whether the rest of the set-up is right cannot be seen."""
+    files = read(recording)
+    files.rows = [row for row in files.rows if int(row["frame"]) < 6 and row["camera"] == "right"]
+    files.run["cameras"]["left"] = {"frames": "left"}
+    run = write(files, tmp_path / "run")
+    width, height = files.rig["cameras"]["left"]["image_size_px"]
+    (run / "left").mkdir()
+    for frame in range(6):
+        cv2.imwrite(str(run / "left" / f"{frame}.png"), np.zeros((height, width), np.uint8))
+    text, _ = checked(run)
+    assert "left: all pictures are black; is the lens covered?" in text
+    assert "BP-M0" not in text
+
+
 @pytest.mark.parametrize("aside_deg", [0.0, 180.0])
 def test_false_points_of_a_camera_are_reported_only_where_the_poses_put_spots_into_its_pictures(
     tmp_path, recording, compared_once, aside_deg

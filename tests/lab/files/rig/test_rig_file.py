@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from lab.errors import InputError
 from lab.files.rig.rig_file import RigFile, load_rig, load_rig_file, save_rig
 from lab.files.text import atomic_write
 from lab.files.text.error_text import FileError
+from lab.files.text.yaml_text import parse_mapping
 from tests.lab.run_folders import RIG
 
 ROUNDING = 1e-15  # of an entry of a rotation matrix or of a direction: some units in the last place of 1
@@ -193,7 +195,11 @@ BROKEN = [
         "rig.yaml: schema: expected 'beampose/rig/1', got 'beampose/rig/2'",
     ),
     ("schema: beampose/rig/1\n", "", "rig.yaml: schema: expected a value, got nothing"),
-    ("schema: beampose/rig/1", "schema: [", "rig.yaml: line 3: expected YAML"),
+    (
+        "schema: beampose/rig/1",
+        "schema: [",
+        "rig.yaml: line 1: expected YAML, found a bracket that is not closed, or a missing comma",
+    ),
     ("screens:\n", "screens:\n\t", "rig.yaml: line 3: expected YAML, found a tab; indent with spaces"),
     ("  beams:\n", "  beams: {}\n  old:\n", "target: unknown key 'old'; known: beams, spots, covariance"),
     ("target:\n", "taget:\n", "rig.yaml: unknown key 'taget'; did you mean 'target'?"),
@@ -399,3 +405,29 @@ def test_a_covariance_block_needs_names_and_a_square_matrix(block, words, tmp_pa
     with pytest.raises(InputError) as caught:
         load_rig(written(tmp_path, RIG + f"  covariance: {block}\n"))
     assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "words"),
+    [
+        ("rig: a\nrate 100\nname: b\n", 2, "text without a colon"),
+        ("rig:a\nrate: 1\n", 2, "a space after the colons of this line and the one above"),
+        ("a: 1\n  b: 2\n", 2, "indent them alike"),
+        ("a: b: c\n", 1, "quote a text that holds a colon"),
+        ("a: [1, 2\nb: 3\n", 1, "a bracket that is not closed"),
+        ("a: {b: 1 c: 2}\n", 1, "or a missing comma"),
+        ("a: 1\nb: 'x\nc: 1\n", 2, "a quote that is not closed"),
+        ("a: it\nb: 'it's'\n", 2, "check indents, brackets and quotes"),
+        ("a:\n    b: 1\n  c: 2\n", 3, "check indents, brackets and quotes"),
+        ("a: {b: 1,, c: 2}\n", 1, "a comma or a bracket in place of a value"),
+        ("a: @x\n", 1, "a value that begins with @; quote it"),
+        ('a: "C:\\lab\\rig.yaml"\n', 1, "use single quotes, or / between folders"),
+        ("a: -\n", 1, 'a lone minus; quote it: "-"'),
+    ],
+)
+def test_a_mistake_of_yaml_is_named_in_its_line_and_in_the_words_of_the_user(text, line, words):
+    with pytest.raises(InputError) as error:
+        parse_mapping(text, "f")
+    assert f"f: line {line}: expected YAML, found " in str(error.value)
+    assert words in str(error.value)
+    assert not re.search("<|token|stream|node|found expected|, but", str(error.value))

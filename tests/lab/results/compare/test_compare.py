@@ -100,6 +100,26 @@ def test_a_tum_file_gives_clocks_frames_tables_and_report(folder, result, motion
     compare_and_write(result, None, path, out)  # an earlier comparison may be replaced
 
 
+def test_differences_far_below_the_stated_uncertainties_do_not_agree_with_them(folder, result, motions):
+    path = write_tum(folder / "other.tum", motions[1])
+    outcome = compare_and_write(result, None, path, folder / "coarse", sigma_m=1e-2, sigma_deg=1.0)
+    assert outcome.lines[0].startswith("PASS: the differences are smaller than the stated uncertainties: chi-square")
+
+
+def test_frames_that_are_excluded_have_a_colour_of_the_page_and_are_explained(folder, result, motions):
+    """A shape of a class without a rule is black in every browser."""
+    jumps = motions[1].position_m.copy()
+    jumps[[50, 150]] += 0.1
+    path = write_tum(folder / "jumps.tum", replace(motions[1], position_m=jumps))
+    out = folder / "with-jumps"
+    compare_and_write(result, None, path, out, sigma_m=1e-4, sigma_deg=np.rad2deg(5e-5))
+    page = (out / "report.html").read_text()
+    classes = set(re.findall(r'<rect class="(\w+)"', page))
+    assert classes
+    assert all(re.search(rf"svg rect\.{name}[,{{]", page) for name in classes)
+    assert "yellow columns frames that were excluded as outliers" in page
+
+
 def test_quaternions_and_angles_of_a_csv_table_agree(folder, result, motions):
     reference = motions[1]
     q = rotations.quaternion_from_matrix(reference.rotation)
