@@ -98,7 +98,7 @@ def solve_clocks(
     S = C - np.einsum("kis,kit->st", B, G[:, :6]) + precision
     right = b - np.einsum("kis,ki->s", B, x[:, :6]) + precision @ clocks.mean_s
     S, right = _beyond_rounding(S, right, clocks)
-    joint = np.linalg.inv(S)
+    joint = np.asarray(np.linalg.inv(S), dtype=float)
     kept = clocks.unsettled | (np.sqrt(np.diagonal(joint)) >= DETERMINED * clocks.sigma_s)
     correction, noise = _with_priors(joint, right, kept, clocks)
     systematic = np.zeros((p, p))

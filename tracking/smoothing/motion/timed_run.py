@@ -236,9 +236,8 @@ class _TimedEstimator(_Estimator):
         others = [other.x]
         if len(smooth) < len(self.turns):
             others.append(smoothed(*search.of_part(smooth, slice(None)), density, tested=False).x)
-        pose, motion = (
-            sum(x[:, part, None] * x[:, None, part] for x in others) for part in (slice(0, 6), slice(6, 12))
-        )
+        x = np.stack(others)
+        pose, motion = (np.einsum("mki,mkj->kij", d, d) for d in (x[..., :6], x[..., 6:12]))
         return out._replace(
             pose_P=0.5 * (out.pose_P + other.pose_P + pose), motion_P=0.5 * (out.motion_P + other.motion_P + motion)
         )
