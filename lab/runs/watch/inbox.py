@@ -17,7 +17,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from lab.files.run.clocks import CameraClock, load_times
+from lab.files.run.clocks import CameraClock, load_times, stamp_sigmas
 from lab.files.run.run_file import Run
 from lab.pictures.picture_file import DROPPED, GreyPicture, MissingPicture
 from lab.runs.frames.frames import Recorded
@@ -25,11 +25,15 @@ from lab.runs.frames.moments import TimedPicture, row_of
 from tracking.detections import Detections
 
 _EARLY = 0.1  # of the usual time between two pictures: the next one may come earlier by this
+_STAMPS = 2 * 64  # the newest times of a camera, which show the error of each: of all pictures that may be waiting
 
 
 @dataclass(slots=True)
 class PictureTimes:
-    """The pictures of a camera: picture n is that of row n + `ahead`, or belongs to the row nearest to its own time."""
+    """The pictures of a camera: picture n is that of row n + `ahead`, or belongs to the row nearest to its own time.
+
+    The newest of its own times are those of `clock`, with their sigmas: what a recording shows as it is made.
+    """
 
     rate_hz: float = 1.0  # of the rows
     clock: CameraClock = CameraClock()  # noqa: RUF009  (frozen)
@@ -81,6 +85,13 @@ class PictureTimes:
                 step_s = (instant_s - self.latest[1]) / (number - self.latest[0])
                 self.step_s = min(self.step_s, step_s) if self.step_s else step_s
             self.known[number], self.latest = instant_s, (number, instant_s)
+        stamps = self.clock.times
+        if times and stamps is not None:
+            numbers, times_s = np.array(times).T
+            if stamps.frames is not None and stamps.times_s is not None:
+                numbers, times_s = np.r_[stamps.frames, numbers], np.r_[stamps.times_s, times_s]
+            stamps.frames, stamps.times_s = numbers[-_STAMPS:].astype(np.int64), times_s[-_STAMPS:]
+            stamps.sigma_s = stamp_sigmas(stamps)
 
     def take(self, row: int) -> list[TimedPicture]:
         """The pictures of a row, by time; the row is closed."""
@@ -137,6 +148,7 @@ def complete_times(run: Run) -> None:
         if clock.times is not None and clock.times_path is not None:
             whole = load_times(clock.times_path, run.frame_rate_hz)
             clock.times.frames, clock.times.times_s = whole.frames, whole.times_s
+            clock.times.sigma_s = stamp_sigmas(whole)
 
 
 MOST_WAITING = 64  # pictures per camera in memory; those of a folder beyond stay on disk

@@ -15,7 +15,14 @@ from tracking.smoothing.motion.fixed_interval import smoothed
 from tracking.smoothing.motion.instants import TOGETHER, Instants
 from tracking.smoothing.motion.run_detections import Delays, RunDetections, Turn, WholeRun
 from tracking.smoothing.motion.timed_run import _bounded, _near_unobserved, _observed
-from tracking.smoothing.motion.turns import TURN_NATS, TurnSearch, successions, unresolved, velocity_jumps
+from tracking.smoothing.motion.turns import (
+    RESOLVED_NATS,
+    TURN_NATS,
+    TurnSearch,
+    successions,
+    unresolved,
+    velocity_jumps,
+)
 
 FRAMES, STEP = 40, 20  # that has the jump
 SIZE = np.array([0.45, 4.7])  # variances of the jump that `drawn` makes
@@ -190,6 +197,20 @@ def test_a_stronger_jerk_replaces_turns_of_a_swing_but_not_a_corner():
     corner = search_in(drawn(6, FRAMES, jump_at=STEP))
     turn = Turn(float(corner.t_s[STEP] - 0.5 * DT), DT, DT, SIZE)
     assert corner.without([turn], [turn]) is None
+
+
+def test_a_jerk_counts_beside_turns_unless_the_spots_exclude_it():
+    """Turns side by side explain few spots about as well as a smooth motion that is none of them."""
+    run = drawn(6, FRAMES, jump_at=STEP)
+    search, at = search_in(run), float(run.info.dt[: STEP + 1].sum() - 0.5 * DT)
+    turns = [Turn(at, 0.1 * DT, 0.1 * DT, SIZE), Turn(at + 2 * DT, 0.1 * DT, 0.1 * DT, 1e-4 * SIZE)]
+    assert search.without(turns, turns, -RESOLVED_NATS) is None
+    weak = replace(search, info=search.info._replace(information=1e-3 * search.info.information))
+    weak = replace(weak, info=weak.info._replace(vector=1e-3 * search.info.vector))
+    assert weak.without(turns[:1], turns[:1]) is None
+    density = weak.without(turns[:1], turns[:1], -RESOLVED_NATS)
+    assert density is not None
+    assert density[STEP].max() > 10 * search.density[STEP].max()
 
 
 def test_a_jerk_in_place_of_turns_is_that_of_the_axis_that_turns():

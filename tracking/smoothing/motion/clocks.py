@@ -33,23 +33,17 @@ _ROUNDING = 30.0  # times the error of the smallest eigenvalue: less is rounding
 _CHUNK = 512  # frames whose rows are in memory at once
 
 
-def _with_priors(S: Array, right: Array, kept: Bools, clocks: UnknownClocks) -> tuple[Array, Array]:
-    """Solution (p,) and covariance (p, p) of normal equations (p, p), (p,) where some numbers keep their priors.
+def _with_priors(joint: Array, right: Array, kept: Bools, clocks: UnknownClocks) -> tuple[Array, Array]:
+    """Corrections (p,) and covariance (p, p) where some numbers keep their priors.
 
-    kept (p,): those that the run hardly determines; noise of the spots' speeds would pass for motion. The others are
-    solved for with these at their means, and have the error that they cause in their covariance (Schmidt 1966).
+    joint (p, p), right (p,): inverse and right side of the normal equations of all numbers. kept (p,): those that the
+    run hardly determines; noise of the spots' speeds would pass for motion. The others are what they are with these
+    free: spots that show one of them alone then count for it (a row time that the rows hardly show is no error of the
+    offset). What is left of the others' errors is correlated with the kept ones' as in the solution for all.
     """
-    found = ~kept
-    correction, covariance = clocks.mean_s.copy(), np.diag(clocks.sigma_s**2)
-    own = np.linalg.inv(S[np.ix_(found, found)])
-    across = S[np.ix_(found, kept)]
-    correction[found] = own @ (right[found] - across @ correction[kept])
-    gain = own @ across
-    prior = covariance[np.ix_(kept, kept)]
-    covariance[np.ix_(found, found)] = own + gain @ prior @ gain.T
-    covariance[np.ix_(found, kept)] = -gain @ prior
-    covariance[np.ix_(kept, found)] = -prior @ gain.T
-    return correction, 0.5 * (covariance + covariance.T)
+    covariance = joint.copy()
+    covariance[np.ix_(kept, kept)] = np.diag(clocks.sigma_s[kept] ** 2)
+    return np.where(kept, clocks.mean_s, joint @ right), 0.5 * (covariance + covariance.T)
 
 
 def _beyond_rounding(S: Array, right: Array, clocks: UnknownClocks) -> tuple[Array, Array]:
@@ -104,12 +98,9 @@ def solve_clocks(
     S = C - np.einsum("kis,kit->st", B, G[:, :6]) + precision
     right = b - np.einsum("kis,ki->s", B, x[:, :6]) + precision @ clocks.mean_s
     S, right = _beyond_rounding(S, right, clocks)
-    noise = np.linalg.inv(S)
-    kept = np.full(p, clocks.unsettled)
-    while np.any(more := ~kept & (np.sqrt(np.diagonal(noise)) >= DETERMINED * clocks.sigma_s)):
-        kept |= more  # and those that these leave open
-        _, noise = _with_priors(S, right, kept, clocks)
-    correction, noise = _with_priors(S, right, kept, clocks)
+    joint = np.asarray(np.linalg.inv(S), dtype=float)
+    kept = clocks.unsettled | (np.sqrt(np.diagonal(joint)) >= DETERMINED * clocks.sigma_s)
+    correction, noise = _with_priors(joint, right, kept, clocks)
     systematic = np.zeros((p, p))
     if clocks.calibration is not None:
         total = np.zeros((p, 0))

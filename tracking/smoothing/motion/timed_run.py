@@ -34,7 +34,7 @@ from tracking.smoothing.motion.run_detections import (
     WholeRun,
     first_variance,
 )
-from tracking.smoothing.motion.turns import TurnSearch, successions, unresolved, velocity_jumps
+from tracking.smoothing.motion.turns import RESOLVED_NATS, TurnSearch, successions, unresolved, velocity_jumps
 from tracking.smoothing.motion.whole_run import (
     CONVERGED_LOG_DENSITY,
     CONVERGED_SIGMAS,
@@ -212,17 +212,32 @@ class _TimedEstimator(_Estimator):
         return turn._replace(length_s=float(np.hypot(turn.length_s, np.sqrt(12) * sigma)))
 
     def _with_unresolved(self, out: Interval) -> Interval:
-        """The covariances, where turns or hidden jumps resemble others, of both motions about that with the former."""
+        """The covariances, where turns or hidden jumps resemble others, of both motions about that with the former.
+
+        And with the difference to the motion by a jerk that turns in succession do not exclude.
+        """
         hidden, search, turns = self._hidden(self._allowed_at_ends(), self.vague), self._search(), list(self.turns)
         if not turns and not hidden.any():
             return out
+        smooth, density = turns, search.density
+        for some in successions(self.turns, self.frame_s):
+            jerk: Array | None = None
+            if len(some) >= FEWEST and self._shown(some):
+                jerk = search.without(some, self.turns, -RESOLVED_NATS)
+            if jerk is not None:
+                smooth = [t for t in smooth if not any(t is each for each in some)]
+                density = np.maximum(density, jerk)
         for some in unresolved(self.turns, self.frame_s):
             one = search.one_for(some, turns)
             if one is not None:
                 turns = [*(t for t in turns if not any(t is each for each in some)), one]
         turns = [search.to_next_spots(search.largest(turn, turns)) for turn in turns]
         other = smoothed(*replace(search, hidden=hidden).of_part(turns, slice(None)), search.density, tested=False)
-        pose, motion = (x[:, :, None] * x[:, None] for x in (other.x[:, :6], other.x[:, 6:12]))
+        others = [other.x]
+        if len(smooth) < len(self.turns):
+            others.append(smoothed(*search.of_part(smooth, slice(None)), density, tested=False).x)
+        x = np.stack(others)
+        pose, motion = (np.einsum("mki,mkj->kij", d, d) for d in (x[..., :6], x[..., 6:12]))
         return out._replace(
             pose_P=0.5 * (out.pose_P + other.pose_P + pose), motion_P=0.5 * (out.motion_P + other.motion_P + motion)
         )
@@ -318,10 +333,7 @@ class _TimedEstimator(_Estimator):
         for some in successions(self.turns, self.frame_s):
             if len(some) < fewest:
                 continue
-            beside, last_s = BESIDE_GAP * self.frame_s, max(t.end_s for t in some)
-            first, after = np.searchsorted(self.t_s, [some[0].begin_s - beside, last_s + beside])
-            # Where few spots are left a strong jerk explains whatever contradicts itself.
-            density = search.without(some, self.turns) if self.measured[first : after + 1].all() else None
+            density = search.without(some, self.turns) if self._shown(some) else None
             if density is None:
                 continue
             self.turns = [t for t in self.turns if not any(t is one for one in some)]
@@ -332,6 +344,12 @@ class _TimedEstimator(_Estimator):
             self.continuous |= (self.t_s > begin) & (self.t_s - self.dt < end)
             found = True
         return found
+
+    def _shown(self, some: list[Turn]) -> bool:
+        """Whether a jerk may replace these turns: where few spots are left it explains whatever contradicts itself."""
+        beside, last_s = BESIDE_GAP * self.frame_s, max(t.end_s for t in some)
+        first, after = np.searchsorted(self.t_s, [some[0].begin_s - beside, last_s + beside])
+        return bool(self.measured[first : after + 1].all())
 
     def _turns_improved(self, every: bool) -> bool:
         """Find when the turns are, one after the other; whether any has changed. every: also those that are settled."""

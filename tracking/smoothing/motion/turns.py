@@ -48,8 +48,8 @@ _IMPOSSIBLE_NATS = 6 * _EXCLUDED_NATS / 2
 _CURVATURE_NATS = 0.5  # drop of the likelihood from which the sigma of the middle is computed
 _CHANGED = 0.02, 0.1  # of a frame, and relative: less does not change a turn
 TURN_NATS = 3.0  # by which each turn must make a run more likely
-AS_MANY = 2  # turns have as many numbers as a jerk has axes
-RESOLVED_NATS = 40.0  # by which turns must be more likely than one smooth turn in their place
+GAINED_NATS = 2 * TURN_NATS  # by which a jerk must be more likely than turns: two have as many numbers as it has axes
+RESOLVED_NATS = 40.0  # by which turns must be more likely than one smooth turn, or a jerk, in their place
 _UNRESOLVED = 4.0  # frames: turns farther apart do not resemble one
 _WIDTHS, _SIZES = (
     np.array([1.0, 1.3, 1.7]),
@@ -136,8 +136,11 @@ class TurnSearch:
         both = filtered(ref, some, density)
         return _WithTurns(tuple(turns), ref, some, density, self.hidden[part], self.t_s[part], both)
 
-    def without(self, some: Sequence[Turn], all_turns: Sequence[Turn]) -> Array | None:
-        """Densities (F, 6) of a jerk that explains the spots without some of all turns; None: these are needed."""
+    def without(self, some: Sequence[Turn], all_turns: Sequence[Turn], gained: float = GAINED_NATS) -> Array | None:
+        """Densities (F, 6) of a jerk that explains the spots without some of all turns; None: these are needed.
+
+        gained: by how much the jerk must be more likely, nats, where each turn costs TURN_NATS.
+        """
         begin, end = min(t.begin_s for t in some), max(t.end_s for t in some)
         part = self.part(begin, end)
         every = self.near(all_turns, part)
@@ -168,7 +171,7 @@ class TurnSearch:
         least = run.nats(likely) - TURN_NATS * len(some)
         if nats[0] > least:
             return self.density
-        return best if most > least + TURN_NATS * AS_MANY else None
+        return best if most > least + gained else None
 
     def one_for(self, some: Sequence[Turn], all_turns: Sequence[Turn]) -> Turn | None:
         """One turn in place of some of all turns; None: the spots exclude it."""

@@ -285,6 +285,7 @@ def test_a_turn_in_a_gap_in_which_nothing_is_seen_is_covered(gap, tmp_path):
         pytest.param(21001, 300, id="a slow corner in a gap beside fast motion"),
         pytest.param(7321, 120, id="smooth turns of eight frames about one axis, which resemble six corners"),
         pytest.param(7331, 120, id="a swing that begins in a gap, with a slow camera"),
+        pytest.param(31005, 300, id="smooth turns of seven frames and four spots, which five corners explain better"),
     ],
 )
 def test_no_pose_beside_a_turn_is_wrong_by_more_than_it_states(seed, frames, tmp_path):

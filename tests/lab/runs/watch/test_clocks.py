@@ -8,6 +8,7 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -131,6 +132,19 @@ def test_a_picture_whose_time_comes_after_its_row_is_late():
     inbox.take(5)
     inbox.add_times("a", [(0, 0.03)])
     assert (queue.late, list(queue.pictures)) == (1, [])
+
+
+@pytest.mark.parametrize(("scatter_s", "wrong_s"), [(0.0, 0.004), (2e-4, 0.004), (2e-4, 0.0)])
+def test_the_error_of_a_time_is_known_when_its_picture_comes(scatter_s, wrong_s):
+    rng = np.random.default_rng(1)
+    times = PictureTimes(100.0, CameraClock(times=Times(100.0)))
+    for number in range(300):
+        times.add([(number, number / 97 + rng.normal(0, scatter_s) + wrong_s * (number == 200))])
+        sigma_s = times.clock.stamp_sigma_s(number)
+        if number == 200 and wrong_s:
+            assert sigma_s == pytest.approx(wrong_s, rel=0.2)
+        elif number > 60:
+            assert sigma_s == pytest.approx(scatter_s, rel=0.6, abs=1e-7)
 
 
 def test_a_table_of_times_is_read_as_it_grows_and_must_rise(tmp_path):
