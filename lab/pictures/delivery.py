@@ -70,8 +70,8 @@ class Delivery:
         some = picture[..., 1] if picture.ndim == 3 else picture
         self._last = [*self._last[1 - _PICTURES :], some]
         self._count += 1
-        if self._count % _EVERY == 0:
-            self._alternating.add(some)
+        if self._count % _EVERY == 0 and len(self._last) > 1:
+            self._alternating.add(*self._last[-2:])
             if len(self._last) == _PICTURES:
                 rounding = grey_step(self._last[-1:]) ** 2 / 12
                 self._shares.append(

@@ -282,10 +282,6 @@ def _prepare(noise: CameraNoise, run: Run, source: PictureSource) -> None:
     shown = pictures_of_frames(source, sorted({*wanted, *three}), size_px)
     pictures = [p for k in wanted if isinstance(p := shown[k], np.ndarray)]
     noise.estimate_from(pictures)
-    rows = RowCounts()
-    for picture in pictures:
-        rows.add(picture)
-    noise.interlaced = rows.interlaced
     successive = [p for k in three if isinstance(p := shown[k], np.ndarray)]
     if noise.estimate is not None:
         noise.kept = kept_of_the_last(successive, noise.estimate.step_dn**2 / 12)
@@ -303,6 +299,10 @@ def _prepare(noise: CameraNoise, run: Run, source: PictureSource) -> None:
             noise.follow_motion([p for p in every if isinstance(p, np.ndarray)], run.tracker.detect)
     else:
         noise.look_for_wide(pictures[::2], run.tracker.detect)
+    rows = RowCounts()
+    for first, second in zip(pictures[::2], pictures[1::2], strict=False):
+        rows.add(first, second)
+    noise.interlaced = noise.motion is None and rows.interlaced  # structure that a camera moves may alternate, too
     if isinstance(source, PictureFiles):
         source.keep(shown)
 

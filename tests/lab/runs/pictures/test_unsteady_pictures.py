@@ -192,6 +192,22 @@ def test_cameras_that_average_their_pictures_over_time_are_named(tmp_path, share
     assert verdict["status"] == ("check" if share else "pass")
 
 
+def test_cameras_with_interlaced_pictures_are_named(tmp_path):
+    """The odd rows of the camera on the left are those of the next picture. The room has lines along the rows."""
+    folder, _ = recording(tmp_path / "run", right=Unsteady(light=lined))
+    files = sorted((folder / "frames" / "left").iterdir())
+    pictures = [cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files]
+    for file, picture, after in zip(files, pictures, pictures[1:], strict=False):
+        picture[1::2] = after[1::2]
+        cv2.imwrite(str(file), picture)
+    evidence = processed(folder, tmp_path / "out")["verdict"]["evidence"]
+    assert [e["numbers"]["camera"] for e in evidence if e["code"] == "BP-V23"] == ["left"]
+
+
+def lined(frame: int) -> Any:
+    return 1 + 0.3 * (np.arange(SIZE[0])[:, None] % 2)
+
+
 def flickers(frame: int) -> Any:
     return 1 + 0.12 * np.sin(0.7 * frame + 1.0)
 
