@@ -86,9 +86,12 @@ class _Library(codegen.JITCodeLibrary):
     def add_linking_library(self, library: Any) -> None:
         library._ensure_finalized()
         if isinstance(library, _Library):
-            self._called |= library._called
+            # numba numbers functions by process: two versions of a function may have one name, and call functions of
+            # different names. The first version stays, since it stands after those that it calls.
+            for symbol, called in library._called.items():
+                self._called.setdefault(symbol, called)
             if library._large is not None:
-                self._called[library._large] = _callable[library._large] = library
+                _callable[library._large] = self._called.setdefault(library._large, library)
                 self._reload_init.update(library._reload_init)
                 return
         super().add_linking_library(library)  # type: ignore[no-untyped-call]  # numba has no types
@@ -185,7 +188,11 @@ class _Cache(FunctionCache):
             with suppress(OSError):
                 self.flush()  # type: ignore[no-untyped-call]  # numba has no types
             return None
-        return None if found is not None and self.for_python and not _is_for_python(found) else found
+        args, _ = normalize_signature(sig)  # type: ignore[no-untyped-call]  # numba has no types
+        # Of two processes that keep code at once, one may overwrite the file of the other, for other types.
+        if found is None or tuple(found.signature.args) != tuple(args):
+            return None
+        return None if self.for_python and not _is_for_python(found) else found
 
     def save_overload(self, sig: Any, data: Any) -> None:
         with suppress(OSError):  # for instance a full disk: the code is compiled, only not kept

@@ -266,6 +266,64 @@ def test_a_large_function_is_called_and_not_copied(program, tmp_path):
     ]
 
 
+def test_code_for_other_types_than_its_index_says_is_compiled_again(program, tmp_path):
+    """Two processes that keep code of one function at once may give their files the same name."""
+    copy = tmp_path / "program"
+    shutil.copytree(program, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    (copy / "geometry" / "slopes.py").write_text(SLOPES)
+    use = "from geometry.slopes import slope; print(slope(0.5), slope(1))"
+    command, environment = [sys.executable, "-c", use], {**os.environ, "PYTHONPATH": str(copy)}
+    printed = []
+    for _ in range(2):
+        done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, timeout=60)
+        printed.append((done.returncode, done.stdout, done.stderr))
+        one, other = copy.rglob("slopes.slope-*.nbc")
+        content = one.read_bytes()
+        one.write_bytes(other.read_bytes())
+        other.write_bytes(content)
+    assert printed[0] == printed[1]
+    assert printed[0][0] == 0
+
+
+CLIMB = """
+import shutil, sys
+from pathlib import Path
+from geometry import slopes
+from geometry.compilation.compile_cache import cache_folder
+from floor import caller
+if "forget" in sys.argv:
+    shutil.rmtree(cache_folder(Path(slopes.__file__).parent))
+else:
+    print(getattr(caller, sys.argv[1])(0.5))
+"""
+
+
+def test_code_of_two_processes_that_name_functions_alike_is_called_together(program, tmp_path):
+    """numba numbers functions by process: `hill` has the same name in both here, and `slope`, which it calls, has not.
+
+    What is kept of their common caller must load each function after those that it calls, else LLVM ends the process.
+    """
+    copy = tmp_path / "program"
+    shutil.copytree(program, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    (copy / "geometry" / "slopes.py").write_text(SLOPES)
+    one = "@compiled\ndef {}(x):\n    return {}\n\n"
+    functions = {"first": "hill(x)", "steep": "slope(x)", "second": "2 * hill(x)", "both": "first(x) + second(x)"}
+    (copy / "floor" / "caller.py").write_text(
+        "from geometry.compilation.jit import compiled\nfrom geometry.slopes import hill, slope\n\n"
+        + "".join(one.format(*each) for each in functions.items())
+    )
+    printed = []
+    for step in ("first", "forget", "steep", "second", "both", "both"):
+        done = subprocess.run(
+            [sys.executable, "-c", CLIMB, step], cwd=copy,
+            env={**os.environ, "PYTHONPATH": str(copy)}, capture_output=True, text=True, timeout=60,
+        )  # fmt: skip
+        assert (done.returncode, done.stderr) == (0, ""), step
+        printed += map(float, done.stdout.split())
+    hill, _, *others = printed
+    assert others == pytest.approx([2 * hill, 3 * hill, 3 * hill], rel=1e-12)
+
+
 def test_with_a_numba_that_has_other_internals_code_is_kept_and_never_that_of_an_edited_source(program, tmp_path):
     copy = tmp_path / "program"
     shutil.copytree(program, copy, ignore=shutil.ignore_patterns("__pycache__"))
