@@ -295,6 +295,15 @@ def test_no_pose_beside_a_turn_is_wrong_by_more_than_it_states(seed, frames, tmp
     assert np.nanmax(own.nees) < 8
 
 
+@pytest.mark.usefixtures("no_search")
+def test_labels_are_compared_with_the_picture_that_a_run_with_unknown_clocks_has_used(tmp_path):
+    """Offsets of half a frame to 1.3: the pictures beside would have other spots at these places."""
+    own = figures(random_recording(7318, frames=20), tmp_path, estimate=True)
+    assert own.wrong == 0
+    assert own.found > 0.9
+    assert own.wrong_poses == 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "frames", "known"),
