@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.clocks.recording import KINDS, Recording, random_recording, write_recording
+from bench.clocks.recording import KINDS, Recording, Truth, random_recording, write_recording
 from bench.random_scenes.scene import view_indices
 from geometry.arrays import Array
 from lab.files.run.results import SpotGrid, read_poses, read_spots
@@ -26,6 +26,7 @@ from tracking.smoothing.motion.clocks import DETERMINED
 from tracking.statuses import PoseStatus
 
 SAME_SPOT_PX, SAME_SPOT_SIGMAS = 3.0, 5.0
+SAME_POINT_PX, NEAR_PICTURES = 1e-3, 7  # of the tables; where a point's picture is: offsets of up to three frames
 WRONG_POSE = 100.0  # NEES
 CORNER = 3  # frames about a corner of the motion that "away from corners" leaves out
 OTHER_NOISE = 1_000_000  # added to the seed
@@ -82,8 +83,11 @@ def _estimated(r: Recording, out: Path) -> tuple[tuple[float, float, float], ...
     return tuple(found)
 
 
-def _labels(r: Recording, truth: dict[tuple[int, int], tuple[Array, Array]], spots: SpotGrid) -> tuple[int, int, int]:
-    """Wrong labels, correct labels and visible spots, in the pictures that the rows are about."""
+def _labels(r: Recording, truth: Truth, spots: SpotGrid) -> tuple[int, int, int]:
+    """Wrong labels, correct labels and visible spots; these in the pictures that the rows are about.
+
+    A run that does not know its clocks takes the picture beside: a label is compared with the picture of its point.
+    """
     camera_of, _ = view_indices(r.rig)
     views = r.rig.views()
     wrong = right = visible = 0
@@ -91,20 +95,18 @@ def _labels(r: Recording, truth: dict[tuple[int, int], tuple[Array, Array]], spo
     for i, frame in enumerate(spots.frames.tolist()):
         for v, view in enumerate(views):
             clock = r.clocks[camera_of[v]]
-            number = frame
-            if clock.own:
-                nearest = int(np.argmin(np.abs(clock.instants_s - frame / r.rate_hz)))
-                if abs(clock.instants_s[nearest] - frame / r.rate_hz) > 0.5 / r.rate_hz:
-                    continue
-                number = int(clock.numbers[nearest])
-            if (camera_of[v], number) not in truth or view not in place:
+            away = np.abs(clock.instants_s - frame / r.rate_hz) if clock.own else np.abs(clock.numbers - frame)
+            near = [(camera_of[v], int(clock.numbers[n])) for n in np.argsort(away)[:NEAR_PICTURES]]
+            if view not in place or away.min() > (0.5 / r.rate_hz if clock.own else 0):
                 continue
-            at, shining = truth[camera_of[v], number]
-            visible += int(shining[v])
+            visible += int(truth[near[0]][1][v])
             if not spots.measured[i, place[view]]:
                 continue
-            away = np.linalg.norm(spots.uv_px[i, place[view]] - at[v])
-            good = shining[v] and away <= max(SAME_SPOT_PX, SAME_SPOT_SIGMAS * r.sigma_px[v])
+            uv = spots.uv_px[i, place[view]]
+            own = next((key for key in near if (np.abs(truth[key][2] - uv) < SAME_POINT_PX).all(axis=1).any()), near[0])
+            at, shining, _ = truth[own]
+            limit = max(SAME_SPOT_PX, SAME_SPOT_SIGMAS * r.sigma_px[v])
+            good = shining[v] and np.linalg.norm(uv - at[v]) <= limit
             right, wrong = right + int(good), wrong + int(not good)
     return wrong, right, visible
 

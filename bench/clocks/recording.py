@@ -43,6 +43,7 @@ LARGEST_OFFSET, DRIFT, ROW_TIME_S = 1.5, 200e-6, (5e-6, 30e-6)  # frames; relati
 LONGEST_READOUT = 0.9  # of the time between two pictures
 LEAD = 4  # frames of motion before frame 0, and after the last
 CLOCKS, LAB, MOTION, NUISANCE, POINTS, PRIOR = range(6)
+Truth = dict[tuple[int, int], tuple[Array, Array, Array]]  # see write_recording
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,8 +185,8 @@ def pictured(r: Recording, c: int) -> tuple[Array, Ints]:
     return uv, nearest
 
 
-def write_recording(r: Recording, folder: Path, estimate: bool = False) -> dict[tuple[int, int], tuple[Array, Array]]:
-    """Write a run folder; returns the true pixels (n, 2) and the visibility (n,) by camera and picture number.
+def write_recording(r: Recording, folder: Path, estimate: bool = False) -> Truth:
+    """Write a run folder; by camera and picture number the true pixels (n, 2), the visibility (n,) and points (m, 2).
 
     estimate: run.yaml leaves the offsets of all cameras but the first, and all row times, to be estimated.
     """
@@ -193,7 +194,7 @@ def write_recording(r: Recording, folder: Path, estimate: bool = False) -> dict[
     save_rig(RigFile(r.rig, {}), folder / "rig.yaml")
     camera_of, _ = view_indices(r.rig)
     sizes = np.array([c.image_size_px for c in r.rig.cameras.values()], dtype=float)
-    truth: dict[tuple[int, int], tuple[Array, Array]] = {}
+    truth: Truth = {}
     blocks: dict[str, dict[str, object]] = {}
     rows = []
     for c, name in enumerate(r.rig.cameras):
@@ -204,7 +205,7 @@ def write_recording(r: Recording, folder: Path, estimate: bool = False) -> dict[
             in_view = np.where(inside, np.where(r.hidden[row], HIDDEN, SHINING), OUTSIDE)
             rng = np.random.default_rng([r.seed, POINTS, c, number])
             points, _ = one_picture(rng, c, at, in_view, camera_of, r.sigma_px, sizes[c], r.false)
-            truth[c, number] = at, in_view == SHINING
+            truth[c, number] = at, in_view == SHINING, points.uv_px
             rows += _rows(number, name, points)
         if not clock.own:  # a picture that is missing
             rows += [(n, name, *[""] * 10) for n in np.setdiff1d(np.arange(len(r.hidden)), clock.numbers).tolist()]

@@ -34,7 +34,15 @@ from tracking.smoothing.motion.run_detections import (
     WholeRun,
     first_variance,
 )
-from tracking.smoothing.motion.turns import RESOLVED_NATS, TurnSearch, successions, unresolved, velocity_jumps
+from tracking.smoothing.motion.turns import (
+    LEAST_LENGTH,
+    LEAST_SHARE,
+    RESOLVED_NATS,
+    TurnSearch,
+    successions,
+    unresolved,
+    velocity_jumps,
+)
 from tracking.smoothing.motion.whole_run import (
     CONVERGED_LOG_DENSITY,
     CONVERGED_SIGMAS,
@@ -57,6 +65,7 @@ NEAR = 10.0
 # strong as assumed. Without these any offset follows from that assumption.
 FEWEST_POSES = 6
 APART = 1.5  # frames: of shocks as close as this only the largest is a turn ...
+POSSIBLE_CHI2 = 12.6  # of 6 degrees (p = .05), above which a step may have a turn
 FIRST_LENGTH = 1.0  # frames: ... of this length at first
 
 
@@ -214,10 +223,14 @@ class _TimedEstimator(_Estimator):
     def _with_unresolved(self, out: Interval) -> Interval:
         """The covariances, where turns or hidden jumps resemble others, of both motions about that with the former.
 
-        And with the difference to the motion by a jerk that turns in succession do not exclude.
+        And with the differences to the motion by a jerk that turns in succession do not exclude, and to that by turns
+        of their most likely lengths and by short ones that the spots do not exclude: a jerk rounds corners as well.
         """
         hidden, search, turns = self._hidden(self._allowed_at_ends(), self.vague), self._search(), list(self.turns)
-        if not turns and not hidden.any():
+        short = [turn._replace(length_s=turn.likely_s) for turn in turns]
+        short += self._possible(out.shock)
+        short = [search.largest(turn, short) for turn in short]
+        if not short and not hidden.any():
             return out
         smooth, density = turns, search.density
         for some in successions(self.turns, self.frame_s):
@@ -233,7 +246,7 @@ class _TimedEstimator(_Estimator):
                 turns = [*(t for t in turns if not any(t is each for each in some)), one]
         turns = [search.to_next_spots(search.largest(turn, turns)) for turn in turns]
         other = smoothed(*replace(search, hidden=hidden).of_part(turns, slice(None)), search.density, tested=False)
-        others = [other.x]
+        others = [other.x, smoothed(*search.of_part(short, slice(None)), search.density, tested=False).x]
         if len(smooth) < len(self.turns):
             others.append(smoothed(*search.of_part(smooth, slice(None)), density, tested=False).x)
         x = np.stack(others)
@@ -241,6 +254,15 @@ class _TimedEstimator(_Estimator):
         return out._replace(
             pose_P=0.5 * (out.pose_P + other.pose_P + pose), motion_P=0.5 * (out.motion_P + other.motion_P + motion)
         )
+
+    def _possible(self, shock: Array) -> list[Turn]:
+        """Short and small turns at the lesser maxima of the shock (F,), outside the turns and gaps."""
+        length = LEAST_LENGTH * self.frame_s
+        shock = np.where((self.open > 0) | (self._jumps()[0].max(axis=1) > 0), 0.0, shock)
+        return [
+            Turn(float(self.t_s[k] - 0.5 * self.dt[k]), length, length, LEAST_SHARE * self.largest[k])
+            for k in self._peaks(shock, POSSIBLE_CHI2)
+        ]
 
     def _passes(self, count: int, common: int = 0, adapting: bool = True, searching: bool = True) -> Interval:
         """Passes, of which the first `common` have one strength of the jerk.
@@ -292,15 +314,18 @@ class _TimedEstimator(_Estimator):
 
     def _add_turns(self, shock: Array) -> bool:
         """Add turns at the local maxima of the shock (F,); whether there are any."""
-        middle_s, before = self.t_s - 0.5 * self.dt, len(self.turns)
-        for k in np.flatnonzero(shock > SHOCK_CHI2).tolist():
-            if shock[k] >= shock[np.abs(middle_s - middle_s[k]) < APART * self.frame_s].max():
-                length = FIRST_LENGTH * self.frame_s
-                self.turns.append(Turn(float(middle_s[k]), length, length, self.largest[k]))
+        length, before = FIRST_LENGTH * self.frame_s, len(self.turns)
+        for k in self._peaks(shock, SHOCK_CHI2):
+            self.turns.append(Turn(float(self.t_s[k] - 0.5 * self.dt[k]), length, length, self.largest[k]))
         self.turns.sort(key=lambda turn: turn.middle_s)
         found = len(self.turns) > before
         self._gaps_opened()
         return found
+
+    def _peaks(self, shock: Array, least: float) -> list[int]:
+        """Steps with a local maximum of the shock (F,) above this."""
+        middle_s, above = self.t_s - 0.5 * self.dt, np.flatnonzero(shock > least).tolist()
+        return [k for k in above if shock[k] >= shock[np.abs(middle_s - middle_s[k]) < APART * self.frame_s].max()]
 
     def _gaps_opened(self) -> None:
         """Replace turns in and beside gaps: nothing shows in which of the unobserved steps the velocities jump."""

@@ -41,6 +41,7 @@ _WIDER = 1.25  # times, in the search for that
 _SIGMAS = 2.0  # of the middle, as a sigma: the same spots show it and then the motion
 _WITH_IT = (-1.0, -0.5, 0.0, 0.5, 1.0)  # of the way of the middle: how far the turn beside it moves, too
 _SHARES = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)  # of a turn's variance, of which the most likely one is taken
+LEAST_SHARE = _SHARES[-1]
 _GAP_SHARES = (*10.0 ** np.arange(0.0, -6.5, -0.5), 0.0)  # of that of a gap's jumps: a thousandth of the fastest speed
 _EXCLUDED_NATS = 5.0  # by which these must be less likely than none, or than smaller ones, to exclude them
 # By which the largest jumps that a gap may have must be: they are of all six axes, those of a motion often of one.
@@ -190,7 +191,7 @@ class TurnSearch:
         run = self.with_turns([t for t in self.near(all_turns, part) if t is not turn], part)
         least = run.nats([turn]) - _AMBIGUOUS_NATS
         for share in _SHARES:  # the largest first
-            larger = turn._replace(size=turn.size * share / _SHARES[-1])
+            larger = turn._replace(size=turn.size * share / LEAST_SHARE)
             if run.nats([larger]) > least:
                 return larger
         return turn

@@ -271,6 +271,16 @@ def test_a_turn_in_a_gap_in_which_nothing_is_seen_is_covered(gap, tmp_path):
     assert np.nanmax(own.nees) < 8
 
 
+@pytest.mark.usefixtures("no_search")
+@pytest.mark.parametrize("seed", [6012, 6043])
+def test_a_turn_that_the_spots_allow_to_be_short_is_in_the_sigmas(seed, tmp_path):
+    """A turn that lasts for as long as they allow, or a jerk in its place, rounds the corners of a turntable."""
+    own = figures(random_recording(seed, frames=60), tmp_path)
+    assert np.isfinite(own.nees).sum() > 40
+    assert np.nanmean(own.nees) < 1.5
+    assert np.nanmax(own.nees) < 7
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_search")
 @pytest.mark.parametrize(
@@ -293,6 +303,15 @@ def test_no_pose_beside_a_turn_is_wrong_by_more_than_it_states(seed, frames, tmp
     assert np.isfinite(own.nees).sum() > 0.25 * frames
     assert np.nanmean(own.nees) < 1.5
     assert np.nanmax(own.nees) < 8
+
+
+@pytest.mark.usefixtures("no_search")
+def test_labels_are_compared_with_the_picture_that_a_run_with_unknown_clocks_has_used(tmp_path):
+    """Offsets of half a frame to 1.3: the pictures beside would have other spots at these places."""
+    own = figures(random_recording(7318, frames=20), tmp_path, estimate=True)
+    assert own.wrong == 0
+    assert own.found > 0.9
+    assert own.wrong_poses == 0
 
 
 @pytest.mark.slow
