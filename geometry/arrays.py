@@ -13,6 +13,14 @@ Bools: TypeAlias = NDArray[np.bool_]
 Ints: TypeAlias = NDArray[np.int64]
 
 
+def perpendicular(directions: Array) -> Array:
+    """Two orthonormal vectors, the columns of (..., 3, 2), perpendicular to unit vectors (..., 3)."""
+    # The coordinate axis farthest from the direction gives the best conditioned cross product.
+    least = np.eye(3)[np.argmin(np.abs(directions), axis=-1)]
+    first = normalised(np.cross(directions, least))
+    return np.stack([first, np.cross(directions, first)], axis=-1)
+
+
 def normalised(vectors: Array) -> Array:
     """Unit vectors along the given vectors (..., n); a null vector stays null."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)

@@ -18,7 +18,7 @@ from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
 from scipy.sparse.linalg import SuperLU, splu
 
 from geometry import rotations
-from geometry.arrays import Array, Bools, Ints, normalised
+from geometry.arrays import Array, Bools, Ints, normalised, perpendicular
 from geometry.pose import Pose
 
 # The unknowns of a calibration: stacks of vectors, of transforms and of lines, with their small errors.
@@ -117,10 +117,7 @@ class Lines:
     @property
     def basis(self) -> Array:
         """Two unit vectors perpendicular to each line, (k, 3, 2); a function of the direction alone."""
-        # The coordinate axis farthest from the line gives the best conditioned cross product.
-        least = np.eye(3)[np.argmin(np.abs(self.directions), axis=1)]
-        first = normalised(np.cross(self.directions, least))
-        return np.stack([first, np.cross(self.directions, first)], axis=-1)
+        return perpendicular(self.directions)
 
     def plus(self, delta: Array) -> Lines:
         B = self.basis

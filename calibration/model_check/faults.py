@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.changes import USUAL_SIZES
-from calibration.least_squares.adjustment import Lines
 from calibration.model_check.linearised_frames import LinearisedFrames, ModelCheckRecording
-from geometry.arrays import Array, Bools, Ints, finite, skew
+from geometry.arrays import Array, Bools, Ints, finite, perpendicular, skew
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import DIRECTION, POINT, POSE, RigCovariance, Sensitivity, is_known
@@ -184,7 +183,7 @@ def _beam_faults(rig: Rig, model: SpotModel, index: dict[str, int]) -> list[Poss
     faults = []
     for i, (name, beam) in enumerate(rig.beams.items()):
         views = model.beam_of == i
-        across = Lines(beam.point[None], beam.direction[None]).basis[0]
+        across = perpendicular(beam.direction)
         aim = _directions(index, f"beams.{name}", DIRECTION, across)
         sideways = _directions(index, f"beams.{name}", POINT, across)
         aim_size, sideways_size = np.full(2, USUAL_SIZES.laser_rad), np.full(2, USUAL_SIZES.laser_m)

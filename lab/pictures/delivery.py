@@ -11,7 +11,6 @@ import numpy as np
 
 from lab.pictures.picture_file import REPEATED, TORN, GreyPicture, MissingPicture
 from tracking.noise_estimation.averaging import LEAST_KEPT, RowCounts, kept_of_the_last
-from tracking.noise_estimation.grey_values import grey_step
 
 _COMPARED = 16  # every such row of two pictures is compared
 _CHANGED = 0.01  # share of the pixels that change from picture to picture by noise: by spots that move fewer do
@@ -51,6 +50,7 @@ _FADES = 0.8  # of a share r, r^2 is left of every second picture; texture that 
 # How much the looks at the share may differ (half of them). Independent pictures have 0 with a scatter of .03, a share
 # of .5 one of .15.
 _SCATTER = 0.15
+_MOST = 1.3  # means of two pictures have the noise of a share of 1; a texture that drifts has up to 3
 
 
 @dataclass(slots=True)
@@ -73,6 +73,8 @@ class Delivery:
         if self._count % _EVERY == 0 and len(self._last) > 1:
             self._alternating.add(*self._last[-2:])
             if len(self._last) == _PICTURES:
+                from tracking.noise_estimation.grey_values import grey_step  # deferred: it loads OpenCV
+
                 rounding = grey_step(self._last[-1:]) ** 2 / 12
                 self._shares.append(
                     (kept_of_the_last(self._last[-3:], rounding), kept_of_the_last(self._last[::2], rounding))
@@ -80,13 +82,14 @@ class Delivery:
 
     @property
     def averaged_share(self) -> float:
-        """Share of each picture that is the picture before; 0 where none is seen."""
+        """Share of each picture that is the picture before, at least; 0 where none is seen."""
         shares = np.array([s for s in self._shares if np.isfinite(s).all()])
         if len(shares) < _LEAST_LOOKS:
             return 0.0
         low, share, high = np.percentile(shares[:, 0], (25, 50, 75)).tolist()
         fades = np.median(shares[:, 1]) < _FADES * share
-        return float(share) if LEAST_KEPT < share < 1 and high - low < _SCATTER and fades else 0.0
+        seen = LEAST_KEPT < share < _MOST and high - low < _SCATTER and fades
+        return min(float(share), 0.5) if seen else 0.0
 
     @property
     def interlaced(self) -> bool:

@@ -12,14 +12,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array
-from tracking.noise import Picture
+
+if TYPE_CHECKING:
+    from tracking.noise import Picture  # loads OpenCV, which runs of points do without
 
 OPEN_SHUTTER = 1 / 12  # px^2 per (px per picture)^2: of a shutter that is always open
 _FASTEST = 3.0  # widths from picture to picture: the pictures of faster spots are apart
@@ -82,7 +83,7 @@ class RowCounts:
         """Two successive pictures (h, w): what stands still, with its lines, is no part of their difference."""
         if first.shape != second.shape:
             return
-        change = cv2.subtract(second, first, dtype=cv2.CV_32F)
+        change = np.subtract(second, first, dtype=np.float32)
         if short := _alternating(change, _SHORT):
             self._short += short
             self._long += _alternating(change, _LONG)

@@ -39,8 +39,8 @@ LONG_EMPTY = (
 MOST_WRONG = 0.005  # share of the measured poses beyond 10 sigmas from the truth, up to which the run does not fail
 LEAST_DISPLACED = 5  # frames in which none of a camera's spots fits the others' pose, from which on it is reported
 TOO_WIDE = "BP-V21"  # a light that max_sigma_px excludes, and a spot that is never found
-# Sigmas, and share of the spots' growth that such a filter gives where they are blurred to more than a Gaussian.
-_SURE_SIGMAS, _OF_GROWTH = 4.0, 0.3
+# Sigmas; least growth of the spots by the share of the picture before: 0.2 gives 0.15 to 0.25, 0.5 gives 0.4 to 1.2.
+_SURE_SIGMAS, _OF_GROWTH = 4.0, 0.6
 _SET_UP = "BP-M06"  # a mistake in the files that describe the set-up
 _FEW_FOUND = 0.2  # measured share of the expected spots, below which a mostly empty camera is reported
 
@@ -149,8 +149,11 @@ def _averaging(kept: Mapping[str, float], stretch: Mapping[str, tuple[float, flo
                 f"the spots of camera {name} are longer along their motion by {format_with_sigma(growth, sigma)} of its"
                 f" square, where a shutter that is always open gives {OPEN_SHUTTER:.2g}"
             )
-        elif share > LEAST_KEPT and growth + _SURE_SIGMAS * sigma > _OF_GROWTH * share / (1 - share) ** 2:
-            shown = f"the noise of successive pictures of camera {name} is correlated ({share:.2f})"
+        elif share > LEAST_KEPT and growth + _SURE_SIGMAS * sigma > _OF_GROWTH * min(share, 0.5):
+            shown = (
+                f"neighbouring pictures of camera {name} differ by {1 / (1 + share):.0%} of the variance by which those"
+                " differ that are two apart, in noise"
+            )
         else:
             continue
         what = f"{shown}: the pictures are averages of successive ones, and the spots lag behind the vehicle"
