@@ -141,25 +141,25 @@ def _moved(moved_px: Mapping[str, float]) -> list[Finding]:
 
 def _averaging(kept: Mapping[str, float], stretch: Mapping[str, tuple[float, float]]) -> list[Finding]:
     """Cameras whose pictures are averages of successive ones."""
-    out = []
+    shown, numbers = [], {}
     for name in dict.fromkeys((*kept, *stretch)):
         share, (growth, sigma) = kept.get(name, float("nan")), stretch.get(name, (0.0, float("inf")))
         if growth - OPEN_SHUTTER > _SURE_SIGMAS * sigma:
-            shown = (
-                f"the spots of camera {name} are longer along their motion by {format_with_sigma(growth, sigma)} of its"
-                f" square, where a shutter that is always open gives {OPEN_SHUTTER:.2g}"
+            sign = (
+                f"spots longer along their motion by {format_with_sigma(growth, sigma)} of its square, where a shutter"
+                f" that is always open gives {OPEN_SHUTTER:.2g}"
             )
         elif share > LEAST_KEPT and growth + _SURE_SIGMAS * sigma > _OF_GROWTH * min(share, 0.5):
-            shown = (
-                f"neighbouring pictures of camera {name} differ by {1 / (1 + share):.0%} of the variance by which those"
-                " differ that are two apart, in noise"
-            )
+            sign = f"neighbouring pictures differ in noise by {1 / (1 + share):.0%} of what pictures two apart do"
         else:
             continue
-        what = f"{shown}: the pictures are averages of successive ones, and the spots lag behind the vehicle"
-        numbers = {"camera": name, "correlation": share, "growth": growth, "growth_sigma": sigma}
-        out.append(finding("BP-V22", Level.WARN, what, numbers=numbers))
-    return out
+        shown.append(f"{name}: {sign}")
+        numbers[name] = {"correlation": share, "growth": growth, "growth_sigma": sigma}
+    if not shown:
+        return []
+    who = "the camera averages" if len(shown) == 1 else "cameras average"
+    what = f"{who} successive pictures, and the spots lag behind the vehicle ({'; '.join(shown)})"
+    return [finding("BP-V22", Level.WARN, what, numbers=numbers)]
 
 
 def _too_wide(sigma_px: Mapping[str, float], statistics: RunStatistics) -> list[Finding]:
