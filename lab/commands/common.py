@@ -55,12 +55,11 @@ def stopped_by_signals() -> Iterator[None]:
     The exception may be lost (in a callback, in a destructor), and threads may go on. So after some seconds, or at a
     second signal, unfinished results are removed and the process ends at once.
     """
-    ours = []  # number, handler before, handler in the block
+    ours: list[tuple[int, Any, Any]] = []  # number, handler before, handler in the block
     if threading.current_thread() is threading.main_thread():
-        ours = [(number, signal.getsignal(number), _first) for number in _SIGNALS]
-        ours = [each for each in ours if each[1] == signal.SIG_DFL]
-        if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
-            ours.append((signal.SIGINT, signal.default_int_handler, _ctrl_c))
+        usual: list[tuple[int, Any, Any]] = [(number, signal.SIG_DFL, _first) for number in _SIGNALS]
+        usual.append((signal.SIGINT, signal.default_int_handler, _ctrl_c))
+        ours = [each for each in usual if signal.getsignal(each[0]) == each[1]]
         for number, _, handler in ours:
             signal.signal(number, handler)
     try:

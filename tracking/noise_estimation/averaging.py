@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Array
+from geometry.arrays import NORMAL_MEDIAN, Array
 
 if TYPE_CHECKING:
     from tracking.noise import Picture  # loads OpenCV, which runs of points do without
@@ -25,20 +25,19 @@ if TYPE_CHECKING:
 OPEN_SHUTTER = 1 / 12  # px^2 per (px per picture)^2: of a shutter that is always open
 _FASTEST = 3.0  # widths from picture to picture: the pictures of faster spots are apart
 LEAST_KEPT = 0.12  # share of the picture before from which a camera averages; without averages 0.03 at most is seen
-_FEWEST = 12  # moments of a spot, of which six give its own shape: it changes with the place, as its screen is oblique
+_FEWEST = 12  # pictures of a spot: three moments of each, of which nine numbers give its own shape and how it changes
 _FARTHEST = 3.0  # sigmas of the usual scatter beyond which a moment counts little: an edge or a neighbour deforms it
 _LEAST_SCATTER = 0.5  # of the sigmas: spots scatter by this where their sigmas include a texture's errors
 _ROUNDS = 10  # of weights: they settle within five
 _BLOCK = 16  # px: compressed videos repeat such blocks
 _BLOCKS = 2000  # of a picture; a third of them give the correlation to about 0.01
-_MOST_REPEATED = (
-    0.02  # share of blocks that repeat exactly; compressed pictures have 0.14 and more, others 0.002 at most
-)
+_MOST_REPEATED = 0.02  # share of blocks that repeat exactly: of compressed pictures 0.14 and more, else 0.002 at most
 # Rows that alternate this often in turn, and of those that alternate four times. Interlaced edges do in 0.3 to 0.6 of
 # these, the texture and the blocks of videos in 0.03 to 0.07. As many columns alternate in texture.
 _SHORT, _LONG, _LONG_SHARE, _OF_COLUMNS = 4, 6, 0.2, 4
 _LEAST_COMBS = 20  # pixels in all pictures looked at
 _COMB_SIGMAS, _COMB_DN = 4.0, 4.0  # least difference of two rows
+_SAMPLE = 16  # each so many rows show the noise
 _FLATTEST = 1 / 3  # of the blocks: in the others, the structure that a camera moves counts as noise
 _PARTS = 6  # of a recording
 
@@ -99,7 +98,7 @@ def _alternating(picture: NDArray[Any], count: int) -> int:
     """Pixels from which `count` differences of successive rows have signs in turn, and are clearly more than noise."""
     before, after = picture[:-1], picture[1:]
     size = np.abs(after - before)
-    large = size > _COMB_SIGMAS * float(np.median(size[::_BLOCK])) / 0.6745 + _COMB_DN
+    large = size > _COMB_SIGMAS * float(np.median(size[::_SAMPLE])) / NORMAL_MEDIAN + _COMB_DN
     rises = after > before
     turns = (rises[1:] != rises[:-1]) & large[1:] & large[:-1]
     out = turns[: len(turns) - count + 2].copy()
@@ -122,8 +121,9 @@ def stretch_by_motion(uv_px: Array, profile_px2: Array, variance_px2: Array) -> 
         size2 = np.trace(shape, axis1=-1, axis2=-2) / 2
         with np.errstate(invalid="ignore"):
             rows = np.flatnonzero(np.sum(motion**2, axis=-1) < _FASTEST**2 * size2)
-        if len(rows) < _FEWEST:
+        if len(rows) < _FEWEST or not motion[rows].any():  # at rest in pictures that repeat
             continue
+        # A screen is oblique, so that the shape changes with the place.
         place = uv_px[rows, 1, spot]
         place = (place - place.mean(axis=0)) / max(float(np.std(place)), 1.0)
         own = np.kron(np.column_stack([np.ones(len(rows)), place]), np.eye(3))

@@ -339,7 +339,7 @@ def noise_frames(source: PictureSource) -> list[int]:
 def successive_frames(source: PictureSource) -> list[int]:
     """Numbers of three successive pictures, of which two serve the estimate of the noise; none in short recordings."""
     if not isinstance(source, PictureFiles):
-        return [16, 17, 18]
+        return [VIDEO_PICTURES[-2], VIDEO_PICTURES[-1], VIDEO_PICTURES[-1] + 1]
     middle = (source.count - 1) // 2
     return source.numbers[middle : middle + 3].tolist() if source.count > 4 else []
 

@@ -38,6 +38,7 @@ def test_the_growth_is_found_to_its_sigma(growth):
 def test_rest_and_few_pictures_say_nothing():
     uv, shape, sigma2 = seen(np.random.default_rng(1), 2.0)
     assert stretch_by_motion(uv[:9], shape[:9], sigma2[:9])[1] == np.inf
+    assert stretch_by_motion(np.repeat(uv[:1, :1], 60, axis=0).repeat(3, axis=1), shape, sigma2)[1] == np.inf
     still = np.repeat(uv[:1, :1], 60, axis=0).repeat(3, axis=1) + 0.002 * np.random.default_rng(2).normal(size=uv.shape)
     growth, sigma = stretch_by_motion(still, shape, sigma2)
     assert growth - OPEN_SHUTTER < 3 * sigma
