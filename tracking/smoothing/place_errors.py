@@ -19,6 +19,7 @@ from geometry.arrays import Array, Ints
 USUAL_WIDTH_PX = 2.0  # of spots whose width is not known
 _CHUNK = 256  # consecutive frames that are compared with each other
 _MIN_CORRELATION = 0.05  # below it two places count as different
+PLACE_REACH = 2.0  # widths of the spot: assumed correlation length of the errors, for their number
 _REACHES = (1.0, 2.0, 4.0, 8.0)  # tried correlation lengths, in widths of the spot
 _SHARES = np.concatenate([[0.0], 1 / (1 + np.geomspace(1e3, 1e-3, 61))])  # of the variance: hypotheses
 PLACE_FACTOR = 1.5  # 1 sigma of the ratio of a predicted standard deviation of the errors of places to the true one
@@ -50,15 +51,15 @@ def correlation(distance_px: Array, width_px: Array | float) -> Array:
 
 
 def place_errors(
-    residual: Array, uv_px: Array, width_px: Array, averaged: Array, explained: Array, predicted: float = 0.0
+    residual: Array, uv_px: Array, width_px: Array, averaged: Array, taken: Array, predicted: float = 0.0
 ) -> PlaceErrors:
     """Estimate the errors that belong to places from a run's residuals and from what is predicted.
 
     residual (T, n, 2): labelled pixels less those of the smoothed poses, in sigmas; nan without a label. uv_px
     (T, n, 2): the pixels. width_px (n,): 1-sigma width of the spots, nan where not known. averaged (T,): number of
-    frames that each pose is a mean of. explained (n,): share of the residuals' variance that is expected from
-    calibration errors, which are constant as well. predicted: the share according to the texture of the background and
-    the misfit of the fits; 0: nothing is known.
+    frames that each pose is a mean of. taken (n,): variance, in sigmas squared, of what the residuals may have lost or
+    kept, the same in all frames, when the errors of the rig were taken from them (`RigErrors`). predicted: the share
+    according to the texture of the background and the misfit of the fits; 0: nothing is known.
 
     The share is its mean under the posterior distribution. Few places, or few spots, whose poses absorb such errors,
     hardly show it: then the prediction decides. Many places show it whatever was predicted. The mean of a variance is
@@ -69,7 +70,7 @@ def place_errors(
     count = float(np.mean(labelled.sum(axis=1)[labelled.any(axis=1)])) if labelled.any() else 0.0
     absorbed = min(3.0 / max(count, 1e-9), _MAX_ABSORBED)
     # Coarse texture and edges of the screen reach farther than a spot is wide: take the most significant length.
-    sums = _products(residual, uv_px, [r * width for r in _REACHES], explained)
+    sums = _products(residual, uv_px, [r * width for r in _REACHES], taken)
     best = max(sums, key=lambda p: p.significance)
     if best.significance * np.sqrt(1 - absorbed) < _SIGNIFICANT:
         best = sums[0]
@@ -181,7 +182,7 @@ class _Products:
 
     reach_px: Array  # (n,) assumed correlation length
     same_error_frames: Array  # (T, n) number of frames with the same errors
-    near: float  # weighted with the correlation of their places, less what the calibration explains
+    near: float  # weighted with the correlation of their places
     expected: float  # the same if all errors belonged to places
     elsewhere: float  # mean over pairs in different places, as far as significant
 
@@ -202,7 +203,7 @@ class _Sums:
     far_pairs: float = 0.0
     independent: float = 0.0  # those of them that are independent of each other
 
-    def add(self, some: Ints, view: int, products: Array, rho: Array, explained: float) -> None:
+    def add(self, some: Ints, view: int, products: Array, rho: Array) -> None:
         """Add a view's pairs among some frames (m,): products (m, m) and correlations (m, m)."""
         self.far += float(np.sum(products[rho == 0]))
         pairs = float(np.count_nonzero(rho == 0))
@@ -211,7 +212,7 @@ class _Sums:
         self.same_error_frames[some, view] = 1 + rho.sum(axis=1)
         self.independent += 0.5 * pairs / float(np.mean(self.same_error_frames[some, view])) ** 2
         # Each pair is counted twice.
-        self.near += 0.5 * float(np.sum(rho * products) - explained * np.sum(rho**2))
+        self.near += 0.5 * float(np.sum(rho * products))
         self.expected += 0.5 * float(np.sum(rho**2))
 
     def products(self, reach_px: Array) -> _Products:
@@ -221,19 +222,20 @@ class _Sums:
         return _Products(reach_px, self.same_error_frames, self.near, self.expected, max(elsewhere, 0.0))
 
 
-def _products(residual: Array, uv_px: Array, reaches_px: Sequence[Array], explained: Array) -> list[_Products]:
+def _products(residual: Array, uv_px: Array, reaches_px: Sequence[Array], taken: Array) -> list[_Products]:
     """For each of several assumed correlation lengths (n,)."""
     sums = [_Sums(np.ones(residual.shape[:2])) for _ in reaches_px]
     for view in range(residual.shape[1]):
         rows = np.flatnonzero(np.isfinite(residual[:, view]).all(axis=-1))
-        mean_square = float(np.mean(np.sum(residual[rows, view] ** 2, axis=-1))) if len(rows) > 1 else 0.0
+        lost = 2 * float(taken[view])
+        mean_square = lost + float(np.mean(np.sum(residual[rows, view] ** 2, axis=-1))) if len(rows) > 1 else 0.0
         if mean_square <= 0:
             continue
         for start in range(0, len(rows), _CHUNK):
             some = rows[start : start + _CHUNK]
             r, at = residual[some, view], uv_px[some, view]
-            products = r @ r.T / mean_square
+            products = (r @ r.T + lost) / mean_square
             distance = _distances(at)
             for one, reach_px in zip(sums, reaches_px, strict=True):
-                one.add(some, view, products, correlation(distance, reach_px[view]), explained[view])
+                one.add(some, view, products, correlation(distance, reach_px[view]))
     return [one.products(reach_px) for one, reach_px in zip(sums, reaches_px, strict=True)]

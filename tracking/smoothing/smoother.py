@@ -50,6 +50,7 @@ from tracking.smoothing.motion.timed_run import estimate_timed
 from tracking.smoothing.motion.whole_run import MAX_DISTANCE, estimate
 from tracking.smoothing.place_errors import place_errors, scaled_shares, with_places
 from tracking.smoothing.recording import FoundClocks, TrackedRecording, merged, track_backward
+from tracking.smoothing.rig_errors import RigErrors
 from tracking.smoothing.single_frame_poses import SingleFramePoses, rms_residuals, single_frame_poses
 from tracking.smoothing.systematic_errors import calibration_errors, exposure_offsets, exposure_sigmas, pose_shift
 from tracking.statuses import Event, MotionEstimate, PoseStatus, SpotStatus, TrackedFrame, view_statuses
@@ -278,16 +279,12 @@ class _Smoother:
         if self.delays is not None:
             every, first, steady = self._first_motion(seen, first)
             ref, labels = first.ref, well_known(every, seen, labels)
-        self.errors = ErrorScale.of(
-            model,
-            seen._replace(uv=every.uv),
-            place_px2,
-            labels,
-            self.calibration_cov,
-            ref,
-            steady,
-            every.cov - seen.cov,
-        )
+        own, unknown = seen._replace(uv=every.uv), np.zeros_like(self.calibration_cov)
+        self.rig_errors: RigErrors | None = None
+        if rec.calibration is not None and steady.any():
+            self.rig_errors = RigErrors.shown(rec.calibration, self.views, own, labels, place_px2, ref, steady)
+            own, unknown = self.rig_errors.taken_from(self.views, own, labels, ref)
+        self.errors = ErrorScale.of(model, own, place_px2, labels, unknown, ref, steady, every.cov - seen.cov)
         # Where the pictures show the points, and where these would have been at the instants of the frames.
         self.seen = self.detections = seen._replace(
             cov=self.errors.of_run(seen, place_px2) + parameters.sigma_model_px**2 * np.eye(2)
@@ -581,16 +578,21 @@ class _Smoother:
         use = (assigned >= 0) & (assigned < BLENDED) & np.isfinite(expected).all(axis=-1)
         k, view = np.nonzero(use)
         rows = detections.begin[frames[k]] + assigned[use]
-        cov = detections.cov[rows] + self.calibration_cov[view]
-        size = np.sqrt(0.5 * np.trace(cov, axis1=1, axis2=2))
-        residual[frames[k], view] = (detections.uv[rows] - expected[use]) / size[:, None]
+        stated, left, taken = detections.cov[rows], detections.uv[rows] - expected[use], np.zeros(len(self.model))
+        size2 = 0.5 * np.trace(stated, axis1=1, axis2=2)
+        if self.rig_errors is not None:
+            shift, unknown = self.rig_errors.in_residuals(
+                self.views, detections, self.assigned, frames, ref, self.calibration_cov
+            )
+            left = left - shift[use]
+            of_points = 0.5 * np.trace(unknown[use], axis1=1, axis2=2) / size2
+            taken = np.bincount(view, of_points, len(taken)) / np.maximum(np.bincount(view, minlength=len(taken)), 1)
+        residual[frames[k], view] = left / np.sqrt(size2)[:, None]
         uv_px[frames[k], view] = detections.uv[rows]
-        explained = np.zeros(len(self.model))
-        explained[view] = 0.5 * np.trace(self.calibration_cov[view], axis1=1, axis2=2) / size**2  # in the last frame
-        shares = self.errors.place_px2(detections, self.rec.place_px2())[rows] / size**2
+        shares = self.errors.place_px2(detections, self.rec.place_px2())[rows] / size2
         width_px, share = self.detections.usual_size_px, float(np.mean(shares)) if len(shares) else 0.0
-        found = place_errors(residual, uv_px, width_px, averaged, explained, share)
+        found = place_errors(residual, uv_px, width_px, averaged, taken, share)
         own = scaled_shares(shares, share, found.share) * found.more[frames[k], view] * averaged[frames[k]]
         covariance = pose_P * found.factor[:, None, None]
-        covariance[frames] = with_places(pose_P[frames], J, cov, (k, view), own)
+        covariance[frames] = with_places(pose_P[frames], J, stated + self.calibration_cov[view], (k, view), own)
         return found.share, found.factor, covariance * self.noise_share[:, None, None]

@@ -16,10 +16,15 @@ from geometry.arrays import Array, Bools, Ints, evenly_spread
 from geometry.compiled_projection import Views, project_all
 from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.smoothing.motion.run_detections import Reference, RunDetections, fit_frames
-from tracking.smoothing.place_errors import PLACE_FACTOR, correlation, frames_with_same_error, usable_widths
+from tracking.smoothing.place_errors import (
+    PLACE_FACTOR,
+    PLACE_REACH,
+    correlation,
+    frames_with_same_error,
+    usable_widths,
+)
 
-_REACH = 2.0  # widths of the spot: assumed correlation length of the errors, for their number ...
-_ALIKE = 0.9  # ... and least correlation, with a length of one width, of errors whose difference shows the noise
+_ALIKE = 0.9  # least correlation, with a length of one width, of errors whose difference shows the noise
 _FRAMES = 2000  # at most so many, evenly spaced
 _NOISE_FACTOR = 1.25  # 1 sigma of the ratio of the stated sigma of the noise to the true one; of places PLACE_FACTOR
 _STEPS = 12  # of Fisher scoring; it converges in about six
@@ -44,7 +49,7 @@ class Squares(NamedTuple):
     noise: Array
     place: Array
     misfit: Array
-    known: Array  # errors of the calibration
+    known: Array  # errors of motion between the pictures
     weight: Array  # number of independent pairs of coordinates that each stands for
 
 
@@ -56,8 +61,9 @@ def variance_factors(
 
     run: m detections of T frames; assigned (T, n): their labels; camera_of (n,): of the views; place_px2, misfit_px2
     (m,): parts of their variances that belong to places, as stated for each and what each has at least;
-    calibration_cov (n, 2, 2), px^2; ref (T,): motion near which the pose of each frame is found; motion_cov (m, 2, 2),
-    px^2: further covariances of the detections, which are known.
+    calibration_cov (n, 2, 2), px^2: of errors of the rig that the points may have lost, or kept, when those that the
+    run shows were taken from them (`RigErrors`); ref (T,): motion near which the pose of each frame is found;
+    motion_cov (m, 2, 2), px^2: further covariances of the detections, which are known.
 
     Noise differs in every frame, errors of one place count once: a vehicle at rest has few residuals that are
     independent of each other. There the change of a residual from frame to frame shows the noise alone.
@@ -86,9 +92,10 @@ def variance_factors(
     rho = np.zeros((len(frames) - 1, assigned.shape[1]))  # correlation of such errors in successive frames
     measured_px = np.where(labelled[..., None], run.uv[row], np.nan)
     for i, width in enumerate(usable_widths(run.usual_size_px)):
-        same[:, i] = frames_with_same_error(measured_px[:, i], _REACH * width)
+        same[:, i] = frames_with_same_error(measured_px[:, i], PLACE_REACH * width)
         rho[:, i] = correlation(np.linalg.norm(np.diff(measured_px[:, i], axis=0), axis=-1), width)
-    square = 0.5 * np.sum(residual**2, axis=-1) / (size2 * free)
+    unknown = 0.5 * np.trace(calibration_cov, axis1=1, axis2=2) / size2
+    square = 0.5 * np.sum(residual**2, axis=-1) / (size2 * free) + unknown / free
     step = 0.5 * np.sum(np.diff(residual, axis=0) ** 2, axis=-1) / (size2 * free)[1:]
     weight = np.where(usable, free, 0.0)
     of_place = float(np.sum(weight * parts[..., 1:].sum(axis=-1))) / max(float(weight.sum()), 1e-9)
@@ -98,7 +105,7 @@ def variance_factors(
         at = usable & (camera_of == camera)
         pair = at[1:] & at[:-1] & (rho > _ALIKE)
         of_step = (1 - rho)[..., None] * parts[1:, :, 1:]
-        known, once = 1 - parts[at].sum(axis=1), (free / same)[at]
+        known, once = (1 - parts.sum(axis=-1) - unknown)[at], (free / same)[at]
         noise, places, again = parts[1:][pair][:, 0], of_step[pair], (free - free / same)[1:][pair]
         both = [
             Squares(square[at], parts[at][:, 0], parts[at][:, 1], parts[at][:, 2], known, once),
