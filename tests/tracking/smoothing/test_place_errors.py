@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from geometry.pose import Pose
+from geometry.rig import Rig
+from geometry.uncertainty.rig_uncertainty import PINHOLE, RigCovariance, perturbed_rig, rig_names, split_name
 from lab.simulate.points import CLUTTER, PointRun, simulate_points
 from lab.simulate.scenarios import RIGS, PriorRegion
 from tests.tracking.rigid_runs import assess, recording_of, smoothed_frames, tracked, zig_zag
@@ -200,12 +202,43 @@ def test_the_correlation_length_of_the_errors_is_the_width_of_the_spot():
     assert np.corrcoef(means.T)[0, 1] == pytest.approx(float(correlation(np.array(shift), width)), abs=0.03)
 
 
-def test_known_calibration_errors_are_not_taken_for_errors_of_places():
+def with_other_rig(run: PointRun, seed: int) -> tuple[Rig, RigCovariance]:
+    """What a calibration knows of the run's rig: the rig drawn from a covariance, and that; spots are .05 px off."""
+    names = rig_names(run.rig)
+    sigma = np.array([{"rad": 2e-5, "m": 5e-5}.get(n.rsplit("_", 1)[-1], 1e-5) for n in names])
+    sigma[[split_name(n)[2] in PINHOLE for n in names]] = 0.05
+    drawn = sigma * np.random.default_rng(seed).standard_normal(len(names))
+    return perturbed_rig(run.rig, names, drawn), RigCovariance(names, np.diag(sigma**2))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_calibration_errors_change_neither_the_noise_of_the_poses_nor_the_errors_of_places(seed):
+    """Spots of .01 px, .05 px off by a calibration that says so: taken for errors of places, 2.9 times the sigmas."""
+    run = simulate_points("small-motion", seed, frames=100, noise_px=0.01, clutter=0.0)
+    rig, covariance = with_other_rig(run, seed)
+    _, exact = smoothed_frames(run, tracked(run))
+    _, known = smoothed_frames(run, tracked(run, rig=rig, covariance=covariance), rig=rig, covariance=covariance)
+    assert known.place_share < 0.05
+    of_exact = np.trace(np.linalg.solve(exact.covariance, known.covariance), axis1=1, axis2=2) / 6
+    assert 0.8 < np.sqrt(np.median(of_exact)) < 1.2
+
+
+@pytest.mark.parametrize("scenario", ["static", "small-motion"])
+def test_errors_of_places_show_beside_those_of_the_calibration(scenario):
+    """At rest both are constant, and what is predicted for the places stays."""
+    run = textured(simulate_points(scenario, 1, frames=60, noise_px=0.05, clutter=0.0), 0.03, 0.01, 1, True)
+    rig, covariance = with_other_rig(run, 1)
+    _, exact = smoothed_frames(run, tracked(run))
+    _, known = smoothed_frames(run, tracked(run, rig=rig, covariance=covariance), rig=rig, covariance=covariance)
+    assert known.place_share == pytest.approx(exact.place_share, abs=0.1)
+    assert exact.place_share > 0.5
+
+
+def test_errors_that_are_the_same_in_all_frames_at_rest_belong_to_places():
     rng = np.random.default_rng(6)
     residual = np.tile(rng.standard_normal((1, 6, 2)), (80, 1, 1))
     uv, width, averaged = np.zeros((80, 6, 2)), np.full(6, 2.0), np.full(80, 80.0)
     assert place_errors(residual, uv, width, averaged, np.zeros(6)).share > 0.75
-    assert place_errors(residual, uv, width, averaged, np.ones(6)).share < 0.05
 
 
 def test_a_run_without_labels_has_no_errors_of_places():
