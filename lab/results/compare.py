@@ -30,7 +30,7 @@ from tracking.comparison.differences import (
     longest_still,
     statistic,
 )
-from tracking.comparison.estimation import Estimate, Free, NotComparableError, estimate_alignment
+from tracking.comparison.estimation import Estimate, Free, Freedom, NotComparableError, estimate_alignment
 from tracking.comparison.frame_alignment import BODY, GAP, LEVER, TRANSLATION, WORLD, Alignment, PoseSeries
 from tracking.statuses import PoseStatus
 
@@ -456,11 +456,11 @@ def compare(
             " offset of its clock with --offset, or allow it to be estimated (--align time)"
         )
     used = found.known if estimate is None else estimate.inliers & found.known
-    parameters = 0 if estimate is None else estimate.determined.basis.shape[1]
+    freedom = Freedom(0.0, 1.0) if estimate is None else estimate.freedom
     stated_total = None
     if np.any(total.covariance != mine.covariance):
         with_total = differences(total, theirs, alignment, gap)
-        stated_total = chi_square(with_total.chi2, found.freedom, used, parameters)
+        stated_total = chi_square(with_total.chi2, found.freedom, used, freedom)
     return Comparison(
         result,
         reference or other or result,
@@ -473,7 +473,7 @@ def compare(
         found,
         used,
         _axes(found, used),
-        chi_square(found.chi2, found.freedom, used, parameters),
+        chi_square(found.chi2, found.freedom, used, freedom),
         stated_total,
         _still(mine),
         notes,

@@ -10,7 +10,7 @@ from scipy.special import gammaincinv
 from geometry import rotations
 from geometry.arrays import Array, Bools, Ints
 from geometry.uncertainty.chi_square import chi2_limit
-from tracking.comparison.estimation import inverse_covariances
+from tracking.comparison.estimation import Freedom, inverse_covariances
 from tracking.comparison.frame_alignment import GAP, Alignment, PoseSeries, interpolate, residuals
 
 _BLOCKS = 30  # of time, drawn with repetition: errors within one are correlated (block bootstrap)
@@ -130,16 +130,19 @@ class ChiSquare:
     times: int
 
 
-def chi_square(chi2: Array, freedom: int, used: Bools, parameters: int) -> ChiSquare:
-    """Chi-square of the used times (n,). parameters: the number estimated from the same data."""
+def chi_square(chi2: Array, coordinates: int, used: Bools, freedom: Freedom) -> ChiSquare:
+    """Chi-square of the used times (n,), each of so many coordinates. freedom: what an alignment left of them."""
     rows = np.flatnonzero(used & np.isfinite(chi2))
     if not len(rows):
         return ChiSquare(np.nan, np.nan, np.nan, 0)
     each = chi2[rows]
-    dof = max(len(rows) * freedom - parameters, 1)
-    factor = float(each.sum() / dof)
-    relative = _bootstrap_sigmas(each)[0] / max(float(each.mean()), 1e-300)
-    return ChiSquare(factor, factor * relative, float(np.mean(each <= chi2_limit(0.05, freedom))), len(rows))
+    count = len(rows) * coordinates
+    left = max(count - freedom.taken, 1.0)
+    factor = float(each.sum() / left)
+    # Blocks of time that hold few independent errors do not show their scatter.
+    by_blocks = _bootstrap_sigmas(each)[0] / max(float(each.mean()), 1e-300)
+    relative = max(by_blocks, float(np.sqrt(2 * freedom.alike * count)) / left)
+    return ChiSquare(factor, factor * relative, float(np.mean(each <= chi2_limit(0.05, coordinates))), len(rows))
 
 
 def longest_still(motion: PoseSeries, least: int) -> slice | None:

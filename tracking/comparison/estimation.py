@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
 from scipy.signal import fftconvolve
 
 from geometry.arrays import Array, Bools, evenly_spaced, symmetric
@@ -202,6 +204,8 @@ _MOST_STEPS = 30  # a limit: the steps end where they are small
 _CANDIDATE_STEPS = 8  # enough to compare offsets of time
 _BLOCKS = 30  # of consecutive frames, whose sums show how much the errors of neighbours have in common
 _CANDIDATE_SAMPLES = 600  # of the result, where candidates of the offset are compared
+_CORRELATION_STEPS = 20  # a limit; the correlation of residuals and what the parameters take follow from each other
+_MOST_TAKEN = 0.8  # largest share of the degrees of freedom that the parameters take: more is not known from the rest
 _SAME_FIT = 5.0  # sigmas of the residuals' variance within which two offsets explain their frames equally well
 LEAST_FRAMES = 8  # fourteen unknowns, two or more numbers of each frame
 
@@ -231,6 +235,47 @@ class Free:
         return free
 
 
+class Freedom(NamedTuple):
+    """How many of the residuals of an alignment are independent of each other."""
+
+    taken: float  # degrees of freedom that the parameters take from them
+    alike: float  # sum of the squared correlations of an error with all errors of its coordinate; 1: independent
+
+    @staticmethod
+    def of(residual: Array, derivatives: Array) -> Freedom:
+        """From residuals (n, m) in sigmas of an estimate of k parameters, and the derivatives (n, m, k).
+
+        Poses of a smoothing pass have errors that are alike in dozens of frames: there a parameter takes not one degree
+        of freedom, but as many. All take sum(rho(l) a(l)) over the lags l, with the correlations rho of the errors and
+        the autocorrelations a of orthonormal columns of the derivatives. Those of the residuals are smaller by a(l)
+        times what one parameter takes. They count up to the first two lags whose sum is not positive (Geyer,
+        Statistical Science 7, 1992, section 3.3). Source for the rest: ours.
+        """
+        (n, m), k = residual.shape, derivatives.shape[2]
+        if not k or not residual.any():
+            return Freedom(float(k), 1.0)
+        columns = np.linalg.qr(derivatives.reshape(n * m, k))[0].reshape(n, m * k)
+        seen, of_columns = _products(residual), _products(columns)
+        twice = np.r_[1.0, np.full(len(seen) - 1, 2.0)]  # a lag is one of two, forward and backward
+        pairs, each = m * np.arange(n, n - len(seen), -1), 1.0
+        for _ in range(_CORRELATION_STEPS):
+            rho = (seen * (n * m - each * k) / seen[0] + each * of_columns) / pairs
+            end = np.flatnonzero(rho[1:-1] + rho[2:] <= 0)
+            rho = rho[: int(end[0]) + 1 if len(end) else len(rho)]
+            taken = float((twice * of_columns)[: len(rho)] @ rho)
+            each = float(np.clip(taken / k, 1.0, _MOST_TAKEN * n * m / k))
+        return Freedom(each * k, float(twice[: len(rho)] @ rho**2))
+
+
+def _products(series: Array) -> Array:
+    """(n // 2,): sums of the products of series (n, c) with themselves, by lag."""
+    size = next_fast_len(2 * len(series), real=True)
+    out = np.zeros(len(series) // 2)
+    for column in series.T:
+        out += irfft(np.abs(rfft(column, size)) ** 2, size)[: len(out)]
+    return out
+
+
 @dataclass(frozen=True, slots=True)
 class Estimate:
     """An alignment with its uncertainty."""
@@ -241,6 +286,7 @@ class Estimate:
     determined: Determined
     scale: float  # robust: residuals against the stated covariances; 1 if these are correct
     correlation: float  # largest factor by which correlated residuals increase the variances of parameters
+    freedom: Freedom  # of the residuals
     inliers: Bools  # (n,)
     other_offsets: tuple[float, ...]  # time offsets that explain the data equally well
 
@@ -388,7 +434,12 @@ def _fit(
         return None
     info = _information(result, reference, alignment, w, (inliers & w.r.known).astype(float))
     covariance, correlation = _covariance(info, what.basis, w)
-    return Estimate(alignment, covariance, mask, what, w.scale, correlation, inliers & w.r.known, ())
+    used = inliers & w.r.known
+    rows, compared = np.ix_(used, w.r.compared, w.r.compared), w.r.compared
+    root = np.swapaxes(np.linalg.cholesky(w.W[rows]), 1, 2)
+    white = np.einsum("nij,nj->ni", root, w.r.values[used][:, compared])
+    freedom = Freedom.of(white, root @ (info.J[used][:, compared] @ what.basis))
+    return Estimate(alignment, covariance, mask, what, w.scale, correlation, freedom, used, ())
 
 
 def _is_small(delta: Array, result: PoseSeries) -> bool:

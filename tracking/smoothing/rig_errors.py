@@ -128,7 +128,7 @@ class _Points:
     def beside_poses(self, views: Views, moves: Array) -> Array:
         """The part of displacements (F, n, 2, r) of the points that is left beside fitted poses; 0 where not used."""
         J, W = project_all(views, self.R, self.t)[1], self.weights()
-        used = W.any(axis=(-2, -1)) & np.isfinite(J).all(axis=(-2, -1)) & np.isfinite(moves).all(axis=(-2, -1))
+        used = finite(self.cov, (2, 3)) & finite(J, (2, 3)) & finite(moves, (2, 3))
         J, moves = np.where(used[..., None, None], J, 0.0), np.where(used[..., None, None], moves, 0.0)
         WJ = W @ J
         information = np.einsum("knia,knib->kab", J, WJ)

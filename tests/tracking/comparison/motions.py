@@ -28,10 +28,17 @@ def smooth(t: Array, axes: tuple[float, float, float] = (1, 1, 1), places: float
     return rotation, places * position
 
 
-def noisy(motion: PoseSeries, sigma_m: float, sigma_rad: float, rng: np.random.Generator) -> PoseSeries:
-    """The motion with white noise, which its covariance states."""
+def noisy(
+    motion: PoseSeries, sigma_m: float, sigma_rad: float, rng: np.random.Generator, alike: float = 0.0
+) -> PoseSeries:
+    """The motion with noise, which its covariance states: white, or alike in frames up to so many apart (1 sigma)."""
     n = len(motion)
-    noise = rng.standard_normal((n, 6)) * np.array([sigma_m] * 3 + [sigma_rad] * 3)
+    noise = rng.standard_normal((n, 6))
+    if alike:
+        kernel = np.exp(-(np.arange(-4 * alike, 4 * alike + 1) ** 2) / alike**2)
+        longer = rng.standard_normal((n + len(kernel) - 1, 6))
+        noise = np.stack([np.convolve(x, kernel / np.linalg.norm(kernel), "valid") for x in longer.T], axis=-1)
+    noise *= np.array([sigma_m] * 3 + [sigma_rad] * 3)
     covariance = np.zeros((n, 6, 6))
     covariance[:] = np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)
     assert motion.rotation is not None
@@ -51,12 +58,13 @@ def recordings(
     reference_step_s: float = 0.025,
     result_sigmas: tuple[float, float] = (2e-4, 1e-4),
     reference_sigmas: tuple[float, float] = (1e-4, 5e-5),
+    alike: float = 0.0,
 ) -> tuple[PoseSeries, PoseSeries]:
-    """A result, and a reference that is aligned to it by `truth`. Sigmas: m and rad."""
+    """A result, and a reference that is aligned to it by `truth`. Sigmas: m and rad; alike: as in `noisy`."""
     rng = np.random.default_rng(seed)
     t = step_s * np.arange(frames)
     s = truth.offset_s - 0.3 + reference_step_s * np.arange(int((frames * step_s + 0.7) / reference_step_s))
     seen = (s - truth.offset_s + truth.rate * truth.middle_s) / (1 + truth.rate)
     aligned = truth.applied(PoseSeries(s, *move(seen), np.zeros((len(s), 6, 6))))
     result = PoseSeries(t, *move(t), np.zeros((len(t), 6, 6)))
-    return noisy(result, *result_sigmas, rng), noisy(aligned, *reference_sigmas, rng)
+    return noisy(result, *result_sigmas, rng, alike), noisy(aligned, *reference_sigmas, rng)

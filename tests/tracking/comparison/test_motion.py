@@ -8,6 +8,7 @@ import pytest
 from geometry import rotations
 from tests.tracking.comparison.motions import TRUTH, recordings, smooth
 from tracking.comparison.differences import chi_square, differences, longest_still, statistic
+from tracking.comparison.estimation import Freedom, estimate_alignment
 from tracking.comparison.frame_alignment import PoseSeries, interpolate, rates
 
 
@@ -52,11 +53,28 @@ def test_a_motion_needs_content_and_rising_times():
 def test_differences_at_the_true_alignment_agree_with_the_stated_covariances():
     result, reference = recordings(4, frames=600)
     found = differences(result, reference, TRUTH)
-    c = chi_square(found.chi2, found.freedom, found.known, 0)
+    c = chi_square(found.chi2, found.freedom, found.known, Freedom(0.0, 1.0))
     assert found.freedom == 6
     # Interpolation averages the reference's noise, which is a fifth of the variance: slightly below 1.
     assert 0.8 < c.factor < 1.05
     assert 0.93 < c.within <= 1.0
+
+
+@pytest.mark.parametrize(("alike", "frames"), [(0.0, 120), (4.0, 120), (8.0, 240)])
+def test_poses_with_errors_that_are_alike_for_many_frames_agree_with_their_covariances_after_an_alignment(
+    alike, frames
+):
+    """Each parameter takes as many degrees of freedom as frames are alike: without them chi-square is .5 or less."""
+    factors, sigmas = [], []
+    for seed in range(24):
+        result, reference = recordings(seed, frames=frames, reference_sigmas=(1e-6, 1e-6), alike=alike)
+        e = estimate_alignment(result, reference)
+        found = differences(result, reference, e.alignment)
+        c = chi_square(found.chi2, found.freedom, found.known & e.inliers, e.freedom)
+        factors.append(c.factor)
+        sigmas.append(c.sigma)
+    assert np.mean(factors) == pytest.approx(1.0, abs=0.12)
+    assert np.mean(sigmas) == pytest.approx(np.std(factors), rel=0.5)
 
 
 def test_the_sigmas_of_statistics_are_those_of_repeated_experiments():
