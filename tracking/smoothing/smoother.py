@@ -400,11 +400,14 @@ class _Smoother:
         dropped = isolated(count)
         # In a long occlusion so few false points fit a pose once by chance; spots would be there in the next frame too.
         measured = self._single_frame_poses(new).measured if left_open.any() else self.measured
-        once = vague & measured & ~next_to(measured)
+        # Nor does another such frame beside it count, of labels that their spots have in one frame only.
+        labelled, lasting = new >= 0, measured
+        alone = labelled & ~next_to(labelled)
+        if alone[vague & measured].any():
+            lasting = self._single_frame_poses(np.where(alone, -1, new)).measured
+        once = vague & measured & ~next_to(lasting)
         dropped |= once & (count <= MIN_REDUNDANT_SPOTS)
         # And one beside spots that one camera always shows, which do not determine the pose without it.
-        labelled = new >= 0
-        alone = labelled & ~next_to(labelled)
         alone &= (once & (distinct_spots(alone, self.model.spot_of) <= MIN_REDUNDANT_SPOTS))[:, None]
         measured &= ~alone.any(axis=1)
         new[dropped[:, None] | alone] = -1
