@@ -64,7 +64,6 @@ NEAR = 10.0
 # Frames with poses of their own: three show position, velocity and acceleration, as many more that the jerk is as
 # strong as assumed. Without these any offset follows from that assumption.
 FEWEST_POSES = 6
-SHOWN = 1  # frames: nothing shows what happens farther from all labelled spots, whatever the cameras' steps are
 APART = 1.5  # frames: of shocks as close as this only the largest is a turn ...
 POSSIBLE_CHI2 = 12.6  # of 6 degrees (p = .05), above which a step may have a turn
 FIRST_LENGTH = 1.0  # frames: ... of this length at first
@@ -85,9 +84,8 @@ def estimate_timed(
     if run.clocks is not None and np.count_nonzero(measured) < FEWEST_POSES:
         run = replace(run, clocks=replace(run.clocks, unsettled=True))
     longest = _longest_step(run.detections)
-    labelled = (assigned >= 0).any(axis=1) & trusted
-    observed = _observed(measured, longest) & largest_near(labelled, SHOWN)
-    used = largest_near(measured, max_distance) & labelled
+    observed = _observed(measured, longest)
+    used = largest_near(measured, max_distance) & trusted & (assigned >= 0).any(axis=1)
     instants = Instants.of(run, assigned, used)
     frames_s = np.cumsum(run.dt)
     ref = motion_at(motion.ref, frames_s, instants.t_s)
