@@ -407,12 +407,14 @@ class _Smoother:
         # In a long occlusion so few false points fit a pose once by chance; spots would be there in the next frame too.
         measured = self._single_frame_poses(new).measured if left_open.any() else self.measured
         # Nor does another such frame beside it count, of labels that their spots have in one picture only.
-        alone, lasting = labelled_once(new >= 0, self.seen.has_image[:, self.model.camera_of]), measured
-        if alone[vague & measured].any():
-            lasting = self._single_frame_poses(np.where(alone, -1, new)).measured
+        labelled, lasting = new >= 0, measured
+        single = labelled_once(labelled, self.seen.has_image[:, self.model.camera_of])
+        if single[vague & measured].any():
+            lasting = self._single_frame_poses(np.where(single, -1, new)).measured
         once = vague & measured & ~next_to(lasting)
         dropped |= once & (count <= MIN_REDUNDANT_SPOTS)
         # And one beside spots that one camera always shows, which do not determine the pose without it.
+        alone = labelled & ~next_to(labelled)
         alone &= (once & (distinct_spots(alone, self.model.spot_of) <= MIN_REDUNDANT_SPOTS))[:, None]
         measured &= ~alone.any(axis=1)
         new[dropped[:, None] | alone] = -1

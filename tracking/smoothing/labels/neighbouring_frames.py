@@ -31,7 +31,7 @@ def next_to(mask: Bools) -> Bools:
 
 
 def labelled_once(labelled: Bools, has_image: Bools) -> Bools:
-    """(T, n): labels of views that the camera's pictures before and after do not have. has_image (T, n): of the view."""
+    """(T, n): labels that the pictures before and after of the camera do not have. has_image (T, n): of its views."""
     out = labelled.copy()
     for view, there in enumerate(has_image.T):
         out[there, view] &= ~next_to(labelled[there, view])

@@ -275,7 +275,7 @@ class _Estimator:
         log_density = np.empty((frames, 6))
         log_density[core] = self.log_density
         log_density[: core.start], log_density[core.stop :] = self.log_density[0], self.log_density[-1]
-        # At the core's first frame, and at its last: a vehicle that rests there may go on as it moved before, in gaps too.
+        # At the core's first frame, and at its last. A vehicle at rest may go on as it moved before, in gaps too.
         jump = P_JUMP_OUTSIDE * largest_jumps(self.ref, np.ones_like(self.measured), self.dt)[[0, -1]]
         ref, pose_P, motion_P = extrapolated(self.motion.ref, core, self.ref, out, self.run.dt, log_density, jump)
         sd = np.sqrt(np.diagonal(pose_P, axis1=1, axis2=2))
