@@ -32,13 +32,7 @@ from tracking.rigid_body.hypotheses.hypothesis_set import MAX_CHECKING_SIGMA_PX,
 from tracking.rigid_body.models.information import run_shifts
 from tracking.smoothing.error_scale import ErrorScale, usual_sizes, well_known
 from tracking.smoothing.labels.continuity import continued, transfers_between_cameras
-from tracking.smoothing.labels.neighbouring_frames import (
-    connected,
-    displaced,
-    isolated,
-    labelled_once,
-    next_to,
-)
+from tracking.smoothing.labels.neighbouring_frames import connected, displaced, isolated, labelled_once, next_to
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated, run_log_clutter, run_log_static
 from tracking.smoothing.labels.view_path import PathContext
 from tracking.smoothing.motion.clocks import MAX_CLOCK_STEPS, clock_sigmas, clock_step
