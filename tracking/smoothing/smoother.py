@@ -32,7 +32,7 @@ from tracking.rigid_body.hypotheses.hypothesis_set import MAX_CHECKING_SIGMA_PX,
 from tracking.rigid_body.models.information import run_shifts
 from tracking.smoothing.error_scale import ErrorScale, usual_sizes, well_known
 from tracking.smoothing.labels.continuity import continued, transfers_between_cameras
-from tracking.smoothing.labels.neighbouring_frames import connected, displaced, isolated, next_to
+from tracking.smoothing.labels.neighbouring_frames import connected, displaced, isolated, labelled_once, next_to
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated, run_log_clutter, run_log_static
 from tracking.smoothing.labels.view_path import PathContext
 from tracking.smoothing.motion.clocks import MAX_CLOCK_STEPS, clock_sigmas, clock_step
@@ -397,10 +397,14 @@ class _Smoother:
         dropped = isolated(count)
         # In a long occlusion so few false points fit a pose once by chance; spots would be there in the next frame too.
         measured = self._single_frame_poses(new).measured if left_open.any() else self.measured
-        once = vague & measured & ~next_to(measured)
+        # Nor does another such frame beside it count, of labels that their spots have in one picture only.
+        labelled, lasting = new >= 0, measured
+        single = labelled_once(labelled, self.seen.has_image[:, self.model.camera_of])
+        if single[vague & measured].any():
+            lasting = self._single_frame_poses(np.where(single, -1, new)).measured
+        once = vague & measured & ~next_to(lasting)
         dropped |= once & (count <= MIN_REDUNDANT_SPOTS)
         # And one beside spots that one camera always shows, which do not determine the pose without it.
-        labelled = new >= 0
         alone = labelled & ~next_to(labelled)
         alone &= (once & (distinct_spots(alone, self.model.spot_of) <= MIN_REDUNDANT_SPOTS))[:, None]
         measured &= ~alone.any(axis=1)

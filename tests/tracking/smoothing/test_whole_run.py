@@ -52,6 +52,32 @@ def test_a_step_of_a_vehicle_at_rest_is_fitted_after_an_estimate_without_its_fra
     assert np.max(chi2 / np.maximum(2 * labels, 1)) < 4
 
 
+@pytest.mark.parametrize("last", [True, False])
+def test_a_vehicle_that_rests_at_the_end_of_the_spots_may_go_on_as_it_moved_before(last):
+    """A turntable that turns, rests, and turns again in the frame of the last spots, or of the first."""
+    t_s, rate_rad_s, rest = np.arange(FRAMES) / 80, 1.0, slice(30, 40)
+    angle = rate_rad_s * (np.minimum(t_s, t_s[rest.start]) + np.maximum(t_s - t_s[rest.stop - 1], 0.0))
+    seen = np.arange(FRAMES) < rest.stop
+    if not last:
+        angle, seen = angle[::-1].copy(), seen[::-1].copy()
+    poses = AT_REST.plus(np.stack([0 * t_s] * 3 + [angle, 0 * t_s, 0 * t_s], axis=-1))
+    run = recording_of(RIGS["four-skew-beams"](), poses, t_s, 0.02, 3)
+    recording = TrackedRecording(run.rig, RIGID)
+    for k, frame in enumerate(tracked(run)):
+        recording.append(dt_of(run, k), found_in(run, k), frame)
+    whole = WholeRun(
+        run.model.numbers, recording.run_detections(), np.zeros((len(run.model), 2, 2)), recording.dt_s, 0.0, True
+    )
+    straight = np.concatenate([poses.rotation, poses.translation[:, None]], axis=1)
+    begin = SmoothedMotion.begin(straight_between(straight, seen, t_s), np.zeros(FRAMES, dtype=bool), None)
+    motion = estimate(whole, recording.assigned, seen, begin, 0, seen)
+    beyond = np.flatnonzero(~seen)
+    off = poses[beyond].minus(Pose(motion.ref.R[beyond], motion.ref.t[beyond]))
+    nees = np.sum(off * np.linalg.solve(motion.pose_P[beyond], off[..., None])[..., 0], axis=1) / 6
+    assert np.abs(off[:, 3]).max() > 0.1
+    assert nees.max() < 8
+
+
 def passes_over_a_corner(rate_rad_s: float, monkeypatch: pytest.MonkeyPatch) -> int:
     """Number of passes of the estimate of a vehicle whose pitch rate jumps by twice a rate within an exposure."""
     t_s, corner_s, exposure_s = np.arange(FRAMES) / 100, 0.25, 5e-4

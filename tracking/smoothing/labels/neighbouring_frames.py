@@ -30,6 +30,14 @@ def next_to(mask: Bools) -> Bools:
     return out
 
 
+def labelled_once(labelled: Bools, has_image: Bools) -> Bools:
+    """(T, n): labels that the pictures before and after of the camera do not have. has_image (T, n): of its views."""
+    out = labelled.copy()
+    for view, there in enumerate(has_image.T):
+        out[there, view] &= ~next_to(labelled[there, view])
+    return out
+
+
 def isolated(count: Ints) -> Bools:
     """(T,): frames with one or two spots next to a frame without any, that the other neighbour does not support.
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
-from tracking.rigid_body.online_estimates import MANOEUVRE_S, jump_variance
+from tracking.rigid_body.online_estimates import MANOEUVRE_S
 from tracking.smoothing.motion.fixed_interval import (
     Interval,
     RunInformation,
@@ -24,6 +24,7 @@ from tracking.smoothing.motion.interpolation import Interpolation, extrapolated
 from tracking.smoothing.motion.process_noise import (
     corner_offsets,
     jump_variances,
+    largest_jumps,
     largest_near,
     new_jumps,
     next_log_density,
@@ -37,7 +38,6 @@ from tracking.smoothing.motion.run_detections import (
     delayed_information,
     first_variance,
     shifted,
-    speeds,
     spot_information,
     unknown_moments,
 )
@@ -275,7 +275,8 @@ class _Estimator:
         log_density = np.empty((frames, 6))
         log_density[core] = self.log_density
         log_density[: core.start], log_density[core.stop :] = self.log_density[0], self.log_density[-1]
-        jump = P_JUMP_OUTSIDE * jump_variance(speeds(self.ref.m[[0, -1]]))  # at the core's first frame, and at its last
+        # At the core's first frame, and at its last. A vehicle at rest may go on as it moved before, in gaps too.
+        jump = P_JUMP_OUTSIDE * largest_jumps(self.ref, np.ones_like(self.measured), self.dt)[[0, -1]]
         ref, pose_P, motion_P = extrapolated(self.motion.ref, core, self.ref, out, self.run.dt, log_density, jump)
         sd = np.sqrt(np.diagonal(pose_P, axis1=1, axis2=2))
         known = (sd[:, :3].max(axis=1) < LOST_SIGMA_M) & (sd[:, 3:].max(axis=1) < LOST_SIGMA_RAD)

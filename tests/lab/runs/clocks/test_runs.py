@@ -295,6 +295,7 @@ def test_a_turn_that_the_spots_allow_to_be_short_is_in_the_sigmas(seed, tmp_path
         pytest.param(21001, 300, id="a slow corner in a gap beside fast motion"),
         pytest.param(7321, 120, id="smooth turns of eight frames about one axis, which resemble six corners"),
         pytest.param(7331, 120, id="a swing that begins in a gap, with a slow camera"),
+        pytest.param(22008, 120, id="false points about hidden spots, which make two frames in succession a pose"),
         pytest.param(31005, 300, id="smooth turns of seven frames and four spots, which five corners explain better"),
     ],
 )
