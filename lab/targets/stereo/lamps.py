@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +59,7 @@ def spots(picture: Picture, noise: NoiseModel | None = None) -> MarkerImages:
 # Name for --detector: what finds lights in a picture, given the noise of the recording.
 DETECTORS: Mapping[str, Callable[[Picture, NoiseModel | None], MarkerImages]] = {
     "spots": spots,
-    "harris": lambda picture, noise: harris_corners(picture),
+    "harris": lambda picture, _: harris_corners(picture),
 }
 
 
@@ -112,8 +111,10 @@ class LampsTarget(Target[LampFrame]):
         seen = [p for p in first if not isinstance(p, MissingPicture)]
         # Without it the texture of ground counts as lights, and each costs a fit.
         noise = estimate_noise(seen).model if seen else None
-        find = partial(DETECTORS[self.options.detector], noise=noise)
-        tracker = LampTracker(self._lens.camera(), self._model, find, 1 / rate, self._covariance)
+        detector = DETECTORS[self.options.detector]
+        tracker = LampTracker(
+            self._lens.camera(), self._model, lambda picture: detector(picture, noise), 1 / rate, self._covariance
+        )
         track = track_pictures(path, tracker.step, self.options, progress)
         measured = [f.tracked for f in track.frames if f.status is PoseStatus.MEASURED]
         some = [measured[k] for k in evenly_spread(np.arange(len(measured)), MOST_FRAMES).tolist()]
