@@ -5,8 +5,12 @@
 Written from the question alone, without the code of studies/: lamps are discs of light that the lens blurs, with a
 size and a brightness of their own, on a black body before clouds or ground; the camera has a lens with distortion, the
 body six degrees of freedom. Each recording is a folder of pictures, a camera.yaml and a lamps.yaml, given to the
-command. Lamps are hidden one at a time, for 3 to 19 frames, and
-other lights shine.
+command. Lamps are hidden one at a time, for 3 to 19 frames, and other lights shine, others in each picture.
+
+    python -m bench.related_measurements.lamps --seeds 1:17 --lamps 4 --others 5
+
+The first lamps alone, never hidden, among lights that move through the pictures, each on its own; without the target
+with --lamps 0 (then the target has four).
 """
 
 from __future__ import annotations
@@ -44,8 +48,11 @@ def truth(rng: np.random.Generator, n: int) -> tuple[Array, Rotation]:
     return position, Rotation.from_euler("zyx", np.array([6.0, 8.0, 8.0]) * sway[:, 3:], degrees=True)
 
 
-def draw(at: Array, turn: Rotation, scene: Array, glow: Array, hidden: int, rng: np.random.Generator) -> Array:
-    """A picture (h, w), 8 bit. hidden: the lamp that does not shine, or -1."""
+def draw(
+    at: Array, turn: Rotation, scene: Array, glow: Array, hidden: list[int], rng: np.random.Generator,
+    others: Array | None = None,
+) -> Array:  # fmt: skip
+    """A picture (h, w), 8 bit. hidden: lamps that do not shine; others (n, 2): lights beside them, None: some."""
     K = np.array([[F, 0, SIZE[0] / 2 - 0.5], [0, F, SIZE[1] / 2 - 0.5], [0, 0, 1]])
 
     def pixels(points: Array) -> Array:
@@ -56,7 +63,7 @@ def draw(at: Array, turn: Rotation, scene: Array, glow: Array, hidden: int, rng:
     out = scene.copy()
     cv2.fillPoly(out, [np.round(8 * pixels(HULL)).astype(np.int32)], 40.0, cv2.LINE_AA, 3)
     light = np.zeros((4 * SIZE[1], 4 * SIZE[0]), np.float32)  # 4 x 4 samples per pixel
-    lamps = np.delete(pixels(LAMPS), hidden, axis=0) if hidden >= 0 else pixels(LAMPS)
+    lamps = np.delete(pixels(LAMPS), hidden, axis=0)
     for (u, v), (radius_px, peak) in zip(lamps, glow, strict=False):
         cv2.circle(
             light,
@@ -67,28 +74,41 @@ def draw(at: Array, turn: Rotation, scene: Array, glow: Array, hidden: int, rng:
             0,
             4,
         )
-    for u, v in rng.uniform(0, 1, (rng.integers(0, 6), 2)) * SIZE:  # other lights
+    if others is None:
+        others = rng.uniform(0, 1, (rng.integers(0, 6), 2)) * SIZE
+    for u, v in others:
         cv2.circle(light, (int(4 * u), int(4 * v)), int(4 * rng.uniform(0.5, 2)), float(rng.uniform(60, 200)), -1)
     small = cv2.resize(light, SIZE, interpolation=cv2.INTER_AREA)
     out = cv2.GaussianBlur(out, (0, 0), 0.8) + cv2.GaussianBlur(small, (0, 0), 0.9)
     return np.clip(np.round(out + 2.0 * rng.normal(size=out.shape)), 0, 255).astype(np.uint8)
 
 
-def write_recording(folder: Path, seed: int, n: int) -> tuple[Array, Rotation]:
-    """Pictures, camera.yaml and lamps.yaml in a folder, and the true motion."""
+def write_recording(
+    folder: Path, seed: int, n: int, shining: int | None = None, others: int = 0
+) -> tuple[Array, Rotation]:
+    """Pictures, camera.yaml and lamps.yaml in a folder, and the true motion.
+
+    shining: lamps that shine, never hidden, of a target that has as many, and others that move; None: all lamps.
+    """
     rng = np.random.default_rng(seed)
     position, attitude = truth(rng, n)
     kind = ("cloud", "ground", "sky")[seed % 3]
     scene = (0.6 * background(kind, rng, SIZE) + 4 * field(rng, SIZE, 60, 4, 0.6)).astype(np.float32)
     glow = np.stack([rng.uniform(0.7, 2.0, len(LAMPS)), rng.uniform(130, 230, len(LAMPS))], -1)
     (folder / "frames").mkdir(parents=True)
+    apart = np.random.default_rng((seed, 1))
+    start, speed = apart.uniform(0.1, 0.9, (others, 2)) * SIZE, apart.normal(0, 1.0, (others, 2))  # px, px per frame
     hidden, until = -1, 0
     for k in range(n):
         if k == until:
             hidden = -1
         if k > until and rng.random() < 0.04:
             hidden, until = int(rng.integers(len(LAMPS))), k + int(rng.integers(3, 20))
-        drawn = draw(position[k], attitude[k], scene, glow, hidden, rng)
+        if shining is None:
+            drawn = draw(position[k], attitude[k], scene, glow, [hidden] if hidden >= 0 else [], rng)
+        else:
+            off = list(range(shining, len(LAMPS)))
+            drawn = draw(position[k], attitude[k], scene, glow, off, rng, start + k * speed)
         cv2.imwrite(str(folder / "frames" / f"{k:05d}.png"), drawn)
     camera = {
         "schema": "beampose/camera/1", "name": "nose", "image_size_px": list(SIZE),
@@ -97,7 +117,8 @@ def write_recording(folder: Path, seed: int, n: int) -> tuple[Array, Rotation]:
         "covariance": {"parameters": ["fx", "fy"], "matrix": [[0.04, 0.0], [0.0, 0.04]]},
     }  # fmt: skip
     (folder / "camera.yaml").write_text(yaml.safe_dump(camera))
-    markers = {f"L{k + 1}": {"position_m": lamp.tolist()} for k, lamp in enumerate(LAMPS)}
+    of_target = LAMPS if shining is None else LAMPS[: max(shining, 4)]
+    markers = {f"L{k + 1}": {"position_m": lamp.tolist()} for k, lamp in enumerate(of_target)}
     (folder / "lamps.yaml").write_text(yaml.safe_dump({"markers": markers}))
     return position, attitude
 
@@ -131,24 +152,31 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="1:6", help="FIRST:LAST, one recording each")
     parser.add_argument("--frames", type=int, default=100)
+    parser.add_argument("--lamps", type=int, help="lamps that shine, among --others; else five, one hidden at times")
+    parser.add_argument("--others", type=int, default=5)
     parser.add_argument("--detector", default="spots", choices=["spots", "harris"])
     given = parser.parse_args()
     status, errors = [], []
     for seed in range(*map(int, given.seeds.split(":"))):
         with tempfile.TemporaryDirectory() as place:
-            motion = write_recording(Path(place), seed, given.frames)
+            motion = write_recording(Path(place), seed, given.frames, given.lamps, given.others)
             of_run, e = judged(Path(place), *motion, given.detector)
         measured = np.array(of_run) == "measured"
         right = (e[:, 0] < 0.1) & (e[:, 1] < 1.0)
+        status += of_run
+        errors.append(e)
+        if not measured.any():
+            print(f"seed {seed}: none measured", flush=True)
+            continue
         print(
             f"seed {seed}: measured {measured.mean():.3f}; within 10 cm and 1 deg {right.mean():.3f} of all,"
             f" {right[measured].mean():.3f} of the measured frames; NEES/6 {np.nanmean(e[measured, 2]):.2f}; largest"
             f" measured error {np.nanmax(e[measured, 0]):.3f} m, {np.nanmax(e[measured, 1]):.2f} deg",
             flush=True,
         )
-        status += of_run
-        errors.append(e)
     e, measured = np.concatenate(errors), np.array(status) == "measured"
+    if not measured.any():
+        return
     right = (e[:, 0] < 0.1) & (e[:, 1] < 1.0)
     print(
         f"all {len(e)} frames: measured {measured.mean():.4f}; within 10 cm and 1 deg {right.mean():.4f} of all,"

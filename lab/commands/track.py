@@ -202,7 +202,7 @@ def point(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> Non
     "--target",
     required=True,
     type=ANY_PATH,
-    help="The lamps: markers: {NAME: {position_m: [X, Y, Z]}, ...}, four or more; with other lights five.",
+    help="The lamps: markers: {NAME: {position_m: [X, Y, Z]}, ...}, four or more.",
 )
 @click.option("--camera", required=True, type=ANY_PATH, help="camera.yaml, or the file of another program.")
 @click.option("--camera-name", help="The camera, where that file has several.")
@@ -220,9 +220,10 @@ def point(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> Non
 def lamps(ctx: click.Context, /, pictures: Path, out: Path, **options: Any) -> None:
     """Pose of a target with lamps at known places, from the pictures of one calibrated camera.
 
-    The lamps look alike: which light is which follows from their places. Five must be visible at the start, or four
-    without any other light, and four in each later measured frame. With more than 18 other lights that are brighter
-    than the lamps the target may not be found. The pose is in the camera's frame: x to the right, y down, z ahead.
+    The lamps look alike: which light is which follows from their places. Four must be visible in each measured frame;
+    among other lights four are found after the lights have moved relative to each other, five at once. With more than
+    18 other lights that are brighter than the lamps the target may not be found. The pose is in the camera's frame: x
+    to the right, y down, z ahead.
 
     \b
     Example:

@@ -21,13 +21,11 @@ from tracking.binocular.acquisition import (
     mirrored,
     observations,
 )
+from tracking.binocular.histories import FIRST_RATE_RAD_S, FIRST_SPEED_M_S, Histories
 from tracking.binocular.joint_fit import MarkerObservations
 from tracking.binocular.marker_model import MarkerImages, MarkerModel, MatchParameters, StereoPair, project_markers
 from tracking.kalman import RigidMotion
 from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, PoseStatus
-
-FIRST_SPEED_M_S, FIRST_RATE_RAD_S = 5.0, 2.0  # 1 sigma of the unknown velocity after the first pose
-
 
 # The pose of the target in each frame of a sequence; the previous frames help to label, not to measure.
 #
@@ -79,6 +77,7 @@ class BinocularTracker:
         self._t_s = 0.0
         self._images: Images = (MarkerImages.none(), MarkerImages.none())  # of the current frame
         self._last_measured: int = -1
+        self._histories = Histories(self._predicted)
         self._count = -1
 
     def step(self, t_s: float, pictures: tuple[MarkerImages | None, MarkerImages | None]) -> BinocularFrame:
@@ -92,6 +91,8 @@ class BinocularTracker:
             return self._unmeasured(TOO_FEW, ahead)
         self._images = images
         candidates = self._candidates(images, ahead)
+        if ahead is None:
+            candidates = self._histories.added_to(t_s, images, candidates)
         if not candidates:
             return self._unmeasured(NO_POSE, ahead)
         scores = [c.score + self._prior_nats(c, ahead) for c in candidates]
@@ -105,6 +106,7 @@ class BinocularTracker:
         if reason:
             return self._unmeasured(reason, ahead, best)
         self._last_measured = self._count
+        self._histories.clear()
         pose, covariance = best.fit.world_from_body, best.fit.covariance
         first = RigidMotion.at_rest(pose, covariance, FIRST_SPEED_M_S, FIRST_RATE_RAD_S)
         self._motion = first if ahead is None else ahead.updated_with_pose(pose, covariance)[0]
@@ -114,7 +116,11 @@ class BinocularTracker:
     def _prediction(self, t_s: float) -> RigidMotion | None:
         if self._motion is None or self._count - self._last_measured > self._p.max_predicted_frames:
             return None
-        ahead = self._motion.predicted(t_s - self._t_s, self._p.acceleration_m_s2, self._p.turn_rad_s2)
+        return self._predicted(self._motion, t_s - self._t_s)
+
+    def _predicted(self, motion: RigidMotion, dt_s: float) -> RigidMotion | None:
+        """The motion after a time; None where it is too uncertain."""
+        ahead = motion.predicted(dt_s, self._p.acceleration_m_s2, self._p.turn_rad_s2)
         worst = np.sqrt([np.linalg.eigvalsh(ahead.covariance[s, s])[-1] for s in (slice(0, 3), slice(3, 6))])
         return ahead if worst[0] <= LOST_SIGMA_M and worst[1] <= LOST_SIGMA_RAD else None
 

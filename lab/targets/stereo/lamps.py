@@ -17,11 +17,13 @@ from lab.files.rig.camera_file import CameraFile, require_valid_calibration
 from lab.files.text import columns
 from lab.findings.finding import Finding, Level, finding, level_above, passed
 from lab.number_format import format_length, format_number
-from lab.pictures.source import open_inputs
+from lab.pictures.picture_file import MissingPicture
+from lab.pictures.source import open_inputs, pictures_of_frames
 from lab.progress import Progress
 from lab.report.page import Section
 from lab.report.plot.series import Band, Line
 from lab.report.plot.svg import BLUE, SKY
+from lab.runs.frames.sensor_noise import noise_frames
 from lab.runs.processed import quantiles
 from lab.runs.tables import pose_numbers
 from lab.targets.page import TimeAxis
@@ -35,23 +37,30 @@ from tracking.binocular.lamp_corners import harris_corners
 from tracking.binocular.lamp_tracker import LampFrame, LampTracker
 from tracking.binocular.marker_model import MarkerImages, MatchParameters
 from tracking.detection.detect import find_spots
-from tracking.noise import Picture
+from tracking.noise import NoiseModel, Picture
+from tracking.noise_estimation.photon_transfer import estimate_noise
 from tracking.statuses import PoseStatus
 
 _MOST_LIGHTS = 60  # of a picture; the strongest
 _POSE = (("x", "m"), ("y", "m"), ("z", "m"), ("yaw", "deg"), ("pitch", "deg"), ("roll", "deg"))
 
 
-def spots(picture: Picture) -> MarkerImages:
-    """The spots of light of a picture, those of the highest peak first."""
-    found = find_spots(picture)
+def spots(picture: Picture, noise: NoiseModel | None = None) -> MarkerImages:
+    """The spots of light of a picture, those of the highest peak first.
+
+    noise: that of the recording, with the texture of its background; None: that of this picture, without it.
+    """
+    found = find_spots(picture, noise=noise)
     rows = np.argsort(-found.peak, kind="stable")[:_MOST_LIGHTS]
     n = len(rows)
     return MarkerImages(found.uv_px[rows], found.cov_px2[rows], np.full(n, np.nan), np.zeros(n, dtype=np.int64))
 
 
-# Name for --detector: what finds lights in a picture.
-DETECTORS: Mapping[str, Callable[[Picture], MarkerImages]] = {"spots": spots, "harris": harris_corners}
+# Name for --detector: what finds lights in a picture, given the noise of the recording.
+DETECTORS: Mapping[str, Callable[[Picture, NoiseModel | None], MarkerImages]] = {
+    "spots": spots,
+    "harris": lambda picture, _: harris_corners(picture),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,9 +105,16 @@ class LampsTarget(Target[LampFrame]):
         self._check: CalibrationCheck | None = None  # of the lens, with the recording that was read
 
     def read(self, path: Path, progress: Progress | None) -> Track[LampFrame]:
-        rate = self.options.rate_hz or header_rate(open_inputs([path])) or DEFAULT_RATE_HZ
-        find = DETECTORS[self.options.detector]
-        tracker = LampTracker(self._lens.camera(), self._model, find, 1 / rate, self._covariance)
+        inputs = open_inputs([path])
+        rate = self.options.rate_hz or header_rate(inputs) or DEFAULT_RATE_HZ
+        first = pictures_of_frames(inputs, noise_frames(inputs)).values()
+        seen = [p for p in first if not isinstance(p, MissingPicture)]
+        # Without it the texture of ground counts as lights, and each costs a fit.
+        noise = estimate_noise(seen).model if seen else None
+        detector = DETECTORS[self.options.detector]
+        tracker = LampTracker(
+            self._lens.camera(), self._model, lambda picture: detector(picture, noise), 1 / rate, self._covariance
+        )
         track = track_pictures(path, tracker.step, self.options, progress)
         measured = [f.tracked for f in track.frames if f.status is PoseStatus.MEASURED]
         some = [measured[k] for k in evenly_spread(np.arange(len(measured)), MOST_FRAMES).tolist()]

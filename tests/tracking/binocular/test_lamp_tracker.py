@@ -20,6 +20,9 @@ from studies.fu2016 import (
     projected,
     render,
 )
+from tracking.binocular.acquisition import observations
+from tracking.binocular.histories import _has_its_lights, _relative_motion
+from tracking.binocular.joint_fit import MarkerObservations
 from tracking.binocular.lamp_corners import harris_corners, harris_response
 from tracking.binocular.lamp_tracker import LampTracker
 from tracking.binocular.marker_model import MarkerImages
@@ -100,6 +103,63 @@ def test_false_lights_alone_give_no_pose():
 def test_at_the_start_four_lamps_among_many_lights_are_not_enough():
     crowd = PLACES.mean(axis=0) + np.random.default_rng(7).uniform(-60, 60, (12, 2))
     assert tracker_of([np.concatenate([PLACES[1:], crowd])]).step(BLACK).status is PoseStatus.LOST
+
+
+def approach(count, seed, *, lamps=4, moving=1.0):
+    """Pictures of a target that comes nearer and turns, and of five lights that move on their own."""
+    rng = np.random.default_rng(seed)
+    start, speed = PLACES.mean(axis=0) + rng.uniform(-150, 150, (9 - lamps, 2)), rng.normal(0, 1.0, (9 - lamps, 2))
+    for k in range(count):
+        t = moving * k
+        state = STATE - t * np.array([0.2, 0.02, 0, 0, 0, 0, 0.01, 0.015])
+        seen = projected(MARKERS, pose_of(state))[:lamps] if lamps else np.zeros((0, 2))
+        yield np.concatenate([start + t * speed, seen]) + rng.normal(0, 0.05, (9, 2))
+
+
+@pytest.mark.parametrize("seed", [11, 12])
+def test_four_lamps_among_five_other_lights_are_found_when_the_lights_have_moved(seed):
+    tracker = tracker_of(list(approach(25, seed)))
+    frames = [tracker.step(BLACK) for _ in range(25)]
+    assert frames[0].status is PoseStatus.LOST
+    assert frames[-1].status is PoseStatus.MEASURED
+    for frame in frames:
+        if frame.status is PoseStatus.MEASURED:
+            np.testing.assert_array_equal(frame.tracked.index[0], [5, 6, 7, 8, -1])
+
+
+@pytest.mark.parametrize(("lamps", "moving"), [(4, 0.0), (0, 1.0)])
+def test_lights_at_rest_and_other_lights_give_no_pose_however_many_pictures(lamps, moving):
+    tracker = tracker_of(list(approach(10, 13, lamps=lamps, moving=moving)))
+    assert {tracker.step(BLACK).status for _ in range(10)} == {PoseStatus.LOST}
+
+
+def test_the_relative_motion_of_lights_is_that_beyond_shift_turn_and_scale_in_their_largest_noise():
+    uv = np.full((2, 5, 2), np.nan)
+    uv[0, :4] = [[0, 0], [100, 0], [0, 80], [60, 50]]
+    cov = np.tile(0.01 * np.eye(2), (2, 5, 1, 1))
+    turned = 50 + 1.3 * uv @ np.array([[0.8, 0.6], [-0.6, 0.8]])
+    assert _relative_motion(MarkerObservations(uv, cov), MarkerObservations(turned, cov)) == pytest.approx(0, abs=1e-9)
+    moved, vague = uv.copy(), cov.copy()
+    moved[0, 0] += [2.0, -1.0]
+    vague[0, 3] *= 25
+    clear, hidden = (_relative_motion(MarkerObservations(uv, c), MarkerObservations(moved, c)) for c in (cov, vague))
+    assert clear > 50
+    assert hidden == pytest.approx(clear / 25)
+
+
+def test_a_pose_is_continued_by_its_own_lights_alone():
+    rng = np.random.default_rng(3)
+    at = rng.uniform(0, 400, (30, 2))
+    images = MarkerImages(at, np.tile(0.01 * np.eye(2), (30, 1, 1)), np.full(30, np.nan), np.zeros(30, int))
+
+    def of(*chosen, shift=0.0):
+        index = np.full((2, 4), -1)
+        index[0] = chosen
+        seen = observations((images, MarkerImages.none()), index)
+        return MarkerObservations(seen.uv_px - shift, seen.cov_px2)
+
+    assert _has_its_lights(of(0, 1, 2, 3, shift=9.0), of(0, 1, 2, 3), (images, MarkerImages.none()))
+    assert not _has_its_lights(of(0, 1, 2, 3), of(0, 1, 2, 4), (images, MarkerImages.none()))
 
 
 @pytest.mark.parametrize("others", [12, 18])
