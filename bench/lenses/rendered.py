@@ -1,9 +1,9 @@
 """Lenses from rendered photographs with exact truth: `python -m bench.lenses.rendered [sets] [seed] [n] [KIND ...]`.
 
-KIND: LENS-BOARD with LENS plain (five coefficients), zoom (five, 15 to 30 deg wide, tangential coefficients of .006),
-rational (eight) or fisheye and BOARD chess, circles, acircles or
-charuco; default: all. A set has 6 to 40 photographs of 1280 x 960 px, or n. Ten sets per kind
-take an hour. Process times of sets of fewer than 20 are too long: not all of the work grows with the photographs.
+KIND: LENS-BOARD with LENS plain (five coefficients), zoom (the same, 15 to 30 deg wide, tangential coefficients of
+.006), rational (eight) or fisheye and BOARD chess, circles, acircles or charuco; default: all sixteen. A set has 6 to
+40 photographs of 1280 x 960 px, or n. Ten sets per kind take an hour or two.
+Process times of sets of fewer than 20 are too long: not all of the work grows with the photographs.
 """
 
 from __future__ import annotations
