@@ -150,32 +150,31 @@ def find_in_photos(
                     found.search(name, picture)
             found.settle()
     order = {name: k for k, name in enumerate(path_of)}
-    views, copies = _without_copies(sorted(found.views, key=lambda view: order[view[0]]), board)
-    refused = found.refused + copies + [(name, QUICK_SEARCH_FAILED.reason) for name in found.quick]
+    views = sorted(found.views, key=lambda view: order[view[0]])
+    copies = _copies(views, board)
+    views = [view for view in views if view[0] not in copies]
+    refused = [*found.refused, *copies.items(), *((name, QUICK_SEARCH_FAILED.reason) for name in found.quick)]
     refused.sort(key=lambda item: order[item[0]])
     _refuse_too_few(views, refused, board, fewest)
     return PhotoSet(board, size, tuple(views), tuple(refused), path_of)
 
 
-def _without_copies(
-    views: Sequence[tuple[str, BoardView]], board: Board
-) -> tuple[list[tuple[str, BoardView]], list[tuple[str, str]]]:
-    """The views that are no copies of earlier ones; names of the others with the reason."""
-    kept, refused = [], []
+def _copies(views: Sequence[tuple[str, BoardView]], board: Board) -> dict[str, str]:
+    """Names of the views that are copies of earlier ones, with the reason."""
+    out: dict[str, str] = {}
     pixels = np.full((len(views), len(board.ids), 2), np.nan)
-    for name, view in views:
+    for k, (name, view) in enumerate(views):
         own = np.searchsorted(board.ids, view.ids)
-        squares = (pixels[: len(kept), own] - view.pixels) ** 2
+        squares = (pixels[:k, own] - view.pixels) ** 2
         common = np.isfinite(squares[..., 0])
-        rms = np.sqrt(np.nansum(squares, axis=(1, 2)) / np.maximum(2 * common.sum(axis=1), 1))
-        rms[common.mean(axis=1) < 0.5] = np.inf  # most of its points are not those of the other
-        if len(kept) and rms.min() < _SAME_PX:
-            original, apart = kept[int(rms.argmin())][0], format_number(rms.min(), 1)
-            refused.append((name, f"{_DUPLICATE}{original}, points within {apart} px: it would count twice"))
+        apart = np.sqrt(np.nansum(squares, axis=(1, 2)) / np.maximum(2 * common.sum(axis=1), 1))
+        apart[common.mean(axis=1) < 0.5] = np.inf  # most of its points are not those of the other
+        if k and apart.min() < _SAME_PX:
+            original, px = views[int(apart.argmin())][0], format_number(apart.min(), 1)
+            out[name] = f"{_DUPLICATE}{original}, points within {px} px: it would count twice"
         else:
-            pixels[len(kept), own] = view.pixels
-            kept.append((name, view))
-    return kept, refused
+            pixels[k, own] = view.pixels
+    return out
 
 
 @dataclass(slots=True)
@@ -382,8 +381,9 @@ def read_corner_table(path: Path, board: Board, image_size_px: tuple[int, int]) 
             found.append((name, BoardView(ids[order], pixels[order], np.nan, np.nan)))
     if not found:
         raise InputError(f"{path}: expected corners of {board.describe()}, got none")
-    kept, refused = _without_copies(found, board)
-    return PhotoSet(board, image_size_px, tuple(kept), tuple(refused), {name: path for name, _ in found})
+    copies = _copies(found, board)
+    kept = tuple(view for view in found if view[0] not in copies)
+    return PhotoSet(board, image_size_px, kept, tuple(copies.items()), {name: path for name, _ in found})
 
 
 def _read_vnl(path: Path, board: Board) -> dict[str, tuple[Ints, Array]]:
