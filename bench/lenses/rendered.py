@@ -1,8 +1,9 @@
 """Lenses from rendered photographs with exact truth: `python -m bench.lenses.rendered [sets] [seed] [n] [KIND ...]`.
 
-KIND: LENS-BOARD with LENS plain (five coefficients), rational (eight) or fisheye and BOARD chess, circles, acircles or
-charuco; default: all twelve. A set has 6 to 40 photographs of 1280 x 960 px, or n. Ten sets per kind
-take an hour. Process times of sets of fewer than 20 are too long: not all of the work grows with the photographs.
+KIND: LENS-BOARD with LENS plain (five coefficients), zoom (the same, 15 to 30 deg wide, tangential coefficients of
+.006), rational (eight) or fisheye and BOARD chess, circles, acircles or charuco; default: all sixteen. A set has 6 to
+40 photographs of 1280 x 960 px, or n. Ten sets per kind take an hour or two.
+Process times of sets of fewer than 20 are too long: not all of the work grows with the photographs.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from lab.simulate.board_photo import PhotoSettings, photograph
 from tests.calibration.lens.random_lenses import KEPT, TrueLens, lens_error
 
 SIZE = (1280, 960)
-LENSES = ("plain", "rational", "fisheye")
+LENSES = ("plain", "rational", "fisheye", "zoom")
 BOARDS = {
     "chess": "chessboard:9x6:30mm",
     "circles": "circles:9x7:30mm",
@@ -72,6 +73,11 @@ def _drawn(kind: str, rng: np.random.Generator) -> Array:
         out[:4] = f, f * (1 + rng.normal(0, 3e-4)), *centre
         out[4:9] = rng.uniform(-0.35, -0.1), rng.uniform(0.05, 0.15), *rng.normal(0, 5e-4, 2), rng.uniform(-0.1, 0.1)
         return out
+    if kind == "zoom":
+        f = rng.uniform(2400, 4800)
+        out[:4] = f, f * (1 + rng.normal(0, 3e-4)), *centre
+        out[4:9] = rng.uniform(-0.6, 0.2), rng.uniform(-0.5, 0.5), *(rng.choice([-1, 1], 2) * 0.006), 0.0
+        return out
     f = rng.uniform(400, 480) if kind == "fisheye" else rng.uniform(480, 560)
     out[:4] = f, f * (1 + rng.normal(0, 3e-4)), *centre
     out[4:8] = rng.uniform(-0.02, 0.04), rng.uniform(-0.01, 0.01), rng.normal(0, 2e-3), 0.0
@@ -87,7 +93,7 @@ def rendered_set(kind: str, text: str, seed: int, views: int | None = None) -> R
     lens, board, fisheye = true_lens(kind, rng), parse(text), kind == "fisheye"
     fx, fy, cx, cy = lens[:4]
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    coefficients = {"plain": 5, "rational": 8, "fisheye": 4}[kind]
+    coefficients = {"plain": 5, "zoom": 5, "rational": 8, "fisheye": 4}[kind]
     camera = Camera(
         "", "", SIZE, K, tuple(lens[4 : 4 + coefficients]), Pose.identity(), lens=FISHEYE if fisheye else PERSPECTIVE
     )
@@ -97,7 +103,7 @@ def rendered_set(kind: str, text: str, seed: int, views: int | None = None) -> R
     clock, searched = 0.0, 0
     partial = text.startswith("charuco")
     while len(found) < wanted:
-        pose = _pose(board, fx, kind != "plain", partial, rng)
+        pose = _pose(board, fx, kind in ("rational", "fisheye"), partial, rng)
         inside = np.all((p := camera.project(pose.apply(board.points))) > 12, axis=1) & np.all(
             p < np.array(SIZE) - 13, 1
         )

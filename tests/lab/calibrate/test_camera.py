@@ -9,7 +9,9 @@ import json
 import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from cli import main
 from lab.calibrate.camera.camera import (
     CAMERA,
     CORNER_COLUMNS,
@@ -172,6 +174,28 @@ def test_copies_of_one_photograph_count_once(tmp_path):
         (tmp_path / f"{k}.jpg").write_bytes((STEREO / "left01.jpg").read_bytes())
     with pytest.raises(InputError, match=r"the same picture as 0\.jpg: it would count twice"):
         calibrate_camera([tmp_path], BOARD, tmp_path / "out")
+
+
+@needs_stereo
+def test_copies_of_other_quality_change_nothing_and_are_named(tmp_path):
+    """With copies as photographs of their own the sigmas would be too small by the root of the number of copies."""
+    for out in ("once", "often"):
+        given = ["calibrate", "camera", str(tmp_path / "shots"), "--board", BOARD, "--out", str(tmp_path / out)]
+        for path in sorted(STEREO.glob("left*.jpg")):
+            (tmp_path / "shots").mkdir(exist_ok=True)
+            (tmp_path / "shots" / path.name).write_bytes(path.read_bytes())
+            picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            for quality in (90, 60, 30) if out == "often" else ():
+                name = str(tmp_path / "shots" / f"{path.stem}_q{quality}.jpg")
+                cv2.imwrite(name, picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
+        done = CliRunner().invoke(main, [*given, "--lens", "4", "--warp", "off", "--stretch", "off"])
+        assert done.exit_code == 0, done.output
+    once, often = (load_camera(tmp_path / out / CAMERA) for out in ("once", "often"))
+    np.testing.assert_array_equal(once.covariance.matrix, often.covariance.matrix)
+    assert once.calibration.views == often.calibration.views == 7
+    report = (tmp_path / "often" / "report.html").read_text(encoding="utf-8")
+    assert report.count("it would count twice") >= 21
+    assert "left01_q30.jpg" in report
 
 
 @needs_stereo

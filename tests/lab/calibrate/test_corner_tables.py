@@ -61,6 +61,17 @@ def test_a_camera_from_a_table_has_a_report_and_corners_that_can_be_read_again(t
     assert again.result.fit.lens[0] == pytest.approx(first.result.fit.lens[0], abs=0.01)
 
 
+def test_a_view_that_a_table_holds_twice_counts_once(tmp_path, views):
+    """Also where a tenth of its points was not found; a view that is elsewhere counts."""
+    noise = np.random.default_rng(0).normal(0, 0.02, (len(views[0][1]), 2))
+    again = [("again.png", views[0][1][5:], views[0][2][5:] + noise[5:]), ("moved.png", views[1][1], views[1][2] + 1)]
+    write_csv(tmp_path / "c.csv", [*views, *again])
+    found = read_corner_table(tmp_path / "c.csv", parse(BOARD), SIZE)
+    assert [n for n, _ in found.views] == [*(n for n, _, _ in views), "moved.png"]
+    assert [n for n, _ in found.refused] == ["again.png"]
+    assert found.refused[0][1].startswith("the same picture as view0.png, points within 0.0")
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
@@ -29,11 +30,16 @@ def picture() -> np.ndarray:
     return photograph(BOARD, camera, at, look=PhotoSettings(samples=16)).image
 
 
+def moved(picture: np.ndarray, k: int) -> np.ndarray:
+    """Another photograph: the board is elsewhere in the picture."""
+    return np.roll(picture, 2 * k, axis=1)
+
+
 def test_pictures_of_every_kind_are_read_in_natural_order(tmp_path, picture):
     for k in (1, 2, 10):
-        cv2.imwrite(str(tmp_path / f"shot-{k}.png"), np.clip(picture.astype(int) + k, 0, 255).astype(np.uint8))
-    cv2.imwrite(str(tmp_path / "shot-11.png"), 100 + picture.astype(np.uint16) * 7)  # 16 bits, of which 11 are used
-    cv2.imwrite(str(tmp_path / "shot-12.jpg"), cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR))
+        cv2.imwrite(str(tmp_path / f"shot-{k}.png"), moved(picture, k))
+    cv2.imwrite(str(tmp_path / "shot-11.png"), 100 + moved(picture, 11).astype(np.uint16) * 7)  # 16 bits, 11 are used
+    cv2.imwrite(str(tmp_path / "shot-12.jpg"), cv2.cvtColor(moved(picture, 12), cv2.COLOR_GRAY2BGR))
     (tmp_path / "shot-13.png").write_bytes(b"")
     steps = []
     photos = find_in_photos([tmp_path, tmp_path / "shot-1.png"], BOARD, lambda *step: steps.append(step))
@@ -42,8 +48,8 @@ def test_pictures_of_every_kind_are_read_in_natural_order(tmp_path, picture):
     assert photos.image_size_px == (400, 300)
     assert steps[-1] == (6, 6, "shot-13.png")
     first = photos.views[0][1].pixels
-    for _, view in photos.views:
-        np.testing.assert_allclose(view.pixels, first, atol=0.05)
+    for k, (_, view) in zip((1, 2, 10, 11, 12), photos.views, strict=True):
+        np.testing.assert_allclose(view.pixels - first, [[2 * (k - 1), 0]] * len(first), atol=0.05)
 
 
 def test_the_same_picture_twice_counts_once(tmp_path, picture):
@@ -51,6 +57,21 @@ def test_the_same_picture_twice_counts_once(tmp_path, picture):
         cv2.imwrite(str(tmp_path / f"{name}.png"), picture)
     with pytest.raises(InputError, match=r"found in 1 of 3 pictures, 3 or more .*\(2 of 2.*the same picture as a"):
         find_in_photos([tmp_path], BOARD)
+
+
+def test_a_picture_that_was_saved_again_or_taken_again_counts_once(tmp_path, picture):
+    """JPEG of several qualities, more light, more noise; the first one is kept, and other pictures are not touched."""
+    noise = np.random.default_rng(0).normal(0, 3, picture.shape)
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"{k}-a.png"), moved(picture, k))
+        for quality in (90, 50):
+            cv2.imwrite(str(tmp_path / f"{k}-b{quality}.jpg"), moved(picture, k), [cv2.IMWRITE_JPEG_QUALITY, quality])
+        cv2.imwrite(str(tmp_path / f"{k}-c.png"), np.clip(moved(picture, k) * 1.1 + noise, 0, 255).astype(np.uint8))
+    photos = find_in_photos([tmp_path], BOARD)
+    assert [name for name, _ in photos.views] == ["0-a.png", "1-a.png", "2-a.png"]
+    assert len(photos.refused) == 9
+    for name, reason in photos.refused:
+        assert re.match(rf"the same picture as {name[0]}-a.png, points within 0.0\d+ px: it would count twice", reason)
 
 
 def test_the_error_for_mixed_sizes_names_the_pictures(tmp_path, picture):
@@ -64,7 +85,7 @@ def test_the_error_for_mixed_sizes_names_the_pictures(tmp_path, picture):
 def test_pictures_of_another_size_than_most_are_named_and_left_out(tmp_path, picture):
     cv2.imwrite(str(tmp_path / "a.png"), picture[:, ::2])
     for k in range(3):
-        cv2.imwrite(str(tmp_path / f"b{k}.png"), picture + np.uint8(k))
+        cv2.imwrite(str(tmp_path / f"b{k}.png"), moved(picture, k))
     photos = find_in_photos([tmp_path / "*.png"], BOARD)
     assert photos.image_size_px == (400, 300)
     assert len(photos.views) == 3
@@ -120,7 +141,7 @@ def test_only_the_first_pictures_without_a_board_are_searched_thoroughly(at_once
         find_in_photos([tmp_path], BOARD)
     assert searches == [True, True, False, False]
     for k in range(3):
-        cv2.imwrite(str(tmp_path / f"b{k}.png"), picture + np.uint8(k))
+        cv2.imwrite(str(tmp_path / f"b{k}.png"), moved(picture, k))
     searches.clear()
     found = find_in_photos([tmp_path], BOARD)
     assert searches == [True, True, False, False, False, True, True, True, True]
@@ -142,7 +163,7 @@ def test_a_video_that_shows_a_charuco_board_now_and_then_has_the_reasons_of_thre
     ).image
     wall = np.random.default_rng(0).integers(60, 190, seen.shape).astype(np.uint8)
     for k in range(12):
-        cv2.imwrite(str(tmp_path / f"{k}.png"), seen + np.uint8(k) if k % 4 == 3 else np.roll(wall, k))
+        cv2.imwrite(str(tmp_path / f"{k}.png"), moved(seen, k) if k % 4 == 3 else np.roll(wall, k))
     threads = cv2.getNumThreads()
     found = find_in_photos([tmp_path], board)
     assert [name for name, _ in found.views] == ["3.png", "7.png", "11.png"]
