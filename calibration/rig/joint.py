@@ -27,7 +27,7 @@ from calibration.terms.rig_blocks import (
     STAND,
     SpotPixels,
     SpotTerm,
-    named_errors,
+    named_covariance,
     rig_of,
 )
 from calibration.terms.surveyed import (
@@ -247,12 +247,9 @@ def calibrate_jointly(measured: Measured, *, without: Bools | None = None, start
     rig = rig_of(measured.network.rig, found.values)
     at = [a for a in unknowns.at if a[0] in (INTRINSICS, CAMERAS, SCREENS, BOWS, BEAMS)]
     rows = unknowns.of_several(at)
-    names, T = named_errors(rig, found.values, at)
-    matrix = T @ C[np.ix_(rows, rows)] @ T.T
-    named = np.diagonal(matrix) > 0
     return Joint(
         rig=rig,
-        covariance=RigCovariance(tuple(np.array(names)[named].tolist()), matrix[np.ix_(named, named)]),
+        covariance=named_covariance(rig, found.values, at, C[np.ix_(rows, rows)]),
         values=found.values,
         adjusted=found,
         unknowns=unknowns,

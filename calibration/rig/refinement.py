@@ -51,6 +51,7 @@ from calibration.terms.rig_blocks import (
     CAMERAS,
     INTRINSICS,
     SCREENS,
+    named_covariance,
     named_errors,
     names_at,
     prior_of,
@@ -399,17 +400,14 @@ def refine(
     given_data = [t.reduced(stacks_of(rig)) for t in terms]
     S, _ = normal_equations(data)
     gain, vectors = np.linalg.eigh(known.root.T @ S @ known.root)
-    names, T = named_errors(rig, values, prior.at)
     directions = known.root @ vectors
     if not for_labels:
         after = _with_curvature(after, known, terms, values, changed)
-    matrix = T @ after.covariance @ T.T
-    named = np.diagonal(matrix) > 0
     moved, lenses = ((), {}) if start is None else MovedParts(rig, prior, terms, free, values, known).found()
     return Refinement(
         given=rig,
         rig=rig_of(rig, {s: v for s, v in values.items() if s in stacks}),
-        covariance=RigCovariance(tuple(np.array(names)[named].tolist()), matrix[np.ix_(named, named)]),
+        covariance=named_covariance(rig, values, prior.at, after.covariance),
         at=prior.at,
         values=values,
         before=known,

@@ -28,7 +28,7 @@ from calibration.least_squares.adjustment import (
 )
 from calibration.screens.flatness import smallest_scatter
 from calibration.terms.corners import CornerTerm
-from calibration.terms.rig_blocks import named_errors, rig_of, stacks_of
+from calibration.terms.rig_blocks import named_covariance, rig_of, stacks_of
 from calibration.terms.surveyed import (
     BoardOnScreenTerm,
     FrameTerm,
@@ -39,7 +39,7 @@ from calibration.terms.surveyed import (
     picked,
     whitening,
 )
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, symmetric
 from geometry.camera import FISHEYE, Camera
 from geometry.planes import intersect_plane
 from geometry.pose import Pose
@@ -302,17 +302,12 @@ def _fit(
     chi2, dof = found.chi2, found.dof
     p_fits = float(chdtrc(dof, chi2)) if dof > 0 else 1.0
     factor = chi2 / dof if dof > 0 and p_fits < SIGNIFICANT else 1.0
-    names, T = named_errors(rig, found.values, list(at))
-    covariance = T @ found.covariance(list(at)) @ T.T * factor
-    # Fixed lens parameters have no error and are omitted.
-    known = np.diagonal(covariance) > 0
-    names = tuple(n for n, k in zip(names, known, strict=True) if k)
-    covariance = covariance[np.ix_(known, known)]
+    named = named_covariance(rig, found.values, at, found.covariance(list(at)))  # without fixed lens parameters
     corner_errors = np.empty((0, 2)) if corners is None else corners.pixels - corners.project(found.values)
     return NetworkFit(
         rig=rig,
         values=found.values,
-        covariance=RigCovariance(names, (covariance + covariance.T) / 2),
+        covariance=RigCovariance(named.names, symmetric(named.matrix * factor)),
         variance_factor=factor,
         dof=dof,
         observation_residuals_px=observation_residuals(network, found.values),

@@ -115,6 +115,13 @@ def named_errors(rig: Rig, values: Values, at: Sequence[At]) -> tuple[tuple[str,
     return tuple(n for some in names for n in some), T
 
 
+def named_covariance(rig: Rig, values: Values, at: Sequence[At], covariance: Array) -> RigCovariance:
+    """The covariance (q, q) of some unknowns as that of their named numbers; without those that have no error."""
+    names, T = named_errors(rig, values, at)
+    matrix = T @ covariance @ T.T
+    return RigCovariance(names, matrix).part(np.diagonal(matrix) > 0)
+
+
 def prior_of(rig: Rig, covariance: RigCovariance) -> tuple[Prior | None, dict[str, Bools]]:
     """A covariance of rig parameters as a prior on the rig's stacks, and the numbers (k, dof) that are then free.
 

@@ -9,12 +9,12 @@ along the beam have no effect.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geometry.arrays import Array, robust_sigma, symmetric
+from geometry.arrays import Array, Bools, robust_sigma, symmetric
 from geometry.camera import FISHEYE, Camera
 from geometry.forward_model import SpotDerivatives, SpotModel
 from geometry.pose import Pose
@@ -36,6 +36,22 @@ class RigCovariance:
 
     names: tuple[str, ...]  # p names, as in the module's docstring; of one part without its place: fx, k1, x_m ...
     matrix: Array  # (p, p), in the parameters' units; may be singular
+
+    def part(self, keep: Sequence[bool] | Bools) -> RigCovariance:
+        """That of some of the p parameters."""
+        rows = np.flatnonzero(keep)
+        return RigCovariance(tuple(self.names[i] for i in rows), self.matrix[np.ix_(rows, rows)])
+
+
+def independent(parts: Iterable[RigCovariance]) -> RigCovariance:
+    """The joint covariance of the parameters of parts without correlations between them."""
+    names: tuple[str, ...] = ()
+    matrix = np.zeros((0, 0))
+    for part in parts:
+        matrix = np.pad(matrix, (0, len(part.names)))
+        matrix[len(names) :, len(names) :] = part.matrix
+        names += part.names
+    return RigCovariance(names, matrix)
 
 
 def with_variances(covariance: RigCovariance | None, variances: Mapping[str, float]) -> RigCovariance:
