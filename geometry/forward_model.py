@@ -54,6 +54,7 @@ class SpotModel:
     spot_names: tuple[str, ...]
     camera_of: Ints  # (n,) index into camera_names
     spot_of: Ints  # (n,) index into spot_names
+    screen_of: Ints  # (n,) index into the rig's screens
     beam_of: Ints  # (n,) index into the rig's beams
     point: Array  # (n, 3), m, in body: the beam's point
     ray: Array  # (n, 3), unit, in body: from that point towards the spot
@@ -91,7 +92,8 @@ class SpotModel:
         spots = [rig.spots[s] for _, s in views]
         beams = [rig.beams[s.beam] for s in spots]
         screens = [rig.screens[s.screen] for s in spots]
-        camera_names, spot_names, beam_names = list(rig.cameras), list(rig.spots), list(rig.beams)
+        camera_names, spot_names = list(rig.cameras), list(rig.spots)
+        screen_names, beam_names = list(rig.screens), list(rig.beams)
 
         def rows(values: list[Array], width: int) -> Array:
             return np.array(values, dtype=float).reshape(len(views), width)
@@ -105,6 +107,7 @@ class SpotModel:
             spot_names=tuple(spot_names),
             camera_of=np.array([camera_names.index(c) for c, _ in views], dtype=np.int64),
             spot_of=np.array([spot_names.index(s) for _, s in views], dtype=np.int64),
+            screen_of=np.array([screen_names.index(s.screen) for s in spots], dtype=np.int64),
             beam_of=np.array([beam_names.index(b.name) for b in beams], dtype=np.int64),
             point=rows([b.point for b in beams], 3),
             ray=rows([s.sign * b.direction for s, b in zip(spots, beams, strict=True)], 3),

@@ -62,29 +62,24 @@ class Unknowns:
     """Positions of the unknowns in one long vector."""
 
     at: tuple[At, ...]
-    start: Mapping[str, int]  # per block with free parameters
-    dof: Mapping[str, int]
+    column: Mapping[str, Ints]  # (k, dof) per block with free parameters
     size: int
 
     @staticmethod
     def of(values: Values, free: Free) -> Unknowns:
         """All unknowns of the blocks with free parameters, including their fixed ones."""
         at: list[At] = []
-        start, dof, size = {}, {}, 0
+        column, size = {}, 0
         for name, stack in values.items():
             if name in free and np.any(free[name]) and len(stack):
-                start[name], dof[name] = size, stack.dof
-                size += len(stack) * stack.dof
+                column[name] = size + np.arange(len(stack) * stack.dof).reshape(len(stack), stack.dof)
+                size += column[name].size
                 at += [(name, i) for i in range(len(stack))]
-        return Unknowns(tuple(at), start, dof, size)
-
-    def places(self, stack: str, element: int) -> Ints:
-        """Positions of the parameters of one unknown."""
-        return self.start[stack] + element * self.dof[stack] + np.arange(self.dof[stack])
+        return Unknowns(tuple(at), column, size)
 
     def of_several(self, at: Sequence[At]) -> Ints:
         """Positions of the parameters of several unknowns, in order."""
-        return np.concatenate([self.places(*a) for a in at])
+        return np.concatenate([self.column[stack][i] for stack, i in at])
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,11 +107,10 @@ def jacobian(term: Term, values: Values, unknowns: Unknowns) -> tuple[Array, spa
     n, d = line.residuals.shape
     rows, columns, entries = [], [], []
     for part in line.parts:
-        if part.stack not in unknowns.start:
+        if part.stack not in unknowns.column:
             continue
-        dof = part.jacobian.shape[2]
         row = (np.arange(n)[:, None] * d + np.arange(d))[:, :, None]
-        column = unknowns.start[part.stack] + part.index[:, None, None] * dof + np.arange(dof)
+        column = unknowns.column[part.stack][part.index][:, None]
         rows.append(np.broadcast_to(row, part.jacobian.shape).ravel())
         columns.append(np.broadcast_to(column, part.jacobian.shape).ravel())
         entries.append(part.jacobian.ravel())

@@ -169,7 +169,6 @@ class Sensitivity:
         self.names = tuple(names)
         cameras, screens, beams = list(rig.cameras), list(rig.screens), list(rig.beams)
         camera_of = model.camera_of
-        screen_of = np.array([screens.index(rig.spots[s].screen) for _, s in model.views], dtype=np.int64)
         # Per field of SpotDerivatives: indices of parameters, their columns in it, and the views (n, .) they act on.
         self._actions: dict[str, tuple[list[int], list[int], Array]] = {}
         masks: dict[str, list[Array]] = {}
@@ -184,7 +183,7 @@ class Sensitivity:
                 views = camera_of == cameras.index(item)
             elif kind == "screens":
                 field, column = ("bow", BOW.index(parameter)) if parameter in BOW else ("screen", POSE.index(parameter))
-                views = screen_of == screens.index(item)
+                views = model.screen_of == screens.index(item)
             else:
                 is_direction = parameter in DIRECTION
                 field = "direction" if is_direction else "point"

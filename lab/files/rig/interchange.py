@@ -169,12 +169,8 @@ def _from_rig(file: RigFile) -> tuple[Read, dict[str, RigCovariance]]:
 
 def _share(covariance: RigCovariance, prefix: str) -> RigCovariance | None:
     """The covariance of the lens parameters: with the prefix, not the pose's; None where there are none."""
-    own = covariance.part(
-        [
-            n.startswith(prefix) and "." not in n[len(prefix) :] and not re.search(r"_(m|rad)$", n)
-            for n in covariance.names
-        ]
-    )
+    of_lens = re.compile(re.escape(prefix) + r"[^.]*(?<!_m)(?<!_rad)")
+    own = covariance.part([of_lens.fullmatch(n) is not None for n in covariance.names])
     return RigCovariance(tuple(n.removeprefix(prefix) for n in own.names), own.matrix) if own.names else None
 
 
