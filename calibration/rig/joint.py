@@ -15,8 +15,15 @@ from scipy.special import chdtrc, chdtri
 
 from calibration.beams.beams import StandModel
 from calibration.least_squares.adjustment import Adjusted, At, Cauchy, Free, Limits, Poses, Prior, Term, Values, solve
-from calibration.screens.flatness import smallest_scatter
-from calibration.screens.network import Network, NetworkFit, flat_boards, normalised_residuals
+from calibration.screens.network import (
+    SURFACES,
+    SURVEY,
+    Network,
+    NetworkFit,
+    normalised_residuals,
+    point_term,
+    stated_terms,
+)
 from calibration.terms.rig_blocks import (
     BEAMS,
     BOWS,
@@ -31,19 +38,13 @@ from calibration.terms.rig_blocks import (
     rig_of,
 )
 from calibration.terms.surveyed import (
-    FrameTerm,
-    PointTerm,
     RecordTerm,
-    SurfaceTerm,
-    SurveyTerm,
     picked,
     pose_of,
     rows_of,
-    whitening,
     widened,
 )
 from geometry.arrays import Array, Bools, Ints
-from geometry.camera import FISHEYE
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 
@@ -152,11 +153,9 @@ def shares(informations: Mapping[str, Array], C: Array, effect: Array) -> dict[s
     return {name: spread @ A @ spread.T for name, A in informations.items()}
 
 
-# The kinds of measurement, named as in reports.
-LENSES, SURVEY, DOTS, SURFACES = "lens calibrations", "survey", "pixels of dots", "screen surfaces"
-CORNERS, FIXED, SCANS = "board corners", "boards on screens", "scans"
-FLAT_BOARDS = "flatness of boards"
-SPOTS, RECORDS, PLACE, FRAMES = "spots", "stand positions", "place of the stand", "screen axes"
+# The kinds of measurement beside those of network.py, named as in reports.
+DOTS, CORNERS = "pixels of dots", "board corners"
+SPOTS, RECORDS, PLACE = "spots", "stand positions", "place of the stand"
 LOST = "positions without a record"
 P_OUTLIER = 1e-4  # probability that a correct measurement is excluded
 P_MISFIT = 1e-3  # p-value of chi-square below which a kind of measurement misfits
@@ -278,41 +277,18 @@ def free_parameters(measured: Measured) -> dict[str, bool | Bools]:
 def _terms_by_kind(measured: Measured) -> tuple[dict[str, Term], dict[str, tuple[Term, ...]]]:
     """Terms by kind: those whose rows may be excluded, and the others."""
     network, stand = measured.network, measured.stand
-    control_points, s = network.control_points, network.point_observations
-    fisheye = np.array([c.lens == FISHEYE for c in network.rig.cameras.values()], dtype=bool)
     every: dict[str, Term] = {SPOTS: SpotTerm(network.rig, measured.spots)}
-    fixed: dict[str, tuple[Term, ...]] = {}
-    if len(s):
-        every[DOTS] = PointTerm(s.camera_of, s.point_of, s.pixels, np.eye(2) / s.sigma_px[:, None, None], fisheye)
-    if len(control_points):
-        index = np.arange(len(control_points))
-        fixed[SURVEY] = (SurveyTerm(index, control_points.xyz, whitening(control_points.covariance)),)
-        on = control_points.screen_of >= 0
-        if network.off_surface is not None:
-            on = on & ~network.off_surface
-        if on.any():
-            scatter = np.array(
-                [smallest_scatter(network.surface_scatter_m.get(int(k), 0.0)) for k in control_points.screen_of]
-            )
-            fixed[SURFACES] = (SurfaceTerm(control_points.screen_of[on], index[on], scatter[on]),)
+    if len(network.point_observations):
+        every[DOTS] = point_term(network)
     if measured.screens.corners is not None:
         every[CORNERS] = measured.screens.corners
-        fixed[FLAT_BOARDS] = tuple(flat_boards(measured.screens.corners))
-    if network.fixed is not None:
-        fixed[FIXED] = (network.fixed,)
-    if network.screen_priors:
-        fixed[SCANS] = tuple(network.screen_priors)
-    if network.lens_priors:
-        fixed[LENSES] = tuple(network.lens_priors)
+    fixed = stated_terms(network, pose_of(measured.screens.values, SCREENS), measured.screens.corners)
     count = len(stand.stand_from_body.translation)
     sigmas = np.broadcast_to(np.asarray(stand.pose_sigmas, dtype=float), (count, 6))
     if np.any((sigmas > 0) & np.isfinite(sigmas)):
         every[RECORDS] = RecordTerm(POSES, np.arange(count), stand.stand_from_body, sigmas)
     if stand.world_from_stand is not None and stand.stand_covariance is not None and np.any(stand.stand_covariance):
         fixed[PLACE] = (Prior(((STAND, 0),), (Poses.of([stand.world_from_stand]),), stand.stand_covariance),)
-    screens = pose_of(measured.screens.values, SCREENS)
-    if len(screens.translation):
-        fixed[FRAMES] = (FrameTerm(np.arange(len(screens.translation)), screens),)
     return every, fixed
 
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.rig.joint import DOTS, FRAMES, LEAST_REDUNDANCY, LOST, P_MISFIT, RECORDS, SPOTS, Joint
+from calibration.rig.joint import DOTS, LEAST_REDUNDANCY, LOST, P_MISFIT, RECORDS, SPOTS, Joint
 from calibration.rig.rig_figures import ExpectedPose, HoldOut, RigCalibration, in_degrees, in_mm
+from calibration.screens.network import FRAMES
 from calibration.terms.rig_blocks import POSES, STAND, lines_in, stacks_of
 from calibration.terms.surveyed import pose_of
 from geometry.arrays import Array, Bools, Ints, skew

@@ -10,8 +10,9 @@ import pytest
 
 from bench.rig_calibration import as_measured, bench_figures, calibrated, measured_with, parameter_errors
 from calibration.least_squares.adjustment import AdjustmentError
-from calibration.rig.joint import CORNERS, DOTS, FRAMES, LENSES, RECORDS, SPOTS, calibrate_jointly
+from calibration.rig.joint import CORNERS, DOTS, RECORDS, SPOTS, calibrate_jointly
 from calibration.rig.rig_figures import calibrate_in_steps, central_pose, expected_pose, hold_out, spot_sigma
+from calibration.screens.network import FRAMES, LENSES
 from calibration.screens.screens import calibrate
 from calibration.terms.corners import CornerTerm
 from geometry.pose import Pose
