@@ -108,10 +108,8 @@ def test_a_stand_ten_times_less_accurate_than_stated_is_detected():
 def test_a_lens_refocused_since_its_calibration_is_detected():
     c = campaign()
     left = c.lenses["left"]
-    matrix = left.camera.matrix + np.diag([9.0, 9.0, 0.0])  # 20 sigmas and more
-    found = calibrated(
-        replace(c, lenses={**c.lenses, "left": replace(left, camera=replace(left.camera, matrix=matrix))})
-    )
+    matrix = left.camera_matrix + np.diag([9.0, 9.0, 0.0])  # 20 sigmas and more
+    found = calibrated(replace(c, lenses={**c.lenses, "left": replace(left, camera_matrix=matrix)}))
     (finding,) = [f for f in findings_of(found) if f.what.startswith(LENSES)]
     assert finding.level >= Level.WARN
     assert "refocused" in finding.why
