@@ -20,6 +20,7 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.camera import FISHEYE, in_picture, pinhole_numbers, project_points_full
 from geometry.compiled_projection import VIEW, Views, derivatives_all, lens_codes, lit_points, project_all
 from geometry.lens import padded, tilt_matrix
+from geometry.planes import intersect_plane, screen_to_world
 from geometry.pose import Pose
 from geometry.rig import Rig
 
@@ -203,3 +204,14 @@ def _stacked(poses: Pose, rows: tuple[int, ...] = ()) -> tuple[Array, Array, tup
         np.array(t, dtype=np.float64, order="C").reshape(-1, 3),
         stack,
     )
+
+
+def points_on_screens(rig: Rig, view: Ints, pixels: Array) -> Array:
+    """World points (N, 3), m, on the planes of the screens, of pixels (N, 2) of some views (N,); nan for nan."""
+    out = np.full((len(pixels), 3), np.nan)
+    for v, (camera, spot) in enumerate(rig.views()):
+        rows = np.flatnonzero((view == v) & ~np.isnan(pixels[:, 0]))
+        if len(rows):
+            screen = rig.screens[rig.spots[spot].screen].world_from_screen
+            out[rows] = screen_to_world(intersect_plane(*rig.cameras[camera].rays(pixels[rows]), screen), screen)
+    return out

@@ -103,16 +103,10 @@ def is_known(rig: Rig, name: str) -> bool:
 
 def perturbed_camera(camera: Camera, change: Mapping[str, float]) -> Camera:
     """The camera with some parameters, by their names without its own, changed by so much."""
-
-    def of(names: Sequence[str]) -> Array:
-        return np.array([change.get(name, 0.0) for name in names])
-
-    d = of(PINHOLE)
+    d = _changes_of(change, PINHOLE)
     matrix = camera.matrix + np.array([[d[0], 0, d[2]], [0, d[1], d[3]], [0, 0, 0]])
-    distortion = tuple((np.array(camera.distortion) + of(distortion_names(camera))).tolist())
-    moved = of(POSE)
-    pose = camera.camera_from_world
-    place = pose.plus(moved) if moved.any() else pose
+    distortion = tuple((np.array(camera.distortion) + _changes_of(change, distortion_names(camera))).tolist())
+    place = _perturbed_pose(camera.camera_from_world, change)
     clock = {n: getattr(camera, n) + change.get(n, 0.0) for n in CLOCK}
     return replace(camera, matrix=matrix, distortion=distortion, camera_from_world=place, **clock)
 
@@ -315,16 +309,9 @@ def uncertainty_tracks(
         if not values[-1] > 0:
             continue
         direction = covariance @ J[i].T @ vectors[:, -1] / np.sqrt(values[-1])
-        moved = world_from_body_moved(world_from_body, np.linspace(-sigmas, sigmas, steps)[:, None] * direction)
+        moved = world_from_body.plus(np.linspace(-sigmas, sigmas, steps)[:, None] * direction)
         out[i] = model.subset(np.array([i])).project(moved)[0][:, 0]
     return out
-
-
-def world_from_body_moved(world_from_body: Pose, deltas: Array) -> Pose:
-    """A stack of poses (k,): one pose changed by each of the pose errors (k, 6)."""
-    k = len(deltas)
-    stack = Pose(np.tile(world_from_body.rotation, (k, 1, 1)), np.tile(world_from_body.translation, (k, 1)))
-    return stack.plus(deltas)
 
 
 def beam_image(rig: Rig, camera: Camera, spot: str, world_from_body: Pose, steps: int = 81) -> Array:
